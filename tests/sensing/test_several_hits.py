@@ -157,6 +157,7 @@ def test_gradients(dead):
     assert torch.autograd.gradcheck(noisy, (x,), fast_mode=True, nondet_tol=1e-12)
 
 
+@pytest.mark.slow
 def test_score_of_draws_gives_the_gradient_of_the_mean():
     rate, draws = 4 * shapes(6)["ends"], 10_000
     brightness = torch.ones(draws, 1, 1, 1, 1, dtype=torch.float64, requires_grad=True)

@@ -21,6 +21,7 @@ from torchtransient.sensing.renewal_chain import BinResponse, bin_response
 
 PHOTONS = 0.25  # of the brightest piece, at most: the total variation of means is then below 1e-5
 MOST_PIECES = 1 << 14
+_AT_ONCE = 1 << 15  # pieces
 _STRETCH = 1000  # pieces, over which exp(flux) stays inside float64
 _ROOT = math.sqrt(3.0)
 
@@ -155,11 +156,14 @@ def _armed(start: Tensor, rate: Tensor, joined: Tensor | None) -> tuple[Tensor, 
     return torch.cat(found, -1), start
 
 
-def cycle_of_rows(rate: Tensor, dead_bins: Tensor, pieces: int) -> Cycle:
-    """For rates (P, T) per cycle and bin, at least 0, and a scalar dead time in bins, float64, bins cut in `pieces`."""
+def cycle_of_rows(rate: Tensor, dead_bins: Tensor, pieces: int, largest: float | None = PHOTONS) -> Cycle:
+    """For rates (P, T) per cycle and bin, at least 0, and a scalar dead time in bins, float64, bins cut in `pieces`.
+
+    `largest`: a bound of the photons in a piece, None where it is not known.
+    """
     whole, part = whole_and_part(dead_bins.to(rate.device, torch.float64) * pieces)
     walk = BlockWalk(rate.shape[-1], whole, pieces)
-    response = bin_response(rate / pieces, part, 1.0)
+    response = bin_response(rate / pieces, part, largest)
     start = torch.ones_like(rate[:, :1])
     columns: list[tuple[Tensor, Tensor, Tensor]] = []
     for begin, end in walk.stretches():
@@ -183,8 +187,11 @@ def detected_rows(rate: Tensor, dead_bins: Tensor) -> Tensor:
     level, present, hidden = row_levels(rate, least)
 
     def solved(rows: Tensor, k: int) -> Tensor:
-        count = cycle_of_rows(rows, dead_bins, least << k).count
-        return count.view(*rows.shape[:-1], bins, least << k).sum(-1)
+        # as many rows at a time as stay in the cache
+        found = []
+        for few in torch.split(rows, max(1, _AT_ONCE // (bins << k))):
+            found.append(cycle_of_rows(few, dead_bins, least << k).count.view(*few.shape, least << k).sum(-1))
+        return torch.cat(found) if len(found) > 1 else found[0]
 
     if len(present) == 1:
         return solved(rate, present[0])

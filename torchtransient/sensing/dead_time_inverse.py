@@ -138,7 +138,7 @@ def rates_of_counts(counts: Tensor, cycles: float, dead_bins: float) -> tuple[Te
         with torch.no_grad():
             # in a flood the histogram tells little, and the cost of looking closer has no end
             seen = rate.nan_to_num(0.0).clamp_max(_FLOOD)
-            missed = cycles * (detected_rows(seen, dead) - cycle_of_rows(seen, dead, 1).count)
+            missed = cycles * (detected_rows(seen, dead) - cycle_of_rows(seen, dead, 1, None).count)
             missed = missed.clamp(-_FARTHEST * counts, _FARTHEST * counts)
             settled = not bool(((missed - last).abs() > 1e-10 * counts).any())
         if settled:

@@ -30,22 +30,31 @@ def _weights(largest: float) -> list[float]:
     return weights
 
 
+def _series(x: Tensor, largest: float) -> Tensor:
+    weights = _weights(largest)
+    series = torch.full_like(x, weights[-1])
+    for weight in reversed(weights[:-1]):
+        series = weight - x * series
+    return series
+
+
 def moments(x: Tensor, largest: float | None = None) -> Moments:
     """For x >= 0, float64. One of them is a series where x is small; the others follow by parts, adding up only.
 
     `largest`: a bound of x that is known, for x that cannot be looked at (torch.func.vmap).
     """
-    small = x < _SERIES_BELOW
-    near, far = torch.where(small, x, torch.zeros_like(x)), torch.where(small, torch.ones_like(x), x)
-    if largest is None:
-        largest = float(near.detach().amax()) if near.numel() else 0.0
-    weights = _weights(min(largest, _SERIES_BELOW))
-    series = torch.full_like(x, weights[-1])
-    for weight in reversed(weights[:-1]):
-        series = weight - near * series
-    closed = (0.5 - (1 - (1 + far) * torch.exp(-far)) / far**2) / far
-    hit_1 = torch.where(small, series, closed)
-    decay_1 = torch.where(small, 0.5 - near * series, (1 - (1 + far) * torch.exp(-far)) / far**2)
+    if largest is not None and largest <= _SERIES_BELOW:
+        hit_1 = _series(x, largest)
+        decay_1 = 0.5 - x * hit_1
+    else:
+        small = x < _SERIES_BELOW
+        near, far = torch.where(small, x, torch.zeros_like(x)), torch.where(small, torch.ones_like(x), x)
+        if largest is None:
+            largest = float(near.detach().amax()) if near.numel() else 0.0
+        series = _series(near, min(largest, _SERIES_BELOW))
+        closed = (0.5 - (1 - (1 + far) * torch.exp(-far)) / far**2) / far
+        hit_1 = torch.where(small, series, closed)
+        decay_1 = torch.where(small, 0.5 - near * series, (1 - (1 + far) * torch.exp(-far)) / far**2)
     decay_0 = torch.exp(-x) + x * decay_1
     return Moments((decay_0, decay_1), (decay_0 - decay_1, hit_1))
 
