@@ -50,7 +50,9 @@ def stages_of(chain: nn.Module) -> Iterator[Stage | None]:
     """The sensors of a chain in their order, those of nested chains too; None for modules of another kind."""
 
     def walk(module: nn.Module, prefix: str) -> Iterator[Stage | None]:
-        for name, child in module.named_children():
+        for name, child in module._modules.items():  # named_children leaves out what comes twice
+            if child is None:
+                continue
             inner = getattr(child, "stages", child)
             if isinstance(inner, (nn.ModuleList, nn.Sequential)):
                 yield from walk(inner, f"{prefix}{name}.")
@@ -84,8 +86,8 @@ def check_stages(chain: nn.Module) -> bool:
 
 def _parts_of(chain: nn.Module) -> list[Stage]:
     """Every sensor of a chain, those that other sensors are made of too."""
-    parts = ((name.replace("stages.", ""), part) for name, part in chain.named_modules() if part is not chain)
-    return [Stage(name, part) for name, part in parts if isinstance(part, Sensor)]
+    parts = ((name.replace("stages.", ""), part) for name, part in chain.named_modules(remove_duplicate=False))
+    return [Stage(name, part) for name, part in parts if isinstance(part, Sensor) and part is not chain]
 
 
 # ------------------------------------------------------------------------------------------------------------- bins
