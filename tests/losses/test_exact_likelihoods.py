@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 
@@ -227,3 +228,39 @@ def test_gradcheck_in_the_dark(loss, exposures):
     change = (loss(torch.full_like(dark, step), counts) - loss(dark, counts)).detach() / step
     torch.testing.assert_close(there, change, rtol=1e-4, atol=1e-3 * exposures)
     assert bool(torch.isfinite(slope).all())
+
+
+@pytest.mark.parametrize("cycles", [40, 1000, 30_000])
+@pytest.mark.parametrize("reduction", ["mean", "sum"])
+@pytest.mark.parametrize("masked", [False, True])
+def test_slopes_of_half_precision_are_numbers_whatever_the_cycles(cycles, reduction, masked):
+    """Slopes are counts over the level, times cycles: -inf of float16 from three cycles on, and of coarse bins."""
+    n = torch.zeros(1, 8, 1, 2)
+    n[0, 2], n[0, 6, 0, 0] = 5.0, 1.0
+    free, first = losses.free_running_nll, functools.partial(losses.first_photon_nll, cycles=cycles)
+    each = {
+        "first": first,
+        "dead time": functools.partial(first, dead_bins=2.5),
+        "free": functools.partial(free, periods=cycles, dead_bins=2.5),
+        "poisson": losses.poisson_nll,
+        "first, coarse": functools.partial(losses.multiscale_loss, compare=first),
+        "poisson, coarse": functools.partial(losses.multiscale_loss, compare=losses.poisson_nll, scales=[3, 8]),
+    }
+    mask = torch.tensor([1, 1, 1, 0, 1, 1, 1, 0]).bool().view(1, 8, 1, 1) if masked else None
+    for name, loss in each.items():
+        for rate in (0.0, 1e-7, 1e-3):
+            leaf = torch.full(n.shape, rate, dtype=torch.float16, requires_grad=True)
+            (slope,) = torch.autograd.grad(loss(leaf, n, mask=mask, reduction=reduction), leaf)
+            assert bool(slope.isfinite().all()), name
+            assert float(slope[0, 2, 0, 0]) < 0 or rate > 0, name
+
+
+def test_a_mean_in_half_precision_is_that_of_single():
+    """Where the slopes of the formula fit into float16 once averaged, they are those of the formula."""
+    n = torch.poisson(torch.full((1, 64, 8, 8), 0.3), generator=seeded())
+    rate = torch.full(n.shape, 2.0**-12)
+    slopes = []
+    for dtype in (torch.float16, torch.float32):
+        leaf = rate.to(dtype).requires_grad_()
+        slopes.append(torch.autograd.grad(losses.first_photon_nll(leaf, n, 100_000), leaf)[0].float())
+    torch.testing.assert_close(*slopes, rtol=2e-3, atol=1e-3)

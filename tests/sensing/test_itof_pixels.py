@@ -475,3 +475,24 @@ def test_frequencies_of_any_kind(given):
 def test_errors(call, error):
     with pytest.raises(error, match=r"\w+: .*expected"):
         call()
+
+
+@pytest.mark.parametrize("readout", ["two_tap", "differential", "single"])
+def test_the_standard_deviation_at_the_corners_of_a_square_code(readout):
+    """The slope has two values at a corner: one of them was claimed, up to 19 % too small."""
+    axis = TimeAxis.from_seconds(0.0, 1e-10, 256)
+    code = square_code(5)
+    pixel = code if readout == "single" else TwoTapCode(code)
+    x = torch.full((1, 256, 1, 1), 2.0, dtype=torch.float64)
+    x[0, 150] = 4000.0
+    mean = ItofCorrelation(pixel, [20e6], axis).expected(x)
+    number = 4000
+    many = mean.expand(number, *mean.shape[-4:]).contiguous()
+    frames = torch.poisson(many, generator=torch.Generator().manual_seed(1))
+    noise = None
+    if readout == "differential":
+        frames, noise = TapDifference()(frames), ItofNoise(offset_e=float(x.sum()) / 5)
+    reading = read_itof(frames, [20e6], 5, readout=readout, code=pixel, noise=noise)
+    claimed = float(reading.depth_std_m.square().mean().sqrt())
+    # four deviations of a standard deviation of so many, and what second order leaves of the average
+    assert float(reading.depth_m.std()) == pytest.approx(claimed, rel=4 / (2 * number) ** 0.5 + 0.01)

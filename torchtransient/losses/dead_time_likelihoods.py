@@ -27,6 +27,7 @@ from torchtransient.losses.comparison import (
 from torchtransient.losses.comparison import reduce as _reduce
 from torchtransient.losses.layouts import as_columns, bins_dim, check_held
 from torchtransient.losses.likelihoods import (
+    averaged_over,
     check_constant,
     check_prediction,
     check_rates,
@@ -92,7 +93,7 @@ def first_photon_nll(
     measured = _exact(target, mask, dim)
     check_constant(measured, constant, where)
     n, r = as_columns(measured, dim), as_columns(floored(rate, floor, where), dim).to(torch.float64)
-    level = dark_level(n, floor, input, number)
+    level = dark_level(n, floor, input, number, averaged_over(rate, mask, reduction))
     dark = None if level is None else _dark(n, r, level)
     near = r if level is None or dark is None else torch.where(dark, level, r)
     value = -first_photon_log_prob(n, near, number, dead, constant=constant, where=where)
@@ -173,7 +174,8 @@ def free_running_nll(
             "got more. Check periods and dead time."
         )
     r = as_columns(floored(rate, floor, where), dim).to(torch.float64)
-    value = r * armed.clamp_min(0) - count_log(n, r, dark_level(n, floor, input, periods))
+    level = dark_level(n, floor, input, periods, averaged_over(rate, mask, reduction))
+    value = r * armed.clamp_min(0) - count_log(n, r, level)
     return _reduce(value.to(rate.dtype).reshape(rate.shape), reduction, where, mask)
 
 

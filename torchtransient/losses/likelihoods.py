@@ -3,21 +3,26 @@
 All take a prediction, rates or means (..., C, T, H, W), and measurements of the same shape: `(input, target)`, as torch
 and the other losses. They are exact, and finite with finite gradients at zero counts, in empty bins and of a model
 without any light. Where the model says "impossible" (a count where the mean is 0) the logarithm goes on as its tangent,
-from a mean of 1e-9 of the counts of the bin on (`count_log`; 3e-5 of float16): convex, with a slope, and no fit
-notices, since as many bins as that hold less than one count in all. A `floor` is a choice: in the unit of the mean, it
-is added to it and biases what is as dark as it (0 is the plain formula, infinite there). Counts below 0 (those of a
-normal surrogate) enter the same formulas, which are linear in them: the gradient stays unbiased. With `constant` there
-is no such formula, and they are an error. NaN in what counts, in counts or model, is NaN in the loss. Terms that do not
-depend on the mean are left out unless `constant`. Counts may be whole numbers, truth values of frames, or half
-precision; the loss is computed and returned in the precision of the more precise of the two, float32 at least. `dim`:
-where time is (`layouts.py`). `mask`: truth values that broadcast to the tensors, True counts (`comparison.py`). A
-measurement in the place of the prediction is an error where it shows (`check_prediction`).
+from a mean of 1e-9 of the counts of the bin on (`count_log`): convex, with a slope, and no fit notices, since as many
+bins as that hold less than one count in all. Of a prediction in float16 slopes end where float16 holds them, at 2^15
+times the bins averaged over: of sums over first photons of many cycles that is too early, take means. A `floor` is a
+choice: in the unit of the mean, it is added to it and biases what is as dark as it (0 is the plain formula, infinite
+there). Counts below 0 (those of a normal surrogate) enter the same formulas, which are linear in them: the gradient
+stays unbiased. With `constant` there is no such formula, and they are an error. NaN in what counts, in counts or
+model, is NaN in the loss. Terms that do not depend on the mean are left out unless `constant`. Counts may be whole
+numbers, truth values of frames, or half precision; the loss is computed and returned in the precision of the more
+precise of the two, float32 at least. `dim`: where time is (`layouts.py`). `mask`: truth values that broadcast to the
+tensors, True counts (`comparison.py`). A measurement in the place of the prediction is an error where it shows
+(`check_prediction`).
 """
 
 from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 
 import torch
 from torch import Tensor, nn
@@ -47,6 +52,8 @@ from torchtransient.losses.results import LIGHT, Light, reads
 LEAST_MEAN = 1e-9
 # Of predictions in float16, whose numbers of full precision go from 6e-5 to 65504: a slope that is one of them.
 _LEAST_IN_HALF = 2.0**-15
+# The bins that a loss of a float16 prediction is averaged over, whose parts are compared in single precision.
+_OF_HALF: ContextVar[Tensor | float | None] = ContextVar("of_half", default=None)
 # Smaller records are examples made by hand, where whole numbers say nothing.
 _A_RECORD = 64
 # Relative to the average of an item: small against noise, large enough that 1/floor stays a usable gradient.
@@ -108,14 +115,38 @@ def floored(model: Tensor, floor: Tensor | float | None, where: str) -> Tensor:
     return model if floor is None else model + check_level("floor", floor, model, where, zero=True)
 
 
-def dark_level(counts: Tensor, floor: object, input: object, exposures: int = 1) -> Tensor | None:
+def dark_level(
+    counts: Tensor, floor: object, input: object, exposures: int = 1, averaged: Tensor | float = 1
+) -> Tensor | None:
     """Of each bin, the mean per exposure below which a logarithm goes on as its tangent; None with a floor. `input`:
-    the prediction as it was given, in the precision that its gradient is given in.
+    the prediction as it was given, in the precision that its gradient is given in. A slope is counts over the level,
+    over the number of bins that the loss is `averaged` over: in float16 it has to be a number, however many exposures.
     """
     if floor is not None:
         return None
-    least = _LEAST_IN_HALF if isinstance(input, Tensor) and input.dtype == torch.float16 else LEAST_MEAN
-    return (least / exposures * counts.detach().abs()).clamp_min(torch.finfo(counts.dtype).tiny)
+    least: Tensor | float = LEAST_MEAN / exposures
+    outer = _OF_HALF.get()
+    if outer is not None or (isinstance(input, Tensor) and input.dtype == torch.float16):
+        averaged = averaged if outer is None else outer
+        least = torch.as_tensor(_LEAST_IN_HALF / averaged, dtype=counts.dtype, device=counts.device).clamp_min(least)
+    return (least * counts.detach().abs()).clamp_min(torch.finfo(counts.dtype).tiny)
+
+
+@contextmanager
+def in_the_name_of(input: object, averaged: Tensor | float) -> Iterator[None]:
+    """Likelihoods inside are those of parts of a prediction `input`, averaged over as many bins as it says."""
+    token = _OF_HALF.set(averaged if isinstance(input, Tensor) and input.dtype == torch.float16 else None)
+    try:
+        yield
+    finally:
+        _OF_HALF.reset(token)
+
+
+def averaged_over(value: Tensor, mask: Tensor | None, reduction: Reduction) -> Tensor | float:
+    """The number that a loss of these values is divided by."""
+    if reduction != "mean":
+        return 1
+    return max(value.numel(), 1) if mask is None else mask.sum().clamp_min(1)
 
 
 def count_log(counts: Tensor, mean: Tensor, least: Tensor | None) -> Tensor:
@@ -201,7 +232,8 @@ def poisson_nll(
     check_rates(mean, where)
     check_constant(counts, constant, where)
     m = floored(mean, floor, where)
-    value = m - count_log(counts, m, dark_level(counts, floor, input))
+    level = dark_level(counts, floor, input, averaged=averaged_over(mean, mask, reduction))
+    value = m - count_log(counts, m, level)
     if constant:
         value = value + torch.lgamma(counts + 1)
     return _reduce(value, reduction, where, mask)

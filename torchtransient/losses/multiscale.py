@@ -30,6 +30,7 @@ from torchtransient.losses.comparison import (
     reduce,
 )
 from torchtransient.losses.layouts import bins_dim, check_held
+from torchtransient.losses.likelihoods import averaged_over, in_the_name_of
 from torchtransient.losses.measurement import squared_loss
 from torchtransient.losses.pair_losses import PairLoss, check_compare, shared_dim
 from torchtransient.losses.results import TRANSIENT, Transient, reads
@@ -78,6 +79,7 @@ def multiscale_loss(
     check_held(reduction, dim, where)
     steps = _check_scales(scales, where)
     known = _check_compare(compare, where)
+    given = input
     input, target = check_pair(input, target, where)
     dim = bins_dim(input, shared_dim(compare, known, dim, input, where), where)
     mask = check_mask(mask, input, where)
@@ -93,7 +95,10 @@ def multiscale_loss(
     windows = _Windows(records[0]), _Windows(records[1]), _Windows(seen)
     light = {name: _Windows(level) for name, level in _levels(compare, input, mask, seen, dim, where).items()}
     each: Callable[..., Tensor] = functools.partial(compare, dim=_BINS) if "dim" in known else compare  # type: ignore[call-arg]
-    values = [_at_scale(s, windows, light, input.select(dim, 0), each) for s in steps]
+    # each bin has the mean of the slopes of its coarse ones
+    averaged = number.amin().to(input.device) * averaged_over(input.select(dim, 0), pixels, reduction)
+    with in_the_name_of(given, averaged):
+        values = [_at_scale(s, windows, light, input.select(dim, 0), each) for s in steps]
     mean = torch.stack(values).mean(0) / number.to(input)
     return reduce(mean, reduction, where, pixels)
 

@@ -38,6 +38,7 @@ from torchtransient.sensing.itof_depth import (
     sums_of,
     tap_phasor,
     unwrap_depth,
+    wrapped_difference,
 )
 from torchtransient.sensing.itof_pixels import ItofCalibration, TwoTapCode, in_direction
 from torchtransient.sensing.layout import check_number, without_autocast
@@ -45,6 +46,7 @@ from torchtransient.tensor_record import TensorRecord
 from torchtransient.units import SPEED_OF_LIGHT
 
 _TURN = 2 * math.pi
+_SMALL_PHASE = 0.2  # radians of noise, up to which a phase is right to first order
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -53,9 +55,9 @@ class ItofReading(TensorRecord):
     ``offset``, of one exposure, in the units of the frames, (..., C, F, H, W), the offset None for differences;
     ``depth_std_m`` the standard deviation of depth, ``depth_m`` the depth, both (..., C, H, W) in metres.
 
-    ``depth_std_m`` is first order in the noise, infinite without modulated
-    light, and None where nobody can know it: see `ItofNoise`. It holds no wrong number of turns, no wiggling and no
-    second path.
+    ``depth_std_m`` is first order in the noise, averaged over it where a ``code`` has corners (2 N frames are
+    decoded for it), infinite without modulated light, and None where nobody can know it: see `ItofNoise`. It holds no
+    wrong number of turns, no wiggling and no second path.
     """
 
     phase: Tensor
@@ -224,8 +226,14 @@ def read_itof(
             raise ShapeError(f"{me}: expected num_taps = {gates.num_taps} of the code, got {num_taps}.")
         phase, slopes = _by_shape(steps, gates, 1024, readout)
     offset = None if readout == "differential" else offset_of(taps, num_taps, readout)
+    variance = _variance(taps, steps, readout, noise)
+    std = None
+    if variance is not None:
+        turn = _first_order(slopes, variance)
+        if code is not None:
+            turn = _at_corners(turn, steps, phase, variance, gates, readout)
+        std = _depth_std(turn, values)
     phase = _without_offsets(phase, known, values)
-    std = _depth_std(taps, steps, slopes, values, readout, noise)
     if len(values) == 1:
         depth = depth_of_phase(phase, values[0]).squeeze(-3)
     else:
@@ -259,10 +267,8 @@ def _slopes(phasor: Tensor, num_taps: int) -> Tensor:
     return torch.where(there, slopes, math.inf)
 
 
-def _depth_std(
-    taps: Tensor, steps: Tensor, slopes: Tensor, values: tuple[float, ...], readout: str, noise: ItofNoise | None
-) -> Tensor | None:
-    """(..., C, H, W) metres, or None where the noise cannot be known."""
+def _variance(taps: Tensor, steps: Tensor, readout: str, noise: ItofNoise | None) -> Tensor | None:
+    """Of the steps (..., F, N, H, W), or what broadcasts to it, in their unit; None where it cannot be known."""
     if noise is None and not taps.is_floating_point():
         return None  # nobody said how many electrons a number of the converter is
     known = noise or ItofNoise()
@@ -277,14 +283,47 @@ def _depth_std(
         variance = sums_of(taps, steps.shape[-3], "read_itof").clamp_min(0) * gain + 2 * known.read_noise_e**2
     else:
         variance = steps.clamp_min(0) * gain + known.read_noise_e**2
+    return variance / gain**2
+
+
+def _first_order(slopes: Tensor, variance: Tensor) -> Tensor:
+    """Variance of the phases (..., F, H, W), infinite in darkness."""
     # The slopes of dark pixels are infinite: neither a product with zero nor a gradient may come of them.
     there = ~torch.isinf(slopes)
-    power = ((torch.where(there, slopes, 0.0) / gain).square() * variance).sum(-3)
+    power = (torch.where(there, slopes, 0.0).square() * variance).sum(-3)
+    return torch.where(there.all(-3), power, math.inf)
+
+
+def _at_corners(
+    first: Tensor, steps: Tensor, phase: Tensor, variance: Tensor, code: CorrelationCode, readout: str
+) -> Tensor:
+    """Variance of phases decoded by shape, where noise is small beside the phase: that of 2 N frames around.
+
+    At a corner of a code the slope has two values, and frames on its inner side jump from one side to the other: the
+    slope is averaged over the noise. sqrt(N) deviations in each step have the covariance of all of them together.
+    """
+    number = steps.shape[-3]
+    # sqrt has no slope at 0
+    far = torch.where(variance > 0, (number * torch.where(variance > 0, variance, 1.0)).sqrt(), 0.0)
+    total, squares = torch.zeros_like(first), torch.zeros_like(first)
+    for row in torch.eye(number, dtype=steps.dtype, device=steps.device):
+        away = far * row.view(-1, 1, 1)
+        for moved in (steps + away, steps - away):
+            difference = wrapped_difference(_by_shape(moved, code, 1024, readout)[0], phase)
+            total, squares = total + difference, squares + difference.square()
+    around = squares / (2 * number) - (total / (2 * number)).square()
+    return torch.where(first < _SMALL_PHASE**2, around.clamp_min(0), first)
+
+
+def _depth_std(turn: Tensor, values: tuple[float, ...]) -> Tensor:
+    """(..., C, H, W) metres, of variances of phases (..., F, H, W)."""
+    there = ~torch.isinf(turn)
+    power = torch.where(there, turn, 0.0)
     metres = [SPEED_OF_LIGHT / (2 * _TURN * f) * s for f, s in zip(values, shares_of_depth(values), strict=True)]
     factor = torch.tensor(metres, dtype=torch.float64).reshape(-1, 1, 1).to(power)
     total = (power * factor.square()).sum(-3)
     std = torch.where(total > 0, torch.where(total > 0, total, 1.0).sqrt(), total)
-    return torch.where(there.all(-3).all(-3), std, math.inf)
+    return torch.where(there.all(-3), std, math.inf)
 
 
 def _of_frequencies(given: float | Tensor, steps: Tensor) -> Tensor:
