@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 from torch import nn
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import UnitError
+from torchtransient.sensing.chain_walk import branches_of, in_order, named, parts_of
 from torchtransient.sensing.sensor import Quantity, Sensor
 
 # Two axes are the same when their bins agree to a millionth of a bin over the whole length.
@@ -48,16 +49,8 @@ class _Light:
 
 def stages_of(chain: nn.Module) -> Iterator[Stage | None]:
     """The sensors of a chain in their order, those of nested chains too; None for modules of another kind."""
-
-    def walk(module: nn.Module, prefix: str) -> Iterator[Stage | None]:
-        for name, child in module.named_children():
-            inner = getattr(child, "stages", child)
-            if isinstance(inner, (nn.ModuleList, nn.Sequential)):
-                yield from walk(inner, f"{prefix}{name}.")
-            else:
-                yield Stage(f"{prefix}{name}", child) if isinstance(child, Sensor) else None
-
-    yield from walk(getattr(chain, "stages", chain), "")
+    for name, stage in in_order(named(getattr(chain, "stages", chain))):
+        yield Stage(name, stage) if isinstance(stage, Sensor) else None
 
 
 def check_stages(chain: nn.Module) -> bool:
@@ -67,14 +60,7 @@ def check_stages(chain: nn.Module) -> bool:
     Compared are bins, `cycles`, laser periods and quantities. What a module of another kind does to the light is not
     known, nor what a sensor does that has no `gives`: behind these, bins and quantities are compared anew.
     """
-    light = _Light()
-    stages = list(stages_of(chain))
-    for stage in stages:
-        if stage is None:
-            light = _Light()
-            continue
-        _check_quantity(light, stage)
-        light = _after(stage, _same_bins(light, stage))
+    _through(stages_of(chain), _Light())
     parts = _parts_of(chain)
     _check_cycles(parts)
     check_window(chain, None)
@@ -82,10 +68,25 @@ def check_stages(chain: nn.Module) -> bool:
     return has_period and any((_bins(part) or (0.0, 1))[1] is None for part in parts)
 
 
+def _through(stages: Iterable[Stage | None], light: _Light) -> _Light:
+    """The light behind stages in a row, each compared with what comes to it; every branch with the same."""
+    for stage in stages:
+        if stage is None:
+            light = _Light()
+            continue
+        _check_quantity(light, stage)
+        before = _same_bins(light, stage)
+        for name, sensor in branches_of(stage.sensor):
+            row = in_order([(f"{stage.name}.{name}", sensor)])
+            end = _through((Stage(n, s) if isinstance(s, Sensor) else None for n, s in row), light)
+            before = replace(before, bins=end.bins)
+        light = _after(stage, before)
+    return light
+
+
 def _parts_of(chain: nn.Module) -> list[Stage]:
     """Every sensor of a chain, those that other sensors are made of too."""
-    parts = ((name.replace("stages.", ""), part) for name, part in chain.named_modules() if part is not chain)
-    return [Stage(name, part) for name, part in parts if isinstance(part, Sensor)]
+    return [Stage(name, part) for name, part in parts_of(chain)]
 
 
 # ------------------------------------------------------------------------------------------------------------- bins
@@ -116,31 +117,39 @@ def check_axis(sensor: nn.Module, axis: TimeAxis) -> None:
 def _same_bins(light: _Light, stage: Stage) -> _Light:
     """The light with the stage that its bins are known from. UnitError for a stage that was made for others."""
     own, before = _bins(stage), light.bins
-    if own is None or before is None:
-        return light if own is None else replace(light, bins=stage)
-    width, number = own
+    if own == (None, None):
+        return light
+    if before is None:
+        return replace(light, bins=stage)
     known = _bins(before)
-    if known is not None:
-        most = max(number or 1, known[1] or 1)
-        same = None in (number, known[1]) or number == known[1]
-        if not same or abs(width - known[0]) * most > _SAME_BIN * width:
-            raise UnitError(
-                f"Compose: expected one time axis for all stages, got {_shown(known)} in {before} and {_shown(own)} in "
-                f"{stage}. Make both with the axis of the light."
-            )
-    return replace(light, bins=stage) if number is not None else light
+    widths, numbers = (own[0], known[0]), (own[1], known[1])
+    same = None in numbers or own[1] == known[1]
+    if own[0] is not None and known[0] is not None:
+        most = max(own[1] or 1, known[1] or 1)
+        same = same and abs(own[0] - known[0]) * most <= _SAME_BIN * own[0]
+    if not same:
+        raise UnitError(
+            f"Compose: expected one time axis for all stages, got {_shown(known)} in {before} and {_shown(own)} in "
+            f"{stage}. Make both with the axis of the light."
+        )
+    # the one that more is known of; a width and a number of two stages are compared with what follows one by one
+    more = sum(v is not None for v in own) > sum(v is not None for v in known)
+    return replace(light, bins=stage) if more or None not in (*widths, *numbers) else light
 
 
-def _bins(stage: Stage) -> tuple[float, int | None] | None:
-    """(width in seconds, number or None) of the bins that a sensor was made for; None when it takes any."""
-    axis, width = getattr(stage.sensor, "axis", None), getattr(stage.sensor, "bin_width_s", None)
+def _bins(stage: Stage) -> tuple[float | None, int | None]:
+    """(width in seconds, number) of the bins that a sensor was made for; None for what it takes any of."""
+    axis, width = getattr(stage.sensor, "axis", None), as_number(getattr(stage.sensor, "bin_width_s", None))
     if isinstance(axis, TimeAxis):
         return axis.bin_width_s, axis.num_bins
-    return (width, stage.sensor.num_bins) if isinstance(width, float) else None
+    return width, stage.sensor.num_bins
 
 
-def _shown(bins: tuple[float, int | None]) -> str:
-    return f"bins of {bins[0]:g} s" if bins[1] is None else f"{bins[1]} bins of {bins[0]:g} s"
+def _shown(bins: tuple[float | None, int | None]) -> str:
+    width, number = bins
+    if width is None:
+        return f"{number} bins"
+    return f"bins of {width:g} s" if number is None else f"{number} bins of {width:g} s"
 
 
 # ------------------------------------------------------------------------------------------------------- quantities

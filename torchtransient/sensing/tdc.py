@@ -87,8 +87,6 @@ class TDC(MovedCounts):
     ShapeError when T does not fit.
     """
 
-    gives = "the same"
-
     code_widths: Tensor
     bands: Tensor
 
@@ -117,10 +115,15 @@ class TDC(MovedCounts):
         check_choice(acts_on, ActsOn, "acts_on", "TDC")
         check_choice(boundary, Boundary, "boundary", "TDC")
         self.acts_on: ActsOn = acts_on
+        if acts_on == "detections":
+            self.takes, self.gives = ("counts",), "counts"
+        else:
+            self.takes, self.gives = ("radiance", "rate", "electrons"), "the same"
         self.boundary: Boundary = boundary
         self.sliding_scale = check_count(sliding_scale, "sliding_scale", "TDC")
         self.offset_bins = check_number(offset_bins, "offset_bins", "TDC", low=-1e6)
         self.dither = bool(dither)
+        self.num_bins = widths.shape[0]
         self.register_buffer("code_widths", widths)
         self.first, bands = self._bands(widths)
         # not saved: the band of other widths may have another shape, and begins at another bin
