@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import UnitError
+from torchtransient.quantities import as_number
 from torchtransient.sensing.chain_walk import branches_of, in_order, named, parts_of
 from torchtransient.sensing.sensor import Quantity, Sensor
 
@@ -44,7 +45,8 @@ class _Light:
     quantity: Quantity | None = None
     giver: Stage | None = None
     cycles: int = 1  # of the exposure that a rate per cycle belongs to
-    bins: Stage | None = None
+    width: Stage | None = None
+    number: Stage | None = None  # of bins
 
 
 def stages_of(chain: nn.Module) -> Iterator[Stage | None]:
@@ -79,7 +81,7 @@ def _through(stages: Iterable[Stage | None], light: _Light) -> _Light:
         for name, sensor in branches_of(stage.sensor):
             row = in_order([(f"{stage.name}.{name}", sensor)])
             end = _through((Stage(n, s) if isinstance(s, Sensor) else None for n, s in row), light)
-            before = replace(before, bins=end.bins)
+            before = replace(before, width=end.width, number=end.number)
         light = _after(stage, before)
     return light
 
@@ -116,25 +118,22 @@ def check_axis(sensor: nn.Module, axis: TimeAxis) -> None:
 
 def _same_bins(light: _Light, stage: Stage) -> _Light:
     """The light with the stage that its bins are known from. UnitError for a stage that was made for others."""
-    own, before = _bins(stage), light.bins
-    if own == (None, None):
-        return light
-    if before is None:
-        return replace(light, bins=stage)
-    known = _bins(before)
-    widths, numbers = (own[0], known[0]), (own[1], known[1])
-    same = None in numbers or own[1] == known[1]
-    if own[0] is not None and known[0] is not None:
-        most = max(own[1] or 1, known[1] or 1)
-        same = same and abs(own[0] - known[0]) * most <= _SAME_BIN * own[0]
-    if not same:
+    width, number = _bins(stage)
+    other: Stage | None = None
+    if light.number is not None and number not in (None, _bins(light.number)[1]):
+        other = light.number
+    if light.width is not None and width is not None:
+        known, bins = _bins(light.width)
+        if abs(width - (known or 0.0)) * max(number or 1, bins or 1) > _SAME_BIN * width:
+            other = light.width
+    if other is not None:
         raise UnitError(
-            f"Compose: expected one time axis for all stages, got {_shown(known)} in {before} and {_shown(own)} in "
-            f"{stage}. Make both with the axis of the light."
+            f"Compose: expected one time axis for all stages, got {_shown(_bins(other))} in {other} and "
+            f"{_shown((width, number))} in {stage}. Make both with the axis of the light."
         )
-    # the one that more is known of; a width and a number of two stages are compared with what follows one by one
-    more = sum(v is not None for v in own) > sum(v is not None for v in known)
-    return replace(light, bins=stage) if more or None not in (*widths, *numbers) else light
+    return replace(
+        light, width=light.width if width is None else stage, number=light.number if number is None else stage
+    )
 
 
 def _bins(stage: Stage) -> tuple[float | None, int | None]:
@@ -193,9 +192,8 @@ def _after(stage: Stage, light: _Light) -> _Light:
     if gives is None:
         return _Light()
     cycles = getattr(stage.sensor, "cycles", 1)
-    # taps and gates stand where bins were
-    bins = None if gives == "electrons" else light.bins
-    return _Light(gives, stage, cycles if isinstance(cycles, int) else 1, bins)
+    light = _Light() if gives == "electrons" else light  # taps and gates stand where bins were
+    return replace(light, quantity=gives, giver=stage, cycles=cycles if isinstance(cycles, int) else 1)
 
 
 # ----------------------------------------------------------------------------------------------- cycles and periods
@@ -259,23 +257,23 @@ def _check_period(budget: Stage, period_s: float, stage: Stage, num_bins: int | 
                 "period_s=1 / repetition_rate_hz."
             )
         return
-    bins = _bins(stage)
-    number = None if bins is None else bins[1] or num_bins
-    if bins is None or number is None or not stage.sensor.window_is_period:
+    width_s, own_number = _bins(stage)
+    number = own_number or num_bins
+    if width_s is None or number is None or not stage.sensor.window_is_period:
         return
-    if not math.isclose(number * bins[0], period_s, rel_tol=_SAME_PERIOD):
+    if not math.isclose(number * width_s, period_s, rel_tol=_SAME_PERIOD):
         raise UnitError(
             f"Compose: expected the bins of {stage} to be one laser period of {budget}, {period_s:g} s, got {number} "
-            f"bins of {bins[0]:g} s, {number * bins[0]:g} s. Take an axis of the whole period; Afterpulsing takes "
+            f"bins of {width_s:g} s, {number * width_s:g} s. Take an axis of the whole period; Afterpulsing takes "
             "period_s= as well."
         )
 
 
 def _check_armed(giver: Stage, period_s: float, stage: Stage, num_bins: int | None) -> None:
     """UnitError for a detector that is still dead when the next cycle begins."""
-    bins, dead_s = _bins(stage), _dead_time(stage) or 0.0
+    (width_s, number), dead_s = _bins(stage), _dead_time(stage) or 0.0
     # what is not known yet is looked at when light comes
-    window_s = 0.0 if bins is None else (bins[1] or num_bins or 0) * bins[0]
+    window_s = 0.0 if width_s is None else (number or num_bins or 0) * width_s
     if dead_s and window_s + dead_s > period_s * (1 + _SAME_PERIOD):
         raise UnitError(
             f"Compose: expected {stage} to be armed again before the next cycle of {giver}, {period_s:g} s later, got "

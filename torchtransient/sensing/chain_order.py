@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -28,20 +28,34 @@ _SPREADS = (ImpulseResponse, LensBlur, PixelSkew, SpatialPSF, SweepJitter)
 # share of a gate outside the window that starves no image by more than the rounding of a count
 _OUTSIDE = 1e-6
 
+_PULSE_AND_JITTER = (
+    "The pulse of the laser stays an ImpulseResponse and goes in front of the PhotonBudget; the jitter of the detector "
+    "and its timing becomes a DetectionJitter of the same response behind the detector, where every detection moves."
+)
+
+
+def _instead(stage: nn.Module, outer: Sequence[nn.Module]) -> str:
+    """What to do about a zero boundary; a camera that is made of responses has a boundary of its own."""
+    within = any(getattr(o, "boundary", None) and o is not stage and stage in list(o.modules()) for o in outer)
+    return _PULSE_AND_JITTER if isinstance(stage, ImpulseResponse) and not within else "Use boundary='periodic'."
+
 
 @dataclass(frozen=True)
 class _Seen:
-    """What the light has passed: a background, what has made counts of it, what has made codes of its bins."""
+    """What the light has passed: a background, what has made counts of it, what has made codes of its bins.
+
+    `outer`: the stages of the chain as they were given.
+    """
 
     background: bool = False
     behind: str | None = None
     codes: str | None = None
+    outer: tuple[nn.Module, ...] = ()
 
     def also(self, other: _Seen) -> _Seen:
         """What pixels of one kind or another have passed."""
-        return _Seen(
-            self.background or other.background, self.behind or other.behind, self.codes or other.codes
-        )
+        background = self.background or other.background
+        return _Seen(background, self.behind or other.behind, self.codes or other.codes, self.outer)
 
 
 def has_background(budget: PhotonBudget) -> bool:
@@ -61,7 +75,8 @@ def _detects(stage: nn.Module) -> bool:
 
 def check_order(stages: Iterable[nn.Module], where: str) -> None:
     """UnitError where constant light meets the end of a window, or counts and rates are taken for one another."""
-    _follow([stage for _, stage in in_order(numbered(stages))], _Seen(), [], where)
+    outer = list(stages)
+    _follow([stage for _, stage in in_order(numbered(outer))], _Seen(outer=tuple(outer)), [], where)
 
 
 def _follow(row: list[nn.Module], seen: _Seen, after: list[nn.Module], where: str) -> _Seen:
@@ -95,15 +110,13 @@ def _check_stage(stage: nn.Module, seen: _Seen, rest: list[nn.Module], where: st
     if seen.background and isinstance(stage, Sensor) and getattr(stage, "boundary", None) == "zero":
         raise UnitError(
             f"{where}: expected no {name} with boundary='zero' behind the background of a PhotonBudget, whose "
-            "ambient light and dark counts would starve at the ends of the window. Put an ImpulseResponse in "
-            "front of the budget (the shape of the light), or use boundary='periodic'."
+            f"ambient light and dark counts would starve at the ends of the window. {_instead(stage, seen.outer)}"
         )
     if seen.background and isinstance(stage, GatedIntegration):
         _check_gates(stage, where)
     if seen.behind is not None and isinstance(stage, ImpulseResponse):
         raise UnitError(
-            f"{where}: expected no ImpulseResponse behind {seen.behind}: it would average counts. Use DetectionJitter, "
-            "which moves every detection, or put the response in front of the detector."
+            f"{where}: expected no ImpulseResponse behind {seen.behind}: it would average counts. {_PULSE_AND_JITTER}"
         )
     if seen.behind is not None and (isinstance(stage, _SPREADS) or (isinstance(stage, TDC) and not _codes(stage))):
         instead = {"PixelSkew": "Use DetectionSkew, which moves every detection", "TDC": "Say acts_on='detections'"}

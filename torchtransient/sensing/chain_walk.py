@@ -127,7 +127,7 @@ def mean_of(stage: nn.Module, x: Tensor) -> Tensor:
 def draw_of(stage: nn.Module, x: Tensor, generator: torch.Generator | None) -> Tensor:
     """A draw of one stage whatever its policy; the mean of one that draws nothing."""
     if isinstance(stage, Sensor) and hasattr(stage, "sample"):
-        result: Tensor = stage.sample(x, generator)
+        result: Tensor = stage.sample(x, generator)  # type: ignore[operator]
         return result
     return mean_of(stage, x)
 
@@ -135,7 +135,7 @@ def draw_of(stage: nn.Module, x: Tensor, generator: torch.Generator | None) -> T
 def normal_of(stage: nn.Module, x: Tensor, generator: torch.Generator | None) -> Tensor:
     """The normal surrogate of one stage; the mean of one that draws nothing."""
     if isinstance(stage, Sensor) and hasattr(stage, "gaussian"):
-        result: Tensor = stage.gaussian(x, generator)
+        result: Tensor = stage.gaussian(x, generator)  # type: ignore[operator]
         return result
     return mean_of(stage, x)
 
