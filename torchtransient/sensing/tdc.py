@@ -168,10 +168,16 @@ class TDC(MovedCounts):
         """(T,) deviation of each code's end from where it should be, in bins."""
         return self.differential_nonlinearity.cumsum(0)
 
+    def check_bins(self, x: object) -> None:
+        if isinstance(x, Tensor) and x.ndim >= 4 and x.shape[TIME] != self.num_bins:
+            raise ShapeError(
+                f"TDC: expected T = {self.num_bins} as in code_widths, got {x.shape[TIME]} of {tuple(x.shape)}. Make "
+                "one width for every bin of the light."
+            )
+
     def _check(self, x: Tensor) -> Tensor:
-        bins = check_transient(x, "TDC").shape[TIME]
-        if self.bands.shape[0] != bins:
-            raise ShapeError(f"TDC: expected T = {self.bands.shape[0]} as in code_widths, got {bins}.")
+        check_transient(x, "TDC")
+        self.check_bins(x)
         return x
 
     def expected(self, x: Tensor) -> Tensor:
