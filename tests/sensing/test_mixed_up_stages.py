@@ -219,6 +219,21 @@ def test_a_synchronous_detector_is_armed_when_a_cycle_begins():
     sensing.Compose([budget(rate_hz=40e6), spad])
 
 
+@pytest.mark.parametrize("behind", [False, True])
+def test_what_becomes_of_a_chain_in_the_order_of_before(behind):
+    """A response behind the budget held the pulse and the jitter: both have a place, and neither is a flag."""
+    spad, irf = sensing.SynchronousSPAD(1000), sensing.ImpulseResponse(sensing.emg_response(90 * PS, 80 * PS), AXIS)
+    bright = budget(ambient_rate_hz=1e6, axis=AXIS, pulse_energy_j=1e-9, wavelength_m=532e-9)
+    with pytest.raises(UnitError) as told:
+        sensing.Compose([bright, spad, irf] if behind else [bright, irf, spad])
+    words = str(told.value)
+    assert "stays an ImpulseResponse and goes in front of the PhotonBudget" in words
+    assert "becomes a DetectionJitter of the same response behind the detector" in words
+    assert "periodic" not in words  # jitter would go in front of pile-up again
+    with pytest.raises(UnitError, match="Use boundary='periodic'"):
+        sensing.Compose([bright, sensing.StreakCamera(AXIS, time_fwhm_s=300 * PS, boundary="zero")])
+
+
 MIXED = {
     "two detectors": (lambda: [budget(), *(sensing.SynchronousSPAD(1000) for _ in "ab")], "counts that a"),
     "a budget of counts": (lambda: [sensing.SynchronousSPAD(1000), budget()], "PhotonBudget takes what a renderer"),
