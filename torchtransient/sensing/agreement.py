@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from torch import nn
+from torch import Tensor, nn
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import UnitError
@@ -77,9 +77,9 @@ def check_stages(chain: nn.Module) -> bool:
         light = _after(stage, _same_bins(light, stage))
     parts = _parts_of(chain)
     _check_cycles(parts)
+    check_dead_times(chain)
     check_window(chain, None)
-    has_period = any(isinstance(getattr(part.sensor, "repetition_rate_hz", None), float) for part in parts)
-    return has_period and any((_bins(part) or (0.0, 1))[1] is None for part in parts)
+    return has_period(chain) and any((_bins(part) or (0.0, 1))[1] is None for part in parts)
 
 
 def _parts_of(chain: nn.Module) -> list[Stage]:
@@ -205,18 +205,40 @@ def _check_cycles(stages: list[Stage]) -> None:
 
 
 def check_window(chain: nn.Module, num_bins: int | None) -> None:
-    """UnitError where bins and the laser period of a `PhotonBudget` in the chain do not go together.
+    """UnitError where bins, dead times and the laser period of a chain do not go together.
 
-    A `FreeRunningSPAD` takes its bins for the whole period, and so does an `Afterpulsing` without `period_s`; a
-    `SynchronousSPAD` with a dead time has to be armed again when the next cycle begins. ``num_bins``: of the light,
-    None while there is none, which leaves out stages that were made with a width alone.
+    A `FreeRunningSPAD` takes its bins for the whole period, and so does an `Afterpulsing` without `period_s`; any other
+    detector has to be armed again when the next cycle begins, with the dead time of its afterpulses as with its own.
+    The period is that of a `PhotonBudget`, or without one the `period_s` of an Afterpulsing. ``num_bins``: of the
+    light, None while there is none, which leaves out the window of stages that were made with a width alone.
     """
     stages = _parts_of(chain)
-    for budget in stages:
-        rate_hz = getattr(budget.sensor, "repetition_rate_hz", None)
-        if isinstance(rate_hz, float):
-            for stage in stages:
-                _check_period(budget, 1 / rate_hz, stage, num_bins)
+    budgets = [s for s in stages if isinstance(getattr(s.sensor, "repetition_rate_hz", None), float)]
+    for budget in budgets:
+        period_s = 1 / float(budget.sensor.repetition_rate_hz)  # type: ignore[arg-type]
+        for stage in stages:
+            _check_period(budget, period_s, stage, num_bins)
+    goes_on = any(s.sensor.takes == ("rate",) and s.sensor.window_is_period for s in stages)
+    for stage in stages:
+        own = getattr(stage.sensor, "period_s", None)
+        if not goes_on and isinstance(_dead_time(stage), float):
+            for budget in budgets:
+                _check_armed(budget, 1 / float(budget.sensor.repetition_rate_hz), stage, num_bins)  # type: ignore[arg-type]
+            if not budgets and isinstance(own, float):
+                _check_armed(stage, own, stage, num_bins)
+
+
+def has_period(chain: nn.Module) -> bool:
+    """Whether a laser period is known in a chain."""
+    names = ("repetition_rate_hz", "period_s")
+    return any(isinstance(getattr(part.sensor, name, None), float) for part in _parts_of(chain) for name in names)
+
+
+def _dead_time(stage: Stage) -> float | None:
+    dead_s = getattr(stage.sensor, "dead_time_s", None)
+    if isinstance(dead_s, Tensor):  # learnt
+        return float(dead_s.detach()) if dead_s.numel() == 1 else None
+    return float(dead_s) if isinstance(dead_s, (int, float)) else None
 
 
 def _check_period(budget: Stage, period_s: float, stage: Stage, num_bins: int | None) -> None:
@@ -230,20 +252,47 @@ def _check_period(budget: Stage, period_s: float, stage: Stage, num_bins: int | 
         return
     bins = _bins(stage)
     number = None if bins is None else bins[1] or num_bins
-    if bins is None or number is None:
+    if bins is None or number is None or not stage.sensor.window_is_period:
         return
-    window_s = number * bins[0]
-    if stage.sensor.window_is_period and not math.isclose(window_s, period_s, rel_tol=_SAME_PERIOD):
+    if not math.isclose(number * bins[0], period_s, rel_tol=_SAME_PERIOD):
         raise UnitError(
             f"Compose: expected the bins of {stage} to be one laser period of {budget}, {period_s:g} s, got {number} "
-            f"bins of {bins[0]:g} s, {window_s:g} s. Take an axis of the whole period; Afterpulsing takes period_s= "
-            "as well."
+            f"bins of {bins[0]:g} s, {number * bins[0]:g} s. Take an axis of the whole period; Afterpulsing takes "
+            "period_s= as well."
         )
-    dead_s = getattr(stage.sensor, "dead_time_s", None)
-    rearms = stage.sensor.takes == ("rate",) and isinstance(dead_s, float)
-    if rearms and window_s + float(dead_s or 0.0) > period_s * (1 + _SAME_PERIOD):
+
+
+def _check_armed(giver: Stage, period_s: float, stage: Stage, num_bins: int | None) -> None:
+    """UnitError for a detector that is still dead when the next cycle begins."""
+    bins, dead_s = _bins(stage), _dead_time(stage) or 0.0
+    # what is not known yet is looked at when light comes
+    window_s = 0.0 if bins is None else (bins[1] or num_bins or 0) * bins[0]
+    if dead_s and window_s + dead_s > period_s * (1 + _SAME_PERIOD):
         raise UnitError(
-            f"Compose: expected {stage} to be armed again before the next cycle of {budget}, {period_s:g} s later, got "
+            f"Compose: expected {stage} to be armed again before the next cycle of {giver}, {period_s:g} s later, got "
             f"a window of {window_s:g} s and a dead time of {dead_s:g} s. A detector that goes on into the next cycle "
             "is a FreeRunningSPAD on an axis of the whole period; or lower repetition_rate_hz."
         )
+
+
+def check_dead_times(chain: nn.Module) -> None:
+    """UnitError for an `Afterpulsing` behind a detector of another dead time: one detector has one.
+
+    A detector of one detection per cycle has none of its own. In `PixelGroups`, whose sensors stand beside one another,
+    the dead time has to be that of one of them.
+    """
+    before: list[Stage] = []
+    for stage in _parts_of(chain):
+        dead_s = _dead_time(stage)
+        if dead_s is None:
+            continue
+        if stage.sensor.takes == ("rate",):
+            before.append(stage)
+        elif stage.sensor.takes == ("counts",):
+            others = [s for s in before if not math.isclose(_dead_time(s) or 0.0, dead_s, rel_tol=1e-6, abs_tol=1e-15)]
+            grouped = ".sensors." in f".{stage.name}."
+            if others and (not grouped or len(others) == len(before)):
+                raise UnitError(
+                    f"Compose: expected the dead time of {others[0]}, {_dead_time(others[0]):g} s, in {stage}, got "
+                    f"{dead_s:g} s. One detector has one dead time: give both the same."
+                )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 import torch
 from torch import nn
@@ -20,6 +20,17 @@ from torchtransient.sensing.tdc import TDC
 _MOVES = (DetectionJitter, DetectionSkew)
 # share of a gate outside the window that starves no image by more than the rounding of a count
 _OUTSIDE = 1e-6
+
+_PULSE_AND_JITTER = (
+    "The pulse of the laser stays an ImpulseResponse and goes in front of the PhotonBudget; the jitter of the detector "
+    "and its timing becomes a DetectionJitter of the same response behind the detector, where every detection moves."
+)
+
+
+def _instead(stage: nn.Module, outer: Sequence[nn.Module]) -> str:
+    """What to do about a zero boundary; a camera that is made of responses has a boundary of its own."""
+    within = any(getattr(o, "boundary", None) and o is not stage and stage in list(o.modules()) for o in outer)
+    return _PULSE_AND_JITTER if isinstance(stage, ImpulseResponse) and not within else "Use boundary='periodic'."
 
 
 def flattened(stages: Iterable[nn.Module]) -> Iterator[nn.Module]:
@@ -45,23 +56,21 @@ def _detects(stage: nn.Module) -> bool:
 
 def check_order(stages: Iterable[nn.Module], where: str) -> None:
     """UnitError where constant light meets the end of a window, or counts and rates are taken for one another."""
-    background, behind = False, None
+    background, behind, outer = False, None, list(stages)
     # of pixels of several kinds the first stands for all
-    found = [stage.sensors[0] if isinstance(stage, PixelGroups) else stage for stage in flattened(stages)]
+    found = [stage.sensors[0] if isinstance(stage, PixelGroups) else stage for stage in flattened(outer)]
     for number, stage in enumerate(found):
         name = type(stage).__name__
         if background and isinstance(stage, Sensor) and getattr(stage, "boundary", None) == "zero":
             raise UnitError(
                 f"{where}: expected no {name} with boundary='zero' behind the background of a PhotonBudget, whose "
-                "ambient light and dark counts would starve at the ends of the window. Put an ImpulseResponse in "
-                "front of the budget (the shape of the light), or use boundary='periodic'."
+                f"ambient light and dark counts would starve at the ends of the window. {_instead(stage, outer)}"
             )
         if background and isinstance(stage, GatedIntegration):
             _check_gates(stage, where)
         if behind is not None and isinstance(stage, ImpulseResponse):
             raise UnitError(
-                f"{where}: expected no ImpulseResponse behind {behind}: it would average counts. Use DetectionJitter, "
-                "which moves every detection, or put the response in front of the detector."
+                f"{where}: expected no ImpulseResponse behind {behind}: it would average counts. {_PULSE_AND_JITTER}"
             )
         on_detections = isinstance(stage, _MOVES) or (isinstance(stage, TDC) and stage.acts_on == "detections")
         later = next((type(s).__name__ for s in found[number + 1 :] if _detects(s)), None)

@@ -7,6 +7,7 @@ multinomial. Sources: Coates, J. Phys. E 1 (1968); Gupta et al., Photon-flooded 
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -261,6 +262,18 @@ class SynchronousSPAD(RandomSensor):
         return f"cycles={self.cycles}, dead_time_s={self.dead_time_s}, {super().extra_repr()}"
 
 
+def log_of_firing(rate: Tensor) -> Tensor:
+    """log(1 - exp(-rate)), the log-probability that an armed detector fires, with all digits of dark and bright bins.
+
+    Differentiable; -inf at rate 0. Source: Maechler, Accurately computing log(1 - exp(-|a|)) (2012).
+    """
+    bright = rate > math.log(2)
+    half = torch.full_like(rate, 0.5)
+    dark = torch.where(bright, half, rate)
+    many = torch.where(bright, rate, 2 * half)
+    return torch.where(bright, torch.log1p(-torch.exp(-many)), (-torch.expm1(-dark)).log())
+
+
 def exposed_cycles(counts: Tensor, cycles: int, dead_bins: float | None) -> Tensor:
     """Cycles that could fire in each bin (..., T, H, W), times the part of it in which they could, float64."""
     if dead_bins is None:
@@ -300,8 +313,8 @@ def first_photon_log_prob(
     quiet = quiet.clamp_min(0)
     hit = n != 0
     # where on the input: the logarithm of 0 has no finite gradient
-    fire = torch.where(hit, -torch.expm1(-r), torch.ones_like(r))
-    value = torch.where(hit, n * fire.log(), torch.zeros_like(r)) - r * quiet - sooner
+    fire = log_of_firing(torch.where(hit, r, torch.ones_like(r)))
+    value = torch.where(hit, n * fire, torch.zeros_like(r)) - r * quiet - sooner
     if constant:
-        value = value + torch.lgamma(n + quiet + 1) - torch.lgamma(n + 1) - torch.lgamma(quiet + 1)
+        value = value + (torch.lgamma(n + quiet + 1) - torch.lgamma(n + 1) - torch.lgamma(quiet + 1))
     return value.to(rate.dtype)
