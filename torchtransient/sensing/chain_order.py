@@ -9,8 +9,10 @@ from torch import nn
 
 from torchtransient.errors import UnitError
 from torchtransient.sensing.detection_jitter import DetectionJitter
+from torchtransient.sensing.electronics import PixelElectronics
 from torchtransient.sensing.gated import GatedIntegration
 from torchtransient.sensing.impulse_response import ImpulseResponse
+from torchtransient.sensing.itof_pixels import TapDifference
 from torchtransient.sensing.photon_budget import PhotonBudget
 from torchtransient.sensing.pixel_groups import PixelGroups
 from torchtransient.sensing.pixel_skew import DetectionSkew
@@ -56,7 +58,7 @@ def _detects(stage: nn.Module) -> bool:
 
 def check_order(stages: Iterable[nn.Module], where: str) -> None:
     """UnitError where constant light meets the end of a window, or counts and rates are taken for one another."""
-    background, behind, outer = False, None, list(stages)
+    background, behind, difference, outer = False, None, False, list(stages)
     # of pixels of several kinds the first stands for all
     found = [stage.sensors[0] if isinstance(stage, PixelGroups) else stage for stage in flattened(outer)]
     for number, stage in enumerate(found):
@@ -68,6 +70,9 @@ def check_order(stages: Iterable[nn.Module], where: str) -> None:
             )
         if background and isinstance(stage, GatedIntegration):
             _check_gates(stage, where)
+        difference = difference or isinstance(stage, TapDifference)
+        if difference and isinstance(stage, PixelElectronics):
+            _check_signed(stage, where)
         if behind is not None and isinstance(stage, ImpulseResponse):
             raise UnitError(
                 f"{where}: expected no ImpulseResponse behind {behind}: it would average counts. {_PULSE_AND_JITTER}"
@@ -84,6 +89,23 @@ def check_order(stages: Iterable[nn.Module], where: str) -> None:
             background = background or has_background(stage)
         elif _detects(stage) and "rate" in getattr(stage, "takes", ()):
             behind = name
+
+
+def _check_signed(stage: PixelElectronics, where: str) -> None:
+    """UnitError for the electronics of a difference that know no numbers below zero."""
+    if stage.shot_noise:
+        raise UnitError(
+            f"{where}: expected no shot noise behind a TapDifference, whose negative numbers are no light, got a "
+            "PixelElectronics that draws it. Put it in front of the difference, where both taps have theirs; the one "
+            "behind is PixelElectronics(shot_noise=False, ...)."
+        )
+    low, high = stage.range_dn
+    if stage.bits is not None and stage.black_level_dn - low < 0.25 * (high - low):
+        raise UnitError(
+            f"{where}: expected a converter with room below zero behind a TapDifference, got codes from {low:g} to "
+            f"{high:g} and a black level of {stage.black_level_dn:g}, which clip negative differences. Say signed=True "
+            "(codes in two's complement), or a black_level_dn in the middle of the range."
+        )
 
 
 def _check_gates(stage: GatedIntegration, where: str) -> None:
