@@ -213,7 +213,7 @@ def _numbers(given: object, name: str, dims: tuple[int, ...], most: float = math
             raise UnitError(f"ItofCalibration: expected {name} as finite numbers, got {shown(given)}.")
         numbers = torch.from_numpy(array)
     if numbers.ndim not in dims or not numbers.numel():
-        raise ShapeError(f"ItofCalibration: expected {name} of {dims} dimensions, got the shape {tuple(numbers.shape)}.")
+        raise ShapeError(f"ItofCalibration: expected {name} of {dims} dimensions, got {tuple(numbers.shape)}.")
     if not holds(torch.isfinite(numbers.detach())):
         raise UnitError(f"ItofCalibration: expected {name} as finite numbers, got {shown(given)}.")
     if not holds(numbers.detach().abs() <= most):

@@ -97,7 +97,7 @@ def move_counts(
     tallies: Tensor | None = None
     if tally:
         tallies = data.new_zeros(moves.shares.shape[0], data.shape[0], data.shape[2])
-        moved = _Tree(moves, data, tallies).run(generator)
+        moved = _Tree(moves, data.contiguous(), tallies).run(generator)
         tallies = tallies.view(-1, *shape[:TIME], *shape[-2:])
     else:
         columns = data.movedim(2, 0)

@@ -50,6 +50,9 @@ class WrappedDetector(RandomSensor):
     def variance(self, x: Tensor) -> Tensor:
         return self.detector.variance(self.rate(x))
 
+    def gaussian(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        return self.detector.gaussian(self.rate(x), generator)
+
     def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
         return self.detector.log_prob(measurement, self.rate(x))
 
