@@ -15,6 +15,7 @@ from torchtransient.sensing.detection_jitter import DetectionJitter
 from torchtransient.sensing.electronics import PixelElectronics
 from torchtransient.sensing.gated import GatedIntegration
 from torchtransient.sensing.impulse_response import ImpulseResponse
+from torchtransient.sensing.itof_pixels import TapDifference
 from torchtransient.sensing.photon_budget import PhotonBudget
 from torchtransient.sensing.pixel_skew import DetectionSkew, PixelSkew
 from torchtransient.sensing.sensor import Sensor
@@ -42,7 +43,8 @@ def _instead(stage: nn.Module, outer: Sequence[nn.Module]) -> str:
 
 @dataclass(frozen=True)
 class _Seen:
-    """What the light has passed: a background, what has made counts of it, what has made codes of its bins.
+    """What the light has passed: a background, what has made counts of it, what has made codes of its bins, and
+    whether taps were subtracted.
 
     `outer`: the stages of the chain as they were given.
     """
@@ -50,12 +52,14 @@ class _Seen:
     background: bool = False
     behind: str | None = None
     codes: str | None = None
+    difference: bool = False
     outer: tuple[nn.Module, ...] = ()
 
     def also(self, other: _Seen) -> _Seen:
         """What pixels of one kind or another have passed."""
         background = self.background or other.background
-        return _Seen(background, self.behind or other.behind, self.codes or other.codes, self.outer)
+        difference = self.difference or other.difference
+        return _Seen(background, self.behind or other.behind, self.codes or other.codes, difference, self.outer)
 
 
 def has_background(budget: PhotonBudget) -> bool:
@@ -99,6 +103,8 @@ def _passed(stage: nn.Module, seen: _Seen) -> _Seen:
         return replace(seen, background=seen.background or has_background(stage))
     if isinstance(stage, TDC) and stage.acts_on == "detections":
         return replace(seen, codes=type(stage).__name__)
+    if isinstance(stage, TapDifference):
+        return replace(seen, difference=True)
     # charge behind an amplifier is spread like light, by a phosphor for instance
     if isinstance(stage, Sensor) and stage.gives == "counts" and not isinstance(stage, PixelElectronics):
         return replace(seen, behind=seen.behind or type(stage).__name__)
@@ -114,6 +120,8 @@ def _check_stage(stage: nn.Module, seen: _Seen, rest: list[nn.Module], where: st
         )
     if seen.background and isinstance(stage, GatedIntegration):
         _check_gates(stage, where)
+    if seen.difference and isinstance(stage, PixelElectronics):
+        _check_signed(stage, where)
     if seen.behind is not None and isinstance(stage, ImpulseResponse):
         raise UnitError(
             f"{where}: expected no ImpulseResponse behind {seen.behind}: it would average counts. {_PULSE_AND_JITTER}"
@@ -140,6 +148,23 @@ def _check_stage(stage: nn.Module, seen: _Seen, rest: list[nn.Module], where: st
 
 def _codes(stage: nn.Module) -> bool:
     return isinstance(stage, TDC) and stage.acts_on == "detections"
+
+
+def _check_signed(stage: PixelElectronics, where: str) -> None:
+    """UnitError for the electronics of a difference that know no numbers below zero."""
+    if stage.shot_noise:
+        raise UnitError(
+            f"{where}: expected no shot noise behind a TapDifference, whose negative numbers are no light, got a "
+            "PixelElectronics that draws it. Put it in front of the difference, where both taps have theirs; the one "
+            "behind is PixelElectronics(shot_noise=False, ...)."
+        )
+    low, high = stage.range_dn
+    if stage.bits is not None and stage.black_level_dn - low < 0.25 * (high - low):
+        raise UnitError(
+            f"{where}: expected a converter with room below zero behind a TapDifference, got codes from {low:g} to "
+            f"{high:g} and a black level of {stage.black_level_dn:g}, which clip negative differences. Say signed=True "
+            "(codes in two's complement), or a black_level_dn in the middle of the range."
+        )
 
 
 def _check_gates(stage: GatedIntegration, where: str) -> None:

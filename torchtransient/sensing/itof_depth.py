@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.quantities import shown
+from torchtransient.sensing.given import tensor_of
 from torchtransient.sensing.itof import Frequencies, check_frequencies
 from torchtransient.sensing.itof_codes import phase_steps
 from torchtransient.sensing.layout import check_count, product
@@ -87,10 +87,15 @@ def sums_of(taps: Frames, num_taps: int, where: str) -> Tensor:
     return split[..., 0, :, :] + split[..., 1, :, :]
 
 
-def _split(taps: Frames, num_taps: int, readout: str, where: str) -> Tensor:
-    """(..., C, F, N, taps of a pixel, H, W)."""
+def check_readout(readout: str, where: str) -> None:
+    """UnitError for what is no way of reading pixels out."""
     if readout not in get_args(Readout):
         raise UnitError(f"{where}: expected readout to be one of {', '.join(get_args(Readout))}, got {readout!r}.")
+
+
+def _split(taps: Frames, num_taps: int, readout: str, where: str) -> Tensor:
+    """(..., C, F, N, taps of a pixel, H, W)."""
+    check_readout(readout, where)
     frames = _precise(as_frames(taps, where), where)
     each, least = (2 if readout == "two_tap" else 1), (3 if readout == "single" else 2)
     count = check_count(num_taps, "num_taps", where)
@@ -107,10 +112,7 @@ def _split(taps: Frames, num_taps: int, readout: str, where: str) -> Tensor:
 
 def as_frames(taps: Frames, where: str) -> Tensor:
     """A tensor as it is, an array as one. UnitError for what holds no numbers."""
-    try:
-        return taps if isinstance(taps, Tensor) else torch.from_numpy(np.ascontiguousarray(taps))
-    except TypeError as error:
-        raise UnitError(f"{where}: expected frames as a tensor or an array of numbers, got {shown(taps)}.") from error
+    return taps if isinstance(taps, Tensor) else tensor_of(np.asarray(taps), where)
 
 
 def _precise(frames: Tensor, where: str) -> Tensor:

@@ -95,12 +95,14 @@ def _by_rows(matrix: Tensor, x: Tensor) -> Tensor:
 # ------------------------------------------------------------------------------------------------------ physicality
 
 
+@in_single
 def unphysical_part(stokes: Tensor, dim: int = TRANSIENT_DIM) -> Tensor:
     """``max(|S123| - S0, 0)``, without ``dim``: zero for every Stokes vector that light can have. ShapeError."""
     s0, length = _parts(stokes, dim)
     return (length - s0).clamp_min(0)
 
 
+@in_single
 def project_physical(stokes: Tensor, dim: int = TRANSIENT_DIM) -> Tensor:
     """The nearest Stokes vectors that light can have (S0 >= |S123|), in the same shape.
 

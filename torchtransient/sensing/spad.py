@@ -176,11 +176,11 @@ class SynchronousSPAD(RandomSensor):
         if axis is not None or bin_width_s is not None:
             self.bin_width_s = bin_width_of(axis, bin_width_s, "SynchronousSPAD")
         self.num_bins = None if axis is None else axis.num_bins
-        self.dead_time_s = dead_time_s
+        self.dead_time_s: float | None = None
         self.dead_bins: float | None = None
         if dead_time_s is not None:
-            dead = check_seconds(dead_time_s, "dead_time_s", "SynchronousSPAD")
-            self.dead_bins = dead / bin_width_of(axis, bin_width_s, "SynchronousSPAD")
+            self.dead_time_s = check_seconds(dead_time_s, "dead_time_s", "SynchronousSPAD")
+            self.dead_bins = self.dead_time_s / bin_width_of(axis, bin_width_s, "SynchronousSPAD")
             check_dead_bins(self.dead_bins)
         if gate is not None:
             if not isinstance(gate, Tensor) or gate.ndim != 1:
