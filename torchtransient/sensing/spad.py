@@ -38,9 +38,11 @@ def first_photon_probabilities(rate: Tensor) -> tuple[Tensor, Tensor]:
     """Probability (..., C, T, H, W) that the first photon of a cycle falls into each bin, and (..., C, H, W) of none.
 
     `rate`: expected detections per cycle and bin, >= 0. Sums over bins are made in float64, in the exponent, so that
-    1e4 bins lose no digits; in a saturated pixel the late bins get probability and gradient 0, as they should.
+    1e4 bins lose no digits; in a saturated pixel the late bins get probability and gradient 0, as they should. Raises
+    UnitError for rates that are negative, infinite or NaN.
     """
     check_transient(rate, "first_photon_probabilities")
+    check_rates(rate, "first_photon_probabilities")
     before = sum_before(rate)
     p = -torch.expm1(-rate) * torch.exp(-before.to(rate.dtype))
     none = torch.exp(-(before.select(TIME, -1) + rate.select(TIME, -1).double()))
@@ -69,9 +71,11 @@ def detections_with_dead_time(rate: Tensor, dead_bins: Tensor | float) -> Tensor
     `rate`: expected detections per cycle and bin of a detector that is never dead, >= 0, constant inside a bin.
     `dead_bins`: non-paralyzable dead time in bins, at least 1/2, a number or a scalar tensor; differentiable in both.
     Dead times are exact to fractions of a bin, and a bin may hold any number of photons and detections: bins of more
-    than a photon are cut. Total variation from the exact mean: below 1e-5 (docs/photon_counting.md).
+    than a photon are cut. Total variation from the exact mean: below 1e-5 (docs/photon_counting.md). Raises UnitError
+    for rates that are negative, infinite or NaN.
     """
     check_transient(rate, "detections_with_dead_time")
+    check_rates(rate, "detections_with_dead_time")
     check_dead_bins(dead_bins)
     if rate.numel() == 0:
         return rate.to(torch.float64)
@@ -220,7 +224,7 @@ class SynchronousSPAD(RandomSensor):
 
     def gaussian(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         if self.dead_bins is not None:
-            rate = self._gated(x)
+            rate = check_rates(self._gated(x), "SynchronousSPAD")
             if rate.numel() == 0:
                 return rate * self.cycles
             dead = torch.as_tensor(self.dead_bins, dtype=torch.float64, device=x.device)
@@ -232,7 +236,8 @@ class SynchronousSPAD(RandomSensor):
         return sample_detections(self._gated(x), self.cycles, self.dead_bins, generator)
 
     def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
-        return first_photon_log_prob(measurement, self._gated(x), self.cycles, self.dead_bins).sum(TIME)
+        rate = check_rates(self._gated(x), "SynchronousSPAD")
+        return first_photon_log_prob(measurement, rate, self.cycles, self.dead_bins).sum(TIME)
 
     def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         if self.grad != "score" or self.dead_bins is None:
