@@ -16,9 +16,10 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
-from torchtransient.sensing.dead_time_cycle import check_dead_bins, detected_rows, double_detections
+from torchtransient.sensing.dead_time_cycle import check_dead_bins, double_detections
 from torchtransient.sensing.dead_time_draws import DrawnRows, draw_cycles, gaussian_cycles, score_of_cycles
 from torchtransient.sensing.dead_time_inverse import armed_time, check_cycles, rates_of_counts
+from torchtransient.sensing.dead_time_means import detected_columns
 from torchtransient.sensing.draws import check_rates, sample_first_photons
 from torchtransient.sensing.layout import (
     TIME,
@@ -80,7 +81,9 @@ def detections_with_dead_time(rate: Tensor, dead_bins: Tensor | float) -> Tensor
     if rate.numel() == 0:
         return rate.to(torch.float64)
     dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=rate.device)
-    return _image(detected_rows(_rows(rate), dead), rate)
+    wide = rate.to(torch.float64).movedim(TIME, 0)
+    detected = detected_columns(wide.reshape(wide.shape[0], -1), dead)
+    return detected.view(wide.shape).movedim(0, TIME)
 
 
 @in_single
