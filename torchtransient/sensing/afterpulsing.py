@@ -16,6 +16,7 @@ from torchtransient.sensing.added_counts import AddedCounts
 from torchtransient.sensing.afterpulse_delays import AfterpulseDelays, exponential_kernel, exponential_shares
 from torchtransient.sensing.binomial_tables import LagTable, sixteen_bits
 from torchtransient.sensing.draws import by_pieces
+from torchtransient.sensing.given import numbers_of
 from torchtransient.sensing.layout import TIME, bin_width_of, check_number, check_seconds, check_transient
 from torchtransient.sensing.pixel_maps import check_map, keep_map, over_time, wide
 from torchtransient.sensing.policies import GradPolicy
@@ -149,6 +150,7 @@ class Afterpulsing(AddedCounts):
 
     def _keep(self, probability: float | Sequence[float], tau_s: float | Sequence[float], learnable: bool) -> None:
         where = "Afterpulsing"
+        probability, tau_s = numbers_of(probability, "probability", where), numbers_of(tau_s, "tau_s", where)
         several = isinstance(probability, Sequence) and not isinstance(probability, str)
         shares = list(probability) if isinstance(probability, Sequence) else [probability]
         p = [check_number(v, "probability", where, high=_MOST, open_low=True) for v in shares]

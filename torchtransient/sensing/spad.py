@@ -21,6 +21,7 @@ from torchtransient.sensing.dead_time_draws import DrawnRows, draw_cycles, gauss
 from torchtransient.sensing.dead_time_inverse import armed_time, check_cycles, rates_of_counts
 from torchtransient.sensing.dead_time_means import detected_columns
 from torchtransient.sensing.draws import check_rates, sample_first_photons
+from torchtransient.sensing.given import refuse_cut_off
 from torchtransient.sensing.layout import (
     TIME,
     bin_width_of,
@@ -100,6 +101,7 @@ def coates(counts: Tensor, cycles: int, dead_bins: float | None = None) -> Coate
     check_transient(counts, "coates")
     number = check_count(cycles, "cycles", "coates")
     if dead_bins is not None and counts.numel():
+        refuse_cut_off(dead_bins, "dead_bins", "coates")
         rate, valid = rates_of_counts(_rows(counts), number, float(dead_bins))
         return CoatesEstimate(_image(rate, counts).to(counts.dtype), _image(valid, counts))
     armed = number - sum_before(counts)
@@ -317,6 +319,7 @@ def first_photon_log_prob(
         sooner, exposed = time.sooner(r), time.exposed
     quiet = exposed - n
     # with a dead time the armed cycles are known on average only
+    refuse_cut_off(dead_bins, "dead_bins", where)
     check_cycles(quiet, number, -0.5 if dead_bins is None else -0.5 - 6 * number**0.5, where)
     quiet = quiet.clamp_min(0)
     hit = n != 0
