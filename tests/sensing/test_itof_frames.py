@@ -1,4 +1,4 @@
-"""Frames as cameras hand them out: converters of differences, noise that light cannot give, arguments in other units."""
+"""Frames as cameras hand them out: converters of differences, noise that light cannot give, other units."""
 
 from __future__ import annotations
 
