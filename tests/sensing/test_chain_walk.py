@@ -233,6 +233,10 @@ REFUSED = {
         lambda: [spad(), sensing.TDC(torch.ones(BINS)), sensing.Afterpulsing(0.1, 1e-9, 1e-10, axis=AXIS)],
         "in front of TDC",
     ),
+    "afterpulses twice": (
+        lambda: [halves(lambda: sensing.MacroPixel(pulsing(), 2)), sensing.Afterpulsing(0.05, 1e-9, 3e-10, axis=AXIS)],
+        "afterpulses of its own",
+    ),
     "codes of another number": (lambda: [budget(), spad(), sensing.TDC(torch.ones(64))], "16 bins .*64 bins"),
     "codes behind codes of another number": (
         lambda: [sensing.TDC(torch.ones(64)), sensing.TDC(torch.ones(32))],

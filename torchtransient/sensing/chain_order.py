@@ -10,6 +10,7 @@ from torch import nn
 
 from torchtransient.errors import UnitError
 from torchtransient.sensing.afterpulsing import Afterpulsing
+from torchtransient.sensing.afterpulsing_spad import AfterpulsingSPAD
 from torchtransient.sensing.chain_walk import branches_of, in_order, numbered
 from torchtransient.sensing.detection_jitter import DetectionJitter
 from torchtransient.sensing.electronics import PixelElectronics
@@ -44,7 +45,7 @@ def _instead(stage: nn.Module, outer: Sequence[nn.Module]) -> str:
 @dataclass(frozen=True)
 class _Seen:
     """What the light has passed: a background, what has made counts of it, what has made codes of its bins, and
-    whether taps were subtracted.
+    whether taps were subtracted and the detector had afterpulses of its own.
 
     `outer`: the stages of the chain as they were given.
     """
@@ -53,13 +54,19 @@ class _Seen:
     behind: str | None = None
     codes: str | None = None
     difference: bool = False
+    pulses: bool = False
     outer: tuple[nn.Module, ...] = ()
 
     def also(self, other: _Seen) -> _Seen:
         """What pixels of one kind or another have passed."""
-        background = self.background or other.background
-        difference = self.difference or other.difference
-        return _Seen(background, self.behind or other.behind, self.codes or other.codes, difference, self.outer)
+        return _Seen(
+            background=self.background or other.background,
+            behind=self.behind or other.behind,
+            codes=self.codes or other.codes,
+            difference=self.difference or other.difference,
+            pulses=self.pulses or other.pulses,
+            outer=self.outer,
+        )
 
 
 def has_background(budget: PhotonBudget) -> bool:
@@ -107,7 +114,8 @@ def _passed(stage: nn.Module, seen: _Seen) -> _Seen:
         return replace(seen, difference=True)
     # charge behind an amplifier is spread like light, by a phosphor for instance
     if isinstance(stage, Sensor) and stage.gives == "counts" and not isinstance(stage, PixelElectronics):
-        return replace(seen, behind=seen.behind or type(stage).__name__)
+        pulses = seen.pulses or any(isinstance(part, AfterpulsingSPAD) for part in stage.modules())
+        return replace(seen, behind=seen.behind or type(stage).__name__, pulses=pulses)
     return seen
 
 
@@ -136,6 +144,11 @@ def _check_stage(stage: nn.Module, seen: _Seen, rest: list[nn.Module], where: st
         raise UnitError(
             f"{where}: expected {name} in front of {seen.codes}, got it behind: bins are codes there, of unequal "
             "widths, and it needs times. The converter is the last that acts on detections."
+        )
+    if seen.pulses and isinstance(stage, Afterpulsing):
+        raise UnitError(
+            f"{where}: expected no {name} behind {seen.behind} with an AfterpulsingSPAD, which has afterpulses of its "
+            "own, got both. Leave one of them out."
         )
     later = next((type(s).__name__ for s in rest if _detects(s)), None)
     if (isinstance(stage, _MOVES) or _codes(stage)) and later is not None:

@@ -99,7 +99,8 @@ class Delayed:
 
     def mean(self, x: Tensor) -> Tensor:
         first = _moved(x, self.whole, self.boundary)
-        return first + self.part.to(x.dtype) * (_moved(x, self.whole + 1, self.boundary) - first)
+        moved: Tensor = first + self.part.to(x.dtype) * (_moved(x, self.whole + 1, self.boundary) - first)
+        return moved
 
     def noise(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         late = gaussian_noise(x * (self.part * (1 - self.part)).to(x.dtype), generator)
@@ -118,7 +119,8 @@ class Delayed:
         part = self.part.squeeze(TIME) if self.part.ndim else self.part
         # no count takes a way of probability 0
         tiny = torch.finfo(torch.float64).tiny
-        return late * part.clamp_min(tiny).log() + early * torch.log1p(-part)
+        ways: Tensor = late * part.clamp_min(tiny).log() + early * torch.log1p(-part)
+        return ways
 
 
 class PixelSkew(Sensor):
