@@ -12,6 +12,7 @@ from torchtransient.floating import in_single
 from torchtransient.sensing.afterpulsing import Afterpulsing
 from torchtransient.sensing.free_running import FreeRunningSPAD
 from torchtransient.sensing.layout import TIME, check_transient
+from torchtransient.sensing.own_bins import common_bins
 from torchtransient.sensing.pixel_maps import over_time, wide
 from torchtransient.sensing.policies import GradPolicy
 from torchtransient.sensing.spad import SynchronousSPAD
@@ -39,7 +40,8 @@ class AfterpulsingSPAD(WrappedDetector):
     to a third of the probability, in total variation (see docs/photon_counting.md). Draws have the variance of the
     detector at that rate: afterpulses vary as photons do, short by twice their share in dim light.
 
-    Raises UnitError for a dead time that is not the detector's, and for periods that do not go with the window.
+    Raises UnitError for a dead time or bins that are not the detector's, and for periods that do not go with the
+    window.
     """
 
     detector: SynchronousSPAD | FreeRunningSPAD
@@ -64,6 +66,7 @@ class AfterpulsingSPAD(WrappedDetector):
                 f"{afterpulsing.dead_time_s:g} s. One detector has one dead time."
             )
         super().__init__(detector, grad)
+        self.bin_width_s, self.num_bins = common_bins([detector, afterpulsing], where)
         self.afterpulsing = afterpulsing
 
     def check_bins(self, x: object) -> None:

@@ -29,6 +29,7 @@ from torchtransient.sensing.layout import (
     check_transient,
 )
 from torchtransient.sensing.macro_pixel import checked_detector, groups_of
+from torchtransient.sensing.own_bins import common_bins
 from torchtransient.sensing.policies import GradPolicy
 from torchtransient.sensing.sensor import RandomSensor
 from torchtransient.sensing.spad import SynchronousSPAD
@@ -89,7 +90,8 @@ class CoincidencePixel(RandomSensor):
 
     Samples are independent binomials of the cycles, with the exact mean: neighbouring bins of a cycle exclude each
     other a little, which they leave out. Policies: all. Raises UnitError for more SPADs in coincidence than there are,
-    a window longer than the dead time, and light that has more than one coincidence per cycle in a bin.
+    a window longer than the dead time, a
+    detector made for other bins, and light that has more than one coincidence per cycle in a bin.
     """
 
     takes, gives = ("rate",), "counts"
@@ -115,7 +117,8 @@ class CoincidencePixel(RandomSensor):
         if self.coincidence > sum(number for _, number in self.groups):
             raise UnitError(f"{where}: expected a coincidence of at most {spads} SPADs with light, got {coincidence}.")
         self.bin_width_s = bin_width_of(axis, bin_width_s, where)
-        self.num_bins = None if axis is None else axis.num_bins
+        given = None if axis is None else axis.num_bins
+        self.num_bins = common_bins([detector], where, (self.bin_width_s, given))[1]
         self.window_s = check_seconds(window_s, "window_s", where, open_low=True)
         inner = detector.detector if isinstance(detector, AfterpulsingSPAD) else detector
         self.periodic = isinstance(inner, FreeRunningSPAD)

@@ -45,6 +45,7 @@ def free_running_rate(rate_hz: Tensor, dead_time_s: float, kind: DeadTime = "non
     """Detections per second at a constant photon rate n: n/(1 + n td), or n exp(-n td) for "paralyzable"."""
     dead = check_seconds(dead_time_s, "dead_time_s", "free_running_rate")
     check_choice(kind, DeadTime, "kind", "free_running_rate")
+    check_rates(rate_hz, "free_running_rate")
     if kind == "paralyzable":
         return rate_hz * torch.exp(-rate_hz * dead)
     return rate_hz / (1 + rate_hz * dead)
@@ -105,6 +106,7 @@ def paralyzable_histogram(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
     also longer than a period; differentiable in both. dtype and device are kept; computed in float64.
     """
     check_transient(rate, "paralyzable_histogram")
+    check_rates(rate, "paralyzable_histogram")
     dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=rate.device)
     if not float(dead.detach()) >= 0 or not math.isfinite(float(dead.detach())):
         raise UnitError(f"paralyzable_histogram: expected dead_bins >= 0, got {float(dead.detach()):g}.")

@@ -7,6 +7,7 @@ import copy
 import torch
 from torch import Tensor
 
+from torchtransient.sensing.own_bins import bins_of
 from torchtransient.sensing.policies import GradPolicy, check_policy
 from torchtransient.sensing.sensor import RandomSensor
 
@@ -19,6 +20,7 @@ class WrappedDetector(RandomSensor):
     def __init__(self, detector: RandomSensor, grad: GradPolicy | None = None) -> None:
         super(RandomSensor, self).__init__()
         self.detector = detector
+        self.bin_width_s, self.num_bins = bins_of(detector)
         if grad is not None:
             self.grad = grad
 
@@ -49,6 +51,9 @@ class WrappedDetector(RandomSensor):
 
     def variance(self, x: Tensor) -> Tensor:
         return self.detector.variance(self.rate(x))
+
+    def gaussian(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        return self.detector.gaussian(self.rate(x), generator)
 
     def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
         return self.detector.log_prob(measurement, self.rate(x))
