@@ -33,7 +33,8 @@ class AfterpulsingSPAD(WrappedDetector):
     `afterpulsing`: an `Afterpulsing`, of the detector's bins and dead time. One detection per cycle (`SynchronousSPAD`
     without dead time) leaves the detector dead to the end of the cycle: only afterpulses of later cycles are seen. A
     closed gate stops them, too. With a `period_s` beyond the window the `background` of the Afterpulsing, counts of a
-    bin of the whole exposure, goes on outside of it.
+    bin of the whole exposure, goes on outside of it; inside a `MacroPixel` or `CoincidencePixel` it is that of the
+    whole pixel, of which every SPAD has its share.
 
     Releases are taken as independent of whether a photon has fired the detector since the detection that they come
     from: right in dim light, in constant light and where most delays are longer than the next dead time; else off by up
@@ -104,11 +105,12 @@ class AfterpulsingSPAD(WrappedDetector):
         given = self.afterpulsing.background
         if period == x.shape[TIME] or (not isinstance(given, Tensor) and given == 0):
             return 0.0
+        cycles = self.exposure_cycles or cycles_of(self.detector)
         level = over_time(wide(given), x, "background", "AfterpulsingSPAD")
         all_of_one = round_period[0].real
         ones = torch.ones(1, x.shape[TIME], dtype=torch.float64, device=x.device)
         missing = (all_of_one - filter_rows(ones, round_period, period, 0, x.shape[TIME])).clamp_min(0)
-        return missing.view(-1, 1, 1) * level / ((1 - all_of_one) * cycles_of(self.detector))
+        return missing.view(-1, 1, 1) * level / ((1 - all_of_one) * cycles)
 
     @in_single
     def released(self, x: Tensor) -> Tensor:
@@ -117,7 +119,9 @@ class AfterpulsingSPAD(WrappedDetector):
         most = float(self.afterpulsing.kernel(transfers[2]).detach().sum())
         outside = self._from_outside(x, transfers[0], transfers[2])
         free = torch.zeros_like(x)
-        for _ in range(max(1, math.ceil(math.log(_LEFT) / math.log(most)) - 1)):
+        # where all carriers are set free during the dead time, there is nothing to iterate
+        rounds = max(1, math.ceil(math.log(_LEFT) / math.log(most)) - 1) if most > _LEFT else 1
+        for _ in range(rounds):
             inside = self._released(self.detector.probabilities(x + free), transfers)
             free = (inside + outside).to(x.dtype)
         return free
