@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Literal
@@ -26,7 +27,8 @@ from torchtransient.sensing.time_convolution import check_choice, filter_rows
 CountedFrom = Literal["dead_time", "avalanche"]
 
 _BLOCK = 1 << 17  # entries at a time, so that temporaries stay in the cache
-_WORTH_TABLE = 1e4  # afterpulses, above which their lags are looked up
+_WORTH_TABLE = 1 << 16  # entries, above which the lags of afterpulses are looked up
+_FEW = 1 << 12  # places, below which one slow operation takes less time than several fast ones
 _VALUES = 1 << 16  # of a random number of 16 bits
 _MOST_LAGS = 1 << 14  # bins of a period, above which a table of 2^16 cells says little
 _FINE = 2.0**14  # bins of a period, or of a delay, up to which single precision places afterpulses
@@ -80,6 +82,21 @@ def add_afterpulses(
 def _check_period(period: int, bins: int) -> None:
     if period < bins:
         raise UnitError(f"add_afterpulses: expected a period of at least the window of {bins} bins, got {period}.")
+
+
+def _from_outside(kernel: Tensor, bins: int) -> Tensor:
+    window = torch.ones(1, bins, 1, 1, dtype=torch.float64, device=kernel.device)
+    total = kernel.sum() / (1 - kernel.sum())
+    return (total - add_afterpulses(window, 1.0, kernel, only_added=True)).clamp_min(0).flatten()
+
+
+@functools.lru_cache(maxsize=16)
+def _missing_of_numbers(
+    seen: tuple[float, ...], tau_bins: tuple[float, ...], dead_bins: float, period: int, bins: int
+) -> Tensor:
+    """`_from_outside` of exponentials. Half the time of a small image, where nothing is learnt."""
+    shares, tau = torch.tensor(seen, dtype=torch.float64), torch.tensor(tau_bins, dtype=torch.float64)
+    return _from_outside(shares @ exponential_kernel(tau, dead_bins, period), bins)
 
 
 class Afterpulsing(AddedCounts):
@@ -223,11 +240,16 @@ class Afterpulsing(AddedCounts):
         dark = not isinstance(self.background, Tensor) and self.background == 0
         if dark or period <= bins:
             return None
-        window = torch.ones(1, bins, 1, 1, dtype=torch.float64, device=x.device)
-        kernel = self.kernel(period).to(x.device)
-        total = kernel.sum() / (1 - kernel.sum())
-        missing = (total - add_afterpulses(window, 1.0, kernel, only_added=True)).clamp_min(0).view(-1, 1, 1)
+        missing = self._missing(period, bins).to(x.device).view(-1, 1, 1)
         return (missing * over_time(wide(self.background), x, "background", "Afterpulsing")).to(x.dtype).expand_as(x)
+
+    def _missing(self, period: int, bins: int) -> Tensor:
+        """Afterpulses in the window of one count in every bin outside of it: (bins,) float64."""
+        if self.delays is not None or torch.is_grad_enabled():
+            return _from_outside(self.kernel(period), bins)
+        tau = self.tau_s.reshape(-1) / self.bin_width_s
+        dead = self.dead_time_s / self.bin_width_s
+        return _missing_of_numbers(tuple(self._seen().tolist()), tuple(tau.tolist()), dead, period, bins)
 
     def share(self) -> float:
         p = float(self._seen().detach().sum())
@@ -253,7 +275,7 @@ class Afterpulsing(AddedCounts):
         p = float(self._seen().detach().sum())
         period, bins, pixels = self._period_bins(counts), counts.shape[TIME], counts.shape[-2] * counts.shape[-1]
         _check_period(period, bins)
-        draw = self._lags(period, p * float(counts.sum()))
+        draw = self._lags(period, counts)
 
         def follow(piece: Tensor, begin: int, own: torch.Generator | None) -> Tensor:
             """Places of all afterpulses of the detections of a piece, and of those triggered by them."""
@@ -280,10 +302,10 @@ class Afterpulsing(AddedCounts):
         beyond = self._beyond(counts)
         return total if beyond is None else total + self._poisson(beyond, generator)
 
-    def _lags(self, period: int, expected: float) -> Callable[[Tensor, torch.Generator | None], Tensor]:
+    def _lags(self, period: int, counts: Tensor) -> Callable[[Tensor, torch.Generator | None], Tensor]:
         """Draws of the bins from a detection to its afterpulse, folded into one period: int64 as large as a tensor."""
-        if self.logit_probability.device.type == "cpu" and expected > _WORTH_TABLE and period <= _MOST_LAGS:
-            kernel = self.kernel(period).detach()
+        if counts.device.type == "cpu" and counts.numel() >= _WORTH_TABLE and period <= _MOST_LAGS:
+            kernel = self.kernel(period).detach().cpu()
             return LagTable(kernel / kernel.sum()).draw
         longest = self.delays.end_s() if self.delays is not None else 20 * float(self.tau_s.max()) + self.dead_time_s
         # bins are told apart to 1e-3 of a bin, and delays have as many steps
@@ -299,6 +321,8 @@ class Afterpulsing(AddedCounts):
 
 def _one_each(place: Tensor, number: Tensor) -> Tensor:
     """Every place as often as its number says."""
+    if place.numel() < _FEW:
+        return place.repeat_interleave(number.long())
     all_places, k = [place if bool((number >= 1).all()) else place[number >= 1]], 2
     while True:
         more = (number >= k).nonzero().squeeze(-1)

@@ -14,9 +14,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchtransient.errors import UnitError
 from torchtransient.sensing.binomial_tables import FEW_TRIALS, sixteen_bits, table_of, up_to_share
 
-_WORTH_TABLES = 1 << 14  # draws, below which many short operations cost more than they save
+_WORTH_TABLES = 1 << 15  # draws, below which many short operations cost more than they save
 _WORTH_ONE_TABLE = 1 << 13  # ... of one probability, which may be new in every call
 _BLOCK = 1 << 17  # entries at a time, so that temporaries stay in the cache
 _ROOM = 2e-6  # for the rounding of probabilities and uniform numbers in single precision
@@ -99,8 +100,11 @@ def _apart(
     counts: Tensor, probability: float, generator: torch.Generator | None
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Trials (K,) int32 without those of large counts; the places of these, and their numbers from torch.binomial."""
+    low, high = torch.aminmax(counts)
+    if not float(low) >= 0:
+        raise UnitError(f"thin: expected counts >= 0, got {float(low):g}. Look for NaN or a difference upstream.")
     trials = counts.to(torch.int32)
-    if float(counts.amax()) <= _LARGE:
+    if float(high) <= _LARGE:
         return trials, counts[:0].long(), counts[:0]
     large = (counts > _LARGE).nonzero().squeeze(-1)
     trials[large] = 0
