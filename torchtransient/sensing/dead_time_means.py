@@ -45,7 +45,7 @@ def _tangent(of: Callable[..., Tensor], at: tuple[Tensor, ...], along: tuple[Ten
     return found
 
 
-def _walks(rate: Tensor, dead_bins: Tensor) -> Iterator[tuple[Tensor | slice, Walk]]:
+def walks(rate: Tensor, dead_bins: Tensor) -> Iterator[tuple[Tensor | slice, Walk]]:
     """(Columns, walk over them), bins cut as finely as the columns need."""
     dead = check_dead_bins(dead_bins)
     least = 1 if dead >= 1 - 1e-9 else 2
@@ -64,45 +64,58 @@ def _walks(rate: Tensor, dead_bins: Tensor) -> Iterator[tuple[Tensor | slice, Wa
 
 
 class _Detected(torch.autograd.Function):
-    """Columns (T, P) of rates -> detections per cycle."""
+    """Columns (T, P) of rates -> detections per cycle, and the states of the walk where they are wanted and few."""
 
     @staticmethod
-    def forward(rate: Tensor, dead_bins: Tensor) -> Tensor:
+    def forward(rate: Tensor, dead_bins: Tensor, keep: bool) -> tuple[Tensor, Tensor]:
         detected = torch.empty_like(rate)
-        for columns, walk in _walks(rate, dead_bins):
-            detected[:, columns] = walk.forward()[1:, 1].view(rate.shape[0], walk.pieces, -1).sum(1)
-        return detected
+        kept = rate.new_empty(0)
+        for columns, walk in walks(rate, dead_bins):
+            states = walk.forward()
+            detected[:, columns] = states[1:, 1].view(rate.shape[0], walk.pieces, -1).sum(1)
+            if keep and walk.columns == rate.shape[1] and walk.pieces == 1:
+                kept = states
+        return detected, kept
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        ctx.save_for_backward(*inputs)
-        ctx.save_for_forward(*inputs)
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
+        ctx.mark_non_differentiable(output[1])
+        ctx.save_for_backward(inputs[0], inputs[1], output[1])
+        ctx.save_for_forward(inputs[0], inputs[1])
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor | None]:
-        rate, dead_bins = ctx.saved_tensors
-        if ctx.needs_input_grad[1]:
-            return _gradient_in_steps(rate, dead_bins, gradients[0])
-        found: Tensor = _Adjoint.apply(rate, dead_bins, gradients[0])  # type: ignore[no-untyped-call]
-        return found, None
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor | None, None]:
+        rate, dead_bins, kept = ctx.saved_tensors
+        # batches of torch.autograd (is_grads_batched) know no rule of ours
+        if ctx.needs_input_grad[1] or torch._C._functorch.is_legacy_batchedtensor(gradients[0]):
+            return *_gradient_in_steps(rate, dead_bins, gradients[0]), None
+        found: Tensor = _Adjoint.apply(rate, dead_bins, gradients[0], kept)  # type: ignore[no-untyped-call]
+        return found, None, None
 
     @staticmethod
-    def jvp(ctx: Any, *tangents: Any) -> Tensor:
-        return _tangent(_in_steps, ctx.saved_tensors, tangents)
+    def jvp(ctx: Any, *tangents: Any) -> tuple[Tensor, None]:
+        return _tangent(_in_steps, ctx.saved_tensors, tangents[:2]), None
 
     @staticmethod
-    def vmap(info: Any, in_dims: tuple[int | None, ...], rate: Tensor, dead_bins: Tensor) -> tuple[Tensor, int]:
-        return _mapped(_Detected, info.batch_size, in_dims, rate, dead_bins)
+    def vmap(
+        info: Any, in_dims: tuple[int | None, ...], rate: Tensor, dead_bins: Tensor, keep: bool
+    ) -> tuple[tuple[Tensor, Tensor], tuple[int, int | None]]:
+        given = _beside(info.batch_size, in_dims, rate, dead_bins)
+        detected, kept = _Detected.apply(*given, keep)  # type: ignore[no-untyped-call]
+        detected = detected.view(detected.shape[0], info.batch_size, -1)
+        if kept.ndim == 1:
+            return (detected, kept), (1, None)
+        return (detected, kept.view(*kept.shape[:2], info.batch_size, -1)), (1, 2)
 
 
 class _Adjoint(torch.autograd.Function):
     """Weights (T, P) of the detections -> derivatives (T, P) of their sum with respect to the rates."""
 
     @staticmethod
-    def forward(rate: Tensor, dead_bins: Tensor, weights: Tensor) -> Tensor:
+    def forward(rate: Tensor, dead_bins: Tensor, weights: Tensor, kept: Tensor) -> Tensor:
         gradient = torch.empty_like(rate)
-        for columns, walk in _walks(rate, dead_bins):
-            states = walk.forward()
+        for columns, walk in walks(rate, dead_bins):
+            states = kept if kept.ndim > 1 else walk.forward()
             given = torch.zeros_like(states)
             own = weights[:, columns]
             given[1:, 1] = own.repeat_interleave(walk.pieces, 0) if walk.pieces > 1 else own
@@ -111,43 +124,37 @@ class _Adjoint(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        ctx.save_for_backward(*inputs)
-        ctx.save_for_forward(*inputs)
+        ctx.save_for_backward(*inputs[:3])
+        ctx.save_for_forward(*inputs[:3])
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        found: tuple[Tensor, Tensor, Tensor] = torch.func.vjp(_rate_gradient_in_steps, *ctx.saved_tensors)[1](
-            gradients[0]
-        )
-        return found
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        return *torch.func.vjp(_rate_gradient_in_steps, *ctx.saved_tensors)[1](gradients[0]), None
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Any) -> Tensor:
-        return _tangent(_rate_gradient_in_steps, ctx.saved_tensors, tangents)
+        return _tangent(_rate_gradient_in_steps, ctx.saved_tensors, tangents[:3])
 
     @staticmethod
-    def vmap(
-        info: Any, in_dims: tuple[int | None, ...], rate: Tensor, dead_bins: Tensor, weights: Tensor
-    ) -> tuple[Tensor, int]:
-        return _mapped(_Adjoint, info.batch_size, in_dims, rate, dead_bins, weights)
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *inputs: Tensor) -> tuple[Tensor, int]:
+        found: Tensor = _Adjoint.apply(*_beside(info.batch_size, in_dims, *inputs))  # type: ignore[no-untyped-call]
+        return found.view(found.shape[0], info.batch_size, -1), 1
 
 
-def _mapped(
-    function: type[torch.autograd.Function], batch: int, in_dims: tuple[int | None, ...], *inputs: Tensor
-) -> tuple[Tensor, int]:
-    """Over a batch of columns, beside one another; one dead time for all of them."""
+def _beside(batch: int, in_dims: tuple[int | None, ...], *inputs: Tensor) -> list[Tensor]:
+    """The columns of a batch beside one another; one dead time for all of them."""
     given = []
-    for place, x in zip(in_dims, inputs, strict=True):
+    for place, x in zip(in_dims, inputs, strict=False):
         if x.ndim < 2:
             given.append(x)
             continue
-        wide = x.unsqueeze(1).expand(-1, batch, -1) if place is None else x.movedim(place, 1)
-        given.append(wide.reshape(wide.shape[0], -1))
-    found: Tensor = function.apply(*given)  # type: ignore[no-untyped-call]
-    return found.view(found.shape[0], batch, -1), 1
+        wide = x.unsqueeze(-2).expand(*x.shape[:-1], batch, -1) if place is None else x.movedim(place, -2)
+        given.append(wide.flatten(-2))
+    return given
 
 
 def detected_columns(rate: Tensor, dead_bins: Tensor) -> Tensor:
     """Detections per cycle and bin for rates (T, P), float64; differentiable in both."""
-    found: Tensor = _Detected.apply(rate, dead_bins)  # type: ignore[no-untyped-call]
+    keep = torch.is_grad_enabled() and rate.requires_grad
+    found: Tensor = _Detected.apply(rate, dead_bins, keep)[0]  # type: ignore[no-untyped-call]
     return found

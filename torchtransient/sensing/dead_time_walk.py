@@ -65,16 +65,16 @@ class Walk:
 
     def __init__(self, rate: Tensor, whole: int, part: float, pieces: int, largest: float) -> None:
         series, derivative = response_series(part, largest)
-        self.rate, self.whole, self.pieces = rate, whole, pieces
+        self.rate, self.whole, self.part, self.pieces = rate, whole, part, pieces
         self.bins, self.columns = rate.shape
         self.size = self.bins * pieces
         self._series = series.to(rate.device).view(15, -1)
         self._derivative = derivative.to(rate.device).view(10, -1)
 
-    def blocks(self) -> list[tuple[int, int]]:
-        """(begin, end) of pieces, whole bins."""
-        bins = max(1, _AT_ONCE // (self.pieces * max(1, self.columns)))
-        return [(k * self.pieces, min(k + bins, self.bins) * self.pieces) for k in range(0, self.bins, bins)]
+    def blocks(self, wider: int = 1) -> list[tuple[int, int]]:
+        """(begin, end) of pieces, or of those `wider` times as wide: whole bins."""
+        bins, pieces = max(1, _AT_ONCE // (self.pieces * max(1, self.columns))), self.pieces // wider
+        return [(k * pieces, min(k + bins, self.bins) * pieces) for k in range(0, self.bins, bins)]
 
     def responses(self, begin: int, end: int, derivative: bool = False) -> tuple[Tensor, Tensor]:
         """(3, 5, L, P) for L pieces, and (2, 5, L, P) of slopes or nothing."""

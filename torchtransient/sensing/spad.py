@@ -17,7 +17,13 @@ from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
 from torchtransient.sensing.dead_time_cycle import check_dead_bins, double_detections
-from torchtransient.sensing.dead_time_draws import DrawnRows, draw_cycles, gaussian_cycles, score_of_cycles
+from torchtransient.sensing.dead_time_draws import (
+    DrawnRows,
+    draw_cycles,
+    gaussian_cycles,
+    sample_cycles,
+    score_of_cycles,
+)
 from torchtransient.sensing.dead_time_inverse import armed_time, check_cycles, rates_of_counts
 from torchtransient.sensing.dead_time_means import detected_columns
 from torchtransient.sensing.draws import check_rates, sample_first_photons
@@ -67,6 +73,15 @@ def _image(rows: Tensor, like: Tensor) -> Tensor:
     return rows.view(like.movedim(TIME, -1).shape).movedim(-1, TIME)
 
 
+def _columns(x: Tensor) -> Tensor:
+    """(..., T, H, W) -> columns (T, P), float64."""
+    return x.to(torch.float64).movedim(TIME, 0).reshape(x.shape[TIME], -1)
+
+
+def _of_columns(columns: Tensor, like: Tensor) -> Tensor:
+    return columns.view(like.movedim(TIME, 0).shape).movedim(0, TIME)
+
+
 def detections_with_dead_time(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
     """Detections per cycle and bin, armed at the start of each cycle, with dead time: float64 (..., C, T, H, W).
 
@@ -82,9 +97,7 @@ def detections_with_dead_time(rate: Tensor, dead_bins: Tensor | float) -> Tensor
     if rate.numel() == 0:
         return rate.to(torch.float64)
     dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=rate.device)
-    wide = rate.to(torch.float64).movedim(TIME, 0)
-    detected = detected_columns(wide.reshape(wide.shape[0], -1), dead)
-    return detected.view(wide.shape).movedim(0, TIME)
+    return _of_columns(detected_columns(_columns(rate), dead), rate)
 
 
 @in_single
@@ -128,7 +141,13 @@ def sample_detections(
     rate = rate.detach()
     if dead_bins is None:
         return sample_first_photons(number, rate, generator)
-    return _drawn(rate, number, dead_bins, generator)[0]
+    check_dead_bins(dead_bins)
+    check_rates(rate, "sample_detections")
+    if rate.numel() == 0:
+        return rate.clone()
+    dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=rate.device)
+    counts = sample_cycles(_columns(rate), dead, number, generator)
+    return _of_columns(counts, rate).to(rate.dtype)
 
 
 def _drawn(
