@@ -152,7 +152,64 @@ def test_afterpulses_go_round_the_laser_period():
     with pytest.raises(UnitError, match=r"the laser period of stage '0' .*1e-07 s, in stage '2' .*got 1\.28e-08"):
         sensing.Compose([budget(rate_hz=10e6), spad, afterpulsing(period_s=12.8 * NS)])
     sensing.Compose([budget(rate_hz=10e6), spad, afterpulsing(period_s=100 * NS)])
-    sensing.Compose([budget(rate_hz=1 / 12.8e-9), spad, afterpulsing()])
+    sensing.Compose([budget(rate_hz=1 / 12.8e-9), sensing.FreeRunningSPAD(1000, 20 * NS, axis=AXIS), afterpulsing()])
+
+
+def module(dead_ns, period_s=100 * NS, **bins):
+    return sensing.Afterpulsing(0.01, 30 * NS, dead_ns * NS, period_s=period_s, **(bins or {"axis": AXIS}))
+
+
+def test_the_dead_time_of_afterpulses_is_the_detectors():
+    """A module that is dead for longer than a period misses cycles: a detector of one detection per cycle cannot."""
+    spad, again = sensing.SynchronousSPAD(1000), "armed again before the next cycle"
+    for dead_ns in (88, 150, 1000):
+        with pytest.raises(UnitError, match=rf"'2' \(Afterpulsing\).*{again}.*FreeRunningSPAD"):
+            sensing.Compose([budget(), spad, module(dead_ns)])
+        with pytest.raises(UnitError, match=rf"Afterpulsing.*{again}"):  # without a budget
+            sensing.Compose([spad, module(dead_ns)])
+        with pytest.raises(UnitError, match=rf"Afterpulsing.*{again}"):
+            sensing.counting_chain(budget(), sensing.AfterpulsingSPAD(spad, module(dead_ns)))
+        with pytest.raises(UnitError, match=rf"Afterpulsing.*{again}"):
+            sensing.Compose([budget(), sensing.MacroPixel(spad, 4), module(dead_ns)])
+    # the window of light is not known before there is some
+    open_window = sensing.Compose([budget(bin_width_s=100 * PS, pulse_energy_j=1e-9, wavelength_m=532e-9), spad,
+                                   module(88, bin_width_s=100 * PS)])  # fmt: skip
+    assert open_window.expected(torch.zeros(1, 120, 1, 1)).isfinite().all()  # 12 and 88 ns are a period
+    with pytest.raises(UnitError, match=again):
+        open_window.expected(torch.zeros(1, 121, 1, 1))
+    assert len(sensing.Compose([budget(), spad, module(87.2)]).stages) == 3
+    free = sensing.FreeRunningSPAD(1000, 150 * NS, axis=AXIS)
+    sensing.Compose([budget(rate_hz=1 / 12.8e-9), free, module(150, 12.8 * NS)])
+
+
+@pytest.mark.parametrize("nested", [False, True])
+def test_one_detector_has_one_dead_time(nested):
+    def wrapped(detector):
+        return sensing.MacroPixel(detector, 4) if nested else detector
+
+    synchronous = wrapped(sensing.SynchronousSPAD(1000, dead_time_s=5 * NS, axis=AXIS))
+    free = wrapped(sensing.FreeRunningSPAD(1000, 5 * NS, axis=AXIS))
+    for detector, rate_hz, period in ((synchronous, 10e6, 100 * NS), (free, 1 / 12.8e-9, 12.8 * NS)):
+        for dead_ns in (0, 4.9, 30):
+            with pytest.raises(UnitError, match=r"expected the dead time of .*5e-09 s, in stage '2' \(Afterpulsing\)"):
+                sensing.Compose([budget(rate_hz=rate_hz), detector, module(dead_ns, period)])
+        assert len(sensing.Compose([budget(rate_hz=rate_hz), detector, module(5, period)]).stages) == 3
+
+
+def test_pixels_with_dead_times_of_their_own():
+    dead = torch.tensor([[5.0, 7.0]])
+
+    def spads(d):
+        return sensing.SynchronousSPAD(1000, dead_time_s=d * NS, axis=AXIS)
+
+    groups = sensing.PixelGroups.by_value(dead, spads)
+    own = sensing.PixelGroups.by_value(dead, lambda d: module(d))
+    assert len(sensing.Compose([budget(), groups, own]).stages) == 3
+    both = sensing.PixelGroups.by_value(dead, lambda d: sensing.AfterpulsingSPAD(spads(d), module(d)))
+    assert len(sensing.Compose([budget(), both]).stages) == 2
+    for wrong in (module(5), sensing.PixelGroups.by_value(dead, lambda d: module(d + 1))):
+        with pytest.raises(UnitError, match="One detector has one dead time"):
+            sensing.Compose([budget(), groups, wrong])
 
 
 def test_a_synchronous_detector_is_armed_when_a_cycle_begins():
@@ -160,6 +217,21 @@ def test_a_synchronous_detector_is_armed_when_a_cycle_begins():
     with pytest.raises(UnitError, match=r"armed again before the next cycle .*2e-08 s later.*FreeRunningSPAD"):
         sensing.Compose([budget(rate_hz=50e6), spad])
     sensing.Compose([budget(rate_hz=40e6), spad])
+
+
+@pytest.mark.parametrize("behind", [False, True])
+def test_what_becomes_of_a_chain_in_the_order_of_before(behind):
+    """A response behind the budget held the pulse and the jitter: both have a place, and neither is a flag."""
+    spad, irf = sensing.SynchronousSPAD(1000), sensing.ImpulseResponse(sensing.emg_response(90 * PS, 80 * PS), AXIS)
+    bright = budget(ambient_rate_hz=1e6, axis=AXIS, pulse_energy_j=1e-9, wavelength_m=532e-9)
+    with pytest.raises(UnitError) as told:
+        sensing.Compose([bright, spad, irf] if behind else [bright, irf, spad])
+    words = str(told.value)
+    assert "stays an ImpulseResponse and goes in front of the PhotonBudget" in words
+    assert "becomes a DetectionJitter of the same response behind the detector" in words
+    assert "periodic" not in words  # jitter would go in front of pile-up again
+    with pytest.raises(UnitError, match="Use boundary='periodic'"):
+        sensing.Compose([bright, sensing.StreakCamera(AXIS, time_fwhm_s=300 * PS, boundary="zero")])
 
 
 MIXED = {
@@ -267,6 +339,9 @@ SECONDS = {
     "UniformResponse": {"width_s": 60 * PS, "delay_s": 1 * NS},
     "emg_response": {"fwhm_s": 60 * PS, "tau_s": 80 * PS, "delay_s": 1 * NS},
     "free_running_rate": {"rate_hz": torch.tensor(1e6), "dead_time_s": 20 * NS},
+    "ml_position": {
+        "histogram": torch.ones(1, 128, 1, 1), "response": GAUSS, "bin_width_s": 100 * PS, "signal_to_background": 9.0
+    },
     "range_deviation_m": {"response_fwhm_s": 300 * PS, "detections": torch.ones(1)},
 }  # fmt: skip
 # formulas that hold in any unit, what others compute, and devices, which say it when they are built
@@ -396,6 +471,7 @@ def test_functions_that_count(dtype):
         lambda v: sensing.frames_to_rate(many.to(v.dtype), 10**6),
         lambda v: sensing.equi_depth_edges(v, 4),
         lambda v: sensing.peak_position(v),
+        lambda v: sensing.ml_position(v, sensing.GaussianResponse(1 * NS), bin_width_s=1 * NS),
         lambda v: sensing.soft_argmax(v),
         lambda v: sensing.centre_of_mass(v),
         lambda v: sensing.first_return(v, 0.5).position,

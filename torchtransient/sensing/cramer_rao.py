@@ -180,9 +180,14 @@ def covariance_bound(
 def _shares(response: Response, axis: TimeAxis, distance: Tensor) -> Tensor:
     """(..., T): the share of a return at `distance` in each bin."""
     edges = axis.edges_s.to(distance.device) - distance.unsqueeze(-1) * (2 / SPEED_OF_LIGHT)
+    return shares_between(response, edges, axis.bin_width_s)
+
+
+def shares_between(response: Response, edges_s: Tensor, bin_width_s: float) -> Tensor:
+    """(..., K): the share of a response, of light at one known time, between edges (..., K + 1) in seconds."""
     if type(response).cdf is Response.cdf:
-        return _by_kernel(response, axis.bin_width_s / _FINE, edges)
-    below, above = response.cdf(edges), response.survival(edges)
+        return _by_kernel(response, bin_width_s / _FINE, edges_s)
+    below, above = response.cdf(edges_s), response.survival(edges_s)
     # differences of what is small: tails keep their relative precision
     late = (below > 0.5)[..., :-1]
     return torch.where(late, above[..., :-1] - above[..., 1:], below.diff(dim=-1)).clamp_min(0)
