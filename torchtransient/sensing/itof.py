@@ -238,9 +238,10 @@ class ItofCorrelation(Sensor):
     """Photoelectrons per bin (..., C, T, H, W) to the mean electrons of the taps (..., C, F N, H, W).
 
     ``code``, ``frequencies_hz`` (F of them), ``axis`` (of the transient), ``contrast`` and ``within_bin`` as in
-    `tap_weights`; ``background_e`` electrons of unmodulated light per exposure, shared equally by the taps;
-    ``electrons_per_unit`` scales a radiance to electrons; ``calibration``: phase offsets, direction of the steps, maps
-    of pixels. Linear but for the background, hence exact in the mean. Noise, saturation and converter follow in
+    `tap_weights`. Light and ``background_e``, electrons of unmodulated light, are those of *all* N phase steps of a
+    frequency and all taps together, which share them equally. ``electrons_per_unit`` scales a radiance to electrons;
+    ``calibration``: phase offsets, direction of the steps, maps of pixels; an `nn.Parameter` in it is learnt, with a
+    `FourierCode`. Linear but for the background, hence exact in the mean. Noise, saturation and converter follow in
     `PixelElectronics`, the difference of two taps in `TapDifference`; phase and depth in `read_itof`.
 
     A map of pixels costs one pass over the transient for each harmonic of a sine code; a code with corners needs
