@@ -16,7 +16,7 @@ from torchtransient.sensing.added_counts import AddedCounts
 from torchtransient.sensing.afterpulse_delays import AfterpulseDelays, exponential_kernel, exponential_shares
 from torchtransient.sensing.draws import by_pieces
 from torchtransient.sensing.layout import TIME, bin_width_of, check_number, check_seconds, check_transient
-from torchtransient.sensing.pixel_maps import check_map, keep_map, over_time, wide
+from torchtransient.sensing.pixel_maps import check_map, keep_map, kept_map, over_time
 from torchtransient.sensing.policies import GradPolicy
 from torchtransient.sensing.thinning import thin
 from torchtransient.sensing.time_convolution import check_choice, filter_rows
@@ -181,6 +181,11 @@ class Afterpulsing(AddedCounts):
     def _seen(self) -> Tensor:
         """Afterpulses of a detection after its dead time, by exponential: (K,) float64."""
         p = self.probability.reshape(-1)
+        if not float(p.detach().sum()) <= _MOST * (1 + 1e-9):
+            raise UnitError(
+                f"Afterpulsing: expected a sum of probability in (0, {_MOST:g}], got {p.detach().tolist()}. If it is "
+                "learnt, lower the learning rate: at a sum of 1 a detection would never end."
+            )
         if self.counted_from == "dead_time":
             return p
         if self.delays is not None:
@@ -221,7 +226,8 @@ class Afterpulsing(AddedCounts):
         kernel = self.kernel(period).to(x.device)
         total = kernel.sum() / (1 - kernel.sum())
         missing = (total - add_afterpulses(window, 1.0, kernel, only_added=True)).clamp_min(0).view(-1, 1, 1)
-        return (missing * over_time(wide(self.background), x, "background", "Afterpulsing")).to(x.dtype).expand_as(x)
+        level = over_time(kept_map(self, "background"), x, "background", "Afterpulsing")
+        return (missing * level).to(x.dtype).expand_as(x)
 
     def share(self) -> float:
         p = float(self._seen().detach().sum())
