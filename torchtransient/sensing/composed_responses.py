@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.layout import check_seconds
-from torchtransient.sensing.response_shapes import integrated_counts, normal_integrals, remove_floor, resample_counts
+from torchtransient.sensing.response_shapes import above_floor, integrated_counts, normal_integrals, resample_counts
 from torchtransient.sensing.responses import (
     CLOSED_BINS,
     GaussianResponse,
@@ -24,7 +24,8 @@ from torchtransient.sensing.time_convolution import check_choice
 class MeasuredResponse(Response):
     """A measured histogram `counts` (T,) in bins of `bin_width_s`, resampled by integrating.
 
-    The median of all bins is taken off as background (`floor=False` keeps it), the rest normalised to 1. `align`
+    `floor`: what is taken off as background: True the median of all bins, False nothing, or a number of counts of every
+    bin. The rest is normalised to 1. `align`
     "center_of_mass" puts the mean delay at `delay_s` (the highest bin would shift an asymmetric response by about its
     tail); "start" puts the start of the first bin there. `learnable` makes the delay and the shape (as logits) learnt.
     """
@@ -40,7 +41,7 @@ class MeasuredResponse(Response):
         delay_s: float = 0.0,
         *,
         align: str = "center_of_mass",
-        floor: bool = True,
+        floor: float | bool = True,
         learnable: bool = False,
     ) -> None:
         super().__init__(delay_s, learnable)
@@ -53,7 +54,7 @@ class MeasuredResponse(Response):
         values = counts.detach().double()
         if not bool(torch.isfinite(values).all()) or not bool((values.amax() > values.median()) & (values >= 0).all()):
             raise UnitError("MeasuredResponse: expected finite counts >= 0 with a peak above their median.")
-        shares = remove_floor(values) if floor else values / values.sum()
+        shares = above_floor(values, floor, "MeasuredResponse")
         self.align = align
         if self.learnable:
             # a bin without light starts at e^-30 of the whole, so that it can be learnt at all

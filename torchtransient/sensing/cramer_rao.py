@@ -21,6 +21,7 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import DeviceError, GradientError, ShapeError, UnitError
+from torchtransient.sensing.given import no_arrays
 from torchtransient.sensing.impulse_response import Response
 from torchtransient.sensing.layout import TIME, check_count, check_time_axis
 from torchtransient.sensing.response_shapes import resample_counts
@@ -228,7 +229,8 @@ def _pixels(values: tuple[Tensor | float, ...], response: Response, where: str) 
     """Distance, signal and background of every pixel, float64, of one shape, on the device of the response."""
     names = ("distance_m", "signal", "background")
     tensors = []
-    for name, value in zip(names, values, strict=True):
+    for name, given in zip(names, values, strict=True):
+        value = no_arrays(given, where)
         if isinstance(value, bool) or not isinstance(value, (Tensor, int, float)):
             raise UnitError(f"{where}: expected {name} to be a number or a tensor, got {type(value).__name__}.")
         device = response.delay_ps.device
@@ -255,7 +257,8 @@ def _pixels(values: tuple[Tensor | float, ...], response: Response, where: str) 
 
 def _floating(values: tuple[Tensor | float, ...]) -> torch.dtype:
     """The dtype of the most precise tensor, float32 at least; torch's default without one."""
-    dtypes = [v.dtype for v in values if isinstance(v, Tensor) and v.is_floating_point()]
+    tensors = [no_arrays(value, "crlb") for value in values]
+    dtypes = [v.dtype for v in tensors if isinstance(v, Tensor) and v.is_floating_point()]
     if not dtypes:
         return torch.get_default_dtype()
     return torch.float64 if torch.float64 in dtypes else torch.float32

@@ -19,16 +19,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Literal
 
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import GradientError, ShapeError, UnitError
 from torchtransient.floating import in_single
-from torchtransient.quantities import real_array
+from torchtransient.quantities import real_array, shown
+from torchtransient.sensing.given import refuse_cut_off
 from torchtransient.sensing.itof_codes import CorrelationCode
 from torchtransient.sensing.itof_pixels import ItofCalibration, in_direction
 from torchtransient.sensing.layout import check_number, check_time_axis, check_transient, product
@@ -44,6 +46,7 @@ _LARGEST = 1 << 22  # numbers of a table of weights of pixels
 
 def check_frequencies(frequencies_hz: Frequencies, where: str) -> tuple[float, ...]:
     """Modulation frequencies in hertz as a tuple; UnitError unless there are some, between 1 kHz and 1 THz."""
+    refuse_cut_off(frequencies_hz, "frequencies_hz", where)
     array = real_array(frequencies_hz)
     given: Sequence[Any] = [frequencies_hz]  # what is no row of numbers is told by the check of its entries
     if array is not None and array.ndim <= 1:
@@ -78,6 +81,8 @@ def tap_weights(
     code, phases = _checked(code, frequencies_hz, axis, contrast, within_bin, calibration, me)
     if phases.shape[1:] != (1, 1):
         raise UnitError(f"{me}: expected a calibration without maps of pixels, whose weights ItofCorrelation makes.")
+    if phases.requires_grad:
+        refuse_cut_off(phases, "calibration", me)
     rows = []
     for f, phase in zip(check_frequencies(frequencies_hz, me), phases.flatten().tolist(), strict=True):
         if within_bin == "uniform":
@@ -197,7 +202,7 @@ def _mixed(
     offset = code.coefficients([0]).real.reshape(-1, 1, 1)
     taps = (1 + contrast * offset).to(total) * total.unsqueeze(-3)
     for h, cosine, sine in parts:
-        size, angle = code.coefficients([h]).reshape(-1, 1, 1), h * phase.detach().double()
+        size, angle = code.coefficients([h]).reshape(-1, 1, 1), h * phase.to(total.device).double()
         factor = 2 * contrast * size.to(angle.device) * torch.complex(angle.cos(), angle.sin())
         taps = taps + factor.real.to(total) * cosine.unsqueeze(-3) - factor.imag.to(total) * sine.unsqueeze(-3)
     return taps / code.num_taps
@@ -246,7 +251,7 @@ class ItofCorrelation(Sensor):
     takes, gives = ("electrons", "counts"), "electrons"
 
     weights: Tensor
-    phases_rad: Tensor | None
+    phases_rad: Tensor | None  # as they were made; those of learnt calibrations are made anew
 
     def __init__(
         self,
@@ -271,7 +276,18 @@ class ItofCorrelation(Sensor):
         self.within_bin: WithinBin = within_bin
         self.calibration = calibration
         self._turned, phases = _checked(code, self.frequencies_hz, axis, self.contrast, within_bin, calibration, me)
-        mapped = calibration is not None and calibration.has_map
+        learnt = () if calibration is None else calibration.learnt
+        for name in learnt:
+            value = getattr(calibration, name)
+            if not isinstance(value, nn.Parameter) or self._turned.harmonics is None:
+                raise GradientError(
+                    f"{me}: expected the {name} of a calibration that requires a gradient to be an nn.Parameter, with "
+                    f"a sine code (or any FourierCode), got {type(value).__name__} with {shown(code)}. Other codes are "
+                    "not supported: give .detach()."
+                )
+            self.register_parameter(name, value)
+        self._learnt = learnt
+        mapped = calibration is not None and (calibration.has_map or bool(learnt))
         if not mapped:
             weights = tap_weights(code, self.frequencies_hz, axis, self.contrast, within_bin, calibration)
         elif self._turned.harmonics is not None:
@@ -279,12 +295,23 @@ class ItofCorrelation(Sensor):
         else:
             weights = torch.zeros(0, axis.num_bins, dtype=torch.float64)
         self.register_buffer("weights", weights)
-        self.register_buffer("phases_rad", phases if mapped else None)
+        self.register_buffer("phases_rad", phases.detach() if mapped else None)
         self.num_bins = axis.num_bins
 
+    def _known(self) -> ItofCalibration | None:
+        """The calibration with the parameters as they are now."""
+        if self.calibration is None or not self._learnt:
+            return self.calibration
+        return replace(self.calibration, **{name: getattr(self, name) for name in self._learnt})
+
+    def _phases(self) -> Tensor | None:
+        known = self._known() if self._learnt else None
+        return self.phases_rad if known is None else known.phases_rad(self.frequencies_hz)
+
     def expected(self, x: Tensor) -> Tensor:
+        phases = self._phases()
         # Scaled on the small side: taps are fewer than bins.
-        taps = correlate(x, self.weights) if self.phases_rad is None else self._of_pixels(x, self.phases_rad)
+        taps = correlate(x, self.weights) if phases is None else self._of_pixels(x, phases)
         return taps * self.electrons_per_unit + self.background_e / self.code.num_taps
 
     def _of_pixels(self, x: Tensor, phases: Tensor) -> Tensor:
@@ -323,7 +350,7 @@ class ItofCorrelation(Sensor):
             steady=steady,
             harmonics=harmonics,
             contrast=self.contrast,
-            calibration=self.calibration,
+            calibration=self._known(),
         )
         return taps * self.electrons_per_unit + self.background_e / self.code.num_taps
 

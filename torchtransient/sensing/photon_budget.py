@@ -90,6 +90,7 @@ def _check_optics(optics: object, where: str) -> None:
         raise UnitError(f"{where}: expected optics to be an Optics, got {optics!r}. Optics(f_number=2.0), say.")
 
 
+@in_single
 def ambient_photon_rate(
     optics: Optics,
     albedo: float | Tensor,

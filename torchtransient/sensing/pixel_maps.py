@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import holds
 from torchtransient.quantities import shown
+from torchtransient.sensing.given import no_arrays
 from torchtransient.sensing.layout import check_number
 
 
@@ -17,10 +18,12 @@ def check_map(
     value: object, name: str, where: str, *, low: float = 0.0, high: float = math.inf, open_low: bool = False
 ) -> float | Tensor:
     """A number in [low, high] as a float, or a tensor of them as it is, with its gradient; floating, else float64.
+    An array is a tensor.
 
     A map is (), (H, W) or (..., C, H, W). UnitError outside the range and for NaN, ShapeError for one dimension, which
     could be rows as well as channels.
     """
+    value = no_arrays(value, where)
     if not isinstance(value, Tensor):
         return check_number(value, name, where, low=low, high=high, open_low=open_low)  # type: ignore[arg-type]
     if value.is_complex() or value.dtype == torch.bool:
