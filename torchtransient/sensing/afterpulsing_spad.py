@@ -13,7 +13,7 @@ from torchtransient.sensing.afterpulsing import Afterpulsing
 from torchtransient.sensing.free_running import FreeRunningSPAD
 from torchtransient.sensing.layout import TIME, check_transient
 from torchtransient.sensing.own_bins import common_bins
-from torchtransient.sensing.pixel_maps import over_time, wide
+from torchtransient.sensing.pixel_maps import kept_map, over_time
 from torchtransient.sensing.policies import GradPolicy
 from torchtransient.sensing.spad import SynchronousSPAD
 from torchtransient.sensing.time_convolution import filter_rows
@@ -106,7 +106,7 @@ class AfterpulsingSPAD(WrappedDetector):
         if period == x.shape[TIME] or (not isinstance(given, Tensor) and given == 0):
             return 0.0
         cycles = self.exposure_cycles or cycles_of(self.detector)
-        level = over_time(wide(given), x, "background", "AfterpulsingSPAD")
+        level = over_time(kept_map(self.afterpulsing, "background"), x, "background", "AfterpulsingSPAD")
         all_of_one = round_period[0].real
         ones = torch.ones(1, x.shape[TIME], dtype=torch.float64, device=x.device)
         missing = (all_of_one - filter_rows(ones, round_period, period, 0, x.shape[TIME])).clamp_min(0)
