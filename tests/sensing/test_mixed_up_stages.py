@@ -339,6 +339,9 @@ SECONDS = {
     "UniformResponse": {"width_s": 60 * PS, "delay_s": 1 * NS},
     "emg_response": {"fwhm_s": 60 * PS, "tau_s": 80 * PS, "delay_s": 1 * NS},
     "free_running_rate": {"rate_hz": torch.tensor(1e6), "dead_time_s": 20 * NS},
+    "ml_position": {
+        "histogram": torch.ones(1, 128, 1, 1), "response": GAUSS, "bin_width_s": 100 * PS, "signal_to_background": 9.0
+    },
     "range_deviation_m": {"response_fwhm_s": 300 * PS, "detections": torch.ones(1)},
 }  # fmt: skip
 # formulas that hold in any unit, what others compute, and devices, which say it when they are built
@@ -468,6 +471,7 @@ def test_functions_that_count(dtype):
         lambda v: sensing.frames_to_rate(many.to(v.dtype), 10**6),
         lambda v: sensing.equi_depth_edges(v, 4),
         lambda v: sensing.peak_position(v),
+        lambda v: sensing.ml_position(v, sensing.GaussianResponse(1 * NS), bin_width_s=1 * NS),
         lambda v: sensing.soft_argmax(v),
         lambda v: sensing.centre_of_mass(v),
         lambda v: sensing.first_return(v, 0.5).position,

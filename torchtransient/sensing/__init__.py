@@ -116,6 +116,7 @@ from torchtransient.sensing.policies import GradPolicy as GradPolicy
 from torchtransient.sensing.policies import ScoreFunction as ScoreFunction
 from torchtransient.sensing.policies import gaussian_noise as gaussian_noise
 from torchtransient.sensing.policies import straight_through as straight_through
+from torchtransient.sensing.position_likelihood import ml_position as ml_position
 from torchtransient.sensing.presets import DEVICES as DEVICES
 from torchtransient.sensing.presets import device as device
 from torchtransient.sensing.pulse import apply_pulse as apply_pulse

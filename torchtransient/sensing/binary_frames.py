@@ -45,9 +45,10 @@ class BinaryFrames(RandomSensor):
         self.frames = check_count(frames, "frames", "BinaryFrames")
 
     def expected(self, x: Tensor) -> Tensor:
-        return -torch.expm1(-check_transient(x, "BinaryFrames")) * self.frames
+        return -torch.expm1(-check_rates(check_transient(x, "BinaryFrames"), "BinaryFrames")) * self.frames
 
     def variance(self, x: Tensor) -> Tensor:
+        check_rates(x, "BinaryFrames")
         variance: Tensor = -torch.expm1(-x) * torch.exp(-x) * self.frames
         return variance
 
@@ -61,7 +62,7 @@ class BinaryFrames(RandomSensor):
         return torch.binomial(torch.full_like(p, float(self.frames)), p, generator=generator).to(x.dtype)
 
     def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
-        n, r = measurement.double(), x.double()
+        n, r = measurement.double(), check_rates(x, "BinaryFrames").double()
         hit = n > 0
         fire = log_of_firing(torch.where(hit, r, torch.ones_like(r)))
         value = torch.where(hit, n * fire, torch.zeros_like(r)) - r * (self.frames - n)

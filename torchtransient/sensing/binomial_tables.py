@@ -13,6 +13,7 @@ import math
 import torch
 from torch import Tensor
 
+_VALUES = 1 << 16  # of a random number of 16 bits
 _ROOM = 1e-9  # beside the border of two results, more than the rounding of the distribution function
 FEW_TRIALS = 127  # of an entry: their numbers fit into a byte. With more, torch.binomial is cheaper than two looks
 _RARE, _RARE_TRIALS = 0.05, 511  # up to this probability so many trials have results that fit into a byte
@@ -44,26 +45,77 @@ class BinomialTable:
 
     def draw(self, which: Tensor | int, trials: Tensor, generator: torch.Generator | None) -> Tensor:
         """Numbers (K,) int32 of `trials` (K,) int32, each of the probability number `which` (K,) int32."""
-        row = trials.clamp_max(self._most)
-        row += which * (self._most + 1)
-        number = self._look_up(row, generator).to(torch.int32)
+        if int(trials.max()) <= self._most:
+            return self._of_few(which, trials, generator).to(torch.int32)
+        number = self._of_few(which, trials.clamp_max(self._most), generator).to(torch.int32)
         more = (trials > self._most).nonzero().squeeze(-1)
-        if more.numel():
-            others = which[more] if isinstance(which, Tensor) else which
-            number[more] += self.draw(others, trials[more] - self._most, generator)
+        others = which[more] if isinstance(which, Tensor) else which
+        number[more] += self.draw(others, trials[more] - self._most, generator)
         return number
 
-    def _look_up(self, row: Tensor, generator: torch.Generator | None) -> Tensor:
-        cell = sixteen_bits(row, generator).to(torch.int32).bitwise_and_(self._cells - 1)
-        number = self._number.index_select(0, cell.add(row, alpha=self._cells))
+    def _of_few(self, which: Tensor | int, trials: Tensor, generator: torch.Generator | None) -> Tensor:
+        """Numbers (K,) int8 of at most as many trials as the table has."""
+        cell, number = self._look(self._row(which, trials), generator)
         unsure = (number < 0).nonzero().squeeze(-1)
         if unsure.numel():
-            row = row[unsure]
+            number[unsure] = self._exactly(self._row(which, trials)[unsure], cell[unsure], generator)
+        return number
+
+    def draw_some(self, trials: Tensor, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
+        """Places (J,) int64 of the numbers above 0 (a few of 0 among them), and these (J,) int32, for one probability.
+
+        `trials` (K,) int32.
+        """
+        if int(trials.max()) > self._most:
+            number = self.draw(0, trials, generator)
+            place = number.nonzero().squeeze(-1)
+            return place, number.index_select(0, place)
+        cell, number = self._look(trials, generator)
+        place = number.nonzero().squeeze(-1)
+        some = number.index_select(0, place)
+        unsure = (some < 0).nonzero().squeeze(-1)
+        if unsure.numel():
+            among = place[unsure]
+            some[unsure] = self._exactly(trials[among], cell[among], generator)
+        return place, some.to(torch.int32)
+
+    def _row(self, which: Tensor | int, trials: Tensor) -> Tensor:
+        return trials if isinstance(which, int) and which == 0 else trials + which * (self._most + 1)
+
+    def _look(self, row: Tensor, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
+        """Cells, and what the table says in them: -1 where it does not tell."""
+        cell = sixteen_bits(row, generator).to(torch.int32).bitwise_and_(self._cells - 1)
+        return cell, self._number.index_select(0, cell.add(row, alpha=self._cells))
+
+    def _exactly(self, row: Tensor, cell: Tensor, generator: torch.Generator | None) -> Tensor:
+        """The number by the rest of the uniform number, somewhere in the cell."""
+        u = torch.rand(row.shape, dtype=torch.float64, generator=generator)
+        u = u.add_(cell).mul_(1 / self._cells).add_(row)
+        k = torch.searchsorted(self._below, u, right=True) - row * self._results
+        # the end of a row is rounded
+        return k.clamp_(min=0).minimum(row % (self._most + 1)).to(torch.int8)
+
+
+class LagTable:
+    """Draws of 0 ... K - 1 with `probabilities` (K,) float64 whose sum is 1, on the CPU. K at most 32767."""
+
+    def __init__(self, probabilities: Tensor) -> None:
+        self._below = probabilities.cumsum(0)[:-1]
+        place = self._below * _VALUES
+        started = torch.bincount(place.ceil().long().clamp_(max=_VALUES), minlength=_VALUES + 1)
+        self._number = started.cumsum(0)[:_VALUES].to(torch.int16)
+        for shift in (-_ROOM, _ROOM):
+            cell = (place + shift * _VALUES).floor().long()
+            self._number[cell[(cell >= 0) & (cell < _VALUES)]] = -1
+
+    def draw(self, like: Tensor, generator: torch.Generator | None) -> Tensor:
+        """(N,) int64 for `like` (N,)."""
+        cell = sixteen_bits(like, generator).to(torch.int32).bitwise_and_(_VALUES - 1)
+        number = self._number.index_select(0, cell).long()
+        unsure = (number < 0).nonzero().squeeze(-1)
+        if unsure.numel():
             u = torch.rand(unsure.shape, dtype=torch.float64, generator=generator)
-            u = u.add_(cell[unsure]).mul_(1 / self._cells).add_(row)
-            k = torch.searchsorted(self._below, u, right=True) - row * self._results
-            # the end of a row is rounded
-            number[unsure] = k.clamp_(min=0).minimum(row % (self._most + 1)).to(torch.int8)
+            number[unsure] = torch.searchsorted(self._below, u.add_(cell[unsure]).mul_(1 / _VALUES), right=True)
         return number
 
 
@@ -85,11 +137,11 @@ def _distribution(probabilities: Tensor, most: int) -> Tensor:
     return torch.where(k <= n, chance, 0.0).cumsum_(-1).clamp_(max=1.0).view(-1, results + 1)
 
 
-@functools.lru_cache(maxsize=16)
-def table_of(probability: float) -> BinomialTable:
-    """The table of one probability in [0, 1/2]."""
-    most = _RARE_TRIALS if probability <= _RARE else FEW_TRIALS
-    return BinomialTable(torch.tensor([probability], dtype=torch.float64), most, 1024)
+@functools.lru_cache(maxsize=32)
+def table_of(probability: float, *, small: bool = False) -> BinomialTable:
+    """The table of one probability in [0, 1/2]. `small`: one that is made in less time, for fewer entries."""
+    most = _RARE_TRIALS if probability <= _RARE and not small else FEW_TRIALS
+    return BinomialTable(torch.tensor([probability], dtype=torch.float64), most, 256 if small else 1024)
 
 
 @functools.cache

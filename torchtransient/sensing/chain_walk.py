@@ -56,7 +56,7 @@ def numbered(stages: Iterable[nn.Module]) -> Iterator[tuple[str, nn.Module]]:
 
 def parts_of(chain: nn.Module) -> Iterator[tuple[str, Sensor]]:
     """Every sensor in a chain with its place, those that other sensors are made of too."""
-    for name, part in chain.named_modules():
+    for name, part in chain.named_modules(remove_duplicate=False):
         if part is not chain and isinstance(part, Sensor):
             yield name.replace("stages.", ""), part
 

@@ -29,10 +29,11 @@ from torchtransient.sensing.layout import (
     check_transient,
 )
 from torchtransient.sensing.macro_pixel import checked_detector, groups_of
+from torchtransient.sensing.own_bins import common_bins
 from torchtransient.sensing.policies import GradPolicy
 from torchtransient.sensing.sensor import RandomSensor
 from torchtransient.sensing.spad import SynchronousSPAD
-from torchtransient.sensing.wrapped_detector import cycles_of
+from torchtransient.sensing.wrapped_detector import cycles_of, of_cycles
 
 # Gauss-Legendre, 8 points on [0, 1]: the lower half, and the weights of both halves
 _HALF = (0.019855071751231884, 0.10166676129318664, 0.23723379504183550, 0.40828267875217510)
@@ -89,7 +90,8 @@ class CoincidencePixel(RandomSensor):
 
     Samples are independent binomials of the cycles, with the exact mean: neighbouring bins of a cycle exclude each
     other a little, which they leave out. Policies: all. Raises UnitError for more SPADs in coincidence than there are,
-    a window longer than the dead time, and light that has more than one coincidence per cycle in a bin.
+    a window longer than the dead time, a detector
+    made for other bins, and light that has more than one coincidence per cycle in a bin.
     """
 
     takes, gives = ("rate",), "counts"
@@ -115,7 +117,8 @@ class CoincidencePixel(RandomSensor):
         if self.coincidence > sum(number for _, number in self.groups):
             raise UnitError(f"{where}: expected a coincidence of at most {spads} SPADs with light, got {coincidence}.")
         self.bin_width_s = bin_width_of(axis, bin_width_s, where)
-        self.num_bins = None if axis is None else axis.num_bins
+        given = None if axis is None else axis.num_bins
+        self.num_bins = common_bins([detector], where, (self.bin_width_s, given))[1]
         self.window_s = check_seconds(window_s, "window_s", where, open_low=True)
         inner = detector.detector if isinstance(detector, AfterpulsingSPAD) else detector
         self.periodic = isinstance(inner, FreeRunningSPAD)
@@ -144,7 +147,7 @@ class CoincidencePixel(RandomSensor):
             raise UnitError(
                 f"CoincidencePixel: expected window_s within the {bins} bins of the light, got {window:g} bins."
             )
-        parts = [self._one(x * share, number) for share, number in self.groups]
+        parts = [self._one(x * share, share, number) for share, number in self.groups]
         whole = math.floor(window)
         total = torch.zeros_like(x, dtype=torch.float64)
         # the rear edge of the window passes a border of bins when its front edge has gone `window` - `whole` into one
@@ -155,9 +158,9 @@ class CoincidencePixel(RandomSensor):
                     total = total + (high - low) * weight * self._reached(parts, at, window)
         return total.to(x.dtype)
 
-    def _one(self, rate: Tensor, number: int) -> _Group:
-        """A SPAD at its rate (..., T, H, W), one of `number`."""
-        inner = self.detector
+    def _one(self, rate: Tensor, share: float, number: int) -> _Group:
+        """A SPAD at its rate (..., T, H, W), one of `number` with a `share` of the pixel."""
+        inner = of_cycles(self.detector, self.cycles, share)
         if isinstance(inner, AfterpulsingSPAD):
             rate, inner = inner.rate(rate), inner.detector
         detections: Tensor = inner.probabilities(rate)  # type: ignore[operator]

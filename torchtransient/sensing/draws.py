@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.floating import holds
 from torchtransient.sensing.layout import TIME
 from torchtransient.sensing.thinning import halve
 
@@ -27,9 +28,12 @@ WHOLE_FLOAT32 = 2.0**24  # above, float32 skips whole numbers
 
 
 def check_rates(rate: Tensor, where: str) -> Tensor:
-    """`rate` when all of it is finite and >= 0, else UnitError: torch.binomial never returns from a NaN count."""
+    """`rate` when all of it is finite and >= 0, else UnitError: torch.binomial never returns from a NaN count, and the
+    formulas of detectors that saturate give plausible counts of negative light. Not looked at where nobody can
+    (`floating.holds`).
+    """
     low, high = torch.aminmax(rate.detach()) if rate.numel() else (rate.new_zeros(()), rate.new_zeros(()))
-    if not bool(low >= 0) or not bool(torch.isfinite(high)):
+    if not holds((low >= 0) & torch.isfinite(high)):
         raise UnitError(
             f"{where}: expected finite values >= 0, got {float(low):g} to {float(high):g}. Look for NaN upstream; "
             "clamp or use softplus where a network gives the rate."

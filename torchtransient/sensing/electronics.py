@@ -88,8 +88,9 @@ class PixelElectronics(RandomSensor):
     ``read_noise_e``, ``ktc_noise_e`` rms electrons; ``excess_noise`` F^2 >= 1 of an intensifier (2 is an exponential
     pulse height), drawn as normal gain noise; ``gain_e_per_dn`` with ``bits`` adds the converter, both or neither;
     ``signed``: of codes in two's complement, for the differences of two taps, which a converter without room below
-    zero would clip. ``dark_e``: dark electrons of one number of the input, which is one tap, exposure or gate. ``gain_map`` and ``offset_map_e`` broadcast to the input, buffers, or learnt where they are an
-    `nn.Parameter`. Output in electrons, in the shape of the input.
+    zero would clip. ``dark_e``: dark electrons of *one* number of the input: of one tap in one exposure, one gate.
+    ``gain_map`` and ``offset_map_e`` broadcast to the input: buffers, or learnt as an `nn.Parameter`. Output in
+    electrons, in the shape of the input.
 
     ``expected`` is the mean with both clips, which takes the charge as normal: 0.01 e off for a full well of 100 e and
     better above. Rounding has the mean zero when the noise is at least half a step, which it does not check.
@@ -242,8 +243,9 @@ class PixelElectronics(RandomSensor):
         return values.to(x.dtype)
 
     def extra_repr(self) -> str:
-        names = ("full_well_e", "read_noise_e", "ktc_noise_e", "excess_noise", "dark_e", "gain_e_per_dn", "bits", "signed")
-        return ", ".join([*(f"{n}={getattr(self, n)!r}" for n in names), super().extra_repr()])
+        names = ("full_well_e", "read_noise_e", "ktc_noise_e", "excess_noise", "dark_e", "gain_e_per_dn", "bits")
+        signed = ["signed=True"] if self.signed else []
+        return ", ".join([*(f"{n}={getattr(self, n)!r}" for n in names), *signed, super().extra_repr()])
 
 
 def _density(t: Tensor) -> Tensor:

@@ -45,6 +45,7 @@ def free_running_rate(rate_hz: Tensor, dead_time_s: float, kind: DeadTime = "non
     """Detections per second at a constant photon rate n: n/(1 + n td), or n exp(-n td) for "paralyzable"."""
     dead = check_seconds(dead_time_s, "dead_time_s", "free_running_rate")
     check_choice(kind, DeadTime, "kind", "free_running_rate")
+    check_rates(rate_hz, "free_running_rate")
     if kind == "paralyzable":
         return rate_hz * torch.exp(-rate_hz * dead)
     return rate_hz / (1 + rate_hz * dead)
@@ -105,6 +106,7 @@ def paralyzable_histogram(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
     also longer than a period; differentiable in both. dtype and device are kept; computed in float64.
     """
     check_transient(rate, "paralyzable_histogram")
+    check_rates(rate, "paralyzable_histogram")
     dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=rate.device)
     if not float(dead.detach()) >= 0 or not math.isfinite(float(dead.detach())):
         raise UnitError(f"paralyzable_histogram: expected dead_bins >= 0, got {float(dead.detach()):g}.")
@@ -138,12 +140,14 @@ class FreeRunningSPAD(RandomSensor):
     `dead_time_s`: at least one bin ("paralyzable": any), also longer than the period; `kind`: "non_paralyzable" or
     "paralyzable"; `learnable` keeps log(dead time) as a parameter `log_dead_time_s`.
 
-    Samples, non-paralyzable: one detector over all `cycles` periods, from its stationary state on. Means and
-    correlations inside a period are those of the chain of detections, correlations between periods (which make totals
-    up to hundreds of times less variable in saturation) those of its central limit theorem. Whole numbers add up to a
-    quarter of a count^2 to the variance of a total, a phase locked by a dead time of whole periods up to one. The cost
-    does not grow with `cycles`. Paralyzable: independent binomials with the exact mean and N d (1 - d) as variance:
-    totals of a real one vary less, down to a quarter.
+    Samples, non-paralyzable: one detector over all `cycles` periods, from its stationary state on. Up to a thousand
+    detections, and wherever a phase is remembered for long (dead time and wait make up a period or a part of one), are
+    drawn one after the other. More are drawn with means and correlations inside a period of the chain of detections,
+    and correlations between periods (which make totals up to hundreds of times less variable in saturation) of its
+    central limit theorem; whole numbers then add up to a quarter of a count^2 to the variance of a total, and the cost
+    does not grow with `cycles`. TorchTransientError for a phase that is remembered over more than four million
+    detections. Paralyzable: independent binomials with the exact mean and N d (1 - d) as variance: totals of a real
+    one vary less, down to a quarter.
 
     Policies: all. `gaussian`: normal numbers with the covariance of the draws (paralyzable: independent bins), whose
     size is differentiated as that of independent bins. `score`: that of `cycles` periods drawn on their own, dead and

@@ -29,6 +29,12 @@ def no_arrays(value: Any, where: str) -> Any:
     return tensor_of(value, where) if isinstance(value, np.ndarray) and value.ndim else value
 
 
+def numbers_of(value: Any, name: str, where: str) -> Any:
+    """A list of the numbers of a tensor of one dimension; anything else as it is. GradientError as `refuse_cut_off`."""
+    refuse_cut_off(value, name, where)
+    return value.tolist() if isinstance(value, Tensor) and value.ndim == 1 else value
+
+
 def refuse_cut_off(value: object, name: str, where: str) -> None:
     """GradientError for a number that requires a gradient and is about to be taken without it."""
     if isinstance(value, Tensor) and value.requires_grad and torch.is_grad_enabled():

@@ -46,6 +46,7 @@ _LARGEST = 1 << 22  # numbers of a table of weights of pixels
 
 def check_frequencies(frequencies_hz: Frequencies, where: str) -> tuple[float, ...]:
     """Modulation frequencies in hertz as a tuple; UnitError unless there are some, between 1 kHz and 1 THz."""
+    refuse_cut_off(frequencies_hz, "frequencies_hz", where)
     array = real_array(frequencies_hz)
     given: Sequence[Any] = [frequencies_hz]  # what is no row of numbers is told by the check of its entries
     if array is not None and array.ndim <= 1:

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.given import no_arrays, refuse_cut_off
+from torchtransient.sensing.layout import check_number
 
 _FULL = 2 * math.pi
 
@@ -185,6 +186,8 @@ def square_code(num_taps: int = 4, light_duty: float = 0.5, gate_duty: float = 0
     With both at one half the weight is a triangle wave, whose odd harmonics fall as ``1 / h^2``. The gates are placed
     so that tap 0 weighs phase zero highest, as in `sine_code`. Raises UnitError for duties outside (0, 1).
     """
+    light_duty = check_number(light_duty, "light_duty", "square_code")
+    gate_duty = check_number(gate_duty, "gate_duty", "square_code")
     for name, duty in (("light_duty", light_duty), ("gate_duty", gate_duty)):
         if not 0 < duty < 1:
             raise UnitError(f"square_code: expected {name} between 0 and 1 turn, got {duty!r}.")
@@ -217,8 +220,12 @@ def binary_code(
     ``gates``: per tap its openings as (start, end) in turns, ``0 < end - start < 1``. Light of phase x falls into an
     opening with the part of it that overlaps; all of it gives +1, none -1. Raises UnitError where openings overlap.
     """
+    light_duty = check_number(light_duty, "light_duty", "binary_code", high=1.0, open_low=True)
+    if shifts is not None:
+        shifts = _plain(shifts, "shifts", "binary_code")
     knots, values = [], []
-    for openings in gates:
+    for given in gates:
+        openings = [tuple(check_number(e, "gates", "binary_code", low=-math.inf) for e in edges) for edges in given]
         corners = sorted({round(e % 1, 12) % 1 for a, b in openings for e in (a, b, a - light_duty, b - light_duty)})
         x = torch.tensor(corners, dtype=torch.float64)
         inside = sum((_overlap(x, light_duty, a, b) for a, b in openings), torch.zeros_like(x))

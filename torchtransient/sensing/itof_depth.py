@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.given import tensor_of
+from torchtransient.floating import in_single
+from torchtransient.sensing.given import refuse_cut_off, tensor_of
 from torchtransient.sensing.itof import Frequencies, check_frequencies
 from torchtransient.sensing.itof_codes import phase_steps
 from torchtransient.sensing.layout import check_count, product
@@ -149,6 +150,7 @@ def amplitude_of(phasor: Tensor) -> Tensor:
     return torch.where(there, torch.where(there, square, 1.0).sqrt() * scale, 0.0)
 
 
+@in_single
 def depth_of_phase(phase: Tensor, frequency_hz: float) -> Tensor:
     """``c phase / (4 pi f)`` in metres, in the shape of ``phase``."""
     (f,) = check_frequencies(frequency_hz, "depth_of_phase")
@@ -166,6 +168,7 @@ def unambiguous_range_m(frequencies_hz: Frequencies) -> float:
     return SPEED_OF_LIGHT / (2 * math.gcd(*(int(f) for f in values)))
 
 
+@in_single
 def wrapped_difference(a: Tensor, b: Tensor) -> Tensor:
     """``a - b`` in radians, the short way round: in [-pi, pi), derivative one everywhere. Shapes broadcast."""
     difference = a - b
@@ -191,6 +194,7 @@ def shares_of_depth(frequencies_hz: Sequence[float], weights: Sequence[float] | 
     return [part / sum(parts) for part in parts]
 
 
+@in_single
 def unwrap_depth(
     phase: Tensor,
     frequencies_hz: Frequencies,
@@ -223,6 +227,7 @@ def unwrap_depth(
             f"{me}: expected max_depth_m - min_depth_m of at most {unambiguous_range_m(values):.4g} m, after which the "
             f"phases of {values} Hz repeat, got {longest - min_depth_m:.4g} m. Metres? Or add a frequency."
         )
+    refuse_cut_off(weights, "weights", me)
     weight = [1.0] * len(values) if weights is None else [float(w) for w in weights]
     if len(weight) != len(values) or not all(w > 0 for w in weight):
         raise UnitError(f"{me}: expected {len(values)} positive weights, got {weights!r}.")

@@ -26,6 +26,7 @@ from torch import Tensor
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import holds
 from torchtransient.quantities import real_array, shown
+from torchtransient.sensing.given import no_arrays
 from torchtransient.sensing.itof_codes import CorrelationCode
 from torchtransient.sensing.layout import check_transient
 from torchtransient.sensing.sensor import Sensor
@@ -152,6 +153,8 @@ class ItofCalibration:
         if isinstance(self.direction, bool) or self.direction not in (1, -1):
             raise UnitError(f"ItofCalibration: expected direction 1 or -1, got {shown(self.direction)}.")
         object.__setattr__(self, "direction", int(self.direction))
+        for name in ("phase_offset_rad", "phase_map_rad", "depth_map_m"):
+            object.__setattr__(self, name, no_arrays(getattr(self, name), "ItofCalibration"))
         degrees = "Degrees? Say math.radians(...); a phase of more than a turn is one of less."
         _numbers(self.phase_offset_rad, "phase_offset_rad", (0, 1), 2 * _TURN, degrees)
         _numbers(self.phase_map_rad, "phase_map_rad", (2, 3), 2 * _TURN, degrees)
@@ -213,7 +216,8 @@ def _numbers(given: object, name: str, dims: tuple[int, ...], most: float = math
             raise UnitError(f"ItofCalibration: expected {name} as finite numbers, got {shown(given)}.")
         numbers = torch.from_numpy(array)
     if numbers.ndim not in dims or not numbers.numel():
-        raise ShapeError(f"ItofCalibration: expected {name} of {dims} dimensions, got {tuple(numbers.shape)}.")
+        got = tuple(numbers.shape)
+        raise ShapeError(f"ItofCalibration: expected {name} of {dims} dimensions, got the shape {got}.")
     if not holds(torch.isfinite(numbers.detach())):
         raise UnitError(f"ItofCalibration: expected {name} as finite numbers, got {shown(given)}.")
     if not holds(numbers.detach().abs() <= most):

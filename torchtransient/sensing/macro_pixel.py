@@ -54,7 +54,8 @@ class MacroPixel(WrappedDetector):
     the light of one. SPADs of equal shares are drawn at once, as one of as many times the cycles: the cost does not
     depend on their number.
 
-    Policies: all, those of the detector (`grad` None leaves its own). Dark counts are shared as light is. One converter
+    Policies: all, those of the detector (`grad` None leaves its own). Dark counts are shared as light is,
+    and so is the `background` of an AfterpulsingSPAD: that of the whole pixel, too. One converter
     for all, which is dead after the first of them, is a SPAD of its own: use the detector alone. Raises ShapeError for
     another number of weights, UnitError for weights below 0.
     """
@@ -77,7 +78,7 @@ class MacroPixel(WrappedDetector):
         """Detectors for all SPADs of an equal share, and their light."""
         check_transient(x, "MacroPixel")
         cycles = cycles_of(self.detector)
-        return [(of_cycles(self.detector, cycles * number), x * share) for share, number in self.groups]
+        return [(of_cycles(self.detector, cycles * number, share), x * share) for share, number in self.groups]
 
     def probabilities(self, x: Tensor) -> Tensor:
         """Expected detections of all SPADs per cycle and bin."""

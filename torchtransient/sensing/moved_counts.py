@@ -164,13 +164,13 @@ class _Tree:
     """Splits counts (N, T, P) over lags, adding them up where they go."""
 
     def __init__(self, moves: Moves, data: Tensor, tallies: Tensor | None) -> None:
-        self.moves, self.data, self.tallies = moves, data, tallies
+        self.moves, self.data, self.tallies = moves, data.contiguous(), tallies
         self.shares = moves.shares.detach().double().to(data.device)
         rest = (1 - self.shares.sum(0, keepdim=True)).clamp_min(0)
         if float(rest.max()) > 1e-12:
             self.shares = torch.cat([self.shares, rest])  # those that are lost
         self.weights = (self.shares if self.shares.ndim == 1 else self.shares.mean(1)).tolist()
-        self.total = torch.zeros_like(data)
+        self.total = torch.zeros_like(self.data)
 
     def run(self, generator: torch.Generator | None) -> Tensor:
         self._node(list(range(len(self.weights))), None, self.data, generator)

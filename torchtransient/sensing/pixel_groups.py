@@ -18,6 +18,7 @@ from torchtransient.sensing.chain_walk import (
     policies_of,
 )
 from torchtransient.sensing.layout import check_transient
+from torchtransient.sensing.own_bins import common_bins
 from torchtransient.sensing.policies import GradPolicy, ScoreFunction, check_policy, record_score
 from torchtransient.sensing.sensor import RandomSensor, Sensor
 
@@ -54,6 +55,7 @@ class PixelGroups(RandomSensor):
         self.takes, self.gives = sensors[0].takes, sensors[0].gives
         if any((s.takes, s.gives) != (self.takes, self.gives) for s in sensors):
             raise UnitError("PixelGroups: expected sensors that take and give the same, got different kinds of light.")
+        self.bin_width_s, self.num_bins = common_bins(sensors, "PixelGroups")
         if grad is not None:
             self.grad = grad
 

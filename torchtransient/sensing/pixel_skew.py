@@ -27,6 +27,8 @@ def _whole_and_part(delay_bins: Tensor | float, x: Tensor) -> tuple[Tensor, Tens
     delay = torch.as_tensor(delay_bins, dtype=torch.float64, device=x.device)
     delay = delay.unsqueeze(TIME) if delay.ndim >= 2 else delay
     whole = delay.detach().floor()
+    # less than a rounding below a whole bin is that bin: 1 - 1e-30 is 1, and no share of a bin
+    whole = whole + (delay.detach() - whole >= 1).to(whole)
     return whole.long(), delay - whole
 
 

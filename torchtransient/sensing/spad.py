@@ -16,10 +16,18 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
-from torchtransient.sensing.dead_time_cycle import check_dead_bins, detected_rows, double_detections
-from torchtransient.sensing.dead_time_draws import DrawnRows, draw_cycles, gaussian_cycles, score_of_cycles
+from torchtransient.sensing.dead_time_cycle import check_dead_bins, double_detections
+from torchtransient.sensing.dead_time_draws import (
+    DrawnRows,
+    draw_cycles,
+    gaussian_cycles,
+    sample_cycles,
+    score_of_cycles,
+)
 from torchtransient.sensing.dead_time_inverse import armed_time, check_cycles, rates_of_counts
+from torchtransient.sensing.dead_time_means import detected_columns
 from torchtransient.sensing.draws import check_rates, sample_first_photons
+from torchtransient.sensing.given import refuse_cut_off
 from torchtransient.sensing.layout import (
     TIME,
     bin_width_of,
@@ -38,9 +46,11 @@ def first_photon_probabilities(rate: Tensor) -> tuple[Tensor, Tensor]:
     """Probability (..., C, T, H, W) that the first photon of a cycle falls into each bin, and (..., C, H, W) of none.
 
     `rate`: expected detections per cycle and bin, >= 0. Sums over bins are made in float64, in the exponent, so that
-    1e4 bins lose no digits; in a saturated pixel the late bins get probability and gradient 0, as they should.
+    1e4 bins lose no digits; in a saturated pixel the late bins get probability and gradient 0, as they should. Raises
+    UnitError for rates that are negative, infinite or NaN.
     """
     check_transient(rate, "first_photon_probabilities")
+    check_rates(rate, "first_photon_probabilities")
     before = sum_before(rate)
     p = -torch.expm1(-rate) * torch.exp(-before.to(rate.dtype))
     none = torch.exp(-(before.select(TIME, -1) + rate.select(TIME, -1).double()))
@@ -63,20 +73,31 @@ def _image(rows: Tensor, like: Tensor) -> Tensor:
     return rows.view(like.movedim(TIME, -1).shape).movedim(-1, TIME)
 
 
+def _columns(x: Tensor) -> Tensor:
+    """(..., T, H, W) -> columns (T, P), float64."""
+    return x.to(torch.float64).movedim(TIME, 0).reshape(x.shape[TIME], -1)
+
+
+def _of_columns(columns: Tensor, like: Tensor) -> Tensor:
+    return columns.view(like.movedim(TIME, 0).shape).movedim(0, TIME)
+
+
 def detections_with_dead_time(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
     """Detections per cycle and bin, armed at the start of each cycle, with dead time: float64 (..., C, T, H, W).
 
     `rate`: expected detections per cycle and bin of a detector that is never dead, >= 0, constant inside a bin.
     `dead_bins`: non-paralyzable dead time in bins, at least 1/2, a number or a scalar tensor; differentiable in both.
     Dead times are exact to fractions of a bin, and a bin may hold any number of photons and detections: bins of more
-    than a photon are cut. Total variation from the exact mean: below 1e-5 (docs/photon_counting.md).
+    than a photon are cut. Total variation from the exact mean: below 1e-5 (docs/photon_counting.md). Raises UnitError
+    for rates that are negative, infinite or NaN.
     """
     check_transient(rate, "detections_with_dead_time")
+    check_rates(rate, "detections_with_dead_time")
     check_dead_bins(dead_bins)
     if rate.numel() == 0:
         return rate.to(torch.float64)
     dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=rate.device)
-    return _image(detected_rows(_rows(rate), dead), rate)
+    return _of_columns(detected_columns(_columns(rate), dead), rate)
 
 
 @in_single
@@ -93,6 +114,7 @@ def coates(counts: Tensor, cycles: int, dead_bins: float | None = None) -> Coate
     check_transient(counts, "coates")
     number = check_count(cycles, "cycles", "coates")
     if dead_bins is not None and counts.numel():
+        refuse_cut_off(dead_bins, "dead_bins", "coates")
         rate, valid = rates_of_counts(_rows(counts), number, float(dead_bins))
         return CoatesEstimate(_image(rate, counts).to(counts.dtype), _image(valid, counts))
     armed = number - sum_before(counts)
@@ -119,7 +141,13 @@ def sample_detections(
     rate = rate.detach()
     if dead_bins is None:
         return sample_first_photons(number, rate, generator)
-    return _drawn(rate, number, dead_bins, generator)[0]
+    check_dead_bins(dead_bins)
+    check_rates(rate, "sample_detections")
+    if rate.numel() == 0:
+        return rate.clone()
+    dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=rate.device)
+    counts = sample_cycles(_columns(rate), dead, number, generator)
+    return _of_columns(counts, rate).to(rate.dtype)
 
 
 def _drawn(
@@ -220,7 +248,7 @@ class SynchronousSPAD(RandomSensor):
 
     def gaussian(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         if self.dead_bins is not None:
-            rate = self._gated(x)
+            rate = check_rates(self._gated(x), "SynchronousSPAD")
             if rate.numel() == 0:
                 return rate * self.cycles
             dead = torch.as_tensor(self.dead_bins, dtype=torch.float64, device=x.device)
@@ -232,7 +260,8 @@ class SynchronousSPAD(RandomSensor):
         return sample_detections(self._gated(x), self.cycles, self.dead_bins, generator)
 
     def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
-        return first_photon_log_prob(measurement, self._gated(x), self.cycles, self.dead_bins).sum(TIME)
+        rate = check_rates(self._gated(x), "SynchronousSPAD")
+        return first_photon_log_prob(measurement, rate, self.cycles, self.dead_bins).sum(TIME)
 
     def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         if self.grad != "score" or self.dead_bins is None:
@@ -309,6 +338,7 @@ def first_photon_log_prob(
         sooner, exposed = time.sooner(r), time.exposed
     quiet = exposed - n
     # with a dead time the armed cycles are known on average only
+    refuse_cut_off(dead_bins, "dead_bins", where)
     check_cycles(quiet, number, -0.5 if dead_bins is None else -0.5 - 6 * number**0.5, where)
     quiet = quiet.clamp_min(0)
     hit = n != 0

@@ -14,10 +14,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchtransient.errors import UnitError
 from torchtransient.sensing.binomial_tables import FEW_TRIALS, sixteen_bits, table_of, up_to_share
 
-_WORTH_TABLES = 1 << 14  # draws, below which many short operations cost more than they save
-_WORTH_ONE_TABLE = 1 << 16  # ... of one probability, which may be new in every call
+_WORTH_TABLES = 1 << 15  # draws, below which many short operations cost more than they save
+_WORTH_ONE_TABLE = 1 << 13  # ... of one probability, which may be new in every call
 _BLOCK = 1 << 17  # entries at a time, so that temporaries stay in the cache
 _ROOM = 2e-6  # for the rounding of probabilities and uniform numbers in single precision
 _HEAVY = 6.0  # expected events of an entry, above which torch.binomial is cheaper than inversion
@@ -69,8 +70,9 @@ def add_passing(counts: Tensor, probability: float, into: Tensor, generator: tor
     Both of one shape, float32 or float64, `into` contiguous; meant for some 1e5 entries at a time.
     """
     if counts.device.type == "cpu" and counts.numel() >= _WORTH_ONE_TABLE:
-        number = _by_table(counts.reshape(-1), probability, generator)
-        into.view(-1).add_(number)
+        trials, large, others = _apart(counts.reshape(-1), probability, generator)
+        table = table_of(probability, small=counts.numel() < _BLOCK // 4)
+        into.view(-1).add_(table.draw(0, trials, generator)).index_add_(0, large, others)
         return
     events = thin(counts, probability, generator)
     into.view(-1).scatter_add_(0, events.place, events.number)
@@ -78,25 +80,36 @@ def add_passing(counts: Tensor, probability: float, into: Tensor, generator: tor
 
 def _thin_by_table(flat: Tensor, probability: float, generator: torch.Generator | None) -> Events:
     places, numbers = [], []
+    table = table_of(probability, small=flat.numel() < _BLOCK // 4)
     for begin in range(0, flat.numel(), _BLOCK):
-        number = _by_table(flat[begin : begin + _BLOCK], probability, generator)
-        place = number.nonzero().squeeze(-1)
-        numbers.append(number.index_select(0, place))
+        trials, large, others = _apart(flat[begin : begin + _BLOCK], probability, generator)
+        place, number = table.draw_some(trials, generator)
         places.append(place.add_(begin))
-    return Events(torch.cat(places), torch.cat(numbers).to(flat.dtype))
+        numbers.append(number.to(flat.dtype))
+        if large.numel():
+            places.append(large + begin)
+            numbers.append(others)
+    place, number = torch.cat(places), torch.cat(numbers)
+    if place.numel() and not bool((place[1:] > place[:-1]).all()):
+        place, order = place.sort()
+        number = number[order]
+    return Events(place, number)
 
 
-def _by_table(counts: Tensor, probability: float, generator: torch.Generator | None) -> Tensor:
-    """Binomial numbers (K,) int32, or in the dtype of `counts` (K,) where some of these are large."""
-    large = (counts > _LARGE).nonzero().squeeze(-1)
+def _apart(
+    counts: Tensor, probability: float, generator: torch.Generator | None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Trials (K,) int32 without those of large counts; the places of these, and their numbers from torch.binomial."""
+    low, high = torch.aminmax(counts)
+    if not float(low) >= 0:
+        raise UnitError(f"thin: expected counts >= 0, got {float(low):g}. Look for NaN or a difference upstream.")
     trials = counts.to(torch.int32)
-    if not large.numel():
-        return table_of(probability).draw(0, trials, generator)
+    if float(high) <= _LARGE:
+        return trials, counts[:0].long(), counts[:0]
+    large = (counts > _LARGE).nonzero().squeeze(-1)
     trials[large] = 0
-    number = table_of(probability).draw(0, trials, generator).to(counts.dtype)
-    share = torch.full_like(counts[large], probability)
-    number[large] = torch.binomial(counts[large], share, generator=generator)
-    return number
+    many = counts[large]
+    return trials, large, torch.binomial(many, torch.full_like(many, probability), generator=generator)
 
 
 def _sift(n: Tensor, p: Tensor, generator: torch.Generator | None) -> _Candidates:
@@ -191,7 +204,8 @@ def halve(counts: Tensor, share: Tensor, generator: torch.Generator | None = Non
         many, p = flat[at], shares[at]
         less = torch.minimum(p, 1 - p)
         # NaN fits nowhere and is torch.binomial's to refuse
-        unfit = (many <= FEW_TRIALS).logical_and_(less >= 0).logical_not_().nonzero().squeeze(-1)
+        fit = (many <= FEW_TRIALS).logical_and_(less >= 0)
+        unfit = flat[:0].long() if bool(fit.all()) else fit.logical_not_().nonzero().squeeze(-1)
         if unfit.numel() > _MOST_MISFITS * many.numel():
             out[at] = torch.binomial(many, p, generator=generator)
             continue

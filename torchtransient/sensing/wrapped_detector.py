@@ -7,6 +7,7 @@ import copy
 import torch
 from torch import Tensor
 
+from torchtransient.sensing.own_bins import bins_of
 from torchtransient.sensing.policies import GradPolicy, check_policy
 from torchtransient.sensing.sensor import RandomSensor
 
@@ -15,10 +16,13 @@ class WrappedDetector(RandomSensor):
     """A random sensor whose draws are made by its `detector`. `grad` is the detector's, and sets it."""
 
     detector: RandomSensor
+    # cycles by which counts of the whole exposure and pixel are divided; None: those of the detector
+    exposure_cycles: float | None = None
 
     def __init__(self, detector: RandomSensor, grad: GradPolicy | None = None) -> None:
         super(RandomSensor, self).__init__()
         self.detector = detector
+        self.bin_width_s, self.num_bins = bins_of(detector)
         if grad is not None:
             self.grad = grad
 
@@ -66,10 +70,14 @@ class WrappedDetector(RandomSensor):
         return result
 
 
-def of_cycles(detector: RandomSensor, cycles: int) -> RandomSensor:
-    """A detector with the numbers of another one (its parameters are the same tensors) for as many cycles."""
+def of_cycles(detector: RandomSensor, cycles: int, share: float = 1.0) -> RandomSensor:
+    """A detector with the numbers of another one (its parameters are the same tensors) for as many cycles.
+
+    `share`: what it has of light, and of counts, that are given for a whole pixel.
+    """
     other = copy.copy(detector)
     if isinstance(other, WrappedDetector):
+        other.exposure_cycles = (other.exposure_cycles or cycles_of(detector)) / share
         other._modules = dict(other._modules)  # its own children
         other.detector = of_cycles(other.detector, cycles)
     else:
