@@ -87,7 +87,7 @@ def spread(y):
 @pytest.mark.parametrize("nested, plain", NESTED.values(), ids=NESTED)
 def test_a_nested_sensor_is_the_sensor(nested, plain):
     """The same mean, whole draws of the same variance, and normal surrogates with the covariance between bins."""
-    number = 500
+    number = 250
     a, b, x = nested(), plain(), light(number)
     torch.testing.assert_close(a.expected(x[:2]), b.expected(x[:2]))
     drawn = a.sample(x, generator(1))

@@ -107,7 +107,7 @@ def test_no_count_is_lost_at_the_end_of_single_precision(make):
 
 def test_a_skew_is_drawn_with_the_first_photon():
     """One distribution: covariance between bins of the cycles, which a separate draw has as well."""
-    x = torch.full((1500, 1, BINS, 1, 1), 0.1, dtype=torch.float64)
+    x = torch.full((600, 1, BINS, 1, 1), 0.1, dtype=torch.float64)
     stages = [sensing.SynchronousSPAD(50), sensing.DetectionSkew(130e-12, AXIS)]
     together = sensing.Compose(stages).sample(x, generator())
     apart = stages[1].sample(stages[0].sample(x, generator(1)), generator(2))

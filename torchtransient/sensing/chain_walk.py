@@ -66,8 +66,10 @@ def unrolled(stages: Iterable[nn.Module]) -> list[nn.Module]:
     found: list[nn.Module] = []
     for stage in stages:
         row = None if isinstance(stage, Sensor) else row_of(stage)
-        sensors = isinstance(row, nn.ModuleList) or any(isinstance(part, Sensor) for part in stage.modules())
-        found += unrolled(s for _, s in named(row)) if row is not None and sensors else [stage]
+        if row is None or (isinstance(row, nn.Sequential) and not any(isinstance(p, Sensor) for p in row.modules())):
+            found.append(stage)
+        else:
+            found += unrolled(part for _, part in named(row))
     return found
 
 
