@@ -168,7 +168,8 @@ NOT_NUMBERS_OF_A_DEVICE = {
     "code", "optics", "diagonal_ratio", "fwhm_px", "spatial_fwhm_px", "phosphor_fwhm_px", "code_widths",
     "sliding_scale", "dither", "num_bins", "seed", "values", "harmonics_of_one_tap", "num_taps", "num_codes",
     "albedo", "illumination", "gates", "knots", "shifts", "make", "stages", "psf", "radius_px", "numbers", "height",
-    "width", "samples", "closed", "acts_on", "args", "kwargs", "calibration", "depth_map_m", "direction", "phase_map_rad",
+    "width", "samples", "closed", "acts_on", "args", "kwargs", "calibration", "depth_map_m", "direction",
+    "phase_map_rad",
     "phase_offset_rad", "start_s", "afterpulsing", "columns", "delays", "detector", "sensors", "weights", "which",
 }  # fmt: skip
 
