@@ -37,8 +37,11 @@ class AfterpulsingSPAD(WrappedDetector):
     whole pixel, of which every SPAD has its share.
 
     Releases are taken as independent of whether a photon has fired the detector since the detection that they come
-    from: right in dim light, in constant light and where most delays are longer than the next dead time; else off by up
-    to a third of the probability, in total variation (see docs/photon_counting.md). Draws have the variance of the
+    from: right in dim light and where most delays are longer than the next dead time; else off by up to a third of the
+    probability, in total variation (see docs/photon_counting.md). Carriers that are set free right after the dead time
+    find the detector armed more often than on the mean: totals are then short by up to a quarter of the probability, in
+    constant light too (3.7 % for a probability of .3, 3 photons a dead time and delays of an eighth of it).
+    Draws have the variance of the
     detector at that rate: afterpulses vary as photons do, short by twice their share in dim light.
 
     Raises UnitError for a dead time or bins that are not the detector's, and for periods that do not go with the
