@@ -95,7 +95,7 @@ def _missing_of_numbers(
     seen: tuple[float, ...], tau_bins: tuple[float, ...], dead_bins: float, period: int, bins: int
 ) -> Tensor:
     """`_from_outside` of exponentials. Half the time of a small image, where nothing is learnt."""
-    shares, tau = torch.tensor(seen, dtype=torch.float64), torch.tensor(tau_bins, dtype=torch.float64)
+    shares, tau = (torch.tensor(v, dtype=torch.float64, device="cpu") for v in (seen, tau_bins))
     return _from_outside(shares @ exponential_kernel(tau, dead_bins, period), bins)
 
 
@@ -239,23 +239,26 @@ class Afterpulsing(AddedCounts):
         beyond = self._beyond(x)
         return added if beyond is None else added + beyond
 
-    def _beyond(self, x: Tensor) -> Tensor | None:
-        """Mean afterpulses in the window of constant counts outside of it; None where there are none."""
+    def _beyond(self, x: Tensor, *, drawn: bool = False) -> Tensor | None:
+        """Mean afterpulses in the window of constant counts outside of it; None where there are none.
+
+        `drawn`: nobody asks for a derivative.
+        """
         bins, period = x.shape[TIME], self._period_bins(x)
         dark = not isinstance(self.background, Tensor) and self.background == 0
         if dark or period <= bins:
             return None
-        missing = self._missing(period, bins).to(x.device).view(-1, 1, 1)
+        missing = self._missing(period, bins, drawn).to(x.device).view(-1, 1, 1)
         level = over_time(kept_map(self, "background"), x, "background", "Afterpulsing")
         return (missing * level).to(x.dtype).expand_as(x)
 
-    def _missing(self, period: int, bins: int) -> Tensor:
+    def _missing(self, period: int, bins: int, drawn: bool) -> Tensor:
         """Afterpulses in the window of one count in every bin outside of it: (bins,) float64."""
-        if self.delays is not None or torch.is_grad_enabled():
+        if self.delays is not None or not drawn:
             return _from_outside(self.kernel(period), bins)
-        tau = self.tau_s.reshape(-1) / self.bin_width_s
+        tau = self.tau_s.detach().reshape(-1) / self.bin_width_s
         dead = self.dead_time_s / self.bin_width_s
-        return _missing_of_numbers(tuple(self._seen().tolist()), tuple(tau.tolist()), dead, period, bins)
+        return _missing_of_numbers(tuple(self._seen().detach().tolist()), tuple(tau.tolist()), dead, period, bins)
 
     def share(self) -> float:
         p = float(self._seen().detach().sum())
@@ -305,7 +308,7 @@ class Afterpulsing(AddedCounts):
         total = counts.clone(memory_format=torch.contiguous_format)
         for places in by_pieces(follow, counts.reshape(-1), generator):
             total.view(-1).scatter_add_(0, places, one.expand(places.shape))
-        beyond = self._beyond(counts)
+        beyond = self._beyond(counts, drawn=True)
         return total if beyond is None else total + self._poisson(beyond, generator)
 
     def _lags(self, period: int, counts: Tensor) -> Callable[[Tensor, torch.Generator | None], Tensor]:

@@ -30,12 +30,12 @@ class BinomialTable:
         self._most, self._cells = most, cells
         below = _distribution(probabilities, most)
         rows, self._results = below.shape
-        row = torch.arange(rows).unsqueeze(1)
+        row = torch.arange(rows, device="cpu").unsqueeze(1)
         # one ascending list of all rows: row r lies between r and r + 1
         self._below = (below + row).reshape(-1)
         place = below * cells
-        started = torch.zeros(rows, cells + 1, dtype=torch.int8)
-        one = torch.ones(1, dtype=torch.int8).expand(below.numel())
+        started = torch.zeros(rows, cells + 1, dtype=torch.int8, device="cpu")
+        one = torch.ones(1, dtype=torch.int8, device="cpu").expand(below.numel())
         started.view(-1).scatter_add_(0, (row * (cells + 1) + place.ceil().long()).view(-1), one)
         number = started[:, :-1].cumsum(1, dtype=torch.int8)
         for shift in (-_ROOM, _ROOM):
@@ -89,7 +89,7 @@ class BinomialTable:
 
     def _exactly(self, row: Tensor, cell: Tensor, generator: torch.Generator | None) -> Tensor:
         """The number by the rest of the uniform number, somewhere in the cell."""
-        u = torch.rand(row.shape, dtype=torch.float64, generator=generator)
+        u = torch.rand(row.shape, dtype=torch.float64, device="cpu", generator=generator)
         u = u.add_(cell).mul_(1 / self._cells).add_(row)
         k = torch.searchsorted(self._below, u, right=True) - row * self._results
         # the end of a row is rounded
@@ -114,7 +114,7 @@ class LagTable:
         number = self._number.index_select(0, cell).long()
         unsure = (number < 0).nonzero().squeeze(-1)
         if unsure.numel():
-            u = torch.rand(unsure.shape, dtype=torch.float64, generator=generator)
+            u = torch.rand(unsure.shape, dtype=torch.float64, device="cpu", generator=generator)
             number[unsure] = torch.searchsorted(self._below, u.add_(cell[unsure]).mul_(1 / _VALUES), right=True)
         return number
 
@@ -129,8 +129,8 @@ def _distribution(probabilities: Tensor, most: int) -> Tensor:
     """P(K <= k) for all probabilities and n = 0 ... `most`, one a row, and all k within reach: float64."""
     mean = most * float(probabilities.max())
     results = min(most, math.ceil(mean + 10 * math.sqrt(mean) + 25))
-    n = torch.arange(most + 1, dtype=torch.float64).unsqueeze(1)
-    k = torch.arange(results + 1, dtype=torch.float64)
+    n = torch.arange(most + 1, dtype=torch.float64, device="cpu").unsqueeze(1)
+    k = torch.arange(results + 1, dtype=torch.float64, device="cpu")
     ways = torch.lgamma(n + 1) - torch.lgamma(k + 1) - torch.lgamma((n - k).clamp_min(0) + 1)
     p = probabilities.view(-1, 1, 1)
     chance = torch.exp(ways + torch.xlogy(k, p) + (n - k) * torch.log1p(-p))
@@ -141,17 +141,17 @@ def _distribution(probabilities: Tensor, most: int) -> Tensor:
 def table_of(probability: float, *, small: bool = False) -> BinomialTable:
     """The table of one probability in [0, 1/2]. `small`: one that is made in less time, for fewer entries."""
     most = _RARE_TRIALS if probability <= _RARE and not small else FEW_TRIALS
-    return BinomialTable(torch.tensor([probability], dtype=torch.float64), most, 256 if small else 1024)
+    return BinomialTable(torch.tensor([probability], dtype=torch.float64, device="cpu"), most, 256 if small else 1024)
 
 
 @functools.cache
 def _coarse() -> BinomialTable:
-    return BinomialTable(torch.arange(17, dtype=torch.float64) / 32, FEW_TRIALS, 4096)
+    return BinomialTable(torch.arange(17, dtype=torch.float64, device="cpu") / 32, FEW_TRIALS, 4096)
 
 
 @functools.cache
 def _fine() -> BinomialTable:
-    return BinomialTable(torch.arange(64, dtype=torch.float64) / 1024, FEW_TRIALS, 512)
+    return BinomialTable(torch.arange(64, dtype=torch.float64, device="cpu") / 1024, FEW_TRIALS, 512)
 
 
 def up_to_share(
@@ -163,13 +163,12 @@ def up_to_share(
     `trials` (K,) int32.
     """
     # a share in steps of 1/32, then what is left of it in steps of 1/1024: trials pass the first time or the second
-    number, rest, left = None, share, trials
+    number, rest, left = torch.zeros_like(trials), share, trials
     for table, steps in ((_coarse(), 32), (_fine(), 1024)):
         which = (rest * steps).to(torch.int32)
         lower = which * (1 / steps)
         rest = (rest - lower).div_(1 - lower)
         drawn = table.draw(which, left, generator)
         left = left - drawn
-        number = drawn if number is None else number.add_(drawn)
-    assert number is not None
+        number += drawn
     return number, left, rest

@@ -204,8 +204,10 @@ def halve(counts: Tensor, share: Tensor, generator: torch.Generator | None = Non
         many, p = flat[at], shares[at]
         less = torch.minimum(p, 1 - p)
         # NaN fits nowhere and is torch.binomial's to refuse
-        fit = (many <= FEW_TRIALS).logical_and_(less >= 0)
-        unfit = flat[:0].long() if bool(fit.all()) else fit.logical_not_().nonzero().squeeze(-1)
+        if float(many.amax()) <= FEW_TRIALS and float(less.amin()) >= 0:
+            unfit = flat[:0].long()
+        else:
+            unfit = (many <= FEW_TRIALS).logical_and_(less >= 0).logical_not_().nonzero().squeeze(-1)
         if unfit.numel() > _MOST_MISFITS * many.numel():
             out[at] = torch.binomial(many, p, generator=generator)
             continue
@@ -215,7 +217,8 @@ def halve(counts: Tensor, share: Tensor, generator: torch.Generator | None = Non
         number, left, missing = up_to_share(trials, less, generator)
         likely = p > 0.5
         candidates = _sift(left.to(flat.dtype), missing, generator)
-        out[at] = torch.where(likely, trials.sub_(number), number)
+        # not `where`, which guesses at every entry
+        out[at] = trials.sub_(number, alpha=2).mul_(likely).add_(number)
         if unfit.numel():
             out[at][unfit] = torch.binomial(many[unfit], p[unfit], generator=generator)
         found.append(candidates._replace(place=(candidates.place + begin) * 2 + likely[candidates.place]))
