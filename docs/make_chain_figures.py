@@ -81,6 +81,13 @@ def light_of(name: str, sensor: nn.Module, axis: tt.TimeAxis | None) -> Tensor:
     return shape + 0.2 / axis.num_bins if "harp" in name else shape
 
 
+def of_steps(stage: nn.Module, label: str) -> str:
+    """What stands where time was, behind a stage."""
+    if isinstance(stage, sensing.ItofCorrelation):
+        return "tap"
+    return "exposure" if isinstance(stage, sensing.TapDifference) else label
+
+
 def stages_of(sensor: nn.Module) -> Iterator[nn.Module]:
     for stage in sensor.children() if not isinstance(sensor, sensing.Compose) else sensor.stages:
         inner = isinstance(stage, sensing.Compose)
@@ -88,9 +95,15 @@ def stages_of(sensor: nn.Module) -> Iterator[nn.Module]:
 
 
 def draw_panel(
-    axes: Axes, mean: Tensor, drawn: Tensor | None, before: Tensor | None, axis: tt.TimeAxis | None, label: str
+    axes: Axes,
+    mean: Tensor,
+    drawn: Tensor | None,
+    before: Tensor | None,
+    axis: tt.TimeAxis | None,
+    label: str,
+    has_floor: bool = False,
 ) -> None:
-    """One pixel behind one stage."""
+    """One pixel behind one stage. `has_floor`: there is constant light, which the axis then goes down to."""
     bins = mean.numel()
     axes.tick_params(labelsize=7)
     if bins <= 20:
@@ -109,7 +122,11 @@ def draw_panel(
     shown = mean if before is None else torch.stack([mean, before]).amax(0)
     top = float(shown.max())
     axes.set_yscale("log")
-    axes.set_ylim(max(float(mean.min()) / 3, (3e-5 if bins > 400 else 1e-6) * top), 3 * top)
+    least = 1e-9 if has_floor else 3e-5 if bins > 400 else 1e-6
+    low = float(mean.min())
+    if has_floor and before is not None and 0 < float(before.min()) < low < 100 * float(before.min()):
+        low = float(before.min())
+    axes.set_ylim(max(low / 3, least * top), 3 * top)
     if timed and bins > 400:  # where something happens, so that bins can be seen
         axes.set_xlim(where[round(0.26 * bins)], where[round(0.52 * bins)])
     axes.set_xlabel("ns" if timed else "gate", fontsize=8)
@@ -135,6 +152,7 @@ def device_row(name: str) -> Figure:
     takes = "radiance" if "radiance" in takes else takes
     panels: list[tuple[str, str, Tensor, Tensor | None, Tensor | None, str]]
     panels = [("light", takes, pixel(mean), None, None, "S0 to S3")]
+    label = "pixel" if axis is None else "gate"
     drawn, is_drawn, random = mean, False, torch.Generator().manual_seed(0)
     for number, stage in enumerate(stages_of(sensor)):
         assert isinstance(stage, Sensor)
@@ -143,15 +161,16 @@ def device_row(name: str) -> Figure:
         is_drawn = is_drawn or isinstance(stage, RandomSensor)
         kind = type(stage).__name__
         grey = None if before is None or before.shape != mean.shape else pixel(before)
-        label = "pixel" if axis is None else "tap"
+        label = of_steps(stage, label)
         own = getattr(stage, "dead_time_s", None) is not None and kind == "SynchronousSPAD"
         caption = DEAD_TIME if own else CAPTIONS[kind]
         caption = OWN_CAPTIONS[name][number] if name in OWN_CAPTIONS else caption
         panels.append((kind, caption, pixel(mean), pixel(drawn) if is_drawn else None, grey, label))
-    figure = Figure(figsize=(2.35 * len(panels), 2.6), layout="constrained")
+    figure, has_floor = Figure(figsize=(2.35 * len(panels), 2.6), layout="constrained"), False
     for axes, (title, caption, *values) in zip(figure.subplots(1, len(panels)), panels, strict=True):
         of_mean, of_draw, grey, label = values
-        draw_panel(axes, of_mean, of_draw, grey, axis, label)
+        has_floor = has_floor or title == "PhotonBudget"
+        draw_panel(axes, of_mean, of_draw, grey, axis, label, has_floor)
         axes.set_title(f"{title}\n\n", fontsize=10, fontweight="bold")
         axes.text(0.5, 1.03, caption, transform=axes.transAxes, ha="center", va="bottom", fontsize=7.5)
     return figure

@@ -30,6 +30,19 @@ def planes(generator: torch.Generator) -> Tensor:
     return 0.5 * AXIS.bin_width_opl * (30 + 30 * torch.rand(DRAWS, generator=generator, dtype=torch.float64))
 
 
+# full widths at half maximum, and mean delays of tails, in bins
+RESPONSES: dict[str, Callable[[], sensing.Response]] = {
+    "0.6": lambda: sensing.GaussianResponse(60 * PS),
+    "1": lambda: sensing.GaussianResponse(100 * PS),
+    "5": lambda: sensing.GaussianResponse(500 * PS),
+    "2, tail of 2": lambda: sensing.emg_response(200 * PS, 200 * PS),
+    "2, tail of 4": lambda: sensing.emg_response(200 * PS, 400 * PS),
+    "0.6, tail of 4": lambda: sensing.emg_response(60 * PS, 400 * PS),
+    "5, rectangle": lambda: sensing.UniformResponse(500 * PS),
+}
+WITHOUT_TAILS = ("0.6", "1", "5")
+
+
 def columns(x: Tensor) -> Tensor:
     """(1, T, 1, N) of (N, T)."""
     return x.T.reshape(1, x.shape[1], 1, -1)
@@ -39,6 +52,11 @@ def matched(counts: Tensor, response: sensing.Response, ratio: float) -> Tensor:
     first, kernel = response.kernel(AXIS.bin_width_s)
     scores = sensing.log_matched_filter(counts, kernel, first, signal_to_background=ratio)
     return sensing.distance_of_position(sensing.peak_position(scores), AXIS).flatten()
+
+
+def greatest(counts: Tensor, response: sensing.Response, ratio: float) -> Tensor:
+    place = sensing.ml_position(counts, response, AXIS, signal_to_background=ratio)
+    return sensing.distance_of_position(place, AXIS).flatten()
 
 
 def centre(counts: Tensor, background: float) -> Tensor:
@@ -75,12 +93,14 @@ def without_pile_up() -> list[str]:
     """Poisson counts: response, background per bin, and each number of photons."""
     lines = []
     ways: dict[str, Callable[[Tensor, sensing.Response, float, float], Tensor]] = {
+        "`ml_position`": lambda x, r, n, b: greatest(x, r, n / b if b else 1e3),
         "matched filter, parabola": lambda x, r, n, b: matched(x, r, n / b if b else 1e3),
         "centre of mass, 6 bins": lambda x, r, n, b: centre(x, b),
     }
     for way, estimate in ways.items():
-        for fwhm_bins, background in ((0.6, 0.0), (1.0, 0.0), (1.0, 0.6), (5.0, 0.0), (5.0, 0.05), (5.0, 0.6)):
-            response, row = sensing.GaussianResponse(fwhm_bins * AXIS.bin_width_s), []
+        widths = WITHOUT_TAILS if "centre" in way else tuple(RESPONSES)
+        for width, background in ((w, b) for w in widths for b in (0.0, 0.05, 0.6)):
+            response, row = RESPONSES[width](), []
             for photons in PHOTONS:
                 g = torch.Generator().manual_seed(1)
                 truth = planes(g)
@@ -88,7 +108,7 @@ def without_pile_up() -> list[str]:
                 counts = torch.poisson(columns(mean), generator=g)
                 bound = sensing.crlb(response, AXIS, truth, photons, background).distance_m
                 row.append(ratio_of(estimate(counts, response, photons, background), truth, bound))
-            lines.append(f"| {way} | {fwhm_bins:g} | {background:g} | " + " | ".join(row) + " |")
+            lines.append(f"| {way} | {width} | {background:g} | " + " | ".join(row) + " |")
     return lines
 
 

@@ -288,6 +288,27 @@ def test_counts_in_the_place_of_the_prediction_are_told(name):
         loss(n[:, 30:40], r[:, 30:40])  # an example made by hand may be of whole numbers
 
 
+@pytest.mark.parametrize("name", SWAPPED)
+def test_draws_in_the_place_of_their_own_mean_are_told(name):
+    """Both have the gradient of what a chain has learnt: straight_through gives its counts that of the mean."""
+    loss = SWAPPED[name]
+    gain = torch.tensor(1.0, requires_grad=True)
+    r = rates(bins=64) * gain
+    chain = SynchronousSPAD(10**4, grad="straight_through")
+    n = chain(r, generator=seeded(7))
+    assert n.requires_grad and r.requires_grad
+    with pytest.raises(GradientError, match=f"^{name}: expected the prediction first, got counts with a gradient"):
+        loss(n, r)
+    with pytest.warns(TorchTransientWarning, match=f"^{name}: the first argument holds counts"):
+        loss(n, r.detach())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        loss(r, n).backward()
+        loss(n, n.flip(1)), loss(torch.full_like(n, 2.0).requires_grad_(), r.detach())
+        loss(r.detach().mT.contiguous().mT.requires_grad_(), n.detach())
+    assert bool(torch.isfinite(gain.grad))
+
+
 # --------------------------------------------------------------------------------- one rule for what counts may be
 
 _COUNTS = [case for case in loss_cases.CASES if case.draw_target is not None]

@@ -8,7 +8,13 @@ import torch
 
 from support.sensing.event_driven import compare, dense_limit, detect, last_phases, total_variation
 from torchtransient.errors import TorchTransientError
-from torchtransient.sensing import FreeRunningSPAD, ScoreFunction, free_running_state, nonparalyzable_histogram
+from torchtransient.sensing import (
+    FreeRunningSPAD,
+    ScoreFunction,
+    free_running_ring,
+    free_running_state,
+    nonparalyzable_histogram,
+)
 from torchtransient.sensing.banded_solve import solve_banded
 from torchtransient.sensing.constant_light import ConstantLight
 from torchtransient.sensing.exponential_moments import moments
@@ -226,16 +232,61 @@ def test_draws_are_those_of_one_detector(which, flux, dead):
     assert abs(np.median(ratio) - 1) < 0.15 and ratio.min() > 0.5 and ratio.max() < 2.0
 
 
+RESONANT = [
+    (5.0, 10.3, 3), (10.0, 10.3, 10), (100.0, 31.68, 200), (100.0, 15.7, 200), (20.0, 30.4, 200),
+    *(slow(r, d, n) for r in (0.1, 1.0, 10.0, 100.0) for d in (9.6, 10.35, 15.7, 31.68, 63.0, 96.0)
+      for n in (1, 2, 10, 100, 2000) if not (r == 0.1 and n == 2000)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("flux, dead, periods", RESONANT)
+def test_draws_near_resonance(flux, dead, periods):
+    """Dead time and wait make up a period, or half of one; few periods. Constant light: every bin has the same mean."""
+    row, repeats = np.full(BINS, flux / BINS), 600
+    spad = FreeRunningSPAD(periods, dead * 1e-10, bin_width_s=1e-10)
+    x = image(double(row)[None]).expand(1, BINS, 20, 30).contiguous()
+    h = spad.sample(x, torch.Generator().manual_seed(0))[0].flatten(1).T.numpy()
+    totals, mean = h.sum(1), periods * BINS * flux / (BINS + dead * flux)
+    wanted = detect(np.random.default_rng(2), row, repeats, periods, dead, free_running=True, warm_up=40).counts
+    wanted = wanted.sum(1).var(ddof=1)
+    # by a renewal train: variances of 600 numbers, and what whole numbers may add to a total
+    assert abs(totals.mean() - mean) < 4.5 * ((wanted + 0.25) / repeats) ** 0.5
+    assert abs(totals.var(ddof=1) - wanted) < 4.5 * 2 * (wanted + 0.05) / repeats**0.5 + 0.25 * (mean > 1000)
+    assert totals.max() <= np.ceil(periods * BINS / dead) + (mean > 1000)
+    assert h.min() >= 0 and np.array_equal(h, h.round())
+    far = np.abs(h.mean(0) - mean / BINS) / (h.var(0) / repeats + mean / BINS / repeats**2 + 1e-3 / repeats) ** 0.5
+    assert far.max() < 5.5
+
+
+def test_a_phase_that_is_remembered():
+    """Two bright bins, each of which leads back to itself: a train stays with the one where it began."""
+    row = np.full(16, 1e-3)
+    row[3] = row[11] = 20.0
+    spad = FreeRunningSPAD(1200, 15.5e-10, bin_width_s=1e-10)
+    x = double(row).view(1, 16, 1, 1).expand(1, 16, 3, 3).contiguous()
+    h = spad.sample(x, torch.Generator().manual_seed(0))[0].flatten(1)
+    assert float(h.sum(0).max()) <= np.ceil(1200 * 16 / 15.5)
+    first = h[2:4].sum(0) / h.sum(0)
+    assert bool(((first > 0.99) | (first < 0.01)).all()) and 0 < float(first.mean()) < 1
+
+
+def test_more_detections_than_can_be_drawn(monkeypatch):
+    monkeypatch.setattr(free_running_ring, "MOST_ONE_BY_ONE", 1100)
+    spad = FreeRunningSPAD(1200, 15.984e-10, bin_width_s=1e-10)
+    with pytest.raises(TorchTransientError, match="fewer cycles, or grad='gaussian'"):
+        spad.sample(torch.full((1, 16, 1, 1), 1000 / 16.0))
+
+
 def test_totals_in_saturation():
     """Renewal theory: a Fano factor of 1/(1 + n d)^2, 0.010 where independent periods have 0.41."""
     n, dead, periods = 1.5, 6.0, 10_000
-    x = torch.full((400, 1, 64, 1, 1), n, dtype=torch.float64)
+    x = torch.full((200, 1, 64, 1, 1), n, dtype=torch.float64)
     spad = FreeRunningSPAD(periods, dead * 1e-10, bin_width_s=1e-10)
     for grad in ("straight_through", "gaussian"):
         spad.grad = grad
         totals = spad(x, generator=torch.Generator().manual_seed(0)).sum((1, 2, 3, 4))
         assert float(totals.mean()) == pytest.approx(periods * 64 * n / (1 + n * dead), rel=1e-4)
-        assert float(totals.var() / totals.mean()) == pytest.approx(1 / (1 + n * dead) ** 2, rel=0.25)
+        assert float(totals.var() / totals.mean()) == pytest.approx(1 / (1 + n * dead) ** 2, rel=0.3)
 
 
 def test_trains_of_one_period_and_of_the_dark():

@@ -9,7 +9,7 @@ import torch
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing import depth
+from torchtransient.sensing import depth, ml_position
 from torchtransient.sensing.impulse_response import GaussianResponse
 from torchtransient.units import SPEED_OF_LIGHT
 
@@ -176,6 +176,7 @@ ESTIMATORS = {
     "peak of scores": lambda h: depth.peak_position(
         depth.log_matched_filter(h, *reversed(GaussianResponse(471e-12).kernel(WIDTH_S)))
     ),
+    "likeliest": lambda h: ml_position(h, GaussianResponse(471e-12), bin_width_s=WIDTH_S, signal_to_background=100.0),
     "soft": depth.soft_argmax,
     "first": lambda h: depth.first_return(h, 0.5).position.squeeze(-3),
     "first, any light": lambda h: depth.first_return(h, -1.0).position.squeeze(-3),

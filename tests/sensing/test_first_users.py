@@ -101,6 +101,7 @@ def test_no_added_counts_of_what_is_no_count(policy, value):
     [
         sensing.peak_position,
         lambda h: sensing.peak_position(h, refine=False),
+        lambda h: sensing.ml_position(h, sensing.GaussianResponse(40 * PS), bin_width_s=20 * PS),
         sensing.soft_argmax,
         sensing.centre_of_mass,
         lambda h: sensing.centre_of_mass(h, half_width_bins=2),
@@ -108,7 +109,7 @@ def test_no_added_counts_of_what_is_no_count(policy, value):
         lambda h: sensing.multi_return(h, 1, threshold=0.1).position.squeeze(-3),
         lambda h: sensing.coates(h, 1000).rate.sum(-3),
     ],
-    ids=["peak", "bin", "soft", "mass", "mass near", "first", "multi", "coates"],
+    ids=["peak", "bin", "likeliest", "soft", "mass", "mass near", "first", "multi", "coates"],
 )
 def test_depth_of_nan_is_nan(estimate):
     found = estimate(with_nan())

@@ -152,7 +152,7 @@ def test_afterpulses_go_round_the_laser_period():
     with pytest.raises(UnitError, match=r"the laser period of stage '0' .*1e-07 s, in stage '2' .*got 1\.28e-08"):
         sensing.Compose([budget(rate_hz=10e6), spad, afterpulsing(period_s=12.8 * NS)])
     sensing.Compose([budget(rate_hz=10e6), spad, afterpulsing(period_s=100 * NS)])
-    sensing.Compose([budget(rate_hz=1 / 12.8e-9), spad, afterpulsing()])
+    sensing.Compose([budget(rate_hz=1 / 12.8e-9), sensing.FreeRunningSPAD(1000, 20 * NS, axis=AXIS), afterpulsing()])
 
 
 def test_a_synchronous_detector_is_armed_when_a_cycle_begins():
@@ -160,6 +160,21 @@ def test_a_synchronous_detector_is_armed_when_a_cycle_begins():
     with pytest.raises(UnitError, match=r"armed again before the next cycle .*2e-08 s later.*FreeRunningSPAD"):
         sensing.Compose([budget(rate_hz=50e6), spad])
     sensing.Compose([budget(rate_hz=40e6), spad])
+
+
+@pytest.mark.parametrize("behind", [False, True])
+def test_what_becomes_of_a_chain_in_the_order_of_before(behind):
+    """A response behind the budget held the pulse and the jitter: both have a place, and neither is a flag."""
+    spad, irf = sensing.SynchronousSPAD(1000), sensing.ImpulseResponse(sensing.emg_response(90 * PS, 80 * PS), AXIS)
+    bright = budget(ambient_rate_hz=1e6, axis=AXIS, pulse_energy_j=1e-9, wavelength_m=532e-9)
+    with pytest.raises(UnitError) as told:
+        sensing.Compose([bright, spad, irf] if behind else [bright, irf, spad])
+    words = str(told.value)
+    assert "stays an ImpulseResponse and goes in front of the PhotonBudget" in words
+    assert "becomes a DetectionJitter of the same response behind the detector" in words
+    assert "periodic" not in words  # jitter would go in front of pile-up again
+    with pytest.raises(UnitError, match="Use boundary='periodic'"):
+        sensing.Compose([bright, sensing.StreakCamera(AXIS, time_fwhm_s=300 * PS, boundary="zero")])
 
 
 MIXED = {
@@ -267,6 +282,9 @@ SECONDS = {
     "UniformResponse": {"width_s": 60 * PS, "delay_s": 1 * NS},
     "emg_response": {"fwhm_s": 60 * PS, "tau_s": 80 * PS, "delay_s": 1 * NS},
     "free_running_rate": {"rate_hz": torch.tensor(1e6), "dead_time_s": 20 * NS},
+    "ml_position": {
+        "histogram": torch.ones(1, 128, 1, 1), "response": GAUSS, "bin_width_s": 100 * PS, "signal_to_background": 9.0
+    },
     "range_deviation_m": {"response_fwhm_s": 300 * PS, "detections": torch.ones(1)},
 }  # fmt: skip
 # formulas that hold in any unit, what others compute, and devices, which say it when they are built
@@ -396,6 +414,7 @@ def test_functions_that_count(dtype):
         lambda v: sensing.frames_to_rate(many.to(v.dtype), 10**6),
         lambda v: sensing.equi_depth_edges(v, 4),
         lambda v: sensing.peak_position(v),
+        lambda v: sensing.ml_position(v, sensing.GaussianResponse(1 * NS), bin_width_s=1 * NS),
         lambda v: sensing.soft_argmax(v),
         lambda v: sensing.centre_of_mass(v),
         lambda v: sensing.first_return(v, 0.5).position,

@@ -21,6 +21,10 @@ def run(number):
     return names
 
 
+def test_every_example_is_run_here():
+    assert len(re.findall(r"```python\n", TEXT)) == 3
+
+
 def test_first_example():
     names = run(0)
     assert names["taps"].shape == (1, 8, 16, 16)
@@ -50,8 +54,8 @@ def test_names_exist():
     known = {n for n in named if hasattr(sensing, n)}
     elsewhere = {
         "Compose", "TransientRenderer", "expected", "forward", "gaussian", "straight_through", "score", "transform",
-        "polarsens", "LinearPhysics", "Physics", "img_size", *sensing.DEVICES, "depth_std_m", "std_e", "offset_e",
-        "electrons_per_unit",
+        "LinearPhysics", "Physics", "img_size", *sensing.DEVICES, "depth_std_m", "std_e", "offset_e",
+        "electrons_per_unit", "background_e", "dark_e", "read_noise_e", "full_well_e", "black_level_dn",
     }  # fmt: skip
     assert named - known - elsewhere == set()
     assert {"read_itof", "StreakCamera", "PolarizationMosaic", "log_matched_filter"} <= known

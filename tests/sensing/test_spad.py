@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mpmath
 import numpy as np
 import pytest
 import torch
@@ -10,6 +11,7 @@ from scipy import stats
 from support.sensing.event_driven import chi2_per_dof, synchronous
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing import (
+    BinaryFrames,
     ScoreFunction,
     SynchronousSPAD,
     coates,
@@ -281,3 +283,20 @@ def test_errors():
         SynchronousSPAD(10, dead_time_s=75, bin_width_s=1e-10)
     with pytest.raises(UnitError, match="more detections"):
         SynchronousSPAD(3).log_prob(torch.ones(1, 6, 1, 1), torch.ones(1, 6, 1, 1))
+
+
+@pytest.mark.parametrize("make", [SynchronousSPAD, BinaryFrames])
+def test_likelihood_of_certain_detections_keeps_its_digits(make):
+    """All fire: log(1 - exp(-r)) is -exp(-r) for large r and log r for small. 1e-14 is some 30 roundings."""
+    cycles = 1000
+    rates = torch.tensor([1e-300, 1e-20, 1e-3, 0.69, 0.7, 1, 5, 20, 35, 40, 100, 700], dtype=torch.float64)
+    with mpmath.workdps(500):
+        wanted = [float(mpmath.log(-mpmath.expm1(-mpmath.mpf(float(r))))) for r in rates]
+        slopes = [float(1 / mpmath.expm1(mpmath.mpf(float(r)))) for r in rates]
+    x = rates.view(1, 1, 1, -1).requires_grad_()
+    value = make(cycles).log_prob(torch.full_like(x, cycles), x)
+    value.sum().backward()
+    assert value.flatten().tolist() == pytest.approx([cycles * v for v in wanted], rel=1e-14, abs=0)
+    assert x.grad.flatten().tolist() == pytest.approx([cycles * v for v in slopes], rel=1e-14, abs=0)
+    none = make(cycles).log_prob(torch.zeros_like(x), torch.zeros_like(x))
+    assert none.tolist() == torch.zeros_like(none).tolist()

@@ -7,7 +7,9 @@ import pytest
 import torch
 from scipy import stats
 
-from torchtransient.sensing.thinning import halve, thin
+from torchtransient.errors import UnitError
+from torchtransient.sensing.binomial_tables import LagTable
+from torchtransient.sensing.thinning import add_passing, halve, thin
 
 DRAWS = 25_000
 
@@ -103,3 +105,66 @@ def test_gaps_in_memory_do_not_matter():
     share = torch.full((6, 4), 0.4)
     wanted = halve(counts.contiguous(), share, torch.Generator().manual_seed(0))
     assert torch.equal(halve(counts, share, torch.Generator().manual_seed(0)), wanted)
+
+
+STEPS = [
+    (n, p)
+    for n in (1, 26, 126, 127, 128, 129)
+    for p in (1 / 1024, 0.03124, 1 / 32, 0.0322, 0.15625 - 1e-6, 0.4999, 1 - 1 / 32, 0.971)
+]
+
+
+@pytest.mark.parametrize("n, p", STEPS)
+def test_ends_of_the_tables(n, p):
+    """Shares on the steps of the tables and beside them, and the most trials that these hold."""
+    share = torch.full((50_000,), p)
+    found = halve(torch.full_like(share, float(n)), share, torch.Generator().manual_seed(3))
+    chi_square_is_small(found.numpy(), n, float(share[0].double()))
+
+
+@pytest.mark.parametrize("size", [9_000, 50_000, 150_000], ids=["small table", "table", "two blocks"])
+@pytest.mark.parametrize("p", [1e-4, 0.02, 0.25, 0.5])
+def test_one_probability(size, p):
+    """Rows, counts beyond the rows, and counts for torch.binomial, side by side: `thin` and `add_passing`."""
+    cases = (0, 1, 100, 127, 128, 511, 512, 1500, 1501, 4000)
+    n = torch.tensor([float(c) for c in cases]).repeat(-(-size // len(cases)))[:size]
+    into = torch.full_like(n, 5.0)
+    add_passing(n, p, into, torch.Generator().manual_seed(4))
+    for draws in (into - 5, dense(thin(n, p, torch.Generator().manual_seed(5)), n)):
+        for k, c in enumerate(cases):
+            chi_square_is_small(draws[k :: len(cases)].numpy(), c, p)
+
+
+def test_a_sum_of_many_draws_has_the_variance_of_a_binomial():
+    """Small differences from the distribution add up in sums: 2e6 draws of 60 with share 0.47 each."""
+    n, p, size = 60, 0.47, 2_000_000
+    x = halve(torch.full((size,), float(n)), torch.full((size,), p), torch.Generator().manual_seed(6)).double()
+    p = float(torch.tensor(p).double())
+    assert abs(float(x.mean()) - n * p) < 5 * (n * p * (1 - p) / size) ** 0.5
+    assert abs(float(x.var()) / (n * p * (1 - p)) - 1) < 5 * (2 / size) ** 0.5
+
+
+def test_broken_counts_are_refused():
+    """A table has no row for them."""
+    for broken in (-1.0, float("nan")):
+        n = torch.full((50_000,), 3.0)
+        n[7] = broken
+        with pytest.raises(UnitError, match="counts"):
+            thin(n, 0.1, torch.Generator().manual_seed(0))
+
+
+def test_lags_follow_their_distribution():
+    """Also where a lag is much rarer than a cell of the table, and where it is impossible."""
+    k = torch.arange(3000, dtype=torch.float64)
+    p = torch.exp(-k / 300) * (k % 7 != 3)
+    p[2500:] *= 1e-2
+    p = p / p.sum()
+    found = LagTable(p).draw(torch.empty(1_000_000), torch.Generator().manual_seed(0))
+    counts = torch.bincount(found, minlength=3000).double()
+    assert counts.numel() == 3000
+    assert float(counts[p == 0].sum()) == 0
+    often = p * 1e6 > 8
+    chi2 = float(((counts - 1e6 * p) ** 2 / (1e6 * p))[often].sum())
+    assert chi2 < stats.chi2.isf(1e-7, int(often.sum()) - 1)
+    rest = float(p[~often].sum() * 1e6)
+    assert abs(float(counts[~often].sum()) - rest) < 6 * rest**0.5 + 3

@@ -185,6 +185,7 @@ OTHERS = {
     losses.surface_distance: _mesh,
     losses.relative_floor: losses.relative_floor,
     losses.anscombe: losses.anscombe,
+    losses.armed_periods: lambda x: losses.armed_periods(x, 20, 2.5),
     losses.expected_anscombe: losses.expected_anscombe,
     losses.transient_phasors: lambda x: losses.transient_phasors(x, AXIS, BAND),
     losses.maximum_projections: lambda x: torch.cat([view.flatten() for view in losses.maximum_projections(x)]),

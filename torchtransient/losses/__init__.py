@@ -8,6 +8,7 @@ from torchtransient.losses.cumulative import cumulative_loss as cumulative_loss
 from torchtransient.losses.dead_time_likelihoods import FirstPhotonLoss as FirstPhotonLoss
 from torchtransient.losses.dead_time_likelihoods import FirstPhotonNLL as FirstPhotonNLL
 from torchtransient.losses.dead_time_likelihoods import FreeRunningNLL as FreeRunningNLL
+from torchtransient.losses.dead_time_likelihoods import armed_periods as armed_periods
 from torchtransient.losses.dead_time_likelihoods import first_photon_loss as first_photon_loss
 from torchtransient.losses.dead_time_likelihoods import first_photon_nll as first_photon_nll
 from torchtransient.losses.dead_time_likelihoods import free_running_nll as free_running_nll

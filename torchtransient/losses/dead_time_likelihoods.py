@@ -12,7 +12,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from torchtransient.errors import UnitError
+from torchtransient.errors import ShapeError, UnitError
 from torchtransient.losses.comparison import (
     Reduction,
     check_dense,
@@ -118,9 +118,18 @@ first_photon_loss = first_photon_nll
 def armed_periods(counts: Tensor, periods: int, dead_bins: float) -> Tensor:
     """Periods in which a free-running detector was armed, averaged over each bin, from its histogram: float64.
 
-    Every detection takes the dead time that follows it, round the period and for as many periods as it lasts.
-    Detections count as spread evenly over their bin.
+    `counts` (..., T, H, W) of `periods` laser periods of T bins; `dead_bins`: the dead time in bins. Every detection
+    takes the dead time that follows it, round the period and for as many periods as it lasts. Detections
+    count as spread evenly over their bin. Linear in the counts; below zero where they do not fit. Raises ShapeError for
+    what is no such tensor, UnitError for other numbers. Not supported: paralyzable dead times.
     """
+    where = "armed_periods"
+    (counts,) = check_dense((counts,), where)
+    if counts.ndim < 3:
+        raise ShapeError(f"{where}: expected counts (..., T, H, W), got {tuple(counts.shape)}. Add the missing ones.")
+    if counts.is_complex():
+        raise UnitError(f"{where}: expected counts, got complex numbers ({counts.dtype}). Give the histogram.")
+    periods, dead_bins = check_whole("periods", periods, where, UnitError), _check_dead_time(dead_bins, where)
     whole = math.floor(dead_bins + 1e-9)
     part = max(0.0, dead_bins - whole)
     bins = counts.shape[_TIME]

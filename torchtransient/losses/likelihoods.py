@@ -66,9 +66,10 @@ _DARK = 0.1
 def check_prediction(input: object, target: object, where: str) -> tuple[Tensor, Tensor]:
     """Both in their common dtype. Raises ShapeError, DeviceError; UnitError for other numbers.
 
-    What tells that they are the wrong way round is an error: an integer prediction (UnitError), or a target with a
-    gradient and a prediction without (GradientError). Two records without gradients, of which the first one holds
-    counts and the second one does not, may have a reason, and are a warning.
+    What tells that they are the wrong way round is an error: an integer prediction (UnitError), a target with a
+    gradient and a prediction without (GradientError), or with both, where the first one holds counts and the second one
+    does not: draws in front of their own mean (GradientError). Counts in front of a record without gradient that holds
+    none may have a reason, and are a warning.
     """
     pair = check_pair(input, target, where, names="prediction and counts")
     if isinstance(input, Tensor) and not input.is_floating_point():
@@ -76,13 +77,19 @@ def check_prediction(input: object, target: object, where: str) -> tuple[Tensor,
             f"{where}: expected a prediction of a floating dtype first and counts second, got {input.dtype} first. "
             "Take (input, target) in that order; a prediction of whole numbers as input.float()."
         )
-    if isinstance(input, Tensor) and isinstance(target, Tensor) and not input.requires_grad:
-        if target.requires_grad:
+    if isinstance(input, Tensor) and isinstance(target, Tensor):
+        if target.requires_grad and not input.requires_grad:
             raise GradientError(
                 f"{where}: expected the prediction first, got an input without and a target with a gradient. Take "
                 "(input, target) in that order, or target.detach()."
             )
         if _are_counts(input) and not _are_counts(target):
+            if target.requires_grad:
+                raise GradientError(
+                    f"{where}: expected the prediction first, got counts with a gradient first (draws of a chain with "
+                    "straight_through?) and a target with a gradient that holds none. Take (input, target) in that "
+                    "order; if it is right, target.detach()."
+                )
             warnings.warn(
                 f"{where}: the first argument holds counts and the second one does not. The prediction comes first: "
                 "(input, target).",
@@ -94,7 +101,12 @@ def check_prediction(input: object, target: object, where: str) -> tuple[Tensor,
 
 def _are_counts(x: Tensor) -> bool:
     """Whole numbers, not all alike, of a record, as far as it can be looked at."""
-    return x.numel() >= _A_RECORD and holds((x == x.round()) & (x.amin() != x.amax()))
+    x = x.detach()
+    if x.numel() < _A_RECORD or not x.is_floating_point():
+        return x.numel() >= _A_RECORD
+    # of predictions as a rule a few entries say enough
+    few = x.view(-1)[:: x.numel() // _A_RECORD] if x.is_contiguous() else x.select(0, 0) if x.ndim else x
+    return holds(few == few.round()) and holds((x == x.round()) & (x.amin() != x.amax()))
 
 
 def check_rates(model: Tensor, where: str) -> None:

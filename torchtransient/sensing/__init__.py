@@ -1,5 +1,6 @@
 """After the light: detectors, noise and calibration as differentiable torch modules. Torch only, never Mitsuba."""
 
+from torchtransient.sensing.added_counts import AddedCounts as AddedCounts
 from torchtransient.sensing.afterpulse_delays import AfterpulseDelays as AfterpulseDelays
 from torchtransient.sensing.afterpulse_delays import MeasuredDelays as MeasuredDelays
 from torchtransient.sensing.afterpulse_delays import PowerLawDelays as PowerLawDelays
@@ -88,6 +89,8 @@ from torchtransient.sensing.linear_part import adjoint as adjoint
 from torchtransient.sensing.linear_part import linearity_error as linearity_error
 from torchtransient.sensing.macro_pixel import MacroPixel as MacroPixel
 from torchtransient.sensing.macro_pixel import ZoneSum as ZoneSum
+from torchtransient.sensing.moved_counts import MovedCounts as MovedCounts
+from torchtransient.sensing.moved_counts import Moves as Moves
 from torchtransient.sensing.photon_budget import BudgetReport as BudgetReport
 from torchtransient.sensing.photon_budget import Optics as Optics
 from torchtransient.sensing.photon_budget import PhotonBudget as PhotonBudget
@@ -113,6 +116,7 @@ from torchtransient.sensing.policies import GradPolicy as GradPolicy
 from torchtransient.sensing.policies import ScoreFunction as ScoreFunction
 from torchtransient.sensing.policies import gaussian_noise as gaussian_noise
 from torchtransient.sensing.policies import straight_through as straight_through
+from torchtransient.sensing.position_likelihood import ml_position as ml_position
 from torchtransient.sensing.presets import DEVICES as DEVICES
 from torchtransient.sensing.presets import device as device
 from torchtransient.sensing.pulse import apply_pulse as apply_pulse
@@ -129,6 +133,7 @@ from torchtransient.sensing.shot_noise import poisson_log_prob as poisson_log_pr
 from torchtransient.sensing.spad import CoatesEstimate as CoatesEstimate
 from torchtransient.sensing.spad import SynchronousSPAD as SynchronousSPAD
 from torchtransient.sensing.spad import coates as coates
+from torchtransient.sensing.spad import detections_with_dead_time as detections_with_dead_time
 from torchtransient.sensing.spad import first_photon_log_prob as first_photon_log_prob
 from torchtransient.sensing.spad import first_photon_probabilities as first_photon_probabilities
 from torchtransient.sensing.spad import sample_detections as sample_detections

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchtransient.errors import UnitError
 from torchtransient.sensing.draws import WHOLE_FLOAT32, fast_poisson
-from torchtransient.sensing.layout import TIME, check_tensor
+from torchtransient.sensing.layout import TIME, check_transient
 from torchtransient.sensing.policies import record_score
 from torchtransient.sensing.sensor import RandomSensor
 from torchtransient.sensing.shot_noise import poisson_log_prob
@@ -26,14 +26,25 @@ def is_whole(counts: Tensor) -> bool:
     return all(torch.equal(block, block.round().clamp_min_(0)) for block in blocks)
 
 
+def whole_items(counts: Tensor) -> Tensor:
+    """(..., 1, 1, 1, 1): which items (C, T, H, W) of a batch hold whole numbers >= 0 alone.
+
+    Item by item, so that an item is drawn or not whatever is beside it in a batch.
+    """
+    lead = counts.shape[:-4]
+    if is_whole(counts):
+        return torch.ones(*lead, 1, 1, 1, 1, dtype=torch.bool, device=counts.device)
+    return (counts == counts.round().clamp_min_(0)).flatten(-4).all(-1).view(*lead, 1, 1, 1, 1)
+
+
 class AddedCounts(RandomSensor):
     """A sensor that adds counts n to those it is given: x + n with mean `extra(x)`. All four policies.
 
     The counts given pass with their own gradient under every policy. Every detection triggers others with a small
     probability: whole counts are followed one by one (`trigger`), which is exact. Where there is no such number, or
-    no use in it, Poisson numbers of the same mean stand for the sum: for counts that are not whole (the means of
-    another sensor), for more than 16 events per entry on average, and under the policy "score", whose probabilities
-    are theirs. Their variance is off by the probability of the effect (by 1 % at 1 %).
+    no use in it, Poisson numbers of the same mean stand for the sum: for items (C, T, H, W) of which not all counts are
+    whole (the means of another sensor), for those with more than 16 events per entry on average, and under the policy
+    "score", whose probabilities are theirs. Their variance is off by the probability of the effect (by 1 % at 1 %).
     """
 
     takes, gives = ("counts",), "counts"
@@ -58,11 +69,18 @@ class AddedCounts(RandomSensor):
 
     def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         with torch.no_grad():
-            counts = check_tensor(x, type(self).__name__).detach()
-            events = self.share() * self._total(counts)
-            if not is_whole(counts) or events > _MOST_EVENTS * counts.numel():
-                return counts + self._poisson(self.extra(counts), generator)
-            return self.trigger(counts, generator)
+            counts = check_transient(x, type(self).__name__).detach()
+            self._total(counts)
+            followed = whole_items(counts)
+            entries = max(math.prod(counts.shape[-4:]), 1)
+            events = counts.flatten(-4).sum(-1, dtype=torch.float64).view(followed.shape) * self.share() / entries
+            followed = followed & (events <= _MOST_EVENTS)
+            if bool(followed.all()):
+                return self.trigger(counts, generator)
+            others = counts + self._poisson(self.extra(counts), generator)
+            if not bool(followed.any()):
+                return others
+            return torch.where(followed, self.trigger(torch.where(followed, counts, 0), generator), others)
 
     def _total(self, counts: Tensor) -> float:
         total = float(counts.sum())

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import number_tensor
 from torchtransient.sensing.layout import check_number, check_seconds
+from torchtransient.sensing.response_shapes import above_floor
 from torchtransient.sensing.sensor import PhysicalModule
 
 _MOST_LAGS = 1 << 23  # of a law that ends
@@ -165,13 +166,13 @@ class MeasuredDelays(AfterpulseDelays):
     """Delays by a measured histogram `counts` (K,) in bins of `bin_width_s`, the first beginning `start_s` after it.
 
     Counts are spread evenly over their bins. `floor`: counts of a bin that are no afterpulses (dark counts, the level
-    far out), taken off; below it nothing is left. Raises ShapeError for what is no histogram, UnitError for counts that
-    are negative, not finite, or nothing above the floor.
+    far out), taken off; True the median of all bins, False nothing. Below it nothing is left. Raises ShapeError for
+    what is no histogram, UnitError for counts that are negative, not finite, or nothing above the floor.
     """
 
     share_of_bins: Tensor
 
-    def __init__(self, counts: Tensor, bin_width_s: float, *, start_s: float = 0.0, floor: float = 0.0) -> None:
+    def __init__(self, counts: Tensor, bin_width_s: float, *, start_s: float = 0.0, floor: float | bool = 0.0) -> None:
         super().__init__()
         where = "MeasuredDelays"
         counts = number_tensor(counts, f"{where}: expected counts (K,) of a histogram of delays")
@@ -180,12 +181,10 @@ class MeasuredDelays(AfterpulseDelays):
         numbers = counts.detach().double()
         if not bool((numbers >= 0).all()) or not bool(torch.isfinite(numbers).all()):
             raise UnitError(f"{where}: expected finite counts >= 0. Look at the measurement.")
-        above = (numbers - check_number(floor, "floor", where)).clamp_min(0)
-        if not float(above.sum()) > 0:
-            raise UnitError(f"{where}: expected counts above the floor of {floor:g}, got none.")
+        shares = above_floor(numbers, floor, where)
         self.own_width_s = check_seconds(bin_width_s, "bin_width_s", where, open_low=True)
         self.start_s = check_seconds(start_s, "start_s", where)
-        self.register_buffer("share_of_bins", above / above.sum())
+        self.register_buffer("share_of_bins", shares)
 
     def end_s(self) -> float:
         return self.start_s + self.share_of_bins.numel() * self.own_width_s

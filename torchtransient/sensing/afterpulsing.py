@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import torch
@@ -14,9 +15,11 @@ from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
 from torchtransient.sensing.added_counts import AddedCounts
 from torchtransient.sensing.afterpulse_delays import AfterpulseDelays, exponential_kernel, exponential_shares
+from torchtransient.sensing.binomial_tables import LagTable, sixteen_bits
 from torchtransient.sensing.draws import by_pieces
+from torchtransient.sensing.given import numbers_of
 from torchtransient.sensing.layout import TIME, bin_width_of, check_number, check_seconds, check_transient
-from torchtransient.sensing.pixel_maps import check_map, keep_map, over_time, wide
+from torchtransient.sensing.pixel_maps import check_map, keep_map, kept_map, over_time
 from torchtransient.sensing.policies import GradPolicy
 from torchtransient.sensing.thinning import thin
 from torchtransient.sensing.time_convolution import check_choice, filter_rows
@@ -24,6 +27,10 @@ from torchtransient.sensing.time_convolution import check_choice, filter_rows
 CountedFrom = Literal["dead_time", "avalanche"]
 
 _BLOCK = 1 << 17  # entries at a time, so that temporaries stay in the cache
+_WORTH_TABLE = 1 << 16  # entries, above which the lags of afterpulses are looked up
+_FEW = 1 << 12  # places, below which one slow operation takes less time than several fast ones
+_VALUES = 1 << 16  # of a random number of 16 bits
+_MOST_LAGS = 1 << 14  # bins of a period, above which a table of 2^16 cells says little
 _FINE = 2.0**14  # bins of a period, or of a delay, up to which single precision places afterpulses
 _MOST = 0.5  # afterpulses of a detection
 
@@ -75,6 +82,21 @@ def add_afterpulses(
 def _check_period(period: int, bins: int) -> None:
     if period < bins:
         raise UnitError(f"add_afterpulses: expected a period of at least the window of {bins} bins, got {period}.")
+
+
+def _from_outside(kernel: Tensor, bins: int) -> Tensor:
+    window = torch.ones(1, bins, 1, 1, dtype=torch.float64, device=kernel.device)
+    total = kernel.sum() / (1 - kernel.sum())
+    return (total - add_afterpulses(window, 1.0, kernel, only_added=True)).clamp_min(0).flatten()
+
+
+@functools.lru_cache(maxsize=16)
+def _missing_of_numbers(
+    seen: tuple[float, ...], tau_bins: tuple[float, ...], dead_bins: float, period: int, bins: int
+) -> Tensor:
+    """`_from_outside` of exponentials. Half the time of a small image, where nothing is learnt."""
+    shares, tau = (torch.tensor(v, dtype=torch.float64, device="cpu") for v in (seen, tau_bins))
+    return _from_outside(shares @ exponential_kernel(tau, dead_bins, period), bins)
 
 
 class Afterpulsing(AddedCounts):
@@ -145,6 +167,7 @@ class Afterpulsing(AddedCounts):
 
     def _keep(self, probability: float | Sequence[float], tau_s: float | Sequence[float], learnable: bool) -> None:
         where = "Afterpulsing"
+        probability, tau_s = numbers_of(probability, "probability", where), numbers_of(tau_s, "tau_s", where)
         several = isinstance(probability, Sequence) and not isinstance(probability, str)
         shares = list(probability) if isinstance(probability, Sequence) else [probability]
         p = [check_number(v, "probability", where, high=_MOST, open_low=True) for v in shares]
@@ -181,6 +204,11 @@ class Afterpulsing(AddedCounts):
     def _seen(self) -> Tensor:
         """Afterpulses of a detection after its dead time, by exponential: (K,) float64."""
         p = self.probability.reshape(-1)
+        if not float(p.detach().sum()) <= _MOST * (1 + 1e-9):
+            raise UnitError(
+                f"Afterpulsing: expected a sum of probability in (0, {_MOST:g}], got {p.detach().tolist()}. If it is "
+                "learnt, lower the learning rate: at a sum of 1 a detection would never end."
+            )
         if self.counted_from == "dead_time":
             return p
         if self.delays is not None:
@@ -211,17 +239,26 @@ class Afterpulsing(AddedCounts):
         beyond = self._beyond(x)
         return added if beyond is None else added + beyond
 
-    def _beyond(self, x: Tensor) -> Tensor | None:
-        """Mean afterpulses in the window of constant counts outside of it; None where there are none."""
+    def _beyond(self, x: Tensor, *, drawn: bool = False) -> Tensor | None:
+        """Mean afterpulses in the window of constant counts outside of it; None where there are none.
+
+        `drawn`: nobody asks for a derivative.
+        """
         bins, period = x.shape[TIME], self._period_bins(x)
         dark = not isinstance(self.background, Tensor) and self.background == 0
         if dark or period <= bins:
             return None
-        window = torch.ones(1, bins, 1, 1, dtype=torch.float64, device=x.device)
-        kernel = self.kernel(period).to(x.device)
-        total = kernel.sum() / (1 - kernel.sum())
-        missing = (total - add_afterpulses(window, 1.0, kernel, only_added=True)).clamp_min(0).view(-1, 1, 1)
-        return (missing * over_time(wide(self.background), x, "background", "Afterpulsing")).to(x.dtype).expand_as(x)
+        missing = self._missing(period, bins, drawn).to(x.device).view(-1, 1, 1)
+        level = over_time(kept_map(self, "background"), x, "background", "Afterpulsing")
+        return (missing * level).to(x.dtype).expand_as(x)
+
+    def _missing(self, period: int, bins: int, drawn: bool) -> Tensor:
+        """Afterpulses in the window of one count in every bin outside of it: (bins,) float64."""
+        if self.delays is not None or not drawn:
+            return _from_outside(self.kernel(period), bins)
+        tau = self.tau_s.detach().reshape(-1) / self.bin_width_s
+        dead = self.dead_time_s / self.bin_width_s
+        return _missing_of_numbers(tuple(self._seen().detach().tolist()), tuple(tau.tolist()), dead, period, bins)
 
     def share(self) -> float:
         p = float(self._seen().detach().sum())
@@ -247,9 +284,7 @@ class Afterpulsing(AddedCounts):
         p = float(self._seen().detach().sum())
         period, bins, pixels = self._period_bins(counts), counts.shape[TIME], counts.shape[-2] * counts.shape[-1]
         _check_period(period, bins)
-        longest = self.delays.end_s() if self.delays is not None else 20 * float(self.tau_s.max()) + self.dead_time_s
-        # bins are told apart to 1e-3 of a bin, and delays have as many steps
-        real = torch.float32 if max(period, longest / self.bin_width_s) < _FINE else torch.float64
+        draw = self._lags(period, counts)
 
         def follow(piece: Tensor, begin: int, own: torch.Generator | None) -> Tensor:
             """Places of all afterpulses of the detections of a piece, and of those triggered by them."""
@@ -257,30 +292,63 @@ class Afterpulsing(AddedCounts):
             found = [first.place[:0]]
             for block in range(0, first.place.numel(), _BLOCK):
                 at = slice(block, block + _BLOCK)
-                place, number = first.place[at] + begin, first.number[at].long()
-                start = place.div(pixels, rounding_mode="floor") % bins
-                origin = place.sub_(start * pixels).repeat_interleave(number)
-                time = start.to(real).repeat_interleave(number)
+                place = _one_each(first.place[at] + begin, first.number[at])
+                time = place.div(pixels, rounding_mode="floor") % bins
                 while time.numel():
-                    # somewhere in its bin, with the same chance everywhere
-                    inside = torch.rand(time.shape, dtype=real, device=time.device, generator=own)
-                    time = self._draw_delays(time, own).add_(inside).floor_().add_(time)
-                    time.sub_((time * (1 / period)).floor_().mul_(period))
-                    # where the quotient was rounded
-                    time.sub_(period * (time >= period)).add_(period * (time < 0))
-                    seen = (time < bins).nonzero().squeeze(-1)
-                    found.append(time[seen].long().mul_(pixels).add_(origin[seen]))
-                    again = torch.rand(time.shape, dtype=real, device=time.device, generator=own) < p
-                    again = again.nonzero().squeeze(-1)
-                    time, origin = time[again], origin[again]
+                    lag = draw(time, own)
+                    lag -= period * (lag + time >= period)
+                    # a round later is as far in front of the window as it is behind the end of the period
+                    time, place = time.add_(lag), place.add_(lag, alpha=pixels)
+                    found.append(place[time < bins])
+                    again = _passes(time, p, own)
+                    time, place = time[again], place[again]
             return torch.cat(found)
 
         one = torch.ones(1, dtype=counts.dtype, device=counts.device)
         total = counts.clone(memory_format=torch.contiguous_format)
         for places in by_pieces(follow, counts.reshape(-1), generator):
             total.view(-1).scatter_add_(0, places, one.expand(places.shape))
-        beyond = self._beyond(counts)
+        beyond = self._beyond(counts, drawn=True)
         return total if beyond is None else total + self._poisson(beyond, generator)
+
+    def _lags(self, period: int, counts: Tensor) -> Callable[[Tensor, torch.Generator | None], Tensor]:
+        """Draws of the bins from a detection to its afterpulse, folded into one period: int64 as large as a tensor."""
+        if counts.device.type == "cpu" and counts.numel() >= _WORTH_TABLE and period <= _MOST_LAGS:
+            kernel = self.kernel(period).detach().cpu()
+            return LagTable(kernel / kernel.sum()).draw
+        longest = self.delays.end_s() if self.delays is not None else 20 * float(self.tau_s.max()) + self.dead_time_s
+        # bins are told apart to 1e-3 of a bin, and delays have as many steps
+        real = torch.float32 if max(period, longest / self.bin_width_s) < _FINE else torch.float64
+
+        def draw(like: Tensor, generator: torch.Generator | None) -> Tensor:
+            # somewhere in its bin, with the same chance everywhere
+            inside = torch.rand(like.shape, dtype=real, device=like.device, generator=generator)
+            return self._draw_delays(inside, generator).add_(inside).floor_().long().remainder_(period)
+
+        return draw
+
+
+def _one_each(place: Tensor, number: Tensor) -> Tensor:
+    """Every place as often as its number says."""
+    if place.numel() < _FEW:
+        return place.repeat_interleave(number.long())
+    all_places, k = [place if bool((number >= 1).all()) else place[number >= 1]], 2
+    while True:
+        more = (number >= k).nonzero().squeeze(-1)
+        if not more.numel():
+            return torch.cat(all_places)
+        place, number, k = place[more], number[more], k + 1
+        all_places.append(place)
+
+
+def _passes(like: Tensor, p: float, generator: torch.Generator | None) -> Tensor:
+    """Indices of the entries that pass, each with probability `p`."""
+    steps = math.floor(p * _VALUES)
+    bits = sixteen_bits(like, generator)
+    passing = (bits <= steps - _VALUES // 2).nonzero().squeeze(-1)
+    # the last step passes in part
+    finer = torch.rand(passing.shape, dtype=torch.float64, device=like.device, generator=generator)
+    return passing[(bits[passing] < steps - _VALUES // 2).logical_or_(finer < p * _VALUES - steps)]
 
 
 def hot_pixel_rates(

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
-from torch import nn
+from torch import Tensor, nn
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import UnitError
+from torchtransient.quantities import as_number
+from torchtransient.sensing.chain_walk import branches_of, in_order, named, parts_of
 from torchtransient.sensing.sensor import Quantity, Sensor
 
 # Two axes are the same when their bins agree to a millionth of a bin over the whole length.
@@ -43,23 +45,14 @@ class _Light:
     quantity: Quantity | None = None
     giver: Stage | None = None
     cycles: int = 1  # of the exposure that a rate per cycle belongs to
-    bins: Stage | None = None
+    width: Stage | None = None
+    number: Stage | None = None  # of bins
 
 
 def stages_of(chain: nn.Module) -> Iterator[Stage | None]:
     """The sensors of a chain in their order, those of nested chains too; None for modules of another kind."""
-
-    def walk(module: nn.Module, prefix: str) -> Iterator[Stage | None]:
-        for name, child in module._modules.items():  # named_children leaves out what comes twice
-            if child is None:
-                continue
-            inner = getattr(child, "stages", child)
-            if isinstance(inner, (nn.ModuleList, nn.Sequential)):
-                yield from walk(inner, f"{prefix}{name}.")
-            else:
-                yield Stage(f"{prefix}{name}", child) if isinstance(child, Sensor) else None
-
-    yield from walk(getattr(chain, "stages", chain), "")
+    for name, stage in in_order(named(getattr(chain, "stages", chain))):
+        yield Stage(name, stage) if isinstance(stage, Sensor) else None
 
 
 def check_stages(chain: nn.Module) -> bool:
@@ -69,25 +62,33 @@ def check_stages(chain: nn.Module) -> bool:
     Compared are bins, `cycles`, laser periods and quantities. What a module of another kind does to the light is not
     known, nor what a sensor does that has no `gives`: behind these, bins and quantities are compared anew.
     """
-    light = _Light()
-    stages = list(stages_of(chain))
+    _through(stages_of(chain), _Light())
+    parts = _parts_of(chain)
+    _check_cycles(parts)
+    check_dead_times(chain)
+    check_window(chain, None)
+    return has_period(chain) and any((_bins(part) or (0.0, 1))[1] is None for part in parts)
+
+
+def _through(stages: Iterable[Stage | None], light: _Light) -> _Light:
+    """The light behind stages in a row, each compared with what comes to it; every branch with the same."""
     for stage in stages:
         if stage is None:
             light = _Light()
             continue
         _check_quantity(light, stage)
-        light = _after(stage, _same_bins(light, stage))
-    parts = _parts_of(chain)
-    _check_cycles(parts)
-    check_window(chain, None)
-    has_period = any(isinstance(getattr(part.sensor, "repetition_rate_hz", None), float) for part in parts)
-    return has_period and any((_bins(part) or (0.0, 1))[1] is None for part in parts)
+        before = _same_bins(light, stage)
+        for name, sensor in branches_of(stage.sensor):
+            row = in_order([(f"{stage.name}.{name}", sensor)])
+            end = _through((Stage(n, s) if isinstance(s, Sensor) else None for n, s in row), light)
+            before = replace(before, width=end.width, number=end.number)
+        light = _after(stage, before)
+    return light
 
 
 def _parts_of(chain: nn.Module) -> list[Stage]:
     """Every sensor of a chain, those that other sensors are made of too."""
-    parts = ((name.replace("stages.", ""), part) for name, part in chain.named_modules(remove_duplicate=False))
-    return [Stage(name, part) for name, part in parts if isinstance(part, Sensor) and part is not chain]
+    return [Stage(name, part) for name, part in parts_of(chain)]
 
 
 # ------------------------------------------------------------------------------------------------------------- bins
@@ -117,32 +118,37 @@ def check_axis(sensor: nn.Module, axis: TimeAxis) -> None:
 
 def _same_bins(light: _Light, stage: Stage) -> _Light:
     """The light with the stage that its bins are known from. UnitError for a stage that was made for others."""
-    own, before = _bins(stage), light.bins
-    if own is None or before is None:
-        return light if own is None else replace(light, bins=stage)
-    width, number = own
-    known = _bins(before)
-    if known is not None:
-        most = max(number or 1, known[1] or 1)
-        same = None in (number, known[1]) or number == known[1]
-        if not same or abs(width - known[0]) * most > _SAME_BIN * width:
-            raise UnitError(
-                f"Compose: expected one time axis for all stages, got {_shown(known)} in {before} and {_shown(own)} in "
-                f"{stage}. Make both with the axis of the light."
-            )
-    return replace(light, bins=stage) if number is not None else light
+    width, number = _bins(stage)
+    other: Stage | None = None
+    if light.number is not None and number not in (None, _bins(light.number)[1]):
+        other = light.number
+    if light.width is not None and width is not None:
+        known, bins = _bins(light.width)
+        if abs(width - (known or 0.0)) * max(number or 1, bins or 1) > _SAME_BIN * width:
+            other = light.width
+    if other is not None:
+        raise UnitError(
+            f"Compose: expected one time axis for all stages, got {_shown(_bins(other))} in {other} and "
+            f"{_shown((width, number))} in {stage}. Make both with the axis of the light."
+        )
+    return replace(
+        light, width=light.width if width is None else stage, number=light.number if number is None else stage
+    )
 
 
-def _bins(stage: Stage) -> tuple[float, int | None] | None:
-    """(width in seconds, number or None) of the bins that a sensor was made for; None when it takes any."""
-    axis, width = getattr(stage.sensor, "axis", None), getattr(stage.sensor, "bin_width_s", None)
+def _bins(stage: Stage) -> tuple[float | None, int | None]:
+    """(width in seconds, number) of the bins that a sensor was made for; None for what it takes any of."""
+    axis, width = getattr(stage.sensor, "axis", None), as_number(getattr(stage.sensor, "bin_width_s", None))
     if isinstance(axis, TimeAxis):
         return axis.bin_width_s, axis.num_bins
-    return (width, stage.sensor.num_bins) if isinstance(width, float) else None
+    return width, stage.sensor.num_bins
 
 
-def _shown(bins: tuple[float, int | None]) -> str:
-    return f"bins of {bins[0]:g} s" if bins[1] is None else f"{bins[1]} bins of {bins[0]:g} s"
+def _shown(bins: tuple[float | None, int | None]) -> str:
+    width, number = bins
+    if width is None:
+        return f"{number} bins"
+    return f"bins of {width:g} s" if number is None else f"{number} bins of {width:g} s"
 
 
 # ------------------------------------------------------------------------------------------------------- quantities
@@ -186,9 +192,8 @@ def _after(stage: Stage, light: _Light) -> _Light:
     if gives is None:
         return _Light()
     cycles = getattr(stage.sensor, "cycles", 1)
-    # taps and gates stand where bins were
-    bins = None if gives == "electrons" else light.bins
-    return _Light(gives, stage, cycles if isinstance(cycles, int) else 1, bins)
+    light = _Light() if gives == "electrons" else light  # taps and gates stand where bins were
+    return replace(light, quantity=gives, giver=stage, cycles=cycles if isinstance(cycles, int) else 1)
 
 
 # ----------------------------------------------------------------------------------------------- cycles and periods
@@ -207,18 +212,40 @@ def _check_cycles(stages: list[Stage]) -> None:
 
 
 def check_window(chain: nn.Module, num_bins: int | None) -> None:
-    """UnitError where bins and the laser period of a `PhotonBudget` in the chain do not go together.
+    """UnitError where bins, dead times and the laser period of a chain do not go together.
 
-    A `FreeRunningSPAD` takes its bins for the whole period, and so does an `Afterpulsing` without `period_s`; a
-    `SynchronousSPAD` with a dead time has to be armed again when the next cycle begins. ``num_bins``: of the light,
-    None while there is none, which leaves out stages that were made with a width alone.
+    A `FreeRunningSPAD` takes its bins for the whole period, and so does an `Afterpulsing` without `period_s`; any other
+    detector has to be armed again when the next cycle begins, with the dead time of its afterpulses as with its own.
+    The period is that of a `PhotonBudget`, or without one the `period_s` of an Afterpulsing. ``num_bins``: of the
+    light, None while there is none, which leaves out the window of stages that were made with a width alone.
     """
     stages = _parts_of(chain)
-    for budget in stages:
-        rate_hz = getattr(budget.sensor, "repetition_rate_hz", None)
-        if isinstance(rate_hz, float):
-            for stage in stages:
-                _check_period(budget, 1 / rate_hz, stage, num_bins)
+    budgets = [s for s in stages if isinstance(getattr(s.sensor, "repetition_rate_hz", None), float)]
+    for budget in budgets:
+        period_s = 1 / float(budget.sensor.repetition_rate_hz)  # type: ignore[arg-type]
+        for stage in stages:
+            _check_period(budget, period_s, stage, num_bins)
+    goes_on = any(s.sensor.takes == ("rate",) and s.sensor.window_is_period for s in stages)
+    for stage in stages:
+        own = getattr(stage.sensor, "period_s", None)
+        if not goes_on and isinstance(_dead_time(stage), float):
+            for budget in budgets:
+                _check_armed(budget, 1 / float(budget.sensor.repetition_rate_hz), stage, num_bins)  # type: ignore[arg-type]
+            if not budgets and isinstance(own, float):
+                _check_armed(stage, own, stage, num_bins)
+
+
+def has_period(chain: nn.Module) -> bool:
+    """Whether a laser period is known in a chain."""
+    names = ("repetition_rate_hz", "period_s")
+    return any(isinstance(getattr(part.sensor, name, None), float) for part in _parts_of(chain) for name in names)
+
+
+def _dead_time(stage: Stage) -> float | None:
+    dead_s = getattr(stage.sensor, "dead_time_s", None)
+    if isinstance(dead_s, Tensor):  # learnt
+        return float(dead_s.detach()) if dead_s.numel() == 1 else None
+    return float(dead_s) if isinstance(dead_s, (int, float)) else None
 
 
 def _check_period(budget: Stage, period_s: float, stage: Stage, num_bins: int | None) -> None:
@@ -230,22 +257,49 @@ def _check_period(budget: Stage, period_s: float, stage: Stage, num_bins: int | 
                 "period_s=1 / repetition_rate_hz."
             )
         return
-    bins = _bins(stage)
-    number = None if bins is None else bins[1] or num_bins
-    if bins is None or number is None:
+    width_s, own_number = _bins(stage)
+    number = own_number or num_bins
+    if width_s is None or number is None or not stage.sensor.window_is_period:
         return
-    window_s = number * bins[0]
-    if stage.sensor.window_is_period and not math.isclose(window_s, period_s, rel_tol=_SAME_PERIOD):
+    if not math.isclose(number * width_s, period_s, rel_tol=_SAME_PERIOD):
         raise UnitError(
             f"Compose: expected the bins of {stage} to be one laser period of {budget}, {period_s:g} s, got {number} "
-            f"bins of {bins[0]:g} s, {window_s:g} s. Take an axis of the whole period; Afterpulsing takes period_s= "
-            "as well."
+            f"bins of {width_s:g} s, {number * width_s:g} s. Take an axis of the whole period; Afterpulsing takes "
+            "period_s= as well."
         )
-    dead_s = getattr(stage.sensor, "dead_time_s", None)
-    rearms = stage.sensor.takes == ("rate",) and isinstance(dead_s, float)
-    if rearms and window_s + float(dead_s or 0.0) > period_s * (1 + _SAME_PERIOD):
+
+
+def _check_armed(giver: Stage, period_s: float, stage: Stage, num_bins: int | None) -> None:
+    """UnitError for a detector that is still dead when the next cycle begins."""
+    (width_s, number), dead_s = _bins(stage), _dead_time(stage) or 0.0
+    # what is not known yet is looked at when light comes
+    window_s = 0.0 if width_s is None else (number or num_bins or 0) * width_s
+    if dead_s and window_s + dead_s > period_s * (1 + _SAME_PERIOD):
         raise UnitError(
-            f"Compose: expected {stage} to be armed again before the next cycle of {budget}, {period_s:g} s later, got "
+            f"Compose: expected {stage} to be armed again before the next cycle of {giver}, {period_s:g} s later, got "
             f"a window of {window_s:g} s and a dead time of {dead_s:g} s. A detector that goes on into the next cycle "
             "is a FreeRunningSPAD on an axis of the whole period; or lower repetition_rate_hz."
         )
+
+
+def check_dead_times(chain: nn.Module) -> None:
+    """UnitError for an `Afterpulsing` behind a detector of another dead time: one detector has one.
+
+    A detector of one detection per cycle has none of its own. In `PixelGroups`, whose sensors stand beside one another,
+    the dead time has to be that of one of them.
+    """
+    before: list[Stage] = []
+    for stage in _parts_of(chain):
+        dead_s = _dead_time(stage)
+        if dead_s is None:
+            continue
+        if stage.sensor.takes == ("rate",):
+            before.append(stage)
+        elif stage.sensor.takes == ("counts",):
+            others = [s for s in before if not math.isclose(_dead_time(s) or 0.0, dead_s, rel_tol=1e-6, abs_tol=1e-15)]
+            grouped = ".sensors." in f".{stage.name}."
+            if others and (not grouped or len(others) == len(before)):
+                raise UnitError(
+                    f"Compose: expected the dead time of {others[0]}, {_dead_time(others[0]):g} s, in {stage}, got "
+                    f"{dead_s:g} s. One detector has one dead time: give both the same."
+                )

@@ -11,6 +11,7 @@ from torchtransient.sensing.draws import WHOLE_FLOAT32, check_rates
 from torchtransient.sensing.layout import TIME, check_count, check_transient
 from torchtransient.sensing.policies import GradPolicy
 from torchtransient.sensing.sensor import RandomSensor
+from torchtransient.sensing.spad import log_of_firing
 
 
 @in_single
@@ -63,10 +64,10 @@ class BinaryFrames(RandomSensor):
     def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
         n, r = measurement.double(), check_rates(x, "BinaryFrames").double()
         hit = n > 0
-        fire = torch.where(hit, -torch.expm1(-r), torch.ones_like(r))
-        value = torch.where(hit, n * fire.log(), torch.zeros_like(r)) - r * (self.frames - n)
+        fire = log_of_firing(torch.where(hit, r, torch.ones_like(r)))
+        value = torch.where(hit, n * fire, torch.zeros_like(r)) - r * (self.frames - n)
         total = torch.lgamma(torch.tensor(self.frames + 1.0, dtype=torch.float64))
-        value = value + total - torch.lgamma(n + 1) - torch.lgamma(self.frames - n + 1)
+        value = value + (total - torch.lgamma(n + 1) - torch.lgamma(self.frames - n + 1))
         return value.sum(TIME).to(x.dtype)
 
     def extra_repr(self) -> str:

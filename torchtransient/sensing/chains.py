@@ -26,14 +26,14 @@ def counting_chain(
     budget: PhotonBudget,
     detector: Sensor,
     *,
-    optics: Sequence[Sensor] = (),
+    optics: Sequence[Sensor] | None = (),
     pulse: Response | ImpulseResponse | None = None,
     jitter: Response | DetectionJitter | None = None,
     skew: DetectionSkew | None = None,
     afterpulsing: Afterpulsing | None = None,
     crosstalk: Crosstalk | None = None,
     converter: TDC | None = None,
-    readout: Sequence[Sensor] = (),
+    readout: Sequence[Sensor] | None = (),
     grad: GradPolicy | None = None,
 ) -> Compose:
     """Radiance (..., C, T, H, W) to counts: the parts of a single-photon detector as one chain, whatever their order.
@@ -57,7 +57,7 @@ def counting_chain(
         raise ShapeError(
             f"{where}: expected afterpulsing=None with an AfterpulsingSPAD, got both. Its own afterpulses are enough."
         )
-    light: list[Sensor | None] = [*optics, _response(pulse, budget, where)]
+    light: list[nn.Module | None] = [*_parts(optics, "optics", where), _response(pulse, budget, where)]
     stages = [
         *light,
         budget,
@@ -67,9 +67,21 @@ def counting_chain(
         _check(afterpulsing, (Afterpulsing, type(None)), "afterpulsing", where),
         _check(crosstalk, (Crosstalk, type(None)), "crosstalk", where),
         _check(converter, (TDC, type(None)), "converter", where),
-        *readout,
+        *_parts(readout, "readout", where),
     ]
     return Compose([s for s in stages if s is not None], grad=grad)
+
+
+def _parts(parts: Sequence[nn.Module] | None, name: str, where: str) -> list[nn.Module]:
+    """A list of sensors, or None for none of them."""
+    if parts is None:
+        return []
+    if not isinstance(parts, (list, tuple, nn.ModuleList, nn.Sequential)):
+        raise ShapeError(f"{where}: expected {name} as a list of sensors, got {shown(parts)}. Put it into [].")
+    wrong = [shown(part) for part in parts if not isinstance(part, nn.Module)]
+    if wrong:
+        raise ShapeError(f"{where}: expected {name} as a list of sensors, got {', '.join(wrong)} in it.")
+    return list(parts)
 
 
 def _response(pulse: Response | ImpulseResponse | None, budget: PhotonBudget, where: str) -> ImpulseResponse | None:

@@ -36,7 +36,7 @@ from torchtransient.sensing.own_bins import common_bins
 from torchtransient.sensing.policies import GradPolicy
 from torchtransient.sensing.sensor import RandomSensor
 from torchtransient.sensing.spad import SynchronousSPAD
-from torchtransient.sensing.wrapped_detector import cycles_of
+from torchtransient.sensing.wrapped_detector import cycles_of, of_cycles
 
 # Gauss-Legendre, 8 points on [0, 1]: the lower half, and the weights of both halves
 _HALF = (0.019855071751231884, 0.10166676129318664, 0.23723379504183550, 0.40828267875217510)
@@ -110,8 +110,8 @@ class CoincidencePixel(RandomSensor):
 
     Samples are independent binomials of the cycles, with the exact mean: neighbouring bins of a cycle exclude each
     other a little, which they leave out. Policies: all. Raises UnitError for more SPADs in coincidence than there are,
-    a window longer than the dead time, a
-    detector made for other bins, and light that has more than one coincidence per cycle in a bin.
+    a window longer than the dead time, a detector
+    made for other bins, and light that has more than one coincidence per cycle in a bin.
     """
 
     takes, gives = ("rate",), "counts"
@@ -167,7 +167,7 @@ class CoincidencePixel(RandomSensor):
             raise UnitError(
                 f"CoincidencePixel: expected window_s within the {bins} bins of the light, got {window:g} bins."
             )
-        parts = [self._one(x * share, number) for share, number in self.groups]
+        parts = [self._one(x * share, share, number) for share, number in self.groups]
         whole = math.floor(window)
         total = torch.zeros_like(x, dtype=torch.float64)
         photons = (x.detach().double() / _PHOTONS).clamp(1, _FLOOD * self.spads)
@@ -180,9 +180,9 @@ class CoincidencePixel(RandomSensor):
                     total = total + (end - begin) * weight * self._reached(parts, at, window)
         return total.to(x.dtype)
 
-    def _one(self, rate: Tensor, number: int) -> _Group:
-        """A SPAD at its rate (..., T, H, W), one of `number`."""
-        inner = self.detector
+    def _one(self, rate: Tensor, share: float, number: int) -> _Group:
+        """A SPAD at its rate (..., T, H, W), one of `number` with a `share` of the pixel."""
+        inner = of_cycles(self.detector, self.cycles, share)
         if isinstance(inner, AfterpulsingSPAD):
             rate, inner = inner.rate(rate), inner.detector
         detections: Tensor = inner.probabilities(rate)  # type: ignore[operator]

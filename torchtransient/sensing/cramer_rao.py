@@ -21,6 +21,7 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import DeviceError, GradientError, ShapeError, UnitError
+from torchtransient.sensing.given import no_arrays
 from torchtransient.sensing.impulse_response import Response
 from torchtransient.sensing.layout import TIME, check_count, check_time_axis
 from torchtransient.sensing.response_shapes import resample_counts
@@ -30,7 +31,8 @@ from torchtransient.units import SPEED_OF_LIGHT
 UNKNOWNS = ("distance", "signal", "background")
 _DARK = 1e-100  # a rate of that much is none, and its square still a number
 _SAME = 1e-13  # of a variance, what is left when the others are known: two parameters that do the same but for rounding
-_FINE = 32  # parts of a bin, of responses that know their kernel only
+_FINE = 32  # parts of a bin, of responses that know their kernel only,
+_PARTS = 500  # and of such a response
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -179,9 +181,14 @@ def covariance_bound(
 def _shares(response: Response, axis: TimeAxis, distance: Tensor) -> Tensor:
     """(..., T): the share of a return at `distance` in each bin."""
     edges = axis.edges_s.to(distance.device) - distance.unsqueeze(-1) * (2 / SPEED_OF_LIGHT)
+    return shares_between(response, edges, axis.bin_width_s)
+
+
+def shares_between(response: Response, edges_s: Tensor, bin_width_s: float) -> Tensor:
+    """(..., K): the share of a response, of light at one known time, between edges (..., K + 1) in seconds."""
     if type(response).cdf is Response.cdf:
-        return _by_kernel(response, axis.bin_width_s / _FINE, edges)
-    below, above = response.cdf(edges), response.survival(edges)
+        return _by_kernel(response, bin_width_s / _FINE, edges_s)
+    below, above = response.cdf(edges_s), response.survival(edges_s)
     # differences of what is small: tails keep their relative precision
     late = (below > 0.5)[..., :-1]
     return torch.where(late, above[..., :-1] - above[..., 1:], below.diff(dim=-1)).clamp_min(0)
@@ -223,7 +230,8 @@ def _pixels(values: tuple[Tensor | float, ...], response: Response, where: str) 
     """Distance, signal and background of every pixel, float64, of one shape, on the device of the response."""
     names = ("distance_m", "signal", "background")
     tensors = []
-    for name, value in zip(names, values, strict=True):
+    for name, given in zip(names, values, strict=True):
+        value = no_arrays(given, where)
         if isinstance(value, bool) or not isinstance(value, (Tensor, int, float)):
             raise UnitError(f"{where}: expected {name} to be a number or a tensor, got {type(value).__name__}.")
         device = response.delay_ps.device
@@ -250,7 +258,8 @@ def _pixels(values: tuple[Tensor | float, ...], response: Response, where: str) 
 
 def _floating(values: tuple[Tensor | float, ...]) -> torch.dtype:
     """The dtype of the most precise tensor, float32 at least; torch's default without one."""
-    dtypes = [v.dtype for v in values if isinstance(v, Tensor) and v.is_floating_point()]
+    tensors = [no_arrays(value, "crlb") for value in values]
+    dtypes = [v.dtype for v in tensors if isinstance(v, Tensor) and v.is_floating_point()]
     if not dtypes:
         return torch.get_default_dtype()
     return torch.float64 if torch.float64 in dtypes else torch.float32

@@ -8,16 +8,28 @@ correlations by less than can be seen in a hundred thousand cycles.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from torchtransient.sensing.dead_time_cycle import check_dead_bins, cycle_of_rows, rows_by_level
-from torchtransient.sensing.free_running_draws import BinChances, Path, draw_path, path_log_prob, step_chances
+from torchtransient.sensing.dead_time_means import walks
+from torchtransient.sensing.dead_time_walk import Walk
+from torchtransient.sensing.free_running_draws import (
+    BinChances,
+    Path,
+    draw_path,
+    path_log_prob,
+    share,
+    step_chances,
+    step_shares,
+)
 from torchtransient.sensing.policies import gaussian_noise
 
 _WIDER = 4
+_ROOT = math.sqrt(3.0)
 
 
 @dataclass(frozen=True)
@@ -49,13 +61,35 @@ def _columns(x: Tensor) -> Tensor:
     return x.T.unsqueeze(-1)  # time is the third dimension from behind
 
 
+def _width(pieces: int, whole: int) -> int:
+    """Pieces that are drawn as one; a dead time is one of these at least."""
+    wider = min(_WIDER, pieces, max(whole, 1))
+    while pieces % wider or whole < wider:
+        wider -= 1
+    return wider
+
+
+def _wider_pieces(states: Tensor, part: float, whole: int, wider: int) -> tuple[Tensor, Tensor, Tensor]:
+    """(detections, armed at the start, late ones after a row of zeros), (N, P) each, from the states of a walk."""
+    count, slope, armed = states[1:, 1], states[1:, 2], states[:-1, 0]
+    late = torch.zeros_like(states[:, 1])
+    if part:
+        soon = (1 - part) * count - (_ROOT * (1 - part) * part) * slope
+        torch.minimum((count - soon).clamp_min_(0), count, out=late[1:])
+    if wider == 1:
+        return count, armed, late
+    shape = (-1, wider, count.shape[1])
+    fine = late[1:].reshape(shape)
+    place = torch.arange(wider, device=count.device).view(-1, 1) + whole % wider
+    soon = (count.reshape(shape) - fine) * (place >= wider)
+    late = (soon + fine * (place + 1 >= wider)).sum(1)
+    return count.reshape(shape).sum(1), armed[::wider], torch.nn.functional.pad(late, (0, 0, 1, 0))
+
+
 def _steps(rate: Tensor, dead_bins: Tensor, pieces: int) -> Steps:
     """For rates (P, T) per cycle and bin."""
     cycle = cycle_of_rows(rate, dead_bins, pieces)
-    # a dead time is one wider piece at least
-    wider = min(_WIDER, pieces, max(cycle.whole, 1))
-    while pieces % wider or cycle.whole < wider:
-        wider -= 1
+    wider = _width(pieces, cycle.whole)
     shape = (rate.shape[0], -1, wider)
     fine_late = cycle.late
     place = torch.arange(wider, device=rate.device) + cycle.whole % wider
@@ -71,6 +105,55 @@ def _steps(rate: Tensor, dead_bins: Tensor, pieces: int) -> Steps:
 def _bins(counts: Tensor, pieces: int) -> Tensor:
     """Columns (N, P, 1) of pieces -> rows (P, T) of bins."""
     return counts.view(-1, pieces, counts.shape[1]).sum(1).T
+
+
+def sample_cycles(rate: Tensor, dead_bins: Tensor, cycles: int, generator: torch.Generator | None) -> Tensor:
+    """Counts (T, P) of `cycles` cycles for rates (T, P), float64: `draw_cycles`, without what a score needs."""
+    counts = torch.empty_like(rate)
+    with torch.no_grad():
+        for columns, walk in walks(rate, dead_bins):
+            drawn = _sampled(walk, cycles, generator)
+            counts[:, columns] = drawn.view(walk.bins, -1, walk.columns).sum(1) if len(drawn) > walk.bins else drawn
+    return counts
+
+
+def _sampled(walk: Walk, cycles: int, generator: torch.Generator | None) -> Tensor:
+    """Counts (N, P) of wider pieces."""
+    wider = _width(walk.pieces, walk.whole)
+    count, armed, late = _wider_pieces(walk.forward(), walk.part, walk.whole, wider)
+    size, whole, pieces = count.shape[0], walk.whole // wider, walk.pieces // wider
+    counts = torch.empty_like(count)
+    able = torch.full_like(count[0], float(cycles))
+    returning: dict[int, Tensor] = {}
+    delayed, some_later = torch.zeros_like(able), walk.part > 0 or walk.whole % wider > 0
+    for begin, end in walk.blocks(wider):
+        flux = walk.rate[begin // pieces : end // pieces] / pieces
+        fire = -torch.expm1(-(flux.repeat_interleave(pieces, 0) if pieces > 1 else flux))
+        after = max(begin, whole)
+        soon = fire[:0]
+        if after < end:
+            ago = slice(after - whole, end - whole)
+            back = count[ago] - late[1:][ago] + late[ago]
+            own = fire[after - begin :]
+            chances = step_shares(own, count[after:end], armed[after:end], back)
+            fire, soon = torch.cat([fire[: after - begin], chances[0]]), chances[1]
+        later = share(late[begin + 1 : end + 1], count[begin:end]) if some_later else soon
+        for k in range(begin, end):
+            hit = torch.binomial(able, fire[k - begin], generator=generator)
+            if k >= whole:
+                back = returning.pop(k)
+                hit += torch.binomial(back, soon[k - after], generator=generator)
+                able += back
+            able -= hit
+            counts[k] = hit
+            if k + whole >= size:  # not back in this cycle
+                continue
+            returning[k + whole] = hit
+            if some_later:
+                waits = torch.binomial(hit, later[k - begin], generator=generator)
+                returning[k + whole] = hit - waits + delayed
+                delayed = waits
+    return counts
 
 
 def draw_cycles(

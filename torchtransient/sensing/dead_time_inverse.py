@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import UnitError
-from torchtransient.sensing.dead_time_cycle import BlockWalk, check_dead_bins, cycle_of_rows, detected_rows
+from torchtransient.sensing.dead_time_cycle import BlockWalk, check_dead_bins, cycle_of_rows
+from torchtransient.sensing.dead_time_means import detected_columns
 from torchtransient.sensing.exponential_moments import moments, second_moment
 from torchtransient.sensing.layout import TIME
 from torchtransient.sensing.renewal_chain import bin_response
@@ -138,7 +139,7 @@ def rates_of_counts(counts: Tensor, cycles: float, dead_bins: float) -> tuple[Te
         with torch.no_grad():
             # in a flood the histogram tells little, and the cost of looking closer has no end
             seen = rate.nan_to_num(0.0).clamp_max(_FLOOD)
-            missed = cycles * (detected_rows(seen, dead) - cycle_of_rows(seen, dead, 1, None).count)
+            missed = cycles * (detected_columns(seen.T, dead).T - cycle_of_rows(seen, dead, 1, None).count)
             missed = missed.clamp(-_FARTHEST * counts, _FARTHEST * counts)
             settled = not bool(((missed - last).abs() > 1e-10 * counts).any())
         if settled:

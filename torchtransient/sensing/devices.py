@@ -3,8 +3,9 @@
 A stage is a dictionary with a ``kind`` (a name in `KINDS`) and the arguments of that class or function; arguments may
 be stages themselves (a response, a code). The strings ``"@axis"`` and ``"@num_bins"`` stand for the axis that the
 sensor is built for, ``"@cycles"``, ``"@period_s"`` and ``"@background"`` for the laser cycles, the laser period and the
-constant counts of a bin of the chain's `PhotonBudget`, so that one change reaches all stages that have to agree. Only
-kinds in the list are ever called, so that a file from elsewhere runs no code of its own.
+constant counts of a bin of the chain's `PhotonBudget`, so that one change reaches all stages that have to agree. The
+``make`` of a ``PixelGroups.by_value`` is a stage, in which ``"@value"`` stands for the value of the pixel. Only kinds
+in the list are ever called, so that a file from elsewhere runs no code of its own.
 
     device = tt.sensing.device("kinect_v2_like")
     sensor = device.sensor(axis, grad="gaussian")          # a Compose, behind a TransientRenderer with that axis
@@ -28,7 +29,7 @@ from torchtransient.axes import TimeAxis
 from torchtransient.errors import StorageError, TorchTransientError
 from torchtransient.quantities import shown
 from torchtransient.sensing.afterpulse_delays import MeasuredDelays, PowerLawDelays
-from torchtransient.sensing.afterpulsing import Afterpulsing
+from torchtransient.sensing.afterpulsing import Afterpulsing, hot_pixel_rates
 from torchtransient.sensing.afterpulsing_spad import AfterpulsingSPAD
 from torchtransient.sensing.binary_frames import BinaryFrames
 from torchtransient.sensing.coincidence import CoincidencePixel
@@ -48,18 +49,26 @@ from torchtransient.sensing.impulse_response import (
     UniformResponse,
 )
 from torchtransient.sensing.itof import ItofCorrelation
-from torchtransient.sensing.itof_codes import FourierCode, hamiltonian_code, measured_code, sine_code, square_code
+from torchtransient.sensing.itof_codes import (
+    FourierCode,
+    PiecewiseLinearCode,
+    binary_code,
+    hamiltonian_code,
+    measured_code,
+    sine_code,
+    square_code,
+)
 from torchtransient.sensing.itof_pixels import ItofCalibration, ReversedCode, TapDifference, TwoTapCode
 from torchtransient.sensing.layout import check_number
 from torchtransient.sensing.macro_pixel import MacroPixel, ZoneSum
-from torchtransient.sensing.photon_budget import Optics, PhotonBudget
+from torchtransient.sensing.photon_budget import Optics, PhotonBudget, ambient_photon_rate
 from torchtransient.sensing.pixel_groups import PixelGroups
 from torchtransient.sensing.pixel_skew import DetectionSkew, PixelSkew
-from torchtransient.sensing.polarization import Analysers, PolarizationMosaic, linear_analysers
+from torchtransient.sensing.polarization import Analysers, PolarizationMosaic, circular_analysers, linear_analysers
 from torchtransient.sensing.policies import GradPolicy
 from torchtransient.sensing.shot_noise import ShotNoise
 from torchtransient.sensing.spad import SynchronousSPAD
-from torchtransient.sensing.spatial_psf import LensBlur
+from torchtransient.sensing.spatial_psf import LensBlur, SpatialPSF, defocus_psf, gaussian_psf
 from torchtransient.sensing.streak import StreakCamera, SweepJitter
 from torchtransient.sensing.tdc import TDC, random_code_widths
 from torchtransient.yaml_numbers import reads_exponents
@@ -68,6 +77,15 @@ from torchtransient.yaml_numbers import reads_exponents
 def _seeded_code_widths(num_bins: int, dnl_std: float, seed: int = 0) -> torch.Tensor:
     """The same random TDC wherever the file is read."""
     return random_code_widths(num_bins, dnl_std, torch.Generator().manual_seed(seed))
+
+
+def _seeded_dark_rates(height: int, width: int, seed: int = 0, **numbers: float) -> torch.Tensor:
+    """The same hot pixels wherever the file is read."""
+    return hot_pixel_rates(height, width, generator=torch.Generator().manual_seed(seed), **numbers)
+
+
+def _gaussian_psf(fwhm_px: float, size: int) -> torch.Tensor:
+    return gaussian_psf(torch.as_tensor(fwhm_px, dtype=torch.float64), size)
 
 
 def _tensor(values: Any) -> torch.Tensor:
@@ -86,12 +104,18 @@ KINDS: Mapping[str, Callable[..., Any]] = {
             fourier_codes, hamiltonian_code, linear_analysers, measured_code, sine_code, square_code,
             AfterpulsingSPAD, CoincidencePixel, DetectionSkew, MacroPixel, MeasuredDelays, PixelGroups, PixelSkew,
             PowerLawDelays, ZoneSum,
+            Compose, PiecewiseLinearCode, SpatialPSF, ambient_photon_rate, binary_code, circular_analysers, defocus_psf,
         )
     },
+    "PixelGroups.by_value": PixelGroups.by_value,
+    "gaussian_psf": _gaussian_psf,
+    "hot_pixel_rates": _seeded_dark_rates,
     "polarsens": PolarizationMosaic.polarsens,
     "tdc_code_widths": _seeded_code_widths,
     "tensor": _tensor,
 }  # fmt: skip
+
+_BY_VALUE = ("PixelGroups.by_value", "make")
 
 
 @dataclass(frozen=True)
@@ -153,6 +177,11 @@ class Device:
                 raise StorageError(f"Device '{self.name}': expected one stage of kind '{stage}', got stages {kinds}.")
             parts[0].update(arguments)
         else:
+            if isinstance(stage, bool) or not isinstance(stage, int) or not -len(stages) <= stage < len(stages):
+                raise StorageError(
+                    f"Device '{self.name}': expected a stage by its kind or by a number from 0 to {len(stages) - 1}, "
+                    f"got {shown(stage)}."
+                )
             stages[stage].update(arguments)
         return Device(self.name, self.description, self.sources, tuple(stages), self.bin_width_s, self.num_bins)
 
@@ -229,7 +258,11 @@ def build_stage(spec: Any, axis: TimeAxis | None = None, budget: Mapping[str, An
     if not isinstance(spec, dict) or "kind" not in spec:
         return spec
     _check_spec(spec, "build_stage")
-    arguments = {k: build_stage(v, axis, budget) for k, v in spec.items() if k != "kind"}
+    arguments = {
+        k: _maker(v, axis, budget) if (spec["kind"], k) == _BY_VALUE else build_stage(v, axis, budget)
+        for k, v in spec.items()
+        if k != "kind"
+    }
     try:
         return KINDS[spec["kind"]](**arguments)
     except TorchTransientError:
@@ -238,6 +271,23 @@ def build_stage(spec: Any, axis: TimeAxis | None = None, budget: Mapping[str, An
         raise StorageError(
             f"build_stage: expected arguments of {spec['kind']}, got {sorted(arguments)}: {error}."
         ) from error
+
+
+def _maker(spec: Any, axis: TimeAxis | None, budget: Mapping[str, Any] | None) -> Callable[[float], Any]:
+    """What makes a stage of a value, "@value" in its description. StorageError where it does not stand there."""
+    if not isinstance(spec, dict) or "@value" not in json.dumps(spec, default=str):
+        raise StorageError(
+            f"build_stage: expected make of PixelGroups.by_value as a stage with '@value' in it, got {shown(spec)}."
+        )
+    return lambda value: build_stage(_with_value(spec, value), axis, budget)
+
+
+def _with_value(spec: Any, value: float) -> Any:
+    if isinstance(spec, dict):
+        return {k: _with_value(v, value) for k, v in spec.items()}
+    if isinstance(spec, (list, tuple)):
+        return [_with_value(v, value) for v in spec]
+    return value if isinstance(spec, str) and spec == "@value" else spec
 
 
 def _placeholder(name: str, axis: TimeAxis | None, budget: Mapping[str, Any] | None) -> Any:
@@ -265,10 +315,21 @@ def _check_spec(spec: Any, where: str) -> None:
         known = ", ".join(sorted(KINDS))
         raise StorageError(f"Device '{where}': expected a dictionary with a kind out of {known}; got {kind or spec!r}.")
     for value in spec.values():
-        if isinstance(value, float) and not math.isfinite(value):
-            raise StorageError(f"Device '{where}': expected finite numbers in {kind}; leave the argument out instead.")
-        if isinstance(value, dict) and "kind" in value:
-            _check_spec(value, where)
+        _check_value(value, kind, where)
+
+
+def _check_value(value: Any, kind: str, where: str) -> None:
+    """StorageError for numbers that are not finite and unknown kinds, in lists and dictionaries too."""
+    if isinstance(value, float) and not math.isfinite(value):
+        raise StorageError(f"Device '{where}': expected finite numbers in {kind}; leave the argument out instead.")
+    if isinstance(value, dict) and "kind" in value:
+        _check_spec(value, where)
+    elif isinstance(value, dict):
+        for inner in value.values():
+            _check_value(inner, kind, where)
+    elif isinstance(value, (list, tuple)):
+        for inner in value:
+            _check_value(inner, kind, where)
 
 
 def _parts(spec: Any) -> list[dict[str, Any]]:

@@ -105,16 +105,17 @@ def _distribute(
     while levels[-1].shape[0] > 1:
         finer = levels[-1]
         even = finer.shape[0] // 2
-        coarser = finer[0::2].clone()
-        coarser[:even] += finer[1::2]
-        levels.append(coarser)
-    total = chance(levels[-1]).clamp_max(1)
+        coarser = torch.add(finer[0 : 2 * even : 2], finer[1::2])
+        levels.append(coarser if finer.shape[0] == 2 * even else torch.cat([coarser, finer[-1:]]))
+    chances = [chance(level) for level in levels[1:]]
+    total = (chances[-1] if chances else chance(weights)).clamp_max(1)
     counts = torch.binomial(torch.full_like(total, float(trials)), total, generator=generator)
-    for finer, coarser in zip(reversed(levels[:-1]), reversed(levels[1:]), strict=True):
+    while chances:
+        whole, finer = chances.pop(), levels[len(chances)]
         even = finer.shape[0] // 2
+        share = chances[-1][0 : 2 * even : 2] if chances else chance(finer[0 : 2 * even : 2])
         # 0/0 means no light and no counts
-        whole = chance(coarser[:even]).clamp_min(torch.finfo(finer.dtype).tiny)
-        share = chance(finer[0 : 2 * even : 2]).div(whole).clamp_max_(1)
+        share = share.div(whole[:even].clamp_min(torch.finfo(finer.dtype).tiny)).clamp_max_(1)
         split = torch.empty_like(finer)
         first = halve(counts[:even], share, generator)
         split[0 : 2 * even : 2] = first

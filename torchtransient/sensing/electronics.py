@@ -4,7 +4,8 @@ The chain of a pixel with the mean charge ``m`` (electrons per exposure, tap or 
 
     n = Poisson(m g + d), amplified with excess noise            g: gain map, d: dark electrons
     q = min(n, full_well_e) + offset + normal(ktc_noise_e) + normal(read_noise_e)
-    dn = clip(round(q / gain_e_per_dn + black_level_dn), 0, 2^bits - 1)
+    dn = clip(round(q / gain_e_per_dn + black_level_dn), 0, 2^bits - 1), or
+    dn = clip(round(q / gain_e_per_dn + black_level_dn), -2^(bits - 1), 2^(bits - 1) - 1)    of a signed converter
 
 and reported back in electrons, ``(dn - black_level_dn) gain_e_per_dn``. Sources: Janesick, "Photon transfer" (SPIE
 2007); EMVA standard 1288, release 4.0 (2021).
@@ -15,7 +16,7 @@ from __future__ import annotations
 import math
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
@@ -86,8 +87,10 @@ class PixelElectronics(RandomSensor):
     ``shot_noise`` False: the input is a charge that an earlier stage has drawn. ``full_well_e`` electrons or None;
     ``read_noise_e``, ``ktc_noise_e`` rms electrons; ``excess_noise`` F^2 >= 1 of an intensifier (2 is an exponential
     pulse height), drawn as normal gain noise; ``gain_e_per_dn`` with ``bits`` adds the converter, both or neither;
-    ``dark_e`` dark electrons per exposure. ``gain_map`` and ``offset_map_e`` are buffers that broadcast to the input.
-    Output in electrons, in the shape of the input.
+    ``signed``: of codes in two's complement, for the differences of two taps, which a converter without room below
+    zero would clip. ``dark_e``: dark electrons of *one* number of the input: of one tap in one exposure, one gate.
+    ``gain_map`` and ``offset_map_e`` broadcast to the input: buffers, or learnt as an `nn.Parameter`. Output in
+    electrons, in the shape of the input.
 
     ``expected`` is the mean with both clips, which takes the charge as normal: 0.01 e off for a full well of 100 e and
     better above. Rounding has the mean zero when the noise is at least half a step, which it does not check.
@@ -114,6 +117,7 @@ class PixelElectronics(RandomSensor):
         dark_e: float = 0.0,
         gain_e_per_dn: float | None = None,
         bits: int | None = None,
+        signed: bool = False,
         black_level_dn: float = 0.0,
         gain_map: Tensor | None = None,
         offset_map_e: Tensor | None = None,
@@ -134,9 +138,22 @@ class PixelElectronics(RandomSensor):
             None if gain_e_per_dn is None else check_number(gain_e_per_dn, "gain_e_per_dn", me, open_low=True)
         )
         self.bits = None if bits is None else check_count(bits, "bits", me)
-        self.black_level_dn = check_number(black_level_dn, "black_level_dn", me, high=2.0 ** (self.bits or 0) - 1)
-        self.register_buffer("gain_map", gain_map)
-        self.register_buffer("offset_map_e", offset_map_e)
+        self.signed = bool(signed)
+        if self.signed and self.bits is None:
+            raise UnitError(f"{me}: expected gain_e_per_dn and bits of a signed converter, got neither.")
+        lowest, highest = self.range_dn
+        self.black_level_dn = check_number(black_level_dn, "black_level_dn", me, low=lowest, high=highest)
+        for name, values in (("gain_map", gain_map), ("offset_map_e", offset_map_e)):
+            if isinstance(values, nn.Parameter):
+                self.register_parameter(name, values)
+            else:
+                self.register_buffer(name, values)
+
+    @property
+    def range_dn(self) -> tuple[float, float]:
+        """The lowest and the highest code of the converter; (0, 0) without one."""
+        codes = 2.0 ** (self.bits or 0)
+        return (-codes / 2, codes / 2 - 1) if self.signed else (0.0, codes - 1)
 
     @property
     def range_e(self) -> tuple[float, float]:
@@ -144,8 +161,8 @@ class PixelElectronics(RandomSensor):
         high = math.inf if self.full_well_e is None else self.full_well_e
         if self.gain_e_per_dn is None or self.bits is None:
             return (-math.inf, high)
-        low = -self.black_level_dn * self.gain_e_per_dn
-        return low, low + (2**self.bits - 1) * self.gain_e_per_dn
+        low, high = ((code - self.black_level_dn) * self.gain_e_per_dn for code in self.range_dn)
+        return low, high
 
     @in_single
     def collected(self, x: Tensor) -> Tensor:
@@ -214,7 +231,7 @@ class PixelElectronics(RandomSensor):
             return charge
         level = charge / self.gain_e_per_dn + self.black_level_dn
         level = straight_through(level.detach().round(), level) if level.requires_grad else level.round()
-        return (level.clamp(0, 2**self.bits - 1) - self.black_level_dn) * self.gain_e_per_dn
+        return (level.clamp(*self.range_dn) - self.black_level_dn) * self.gain_e_per_dn
 
     def _map(self, values: Tensor, name: str, x: Tensor) -> Tensor:
         missing = x.ndim - values.ndim
@@ -227,7 +244,8 @@ class PixelElectronics(RandomSensor):
 
     def extra_repr(self) -> str:
         names = ("full_well_e", "read_noise_e", "ktc_noise_e", "excess_noise", "dark_e", "gain_e_per_dn", "bits")
-        return ", ".join([*(f"{n}={getattr(self, n)!r}" for n in names), super().extra_repr()])
+        signed = ["signed=True"] if self.signed else []
+        return ", ".join([*(f"{n}={getattr(self, n)!r}" for n in names), *signed, super().extra_repr()])
 
 
 def _density(t: Tensor) -> Tensor:

@@ -141,12 +141,14 @@ class FreeRunningSPAD(RandomSensor):
     `dead_time_s`: at least one bin ("paralyzable": any), also longer than the period; `kind`: "non_paralyzable" or
     "paralyzable"; `learnable` keeps log(dead time) as a parameter `log_dead_time_s`.
 
-    Samples, non-paralyzable: one detector over all `cycles` periods, from its stationary state on. Means and
-    correlations inside a period are those of the chain of detections, correlations between periods (which make totals
-    up to hundreds of times less variable in saturation) those of its central limit theorem. Whole numbers add up to a
-    quarter of a count^2 to the variance of a total, a phase locked by a dead time of whole periods up to one. The cost
-    does not grow with `cycles`. Paralyzable: independent binomials with the exact mean and N d (1 - d) as variance:
-    totals of a real one vary less, down to a quarter.
+    Samples, non-paralyzable: one detector over all `cycles` periods, from its stationary state on. Up to a thousand
+    detections, and wherever a phase is remembered for long (dead time and wait make up a period or a part of one), are
+    drawn one after the other. More are drawn with means and correlations inside a period of the chain of detections,
+    and correlations between periods (which make totals up to hundreds of times less variable in saturation) of its
+    central limit theorem; whole numbers then add up to a quarter of a count^2 to the variance of a total, and the cost
+    does not grow with `cycles`. TorchTransientError for a phase that is remembered over more than four million
+    detections. Paralyzable: independent binomials with the exact mean and N d (1 - d) as variance: totals of a real
+    one vary less, down to a quarter.
 
     Policies: all. `gaussian`: normal numbers with the covariance of the draws (paralyzable: independent bins), whose
     size is differentiated as that of independent bins. `score`: that of `cycles` periods drawn on their own, dead and
@@ -173,7 +175,7 @@ class FreeRunningSPAD(RandomSensor):
     ) -> None:
         super().__init__(grad)
         self.cycles = check_count(cycles, "cycles", "FreeRunningSPAD")
-        self.trains = 1  # detectors alike that share the cycles, of a pixel of several: see `several_of`
+        self.trains = 1  # detectors alike that share the cycles, of a pixel of several: see `of_cycles`
         check_choice(kind, DeadTime, "kind", "FreeRunningSPAD")
         self.kind: DeadTime = kind
         self.bin_width_s = bin_width_of(axis, bin_width_s, "FreeRunningSPAD")

@@ -45,7 +45,7 @@ class Path:
         return self.fired + self.soon
 
 
-def _share(part: Tensor, whole: Tensor) -> Tensor:
+def share(part: Tensor, whole: Tensor) -> Tensor:
     """part / whole, 0 where nothing is, within [0, 1]."""
     some = whole > 1e-13
     share = part / torch.where(some, whole, torch.ones_like(whole))
@@ -70,18 +70,17 @@ def step_chances(
     rate: Tensor, detected: Tensor, armed: Tensor, late: Tensor, back: Tensor, begin: Tensor | None, whole: int
 ) -> BinChances:
     """Of bins with these means; `back`: armed again in the bin."""
-    fire = -torch.expm1(-rate)
+    fire, soon = step_shares(-torch.expm1(-rate), detected, armed, back)
+    return BinChances(begin=begin, fire=fire, soon=soon, late=share(late, detected), whole=whole)
+
+
+def step_shares(fire: Tensor, detected: Tensor, armed: Tensor, back: Tensor) -> tuple[Tensor, Tensor]:
+    """Chances to be detected when armed at the start, nearly `fire`, and when armed again in the bin."""
     rest = detected - armed * fire
     # straight lines can put a little too much or too little here; one chance for both keeps the mean
-    whole_chance = _share(detected, armed + back)
+    whole_chance = share(detected, armed + back)
     fits = (rest >= 0) & (rest <= back)
-    return BinChances(
-        begin=begin,
-        fire=torch.where(fits, fire, whole_chance),
-        soon=torch.where(fits, _share(rest, back), whole_chance),
-        late=_share(late, detected),
-        whole=whole,
-    )
+    return torch.where(fits, fire, whole_chance), torch.where(fits, share(rest, back), whole_chance)
 
 
 def binomial_share(number: Tensor, chance: Tensor, generator: torch.Generator | None) -> Tensor:
@@ -98,7 +97,7 @@ def draw_path(
     chances: BinChances,
     periods: int,
     generator: torch.Generator | None,
-    share: Callable[[Tensor, Tensor, torch.Generator | None], Tensor] = binomial_share,
+    draw: Callable[[Tensor, Tensor, torch.Generator | None], Tensor] = binomial_share,
 ) -> Path:
     """`periods` detectors, each run over one period."""
     bins, begin = chances.fire.shape[TIME], None
@@ -113,10 +112,10 @@ def draw_path(
     wrapped, missed = [torch.zeros_like(armed)] * bins, torch.zeros_like(armed)
     for k in range(bins):
         back = returning[k]
-        fired = share(armed, chances.fire.select(TIME, k), generator)
-        soon = share(back, chances.soon.select(TIME, k), generator)
+        fired = draw(armed, chances.fire.select(TIME, k), generator)
+        soon = draw(back, chances.soon.select(TIME, k), generator)
         hit = fired + soon
-        late = share(hit, chances.late.select(TIME, k), generator)
+        late = draw(hit, chances.late.select(TIME, k), generator)
         for column, value in zip(taken, (armed, back, fired, soon, late), strict=True):
             column.append(value)
         for slot, amount in ((k + chances.whole, hit - late), (k + chances.whole + 1, late)):

@@ -1,18 +1,25 @@
 """Counts of one detector that runs free for many periods: no period begins but where the one before it ended.
 
-Periods drawn on their own, each from the stationary state, have the right mean and the right correlations inside a
-period. What one of them leaves behind (armed, or dead until some bin) is not what the others begin with, though, and
-the random difference makes totals far too wide in bright light. The excess of ends over beginnings is sent on through
-the chain of detections until all of it has been detected, in linear order: the sum over periods then obeys the balance
-of a train of detections, and has its covariance (that of the central limit theorem for Markov chains). The state before
-the first period and that after the last one are free.
+Few detections are drawn one after the other. Many are those of periods drawn on their own, each from the stationary
+state, with the right mean and the right correlations inside a period. What one of them leaves behind (armed, or dead
+until some bin) is not what the others begin with, though, and the random difference makes totals far too wide in bright
+light. The excess of ends over beginnings is sent on through the chain of detections until all of it has been detected,
+in linear order: the sum over periods then obeys the balance of a train of detections, and has its covariance (that of
+the central limit theorem for Markov chains). The state before the first period and that after the last one are free.
+
+Near resonance (a dead time and a wait make up a period, or a whole part of one) a detector remembers its phase for
+long. What is sent on may then be as large as the counts themselves, and no limit theorem holds: such trains are drawn
+detection by detection, too.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
+from torchtransient.errors import TorchTransientError
 from torchtransient.sensing.dead_time_cycle import rows_by_level, whole_and_part
 from torchtransient.sensing.draws import sample_multinomial
 from torchtransient.sensing.free_running_draws import (
@@ -23,11 +30,16 @@ from torchtransient.sensing.free_running_draws import (
     draw_path,
     normal_share,
 )
+from torchtransient.sensing.free_running_events import begin_places, event_counts
 from torchtransient.sensing.free_running_state import DARK, FreeRunningState, late_lines, per_period
 from torchtransient.sensing.renewal_chain import RenewalChain
 from torchtransient.sensing.stationary_phases import stationary_phases, tangent_phases
 
 PHOTONS = 0.5  # of a piece of a bin: where in it a detection lay is forgotten, 1/6 piece^2 beside waits of 4
+ONE_BY_ONE = 1000  # detections of a train, up to which they are: a limit theorem does not hold yet, and costs as much
+MOST_ONE_BY_ONE = 1 << 22  # minutes
+_CLIPPED, _DEVIATIONS = 1e-2, 3.0  # share of counts that bins would lack after so many standard deviations
+_PILOTS = 2  # numbers for a standard deviation, of which the larger counts
 _FLOOD = 64.0  # of a bin, from which on pieces get no narrower: nothing but the rounding of totals is left to see
 
 
@@ -39,19 +51,65 @@ def _rows(x: Tensor) -> Tensor:
     return x.squeeze(-1).T
 
 
+@dataclass(frozen=True)
+class _Stationary:
+    """Detectors whose bins are cut in `pieces`, in their stationary state."""
+
+    chain: RenewalChain
+    pieces: int
+    phases: Tensor  # lines whose counts sum to 1,
+    lines: Tensor  # per period
+    chances: BinChances
+
+    @property
+    def per_bin(self) -> Tensor:
+        """Detections (P, T) per period."""
+        return _whole_bins(self.lines[:, : self.chain.bins].clamp_min(0), self.pieces)
+
+    def of(self, rows: Tensor) -> _Stationary:
+        c = self.chances
+        begin = None if c.begin is None else c.begin[:, rows]
+        chances = BinChances(begin, c.fire[:, rows], c.soon[:, rows], c.late[:, rows], c.whole)
+        chain = RenewalChain(self.chain.rate[rows], self.chain.whole, self.chain.part)
+        return _Stationary(chain, self.pieces, self.phases[rows], self.lines[rows], chances)
+
+
+def _whole_bins(fine: Tensor, pieces: int) -> Tensor:
+    return fine.view(fine.shape[0], -1, pieces).sum(-1)
+
+
+def _stationary(rate: Tensor, dead_bins: Tensor, pieces: int) -> _Stationary:
+    fine = (rate / pieces).repeat_interleave(pieces, -1)
+    whole, part = whole_and_part(dead_bins.to(rate.device) * pieces)
+    chain = RenewalChain(fine, whole, part)
+    phases = stationary_phases(fine, part, whole)
+    lines = per_period(chain, phases)
+    count = lines[:, : chain.bins].clamp_min(0)
+    late = torch.minimum(late_lines(lines, part).clamp_min(0), count)
+    armed = chain.at_start(chain.inflow(lines)).clamp(0, 1)
+    state = FreeRunningState(_columns(count), _columns(armed), _columns(late), whole)
+    return _Stationary(chain, pieces, phases, lines, bin_chances(_columns(fine), state))
+
+
 def train_counts(
     rate: Tensor, dead_bins: Tensor, periods: int, generator: torch.Generator | None, *, normal: bool = False
 ) -> Tensor:
     """Counts (P, T) of detectors in the stationary state over `periods` periods, rates (P, T) per period, float64.
 
-    Whole numbers, or with `normal` normal numbers of the same mean and covariance. Without gradient.
+    Whole numbers, or with `normal` normal numbers of the same mean and covariance. Without gradient. Raises
+    TorchTransientError for a phase that is remembered over more detections than can be drawn one by one.
     """
     counts = torch.zeros_like(rate)
     dark = rate.sum(-1, keepdim=True) < DARK
     safe = torch.where(dark, torch.full_like(rate, 1.0 / rate.shape[-1]), rate)
     for rows, pieces in rows_by_level(safe.clamp_max(_FLOOD), float(dead_bins), PHOTONS):
         own = safe if rows is None else safe[rows]
-        found = _train(own, dead_bins, pieces, periods, generator, normal)
+        state = _stationary(own, dead_bins, pieces)
+        if normal:
+            found, more = _periods(state, periods, generator, normal=True)
+            found = found if more is None else found + more
+        else:
+            found = _whole_counts(state, own, dead_bins, periods, generator)
         counts = found if rows is None else counts.index_copy(0, rows, found)
     if bool(dark.any()):
         many = torch.full_like(rate, float(periods))
@@ -61,24 +119,66 @@ def train_counts(
     return counts
 
 
-def _train(
-    rate: Tensor, dead_bins: Tensor, pieces: int, periods: int, generator: torch.Generator | None, normal: bool
+def _whole_counts(
+    state: _Stationary, rate: Tensor, dead_bins: Tensor, periods: int, generator: torch.Generator | None
 ) -> Tensor:
-    fine = (rate / pieces).repeat_interleave(pieces, -1)
-    whole, part = whole_and_part(dead_bins.to(rate.device) * pieces)
-    chain = RenewalChain(fine, whole, part)
-    phases = stationary_phases(fine, part, whole)
-    lines = per_period(chain, phases)
-    count = lines[:, : chain.bins]
-    late = torch.minimum(late_lines(lines, part).clamp_min(0), count.clamp_min(0))
-    armed = chain.at_start(chain.inflow(lines)).clamp(0, 1)
-    state = FreeRunningState(_columns(count.clamp_min(0)), _columns(armed), _columns(late), whole)
-    chances = bin_chances(_columns(fine), state)
-    path = draw_path(chances, periods, generator, normal_share if normal else binomial_share)
-    found = _rows(path.counts)
-    if periods > 1:
-        found = _added(found, _closing(chain, phases, chances, path, periods, generator), normal, generator)
-    return found.view(*rate.shape, pieces).sum(-1)
+    counts = torch.zeros_like(rate)
+    number = periods * state.per_bin.sum(-1)
+    one_by_one = number <= ONE_BY_ONE
+    many = (~one_by_one).nonzero().flatten()
+    if many.numel():
+        wide = _remembered(state.of(many), rate[many], dead_bins, periods)
+        one_by_one = one_by_one.index_fill(0, many[wide], True)
+        many = many[~wide]
+    if many.numel():
+        found, more = _periods(state.of(many), periods, generator, normal=False)
+        counts = counts.index_copy(0, many, found if more is None else _added(found, more, generator))
+    rows = one_by_one.nonzero().flatten()
+    if rows.numel():
+        chosen = state.of(rows)
+        if float(number[rows].max()) > MOST_ONE_BY_ONE:
+            raise TorchTransientError(
+                f"FreeRunningSPAD: expected at most {MOST_ONE_BY_ONE:g} detections where dead time and wait make up a "
+                f"part of the period, got {float(number[rows].max()):g}. The phase is remembered over so many of them "
+                "that they are drawn one by one. Use fewer cycles, or grad='gaussian'."
+            )
+        start = begin_places(chosen.chain, chosen.lines, generator) / state.pieces
+        counts = counts.index_copy(0, rows, event_counts(rate[rows], dead_bins, start, periods, generator))
+    return counts
+
+
+def _periods(
+    state: _Stationary, periods: int, generator: torch.Generator | None, *, normal: bool
+) -> tuple[Tensor, Tensor | None]:
+    """Counts (P, T) of periods drawn on their own, and what has to be added to them."""
+    path = draw_path(state.chances, periods, generator, normal_share if normal else binomial_share)
+    counts = _whole_bins(_rows(path.counts), state.pieces)
+    if periods == 1:
+        return counts, None
+    more = _closing(state.chain, state.phases, state.chances, path, periods, generator)
+    return counts, _whole_bins(more, state.pieces)
+
+
+def _remembered(state: _Stationary, rate: Tensor, dead_bins: Tensor, periods: int) -> Tensor:
+    """Which rows (P,) would be left with less than nothing in some bins by what has to be added to independent periods.
+
+    Normal numbers of their own decide: what is drawn may not depend on how it came out, and whole numbers would not
+    show what happens once in many trains.
+    """
+    mean = periods * state.per_bin
+    bins = rate.shape[-1]
+    wait = bins / state.per_bin.sum(-1) - float(dead_bins)
+    # a wait of half a period forgets the phase
+    asked = (wait < 0.5 * bins).nonzero().flatten()
+    wide = torch.zeros(rate.shape[0], dtype=torch.bool, device=rate.device)
+    if periods == 1 or not asked.numel():
+        return wide
+    pilot = torch.Generator(rate.device).manual_seed(0)
+    _, more = _periods(state.of(asked.repeat(_PILOTS)), periods, pilot, normal=True)
+    if more is not None:
+        size = _DEVIATIONS * more.view(_PILOTS, -1, bins).abs().amax(0)
+        wide[asked] = (size - mean[asked]).clamp_min(0).sum(-1) > _CLIPPED * mean[asked].sum(-1)
+    return wide
 
 
 def _closing(
@@ -119,12 +219,10 @@ def _closing(
     return sent[:, : chain.bins]
 
 
-def _added(counts: Tensor, more: Tensor, normal: bool, generator: torch.Generator | None) -> Tensor:
+def _added(counts: Tensor, more: Tensor, generator: torch.Generator | None) -> Tensor:
     """Counts with `more`, whole numbers >= 0 whose running sum is within one of the true one, wherever it rises."""
-    if normal:
-        return counts + more
     start = torch.rand(counts[:, :1].shape, dtype=counts.dtype, device=counts.device, generator=generator)
     upto = counts.cumsum(-1) + torch.floor(more.cumsum(-1) + start)
-    # a bin with too few to take away from leaves it to the next one
-    upto = upto.clamp_min(0).cummax(-1).values
-    return upto.diff(dim=-1, prepend=torch.zeros_like(start))
+    # a bin with too few to take away from leaves it to the next one, the last one to the first: the total is kept
+    total = upto[:, -1:].clamp_min(0)
+    return torch.cat([upto - total, upto], -1).cummax(-1).values[:, -counts.shape[-1] - 1 :].diff(dim=-1)

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.sensing.given import numbers_of
 from torchtransient.sensing.itof import correlate
 from torchtransient.sensing.layout import check_number, check_seconds, check_time_axis
 from torchtransient.sensing.response_shapes import normal_integral
@@ -88,6 +89,7 @@ class GatedIntegration(Sensor):
     ) -> None:
         super().__init__()
         me = type(self).__name__
+        delays_s, widths_s = numbers_of(delays_s, "delays_s", me), numbers_of(widths_s, "widths_s", me)
         delays = [check_seconds(d, "delays_s", me, signed=True) for d in delays_s]
         given = list(widths_s) if isinstance(widths_s, Sequence) else [widths_s] * len(delays)
         widths = [check_seconds(w, "widths_s", me, open_low=True) for w in given]

@@ -19,6 +19,8 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.sensing.given import no_arrays, refuse_cut_off
+from torchtransient.sensing.layout import check_number
 
 _FULL = 2 * math.pi
 
@@ -62,6 +64,8 @@ class FourierCode(CorrelationCode):
 
     def __init__(self, num_taps: int, harmonics_of_one_tap: Mapping[int, tuple[float, float]]) -> None:
         self.num_taps = _check_taps(num_taps)
+        for number in (part for pair in harmonics_of_one_tap.values() for part in pair):
+            refuse_cut_off(number, "harmonics_of_one_tap", "FourierCode")
         self.parts = {int(h): (float(a), float(p)) for h, (a, p) in sorted(harmonics_of_one_tap.items())}
         if not self.parts or any(h < 1 for h in self.parts):
             raise UnitError(f"FourierCode: expected harmonics 1, 2, ..., got {sorted(self.parts)}.")
@@ -109,7 +113,8 @@ class PiecewiseLinearCode(CorrelationCode):
     """
 
     def __init__(self, knots: Tensor, values: Tensor, shifts: Tensor | None = None) -> None:
-        knots, values = (torch.as_tensor(x).detach().to("cpu", torch.float64) for x in (knots, values))
+        me = "PiecewiseLinearCode"
+        knots, values = _plain(knots, "knots", me), _plain(values, "values", me)
         if knots.ndim != 2 or knots.shape != values.shape or knots.shape[1] < 2:
             raise ShapeError(
                 f"PiecewiseLinearCode: expected knots and values (N, J >= 2), got {tuple(knots.shape)} and "
@@ -121,7 +126,7 @@ class PiecewiseLinearCode(CorrelationCode):
             raise UnitError("PiecewiseLinearCode: expected knots that ascend within one turn along dim 1.")
         if not bool((values.abs() <= 1 + 1e-9).all()):
             raise UnitError(f"PiecewiseLinearCode: expected values in [-1, 1], got up to {float(values.abs().max())}.")
-        self.shifts = None if shifts is None else torch.as_tensor(shifts, dtype=torch.float64)
+        self.shifts = None if shifts is None else _plain(shifts, "shifts", me)
         # One period from the first knot on, closed by a copy of it, so that every phase lies between two knots.
         self._start = knots[:, :1]
         self._x = torch.cat([knots, knots[:, :1] + 1], dim=1) - self._start
@@ -181,6 +186,8 @@ def square_code(num_taps: int = 4, light_duty: float = 0.5, gate_duty: float = 0
     With both at one half the weight is a triangle wave, whose odd harmonics fall as ``1 / h^2``. The gates are placed
     so that tap 0 weighs phase zero highest, as in `sine_code`. Raises UnitError for duties outside (0, 1).
     """
+    light_duty = check_number(light_duty, "light_duty", "square_code")
+    gate_duty = check_number(gate_duty, "gate_duty", "square_code")
     for name, duty in (("light_duty", light_duty), ("gate_duty", gate_duty)):
         if not 0 < duty < 1:
             raise UnitError(f"square_code: expected {name} between 0 and 1 turn, got {duty!r}.")
@@ -213,8 +220,12 @@ def binary_code(
     ``gates``: per tap its openings as (start, end) in turns, ``0 < end - start < 1``. Light of phase x falls into an
     opening with the part of it that overlaps; all of it gives +1, none -1. Raises UnitError where openings overlap.
     """
+    light_duty = check_number(light_duty, "light_duty", "binary_code", high=1.0, open_low=True)
+    if shifts is not None:
+        shifts = _plain(shifts, "shifts", "binary_code")
     knots, values = [], []
-    for openings in gates:
+    for given in gates:
+        openings = [tuple(check_number(e, "gates", "binary_code", low=-math.inf) for e in edges) for edges in given]
         corners = sorted({round(e % 1, 12) % 1 for a, b in openings for e in (a, b, a - light_duty, b - light_duty)})
         x = torch.tensor(corners, dtype=torch.float64)
         inside = sum((_overlap(x, light_duty, a, b) for a, b in openings), torch.zeros_like(x))
@@ -233,7 +244,7 @@ def measured_code(samples: Tensor, closed: bool = False) -> PiecewiseLinearCode:
     ``samples``: (N, S), any unit; each tap is scaled by its largest magnitude. ``closed``: the last sample repeats
     the first one of the next period and is left out. Raises ShapeError, and UnitError for a tap that is zero.
     """
-    table = torch.as_tensor(samples).detach().to("cpu", torch.float64)
+    table = _plain(samples, "samples", "measured_code")
     if table.ndim != 2 or table.shape[1] < 3:
         raise ShapeError(f"measured_code: expected samples (N, S >= 3), got {tuple(table.shape)}.")
     table = table[:, :-1] if closed else table
@@ -242,6 +253,12 @@ def measured_code(samples: Tensor, closed: bool = False) -> PiecewiseLinearCode:
         raise UnitError("measured_code: expected finite samples that are not all zero in any tap.")
     knots = torch.arange(table.shape[1], dtype=torch.float64) / table.shape[1]
     return PiecewiseLinearCode(knots.expand_as(table), table / largest)
+
+
+def _plain(given: object, name: str, where: str) -> Tensor:
+    """float64 on the CPU, of a tensor, an array or rows of numbers. GradientError: codes are not learnt."""
+    refuse_cut_off(given, name, where)
+    return torch.as_tensor(no_arrays(given, where)).detach().to("cpu", torch.float64)
 
 
 def _overlap(x: Tensor, light: float, a: float, b: float) -> Tensor:

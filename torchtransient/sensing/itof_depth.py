@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.quantities import shown
+from torchtransient.floating import in_single
+from torchtransient.sensing.given import refuse_cut_off, tensor_of
 from torchtransient.sensing.itof import Frequencies, check_frequencies
 from torchtransient.sensing.itof_codes import phase_steps
 from torchtransient.sensing.layout import check_count, product
@@ -87,10 +88,15 @@ def sums_of(taps: Frames, num_taps: int, where: str) -> Tensor:
     return split[..., 0, :, :] + split[..., 1, :, :]
 
 
-def _split(taps: Frames, num_taps: int, readout: str, where: str) -> Tensor:
-    """(..., C, F, N, taps of a pixel, H, W)."""
+def check_readout(readout: str, where: str) -> None:
+    """UnitError for what is no way of reading pixels out."""
     if readout not in get_args(Readout):
         raise UnitError(f"{where}: expected readout to be one of {', '.join(get_args(Readout))}, got {readout!r}.")
+
+
+def _split(taps: Frames, num_taps: int, readout: str, where: str) -> Tensor:
+    """(..., C, F, N, taps of a pixel, H, W)."""
+    check_readout(readout, where)
     frames = _precise(as_frames(taps, where), where)
     each, least = (2 if readout == "two_tap" else 1), (3 if readout == "single" else 2)
     count = check_count(num_taps, "num_taps", where)
@@ -107,10 +113,7 @@ def _split(taps: Frames, num_taps: int, readout: str, where: str) -> Tensor:
 
 def as_frames(taps: Frames, where: str) -> Tensor:
     """A tensor as it is, an array as one. UnitError for what holds no numbers."""
-    try:
-        return taps if isinstance(taps, Tensor) else torch.from_numpy(np.ascontiguousarray(taps))
-    except TypeError as error:
-        raise UnitError(f"{where}: expected frames as a tensor or an array of numbers, got {shown(taps)}.") from error
+    return taps if isinstance(taps, Tensor) else tensor_of(np.asarray(taps), where)
 
 
 def _precise(frames: Tensor, where: str) -> Tensor:
@@ -147,6 +150,7 @@ def amplitude_of(phasor: Tensor) -> Tensor:
     return torch.where(there, torch.where(there, square, 1.0).sqrt() * scale, 0.0)
 
 
+@in_single
 def depth_of_phase(phase: Tensor, frequency_hz: float) -> Tensor:
     """``c phase / (4 pi f)`` in metres, in the shape of ``phase``."""
     (f,) = check_frequencies(frequency_hz, "depth_of_phase")
@@ -164,6 +168,7 @@ def unambiguous_range_m(frequencies_hz: Frequencies) -> float:
     return SPEED_OF_LIGHT / (2 * math.gcd(*(int(f) for f in values)))
 
 
+@in_single
 def wrapped_difference(a: Tensor, b: Tensor) -> Tensor:
     """``a - b`` in radians, the short way round: in [-pi, pi), derivative one everywhere. Shapes broadcast."""
     difference = a - b
@@ -189,6 +194,7 @@ def shares_of_depth(frequencies_hz: Sequence[float], weights: Sequence[float] | 
     return [part / sum(parts) for part in parts]
 
 
+@in_single
 def unwrap_depth(
     phase: Tensor,
     frequencies_hz: Frequencies,
@@ -221,6 +227,7 @@ def unwrap_depth(
             f"{me}: expected max_depth_m - min_depth_m of at most {unambiguous_range_m(values):.4g} m, after which the "
             f"phases of {values} Hz repeat, got {longest - min_depth_m:.4g} m. Metres? Or add a frequency."
         )
+    refuse_cut_off(weights, "weights", me)
     weight = [1.0] * len(values) if weights is None else [float(w) for w in weights]
     if len(weight) != len(values) or not all(w > 0 for w in weight):
         raise UnitError(f"{me}: expected {len(values)} positive weights, got {weights!r}.")

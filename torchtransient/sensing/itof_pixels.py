@@ -24,13 +24,16 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.floating import holds
 from torchtransient.quantities import real_array, shown
+from torchtransient.sensing.given import no_arrays
 from torchtransient.sensing.itof_codes import CorrelationCode
 from torchtransient.sensing.layout import check_transient
 from torchtransient.sensing.sensor import Sensor
 from torchtransient.units import SPEED_OF_LIGHT
 
 _TURN = 2 * math.pi
+_DEEPEST_M = 10.0  # depth that a pixel or its wires may add; millimetres are a thousand times that of cameras
 
 
 class TwoTapCode(CorrelationCode):
@@ -108,9 +111,11 @@ def _with_opposites(weights: Tensor) -> Tensor:
 class TapDifference(Sensor):
     """Taps A_0, B_0, A_1, B_1, ... (..., C, 2 M, H, W) to the differences ``A - B`` (..., C, M, H, W).
 
-    Stands behind the `PixelElectronics` that draw the noise of both taps; a second `PixelElectronics(shot_noise=False,
-    ...)` behind it is the converter of a camera that digitizes the difference. Raises ShapeError for an
-    odd number of taps.
+    Stands behind the `PixelElectronics` that draw the noise of both taps. A camera that digitizes the difference has
+    its converter in a second one behind it, of signed codes, `PixelElectronics(shot_noise=False, gain_e_per_dn=...,
+    bits=..., signed=True)`, or with a black level in the middle of its range: `Compose` refuses one without room below
+    zero, which would clip every negative difference, and shot noise of a difference, which has none of its own. Raises
+    ShapeError for an odd number of taps.
     """
 
     gives = "the same"
@@ -132,12 +137,14 @@ class ItofCalibration:
     ``phase_offset_rad``: of all pixels, one number or one for each frequency; a delay in the camera is positive, as if
     the scene were further away. ``direction``: -1 for a camera whose phase steps go the other way. ``phase_map_rad``:
     fixed pattern of the pixels, (H, W) for all frequencies or (F, H, W). ``depth_map_m``: the same as metres of depth,
-    (H, W), ``4 pi f / c`` radians each (wires and drivers are delays). Maps and offsets add up.
+    (H, W), ``4 pi f / c`` radians each (wires and drivers are delays). Maps and offsets add up. Tensors keep their
+    gradients, in `read_itof` and, as an `nn.Parameter`, in an `ItofCorrelation` of a sine code.
 
-    `ItofCorrelation` puts them in, `read_itof` takes them off. Raises UnitError and ShapeError.
+    `ItofCorrelation` puts them in, `read_itof` takes them off. Raises UnitError, for more than two turns (degrees?)
+    and for depths beyond 10 m (millimetres?) too, and ShapeError.
     """
 
-    phase_offset_rad: float | Sequence[float] = 0.0
+    phase_offset_rad: float | Sequence[float] | Tensor = 0.0
     direction: int = 1
     phase_map_rad: Tensor | None = None
     depth_map_m: Tensor | None = None
@@ -146,9 +153,18 @@ class ItofCalibration:
         if isinstance(self.direction, bool) or self.direction not in (1, -1):
             raise UnitError(f"ItofCalibration: expected direction 1 or -1, got {shown(self.direction)}.")
         object.__setattr__(self, "direction", int(self.direction))
-        _numbers(self.phase_offset_rad, "phase_offset_rad", (0, 1))
-        _numbers(self.phase_map_rad, "phase_map_rad", (2, 3))
-        _numbers(self.depth_map_m, "depth_map_m", (2,))
+        for name in ("phase_offset_rad", "phase_map_rad", "depth_map_m"):
+            object.__setattr__(self, name, no_arrays(getattr(self, name), "ItofCalibration"))
+        degrees = "Degrees? Say math.radians(...); a phase of more than a turn is one of less."
+        _numbers(self.phase_offset_rad, "phase_offset_rad", (0, 1), 2 * _TURN, degrees)
+        _numbers(self.phase_map_rad, "phase_map_rad", (2, 3), 2 * _TURN, degrees)
+        _numbers(self.depth_map_m, "depth_map_m", (2,), _DEEPEST_M, "Millimetres? 12 mm are 12e-3.")
+
+    @property
+    def learnt(self) -> tuple[str, ...]:
+        """Names of what requires a gradient."""
+        values = {name: getattr(self, name) for name in ("phase_offset_rad", "phase_map_rad", "depth_map_m")}
+        return tuple(name for name, v in values.items() if isinstance(v, Tensor) and v.requires_grad)
 
     @property
     def has_map(self) -> bool:
@@ -156,7 +172,7 @@ class ItofCalibration:
         return self.phase_map_rad is not None or self.depth_map_m is not None
 
     def phases_rad(self, frequencies_hz: Sequence[float]) -> Tensor:
-        """(F, H, W) float64 on the CPU: offset and maps together, (F, 1, 1) without maps.
+        """(F, H, W) float64 on the CPU: offset and maps together, (F, 1, 1) without maps, with their gradients.
 
         Raises ShapeError when offsets or maps are of another number of frequencies, or maps of different sizes.
         """
@@ -186,13 +202,27 @@ class ItofCalibration:
         return total
 
 
-def _numbers(given: object, name: str, dims: tuple[int, ...]) -> Tensor:
-    """float64 on the CPU. UnitError for what holds no finite numbers, ShapeError for other numbers of dimensions."""
+def _numbers(given: object, name: str, dims: tuple[int, ...], most: float = math.inf, why: str = "") -> Tensor:
+    """float64 on the CPU, with its gradient. UnitError for what holds no finite numbers or larger ones than ``most``,
+    ShapeError for other numbers of dimensions.
+    """
     if given is None:
         return torch.zeros((), dtype=torch.float64)
-    array = real_array(given)
-    if array is None or not bool(torch.isfinite(torch.from_numpy(array)).all()):
+    if isinstance(given, Tensor) and given.is_floating_point():
+        numbers = given.to("cpu", torch.float64)
+    else:
+        array = real_array(given)
+        if array is None:
+            raise UnitError(f"ItofCalibration: expected {name} as finite numbers, got {shown(given)}.")
+        numbers = torch.from_numpy(array)
+    if numbers.ndim not in dims or not numbers.numel():
+        got = tuple(numbers.shape)
+        raise ShapeError(f"ItofCalibration: expected {name} of {dims} dimensions, got the shape {got}.")
+    if not holds(torch.isfinite(numbers.detach())):
         raise UnitError(f"ItofCalibration: expected {name} as finite numbers, got {shown(given)}.")
-    if array.ndim not in dims or not array.size:
-        raise ShapeError(f"ItofCalibration: expected {name} of {dims} dimensions, got the shape {array.shape}.")
-    return torch.from_numpy(array)
+    if not holds(numbers.detach().abs() <= most):
+        raise UnitError(
+            f"ItofCalibration: expected {name} between -{most:.4g} and {most:.4g}, got up to "
+            f"{float(numbers.detach().abs().max()):g}. {why}"
+        )
+    return numbers

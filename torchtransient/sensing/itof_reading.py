@@ -15,14 +15,20 @@ time-of-flight range cameras" (Opt. Eng. 2009); Gupta et al. (ACM TOG 2018) for 
 
 from __future__ import annotations
 
+import functools
 import math
+import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import PhysicsWarning, ShapeError, UnitError
+from torchtransient.floating import holds, in_single
 from torchtransient.quantities import shown
+from torchtransient.sensing.given import no_arrays
 from torchtransient.sensing.itof import Frequencies, check_frequencies
 from torchtransient.sensing.itof_codes import CorrelationCode, phase_steps
 from torchtransient.sensing.itof_depth import (
@@ -30,6 +36,7 @@ from torchtransient.sensing.itof_depth import (
     Readout,
     amplitude_of,
     as_frames,
+    check_readout,
     depth_of_phase,
     offset_of,
     phase_of,
@@ -41,7 +48,7 @@ from torchtransient.sensing.itof_depth import (
     wrapped_difference,
 )
 from torchtransient.sensing.itof_pixels import ItofCalibration, TwoTapCode, in_direction
-from torchtransient.sensing.layout import check_number, without_autocast
+from torchtransient.sensing.layout import check_count, check_number, without_autocast
 from torchtransient.tensor_record import TensorRecord
 from torchtransient.units import SPEED_OF_LIGHT
 
@@ -55,9 +62,11 @@ class ItofReading(TensorRecord):
     ``offset``, of one exposure, in the units of the frames, (..., C, F, H, W), the offset None for differences;
     ``depth_std_m`` the standard deviation of depth, ``depth_m`` the depth, both (..., C, H, W) in metres.
 
-    ``depth_std_m`` is first order in the noise, averaged over it where a ``code`` has corners (2 N frames are
-    decoded for it), infinite without modulated light, and None where nobody can know it: see `ItofNoise`. It holds no
-    wrong number of turns, no wiggling and no second path.
+    ``depth_std_m`` is first order in the noise, averaged over it where a ``code`` has corners (2 N frames are decoded
+    for it), infinite without modulated light, and None where nobody can know it: see `ItofNoise`. It is NaN in pixels
+    that no light can give: more amplitude than twice the offset, by more than the noise, of differences that were read
+    as taps, say, or of an ``offset_e`` that is too small. It holds no wrong number of turns, no wiggling and no second
+    path.
     """
 
     phase: Tensor
@@ -65,6 +74,12 @@ class ItofReading(TensorRecord):
     offset: Tensor | None
     depth_std_m: Tensor | None
     depth_m: Tensor
+
+    def __getattr__(self, name: str) -> Any:
+        hint = ""
+        if name == "confidence":
+            hint = " What it stood for: depth_std_m (metres), amplitude, or contrast (amplitude / offset)."
+        raise AttributeError(f"'{type(self).__name__}' object has no attribute '{name}'.{hint}")
 
     @property
     def contrast(self) -> Tensor | None:
@@ -79,29 +94,38 @@ class ItofReading(TensorRecord):
 class ItofNoise:
     """What is known of the noise of frames, for `ItofReading.depth_std_m`.
 
-    ``electrons_per_unit``: of the numbers of the frames (1: they are electrons, as `PixelElectronics` gives them);
-    ``read_noise_e``: rms electrons of every tap, converter included. Shot noise is that of the taps themselves;
-    differences know their light no longer: ``offset_e``, electrons of A + B in one exposure, a number or (..., C, F,
-    H, W), of an intensity picture for instance. ``std_e`` replaces all of it: rms electrons of a tap ("single") or a
-    difference, a number or (..., C, F, H, W). Raises UnitError.
+    ``electrons_per_unit``: of the numbers of the frames. None: frames of floating numbers are electrons, as
+    `PixelElectronics` gives them; whole numbers are those of a converter and ask for it (UnitError in `read_itof`).
+    ``read_noise_e``: rms electrons of one tap in one exposure, converter included. Shot noise is that of the taps
+    themselves; differences know their light no longer: ``offset_e``, mean electrons of A + B in *one* exposure of the N
+    (all light, background and the dark electrons of both taps), a number above 0 or (..., C, F, H, W), of an intensity
+    picture for instance. ``std_e`` replaces all of it: rms electrons of what a phase step has measured, a tap
+    ("single") or a difference A - B ("two_tap" and "differential"), a number or (..., C, F, H, W). Arrays are taken as
+    tensors. Raises UnitError.
     """
 
-    electrons_per_unit: float = 1.0
+    electrons_per_unit: float | None = None
     read_noise_e: float = 0.0
     offset_e: float | Tensor | None = None
     std_e: float | Tensor | None = None
 
     def __post_init__(self) -> None:
         me = "ItofNoise"
-        gain = check_number(self.electrons_per_unit, "electrons_per_unit", me, open_low=True)
-        object.__setattr__(self, "electrons_per_unit", gain)
+        if self.electrons_per_unit is not None:
+            gain = check_number(self.electrons_per_unit, "electrons_per_unit", me, open_low=True)
+            object.__setattr__(self, "electrons_per_unit", gain)
         object.__setattr__(self, "read_noise_e", check_number(self.read_noise_e, "read_noise_e", me))
         for name in ("offset_e", "std_e"):
-            given = getattr(self, name)
+            given = no_arrays(getattr(self, name), me)
             if given is not None and not isinstance(given, Tensor):
-                object.__setattr__(self, name, check_number(given, name, me))
+                # no light at all has no phase, and no noise no deviation
+                given = check_number(given, name, me, open_low=True)
+            elif given is not None and not holds(given.detach() >= 0):
+                raise UnitError(f"{me}: expected every {name} to be a number >= 0, got {shown(given)}.")
+            object.__setattr__(self, name, given)
 
 
+@in_single
 def phase_noise_rad(
     amplitude: Tensor, offset: Tensor, num_taps: int, read_noise_e: float = 0.0, readout: Readout = "single"
 ) -> Tensor:
@@ -113,6 +137,8 @@ def phase_noise_rad(
     single taps the variance also swings with the phase, ``(2 B - A cos 3 phi) / A^2``; this is its root mean square.
     """
     check_number(read_noise_e, "read_noise_e", "phase_noise_rad")
+    check_readout(readout, "phase_noise_rad")
+    num_taps = check_count(num_taps, "num_taps", "phase_noise_rad")
     each = 1 if readout == "single" else 2
     return (2 * (offset + each * read_noise_e**2) / num_taps).sqrt() / amplitude
 
@@ -226,14 +252,9 @@ def read_itof(
             raise ShapeError(f"{me}: expected num_taps = {gates.num_taps} of the code, got {num_taps}.")
         phase, slopes = _by_shape(steps, gates, 1024, readout)
     offset = None if readout == "differential" else offset_of(taps, num_taps, readout)
-    variance = _variance(taps, steps, readout, noise)
-    std = None
-    if variance is not None:
-        turn = _first_order(slopes, variance)
-        if code is not None:
-            turn = _at_corners(turn, steps, phase, variance, gates, readout)
-        std = _depth_std(turn, values)
+    at_corners = None if code is None else functools.partial(_at_corners, steps, phase, gates, readout)
     phase = _without_offsets(phase, known, values)
+    std = _depth_std(taps, steps, slopes, values, readout, noise, at_corners)
     if len(values) == 1:
         depth = depth_of_phase(phase, values[0]).squeeze(-3)
     else:
@@ -267,35 +288,8 @@ def _slopes(phasor: Tensor, num_taps: int) -> Tensor:
     return torch.where(there, slopes, math.inf)
 
 
-def _variance(taps: Tensor, steps: Tensor, readout: str, noise: ItofNoise | None) -> Tensor | None:
-    """Of the steps (..., F, N, H, W), or what broadcasts to it, in their unit; None where it cannot be known."""
-    if noise is None and not taps.is_floating_point():
-        return None  # nobody said how many electrons a number of the converter is
-    known = noise or ItofNoise()
-    gain = known.electrons_per_unit
-    if known.std_e is not None:
-        variance = _of_frequencies(known.std_e, steps).square()
-    elif readout == "differential":
-        if known.offset_e is None:
-            return None
-        variance = _of_frequencies(known.offset_e, steps) + 2 * known.read_noise_e**2
-    elif readout == "two_tap":
-        variance = sums_of(taps, steps.shape[-3], "read_itof").clamp_min(0) * gain + 2 * known.read_noise_e**2
-    else:
-        variance = steps.clamp_min(0) * gain + known.read_noise_e**2
-    return variance / gain**2
-
-
-def _first_order(slopes: Tensor, variance: Tensor) -> Tensor:
-    """Variance of the phases (..., F, H, W), infinite in darkness."""
-    # The slopes of dark pixels are infinite: neither a product with zero nor a gradient may come of them.
-    there = ~torch.isinf(slopes)
-    power = (torch.where(there, slopes, 0.0).square() * variance).sum(-3)
-    return torch.where(there.all(-3), power, math.inf)
-
-
 def _at_corners(
-    first: Tensor, steps: Tensor, phase: Tensor, variance: Tensor, code: CorrelationCode, readout: str
+    steps: Tensor, phase: Tensor, code: CorrelationCode, readout: str, first: Tensor, variance: Tensor
 ) -> Tensor:
     """Variance of phases decoded by shape, where noise is small beside the phase: that of 2 N frames around.
 
@@ -315,15 +309,84 @@ def _at_corners(
     return torch.where(first < _SMALL_PHASE**2, around.clamp_min(0), first)
 
 
-def _depth_std(turn: Tensor, values: tuple[float, ...]) -> Tensor:
-    """(..., C, H, W) metres, of variances of phases (..., F, H, W)."""
-    there = ~torch.isinf(turn)
-    power = torch.where(there, turn, 0.0)
+def _depth_std(
+    taps: Tensor,
+    steps: Tensor,
+    slopes: Tensor,
+    values: tuple[float, ...],
+    readout: str,
+    noise: ItofNoise | None,
+    at_corners: Callable[[Tensor, Tensor], Tensor] | None,
+) -> Tensor | None:
+    """(..., C, H, W) metres, or None where the noise cannot be known."""
+    raw = not taps.is_floating_point()
+    if noise is None and raw:
+        return None  # nobody said how many electrons a number of the converter is
+    known = noise or ItofNoise()
+    if raw and known.electrons_per_unit is None:
+        raise UnitError(
+            f"read_itof: expected ItofNoise(electrons_per_unit=...) for frames of whole numbers ({taps.dtype}), which "
+            "are those of a converter, got none. The gain of the camera in electrons per number; 1.0 if they are "
+            "electrons."
+        )
+    gain = known.electrons_per_unit or 1.0
+    offset: Tensor | None = None  # electrons of all light in a step; None where the deviations were given
+    if readout == "differential" and known.offset_e is not None:
+        offset = _of_frequencies(known.offset_e, steps)
+    elif readout == "two_tap":
+        offset = sums_of(taps, steps.shape[-3], "read_itof").clamp_min(0) * gain
+    elif readout == "single":
+        offset = steps.clamp_min(0) * gain
+    read = (1 if readout == "single" else 2) * known.read_noise_e**2
+    if known.std_e is not None:
+        variance = _of_frequencies(known.std_e, steps).square()
+    elif offset is None:
+        return None
+    else:
+        variance = offset + read
+    # The slopes of dark pixels are infinite: neither a product with zero nor a gradient may come of them.
+    there = ~torch.isinf(slopes)
+    power = ((torch.where(there, slopes, 0.0) / gain).square() * variance).sum(-3)
+    if at_corners is not None:
+        power = at_corners(power, variance / gain**2)
     metres = [SPEED_OF_LIGHT / (2 * _TURN * f) * s for f, s in zip(values, shares_of_depth(values), strict=True)]
     factor = torch.tensor(metres, dtype=torch.float64).reshape(-1, 1, 1).to(power)
     total = (power * factor.square()).sum(-3)
     std = torch.where(total > 0, torch.where(total > 0, total, 1.0).sqrt(), total)
-    return torch.where(there.all(-3), std, math.inf)
+    std = torch.where(there.all(-3).all(-3), std, math.inf)
+    if offset is None:
+        return std
+    rounding = (gain if raw else 0.0) ** 2 / 12
+    if readout == "single":
+        offset = steps * gain  # signs and all
+    elif readout == "two_tap":
+        offset = sums_of(taps, steps.shape[-3], "read_itof") * gain
+    lit = _can_be(steps.detach() * gain, offset.detach(), readout == "differential", read + rounding)
+    if lit.numel() and not holds(lit.double().mean() >= 0.5):
+        warnings.warn(
+            f"read_itof: most of these {readout} frames have more amplitude than their light can have, and no "
+            "depth_std_m (NaN). Differences of two taps are readout='differential', with offset_e of all their light; "
+            "frames with read noise say so in ItofNoise.",
+            PhysicsWarning,
+            stacklevel=3,
+        )
+    return torch.where(lit.all(-3), std, math.nan)
+
+
+def _can_be(steps: Tensor, offset: Tensor, from_picture: bool, read: float) -> Tensor:
+    """(..., F, H, W) whether light can have given steps (..., F, N, H, W) in electrons: ``a <= 2 offset``.
+
+    Of numbers X_n >= 0 the sum ``a = (2 / N) |sum_n X_n exp(2 pi i n / N)|`` is at most twice their mean, and the
+    differences of two taps lie within their sums. What is above that by six deviations is no light.
+    """
+    number = steps.shape[-3]
+    angles = (_TURN * phase_steps(number)).reshape(-1, 1, 1).to(steps)
+    size = (2 / number) * torch.hypot((steps * angles.cos()).sum(-3), (steps * angles.sin()).sum(-3))
+    mean = offset.mean(-3)
+    # read noise of both sides, and the shot noise of differences beside a mean that does not know it
+    spread = (6 / number * (read + (mean.clamp_min(0) if from_picture else 0.0))) ** 0.5
+    largest = steps.abs().amax(-3)
+    return ~(size > 2 * mean + 6 * spread + 1e-5 * largest)
 
 
 def _of_frequencies(given: float | Tensor, steps: Tensor) -> Tensor:

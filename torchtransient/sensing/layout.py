@@ -12,6 +12,7 @@ from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import product as product
 from torchtransient.floating import without_autocast as without_autocast
 from torchtransient.quantities import as_number, shown
+from torchtransient.sensing.given import refuse_cut_off
 
 TIME = -3  # the time dimension of (..., C, T, H, W)
 _OTHER_FILMS = (
@@ -60,7 +61,11 @@ def not_a_transient(x: object) -> str:
 def check_number(
     value: float, name: str, where: str, *, low: float = 0.0, high: float = math.inf, open_low: bool = False
 ) -> float:
-    """`value` as a float when it is finite and in [low, high] (or (low, high] with `open_low`), else UnitError."""
+    """`value` as a float when it is finite and in [low, high] (or (low, high] with `open_low`), else UnitError.
+
+    GradientError for a tensor that requires a gradient, which a float cannot carry.
+    """
+    refuse_cut_off(value, name, where)
     number = as_number(value)
     if number is None:
         raise UnitError(f"{where}: expected {name} to be one number, got {shown(value)}.")

@@ -15,7 +15,7 @@ from torchtransient.sensing.layout import check_count, check_number, check_trans
 from torchtransient.sensing.policies import GradPolicy
 from torchtransient.sensing.sensor import RandomSensor, Sensor
 from torchtransient.sensing.spad import SynchronousSPAD
-from torchtransient.sensing.wrapped_detector import WrappedDetector, cycles_of, several_of
+from torchtransient.sensing.wrapped_detector import WrappedDetector, cycles_of, of_cycles
 
 Groups = list[tuple[float, int]]  # (share of the light, SPADs that have it)
 
@@ -54,7 +54,8 @@ class MacroPixel(WrappedDetector):
     the light of one. SPADs in step with the laser and of equal shares are drawn at
     once, and the cost does not depend on their number; each that runs free is a train of its own.
 
-    Policies: all, those of the detector (`grad` None leaves its own). Dark counts are shared as light is. One converter
+    Policies: all, those of the detector (`grad` None leaves its own). Dark counts are shared as light is,
+    and so is the `background` of an AfterpulsingSPAD: that of the whole pixel, too. One converter
     for all, which is dead after the first of them, is a SPAD of its own: use the detector alone. Raises ShapeError for
     another number of weights, UnitError for weights below 0.
     """
@@ -76,7 +77,8 @@ class MacroPixel(WrappedDetector):
     def _parts(self, x: Tensor) -> list[tuple[RandomSensor, Tensor]]:
         """Detectors for all SPADs of an equal share, and their light."""
         check_transient(x, "MacroPixel")
-        return [(several_of(self.detector, number), x * share) for share, number in self.groups]
+        cycles = cycles_of(self.detector)
+        return [(of_cycles(self.detector, cycles * number, share), x * share) for share, number in self.groups]
 
     def probabilities(self, x: Tensor) -> Tensor:
         """Expected detections of all SPADs per cycle and bin."""

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from torchtransient.errors import UnitError
-from torchtransient.sensing.added_counts import is_whole
+from torchtransient.errors import GradientError, UnitError
+from torchtransient.sensing.added_counts import whole_items
 from torchtransient.sensing.draws import WHOLE_FLOAT32, by_pieces
 from torchtransient.sensing.layout import TIME, check_transient
 from torchtransient.sensing.policies import record_score, standard_normal, straight_through
@@ -29,6 +30,29 @@ _TOSSED = (0.7, 60.0)  # counts of an entry, on average, between which it pays
 _FEW = 0.25  # share of occupied entries below which these alone are followed
 
 
+class Moving(Protocol):
+    """Where counts go: what `MovedCounts` asks of a table of moves."""
+
+    @property
+    def learnt(self) -> bool:
+        """Whether the probabilities have gradients."""
+
+    def detached(self) -> Moving:
+        """The same without."""
+
+    def mean(self, x: Tensor) -> Tensor:
+        """The mean of moved counts, linear in `x` (..., T, H, W)."""
+
+    def noise(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """Normal noise with the covariance of moved counts `x` that are known themselves."""
+
+    def draw(self, counts: Tensor, generator: torch.Generator | None, tally: bool) -> tuple[Tensor, Tensor | None]:
+        """Whole `counts`, float32 or float64, each moved by itself, and if `tally` how many went each way."""
+
+    def log_prob(self, tallies: Tensor) -> Tensor:
+        """Log-probability of the ways that were drawn, (..., C, H, W) float64, differentiable."""
+
+
 @dataclass(frozen=True)
 class Moves:
     """Shares of the counts of a bin that go `first + l` bins later: (L,) for all bins, or (L, T) for each.
@@ -39,6 +63,24 @@ class Moves:
     first: int
     shares: Tensor
     boundary: Boundary
+
+    @property
+    def learnt(self) -> bool:
+        return self.shares.requires_grad
+
+    def detached(self) -> Moves:
+        return Moves(self.first, self.shares.detach(), self.boundary)
+
+    def draw(self, counts: Tensor, generator: torch.Generator | None, tally: bool) -> tuple[Tensor, Tensor | None]:
+        return move_counts(counts, self, generator, tally=tally)
+
+    def log_prob(self, tallies: Tensor) -> Tensor:
+        if self.shares.ndim > 1:
+            raise GradientError(
+                "MovedCounts: expected shares (L,) under grad='score', got those of every bin. Choose another policy."
+            )
+        shares = self.shares.clamp_min(torch.finfo(torch.float64).tiny).log()
+        return (tallies.double() * shares.view(-1, *[1] * (tallies.ndim - 1))).sum(0)
 
     def of_lag(self, index: int, like: Tensor) -> Tensor:
         """The share of one lag, for entries (..., T, H, W)."""
@@ -97,7 +139,7 @@ def move_counts(
     tallies: Tensor | None = None
     if tally:
         tallies = data.new_zeros(moves.shares.shape[0], data.shape[0], data.shape[2])
-        moved = _Tree(moves, data, tallies).run(generator)
+        moved = _Tree(moves, data.contiguous(), tallies).run(generator)
         tallies = tallies.view(-1, *shape[:TIME], *shape[-2:])
     else:
         columns = data.movedim(2, 0)
@@ -222,13 +264,14 @@ class _Tree:
 class MovedCounts(RandomSensor):
     """A sensor that moves detections in time. All four policies.
 
-    Whole counts move one by one; draws refuse NaN and infinity with UnitError. What is not whole, the means of another
-    stage, stays a mean under every policy but "gaussian", which takes its input for a normal surrogate of counts.
-    Under "score" the probabilities are those of the moves; the counts given pass with the gradient of the mean, as
-    under "straight_through".
+    Whole counts move one by one; draws refuse NaN and infinity with UnitError. Items (C, T, H, W) of which not all
+    counts are whole, the means of another stage, stay means under every policy but "gaussian", which takes its input
+    for a normal surrogate of counts; what is beside an item in a batch makes no difference. Under "score" the
+    probabilities are those of the moves; the counts given pass with the gradient of the mean, as under
+    "straight_through".
     """
 
-    def moves(self, x: Tensor) -> Moves:
+    def moves(self, x: Tensor) -> Moving:
         """Where the counts of `x` go; differentiable in the parameters."""
         raise NotImplementedError(f"{type(self).__name__} has to define moves(x).")
 
@@ -239,35 +282,36 @@ class MovedCounts(RandomSensor):
         with torch.no_grad():
             return self._drawn(x, generator, tally=False)[0]
 
-    def _drawn(self, x: Tensor, generator: torch.Generator | None, tally: bool) -> tuple[Tensor, Tensor | None]:
+    def _drawn(self, x: Tensor, generator: torch.Generator | None, tally: bool) -> tuple[Tensor, Tensor | None, Tensor]:
+        """Items moved, how many of the whole ones went each way, and which are whole; see `whole_items`."""
         given = check_transient(x, type(self).__name__).detach()
         counts = given.float() if x.dtype in (torch.float16, torch.bfloat16) else given
         highest = float(counts.abs().amax()) if counts.numel() else 0.0
         if not math.isfinite(highest):
             raise UnitError(f"{type(self).__name__}: expected finite counts, got NaN or infinity. Look upstream.")
-        if not is_whole(counts):
-            return self.expected(given), None
+        whole = whole_items(counts)
+        if whole.numel() and not bool(whole.any()):
+            return self.expected(given), None, whole
+        every = bool(whole.all())
+        counts = counts if every else torch.where(whole, counts, 0)
         if counts.dtype == torch.float32 and highest > WHOLE_FLOAT32 / 2:
             counts = counts.double()
-        moved, tallies = move_counts(counts, self.moves(x), generator, tally=tally)
-        return moved.to(x.dtype), tallies
+        moved, tallies = self.moves(x).draw(counts, generator, tally)
+        moved = moved.to(x.dtype)
+        return moved if every else torch.where(whole, moved, self.expected(given)), tallies, whole
 
     def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         if self.grad != "score":
             return super().forward(x, generator)
         with torch.no_grad():
-            moved, tallies = self._drawn(x, generator, tally=True)
+            moved, tallies, whole = self._drawn(x, generator, tally=True)
         if tallies is None:
             return self.expected(x)
         if not torch.is_grad_enabled():
             return moved
         moves, counted = self.moves(x), tallies
-
-        def log_prob() -> Tensor:
-            shares = moves.shares.clamp_min(torch.finfo(torch.float64).tiny).log()
-            return (counted.double() * shares.view(-1, *[1] * (counted.ndim - 1))).sum(0)
-
-        if moves.shares.requires_grad:
-            record_score(log_prob, type(self).__name__)
-        fixed = Moves(moves.first, moves.shares.detach(), moves.boundary)
-        return straight_through(moved, fixed.mean(x)) if x.requires_grad else moved
+        if moves.learnt:
+            record_score(lambda: moves.log_prob(counted), type(self).__name__)
+        if x.requires_grad:
+            moved = straight_through(moved, moves.detached().mean(x))
+        return moved if bool(whole.all()) else torch.where(whole, moved, self.expected(x))

@@ -8,6 +8,15 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.errors import GradientError, ShapeError, UnitError
+from torchtransient.sensing.chain_walk import (
+    check_draws,
+    draw_of,
+    draws,
+    mean_of,
+    measurement_of,
+    normal_of,
+    policies_of,
+)
 from torchtransient.sensing.layout import check_transient
 from torchtransient.sensing.own_bins import common_bins
 from torchtransient.sensing.policies import GradPolicy, ScoreFunction, check_policy, record_score
@@ -20,9 +29,10 @@ class PixelGroups(RandomSensor):
     """An image (..., C, T, H, W) whose pixels go to different sensors: pixel (i, j) to `sensors[which[i, j]]`.
 
     For everything that is one number in a sensor and differs from pixel to pixel: dead times (`by_value`), gates,
-    afterpulses. Sensors have to treat pixels alone (no lenses, no crosstalk) and give equal numbers of bins. Costs a
-    call for each sensor. `which`: (H, W) whole numbers; every policy is that of the sensors, and `grad` sets all of
-    theirs. Raises ShapeError for other images and for numbers that are no sensor's.
+    afterpulses. Sensors, chains of them (`Compose`) too, have to treat pixels alone (no lenses, no crosstalk) and give
+    equal numbers of bins. Costs a call for each sensor. `which`: (H, W) whole numbers; draws, normal surrogates, scores
+    and policies are those of the sensors, and `grad` sets all of theirs. Raises ShapeError for other images and for
+    numbers that are no sensor's, GradientError for a `variance` or `log_prob` that a sensor has not.
     """
 
     which: Tensor
@@ -39,6 +49,7 @@ class PixelGroups(RandomSensor):
         inside = (numbers == which.detach()) & (numbers >= 0) & (numbers < len(sensors))
         if not bool(inside.all()):
             raise ShapeError(f"PixelGroups: expected numbers of {len(sensors)} sensors, 0 to {len(sensors) - 1}.")
+        check_draws(sensors, "PixelGroups")
         self.sensors = nn.ModuleList(sensors)
         self.register_buffer("which", numbers)
         self.takes, self.gives = sensors[0].takes, sensors[0].gives
@@ -69,7 +80,7 @@ class PixelGroups(RandomSensor):
     @property
     def grad(self) -> GradPolicy:
         """The policy of all random sensors. GradientError where they have different ones."""
-        policies = {s.grad for s in self.sensors if isinstance(s, RandomSensor)}
+        policies = policies_of(self)
         if len(policies) > 1:
             raise GradientError(f"PixelGroups: expected one policy of all sensors, got {sorted(policies)}. Set grad.")
         return policies.pop() if policies else "expected"
@@ -77,9 +88,9 @@ class PixelGroups(RandomSensor):
     @grad.setter
     def grad(self, value: GradPolicy) -> None:
         policy = check_policy(value, "PixelGroups")
-        for sensor in self.sensors:
-            if isinstance(sensor, RandomSensor):
-                sensor.grad = policy
+        for part in self.sensors.modules():
+            if isinstance(part, RandomSensor):
+                part.grad = policy
 
     def check_bins(self, x: object) -> None:
         super().check_bins(x)
@@ -124,27 +135,30 @@ class PixelGroups(RandomSensor):
         return self._measured(x, lambda sensor, own: sensor.probabilities(own))  # type: ignore[operator]
 
     def expected(self, x: Tensor) -> Tensor:
-        return self._measured(x, lambda sensor, own: sensor.expected(own))
+        return self._measured(x, mean_of)
 
     def variance(self, x: Tensor) -> Tensor:
-        return self._measured(
-            x, lambda s, own: s.variance(own) if isinstance(s, RandomSensor) else torch.zeros_like(s.expected(own))
-        )
+        def spread(sensor: Sensor, own: Tensor) -> Tensor:
+            result: Tensor = sensor.variance(own) if draws(sensor) else torch.zeros_like(sensor.expected(own))  # type: ignore[operator]
+            return result
+
+        return self._measured(x, spread)
+
+    def gaussian(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """The normal surrogates of the sensors, with their covariance between bins."""
+        return self._measured(x, lambda sensor, own: normal_of(sensor, own, generator))
 
     def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        def draw(sensor: Sensor, own: Tensor) -> Tensor:
-            return sensor.sample(own, generator) if isinstance(sensor, RandomSensor) else sensor.expected(own)
-
         with torch.no_grad():
-            return self._measured(x, draw)
+            return self._measured(x, lambda sensor, own: draw_of(sensor, own, generator))
 
     def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
         parts, places = [], []
         for sensor, place in self._apart(x):
-            if not isinstance(sensor, RandomSensor):
+            if not draws(sensor):
                 raise GradientError(f"PixelGroups.log_prob: expected random sensors, got {type(sensor).__name__}.")
             seen, own = (v.flatten(-2).index_select(-1, place).unsqueeze(-2) for v in (measurement, x))
-            parts.append(sensor.log_prob(seen, own).squeeze(-2))
+            parts.append(sensor.log_prob(seen, own).squeeze(-2))  # type: ignore[operator]
             places.append(place)
         return self._together(parts, places)
 
@@ -154,7 +168,7 @@ class PixelGroups(RandomSensor):
 
         def measure(sensor: Sensor, own: Tensor) -> Tensor:
             with ScoreFunction() as score:
-                result: Tensor = sensor(own, generator=generator)
+                result = measurement_of(sensor, own, generator)
             pixels = (*own.shape[:-3], own.shape[-1])
             found = [value.squeeze(-2) for value in score._log_probs]
             scores.append(_sum(found) if found else own.new_zeros(pixels))

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import holds
 from torchtransient.quantities import shown
+from torchtransient.sensing.given import no_arrays
 from torchtransient.sensing.layout import check_number
 
 
@@ -17,10 +18,12 @@ def check_map(
     value: object, name: str, where: str, *, low: float = 0.0, high: float = math.inf, open_low: bool = False
 ) -> float | Tensor:
     """A number in [low, high] as a float, or a tensor of them as it is, with its gradient; floating, else float64.
+    An array is a tensor.
 
     A map is (), (H, W) or (..., C, H, W). UnitError outside the range and for NaN, ShapeError for one dimension, which
     could be rows as well as channels.
     """
+    value = no_arrays(value, where)
     if not isinstance(value, Tensor):
         return check_number(value, name, where, low=low, high=high, open_low=open_low)  # type: ignore[arg-type]
     if value.is_complex() or value.dtype == torch.bool:
@@ -47,6 +50,26 @@ def keep_map(module: nn.Module, name: str, value: float | Tensor) -> None:
         module.register_buffer(name, value.detach().double())
     else:
         setattr(module, name, value)
+
+
+def kept_map(module: nn.Module, name: str, *, high: float = math.inf) -> float | Tensor:
+    """A number or map that a sensor keeps, in float64, for a measurement.
+
+    UnitError where what was in [0, high] when the sensor was made is not any more: a parameter that a step of an
+    optimizer took out of it, or a map that `torch.func.functional_call` put in its place.
+    """
+    value: float | Tensor = getattr(module, name)
+    if isinstance(value, Tensor):
+        plain = value.detach()
+        inside = (plain >= 0) & (plain <= high)
+        if not holds(inside):
+            where, wrong = type(module).__name__, float(plain[~inside].flatten()[0])
+            way = "Bounded()" if high < math.inf else "Positive(function='exp')"
+            raise UnitError(
+                f"{where}: expected every {name} in [0, {high:g}], got {wrong:g}. What keeps a learnt one inside: "
+                f"torch.nn.utils.parametrize.register_parametrization(sensor, {name!r}, tt.parametrize.{way})."
+            )
+    return wide(value)
 
 
 def wide(value: float | Tensor) -> float | Tensor:

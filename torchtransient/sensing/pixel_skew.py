@@ -6,22 +6,20 @@ the one after that.
 
 from __future__ import annotations
 
-from typing import Literal
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
 from torchtransient.axes import TimeAxis
 from torchtransient.floating import in_single
-from torchtransient.sensing.added_counts import is_whole
 from torchtransient.sensing.layout import TIME, bin_width_of, check_seconds, check_transient
+from torchtransient.sensing.moved_counts import MovedCounts
 from torchtransient.sensing.pixel_maps import check_map, pixels_of
-from torchtransient.sensing.policies import GradPolicy, gaussian_noise, record_score, straight_through
-from torchtransient.sensing.sensor import PhysicalModule, RandomSensor, Sensor
+from torchtransient.sensing.policies import GradPolicy, gaussian_noise
+from torchtransient.sensing.sensor import PhysicalModule, Sensor
 from torchtransient.sensing.thinning import halve
-from torchtransient.sensing.time_convolution import check_choice
-
-Boundary = Literal["periodic", "zero"]
+from torchtransient.sensing.time_convolution import Boundary, check_choice
 
 
 def _whole_and_part(delay_bins: Tensor | float, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -84,6 +82,47 @@ class _Delays(PhysicalModule):
         return self.delay_ps.double() * (1e-12 / self.bin_width_s)
 
 
+@dataclass(frozen=True)
+class Delayed:
+    """Counts of every pixel later by `whole` bins, and a share `part` of them by one more: (..., 1, H, W) or ()."""
+
+    whole: Tensor
+    part: Tensor
+    boundary: Boundary
+
+    @property
+    def learnt(self) -> bool:
+        return self.part.requires_grad
+
+    def detached(self) -> Delayed:
+        return Delayed(self.whole, self.part.detach(), self.boundary)
+
+    def mean(self, x: Tensor) -> Tensor:
+        first = _moved(x, self.whole, self.boundary)
+        moved: Tensor = first + self.part.to(x.dtype) * (_moved(x, self.whole + 1, self.boundary) - first)
+        return moved
+
+    def noise(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        late = gaussian_noise(x * (self.part * (1 - self.part)).to(x.dtype), generator)
+        return _moved(late, self.whole + 1, self.boundary) - _moved(late, self.whole, self.boundary)
+
+    def draw(self, counts: Tensor, generator: torch.Generator | None, tally: bool) -> tuple[Tensor, Tensor | None]:
+        """Each goes to the earlier or the later bin; tallies are (2, ..., H, W)."""
+        counts = counts.contiguous()
+        late = halve(counts, self.part.detach().to(counts.dtype).expand(counts.shape).contiguous(), generator)
+        early = counts - late
+        moved = _moved(early, self.whole, self.boundary) + _moved(late, self.whole + 1, self.boundary)
+        return moved, torch.stack([early.sum(TIME), late.sum(TIME)]) if tally else None
+
+    def log_prob(self, tallies: Tensor) -> Tensor:
+        early, late = tallies.double()
+        part = self.part.squeeze(TIME) if self.part.ndim else self.part
+        # no count takes a way of probability 0
+        tiny = torch.finfo(torch.float64).tiny
+        ways: Tensor = late * part.clamp_min(tiny).log() + early * torch.log1p(-part)
+        return ways
+
+
 class PixelSkew(Sensor):
     """Light or rates of every pixel later by a delay of its own; see `shift_time`. Deterministic, linear in the light.
 
@@ -121,14 +160,12 @@ class PixelSkew(Sensor):
         return f"delays={tuple(self.delays.delay_ps.shape)}, boundary={self.boundary!r}"
 
 
-class DetectionSkew(RandomSensor):
+class DetectionSkew(MovedCounts):
     """Detections (counts) of every pixel later by a delay of its own: a signal tree, a converter that starts late.
 
     Draws move whole counts one by one: each of a bin goes to the earlier or the later of the two bins that its delay
-    reaches, a binomial number. Counts that are not whole are means of another sensor, and are moved as `expected` does.
-    Arguments as of `PixelSkew`. Policies: all four. "gaussian" has the covariance of the binomials; "score" the
-    probabilities of the moves that were drawn, for learnable delays, while the counts given pass with the gradient of
-    the mean.
+    reaches, a binomial number. Arguments as of `PixelSkew`; policies as of `MovedCounts`, the score that of learnable
+    delays. Raises UnitError, ShapeError as `PixelSkew`, and UnitError for draws of NaN or infinity.
     """
 
     takes, gives = ("counts",), "counts"
@@ -164,48 +201,9 @@ class DetectionSkew(RandomSensor):
         split = x * (part * (1 - part)).to(x.dtype)
         return _moved(split, whole, self.boundary) + _moved(split, whole + 1, self.boundary)
 
-    def gaussian(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    def moves(self, x: Tensor) -> Delayed:
         whole, part = _whole_and_part(self._delay_bins(x), x)
-        late = gaussian_noise(x * (part * (1 - part)).to(x.dtype), generator)
-        noise = _moved(late, whole + 1, self.boundary) - _moved(late, whole, self.boundary)
-        return self.expected(x) + noise
-
-    def _drawn(self, x: Tensor, generator: torch.Generator | None) -> tuple[Tensor, Tensor | None]:
-        """The counts moved, and how many of each bin went to the later one; None where there are means to move."""
-        with torch.no_grad():
-            delay = self._delay_bins(x)
-            work = x.detach().contiguous()
-            if not is_whole(work):
-                return shift_time(work, delay, boundary=self.boundary), None
-            whole, part = _whole_and_part(delay, x)
-            late = halve(work, part.to(work.dtype).expand(work.shape).contiguous(), generator)
-            moved = _moved(work - late, whole, self.boundary) + _moved(late, whole + 1, self.boundary)
-            return moved, late
-
-    def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        return self._drawn(x, generator)[0]
-
-    def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        if self.grad != "score":
-            return super().forward(x, generator)
-        moved, late = self._drawn(x, generator)
-        if late is None:
-            return self.expected(x)
-        if not torch.is_grad_enabled():
-            return moved
-        _, part = _whole_and_part(self._delay_bins(x), x)
-
-        def log_prob() -> Tensor:
-            # no count takes a way of probability 0
-            tiny = torch.finfo(torch.float64).tiny
-            ways = late.double() * part.clamp_min(tiny).log() + (x.detach() - late).double() * torch.log1p(-part)
-            return ways.sum(TIME)
-
-        if part.requires_grad:
-            record_score(log_prob, type(self).__name__)
-        with torch.no_grad():
-            fixed = self._delay_bins(x)
-        return straight_through(moved, shift_time(x, fixed, boundary=self.boundary)) if x.requires_grad else moved
+        return Delayed(whole, part, self.boundary)
 
     def extra_repr(self) -> str:
         return f"delays={tuple(self.delays.delay_ps.shape)}, boundary={self.boundary!r}, {super().extra_repr()}"

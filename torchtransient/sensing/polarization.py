@@ -22,6 +22,8 @@ from torch.nn import functional
 
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
+from torchtransient.quantities import as_number
+from torchtransient.sensing.given import refuse_cut_off
 from torchtransient.sensing.layout import check_number, check_tensor, product, without_autocast
 from torchtransient.sensing.sensor import Sensor
 from torchtransient.stokes import TRANSIENT_DIM, circular_polarizer, linear_polarizer
@@ -95,12 +97,14 @@ def _by_rows(matrix: Tensor, x: Tensor) -> Tensor:
 # ------------------------------------------------------------------------------------------------------ physicality
 
 
+@in_single
 def unphysical_part(stokes: Tensor, dim: int = TRANSIENT_DIM) -> Tensor:
     """``max(|S123| - S0, 0)``, without ``dim``: zero for every Stokes vector that light can have. ShapeError."""
     s0, length = _parts(stokes, dim)
     return (length - s0).clamp_min(0)
 
 
+@in_single
 def project_physical(stokes: Tensor, dim: int = TRANSIENT_DIM) -> Tensor:
     """The nearest Stokes vectors that light can have (S0 >= |S123|), in the same shape.
 
@@ -250,11 +254,13 @@ class Analysers(Sensor):
 
 
 def _extinction(extinction_ratio: float, where: str) -> float:
-    if not isinstance(extinction_ratio, (int, float)) or not extinction_ratio >= 1:
+    refuse_cut_off(extinction_ratio, "extinction_ratio", where)
+    ratio = as_number(extinction_ratio)
+    if ratio is None or not ratio >= 1:
         raise UnitError(
             f"{where}: expected extinction_ratio >= 1 (power along over power across), got {extinction_ratio!r}."
         )
-    return 1 / extinction_ratio
+    return 1 / ratio
 
 
 def _check_stokes(stokes: Tensor, where: str) -> None:

@@ -33,6 +33,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import GradientError, ShapeError
+from torchtransient.floating import in_single
 
 GradPolicy = Literal["expected", "gaussian", "straight_through", "score"]
 GRAD_POLICIES: tuple[GradPolicy, ...] = get_args(GradPolicy)
@@ -55,6 +56,7 @@ def standard_normal(like: Tensor, generator: torch.Generator | None = None) -> T
     return torch.randn(like.shape, dtype=like.dtype, device=like.device, generator=generator)
 
 
+@in_single
 def gaussian_noise(variance: Tensor, generator: torch.Generator | None = None) -> Tensor:
     """Zero-mean normal noise of the given variance (any shape, counts squared), differentiable in the variance.
 

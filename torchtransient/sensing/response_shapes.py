@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
+
+from torchtransient.errors import UnitError
+from torchtransient.sensing.layout import check_number
 
 FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))  # 2.3548
 
@@ -106,10 +110,17 @@ def resample_counts(counts: Tensor, width_s: float, edges_s: Tensor, start_s: fl
     return value.diff()
 
 
-def remove_floor(counts: Tensor) -> Tensor:
-    """A measured response without its background: minus the median of all bins, not below 0, sum 1. float64.
+def above_floor(counts: Tensor, floor: float | bool, where: str) -> Tensor:
+    """A measured histogram without its background, not below 0, sum 1: float64.
 
-    The median is the background when the response fills less than half of the bins.
+    `floor` True: the median of all bins, which is the background when the response fills less than half of them; False:
+    none; a number: so many counts of every bin. Raises UnitError for other floors, and where nothing is left.
     """
-    clean = (counts.to(torch.float64) - counts.to(torch.float64).median()).clamp_min(0)
+    numbers = counts.to(torch.float64)
+    level = floor if isinstance(floor, (bool, np.bool_)) else check_number(floor, "floor", where)
+    if isinstance(level, (bool, np.bool_)):
+        level = float(numbers.median()) if level else 0.0
+    clean = (numbers - level).clamp_min(0)
+    if not float(clean.sum()) > 0:
+        raise UnitError(f"{where}: expected counts above the floor of {level:g}, got none.")
     return clean / clean.sum()

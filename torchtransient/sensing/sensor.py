@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from torchtransient.errors import GradientError, ShapeError
 from torchtransient.floating import in_single
+from torchtransient.sensing.given import careful_init
 from torchtransient.sensing.layout import TIME, check_generator
 from torchtransient.sensing.policies import (
     GradPolicy,
@@ -26,7 +27,15 @@ class PhysicalModule(nn.Module):
 
     In bfloat16 the logarithm of 60 ps is that of 62 ps, and 1e5 dark counts are infinite in float16. Devices, float32
     and float64 are followed; modules of another kind inside follow everything.
+
+    Constructors of every subclass take arrays where they take tensors. An argument that requires a gradient is kept
+    with it, or refused with GradientError: see `given`.
     """
+
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        super().__init_subclass__(**keywords)
+        if "__init__" in cls.__dict__:
+            cls.__init__ = careful_init(cls.__dict__["__init__"])  # type: ignore[method-assign]
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         def careful(value: Tensor) -> Tensor:

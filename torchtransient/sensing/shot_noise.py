@@ -30,6 +30,7 @@ def poisson(mean: Tensor, generator: torch.Generator | None = None) -> Tensor:
     return torch.poisson(mean, generator=generator)
 
 
+@in_single
 def poisson_log_prob(counts: Tensor, mean: Tensor) -> Tensor:
     """Log-probability of counts under Poisson means, elementwise; finite gradients at mean 0 with count 0.
 

@@ -7,6 +7,7 @@ multinomial. Sources: Coates, J. Phys. E 1 (1968); Gupta et al., Photon-flooded 
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -15,10 +16,18 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
-from torchtransient.sensing.dead_time_cycle import check_dead_bins, detected_rows, double_detections
-from torchtransient.sensing.dead_time_draws import DrawnRows, draw_cycles, gaussian_cycles, score_of_cycles
+from torchtransient.sensing.dead_time_cycle import check_dead_bins, double_detections
+from torchtransient.sensing.dead_time_draws import (
+    DrawnRows,
+    draw_cycles,
+    gaussian_cycles,
+    sample_cycles,
+    score_of_cycles,
+)
 from torchtransient.sensing.dead_time_inverse import armed_time, check_cycles, rates_of_counts
+from torchtransient.sensing.dead_time_means import detected_columns
 from torchtransient.sensing.draws import check_rates, sample_first_photons
+from torchtransient.sensing.given import refuse_cut_off
 from torchtransient.sensing.layout import (
     TIME,
     bin_width_of,
@@ -64,6 +73,15 @@ def _image(rows: Tensor, like: Tensor) -> Tensor:
     return rows.view(like.movedim(TIME, -1).shape).movedim(-1, TIME)
 
 
+def _columns(x: Tensor) -> Tensor:
+    """(..., T, H, W) -> columns (T, P), float64."""
+    return x.to(torch.float64).movedim(TIME, 0).reshape(x.shape[TIME], -1)
+
+
+def _of_columns(columns: Tensor, like: Tensor) -> Tensor:
+    return columns.view(like.movedim(TIME, 0).shape).movedim(0, TIME)
+
+
 def detections_with_dead_time(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
     """Detections per cycle and bin, armed at the start of each cycle, with dead time: float64 (..., C, T, H, W).
 
@@ -79,7 +97,7 @@ def detections_with_dead_time(rate: Tensor, dead_bins: Tensor | float) -> Tensor
     if rate.numel() == 0:
         return rate.to(torch.float64)
     dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=rate.device)
-    return _image(detected_rows(_rows(rate), dead), rate)
+    return _of_columns(detected_columns(_columns(rate), dead), rate)
 
 
 @in_single
@@ -96,6 +114,7 @@ def coates(counts: Tensor, cycles: int, dead_bins: float | None = None) -> Coate
     check_transient(counts, "coates")
     number = check_count(cycles, "cycles", "coates")
     if dead_bins is not None and counts.numel():
+        refuse_cut_off(dead_bins, "dead_bins", "coates")
         rate, valid = rates_of_counts(_rows(counts), number, float(dead_bins))
         return CoatesEstimate(_image(rate, counts).to(counts.dtype), _image(valid, counts))
     armed = number - sum_before(counts)
@@ -122,7 +141,13 @@ def sample_detections(
     rate = rate.detach()
     if dead_bins is None:
         return sample_first_photons(number, rate, generator)
-    return _drawn(rate, number, dead_bins, generator)[0]
+    check_dead_bins(dead_bins)
+    check_rates(rate, "sample_detections")
+    if rate.numel() == 0:
+        return rate.clone()
+    dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=rate.device)
+    counts = sample_cycles(_columns(rate), dead, number, generator)
+    return _of_columns(counts, rate).to(rate.dtype)
 
 
 def _drawn(
@@ -179,11 +204,11 @@ class SynchronousSPAD(RandomSensor):
         if axis is not None or bin_width_s is not None:
             self.bin_width_s = bin_width_of(axis, bin_width_s, "SynchronousSPAD")
         self.num_bins = None if axis is None else axis.num_bins
-        self.dead_time_s = dead_time_s
+        self.dead_time_s: float | None = None
         self.dead_bins: float | None = None
         if dead_time_s is not None:
-            dead = check_seconds(dead_time_s, "dead_time_s", "SynchronousSPAD")
-            self.dead_bins = dead / bin_width_of(axis, bin_width_s, "SynchronousSPAD")
+            self.dead_time_s = check_seconds(dead_time_s, "dead_time_s", "SynchronousSPAD")
+            self.dead_bins = self.dead_time_s / bin_width_of(axis, bin_width_s, "SynchronousSPAD")
             check_dead_bins(self.dead_bins)
         if gate is not None:
             if not isinstance(gate, Tensor) or gate.ndim != 1:
@@ -266,6 +291,18 @@ class SynchronousSPAD(RandomSensor):
         return f"cycles={self.cycles}, dead_time_s={self.dead_time_s}, {super().extra_repr()}"
 
 
+def log_of_firing(rate: Tensor) -> Tensor:
+    """log(1 - exp(-rate)), the log-probability that an armed detector fires, with all digits of dark and bright bins.
+
+    Differentiable; -inf at rate 0. Source: Maechler, Accurately computing log(1 - exp(-|a|)) (2012).
+    """
+    bright = rate > math.log(2)
+    half = torch.full_like(rate, 0.5)
+    dark = torch.where(bright, half, rate)
+    many = torch.where(bright, rate, 2 * half)
+    return torch.where(bright, torch.log1p(-torch.exp(-many)), (-torch.expm1(-dark)).log())
+
+
 def exposed_cycles(counts: Tensor, cycles: int, dead_bins: float | None) -> Tensor:
     """Cycles that could fire in each bin (..., T, H, W), times the part of it in which they could, float64."""
     if dead_bins is None:
@@ -301,12 +338,13 @@ def first_photon_log_prob(
         sooner, exposed = time.sooner(r), time.exposed
     quiet = exposed - n
     # with a dead time the armed cycles are known on average only
+    refuse_cut_off(dead_bins, "dead_bins", where)
     check_cycles(quiet, number, -0.5 if dead_bins is None else -0.5 - 6 * number**0.5, where)
     quiet = quiet.clamp_min(0)
     hit = n != 0
     # where on the input: the logarithm of 0 has no finite gradient
-    fire = torch.where(hit, -torch.expm1(-r), torch.ones_like(r))
-    value = torch.where(hit, n * fire.log(), torch.zeros_like(r)) - r * quiet - sooner
+    fire = log_of_firing(torch.where(hit, r, torch.ones_like(r)))
+    value = torch.where(hit, n * fire, torch.zeros_like(r)) - r * quiet - sooner
     if constant:
-        value = value + torch.lgamma(n + quiet + 1) - torch.lgamma(n + 1) - torch.lgamma(quiet + 1)
+        value = value + (torch.lgamma(n + quiet + 1) - torch.lgamma(n + 1) - torch.lgamma(quiet + 1))
     return value.to(rate.dtype)

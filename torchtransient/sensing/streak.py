@@ -73,4 +73,5 @@ class StreakCamera(Compose):
             camera,
         ]
         super().__init__([s for s in stages if s is not None], grad=grad)
+        self.boundary: Boundary = boundary
         self.axis, self.num_bins = axis, axis.num_bins

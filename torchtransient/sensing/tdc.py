@@ -87,8 +87,6 @@ class TDC(MovedCounts):
     ShapeError when T does not fit.
     """
 
-    gives = "the same"
-
     code_widths: Tensor
     bands: Tensor
 
@@ -117,10 +115,15 @@ class TDC(MovedCounts):
         check_choice(acts_on, ActsOn, "acts_on", "TDC")
         check_choice(boundary, Boundary, "boundary", "TDC")
         self.acts_on: ActsOn = acts_on
+        if acts_on == "detections":
+            self.takes, self.gives = ("counts",), "counts"
+        else:
+            self.takes, self.gives = ("radiance", "rate", "electrons"), "the same"
         self.boundary: Boundary = boundary
         self.sliding_scale = check_count(sliding_scale, "sliding_scale", "TDC")
         self.offset_bins = check_number(offset_bins, "offset_bins", "TDC", low=-1e6)
         self.dither = bool(dither)
+        self.num_bins = widths.shape[0]
         self.register_buffer("code_widths", widths)
         self.first, bands = self._bands(widths)
         # not saved: the band of other widths may have another shape, and begins at another bin
@@ -165,10 +168,16 @@ class TDC(MovedCounts):
         """(T,) deviation of each code's end from where it should be, in bins."""
         return self.differential_nonlinearity.cumsum(0)
 
+    def check_bins(self, x: object) -> None:
+        if isinstance(x, Tensor) and x.ndim >= 4 and x.shape[TIME] != self.num_bins:
+            raise ShapeError(
+                f"TDC: expected T = {self.num_bins} as in code_widths, got {x.shape[TIME]} of {tuple(x.shape)}. Make "
+                "one width for every bin of the light."
+            )
+
     def _check(self, x: Tensor) -> Tensor:
-        bins = check_transient(x, "TDC").shape[TIME]
-        if self.bands.shape[0] != bins:
-            raise ShapeError(f"TDC: expected T = {self.bands.shape[0]} as in code_widths, got {bins}.")
+        check_transient(x, "TDC")
+        self.check_bins(x)
         return x
 
     def expected(self, x: Tensor) -> Tensor:

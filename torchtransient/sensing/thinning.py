@@ -1,9 +1,10 @@
-"""Binomial draws for whole histograms: exact, and much cheaper than `torch.binomial` where most results are 0 or 1.
+"""Binomial draws for whole histograms: exact, and much cheaper than `torch.binomial`.
 
-`torch.binomial` spends 70 to 120 ns a draw on the CPU. Two kinds of draws that histograms need by the million take
-less: rare events (`thin`), where one comparison with a random number says "none" for most entries, and splits of a few
-counts into nearly equal halves (`halve`), by counting random bits and turning the few coins that the bias asks for.
-Both draw from the exact distribution: the cheap numbers only sort out the entries of which nothing more need be known.
+`torch.binomial` spends 40 to 120 ns a draw on the CPU. Two kinds of draws that histograms need by the million take
+less: rare events (`thin`), where one comparison with a random number says "none" for most entries, or a table gives the
+number (`add_passing`); and splits of counts into two places (`halve`), by tables and the few events that the steps of
+the tables leave out. All draw from the exact distribution: the cheap numbers only sort out the entries of which
+nothing more need be known.
 """
 
 from __future__ import annotations
@@ -13,16 +14,17 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-_WORTH_TOSSING = 1 << 15  # draws, below which many short operations cost more than they save
+from torchtransient.errors import UnitError
+from torchtransient.sensing.binomial_tables import FEW_TRIALS, sixteen_bits, table_of, up_to_share
+
+_WORTH_TABLES = 1 << 15  # draws, below which many short operations cost more than they save
+_WORTH_ONE_TABLE = 1 << 13  # ... of one probability, which may be new in every call
 _BLOCK = 1 << 17  # entries at a time, so that temporaries stay in the cache
 _ROOM = 2e-6  # for the rounding of probabilities and uniform numbers in single precision
 _HEAVY = 6.0  # expected events of an entry, above which torch.binomial is cheaper than inversion
 _GRID = 65536.0  # steps of a 16 bit number
-_BITS = 31  # random bits of an int32 that is not negative
-_MOST_WORDS = 2  # as many as `_coins` counts together
-_TURNED = 2.0  # number of coins an entry has to turn, above which tossing them does not pay
-_FEW_MISFITS = 0.04  # share of entries with too many counts, above which more random bits are drawn
-_MOST_MISFITS = 0.6  # ... above which tossing coins does not pay at all
+_LARGE = 1500  # trials, above which torch.binomial is cheaper than several looks into a table
+_MOST_MISFITS = 0.6  # share of entries with too many counts, above which tables do not pay
 
 
 class Events(NamedTuple):
@@ -52,12 +54,62 @@ def thin(counts: Tensor, probability: Tensor | float, generator: torch.Generator
     """
     flat = counts.detach().reshape(-1)
     p = torch.as_tensor(probability, dtype=torch.float64, device=flat.device).detach().reshape(-1)
+    if p.numel() == 1 and flat.device.type == "cpu" and flat.numel() >= _WORTH_ONE_TABLE and 0 <= float(p) <= 0.5:
+        return _thin_by_table(flat, float(p), generator)
     found = []
     for begin in range(0, max(flat.numel(), 1), _BLOCK):
         at = slice(begin, begin + _BLOCK)
         candidates = _sift(flat[at], p if p.numel() == 1 else p[at], generator)
         found.append(candidates._replace(place=candidates.place + begin))
     return _decide(_joined(found), flat.dtype, generator)
+
+
+def add_passing(counts: Tensor, probability: float, into: Tensor, generator: torch.Generator | None = None) -> None:
+    """Add to `into` how many of `counts` pass, each with `probability` in [0, 1/2]. Binomial, no gradient.
+
+    Both of one shape, float32 or float64, `into` contiguous; meant for some 1e5 entries at a time.
+    """
+    if counts.device.type == "cpu" and counts.numel() >= _WORTH_ONE_TABLE:
+        trials, large, others = _apart(counts.reshape(-1), probability, generator)
+        table = table_of(probability, small=counts.numel() < _BLOCK // 4)
+        into.view(-1).add_(table.draw(0, trials, generator)).index_add_(0, large, others)
+        return
+    events = thin(counts, probability, generator)
+    into.view(-1).scatter_add_(0, events.place, events.number)
+
+
+def _thin_by_table(flat: Tensor, probability: float, generator: torch.Generator | None) -> Events:
+    places, numbers = [], []
+    table = table_of(probability, small=flat.numel() < _BLOCK // 4)
+    for begin in range(0, flat.numel(), _BLOCK):
+        trials, large, others = _apart(flat[begin : begin + _BLOCK], probability, generator)
+        place, number = table.draw_some(trials, generator)
+        places.append(place.add_(begin))
+        numbers.append(number.to(flat.dtype))
+        if large.numel():
+            places.append(large + begin)
+            numbers.append(others)
+    place, number = torch.cat(places), torch.cat(numbers)
+    if place.numel() and not bool((place[1:] > place[:-1]).all()):
+        place, order = place.sort()
+        number = number[order]
+    return Events(place, number)
+
+
+def _apart(
+    counts: Tensor, probability: float, generator: torch.Generator | None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Trials (K,) int32 without those of large counts; the places of these, and their numbers from torch.binomial."""
+    low, high = torch.aminmax(counts)
+    if not float(low) >= 0:
+        raise UnitError(f"thin: expected counts >= 0, got {float(low):g}. Look for NaN or a difference upstream.")
+    trials = counts.to(torch.int32)
+    if float(high) <= _LARGE:
+        return trials, counts[:0].long(), counts[:0]
+    large = (counts > _LARGE).nonzero().squeeze(-1)
+    trials[large] = 0
+    many = counts[large]
+    return trials, large, torch.binomial(many, torch.full_like(many, probability), generator=generator)
 
 
 def _sift(n: Tensor, p: Tensor, generator: torch.Generator | None) -> _Candidates:
@@ -67,12 +119,6 @@ def _sift(n: Tensor, p: Tensor, generator: torch.Generator | None) -> _Candidate
     bits = sixteen_bits(n, generator)
     place = (bits <= steps).nonzero().squeeze(-1)
     return _Candidates(place, n[place], p if p.numel() == 1 else p[place], bits[place])
-
-
-def sixteen_bits(like: Tensor, generator: torch.Generator | None = None) -> Tensor:
-    """One int16, uniform over all its values, for each entry of `like`: four out of every random 64 bits."""
-    words = torch.empty((like.numel() + 3) // 4, dtype=torch.int64, device=like.device)
-    return words.random_(-(2**63), None, generator=generator).view(torch.int16)[: like.numel()]
 
 
 def _joined(parts: list[_Candidates]) -> _Candidates:
@@ -141,87 +187,43 @@ def _count_down(many: Tensor, share: Tensor, u: Tensor, generator: torch.Generat
 def halve(counts: Tensor, share: Tensor, generator: torch.Generator | None = None) -> Tensor:
     """How many of `counts` go to the first of two places that gets each with probability `share`: binomial.
 
-    No gradient. Exact for any share in [0, 1], cheap for counts below about 60 and shares near one half; other draws,
-    few draws, and all draws on other devices than the CPU, are those of `torch.binomial`. Same shapes and dtype,
-    float32 or float64.
+    No gradient. Exact for any share in [0, 1], cheap for counts up to 127; other draws, few draws, and all draws
+    on other devices than the CPU, are those of `torch.binomial`. Same shapes and dtype, float32 or float64.
 
-    A fair coin is tossed for every count; those on the side that is too unlikely are turned with |2 share - 1|.
+    Tables give the number for a share just below the one that is meant, or below its complement; of the trials that
+    are left each is added with the small probability that is missing.
     """
     n, p = counts.detach(), share.detach()
-    if n.device.type != "cpu" or n.numel() < _WORTH_TOSSING:
+    if n.device.type != "cpu" or n.numel() < _WORTH_TABLES:
         return torch.binomial(n, p.contiguous(), generator=generator)
     flat, shares = n.reshape(-1), p.reshape(-1)
     out = torch.empty_like(flat)
     found: list[_Candidates] = []
     for begin in range(0, flat.numel(), _BLOCK):
         at = slice(begin, begin + _BLOCK)
-        coins = _coins(flat[at], shares[at], generator)
-        if coins is None:
-            out[at] = torch.binomial(flat[at], shares[at], generator=generator)
+        many, p = flat[at], shares[at]
+        less = torch.minimum(p, 1 - p)
+        # NaN fits nowhere and is torch.binomial's to refuse
+        if float(many.amax()) <= FEW_TRIALS and float(less.amin()) >= 0:
+            unfit = flat[:0].long()
+        else:
+            unfit = (many <= FEW_TRIALS).logical_and_(less >= 0).logical_not_().nonzero().squeeze(-1)
+        if unfit.numel() > _MOST_MISFITS * many.numel():
+            out[at] = torch.binomial(many, p, generator=generator)
             continue
-        tilt, number, heads, unfit = coins
-        out[at] = heads
-        if unfit is not None:
-            out[at][unfit] = torch.binomial(flat[at][unfit], shares[at][unfit], generator=generator)
-        # heads count for the first place; tails become heads where it is the likely one, heads tails where not
-        to_first = tilt >= 0
-        candidates = _sift(torch.where(to_first, number - heads, heads), tilt.abs(), generator)
-        sign = to_first[candidates.place]
-        found.append(candidates._replace(place=(candidates.place + begin) * 2 + sign))
+        trials = many.to(torch.int32)
+        if unfit.numel():
+            trials[unfit], less[unfit] = 0, 0.0
+        number, left, missing = up_to_share(trials, less, generator)
+        likely = p > 0.5
+        candidates = _sift(left.to(flat.dtype), missing, generator)
+        # not `where`, which guesses at every entry
+        out[at] = trials.sub_(number, alpha=2).mul_(likely).add_(number)
+        if unfit.numel():
+            out[at][unfit] = torch.binomial(many[unfit], p[unfit], generator=generator)
+        found.append(candidates._replace(place=(candidates.place + begin) * 2 + likely[candidates.place]))
     if found:
-        turned = _decide(_joined(found), flat.dtype, generator)
-        place = turned.place >> 1
-        out[place] += turned.number * ((turned.place & 1) * 2 - 1)
+        added = _decide(_joined(found), flat.dtype, generator)
+        place = added.place >> 1
+        out[place] += added.number * (1 - (added.place & 1) * 2)
     return out.view(n.shape)
-
-
-def _coins(
-    n: Tensor, p: Tensor, generator: torch.Generator | None
-) -> tuple[Tensor, Tensor, Tensor, Tensor | None] | None:
-    """(2 p - 1, coins tossed, heads, indices of entries that toss none); None if it does not pay.
-
-    Entries with too many counts, or too many coins to turn, toss none.
-    """
-    tilt = 2 * p - 1
-    turned = (n * tilt).abs_()
-    for words in range(1, _MOST_WORDS + 1):
-        fits = (turned <= 2 * _TURNED).logical_and_(n <= _BITS * words)
-        misfits = n.numel() - int(torch.count_nonzero(fits))
-        if misfits <= _FEW_MISFITS * n.numel():
-            break
-    if misfits > _MOST_MISFITS * n.numel():
-        return None
-    coins, unfit = n, None
-    if misfits:
-        coins, unfit = n * fits, (~fits).nonzero().squeeze(-1)
-    left = coins.to(torch.int32)
-    if words == 1:
-        nibbles = _nibble_counts(_tossed(left, generator))
-    else:
-        now = left.clamp_max(_BITS)
-        nibbles = _nibble_counts(_tossed(now, generator))
-        # two words have at most eight ones in a nibble
-        nibbles += _nibble_counts(_tossed(left.sub_(now), generator))
-    heads = _sum_of_nibbles(nibbles)
-    return tilt, coins, heads.to(n.dtype), unfit
-
-
-def _tossed(coins: Tensor, generator: torch.Generator | None) -> Tensor:
-    """As many random bits as there are coins (int32, up to 31), the others 0."""
-    bits = torch.empty_like(coins).random_(generator=generator)  # 0 to 2^31 - 1
-    # a shift by 31 leaves no bit
-    return bits.bitwise_right_shift_(_BITS - coins)
-
-
-def _nibble_counts(v: Tensor) -> Tensor:
-    """Number of ones of every 4 bits of int32 values >= 0, in their place. `v` is overwritten."""
-    v -= (v >> 1).bitwise_and_(0x55555555)
-    pairs = (v >> 2).bitwise_and_(0x33333333)
-    return v.bitwise_and_(0x33333333).add_(pairs)
-
-
-def _sum_of_nibbles(v: Tensor) -> Tensor:
-    """Sum of the eight nibbles, each at most 8. `v` is overwritten."""
-    v = (v >> 4).bitwise_and_(0x0F0F0F0F).add_(v.bitwise_and_(0x0F0F0F0F))
-    # the product holds the sum of all bytes, at most 64, in the highest one
-    return v.mul_(0x01010101).bitwise_right_shift_(24)

@@ -16,10 +16,13 @@ class WrappedDetector(RandomSensor):
     """A random sensor whose draws are made by its `detector`. `grad` is the detector's, and sets it."""
 
     detector: RandomSensor
+    # cycles by which counts of the whole exposure and pixel are divided; None: those of the detector
+    exposure_cycles: float | None = None
 
     def __init__(self, detector: RandomSensor, grad: GradPolicy | None = None) -> None:
         super(RandomSensor, self).__init__()
         self.detector = detector
+        self.bin_width_s, self.num_bins = bins_of(detector)
         self.bin_width_s, self.num_bins = bins_of(detector)
         if grad is not None:
             self.grad = grad
@@ -52,6 +55,9 @@ class WrappedDetector(RandomSensor):
     def variance(self, x: Tensor) -> Tensor:
         return self.detector.variance(self.rate(x))
 
+    def gaussian(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        return self.detector.gaussian(self.rate(x), generator)
+
     def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
         return self.detector.log_prob(measurement, self.rate(x))
 
@@ -65,18 +71,20 @@ class WrappedDetector(RandomSensor):
         return result
 
 
-def several_of(detector: RandomSensor, number: int) -> RandomSensor:
-    """As many detectors alike as one whose counts are their sum, in the same light each: the cycles of all of them,
-    and the same parameters.
+def of_cycles(detector: RandomSensor, cycles: int, share: float = 1.0) -> RandomSensor:
+    """A detector with the numbers of another one (its parameters are the same tensors) for as many cycles.
+
+    `share`: what it has of light, and of counts, that are given for a whole pixel.
     """
     other = copy.copy(detector)
     if isinstance(other, WrappedDetector):
+        other.exposure_cycles = (other.exposure_cycles or cycles_of(detector)) / share
         other._modules = dict(other._modules)  # its own children
-        other.detector = several_of(other.detector, number)
+        other.detector = of_cycles(other.detector, cycles)
     else:
-        other.cycles = cycles_of(detector) * number  # type: ignore[assignment]
         if hasattr(other, "trains"):  # detections of different detectors know nothing of one another
-            other.trains = other.trains * number  # type: ignore[assignment, operator]
+            other.trains = other.trains * cycles // other.cycles  # type: ignore[assignment, operator]
+        other.cycles = cycles  # type: ignore[assignment]
     return other
 
 

@@ -167,7 +167,9 @@ NOT_NUMBERS_OF_A_DEVICE = {
     "rows", "codes", "counts", "align", "gain_map", "offset_map_e", "angles_deg", "responses", "response",
     "code", "optics", "diagonal_ratio", "fwhm_px", "spatial_fwhm_px", "phosphor_fwhm_px", "code_widths",
     "sliding_scale", "dither", "num_bins", "seed", "values", "harmonics_of_one_tap", "num_taps", "num_codes",
-    "samples", "closed", "acts_on", "args", "kwargs", "calibration", "depth_map_m", "direction", "phase_map_rad",
+    "albedo", "illumination", "gates", "knots", "shifts", "make", "stages", "psf", "radius_px", "numbers", "height",
+    "width", "samples", "closed", "acts_on", "args", "kwargs", "calibration", "depth_map_m", "direction",
+    "phase_map_rad",
     "phase_offset_rad", "start_s", "afterpulsing", "columns", "delays", "detector", "sensors", "weights", "which",
 }  # fmt: skip
 

@@ -51,7 +51,8 @@ OF_DEVICES = frozenset(
         "fractions", "frequencies_hz", "contrast", "background_e", "floor", "pulse_energy_j", "wavelength_m",
         "repetition_rate_hz", "exposure_s", "quantum_efficiency", "ambient_rate_hz", "dark_count_rate_hz",
         "full_well_e", "read_noise_e", "ktc_noise_e", "excess_noise", "dark_e", "gain_e_per_dn", "bits",
-        "black_level_dn", "shot_noise", "time_fwhm_s", "jitter_fwhm_s", "sweeps", "dnl_std", "offset_bins", "f_number",
+        "black_level_dn", "shot_noise", "signed", "time_fwhm_s", "jitter_fwhm_s", "sweeps", "dnl_std", "offset_bins",
+        "f_number", "filter_bandwidth_m", "spectral_irradiance_w_m2_nm",
         "light_duty", "transmission", "pixel_area_m2", "solid_angle_sr", "gate_duty", "extinction_ratio",
         "spads", "coincidence", "window_s", "exponent", "longest_s", "counted_from", "background",
     )
