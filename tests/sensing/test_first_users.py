@@ -9,7 +9,7 @@ import torch
 
 import torchtransient as tt
 from torchtransient import losses, sensing
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import GradientError, ShapeError, UnitError
 
 PS = 1e-12
 
@@ -48,6 +48,41 @@ def test_no_draw_from_what_is_no_rate(sensor, value):
     """torch.binomial does not return from a NaN count, and takes a negative probability for zero."""
     with pytest.raises(UnitError, match="expected finite"):
         sensor.sample(with_nan(value=value), generator())
+
+
+SATURATING = {
+    "first photon": lambda: sensing.SynchronousSPAD(50),
+    "dead time": lambda: sensing.SynchronousSPAD(50, dead_time_s=70 * PS, bin_width_s=20 * PS),
+    "free": lambda: sensing.FreeRunningSPAD(50, 70 * PS, bin_width_s=20 * PS),
+    "paralyzable": lambda: sensing.FreeRunningSPAD(50, 70 * PS, bin_width_s=20 * PS, kind="paralyzable"),
+    "frames": lambda: sensing.BinaryFrames(50),
+    "coincidence": lambda: sensing.CoincidencePixel(sensing.SynchronousSPAD(50), 4, 2, 70 * PS, bin_width_s=20 * PS),
+    "macro-pixel": lambda: sensing.MacroPixel(sensing.SynchronousSPAD(50), 3),
+    "afterpulses": lambda: sensing.AfterpulsingSPAD(
+        sensing.SynchronousSPAD(50, dead_time_s=70 * PS, bin_width_s=20 * PS),
+        sensing.Afterpulsing(0.05, 90 * PS, 70 * PS, bin_width_s=20 * PS),
+    ),
+    "groups": lambda: sensing.PixelGroups([sensing.SynchronousSPAD(50)], torch.zeros(2, 3)),
+}
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -0.1])
+@pytest.mark.parametrize("make", SATURATING.values(), ids=SATURATING)
+def test_no_mean_of_what_is_no_rate(make, value):
+    """Formulas of saturation give plausible counts of negative light."""
+    sensor, x = make(), with_nan(value=value)
+    methods = [sensor.expected, sensor.variance, sensor.sample, sensor.gaussian]
+    if hasattr(sensor, "probabilities"):
+        methods.append(sensor.probabilities)
+    for method in methods:
+        with pytest.raises(UnitError, match="expected finite"):
+            method(x)
+    try:
+        assert bool(sensor.log_prob(torch.zeros_like(x), with_nan(value=0.1)).isfinite().all())
+    except GradientError:
+        return
+    with pytest.raises(UnitError, match="expected finite"):
+        sensor.log_prob(torch.zeros_like(x), x)
 
 
 @pytest.mark.parametrize("policy", ["straight_through", "score"])

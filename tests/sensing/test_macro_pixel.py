@@ -122,6 +122,22 @@ def test_draws_of_equal_spads_are_one_draw_of_more_cycles():
     assert float(error.max()) < 5
 
 
+@pytest.mark.parametrize("policy", ["gaussian", "straight_through"])
+def test_totals_of_free_spads_vary_as_those_of_independent_ones(policy):
+    """50 photons a period on each, dead for 33.7 of 32 bins: one train of N times the periods varies N times less.
+
+    The logarithm of a ratio of two variances of n has the standard deviation 2 / sqrt(n - 1) of normal totals.
+    """
+    number, spads = 100, 4
+    x = image(light(50.0, "constant")).expand(number, 1, BINS, 1, 1)
+    spad = detector("free", 33.7, 10, grad=policy)
+    with ScoreFunction():
+        alone = [spad(x, generator=torch.Generator().manual_seed(s)) for s in range(spads)]
+        whole = MacroPixel(spad, spads)(x * spads, generator=torch.Generator().manual_seed(spads))
+    ratio = whole.sum(2).var() / sum(alone).sum(2).var()
+    assert abs(math.log(float(ratio))) < 5 * 2 / (number - 1) ** 0.5
+
+
 @pytest.mark.parametrize("policy", ["expected", "gaussian", "straight_through", "score"])
 def test_policies(policy):
     """d/da of E sum(counts) / cycles at a times the light, for two shares; exact for the mean, a linear loss."""
@@ -256,3 +272,22 @@ def test_equal_weights_are_no_weights():
 def test_no_image_at_all(make):
     for measure in (make(), make().sample, make().probabilities):
         assert measure(torch.ones(0, 1, BINS, 2, 2)).shape == (0, 1, BINS, 2, 2)
+
+
+@pytest.mark.parametrize("photons", [1e-3, 40.0, 400.0, pytest.param(1e15, marks=pytest.mark.slow)])
+def test_coincidences_of_a_bin_with_any_number_of_photons(photons):
+    """All light in bin 0, first photons, a window of a bin: one as soon as k of n SPADs have fired, none after that.
+
+    Eight points for the bin lost them: .695 of 1 at 100 photons, .0072 at 400.
+    """
+    x = torch.zeros(1, BINS, 1, 1, dtype=torch.float64)
+    x[:, 0] = photons
+    for spads, k, window in ((1, 1, 1.0), (8, 2, 1.0), (8, 1, 1.37)):
+        pixel = CoincidencePixel(SynchronousSPAD(3), spads, k, window * WIDTH, bin_width_s=WIDTH)
+        p = -math.expm1(-photons / spads)
+        wanted = math.fsum(math.comb(spads, j) * p**j * (1 - p) ** (spads - j) for j in range(k, spads + 1))
+        found = pixel.probabilities(x)
+        assert float(found.sum()) == pytest.approx(wanted, rel=1e-6, abs=1e-12)
+        if spads == 1:  # probabilities of one
+            assert float(pixel.sample(x, torch.Generator().manual_seed(0)).max()) <= 3
+            assert bool(pixel.log_prob(torch.round(3 * found), x).isfinite().all())

@@ -7,8 +7,9 @@ sensors by adaptive photon coincidence detection (Sensors 2018), rates of coinci
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -18,8 +19,10 @@ from torchtransient.axes import TimeAxis
 from torchtransient.errors import UnitError
 from torchtransient.floating import in_single
 from torchtransient.sensing.afterpulsing_spad import AfterpulsingSPAD
+from torchtransient.sensing.dead_time_cycle import highest_level
 from torchtransient.sensing.draws import check_rates
 from torchtransient.sensing.free_running import FreeRunningSPAD
+from torchtransient.sensing.free_running_draws import log_likelihood
 from torchtransient.sensing.layout import (
     TIME,
     bin_width_of,
@@ -33,13 +36,16 @@ from torchtransient.sensing.own_bins import common_bins
 from torchtransient.sensing.policies import GradPolicy
 from torchtransient.sensing.sensor import RandomSensor
 from torchtransient.sensing.spad import SynchronousSPAD
-from torchtransient.sensing.wrapped_detector import cycles_of, of_cycles
+from torchtransient.sensing.wrapped_detector import cycles_of, several_of
 
 # Gauss-Legendre, 8 points on [0, 1]: the lower half, and the weights of both halves
 _HALF = (0.019855071751231884, 0.10166676129318664, 0.23723379504183550, 0.40828267875217510)
 _SIDES = (0.050614268145188130, 0.11119051722668724, 0.15685332293894363, 0.18134189168918100)
 _PLACES = (*_HALF, *(1 - place for place in reversed(_HALF)))
 _WEIGHTS = (*_SIDES, *reversed(_SIDES))
+_PHOTONS = 4.0  # of all SPADs in a piece, which 8 points integrate
+_ROUNDED = 1e-6  # of a probability
+_FLOOD = 1e8  # photons of a bin, from which on first ones are where it begins
 
 
 @dataclass(frozen=True)
@@ -66,6 +72,19 @@ class _Group:
         return self.one * torch.exp(-at * self.rate) / _mean_survival(self.rate)
 
 
+def _pieces(low: float, high: float, halvings: int) -> Iterator[tuple[float, float]]:
+    """A part of a bin in pieces that 8 points integrate to 1e-9.
+
+    First photons fall off as exp(-rate), others crowd at one end: pieces get shorter, by halves, to both ends.
+    """
+    if not high > low:
+        return
+    steps = [0.0, *(2.0**-k for k in range(halvings, 0, -1))]
+    shares = [*steps, *(1 - step for step in reversed(steps[:-1]))] if halvings else [0.0, 1.0]
+    for first, last in itertools.pairwise(shares):
+        yield low + (high - low) * first, low + (high - low) * last
+
+
 def _mean_survival(x: Tensor) -> Tensor:
     """(1 - exp(-x)) / x."""
     small = x < 1e-5
@@ -85,7 +104,8 @@ class CoincidencePixel(RandomSensor):
     `coincidence` - 1 of the others have detected within the window before. In constant light of r detections per second
     of many SPADs it is r (r w)^(k - 1) exp(-r w) / (k - 1)!. Inside a bin the light is spread evenly; detections are
     taken so too, except those of one per cycle, of which the first photons of a bin are the first: with a dead time,
-    use bins of at most one photon a SPAD. Integrals over a bin are right to 2e-4 for 40 photons in one, to 0.1 for 120.
+    use bins of at most one photon a SPAD. Integrals over a bin are right to 1e-6, however bright it is; a pixel with
+    thousands of photons in a bin takes ten times as long, for the whole image.
     Lines are down at the start of a cycle of a SynchronousSPAD, and come round the period of a FreeRunningSPAD.
 
     Samples are independent binomials of the cycles, with the exact mean: neighbouring bins of a cycle exclude each
@@ -150,22 +170,25 @@ class CoincidencePixel(RandomSensor):
         parts = [self._one(x * share, share, number) for share, number in self.groups]
         whole = math.floor(window)
         total = torch.zeros_like(x, dtype=torch.float64)
+        photons = (x.detach().double() / _PHOTONS).clamp(1, _FLOOD * self.spads)
+        halvings = highest_level(photons.log2().ceil().long())
         # the rear edge of the window passes a border of bins when its front edge has gone `window` - `whole` into one
         for low, high in ((0.0, window - whole), (window - whole, 1.0)):
-            for place, weight in zip(_PLACES, _WEIGHTS, strict=True):
-                if high > low:
-                    at = low + (high - low) * place
-                    total = total + (high - low) * weight * self._reached(parts, at, window)
+            for begin, end in _pieces(low, high, halvings):
+                for place, weight in zip(_PLACES, _WEIGHTS, strict=True):
+                    at = begin + (end - begin) * place
+                    total = total + (end - begin) * weight * self._reached(parts, at, window)
         return total.to(x.dtype)
 
     def _one(self, rate: Tensor, share: float, number: int) -> _Group:
         """A SPAD at its rate (..., T, H, W), one of `number` with a `share` of the pixel."""
-        inner = of_cycles(self.detector, self.cycles, share)
+        inner = several_of(self.detector, 1, share)
         if isinstance(inner, AfterpulsingSPAD):
             rate, inner = inner.rate(rate), inner.detector
         detections: Tensor = inner.probabilities(rate)  # type: ignore[operator]
         once = isinstance(inner, SynchronousSPAD) and inner.dead_time_s is None
-        return _Group(detections.double(), inner._gated(rate).double() if once else None, number)  # type: ignore[operator]
+        seen = inner._gated(rate).double().clamp_max(_FLOOD) if once else None  # type: ignore[operator]
+        return _Group(detections.double(), seen, number)
 
     def _reached(self, parts: list[_Group], at: float, window: float) -> Tensor:
         """Coincidences per bin and cycle at a share `at` of every bin."""
@@ -213,20 +236,18 @@ class CoincidencePixel(RandomSensor):
     def _chances(self, x: Tensor) -> Tensor:
         """`probabilities` when they are some, else UnitError."""
         p = self.probabilities(check_rates(x, "CoincidencePixel"))
-        if p.numel() and float(p.max()) > 1:
+        if p.numel() and float(p.max()) > 1 + _ROUNDED:
             raise UnitError(
                 f"CoincidencePixel: expected at most one coincidence per cycle in a bin, got {float(p.max()):g}. Use "
                 "narrower bins to draw."
             )
-        return p
+        return p.clamp_max(1)
 
     def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
         """Of the draws as described: independent binomials."""
-        p, n = self.probabilities(x.double()), measurement.double()
+        p, n = self.probabilities(x.double()).clamp_max(1), measurement.double()
         quiet = self.cycles - n
-        hit = n != 0
-        value = torch.where(hit, n * torch.where(hit, p, torch.ones_like(p)).log(), torch.zeros_like(p))
-        value = value + quiet * torch.log1p(-p)
+        value = log_likelihood(n, p) + log_likelihood(quiet, 1 - p)
         ways = math.lgamma(self.cycles + 1) - torch.lgamma(n + 1) - torch.lgamma(quiet + 1)
         return (value + ways).sum(TIME).to(x.dtype)
 

@@ -100,6 +100,11 @@ def row_levels(rate: Tensor, least: int, photons: float = PHOTONS) -> tuple[Tens
     return level, present, bool(found[0])
 
 
+def highest_level(level: Tensor) -> int:
+    """The largest of whole numbers >= 0, of all that is mapped over inside of torch.func.vmap; 0 of none."""
+    return len(_Levels.apply(level, False).tolist()) - 2  # type: ignore[no-untyped-call]
+
+
 def rows_by_level(rate: Tensor, dead: float, photons: float = PHOTONS) -> Iterator[tuple[Tensor | None, int]]:
     """(indices of rows, None for all; pieces of their bins) of every level that there is."""
     least = 1 if dead >= 1 - 1e-9 else 2

@@ -38,6 +38,7 @@ from torchtransient.sensing.sensor import RandomSensor
 from torchtransient.sensing.time_convolution import check_choice
 
 DeadTime = Literal["non_paralyzable", "paralyzable"]
+_SIDE_BY_SIDE = 1 << 10  # detectors drawn at a time
 
 
 @in_single
@@ -174,6 +175,7 @@ class FreeRunningSPAD(RandomSensor):
     ) -> None:
         super().__init__(grad)
         self.cycles = check_count(cycles, "cycles", "FreeRunningSPAD")
+        self.trains = 1  # detectors alike that share the cycles, of a pixel of several: see `several_of`
         check_choice(kind, DeadTime, "kind", "FreeRunningSPAD")
         self.kind: DeadTime = kind
         self.bin_width_s = bin_width_of(axis, bin_width_s, "FreeRunningSPAD")
@@ -235,7 +237,12 @@ class FreeRunningSPAD(RandomSensor):
                 return x.detach().clone()
             wide = rate.movedim(TIME, -1)
             rows = wide.reshape(-1, wide.shape[-1])
-            counts = train_counts(rows, self._dead_bins.to(rate.device), self.cycles, generator, normal=normal)
+            dead, periods = self._dead_bins.to(rate.device), self.cycles // self.trains
+            counts, left = torch.zeros_like(rows), self.trains
+            while left:  # several rows of one light side by side: few pixels cost as much as one
+                number = min(left, max(1, _SIDE_BY_SIDE // rows.shape[0]))
+                found = train_counts(rows.repeat(number, 1), dead, periods, generator, normal=normal)
+                counts, left = counts + found.view(number, *rows.shape).sum(0), left - number
             return counts.view(wide.shape).movedim(-1, TIME).to(x.dtype)
 
     def gaussian(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:

@@ -15,7 +15,7 @@ from torchtransient.sensing.layout import check_count, check_number, check_trans
 from torchtransient.sensing.policies import GradPolicy
 from torchtransient.sensing.sensor import RandomSensor, Sensor
 from torchtransient.sensing.spad import SynchronousSPAD
-from torchtransient.sensing.wrapped_detector import WrappedDetector, cycles_of, of_cycles
+from torchtransient.sensing.wrapped_detector import WrappedDetector, cycles_of, several_of
 
 Groups = list[tuple[float, int]]  # (share of the light, SPADs that have it)
 
@@ -51,8 +51,8 @@ class MacroPixel(WrappedDetector):
     The input is the rate of the whole pixel, per cycle and bin (`PhotonBudget` with the area and the dark counts of all
     its SPADs). `detector`: one of them, for the cycles of the exposure. They share the light evenly, or by `weights`
     (`spads` numbers, of which only the ratios matter; 0 switches a SPAD off). A pixel of N SPADs piles up at N times
-    the light of one. SPADs of equal shares are drawn at once, as one of as many times the cycles: the cost does not
-    depend on their number.
+    the light of one. SPADs in step with the laser and of equal shares are drawn at
+    once, and the cost does not depend on their number; each that runs free is a train of its own.
 
     Policies: all, those of the detector (`grad` None leaves its own). Dark counts are shared as light is,
     and so is the `background` of an AfterpulsingSPAD: that of the whole pixel, too. One converter
@@ -77,8 +77,7 @@ class MacroPixel(WrappedDetector):
     def _parts(self, x: Tensor) -> list[tuple[RandomSensor, Tensor]]:
         """Detectors for all SPADs of an equal share, and their light."""
         check_transient(x, "MacroPixel")
-        cycles = cycles_of(self.detector)
-        return [(of_cycles(self.detector, cycles * number, share), x * share) for share, number in self.groups]
+        return [(several_of(self.detector, number, share), x * share) for share, number in self.groups]
 
     def probabilities(self, x: Tensor) -> Tensor:
         """Expected detections of all SPADs per cycle and bin."""
