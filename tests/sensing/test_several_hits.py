@@ -54,9 +54,9 @@ def test_means_and_draws_against_events(shape, total, dead, request):
     x = image(rate).unsqueeze(0).expand(repeats, 1, BINS, 1, 1)
     h = sensor.sample(x, torch.Generator().manual_seed(0)).view(repeats, BINS)
     assert torch.equal(h, h.round())
-    # two noises of the same size
+    # two noises of the same size; what was seen in none of the cycles may well happen three times in as many
     agreement = compare(events, h.mean(0).numpy() / 50)
-    assert agreement.within(1.5 * 2**0.5, exact=1e-5), agreement
+    assert agreement.within(1.5 * 2**0.5, exact=1e-5 + 0.5 * 3 / len(events)), agreement
     # variance of bins and of totals, per cycle; a normal estimate has an error of sqrt(2 / n), rare counts more
     variance = sensor.variance(image(rate)).flatten().numpy() / 50
     seen = events.variance()
