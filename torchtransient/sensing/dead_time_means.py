@@ -39,7 +39,7 @@ def _rate_gradient_in_steps(rate: Tensor, dead_bins: Tensor, weights: Tensor) ->
 
 def _tangent(of: Callable[..., Tensor], at: tuple[Tensor, ...], along: tuple[Tensor | None, ...]) -> Tensor:
     """The derivative along a direction, as the derivative of the (linear) gradient in its weights."""
-    value, pull = torch.func.vjp(of, *at)
+    value, pull, *_ = torch.func.vjp(of, *at)
     along = tuple(torch.zeros_like(x) if t is None else t for x, t in zip(at, along, strict=True))
     found: Tensor = torch.func.vjp(pull, torch.zeros_like(value))[1](along)[0]
     return found
