@@ -81,6 +81,13 @@ def light_of(name: str, sensor: nn.Module, axis: tt.TimeAxis | None) -> Tensor:
     return shape + 0.2 / axis.num_bins if "harp" in name else shape
 
 
+def of_steps(stage: nn.Module, label: str) -> str:
+    """What stands where time was, behind a stage."""
+    if isinstance(stage, sensing.ItofCorrelation):
+        return "tap"
+    return "exposure" if isinstance(stage, sensing.TapDifference) else label
+
+
 def stages_of(sensor: nn.Module) -> Iterator[nn.Module]:
     for stage in sensor.children() if not isinstance(sensor, sensing.Compose) else sensor.stages:
         inner = isinstance(stage, sensing.Compose)
@@ -145,6 +152,7 @@ def device_row(name: str) -> Figure:
     takes = "radiance" if "radiance" in takes else takes
     panels: list[tuple[str, str, Tensor, Tensor | None, Tensor | None, str]]
     panels = [("light", takes, pixel(mean), None, None, "S0 to S3")]
+    label = "pixel" if axis is None else "gate"
     drawn, is_drawn, random = mean, False, torch.Generator().manual_seed(0)
     for number, stage in enumerate(stages_of(sensor)):
         assert isinstance(stage, Sensor)
@@ -153,7 +161,7 @@ def device_row(name: str) -> Figure:
         is_drawn = is_drawn or isinstance(stage, RandomSensor)
         kind = type(stage).__name__
         grey = None if before is None or before.shape != mean.shape else pixel(before)
-        label = "pixel" if axis is None else "tap"
+        label = of_steps(stage, label)
         own = getattr(stage, "dead_time_s", None) is not None and kind == "SynchronousSPAD"
         caption = DEAD_TIME if own else CAPTIONS[kind]
         caption = OWN_CAPTIONS[name][number] if name in OWN_CAPTIONS else caption

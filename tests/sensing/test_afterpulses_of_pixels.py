@@ -5,7 +5,14 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchtransient.sensing import Afterpulsing, AfterpulsingSPAD, CoincidencePixel, MacroPixel, SynchronousSPAD
+from torchtransient.sensing import (
+    Afterpulsing,
+    AfterpulsingSPAD,
+    CoincidencePixel,
+    FreeRunningSPAD,
+    MacroPixel,
+    SynchronousSPAD,
+)
 
 LIGHT, CYCLES = 4e-3, 1000
 
@@ -44,3 +51,19 @@ def test_all_carriers_are_set_free_during_the_dead_time(tau_s):
     counts = spad.sample(x, torch.Generator().manual_seed(0))
     afterpulsing.grad = "straight_through"
     assert torch.equal(afterpulsing(counts, generator=torch.Generator().manual_seed(0)), counts)
+
+
+@pytest.mark.parametrize("p", [0.05, 0.3])
+@pytest.mark.parametrize("n", [0.001, 0.01, 0.125, 1.0])
+def test_renewal_theory_of_constant_light(p, n):
+    """Carriers set free right after the dead time: short of what they add by no more than the docstring says."""
+    dead, tau = 25.0, 3.0
+    afterpulsing = Afterpulsing(p, tau * 1e-9, dead * 1e-9, bin_width_s=1e-9)
+    spad = AfterpulsingSPAD(FreeRunningSPAD(1, dead * 1e-9, bin_width_s=1e-9), afterpulsing)
+    found = float(spad.expected(torch.full((1, 40, 1, 1), n, dtype=torch.float64)).mean())
+    wanted = 1 / (dead + (1 - p) / n + p / (n + 1 / tau))
+    # carriers that outlast a second dead time, exp(-25 / 3) of them, are not in the formula
+    assert -1e-4 * p < 1 - found / wanted < p / 4
+    assert found > 1 / (dead + 1 / n)
+    if n == 0.125 and p == 0.3:
+        assert 1 - found / wanted == pytest.approx(0.037, abs=5e-4)

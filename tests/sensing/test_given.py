@@ -138,6 +138,25 @@ def test_buffers_are_learnt_by_functional_call():
     assert bool((gate.grad != 0).all())
 
 
+@pytest.mark.parametrize("transform", [torch.func.jacfwd, torch.func.jacrev], ids=lambda t: t.__name__)
+def test_transforms_of_what_is_cut_off(transform):
+    """Their tensors require no gradient that can be seen in forward mode."""
+    x = torch.rand(1, 12, 2, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+
+    def measured(delay_s):
+        return sensing.PixelSkew(delay_s, bin_width_s=1e-10)(x).square().sum()
+
+    with pytest.raises(GradientError, match="PixelSkew: expected delay_s"):
+        transform(measured)(torch.full((2, 3), 3e-11, dtype=torch.float64))
+    with pytest.raises(GradientError, match="dead_time_s"):
+        transform(lambda t: sensing.free_running_rate(torch.ones(1), t))(torch.tensor(1e-8))
+
+    def shifted(delay):
+        return sensing.shift_time(x, delay).square().sum()
+
+    assert bool((transform(shifted)(torch.full((2, 3), 0.3, dtype=torch.float64)) != 0).all())
+
+
 def test_parameters_that_are_kept_may_be_used_on_the_way():
     """A sensor of one's own that keeps what it makes of an argument has not cut it off; one that copies it has."""
 

@@ -97,6 +97,8 @@ def test_differences_that_are_read_as_taps_have_no_deviation():
     with pytest.warns(PhysicsWarning):
         told = sensing.read_itof(frames, F, 4, noise=sensing.ItofNoise(read_noise_e=20.0))
     assert bool(told.depth_std_m.isnan().all())
+    with pytest.warns(PhysicsWarning):  # or as two steps of two taps
+        assert bool(sensing.read_itof(frames, F, 2, readout="two_tap").depth_std_m.isnan().all())
     known = sensing.ItofNoise(read_noise_e=20.0, offset_e=2e4 / 4)
     right = sensing.read_itof(frames, F, 4, readout="differential", noise=known)
     measured = right.depth_m.std()
@@ -105,16 +107,18 @@ def test_differences_that_are_read_as_taps_have_no_deviation():
 
 
 @pytest.mark.parametrize("electrons", [0.0, 3.0, 100.0, 2e4])
+@pytest.mark.parametrize("readout", ["single", "two_tap", "differential"])
 @pytest.mark.parametrize("code", [sensing.sine_code(4), sensing.square_code(3), sensing.square_code(4, 0.1, 0.3)])
-def test_taps_of_light_have_their_deviation(code, electrons):
+def test_frames_of_light_have_their_deviation(code, electrons, readout):
     """Whatever light there is, and of every contrast: short pulses have twice the offset as amplitude, at most."""
-    chain = sensing.Compose(
-        [sensing.ItofCorrelation(code, F, AXIS, background_e=1.0), sensing.PixelElectronics(read_noise_e=5.0)]
-    )
+    gates = code if readout == "single" else sensing.TwoTapCode(code)
+    stages = [sensing.ItofCorrelation(gates, F, AXIS, background_e=1.0), sensing.PixelElectronics(read_noise_e=5.0)]
+    chain = sensing.Compose([*stages, *([sensing.TapDifference()] if readout == "differential" else [])])
     frames = chain.sample(at(77, electrons, size=50)[0], torch.Generator().manual_seed(1))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        found = sensing.read_itof(frames, F, code.num_taps, noise=sensing.ItofNoise(read_noise_e=5.0))
+        known = sensing.ItofNoise(read_noise_e=5.0, offset_e=(electrons + 1.0) / code.num_taps)
+        found = sensing.read_itof(frames, F, code.num_taps, readout=readout, noise=known)
     assert not bool(found.depth_std_m.isnan().any())
 
 

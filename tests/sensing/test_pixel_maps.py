@@ -11,7 +11,9 @@ import torch
 from torchtransient import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing import (
+    Afterpulsing,
     Compose,
+    Crosstalk,
     DetectionSkew,
     MacroPixel,
     Optics,
@@ -234,3 +236,59 @@ def test_orders_that_are_none():
 def test_no_image_at_all(make):
     sensor = make(torch.zeros(3, 4), AXIS)
     assert sensor(torch.zeros(0, 1, 32, 3, 4)).shape == (0, 1, 32, 3, 4)
+
+
+# ------------------------------------------------------------------------------------ what is learnt keeps its range
+
+RANGES = {"quantum_efficiency": (1.7, -0.2), "ambient_rate_hz": (-1.0,), "dark_count_rate_hz": (-1.0,)}
+
+
+@pytest.mark.parametrize("name, value", [(n, v) for n, many in RANGES.items() for v in (*many, float("nan"))])
+@pytest.mark.parametrize("shape", [(), (2, 3)], ids=["number", "map"])
+def test_a_learnt_number_that_left_its_range_is_told(name, value, shape):
+    """A step of an optimizer may go anywhere: light of 1.7 photons for each that came was measured without a word."""
+    learnt = torch.nn.Parameter(torch.full(shape, 0.5, dtype=torch.float64))
+    stage = budget(**{name: learnt})
+    x = uniform(1, 32, 2, 3)
+    assert stage(x).requires_grad
+    with torch.no_grad():
+        learnt.view(-1)[-1:] = value
+    calls = [lambda: stage(x), lambda: stage.report(x), lambda: stage.background_counts]
+    calls += [lambda: stage.signal(x)] if name == "quantum_efficiency" else []
+    for call in calls:
+        with pytest.raises(UnitError, match=rf"expected every {name} in \[0, .*got {value:g}\. .*tt.param"):
+            call()
+    swapped = budget(**{name: torch.full((2, 3), 0.5)})
+    with pytest.raises(UnitError, match=name):
+        torch.func.functional_call(swapped, {name: torch.full((2, 3), value, dtype=torch.float64)}, (x,))
+
+
+def test_learnt_probabilities_keep_their_range():
+    """Above a sum of 1 afterpulses of afterpulses have no end, and the mean went below zero."""
+    x = uniform(1, 32, 2, 3)
+    after = Afterpulsing([0.2, 0.2], [1e-9, 3e-9], 1e-9, bin_width_s=1e-9, learnable=True)
+    across = Crosstalk(0.2, learnable=True)
+    for stage, logit in ((after, 0.0), (across, -1.0)):
+        assert stage.expected(x).isfinite().all()
+        with torch.no_grad():
+            stage.logit_probability.fill_(logit + 0.1)
+        for call in (stage.expected, stage.forward, lambda v, s=stage: s.sample(v.round())):
+            with pytest.raises(UnitError, match=r"expected .*probability in .*learnt"):
+                call(x)
+    period = Afterpulsing(
+        0.2, 1e-9, 1e-9, bin_width_s=1e-9, period_s=1e-7, background=torch.nn.Parameter(torch.ones(2, 3))
+    )
+    assert period.expected(x).requires_grad
+    with torch.no_grad():
+        period.background[0, 0] = -1.0
+    with pytest.raises(UnitError, match="Afterpulsing: expected every background"):
+        period.expected(x)
+
+
+def test_irradiance_by_the_micrometre_is_told():
+    known = {"filter_bandwidth_m": 10e-9, "wavelength_m": 940e-9}
+    optics = Optics(f_number=2.0)
+    assert ambient_photon_rate(optics, 0.5, spectral_irradiance_w_m2_nm=1.3, **known) > 0
+    for wrong in (1300.0, 1.3e9):
+        with pytest.raises(UnitError, match=r"spectral_irradiance_w_m2_nm of at most 20 .*got 1\.?3"):
+            ambient_photon_rate(optics, 0.5, spectral_irradiance_w_m2_nm=wrong, **known)

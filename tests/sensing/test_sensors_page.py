@@ -55,7 +55,7 @@ def test_names_exist():
     elsewhere = {
         "Compose", "TransientRenderer", "expected", "forward", "gaussian", "straight_through", "score", "transform",
         "LinearPhysics", "Physics", "img_size", *sensing.DEVICES, "depth_std_m", "std_e", "offset_e",
-        "electrons_per_unit",
+        "electrons_per_unit", "background_e", "dark_e", "read_noise_e", "full_well_e", "black_level_dn",
     }  # fmt: skip
     assert named - known - elsewhere == set()
     assert {"read_itof", "StreakCamera", "PolarizationMosaic", "log_matched_filter"} <= known

@@ -19,7 +19,7 @@ from torchtransient.sensing.binomial_tables import LagTable, sixteen_bits
 from torchtransient.sensing.draws import by_pieces
 from torchtransient.sensing.given import numbers_of
 from torchtransient.sensing.layout import TIME, bin_width_of, check_number, check_seconds, check_transient
-from torchtransient.sensing.pixel_maps import check_map, keep_map, over_time, wide
+from torchtransient.sensing.pixel_maps import check_map, keep_map, kept_map, over_time
 from torchtransient.sensing.policies import GradPolicy
 from torchtransient.sensing.thinning import thin
 from torchtransient.sensing.time_convolution import check_choice, filter_rows
@@ -204,6 +204,11 @@ class Afterpulsing(AddedCounts):
     def _seen(self) -> Tensor:
         """Afterpulses of a detection after its dead time, by exponential: (K,) float64."""
         p = self.probability.reshape(-1)
+        if not float(p.detach().sum()) <= _MOST * (1 + 1e-9):
+            raise UnitError(
+                f"Afterpulsing: expected a sum of probability in (0, {_MOST:g}], got {p.detach().tolist()}. If it is "
+                "learnt, lower the learning rate: at a sum of 1 a detection would never end."
+            )
         if self.counted_from == "dead_time":
             return p
         if self.delays is not None:
@@ -241,7 +246,8 @@ class Afterpulsing(AddedCounts):
         if dark or period <= bins:
             return None
         missing = self._missing(period, bins).to(x.device).view(-1, 1, 1)
-        return (missing * over_time(wide(self.background), x, "background", "Afterpulsing")).to(x.dtype).expand_as(x)
+        level = over_time(kept_map(self, "background"), x, "background", "Afterpulsing")
+        return (missing * level).to(x.dtype).expand_as(x)
 
     def _missing(self, period: int, bins: int) -> Tensor:
         """Afterpulses in the window of one count in every bin outside of it: (bins,) float64."""

@@ -13,7 +13,7 @@ from torchtransient.sensing.afterpulsing import Afterpulsing
 from torchtransient.sensing.free_running import FreeRunningSPAD
 from torchtransient.sensing.layout import TIME, check_transient
 from torchtransient.sensing.own_bins import common_bins
-from torchtransient.sensing.pixel_maps import over_time, wide
+from torchtransient.sensing.pixel_maps import kept_map, over_time
 from torchtransient.sensing.policies import GradPolicy
 from torchtransient.sensing.spad import SynchronousSPAD
 from torchtransient.sensing.time_convolution import filter_rows
@@ -37,8 +37,11 @@ class AfterpulsingSPAD(WrappedDetector):
     whole pixel, of which every SPAD has its share.
 
     Releases are taken as independent of whether a photon has fired the detector since the detection that they come
-    from: right in dim light, in constant light and where most delays are longer than the next dead time; else off by up
-    to a third of the probability, in total variation (see docs/photon_counting.md). Draws have the variance of the
+    from: right in dim light and where most delays are longer than the next dead time; else off by up to a third of the
+    probability, in total variation (see docs/photon_counting.md). Carriers that are set free right after the dead time
+    find the detector armed more often than on the mean: totals are then short by up to a quarter of the probability, in
+    constant light too (3.7 % for a probability of .3, 3 photons a dead time and delays of an eighth of it).
+    Draws have the variance of the
     detector at that rate: afterpulses vary as photons do, short by twice their share in dim light.
 
     Raises UnitError for a dead time or bins that are not the detector's, and for periods that do not go with the
@@ -106,7 +109,7 @@ class AfterpulsingSPAD(WrappedDetector):
         if period == x.shape[TIME] or (not isinstance(given, Tensor) and given == 0):
             return 0.0
         cycles = self.exposure_cycles or cycles_of(self.detector)
-        level = over_time(wide(given), x, "background", "AfterpulsingSPAD")
+        level = over_time(kept_map(self.afterpulsing, "background"), x, "background", "AfterpulsingSPAD")
         all_of_one = round_period[0].real
         ones = torch.ones(1, x.shape[TIME], dtype=torch.float64, device=x.device)
         missing = (all_of_one - filter_rows(ones, round_period, period, 0, x.shape[TIME])).clamp_min(0)

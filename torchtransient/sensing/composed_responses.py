@@ -9,7 +9,13 @@ from torch import Tensor, nn
 
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.layout import check_seconds
-from torchtransient.sensing.response_shapes import above_floor, integrated_counts, normal_integrals, resample_counts
+from torchtransient.sensing.response_shapes import (
+    above_floor,
+    integrated_counts,
+    normal_cdf,
+    normal_integrals,
+    resample_counts,
+)
 from torchtransient.sensing.responses import (
     CLOSED_BINS,
     GaussianResponse,
@@ -19,6 +25,8 @@ from torchtransient.sensing.responses import (
     kernel_of,
 )
 from torchtransient.sensing.time_convolution import check_choice
+
+_TABLE = 2000  # bins of a response without a closed form
 
 
 class MeasuredResponse(Response):
@@ -128,6 +136,38 @@ class ComposedResponse(Response):
         sigma = torch.stack([r.sigma_s for r in parts]).square().sum().sqrt()  # type: ignore[misc]
         return (tailed[0] if tailed else None), delay, sigma
 
+    def cdf(self, time_s: Tensor) -> Tensor:
+        """Without a closed form: from a histogram of 2000 bins, 1e-6 off where the parts are of one size."""
+        if len(self.responses) == 1:
+            return self.responses[0].cdf(time_s)  # type: ignore[operator, no-any-return]
+        found = self._normal_part()
+        if found is None:
+            shares, width_s, start_s = self._table()
+            return _below(shares, width_s, start_s, time_s)
+        tailed, delay, sigma = found
+        return normal_cdf((time_s - delay) / sigma) if tailed is None else tailed.widened_cdf(time_s, delay, sigma)
+
+    def survival(self, time_s: Tensor) -> Tensor:
+        if len(self.responses) == 1:
+            return self.responses[0].survival(time_s)  # type: ignore[operator, no-any-return]
+        found = self._normal_part()
+        if found is None:
+            shares, width_s, start_s = self._table()
+            # seen from its end, the response runs the other way
+            return _below(shares.flip(0), width_s, -(start_s + shares.numel() * width_s), -time_s)
+        tailed, delay, sigma = found
+        if tailed is None:
+            return normal_cdf((delay - time_s) / sigma)
+        above: Tensor = tailed.widened_survival(time_s, delay, sigma)
+        return above
+
+    def _table(self) -> tuple[Tensor, float, float]:
+        """Shares (K,) in bins of a width that suits the response, and where the first begins."""
+        low, high = self.support_s()
+        width_s = (high - low) / _TABLE
+        first, shares = self.kernel(width_s)
+        return shares, width_s, (first - 0.5) * width_s
+
     def integrals(self, time_s: Tensor) -> tuple[Tensor, Tensor] | None:
         found = self._normal_part()
         if found is None:
@@ -165,6 +205,13 @@ class ComposedResponse(Response):
         tops = [_gathered(total, first + place - coarse * fine, fine, len(total) // fine + 3) for place in places]
         shares = torch.stack(tops).mean(0)
         return coarse, shares / shares.sum()
+
+
+def _below(shares: Tensor, width_s: float, start_s: float, time_s: Tensor) -> Tensor:
+    """Sum of a histogram before each time, even within its bins."""
+    times = time_s.reshape(-1)
+    edges = torch.cat([times.new_full((1,), start_s - width_s), times])
+    return resample_counts(shares, width_s, edges, start_s).cumsum(0).reshape(time_s.shape)
 
 
 def _gathered(fine_shares: Tensor, before: int, fine: int, bins: int) -> Tensor:

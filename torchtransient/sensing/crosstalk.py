@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor, nn
 
+from torchtransient.errors import UnitError
 from torchtransient.floating import in_single
 from torchtransient.sensing.added_counts import AddedCounts
 from torchtransient.sensing.draws import by_pieces
@@ -16,6 +17,7 @@ from torchtransient.sensing.thinning import add_passing
 
 _EDGES = ((-1, 0), (1, 0), (0, -1), (0, 1))
 _CORNERS = ((-1, -1), (-1, 1), (1, -1), (1, 1))
+_MOST = 0.25  # of each of four neighbours: one detection may trigger one other
 _BLOCK = 1 << 17  # entries at a time, so that temporaries stay in the cache
 
 
@@ -60,7 +62,7 @@ class Crosstalk(AddedCounts):
         grad: GradPolicy = "expected",
     ) -> None:
         super().__init__(grad)
-        p = check_number(probability, "probability", "Crosstalk", high=0.25, open_low=True)
+        p = check_number(probability, "probability", "Crosstalk", high=_MOST, open_low=True)
         self.diagonal_ratio = check_number(diagonal_ratio, "diagonal_ratio", "Crosstalk", high=1.0)
         tensor = torch.tensor(math.log(p / (1 - p)), dtype=torch.float64)
         if learnable:
@@ -76,6 +78,11 @@ class Crosstalk(AddedCounts):
     def _probabilities(self) -> tuple[Tensor, Tensor | float]:
         """Of an edge and of a corner."""
         p = self.probability
+        if not bool(p.detach() <= _MOST * (1 + 1e-9)):
+            raise UnitError(
+                f"Crosstalk: expected probability in (0, {_MOST:g}], got {float(p.detach()):g}. If it is learnt, lower "
+                "the learning rate."
+            )
         return p, p * self.diagonal_ratio if self.diagonal_ratio > 0 else 0.0
 
     @in_single

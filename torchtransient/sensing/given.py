@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.autograd import forward_ad
 
 from torchtransient.errors import GradientError, UnitError
 from torchtransient.quantities import shown
@@ -37,8 +38,15 @@ def numbers_of(value: Any, name: str, where: str) -> Any:
 
 def refuse_cut_off(value: object, name: str, where: str) -> None:
     """GradientError for a number that requires a gradient and is about to be taken without it."""
-    if isinstance(value, Tensor) and value.requires_grad and torch.is_grad_enabled():
+    if isinstance(value, Tensor) and (_is_dual(value) or (value.requires_grad and torch.is_grad_enabled())):
         raise GradientError(_message(name, where))
+
+
+def _is_dual(value: Tensor) -> bool:
+    """Whether a tensor carries a tangent of forward-mode differentiation."""
+    if torch.compiler.is_compiling():
+        return False
+    return forward_ad.unpack_dual(value).tangent is not None  # type: ignore[no-untyped-call]
 
 
 def _message(name: str, where: str) -> str:
@@ -73,7 +81,7 @@ def careful_init(init: Callable[..., None]) -> Callable[..., None]:
 
 def check_kept(module: nn.Module, given: Mapping[str, Any], where: str) -> None:
     """GradientError for a given tensor that requires a gradient, of which the module holds neither it nor a result."""
-    wanted = [(name, t) for name, value in given.items() for t in _tensors(value) if t.requires_grad]
+    wanted = [(name, t) for name, value in given.items() for t in _tensors(value) if t.requires_grad or _is_dual(t)]
     if not wanted:
         return
     held = list(_held(module))
@@ -81,6 +89,8 @@ def check_kept(module: nn.Module, given: Mapping[str, Any], where: str) -> None:
     lost = [(name, t) for name, t in wanted if id(t) not in same]
     reached = _reached(held) if lost else set()
     for name, tensor in lost:
+        if _is_dual(tensor) and any(_is_dual(t) for t in held):
+            continue  # tangents have no graph to follow
         if id(tensor) not in reached and (tensor.grad_fn is None or id(tensor.grad_fn) not in reached):
             raise GradientError(_message(name, where))
 

@@ -33,6 +33,7 @@ from torchtransient.quantities import real_array, shown
 from torchtransient.sensing.given import refuse_cut_off
 from torchtransient.sensing.itof_codes import CorrelationCode
 from torchtransient.sensing.itof_pixels import ItofCalibration, in_direction
+from torchtransient.sensing.itof_weights import harmonic_rows, rounding_of, taps_by_pixel
 from torchtransient.sensing.layout import check_number, check_time_axis, check_transient, product
 from torchtransient.sensing.sensor import Sensor
 
@@ -41,7 +42,6 @@ WithinBin = Literal["uniform", "center"]
 Frequencies = float | Sequence[float] | Tensor | NDArray[Any]
 
 _TURN = 2 * math.pi
-_LARGEST = 1 << 22  # numbers of a table of weights of pixels
 
 
 def check_frequencies(frequencies_hz: Frequencies, where: str) -> tuple[float, ...]:
@@ -238,9 +238,10 @@ class ItofCorrelation(Sensor):
     """Photoelectrons per bin (..., C, T, H, W) to the mean electrons of the taps (..., C, F N, H, W).
 
     ``code``, ``frequencies_hz`` (F of them), ``axis`` (of the transient), ``contrast`` and ``within_bin`` as in
-    `tap_weights`; ``background_e`` electrons of unmodulated light per exposure, shared equally by the taps;
-    ``electrons_per_unit`` scales a radiance to electrons; ``calibration``: phase offsets, direction of the steps, maps
-    of pixels. Linear but for the background, hence exact in the mean. Noise, saturation and converter follow in
+    `tap_weights`. Light and ``background_e``, electrons of unmodulated light, are those of *all* N phase steps of a
+    frequency and all taps together, which share them equally. ``electrons_per_unit`` scales a radiance to electrons;
+    ``calibration``: phase offsets, direction of the steps, maps of pixels; an `nn.Parameter` in it is learnt, with a
+    `FourierCode`. Linear but for the background, hence exact in the mean. Noise, saturation and converter follow in
     `PixelElectronics`, the difference of two taps in `TapDifference`; phase and depth in `read_itof`.
 
     A map of pixels costs one pass over the transient for each harmonic of a sine code; a code with corners needs
@@ -251,7 +252,7 @@ class ItofCorrelation(Sensor):
     takes, gives = ("electrons", "counts"), "electrons"
 
     weights: Tensor
-    phases_rad: Tensor | None  # as they were made; those of learnt calibrations are made anew
+    phases_rad: Tensor  # (F, H, W), as they were made; those of learnt calibrations are made anew
 
     def __init__(
         self,
@@ -287,26 +288,61 @@ class ItofCorrelation(Sensor):
                 )
             self.register_parameter(name, value)
         self._learnt = learnt
-        mapped = calibration is not None and (calibration.has_map or bool(learnt))
-        if not mapped:
-            weights = tap_weights(code, self.frequencies_hz, axis, self.contrast, within_bin, calibration)
-        elif self._turned.harmonics is not None:
-            weights = _harmonic_rows(self._turned.harmonics, self.frequencies_hz, axis, within_bin)
-        else:
-            weights = torch.zeros(0, axis.num_bins, dtype=torch.float64)
-        self.register_buffer("weights", weights)
-        self.register_buffer("phases_rad", phases.detach() if mapped else None)
+        self.register_buffer("phases_rad", phases.detach())
+        self.register_buffer("weights", self._weights_for(self.phases_rad))
         self.num_bins = axis.num_bins
 
-    def _known(self) -> ItofCalibration | None:
-        """The calibration with the parameters as they are now."""
+    def _of_one(self, phases: Tensor) -> bool:
+        """Whether all pixels have the same phases, which are then in the weights."""
+        return not self._learnt and phases.shape[1:] == (1, 1)
+
+    def _weights_for(self, phases: Tensor) -> Tensor:
+        given = self.code, self.frequencies_hz, self.axis
+        if self._of_one(phases):
+            return tap_weights(*given, self.contrast, self.within_bin, self._with(phases))
+        if self._turned.harmonics is not None:
+            return harmonic_rows(self._turned.harmonics, self.frequencies_hz, self.axis, self.within_bin)
+        return torch.zeros(0, self.axis.num_bins, dtype=torch.float64)
+
+    def _with(self, phases: Tensor) -> ItofCalibration:
+        """The calibration that has these phases."""
+        direction = 1 if self.calibration is None else self.calibration.direction
+        if phases.shape[1:] == (1, 1):
+            return ItofCalibration(phase_offset_rad=phases.detach().flatten().tolist(), direction=direction)
+        return ItofCalibration(direction=direction, phase_map_rad=phases.detach())
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *others: Any) -> None:
+        """Phases of another size come with the state; what else is another camera's is an error."""
+        phases, weights = state_dict.get(f"{prefix}phases_rad"), state_dict.get(f"{prefix}weights")
+        if isinstance(phases, Tensor) and isinstance(weights, Tensor) and not self._learnt:
+            if phases.ndim != 3 or phases.shape[0] != len(self.frequencies_hz):
+                raise ShapeError(
+                    f"ItofCorrelation.load_state_dict: expected phases_rad ({len(self.frequencies_hz)}, H, W), got "
+                    f"{tuple(phases.shape)}. Make the camera with the frequencies of the state."
+                )
+            own = self._weights_for(phases.double().cpu()).to(weights)
+            # as much as rounding to half precision leaves
+            near = own.shape == weights.shape and torch.allclose(own, weights, rtol=0, atol=4 * rounding_of(weights))
+            if not near:
+                raise UnitError(
+                    "ItofCorrelation.load_state_dict: expected the state of a camera with the code, frequencies, axis, "
+                    "contrast and direction of this one, got weights of another. Make the camera as that one was made; "
+                    "its phases come with the state."
+                )
+            self.phases_rad, self.weights = (torch.empty_like(v, device=self.weights.device) for v in (phases, own))
+        super()._load_from_state_dict(state_dict, prefix, *others)
+
+    def _known(self) -> ItofCalibration:
+        """The calibration with the parameters and phases as they are now."""
         if self.calibration is None or not self._learnt:
-            return self.calibration
+            return self._with(self.phases_rad)
         return replace(self.calibration, **{name: getattr(self, name) for name in self._learnt})
 
     def _phases(self) -> Tensor | None:
-        known = self._known() if self._learnt else None
-        return self.phases_rad if known is None else known.phases_rad(self.frequencies_hz)
+        """Of pixels that differ."""
+        if self._learnt:
+            return self._known().phases_rad(self.frequencies_hz)
+        return None if self._of_one(self.phases_rad) else self.phases_rad
 
     def expected(self, x: Tensor) -> Tensor:
         phases = self._phases()
@@ -323,7 +359,7 @@ class ItofCorrelation(Sensor):
         code, harmonics = self._turned, self._turned.harmonics
         if harmonics is None:
             given = zip(self.frequencies_hz, phases, strict=True)
-            found = [_by_pixel(x, code, f, self.axis, self.contrast, self.within_bin, p) for f, p in given]
+            found = [taps_by_pixel(x, code, f, self.axis, self.contrast, self.within_bin, p) for f, p in given]
             return torch.cat(found, dim=-3)
         sums = torch.split(correlate(x, self.weights), 2 * len(harmonics), dim=-3)
         total = x.sum(-3)
@@ -357,43 +393,3 @@ class ItofCorrelation(Sensor):
     def extra_repr(self) -> str:
         megahertz = ", ".join(f"{f / 1e6:g}" for f in self.frequencies_hz)
         return f"taps={self.code.num_taps}, frequencies_MHz=({megahertz}), contrast={self.contrast:g}"
-
-
-def _harmonic_rows(harmonics: Sequence[int], frequencies: Sequence[float], axis: TimeAxis, within_bin: str) -> Tensor:
-    """(F x 2 harmonics, T) float64: cosine and sine of every harmonic of every frequency."""
-    rows = []
-    for f in frequencies:
-        for h in harmonics:
-            # The mean of a cosine over a bin is its value in the middle times sinc.
-            turns = h * f * axis.centers_s
-            keep = torch.sinc(h * f * axis.edges_s.diff()) if within_bin == "uniform" else torch.ones_like(turns)
-            rows += [keep * torch.cos(_TURN * turns), keep * torch.sin(_TURN * turns)]
-    return torch.stack(rows)
-
-
-def _by_pixel(
-    x: Tensor, code: CorrelationCode, f: float, axis: TimeAxis, contrast: float, within_bin: str, phase: Tensor
-) -> Tensor:
-    """Taps (..., N, H, W) of light (..., T, H, W), each pixel with weights of its own, at phases (H, W)."""
-    light, bins = x.flatten(-2), axis.num_bins
-    turns = (phase.detach().to("cpu", torch.float64) / _TURN % 1.0).flatten()
-    turns = turns.expand(light.shape[-1]) if turns.numel() == 1 else turns
-    places = axis.edges_s * f if within_bin == "uniform" else axis.centers_s * f
-    apart = math.ceil(float(places[-1] - places[0])) + 2.0
-    rows = math.prod(light.shape[:-2]) * code.num_taps * bins
-    size = max(_LARGEST // max(rows, 1), 1)
-    taps = []
-    for begin in range(0, light.shape[-1], size):
-        here = turns[begin : begin + size]
-        if within_bin == "uniform":
-            # Codes are periodic: whole turns between the pixels make one ascending row of all their edges.
-            edges = places + (here + apart * torch.arange(len(here), dtype=torch.float64))[:, None]
-            means = torch.nn.functional.pad(code.bin_means(edges.flatten()), (0, 1))
-            shape = means.reshape(code.num_taps, len(here), bins + 1)[..., :bins]
-        else:
-            shape = code.evaluate(places + here[:, None])
-        weights = ((1 + contrast * shape) / code.num_taps).movedim(1, -1).to(x)
-        # No product of matrices, which autocast would round.
-        taps.append((light[..., None, :, begin : begin + size] * weights).sum(-2))
-    together = torch.cat(taps, dim=-1) if taps else light.new_zeros(*light.shape[:-2], code.num_taps, 0)
-    return together.reshape(*together.shape[:-1], *x.shape[-2:])

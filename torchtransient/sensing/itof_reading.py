@@ -319,10 +319,14 @@ def _depth_std(
     total = (power * factor.square()).sum(-3)
     std = torch.where(total > 0, torch.where(total > 0, total, 1.0).sqrt(), total)
     std = torch.where(there.all(-3).all(-3), std, math.inf)
-    if offset is None or readout == "two_tap":
+    if offset is None:
         return std
     rounding = (gain if raw else 0.0) ** 2 / 12
-    lit = _can_be(steps.detach() * gain, offset.detach(), known.offset_e is not None, read + rounding)
+    if readout == "single":
+        offset = steps * gain  # signs and all
+    elif readout == "two_tap":
+        offset = sums_of(taps, steps.shape[-3], "read_itof") * gain
+    lit = _can_be(steps.detach() * gain, offset.detach(), readout == "differential", read + rounding)
     if lit.numel() and not holds(lit.double().mean() >= 0.5):
         warnings.warn(
             f"read_itof: most of these {readout} frames have more amplitude than their light can have, and no "
@@ -343,8 +347,7 @@ def _can_be(steps: Tensor, offset: Tensor, from_picture: bool, read: float) -> T
     number = steps.shape[-3]
     angles = (_TURN * phase_steps(number)).reshape(-1, 1, 1).to(steps)
     size = (2 / number) * torch.hypot((steps * angles.cos()).sum(-3), (steps * angles.sin()).sum(-3))
-    # single taps carry their offset in them, signs and all
-    mean = offset.mean(-3) if from_picture else steps.mean(-3)
+    mean = offset.mean(-3)
     # read noise of both sides, and the shot noise of differences beside a mean that does not know it
     spread = (6 / number * (read + (mean.clamp_min(0) if from_picture else 0.0))) ** 0.5
     largest = steps.abs().amax(-3)

@@ -12,13 +12,14 @@ from torchtransient.axes import TimeAxis
 from torchtransient.errors import UnitError
 from torchtransient.floating import in_single
 from torchtransient.sensing.layout import TIME, bin_width_of, check_count, check_number, check_transient
-from torchtransient.sensing.pixel_maps import check_map, keep_map, over_time, wide
+from torchtransient.sensing.pixel_maps import check_map, keep_map, kept_map, over_time
 from torchtransient.sensing.sensor import Sensor
 from torchtransient.tensor_record import TensorRecord
 from torchtransient.units import SPEED_OF_LIGHT
 
 _DARKEST = 1e3  # f-number of a pinhole; millimetres over metres are a thousand times those of lenses
 _MOST_WATTS = 1e3  # on average, of a laser; nanojoules taken for joules are megawatts
+_MOST_IRRADIANCE = 20.0  # W / (m^2 nm), ten suns; per micrometre and per metre are thousands
 _LONGEST_S = 3600.0  # exposure of one histogram; megahertz taken for hertz make a million of it
 
 PLANCK_J_S = 6.626_070_15e-34  # exact by the definition of the kilogram (SI)
@@ -115,6 +116,11 @@ def ambient_photon_rate(
     _check_optics(optics, where)
     energy = photon_energy_j(wavelength_m)
     irradiance = check_number(spectral_irradiance_w_m2_nm, "spectral_irradiance_w_m2_nm", where)
+    if irradiance > _MOST_IRRADIANCE:
+        raise UnitError(
+            f"{where}: expected spectral_irradiance_w_m2_nm of at most {_MOST_IRRADIANCE:g} W / (m^2 nm), got "
+            f"{irradiance:g}. The sun has up to 2.2; 1300 W / (m^2 um), or 1.3e9 W / m^3, are 1.3 of them."
+        )
     bandwidth = check_number(filter_bandwidth_m, "filter_bandwidth_m", where)
     if bandwidth > 1e-6:
         raise UnitError(f"{where}: expected filter_bandwidth_m in metres, got {bandwidth!r}. 10 nm is 10e-9.")
@@ -170,7 +176,9 @@ class PhotonBudget(Sensor):
 
     `quantum_efficiency` (the probability that a photon is detected), `ambient_rate_hz` and `dark_count_rate_hz` are
     numbers or maps, (H, W) or what broadcasts to (..., C, H, W). An `nn.Parameter` is kept as one and learnt; other
-    maps are buffers, in float64 (a map from a network: `torch.func.functional_call(budget, {name: map}, x)`).
+    maps are buffers, in float64 (a map from a network: `torch.func.functional_call(budget, {name: map}, x)`). Learnt
+    rates are in hertz, which no optimizer's steps suit: learn their logarithm (docs/photon_counting.md). A learnt
+    number that has left its range is a UnitError of the next measurement.
 
     Raises UnitError outside the ranges, for wavelengths in nanometres, for a window longer than a laser period, for
     more than 1 kW on average, for exposures of more than an hour or of less than one cycle, ShapeError for maps of
@@ -245,15 +253,15 @@ class PhotonBudget(Sensor):
     @property
     def background_counts(self) -> float | Tensor:
         """Ambient and dark counts of a bin in the whole exposure, before pile-up: a number, or a map."""
-        ambient = wide(self.ambient_rate_hz) * wide(self.quantum_efficiency)
-        counts = (ambient + self.dark_count_rate_hz.double()) * (self.bin_width_s * self.cycles)
+        ambient = kept_map(self, "ambient_rate_hz") * kept_map(self, "quantum_efficiency", high=1.0)
+        counts = torch.as_tensor(ambient + kept_map(self, "dark_count_rate_hz")) * (self.bin_width_s * self.cycles)
         return counts if counts.ndim else float(counts)
 
     @property
     def detections_per_unit(self) -> float | Tensor:
         """Detections per cycle for a radiance of 1 in a bin: a number, or a map where the efficiency is one."""
         photons = self.pulse_energy_j * self.optics.etendue_m2_sr / self.photon_energy_j
-        return photons * wide(self.quantum_efficiency)
+        return photons * kept_map(self, "quantum_efficiency", high=1.0)
 
     @in_single
     def signal(self, x: Tensor) -> Tensor:
@@ -272,9 +280,10 @@ class PhotonBudget(Sensor):
     def _background_hz(self, x: Tensor) -> tuple[float | Tensor, Tensor]:
         """Ambient and dark detections per second, over the time of `x`, float64."""
         where = "PhotonBudget"
-        ambient = over_time(wide(self.ambient_rate_hz), x, "ambient_rate_hz", where)
-        ambient = ambient * over_time(wide(self.quantum_efficiency), x, "quantum_efficiency", where)
-        dark = over_time(self.dark_count_rate_hz.double(), x, "dark_count_rate_hz", where)
+        ambient = over_time(kept_map(self, "ambient_rate_hz"), x, "ambient_rate_hz", where)
+        efficiency = kept_map(self, "quantum_efficiency", high=1.0)
+        ambient = ambient * over_time(efficiency, x, "quantum_efficiency", where)
+        dark = over_time(kept_map(self, "dark_count_rate_hz"), x, "dark_count_rate_hz", where)
         return ambient, torch.as_tensor(dark)
 
     @in_single

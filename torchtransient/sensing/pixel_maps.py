@@ -52,6 +52,26 @@ def keep_map(module: nn.Module, name: str, value: float | Tensor) -> None:
         setattr(module, name, value)
 
 
+def kept_map(module: nn.Module, name: str, *, high: float = math.inf) -> float | Tensor:
+    """A number or map that a sensor keeps, in float64, for a measurement.
+
+    UnitError where what was in [0, high] when the sensor was made is not any more: a parameter that a step of an
+    optimizer took out of it, or a map that `torch.func.functional_call` put in its place.
+    """
+    value: float | Tensor = getattr(module, name)
+    if isinstance(value, Tensor):
+        plain = value.detach()
+        inside = (plain >= 0) & (plain <= high)
+        if not holds(inside):
+            where, wrong = type(module).__name__, float(plain[~inside].flatten()[0])
+            way = "Bounded()" if high < math.inf else "Positive(function='exp')"
+            raise UnitError(
+                f"{where}: expected every {name} in [0, {high:g}], got {wrong:g}. What keeps a learnt one inside: "
+                f"torch.nn.utils.parametrize.register_parametrization(sensor, {name!r}, tt.parametrize.{way})."
+            )
+    return wide(value)
+
+
 def wide(value: float | Tensor) -> float | Tensor:
     """In float64."""
     return value.double() if isinstance(value, Tensor) else value

@@ -295,12 +295,20 @@ class TailedResponse(Response):
         return mixed + shares[0] * core if self.has_core else mixed
 
     def cdf(self, time_s: Tensor) -> Tensor:
-        tail = emg_cdf(time_s.unsqueeze(-1), self.delay_s, self.sigma_s, self.tails_s)
-        return self._mix(time_s, normal_cdf((time_s - self.delay_s) / self.sigma_s), tail)
+        return self.widened_cdf(time_s, self.delay_s, self.sigma_s)
 
     def survival(self, time_s: Tensor) -> Tensor:
-        tail = emg_survival(time_s.unsqueeze(-1), self.delay_s, self.sigma_s, self.tails_s)
-        return self._mix(time_s, normal_cdf((self.delay_s - time_s) / self.sigma_s), tail)
+        return self.widened_survival(time_s, self.delay_s, self.sigma_s)
+
+    def widened_cdf(self, time_s: Tensor, delay_s: Tensor, sigma_s: Tensor) -> Tensor:
+        """`cdf` with another delay and core: of what this response and normal ones make together."""
+        tail = emg_cdf(time_s.unsqueeze(-1), delay_s, sigma_s, self.tails_s)
+        return self._mix(time_s, normal_cdf((time_s - delay_s) / sigma_s), tail)
+
+    def widened_survival(self, time_s: Tensor, delay_s: Tensor, sigma_s: Tensor) -> Tensor:
+        """`survival` of the same."""
+        tail = emg_survival(time_s.unsqueeze(-1), delay_s, sigma_s, self.tails_s)
+        return self._mix(time_s, normal_cdf((delay_s - time_s) / sigma_s), tail)
 
     def integrals(self, time_s: Tensor) -> tuple[Tensor, Tensor]:
         return self.widened_integrals(time_s, self.delay_s, self.sigma_s)

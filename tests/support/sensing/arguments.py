@@ -65,7 +65,8 @@ CALLS = {
     "MacroPixel": ({"weights": rand(4)}, {"detector": SPAD, "spads": 4}),
     "MeasuredDelays": (
         {"counts": rand(12), "bin_width_s": number(1e-9), "start_s": number(1e-9), "floor": number(0.01)}, {}),
-    "MeasuredResponse": ({"counts": rand(12), "bin_width_s": number(1e-10), "delay_s": number(1e-10)}, {}),
+    "MeasuredResponse": (
+        {"counts": rand(12), "bin_width_s": number(1e-10), "delay_s": number(1e-10), "floor": number(0.05)}, {}),
     "Optics": (
         {"f_number": number(2.0), "pixel_area_m2": number(1e-10), "transmission": number(0.5)}, {}),
     "PhotonBudget": (
@@ -120,6 +121,7 @@ CALLS = {
     "demosaic": ({"raw": rand(1, 2, 4, 4)}, {}),
     "depth_of_phase": ({"phase": rand(2, 2), "frequency_hz": number(60e6)}, {}),
     "distance_of_position": ({"position": 10 * rand(2, 3)}, TIMED),
+    "detections_with_dead_time": ({"rate": LIGHT, "dead_bins": number(2.5)}, {}),
     "emg_cdf": (DELAYS, {}),
     "emg_density": (DELAYS, {}),
     "emg_survival": (DELAYS, {}),
@@ -145,6 +147,9 @@ CALLS = {
     "log_matched_filter": (
         {"histogram": COUNTS, "kernel": KERNEL, "signal_to_background": number(100.0)}, {}),
     "measured_code": ({"samples": rand(3, 12) - 0.5}, {}),
+    "ml_position": (
+        {"histogram": COUNTS, "bin_width_s": number(1e-10), "signal_to_background": number(100.0)},
+        {"response": RESPONSE}),
     "mosaic_rows": (
         {"angles_deg": 90 * rand(2, 2), "extinction_ratio": number(100.0), "transmission": number(0.5)}, {}),
     "multi_return": ({"scores": LIGHT, "threshold": number(0.5)}, {"max_returns": 2}),
@@ -190,9 +195,10 @@ CALLS = {
 
 # What takes no real numbers of its own, or takes modules, records and names.
 OTHERS = {
-    "AfterpulseDelays", "AfterpulsingSPAD", "BinaryFrames", "BudgetReport", "CoatesEstimate", "Compose",
+    "AddedCounts", "AfterpulseDelays", "AfterpulsingSPAD", "BinaryFrames", "BudgetReport", "CoatesEstimate", "Compose",
     "ComposedResponse", "CorrelationCode", "CramerRaoBound", "Device", "EquiDepthHistogram", "GradPolicy",
-    "ItofReading", "PixelGroups", "RandomSensor", "Response", "Returns", "ReversedCode", "ScoreFunction", "Sensor",
+    "ItofReading", "MovedCounts", "Moves",
+    "PixelGroups", "RandomSensor", "Response", "Returns", "ReversedCode", "ScoreFunction", "Sensor",
     "ShotNoise", "TapDifference", "TwoTapCode", "ZoneSum", "adjoint", "axis_with_margin", "build_stage",
     "counting_chain", "covariance_bound", "deepinv_physics", "device", "distance_to_points", "fourier_codes",
     "hamiltonian_code", "linearity_error", "sine_code",

@@ -89,6 +89,18 @@ ENTRIES: list[Entry] = [
         conserves=lambda y: y.sum() / (2 if y.shape[-3] == 6 else 1),
     ),
     Entry(
+        "ItofCorrelation-learnt",
+        lambda: itof.ItofCorrelation(
+            sensing.TwoTapCode(itof_codes.sine_code(2)),
+            (20e6, 60e6),
+            AXIS,
+            calibration=sensing.ItofCalibration(
+                torch.nn.Parameter(torch.tensor([0.1, 0.2])), depth_map_m=torch.nn.Parameter(MAP_M.clone())
+            ),
+        ),
+        conserves=lambda y: y.sum() / (2 if y.shape[-3] == 8 else 1),
+    ),
+    Entry(
         "TapDifference",
         sensing.TapDifference,
         errors=((lambda: sensing.TapDifference()(torch.ones(1, 7, 1, 1)), ShapeError),),
