@@ -67,6 +67,9 @@ class _Stationary:
         return _whole_bins(self.lines[:, : self.chain.bins].clamp_min(0), self.pieces)
 
     def of(self, rows: Tensor) -> _Stationary:
+        """Of rows in ascending order, or of some more than once."""
+        if rows.numel() == self.chain.rate.shape[0]:
+            return self
         c = self.chances
         begin = None if c.begin is None else c.begin[:, rows]
         chances = BinChances(begin, c.fire[:, rows], c.soon[:, rows], c.late[:, rows], c.whole)
