@@ -5,7 +5,14 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchtransient.sensing import Afterpulsing, AfterpulsingSPAD, CoincidencePixel, FreeRunningSPAD, MacroPixel, SynchronousSPAD
+from torchtransient.sensing import (
+    Afterpulsing,
+    AfterpulsingSPAD,
+    CoincidencePixel,
+    FreeRunningSPAD,
+    MacroPixel,
+    SynchronousSPAD,
+)
 
 LIGHT, CYCLES = 4e-3, 1000
 

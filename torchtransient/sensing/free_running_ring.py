@@ -67,8 +67,7 @@ class _Stationary:
         return _whole_bins(self.lines[:, : self.chain.bins].clamp_min(0), self.pieces)
 
     def of(self, rows: Tensor) -> _Stationary:
-        """Of rows in ascending order, or of some more than once."""
-        if rows.numel() == self.chain.rate.shape[0]:
+        if torch.equal(rows, torch.arange(self.chain.rate.shape[0], device=rows.device)):
             return self
         c = self.chances
         begin = None if c.begin is None else c.begin[:, rows]
