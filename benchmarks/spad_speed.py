@@ -3,7 +3,8 @@
 The first case is 64 x 64 pixels, 1024 bins, 1e5 laser cycles: dark and hot pixels, unequal converter codes, a gate,
 first-photon pile-up, afterpulses and crosstalk, sampled. `torch.poisson` draws independent counts of the same means.
 The two take turns; medians and quartiles are printed. The second case is the stationary state of a free-running
-detector, 32 x 32 pixels, 512 bins, for several fluxes, forward and backward.
+detector, 32 x 32 pixels, 512 bins, for several fluxes, forward and backward. The third one is a detector in step with
+the laser that fires several times in a cycle: mean, mean and gradient, draws, and what training holds in memory.
 """
 
 from __future__ import annotations
@@ -50,6 +51,13 @@ def seconds(call: Callable[[], object]) -> float:
     begin = time.perf_counter()
     call()
     return time.perf_counter() - begin
+
+
+def cpu_seconds(call: Callable[[], object]) -> float:
+    """CPU time of one call."""
+    begin = time.process_time()
+    call()
+    return time.process_time() - begin
 
 
 def spread(values: list[float]) -> dict[str, float]:
@@ -124,6 +132,39 @@ def free_running(bins: int, size: int, repeats: int) -> dict[str, object]:
     return report
 
 
+def several_hits(bins: int, size: int, repeats: int) -> dict[str, object]:
+    """CPU seconds of this process, and MiB that the graph holds beside light and result."""
+    report: dict[str, object] = {}
+    width_s = 50e-12
+    for dead_bins in (400.3, 20.5, 1.3):
+        for flux in (0.3, 3.0):
+            light = pulse_image(bins, size, flux)
+            sensor = sensing.SynchronousSPAD(1000, dead_time_s=dead_bins * width_s, bin_width_s=width_s)
+            g = torch.Generator().manual_seed(1)
+            leaf = light.clone().requires_grad_()
+            held: dict[int, int] = {}
+
+            def hold(t: Tensor, held: dict[int, int] = held) -> Tensor:
+                held[t.untyped_storage().data_ptr()] = t.untyped_storage().nbytes()
+                return t
+
+            cases: dict[str, Callable[[], object]] = {
+                "mean": lambda x=light, s=sensor: s.expected(x),  # type: ignore[misc]
+                "mean and gradient": lambda x=leaf, s=sensor: s.expected(x).square().sum().backward(),  # type: ignore[misc]
+                "draws": lambda x=light, s=sensor, g=g: s.sample(x, g),  # type: ignore[misc]
+            }
+            times = {name: [cpu_seconds(call) for _ in range(repeats + 1)][1:] for name, call in cases.items()}
+            with torch.autograd.graph.saved_tensors_hooks(hold, lambda t: t):
+                sensor.expected(leaf)
+            held.pop(leaf.untyped_storage().data_ptr(), None)
+            mib = sum(held.values()) / 2**20
+            name = f"dead for {dead_bins:g} bins, {flux:g} photons per cycle"
+            report[name] = {**{k: spread(v) for k, v in times.items()}, "held_mib": mib}
+            row = ", ".join(f"{spread(v)['median_s']:.4f} s {k}" for k, v in times.items())
+            print(f"{name}: {row}, {mib:.0f} MiB held")
+    return report
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
@@ -141,6 +182,9 @@ def main() -> None:
     size, bins = (4, 64) if options.quick else (32, 512)
     print(f"{size} x {size} x {bins}")
     report["free_running"] = free_running(bins, size, repeats)
+    size, bins = (4, 64) if options.quick else (64, 1024)
+    print(f"{size} x {size} x {bins}, several hits")
+    report["several_hits"] = several_hits(bins, size, repeats)
     report["peak_memory_gib"] = {"whole run": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20}
     report["load"] = {"one minute": os.getloadavg()[0]}
     if options.json:

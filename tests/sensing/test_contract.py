@@ -216,19 +216,24 @@ def test_generator_reproduces(entry, policy):
         assert all(torch.equal(a, b) for a, b in zip(first, parts(module(x)), strict=True))
 
 
-@each_random
-def test_mean_and_dtype_of_samples(entry):
+# a train of detections takes long to draw; test_bright_light and test_several_hits hold its means to events
+number_of_draws = [(e, 200 if e.name == "FreeRunningSPAD" else 2000) for e in ENTRIES if e.random]
+number_of_draws += [pytest.param(e, 2000, marks=pytest.mark.slow) for e, number in number_of_draws if number < 2000]
+
+
+@pytest.mark.parametrize("entry, number", number_of_draws, ids=lambda v: getattr(v, "name", v))
+def test_mean_and_dtype_of_samples(entry, number):
     """The mean of many draws is the expectation, within 5 standard errors everywhere (and rounding)."""
     module = entry.module()
     x = entry.x()[:1]
     g = torch.Generator().manual_seed(11)
-    draws = module.sample(x.expand(2000, *x.shape[1:]), g)
+    draws = module.sample(x.expand(number, *x.shape[1:]), g)
     exact = parts(expected(module, x))
     for values, mean in zip(parts(draws), exact, strict=True):
         assert values.dtype == mean.dtype
         assert not values.requires_grad
         error = (values.mean(0) - mean[0]).abs()
-        standard_error = values.std(0) / 2000**0.5
+        standard_error = values.std(0) / number**0.5
         assert bool((error <= 5 * standard_error + 0.004).all())
 
 

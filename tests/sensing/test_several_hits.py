@@ -9,6 +9,8 @@ import torch
 from support.sensing.event_driven import compare, detect
 from torchtransient.errors import TorchTransientError, UnitError
 from torchtransient.sensing import ScoreFunction, SynchronousSPAD, coates, first_photon_log_prob, sample_detections
+from torchtransient.sensing.dead_time_cycle import detected_rows
+from torchtransient.sensing.dead_time_means import detected_columns
 from torchtransient.sensing.spad import detections_with_dead_time
 
 BINS = 24
@@ -54,9 +56,9 @@ def test_means_and_draws_against_events(shape, total, dead, request):
     x = image(rate).unsqueeze(0).expand(repeats, 1, BINS, 1, 1)
     h = sensor.sample(x, torch.Generator().manual_seed(0)).view(repeats, BINS)
     assert torch.equal(h, h.round())
-    # two noises of the same size
+    # two noises of the same size; what was seen in none of the cycles may well happen three times in as many
     agreement = compare(events, h.mean(0).numpy() / 50)
-    assert agreement.within(1.5 * 2**0.5, exact=1e-5), agreement
+    assert agreement.within(1.5 * 2**0.5, exact=1e-5 + 0.5 * 3 / len(events)), agreement
     # variance of bins and of totals, per cycle; a normal estimate has an error of sqrt(2 / n), rare counts more
     variance = sensor.variance(image(rate)).flatten().numpy() / 50
     seen = events.variance()
@@ -142,11 +144,43 @@ def test_pixels_of_all_levels():
     assert sample_detections(torch.zeros(0, 1, 8, 2, 2), 10, 1.3).shape == (0, 1, 8, 2, 2)
 
 
+@pytest.mark.parametrize("dead", [0.6, 1.0, 1.3, 5.0, 5.6, 40.4])
+def test_the_walk_is_the_recursion_in_steps(dead):
+    """Means and gradients by columns and their adjoint: float64 rounding beside autograd through the recursion."""
+    x = torch.cat([f * torch.rand(23, 3, generator=torch.Generator().manual_seed(1)) for f in (0.02, 0.2, 9.0)], -1)
+    weights = torch.randn(23, 9, generator=torch.Generator().manual_seed(2)).double()
+    d = torch.tensor(dead, dtype=torch.float64)
+    found = []
+    for solve in (lambda v: detected_columns(v, d), lambda v: detected_rows(v.T, d).T):
+        leaf = x.double().requires_grad_()
+        y = solve(leaf)
+        found.append((y.detach(), *torch.autograd.grad((y * weights).sum(), leaf)))
+    for walked, stepped in zip(*found, strict=True):
+        torch.testing.assert_close(walked, stepped, rtol=1e-11, atol=1e-13)
+
+
+def test_batches_of_autograd_and_of_func():
+    """Jacobians and Hessians of every kind, one pixel."""
+    x = image(np.linspace(0.05, 0.3, 4))
+
+    def f(v):
+        return detections_with_dead_time(v, 1.3)
+
+    rows = torch.func.jacrev(f)(x)
+    torch.testing.assert_close(torch.func.jacfwd(f)(x), rows, rtol=1e-11, atol=1e-13)
+    leaf = x.clone().requires_grad_()
+    unit = torch.eye(4, dtype=torch.float64).view(4, *x.shape)
+    (together,) = torch.autograd.grad(f(leaf), leaf, unit, is_grads_batched=True)
+    torch.testing.assert_close(together.view(4, 4), rows.view(4, 4), rtol=1e-11, atol=1e-13)
+    bend = torch.func.hessian(lambda v: f(v).square().sum())(x)
+    numeric = torch.autograd.functional.hessian(lambda v: f(v).square().sum(), x)
+    torch.testing.assert_close(bend, numeric, rtol=1e-11, atol=1e-13)
+
+
 @pytest.mark.parametrize("dead", [slow(0.7), 1.3])
 def test_gradients(dead):
-    x = mixed(True)
-    with torch.no_grad():
-        x += 0.01
+    x = mixed()[..., :2] + 0.01  # not cut, and cut
+    x.requires_grad_()
     d = torch.tensor(dead, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(detections_with_dead_time, (x, d), check_forward_ad=True, fast_mode=True)
     assert torch.autograd.gradgradcheck(lambda v: detections_with_dead_time(v, dead), (x,), fast_mode=True)
@@ -174,7 +208,7 @@ def test_score_of_draws_gives_the_gradient_of_the_mean():
 
 
 @pytest.mark.parametrize(
-    "total, dead", [(1.0, 1.3), (30.0, 7.9), (2.0, 40.0), slow(30.0, 1.0), slow(100.0, 1.3), slow(100.0, 2.2)]
+    "total, dead", [(1.0, 1.3), (2.0, 40.0), slow(30.0, 7.9), slow(30.0, 1.0), slow(100.0, 1.3), slow(100.0, 2.2)]
 )
 def test_coates_undoes_the_mean(total, dead):
     rate, cycles = image(total * shapes()["pulse"]), 10_000

@@ -70,6 +70,8 @@ class AddedCounts(RandomSensor):
     def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         with torch.no_grad():
             counts = check_transient(x, type(self).__name__).detach()
+            if not counts.numel():
+                return counts.clone()
             self._total(counts)
             followed = whole_items(counts)
             entries = max(math.prod(counts.shape[-4:]), 1)

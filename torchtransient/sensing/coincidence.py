@@ -36,7 +36,7 @@ from torchtransient.sensing.own_bins import common_bins
 from torchtransient.sensing.policies import GradPolicy
 from torchtransient.sensing.sensor import RandomSensor
 from torchtransient.sensing.spad import SynchronousSPAD
-from torchtransient.sensing.wrapped_detector import cycles_of, of_cycles
+from torchtransient.sensing.wrapped_detector import cycles_of, several_of
 
 # Gauss-Legendre, 8 points on [0, 1]: the lower half, and the weights of both halves
 _HALF = (0.019855071751231884, 0.10166676129318664, 0.23723379504183550, 0.40828267875217510)
@@ -182,7 +182,7 @@ class CoincidencePixel(RandomSensor):
 
     def _one(self, rate: Tensor, share: float, number: int) -> _Group:
         """A SPAD at its rate (..., T, H, W), one of `number` with a `share` of the pixel."""
-        inner = of_cycles(self.detector, self.cycles, share)
+        inner = several_of(self.detector, 1, share)
         if isinstance(inner, AfterpulsingSPAD):
             rate, inner = inner.rate(rate), inner.detector
         detections: Tensor = inner.probabilities(rate)  # type: ignore[operator]

@@ -27,7 +27,7 @@ def _degree(largest: float) -> int:
 
 
 def response_series(part: float, largest: float) -> tuple[Tensor, Tensor]:
-    """Power series (3, 5, D + 1) for (armed at the end, detections, slope) and the slopes (2, 5, D + 1) of the last two.
+    """Power series (3, 5, D + 1) for (armed at the end, detections, slope), and derivatives (2, 5, D + 1) of two.
 
     Of the inflow, ordered (older line's constant, its slope, younger line's constant, its slope), and of the armed.
     As `renewal_chain.bin_response`, for rates of at most `largest`.

@@ -67,6 +67,8 @@ class _Stationary:
         return _whole_bins(self.lines[:, : self.chain.bins].clamp_min(0), self.pieces)
 
     def of(self, rows: Tensor) -> _Stationary:
+        if torch.equal(rows, torch.arange(self.chain.rate.shape[0], device=rows.device)):
+            return self
         c = self.chances
         begin = None if c.begin is None else c.begin[:, rows]
         chances = BinChances(begin, c.fire[:, rows], c.soon[:, rows], c.late[:, rows], c.whole)

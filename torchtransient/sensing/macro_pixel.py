@@ -15,7 +15,7 @@ from torchtransient.sensing.layout import check_count, check_number, check_trans
 from torchtransient.sensing.policies import GradPolicy
 from torchtransient.sensing.sensor import RandomSensor, Sensor
 from torchtransient.sensing.spad import SynchronousSPAD
-from torchtransient.sensing.wrapped_detector import WrappedDetector, cycles_of, of_cycles
+from torchtransient.sensing.wrapped_detector import WrappedDetector, cycles_of, several_of
 
 Groups = list[tuple[float, int]]  # (share of the light, SPADs that have it)
 
@@ -77,8 +77,7 @@ class MacroPixel(WrappedDetector):
     def _parts(self, x: Tensor) -> list[tuple[RandomSensor, Tensor]]:
         """Detectors for all SPADs of an equal share, and their light."""
         check_transient(x, "MacroPixel")
-        cycles = cycles_of(self.detector)
-        return [(of_cycles(self.detector, cycles * number, share), x * share) for share, number in self.groups]
+        return [(several_of(self.detector, number, share), x * share) for share, number in self.groups]
 
     def probabilities(self, x: Tensor) -> Tensor:
         """Expected detections of all SPADs per cycle and bin."""

@@ -23,7 +23,6 @@ class WrappedDetector(RandomSensor):
         super(RandomSensor, self).__init__()
         self.detector = detector
         self.bin_width_s, self.num_bins = bins_of(detector)
-        self.bin_width_s, self.num_bins = bins_of(detector)
         if grad is not None:
             self.grad = grad
 
@@ -71,20 +70,21 @@ class WrappedDetector(RandomSensor):
         return result
 
 
-def of_cycles(detector: RandomSensor, cycles: int, share: float = 1.0) -> RandomSensor:
-    """A detector with the numbers of another one (its parameters are the same tensors) for as many cycles.
+def several_of(detector: RandomSensor, number: int, share: float = 1.0) -> RandomSensor:
+    """As many detectors alike as one whose counts are their sum, in the same light each: the cycles of all of them,
+    and the same parameters.
 
-    `share`: what it has of light, and of counts, that are given for a whole pixel.
+    `share`: what each has of light, and of counts, that are given for a whole pixel.
     """
     other = copy.copy(detector)
     if isinstance(other, WrappedDetector):
         other.exposure_cycles = (other.exposure_cycles or cycles_of(detector)) / share
         other._modules = dict(other._modules)  # its own children
-        other.detector = of_cycles(other.detector, cycles)
+        other.detector = several_of(other.detector, number)
     else:
+        other.cycles = cycles_of(detector) * number  # type: ignore[assignment]
         if hasattr(other, "trains"):  # detections of different detectors know nothing of one another
-            other.trains = other.trains * cycles // other.cycles  # type: ignore[assignment, operator]
-        other.cycles = cycles  # type: ignore[assignment]
+            other.trains = other.trains * number  # type: ignore[assignment, operator]
     return other
 
 
