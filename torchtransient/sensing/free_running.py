@@ -175,7 +175,7 @@ class FreeRunningSPAD(RandomSensor):
     ) -> None:
         super().__init__(grad)
         self.cycles = check_count(cycles, "cycles", "FreeRunningSPAD")
-        self.trains = 1  # detectors alike that share the cycles, of a pixel of several: see `of_cycles`
+        self.trains = 1  # detectors alike that share the cycles, of a pixel of several: see `several_of`
         check_choice(kind, DeadTime, "kind", "FreeRunningSPAD")
         self.kind: DeadTime = kind
         self.bin_width_s = bin_width_of(axis, bin_width_s, "FreeRunningSPAD")
