@@ -81,6 +81,7 @@ def test_background_under_a_bright_peak(dtype):
     assert float(biased[:, 1].mean()) / truth[1] - 1 == pytest.approx(-0.16, abs=0.01)
 
 
+@pytest.mark.slow
 @SINGLE
 @pytest.mark.parametrize("photons", [0.5, 5.0, 20.0])
 def test_background_behind_a_strong_return_of_first_photons(photons, dtype):

@@ -219,6 +219,7 @@ def deviations(draws, wanted):
     return (draws.mean(1) - wanted) / (draws.std(1) / draws.shape[1] ** 0.5)
 
 
+@pytest.mark.slow
 def test_two_seeds_are_the_squared_error_of_a_render_without_noise(draws):
     """Value and gradient, within four standard errors; one seed twice has the variance of the render on top."""
     two, one, wanted = draws

@@ -88,6 +88,7 @@ def fitted(compare, offset, sigma, histogram, steps=60):
     return (at.detach() - 0.96).abs()
 
 
+@pytest.mark.slow
 def test_first_photons_come_home_from_ten_centimetres():
     """Pulses of 1 cm in bins of 2 cm, 0.3 photons a cycle, 1000 cycles, background: from 10 and 50 cm.
 

@@ -25,7 +25,7 @@ from torchtransient.testing.small_room import COLOUR, GREY, VARIANT, WALL_POSE, 
 TOLERANCE = 2e-5
 # One of each kind of thing that a scene can have, where recordings could go wrong in a way of its own.
 FEW = (
-    "bsdf roughdielectric in blendbsdf", "bsdf delayed", "shape ply", "emitter area in sphere",
+    "bsdf roughdielectric in blendbsdf", "shape ply", "emitter area in sphere",
     "spectrum regular in reflectance, spectral", "phase hg in homogeneous", "bsdf conductor, mono_polarized",
 )  # fmt: skip
 
@@ -429,6 +429,7 @@ def test_many_kinds_of_calls_by_turns_do_not_warn():
     assert out.stats.recorded == (LAUNCHED,) and out.stats.derivatives_recorded == [LAUNCHED]
 
 
+@pytest.mark.slow
 def test_what_changes_is_said(room_scene):
     """Another number in a plugin at every call."""
     renderer = tt.TransientRenderer(tt.load(make_room(), variant=VARIANT), parameters=[COLOUR], spp=2)

@@ -137,6 +137,7 @@ def test_numbers_are_the_same_whatever_the_count(freeze):
     assert int(launched) >= 3 if freeze else launched == "0"
 
 
+@pytest.mark.slow
 def test_drjit_computes_with_as_many_threads():
     """Threads of the process, and those among them that have computed."""
     if not os.path.isdir("/proc/self/task"):

@@ -147,6 +147,7 @@ def test_a_measured_exponential_is_an_exponential():
     torch.testing.assert_close(found, wanted, rtol=1e-5, atol=0.3 / 200**2 / 8)
 
 
+@pytest.mark.slow
 def test_exponents_and_times_are_learnt():
     law = PowerLawDelays(1.5, 300 * WIDTH, learnable=True)
     module = Afterpulsing(0.1, dead_time_s=4 * WIDTH, delays=law, bin_width_s=WIDTH, learnable=True)

@@ -27,6 +27,7 @@ def light():
     return torch.full((1, 16, 1, 1), LIGHT, dtype=torch.float64)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("weights", [[1 + 1e-4 * i for i in range(100)], [1.0] * 50 + [1.001] * 50])
 def test_background_of_a_pixel_is_shared(weights):
     """SPADs whose shares hardly differ count what equal ones do."""

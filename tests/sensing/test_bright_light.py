@@ -168,6 +168,7 @@ def test_third_order_in_the_width_of_bins():
     assert errors[0] > 6 * errors[1] > 36 * errors[2] > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "which, flux, dead", [(0, 60.0, 12.8), (0, 1000.0, 45.3), (1, 60.0, 31.9), (2, 200.0, 31.9), (2, 3000.0, 20.25)]
 )

@@ -91,6 +91,7 @@ def test_paralyzable_in_constant_light():
     assert totals(events).var() == pytest.approx(variance, rel=6 * (2 / 1500) ** 0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("free", [False, True])
 @pytest.mark.parametrize("total, dead", [(0.1, 3.7), (3.0, 21.4), (40.0, 1.3)])
 def test_both_ways_agree_in_uneven_light(free, total, dead):

@@ -119,6 +119,7 @@ def test_gradients(solve, dead):
     assert torch.autograd.gradcheck(solve, (x, d), check_forward_ad=True)
 
 
+@pytest.mark.slow
 def test_learnable_dead_time_is_found():
     rate = as_image(pulse(2.0))
     data = FreeRunningSPAD(1000, 40e-10, bin_width_s=1e-10)(rate)

@@ -172,6 +172,7 @@ def test_variance_of_phase_and_depth(num_taps, readout, dark_e, read_noise_e):
     assert abs(float(reading.depth_std_m.std()) / metres) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("readout", READOUTS)
 @pytest.mark.parametrize("name", ["hamiltonian3", "hamiltonian4", "square4", "measured5"])
 def test_deviation_of_depth_decoded_by_shape(name, readout):

@@ -396,7 +396,5 @@ def _of_frequencies(given: float | Tensor, steps: Tensor) -> Tensor:
     try:
         return value.broadcast_to(like.shape).unsqueeze(-3)
     except RuntimeError as error:
-        raise ShapeError(
-            f"ItofNoise: expected a number or what broadcasts to (..., C, F, H, W) = {tuple(like.shape)}, got "
-            f"{tuple(value.shape)}."
-        ) from error
+        got = f"expected a number or what broadcasts to {tuple(like.shape)}, got {tuple(value.shape)}"
+        raise ShapeError(f"ItofNoise: {got}.") from error
