@@ -18,7 +18,6 @@ import argparse
 import itertools
 import os
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -60,7 +59,8 @@ def detector() -> sensing.Compose:
     Keyhole's set-up stands for its jitter: behind the detector, since the rates have their background already."""
     device = sensing.device("mpd_spad_like")
     pulse = {"kind": "TailedResponse", "fwhm_s": 90e-12, "tails_s": [70e-12], "fractions": [0.5]}
-    return replace(device, stages=device.changed("DetectionJitter", response=pulse).stages[2:]).sensor(AXIS)
+    whole = device.changed("DetectionJitter", response=pulse).changed("Afterpulsing", background=0.0).sensor(AXIS)
+    return sensing.Compose(list(whole.stages)[2:])
 
 
 def exposed(light: Tensor, counts: tuple[float, float], generator: torch.Generator) -> Tensor:
