@@ -31,7 +31,7 @@ from _dataset_cases import NoOne, captures, described, moving_boxes, several_vie
 
 from torchtransient.data.generation.settings import Settings
 from torchtransient.data.generation.shard_making import ShardMaker
-from torchtransient.render.variant import active_variant
+from torchtransient.rendering.variant import active_variant
 
 CPU = time.process_time
 MB = 1e6
@@ -166,7 +166,7 @@ def workers(film: list[int], per_shard: int, shards: int, repeats: int) -> dict[
             for n in (few, many):
                 with tempfile.TemporaryDirectory() as folder:
                     start, used = time.perf_counter(), sum(os.times()[:4])
-                    tt.data.generate(recipe, folder, n, count, per_shard=per_shard, progress=False)
+                    tt.data.generate(recipe, folder, n, workers=count, per_shard=per_shard, progress=False)
                     spent.append((time.perf_counter() - start, sum(os.times()[:4]) - used))
             # What comes before the first sample, and behind the last one, is in both.
             for what, short, long in zip(("wall", "cpu"), *spent, strict=True):

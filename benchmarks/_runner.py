@@ -15,6 +15,7 @@ import platform
 import statistics
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
@@ -45,11 +46,20 @@ def arguments(description: str | None, *, peer: bool = True) -> argparse.Argumen
 def curve_arguments(description: str | None, picture: str, numbers: str, *, repeats: int) -> argparse.ArgumentParser:
     """The options of a benchmark that draws error against time into `picture` and writes `numbers` next to it."""
     parser = argparse.ArgumentParser(description=(description or "").split("\n", 1)[0])
-    parser.add_argument("--picture", type=Path, default=Path(picture))
-    parser.add_argument("--json", type=Path, default=Path(numbers))
+    parser.add_argument("--picture", type=Path, help=f"written to {picture}, if not given")
+    parser.add_argument("--json", type=Path, help=f"written to {numbers}, if not given")
     parser.add_argument("--repeats", type=int, default=repeats)
     parser.add_argument("--quick", action="store_true", help="tiny: shows that it runs, measures nothing")
     return parser
+
+
+def output(given: Path | None, kept: str | Path, *, quick: bool) -> Path:
+    """`given`, else the file that is kept in the repository; of a quick run, which measures nothing, one elsewhere."""
+    if given is None and not quick:
+        return Path(kept)
+    path = given or Path(tempfile.gettempdir()) / "torchtransient_quick_runs" / Path(kept).name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
 
 
 class ChildProcess:

@@ -1,13 +1,14 @@
-"""What accuracy costs in time: error of the Cornell box's transient and gradients, for the README's curve.
+"""What accuracy costs in time: error of the Cornell box's transient and gradients, for the curve of docs/accuracy.md.
 
 Writes the picture and the numbers next to it. The choices compared are the sampler and the temporal filter.
 """
 
 from __future__ import annotations
 
-from _runner import curve_arguments
+from _runner import curve_arguments, output
 
 import torchtransient as tt
+from torchtransient.vis.files import to_palette
 
 
 def main() -> None:
@@ -29,8 +30,11 @@ def main() -> None:
         temporal_filters=("box", "tent"),
     )
     print(report.table())
+    options.picture = output(options.picture, picture, quick=options.quick)
+    options.json = output(options.json, numbers, quick=options.quick)
     report.to_json(options.json)
     report.plot(options.picture)
+    to_palette(options.picture)
     print(f"picture: {options.picture}, numbers: {options.json}")
 
 

@@ -96,14 +96,14 @@ def written(path: Path, way: Way, x: np.ndarray) -> None:
     """A shard of all samples."""
     bins = x.shape[2]
     about = {"axis": {"start_opl": 3.5, "bin_width_opl": 10 / bins, "num_bins": bins}, "channels": ["Y"]}
-    with ShardWriter(path, len(x), {"about": about}, way.store, way.compression) as shard:
+    with ShardWriter(path, len(x), {"about": about}, store=way.store, compression=way.compression) as shard:
         for row, cube in enumerate(x):
             shard.put(row, Sample(row, {way.array: cube}))
 
 
 def read(path: Path, array: str, window: slice | None) -> float:
     """CPU seconds of all samples of a shard that is open, in a shuffled order."""
-    data = TransientDataset(path, [array], window)
+    data = TransientDataset(path, fields=[array], window=window)
     data[0]
     order = np.random.default_rng(2).permutation(len(data)).tolist()
     seconds = cpu(lambda: [data[number] for number in order])

@@ -131,6 +131,8 @@ def main() -> None:
     parser.add_argument("--docs", action="store_true", help="write docs/effects.md and docs/images/effects.png")
     parser.add_argument("--only", nargs="+", default=None, help="names of the cases to run")
     options = parser.parse_args()
+    if options.quick and options.docs:
+        parser.error("--docs keeps what is measured, and --quick measures nothing: give one of the two")
     resolution, spp = (8, 4) if options.quick else (128, 64)
     repeats = options.repeats or (2 if options.quick else 9)
     chosen = [case for case in CASES if options.only is None or case.name in options.only]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 
-from _runner import curve_arguments
+from _runner import curve_arguments, output
 
 import torchtransient as tt
 from torchtransient.vis.accuracy_curve import Curve, plot_accuracy
@@ -32,6 +32,8 @@ def main() -> None:
     parser = curve_arguments(__doc__, picture, numbers_file, repeats=4)
     parser.add_argument("--points", type=int, default=32)
     options = parser.parse_args()
+    options.picture = output(options.picture, picture, quick=options.quick)
+    options.json = output(options.json, numbers_file, quick=options.quick)
     points, spp = (2, (4, 16)) if options.quick else (options.points, (256, 1024, 4096, 16384))
     curves, numbers = [], {}
     for name, (hidden, size) in HIDDEN.items():

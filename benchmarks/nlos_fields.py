@@ -45,8 +45,8 @@ BARS = {(64, "phasor planes"): 1 / 50, (64, "fbp"): 1 / 10, (32, "bp"): 1 / 10}
 
 def correlation(a: torch.Tensor, b: torch.Tensor) -> float:
     """Of two pictures as they are: sum of products over the root of the sums of squares."""
-    a, b = a.abs().double().flatten(), b.abs().double().flatten()
-    return float(a @ b / (a.norm() * b.norm()))
+    a, b = (x.abs().double().reshape(1, -1) for x in (a, b))
+    return float(tt.metrics.picture_correlation(a, b, centered=False))
 
 
 def clock(function: Callable[[], Any]) -> tuple[Any, float]:

@@ -123,7 +123,7 @@ class Case:
 def film(size: int, samples: int, **arguments: Any) -> Any:
     node = {"type": "transient_hdr_film", "temporal_bins": BINS, "bin_width_opl": BIN_WIDTH, "start_opl": START}
     made = mi.load_dict({**node, "width": size, "height": size, "rfilter": {"type": "box"}, **arguments})
-    made.prepare(samples=samples)
+    made.start_render(samples)
     return made
 
 

@@ -15,7 +15,6 @@ named.
 from __future__ import annotations
 
 import json
-import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -93,33 +92,18 @@ def filled(triangles: torch.Tensor, grid: VoxelGrid, samples: int = 8) -> torch.
 
 
 def correlation(volume: torch.Tensor, truth: torch.Tensor) -> float:
-    front = volume.clamp_min(0).amax(0)
-    return float(torch.corrcoef(torch.stack([front.flatten(), truth.flatten()]))[0, 1])
+    return float(tt.metrics.picture_correlation(tt.metrics.front_view(volume), truth))
 
 
 def depth_error(volume: torch.Tensor, grid: VoxelGrid, truth: torch.Tensor) -> float:
     """Metres."""
-    depth = tt.nlos.depth_map(volume, grid).depth[truth == 1]
-    return float((depth - DISTANCE).abs().median())
+    depth = tt.nlos.depth_map(volume, grid).depth
+    return float(tt.metrics.depth_median_error(depth, torch.full_like(depth, DISTANCE), mask=truth == 1))
 
 
 def position_error(volume: torch.Tensor, grid: VoxelGrid) -> float:
     """Metres: the root of the mean square over the points."""
-    errors = []
-    steps = torch.tensor([float(grid.depths.diff()[0]), *grid.pitch], dtype=torch.float64)
-    for point in torch.tensor(POINTS, dtype=torch.float64):
-        near = torch.linalg.vector_norm(grid.points - point, dim=-1) <= NEAR
-        index = torch.stack(torch.unravel_index(torch.where(near, volume, -math.inf).argmax(), volume.shape))
-        offset = torch.zeros(3, dtype=torch.float64)
-        for k in range(3):
-            if 0 < index[k] < volume.shape[k] - 1:
-                low, middle, high = (volume[tuple(index + torch.eye(3, dtype=torch.int64)[k] * s)] for s in (-1, 0, 1))
-                bend = low - 2 * middle + high
-                offset[k] = ((low - high) / (2 * bend)).clamp(-0.5, 0.5) if bend < 0 else 0.0
-        z, y, x = offset * steps
-        found = grid.points[tuple(index)] + x * grid.along_x + y * grid.along_y + z * grid.normal
-        errors.append(float((found - point).square().sum()))
-    return math.sqrt(sum(errors) / len(errors))
+    return float(tt.metrics.localization_rmse(volume, POINTS, radius_m=NEAR, grid=grid))
 
 
 def main() -> None:

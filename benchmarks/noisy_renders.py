@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from _runner import arguments, environment
+from _runner import arguments, environment, output
 
 from _linear_fits import GROUPS, Linear, Loss, Scene, two_walls  # isort: skip  (what is measured comes by `_runner`)
 from _noisy_scene_fits import fits, priors
@@ -87,9 +87,11 @@ CASES = {
     "`squared_loss`, weighted": Case(weighted, linear=True),
     '`squared_loss`, weighted, `grad_seed="same"`': Case(weighted, linear=True, same=True),
     "`two_render_loss`, weighted": Case(two_renders, linear=True, renders=2),
-    "`transient_phasor_loss`, 0.2 to 1.6 per m": Case(plain(losses.transient_phasor_loss, AXIS, BAND), linear=True),
+    "`transient_phasor_loss`, 0.2 to 1.6 per m": Case(
+        plain(losses.transient_phasor_loss, axis=AXIS, frequencies=BAND), linear=True
+    ),
     "`transient_phasor_loss`, `phase_only`": Case(
-        plain(losses.transient_phasor_loss, AXIS, BAND, phase_only=True, floor=1.0), free=SHAPE_ALONE
+        plain(losses.transient_phasor_loss, axis=AXIS, frequencies=BAND, phase_only=True, floor=1.0), free=SHAPE_ALONE
     ),
     "`multiscale_loss` of `squared_loss`": Case(plain(losses.multiscale_loss), linear=True, part=4),
     "`multiscale_loss` of `poisson_loss`": Case(
@@ -207,10 +209,11 @@ def measure(
 
 def main() -> None:
     parser = arguments(__doc__, peer=False)
-    parser.set_defaults(json=RESULTS, variant="llvm_ad_mono")
+    parser.set_defaults(variant="llvm_ad_mono")
     parser.add_argument("--smoke", dest="quick", action="store_true", help="the same as --quick")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help="others stay as they are in the JSON")
     options = parser.parse_args()
+    options.json = output(options.json, RESULTS, quick=options.quick)
     size = QUICK if options.quick else Size()
     tt.threads(1)
     scene, began = Scene.build(), time.process_time()

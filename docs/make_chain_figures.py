@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 import torchtransient as tt
 from torchtransient import sensing
-from torchtransient.sensing.sensor import RandomSensor, Sensor
+from torchtransient.sensing import RandomSensor, Sensor
 
 OUT = Path(__file__).parent / "images" / "chains"
 NS = 1e9

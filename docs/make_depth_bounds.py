@@ -7,7 +7,7 @@ Planes at all places inside a bin; root of the mean square of the error over the
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import torch
@@ -23,6 +23,11 @@ AXIS = tt.TimeAxis.from_seconds(0.0, 100 * PS, 96)
 DRAWS = 2000
 PHOTONS = (10, 30, 100, 1000)
 CYCLES, SIGNALS = 2000, (0.05, 0.5, 2.0, 8.0)
+
+
+def named(unknowns: Iterable[Tensor]) -> dict[str, Tensor]:
+    """Distance, signal and background as arguments."""
+    return dict(zip(("distance_m", "signal", "background"), unknowns, strict=True))
 
 
 def planes(generator: torch.Generator) -> Tensor:
@@ -60,7 +65,7 @@ def greatest(counts: Tensor, response: sensing.Response, ratio: float) -> Tensor
 
 
 def centre(counts: Tensor, background: float) -> Tensor:
-    place = sensing.centre_of_mass(counts, background=background, half_width_bins=6)
+    place = sensing.center_of_mass(counts, background=background, half_width_bins=6)
     return sensing.distance_of_position(place, AXIS).flatten()
 
 
@@ -69,17 +74,17 @@ def likeliest(counts: Tensor, response: sensing.Response, signal: float, backgro
     about, by steps of the inverse of the information.
     """
     bins = 0.5 * AXIS.centers_opl[20:70]
-    rates = sensing.return_rates(response, AXIS, bins, signal, background)
+    rates = sensing.return_rates(response, AXIS, distance_m=bins, signal=signal, background=background)
     least = [tt.losses.first_photon_nll(columns(r.expand(DRAWS, -1)), counts, CYCLES, reduction="none").sum(1)
              for r in rates]  # fmt: skip
     start = bins[torch.stack(least).flatten(1).argmin(0)]
     found = torch.stack([start, torch.full_like(start, signal), torch.full_like(start, background)], -1)
     for _ in range(8):
         leaf = found.clone().requires_grad_()
-        model = columns(sensing.return_rates(response, AXIS, *leaf.unbind(-1)))
+        model = columns(sensing.return_rates(response, AXIS, **named(leaf.unbind(-1))))
         loss = tt.losses.first_photon_nll(model, counts, CYCLES, reduction="sum")
         (slope,) = torch.autograd.grad(loss, leaf)
-        covariance = sensing.crlb(response, AXIS, *found.unbind(-1), cycles=CYCLES).covariance
+        covariance = sensing.crlb(response, AXIS, **named(found.unbind(-1)), cycles=CYCLES).covariance
         found = torch.maximum(found - (covariance @ slope[..., None])[..., 0], 0.3 * found)
     return found[:, 0]
 
@@ -104,9 +109,9 @@ def without_pile_up() -> list[str]:
             for photons in PHOTONS:
                 g = torch.Generator().manual_seed(1)
                 truth = planes(g)
-                mean = sensing.return_rates(response, AXIS, truth, photons, background)
+                mean = sensing.return_rates(response, AXIS, distance_m=truth, signal=photons, background=background)
                 counts = torch.poisson(columns(mean), generator=g)
-                bound = sensing.crlb(response, AXIS, truth, photons, background).distance_m
+                bound = sensing.crlb(response, AXIS, distance_m=truth, signal=photons, background=background).distance_m
                 row.append(ratio_of(estimate(counts, response, photons, background), truth, bound))
             lines.append(f"| {way} | {width} | {background:g} | " + " | ".join(row) + " |")
     return lines
@@ -123,9 +128,11 @@ def with_pile_up() -> list[str]:
     for signal in SIGNALS:
         g = torch.Generator().manual_seed(2)
         truth = planes(g)
-        rates = columns(sensing.return_rates(response, AXIS, truth, signal, background))
+        rates = columns(sensing.return_rates(response, AXIS, distance_m=truth, signal=signal, background=background))
         counts = sensing.SynchronousSPAD(CYCLES).sample(rates, g)
-        bound = sensing.crlb(response, AXIS, truth, signal, background, cycles=CYCLES).distance_m
+        bound = sensing.crlb(
+            response, AXIS, distance_m=truth, signal=signal, background=background, cycles=CYCLES
+        ).distance_m
         undone = matched(sensing.coates(counts, CYCLES).rate, response, signal / background)
         found = {
             "matched filter of the counts": matched(counts, response, signal / background),

@@ -53,9 +53,10 @@ CASES: dict[str, tuple[Pixel, bool]] = {
     "`poisson_nll`": (by_bin(losses.poisson_nll), False),
     "`first_photon_nll`": (by_bin(first_photon), True),
     "`transient_phasor_loss`, 0.2 to 1.6 per m": (
-        lambda x, y: losses.transient_phasor_loss(x, y, AXIS, LOW, reduction="none").sum(1), False),
+        lambda x, y: losses.transient_phasor_loss(x, y, axis=AXIS, frequencies=LOW, reduction="none").sum(1), False),
     "the same, `phase_only`": (
-        lambda x, y: losses.transient_phasor_loss(x, y, AXIS, LOW, phase_only=True, floor=1.0, reduction="none").sum(1),
+        lambda x, y: losses.transient_phasor_loss(x, y, axis=AXIS, frequencies=LOW, phase_only=True, floor=1.0,
+            reduction="none").sum(1),
         False),
     "`wasserstein_loss`": (by_record(losses.wasserstein_loss, WIDTH), False),
     "`cumulative_loss`": (by_record(losses.cumulative_loss, WIDTH), False),

@@ -13,7 +13,7 @@ import torch
 
 import torchtransient as tt
 from torchtransient.scenes.transforms import look_at, scale, translate
-from torchtransient.vis.files import enlarge, save_image
+from torchtransient.vis.files import enlarge, save_image, to_palette
 
 OUT = Path(__file__).parent / "images" / "pictures"
 AXIS = {"num_bins": 200, "start_opl": 3.6, "bin_width_opl": 0.03}
@@ -36,6 +36,7 @@ def surfaces() -> None:
     tt.vis.streak(out, OUT / "streak.png", row=84)
     figure = tt.vis.frame_grid(out, count=8)
     figure.savefig(OUT / "frames.png", dpi=90)
+    to_palette(OUT / "frames.png")
     tt.vis.histogram(out, OUT / "histogram.png", pixels=[(52, 84), (110, 40)], log=True)
     small = torch.nn.functional.avg_pool2d(out.transient.transpose(0, 1), 2).transpose(0, 1)
     tt.vis.video(small, OUT / "light.gif", axis=out.axis, scale=4, every=5, fps=10)
@@ -72,6 +73,7 @@ def phasors() -> None:
     with torch.no_grad():
         out = tt.render(scene, spp=512, seed=0, frequencies=axis)
     tt.vis.phasor_picture(out, OUT / "phasors.png", which=(0, 1), show=("real", "phase", "domain"))
+    to_palette(OUT / "phasors.png")
 
 
 def gradients() -> None:

@@ -217,7 +217,7 @@ def macro_pixels() -> None:
     one.set(title="6 photons a cycle, 3 of the pulse", xlabel="time in ns", ylabel="detections per cycle")
     one.legend(fontsize=8)
     for k in (1, 2, 3):
-        seen = sensing.CoincidencePixel(spad, 16, k, 2 * NS, axis=axis)(x).flatten()
+        seen = sensing.CoincidencePixel(spad, 16, coincidence=k, window_s=2 * NS, axis=axis)(x).flatten()
         two.semilogy(times, seen / seen.max(), label=f"{k} of 16 SPADs")
     two.set(title="coincidences within 2 ns", xlabel="time in ns", ylabel="of the peak", ylim=(1e-4, 2))
     two.legend(fontsize=8)
@@ -318,7 +318,9 @@ def itof_pixels() -> None:
             frames = sensing.Compose(chain).sample(taps, generator(3))
             phase = sensing.read_itof(frames, 60.6e6, 4, readout=readout).phase.flatten()
             drawn.append(float(sensing.wrapped_difference(phase, phase[:1] * 0 + 2 * math.pi * 0.6084).std()))
-        theory = sensing.phase_noise_rad(0.6 * levels / 4, (levels + ambient) / 4, 4, 20.0, readout)
+        theory = sensing.phase_noise_rad(
+            0.6 * levels / 4, (levels + ambient) / 4, 4, read_noise_e=20.0, readout=readout
+        )
         metres = SPEED_OF_LIGHT / (4 * math.pi * 60.6e6)
         label = f"{readout}, {ambient:g} e of background"
         panels[0].loglog(levels, 1000 * metres * theory, colour, label=label)
@@ -329,7 +331,7 @@ def itof_pixels() -> None:
     distance, light = ball()
     rows = torch.linspace(-1, 1, 96, dtype=torch.float64)
     pattern = 0.15 * rows[:, None] * rows + 0.02 * torch.randn(96, 96, generator=generator(4), dtype=torch.float64)
-    known = sensing.ItofCalibration(0.3, -1, depth_map_m=pattern)
+    known = sensing.ItofCalibration(phase_offset_rad=0.3, direction=-1, depth_map_m=pattern)
     camera = sensing.Compose(
         [
             sensing.ItofCorrelation(
@@ -341,14 +343,14 @@ def itof_pixels() -> None:
         ]
     )  # fmt: skip
     frames = camera.sample(transient(axis, distance, light), generator(0))
-    right = sensing.ItofCalibration(0.3, -1)
+    right = sensing.ItofCalibration(phase_offset_rad=0.3, direction=-1)
     for panel, (name, used) in zip(
         panels[1:], {"no map": right, "with its map": known, "steps taken the wrong way": None}.items(), strict=True
     ):
         found = sensing.read_itof(
             frames, (80e6, 60e6), 4, readout="differential", calibration=used, max_depth_m=5.0
         ).depth_m[0]
-        shown = panel.imshow(1000 * (found - distance), vmin=-200, vmax=200, cmap="RdBu_r")
+        shown = panel.imshow(1000 * (found - distance), vmin=-200, vmax=200, cmap="RdBu_r", interpolation="nearest")
         panel.set(title=name, xticks=[], yticks=[])
     figure.colorbar(shown, ax=panels[3], label="error of depth in mm")
     save(figure, "itof_pixels.png")
@@ -382,8 +384,8 @@ def depth_estimators() -> None:
     scores = sensing.log_matched_filter(counts, kernel, first, signal_to_background=100.0)
     one.step(range(128), counts.flatten(), color="0.6", linewidth=0.8, where="mid")
     places = {
-        "centre of mass": sensing.centre_of_mass(counts),
-        "... background off": sensing.centre_of_mass(counts, background=0.6),
+        "centre of mass": sensing.center_of_mass(counts),
+        "... background off": sensing.center_of_mass(counts, background=0.6),
         "matched filter": sensing.peak_position(scores),
         "first return": sensing.first_return(counts, 4.0).position.squeeze(-3),
     }
@@ -438,9 +440,9 @@ def gates() -> None:
 
 def streak() -> None:
     """One line of the scene through a streak camera."""
-    axis = tt.TimeAxis(2.8, 0.003, 450)
-    distance, light = ball(192)
-    line = slice(100, 101)
+    axis = tt.TimeAxis(2.8, 0.006, 200)
+    distance, light = ball(128)
+    line = slice(67, 68)
     x = transient(axis, distance[line], light[line]) * 40
     camera = sensing.StreakCamera(
         axis, time_fwhm_s=60 * PS, spatial_fwhm_px=2.0, jitter_fwhm_s=30 * PS, sweeps=50, phosphor_fwhm_px=1.5,
@@ -454,7 +456,9 @@ def streak() -> None:
     }
     for panel, (name, image) in zip(panels, views.items(), strict=True):
         flat = image[0, :, 0]
-        panel.imshow(flat.clamp_min(0).sqrt(), aspect="auto", cmap="magma", vmax=float(flat.quantile(0.9995)) ** 0.5)
+        style = {"cmap": "magma", "vmax": float(flat.quantile(0.9995)) ** 0.5}
+        # Smoothed cells would double the file: no two dots of the noise are then alike.
+        panel.imshow(flat.clamp_min(0).sqrt(), aspect="auto", interpolation="nearest", **style)
         panel.set(title=name, xlabel="pixel along the slit", yticks=[])
     panels[0].set_ylabel("time, downwards (root of the light)")
     save(figure, "streak.png")
@@ -492,7 +496,7 @@ def polarization() -> None:
         ("angle, measured", aolp(back, -5)[0, 0], {"vmin": -math.pi / 2, "vmax": math.pi / 2, "cmap": "hsv"}),
     ]
     for panel, (name, image, style) in zip(panels, views, strict=True):
-        panel.imshow(image, **style)
+        panel.imshow(image, interpolation="nearest", **style)
         panel.set(title=name, xticks=[], yticks=[])
     save(figure, "polarization.png")
 

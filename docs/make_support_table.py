@@ -1,5 +1,4 @@
-"""Measure every gradient of the test matrix and print the support table; ``--write README.md`` puts it between the
-markers.
+"""Measure every gradient of the test matrix and write the support table of docs/gradients_table.md.
 
 The cases are those of ``tests/support/gradient_cases``: what the table says is what the tests check.
 """
@@ -14,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).resolve().parent.parent
+PAGE = ROOT / "docs" / "gradients_table.md"
 BEGIN, END = "<!-- support-table:begin -->", "<!-- support-table:end -->"
 NOT_SUPPORTED = (
     (
@@ -35,7 +35,7 @@ NOT_SUPPORTED = (
     ),
     (
         "derivatives of Mitsuba's own `conductor`, `polarizer`, `retarder`, `circular` in polarized variants",
-        "`tt.load` builds `diff_conductor`, `diff_polarizer`, ... in their place, see docs/polarization.md",
+        "`tt.load` builds `diff_conductor`, `diff_polarizer`, ... in their place: [polarization.md](polarization.md)",
     ),
     ("any path length through an explicit box filter", "not supported: `GradientError`"),
     ("second derivatives; unlimited depth (`max_depth=-1`)", "not supported: `GradientError`"),
@@ -74,8 +74,7 @@ def table(rows) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--write", type=Path, help="file with the markers to write the table to")
-    parser.add_argument("--only", nargs="*", default=[], help="names of cases")
+    parser.add_argument("--only", nargs="*", default=[], help="names of cases; what they give is printed, not written")
     arguments = parser.parse_args()
 
     sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
@@ -91,12 +90,9 @@ def main() -> None:
         rows[case.row].append((case, measure(case)))
     text = table(rows)
     print(text)
-    if arguments.write:
-        content = arguments.write.read_text(encoding="utf-8")
-        if BEGIN not in content or END not in content:
-            parser.error(f"{arguments.write} lacks the markers {BEGIN} and {END}")
-        head, rest = content.split(BEGIN)
-        arguments.write.write_text(f"{head}{BEGIN}\n{text}\n{END}{rest.split(END)[1]}", encoding="utf-8")
+    if not arguments.only:
+        head, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
+        PAGE.write_text(f"{head}{BEGIN}\n{text}\n{END}{rest.split(END)[1]}", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -40,16 +40,23 @@ def _syntax_once(f=None, **options):
 
 dr.syntax = _syntax_once
 
-# Processes that run tests side by side share the cores: threads that wait for work do so by spinning. Not one alone:
-# Mitsuba 3.9 waits for ever for the second one when it writes an OpenEXR file.
+# Processes that run tests side by side share the cores: threads that wait for work do so by spinning, which is a third
+# of what renders of small films cost. One thread alone waits for ever for Mitsuba's OpenEXR files (3.9, written or
+# read): tests that call Mitsuba for such a file do it in `with tt.threads(2):`, as users have to.
 if (_workers := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))) > 1:
-    dr.set_thread_count(max(2, (os.cpu_count() or 1) // _workers))
+    dr.set_thread_count(max(1, (os.cpu_count() or 1) // _workers))
+
+
+def pytest_collectstart():
+    """Nothing that is imported or found before the first test is garbage."""
+    gc.disable()
 
 
 def pytest_collection_finish(session):
     """What is there before the first test stays: collections look at what tests have made, not at every module and
     item each time (0.3 s for each of a hundred and more).
     """
+    gc.enable()
     gc.collect()
     gc.freeze()
 

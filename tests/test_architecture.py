@@ -1,4 +1,4 @@
-"""Imports go down the levels of the package or stay in their room, without circles; the two pillars meet in `render/`.
+"""Imports go down the levels or stay in their room, without circles; the two pillars meet in `rendering/`.
 
 Every import of every file is read with `ast`, the ones inside functions too. Tests share through `tests/support`, and
 benchmarks do without tests.
@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 import torchtransient
+from support.sweeps import together
 
 PACKAGE = Path(torchtransient.__file__).parent
 TESTS = Path(__file__).parent
@@ -21,11 +22,11 @@ BENCHMARKS = sorted((TESTS.parent / "benchmarks").glob("*.py"))
 LEVEL = {
     "errors": 0, "_llvm": 0, "_collection": 0, "units": 0, "axes": 0, "capture": 0, "interfaces": 0, "pulses": 0,
     "gates": 0, "stokes": 0, "tensor_record": 0, "quantities": 0, "volume_methods": 0,
-    "transform_bins": 0, "yaml_numbers": 0, "floating": 0,
+    "transform_bins": 0, "yaml_numbers": 0, "floating": 0, "scalar_state": 0, "argument_names": 0,
     "plugins": 1, "sensing": 1, "reconstruction": 1, "losses": 1, "metrics": 1, "vis": 1,
     "parametrize": 1, "geometry": 1,
     "scenes": 2,
-    "render": 3,
+    "rendering": 3,
     "files": 4, "nlos": 4, "data": 4, "accuracy": 4, "testing": 4, "training": 4,
     "cli": 5,
     "__main__": 6,
@@ -37,10 +38,12 @@ FORBIDDEN = {
     "plugins": {"torch", "kornia"},
     "scenes": {"torch", "kornia", *MITSUBA},
     "errors": {"torch", *MITSUBA},
+    "argument_names": {"torch", *MITSUBA},
     "volume_methods": {"torch", *MITSUBA},
     "transform_bins": {"torch", *MITSUBA},
     "yaml_numbers": {"torch", *MITSUBA},
     "floating": MITSUBA,
+    "scalar_state": MITSUBA,
     "units": MITSUBA,
     "axes": MITSUBA,
     "capture": MITSUBA,
@@ -53,8 +56,15 @@ HEAVY = {
     "matplotlib", "h5py", "kornia", "scipy", "imageio", "imageio_ffmpeg", "PIL", "click", "rich", "hdf5plugin",
     "zstandard", "webdataset", "ray",
 }  # fmt: skip
+# The rooms of `sensing`: each reads those below it, and what `sensing` offers stands in its `__init__`.
+SENSING = {
+    "base": 0, "numerics": 1, "response": 2, "counts": 2,
+    "optics": 3, "timing": 3, "itof": 3, "dead_time": 3, "estimation": 3,
+    "cameras": 4, "spad": 4, "correlated_noise": 5, "pixels": 6, "chain": 7, "devices": 8,
+}  # fmt: skip
 FILES = sorted(PACKAGE.rglob("*.py"))
 MOST_LINES = {"file": 400, "function": 160}
+MOST_FILES = 14  # of a room
 
 
 def dotted(path):
@@ -91,8 +101,13 @@ def imports(path, package=PACKAGE, *, for_types=True):
 
 
 def nodes(tree, for_types):
-    """The nodes of a syntax tree, with or without what stands under `if TYPE_CHECKING:`."""
+    """The statements of a syntax tree, with or without what stands under `if TYPE_CHECKING:`.
+
+    Expressions are left out: they contain no imports, and are nine nodes of ten.
+    """
     for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.expr | ast.arguments):
+            continue
         yield node
         if not for_types and isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
             for other in node.orelse:
@@ -154,21 +169,23 @@ def is_below(other, room):
     if LEVEL[other] != LEVEL[room]:
         return LEVEL[other] < LEVEL[room]
     # Within a level: `accuracy` quotes the statistics of `testing`, and everything may know errors and units;
-    # likelihoods are those of the sensors; captures are records with axes; simulated ones have files, data sets both.
+    # likelihoods are those of the sensors; metrics read results as losses do, and volumes; captures are records with
+    # axes; simulated ones have files, data sets both; rows of numbers are given alike.
     within = {
         ("accuracy", "testing"), ("gates", "pulses"), ("losses", "sensing"), ("capture", "axes"),
         ("capture", "tensor_record"), ("capture", "quantities"), ("nlos", "files"), ("data", "files"), ("data", "nlos"),
-        ("floating", "quantities"),
+        ("floating", "quantities"), ("metrics", "losses"), ("metrics", "reconstruction"), ("axes", "quantities"),
+        ("gates", "quantities"), ("pulses", "quantities"), ("capture", "argument_names"),
     }  # fmt: skip
     return other in {"errors", "units"} or (room, other) in within
 
 
-@pytest.mark.parametrize("path", FILES, ids=dotted)
+@together("path", FILES, dotted)
 def test_imports(path):
     assert list(violations(path)) == []
 
 
-@pytest.mark.parametrize("path", [f for f in FILES if f.relative_to(PACKAGE).parts[0] != "cli"], ids=dotted)
+@together("path", [f for f in FILES if f.relative_to(PACKAGE).parts[0] != "cli"], dotted)
 def test_heavy_packages_are_imported_where_they_are_used(path):
     tree = parsed(path.read_text(encoding="utf-8"))
     at_top = [node for node in tree.body if isinstance(node, (ast.Import, ast.ImportFrom))]
@@ -187,9 +204,61 @@ def test_sizes():
     for path in FILES:
         text = path.read_text(encoding="utf-8")
         assert len(text.splitlines()) <= MOST_LINES["file"], dotted(path)
-        for node in ast.walk(parsed(text)):
+        for node in nodes(parsed(text), for_types=True):
             if isinstance(node, ast.FunctionDef):
                 assert node.end_lineno - node.lineno < MOST_LINES["function"], f"{dotted(path)}.{node.name}"
+
+
+def violations_in_sensing(path, package=PACKAGE):
+    """What is wrong with the imports of one file of `sensing`, a line each."""
+    room, *below = path.relative_to(package / "sensing").parts
+    if room == "__init__.py":
+        return
+    if not below or room not in SENSING:
+        yield f"{room} stands in no room of `sensing`; see SENSING in this test and docs/design.md"
+        return
+    for line, name in imports(path, package):
+        if not name.startswith("torchtransient.sensing."):
+            continue
+        other = name.split(".")[2]
+        if other not in SENSING:
+            yield f"{path.name}:{line} {name}: import it from the file that it stands in"
+        elif other != room and SENSING[other] >= SENSING[room]:
+            yield f"{path.name}:{line} '{room}' (level {SENSING[room]}) imports '{other}' (level {SENSING[other]})"
+
+
+def test_rooms_of_sensing():
+    folder = PACKAGE / "sensing"
+    found = {room.name for room in folder.iterdir() if any(room.glob("*.py"))}
+    assert found == set(SENSING)
+    assert [line for path in sorted(folder.rglob("*.py")) for line in violations_in_sensing(path)] == []
+    for room in SENSING:
+        assert len(list((folder / room).glob("[!_]*.py"))) <= MOST_FILES, room
+    tested = {room.name for room in (TESTS / "sensing").iterdir() if any(room.glob("test_*.py"))}
+    assert tested <= set(SENSING)
+
+
+@pytest.mark.parametrize(
+    ("place", "line", "message"),
+    [
+        ("numerics/draws.py", "from torchtransient.sensing.spad.spad import coates", "imports 'spad' (level 4)"),
+        ("itof/itof.py", "from torchtransient.sensing.timing import tdc", "imports 'timing' (level 3)"),
+        ("itof/itof.py", "def f():\n    from ..chain.compose import Compose", "imports 'chain'"),
+        ("spad/spad.py", "from torchtransient.sensing import Sensor", "from the file that it stands in"),
+        ("tdc.py", "import torch", "in no room"),
+        ("toolbox/tdc.py", "import torch", "in no room"),
+        ("spad/spad.py", "from torchtransient.sensing.numerics.draws import binomial", None),
+        ("spad/spad.py", "from torchtransient.sensing.spad.binary_frames import BinaryFrames", None),
+        ("spad/spad.py", "from torchtransient.axes import TimeAxis", None),
+    ],
+)
+def test_the_rules_of_sensing_bite(tmp_path, place, line, message):
+    path = tmp_path / "sensing" / place
+    path.parent.mkdir(parents=True)
+    path.write_text(line + "\n", encoding="utf-8")
+    found = list(violations_in_sensing(path, tmp_path))
+    assert len(found) == (message is not None)
+    assert message is None or message in found[0]
 
 
 def from_tests(path):
@@ -225,7 +294,7 @@ def test_tests_share_through_their_support():
     """A bare name of another test file depends on which folders are on the path."""
     shared = {p.stem for p in TESTS.rglob("*.py") if p.parent != TESTS} - {"__init__"}
     for path in TESTS.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in nodes(ast.parse(path.read_text(encoding="utf-8")), for_types=True):
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
             names += [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
             assert not {n.split(".")[0] for n in names} & shared, f"{path.relative_to(TESTS)}:{node.lineno}"
@@ -245,10 +314,10 @@ def test_every_package_has_a_level():
         ("plugins", "from torch import nn", "must not know torch"),
         ("plugins", "from mitsuba import Float", "import mitsuba as mi"),
         ("plugins", "import mitsuba.ad.integrators", "import mitsuba as mi"),
-        ("render", "from mitsuba.ad import Adam", "import mitsuba as mi"),
-        ("plugins", "from torchtransient.render import autograd", "imports 'render'"),
-        ("plugins", "from ..render import autograd", "imports 'render'"),
-        ("plugins", "from .. import render", "imports 'render'"),
+        ("rendering", "from mitsuba.ad import Adam", "import mitsuba as mi"),
+        ("plugins", "from torchtransient.rendering import autograd", "imports 'rendering'"),
+        ("plugins", "from ..rendering import autograd", "imports 'rendering'"),
+        ("plugins", "from .. import rendering", "imports 'rendering'"),
         ("plugins", "from torchtransient import vis", "imports 'vis'"),
         ("scenes", "from torchtransient.accuracy import measure", "imports 'accuracy'"),
         ("testing", "from torchtransient.accuracy import measure", "imports 'accuracy'"),
@@ -257,7 +326,7 @@ def test_every_package_has_a_level():
         ("reconstruction", "import mitsuba as mi", "must not know mitsuba"),
         ("reconstruction", "from torchtransient.sensing import SPAD", "imports 'sensing'"),
         ("reconstruction", "from torchtransient.nlos import simulate", "imports 'nlos'"),
-        ("render", "from torchtransient.nlos import simulate", "imports 'nlos'"),
+        ("rendering", "from torchtransient.nlos import simulate", "imports 'nlos'"),
         ("files", "from torchtransient.nlos import scene", "imports 'nlos'"),
         ("toolbox", "import os", "has no level"),
     ],
@@ -286,7 +355,7 @@ def test_the_rules_bite(tmp_path, room, line, message):
         ("nlos", "import mitsuba as mi"),
         ("nlos", "from torchtransient.capture import Scan, Capture"),
         ("nlos", "from torchtransient.reconstruction import fk"),
-        ("nlos", "from torchtransient.render.renderer import TransientRenderer"),
+        ("nlos", "from torchtransient.rendering.renderer import TransientRenderer"),
     ],
 )
 def test_what_rooms_may_import(tmp_path, room, line):
@@ -347,7 +416,7 @@ def test_no_old_name_is_left():
 def test_files_of_the_structure_page_exist():
     """Every file that docs/design.md names by its place in the package."""
     page = (PACKAGE.parent / "docs" / "design.md").read_text(encoding="utf-8")
-    rooms = "plugins|render|transport|films|bsdfs|sinks|segment|connection|scattering|derivative"
+    rooms = "plugins|rendering|transport|films|bsdfs|sinks|segment|connection|scattering|derivative"
     named = set(re.findall(rf"`((?:{rooms})/[\w/]+\.py)`", page))
     assert len(named) > 20
     known = {path.relative_to(PACKAGE).as_posix() for path in FILES}

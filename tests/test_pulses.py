@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.gates import Gate
 from torchtransient.pulses import Pulse, cumulative_of_sum, transform
 from torchtransient.units import SPEED_OF_LIGHT
@@ -109,7 +109,7 @@ def test_transform():
         (lambda: Pulse.tabulated([0, 1], [0, 0]), UnitError, "not all zero"),
         (lambda: Pulse.tabulated([0, 0], [1, 1]), UnitError, "rising"),
         (lambda: Pulse.tabulated([0, 1, 2], [1, 1]), ShapeError, "3 and 2"),
-        (lambda: Pulse("sech", 1.0), UnitError, "gaussian, rectangular, tabulated"),
+        (lambda: Pulse("sech", 1.0), ArgumentError, "gaussian, rectangular, tabulated"),
         (lambda: cumulative_of_sum([], 0.1), UnitError, "at least one"),
     ],
 )

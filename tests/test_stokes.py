@@ -126,6 +126,14 @@ def test_elements_do_what_their_names_say():
     torch.testing.assert_close(st.apply_mueller(st.depolarizer(), quarter, 0), light(1, 0, 0, 0))
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_angle_of_a_linear_part_above_the_floor_of_components_below_it(dtype):
+    floor = 0.5
+    s = torch.tensor([1.0, 0.9 * floor, 0.9 * floor, 0.0], dtype=dtype)  # a linear part of 1.27 floor
+    assert st.angle_of_linear_polarization(s, 0, floor).item() == pytest.approx(math.pi / 8, abs=1e-6)
+    assert st.angle_of_linear_polarization(s, 0, 1.3 * floor).item() == 0
+
+
 def test_no_element_polarises_beyond_one():
     s = random_light(200, dim=0)
     for element in (st.linear_polarizer(0.3, 0.01), st.linear_retarder(0.1, 2.0), st.circular_polarizer()):

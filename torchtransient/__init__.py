@@ -1,6 +1,13 @@
-"""torchtransient: time-resolved light transport as differentiable PyTorch tensors."""
+"""torchtransient: time-resolved light transport as differentiable PyTorch tensors.
+
+Public names are imported when they are first used, so that `import torchtransient` stays cheap; type checkers read the
+imports below, and `tests/test_public_names.py` holds the two lists against each other.
+"""
+
+from __future__ import annotations
 
 import importlib
+from typing import TYPE_CHECKING
 
 from torchtransient import _llvm
 
@@ -8,49 +15,86 @@ _llvm.bind()  # chooses the LLVM that Dr.Jit takes at its import, so nothing abo
 
 from torchtransient import plugins as plugins  # noqa: E402  lets Mitsuba tell the plugins of a change of variant
 
-__version__ = "0.1.0.dev0"
+if TYPE_CHECKING:
+    from torchtransient import accuracy as accuracy
+    from torchtransient import data as data
+    from torchtransient import errors as errors
+    from torchtransient import geometry as geometry
+    from torchtransient import losses as losses
+    from torchtransient import metrics as metrics
+    from torchtransient import nlos as nlos
+    from torchtransient import parametrize as parametrize
+    from torchtransient import pulses as pulses
+    from torchtransient import reconstruction as reconstruction
+    from torchtransient import scenes as scenes
+    from torchtransient import sensing as sensing
+    from torchtransient import stokes as stokes
+    from torchtransient import training as training
+    from torchtransient import units as units
+    from torchtransient import vis as vis
+    from torchtransient.accuracy.cost import cost_of_accuracy as cost_of_accuracy
+    from torchtransient.axes import FrequencyAxis as FrequencyAxis
+    from torchtransient.axes import TimeAxis as TimeAxis
+    from torchtransient.gates import Gate as Gate
+    from torchtransient.pulses import Pulse as Pulse
+    from torchtransient.rendering.functional import render as render
+    from torchtransient.rendering.output import RenderOutput as RenderOutput
+    from torchtransient.rendering.output import RenderStats as RenderStats
+    from torchtransient.rendering.plan import Plan as Plan
+    from torchtransient.rendering.plan import plan as plan
+    from torchtransient.rendering.renderer import TransientRenderer as TransientRenderer
+    from torchtransient.rendering.scene_handle import Scene as Scene
+    from torchtransient.rendering.scene_handle import load as load
+    from torchtransient.rendering.threads import threads as threads
+    from torchtransient.rendering.wrap import wrap as wrap
 
-# The room `render` must not hide the function `render`: once the room is imported, later imports leave the name alone.
-importlib.import_module("torchtransient.render")
-del globals()["render"]
+__version__ = "0.1.0.dev0"
 
 _LAZY = {
     "FrequencyAxis": "torchtransient.axes",
     "Gate": "torchtransient.gates",
+    "Plan": "torchtransient.rendering.plan",
     "Pulse": "torchtransient.pulses",
-    "RenderOutput": "torchtransient.render.output",
-    "RenderStats": "torchtransient.render.output",
-    "Scene": "torchtransient.render.scene_handle",
+    "RenderOutput": "torchtransient.rendering.output",
+    "RenderStats": "torchtransient.rendering.output",
+    "Scene": "torchtransient.rendering.scene_handle",
     "TimeAxis": "torchtransient.axes",
-    "TransientRenderer": "torchtransient.render.renderer",
+    "TransientRenderer": "torchtransient.rendering.renderer",
+    "accuracy": "torchtransient.accuracy",
     "cost_of_accuracy": "torchtransient.accuracy.cost",
     "data": "torchtransient.data",
-    "Plan": "torchtransient.render.plan",
+    "errors": "torchtransient.errors",
     "geometry": "torchtransient.geometry",
-    "load": "torchtransient.render.scene_handle",
-    "plan": "torchtransient.render.plan",
+    "load": "torchtransient.rendering.scene_handle",
     "losses": "torchtransient.losses",
+    "metrics": "torchtransient.metrics",
     "nlos": "torchtransient.nlos",
     "parametrize": "torchtransient.parametrize",
-    "render": "torchtransient.render.functional",
+    "plan": "torchtransient.rendering.plan",
+    "pulses": "torchtransient.pulses",
+    "reconstruction": "torchtransient.reconstruction",
+    "render": "torchtransient.rendering.functional",
     "scenes": "torchtransient.scenes",
     "sensing": "torchtransient.sensing",
     "stokes": "torchtransient.stokes",
-    "threads": "torchtransient.render.threads",
+    "threads": "torchtransient.rendering.threads",
     "training": "torchtransient.training",
+    "units": "torchtransient.units",
     "vis": "torchtransient.vis",
+    "wrap": "torchtransient.rendering.wrap",
 }
 
+# Hidden from type checkers: a function of any name would give every name, misspelt ones too, its own type.
+if not TYPE_CHECKING:
 
-def __getattr__(name: str) -> object:
-    """Public names are imported when they are first used: `import torchtransient` stays cheap."""
-    if name not in _LAZY:
-        raise AttributeError(f"module 'torchtransient' has no attribute {name!r}")
-    module = importlib.import_module(_LAZY[name])
-    value = module if _LAZY[name] == f"torchtransient.{name}" else getattr(module, name)
-    globals()[name] = value
-    return value
+    def __getattr__(name):
+        if name not in _LAZY:
+            raise AttributeError(f"module 'torchtransient' has no attribute {name!r}")
+        module = importlib.import_module(_LAZY[name])
+        value = module if _LAZY[name] == f"torchtransient.{name}" else getattr(module, name)
+        globals()[name] = value
+        return value
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *_LAZY])
+    return sorted({*globals(), *_LAZY})

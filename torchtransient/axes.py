@@ -6,11 +6,13 @@ import math
 import operator
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.quantities import Numbers
 from torchtransient.units import LATEST_S, SHORTEST_OPL, SPEED_OF_LIGHT, near_seconds, opl_to_seconds, seconds_to_opl
 
 # What a number in another unit looks like. The bins of real records are 1 ps to 1 us wide: in nanoseconds, picoseconds
@@ -72,8 +74,8 @@ class TimeAxis:
         or metres: UnitError. Records of that kind are made in metres, `TimeAxis(start_opl, bin_width_opl, num_bins)`.
         """
         start, width = _finite(start_s, "start_s"), _finite(bin_width_s, "bin_width_s")
-        near_seconds(width, "bin_width_s", "TimeAxis.from_seconds", WIDEST_BIN_S)
-        near_seconds(start, "start_s", "TimeAxis.from_seconds", LATEST_S)
+        near_seconds(width, "bin_width_s", "TimeAxis.from_seconds", limit_s=WIDEST_BIN_S)
+        near_seconds(start, "start_s", "TimeAxis.from_seconds", limit_s=LATEST_S)
         return cls(seconds_to_opl(start), seconds_to_opl(width), num_bins)
 
     @property
@@ -139,10 +141,12 @@ class FrequencyAxis:
     frequencies: tuple[float, ...]
     start_opl: float = 0.0
 
+    if TYPE_CHECKING:  # what is taken is more than what is kept
+
+        def __init__(self, frequencies: float | Iterable[float] | Numbers, start_opl: float = 0.0) -> None: ...
+
     def __post_init__(self) -> None:
-        given = self.frequencies.tolist() if isinstance(self.frequencies, Tensor) else self.frequencies
-        values = tuple(given) if isinstance(given, Iterable) else (given,)
-        numbers = tuple(_finite(value, "a frequency", "FrequencyAxis") for value in values)
+        numbers = _row(self.frequencies, "FrequencyAxis")
         if not numbers:
             raise ShapeError("FrequencyAxis: expected at least one frequency, got none.")
         highest = max(numbers, key=abs)
@@ -155,16 +159,16 @@ class FrequencyAxis:
         object.__setattr__(self, "start_opl", _finite(self.start_opl, "start_opl", "FrequencyAxis"))
 
     @classmethod
-    def uniform(cls, first: float, step: float, count: int, start_opl: float = 0.0) -> FrequencyAxis:
+    def uniform(cls, first: float, step: float, count: int, *, start_opl: float = 0.0) -> FrequencyAxis:
         """`count` frequencies `first + k step`, in cycles per metre. Equal steps render faster than arbitrary ones."""
         return cls(tuple(float(first) + k * float(step) for k in range(count)), start_opl)
 
     @classmethod
-    def from_hertz(cls, frequencies_hz: Iterable[float], start_opl: float = 0.0) -> FrequencyAxis:
+    def from_hertz(cls, frequencies_hz: float | Iterable[float] | Numbers, start_opl: float = 0.0) -> FrequencyAxis:
         """Modulation frequencies in hertz. Refuses those below 1 kHz but zero, which are most likely megahertz:
         UnitError. Cycles as long as that, 300 km, are given per metre.
         """
-        given = tuple(_finite(f, "a frequency", "FrequencyAxis.from_hertz") for f in frequencies_hz)
+        given = _row(frequencies_hz, "FrequencyAxis.from_hertz")
         for f in given:
             if 0 < abs(f) < LOWEST_HERTZ:
                 raise UnitError(
@@ -197,6 +201,13 @@ class FrequencyAxis:
         low, high = min(self.frequencies), max(self.frequencies)
         start = f", start_opl={self.start_opl:g}" if self.start_opl else ""
         return f"FrequencyAxis({self.num_frequencies} from {low:g} to {high:g} per metre{start})"
+
+
+def _row(given: Any, owner: str) -> tuple[float, ...]:
+    """The numbers of one frequency or of several: any iterable, an array, a tensor."""
+    plain = given.tolist() if isinstance(given, Tensor) else given
+    values = tuple(plain) if isinstance(plain, Iterable) and not isinstance(plain, str) else (plain,)
+    return tuple(_finite(value, "a frequency", owner) for value in values)
 
 
 def _finite(value: float, name: str, owner: str = "TimeAxis") -> float:

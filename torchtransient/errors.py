@@ -29,6 +29,14 @@ class UnknownKeyError(SceneError, KeyError):
     __str__ = Exception.__str__  # that of KeyError would put the message in quotation marks
 
 
+class ArgumentError(TorchTransientError, ValueError):
+    """An option of a function or class is none of its choices, is of another type, or does not go with the others."""
+
+
+class MissingPackageError(TorchTransientError, ImportError):
+    """What was asked for needs a package that is not installed; the message says how to install it."""
+
+
 class StorageError(TorchTransientError, ValueError):
     """A file cannot be read or written, or a result would not fit into memory."""
 
@@ -61,3 +69,7 @@ class PhysicsWarning(TorchTransientWarning):
 
 class VariantWarning(TorchTransientWarning, RuntimeWarning):
     """What is loaded already cannot do what variants of this library need."""
+
+
+class VersionWarning(TorchTransientWarning):
+    """Mitsuba or Dr.Jit is of a version that this library was never tested with."""

@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.pulses import CUT_STDDEVS, FWHM_PER_STDDEV, Pulse
+from torchtransient.quantities import Numbers
 from torchtransient.units import SHORTEST_OPL, near_seconds, seconds_to_opl
 
 Array = NDArray[np.float64]
@@ -41,12 +42,13 @@ class Gate:
     kind: str
     start_opl: float
     end_opl: float
+    _: KW_ONLY
     opl: tuple[float, ...] = ()
     values: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
-            raise UnitError(f"Gate: expected one of {', '.join(KINDS)}, got {self.kind!r}.")
+            raise ArgumentError(f"Gate: expected one of {', '.join(KINDS)}, got {self.kind!r}.")
         start, end = float(self.start_opl), float(self.end_opl)
         if not (math.isfinite(start) and math.isfinite(end) and start < end):
             raise UnitError(f"Gate: expected a finite start before a finite end, got {start!r} m to {end!r} m.")
@@ -73,10 +75,10 @@ class Gate:
         center, fwhm = float(center_opl), float(fwhm_opl)
         half = CUT_STDDEVS * fwhm / FWHM_PER_STDDEV
         # Center and width are kept too: start and end would give them back with a rounding error.
-        return cls("gaussian", center - half, center + half, (center, fwhm))
+        return cls("gaussian", center - half, center + half, opl=(center, fwhm))
 
     @classmethod
-    def tabulated(cls, opl: Sequence[float], values: Sequence[float]) -> Gate:
+    def tabulated(cls, opl: Numbers, values: Numbers) -> Gate:
         """A measured profile: linear between ``values`` at the lengths ``opl`` (rising), zero outside them."""
         lengths = np.asarray(opl, dtype=np.float64).ravel()
         heights = np.asarray(values, dtype=np.float64).ravel()
@@ -93,7 +95,7 @@ class Gate:
                 f"{heights.min():g} and {heights.max():g}."
             )
         table = tuple(lengths.tolist()), tuple(heights.tolist())
-        return cls("tabulated", table[0][0], table[0][-1], *table)
+        return cls("tabulated", table[0][0], table[0][-1], opl=table[0], values=table[1])
 
     @classmethod
     def rectangular_s(cls, start_s: float, end_s: float) -> Gate:
@@ -112,7 +114,7 @@ class Gate:
         if self.kind == "gaussian":
             return Gate.gaussian(self.opl[0] + opl, self.opl[1])
         moved = tuple(length + opl for length in self.opl)
-        return Gate(self.kind, self.start_opl + opl, self.end_opl + opl, moved, self.values)
+        return Gate(self.kind, self.start_opl + opl, self.end_opl + opl, opl=moved, values=self.values)
 
     def sequence(self, step_opl: float, count: int) -> tuple[Gate, ...]:
         """``count`` gates of this shape, each ``step_opl`` metres after the one before."""

@@ -19,7 +19,7 @@ RENDER, BACKWARD, FORWARD = JOBS = ("render", "backward", "forward")
 class FilmInterface(abc.ABC):
     """A film that keeps an array behind every pixel beside the steady image.
 
-    All that integrators and ``render/`` ask of a film beyond ``mi.Film``. Path lengths are handed over as ``opl -
+    All that integrators and ``rendering/`` ask of a film beyond ``mi.Film``. Path lengths are handed over as ``opl -
     start_opl`` in double precision. The array is stored in bands of whole rows, since Dr.Jit's indices have 32 bits; a
     *band* is given by its number, a *base* is the index of a pixel's first value in it.
 
@@ -117,7 +117,7 @@ class FilmInterface(abc.ABC):
         """Largest number of paths with up to ``most_events`` events in one kernel launch, None for no limit."""
 
     @abc.abstractmethod
-    def create_block(
+    def create_event_block(
         self,
         job: Any,
         base: Any,
@@ -183,8 +183,8 @@ class FilmInterface(abc.ABC):
         """The storage bands as (first row, rows)."""
 
     @abc.abstractmethod
-    def prepare(self, aovs: Any = (), samples: int = 0) -> int:
-        """Allocate zeroed storage for one render of ``samples`` per pixel. Returns the number of channels."""
+    def start_render(self, samples: int = 0) -> None:
+        """Allocate zeroed storage for one render of ``samples`` per pixel."""
 
     @abc.abstractmethod
     def add_steady(self, pixel: Any, channels: list[Any]) -> None:
@@ -260,7 +260,7 @@ class FilmInterface(abc.ABC):
 
 
 class IntegratorInterface(abc.ABC):
-    """A transient integrator: what ``render/`` and the pilot run ask of it beyond ``mi.Integrator``.
+    """A transient integrator: what ``rendering/`` and the pilot run ask of it beyond ``mi.Integrator``.
 
     Beside the members below an instance has ``max_depth``, ``rr_depth``, ``camera_unwarp``, ``temporal_filter`` (empty:
     the film's own) and ``gaussian_stddev`` (None: the film's own).

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
+from torchtransient.quantities import Numbers
 from torchtransient.units import LONGEST_PULSE_S, SHORTEST_OPL, near_seconds, seconds_to_opl
 
 Array = NDArray[np.float64]
@@ -40,12 +41,13 @@ class Pulse:
     kind: str
     width_opl: float = 0.0
     center_opl: float = 0.0
+    _: KW_ONLY
     opl: tuple[float, ...] = ()
     values: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
-            raise UnitError(f"Pulse: expected one of {', '.join(KINDS)}, got {self.kind!r}.")
+            raise ArgumentError(f"Pulse: expected one of {', '.join(KINDS)}, got {self.kind!r}.")
         object.__setattr__(self, "center_opl", _number(self.center_opl, "center_opl"))
         if self.kind == "tabulated":
             self._check_table()
@@ -87,26 +89,26 @@ class Pulse:
         return cls("rectangular", width_opl, center_opl)
 
     @classmethod
-    def tabulated(cls, opl: Sequence[float], values: Sequence[float], center_opl: float = 0.0) -> Pulse:
+    def tabulated(cls, opl: Numbers, values: Numbers, center_opl: float = 0.0) -> Pulse:
         """A measured shape: linear between ``values`` at the lengths ``opl`` (metres, rising), zero outside them."""
-        return cls("tabulated", 0.0, center_opl, tuple(opl), tuple(values))
+        return cls("tabulated", 0.0, center_opl, opl=tuple(opl), values=tuple(values))
 
     @classmethod
     def gaussian_s(cls, fwhm_s: float, center_s: float = 0.0) -> Pulse:
         """As :meth:`gaussian`, in seconds."""
-        width = near_seconds(_number(fwhm_s, "fwhm_s"), "fwhm_s", "Pulse.gaussian_s", LONGEST_PULSE_S)
+        width = near_seconds(_number(fwhm_s, "fwhm_s"), "fwhm_s", "Pulse.gaussian_s", limit_s=LONGEST_PULSE_S)
         center = near_seconds(_number(center_s, "center_s"), "center_s", "Pulse.gaussian_s")
         return cls.gaussian(seconds_to_opl(width), seconds_to_opl(center))
 
     @classmethod
     def rectangular_s(cls, width_s: float, center_s: float = 0.0) -> Pulse:
         """As :meth:`rectangular`, in seconds."""
-        width = near_seconds(_number(width_s, "width_s"), "width_s", "Pulse.rectangular_s", LONGEST_PULSE_S)
+        width = near_seconds(_number(width_s, "width_s"), "width_s", "Pulse.rectangular_s", limit_s=LONGEST_PULSE_S)
         center = near_seconds(_number(center_s, "center_s"), "center_s", "Pulse.rectangular_s")
         return cls.rectangular(seconds_to_opl(width), seconds_to_opl(center))
 
     @classmethod
-    def tabulated_s(cls, times_s: Sequence[float], values: Sequence[float], center_s: float = 0.0) -> Pulse:
+    def tabulated_s(cls, times_s: Numbers, values: Numbers, center_s: float = 0.0) -> Pulse:
         """As :meth:`tabulated`, with times in seconds."""
         times = np.asarray(times_s, dtype=np.float64)
         for time in times.ravel().tolist():

@@ -8,12 +8,36 @@ from __future__ import annotations
 
 import math
 import operator
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.errors import SceneError, ShapeError, TorchTransientError, UnitError
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, TorchTransientError, UnitError
+
+if TYPE_CHECKING:
+    import torch
+
+# Several numbers, as people have them. A text: nothing here imports torch.
+Numbers: TypeAlias = "Sequence[float] | NDArray[Any] | torch.Tensor"
+
+# Units by the ends of names, with what is most often mistaken.
+_UNITS = {
+    "hz": "hertz (20 MHz are 20e6)",
+    "s": "seconds (50 ps are 50e-12)",
+    "opl": "metres of optical path",
+    "m": "metres",
+    "m2": "square metres (10 um by 10 um are 100e-12)",
+    "nm": "nanometres",
+    "j": "joules",
+    "sr": "steradians",
+    "deg": "degrees",
+    "rad": "radians",
+    "e": "electrons",
+}
+# So many numbers of an array are written in messages.
+_WRITTEN = 16
 
 
 def finite(name: str, value: Any) -> float:
@@ -64,9 +88,9 @@ def count(name: str, value: Any, least: int = 1, error: type[TorchTransientError
 
 
 def flag(name: str, value: Any) -> bool:
-    """``value`` as a truth value. Raises SceneError for others: a text that says False would count as true."""
+    """``value`` as a truth value. Raises ArgumentError for others: a text that says False would count as true."""
     if not _is_truth(value) or getattr(value, "ndim", None):
-        raise SceneError(f"{name}: expected True or False, got {shown(value)}.")
+        raise ArgumentError(f"{name}: expected True or False, got {shown(value)}.")
     return bool(value)
 
 
@@ -99,12 +123,23 @@ def transform(name: str, given: Any) -> NDArray[np.float64]:
 
 
 def shown(value: Any) -> str:
-    """A value in a message, not more of it than tells what it is."""
+    """A value in a message, not more of it than tells what it is: of arrays and tensors of many numbers the shape."""
+    shape = getattr(value, "shape", None)
+    if isinstance(shape, tuple) and math.prod(shape) > _WRITTEN:
+        return f"{with_article(type(value).__name__)} {tuple(shape)}"
     try:
         text = repr(value)
     except ValueError:  # Python writes no whole numbers of thousands of digits
         text = f"a {type(value).__name__} that is too long to be written"
+    except RecursionError:
+        text = f"a {type(value).__name__} that is nested too deeply to be written"
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def unit_of(name: str) -> str:
+    """The unit that the end of a name says, behind a range in a message; nothing for a number without one."""
+    unit = _UNITS.get(name.rpartition("_")[2]) if "_" in name else None
+    return f" {unit}" if unit else ""
 
 
 def with_article(word: str) -> str:

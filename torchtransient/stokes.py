@@ -60,8 +60,8 @@ def angle_of_linear_polarization(stokes: Tensor, dim: int, floor: float = 0.0) -
     s1, s2 = part[1], part[2]
     largest = torch.maximum(s1.abs(), s2.abs()).detach()
     # The angle does not depend on the scale; at scale one the squares in its derivative cannot underflow.
-    there = largest > max(floor, torch.finfo(stokes.dtype).tiny)
-    there = there & (torch.hypot(s1, s2).detach() > floor)
+    # The larger one alone may stay below the floor where both together do not.
+    there = (largest > torch.finfo(stokes.dtype).tiny) & (torch.hypot(s1, s2).detach() > floor)
     scale = torch.where(there, largest, 1.0)
     s1, s2 = torch.where(there, s1, 1.0) / scale, torch.where(there, s2, 0.0) / scale
     return 0.5 * torch.atan2(s2, s1)

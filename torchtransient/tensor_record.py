@@ -10,7 +10,7 @@ import copy
 import html
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 import torch
@@ -37,6 +37,16 @@ class TensorRecord:
         super().__init_subclass__(**keywords)
         _pytree.register_pytree_node(cls, _taken_apart, _put_together, flatten_with_keys_fn=_taken_apart_with_keys)
         default_collate_fn_map[cls] = _collated
+
+    if not TYPE_CHECKING:  # for type checkers there are no other attributes
+
+        def __getattr__(self, name: str) -> Any:
+            """What is not there: a record that was taken for a tensor is told what its tensors are."""
+            what = f"'{type(self).__name__}' object has no attribute '{name}'"
+            own = {field.name for field in fields(self)}  # of a record that is not whole yet
+            if not name.startswith("_") and name not in own and hasattr(torch.Tensor, name):
+                what += f": it is no tensor, it holds some ({', '.join(self.tensors())}); take one of them"
+            raise AttributeError(what, name=name, obj=self)
 
     # ------------------------------------------------------------------------------------------------------ as torch
 

@@ -44,7 +44,7 @@ def seconds_to_opl(time_s: Quantity) -> Quantity:
     return time_s * SPEED_OF_LIGHT
 
 
-def near_seconds(time_s: float, name: str, where: str, limit_s: float = LATEST_S) -> float:
+def near_seconds(time_s: float, name: str, where: str, *, limit_s: float = LATEST_S) -> float:
     """A time in seconds. UnitError from `limit_s` on, either side of zero: picoseconds, nanoseconds or metres."""
     if abs(time_s) >= limit_s:
         raise UnitError(

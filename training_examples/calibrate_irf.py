@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from torchtransient import sensing
-from torchtransient.sensing.impulse_response import Response
+from torchtransient.sensing import Response
 
 BEFORE = 100  # bins that a response is turned by when it begins in its highest bin
 
@@ -130,8 +130,8 @@ class Zones(nn.Module):
     def forward(self, bins: int) -> Tensor:
         """(zones, T): the model's histograms."""
         edges = torch.arange(bins + 1, dtype=torch.float64)
-        sigma = self.log_fwhm_bins.exp() / sensing.response_shapes.FWHM_PER_SIGMA
-        cdf = sensing.response_shapes.emg_cdf(
+        sigma = self.log_fwhm_bins.exp() / sensing.response.response_shapes.FWHM_PER_SIGMA
+        cdf = sensing.emg_cdf(
             edges.expand(len(self.arrival_bins), -1), self.arrival_bins[:, None], sigma, self.log_tail_bins.exp()
         )
         return self.log_brightness.exp()[:, None] * cdf.diff(dim=1) + self.log_background.exp()[:, None]

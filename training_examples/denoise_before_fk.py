@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 import torchtransient as tt
-from torchtransient.reconstruction import stabilised_root
+from torchtransient.reconstruction import stabilized_root
 
 SIGNAL, BACKGROUND = 10.0, 0.05  # counts a scan point, and a scan point and bin
 PULSE_BINS = 1.5  # standard deviation
@@ -97,7 +97,7 @@ def volume(fk: tt.nlos.FK, root: Tensor) -> Tensor:
 def make_captures(fk: tt.nlos.FK, number: int, generator: torch.Generator) -> Captures:
     signal = torch.stack([bar(fk, generator) for _ in range(number)])
     noisy = torch.poisson(signal + BACKGROUND, generator=generator)
-    return Captures(stabilised_root(noisy), stabilised_root(signal), volume(fk, signal.sqrt()))
+    return Captures(stabilized_root(noisy), stabilized_root(signal), volume(fk, signal.sqrt()))
 
 
 def volume_error(fk: tt.nlos.FK, roots: Tensor, truth: Tensor) -> Tensor:

@@ -4,11 +4,11 @@ A recipe moves two boxes in a Cornell box, changes its paint, and has a flash be
 in ambient light of unknown strength. The data set is generated on disk (again only where it is missing) and read by a
 `DataLoader`; with `--online` the scenes that the network learns from are rendered while it learns, and each is new.
 
-    python training_examples/depth_from_counts.py --output demo_output
+    python training_examples/depth_from_counts.py --seeds 0 1 2 --output demo_output
     python training_examples/depth_from_counts.py --online
 
 Prints the mean error of the depth in millimetres, and how many pixels are more than 10 cm off, on scenes that the
-network has not learnt from: the highest bin, the matched filter, the network before and after.
+network has not learnt from, for each seed: the highest bin, the matched filter, the network before and after.
 """
 
 from __future__ import annotations
@@ -69,7 +69,12 @@ def counter() -> sensing.Device:
          "quantum_efficiency": 0.2, "ambient_rate_hz": 2e6, "axis": "@axis"},
         {"kind": "SynchronousSPAD", "cycles": CYCLES},
     ]  # fmt: skip
-    return sensing.Device("counter", "A first-photon counter behind a small lens.", ["assumed: all numbers"], stages)
+    return sensing.Device(
+        "counter",
+        description="A first-photon counter behind a small lens.",
+        sources=["assumed: all numbers"],
+        stages=stages,
+    )
 
 
 def room(sizes: Sizes) -> tt.data.Recipe:
@@ -132,7 +137,7 @@ def depth_at(position: Tensor) -> Tensor:
 
 def depth_of(scores: Tensor) -> Tensor:
     """(B, 1, H, W) metres: the mean within three bins of the likeliest one."""
-    return depth_at(sensing.centre_of_mass(torch.softmax(scores, dim=2), half_width_bins=3))
+    return depth_at(sensing.center_of_mass(torch.softmax(scores, dim=2), half_width_bins=3))
 
 
 def estimates(network: DepthNetwork, counts: Tensor) -> dict[str, Tensor]:
@@ -174,12 +179,11 @@ def train(network: DepthNetwork, batches: Iterator[dict[str, Tensor]], steps: in
 
 def errors_of(found: dict[str, Tensor], depth: Tensor, on_boxes: Tensor) -> dict[str, Errors]:
     """By method. ``depth``, ``on_boxes``: (B, H, W)."""
-    there = depth.isfinite()
     errors = {}
     for name, estimate in found.items():
-        off = (estimate - depth).abs()
-        far = (off[there] > FAR_OFF_M).float().mean()
-        errors[name] = Errors(1000 * off[there].mean().item(), 1000 * off[on_boxes].mean().item(), far.item())
+        everywhere, boxes = (tt.metrics.depth_mae(estimate, depth, mask=mask) for mask in (None, on_boxes))
+        far = tt.metrics.depth_gross_errors(estimate, depth, beyond_m=FAR_OFF_M)
+        errors[name] = Errors(1000 * float(everywhere), 1000 * float(boxes), float(far))
     return errors
 
 
@@ -208,13 +212,14 @@ def draw(found: dict[str, Tensor], batch: dict[str, Tensor], losses: list[float]
     figure.savefig(path, dpi=80)
 
 
-def main(argv: Sequence[str] | None = None) -> dict[str, Errors]:
-    """Command line; returns the errors by method."""
+def main(argv: Sequence[str] | None = None) -> list[dict[str, Errors]]:
+    """Command line; returns the errors by method, of every seed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--smoke", action="store_true", help="small enough for seconds")
     parser.add_argument("--online", action="store_true", help="render the scenes to learn from meanwhile")
     parser.add_argument("--scenes", type=int, help=f"to learn from ({Sizes.train})")
     parser.add_argument("--steps", type=int, help=f"steps of training ({Sizes.steps})")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="weights and order of scenes (%(default)s)")
     parser.add_argument("--workers", type=int, default=2, help="processes that render (%(default)s)")
     parser.add_argument("--output", type=Path, default=Path("demo_output"), help="folder for all files (%(default)s)")
     options = parser.parse_args(argv)
@@ -226,38 +231,41 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Errors]:
     recipe = room(sizes)
     count = sizes.test if options.online else sizes.test + sizes.train
     folder = options.output / f"depth_from_counts-{recipe.key()[:8]}-{count}"
-    print(tt.data.generate(recipe, folder, count, options.workers, store="counts"))
+    print(tt.data.generate(recipe, folder, count, workers=options.workers, store="counts"))
     dataset = tt.data.TransientDataset(folder)
     is_test = dataset.index < sizes.test
     test = next(iter(DataLoader(Subset(dataset, is_test.nonzero()[:, 0].tolist()), batch_size=sizes.test)))
     boxes = [number for number, name in enumerate(dataset.about["shapes"]) if name in ("small-box", "large-box")]
     on_boxes = torch.isin(test["shape"], torch.tensor(boxes))
 
-    torch.manual_seed(0)
-    network = DepthNetwork(sizes.channels)
-    before = errors_of(estimates(network, test["measurement"]), test["depth"], on_boxes)
-    with ExitStack() as stack:
-        if options.online:
-            online = stack.enter_context(
-                tt.data.OnlineDataset(recipe, capacity=256, workers=options.workers, warm=sizes.batch, first=sizes.test)
-            )
-            batches = iter(DataLoader(online, batch_size=sizes.batch))
-        else:
-            learnt_from = Subset(dataset, (~is_test).nonzero()[:, 0].tolist())
-            loader = DataLoader(learnt_from, batch_size=sizes.batch, shuffle=True, drop_last=True)
-            batches = itertools.chain.from_iterable(itertools.repeat(loader))
-        losses = train(network, batches, sizes.steps)
-    found = estimates(network, test["measurement"])
-    errors = errors_of(found, test["depth"], on_boxes) | {"untrained": before["network"]}
+    tables = []
+    for seed in options.seeds:
+        torch.manual_seed(seed)
+        network = DepthNetwork(sizes.channels)
+        before = errors_of(estimates(network, test["measurement"]), test["depth"], on_boxes)
+        with ExitStack() as stack:
+            if options.online:
+                online = stack.enter_context(tt.data.OnlineDataset(
+                    recipe, capacity=256, workers=options.workers, seed=seed, warm=sizes.batch, first=sizes.test,
+                ))  # fmt: skip
+                batches = iter(DataLoader(online, batch_size=sizes.batch))
+            else:
+                learnt_from = Subset(dataset, (~is_test).nonzero()[:, 0].tolist())
+                loader = DataLoader(learnt_from, batch_size=sizes.batch, shuffle=True, drop_last=True)
+                batches = itertools.chain.from_iterable(itertools.repeat(loader))
+            losses = train(network, batches, sizes.steps)
+        found = estimates(network, test["measurement"])
+        errors = errors_of(found, test["depth"], on_boxes) | {"untrained": before["network"]}
+        tables.append(errors)
 
-    print(f"{sizes.test} new scenes   error in mm, on boxes, off by more than {100 * FAR_OFF_M:.0f} cm")
-    for name in ("highest bin", "matched filter", "untrained", "network"):
-        of = errors[name]
-        print(f"{name:<15}{of.all_mm:12.1f}{of.boxes_mm:10.1f}{of.far_off:12.1%}")
+        print(f"seed {seed}, {sizes.test} new scenes: error in mm, on boxes, off by more than {100 * FAR_OFF_M:.0f} cm")
+        for name in ("highest bin", "matched filter", "untrained", "network"):
+            of = errors[name]
+            print(f"{name:<15}{of.all_mm:12.1f}{of.boxes_mm:10.1f}{of.far_off:12.1%}")
     picture = options.output / "depth_from_counts.png"
     draw(found, test, losses, picture)
     print(f"depth_from_counts: {picture}")
-    return errors
+    return tables
 
 
 if __name__ == "__main__":

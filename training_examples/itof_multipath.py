@@ -64,7 +64,7 @@ def rooms(sizes: argparse.Namespace, max_depth: int = 6) -> tt.data.Recipe:
 def generated(recipe: tt.data.Recipe, count: int, options: argparse.Namespace) -> tuple[Tensor, Tensor]:
     """Differences (N, 1, 9, H, W) in electrons, and depth (N, 1, H, W) in metres."""
     folder = options.output / f"itof_multipath-{recipe.key()[:8]}-{count}"
-    print(tt.data.generate(recipe, folder, count, options.workers))
+    print(tt.data.generate(recipe, folder, count, workers=options.workers))
     whole = next(iter(DataLoader(tt.data.TransientDataset(folder), batch_size=count)))
     return whole["measurement"], whole["depth"].unsqueeze(1)
 
@@ -141,8 +141,9 @@ def lowest(taps: Tensor) -> Tensor:
 
 def errors_of(found: Tensor, depth: Tensor) -> list[float]:
     """Mean and median in millimetres, per cent off by more than 10 cm."""
-    off = (found - depth).abs()
-    return [1000 * off.mean().item(), 1000 * off.median().item(), 100 * (off > 0.1).float().mean().item()]
+    pair = (found, depth)
+    mean, median = tt.metrics.depth_mae(*pair), tt.metrics.depth_median_error(*pair)
+    return [1000 * float(mean), 1000 * float(median), 100 * float(tt.metrics.depth_gross_errors(*pair, beyond_m=0.1))]
 
 
 def draw(found: dict[str, Tensor], depth: Tensor, path: Path) -> None:

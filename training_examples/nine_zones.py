@@ -64,7 +64,7 @@ class Chip(nn.Module):
         """(9, T), of the light, delays (9,) in bins, ambient light and pile-up."""
         edges, (_, ambient, cycles) = torch.arange(LAST - FIRST + 1) * BIN_S, self.levels
         parts = zip(light, delays * BIN_S, strict=True)
-        rate = torch.stack([sensing.resample_counts(part, BIN_S / FINE, edges, late) for part, late in parts])
+        rate = torch.stack([sensing.resample_counts(part, BIN_S / FINE, edges, start_s=late) for part, late in parts])
         rate = rate + (ambient + self.own[2]).exp()[:, None]
         return self.spad((rate / cycles.exp()).T[None, :, None])[0, :, 0].T * cycles.exp()
 

@@ -121,7 +121,7 @@ def bent(vertices: Tensor) -> Tensor:
 
 def letter(subdivide: int) -> dict[str, Any]:
     """The letter where the fits start: upright and flat."""
-    return tt.scenes.nlos_letter(LETTER, SIZE_M, DEPTH_M, subdivide=subdivide)
+    return tt.scenes.nlos_letter(LETTER, size=SIZE_M, depth=DEPTH_M, subdivide=subdivide)
 
 
 def arrays(shape: dict[str, Any]) -> tuple[Tensor, Tensor]:
@@ -348,8 +348,9 @@ def run(what: str, kind: str, seed: int, settings: Settings, folder: Path) -> Fi
     counts = measurement.counts.to(torch.int32).numpy()
     np.savez_compressed(folder / f"{name}.npz", counts=counts, faces=faces.numpy(), losses=fit.losses, **arrays_of)
     tt.vis.plot_shape_fit(
-        measurement.scan, meshes | {"truth": truth}, faces, expected, measurement.axis, fit.losses, fit.errors,
-        folder / f"{name}.png",
+        measurement.scan, meshes | {"truth": truth}, faces, transients=expected, axis=measurement.axis,
+            losses=fit.losses, errors=fit.errors,
+        path=folder / f"{name}.png",
     )  # fmt: skip
     return fit
 

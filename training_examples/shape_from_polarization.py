@@ -38,12 +38,12 @@ PULSE = tt.Pulse.gaussian(0.3)  # 1 ns
 WIDTH, SIDE, CELLS, WAVES = 0.03, 0.05, 40, 20
 DISTANCE, INCIDENCE, PIXELS = 0.5, math.radians(50.0), (24, 16)
 PHOTONS = 1e6  # of a pixel without filters
-FOUR = sensing.linear_analysers([0.0, 45.0, 90.0, 135.0], transmission=0.25)
+FOUR = sensing.linear_analyzers([0.0, 45.0, 90.0, 135.0], transmission=0.25)
 MOSAIC = sensing.PolarizationMosaic.polarsens(300.0)
 CHIP = sensing.PixelElectronics(full_well_e=2e5, read_noise_e=10.0, gain_e_per_dn=12.0, bits=14, black_level_dn=64)
 SENSORS = {
-    "S0 alone": sensing.Compose([sensing.Analysers(torch.tensor([[1.0, 0.0, 0.0, 0.0]])), sensing.ShotNoise()]),
-    "Stokes": sensing.Compose([sensing.Analysers(FOUR), sensing.ShotNoise()]),
+    "S0 alone": sensing.Compose([sensing.Analyzers(torch.tensor([[1.0, 0.0, 0.0, 0.0]])), sensing.ShotNoise()]),
+    "Stokes": sensing.Compose([sensing.Analyzers(FOUR), sensing.ShotNoise()]),
     "mosaic": sensing.Compose([MOSAIC, CHIP]),
 }
 

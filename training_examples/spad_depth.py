@@ -60,7 +60,7 @@ def rendered(sizes: argparse.Namespace, folder: Path, workers: int) -> tuple[Ten
     surface in bins. Scenes 0 to ``test`` - 1 are for the test.
     """
     recipe, count = boxes_before_a_wall(sizes.resolution), sizes.test + sizes.train
-    print(tt.data.generate(recipe, folder := folder / f"spad_depth-{recipe.key()[:8]}-{count}", count, workers))
+    print(tt.data.generate(recipe, folder := folder / f"spad_depth-{recipe.key()[:8]}-{count}", count, workers=workers))
     whole = next(iter(DataLoader(tt.data.TransientDataset(folder), batch_size=count)))
     position = 1000 * whole["depth"].unsqueeze(1) / MM_PER_BIN
     return sensing.ImpulseResponse(PULSE, AXIS).expected(whole["transient"]), position
@@ -131,7 +131,7 @@ def estimates(network: DepthNetwork, counts: Tensor) -> dict[str, Tensor]:
     return {
         "matched filter": sensing.peak_position(matched(counts)),
         "Coates + matched filter": sensing.peak_position(matched(sensing.coates(counts, CYCLES).rate)),
-        "network": sensing.centre_of_mass(network(counts).softmax(2), half_width_bins=3),
+        "network": sensing.center_of_mass(network(counts).softmax(2), half_width_bins=3),
     }
 
 

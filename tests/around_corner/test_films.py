@@ -146,9 +146,9 @@ def test_arguments_are_checked(body):
     points, normals = wall_grid(GRID, 0.4)
     sensors = wall_of(points, normals)
     film = histogram()
-    with pytest.raises(SceneError, match="prepare"):
+    with pytest.raises(SceneError, match="start_render"):
         ThirdBounce(*(body[0], film, body[1], sensors))
-    film.prepare()
+    film.start_render()
     with pytest.raises(ShapeError, match="2 x 2 pixels and 9"):
         ThirdBounce(body[0], film, body[1], wall_of(*wall_grid(3)))
     job = ThirdBounce(body[0], film, body[1], sensors)

@@ -148,7 +148,7 @@ def test_points_outside_of_the_region_are_refused():
     points, normals = wall_grid(2)
     spare_rays(scene, table, points, normals)
     samples, film = draw_samples(table, 64, 0), film_of(2, 2)
-    film.prepare()
+    film.start_render()
     ThirdBounce(scene, film, samples, wall_of(points, normals)).add_confocal()
     with pytest.raises(ShapeError, match="spare_rays"):
         ThirdBounce(scene, film, samples, wall_of(points + np.array([0, 0.1, 0]), normals))

@@ -77,7 +77,7 @@ def test_tiles_have_to_be_told(arm):
     shapes, scene, points, normals = arm
     tiles = ScanTiles(points, normals, 0.1)
     film = film_of(GRID, GRID)
-    film.prepare()
+    film.start_render()
     many = draw_samples(HiddenElements(shapes, tiles.points, tiles.normals), 8, 0)
     one = draw_samples(HiddenElements(shapes, *wall_grid(5)), 8, 0)
     sensors = wall_of(points, normals)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -52,6 +53,12 @@ def test_threads_and_processes(tmp_path):
     assert len(report["cases"]) == 6 and len(report["ratios"]) == 4
 
 
+def test_functions_across(tmp_path):
+    report, _ = run("wrap_cost.py", tmp_path)
+    assert len(report["cases"]) == 20 and all(case["min"] > 0 for case in report["cases"].values())
+    assert len(report["ratios"]) == 12
+
+
 def test_ways_to_store(tmp_path):
     report, printed = run("dataset_storage.py", tmp_path)
     assert list(report["data"]) == ["16 spp", "1024 spp"] and "| exact, gzip |" in printed
@@ -89,3 +96,15 @@ def test_bias_of_noisy_renders(tmp_path):
     assert set(report) >= {"least", "fits", "priors"} and report["settings"]["quick"]
     assert len(report["fits"]) == 16 and all(found["CPU s"] > 0 for found in report["fits"].values())
     assert "the start" in report["priors"] and "`expected_root_loss`" in printed
+
+
+@pytest.mark.parametrize("script", ["accuracy_curve.py", "nlos_accuracy.py"])
+def test_quick_runs_leave_the_kept_numbers(script, tmp_path):
+    """Their kept files have paths below the folder that they are started in: none of these comes into being."""
+    (tmp_path / "temporary").mkdir()
+    command = [sys.executable, str(ROOT / "benchmarks" / script), "--quick", "--repeats", "2"]
+    environment = os.environ | {"TMPDIR": str(tmp_path / "temporary")}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert [path.name for path in tmp_path.iterdir()] == ["temporary"]
+    assert len(list((tmp_path / "temporary" / "torchtransient_quick_runs").iterdir())) == 2

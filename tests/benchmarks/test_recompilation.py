@@ -10,8 +10,11 @@ from pathlib import Path
 
 import pytest
 
+from support.pages import Page
+
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs" / "recompilation.md").read_text(encoding="utf-8")
+RECOMPILATION = Page("docs/recompilation.md")
+PAGE = RECOMPILATION.text
 VARIANT = "llvm_ad_mono"
 
 
@@ -35,9 +38,7 @@ def test_the_page_has_every_case():
 
 
 def test_other_samples_are_traced_once_more():
-    names: dict[str, object] = {}
-    (block,) = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
-    exec(compile(block, "recompilation.md", "exec"), names)
+    names = RECOMPILATION.names()
     kinds = [tuple(how.split(":")[0] for how in both) for both in names["said"]]
     assert kinds == [(how, how) for how in ("traced", "recorded", "launched", "launched", "traced")]
 
@@ -54,8 +55,3 @@ def test_the_verdicts_are_those_of_a_run(tmp_path):
     for name, row in found.items():
         verdict = [row["render"], row["derivative"], str(row["compiled"] or "none"), str(row["steps"])]
         assert tuple(verdict) == page[name], name
-
-
-@pytest.mark.parametrize("link", sorted(set(re.findall(r"\]\(([^)#:]+)\)", PAGE))))
-def test_links_lead_somewhere(link):
-    assert (ROOT / "docs" / link).exists()

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchtransient.capture import Scan, Wall
-from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 
 WALL = Wall.plane(2.0, 1.6)
 ORIGIN = (-0.5, 0.0, 0.25)
@@ -170,14 +170,14 @@ def points(given=LIST, **changes):
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [
-        (lambda: scan("biaxial"), SceneError, "single, confocal, exhaustive"),
+        (lambda: scan("biaxial"), ArgumentError, "single, confocal, exhaustive"),
         (lambda: scan("single", laser=(0.0, 0.0, 0.3)), SceneError, "0.3 m off"),
         (lambda: scan("single", laser=(1.5, 0.0, 0.0)), SceneError, "beside"),
         (lambda: scan("single", laser=(1.5, 0.0)), SceneError, "between 0 and 1"),
         (lambda: scan("single", laser=(np.nan, 0.0, 0.0)), UnitError, "finite"),
-        (lambda: scan("single", laser_grid=3), SceneError, "laser_grid has no meaning"),
-        (lambda: scan("confocal", laser=(0, 0, 0)), SceneError, "laser has no meaning"),
-        (lambda: scan("confocal", laser_grid=4), SceneError, "laser_grid has no meaning"),
+        (lambda: scan("single", laser_grid=3), ArgumentError, "laser_grid has no meaning"),
+        (lambda: scan("confocal", laser=(0, 0, 0)), ArgumentError, "laser has no meaning"),
+        (lambda: scan("confocal", laser_grid=4), ArgumentError, "laser_grid has no meaning"),
         (lambda: scan("confocal", sensor_origin=(0, 0, -1)), SceneError, "12 of 12 points"),
         (lambda: scan("single", laser_origin=(0, 0, 0)), SceneError, "laser_origin in front of the wall"),
         (lambda: scan("single", sensor_origin=(0, 0)), ShapeError, "sensor_origin"),
@@ -186,7 +186,7 @@ def points(given=LIST, **changes):
         (lambda: Scan.grid(WALL, 0, kind="single"), ShapeError, "at least 1"),
         (lambda: Scan.grid(WALL, 1, kind="exhaustive"), SceneError, "grid of one point"),
         (lambda: points(LIST + np.array([0, 0, 0.1]), wall=WALL), SceneError, "3 of 3"),
-        (lambda: points(laser_points=LIST), SceneError, "laser_points has no meaning"),
+        (lambda: points(laser_points=LIST), ArgumentError, "laser_points has no meaning"),
         (lambda: points(kind="single"), SceneError, "expected laser_points"),
         (lambda: points(kind="single", laser_points=LIST), ShapeError, r"\(3,\), the one spot"),
         (lambda: points(kind="exhaustive", laser_points=LIST[0]), ShapeError, r"\(Ly, Lx, 3\)"),
@@ -197,8 +197,10 @@ def points(given=LIST, **changes):
         (lambda: points(normals=LIST[:2]), ShapeError, "sensor_normals"),
         (lambda: points(normals=0 * LIST), UnitError, "direction"),
         (lambda: scan("single").to(torch.float32), ShapeError, "device"),
-        (lambda: Scan("confocal", LIST, LIST + 1, ORIGIN, ORIGIN), SceneError, "sensor points, got others"),
-        (lambda: Scan("confocal", LIST, LIST, ORIGIN, ORIGIN, wall="wall"), SceneError, "dictionary"),
+        (lambda: Scan("confocal", LIST, LIST + 1, sensor_origin=ORIGIN, laser_origin=ORIGIN), SceneError,
+         "sensor points, got others"),
+        (lambda: Scan("confocal", LIST, LIST, sensor_origin=ORIGIN, laser_origin=ORIGIN, wall="wall"), ArgumentError,
+         "dictionary"),
     ],
 )
 def test_what_is_no_scan(make, error, message):

@@ -9,7 +9,7 @@ import torch
 
 from torchtransient.capture import Wall
 from torchtransient.capture.triangles import first_hits
-from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.scenes.transforms import rotate, scale, translate
 
 TRANSFORMS = {
@@ -175,7 +175,7 @@ TETRAHEDRON = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]
         (lambda: Wall.plane(center=(0, 1, float("inf"))), UnitError, "finite"),
         (lambda: Wall.plane(albedo=1.5), UnitError, "between 0 and 1"),
         (lambda: Wall.of({"type": "sphere"}), SceneError, "'sphere'"),
-        (lambda: Wall.of(3), SceneError, "got int"),
+        (lambda: Wall.of(3), ArgumentError, "got int"),
         (lambda: Wall.of({"type": "rectangle", "to_world": np.zeros((4, 4))}), SceneError, "inverse"),
         (lambda: Wall.of({"type": "rectangle", "to_world": np.eye(3)}), ShapeError, r"\(4, 4\)"),
         (lambda: Wall.mesh(BALL, TETRAHEDRON), SceneError, "faces one side"),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +11,7 @@ import torch
 from click.testing import CliRunner
 
 import torchtransient as tt
+from support.pages import Page
 from torchtransient.cli.dataset import command
 from torchtransient.cli.main import main
 from torchtransient.data.recipes.checks import SAMPLES
@@ -21,11 +21,11 @@ from torchtransient.data.recipes.written import read_distribution
 from torchtransient.data.storage.chunks import chunk_shape
 from torchtransient.data.storage.encodings import MANTISSA_BITS, STORES
 from torchtransient.data.storage.shard_writing import FORMAT, SEAL, SEAL_BYTES
-from torchtransient.render.labels import LABELS
+from torchtransient.rendering.labels import LABELS
 
 VARIANT = "llvm_ad_mono"
-PAGE = Path(__file__).parents[2] / "docs" / "data.md"
-TEXT = PAGE.read_text(encoding="utf-8")
+PAGE = Page("docs/data.md")
+TEXT = PAGE.text
 # What makes scenes and data sets small.
 SMALLER = {
     r"resolution=32|resolution: 32": lambda found: found[0].replace("32", "8"),
@@ -44,10 +44,6 @@ SMALLER = {
 }
 
 
-def blocks(language):
-    return re.findall(rf"```{language}\n(.*?)```", TEXT, flags=re.DOTALL)
-
-
 def smaller(code):
     for large, small in SMALLER.items():
         code = re.sub(large, small, code)
@@ -58,7 +54,7 @@ def smaller(code):
 def folder(tmp_path_factory):
     """With the files that the page speaks of."""
     place = tmp_path_factory.mktemp("page")
-    rooms, letters = blocks("yaml")
+    rooms, letters = PAGE.blocks("yaml")
     (place / "rooms.yaml").write_text(smaller(rooms))
     (place / "letters.yaml").write_text(smaller(letters))
     return place
@@ -70,8 +66,8 @@ def names(folder):
     found: dict[str, object] = {"__name__": "__main__"}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        for code in blocks("python"):
-            exec(compile(smaller(code), str(PAGE), "exec"), found)
+        for _ in PAGE.run(found, SMALLER):
+            pass
     return found
 
 
@@ -172,7 +168,7 @@ def test_commands(names, folder, monkeypatch):
     """The data set of the first block is the one that the first command goes on with."""
     monkeypatch.chdir(folder)
     tt.data.generate(names["same"], "named", progress=False)
-    for line in (line.split("#")[0].split() for block in blocks("sh") for line in block.splitlines()):
+    for line in (line.split("#")[0].split() for block in PAGE.blocks("sh") for line in block.splitlines()):
         assert line[:2] == ["torchtransient", "dataset"]
         words = [word.replace("$SLURM_ARRAY_TASK_ID", "3").replace("/shared/rooms", "array") for word in line[1:]]
         words = ["named" if word == "rooms" else word for word in words]
@@ -241,15 +237,6 @@ def test_tables_are_those_of_the_code():
     assert all(f'"{store}"' in TEXT for store in STORES)
 
 
-def test_names_and_links_exist():
+def test_names_exist():
     for name in set(re.findall(r"(?<!utils\.)\bdata\.([A-Za-z]\w+)\(", TEXT)):
         assert hasattr(tt.data, name), name
-    for link, anchor in set(re.findall(r"\]\(([^)#:]+)(?:#([^)]*))?\)", TEXT)):
-        target = PAGE.parent / link
-        assert target.exists(), link
-        if anchor:
-            titles = re.findall(r"^#+ (.*)$", target.read_text(encoding="utf-8"), flags=re.MULTILINE)
-            assert anchor in {re.sub(r"[^\w -]", "", title).lower().replace(" ", "-") for title in titles}, anchor
-    for script in set(re.findall(r"(?:benchmarks|docs|training_examples)/\w+\.py", TEXT)):
-        assert (PAGE.parents[1] / script).is_file(), script
-    assert "docs/data.md" in (PAGE.parents[1] / "README.md").read_text(encoding="utf-8")

@@ -12,7 +12,7 @@ import torch
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
-from torchtransient.errors import StorageError
+from torchtransient.errors import ArgumentError, StorageError
 from torchtransient.files import array_file
 from torchtransient.files.capture_file import read_capture, write_capture
 
@@ -122,7 +122,7 @@ def test_what_is_refused(tmp_path):
     wall = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": object()}}
     with pytest.raises(StorageError, match=r"wall\.bsdf\.reflectance is a object.*plain data"):
         write_capture(tmp_path / "a.h5", replace(capture, scan=replace(capture.scan, wall=wall)))
-    with pytest.raises(StorageError, match=r"expected a tt\.nlos\.Capture, got Tensor"):
+    with pytest.raises(ArgumentError, match=r"expected a tt\.nlos\.Capture, got Tensor"):
         write_capture(tmp_path / "a.h5", torch.zeros(3))
     with pytest.raises(StorageError, match="plain data"):
         write_capture(tmp_path / "a.h5", capture, {"scene": object()})

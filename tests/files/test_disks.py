@@ -21,7 +21,7 @@ import torch
 
 import torchtransient as tt
 from support.capture_files import grids, holdable, made
-from torchtransient.errors import ShapeError, StorageError, UnitError
+from torchtransient.errors import ArgumentError, ShapeError, StorageError, UnitError
 from torchtransient.files import hdf5_limits
 from torchtransient.files.captures.formats import LAYOUTS
 
@@ -31,8 +31,9 @@ ONE_OF_EACH = {layout: capture for layout, _, capture in holdable()}
 
 def volume():
     eye = torch.eye(3, dtype=torch.float64)
-    grid = tt.nlos.VoxelGrid(torch.linspace(0.1, 1, 4), (5, 6), (0.1, 0.2), eye[0] * 0, *eye)
-    return tt.nlos.HiddenVolume(torch.arange(120.0).reshape(1, 4, 5, 6), grid, "fk", {"a": 1})
+    axes = dict(zip(("along_x", "along_y", "normal"), eye, strict=True))
+    grid = tt.nlos.VoxelGrid(torch.linspace(0.1, 1, 4), (5, 6), (0.1, 0.2), first=eye[0] * 0, **axes)
+    return tt.nlos.HiddenVolume(torch.arange(120.0).reshape(1, 4, 5, 6), grid, "fk", metadata={"a": 1})
 
 
 def capture():
@@ -261,8 +262,8 @@ def test_tensors_without_numbers_in_memory(tmp_path):
         ({"times": torch.zeros(3, 2)}, ShapeError, "times"),
         ({"times": torch.tensor([torch.nan])}, UnitError, "finite"),
         ({"directions": torch.zeros(7, 3, 4, 5, 6)}, ShapeError, "one for each of the values"),
-        ({"values": torch.zeros(0, 1, 4, 5, 6)}, ShapeError, "values"), ({"method": 5}, ShapeError, "method"),
-        ({"method": "a\0b"}, ShapeError, "method"), ({"values": torch.ones(1, 4, 5, 6) > 0}, ShapeError, "values"),
+        ({"values": torch.zeros(0, 1, 4, 5, 6)}, ShapeError, "values"), ({"method": 5}, ArgumentError, "method"),
+        ({"method": "a\0b"}, ArgumentError, "method"), ({"values": torch.ones(1, 4, 5, 6) > 0}, ShapeError, "values"),
     ],
 )  # fmt: skip
 def test_what_is_no_volume(changes, error, words):

@@ -11,13 +11,23 @@ import pytest
 import torch
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
-from torchtransient.errors import StorageError
+from torchtransient.errors import ArgumentError, MissingPackageError, StorageError
 from torchtransient.files import array_file
 from torchtransient.files.result_file import check_target, read_result, write_result
-from torchtransient.render.output import RenderOutput, RenderStats
+from torchtransient.rendering.output import RenderOutput, RenderStats
 
 AXIS = TimeAxis(3.5, 0.02, 5)
-STATS = RenderStats(16, 0.5, 1e4, "llvm_ad_rgb", "transient_path", "box", (0,), (0.0,), (0.25,))
+STATS = RenderStats(
+    spp=16,
+    seconds=0.5,
+    samples_per_second=1e4,
+    variant="llvm_ad_rgb",
+    integrator="transient_path",
+    temporal_filter="box",
+    seeds=(0,),
+    energy_before=(0.0,),
+    energy_after=(0.25,),
+)
 ENDINGS = ("h5", "hdf5", "npz")
 
 
@@ -25,7 +35,7 @@ def output(leading=()):
     generator = torch.Generator().manual_seed(0)
     film = torch.rand(*leading, 4, 6, 5, 3, generator=generator)  # the film's order: H, W, T, C
     transient = film.movedim((-1, -2), (-4, -3))
-    return RenderOutput(transient, transient.sum(-3), None, AXIS, STATS)
+    return RenderOutput(transient, transient.sum(-3), None, axis=AXIS, stats=STATS)
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
@@ -45,7 +55,14 @@ def phasors(leading=()):
     generator = torch.Generator().manual_seed(1)
     film = torch.rand(*leading, 4, 6, 3, 2, 2, generator=generator)  # the film's order: H, W, F, C, parts
     phasor = torch.view_as_complex(film).movedim((-1, -2), (-4, -3))
-    return RenderOutput(None, phasor[..., 0, :, :].real, phasor, None, STATS, FrequencyAxis((0.0, 0.5, -2.0), 1.5))
+    return RenderOutput(
+        None,
+        phasor[..., 0, :, :].real,
+        phasor,
+        axis=None,
+        stats=STATS,
+        frequencies=FrequencyAxis((0.0, 0.5, -2.0), 1.5),
+    )
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
@@ -161,12 +178,12 @@ def test_hdf5_without_its_package(tmp_path, monkeypatch):
         return real(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(StorageError, match=r"torchtransient\[data\]"):
+    with pytest.raises(MissingPackageError, match=r"torchtransient\[data\]"):
         check_target(tmp_path / "a.h5")
 
 
 def test_what_is_no_render_is_refused(tmp_path):
-    with pytest.raises(StorageError, match=r"expected what a render returned, a RenderOutput, got Tensor.*torch\.save"):
+    with pytest.raises(ArgumentError, match=r"expected what a render returned, .*got Tensor.*torch\.save"):
         write_result(tmp_path / "out.npz", torch.zeros(3, 4, 2, 2))
 
 

@@ -12,9 +12,9 @@ import torch
 
 import torchtransient as tt
 from torchtransient import geometry
-from torchtransient.errors import SceneError, ShapeError, UnitError
-from torchtransient.render.cameras import camera_of
-from torchtransient.render.labels import scene_labels
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
+from torchtransient.rendering.cameras import camera_of
+from torchtransient.rendering.labels import scene_labels
 from torchtransient.scenes.transforms import look_at, rotate, scale, translate
 from torchtransient.testing.small_room import VARIANT, make_room
 
@@ -49,7 +49,7 @@ def test_intrinsics_are_mitsubas_rays(axis, size, crop, offset):
     with mi.variant_context(VARIANT):
         directions, origins = sensor_rays(axis, size, crop, offset)
     window = (CROP["crop_offset_x"], CROP["crop_offset_y"]) if crop else (0, 0)
-    matrix = geometry.intrinsics(50.0, size, axis, offset, window)
+    matrix = geometry.intrinsics(50.0, size, fov_axis=axis, principal_point_offset=offset, crop_offset=window)
     found = geometry.ray_directions(matrix, directions.shape[1:], POSE)
     np.testing.assert_allclose(found, directions, atol=2e-6)
     # Kornia's own camera goes from the points of these rays to the pixels.
@@ -89,13 +89,15 @@ def test_extrinsics_there_and_back():
 def test_gradients():
     fov, offset = torch.tensor([40.0, 50.0]).double(), torch.tensor([[0.1, 0.0], [0.0, -0.2]]).double()
     leaves = (fov.requires_grad_(), offset.requires_grad_())
-    assert torch.autograd.gradcheck(lambda fov, offset: geometry.intrinsics(fov, (6, 8), "y", offset), leaves)
+    assert torch.autograd.gradcheck(
+        lambda fov, offset: geometry.intrinsics(fov, (6, 8), fov_axis="y", principal_point_offset=offset), leaves
+    )
     distance = torch.linspace(1.0, 3.0, 12).double().reshape(3, 4).requires_grad_()
     matrix = geometry.intrinsics(50.0, (3, 4)).double()
     for function in (
         lambda d: geometry.normals_from_distance(d, matrix),
-        lambda d: geometry.opl_from_distance(d, matrix, POSE, [0.3, 0.1, 2.0]),
-        lambda d: geometry.distance_from_opl(d + 4, matrix, POSE, [0.3, 0.1, 2.0]),
+        lambda d: geometry.opl_from_distance(d, matrix, POSE, light=[0.3, 0.1, 2.0]),
+        lambda d: geometry.distance_from_opl(d + 4, matrix, POSE, light=[0.3, 0.1, 2.0]),
         lambda d: geometry.points_from_distance(geometry.distance_from_z_depth(d, matrix), matrix, POSE),
     ):
         assert torch.autograd.gradcheck(function, (distance,))
@@ -170,7 +172,7 @@ def test_optical_path_is_where_the_light_arrives(seen):
     axis = tt.TimeAxis(5.0, 0.01, 600)
     one = tt.TransientRenderer(renderer.scene, time_axis=axis, spp=16, max_depth=2, temporal_filter="box")
     transient = one(seed=0).transient.sum(0)
-    opl = geometry.opl_from_distance(labels["depth"], camera.intrinsics, camera.to_world, [-0.5, 0.25, 4.0])
+    opl = geometry.opl_from_distance(labels["depth"], camera.intrinsics, camera.to_world, light=[-0.5, 0.25, 4.0])
     arrival = axis.centers_opl.float()[transient.argmax(0)]
     lit = transient.sum(0) > 0
     assert lit.float().mean() > 0.7
@@ -217,9 +219,11 @@ def test_nothing_flows_back_from_a_path_that_is_too_short(light):
         (lambda d, matrix, *_: geometry.z_depth_from_distance(d, matrix), 2),
         (lambda d, matrix, pose, *_: geometry.points_from_distance(d, matrix, pose), 2),
         (lambda d, matrix, pose, *_: geometry.normals_from_distance(d, matrix, pose), 9 + 4),
-        (lambda d, matrix, pose, place, index: geometry.opl_from_distance(d, matrix, pose, place, index), 2),
+        (lambda d, matrix, pose, place, index: geometry.opl_from_distance(d, matrix, pose, light=place, index=index),
+         2),
         (lambda d, matrix, pose, place, index: geometry.opl_from_distance(d, index=index), 2),
-        (lambda d, matrix, pose, place, index: geometry.distance_from_opl(d + 4, matrix, pose, place, index), 2),
+        (lambda d, matrix, pose, place, index: geometry.distance_from_opl(d + 4, matrix, pose, light=place,
+         index=index), 2),
         (lambda d, matrix, pose, place, index: geometry.distance_from_opl(d, index=index), 2),
     ],
 )
@@ -265,7 +269,9 @@ def test_camera_of_takes_values_and_their_gradients(seen):
     renderer, camera, _ = seen
     fov = torch.tensor(40.0, requires_grad=True)
     other = camera_of(renderer, {"sensor.x_fov": fov})
-    assert torch.allclose(other.intrinsics, geometry.intrinsics(40.0, (24, 32), "x", (0.05, 0.0)))
+    assert torch.allclose(
+        other.intrinsics, geometry.intrinsics(40.0, (24, 32), fov_axis="x", principal_point_offset=(0.05, 0.0))
+    )
     other.intrinsics[0, 0].backward()
     assert fov.grad < 0
     assert camera.size == (24, 32) and torch.equal(camera.to_world, renderer.values["sensor.to_world"])
@@ -273,9 +279,9 @@ def test_camera_of_takes_values_and_their_gradients(seen):
 
 def test_camera_of_refuses(seen):
     renderer, *_ = seen
-    with pytest.raises(SceneError, match="without a batch"):
+    with pytest.raises(ArgumentError, match="without a batch"):
         camera_of(renderer, {"sensor.x_fov": torch.tensor([40.0, 41.0])})
-    with pytest.raises(SceneError, match="a sensor from 0 to 0"):
+    with pytest.raises(ArgumentError, match="a sensor from 0 to 0"):
         camera_of(renderer, sensor=1)
     scene = make_room()
     scene["sensor"]["type"] = "orthographic"
@@ -294,11 +300,12 @@ MATRIX, IMAGE = torch.eye(3), torch.ones(4, 5)
         (lambda: geometry.intrinsics("wide", (4, 5)), ShapeError, "fov_deg as numbers"),
         (lambda: geometry.intrinsics(40.0, 4), ShapeError, r"size as \(height, width\)"),
         (lambda: geometry.intrinsics(40.0, (4, 0)), ShapeError, "whole number"),
-        (lambda: geometry.intrinsics(40.0, (4, 5), "z"), SceneError, "fov_axis"),
-        (lambda: geometry.intrinsics(40.0, (4, 5), "x", (0.1,)), ShapeError, "two finite numbers"),
-        (lambda: geometry.intrinsics(40.0, (4, 5), "x", crop_offset=(1,)), ShapeError, "crop_offset"),
-        (lambda: geometry.intrinsics(40.0, (4, 5), "x", crop_offset=3), ShapeError, "crop_offset"),
-        (lambda: geometry.intrinsics(40.0, (4, 5), "x", crop_offset="ab"), ShapeError, "crop_offset"),
+        (lambda: geometry.intrinsics(40.0, (4, 5), fov_axis="z"), ArgumentError, "fov_axis"),
+        (lambda: geometry.intrinsics(40.0, (4, 5), fov_axis="x", principal_point_offset=(0.1,)), ShapeError,
+         "two finite numbers"),
+        (lambda: geometry.intrinsics(40.0, (4, 5), fov_axis="x", crop_offset=(1,)), ShapeError, "crop_offset"),
+        (lambda: geometry.intrinsics(40.0, (4, 5), fov_axis="x", crop_offset=3), ShapeError, "crop_offset"),
+        (lambda: geometry.intrinsics(40.0, (4, 5), fov_axis="x", crop_offset="ab"), ShapeError, "crop_offset"),
         (lambda: geometry.extrinsics(np.eye(3)), ShapeError, r"\(\.\.\., 4, 4\)"),
         (lambda: geometry.extrinsics(np.diag([2.0, 2.0, 2.0, 1.0])), UnitError, "a rigid motion"),
         (lambda: geometry.extrinsics(np.diag([-1.0, 1.0, 1.0, 1.0])), UnitError, "a rigid motion"),
@@ -312,7 +319,7 @@ MATRIX, IMAGE = torch.eye(3), torch.ones(4, 5)
         (lambda: geometry.z_depth_from_distance(IMAGE, torch.zeros(3, 3)), ShapeError, "with an inverse"),
         (lambda: geometry.z_depth_from_distance(IMAGE.long(), MATRIX), ShapeError, "floating image"),
         (lambda: geometry.opl_from_distance(IMAGE, light=[0, 0, 1.0]), UnitError, "camera_matrix= and to_world="),
-        (lambda: geometry.opl_from_distance(IMAGE, MATRIX, np.eye(4), [0.0, 1.0]), ShapeError, "points"),
+        (lambda: geometry.opl_from_distance(IMAGE, MATRIX, np.eye(4), light=[0.0, 1.0]), ShapeError, "points"),
         (lambda: geometry.distance_from_opl(IMAGE, index=0.0), UnitError, "index"),
         (lambda: geometry.normals_from_distance(IMAGE[:1], MATRIX), ShapeError, "two rows"),
     ],

@@ -5,6 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 import pytest
+from scipy.integrate import trapezoid
 from scipy.stats import gamma
 
 import torchtransient as tt
@@ -14,7 +15,7 @@ from torchtransient._collection import no_collection
 from torchtransient.errors import SceneError
 from torchtransient.plugins.bsdfs.delay_table import DECAY_NODES
 from torchtransient.pulses import Pulse
-from torchtransient.sensing.pulse import pulse_kernel
+from torchtransient.sensing.response.pulse import pulse_kernel
 from torchtransient.testing.statistics import two_sample_z_test, z_test
 from torchtransient.units import SPEED_OF_LIGHT
 
@@ -195,11 +196,11 @@ def test_shifted_light_has_the_photons_that_were_absorbed():
     per_intensity = plain / (0.5 * (830 - 360))
     x = np.linspace(380, 600, 220001)
     emission = np.interp(x, [480, 520, 560], [0, 1, 0], left=0, right=0)
-    emission /= np.trapezoid(emission, x)
+    emission /= trapezoid(emission, x)
     absorbed = np.interp(x, [400, 450, 500], [0.2, 0.8, 0.2], left=0, right=0)
     absorbed *= np.interp(x, [360, 420, 480], [3, 6, 12], left=0, right=0)
-    photons = np.trapezoid(absorbed * x, x)
-    green = np.trapezoid(np.where((x >= 500) & (x <= 600), emission / x, 0), x)
+    photons = trapezoid(absorbed * x, x)
+    green = trapezoid(np.where((x >= 500) & (x <= 600), emission / x, 0), x)
     expected = YIELD * photons * green * per_intensity
     result = z_test(steady[:, :1], np.array([expected]), rounding=2e-3 * expected)
     assert result.passed, str(result)

@@ -31,7 +31,7 @@ def test_memory_is_zero_at_the_start_of_every_render(scene):
     again = np.array(scene.integrator().render(scene, seed=1, spp=4)[1])
     assert first.sum() > 0
     np.testing.assert_allclose(again, first, rtol=1e-5, atol=1e-7)
-    film.prepare()
+    film.start_render()
     assert not np.array(film.band_array(0)).any()
     assert film.band_array(0).state == dr.VarState.Evaluated
 

@@ -202,7 +202,7 @@ def test_several_launches_and_bands(monkeypatch):
 def test_sums_of_large_jobs_in_double_precision(monkeypatch):
     monkeypatch.setattr(f"{FILMS}.base.MAX_SINGLE_PRECISION_SAMPLES", 16)
     scene = scene_of(phasor_camera())
-    scene.sensors()[0].film().prepare((), 17)
+    scene.sensors()[0].film().start_render(17)
     assert dr.type_v(scene.sensors()[0].film().bands[0][2]) == dr.VarType.Float64
     _, double = render(scene)
     monkeypatch.undo()

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from torchtransient import losses
-from torchtransient.errors import ShapeError
+from torchtransient.errors import ArgumentError
 
 TAKERS = {
     "multiscale_loss": lambda compare: losses.multiscale_loss(X, Y, compare),
@@ -82,7 +82,7 @@ def test_every_likelihood_is_among_them():
 @pytest.mark.parametrize("taker", TAKERS)
 @pytest.mark.parametrize("name", BACKWARDS)
 def test_what_takes_no_model_first_is_refused(taker, name):
-    with pytest.raises(ShapeError, match=f"^{taker}: expected compare") as caught:
+    with pytest.raises(ArgumentError, match=f"^{taker}: expected compare") as caught:
         TAKERS[taker](BACKWARDS[name])
     if name == "counts_first":
         assert "(input, target)" in str(caught.value) and name in str(caught.value)
@@ -92,7 +92,7 @@ def test_what_takes_no_model_first_is_refused(taker, name):
 @pytest.mark.parametrize("name", FORWARDS)
 def test_what_takes_the_model_first_is_taken(taker, name):
     if name == "free_running_nll" and taker.lower().startswith("multiscale"):  # dead for bins, which are others there
-        with pytest.raises(ShapeError, match="without options in bins"):
+        with pytest.raises(ArgumentError, match="without options in bins"):
             TAKERS[taker](FORWARDS[name])
     else:
         TAKERS[taker](FORWARDS[name])

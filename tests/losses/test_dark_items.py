@@ -57,8 +57,12 @@ def test_levels_of_items_in_every_loss(case):
             # by the loss over the change of a bin that would be all of it
             sizes = [float(t.abs().max()) for t in (alone, own_slope)]
             sizes[1] += 0.01 * sizes[0] / max(1.0, level)
-            for found, wanted, size in zip((whole[0], slope[0]), (alone, own_slope), sizes, strict=True):
-                assert float((found - wanted).abs().max()) <= 1e-4 * size, (level, brightness)
+            off = [float((a - b).abs().max()) for a, b in ((whole[0], alone), (slope[0], own_slope))]
+            if not all(o <= 1e-4 * size for o, size in zip(off, sizes, strict=True)):
+                # Builds of torch add in other orders: what single precision loses by the item alone may be lost twice.
+                exact = slope_of(case, inputs[0].double(), targets[0].double(), reduction="none")
+                lost = [float((a - b).abs().max()) for a, b in zip((alone, own_slope), exact, strict=True)]
+                assert all(o <= max(1e-4 * s, x) for o, s, x in zip(off, sizes, lost, strict=True)), (level, brightness)
 
 
 @own

@@ -13,7 +13,7 @@ import torch
 
 from support.loss_cases import CASES, CYCLES, MESHES, OTHERS
 from torchtransient import FrequencyAxis, losses
-from torchtransient.errors import DeviceError, ShapeError, TorchTransientError, UnitError
+from torchtransient.errors import ArgumentError, DeviceError, ShapeError, TorchTransientError, UnitError
 
 every = pytest.mark.parametrize("case", CASES, ids=str)
 HALVES = (torch.float16, torch.bfloat16)
@@ -307,7 +307,7 @@ def test_on_the_device_of_the_tensors(case):
 def wrong_calls(case):
     """What is wrong with any loss, and what else with those that have such an option."""
     x, y = case.tensors()
-    yield ShapeError, "reduction", lambda: case(x, y, reduction="median")
+    yield ArgumentError, "reduction", lambda: case(x, y, reduction="median")
     yield UnitError, "mask of truth values", lambda: case(x, y, torch.ones_like(y))
     yield ShapeError, "mask that broadcasts", lambda: case(x, y, torch.ones(3, *y.shape, dtype=torch.bool))
     yield DeviceError, "mask", lambda: case(x, y, torch.ones(y.shape, dtype=torch.bool, device="meta"))

@@ -122,7 +122,9 @@ def test_background_of_a_free_running_detector(dtype):
         return (0.8 * shares).to(dtype) + p.reshape(-1, 1, 1, 1)
 
     start = torch.full((1, 1), 1e-2, dtype=dtype)
-    found = fitted(lambda p: losses.free_running_nll(model(p), counts, periods, dead, reduction="none"), start)
+    found = fitted(
+        lambda p: losses.free_running_nll(model(p), counts, periods=periods, dead_bins=dead, reduction="none"), start
+    )
     # second order in the counts of a bin per period, 0.2 here
     assert float(found) == pytest.approx(weak, rel=0.1)
     best = counts.double() / armed_periods(counts, periods, dead)
@@ -139,7 +141,7 @@ def test_a_background_of_few_counts_in_a_large_image(dtype):
     for loss, unit in (
         (lambda m: losses.poisson_nll(m, counts, reduction="sum"), 1),
         (lambda m: losses.first_photon_nll(m, counts, 10**6, reduction="sum"), 1e6),
-        (lambda m: losses.free_running_nll(m, counts, 10**6, 3.0, reduction="sum"), 1e6),
+        (lambda m: losses.free_running_nll(m, counts, periods=10**6, dead_bins=3.0, reduction="sum"), 1e6),
     ):
         leaf = (level.detach() / unit).requires_grad_()
         (slope,) = torch.autograd.grad(loss(leaf * torch.ones_like(counts)), leaf)
@@ -151,7 +153,7 @@ LOSSES = {
     "poisson": (lambda m, n: losses.poisson_nll(m, n, **EACH), 1),
     "first photon": (lambda m, n: losses.first_photon_nll(m, n, 1000, **EACH), 1000),
     "first photon, dead time": (lambda m, n: losses.first_photon_nll(m, n, 1000, dead_bins=2.5, **EACH), 1000),
-    "free running": (lambda m, n: losses.free_running_nll(m, n, 1000, 2.5, **EACH), 1000),
+    "free running": (lambda m, n: losses.free_running_nll(m, n, periods=1000, dead_bins=2.5, **EACH), 1000),
 }
 each = pytest.mark.parametrize("loss, exposures", LOSSES.values(), ids=LOSSES.keys())
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 import torch
 
 from support.loss_cases import AXIS, BAND, CASES
+from support.sweeps import together
 from torchtransient import losses
 from torchtransient.errors import DeviceError, ShapeError, TorchTransientError, UnitError
 
@@ -16,7 +19,7 @@ NLLS = {
     "poisson_nll, constant": lambda x, y, **k: losses.poisson_nll(x, y, constant=True, **k),
     "first_photon_nll": lambda x, y, **k: losses.first_photon_nll(x, y, 10_000, constant=True, **k),
     "first_photon_nll, dead": lambda x, y, **k: losses.first_photon_nll(x, y, 10_000, dead_bins=2.5, **k),
-    "free_running_nll": lambda x, y, **k: losses.free_running_nll(x, y, 10_000, 2.5, **k),
+    "free_running_nll": lambda x, y, **k: losses.free_running_nll(x, y, periods=10_000, dead_bins=2.5, **k),
     "read_noise_nll": lambda x, y, **k: losses.read_noise_nll(x, y, 2.0, **k),
 }
 nlls = pytest.mark.parametrize("loss", NLLS.values(), ids=NLLS.keys())
@@ -140,7 +143,7 @@ FLOATING = (torch.float16, torch.bfloat16, torch.float8_e4m3fn, torch.float8_e5m
 
 
 @over(lambda case: case.pair and not case.tensors()[0].is_complex())
-@pytest.mark.parametrize("dtype", [*WHOLE, *FLOATING, torch.bool], ids=str)
+@together("dtype", [*WHOLE, *FLOATING, torch.bool])
 def test_targets_of_every_kind(case, dtype):
     x, y = case.tensors(dtype=torch.float32)
     y = (y if case.draw_target is not None else 100 * y).to(dtype)
@@ -157,7 +160,7 @@ def real_pair(case):
 
 
 @over(real_pair)
-@pytest.mark.parametrize("dtype", [*WHOLE, *FLOATING, torch.bool], ids=str)
+@together("dtype", [*WHOLE, *FLOATING, torch.bool])
 def test_inputs_of_every_kind(case, dtype):
     x, y = case.tensors(dtype=torch.float32)
     x = (100 * x).to(dtype)
@@ -165,7 +168,7 @@ def test_inputs_of_every_kind(case, dtype):
 
 
 @nlls
-@pytest.mark.parametrize("dtype", [*WHOLE, torch.float16, torch.bfloat16, torch.bool], ids=str)
+@together("dtype", [*WHOLE, torch.float16, torch.bfloat16, torch.bool])
 def test_counts_up_to_the_last_of_their_kind(loss, dtype):
     """255 + 1 is 0 in uint8: the logarithm of a factorial is not computed there."""
     most = 1 if dtype == torch.bool else min(torch.iinfo(dtype).max if dtype in WHOLE else 256, 1000)
@@ -211,7 +214,7 @@ def test_anscombe_of_every_kind(dtype):
 
 
 @over(lambda case: case.function is not losses.measurement_consistency)  # its operator is the user's
-@pytest.mark.parametrize("half", [torch.float16, torch.bfloat16], ids=str)
+@together("half", [torch.float16, torch.bfloat16])
 def test_autocast_does_not_reach_in(case, half):
     for dtype in (torch.float32, torch.float64):
         pair = [t.requires_grad_() for t in case.tensors(dtype=dtype)]
@@ -229,8 +232,8 @@ def test_autocast_does_not_reach_in(case, half):
 
 
 @every
-@pytest.mark.parametrize("place", [0, 1, -1], ids=["no items", "no channels", "no pixels"])
-@pytest.mark.parametrize("masked", [False, True])
+# Items, channels, pixels.
+@together("place, masked", itertools.product([0, 1, -1], [False, True]))
 def test_of_nothing_is_zero(case, place, masked):
     x, y = (t.narrow(place, 0, 0) for t in case.tensors())
     mask = torch.ones(y.shape, dtype=torch.bool) if masked else None
@@ -270,14 +273,15 @@ X, Y = (0.1 + torch.rand(2, 1, 8, 4, 5, generator=torch.Generator().manual_seed(
 LEVELS = {
     "poisson": lambda v: losses.poisson_nll(X, Y, floor=v),
     "first photon": lambda v: losses.first_photon_nll(X, Y, 400, floor=v),
-    "free running": lambda v: losses.free_running_nll(X, Y, 400, 2.0, floor=v),
+    "free running": lambda v: losses.free_running_nll(X, Y, periods=400, dead_bins=2.0, floor=v),
     "read noise": lambda v: losses.read_noise_nll(X, Y, v),
     "log ratio": lambda v: losses.log_ratio_loss(X, Y, background=v),
     "Wasserstein": lambda v: losses.wasserstein_loss(X, Y, 0.1, floor=v),
     "Wasserstein's width": lambda v: losses.wasserstein_loss(X, Y, v),
     "Wasserstein's cost": lambda v: losses.wasserstein_loss(X, Y, 0.1, creation_cost_opl=v),
     "phasor": lambda v: losses.phasor_loss(X + 0j, Y + 0j, phase_only=True, floor=v),
-    "transient phasor": lambda v: losses.transient_phasor_loss(X, Y, AXIS, BAND, phase_only=True, floor=v),
+    "transient phasor": lambda v: losses.transient_phasor_loss(X, Y, axis=AXIS, frequencies=BAND, phase_only=True,
+        floor=v),
     "total variation": lambda v: losses.total_variation(X, smoothing=v),
     "spacing": lambda v: losses.total_variation(X, spacing=(v, 1.0, 1.0)),
     "SSIM": lambda v: losses.ssim_loss(X, Y, window=3, value_range=v),
@@ -326,7 +330,7 @@ def test_no_floor_is_one_of_likelihoods():
 @pytest.mark.parametrize("value", [-5, 0, 2.5, NAN, "a", True, None])
 def test_numbers_of_things(value):
     calls = [
-        lambda: losses.free_running_nll(X, Y, value, 3.0),
+        lambda: losses.free_running_nll(X, Y, periods=value, dead_bins=3.0),
         lambda: losses.first_photon_nll(X, Y, value),
         lambda: losses.ssim_loss(X, Y, window=value),
     ]
@@ -335,7 +339,7 @@ def test_numbers_of_things(value):
             call()
     if value != 2.5:
         with pytest.raises(TorchTransientError, match="expected"):
-            losses.free_running_nll(X, Y, 400, value)
+            losses.free_running_nll(X, Y, periods=400, dead_bins=value)
     assert float(losses.ssim_loss(X, Y, window=3.0)) == float(losses.ssim_loss(X, Y, window=3))
 
 

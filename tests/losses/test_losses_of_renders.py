@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.loss_cases import CASES
 from torchtransient import losses
 from torchtransient.errors import GradientError, UnitError
 from torchtransient.testing.small_room import VARIANT, make_room
@@ -44,28 +45,28 @@ def operator(volume):
     return torch.einsum("tz,...zyx->...tyx", PLANES, volume)
 
 
-# What is called with two results, or two tensors and then with options that results know.
-WIDTH = {"bin_width_opl": 0.25}
-HISTOGRAMS = {
-    losses.squared_loss: ({}, {}),
-    losses.root_loss: ({}, {}),
-    losses.expected_root_loss: ({}, {}),
-    losses.log_ratio_loss: ({"background": 0.1}, {}),
-    losses.poisson_nll: ({"floor": 1e-3}, {}),
-    losses.first_photon_nll: ({"cycles": 1000, "floor": 1e-3}, {}),
-    losses.free_running_nll: ({"periods": 1000, "dead_bins": 2.0, "floor": 1e-3}, {}),
-    losses.read_noise_nll: ({"read_noise": 0.5}, {}),
-    losses.cumulative_loss: ({}, WIDTH),
-    losses.wasserstein_loss: ({}, WIDTH),
-    losses.transient_phasor_loss: ({"frequencies": BAND}, {"axis": tt.TimeAxis(6.0, 0.25, 24)}),
-    losses.multiscale_loss: ({}, {}),
-}
+# Options that results know: of two tensors they have to be given.
+KNOWN = {"bin_width_opl": 0.25, "axis": tt.TimeAxis(6.0, 0.25, 24)}
+
+
+def taken_by(loss):
+    """The kind of result that a loss takes first, as its signature says: `Light`, `Volume`, ..."""
+    return next(iter(inspect.signature(loss).parameters.values())).annotation
+
+
+def histograms():
+    """What compares histograms, by the first case of the list: (options, what tensors are given beside them)."""
+    found = {}
+    for case in CASES:
+        if taken_by(case.function) in ("Light", "Transient") and case.function not in (*OTHER, *found):
+            options = {**case.options, **case.of_renders}
+            known = {name: KNOWN[name] for name in options.keys() & KNOWN.keys()}
+            found[case.function] = ({name: value for name, value in options.items() if name not in KNOWN}, known)
+    return found
+
+
 OTHER = (losses.two_render_loss, losses.measurement_consistency, losses.phasor_loss, losses.ssim_loss)
-# Of depth maps, hidden volumes and meshes, which a renderer does not return.
-OF_OTHER_RESULTS = (
-    losses.depth_loss, losses.scale_invariant_depth_loss, losses.total_variation, losses.projection_ssim_loss,
-    losses.mesh_laplacian_smoothing, losses.mesh_normal_consistency,
-)  # fmt: skip
+HISTOGRAMS = histograms()
 by_name = pytest.mark.parametrize("loss", HISTOGRAMS, ids=lambda loss: loss.__name__)
 
 
@@ -75,10 +76,11 @@ def slope_of(value, renderer):
     return slope
 
 
-def test_every_loss_is_here():
-    functions = {f for f in vars(losses).values() if inspect.isfunction(f)}
-    reducing = {f for f in functions if "reduction" in inspect.signature(f).parameters}
-    assert reducing == {*HISTOGRAMS, *OTHER, *OF_OTHER_RESULTS}
+def test_every_loss_says_what_it_takes():
+    """Histograms are here; depth maps and hidden volumes are nothing that a renderer returns."""
+    others = {case.function for case in CASES} - set(HISTOGRAMS)
+    assert set(OTHER) <= others and len(HISTOGRAMS) > 10
+    assert {taken_by(loss) for loss in others - set(OTHER)} <= {"Volume", "DepthMap"}
 
 
 @by_name

@@ -11,19 +11,19 @@ from pathlib import Path
 import torch
 
 from support.loss_cases import CASES, OTHERS
+from support.pages import Page
 from torchtransient import losses
 from torchtransient.errors import ShapeError
 
-PAGE = (Path(__file__).parents[2] / "docs" / "losses.md").read_text(encoding="utf-8")
+LOSSES = Page("docs/losses.md")
+PAGE = LOSSES.text
 # By the row of another: second names, and phasors of transients.
 SHARED_FLOORS = ("poisson_loss", "first_photon_loss", "transient_phasor_loss")
 
 
 def test_its_program_runs():
-    (program,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
     torch.manual_seed(0)
-    names = {}
-    exec(compile(program, "losses.md", "exec"), names)
+    names = LOSSES.names()
     assert bool(torch.isfinite(names["objective"])) and bool(torch.isfinite(names["loss"]))
     assert bool(torch.isfinite(names["model"].grad).all())
 

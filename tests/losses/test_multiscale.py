@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from torchtransient import losses
-from torchtransient.errors import ShapeError, TorchTransientError
+from torchtransient.errors import ArgumentError, TorchTransientError
 from torchtransient.sensing import SynchronousSPAD
 
 
@@ -134,7 +134,7 @@ def test_where_time_is_may_be_said_by_what_is_compared():
             found = losses.multiscale_loss(x, y, compare, dim=dim, reduction="none")
             torch.testing.assert_close(found, wanted)
             torch.testing.assert_close(losses.MultiscaleLoss(compare, dim=dim)(x, y), wanted.mean())
-        with pytest.raises(ShapeError, match=r"^multiscale_loss: expected time in one .*dim=-3, and dim=-2 held"):
+        with pytest.raises(ArgumentError, match=r"^multiscale_loss: expected time in one .*dim=-3, and dim=-2 held"):
             losses.multiscale_loss(x, y, held, dim=-3)
 
 
@@ -186,8 +186,8 @@ NO_COMPARES = {
 @pytest.mark.parametrize("match", NO_COMPARES)
 def test_what_is_no_loss_of_bins(match):
     x = torch.rand(1, 8, 2, 2)
-    with pytest.raises(ShapeError, match=f"^multiscale_loss: expected compare.*{match}"):
+    with pytest.raises(ArgumentError, match=f"^multiscale_loss: expected compare.*{match}"):
         losses.multiscale_loss(x, x, NO_COMPARES[match])
     if match != "a value for each bin":
-        with pytest.raises(ShapeError, match=f"^MultiscaleLoss: expected compare.*{match}"):
+        with pytest.raises(ArgumentError, match=f"^MultiscaleLoss: expected compare.*{match}"):
             losses.MultiscaleLoss(NO_COMPARES[match])

@@ -10,21 +10,19 @@ from pathlib import Path
 import pytest
 import torch
 
+from support.pages import Page
 from torchtransient import losses
 
 ROOT = Path(__file__).parents[2]
-PAGE = ROOT / "docs" / "noisy_renders.md"
-TEXT = PAGE.read_text(encoding="utf-8")
+PAGE = Page("docs/noisy_renders.md")
+TEXT = PAGE.text
 NUMBERS = ROOT / "benchmarks" / "results" / "noisy_renders.json"
 
 
 @pytest.fixture(scope="module")
 def names():
     torch.manual_seed(0)
-    found: dict[str, object] = {}
-    for code in re.findall(r"```python\n(.*?)```", TEXT, flags=re.DOTALL):
-        exec(compile(code, str(PAGE), "exec"), found)
-    return found
+    return PAGE.names()
 
 
 def test_its_blocks_say_what_noise_adds(names):

@@ -11,7 +11,7 @@ import torch
 
 from support.loss_cases import AXIS, BAND, BINS, CASES
 from torchtransient import TimeAxis, losses
-from torchtransient.errors import ShapeError, TorchTransientError, UnitError
+from torchtransient.errors import ArgumentError, ShapeError, TorchTransientError, UnitError
 
 # The attribute that a loss reads, by the argument that is a pair of results.
 READS = {
@@ -158,13 +158,14 @@ def test_what_is_given_counts_more_than_what_a_result_knows():
     for loss in (losses.cumulative_loss, losses.wasserstein_loss):
         with pytest.raises(UnitError, match="bin_width_opl, metres of optical path, with tensors"):
             loss(x, y)
-    with pytest.raises(UnitError, match="expected a TimeAxis"):
+    with pytest.raises(ArgumentError, match="expected a TimeAxis"):
         losses.transient_phasor_loss(x, y, frequencies=BAND)
     torch.testing.assert_close(
         losses.transient_phasors(result(x), frequencies=BAND), losses.transient_phasors(x, AXIS, BAND)
     )
     torch.testing.assert_close(
-        losses.TransientPhasorLoss(frequencies=BAND)(result(x), y), losses.transient_phasor_loss(x, y, AXIS, BAND)
+        losses.TransientPhasorLoss(frequencies=BAND)(result(x), y),
+        losses.transient_phasor_loss(x, y, axis=AXIS, frequencies=BAND),
     )
 
 
@@ -189,7 +190,7 @@ def test_renders_of_the_library():
     from torchtransient.files.result_file import Result
     from torchtransient.reconstruction.hidden_volume import HiddenVolume
     from torchtransient.reconstruction.voxels import VoxelGrid
-    from torchtransient.sensing.itof_reading import ItofReading
+    from torchtransient.sensing.itof.itof_reading import ItofReading
 
     x = torch.rand(1, BINS, 2, 2)
     scan = Scan.grid(Wall.plane(1.0, 1.0), (2, 2), kind="confocal")
@@ -197,7 +198,8 @@ def test_renders_of_the_library():
     rendered = Result(2 * x, 2 * x.sum(-3), AXIS)
     torch.testing.assert_close(losses.wasserstein_loss(rendered, capture), torch.tensor(0.0), atol=1e-7, rtol=0)
     torch.testing.assert_close(losses.cumulative_loss(capture, rendered), losses.cumulative_loss(x, 2 * x, 0.05))
-    reading = ItofReading(*(torch.rand(1, 2, 3, 3) for _ in range(4)), torch.rand(1, 3, 3))
+    phase, amplitude, offset, deviation = torch.rand(4, 1, 2, 3, 3)
+    reading = ItofReading(phase, amplitude, offset=offset, depth_std_m=deviation, depth_m=torch.rand(1, 3, 3))
     torch.testing.assert_close(losses.depth_loss(reading, reading.depth_m + 1), torch.tensor(1.0))
     grid = VoxelGrid.bounds([[-1, -1, 0.5], [1, 1, 1.5]], (4, 3, 5))
     volume = HiddenVolume(torch.rand(1, 5, 3, 4), grid, "f-k migration")

@@ -10,7 +10,7 @@ import torch
 
 from torchtransient import losses
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.reconstruction import stabilised_root
+from torchtransient.reconstruction import stabilized_root
 
 
 def moments(mean, function):
@@ -64,7 +64,7 @@ def test_the_tangent_below_zero():
 
 def test_other_roots():
     a, b = torch.tensor([0.0, 1.0, 4.0]), torch.tensor([2.0, 0.0, 9.0])
-    found = losses.root_loss(a, b, root=stabilised_root, reduction="none")
+    found = losses.root_loss(a, b, root=stabilized_root, reduction="none")
     torch.testing.assert_close(found, (a / (a + 0.25).sqrt() - b / (b + 0.25).sqrt()) ** 2)
     noisy = functools.partial(losses.anscombe, read_noise=3.0)
     torch.testing.assert_close(

@@ -33,14 +33,14 @@ def test_a_triangle_without_area_is_a_line():
 @pytest.mark.parametrize("cells", [1, 3])
 def test_meshes_of_one_surface_are_not_apart(cells):
     fine, coarse = square(3), square(1)
-    assert float(tt.losses.surface_distance(*fine, *coarse, cells)) < 1e-12
+    assert float(tt.losses.surface_distance(*fine, *coarse, cells=cells)) < 1e-12
     lifted = square(2, z=0.25)
-    assert float(tt.losses.surface_distance(*fine, *lifted, cells)) == pytest.approx(0.25, rel=1e-12)
+    assert float(tt.losses.surface_distance(*fine, *lifted, cells=cells)) == pytest.approx(0.25, rel=1e-12)
 
 
 def test_a_wider_square():
     """To a square of half the width as from one of 1.5 to one of 1: the mean over a border, by quadrature."""
-    far = tt.losses.surface_distance(*square(1), *square(1, 1.5), 64)
+    far = tt.losses.surface_distance(*square(1), *square(1, 1.5), cells=64)
     t = (torch.arange(3000, dtype=torch.float64) + 0.5) / 3000 * 1.5 - 0.75
     outside = (t.abs() - 0.5).clamp_min(0)
     mean = torch.hypot(outside[:, None], outside[None]).mean() / 2  # nothing of the small one is beside the large one
@@ -130,7 +130,7 @@ def test_slopes():
     others = (vertices + 0.3).requires_grad_()
 
     def distance(a, b):
-        return tt.losses.surface_distance(a, faces, b, faces, 2)
+        return tt.losses.surface_distance(a, faces, b, faces, cells=2)
 
     assert torch.autograd.gradcheck(distance, (moved, others), atol=1e-6)
     same = vertices.clone().requires_grad_()
@@ -145,9 +145,9 @@ def test_refusals():
     with pytest.raises(ShapeError, match="one or more faces"):
         tt.losses.surface_distance(vertices, faces[:0], vertices, faces)
     with pytest.raises(ShapeError, match="cells"):
-        tt.losses.surface_distance(vertices, faces, vertices, faces, 0)
+        tt.losses.surface_distance(vertices, faces, vertices, faces, cells=0)
     with pytest.raises(ShapeError, match="cells"):
-        tt.losses.surface_distance(vertices, faces, vertices, faces, 2.5)
+        tt.losses.surface_distance(vertices, faces, vertices, faces, cells=2.5)
     for wrong in (faces - 1, faces + 2):
         with pytest.raises(ShapeError, match="from 0 to 3"):
             tt.losses.surface_distance(vertices, faces, vertices, wrong)

@@ -15,10 +15,17 @@ import torch
 
 import torchtransient as tt
 from torchtransient import sensing
-from torchtransient.errors import PhysicsError, PhysicsWarning, SceneError, TorchTransientError, UnitError
+from torchtransient.errors import (
+    ArgumentError,
+    PhysicsError,
+    PhysicsWarning,
+    SceneError,
+    TorchTransientError,
+    UnitError,
+)
 from torchtransient.nlos import defaults, work
 from torchtransient.nlos.renderer import LASER_ORIGIN, ORIGIN, POINTS, SPOTS
-from torchtransient.render.renderer import TransientRenderer
+from torchtransient.rendering.renderer import TransientRenderer
 
 VARIANT = "llvm_ad_mono"
 AXIS = tt.TimeAxis(1.5, 0.05, 40)
@@ -65,7 +72,7 @@ def test_bins_that_nobody_gave(parameters):
 
 
 def test_depths_are_said_by_bounces():
-    with pytest.raises(SceneError, match="max_depth: bounces= says"):
+    with pytest.raises(ArgumentError, match="max_depth: bounces= says"):
         renderer(max_depth=5)
 
 

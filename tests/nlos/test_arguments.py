@@ -118,9 +118,9 @@ def test_values_that_are_none(values):
 def test_albedos_are_those_of_walls_and_meshes():
     """One number of any library, or three in a list, a tuple or an array."""
     for given in (0.5, np.float32(0.5), torch.tensor(0.5), 1, 0):
-        wall, mesh = tt.nlos.Wall.plane(albedo=given).shape, scenes.triangle_mesh(VERTICES, FACES, given)
+        wall, mesh = tt.nlos.Wall.plane(albedo=given).shape, scenes.triangle_mesh(VERTICES, FACES, reflectance=given)
         assert wall["bsdf"] == mesh["bsdf"] == {"type": "diffuse", "reflectance": float(given)}
     for three in ([0.25, 0.5, 1], (0.25, 0.5, 1.0), np.array([0.25, 0.5, 1.0]), torch.tensor([0.25, 0.5, 1.0])):
-        wall, mesh = tt.nlos.Wall.plane(albedo=three).shape, scenes.triangle_mesh(VERTICES, FACES, three)
+        wall, mesh = tt.nlos.Wall.plane(albedo=three).shape, scenes.triangle_mesh(VERTICES, FACES, reflectance=three)
         assert wall["bsdf"] == mesh["bsdf"]
         assert mesh["bsdf"]["reflectance"] == {"type": "rgb", "value": [0.25, 0.5, 1.0]}

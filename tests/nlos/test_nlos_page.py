@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import inspect
 import re
-from pathlib import Path
 
 import pytest
 import torch
 from click.testing import CliRunner
 
 import torchtransient as tt
+from support.pages import Page
 from torchtransient.cli.main import main
 
 VARIANT = "llvm_ad_mono"
-PAGE = Path(__file__).parents[2] / "docs" / "nlos.md"
-TEXT = PAGE.read_text(encoding="utf-8")
+PAGE = Page("docs/nlos.md")
+TEXT = PAGE.text
 # What makes captures small.
 SMALLER = {r"\(64, 64\)": "(4, 4)", r"\(8, 8\)": "(2, 2)", r"spp=\d+": "spp=8", r"range\(100\)": "range(2)"}
 SCENE = """<scene version="3.0.0">
@@ -42,23 +42,13 @@ SCENE = """<scene version="3.0.0">
 OBJ = "v -0.1 -0.1 0\nv -0.1 0.1 0\nv 0.1 0.1 0\nf 1 2 3\n"
 
 
-def blocks(language):
-    return re.findall(rf"```{language}\n(.*?)```", TEXT, flags=re.DOTALL)
-
-
-def smaller(code):
-    for large, small in SMALLER.items():
-        code = re.sub(large, small, code)
-    return code
-
-
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """With the files that the page speaks of."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scene.xml").write_text(SCENE)
     (tmp_path / "part.obj").write_text(OBJ)
-    (yaml,) = blocks("yaml")
+    (yaml,) = PAGE.blocks("yaml")
     yaml = yaml.replace("[32, 32]", "[4, 4]").replace("spp: 4096 ", "spp: 8 ")
     (tmp_path / "capture.yaml").write_text(yaml)
     made = re.search(r"# (tt\.sensing.*to_yaml.*)", yaml)
@@ -69,9 +59,7 @@ def folder(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_every_block_runs(folder):
     """In one session from top to bottom."""
-    names: dict[str, object] = {}
-    for code in blocks("python"):
-        exec(compile(smaller(code), str(PAGE), "exec"), names)
+    names = PAGE.names(SMALLER)
     for written in ("k.h5", "layout.png", "fit.pt"):
         assert (folder / written).stat().st_size > 500
     assert names["capture"].transient.shape[2:] == (4, 4) and float(names["capture"].total().sum()) > 0
@@ -98,7 +86,7 @@ def test_the_file_holds_all_light_of_its_things(folder):
 @pytest.mark.slow
 def test_the_commands_are_what_python_does(folder):
     """Sixteen parts and the seed's noise."""
-    for line in blocks("sh")[0].splitlines():
+    for line in PAGE.blocks("sh")[0].splitlines():
         words = line.split("#")[0].split()
         assert words[:2] == ["torchtransient", "nlos"]
         words = [word for word in words[1:] if not word.endswith(".mp4") and word != "--video"]
@@ -132,8 +120,6 @@ def test_names_exist():
     for module in ("nlos", "vis", "scenes", "sensing", "errors"):
         for name in set(re.findall(rf"tt\.{module}\.(\w+)", TEXT)):
             assert hasattr(getattr(tt, module), name), f"tt.{module}.{name}"
-    for link in set(re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", TEXT)):
-        assert (PAGE.parent / link).exists(), link
 
 
 def test_the_package_lists_its_names():

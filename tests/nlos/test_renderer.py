@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from torchtransient.errors import PhysicsError, PhysicsWarning, SceneError
+from torchtransient.errors import ArgumentError, PhysicsError, PhysicsWarning, SceneError
 from torchtransient.nlos.renderer import LASER_ORIGIN, ORIGIN, POINTS, SPOTS
 
 VARIANT = "llvm_ad_mono"
@@ -118,10 +118,10 @@ def test_seeds_of_any_library(seed):
 
 @pytest.mark.parametrize("seed", [-1, 2**32, 2**32 + 5, True, 1.5, "5", torch.tensor(-1), [0, -1], np.array([2**33])])
 def test_seeds_that_are_those_of_others(seed):
-    with pytest.raises(SceneError, match="seed: expected a whole number from 0 to 4294967295"):
+    with pytest.raises(ArgumentError, match="seed: expected a whole number from 0 to 4294967295"):
         renderer()(seed=seed)
     if not isinstance(seed, (list, np.ndarray)):
-        with pytest.raises(SceneError, match="seed: expected a whole number from 0 to 4294967295"):
+        with pytest.raises(ArgumentError, match="seed: expected a whole number from 0 to 4294967295"):
             tt.nlos.simulate(tt.scenes.nlos_z(), scan(), time_axis=AXIS, spp=4, seed=seed, progress=False)
 
 

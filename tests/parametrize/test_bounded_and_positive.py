@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 
+from support.sweeps import together
 from torchtransient import parametrize
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.parametrize import bounded, bounded_inverse, positive, positive_inverse, simplex_inverse
@@ -47,12 +48,12 @@ def test_the_ends_need_a_margin(value):
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
-@pytest.mark.parametrize("margin", [1e-30, 1e-8, 1e-4, 1e-3, 0.1])
 @pytest.mark.parametrize("low, high", [(0.0, 1.0), (1.0, 4.0), (-0.99, 0.99), (-7.0, -3.0), (1e-4, 1.0), (0.0, 500.0)])
+@together("margin", [1e-30, 1e-8, 1e-4, 1e-3, 0.1])
 def test_a_margin_below_the_rounding(dtype, margin, low, high):
     """No nearer than the dtype tells from the bound, and at most as far as two of its steps, or the margin."""
     ends = torch.tensor([low, high], dtype=torch.float64).to(dtype)
-    x = bounded_inverse(ends, low, high, margin)
+    x = bounded_inverse(ends, low, high, margin=margin)
     assert bool(torch.isfinite(x).all())
     moved = (bounded(x, low, high) - ends).double().abs()
     step = 2 * torch.finfo(dtype).eps * ends.double().abs() + torch.finfo(dtype).tiny
@@ -68,9 +69,9 @@ def test_ranges_that_the_precision_has_not():
             make()
     for margin in (None, 0.1):
         with pytest.raises(UnitError):
-            bounded_inverse(torch.ones(2), 1.0, 1.0 + 1e-9, margin)
+            bounded_inverse(torch.ones(2), 1.0, 1.0 + 1e-9, margin=margin)
         with pytest.raises(UnitError):
-            bounded_inverse(torch.ones(2), 1.0, 1.0 + 2**-23, margin)
+            bounded_inverse(torch.ones(2), 1.0, 1.0 + 2**-23, margin=margin)
 
 
 def test_bounds_of_nothing():

@@ -43,11 +43,13 @@ CASES = {
     "Simplex": (parametrize.Simplex(), torch.tensor([0.1, 0.2, 0.7], dtype=torch.float64)),
     "AxisAnglePose": (parametrize.AxisAnglePose(), pose(MOVED)),
     "AxisAnglePose of a base": (parametrize.AxisAnglePose(BASE), pose(MOVED @ BASE)),
-    "AxisAnglePose about a point": (parametrize.AxisAnglePose(BASE, [1.0, 0.0, 0.0]), pose(MOVED @ BASE)),
+    "AxisAnglePose about a point": (parametrize.AxisAnglePose(BASE, about=[1.0, 0.0, 0.0]), pose(MOVED @ BASE)),
     "AxisAnglePose, local": (parametrize.AxisAnglePose(BASE, frame="local"), pose(BASE @ MOVED)),
-    "AxisAnglePose in millimetres": (parametrize.AxisAnglePose(BASE, "world", length_scale=1e-3), pose(MOVED @ BASE)),
+    "AxisAnglePose in millimetres": (parametrize.AxisAnglePose(BASE, about="world", length_scale=1e-3),
+        pose(MOVED @ BASE)),
     "SE3Pose": (parametrize.SE3Pose(BASE), pose(MOVED @ BASE)),
-    "SE3Pose, local, about a point": (parametrize.SE3Pose(BASE, [1.0, 0.0, 0.0], "local"), pose(BASE @ MOVED)),
+    "SE3Pose, local, about a point": (parametrize.SE3Pose(BASE, about=[1.0, 0.0, 0.0], frame="local"),
+        pose(BASE @ MOVED)),
 }  # fmt: skip
 ALL = pytest.mark.parametrize("name", CASES)
 

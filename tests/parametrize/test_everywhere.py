@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import inspect
+import itertools
 
 import numpy as np
 import pytest
 import torch
 
+from support.sweeps import together
 from torchtransient import geometry, parametrize
 from torchtransient.scenes.transforms import look_at, rotate, scale, translate
 
@@ -47,8 +49,8 @@ CALLS = {
     "distance_from_z_depth": (lambda x: geometry.distance_from_z_depth(x, MATRIX), IMAGES),
     "z_depth_from_distance": (lambda x: geometry.z_depth_from_distance(x, MATRIX), IMAGES),
     "points_from_distance": (lambda x: geometry.points_from_distance(x, MATRIX, POSE), IMAGES),
-    "opl_from_distance": (lambda x: geometry.opl_from_distance(x, MATRIX, POSE, LIGHT), IMAGES),
-    "distance_from_opl": (lambda x: geometry.distance_from_opl(x + 4, MATRIX, POSE, LIGHT), IMAGES),
+    "opl_from_distance": (lambda x: geometry.opl_from_distance(x, MATRIX, POSE, light=LIGHT), IMAGES),
+    "distance_from_opl": (lambda x: geometry.distance_from_opl(x + 4, MATRIX, POSE, light=LIGHT), IMAGES),
     "normals_from_distance": (lambda x: geometry.normals_from_distance(x, MATRIX, POSE), IMAGES),
 }  # fmt: skip
 MODULES = {
@@ -87,8 +89,7 @@ def forward_and_gradient(function, x):
 
 
 @ALL
-@pytest.mark.parametrize("half", [torch.float16, torch.bfloat16], ids=str)
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@together("half, dtype", itertools.product([torch.float16, torch.bfloat16], [torch.float32, torch.float64]))
 def test_autocast_does_not_reach_in(name, half, dtype):
     function, x = CALLS[name]
     wanted, slope = forward_and_gradient(function, x.to(dtype))
@@ -100,7 +101,7 @@ def test_autocast_does_not_reach_in(name, half, dtype):
 
 
 @ALL
-@pytest.mark.parametrize("half", [torch.float16, torch.bfloat16], ids=str)
+@together("half", [torch.float16, torch.bfloat16])
 def test_half_precision_is_computed_in_single(name, half):
     """What comes back is that of double precision, rounded once."""
     function, x = CALLS[name]

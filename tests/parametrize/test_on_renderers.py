@@ -12,7 +12,7 @@ from torch import nn
 from torch.nn.utils import parametrize as torch_parametrize
 
 import torchtransient as tt
-from torchtransient.errors import SceneError, ShapeError, UnitError, UnknownKeyError
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError, UnknownKeyError
 from torchtransient.parametrize import (
     Albedo,
     AxisAnglePose,
@@ -187,7 +187,7 @@ def test_what_is_wrong_is_said(renderer, plain):
             call()
     with pytest.raises(SceneError, match="has no parametrization"):
         remove(plain, COLOUR)
-    with pytest.raises(SceneError, match=r"an nn\.Module, got type"):
+    with pytest.raises(ArgumentError, match=r"an nn\.Module, got type"):
         register(plain, COLOUR, Albedo)
     with pytest.raises(ShapeError, match=r"AxisAnglePose: expected transforms \(\.\.\., 4, 4\)"):
         register(plain, COLOUR, AxisAnglePose())

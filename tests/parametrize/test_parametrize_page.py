@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,17 +11,16 @@ import torch
 from torch import nn
 
 import torchtransient as tt
+from support.pages import Page
 
 VARIANT = "llvm_ad_mono"
-PAGE = (Path(__file__).parents[2] / "docs" / "parametrize.md").read_text(encoding="utf-8")
+PARAMETRIZE = Page("docs/parametrize.md")
+PAGE = PARAMETRIZE.text
 
 
 @pytest.fixture(scope="module")
 def names():
-    found = {}
-    for block in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL):
-        exec(compile(block, "parametrize.md", "exec"), found)
-    return found
+    return PARAMETRIZE.names()
 
 
 def normal_and_distance(pose):

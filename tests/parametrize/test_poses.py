@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.parametrize import (
     AxisAnglePose,
     SE3Pose,
@@ -92,7 +92,7 @@ def test_twists_add_along_one_screw():
 @pytest.mark.parametrize("about", ["self", "world", [0.5, 1.0, -2.0]])
 def test_turns_about_its_point(kind, frame, about):
     """A turn alone leaves the point where it is, and sends others along a circle about it."""
-    pose = kind(BASE, about, frame)
+    pose = kind(BASE, about=about, frame=frame)
     turned = pose(torch.tensor([0.2, -0.4, 0.9, 0.0, 0.0, 0.0], dtype=torch.float64)).numpy()
     point = BASE[:3, 3] if about == "self" else np.zeros(3) if about == "world" else np.array(about)
     before = np.linalg.solve(BASE, [*point, 1.0])
@@ -159,9 +159,9 @@ def test_a_scale_needs_its_base():
         ({"about": [math.nan, 0.0, 0.0]}, UnitError, "finite numbers"),
         ({"about": torch.tensor([0.0, math.inf, 0.0])}, UnitError, "finite numbers"),
         ({"base": "there"}, ShapeError, r"\(\.\.\., 4, 4\)"),
-        ({"about": "there"}, SceneError, "'self', 'world' or a point"),
+        ({"about": "there"}, ArgumentError, "'self', 'world' or a point"),
         ({"about": [1.0, 2.0]}, ShapeError, "point"),
-        ({"frame": "camera"}, SceneError, "'world' or 'local'"),
+        ({"frame": "camera"}, ArgumentError, "'world' or 'local'"),
         ({"length_scale": 0.0}, UnitError, "length_scale"),
     ],
 )

@@ -11,7 +11,7 @@ from torch import nn
 from torch.nn.utils import parametrizations as torchs_own
 from torch.nn.utils import parametrize as torch_parametrize
 
-from torchtransient.errors import SceneError, ShapeError, TorchTransientError, UnknownKeyError
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, TorchTransientError, UnknownKeyError
 from torchtransient.parametrize import (
     Albedo,
     AxisAnglePose,
@@ -124,7 +124,7 @@ def test_keys_that_are_none(key):
                  lambda: remove(Weights(), key)):  # fmt: skip
         with pytest.raises(UnknownKeyError, match="as a text"):
             call()
-    with pytest.raises(SceneError, match="a module with parameters"):
+    with pytest.raises(ArgumentError, match="a module with parameters"):
         register("w", "w", Albedo())
 
 

@@ -40,7 +40,7 @@ PAIRS = {
     "shares": (ReflectanceSpectrum(NEAR, 6), ReflectanceSpectrum(FAR, 6), CURVE),
     "base": (AxisAnglePose(BASE), AxisAnglePose(OTHER), torch.tensor(BASE)),
     "base and frame": (SE3Pose(BASE, frame="local"), SE3Pose(OTHER), torch.tensor(OTHER)),
-    "about": (AxisAnglePose(BASE, "world"), AxisAnglePose(BASE, [1.0, 2.0, 3.0]), torch.tensor(OTHER)),
+    "about": (AxisAnglePose(BASE, about="world"), AxisAnglePose(BASE, about=[1.0, 2.0, 3.0]), torch.tensor(OTHER)),
     "length_scale": (AxisAnglePose(BASE, length_scale=0.1), AxisAnglePose(BASE), torch.tensor(OTHER)),
 }
 ALL = pytest.mark.parametrize("name", PAIRS)

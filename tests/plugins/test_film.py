@@ -156,7 +156,7 @@ def test_forward_splat_is_the_transpose_of_value_and_slope(name, stddev):
 def test_exhaustive_layout():
     film = make_film(width=3, height=2, exhaustive_scan=True, laser_scan_width=4, laser_scan_height=5)
     assert film.cube_shape() == (2, 3, 5, 4, BINS, 3)
-    film.prepare()
+    film.start_render()
     row, column, laser_row, laser_column, k = 1, 2, 3, 1, 17
     base = mi.UInt32((row * 3 + column) * film.entries_per_pixel())
     value = [mi.Float(v) for v in (1.0, 2.0, 3.0)]
@@ -200,22 +200,17 @@ def test_nothing_rendered_yet():
         make_film().develop()
 
 
-def test_no_arbitrary_outputs():
-    with pytest.raises(SceneError, match="albedo"):
-        make_film().prepare(["albedo"])
-
-
 def test_four_channels_a_colour_in_polarized_variants():
     for variant, channels in (("llvm_ad_mono_polarized", 4), ("llvm_ad_spectral_polarized", 12)):
         with mi.variant_context(variant):
             plugins.sync()
-            assert make_film().prepare() == channels
+            assert make_film().channel_count() == channels
 
 
 def test_row_too_large(monkeypatch):
     monkeypatch.setattr("torchtransient.plugins.films.base.MAX_ARRAY_ENTRIES", 100)
     with pytest.raises(StorageError, match="fewer bins"):
-        make_film().prepare()
+        make_film().start_render()
 
 
 def test_filter_follows_its_settings():
@@ -237,7 +232,8 @@ def test_channels_of_the_variant(variant, channels):
     mi.set_variant(variant)
     plugins.sync()
     film = make_film(width=5, height=4, crop_width=3, crop_height=2, crop_offset_x=1)
-    assert film.prepare() == channels
+    film.start_render()
+    assert film.channel_count() == channels
     steady, transient = film.develop()
     assert steady.shape == (2, 3, channels) and transient.shape == (2, 3, BINS, channels)
     assert "temporal_filter = box" in str(film)

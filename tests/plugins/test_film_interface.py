@@ -10,7 +10,9 @@ import pytest
 from torchtransient import plugins
 from torchtransient.errors import PluginRegistrationError, SceneError
 from torchtransient.interfaces import FilmInterface, is_time_resolved, missing_members
+from torchtransient.plugins import _registry
 from torchtransient.plugins.films import pulsed_filter
+from torchtransient.rendering.films import choices
 
 FILMS = {
     "transient_hdr_film": {"temporal_bins": 4, "bin_width_opl": 1.0},
@@ -28,6 +30,28 @@ def _variant():
 
 def make(kind):
     return mi.load_dict({"type": kind, "width": 2, "height": 2, **FILMS[kind]})
+
+
+def test_every_film_is_looked_at():
+    """Every film plugin of the library is here, and has an object that says what it measures."""
+    ours = {name for module in _registry.PLUGIN_MODULES for kind, name in module.plugins if kind == "film"}
+    assert ours == set(FILMS) == {choice.plugin for choice in choices.CHOICES}
+
+
+def test_a_film_that_is_left_out_is_noticed(monkeypatch):
+    """Of any of the three lists."""
+    gated = ("film", "gated_hdr_film")
+    fewer = {
+        "FILMS": {name: settings for name, settings in FILMS.items() if name not in gated},
+        "PLUGIN_MODULES": [module for module in _registry.PLUGIN_MODULES if gated not in module.plugins],
+        "CHOICES": choices.CHOICES[:-1],
+    }
+    places = {"FILMS": globals(), "PLUGIN_MODULES": vars(_registry), "CHOICES": vars(choices)}
+    for name, value in fewer.items():
+        with monkeypatch.context() as patch:
+            patch.setitem(places[name], name, value)
+            with pytest.raises(AssertionError):
+                test_every_film_is_looked_at()
 
 
 @pytest.mark.parametrize("kind", FILMS)

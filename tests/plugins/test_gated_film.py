@@ -10,7 +10,7 @@ import torch
 
 import torchtransient as tt
 from torchtransient import plugins
-from torchtransient.errors import GradientError, SceneError
+from torchtransient.errors import ArgumentError, GradientError, SceneError
 from torchtransient.files.result_file import read_result, write_result
 from torchtransient.plugins.sampling.light_box import LightBox
 from torchtransient.testing.film_storage import storage
@@ -247,13 +247,13 @@ def test_output_and_file(tmp_path):
 
 def test_arguments():
     scene = tt.load(make_room(), variant=VARIANT)
-    with pytest.raises(SceneError, match="give one of them"):
+    with pytest.raises(ArgumentError, match="give one of them"):
         tt.TransientRenderer(scene, gates=GATES, time_axis=FINE)
-    with pytest.raises(SceneError, match=r"tt\.Gate objects"):
+    with pytest.raises(ArgumentError, match=r"tt\.Gate objects"):
         tt.TransientRenderer(scene, gates=[3.0])
-    with pytest.raises(SceneError, match="steady=False"):
+    with pytest.raises(ArgumentError, match="steady=False"):
         tt.TransientRenderer(scene, gates=GATES, steady=False)
-    with pytest.raises(SceneError, match="gated film has none"):
+    with pytest.raises(ArgumentError, match="gated film has none"):
         tt.TransientRenderer(scene, gates=GATES, temporal_filter="tent")
     pulsed = tt.load({**make_room(), "sensor": {**make_room()["sensor"], "film": _pulsed()}}, variant=VARIANT)
     with pytest.raises(SceneError, match="would lose"):

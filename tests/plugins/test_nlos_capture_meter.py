@@ -12,7 +12,7 @@ import torch
 
 import torchtransient as tt
 from torchtransient.errors import PhysicsWarning, SceneError, UnitError
-from torchtransient.render.build import BuildOptions
+from torchtransient.rendering.build_options import BuildOptions
 
 VARIANT = "llvm_ad_mono"
 AXIS = tt.TimeAxis(1.5, 0.05, 40)

@@ -132,12 +132,12 @@ def exact_sums(frequencies, opl, value, active, pixels, slope=None):
 
 def summed(film, job, opl, value, active, slope=None):
     """What the film's block makes of these events: (pixels of the pass, F, C)."""
-    film.prepare()
+    film.start_render()
     width, channels = int(film.crop_size()[0]), film.channel_count()
     paths = width * job.rows * job.spp
     pixel = dr.arange(mi.UInt32, paths) // job.spp + job.first_row * width
     base = pixel * film.entries_per_pixel()
-    block = film.create_block(job, base, Copies(), len(opl), tangents=slope is not None)
+    block = film.create_event_block(job, base, Copies(), len(opl), tangents=slope is not None)
     events = block.begin()
     for e in range(len(opl)):
         v = [mi.Float(value[e, c]) for c in range(channels)]
@@ -175,7 +175,7 @@ def test_paths_with_more_events_than_fit(monkeypatch, tangents):
     slope = rng.normal(size=value.shape) if tangents else None
     roomy = summed(film, Job(0, 1, 5), opl, value, active, slope)
     monkeypatch.setattr(phasor_events, "MAX_EVENTS", 4)
-    block = film.create_block(Job(0, 1, 5), mi.UInt32(0), Copies(), 9, tangents)
+    block = film.create_event_block(Job(0, 1, 5), mi.UInt32(0), Copies(), 9, tangents)
     assert block.slots == 4 and block.overflows
     tight = summed(film, Job(0, 1, 5), opl, value, active, slope)
     scale = np.abs(roomy).max()
@@ -196,8 +196,8 @@ def test_tangents(frequencies):
 
 def test_zero_contributions_take_no_room():
     film = make_film(1, 1, **LIST)
-    film.prepare()
-    block = film.create_block(Job(0, 1, 2), mi.UInt32(0, 0), Copies(), 4)
+    film.start_render()
+    block = film.create_event_block(Job(0, 1, 2), mi.UInt32(0, 0), Copies(), 4)
     events = block.begin()
     block.put(events, mi.Float64(1.0), [mi.Float(0), mi.Float(0), mi.Float(0, 1)], mi.Bool(True))
     block.put(events, mi.Float64(1.0), [mi.Float(1)] * 3, mi.Bool(False, True))

@@ -6,6 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import torch
+from scipy.integrate import trapezoid
 
 import torchtransient as tt
 from torchtransient import plugins
@@ -61,7 +62,7 @@ def integral(values, nodes, curve_nodes, curve_values):
     """Integral over wavelength of a spectrum times a response curve."""
     at = np.linspace(360, 830, 47001)
     curve = np.interp(at, curve_nodes, curve_values, left=0, right=0)
-    return np.trapezoid(np.interp(at, nodes, values) * curve, at)
+    return trapezoid(np.interp(at, nodes, values) * curve, at)
 
 
 def runs(scene, count=8):

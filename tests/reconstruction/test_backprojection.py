@@ -9,7 +9,7 @@ import torch
 from support.scan_operators import AXIS, DEPTHS, SCANS, WALL, bent_scan, listed_scan, points_anywhere
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.reconstruction import (
     Backprojection,
     FilteredBackprojection,
@@ -281,7 +281,7 @@ def test_captures_go_in_as_they_are():
     "arguments, error, words",
     [
         ((None, POINTS, AXIS, torch.float32), ShapeError, "tt.nlos.Scan"),
-        ((SCANS["single"], POINTS, None, torch.float32), ShapeError, "TimeAxis"),
+        ((SCANS["single"], POINTS, None, torch.float32), ArgumentError, "TimeAxis"),
         ((SCANS["single"], POINTS.tolist(), AXIS, torch.float32), ShapeError, "VoxelGrid"),
         ((SCANS["single"], POINTS[:0], AXIS, torch.float32), ShapeError, "VoxelGrid"),
         ((SCANS["single"], POINTS * math.nan, AXIS, torch.float32), UnitError, "finite points"),
@@ -300,7 +300,7 @@ def test_filters_that_cannot_be_taken():
     of = {"time_axis": AXIS}
     with pytest.raises(UnitError, match="falloff"):
         Backprojection(scan, grid, falloff=math.nan, **of)
-    with pytest.raises(ShapeError, match="PhasorFilter or a LaplacianFilter"):
+    with pytest.raises(ArgumentError, match="PhasorFilter or a LaplacianFilter"):
         FilteredBackprojection(scan, grid, filter="pf", **of)
     for kind, name in ((FilteredBackprojection, "filter"), (PhasorField, "pulse")):
         with pytest.raises(UnitError, match="two bins"):

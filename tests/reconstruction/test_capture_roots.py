@@ -5,7 +5,7 @@ import torch
 
 from support.grid_operators import AXIS, SCAN, SINGLE
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.reconstruction import FK, MidpointFK, StabilisedRoot, stabilised_root
+from torchtransient.reconstruction import FK, MidpointFK, StabilizedRoot, stabilized_root
 
 F64 = torch.float64
 VALUES = torch.tensor([-4.0, -0.5, 0.0, 1e-30, 1e-8, 1.0, 100.0, 1e12], dtype=F64)
@@ -13,8 +13,8 @@ VALUES = torch.tensor([-4.0, -0.5, 0.0, 1e-30, 1e-8, 1.0, 100.0, 1e12], dtype=F6
 
 @pytest.mark.parametrize("floor", [0.0, 1e-6, 0.25, 3.0])
 def test_odd_and_growing_and_the_root_far_above_the_floor(floor):
-    found = stabilised_root(VALUES, floor)
-    torch.testing.assert_close(found, -stabilised_root(-VALUES, floor), rtol=0, atol=0)
+    found = stabilized_root(VALUES, floor)
+    torch.testing.assert_close(found, -stabilized_root(-VALUES, floor), rtol=0, atol=0)
     assert (found.diff() > 0).all()
     assert float(found[2]) == 0
     assert float(found[-1]) == pytest.approx(1e6, rel=1e-10)
@@ -23,40 +23,40 @@ def test_odd_and_growing_and_the_root_far_above_the_floor(floor):
 
 def test_slope_has_a_bound():
     x = VALUES.clone().requires_grad_()
-    (slope,) = torch.autograd.grad(stabilised_root(x, 0.25).sum(), x)
+    (slope,) = torch.autograd.grad(stabilized_root(x, 0.25).sum(), x)
     assert float(slope.max()) == float(slope[2]) == 2.0
-    assert float(stabilised_root(torch.ones(1), 0.25)) == pytest.approx(0.894, abs=1e-3)
+    assert float(stabilized_root(torch.ones(1), 0.25)) == pytest.approx(0.894, abs=1e-3)
 
 
 @pytest.mark.parametrize("floor", [0.0, 0.25])
 def test_derivatives(floor):
     x = torch.tensor([-3.0, -0.2, 0.4, 7.0], dtype=F64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda h: stabilised_root(h, floor), x, check_forward_ad=True)
-    assert torch.autograd.gradgradcheck(lambda h: stabilised_root(h, floor), x)
+    assert torch.autograd.gradcheck(lambda h: stabilized_root(h, floor), x, check_forward_ad=True)
+    assert torch.autograd.gradgradcheck(lambda h: stabilized_root(h, floor), x)
 
 
 def test_kinds_of_numbers():
-    assert stabilised_root(torch.tensor([4]), 0.0).dtype == torch.float32
-    assert stabilised_root(torch.ones(2, dtype=torch.float16)).dtype == torch.float16
-    assert StabilisedRoot(0.0)(torch.tensor([9.0])).item() == 3.0
+    assert stabilized_root(torch.tensor([4]), 0.0).dtype == torch.float32
+    assert stabilized_root(torch.ones(2, dtype=torch.float16)).dtype == torch.float16
+    assert StabilizedRoot(0.0)(torch.tensor([9.0])).item() == 3.0
     with pytest.raises(UnitError, match="floor"):
-        StabilisedRoot(-1.0)
+        StabilizedRoot(-1.0)
     with pytest.raises(UnitError, match="finite"):
-        stabilised_root(torch.ones(1), float("nan"))
+        stabilized_root(torch.ones(1), float("nan"))
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, F64])
 def test_floors_that_a_precision_takes_for_zero(dtype):
     least = torch.finfo(dtype).tiny
-    assert stabilised_root(torch.tensor([0.0, 1.0], dtype=dtype), least).tolist() == [0.0, 1.0]
+    assert stabilized_root(torch.tensor([0.0, 1.0], dtype=dtype), least).tolist() == [0.0, 1.0]
     with pytest.raises(UnitError, match="at least in"):
-        stabilised_root(torch.tensor([0.0, 1.0], dtype=dtype), least / 2)
+        stabilized_root(torch.tensor([0.0, 1.0], dtype=dtype), least / 2)
 
 
 def test_roots_of_other_things_are_refused():
     for transient in (torch.tensor([3 + 4j]), [1.0, 2.0], None):
         with pytest.raises(ShapeError, match="real numbers"):
-            stabilised_root(transient)
+            stabilized_root(transient)
     for kind, scan in ((FK, SCAN), (MidpointFK, SINGLE)):
         with pytest.raises(UnitError, match="floor"):
             kind(scan, time_axis=AXIS, floor=1e-46)

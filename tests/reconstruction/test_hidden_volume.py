@@ -20,7 +20,7 @@ def volume(seed=0, *, directions=False, times=None):
     frames = [] if times is None else [len(times)]
     vectors = torch.rand(1, 3, *GRID.shape, generator=generator) if directions else None
     values = torch.rand(1, *frames, *GRID.shape, generator=generator)
-    return N.HiddenVolume(values, GRID, "fk", {"seed": seed}, times, vectors)
+    return N.HiddenVolume(values, GRID, "fk", metadata={"seed": seed}, times=times, directions=vectors)
 
 
 KINDS = {
@@ -53,10 +53,19 @@ def test_batches(kind):
     assert torch.equal(stacked.values[1], parts[1].values) and torch.equal(stacked.picture(), parts[0].picture())
     (loaded,) = DataLoader(parts, batch_size=3)
     assert loaded == stacked
-    other = N.HiddenVolume(parts[0].values, GRID, "lct", {}, parts[0].times, parts[0].directions)
+    other = N.HiddenVolume(
+        parts[0].values, GRID, "lct", metadata={}, times=parts[0].times, directions=parts[0].directions
+    )
     with pytest.raises(ShapeError, match="same method"):
         N.HiddenVolume.stack([parts[0], other])
-    moved = N.HiddenVolume(parts[0].values, GRID.at_depths([0.3, 0.5]), "fk", {}, parts[0].times, parts[0].directions)
+    moved = N.HiddenVolume(
+        parts[0].values,
+        GRID.at_depths([0.3, 0.5]),
+        "fk",
+        metadata={},
+        times=parts[0].times,
+        directions=parts[0].directions,
+    )
     with pytest.raises(ShapeError, match="same grid"):
         N.HiddenVolume.stack([parts[0], moved])
 

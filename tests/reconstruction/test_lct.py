@@ -8,7 +8,7 @@ import torch
 from support.grid_operators import confocal_points
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
-from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.reconstruction import LCT, DirectionalLCT, directional_lct, lct
 
 F64 = torch.float64
@@ -189,7 +189,7 @@ def test_what_it_cannot_take_is_refused():
         LCT(SCAN, time_axis=TimeAxis(-0.1, 0.02, 64))
     with pytest.raises(UnitError, match="snr"):
         LCT(SCAN, time_axis=AXIS, snr=0.0)
-    with pytest.raises(SceneError, match="target"):
+    with pytest.raises(ArgumentError, match="target"):
         DirectionalLCT(SCAN, time_axis=AXIS, target="mirror")
     with pytest.raises(SceneError, match="v_bins"):
         LCT(SCAN, time_axis=AXIS, v_bins=1)

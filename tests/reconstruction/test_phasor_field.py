@@ -8,7 +8,7 @@ import torch
 from support.scan_operators import AXIS, DEPTHS, PULSE, SCANS, WALL, bent_scan
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Scan
-from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.reconstruction import (
     ConfocalCamera,
     FilteredBackprojection,
@@ -190,9 +190,9 @@ def test_confocal_camera_begins_with_direct_light():
 def test_what_cannot_be_taken():
     scan, grid = SCANS["confocal"], VoxelGrid.before(SCANS["confocal"], DEPTHS)
     of = {"time_axis": AXIS, "pulse": PULSE}
-    with pytest.raises(ShapeError, match="FilteredBackprojection takes points"):
+    with pytest.raises(ArgumentError, match="FilteredBackprojection takes points"):
         PhasorField(scan, grid.points, **of)
-    with pytest.raises(ShapeError, match="pulse as a PhasorFilter"):
+    with pytest.raises(ArgumentError, match="pulse as a PhasorFilter"):
         PhasorField(scan, grid, time_axis=AXIS, pulse=0.1)
     with pytest.raises(ShapeError, match="ConfocalCamera"):
         PhasorField(scan, grid, camera="transient", **of)

@@ -94,7 +94,15 @@ def test_what_is_no_grid():
         VoxelGrid.bounds([[0, 0, 0], [1, 1, 1]], (3, 3))
     grid = VoxelGrid.before(SCAN, [0.1])
     with pytest.raises(ShapeError, match="right angles"):
-        VoxelGrid(grid.depths, grid.size, grid.pitch, grid.first, grid.along_x, grid.along_x, grid.normal)
+        VoxelGrid(
+            grid.depths,
+            grid.size,
+            grid.pitch,
+            first=grid.first,
+            along_x=grid.along_x,
+            along_y=grid.along_x,
+            normal=grid.normal,
+        )
 
 
 def test_walls_that_are_at_right_angles_to_a_share_of_their_pitch_have_voxels():

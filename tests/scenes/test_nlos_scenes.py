@@ -10,7 +10,7 @@ import torchtransient as tt
 from torchtransient import scenes
 from torchtransient.capture import Wall
 from torchtransient.capture.triangles import first_hits
-from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.scenes import meshes
 from torchtransient.scenes.letters import OUTLINES, outline
 from torchtransient.scenes.transforms import rotate, scale, translate
@@ -207,7 +207,7 @@ def test_bounds_are_those_of_mitsuba():
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [
-        (lambda: scenes.nlos_letter("A"), SceneError, "expected one of C, E"),
+        (lambda: scenes.nlos_letter("A"), ArgumentError, "expected one of C, E"),
         (lambda: scenes.nlos_letter(size=0.0), UnitError, "size"),
         (lambda: scenes.nlos_letter(thickness=-1.0), UnitError, "thickness"),
         (lambda: scenes.nlos_plates(gap=0.0), UnitError, "gap"),

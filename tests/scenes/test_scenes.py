@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from torchtransient import scenes
-from torchtransient.errors import SceneError, UnitError
+from torchtransient.errors import ArgumentError, SceneError, UnitError
 
 ALL = {
     "cornell_box": scenes.cornell_box,
@@ -148,15 +148,15 @@ def test_moving_wall_direct_light():
 @pytest.mark.parametrize(
     "call, error, words",
     [
-        (lambda: scenes.cornell_box(mirror=True, glass=True), SceneError, "at most one"),
+        (lambda: scenes.cornell_box(mirror=True, glass=True), ArgumentError, "at most one"),
         (lambda: scenes.cornell_box(0), SceneError, "resolution"),
         (lambda: scenes.cornell_box(num_bins=2.5), SceneError, "num_bins"),
         (lambda: scenes.cornell_box(bin_width_opl=0.0), UnitError, "bin_width_opl"),
         (lambda: scenes.cornell_box(start_opl=float("nan")), UnitError, "start_opl"),
-        (lambda: scenes.cornell_box(max_depth=-2), SceneError, "max_depth"),
+        (lambda: scenes.cornell_box(max_depth=-2), ArgumentError, "max_depth"),
         (lambda: scenes.furnace(radius=-1.0), UnitError, "radius"),
         (lambda: scenes.furnace(reflectance=1.2), UnitError, "reflectance"),
-        (lambda: scenes.etalon_slab(light="left"), SceneError, "behind"),
+        (lambda: scenes.etalon_slab(light="left"), ArgumentError, "behind"),
     ],
 )
 def test_errors(call, error, words):
@@ -194,3 +194,38 @@ def test_milk_bottle_refuses_angles_and_numbers_out_of_range(tmp_path):
     for arguments in ({"beam_degrees": 0.0}, {"anisotropy": 1.0}, {"milk": -1.0}, {"milk": 10.0}):
         with pytest.raises(UnitError):
             scenes.milk_bottle(tmp_path / "bottle.ply", **arguments)
+
+
+def _dictionaries():
+    """Every dictionary that this room makes without a file."""
+    shapes = {"a": scenes.triangle_mesh(np.eye(3), [[0, 1, 2]], reflectance=0.4)}
+    made = {
+        name: make()
+        for name, make in vars(scenes).items()
+        if callable(make) and name not in ("bounds", "triangle_mesh", "milk_bottle")
+    }
+    return {**made, "triangle_mesh": shapes}
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_mono_polarized"])
+def test_mitsuba_loads_every_dictionary(variant):
+    """`mi.load_dict` takes the arrays that keep the dictionaries free of a variant."""
+    mi.set_variant(variant)
+    made = _dictionaries()
+    assert len(made) > 12
+    for name, scene in made.items():
+        before = pickle.dumps(scene)
+        loaded = mi.load_dict(scene)
+        assert isinstance(loaded, mi.Scene if scene.get("type", "scene") == "scene" else mi.Shape), name
+        assert pickle.dumps(scene) == before, name
+    assert mi.load_dict(dict=made["cornell_box"], optimize=False).sensors()
+
+
+def test_what_mitsuba_takes_itself_stays():
+    mi.set_variant("llvm_ad_rgb")
+    placed = mi.ScalarTransform4f().translate([1, 2, 3])
+    theirs = mi.load_dict({"type": "sphere", "to_world": placed, "paint": mi.load_dict({"type": "diffuse"})})
+    ours = mi.load_dict({"type": "sphere", "to_world": np.array(placed.matrix)})
+    assert str(theirs.bbox()) == str(ours.bbox()) and "load" in mi.load_dict.__doc__.lower()
+    with pytest.raises(RuntimeError, match="no_such"):
+        mi.load_dict({"type": "no_such"})

@@ -51,7 +51,7 @@ def test_backward_of_functions_inside_is_that_outside(name):
     weights = torch.rand(7, 4, generator=g)
     call, x = {
         "tap_phasor": (lambda x: sensing.tap_phasor(x, 4).abs(), taps),
-        "stokes_from": (lambda x: sensing.stokes_from(x, sensing.linear_analysers([0, 45, 90, 135])), stokes),
+        "stokes_from": (lambda x: sensing.stokes_from(x, sensing.linear_analyzers([0, 45, 90, 135])), stokes),
         "demosaic": (sensing.demosaic, stokes),
         "correlate": (lambda x: sensing.correlate(x, weights), taps),
     }[name]

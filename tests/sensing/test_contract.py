@@ -10,6 +10,7 @@ import torch
 
 from support.sensing.all_entries import ENTRIES, each
 from support.sensing.contract import HALVES, LOOSE, expected, parts, pickled, through_state_dict
+from torchtransient import sensing
 from torchtransient.errors import ShapeError
 from torchtransient.sensing import ScoreFunction
 
@@ -248,3 +249,10 @@ def test_gradients_are_finite_at_zero(entry, policy):
         loss = score.surrogate(loss)
     loss.backward()
     assert x.grad is not None and bool(torch.isfinite(x.grad).all())
+
+
+def test_every_effect_has_an_entry():
+    """Every public sensor that is no base of others."""
+    bases = {sensing.Sensor, sensing.RandomSensor, sensing.AddedCounts, sensing.MovedCounts}
+    public = {c for c in vars(sensing).values() if isinstance(c, type) and issubclass(c, sensing.Sensor)}
+    assert public - bases == public & {type(entry.module()) for entry in ENTRIES}

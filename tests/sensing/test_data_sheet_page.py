@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import pytest
 import torch
 
+from support.pages import Page
 from torchtransient import sensing
 
-ROOT = Path(__file__).parents[2]
-TEXT = (ROOT / "docs" / "data_sheet_to_chain.md").read_text(encoding="utf-8")
+PAGE = Page("docs/data_sheet_to_chain.md")
+TEXT = PAGE.text
 
 
 @pytest.fixture(scope="module")
 def page():
-    (code,) = re.findall(r"```python\n(.*?)```", TEXT, flags=re.DOTALL)
-    names: dict[str, object] = {}
-    exec(compile(code, "data_sheet_to_chain.md", "exec"), names)
-    return names
+    return PAGE.names()
 
 
 def test_figures(page):
@@ -54,4 +51,4 @@ def test_names_exist_and_pages_link():
     named = set(re.findall(r"`(?:[a-z]+=)?([A-Z]\w+)\(", TEXT))
     assert named and all(hasattr(sensing, n) or n == "TimeAxis" for n in named)
     for page in ("README.md", "docs/sensors.md"):
-        assert "data_sheet_to_chain.md" in (ROOT / page).read_text(encoding="utf-8")
+        assert "data_sheet_to_chain.md" in Page(page).text

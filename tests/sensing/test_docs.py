@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import torch
 
 import torchtransient as tt
+from support.pages import Page
 
-PAGE = Path(__file__).parents[2] / "docs" / "photon_counting.md"
-
-
-TEXT = PAGE.read_text(encoding="utf-8")
+PAGE = Page("docs/photon_counting.md")
+TEXT = PAGE.text
 
 
 def test_every_example_runs():
     """All blocks, one after the other, as a reader would run them."""
-    blocks = re.findall(r"```python\n(.*?)```", TEXT, flags=re.DOTALL)
     names: dict[str, object] = {}
-    for number, code in enumerate(blocks):
-        exec(compile(code, f"photon_counting.md, block {number}", "exec"), names)
+    for number, code in PAGE.run(names):
         if number == 0:
             assert names["counts"].shape == (1, 512, 8, 8)
             assert bool(torch.isfinite(names["loss"]))

@@ -9,7 +9,7 @@ import torch
 
 import torchtransient as tt
 from torchtransient import losses, sensing
-from torchtransient.errors import GradientError, ShapeError, UnitError
+from torchtransient.errors import ArgumentError, GradientError, ShapeError, UnitError
 
 PS = 1e-12
 
@@ -56,7 +56,8 @@ SATURATING = {
     "free": lambda: sensing.FreeRunningSPAD(50, 70 * PS, bin_width_s=20 * PS),
     "paralyzable": lambda: sensing.FreeRunningSPAD(50, 70 * PS, bin_width_s=20 * PS, kind="paralyzable"),
     "frames": lambda: sensing.BinaryFrames(50),
-    "coincidence": lambda: sensing.CoincidencePixel(sensing.SynchronousSPAD(50), 4, 2, 70 * PS, bin_width_s=20 * PS),
+    "coincidence": lambda: sensing.CoincidencePixel(sensing.SynchronousSPAD(50), 4, coincidence=2, window_s=70 * PS,
+        bin_width_s=20 * PS),
     "macro-pixel": lambda: sensing.MacroPixel(sensing.SynchronousSPAD(50), 3),
     "afterpulses": lambda: sensing.AfterpulsingSPAD(
         sensing.SynchronousSPAD(50, dead_time_s=70 * PS, bin_width_s=20 * PS),
@@ -103,8 +104,8 @@ def test_no_added_counts_of_what_is_no_count(policy, value):
         lambda h: sensing.peak_position(h, refine=False),
         lambda h: sensing.ml_position(h, sensing.GaussianResponse(40 * PS), bin_width_s=20 * PS),
         sensing.soft_argmax,
-        sensing.centre_of_mass,
-        lambda h: sensing.centre_of_mass(h, half_width_bins=2),
+        sensing.center_of_mass,
+        lambda h: sensing.center_of_mass(h, half_width_bins=2),
         lambda h: sensing.first_return(h, 5.0).position.squeeze(-3),
         lambda h: sensing.multi_return(h, 1, threshold=0.1).position.squeeze(-3),
         lambda h: sensing.coates(h, 1000).rate.sum(-3),
@@ -132,7 +133,7 @@ def test_phase_of_nan_is_nan(code):
     [
         losses.poisson_nll,
         lambda r, n: losses.first_photon_nll(r, n, 100),
-        lambda r, n: losses.free_running_nll(r, n, 100, 2.5),
+        lambda r, n: losses.free_running_nll(r, n, periods=100, dead_bins=2.5),
         lambda r, n: losses.read_noise_nll(r, n, 2.0),
     ],
     ids=["poisson", "first photon", "free running", "read noise"],
@@ -318,7 +319,7 @@ HISTOGRAM = torch.ones(1, 8, 2, 3)
 @pytest.mark.parametrize(
     "call, error, words",
     [
-        (lambda: sensing.ImpulseResponse(torch.ones(5), AXIS), ShapeError, "MeasuredResponse"),
+        (lambda: sensing.ImpulseResponse(torch.ones(5), AXIS), ArgumentError, "MeasuredResponse"),
         (lambda: sensing.ComposedResponse([60e-12]), ShapeError, "GaussianResponse"),
         (
             lambda: sensing.PhotonBudget(
@@ -327,20 +328,20 @@ HISTOGRAM = torch.ones(1, 8, 2, 3)
             UnitError,
             "Optics",
         ),
-        (lambda: sensing.ShotNoise("straight_through")(HISTOGRAM, generator=0), UnitError, "manual_seed"),
-        (lambda: sensing.Compose(sensing.ShotNoise()), ShapeError, r"\[\]"),
+        (lambda: sensing.ShotNoise("straight_through")(HISTOGRAM, generator=0), ArgumentError, "manual_seed"),
+        (lambda: sensing.Compose(sensing.ShotNoise()), ArgumentError, r"\[\]"),
         (lambda: sensing.SynchronousSPAD(10, gate=[0.0, 1.0]), ShapeError, "list"),
         (lambda: sensing.ItofCorrelation("sine", (20e6,), AXIS), UnitError, "sine_code"),
-        (lambda: sensing.ItofCorrelation(sensing.sine_code(4), (20e6,), 50e-12), UnitError, "from_seconds"),
-        (lambda: sensing.GatedIntegration([1e-9], 1e-9, 50e-12), UnitError, "from_seconds"),
-        (lambda: sensing.distance_of_position(torch.ones(1, 2, 3), 50e-12), UnitError, "from_seconds"),
+        (lambda: sensing.ItofCorrelation(sensing.sine_code(4), (20e6,), 50e-12), ArgumentError, "from_seconds"),
+        (lambda: sensing.GatedIntegration([1e-9], 1e-9, 50e-12), ArgumentError, "from_seconds"),
+        (lambda: sensing.distance_of_position(torch.ones(1, 2, 3), 50e-12), ArgumentError, "from_seconds"),
         (
             lambda: sensing.log_matched_filter(HISTOGRAM, sensing.GaussianResponse(1e-10).kernel(5e-11)),
             ShapeError,
             "first, kernel",
         ),
         (lambda: sensing.first_return(HISTOGRAM, torch.ones(8)), ShapeError, "threshold"),
-        (lambda: sensing.centre_of_mass(HISTOGRAM, background=torch.ones(1, 1, 2, 3)), ShapeError, "background"),
+        (lambda: sensing.center_of_mass(HISTOGRAM, background=torch.ones(1, 1, 2, 3)), ShapeError, "background"),
         (lambda: losses.poisson_nll(HISTOGRAM.numpy(), HISTOGRAM), ShapeError, "ndarray"),
     ],
 )

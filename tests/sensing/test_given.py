@@ -9,6 +9,7 @@ import torch
 from torch import nn
 
 from support.sensing.arguments import CALLS, DECIDE, OTHERS
+from support.sweeps import together
 from torchtransient import sensing
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import GradientError
@@ -76,8 +77,8 @@ def halved(numbers, dtype):
 KEEP_HALF = ("blur_image", "convolve_time", "straight_through")
 
 
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16], ids=str)
 @every_call
+@together("dtype", [torch.float16, torch.bfloat16])
 def test_functions_measure_half_precision_in_single(name, dtype):
     call, (numbers, rest) = getattr(sensing, name), CALLS[name]
     halves = halved(numbers, dtype)

@@ -73,7 +73,8 @@ CHAINS = {
     "dead time": lambda: [sensing.SynchronousSPAD(1000, **SPAD), jitter()],
     "macro-pixel": lambda: [sensing.MacroPixel(sensing.SynchronousSPAD(1000, **SPAD), 3), jitter()],
     "free": lambda: [sensing.FreeRunningSPAD(1000, 0.5 * NS, axis=AXIS), jitter()],
-    "coincidence": lambda: [sensing.CoincidencePixel(sensing.SynchronousSPAD(99), 4, 2, NS, axis=AXIS), jitter()],
+    "coincidence": lambda: [sensing.CoincidencePixel(sensing.SynchronousSPAD(99), 4, coincidence=2, window_s=NS,
+        axis=AXIS), jitter()],
     "afterpulses": lambda: [sensing.SynchronousSPAD(1000, **SPAD), afterpulses(), jitter()],
     "nested": lambda: [sensing.Compose([sensing.SynchronousSPAD(1000, **SPAD)]), sensing.Compose([jitter()])],
     "skew": lambda: [sensing.SynchronousSPAD(1000, **SPAD), sensing.DetectionSkew(30 * PS, AXIS), jitter()],
@@ -111,10 +112,11 @@ FINE = {"bin_width_s": 50 * PS}
 DEAD = {"dead_time_s": 1 * NS}
 OF_OTHER_BINS = {
     "coincidence": lambda: sensing.CoincidencePixel(
-        sensing.SynchronousSPAD(9, **DEAD, bin_width_s=100 * PS), 4, 2, 1 * NS, **FINE
+        sensing.SynchronousSPAD(9, **DEAD, bin_width_s=100 * PS), 4, coincidence=2, window_s=1 * NS, **FINE
     ),
     "coincidence, other T": lambda: sensing.CoincidencePixel(
-        sensing.SynchronousSPAD(9, **DEAD, axis=AXIS), 4, 2, 1 * NS, axis=TimeAxis.from_seconds(0.0, 100 * PS, 32)
+        sensing.SynchronousSPAD(9, **DEAD, axis=AXIS), 4, coincidence=2, window_s=1 * NS,
+            axis=TimeAxis.from_seconds(0.0, 100 * PS, 32)
     ),
     "afterpulses": lambda: sensing.AfterpulsingSPAD(
         sensing.SynchronousSPAD(9, **DEAD, axis=AXIS), sensing.Afterpulsing(0.3, 5 * NS, 1 * NS, bin_width_s=10 * PS)
@@ -145,8 +147,8 @@ def test_parts_of_other_bins_are_refused(make):
 def test_parts_without_bins_and_with_the_same_are_taken():
     alike = sensing.SynchronousSPAD(9, **DEAD, axis=AXIS)
     pixels = [
-        sensing.CoincidencePixel(alike, 4, 2, 1 * NS, bin_width_s=100 * PS),
-        sensing.CoincidencePixel(sensing.SynchronousSPAD(9), 4, 2, 1 * NS, axis=AXIS),
+        sensing.CoincidencePixel(alike, 4, coincidence=2, window_s=1 * NS, bin_width_s=100 * PS),
+        sensing.CoincidencePixel(sensing.SynchronousSPAD(9), 4, coincidence=2, window_s=1 * NS, axis=AXIS),
         sensing.AfterpulsingSPAD(alike, sensing.Afterpulsing(0.3, 5 * NS, 1 * NS, bin_width_s=100 * PS)),
         sensing.MacroPixel(alike, 3),
         sensing.PixelGroups([sensing.SynchronousSPAD(9), alike], torch.tensor([[0, 1]])),

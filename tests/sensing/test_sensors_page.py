@@ -8,21 +8,22 @@ from pathlib import Path
 import pytest
 import torch
 
+from support.pages import Page
 from torchtransient import sensing
 
-PAGE = Path(__file__).parents[2] / "docs" / "sensors.md"
-TEXT = PAGE.read_text(encoding="utf-8")
+SENSORS = Page("docs/sensors.md")
+PAGE, TEXT = SENSORS.path, SENSORS.text
 
 
 def run(number):
-    code = re.findall(r"```python\n(.*?)```", TEXT, flags=re.DOTALL)[number]
+    code = dict(SENSORS.programs())[number]
     names: dict[str, object] = {}
     exec(compile(code, str(PAGE), "exec"), names)
     return names
 
 
 def test_every_example_is_run_here():
-    assert len(re.findall(r"```python\n", TEXT)) == 3
+    assert len(SENSORS.programs()) == 3
 
 
 def test_first_example():

@@ -17,7 +17,7 @@ def mass(samples, count, packets=True):
     film = mi.load_dict(
         {"type": "transient_hdr_film", "width": 1, "height": 1, "temporal_bins": 4, "bin_width_opl": 1.0}
     )
-    film.prepare(samples=samples)
+    film.start_render(samples)
     # 1.3: not a power of two, so that every addition rounds
     value = dr.opaque(mi.Float, np.float32(1 / (1.3 * count)))
     index = dr.arange(mi.UInt32, count)

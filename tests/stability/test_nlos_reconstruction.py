@@ -8,7 +8,7 @@ import torch
 from support.grid_operators import confocal_points
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Scan, Wall
-from torchtransient.reconstruction import FK, LCT, DiffusionDeconvolution, DirectionalLCT, stabilised_root
+from torchtransient.reconstruction import FK, LCT, DiffusionDeconvolution, DirectionalLCT, stabilized_root
 
 F64 = torch.float64
 AXIS = TimeAxis(0.0, 0.04, 96)
@@ -56,7 +56,7 @@ def test_the_plain_root_has_no_gradient_where_nothing_was_measured():
 def test_second_derivatives_at_empty_bins():
     h = torch.zeros(5, dtype=F64, requires_grad=True)
     for floor in (0.0, 0.25):
-        (first,) = torch.autograd.grad(stabilised_root(h, floor).sum(), h, create_graph=True)
+        (first,) = torch.autograd.grad(stabilized_root(h, floor).sum(), h, create_graph=True)
         if first.requires_grad:
             (second,) = torch.autograd.grad(first.sum(), h)
             assert torch.isfinite(second).all()

@@ -8,7 +8,12 @@ import torch
 from torchtransient import stokes as light
 from torchtransient.errors import UnitError
 from torchtransient.sensing import Compose, PixelElectronics
-from torchtransient.sensing.polarization import PolarizationMosaic, mosaic_rows, project_physical, unphysical_part
+from torchtransient.sensing.optics.polarization import (
+    PolarizationMosaic,
+    mosaic_rows,
+    project_physical,
+    unphysical_part,
+)
 
 FLAT = {
     "dark": (0.0, 0.0, 0.0, 0.0),

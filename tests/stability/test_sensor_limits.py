@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from torchtransient import losses, sensing
-from torchtransient.sensing.running_sums import sum_before
+from torchtransient.sensing.numerics.running_sums import sum_before
 
 PS = 1e-12
 
@@ -30,7 +30,7 @@ def column(values, dtype=torch.float32):
     [
         losses.poisson_nll,
         lambda r, n: losses.first_photon_nll(r, n, 100),
-        lambda r, n: losses.free_running_nll(r, n, 100, 2.5),
+        lambda r, n: losses.free_running_nll(r, n, periods=100, dead_bins=2.5),
         lambda r, n: losses.read_noise_nll(r, n, 1.0),
     ],
     ids=["poisson", "first photon", "free running", "read noise"],

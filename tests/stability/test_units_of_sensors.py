@@ -33,7 +33,7 @@ def test_every_sensor_finds_the_same_wall():
     turns = phasor_axis.per_metre * 2 * DISTANCE_M
     phasor = torch.exp(-2j * torch.pi * turns).reshape(1, 1, 1, 1)
     steady = torch.ones(1, 1, 1, dtype=torch.float64)
-    taps = sensing.taps_from_phasor(phasor, phasor_axis, sensing.sine_code(4), 20e6, steady=steady)
+    taps = sensing.taps_from_phasor(phasor, phasor_axis, sensing.sine_code(4), frequencies_hz=20e6, steady=steady)
     assert abs(float(sensing.read_itof(taps, 20e6, 4).depth_m) - DISTANCE_M) < 1e-9
     arrival_s = opl_to_seconds(2 * DISTANCE_M)
     gates = sensing.GatedIntegration([arrival_s - 0.1e-9, arrival_s + 0.1e-9], 0.2e-9, AXIS, rise_s=1e-12)(x)
@@ -93,9 +93,9 @@ def test_a_chain_in_other_bins_is_refused():
         lambda: sensing.SynchronousSPAD(100, dead_time_s=75.0, bin_width_s=1e-10),
         lambda: sensing.photon_energy_j(532.0),  # nanometres
         lambda: sensing.ktc_noise(10.0),  # femtofarads
-        lambda: sensing.linear_analysers([0.0], extinction_ratio=1 / 300),  # its inverse
+        lambda: sensing.linear_analyzers([0.0], extinction_ratio=1 / 300),  # its inverse
         lambda: sensing.range_deviation_m(500.0, torch.ones(1)),
-        lambda: sensing.centre_of_mass(wall(), half_width_bins=0.5e-9),  # seconds, where bins are meant
+        lambda: sensing.center_of_mass(wall(), half_width_bins=0.5e-9),  # seconds, where bins are meant
         lambda: sensing.multi_return(wall(), 2, threshold=1.0, min_separation_bins=0.2),
     ],
 )

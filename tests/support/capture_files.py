@@ -24,7 +24,7 @@ def listed(kind, legs=True):
     spots = {"single": LIST[1], "confocal": LIST, "exhaustive": LIST[:2]}[kind]
     up = UP.expand(3, 3)
     return Scan(
-        kind, LIST, spots, *(torch.tensor(ORIGINS[f"{who}_origin"]) for who in ("sensor", "laser")),
+        kind, LIST, spots, **{name: torch.tensor(origin) for name, origin in ORIGINS.items()},
         sensor_normals=up, laser_normals=up[: len(spots)] if spots.ndim == 2 else UP, first_and_last_leg=legs,
     )  # fmt: skip
 

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from torchtransient.render.build import BuildOptions
-from torchtransient.render.engine import jvp, primal, vjp
-from torchtransient.render.physics import PhysicsWatch
-from torchtransient.render.recordings import LAUNCHED
-from torchtransient.render.scene_handle import Scene
-from torchtransient.render.seeds import Item, Seeding
-from torchtransient.render.session import RenderJob
+from torchtransient.rendering.build_options import BuildOptions
+from torchtransient.rendering.engine import jvp, primal, vjp
+from torchtransient.rendering.physics import PhysicsWatch
+from torchtransient.rendering.recordings import LAUNCHED
+from torchtransient.rendering.scene_handle import Scene
+from torchtransient.rendering.seeds import Item, Seeding
+from torchtransient.rendering.session import RenderJob
 from torchtransient.testing.gradient_sweep.measure import Subject
 
 SPP = 2

@@ -45,12 +45,14 @@ def hidden(bsdf: dict) -> dict:
 
 def picture(folder: Path, name: str, *, coloured: bool) -> str:
     """A 4 x 4 RGB picture in a file."""
+    import torchtransient as tt  # isort: skip
     import mitsuba as mi
 
     pixels = np.full((4, 4, 3), 0.5, dtype=np.float32)
     if coloured:
         pixels[2, 1] = [0.5, 0.5, 0.4]
-    mi.Bitmap(pixels).write(str(folder / name))
+    with tt.threads(2):
+        mi.Bitmap(pixels).write(str(folder / name))
     return str(folder / name)
 
 

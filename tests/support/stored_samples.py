@@ -52,7 +52,7 @@ def write(path, samples, store="exact", compression="blosc2", rows=None, **heade
     """A shard of samples in order; exceptions among them are failures."""
     from torchtransient.data.storage.shard_file import ShardWriter
 
-    with ShardWriter(path, len(samples), {**header(), **header_entries}, store, compression) as shard:
+    with ShardWriter(path, len(samples), {**header(), **header_entries}, store=store, compression=compression) as shard:
         for row in range(len(samples)) if rows is None else rows:
             if isinstance(samples[row], Exception):
                 shard.fail(row, row, str(samples[row]))

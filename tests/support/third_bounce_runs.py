@@ -32,7 +32,7 @@ def table_of(shapes):
 
 def captured(film, run, samples=1):
     """(steady, array) as numpy, after ``run`` has added light to the prepared film."""
-    film.prepare(samples=samples)
+    film.start_render(samples)
     run()
     film.finish_render()
     return tuple(np.array(a, dtype=float) for a in film.develop())

@@ -23,7 +23,7 @@ from torchtransient.testing.gradient_sweep import compare, runner
 from torchtransient.testing.gradient_sweep.bsdfs import HOLDERS
 from torchtransient.testing.gradient_sweep.compare import QUICK, Runs, judge
 from torchtransient.testing.gradient_sweep.measure import Subject, Tangent, tangents_of
-from torchtransient.testing.gradient_sweep.page import PAGE, page, read_rows, swept
+from torchtransient.testing.gradient_sweep.page import PAGE, page, read_rows, swept, with_rows_of_the_page
 from torchtransient.testing.gradient_sweep.runner import ResultFile
 from torchtransient.testing.gradient_sweep.settings import all_settings
 from torchtransient.testing.gradient_sweep.stages import between_lights, matte
@@ -269,6 +269,18 @@ def test_results_are_taken_up_again(tmp_path):
     file.write(row(first, "x", "contradict", []))
     file.write({"done": first})
     assert [(line["setting"], line["verdict"]) for line in file.results()] == [(first, "contradict"), (second, "agree")]
+
+
+def test_one_plugin_is_swept_and_the_page_keeps_the_others(rows, tmp_path):
+    """In the order of the sweep; rows of a setting that was done again are not those of before."""
+    name = "bsdf retroreflector"
+    again = [{**old, "reverse": 2.0, "verdict": "contradict"} for old in rows if old["setting"] == name][:1]
+    merged = with_rows_of_the_page(again, {name}, DOCS)
+    assert [one for one in merged if one["setting"] == name] == again
+    others = [[one for one in some if one["setting"] != name] for some in (merged, rows)]
+    assert json.dumps(others[0]) == json.dumps(others[1]) and len(others[0]) > 2000
+    assert list(dict.fromkeys(one["setting"] for one in merged)) == list(dict.fromkeys(one["setting"] for one in rows))
+    assert with_rows_of_the_page(again, {name}, tmp_path) == again
 
 
 def test_a_process_that_dies_is_a_result(tmp_path, monkeypatch):

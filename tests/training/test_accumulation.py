@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 import torchtransient as tt
-from torchtransient.errors import GradientError, ShapeError, UnitError
+from torchtransient.errors import ArgumentError, GradientError, ShapeError, UnitError
 from torchtransient.testing.small_room import COLOUR, VARIANT, make_room
 from torchtransient.training import Seeds, accumulate
 
@@ -165,10 +165,10 @@ def test_small_shares_of_half_losses_are_not_lost():
         (lambda: accumulate(torch.sum, [1], weights=[float("nan")]), UnitError, "finite"),
         (lambda: accumulate(lambda _: torch.ones(2), [1]), ShapeError, r"got torch\.float32 \(2,\)"),
         (lambda: accumulate(lambda _: 1.0, [1]), ShapeError, "got float"),
-        (lambda: accumulate(torch.sum, 3), ShapeError, "expected parts"),
+        (lambda: accumulate(torch.sum, 3), ArgumentError, "expected parts"),
         (lambda: accumulate(torch.sum, [1], weights=1.0), ShapeError, "a weight for each of 1 parts"),
         (lambda: accumulate(lambda _: torch.ones(()), [1]), GradientError, "has a gradient"),
-        (lambda: accumulate(torch.sum, [1], model=3), UnitError, "model as a module, got int"),
+        (lambda: accumulate(torch.sum, [1], model=3), ArgumentError, "model as a module, got int"),
     ],
 )
 def test_what_it_does_not_take(call, error, message):

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from torchtransient.errors import UnitError
+from torchtransient.errors import ArgumentError, UnitError
 from torchtransient.testing.small_room import VARIANT, make_room
 from torchtransient.training import Seeds
 
@@ -83,7 +83,6 @@ def test_generators():
     ("call", "message"),
     [
         (lambda: Seeds(-1), "seed: expected a whole number of at least 0, got -1"),
-        (lambda: Seeds(0, 3), "purpose as a text"),
         (lambda: Seeds(0)(-1, [0]), "step: expected a whole number"),
         (lambda: Seeds(0)(0, [0.5]), "sample: expected a whole number"),
         (lambda: Seeds(0)(0, [2**32]), "below 2\\^32"),
@@ -96,3 +95,8 @@ def test_generators():
 def test_what_they_do_not_take(call, message):
     with pytest.raises(UnitError, match=message):
         call()
+
+
+def test_a_purpose_is_a_text():
+    with pytest.raises(ArgumentError, match="purpose as a text"):
+        Seeds(0, 3)

@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-import re
-from pathlib import Path
-
 import pytest
 import torch
 
 import torchtransient as tt
+from support.pages import Page
 
 VARIANT = "llvm_ad_mono"
-DOCS = Path(__file__).parents[2] / "docs"
-PAGE = (DOCS / "training.md").read_text(encoding="utf-8")
+TRAINING = Page("docs/training.md")
+PAGE = TRAINING.text
 
 
 @pytest.fixture(scope="module")
 def names():
-    found = {}
-    for block in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL):
-        exec(compile(block, "training.md", "exec"), found)
-    return found
+    return TRAINING.names()
 
 
 def test_a_run_in_parts_ends_as_one_in_one_piece(names):
@@ -72,8 +67,3 @@ def test_it_names_everything_of_the_room():
     missing = [name for name in vars(tt.training) if name[0].isupper() and f"{name}" not in PAGE and name != "Ranks"]
     missing += [name for name in ("accumulate", "ranks(", "worker_init", "load_checkpoint") if name not in PAGE]
     assert not [name for name in missing if name != "Checkpoint"]
-
-
-@pytest.mark.parametrize("link", sorted(set(re.findall(r"\]\(([^)#:]+)\)", PAGE))))
-def test_links_lead_somewhere(link):
-    assert (DOCS / link).exists()

@@ -18,7 +18,7 @@ METHODS = ("highest bin", "matched filter", "untrained", "network")
 @pytest.mark.parametrize("way", [pytest.param([], id="on disk"), pytest.param(["--online"], id="online")])
 def test_the_network_beats_the_filter(tmp_path, capsys, way):
     run = runpy.run_path(str(SCRIPT))["main"]
-    errors = run(["--smoke", "--output", str(tmp_path), *way])
+    (errors,) = run(["--smoke", "--output", str(tmp_path), *way])
     printed = capsys.readouterr().out
     rows = dict(re.findall(rf"^({'|'.join(METHODS)}) +([\d.]+) .*%$", printed, re.MULTILINE))
     assert tuple(rows) == METHODS

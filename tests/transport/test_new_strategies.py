@@ -172,3 +172,21 @@ def test_a_strategy_is_one_class():
     for path in package.rglob("*.py"):
         text = path.read_text(encoding="utf-8")
         assert not [name for name in names if name in text]
+
+
+def test_every_connection_is_asked_by_an_integrator():
+    """A strategy of the library that no integrator makes is one that was forgotten."""
+    package = Path(plugins.__file__).parent
+    files = [ast.parse(path.read_text(encoding="utf-8")) for path in (package / "transport/connection").glob("*.py")]
+    bases = {
+        node.name: {base.id for base in node.bases if isinstance(base, ast.Name)}
+        for tree in files for node in tree.body if isinstance(node, ast.ClassDef)
+    }  # fmt: skip
+    connections, before = {"Connection"}, set()
+    while connections != before:
+        before = set(connections)
+        connections |= {name for name, parents in bases.items() if parents & connections}
+    trees = [ast.parse(path.read_text(encoding="utf-8")) for path in (package / "integrators").glob("*.py")]
+    calls = [node.func for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    made = {call.id for call in calls if isinstance(call, ast.Name)}
+    assert len(connections) > 3 and connections - {"Connection"} - made == set()

@@ -94,7 +94,7 @@ def test_exposure_ignores_outliers_and_broken_pixels():
 def test_picture(tmp_path, channels):
     cube = pulse(channels)
     path = tmp_path / "overview.png"
-    shown = plot_overview(cube, cube.sum(1), AXIS, path, title="pulse")
+    shown = plot_overview(cube, cube.sum(1), AXIS, path=path, title="pulse")
     assert shown.pixel == (19, 4)  # the 137th of 273 equal pixels, the brighter one being last
     assert len(shown.frames) == 3
     content = path.read_bytes()
@@ -109,13 +109,13 @@ def test_refused(tmp_path):
     with pytest.raises(ShapeError, match="T = 9"):
         peak_time(cube, TimeAxis(0, 1, 9))
     with pytest.raises(ShapeError, match="steady of shape"):
-        plot_overview(cube, cube, AXIS, tmp_path / "a.png")
+        plot_overview(cube, cube, AXIS, path=tmp_path / "a.png")
     with pytest.raises(ShapeError, match="outside"):
-        plot_overview(cube, cube.sum(1), AXIS, tmp_path / "a.png", pixel=(40, 0))
+        plot_overview(cube, cube.sum(1), AXIS, path=tmp_path / "a.png", pixel=(40, 0))
     with pytest.raises(StorageError, match="cannot write"):
-        plot_overview(cube, cube.sum(1), AXIS, tmp_path / "missing" / "a.png")
+        plot_overview(cube, cube.sum(1), AXIS, path=tmp_path / "missing" / "a.png")
     with pytest.raises(StorageError, match="cannot write"):
-        plot_overview(cube, cube.sum(1), AXIS, tmp_path / "a.docx")
+        plot_overview(cube, cube.sum(1), AXIS, path=tmp_path / "a.docx")
     with pytest.raises(ShapeError, match="image"):
         tone_map(torch.zeros(4, 2, 2))
     with pytest.raises(UnitError, match="quantile"):
@@ -125,11 +125,11 @@ def test_refused(tmp_path):
 def test_fit_picture(tmp_path):
     images = {"start": torch.rand(3, 5, 6), "truth": torch.rand(3, 5, 6)}
     path = tmp_path / "fit.png"
-    plot_fit(images, [1.0, 0.1, 0.0], {"red": [0.1, 0.2, 0.3]}, {"red": 0.3}, path)
+    plot_fit(images, [1.0, 0.1, 0.0], {"red": [0.1, 0.2, 0.3]}, truth={"red": 0.3}, path=path)
     assert path.read_bytes()[:4] == b"\x89PNG"
     with pytest.raises(ShapeError, match="expected 2 values of 'red'"):
-        plot_fit(images, [1.0, 0.1], {"red": [0.1]}, {}, path)
+        plot_fit(images, [1.0, 0.1], {"red": [0.1]}, truth={}, path=path)
     with pytest.raises(ShapeError, match="at least one image"):
-        plot_fit({}, [1.0], {}, {}, path)
+        plot_fit({}, [1.0], {}, truth={}, path=path)
     with pytest.raises(StorageError, match="cannot write"):
-        plot_fit(images, [1.0], {}, {}, tmp_path / "missing" / "fit.png")
+        plot_fit(images, [1.0], {}, truth={}, path=tmp_path / "missing" / "fit.png")

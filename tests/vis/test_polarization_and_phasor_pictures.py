@@ -9,7 +9,7 @@ import torch
 
 import torchtransient as tt
 from support.cubes import read_gif
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.vis import colour_maps
 from torchtransient.vis.polarization import angle_image
 
@@ -89,9 +89,9 @@ def test_broken_pixels_have_no_degree():
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
-        ({"quantities": ("dolp", "colour")}, UnitError, "out of intensity"),
-        ({"quantities": ()}, UnitError, "out of intensity"),
-        ({"angle_map": "jet"}, UnitError, "'even' or 'hsv'"),
+        ({"quantities": ("dolp", "colour")}, ArgumentError, "out of intensity"),
+        ({"quantities": ()}, ArgumentError, "out of intensity"),
+        ({"angle_map": "jet"}, ArgumentError, "'even' or 'hsv'"),
         ({"floor": -1.0}, UnitError, "floor >= 0"),
         ({"source": torch.ones(3, 4, 4)}, ShapeError, "Stokes"),
         ({"source": torch.ones(4, 1, 0, 4)}, ShapeError, "some pixels"),
@@ -126,7 +126,7 @@ def test_phasor_panels(tmp_path):
 
 def test_domain_colours():
     values = np.array([1, 0.25, 0, 1j, NAN * 1j])
-    image = tt.vis.domain_colours(values, percentile=100)
+    image = tt.vis.domain_colors(values, percentile=100)
     np.testing.assert_allclose(image[0], colour_maps.cyclic(0.0, 1.0))
     np.testing.assert_allclose(image[1], colour_maps.cyclic(0.0, 0.5))
     np.testing.assert_allclose(image[3], colour_maps.cyclic(0.25, 1.0))

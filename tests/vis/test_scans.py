@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from mpl_toolkits.mplot3d import art3d
 
 import torchtransient as tt
 from support.captures import AXIS, WALL, confocal_plane, tilted
@@ -12,7 +13,7 @@ from support.cubes import read_gif, read_png
 from torchtransient import scenes
 from torchtransient.axes import FrequencyAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.errors import ShapeError, StorageError, TorchTransientError, UnitError
+from torchtransient.errors import ArgumentError, ShapeError, StorageError, TorchTransientError, UnitError
 from torchtransient.vis.hidden_shapes import hidden_polygons
 
 ORIGIN = (-0.5, 0.0, 0.25)
@@ -161,10 +162,19 @@ MESH = scenes.triangle_mesh(VERTICES, FACES)
         {"white": {"type": "diffuse"}, "a": MESH | {"bsdf": {"type": "ref", "id": "white"}}},
     ],
 )  # fmt: skip
-def test_the_layout_draws_what_simulations_take(hidden):
+def test_the_layout_draws_what_simulations_take(hidden, monkeypatch):
     """However triangles are given, they are drawn where they are."""
+    drawn = []
+
+    class Kept(art3d.Poly3DCollection):
+        def __init__(self, polygons, **options):
+            drawn.append(polygons)
+            super().__init__(polygons, **options)
+
+    monkeypatch.setattr(art3d, "Poly3DCollection", Kept)
     panel = tt.vis.scan_layout(confocal_plane(), hidden=hidden).axes[0]
-    (found,) = panel.collections[1]._faces
+    (found,) = drawn[-1]
+    assert isinstance(panel.collections[1], Kept)
     np.testing.assert_allclose(found, VERTICES[[0, 2, 1]])
     assert panel.get_zlim()[1] > 1.5
     tt.nlos.capture_scene(hidden, confocal_plane().scan)
@@ -213,8 +223,8 @@ def test_layouts_of_what_is_no_scan(given):
 @pytest.mark.parametrize(
     ("draw", "error", "message"),
     [
-        (lambda: tt.vis.transients_grid(torch.zeros(1, 2, 3, 4)), ShapeError, "expected a Capture"),
-        (lambda: tt.vis.transients_grid(confocal_plane(), style="lines"), UnitError, "'lines'"),
+        (lambda: tt.vis.transients_grid(torch.zeros(1, 2, 3, 4)), ArgumentError, "expected a Capture"),
+        (lambda: tt.vis.transients_grid(confocal_plane(), style="lines"), ArgumentError, "'lines'"),
         (lambda: tt.vis.transients_grid(of_list(), style="curves"), ShapeError, "a list of 5"),
         (lambda: tt.vis.transients_grid(confocal_plane(), rows=0), ShapeError, "at least one row"),
         (lambda: tt.vis.transients_grid(confocal_plane(), laser=1), ShapeError, "a confocal one"),

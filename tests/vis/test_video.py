@@ -10,7 +10,7 @@ import torch
 
 import torchtransient as tt
 from support.cubes import AXIS, read_gif, read_mp4, sweep
-from torchtransient.errors import ShapeError, StorageError, UnitError
+from torchtransient.errors import ArgumentError, MissingPackageError, ShapeError, StorageError, UnitError
 from torchtransient.vis.stamps import moment, with_strip
 
 
@@ -147,7 +147,7 @@ def test_progress_bar(tmp_path, capsys):
 
 def test_missing_package(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(StorageError, match=r"imageio-ffmpeg.*pip install 'torchtransient\[vis\]'.*\.gif"):
+    with pytest.raises(MissingPackageError, match=r"imageio-ffmpeg.*pip install 'torchtransient\[vis\]'.*\.gif"):
         tt.vis.video(sweep(), tmp_path / "a.mp4")
     tt.vis.video(sweep(), tmp_path / "a.gif")
 
@@ -160,14 +160,14 @@ def test_missing_package(tmp_path, monkeypatch):
         ({"fps": 0}, UnitError, "fps > 0"),
         ({"fps": 100}, UnitError, "at most 50"),
         ({"exposure": -1}, UnitError, "exposure > 0"),
-        ({"curve": "sepia"}, UnitError, "srgb, gamma"),
+        ({"curve": "sepia"}, ArgumentError, "srgb, gamma"),
         ({"every": 0}, ShapeError, "every"),
         ({"scale": 0}, ShapeError, "scale"),
         ({"source": torch.zeros(3, 0, 4, 4)}, ShapeError, "C, T, H, W"),
         ({"source": torch.zeros(2, 5, 4, 4)}, ShapeError, "choose one or three"),
         ({"source": torch.zeros(5, 3, 5, 4, 4)}, ShapeError, "of a batch, choose one"),
         ({"source": "cube"}, StorageError, ".npy"),
-        ({"source": [1.0]}, ShapeError, "got list"),
+        ({"source": [1.0]}, ArgumentError, "got list"),
         ({"axis": tt.TimeAxis(0, 1, 3)}, ShapeError, "3 bins"),
     ],
 )

@@ -1,0 +1,5 @@
+"""Error against time: what a smaller error of a transient, or of a gradient, costs. See `tt.cost_of_accuracy`."""
+
+from torchtransient.accuracy.cost import cosine_over_the_window as cosine_over_the_window
+from torchtransient.accuracy.cost import cost_of_accuracy as cost_of_accuracy
+from torchtransient.accuracy.report import AccuracyReport as AccuracyReport

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from torchtransient.accuracy.measure import Candidate, Estimates, Task, measure
 from torchtransient.accuracy.report import AccuracyReport, Choice
-from torchtransient.errors import SceneError, ShapeError
-from torchtransient.render.films.choices import of_output
-from torchtransient.render.opaque import opaque
-from torchtransient.render.output import RenderOutput
-from torchtransient.render.renderer import TransientRenderer
-from torchtransient.render.variant import active_variant
+from torchtransient.errors import ArgumentError, SceneError, ShapeError
+from torchtransient.rendering.films.choices import of_output
+from torchtransient.rendering.opaque import opaque
+from torchtransient.rendering.output import RenderOutput
+from torchtransient.rendering.renderer import TransientRenderer
+from torchtransient.rendering.variant import active_variant
 
 Loss = Callable[[RenderOutput], torch.Tensor]
 
@@ -76,12 +76,13 @@ def cost_of_accuracy(
     Of a phasor film the quantity "phasor" takes the place of "transient": real and imaginary parts, frequencies in the
     place of bins; of a gated film "gated". Both have no temporal filters to choose from.
 
-    Returns an `AccuracyReport` with `table()`, `plot(path)` and `to_json(path)`. Raises SceneError for a key or sampler
+    Returns an `AccuracyReport` with `table()`, `plot(path)` and `to_json(path)`. Raises ArgumentError for what is no
+    renderer, SceneError for a key or sampler
     that the renderer does not know and UnitError for counts out of range. A temporary copy of the largest cube is held
     per curve.
     """
     if not isinstance(renderer, TransientRenderer):
-        raise SceneError(
+        raise ArgumentError(
             f"cost_of_accuracy: expected a tt.TransientRenderer, got {type(renderer).__name__}. Make one of a scene: "
             "tt.TransientRenderer(scene, parameters=[...])."
         )
@@ -93,7 +94,7 @@ def cost_of_accuracy(
         )
     filters = [renderer.effective_filter or "auto"] if temporal_filters is None else list(temporal_filters)
     if not samplers or not filters:
-        raise SceneError("expected at least one sampler and one temporal filter, got none")
+        raise ArgumentError("expected at least one sampler and one temporal filter, got none")
     axis = renderer.axis
     candidates: dict[Choice, Candidate] = {}
     without: list[str] = []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -12,12 +12,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchtransient.argument_names import arguments_of
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture.arithmetic import summed
 from torchtransient.capture.files import reader, writer
 from torchtransient.capture.metadata import metadata_text
 from torchtransient.capture.scan import Scan, laser_index
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.quantities import finite, flag, shown
 from torchtransient.tensor_record import TensorRecord
 
@@ -54,6 +55,7 @@ class Capture(TensorRecord):
     transient: Tensor | None
     axis: TimeAxis | None
     scan: Scan
+    _: KW_ONLY
     metadata: Mapping[str, Any] = field(default_factory=dict)
     phasor: Tensor | None = None
     frequencies: FrequencyAxis | None = None
@@ -80,13 +82,13 @@ class Capture(TensorRecord):
 
     def _check_settings(self) -> None:
         if not isinstance(self.scan, Scan):
-            raise ShapeError(f"Capture: expected scan as a Scan, got {shown(self.scan)}.")
+            raise ArgumentError(f"Capture: expected scan as a Scan, got {shown(self.scan)}.")
         for name, kind in (("axis", TimeAxis), ("frequencies", FrequencyAxis)):
             given = getattr(self, name)
             if given is not None and not isinstance(given, kind):
-                raise ShapeError(f"Capture: expected {name} as a {kind.__name__} or None, got {shown(given)}.")
+                raise ArgumentError(f"Capture: expected {name} as a {kind.__name__} or None, got {shown(given)}.")
         if not isinstance(self.channels, tuple) or not all(isinstance(name, str) for name in self.channels):
-            raise ShapeError(f"Capture: expected channels as a tuple of names, got {shown(self.channels)}.")
+            raise ArgumentError(f"Capture: expected channels as a tuple of names, got {shown(self.channels)}.")
         flag("Capture: polarized", self.polarized)
 
     def _check(self, name: str, tensor: Tensor, count: int | None, axis: str) -> None:
@@ -123,7 +125,9 @@ class Capture(TensorRecord):
     @classmethod
     def read(cls, path: str | Path, format: str | None = None, **said: Any) -> Capture:
         """Read a capture of any known layout: `tt.nlos.read_capture`, with its arguments and errors."""
-        capture: Capture = reader()(path, format, **said)
+        read = reader()
+        with arguments_of("Capture.read", read, ("path", "format")):
+            capture: Capture = read(path, format, **said)
         return capture
 
     def write(self, path: str | Path, format: str = "torchtransient") -> Path:

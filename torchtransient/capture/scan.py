@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -15,8 +15,8 @@ from torchtransient.axes import TimeAxis
 from torchtransient.capture.distances import bounds_of, longest, shortest
 from torchtransient.capture.scan_checks import check_shapes, check_sides, float64_points, unit_normals
 from torchtransient.capture.wall import Wall, grid_size, triple
-from torchtransient.errors import SceneError, ShapeError
-from torchtransient.quantities import flag, positive, real_array, shown
+from torchtransient.errors import ArgumentError, SceneError, ShapeError
+from torchtransient.quantities import Numbers, flag, positive, real_array, shown
 from torchtransient.tensor_record import same
 
 KINDS = ("single", "confocal", "exhaustive")
@@ -38,13 +38,14 @@ class Scan:
 
     Points may carry gradients; float64 tensors are kept, not copied: do not change them in place. Frozen and picklable;
     two scans are equal when all of this is. Most scans are made by :meth:`grid` or :meth:`points`. Raises ShapeError
-    for shapes that do not belong together, UnitError for numbers that are not finite, SceneError for an unknown kind,
-    points off the wall and origins behind it.
+    for shapes that do not belong together, UnitError for numbers that are not finite, ArgumentError for an unknown
+    kind, points off the wall and origins behind it.
     """
 
     kind: str
     sensor_points: Tensor
     laser_points: Tensor
+    _: KW_ONLY
     sensor_origin: Tensor
     laser_origin: Tensor
     sensor_normals: Tensor | None = None
@@ -61,7 +62,7 @@ class Scan:
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, unit_normals(name, float64_points(name, getattr(self, name), device)))
         if self.wall is not None and not isinstance(self.wall, Mapping):
-            raise SceneError(f"Scan: expected wall as a Mitsuba dictionary or None, got {type(self.wall).__name__}.")
+            raise ArgumentError(f"Scan: expected wall as a Mitsuba dictionary or None, got {type(self.wall).__name__}.")
         flag("Scan: first_and_last_leg", self.first_and_last_leg)
         check_shapes(self)
         check_sides(self)
@@ -78,7 +79,7 @@ class Scan:
         laser_origin: Any = None,
         laser_grid: int | Sequence[int] | None = None,
         cell_centers: bool = True,
-        extent: Sequence[float] | None = None,
+        extent: Numbers | None = None,
         first_and_last_leg: bool = False,
     ) -> Scan:
         """A regular grid of nx x ny sensor points on a wall; `size` is (nx, ny) or one number for both.
@@ -164,7 +165,15 @@ class Scan:
             laser_normals = _normals_on(surface, laser, "Scan.points laser_points")
             shape = surface.shape
         return cls(
-            kind, sensor, laser, sensor_origin, laser_origin, sensor_normals, laser_normals, first_and_last_leg, shape
+            kind,
+            sensor,
+            laser,
+            sensor_origin=sensor_origin,
+            laser_origin=laser_origin,
+            sensor_normals=sensor_normals,
+            laser_normals=laser_normals,
+            first_and_last_leg=first_and_last_leg,
+            wall=shape,
         )
 
     # ------------------------------------------------------------------------------------------------------- sizes
@@ -312,7 +321,7 @@ class Scan:
 
 def _check_kind(kind: Any) -> None:
     if not isinstance(kind, str) or kind not in KINDS:
-        raise SceneError(f"Scan: expected kind to be one of {', '.join(KINDS)}, got {shown(kind)}.")
+        raise ArgumentError(f"Scan: expected kind to be one of {', '.join(KINDS)}, got {shown(kind)}.")
 
 
 def laser_index(scan: Scan, laser: int | tuple[int, ...]) -> tuple[int, ...]:
@@ -345,4 +354,4 @@ def _normals_on(surface: Wall, points: Tensor, what: str) -> Tensor:
 
 def _refuse(name: str, value: Any, kind: str, instead: str) -> None:
     if value is not None:
-        raise SceneError(f"Scan: {name} has no meaning for kind={kind!r}: {instead}. Leave it out.")
+        raise ArgumentError(f"Scan: {name} has no meaning for kind={kind!r}: {instead}. Leave it out.")

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.capture.triangles import first_hits, triangle_normals
-from torchtransient.errors import SceneError, ShapeError, UnitError
-from torchtransient.quantities import flag, positive, real_array, shares, shown, transform
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
+from torchtransient.quantities import Numbers, flag, positive, real_array, shares, shown, transform
 
 Array = NDArray[np.float64]
 
@@ -39,6 +39,7 @@ class Wall:
     center: Array
     half_u: Array
     half_v: Array
+    _: KW_ONLY
     normal: Array
     shape: Mapping[str, Any]
     vertices: Array | None = None
@@ -50,10 +51,10 @@ class Wall:
         width: float = 2.0,
         height: float = 2.0,
         *,
-        center: Sequence[float] = (0.0, 0.0, 0.0),
-        normal: Sequence[float] = (0.0, 0.0, 1.0),
-        up: Sequence[float] = (0.0, 1.0, 0.0),
-        albedo: float | Sequence[float] = 0.5,
+        center: Numbers = (0.0, 0.0, 0.0),
+        normal: Numbers = (0.0, 0.0, 1.0),
+        up: Numbers = (0.0, 1.0, 0.0),
+        albedo: float | Numbers = 0.5,
     ) -> Wall:
         """A diffuse rectangle, metres. u runs along `up x normal`, v along `up` as far as it lies in the wall.
 
@@ -73,8 +74,8 @@ class Wall:
         vertices: Any,
         faces: Any,
         *,
-        up: Sequence[float] = (0.0, 1.0, 0.0),
-        albedo: float | Sequence[float] = 0.5,
+        up: Numbers = (0.0, 1.0, 0.0),
+        albedo: float | Numbers = 0.5,
     ) -> Wall:
         """A diffuse triangle mesh: `vertices` (V, 3) metres, `faces` (F, 3) whole numbers, wound against the clock as
         seen from the room.
@@ -130,7 +131,7 @@ class Wall:
             )
         if isinstance(description, Sequence) and len(description) == 2:
             return cls.mesh(*description)
-        raise SceneError(
+        raise ArgumentError(
             "Wall: expected Wall.plane(...), a Mitsuba dictionary of a rectangle, or a pair (vertices, faces), got "
             f"{type(description).__name__}."
         )
@@ -145,7 +146,7 @@ class Wall:
             raise SceneError(f"Wall: expected a to_world with an inverse, got {matrix.tolist()}.") from None
         if description.get("flip_normals"):
             normal = -normal
-        return cls(matrix[:3, 3], half_u, half_v, normal / np.linalg.norm(normal), description)
+        return cls(matrix[:3, 3], half_u, half_v, normal=normal / np.linalg.norm(normal), shape=description)
 
     @property
     def width(self) -> float:
@@ -203,7 +204,7 @@ class Wall:
         return np.clip(share, margin, 1 - margin)
 
     def grid(
-        self, size: int | Sequence[int], extent: Sequence[float] | None = None, *, cell_centers: bool = True
+        self, size: int | Sequence[int], extent: Numbers | None = None, *, cell_centers: bool = True
     ) -> tuple[Array, Array]:
         """Points and normals (ny, nx, 3) of a regular grid; `size` is (nx, ny) or one number for both.
 
@@ -334,13 +335,13 @@ def _frame(normal: Array, up: Array, who: str) -> tuple[Array, Array, Array]:
     return n, u, np.cross(n, u)
 
 
-def _diffuse(albedo: float | Sequence[float]) -> dict[str, Any]:
+def _diffuse(albedo: float | Numbers) -> dict[str, Any]:
     values = shares("Wall: albedo", albedo)
     plain: Any = {"type": "rgb", "value": list(values)} if isinstance(values, tuple) else values
     return {"type": "diffuse", "reflectance": plain}
 
 
-def _extent(extent: Sequence[float] | None) -> tuple[float, float, float, float]:
+def _extent(extent: Numbers | None) -> tuple[float, float, float, float]:
     if extent is None:
         return 0.0, 0.0, 1.0, 1.0
     given = real_array(extent)

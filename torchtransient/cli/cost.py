@@ -8,10 +8,10 @@ from typing import Any
 import click
 
 from torchtransient.cli.options import load_scene, scene_options
-from torchtransient.render.films.choices import from_options
+from torchtransient.rendering.films.choices import from_options
 
 
-class Counts(click.ParamType):
+class Counts(click.ParamType):  # type: ignore[type-arg]  # a parameter of newer versions
     """Whole numbers with commas between them."""
 
     name = "N,N,..."

@@ -45,7 +45,7 @@ def fit_colour(renderer: Any, target: torch.Tensor, steps: int, learning_rate: f
         for step in bar:
             optimizer.zero_grad()
             loss = (weight * (_averages(renderer(seed=step).transient) - wanted).square()).mean()
-            loss.backward()
+            loss.backward()  # type: ignore[no-untyped-call]
             fit.losses.append(loss.item())
             fit.colours.append(colour.detach().tolist())
             optimizer.step()
@@ -82,14 +82,18 @@ def command(output: Path, resolution: int, spp: int, steps: int) -> None:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StorageError(f"demo: the folder '{output}' cannot be made: {error}. Choose another with -o.") from error
-    axis = {"num_bins": 100, "start_opl": 3.5, "bin_width_opl": 0.06}
-    scene = tt.load(tt.scenes.cornell_box(resolution=resolution, max_depth=6, **axis))
-    click.echo(f"Rendering the Cornell box: {resolution} x {resolution} pixels, {axis['num_bins']} bins.")
+    bins = 100
+    box = tt.scenes.cornell_box(
+        resolution=resolution, max_depth=6, num_bins=bins, start_opl=3.5, bin_width_opl=0.06
+    )
+    scene = tt.load(box)
+    click.echo(f"Rendering the Cornell box: {resolution} x {resolution} pixels, {bins} bins.")
     with torch.no_grad():
         truth = tt.render(scene, spp=16 * spp, seed=10_000, progress=True)
+    assert truth.transient is not None and truth.axis is not None  # the film of the box is a histogram
     truth_colour = scene.parameters()[KEY].value
     write_result(output / "cornell_box.npz", truth, {"scene": "cornell_box"})
-    plot_overview(truth.transient, truth.steady, truth.axis, output / "cornell_box.png", title="Cornell box")
+    plot_overview(truth.transient, truth.steady, truth.axis, path=output / "cornell_box.png", title="Cornell box")
 
     click.echo("Fitting the colour of the red wall to this transient, from grey.")
     grey = [0.4, 0.4, 0.4]
@@ -103,8 +107,8 @@ def command(output: Path, resolution: int, spp: int, steps: int) -> None:
         {"start": before, f"after {steps} steps": after, "truth": truth.steady},
         fit.losses,
         {name: [colour[n] for colour in fit.colours] for n, name in enumerate(CHANNELS)},
-        {name: float(truth_colour[n]) for n, name in enumerate(CHANNELS)},
-        output / "fit.png",
+        truth={name: float(truth_colour[n]) for n, name in enumerate(CHANNELS)},
+        path=output / "fit.png",
     )
     click.echo(f"{'':>8}  {'start':>7} {'found':>7} {'truth':>7}")
     for n, name in enumerate(CHANNELS):

@@ -43,16 +43,26 @@ def versions() -> list[Finding]:
     python = platform.python_version()
     good = sys.version_info >= (3, 11)
     found = [Finding("ok" if good else "problem", "python", python if good else f"{python}; 3.11 or newer is needed")]
-    for name in ("torchtransient", "torch", "mitsuba", "drjit", "numpy", "kornia", "jaxtyping", "click", "tqdm"):
+    for name in ("torchtransient", "torch", "mitsuba", "drjit", "numpy", "kornia", "click", "tqdm"):
         version = _version(name)
         found.append(
-            Finding("ok", name, version) if version else Finding("problem", name, f"missing: pip install {name}")
+            _judged(name, version) if version else Finding("problem", name, f"missing: pip install {name}")
         )
     for name, extra, purpose in (("matplotlib", "vis", "pictures"), ("h5py", "data", "HDF5 files")):
         version = _version(name)
         missing = f"not installed; {purpose} need it: pip install 'torchtransient[{extra}]'"
         found.append(Finding("ok", name, version) if version else Finding("note", name, missing))
     return found
+
+
+def _judged(name: str, version: str) -> Finding:
+    """A tested version of a package that is there, or any of one whose internals nothing here follows."""
+    try:
+        from torchtransient.plugins.tested_versions import untested
+    except ImportError as error:  # what the package needs is missing, and stands in a line of its own
+        return Finding("ok", name, f"{version} (not compared with the tested versions: {error})")
+    message = untested(name, version)
+    return Finding("ok", name, version) if message is None else Finding("note", name, message)
 
 
 def _version(name: str) -> str | None:

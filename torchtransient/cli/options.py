@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from torchtransient.render.films.choice import CommandOption
-from torchtransient.render.films.choices import all_films
+from torchtransient.rendering.films.choice import CommandOption
+from torchtransient.rendering.films.choices import all_films
 
 if TYPE_CHECKING:
     import torch
 
-    from torchtransient.render.scene_handle import Scene
+    from torchtransient.rendering.scene_handle import Scene
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 

@@ -40,7 +40,7 @@ def command(result: Path, target: Path, kind: str, **options: Any) -> None:
 def _draw(kind: str, result: Path, target: Path, options: dict[str, Any]) -> None:
     import torchtransient as tt
     from torchtransient.files.result_file import read_result
-    from torchtransient.render.films.choices import of_output
+    from torchtransient.rendering.films.choices import of_output
 
     def overview() -> None:
         from torchtransient.vis.sources import steady_of, transient_of
@@ -51,7 +51,7 @@ def _draw(kind: str, result: Path, target: Path, options: dict[str, Any]) -> Non
             what = "something else" if film is None else film.plural
             raise click.UsageError(f"--kind overview shows a histogram over time, and this file holds {what}.")
         cube, _ = transient_of(result)
-        tt.vis.plot_overview(cube, steady_of(result), held.axis, target, pixel=options["pixel"], title=result.name)
+        tt.vis.plot_overview(cube, steady_of(result), held.axis, path=target, pixel=options["pixel"], title=result.name)
 
     draw: dict[str, Callable[[], Any]] = {
         "overview": overview,

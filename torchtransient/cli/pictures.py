@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 if TYPE_CHECKING:
-    from torchtransient.render.films.choice import FilmChoice
+    from torchtransient.rendering.films.choice import FilmChoice
 
 PICTURES = ("overview", "peak_time", "rainbow", "video")
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -70,7 +70,7 @@ def write_pictures(output: Any, film: FilmChoice, options: dict[str, Any], title
 
     if options["overview"]:
         power = (output.transient[0], output.steady[0]) if output.polarized else (output.transient, output.steady)
-        tt.vis.plot_overview(*power, output.axis, options["overview"], pixel=options["pixel"], title=title)
+        tt.vis.plot_overview(*power, output.axis, path=options["overview"], pixel=options["pixel"], title=title)
         click.echo(f"{options['overview']}: overview")
     if options["peak_time"]:
         tt.vis.peak_time_picture(output, options["peak_time"], title=title)

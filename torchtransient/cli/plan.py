@@ -9,11 +9,11 @@ from typing import Any
 import click
 
 from torchtransient.cli.options import load_scene, scene_options
-from torchtransient.render.films.choices import from_options
-from torchtransient.render.plan_choices import known_outputs
+from torchtransient.rendering.films.choices import from_options
+from torchtransient.rendering.plan_choices import known_outputs
 
 
-class Names(click.ParamType):
+class Names(click.ParamType):  # type: ignore[type-arg]  # a parameter of newer versions
     """Words with commas between them."""
 
     name = "NAME,NAME,..."

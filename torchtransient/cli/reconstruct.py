@@ -18,7 +18,7 @@ _SIX = (float,) * 6
 _OPEN = ("wall_size", "bin_width_s", "start_s", "sensor_origin", "laser_origin")
 
 
-class Numbers(click.ParamType):
+class Numbers(click.ParamType):  # type: ignore[type-arg]  # a parameter of newer versions
     """One to some numbers with commas between them."""
 
     def __init__(self, kind: Callable[[str], Any], most: int, metavar: str) -> None:
@@ -237,7 +237,7 @@ def _grid(capture: Any, method: str, options: dict[str, Any]) -> Any:
             f"--method {method} has a voxel behind each point and a plane for each bin; leave out "
             f"{' and '.join(given)}, or take bp or fbp."
         )
-    voxels = options["voxels"] or ()
+    voxels: tuple[int, ...] = options["voxels"] or ()
     if options["bounds"] is not None:
         if len(voxels) not in (1, 3):
             raise click.UsageError("--bounds needs --voxels N or X,Y,Z.")

@@ -12,7 +12,7 @@ import click
 from torchtransient.cli.options import assignments, load_scene, scene_options, scene_values
 from torchtransient.cli.pictures import check_pictures, picture_options, write_pictures
 from torchtransient.errors import PhysicsWarning
-from torchtransient.render.films.choices import from_options, of_output
+from torchtransient.rendering.films.choices import from_options, of_output
 
 
 @click.command()
@@ -49,6 +49,7 @@ def command(scene: Path, **options: Any) -> None:
     output = _render(described, values, film, options)
     write_result(target, output, {"scene": scene.name, "parameters": options["params"], "set": options["values"]})
     stats, film = output.stats, of_output(output)
+    assert film is not None  # a steady film was refused before the render
     what, how = film.summary(
         _sizes(film.tensor(output)), "Stokes x " if output.polarized else "", stats.temporal_filter
     )

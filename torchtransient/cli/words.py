@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from torchtransient.render.films.choices import all_films
+from torchtransient.rendering.films.choices import all_films
 
 _WORDS = {
     "print(scene.parameters()) lists all keys": "`torchtransient render SCENE --list-parameters` lists all keys",

@@ -30,6 +30,12 @@ from torchtransient.quantities import shown
 
 HDF5 = (".h5", ".hdf5")
 ENDINGS = (*HDF5, ".npz")
+# What reads the library's kinds of files.
+READERS = {
+    "torchtransient result": "torchtransient.files.result_file.read_result",
+    "torchtransient capture": "tt.nlos.Capture.read",
+    "torchtransient volume": "tt.nlos.read_volume",
+}
 _PART_BYTES = 2**26
 # What the readers of NumPy and h5py raise for files that are damaged or something else.
 _DAMAGED = (
@@ -119,8 +125,16 @@ def read_arrays(
         values = _read_hdf5(source, what, known) if hdf5 else _read_npz(source, what, known)
         found = str(values["format"])
         if found != form:
-            raise StorageError(f"{what}: '{source}' is of format '{found}'; this version reads '{form}'.")
+            raise StorageError(f"{what}: '{source}' is {other_kind(found, form)}")
         return values
+
+
+def other_kind(found: str, form: str) -> str:
+    """What a file is that is not of the format ``form``, and what reads it: the end of a message."""
+    kind = found.rpartition(" ")[0]
+    if kind == form.rpartition(" ")[0] or kind not in READERS:
+        return f"of format '{found}'; this version reads '{form}'."
+    return f"of format '{found}', not '{form}'. {READERS[kind]} reads it."
 
 
 @contextmanager

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.capture.metadata import metadata_text
-from torchtransient.errors import StorageError
+from torchtransient.errors import ArgumentError
 from torchtransient.files import array_file
 from torchtransient.files.array_file import array_of, damage_said, read_arrays, tensor_in, write_arrays
 from torchtransient.files.entries import flag_of, names_of, notes_of, number_of, text_of, whole_of
@@ -54,7 +54,7 @@ def write_capture(path: str | Path, capture: Capture, metadata: Mapping[str, Any
     """
     target = check_capture_target(path)
     if not isinstance(capture, Capture):
-        raise StorageError(f"capture file: expected a tt.nlos.Capture, got {type(capture).__name__}.")
+        raise ArgumentError(f"capture file: expected a tt.nlos.Capture, got {type(capture).__name__}.")
     metadata = {} if metadata is None else metadata
     metadata_text(metadata, _WHAT)
     note = metadata_text({**metadata, **capture.metadata}, _WHAT)

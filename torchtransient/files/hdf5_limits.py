@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.errors import StorageError
-from torchtransient.render.memory import available_bytes
+from torchtransient.rendering.memory import available_bytes
 
 # Deflate, the filter that all of these files use, makes at most 1032 bytes of one.
 MOST_BYTES_OF_ONE = 1032

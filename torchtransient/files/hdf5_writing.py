@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from torchtransient.errors import StorageError
+from torchtransient.errors import MissingPackageError
 
 
 @contextmanager
@@ -88,11 +88,11 @@ class _Sink:
 
 
 def hdf5_package(what: str) -> Any:
-    """The module h5py. Raises StorageError where it is missing."""
+    """The module h5py. Raises MissingPackageError where it is not installed."""
     try:
         import h5py
     except ImportError as error:
-        raise StorageError(
+        raise MissingPackageError(
             f"{what}: HDF5 needs the package h5py. Install it with pip install 'torchtransient[data]', "
             "or choose a name that ends in .npz."
         ) from error

@@ -22,12 +22,12 @@ import torch
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture.metadata import metadata_text
-from torchtransient.errors import StorageError
+from torchtransient.errors import ArgumentError, StorageError
 from torchtransient.files import array_file
 from torchtransient.files.array_file import array_of, damage_said, read_arrays, write_arrays
 from torchtransient.gates import Gate
-from torchtransient.render.films.choices import of_entries, of_output
-from torchtransient.render.output import RenderOutput, named_fields
+from torchtransient.rendering.films.choices import of_entries, of_output
+from torchtransient.rendering.output import RenderOutput, named_fields
 from torchtransient.tensor_record import TensorRecord
 
 FORMAT = "torchtransient result 1"
@@ -83,7 +83,7 @@ def write_result(path: str | Path, output: RenderOutput | Result, metadata: Mapp
     target = check_target(path)
     given: Any = output
     if not isinstance(given, RenderOutput | Result):
-        raise StorageError(
+        raise ArgumentError(
             f"result file: expected what a render returned, a RenderOutput, got {type(given).__name__}. Tensors alone "
             "have no axis; write them with torch.save."
         )

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from torchtransient.capture.metadata import metadata_text
-from torchtransient.errors import StorageError
+from torchtransient.errors import ArgumentError
 from torchtransient.files import array_file
 from torchtransient.files.array_file import array_of, damage_said, read_arrays, tensor_in, write_arrays
 from torchtransient.files.entries import notes_of, text_of
@@ -39,7 +39,7 @@ def write_volume(path: str | Path, volume: HiddenVolume) -> Path:
     """
     target = check_volume_target(path)
     if not isinstance(volume, HiddenVolume):
-        raise StorageError(f"volume file: expected a HiddenVolume, got {type(volume).__name__}.")
+        raise ArgumentError(f"volume file: expected a HiddenVolume, got {type(volume).__name__}.")
     note = metadata_text(volume.metadata, _WHAT)
     grid = volume.grid
     given = {"values": volume.values, "times": volume.times, "directions": volume.directions, "depths": grid.depths}
@@ -65,4 +65,6 @@ def read_volume(path: str | Path) -> HiddenVolume:
         dy, dx = values["pitch"].tolist()
         vectors = {name: values[name] for name in _VECTORS}
         grid = VoxelGrid(values["depths"], (rows, columns), (dy, dx), **vectors)
-        return HiddenVolume(values["values"], grid, text_of(found, "method"), notes_of(found, "metadata"), **more)
+        return HiddenVolume(
+            values["values"], grid, text_of(found, "method"), metadata=notes_of(found, "metadata"), **more
+        )

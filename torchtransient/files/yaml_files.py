@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from torchtransient.errors import SceneError, StorageError
+from torchtransient.errors import MissingPackageError, SceneError, StorageError
 from torchtransient.quantities import shown
 from torchtransient.yaml_numbers import reads_exponents
 
@@ -21,12 +21,15 @@ def read_yaml(source: str | Path, who: str) -> tuple[dict[str, Any], Path]:
     current folder.
 
     Read by PyYAML's safe loader: plain data only, nothing is executed. A name that stands twice in a mapping is an
-    error. Raises StorageError for a missing package or file and for what is no YAML, SceneError for what is no mapping.
+    error. Raises MissingPackageError without PyYAML, StorageError for a missing file and for what is no YAML,
+    SceneError for what is no mapping.
     """
     try:
         import yaml
     except ImportError as error:
-        raise StorageError(f"{who}: YAML needs PyYAML. Install it with pip install 'torchtransient[yaml]'.") from error
+        raise MissingPackageError(
+            f"{who}: YAML needs PyYAML. Install it with pip install 'torchtransient[yaml]'."
+        ) from error
 
     class Loader(yaml.SafeLoader):  # type: ignore[misc]  # the package has no types
         """Says so where a later entry would silently replace an earlier one."""

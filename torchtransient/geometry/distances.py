@@ -71,7 +71,7 @@ def points_from_distance(distance: Tensor, camera_matrix: Any, to_world: Any = N
 
 @without_autocast
 def opl_from_distance(
-    distance: Tensor, camera_matrix: Any = None, to_world: Any = None, light: Any = None, index: float | Tensor = 1.0
+    distance: Tensor, camera_matrix: Any = None, to_world: Any = None, *, light: Any = None, index: float | Tensor = 1.0
 ) -> Tensor:
     """Optical path of light that has met one surface, at a distance along each pixel's ray: from the emitter there and
     on to the camera. There and back, `2 index distance`, of a light at the pinhole.
@@ -92,7 +92,7 @@ def opl_from_distance(
 
 @without_autocast
 def distance_from_opl(
-    opl: Tensor, camera_matrix: Any = None, to_world: Any = None, light: Any = None, index: float | Tensor = 1.0
+    opl: Tensor, camera_matrix: Any = None, to_world: Any = None, *, light: Any = None, index: float | Tensor = 1.0
 ) -> Tensor:
     """Distance along each pixel's ray of light that has met one surface, by its optical path: the inverse of
     `opl_from_distance`, on the ellipse with the light and the pinhole as foci.

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import torch
 from torch import Tensor
 
-from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.floating import holds, number_tensor, single, without_autocast
 from torchtransient.quantities import count, shown
+
+if TYPE_CHECKING:
+    from kornia.geometry.camera import PinholeCamera
 
 FovAxis = Literal["x", "y", "diagonal", "smaller", "larger"]
 # From Mitsuba's camera, x to the left and y up, to kornia's, x to the right and y down; and back.
@@ -24,6 +27,7 @@ _RIGID = 1e-4
 def intrinsics(
     fov_deg: float | Tensor,
     size: Sequence[int],
+    *,
     fov_axis: FovAxis = "x",
     principal_point_offset: Any = (0.0, 0.0),
     crop_offset: Sequence[int] = (0, 0),
@@ -37,12 +41,12 @@ def intrinsics(
     that of the window.
 
     Pixels are square. The first pixel's centre is (0, 0). Half precision is computed in float32 and given back. Raises
-    UnitError, ShapeError, SceneError; values are not looked at inside of `torch.func.vmap` and `torch.compile`.
+    UnitError, ShapeError, ArgumentError; values are not looked at inside of `torch.func.vmap` and `torch.compile`.
     """
     where = "intrinsics"
     height, width = image_size(size, where)
     if fov_axis not in get_args(FovAxis):
-        raise SceneError(f"{where}: expected fov_axis among {', '.join(get_args(FovAxis))}, got {shown(fov_axis)}.")
+        raise ArgumentError(f"{where}: expected fov_axis among {', '.join(get_args(FovAxis))}, got {shown(fov_axis)}.")
     given = _numbers(fov_deg, "fov_deg", where)
     fov = single(given)
     if not holds((fov > 0) & (fov < 180)):
@@ -91,7 +95,7 @@ def camera_to_world(to_world: Any) -> Tensor:
 
 
 @without_autocast
-def pinhole_camera(camera_matrix: Tensor, to_world: Any, size: Sequence[int]) -> Any:
+def pinhole_camera(camera_matrix: Tensor, to_world: Any, size: Sequence[int]) -> PinholeCamera:
     """`kornia.geometry.PinholeCamera` of intrinsics (..., 3, 3) and a sensor's `to_world` (..., 4, 4), a batch of one
     or more. `size`: (height, width) of the image. Its `project` and `unproject` take points of the world and pixels as
     said above. Raises ShapeError.

@@ -15,15 +15,16 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from torchtransient.errors import DeviceError, ShapeError, TorchTransientError, UnitError
+from torchtransient.errors import ArgumentError, DeviceError, ShapeError, TorchTransientError, UnitError
 from torchtransient.quantities import finite, flag, shown
+from torchtransient.units import SHORTEST_OPL
 
 Reduction = Literal["none", "sum", "mean"]
 
 
 def check_reduction(reduction: Reduction, where: str) -> None:
     if reduction not in get_args(Reduction):
-        raise ShapeError(f"{where}: expected reduction 'none', 'sum' or 'mean', got {reduction!r}.")
+        raise ArgumentError(f"{where}: expected reduction 'none', 'sum' or 'mean', got {reduction!r}.")
 
 
 def check_pair(
@@ -94,6 +95,8 @@ def check_level(
     dtype = like.real.dtype if like.is_complex() else like.dtype
     limits = torch.finfo(dtype)
     least, most = (math.sqrt(limits.tiny), math.sqrt(limits.max)) if square else (limits.tiny, limits.max)
+    length = name.endswith("_opl")
+    least = max(least, SHORTEST_OPL) if length else least
     if isinstance(value, Tensor):
         _check_fit(name, value, like, where)
         # of whole numbers and narrower ones in the precision they are used in
@@ -104,6 +107,11 @@ def check_level(
         fits = least <= number <= most or (zero and number == 0)
     if not fits:
         got = "some that are not" if isinstance(value, Tensor) and value.ndim else shown(value)
+        if length:
+            raise UnitError(
+                f"{where}: expected {name} in metres of optical path, at least {least:g} (0.3 fs), got {got}. Seconds? "
+                f"Times 299792458 they are metres; a tt.TimeAxis has its {name}."
+            )
         raise UnitError(
             f"{where}: expected {name} {'of zero or ' if zero else ''}greater than zero that {dtype} holds "
             f"({least:.1g} to {most:.1g}), got {got}."
@@ -147,7 +155,7 @@ def check_option(
 
 
 def check_flag(name: str, value: bool, where: str) -> None:
-    """Raises SceneError for what is no truth value: a text that says no is true."""
+    """Raises ArgumentError for what is no truth value: a text that says no is true."""
     flag(f"{where}: {name}", value)
 
 
@@ -188,7 +196,7 @@ def check_whole(name: str, value: object, where: str, error: type[TorchTransient
 
 def check_function(name: str, value: object, where: str) -> None:
     if not callable(value):
-        raise ShapeError(f"{where}: expected {name} to be a function of tensors, got {shown(value)}.")
+        raise ArgumentError(f"{where}: expected {name} to be a function of tensors, got {shown(value)}.")
 
 
 def check_mask(mask: Tensor | None, like: Tensor, where: str) -> Tensor | None:

@@ -64,6 +64,7 @@ class CumulativeLoss(nn.Module):
     def __init__(
         self,
         bin_width_opl: float | None = None,
+        *,
         per_root_count: bool = False,
         dim: int | None = None,
         reduction: Reduction = "mean",

@@ -37,8 +37,8 @@ from torchtransient.losses.likelihoods import (
 )
 from torchtransient.losses.results import TRANSIENT, Transient, reads
 from torchtransient.quantities import positive
-from torchtransient.sensing.dead_time_cycle import check_dead_bins
-from torchtransient.sensing.spad import exposed_cycles, first_photon_log_prob
+from torchtransient.sensing.dead_time.dead_time_cycle import check_dead_bins
+from torchtransient.sensing.spad.spad import exposed_cycles, first_photon_log_prob
 
 _TIME = -3
 
@@ -96,7 +96,7 @@ def first_photon_nll(
     level = dark_level(n, floor, input, number, averaged_over(rate, mask, reduction))
     dark = None if level is None else _dark(n, r, level)
     near = r if level is None or dark is None else torch.where(dark, level, r)
-    value = -first_photon_log_prob(n, near, number, dead, constant=constant, where=where)
+    value = -first_photon_log_prob(n, near, number, dead_bins=dead, constant=constant, where=where)
     if level is not None and dark is not None:
         # the tangent: what does not fire is linear in the rate anyway
         least = torch.where(dark, level, 1.0)
@@ -150,9 +150,9 @@ def armed_periods(counts: Tensor, periods: int, dead_bins: float) -> Tensor:
 def free_running_nll(
     input: Transient,
     target: Transient,
+    *,
     periods: int,
     dead_bins: float,
-    *,
     floor: Tensor | float | None = None,
     dim: int | None = None,
     mask: Tensor | None = None,
@@ -195,10 +195,10 @@ class FirstPhotonNLL(nn.Module):
         self,
         cycles: int,
         dead_bins: float | None = None,
+        *,
         floor: float | None = None,
         dim: int | None = None,
         reduction: Reduction = "mean",
-        *,
         constant: bool = False,
     ) -> None:
         super().__init__()
@@ -234,6 +234,7 @@ class FreeRunningNLL(nn.Module):
         self,
         periods: int,
         dead_bins: float,
+        *,
         floor: float | None = None,
         dim: int | None = None,
         reduction: Reduction = "mean",
@@ -250,8 +251,8 @@ class FreeRunningNLL(nn.Module):
         return free_running_nll(
             input,
             target,
-            self.periods,
-            self.dead_bins,
+            periods=self.periods,
+            dead_bins=self.dead_bins,
             floor=self.floor,
             dim=self.dim,
             mask=mask,

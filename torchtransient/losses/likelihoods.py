@@ -176,6 +176,7 @@ def count_log(counts: Tensor, mean: Tensor, least: Tensor | None) -> Tensor:
 def relative_floor(
     model: Tensor,
     share: float = _RELATIVE_FLOOR,
+    *,
     mask: Tensor | None = None,
     dim: int | None = None,
     measured: Tensor | None = None,

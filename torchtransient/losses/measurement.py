@@ -10,7 +10,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from torchtransient.errors import ShapeError
+from torchtransient.errors import ArgumentError, ShapeError
 from torchtransient.losses.comparison import (
     Reduction,
     check_dense,
@@ -88,7 +88,7 @@ def measurement_consistency(
     dims = value.ndim if isinstance(value, Tensor) else -1
     if dims < 0 or (dims > 0 if reduction != "none" else dims == 0 and measured.ndim > 1):
         got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
-        raise ShapeError(f"{where}: expected compare to heed reduction {reduction!r}, got {got} of it.")
+        raise ArgumentError(f"{where}: expected compare to heed reduction {reduction!r}, got {got} of it.")
     return value
 
 
@@ -103,7 +103,7 @@ def _checked(
         return functools.partial(_compared, compare, reduction), known
     held = getattr(compare, "reduction", None)
     if held != reduction:
-        raise ShapeError(
+        raise ArgumentError(
             f"{where}: expected reduction {reduction!r} of compare, too, got {type(compare).__name__} with {held!r}. "
             "Give both the same."
         )
@@ -159,6 +159,7 @@ class MeasurementConsistency(nn.Module):
         self,
         operator: Callable[[Tensor], Tensor],
         compare: PairLoss | PairModule = squared_loss,
+        *,
         scale_invariant: bool = False,
         dim: int | None = None,
         reduction: Reduction = "mean",

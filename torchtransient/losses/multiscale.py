@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from torchtransient.errors import ShapeError
+from torchtransient.errors import ArgumentError, ShapeError
 from torchtransient.losses.comparison import (
     Reduction,
     check_level,
@@ -192,7 +192,7 @@ def _at_scale(
     value = compare(first, second, mask=kept, reduction="none", **levels)
     if not isinstance(value, Tensor) or value.shape != first.shape:
         got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
-        raise ShapeError(
+        raise ArgumentError(
             f"multiscale_loss: expected compare to give a value for each bin, {tuple(first.shape)}, got {got}. Losses "
             "of whole records, such as wasserstein_loss, need no scales."
         )
@@ -208,15 +208,15 @@ def _check_scales(scales: Sequence[int] | None, where: str) -> list[int] | None:
 
 
 def _check_compare(compare: object, where: str) -> dict[str, inspect.Parameter]:
-    """Its parameters. Raises ShapeError for what is no loss of bins with what is in bins left out, UnitError for levels
-    that are none.
+    """Its parameters. Raises ArgumentError for what is no loss of bins with what is in bins left out, UnitError for
+    levels that are none.
     """
     if isinstance(compare, nn.Module):
-        raise ShapeError(f"{where}: expected compare to be a function, got the module {type(compare).__name__}.")
+        raise ArgumentError(f"{where}: expected compare to be a function, got the module {type(compare).__name__}.")
     known = check_compare(compare, where, "none")
     for name in _OF_BINS:
         if name in known and known[name].default not in (None, inspect.Parameter.empty):
-            raise ShapeError(
+            raise ArgumentError(
                 f"{where}: expected compare without options in bins, got {name}={known[name].default}: bins are others "
                 "at each scale."
             )
@@ -232,6 +232,7 @@ class MultiscaleLoss(nn.Module):
         self,
         compare: PairLoss = squared_loss,
         scales: Sequence[int] | None = None,
+        *,
         dim: int | None = None,
         reduction: Reduction = "mean",
     ) -> None:

@@ -7,7 +7,7 @@ parameters change, too. The product of the residuals of two independent renders 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 
 from torch import Tensor, nn
 
@@ -64,6 +64,7 @@ class SampleSchedule:
     first: int
     last: int
     steps: int
+    _: KW_ONLY
     hold: float = 0.6
 
     def __post_init__(self) -> None:
@@ -122,5 +123,5 @@ class TwoRenderLoss(nn.Module):
         check_reduction(reduction, "TwoRenderLoss")
         self.reduction = reduction
 
-    def forward(self, first: Light, second: Light, target: Light, mask: Tensor | None = None) -> Tensor:
+    def forward(self, first: Light, second: Light, target: Light, *, mask: Tensor | None = None) -> Tensor:
         return two_render_loss(first, second, target, mask=mask, reduction=self.reduction)

@@ -9,7 +9,7 @@ from typing import Any, Protocol, cast
 
 from torch import Tensor, nn
 
-from torchtransient.errors import ShapeError
+from torchtransient.errors import ArgumentError
 from torchtransient.losses.comparison import Reduction, check_function
 from torchtransient.losses.layouts import time_dim
 from torchtransient.quantities import shown
@@ -36,7 +36,7 @@ class PairModule(Protocol):
 
 
 def check_compare(compare: object, where: str, reduction: Reduction | None) -> dict[str, inspect.Parameter]:
-    """Its parameters. Raises ShapeError unless it is a function or module (model, measurement) with a mask, and of
+    """Its parameters. Raises ArgumentError unless it is a function or module (model, measurement) with a mask, and of
     nothing else that is not given; `reduction`: a function takes it, too.
     """
     check_function("compare", compare, where)
@@ -46,7 +46,7 @@ def check_compare(compare: object, where: str, reduction: Reduction | None) -> d
     names: dict[str, object] = {"mask": None} if module else {"mask": None, "reduction": reduction}
     wanted = ", ".join(f"{name}=" for name in names)
     if isinstance(function, functools.partial) and function.args:
-        raise ShapeError(
+        raise ArgumentError(
             f"{where}: expected compare to take (input, target, {wanted}), got a functools.partial of {title} that "
             "fills in the first of them. Hold options by their names."
         )
@@ -54,13 +54,13 @@ def check_compare(compare: object, where: str, reduction: Reduction | None) -> d
         signature = inspect.signature(function)
         bound = signature.bind(None, None, **names)
     except (TypeError, ValueError) as error:
-        raise ShapeError(
+        raise ArgumentError(
             f"{where}: expected compare to take (input, target, {wanted}) and no more, got "
             f"{title}: {error}. functools.partial holds further arguments of a loss of tt.losses."
         ) from None
     first, second = [*bound.arguments, "", ""][:2]
     if first in _MEASUREMENT_FIRST or second in _NO_MEASUREMENT:
-        raise ShapeError(
+        raise ArgumentError(
             f"{where}: expected compare to take the model first and the measurement second, (input, target), got "
             f"{title}, which takes {first} first and {second} second. Turn it round in a function."
         )
@@ -70,14 +70,15 @@ def check_compare(compare: object, where: str, reduction: Reduction | None) -> d
 def shared_dim(
     compare: object, known: dict[str, inspect.Parameter], dim: int | None, like: Tensor, where: str
 ) -> int | None:
-    """Where time is: `dim`, or what `compare` holds, whose parameters are `known`. Raises ShapeError for two places."""
+    """Where time is: `dim`, or what `compare` holds, whose parameters are `known`. Raises ArgumentError for two
+    places."""
     named = known["dim"].default if "dim" in known else None
     held = getattr(compare, "dim", None) if isinstance(compare, nn.Module) else named
     if held is None or held is inspect.Parameter.empty:
         return dim
     place = time_dim(like, held, where)
     if dim is not None and time_dim(like, dim, where) != place:
-        raise ShapeError(
+        raise ArgumentError(
             f"{where}: expected time in one dimension, got dim={dim}, and dim={held} held by compare. Leave "
             "the latter out."
         )

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.losses.comparison import (
     Reduction,
     check_dense,
@@ -86,7 +86,7 @@ def _check_axes(
 ) -> tuple[TimeAxis, FrequencyAxis]:
     """Raises UnitError for no axes, and for frequencies that bins cannot tell from lower ones."""
     if not isinstance(axis, TimeAxis) or not isinstance(frequencies, FrequencyAxis):
-        raise UnitError(
+        raise ArgumentError(
             f"{where}: expected a TimeAxis and a FrequencyAxis, got {type(axis).__name__} and "
             f"{type(frequencies).__name__}. Results that have an axis need no other."
         )
@@ -159,9 +159,9 @@ def _phase(phasor: Tensor, floor: Tensor) -> Tensor:
 def transient_phasor_loss(
     input: Transient,
     target: Transient,
+    *,
     axis: TimeAxis | None = None,
     frequencies: FrequencyAxis | None = None,
-    *,
     phase_only: bool = False,
     floor: Tensor | float | None = None,
     dim: int | None = None,
@@ -190,6 +190,7 @@ class PhasorLoss(nn.Module):
 
     def __init__(
         self,
+        *,
         phase_only: bool = False,
         floor: float | None = None,
         dim: int | None = None,
@@ -220,6 +221,7 @@ class TransientPhasorLoss(nn.Module):
         self,
         axis: TimeAxis | None = None,
         frequencies: FrequencyAxis | None = None,
+        *,
         phase_only: bool = False,
         floor: float | None = None,
         dim: int | None = None,
@@ -240,8 +242,8 @@ class TransientPhasorLoss(nn.Module):
         return transient_phasor_loss(
             input,
             target,
-            self.axis,
-            self.frequencies,
+            axis=self.axis,
+            frequencies=self.frequencies,
             phase_only=self.phase_only,
             floor=self.floor,
             dim=self.dim,

@@ -61,7 +61,7 @@ def root_loss(
     """`(root(input) - root(target))^2` of each element, any shape, in photon counts. Symmetric.
 
     With `anscombe` about 1 on average where `input` is the mean that `target` was drawn of: a fit is as good as the
-    noise lets it be when its loss is. Take `torchtransient.reconstruction.stabilised_root` with a floor of 1/4,
+    noise lets it be when its loss is. Take `torchtransient.reconstruction.stabilized_root` with a floor of 1/4,
     `H / sqrt(|H| + 1/4)`, for what f-k migration sees of counts: `functools.partial` holds options of a root. Raises
     ShapeError, UnitError.
     """

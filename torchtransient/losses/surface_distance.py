@@ -13,7 +13,7 @@ from torchtransient.losses.triangles import check_faces, unit_normals
 _MOST = 1 << 24
 
 
-def surface_distance(vertices: Tensor, faces: Tensor, others: Tensor, other_faces: Tensor, cells: int = 4) -> Tensor:
+def surface_distance(vertices: Tensor, faces: Tensor, others: Tensor, other_faces: Tensor, *, cells: int = 4) -> Tensor:
     """Mean distance of two surfaces, in the unit of the vertices, whatever that is: scalar, differentiable in both.
 
     From points of each to the nearest point of the other, over the area, and the mean of both ways. `vertices` and

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor, nn
 
@@ -24,7 +22,7 @@ from torchtransient.losses.comparison import (
     working_dtype,
 )
 from torchtransient.losses.results import VALUES, Volume, reads
-from torchtransient.quantities import shown
+from torchtransient.quantities import Numbers, shown
 
 _DIMS = (-3, -2, -1)
 _SMOOTHING = 1e-3
@@ -34,7 +32,7 @@ _SMOOTHING = 1e-3
 def total_variation(
     volume: Volume,
     *,
-    spacing: Sequence[float] | None = None,
+    spacing: Numbers | None = None,
     isotropic: bool = True,
     smoothing: float | None = None,
     mask: Tensor | None = None,
@@ -75,7 +73,7 @@ def total_variation(
     return reduce(value, reduction, where, mask)
 
 
-def _check_spacing(spacing: Sequence[float] | None, like: Tensor, where: str) -> tuple[float, float, float]:
+def _check_spacing(spacing: Numbers | None, like: Tensor, where: str) -> tuple[float, float, float]:
     if spacing is None:
         return 1.0, 1.0, 1.0
     if not hasattr(spacing, "__len__") or len(spacing) != 3:
@@ -112,7 +110,8 @@ class TotalVariation(nn.Module):
 
     def __init__(
         self,
-        spacing: Sequence[float] | None = None,
+        spacing: Numbers | None = None,
+        *,
         isotropic: bool = True,
         smoothing: float | None = None,
         reduction: Reduction = "mean",

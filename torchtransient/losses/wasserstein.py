@@ -115,6 +115,7 @@ class WassersteinLoss(nn.Module):
     def __init__(
         self,
         bin_width_opl: float | None = None,
+        *,
         creation_cost_opl: float | None = None,
         floor: float | None = None,
         dim: int | None = None,

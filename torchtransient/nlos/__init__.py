@@ -15,7 +15,7 @@
 - `LCT`, `lct`: the light-cone transform with its Wiener inverse
 - `DirectionalLCT`, `directional_lct`: the same with normals
 - `DiffusionDeconvolution`: confocal captures through turbid matter, and without it
-- `stabilised_root`, `StabilisedRoot`: roots of light, as f-k takes them, with a slope at empty bins
+- `stabilized_root`, `StabilizedRoot`: roots of light, as f-k takes them, with a slope at empty bins
 - `LinearOperator`: what all of these are
 - `PlanarScan`: a regular grid of a flat wall, which transforms take in place of a scan
 - `subtract_legs`: a capture without the first and the last leg of its light
@@ -75,7 +75,7 @@ from torchtransient.reconstruction import MidpointFK as MidpointFK
 from torchtransient.reconstruction import PhasorField as PhasorField
 from torchtransient.reconstruction import PhasorFilter as PhasorFilter
 from torchtransient.reconstruction import PlanarScan as PlanarScan
-from torchtransient.reconstruction import StabilisedRoot as StabilisedRoot
+from torchtransient.reconstruction import StabilizedRoot as StabilizedRoot
 from torchtransient.reconstruction import TransientCamera as TransientCamera
 from torchtransient.reconstruction import VoxelGrid as VoxelGrid
 from torchtransient.reconstruction import backproject as backproject
@@ -89,5 +89,5 @@ from torchtransient.reconstruction import normals_from_depth as normals_from_dep
 from torchtransient.reconstruction import normals_from_volume as normals_from_volume
 from torchtransient.reconstruction import phasor_image as phasor_image
 from torchtransient.reconstruction import soft_depth as soft_depth
-from torchtransient.reconstruction import stabilised_root as stabilised_root
+from torchtransient.reconstruction import stabilized_root as stabilized_root
 from torchtransient.reconstruction import subtract_legs as subtract_legs

@@ -10,10 +10,10 @@ import torch
 from torch import nn
 
 from torchtransient.capture import Scan
-from torchtransient.errors import SceneError, UnitError
+from torchtransient.errors import ArgumentError, SceneError, UnitError
 from torchtransient.quantities import shown
-from torchtransient.render.arguments import samples
-from torchtransient.render.seeds import SEED_RANGE
+from torchtransient.rendering.arguments import samples
+from torchtransient.rendering.seeds import SEED_RANGE
 from torchtransient.sensing import Device
 
 # What samplers count with has 32 bits.
@@ -21,10 +21,10 @@ MOST_SAMPLES = 2**32 - 1
 
 
 def checked_count(who: str, name: str, value: Any) -> int:
-    """A whole number of at least 1. Raises SceneError."""
+    """A whole number of at least 1. Raises ArgumentError."""
     number = _whole(value)
     if number is None or number < 1:
-        raise SceneError(f"{who}: {name}: expected a whole number of at least 1, got {shown(value)}.")
+        raise ArgumentError(f"{who}: {name}: expected a whole number of at least 1, got {shown(value)}.")
     return number
 
 
@@ -36,10 +36,10 @@ def checked_samples(who: str, value: Any) -> int | None:
 
 
 def checked_seed(who: str, value: Any) -> int:
-    """A seed. Those that samplers cannot tell from others are refused: they have 32 bits. Raises SceneError."""
+    """A seed. Those that samplers cannot tell from others are refused: they have 32 bits. Raises ArgumentError."""
     number = _whole(value)
     if number is None or not 0 <= number < SEED_RANGE:
-        raise SceneError(
+        raise ArgumentError(
             f"{who}: seed: expected a whole number from 0 to {SEED_RANGE - 1}, got {shown(value)}. Others would count "
             "modulo 2^32, and be the same as one of these."
         )
@@ -66,15 +66,15 @@ def check_seeds(who: str, value: Any) -> None:
 def check_is_scan(who: str, value: Any) -> None:
     """Raise SceneError for what is no scan."""
     if not isinstance(value, Scan):
-        raise SceneError(f"{who}: expected scan as a tt.nlos.Scan, got {type(value).__name__}.")
+        raise ArgumentError(f"{who}: expected scan as a tt.nlos.Scan, got {type(value).__name__}.")
 
 
 def check_sensor(who: str, sensor: Any, generator: Any = None) -> None:
     """Raise SceneError unless ``sensor`` can take a transient and ``generator`` draw its noise, or they are None."""
     if not isinstance(sensor, nn.Module | Device | None):
-        raise SceneError(f"{who}: expected sensor as a module or device of tt.sensing, got {shown(sensor)}.")
+        raise ArgumentError(f"{who}: expected sensor as a module or device of tt.sensing, got {shown(sensor)}.")
     if not isinstance(generator, torch.Generator | None):
-        raise SceneError(f"{who}: expected generator as a torch.Generator or None, got {shown(generator)}.")
+        raise ArgumentError(f"{who}: expected generator as a torch.Generator or None, got {shown(generator)}.")
 
 
 def keys_and_values(who: str, name: str, given: Any) -> dict[str, Any]:

@@ -168,7 +168,7 @@ def _frequencies(section: Section) -> FrequencyAxis | None:
         return FrequencyAxis(tuple(as_number(value, "frequencies") for value in given))
     part = Section(given, "frequencies", ("first", "step", "count", "start_opl"))
     return FrequencyAxis.uniform(
-        part.number("first"), part.number("step"), part.whole("count"), part.number("start_opl", 0.0)
+        part.number("first"), part.number("step"), part.whole("count"), start_opl=part.number("start_opl", 0.0)
     )
 
 

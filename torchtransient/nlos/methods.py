@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import torch
 
 from torchtransient.capture import Capture, Scan
-from torchtransient.errors import SceneError, ShapeError
+from torchtransient.errors import ArgumentError, ShapeError
 from torchtransient.quantities import shown, with_article
+from torchtransient.reconstruction.capture_checks import not_a_capture
 from torchtransient.reconstruction.planar_scan import PlanarScan
 from torchtransient.volume_methods import METHODS as METHODS
 from torchtransient.volume_methods import Method as Method
@@ -28,7 +29,7 @@ class Choice:
 def choose_method(capture: Capture) -> Choice:
     """The method that suits a capture. Raises ShapeError for what is none."""
     if not isinstance(capture, Capture):
-        raise ShapeError(f"choose_method: expected a tt.nlos.Capture, got {shown(capture)}.")
+        raise ArgumentError(f"choose_method: {not_a_capture(capture)}")
     kind = capture.scan.kind
     this = with_article(kind)
     if not is_planar(capture.scan):
@@ -41,18 +42,18 @@ def choose_method(capture: Capture) -> Choice:
 
 
 def check_method(name: str, capture: Capture) -> Method:
-    """The method of a name. Raises SceneError for unknown ones and for scans that it does not take."""
+    """The method of a name. Raises ArgumentError for unknown ones and for scans that it does not take."""
     if not isinstance(name, str) or name not in METHODS:
-        raise SceneError(f"reconstruct: expected method to be one of {', '.join(METHODS)}, got {shown(name)}.")
+        raise ArgumentError(f"reconstruct: expected method to be one of {', '.join(METHODS)}, got {shown(name)}.")
     method, kind = METHODS[name], capture.scan.kind
     if kind not in method.kinds:
         others = ", ".join(other for other, entry in METHODS.items() if kind in entry.kinds)
-        raise SceneError(
+        raise ArgumentError(
             f"reconstruct: method '{name}' takes {' and '.join(method.kinds)} scans, and this one is {kind}. "
             f"Take one of {others}."
         )
     if method.planar and not is_planar(capture.scan):
-        raise SceneError(
+        raise ArgumentError(
             f"reconstruct: method '{name}' takes regular grids of points on a flat wall, and this scan is none "
             f"({capture.scan!r}). Take bp or fbp."
         )

@@ -31,7 +31,7 @@ def sum_bins(capture: Capture, number: int) -> Capture:
     if bins < 1:
         raise ShapeError(f"sum_bins: expected {axis.num_bins} bins at most, got {number}.")
     dim = transient.ndim - len(capture.scan.shape) - 1
-    together = summed(transient.narrow(dim, 0, bins * number).unflatten(dim, (bins, number)), dim + 1)
+    together = summed(transient.narrow(dim, 0, bins * number).unflatten(dim, (bins, number)), dim + 1)  # type: ignore[no-untyped-call]
     return replace(capture, transient=together, axis=TimeAxis(axis.start_opl, axis.bin_width_opl * number, bins))
 
 
@@ -49,7 +49,7 @@ def without_slab(capture: Capture, thickness: float, snr: float) -> Capture:
     clear = slab.to(transient.device).reconstruct(transient.double())
     if capture.polarized:
         stokes = -len(capture.scan.shape) - 3
-        intensity, others = clear.split((1, 3), stokes)
+        intensity, others = clear.split((1, 3), stokes)  # type: ignore[no-untyped-call]
         clear = torch.cat([intensity.clamp_min(0), others], stokes)
     else:
         clear = clear.clamp_min(0)

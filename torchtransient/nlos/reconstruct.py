@@ -13,11 +13,11 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.capture.arithmetic import precision_of
-from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.nlos.measured_light import checked_light
 from torchtransient.nlos.methods import Choice, check_method, choose_method, default_wavelength, is_planar
 from torchtransient.nlos.volume_memory import AT_ONCE, check_volume_fits
-from torchtransient.quantities import count, finite, positive, real_array, shown
+from torchtransient.quantities import Numbers, count, finite, positive, real_array, shown
 from torchtransient.reconstruction import (
     FK,
     LCT,
@@ -35,6 +35,7 @@ from torchtransient.reconstruction import (
     VoxelGrid,
     subtract_legs,
 )
+from torchtransient.reconstruction.capture_checks import not_a_capture
 from torchtransient.reconstruction.proportions import check_proportions, check_reach, check_wavelength
 from torchtransient.volume_methods import FILTERS, Method
 
@@ -49,7 +50,7 @@ def reconstruct(
     method: str | None = None,
     *,
     grid: VoxelGrid | None = None,
-    depths: Sequence[float] | None = None,
+    depths: Numbers | None = None,
     progress: bool = True,
     **options: Any,
 ) -> HiddenVolume:
@@ -66,11 +67,11 @@ def reconstruct(
     taken off where a method cannot count them, light before time zero and phasors beside a transient are left out, and
     of polarized captures the intensity is taken.
 
-    Raises SceneError for a method or an option that does not fit the capture or each other, ShapeError, UnitError and
-    DeviceError as the operators.
+    Raises ArgumentError for a method or an option that does not fit the capture or each other, ShapeError, UnitError
+    and DeviceError as the operators.
     """
     if not isinstance(capture, Capture):
-        raise ShapeError(f"reconstruct: expected a tt.nlos.Capture, got {shown(capture)}.")
+        raise ShapeError(f"reconstruct: {not_a_capture(capture)}")
     if capture.transient is None:
         raise ShapeError("reconstruct: expected a capture with a transient, got phasors alone.")
     choice = choose_method(capture) if method is None else Choice(method, "asked for")
@@ -78,10 +79,10 @@ def reconstruct(
     options = {name: value for name, value in options.items() if value is not None}
     _check_options(choice.name, entry.options, options)
     if grid is not None and not isinstance(grid, VoxelGrid):
-        raise ShapeError(f"reconstruct: expected grid as a tt.nlos.VoxelGrid, got {shown(grid)}.")
+        raise ArgumentError(f"reconstruct: expected grid as a tt.nlos.VoxelGrid, got {shown(grid)}.")
     if grid is not None and (depths is not None or not entry.free_grid):
         why = "it says its depths itself; leave one of them out" if entry.free_grid else "its voxels are its own"
-        raise SceneError(f"reconstruct: method '{choice.name}' takes no grid= here: {why}.")
+        raise ArgumentError(f"reconstruct: method '{choice.name}' takes no grid= here: {why}.")
     assert capture.axis is not None
     check_proportions(capture.scan, capture.axis, "reconstruct")
     capture = checked_light(_intensities(capture), "reconstruct")
@@ -100,15 +101,15 @@ def reconstruct(
             values, directions, voxels = _on_own_grid(choice.name, capture, near_far, options, progress)
             times, used = None, options
     metadata = {"reason": choice.reason, "settings": _settings(entry, used, capture.axis)}
-    return HiddenVolume(values, voxels, choice.name, metadata, times, directions)
+    return HiddenVolume(values, voxels, choice.name, metadata=metadata, times=times, directions=directions)
 
 
 def default_grid(
     capture: Capture,
     *,
-    depths: Sequence[float] | None = None,
+    depths: Numbers | None = None,
     size: int | Sequence[int] | None = None,
-    extent: float | Sequence[float] | None = None,
+    extent: float | Numbers | None = None,
     planes: int | None = None,
 ) -> VoxelGrid:
     """Voxels before the wall of a capture: ``size`` (X, Y) and ``extent`` (width, height) as of `VoxelGrid.before`,
@@ -117,7 +118,7 @@ def default_grid(
     sensor points on one line say nothing of an ``extent``.
     """
     if not isinstance(capture, Capture):
-        raise ShapeError(f"reconstruct: expected a tt.nlos.Capture, got {shown(capture)}.")
+        raise ShapeError(f"reconstruct: {not_a_capture(capture)}")
     axis = capture.axis
     if axis is None:
         raise ShapeError("reconstruct: expected a capture with a transient, got phasors alone.")
@@ -156,9 +157,10 @@ def _spans_area(scan: Scan) -> bool:
 
 def checked_depths(depths: Any) -> tuple[float, float]:
     """(near, far), metres. Raises UnitError."""
-    if not isinstance(depths, Sequence) or len(depths) != 2:
+    plain = real_array(depths)
+    if plain is None or plain.shape != (2,):
         raise UnitError(f"reconstruct: expected depths as (near, far) in metres, got {shown(depths)}.")
-    near, far = (finite("reconstruct: depths", value) for value in depths)
+    near, far = (finite("reconstruct: depths", value) for value in plain)
     if not 0 <= near < far:
         raise UnitError(f"reconstruct: expected depths with 0 <= near < far in metres, got {near:g} to {far:g}.")
     return near, far
@@ -177,8 +179,9 @@ def normals_of(volume: HiddenVolume) -> Tensor:
         vectors = vectors[0]
     vectors = vectors.sum(0)
     index = vectors.norm(dim=0).argmax(0).expand(3, 1, *vectors.shape[-2:])
-    brightest = vectors.gather(1, index)[:, 0]
-    return brightest / brightest.norm(dim=0).clamp_min(torch.finfo(brightest.dtype).tiny)
+    brightest: Tensor = vectors.gather(1, index)[:, 0]
+    length: Tensor = brightest.norm(dim=0)
+    return brightest / length.clamp_min(torch.finfo(brightest.dtype).tiny)
 
 
 # ------------------------------------------------------------------------------------------------------------- parts
@@ -187,17 +190,21 @@ def normals_of(volume: HiddenVolume) -> Tensor:
 def _check_options(name: str, known: Iterable[str], options: dict[str, Any]) -> None:
     for option in options:
         if option not in known:
-            raise SceneError(
+            raise ArgumentError(
                 f"reconstruct: method '{name}' has no {option}=, it takes {', '.join(f'{n}=' for n in known)}. "
                 "Leave it out, or take another method."
             )
     for option in ("target", "filter"):
         if not isinstance(options.get(option, ""), str):
-            raise SceneError(f"reconstruct: expected {option} as a name, got {shown(options[option])}.")
+            raise ArgumentError(f"reconstruct: expected {option} as a name, got {shown(options[option])}.")
     if options.get("filter", FILTERS[0]) not in FILTERS:
-        raise SceneError(f"reconstruct: expected filter to be one of {', '.join(FILTERS)}, got {options['filter']!r}.")
+        raise ArgumentError(
+            f"reconstruct: expected filter to be one of {', '.join(FILTERS)}, got {options['filter']!r}."
+        )
     if options.get("filter") == "laplacian" and ("wavelength" in options or "cycles" in options):
-        raise SceneError("reconstruct: wavelength= and cycles= have no meaning for filter='laplacian'. Leave them out.")
+        raise ArgumentError(
+            "reconstruct: wavelength= and cycles= have no meaning for filter='laplacian'. Leave them out."
+        )
 
 
 def _settings(entry: Method, used: dict[str, Any], axis: TimeAxis) -> dict[str, Any]:
@@ -245,7 +252,9 @@ def _on_own_grid(
     name: str, capture: Capture, depths: tuple[float, float] | None, options: dict[str, Any], progress: bool
 ) -> tuple[Tensor, Tensor | None, VoxelGrid]:
     """By a method with a plane for each bin, a channel at a time, all by one operator."""
-    kind = {"fk": FK, "midpoint-fk": MidpointFK, "lct": LCT, "directional-lct": DirectionalLCT}[name]
+    kinds: dict[str, Callable[..., Any]] = {
+        "fk": FK, "midpoint-fk": MidpointFK, "lct": LCT, "directional-lct": DirectionalLCT,
+    }  # fmt: skip
     axis, transient = capture.axis, capture.transient
     assert axis is not None and transient is not None
     dim = transient.ndim - len(capture.scan.shape) - 2
@@ -257,7 +266,7 @@ def _on_own_grid(
             f"{shown(depths)}."
         )
     kept = seen.nonzero()[:, 0]
-    operator = kind(capture.scan, time_axis=axis, dtype=precision_of(transient), **options).to(transient.device)
+    operator = kinds[name](capture.scan, time_axis=axis, dtype=precision_of(transient), **options).to(transient.device)
     with _bar(transient.shape[dim], progress) as bar:
         for channel in range(transient.shape[dim]):
             one = replace(capture, transient=transient.narrow(dim, channel, 1), steady=None, channels=())
@@ -315,18 +324,21 @@ def _maker(name: str, capture: Capture, axis: TimeAxis, options: dict[str, Any])
 def camera_of(name: str, times: Sequence[float] | None) -> DirectLight | ConfocalCamera | TransientCamera:
     """A virtual camera by its name, "direct", "confocal" or "transient"; ``times``: (start, stop, count), metres.
 
-    Raises SceneError for unknown names, where times are missing or have no meaning, and for a count that is none,
+    Raises ArgumentError for unknown names, where times are missing or have no meaning, and for a count that is none,
     UnitError for times that are not three finite numbers.
     """
     if isinstance(name, str) and name == "direct":
         if times is not None:
-            raise SceneError("reconstruct: times are for the cameras confocal and transient. Leave them out.")
+            raise ArgumentError("reconstruct: times are for the cameras confocal and transient. Leave them out.")
         return DirectLight()
-    cameras = {"confocal": ConfocalCamera, "transient": TransientCamera}
+    cameras: dict[str, type[ConfocalCamera | TransientCamera]] = {
+        "confocal": ConfocalCamera,
+        "transient": TransientCamera,
+    }
     if not isinstance(name, str) or name not in cameras:
-        raise SceneError(f"reconstruct: expected a camera direct, confocal or transient, got {shown(name)}.")
+        raise ArgumentError(f"reconstruct: expected a camera direct, confocal or transient, got {shown(name)}.")
     if times is None:
-        raise SceneError(f"reconstruct: the camera {name} films: expected times (start, stop, count), got none.")
+        raise ArgumentError(f"reconstruct: the camera {name} films: expected times (start, stop, count), got none.")
     numbers = real_array(times)
     if numbers is None or numbers.shape != (3,):
         raise UnitError(f"reconstruct: expected times as (start, stop, count), got {shown(times)}.")

@@ -10,20 +10,20 @@ import torch
 from torch import nn
 
 from torchtransient.capture import Capture, Scan
-from torchtransient.errors import SceneError, TorchTransientError
+from torchtransient.errors import ArgumentError, SceneError, TorchTransientError
 from torchtransient.nlos import defaults
 from torchtransient.nlos.answers import black_message, checked_module, is_readable, measured
 from torchtransient.nlos.arguments import check_is_scan, check_seeds, check_sensor, checked_samples, keys_and_values
 from torchtransient.nlos.scan_watch import HIDDEN, LASER_RAYS, SENSOR_RAYS, ScanWatch
 from torchtransient.nlos.scene import SENSOR, WALL, capture_scene, film_size, hidden_bounds, laser_size
 from torchtransient.nlos.scene_scan import check_scan_is_seen, tolerance_of
-from torchtransient.render.build import BuildOptions
-from torchtransient.render.opaque import opaque
-from torchtransient.render.output import RenderOutput
-from torchtransient.render.parameters import needing_slope
-from torchtransient.render.renderer import TransientRenderer
-from torchtransient.render.scene_handle import Scene, load
-from torchtransient.render.variant import active_variant
+from torchtransient.rendering.build_options import BuildOptions
+from torchtransient.rendering.opaque import opaque
+from torchtransient.rendering.output import RenderOutput
+from torchtransient.rendering.parameters import needing_slope
+from torchtransient.rendering.renderer import TransientRenderer
+from torchtransient.rendering.scene_handle import Scene, load
+from torchtransient.rendering.variant import active_variant
 from torchtransient.sensing import Device
 
 # Where the points of a scan stand in the scene.
@@ -82,8 +82,8 @@ class CaptureRenderer(nn.Module):
         wanted = keys_and_values("CaptureRenderer", "parameters", parameters)
         settings["spp"] = checked_samples("CaptureRenderer", settings.get("spp"))
         if settings.get("max_depth") is not None:
-            raise SceneError("CaptureRenderer: max_depth: bounces= says how far light is followed; leave it out.")
-        scene = load(capture_scene(hidden, scan, bounces, energy), variant=variant)
+            raise ArgumentError("CaptureRenderer: max_depth: bounces= says how far light is followed; leave it out.")
+        scene = load(capture_scene(hidden, scan, bounces=bounces, energy=energy), variant=variant)
         if not _WHAT_IS_MEASURED & {name for name, value in settings.items() if value is not None}:
             bounds = hidden_bounds(hidden, scene.variant)
             settings["time_axis"] = scan.detach().default_axis(bounds, defaults.BIN_WIDTH_OPL)
@@ -93,10 +93,11 @@ class CaptureRenderer(nn.Module):
         self._own, self._sources = tuple(wanted), _Sources(_points_of(scan)[key] for key in followed)
         self.renderer = TransientRenderer(scene, {**wanted, **dict.fromkeys(followed)}, **settings)
         for key in followed:
-            self.renderer.values[key].requires_grad_(requires_grad=False)
+            self.renderer.values[key].requires_grad_(False)
         if sensor is not None and self.renderer.axis is None:
-            raise SceneError("CaptureRenderer: a sensor takes transients; give time_axis= instead of another film.")
-        self.sensor = None if sensor is None else checked_module(sensor, self.renderer.axis)
+            raise ArgumentError("CaptureRenderer: a sensor takes transients; give time_axis= instead of another film.")
+        axis = self.renderer.axis
+        self.sensor = None if sensor is None or axis is None else checked_module(sensor, axis)
         self.says_black = True
         self._explained: str | None = None
         check_scan(self.renderer.scene, scan, self.renderer._options)
@@ -156,7 +157,7 @@ class CaptureRenderer(nn.Module):
         now = {key: {**self.renderer.values, **given}.get(key) for key in _points_of(self.scan)}
         if all(value is None for value in now.values()):
             return self.scan
-        changed: dict[str, torch.Tensor] = {}
+        changed: dict[str, Any] = {}
         for key, old in _points_of(self.scan).items():
             value = now[key]
             if value is not None and (value.numel() != old.numel() or not is_readable(value)):
@@ -175,7 +176,7 @@ class CaptureRenderer(nn.Module):
             return self.scan
 
 
-def _lasting(scan: Scan) -> dict[str, torch.Tensor | None]:
+def _lasting(scan: Scan) -> dict[str, Any]:
     """Normals of points that have moved: those of a flat wall, None elsewhere."""
     found = {"sensor_normals": scan.sensor_normals, "laser_normals": scan.laser_normals}
     flat = all(n is None or bool((n == n.reshape(-1, 3)[0]).all()) for n in found.values())
@@ -274,7 +275,7 @@ def as_capture(
         return None if tensor is None else in_scan_shape(tensor, scan)
 
     if out.gated is not None:
-        raise SceneError(
+        raise ArgumentError(
             "capture: expected a time axis or frequencies; a capture has no place for gates. Render its scene with "
             "tt.TransientRenderer(tt.nlos.capture_scene(...), gates=...)."
         )

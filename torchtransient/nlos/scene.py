@@ -16,9 +16,9 @@ from torchtransient.nlos import defaults
 from torchtransient.nlos.arguments import check_is_scan
 from torchtransient.nlos.mesh_file import mesh_file
 from torchtransient.quantities import shown
-from torchtransient.render.build import BuildOptions
-from torchtransient.render.scene_handle import load
-from torchtransient.render.variant import active_variant
+from torchtransient.rendering.build_options import BuildOptions
+from torchtransient.rendering.scene_handle import load
+from torchtransient.rendering.variant import active_variant
 
 # Names of a capture's own nodes: those of hidden things must be others.
 WALL, SENSOR, LASER = "wall", "sensor", "laser"
@@ -34,7 +34,7 @@ _LIGHTS = (
 
 
 def capture_scene(
-    hidden: Any, scan: Scan, bounces: Sequence[int] | str = defaults.BOUNCES, energy: Any = defaults.ENERGY
+    hidden: Any, scan: Scan, *, bounces: Sequence[int] | str = defaults.BOUNCES, energy: Any = defaults.ENERGY
 ) -> dict[str, Any]:
     """The scene dictionary of a capture; its film has one pixel for each sensor point and no time axis of its own yet.
 
@@ -126,7 +126,7 @@ def film_size(scan: Scan) -> tuple[int, int]:
 def laser_size(scan: Scan) -> tuple[int, int]:
     """(rows, columns) of the laser's positions, likewise; (1, 1) for a single spot."""
     shape = scan.laser_shape
-    return (shape[0], shape[1]) if len(shape) > 1 else (1, *shape) if shape else (1, 1)
+    return (shape[0], shape[1]) if len(shape) > 1 else (1, shape[0] if shape else 1)
 
 
 def _check_shapes(shapes: Mapping[str, Any]) -> None:

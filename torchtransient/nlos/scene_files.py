@@ -6,8 +6,9 @@ from pathlib import Path
 
 from torchtransient.errors import SceneError
 from torchtransient.files.content_key import contents_of
-from torchtransient.render.scene_handle import Scene
-from torchtransient.render.variant import active_variant
+from torchtransient.rendering.scene_handle import Scene
+from torchtransient.rendering.taken import ReadyScene
+from torchtransient.rendering.variant import active_variant
 
 
 def files_of(scene: Scene) -> dict[str, str]:
@@ -17,6 +18,8 @@ def files_of(scene: Scene) -> dict[str, str]:
     import mitsuba as mi
 
     description, found = scene._description, {}
+    description.check_described("tt.nlos: a simulation that is kept in files")
+    assert not isinstance(description, ReadyScene)  # refused above
     with active_variant(scene.variant), description.resolved_files():
         try:
             nodes = description.parse(mi.parser.ParserConfig(scene.variant)).nodes

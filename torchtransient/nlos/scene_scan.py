@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from torchtransient.capture import Scan
 from torchtransient.errors import SceneError, TorchTransientWarning
+from torchtransient.plugins.parameter_effect import class_of
 
 # Two points are one up to this part of the scan's size.
 SAME_POINT = 1e-3
@@ -52,7 +53,7 @@ def scan_of_scene(scene: Any, number: int = 0) -> Scan:
     integrator, sensor = scene.integrator(), scene.sensors()[number]
     if not hasattr(integrator, "capture"):
         raise SceneError(
-            f"simulate: expected a scene with the integrator transient_nlos_path, got {integrator.class_name()}. "
+            f"simulate: expected a scene with the integrator transient_nlos_path, got {class_of(integrator)}. "
             f"{_REMEDY}"
         )
     sensor, film = integrator.resolve(scene, sensor)
@@ -126,7 +127,7 @@ def _laser_ends(scene: Any, sensor: Any, integrator: Any) -> tuple[NDArray[np.fl
     laser = laser_of(scene)
     if laser.get_shape() is not None or mi.has_flag(laser.flags(), mi.EmitterFlags.Infinite):
         raise SceneError(
-            f"simulate: expected a laser whose beam falls on a spot, got the emitter {laser.class_name()}. Use "
+            f"simulate: expected a laser whose beam falls on a spot, got the emitter {class_of(laser)}. Use "
             f"laser_beam, projector or spot. {_REMEDY}"
         )
     fov = None
@@ -148,7 +149,7 @@ def _ends(scene: Any, ray: Any) -> Ends:
         # A surface without a back side scatters nothing to those behind it.
         behind = si.is_valid() & (si.wi.z < 0) & ~mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.BackSide)
         normals = dr.select(si.wi.z < 0, -si.n, si.n)
-        shapes = [shape.id() or shape.class_name() for shape in scene.shapes()]
+        shapes = [shape.id() or class_of(shape) for shape in scene.shapes()]
         addresses = {shape.ptr: name for shape, name in zip(scene.shapes(), shapes, strict=True)}
         dr.eval(si, behind, normals)
     valid = np.array(si.is_valid())
@@ -238,7 +239,7 @@ def _check_all_meet(spots: Ends) -> None:
 def _check_hidden(scene: Any, wall: Ends) -> None:
     """Raise SceneError unless a shape that rays do not meet reaches before the wall."""
     seen = set(wall.shapes)
-    hidden = [shape for shape in scene.shapes() if (shape.id() or shape.class_name()) not in seen]
+    hidden = [shape for shape in scene.shapes() if (shape.id() or class_of(shape)) not in seen]
     if not hidden:
         raise SceneError(
             "hidden: expected at least one shape beside the wall, got none: a capture around a corner of nothing. Add "
@@ -274,7 +275,7 @@ def _check_areas(shapes: list[Any]) -> None:
     areas = {}
     for shape in shapes:
         try:
-            areas[shape.id() or shape.class_name()] = float(np.array(shape.surface_area()).reshape(-1)[0])
+            areas[shape.id() or class_of(shape)] = float(np.array(shape.surface_area()).reshape(-1)[0])
         except RuntimeError:
             return  # of shapes that do not know theirs, such as copies of groups
     told = ", ".join(f"{name!r} ({area:.3g} m^2)" for name, area in areas.items())

@@ -12,7 +12,7 @@ from torchtransient.files.yaml_files import read_yaml
 from torchtransient.nlos.description import read_description
 from torchtransient.nlos.scene import ALL_BOUNCES
 from torchtransient.nlos.tal_yaml import TalSettings, read_tal_yaml
-from torchtransient.render.scene_handle import load
+from torchtransient.rendering.scene_handle import load
 
 # Bounces of light that goes from spot to scan point, and around one corner.
 _WALL_TO_WALL, _AROUND_A_CORNER = 2, 3

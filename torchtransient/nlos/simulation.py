@@ -22,7 +22,7 @@ import torch
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.errors import SceneError
+from torchtransient.errors import ArgumentError
 from torchtransient.files.array_file import path_of
 from torchtransient.nlos import defaults
 from torchtransient.nlos.answers import checked_module, measured, say_black
@@ -34,8 +34,9 @@ from torchtransient.nlos.renderer import in_film_shape, in_scan_shape
 from torchtransient.nlos.scene import capture_scene, hidden_bounds
 from torchtransient.nlos.variant_choice import choose_variant
 from torchtransient.nlos.work import Film, HiddenWork, SceneWork, Work, seed_of
-from torchtransient.render.scene_handle import Scene, load
-from torchtransient.render.variant import active_variant
+from torchtransient.quantities import Numbers
+from torchtransient.rendering.scene_handle import Scene, load
+from torchtransient.rendering.variant import active_variant
 from torchtransient.sensing import Device
 
 
@@ -44,7 +45,7 @@ def simulate(
     scan: Scan | None = None,
     *,
     time_axis: TimeAxis | None = None,
-    frequencies: FrequencyAxis | Sequence[float] | None = None,
+    frequencies: FrequencyAxis | Numbers | None = None,
     spp: int | None = None,
     bounces: Sequence[int] | str | None = None,
     energy: Any = None,
@@ -83,17 +84,18 @@ def simulate(
     ``metadata``: ``spp``, ``seed``, ``seconds`` of rendering, ``variant`` with ``variant_reason``, ``light`` (how which
     light was found), ``parts``.
 
-    Raises SceneError, ShapeError, UnitError and VariantError for what cannot be simulated; StorageError where the
-    capture does not fit into memory or the disk is full, and for a part file that belongs to another simulation, is
-    damaged, or is worked on by another process.
+    Raises ArgumentError, SceneError, ShapeError, UnitError and VariantError for what cannot be simulated; StorageError
+    where the capture does not fit into memory or the disk is full, and for a part file that belongs to another
+    simulation, is damaged, or is worked on by another process.
     """
     seed, path = checked_seed("simulate", seed), _part_path(part)
     check_sensor("simulate", sensor, generator)
     work = _work(hidden, scan, time_axis, frequencies, spp, (bounces, energy), variant, _parts(scan, path, tiles))
     if sensor is not None and work.axes()[0] is None:
-        raise SceneError("simulate: a sensor takes transients, and phasors are asked for; leave out one of them.")
+        raise ArgumentError("simulate: a sensor takes transients, and phasors are asked for; leave out one of them.")
     # Counts as they are drawn: nothing of a simulation has gradients.
-    chain = None if sensor is None else checked_module(sensor, work.axes()[0], "straight_through")
+    axis = work.axes()[0]
+    chain = None if sensor is None or axis is None else checked_module(sensor, axis, "straight_through")
     with _part_file(path, work, seed) as kept, active_variant(work.variant.name), torch.no_grad():
         finished = kept is not None and all(_has(kept, work, number) for number in range(work.count))
         forecast = forecast_of(work, timed=progress and not finished)
@@ -122,13 +124,16 @@ def forecast(
     there.
     """
     checked_seed("forecast", settings.get("seed", defaults.SEED))
-    given = {name: settings.pop(name, None) for name in ("time_axis", "frequencies", "spp", "bounces", "energy")}
+    time_axis, frequencies, spp, *of_light = (
+        settings.pop(name, None) for name in ("time_axis", "frequencies", "spp", "bounces", "energy")
+    )
     unknown = sorted(set(settings) - {"seed", "sensor", "keep_part", "progress", "generator"})
     if unknown:
-        raise SceneError(f"forecast: expected the arguments of simulate, got {', '.join(unknown)}.")
-    of_light = given.pop("bounces"), given.pop("energy")
+        raise ArgumentError(f"forecast: expected the arguments of simulate, got {', '.join(unknown)}.")
     path = _part_path(part)
-    work = _work(hidden, scan, *given.values(), of_light, variant, _parts(scan, path, tiles))
+    work = _work(
+        hidden, scan, time_axis, frequencies, spp, (of_light[0], of_light[1]), variant, _parts(scan, path, tiles)
+    )
     with active_variant(work.variant.name):
         return forecast_of(work, timed=True)
 
@@ -141,18 +146,18 @@ def _work(
     variant: str | None, parts: int,
 ) -> Work:  # fmt: skip
     if time_axis is not None and frequencies is not None:
-        raise SceneError("simulate: expected time_axis or frequencies, got both. Leave out one of them.")
+        raise ArgumentError("simulate: expected time_axis or frequencies, got both. Leave out one of them.")
     spp = checked_samples("simulate", spp)
     if scan is None:
         return _scene_work(hidden, time_axis, frequencies, spp, of_light, variant, parts)
     check_is_scan("simulate", scan)
     if isinstance(hidden, Scene):
-        raise SceneError(
+        raise ArgumentError(
             "simulate: a tt.Scene has a sensor of its own; expected hidden shapes beside scan=. Leave scan out to "
             "simulate the scene as it is, or give shapes by name."
         )
     bounces, energy = of_light
-    settings = {
+    settings: dict[str, Any] = {
         "bounces": defaults.BOUNCES if bounces is None else bounces,
         "energy": defaults.ENERGY if energy is None else energy,
     }
@@ -172,17 +177,17 @@ def _scene_work(
         ("bounces", "energy"), of_light, ("its integrator's max_depth and filter_bounces", "its laser"), strict=True
     ):
         if value is not None:
-            raise SceneError(
+            raise ArgumentError(
                 f"simulate: {name} has no effect on a complete scene: {where} say so. Leave it out, or give scan= and "
                 "hidden shapes."
             )
     if isinstance(scene, Mapping) and not _is_complete(scene):
-        raise SceneError(
+        raise ArgumentError(
             "simulate: expected scan= beside hidden shapes, or a complete scene with integrator, laser and sensor, got "
             f"{', '.join(map(str, scene)) or 'nothing'} and no scan. Make one with tt.nlos.Scan.grid(wall, ...)."
         )
     if not isinstance(scene, str | os.PathLike | Mapping | Scene):
-        raise SceneError(
+        raise ArgumentError(
             f"simulate: expected scan= beside a mesh, or a complete scene, got {type(scene).__name__} and no scan."
         )
     loaded = load(scene)

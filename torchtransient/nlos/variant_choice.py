@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torchtransient.render.plan import inventory_of
-from torchtransient.render.plan_choices import some
-from torchtransient.render.scene_handle import Scene, load
-from torchtransient.render.variant import is_differentiable, resolve_variant
+from torchtransient.rendering.plan import inventory_of
+from torchtransient.rendering.plan_choices import some
+from torchtransient.rendering.scene_handle import Scene, load
+from torchtransient.rendering.variant import is_differentiable, resolve_variant
 
 
 @dataclass(frozen=True)

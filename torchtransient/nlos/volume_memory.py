@@ -13,7 +13,7 @@ from torchtransient.errors import StorageError
 from torchtransient.nlos.forecast import size as size_in_words
 from torchtransient.quantities import count
 from torchtransient.reconstruction import VoxelGrid
-from torchtransient.render.memory import available_bytes
+from torchtransient.rendering.memory import available_bytes
 from torchtransient.volume_methods import METHODS
 
 # Planes whose points backprojection holds at once: filters run over all rows once for each such pass. Bytes of a
@@ -32,7 +32,8 @@ def check_volume_fits(name: str, capture: Capture, grid: VoxelGrid | None, optio
     if light.device.type == "meta" or available is None or needed <= available:
         return
     if grid is not None:
-        size, way = grid.shape, "Take fewer voxels or depths"
+        size: tuple[int, ...] = grid.shape
+        way = "Take fewer voxels or depths"
     else:
         size, way = tuple(light.shape[-3:]), "Crop the capture, add up bins, or take fewer points"
     sizes = " x ".join(map(str, size))

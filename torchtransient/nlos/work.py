@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,9 +17,10 @@ from torchtransient.nlos.scene import capture_scene
 from torchtransient.nlos.scene_files import files_of
 from torchtransient.nlos.scene_scan import scan_of_scene
 from torchtransient.nlos.variant_choice import VariantChoice
-from torchtransient.render.renderer import TransientRenderer
-from torchtransient.render.scene_handle import Scene, load
-from torchtransient.render.variant import active_variant
+from torchtransient.quantities import Numbers
+from torchtransient.rendering.renderer import TransientRenderer
+from torchtransient.rendering.scene_handle import Scene, load
+from torchtransient.rendering.variant import active_variant
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Film:
     """What is measured: ``time_axis`` or ``frequencies``, and how well: ``spp``."""
 
     time_axis: TimeAxis | None
-    frequencies: FrequencyAxis | Sequence[float] | None
+    frequencies: FrequencyAxis | Numbers | None
     spp: int
 
 
@@ -80,7 +80,8 @@ class HiddenWork:
         """A part as a capture: of a list of points where there are several parts."""
         first, last = self._runs[number]
         values = {} if self.count == 1 else {POINTS: self._points[first:last]}
-        return self._of(number)(values, seed=seed, spp=spp, progress=progress)
+        capture: Capture = self._of(number)(values, seed=seed, spp=spp, progress=progress)
+        return capture
 
     def _of(self, number: int) -> CaptureRenderer:
         first, last = self._runs[number]

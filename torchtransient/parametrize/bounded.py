@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchtransient.argument_names import own_init
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import floating, holds, number_tensor, without_autocast
 from torchtransient.parametrize.settings import Settings
@@ -41,7 +42,7 @@ def _between(x: Tensor, low: Bound, high: Bound, where: str) -> Tensor:
 
 
 @without_autocast
-def bounded_inverse(value: Tensor, low: Bound = 0.0, high: Bound = 1.0, margin: float | None = None) -> Tensor:
+def bounded_inverse(value: Tensor, low: Bound = 0.0, high: Bound = 1.0, *, margin: float | None = None) -> Tensor:
     """The `x` of which `bounded` makes `value`.
 
     At the bounds themselves there is none: UnitError, unless `margin` says how near a value may come to them, as a
@@ -116,6 +117,7 @@ class Bounded(Settings):
         return f"{_said(self.low)} to {_said(self.high)}"
 
 
+@own_init
 class Albedo(Bounded):
     """Shares of the light, 0 to 1: reflectances, transmittances, albedos of media, opacities, weights of lobes."""
 

@@ -14,10 +14,12 @@ import torch
 from torch import nn
 from torch.nn.utils import parametrize
 
+from torchtransient.scalar_state import ScalarState
+
 _CONTAINERS = ("_parameters", "_buffers", "_modules")
 
 
-class CopiesParametrized(nn.Module):
+class CopiesParametrized(ScalarState):
     """A module whose copies and pickles keep their parametrizations, each with a class of its own. Modules inherit from
     it in place of `nn.Module`, or are given their parametrizations by `register`.
 

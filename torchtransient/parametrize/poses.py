@@ -15,7 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.argument_names import own_init
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.floating import floating, holds, number_tensor, single, without_autocast
 from torchtransient.parametrize.settings import Settings, choice_code, choice_of
 from torchtransient.quantities import positive, real_array, shown
@@ -87,21 +88,21 @@ class _RigidPose(Settings):
     """A rigid motion of a base matrix. Subclasses say how six numbers make one."""
 
     base: Tensor
-    centre: Tensor
+    center: Tensor
     length_scale: Tensor
 
     def __init__(
-        self, base: Any = None, about: Any = "self", frame: Frame = "world", length_scale: float = 1.0
+        self, base: Any = None, *, about: Any = "self", frame: Frame = "world", length_scale: float = 1.0
     ) -> None:
         super().__init__()
         name = type(self).__name__
         if frame not in _FRAMES:
-            raise SceneError(f"{name}: expected frame 'world' or 'local', got {shown(frame)}.")
+            raise ArgumentError(f"{name}: expected frame 'world' or 'local', got {shown(frame)}.")
         matrix = torch.eye(4) if base is None else _matrices(base, name)
         self.frame: str = frame
         self._keep("length_scale", positive(f"{name}: length_scale", length_scale))
         self._keep("base", matrix)
-        self._keep("centre", _centre(about, self.base, frame, name))
+        self._keep("center", _centre(about, self.base, frame, name))
 
     _kind: str
     _to_matrix: Callable[[Tensor], Tensor]
@@ -111,7 +112,7 @@ class _RigidPose(Settings):
     def forward(self, x: Tensor) -> Tensor:
         name = type(self).__name__
         exact = single(_six(x, name))
-        base, centre, unit = (one.to(exact) for one in (self.base, self.centre, self.length_scale))
+        base, centre, unit = (one.to(exact) for one in (self.base, self.center, self.length_scale))
         delta = type(self)._to_matrix(torch.cat([exact[..., :3], unit * exact[..., 3:]], -1))
         rotation = delta[..., :3, :3]
         try:
@@ -131,7 +132,7 @@ class _RigidPose(Settings):
         """
         name = type(self).__name__
         matrix = _four_by_four(pose, name).to(torch.float64)
-        base, centre = self.base.to(matrix.device), self.centre.to(matrix.device)
+        base, centre = self.base.to(matrix.device), self.center.to(matrix.device)
         inverse = torch.linalg.inv(base)
         try:
             motion = matrix @ inverse if self.frame == "world" else inverse @ matrix
@@ -164,6 +165,7 @@ class _RigidPose(Settings):
         return f"frame={self.frame!r}, length_scale={self.length_scale.item():g}"
 
 
+@own_init
 class AxisAnglePose(_RigidPose):
     """Six numbers to `to_world` (..., 4, 4): `base`, turned about a point by an axis-angle vector, then moved.
 
@@ -184,6 +186,7 @@ class AxisAnglePose(_RigidPose):
     _from_matrix = staticmethod(_axis_angle_of)
 
 
+@own_init
 class SE3Pose(_RigidPose):
     """As `AxisAnglePose`, by the exponential of SE(3): turn and move at once along a screw. To first order the same;
     the six numbers are then coordinates of one motion, for Lie-algebra optimisers and interpolation of poses.
@@ -280,7 +283,7 @@ def _centre(about: Any, base: Tensor, frame: Frame, where: str) -> Tensor:
     """The point that stays: in the world, or before the base."""
     if isinstance(about, str):
         if about not in ("self", "world"):
-            raise SceneError(f"{where}: expected about='self', 'world' or a point [x, y, z], got {about!r}.")
+            raise ArgumentError(f"{where}: expected about='self', 'world' or a point [x, y, z], got {about!r}.")
         if about == "self":
             return base[..., :3, 3] if frame == "world" else torch.zeros_like(base[..., :3, 3])
         point = base.new_zeros(3)

@@ -18,7 +18,7 @@ _FUNCTIONS: tuple[str, ...] = get_args(PositiveFunction)
 
 
 @without_autocast
-def positive(x: Tensor, low: float = 0.0, scale: float = 1.0, function: PositiveFunction = "softplus") -> Tensor:
+def positive(x: Tensor, *, low: float = 0.0, scale: float = 1.0, function: PositiveFunction = "softplus") -> Tensor:
     """`low + scale * log(1 + exp(x))`, or of `function="exp"` `low + scale * exp(x)`.
 
     Above `low`, of any real `x`, as far as the precision of `x` has numbers: `low` itself where it has none in between
@@ -38,7 +38,7 @@ def _above(x: Tensor, base: float | Tensor, unit: float | Tensor, function: str)
 
 @without_autocast
 def positive_inverse(
-    value: Tensor, low: float = 0.0, scale: float = 1.0, function: PositiveFunction = "softplus"
+    value: Tensor, *, low: float = 0.0, scale: float = 1.0, function: PositiveFunction = "softplus"
 ) -> Tensor:
     """The `x` of which `positive` makes `value`. Raises UnitError for values that are not finite and above `low`."""
     where = "positive_inverse"

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
-from torchtransient.errors import SceneError, ShapeError, TorchTransientError, UnknownKeyError
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, TorchTransientError, UnknownKeyError
 from torchtransient.floating import without_autocast
 from torchtransient.parametrize.bounded import Roughness
 from torchtransient.parametrize.copies import let_copy
@@ -32,7 +32,7 @@ def register(module: nn.Module, key: str, parametrization: nn.Module) -> nn.Modu
     of `right_inverse`, ShapeError where it does not fit, and SceneError for a `Roughness` of principled materials.
     """
     if not isinstance(parametrization, nn.Module):
-        raise SceneError(
+        raise ArgumentError(
             f"register: expected a parametrization, an nn.Module, got {type(parametrization).__name__}; "
             "tt.parametrize.Albedo() for instance."
         )
@@ -143,7 +143,7 @@ def _parametrized(module: nn.Module, key: str) -> tuple[nn.Module, str]:
 def _place(module: nn.Module, key: str) -> tuple[nn.Module, str]:
     """The module that holds the parameter of a key, and its name there."""
     if not isinstance(module, nn.Module):
-        raise SceneError(f"expected a module with parameters, an nn.Module, got {shown(module)}.")
+        raise ArgumentError(f"expected a module with parameters, an nn.Module, got {shown(module)}.")
     if not isinstance(key, str):
         raise UnknownKeyError(f"expected the key of a parameter as a text, got {shown(key)}.")
     # Torch forbids dots in names: renderers have slashes for them.
@@ -159,7 +159,7 @@ def _place(module: nn.Module, key: str) -> tuple[nn.Module, str]:
     found = [one for one in module.modules() if _has(one, name)]
     if len(found) == 1:
         return found[0], name
-    known = sorted({n for n, _ in module.named_parameters()})
+    known = sorted({n.replace("/", ".") for n, _ in module.named_parameters()})  # as keys are written
     there = f"there are {', '.join(known[:8])}{' ...' if len(known) > 8 else ''}" if known else "it has none"
     what = "has no parameter" if not found else "has several modules with a parameter"
     who = parametrize.type_before_parametrizations(module).__name__

@@ -5,12 +5,13 @@ from __future__ import annotations
 from typing import Any, Self
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchtransient.errors import SceneError
+from torchtransient.scalar_state import ScalarState
 
 
-class Settings(nn.Module):
+class Settings(ScalarState):
     """Base of parametrizations. Numbers that the value depends on are buffers of `state_dict`, so that loading a state
     brings the value back; they stay in double precision when the module is made half.
     """

@@ -49,6 +49,7 @@ from torchtransient._llvm import ensure_llvm
 from torchtransient.errors import PluginRegistrationError, TorchTransientError
 from torchtransient.interfaces import missing_members
 from torchtransient.plugins._compat import active_variant, is_jit, require_jit_variant
+from torchtransient.plugins.tested_versions import warn_of_untested
 
 KINDS = (
     "bsdf", "emitter", "film", "integrator", "medium", "phase", "rfilter", "sampler", "sensor", "shape", "texture",
@@ -87,6 +88,7 @@ PLUGIN_MODULES: tuple[PluginModule, ...] = (
     PluginModule("torchtransient.plugins.bsdfs.dielectric", (("bsdf", "diff_dielectric"),)),
     PluginModule("torchtransient.plugins.bsdfs.plastic", (("bsdf", "diff_plastic"),)),
     PluginModule("torchtransient.plugins.bsdfs.delayed", (("bsdf", "delayed"),)),
+    PluginModule("torchtransient.plugins.bsdfs.retroreflector", (("bsdf", "retroreflector"),)),
     PluginModule("torchtransient.plugins.bsdfs.rough_dielectric", (("bsdf", "diff_rough_dielectric"),)),
     PluginModule("torchtransient.plugins.bsdfs.rough_plastic", (("bsdf", "diff_rough_plastic"),)),
     PluginModule(
@@ -113,7 +115,7 @@ class _State:
     constructors: dict[tuple[str, str], Callable[..., object]] = field(default_factory=dict)
     owner: dict[tuple[str, str], str] = field(default_factory=dict)
     loading: str | None = None  # the module that is being executed
-    raised: list[TorchTransientError] = field(default_factory=list)  # by plugin constructors, see plugin_errors()
+    raised: list[BaseException] = field(default_factory=list)  # by plugin constructors, see plugin_errors()
 
 
 _state = _State()
@@ -228,6 +230,7 @@ def sync() -> str | None:
             return None
         if variant.startswith("llvm_"):
             ensure_llvm()  # a bad LLVM would end the process at the first kernel
+        warn_of_untested()
         if _state.variant != variant:
             _load_all(variant)
         else:
@@ -251,7 +254,8 @@ def attach() -> None:
 
 @contextlib.contextmanager
 def plugin_errors() -> Iterator[None]:
-    """Raise the typed error of a plugin's constructor instead of the RuntimeError that Mitsuba makes of it.
+    """Raise the typed error of a plugin's constructor, or what has interrupted it, instead of the RuntimeError that
+    Mitsuba makes of it.
 
     Use it around `mi.load_dict` and `mi.load_file`.
     """
@@ -336,11 +340,11 @@ def _keeping_errors(constructor: Callable[..., object]) -> Callable[[object], ob
     def construct(props: object) -> object:
         try:
             return constructor(props)
-        except Exception as error:
+        except BaseException as error:
             # Whoever keeps the error would keep the half-made plugin alive: Dr.Jit's registry would hand it to every
             # later virtual call of the variant.
             traceback.clear_frames(error.__traceback__)
-            if isinstance(error, TorchTransientError):
+            if isinstance(error, TorchTransientError) or not isinstance(error, Exception):
                 _state.raised.append(error)
             raise
 

@@ -1,7 +1,7 @@
 """What the pixels of a sensor look at: one ray through each pixel's centre, and what is known of the surface it meets.
 
-A :class:`LabelJob` has what :class:`~torchtransient.render.recordings.Recordings` asks of a job, so that it is recorded
-as renders are. Nothing here has derivatives.
+A :class:`LabelJob` has what :class:`~torchtransient.rendering.recordings.Recordings` asks of a job, so that it is
+recorded as renders are. Nothing here has derivatives.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from torchtransient.plugins.frozen_state import says_it_can_be_recorded, state_b
 from torchtransient.plugins.integrators.seen_scene import SeenScene
 from torchtransient.plugins.mitsuba_compat import has_surface, is_distant, is_instance, near_clip
 from torchtransient.plugins.node_walk import shapes_of_scene
+from torchtransient.plugins.parameter_effect import class_of
 from torchtransient.plugins.pointer_table import PointerTable
 from torchtransient.plugins.sensors.origin import length_to_sensor_origin, sensors_of, views
 
@@ -81,15 +82,15 @@ class LabelTables:
 def check_sensor(sensor: Any, names: tuple[str, ...]) -> None:
     """Raise ``SceneError`` where a pixel of a sensor is no direction, or there is no axis to measure along."""
     for one in sensors_of(sensor):
-        if is_distant(one) or one.class_name() == "IrradianceMeter":
+        if is_distant(one) or class_of(one) == "IrradianceMeter":
             raise SceneError(
-                f"labels: each sample of the sensor {one.id()!r} ({one.class_name()}) looks along a line of its own: "
+                f"labels: each sample of the sensor {one.id()!r} ({class_of(one)}) looks along a line of its own: "
                 "its pixels look at nothing in particular. Use a perspective, thinlens, orthographic, radiancemeter or "
                 "nlos_capture_meter sensor, or a batch of such."
             )
         if "z_depth" in names and not _has_axis(one):
             raise SceneError(
-                f"z_depth: the sensor {one.id()!r} ({one.class_name()}) has no optical axis; ask for 'depth', the "
+                f"z_depth: the sensor {one.id()!r} ({class_of(one)}) has no optical axis; ask for 'depth', the "
                 "distance from its origin."
             )
 

@@ -29,6 +29,7 @@ from torchtransient.plugins.bsdfs.inherited import hides_lobe_probability
 from torchtransient.plugins.bsdfs.wrapper_copy import can_be_rebuilt, flags_of, rebuild_wrapper
 from torchtransient.plugins.mitsuba_compat import adds_up_wrongly, weight_slot
 from torchtransient.plugins.node_walk import bsdfs_below, objects_below, objects_of, shown_by
+from torchtransient.plugins.parameter_effect import class_of
 from torchtransient.plugins.pointer_table import PointerTable, registry_number
 from torchtransient.plugins.texture_uses import numbers_below
 
@@ -152,7 +153,7 @@ class Seal:
     )
 
     def _names(self, mixture: Any) -> str:
-        return f"{type(self.node).__name__} '{self.node.id()}' holds {mixture.class_name()} '{mixture.id()}'"
+        return f"{type(self.node).__name__} '{self.node.id()}' holds {class_of(mixture)} '{mixture.id()}'"
 
     def check(self, wanted: Any) -> None:
         """Raise GradientError where derivatives need the mixture taken apart; asked with gradients enabled."""

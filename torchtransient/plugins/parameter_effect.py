@@ -132,6 +132,11 @@ def lineage(node: Any) -> tuple[str, ...]:
     return tuple(names if own in names else [own, *names])
 
 
+def class_of(node: Any) -> str:
+    """The name of a plugin's class, for messages: of one in Python its own."""
+    return lineage(node)[0]
+
+
 def matching_effect(site: Site) -> ParameterEffect:
     """The effect of the row that counts for a parameter."""
     for name in lineage(site.node):

@@ -22,7 +22,7 @@ from torchtransient.plugins.node_walk import ShownValue, objects_of, owners_of, 
 from torchtransient.plugins.parameter_effect import CORRECT as CORRECT
 from torchtransient.plugins.parameter_effect import SILHOUETTES as SILHOUETTES
 from torchtransient.plugins.parameter_effect import ParameterEffect as ParameterEffect
-from torchtransient.plugins.parameter_effect import Site, matching_effect
+from torchtransient.plugins.parameter_effect import Site, class_of, matching_effect
 from torchtransient.plugins.swept_parameters import location_of
 
 
@@ -38,7 +38,7 @@ def effect_of(node: Any, key: str, flags: int = 0, owners: Sequence[tuple[Any, s
     if flags & int(mi.ParamFlags.ReadOnly):
         return replace(effect, supported=False, reason="read-only in Mitsuba")
     if flags & int(mi.ParamFlags.NonDifferentiable) and not effect.trusted:
-        reason = f"Mitsuba marks it as not differentiable ({node.class_name()})"
+        reason = f"Mitsuba marks it as not differentiable ({class_of(node)})"
         return replace(effect, supported=False, reason=reason)
     if effect.reason == CORRECT and site.key in ("value", "data") and keeps_coefficients(node):
         reason = f"{CORRECT}; the numbers are coefficients of Mitsuba's spectral model, not a colour"

@@ -59,7 +59,7 @@ _OF_BSDFS = {
     **dict.fromkeys(
         (
             "metallic", "spec_trans", "spec_tint", "sheen_tint", "clearcoat", "clearcoat_gloss", "anisotropic",
-            "flatness",
+            "flatness", "share",
         ),
         WEIGHT,
     ),

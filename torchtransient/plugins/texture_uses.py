@@ -27,6 +27,7 @@ from torchtransient.plugins.mitsuba_compat import (
 )
 from torchtransient.plugins.mitsuba_parameters import VERTICES
 from torchtransient.plugins.node_walk import objects_below, objects_of, shown_by
+from torchtransient.plugins.parameter_effect import class_of
 
 
 def numbers_below(node: Any, shapes: Sequence[Any]) -> Iterator[Any]:
@@ -164,4 +165,4 @@ def _check_radiance(emitter: Any) -> None:
 
 
 def _named(texture: Any) -> str:
-    return f"{texture.class_name()} {texture.id()!r}" if texture.id() else str(texture.class_name())
+    return f"{class_of(texture)} {texture.id()!r}" if texture.id() else class_of(texture)

@@ -5,8 +5,8 @@ from torchtransient.reconstruction.backprojection import backproject as backproj
 from torchtransient.reconstruction.cameras import ConfocalCamera as ConfocalCamera
 from torchtransient.reconstruction.cameras import DirectLight as DirectLight
 from torchtransient.reconstruction.cameras import TransientCamera as TransientCamera
-from torchtransient.reconstruction.capture_roots import StabilisedRoot as StabilisedRoot
-from torchtransient.reconstruction.capture_roots import stabilised_root as stabilised_root
+from torchtransient.reconstruction.capture_roots import StabilizedRoot as StabilizedRoot
+from torchtransient.reconstruction.capture_roots import stabilized_root as stabilized_root
 from torchtransient.reconstruction.diffusion import DiffusionDeconvolution as DiffusionDeconvolution
 from torchtransient.reconstruction.directional_lct import DirectionalLCT as DirectionalLCT
 from torchtransient.reconstruction.directional_lct import directional_lct as directional_lct

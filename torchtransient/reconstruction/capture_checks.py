@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Collection
 from typing import Any
 
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.quantities import positive, shown, with_article
 from torchtransient.reconstruction.linear import PRECISIONS
 from torchtransient.reconstruction.planar_scan import PlanarScan, check_real
@@ -39,17 +40,17 @@ def within(name: str, value: Any, low: float, high: float) -> float:
 
 
 def one_of(name: str, value: Any, options: Collection[Any]) -> Any:
-    """``value`` where it equals one of ``options``, texts or whole numbers. Raises SceneError for others."""
+    """``value`` where it equals one of ``options``, texts or whole numbers. Raises ArgumentError for others."""
     for option in options:
         if isinstance(value, str | int | np.integer) and not isinstance(value, bool) and value == option:
             return option
-    raise SceneError(f"{name}: expected one of {', '.join(map(str, options))}, got {shown(value)}.")
+    raise ArgumentError(f"{name}: expected one of {', '.join(map(str, options))}, got {shown(value)}.")
 
 
 def checked_axis(time_axis: TimeAxis, who: str) -> TimeAxis:
     """A time axis. Raises ShapeError for anything else."""
     if not isinstance(time_axis, TimeAxis):
-        raise ShapeError(f"{who}: expected time_axis as a tt.TimeAxis, got {shown(time_axis)}.")
+        raise ArgumentError(f"{who}: expected time_axis as a tt.TimeAxis, got {shown(time_axis)}.")
     return time_axis
 
 
@@ -111,10 +112,21 @@ def refuse_legs(scan: Scan, who: str) -> None:
         )
 
 
+def not_a_capture(given: object) -> str:
+    """What to do where a capture is asked for and something else came."""
+    if isinstance(given, (str, os.PathLike)):
+        do = " tt.nlos.Capture.read reads files."
+    elif isinstance(given, Tensor):
+        do = " tt.nlos.Capture(transient, axis, scan) makes one; operators such as tt.nlos.FK take tensors."
+    else:
+        do = ""
+    return f"expected a tt.nlos.Capture, got {shown(given)}.{do}"
+
+
 def checked_capture(capture: Capture, who: str) -> tuple[Tensor, TimeAxis]:
     """Transient and axis of a capture. Raises ShapeError for what is none, or has none."""
     if not isinstance(capture, Capture):
-        raise ShapeError(f"{who}: expected a tt.nlos.Capture, got {shown(capture)}. Tensors go to an operator.")
+        raise ShapeError(f"{who}: {not_a_capture(capture)}")
     if capture.transient is None or capture.axis is None:
         raise ShapeError(f"{who}: expected a capture with a transient, got phasors alone.")
     return capture.transient, capture.axis

@@ -16,7 +16,7 @@ COUNTS_FLOOR = 0.25
 """Floor for photon counts: the slope is at most 2, the root of one count 0.89, that of none zero."""
 
 
-def stabilised_root(transient: Tensor, floor: float = COUNTS_FLOOR) -> Tensor:
+def stabilized_root(transient: Tensor, floor: float = COUNTS_FLOOR) -> Tensor:
     """``H / sqrt(|H| + floor)`` of every value, odd in H: what background leaves below zero keeps its sign.
 
     ``floor``: in the unit of the transient, 1/4 for photon counts; a small part of the brightest bin for radiance. With
@@ -27,7 +27,7 @@ def stabilised_root(transient: Tensor, floor: float = COUNTS_FLOOR) -> Tensor:
     """
     if not isinstance(transient, Tensor) or transient.is_complex():
         got = transient.dtype if isinstance(transient, Tensor) else shown(transient)
-        raise ShapeError(f"stabilised_root: expected a transient as a tensor of real numbers, got {got}.")
+        raise ShapeError(f"stabilized_root: expected a transient as a tensor of real numbers, got {got}.")
     h = transient if transient.is_floating_point() else transient.to(torch.float32)
     floor = checked_floor(floor, h.dtype)
     if floor:
@@ -38,29 +38,29 @@ def stabilised_root(transient: Tensor, floor: float = COUNTS_FLOOR) -> Tensor:
     return torch.where(empty, torch.zeros_like(h), torch.sign(h) * magnitude.sqrt())
 
 
-class StabilisedRoot(nn.Module):
-    """:func:`stabilised_root` as a layer."""
+class StabilizedRoot(nn.Module):
+    """:func:`stabilized_root` as a layer."""
 
     def __init__(self, floor: float = COUNTS_FLOOR) -> None:
         super().__init__()
         self.floor = checked_floor(floor)
 
     def forward(self, transient: Tensor) -> Tensor:
-        return stabilised_root(transient, self.floor)
+        return stabilized_root(transient, self.floor)
 
     def extra_repr(self) -> str:
         return f"floor={self.floor:g}"
 
 
 def checked_floor(value: float, dtype: torch.dtype = torch.float64) -> float:
-    """A floor of :func:`stabilised_root` in a precision. Raises UnitError."""
-    floor = finite("stabilised_root: floor", value)
+    """A floor of :func:`stabilized_root` in a precision. Raises UnitError."""
+    floor = finite("stabilized_root: floor", value)
     if floor < 0:
-        raise UnitError(f"stabilised_root: expected a floor of zero or more, got {floor!r}. For counts take 0.25.")
+        raise UnitError(f"stabilized_root: expected a floor of zero or more, got {floor!r}. For counts take 0.25.")
     # Smaller ones vanish or have few digits, and empty bins would be zero over zero.
     if 0 < floor < (least := torch.finfo(dtype).tiny):
         raise UnitError(
-            f"stabilised_root: expected a floor of zero or of {least:.3g} at least in {dtype}, got {floor!r}. Scale "
+            f"stabilized_root: expected a floor of zero or of {least:.3g} at least in {dtype}, got {floor!r}. Scale "
             "the transient, or take double precision."
         )
     return floor

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.errors import ShapeError
+from torchtransient.errors import ArgumentError
 from torchtransient.quantities import shown
 from torchtransient.reconstruction.capture_checks import checked_axis
 from torchtransient.reconstruction.ellipsoids import EllipsoidOperator, Group
@@ -53,7 +53,7 @@ class FilteredBackprojection(EllipsoidOperator):
         dtype: torch.dtype = torch.float32,
     ) -> None:
         if not callable(getattr(filter, "rows_adjoint", None)):
-            raise ShapeError(
+            raise ArgumentError(
                 f"FilteredBackprojection: expected filter as a PhasorFilter or a LaplacianFilter, got {shown(filter)}."
             )
         width = checked_axis(time_axis, "FilteredBackprojection").bin_width_opl

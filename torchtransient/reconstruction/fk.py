@@ -27,7 +27,7 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.reconstruction.capture_checks import one_of
-from torchtransient.reconstruction.capture_roots import checked_floor, stabilised_root
+from torchtransient.reconstruction.capture_roots import checked_floor, stabilized_root
 from torchtransient.reconstruction.confocal_operator import ConfocalOperator, chunk_rows
 from torchtransient.reconstruction.linear import each
 from torchtransient.reconstruction.planar_scan import PlanarScan
@@ -47,7 +47,7 @@ class FK(ConfocalOperator):
 
     ``target``: "diffuse", light falls with the fourth power of the distance and psi = z sqrt(H), or "retroreflective",
     with the second and psi = sqrt(H), where z is half the optical path length. ``floor``: of the root, see
-    :func:`stabilised_root`, in the unit of the transient; 0, the default, is the root itself, with no derivative at
+    :func:`stabilized_root`, in the unit of the transient; 0, the default, is the root itself, with no derivative at
     empty bins. Take 1/4 for photon counts and wherever gradients go through. ``taps``: 4 interpolate to 3e-4 of the
     field, 2 linearly to some percent.
 
@@ -118,11 +118,11 @@ class FK(ConfocalOperator):
 
         Differentiable; with ``floor=0`` empty bins get no gradient. Raises ShapeError, DeviceError.
         """
-        return self.picture(stabilised_root(self.transients(transient), self.floor))
+        return self.picture(stabilized_root(self.transients(transient), self.floor))
 
     def wavefield(self, transient: Tensor | Capture) -> Tensor:
         """psi (..., T, Y, X) of a transient: z sqrt(H) of a diffuse target, sqrt(H) of a retroreflective one."""
-        return self._falling(stabilised_root(self.transients(transient), self.floor))
+        return self._falling(stabilized_root(self.transients(transient), self.floor))
 
     def picture(self, root: Tensor) -> Tensor:
         """The squared modulus of the field that the root of a transient (..., T, Y, X) migrates to."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, ClassVar
 
 from torch import Tensor
@@ -33,6 +33,7 @@ class HiddenVolume(TensorRecord):
     values: Tensor
     grid: VoxelGrid
     method: str
+    _: KW_ONLY
     metadata: Mapping[str, Any] = field(default_factory=dict)
     times: Tensor | None = None
     directions: Tensor | None = None
@@ -45,7 +46,9 @@ class HiddenVolume(TensorRecord):
         return {name: tensor for name, tensor in super().tensors().items() if name != "times"}
 
     def _settings(self) -> dict[str, Any]:
-        return {**super()._settings(), "times": None if self.times is None else tuple(self.times.tolist())}
+        # One by one: torch 2.6 makes no list inside of `torch.func.grad`.
+        times = None if self.times is None else tuple(time.item() for time in self.times.unbind())
+        return {**super()._settings(), "times": times}
 
     @classmethod
     def merged_notes(cls, records: Sequence[HiddenVolume]) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import ShapeError
 from torchtransient.reconstruction.capture_checks import check_from_zero, checked_axis, checked_scan, refuse_legs
-from torchtransient.reconstruction.capture_roots import stabilised_root
+from torchtransient.reconstruction.capture_roots import stabilized_root
 from torchtransient.reconstruction.confocal_operator import chunk_rows
 from torchtransient.reconstruction.fk import FK
 from torchtransient.reconstruction.linear import each
@@ -66,7 +66,9 @@ class Midpoints(TransientOperator):
         first = (
             sensors.first + float(phase[0]) * step[1] * sensors.along_x + float(phase[1]) * step[0] * sensors.along_y
         )
-        self.wall = PlanarScan(size, step, first, sensors.along_x, sensors.along_y, sensors.normal)
+        self.wall = PlanarScan(
+            size, step, first, along_x=sensors.along_x, along_y=sensors.along_y, normal=sensors.normal
+        )
         self.grid = VoxelGrid.of_wall(self.wall, time_axis.centers_opl / 2)
         self._place = (index[..., 1] * size[1] + index[..., 0]).reshape(-1)
         self._distance_squared = (spots[:, None] - points).square().sum(-1).reshape(-1)
@@ -176,7 +178,7 @@ class MidpointFK(TransientOperator):
         Differentiable; with ``floor=0`` empty bins get no gradient. Raises ShapeError, DeviceError.
         """
         data = self.transients(transient)
-        return self.fk.picture(self.midpoints.adjoint(stabilised_root(data, self.fk.floor)))
+        return self.fk.picture(self.midpoints.adjoint(stabilized_root(data, self.fk.floor)))
 
 
 def midpoint_fk(capture: Capture, **options: Any) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.errors import SceneError, ShapeError
+from torchtransient.errors import ArgumentError, SceneError, ShapeError
 from torchtransient.quantities import finite, shown, with_article
 from torchtransient.reconstruction.cameras import Camera, DirectLight, TransientCamera
 from torchtransient.reconstruction.capture_checks import check_falloff
@@ -76,13 +76,13 @@ class PhasorField(ScanOperator):
         dtype: torch.dtype = torch.float32,
     ) -> None:
         if not isinstance(points, VoxelGrid):
-            raise ShapeError(
+            raise ArgumentError(
                 f"PhasorField: expected planes as a VoxelGrid, got {shown(points)}. Make them with VoxelGrid.before; "
                 "FilteredBackprojection takes points."
             )
         super().__init__(scan, points, time_axis=time_axis, dtype=dtype)
         if not isinstance(pulse, PhasorFilter):
-            raise ShapeError(f"PhasorField: expected pulse as a PhasorFilter, got {shown(pulse)}.")
+            raise ArgumentError(f"PhasorField: expected pulse as a PhasorFilter, got {shown(pulse)}.")
         check_sampling(pulse, time_axis.bin_width_opl, "PhasorField")
         check_wavelength(pulse.wavelength, scan, time_axis, "PhasorField")
         self.camera: Camera = DirectLight() if camera is None else camera

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 
 import torch
 from torch import Tensor
@@ -25,6 +25,7 @@ class PlanarScan:
     size: tuple[int, int]
     pitch: tuple[float, float]
     first: Tensor
+    _: KW_ONLY
     along_x: Tensor
     along_y: Tensor
     normal: Tensor
@@ -58,7 +59,7 @@ class PlanarScan:
         normal = torch.linalg.cross(along_x, along_y)
         if normals is not None:
             normal = _with_normals(normal, normals)
-        return PlanarScan((rows, columns), (dy, dx), p[0, 0], along_x, along_y, normal)
+        return PlanarScan((rows, columns), (dy, dx), p[0, 0], along_x=along_x, along_y=along_y, normal=normal)
 
     @staticmethod
     def of_scan(scan: Scan, who: str) -> PlanarScan:

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchtransient.argument_names import arguments_of
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import ShapeError
@@ -150,6 +151,8 @@ def reconstructed(capture: Capture, kind: Callable[..., Any], *points: Any, who:
     """
     transient, axis = checked_capture(capture, who)
     options.setdefault("dtype", torch.float64 if transient.dtype == torch.float64 else torch.float32)
-    operator = kind(capture.scan, *points, time_axis=axis, **options).to(transient.device)
+    with arguments_of(who, kind.__init__, ("scan", "time_axis")):
+        operator = kind(capture.scan, *points, time_axis=axis, **options)
+    operator = operator.to(transient.device)
     volume: Tensor = operator.reconstruct(capture)
     return volume

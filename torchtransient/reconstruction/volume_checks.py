@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.capture.metadata import metadata_text
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.quantities import shown
 from torchtransient.reconstruction.voxels import VoxelGrid
 
@@ -19,7 +19,7 @@ def check_volume(volume: Any) -> None:
     StorageError for metadata that is not plain.
     """
     if not isinstance(volume.grid, VoxelGrid):
-        raise ShapeError(f"HiddenVolume: expected grid as a VoxelGrid, got {shown(volume.grid)}.")
+        raise ArgumentError(f"HiddenVolume: expected grid as a VoxelGrid, got {shown(volume.grid)}.")
     frames = () if volume.times is None else _frames(volume.times)
     _check("values", volume.values, (*frames, *volume.grid.shape))
     if volume.directions is not None:
@@ -32,7 +32,7 @@ def check_volume(volume: Any) -> None:
                 f"{tuple(volume.directions.shape)}."
             )
     if not isinstance(volume.method, str) or "\0" in volume.method:
-        raise ShapeError(f"HiddenVolume: expected method as a name, got {shown(volume.method)}.")
+        raise ArgumentError(f"HiddenVolume: expected method as a name, got {shown(volume.method)}.")
     metadata_text(volume.metadata, "HiddenVolume")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from torch import Tensor
 from torchtransient.capture import Scan, Wall
 from torchtransient.capture.distances import bounds_of
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.quantities import count, positive, real_array, shown
+from torchtransient.quantities import Numbers, count, positive, real_array, shown
 from torchtransient.reconstruction.planar_scan import PlanarScan, hidden_side
 
 
@@ -29,6 +29,7 @@ class VoxelGrid:
     depths: Tensor
     size: tuple[int, int]
     pitch: tuple[float, float]
+    _: KW_ONLY
     first: Tensor
     along_x: Tensor
     along_y: Tensor
@@ -60,7 +61,7 @@ class VoxelGrid:
         depths: Any,
         *,
         size: int | Sequence[int] | None = None,
-        extent: float | Sequence[float] | None = None,
+        extent: float | Numbers | None = None,
     ) -> VoxelGrid:
         """Planes at ``depths`` (Z,) metres before the wall of a scan, parallel to it, along its rows and columns.
 
@@ -106,12 +107,20 @@ class VoxelGrid:
             + (spans[1][0] - (rows - 1) / 2 * dy) * along_y
             + (flat.mean(0) @ normal) * normal
         )
-        return cls(depths, (rows, columns), (dy, dx), first, along_x, along_y, normal)
+        return cls(depths, (rows, columns), (dy, dx), first=first, along_x=along_x, along_y=along_y, normal=normal)
 
     @classmethod
     def of_wall(cls, wall: PlanarScan, depths: Any) -> VoxelGrid:
         """A voxel before each point of a regular grid, at each of ``depths`` (Z,) metres. Raises as the class."""
-        return cls(depths, wall.size, wall.pitch, wall.first, wall.along_x, wall.along_y, wall.normal)
+        return cls(
+            depths,
+            wall.size,
+            wall.pitch,
+            first=wall.first,
+            along_x=wall.along_x,
+            along_y=wall.along_y,
+            normal=wall.normal,
+        )
 
     @classmethod
     def bounds(cls, bounds: Any, size: int | Sequence[int]) -> VoxelGrid:
@@ -128,7 +137,7 @@ class VoxelGrid:
         eye = torch.eye(3, dtype=torch.float64, device="cpu")
         first = torch.stack([low[0] + dx / 2, low[1] + dy / 2, torch.zeros((), dtype=torch.float64, device="cpu")])
         depths = low[2] + dz * (torch.arange(sizes[2], dtype=torch.float64, device="cpu") + 0.5)
-        return cls(depths, (sizes[1], sizes[0]), (dy, dx), first, eye[0], eye[1], eye[2])
+        return cls(depths, (sizes[1], sizes[0]), (dy, dx), first=first, along_x=eye[0], along_y=eye[1], normal=eye[2])
 
     @property
     def shape(self) -> tuple[int, int, int]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torchtransient.errors import SceneError
+from torchtransient.errors import ArgumentError
 from torchtransient.quantities import positive
 from torchtransient.scenes.parts import SceneDict, diffuse, perspective, transient_film, transient_path
 from torchtransient.scenes.transforms import look_at, rotate, scale, translate
@@ -30,14 +30,14 @@ def cornell_box(
     The room is the cube [-1, 1]^3 without its front face, the camera sits at z = 3.90 and looks along -z. Keys of
     interest: `white`, `red`, `green` (BSDFs), `light`, `small-box`, `large-box`. `large-box` stands on the left;
     `mirror=True` makes it an ideal mirror, `glass=True` a smooth dielectric of refractive index `index` (not both,
-    SceneError).
+    ArgumentError).
 
     `resolution` is one side in pixels or (width, height); the film holds `num_bins` bins of `bin_width_opl` from
     `start_opl` on. Returns a dictionary with transforms as (4, 4) arrays. Source of the numbers: the scene `cbox` of
     Mitsuba 3.
     """
     if mirror and glass:
-        raise SceneError("cornell_box: expected at most one of mirror=True and glass=True, got both; choose one")
+        raise ArgumentError("cornell_box: expected at most one of mirror=True and glass=True, got both; choose one")
     white = {"type": "ref", "id": "white"}
     large: SceneDict = white
     if mirror:

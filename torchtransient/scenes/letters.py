@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.errors import SceneError
+from torchtransient.errors import ArgumentError
 from torchtransient.quantities import shown
 
 _S = 0.2  # width of a stroke
@@ -41,8 +41,8 @@ OUTLINES: dict[str, tuple[tuple[float, float], ...]] = {
 def outline(letter: str, size: float = 1.0) -> NDArray[np.float64]:
     """Corners (N, 2) of a letter of height and width `size` around the origin, metres, against the clock.
 
-    Raises SceneError for a letter that is not there (those with holes are not).
+    Raises ArgumentError for a letter that is not there (those with holes are not).
     """
     if not isinstance(letter, str) or letter not in OUTLINES:
-        raise SceneError(f"letter: expected one of {', '.join(OUTLINES)}, got {shown(letter)}")
+        raise ArgumentError(f"letter: expected one of {', '.join(OUTLINES)}, got {shown(letter)}")
     return (np.array(OUTLINES[letter], dtype=np.float64) - 0.5) * size

@@ -4,25 +4,24 @@ outside. `triangle_mesh` makes shapes of scene dictionaries of them; nothing is 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.capture.wall import checked_mesh
 from torchtransient.errors import SceneError, ShapeError
-from torchtransient.quantities import count, positive, transform
+from torchtransient.quantities import Numbers, count, positive, transform
 from torchtransient.scenes.parts import SceneDict, diffuse
 from torchtransient.scenes.transforms import Matrix, Triple
 
 Vertices = NDArray[np.float64]
 Faces = NDArray[np.int64]
 Mesh = tuple[Vertices, Faces]
-Albedo = float | Sequence[float]
+Albedo: TypeAlias = "float | Numbers"
 
 
-def triangle_mesh(vertices: Any, faces: Any, reflectance: Albedo = 0.5, to_world: Matrix | None = None) -> SceneDict:
+def triangle_mesh(vertices: Any, faces: Any, *, reflectance: Albedo = 0.5, to_world: Matrix | None = None) -> SceneDict:
     """A diffuse shape of a scene dictionary, `mesh_arrays`, made of `vertices` (V, 3), metres, and `faces` (F, 3).
 
     `reflectance`: one albedo, or three of linear sRGB. Its key `<name>.vertex_positions` is a parameter of the scene,
@@ -72,7 +71,7 @@ def ellipsoid(center: Triple, radii: float | Triple, level: int = 3) -> Mesh:
     corners = [[-a, b, 0], [a, b, 0], [-a, -b, 0], [a, -b, 0], [0, -a, b], [0, a, b], [0, -a, -b], [0, a, -b],
                [b, 0, -a], [b, 0, a], [-b, 0, -a], [-b, 0, a]]  # fmt: skip
     vertices = np.array(corners, dtype=np.float64)
-    edge = np.linalg.norm(vertices[0] - vertices[1])
+    edge = float(np.linalg.norm(vertices[0] - vertices[1]))
     faces = _triangles_of_edges(vertices, edge)
     for _ in range(_times("level", level)):
         vertices, faces = subdivided((vertices, faces))
@@ -148,7 +147,7 @@ def triangulated(outline: Vertices) -> Faces:
         for k in range(len(left)):
             before, corner, after = left[k - 1], left[k], left[(k + 1) % len(left)]
             others = outline[[i for i in left if i not in (before, corner, after)]]
-            if _is_ear(*outline[[before, corner, after]], others):
+            if _is_ear(outline[before], outline[corner], outline[after], others):
                 triangles.append((before, corner, after))
                 del left[k]
                 break

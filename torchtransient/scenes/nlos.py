@@ -26,18 +26,18 @@ def relay_wall(width: float = 2.0, height: float = 2.0, albedo: Albedo = 0.5) ->
     return {"type": "rectangle", "to_world": scale(half), "bsdf": diffuse(albedo)}
 
 
-def nlos_z(size: float = 1.0, depth: float = 1.0, albedo: Albedo = 0.9, thickness: float = 0.0) -> SceneDict:
+def nlos_z(*, size: float = 1.0, depth: float = 1.0, albedo: Albedo = 0.9, thickness: float = 0.0) -> SceneDict:
     """The letter Z, `size` high and wide, `depth` before the wall: `nlos_letter("Z")`."""
-    return nlos_letter("Z", size, depth, albedo, thickness)
+    return nlos_letter("Z", size=size, depth=depth, albedo=albedo, thickness=thickness)
 
 
 def nlos_letter(
     letter: str = "T",
+    *,
     size: float = 1.0,
     depth: float = 1.0,
     albedo: Albedo = 0.9,
     thickness: float = 0.0,
-    *,
     subdivide: int = 0,
 ) -> SceneDict:
     """A block letter, `size` high and wide, as the mesh `letter`, the side that faces the wall at z = `depth`.
@@ -49,18 +49,19 @@ def nlos_letter(
     corners = outline(letter, positive("size", size))
     z = positive("depth", depth)
     mesh = sheet(corners, z) if finite("thickness", thickness) == 0 else solid(corners, z, thickness)
-    return {"letter": triangle_mesh(*subdivided(mesh, subdivide), albedo)}
+    return {"letter": triangle_mesh(*subdivided(mesh, subdivide), reflectance=albedo)}
 
 
 def nlos_plates(
+    *,
     size: float = 0.8, depth: float = 0.8, gap: float = 0.5, albedo: Albedo = 0.9, second_size: float | None = None
 ) -> SceneDict:
     """A square plate `front` before the wall and another one, `back`, `gap` behind it. `second_size` None: as large."""
     z = positive("depth", depth)
     far = positive("second_size", size if second_size is None else second_size)
     return {
-        "front": triangle_mesh(*plate(size, size, [0.0, 0.0, z]), albedo),
-        "back": triangle_mesh(*plate(far, far, [0.0, 0.0, z + positive("gap", gap)]), albedo),
+        "front": triangle_mesh(*plate(size, size, [0.0, 0.0, z]), reflectance=albedo),
+        "back": triangle_mesh(*plate(far, far, [0.0, 0.0, z + positive("gap", gap)]), reflectance=albedo),
     }
 
 
@@ -81,9 +82,9 @@ def nlos_corner(size: float = 1.0, depth: float = 1.0, albedo: Albedo = 0.9) -> 
         return np.array(corners), faces if x < 0 else faces[:, ::-1].copy()
 
     return {
-        "left": triangle_mesh(*side(-s / 2), albedo),
-        "right": triangle_mesh(*side(s / 2), albedo),
-        "small": triangle_mesh(*plate(s / 4, s / 4, [0.3 * s, 0.2 * s, z - 0.1 * s]), albedo),
+        "left": triangle_mesh(*side(-s / 2), reflectance=albedo),
+        "right": triangle_mesh(*side(s / 2), reflectance=albedo),
+        "small": triangle_mesh(*plate(s / 4, s / 4, [0.3 * s, 0.2 * s, z - 0.1 * s]), reflectance=albedo),
     }
 
 
@@ -109,6 +110,7 @@ def mannequin(height: float = 1.45, level: int = 3) -> Mesh:
 
 
 def nlos_mannequin(
+    *,
     depth: float = 1.2, height: float = 1.45, albedo: Albedo = 0.7, level: int = 3, x: float = 0.0
 ) -> SceneDict:
     """A standing `mannequin` as the mesh `body`, its axis `depth` before the wall and `x` beside its middle.
@@ -120,7 +122,7 @@ def nlos_mannequin(
     if vertices[:, 2].min() <= 0:
         needed = depth - vertices[:, 2].min()
         raise SceneError(f"depth: expected more than {needed:.3g} m, the reach of the arm, got {depth!r}")
-    return {"body": triangle_mesh(vertices, faces, albedo)}
+    return {"body": triangle_mesh(vertices, faces, reflectance=albedo)}
 
 
 def bounds(shapes: SceneDict) -> NDArray[np.float64]:

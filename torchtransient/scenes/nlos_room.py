@@ -65,7 +65,7 @@ def nlos_room(
         place = [-0.25 * x, floor + 0.85, min(0.55 * z, 2.0)]
         vertices, faces = mannequin(1.7, level)
         vertices = vertices + np.array(place) - [0.0, vertices[:, 1].min() + 0.85, 0.0]
-        shapes["person"] = triangle_mesh(vertices, faces, of("person"))
+        shapes["person"] = triangle_mesh(vertices, faces, reflectance=of("person"))
     return shapes
 
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import Any
 
-from torchtransient.errors import SceneError
-from torchtransient.quantities import count, finite, positive, shares
+from torchtransient.errors import ArgumentError, SceneError
+from torchtransient.quantities import Numbers, count, finite, positive, shares, shown
 from torchtransient.scenes.transforms import Matrix
 
 SceneDict = dict[str, Any]
@@ -21,7 +21,12 @@ def transient_film(
     of optical path length. Raises SceneError or UnitError for sizes below one, a width of zero or a start that is not
     finite.
     """
-    width, height = (resolution, resolution) if isinstance(resolution, int) else resolution
+    given: Any = resolution
+    several = isinstance(given, Iterable) and not isinstance(given, str)
+    sides = list(given) if several else [given, given]
+    if len(sides) != 2:
+        raise SceneError(f"resolution: expected one side in pixels or (width, height), got {shown(resolution)}.")
+    width, height = sides
     return {
         "type": "transient_hdr_film",
         "width": count("resolution", width),
@@ -56,14 +61,14 @@ def transient_path(max_depth: int, rr_depth: int | None = None) -> SceneDict:
     `rr_depth=None` keeps the plugin's own start of Russian roulette.
     """
     if isinstance(max_depth, bool) or int(max_depth) != max_depth or max_depth < -1:
-        raise SceneError(f"max_depth: expected -1 or a whole number of at least 0, got {max_depth!r}")
+        raise ArgumentError(f"max_depth: expected -1 or a whole number of at least 0, got {max_depth!r}")
     integrator: SceneDict = {"type": "transient_path", "max_depth": int(max_depth)}
     if rr_depth is not None:
         integrator["rr_depth"] = count("rr_depth", rr_depth)
     return integrator
 
 
-def diffuse(reflectance: float | Sequence[float]) -> SceneDict:
+def diffuse(reflectance: float | Numbers) -> SceneDict:
     """A Lambertian BSDF; one albedo for all wavelengths or three, linear sRGB. Raises UnitError outside of [0, 1]."""
     albedo = shares("albedo or reflectance", reflectance)
     value = {"type": "rgb", "value": list(albedo)} if isinstance(albedo, tuple) else albedo

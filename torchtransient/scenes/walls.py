@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torchtransient.errors import SceneError
+from torchtransient.errors import ArgumentError
 from torchtransient.quantities import positive
 from torchtransient.scenes.parts import SceneDict, diffuse, perspective, transient_film, transient_path
 from torchtransient.scenes.transforms import look_at, rotate, scale, translate
@@ -111,7 +111,7 @@ def etalon_slab(
     elif light == "front":
         emitter_to_world = translate([0.0, 0.0, d + 2.0]) @ rotate([0, 1, 0], 180)
     else:
-        raise SceneError(f"etalon_slab: expected light='behind' or light='front', got {light!r}")
+        raise ArgumentError(f"etalon_slab: expected light='behind' or light='front', got {light!r}")
     film = transient_film(resolution, num_bins, start_opl, bin_width_opl)
     # The cube's faces are pairs of triangles; one ray in 1e4 would slip through the diagonal if the camera looked along
     # it.

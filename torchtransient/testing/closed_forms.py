@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from torchtransient.errors import UnitError
+from torchtransient.errors import ArgumentError, UnitError
 from torchtransient.quantities import positive, share
 from torchtransient.testing.flight_lengths import (
     Array,
@@ -166,7 +166,7 @@ def etalon_orders(
     side: str,
     *,
     incidence_deg: float = 0.0,
-    polarisation: str | None = None,
+    polarization: str | None = None,
     absorption_per_m: float = 0.0,
 ) -> list[EtalonOrder]:
     """Reflected or transmitted orders of a plane-parallel slab in air, incoherent, down to 1e-18 of the light.
@@ -174,16 +174,16 @@ def etalon_orders(
     With R, T = 1 - R at one interface and the travelled path q = index * thickness / cos_t: reflected m = 0: R at 0; m
     >= 1: T^2 R^(2m-1) at 2 m q; transmitted m >= 0: T^2 R^(2m) at (2m + 1) q; absorption multiplies by exp(-alpha *
     length). Totals without absorption 2R / (1 + R) and (1 - R) / (1 + R). `side` is "reflected" or "transmitted";
-    `polarisation` "s", "p" or None for the mean of both. Lengths in metres, `absorption_per_m` per metre of length in
+    `polarization` "s", "p" or None for the mean of both. Lengths in metres, `absorption_per_m` per metre of length in
     the glass. The path is the one light travels, not the delay of a wavefront, 2 n d cos_t; dispersion (group index) is
     not covered.
     """
     if side not in ("reflected", "transmitted"):
-        raise UnitError(f"side: expected 'reflected' or 'transmitted', got {side!r}")
-    if polarisation not in ("s", "p", None):
-        raise UnitError(f"polarisation: expected 's', 'p' or None, got {polarisation!r}")
+        raise ArgumentError(f"side: expected 'reflected' or 'transmitted', got {side!r}")
+    if polarization not in ("s", "p", None):
+        raise ArgumentError(f"polarization: expected 's', 'p' or None, got {polarization!r}")
     rs, rp = fresnel_reflectances(index, incidence_deg)
-    reflectances = {"s": [rs], "p": [rp], None: [rs, rp]}[polarisation]
+    reflectances = {"s": [rs], "p": [rp], None: [rs, rp]}[polarization]
     cos_t = math.sqrt(max(0.0, 1.0 - (math.sin(math.radians(incidence_deg)) / index) ** 2))
     if max(reflectances) >= 1.0:
         return [EtalonOrder(0.0, 1.0)] if side == "reflected" else []

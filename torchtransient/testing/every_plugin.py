@@ -142,6 +142,7 @@ def bsdfs() -> dict[str, dict[str, Any]]:
         "twosided": {"type": "twosided", "nested": paint},
         "bumpmap": {"type": "bumpmap", "arbitrary": _bitmap(), "nested": paint},
         "normalmap": {"type": "normalmap", "normalmap": _bitmap(), "nested": paint},
+        "retroreflector": {"type": "retroreflector", "share": 0.7},
         "delayed": {"type": "delayed", "nested": paint, "lifetime": 1.0, "elastic_fraction": 0.2},
     }
 

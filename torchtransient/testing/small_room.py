@@ -7,6 +7,7 @@ between 6 and 12 m. Plain data; no Mitsuba variant is needed.
 from __future__ import annotations
 
 import copy
+from typing import Any
 
 import numpy as np
 
@@ -50,7 +51,7 @@ _ROOM = {
 }
 
 
-def make_room() -> dict:
+def make_room() -> dict[str, Any]:
     """A wall seen frontally, a coloured cube before it, a point light beside the camera."""
     return copy.deepcopy(_ROOM)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from contextlib import nullcontext
 from typing import Any, TypeVar
 
@@ -11,8 +11,8 @@ import torch
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
-from torchtransient.errors import GradientError, ShapeError, UnitError
-from torchtransient.quantities import as_number, shown
+from torchtransient.errors import ArgumentError, GradientError, ShapeError, UnitError
+from torchtransient.quantities import Numbers, as_number, shown
 
 Part = TypeVar("Part")
 
@@ -21,7 +21,7 @@ def accumulate(
     loss_of: Callable[[Part], torch.Tensor],
     parts: Iterable[Part],
     *,
-    weights: Sequence[float] | None = None,
+    weights: Numbers | None = None,
     model: nn.Module | None = None,
     scaler: torch.amp.GradScaler | None = None,
 ) -> float:
@@ -46,7 +46,7 @@ def accumulate(
     parts that came before the wrong loss.
     """
     if not isinstance(parts, Iterable):
-        raise ShapeError(f"accumulate: expected parts as a list or any iterable, got {shown(parts)}.")
+        raise ArgumentError(f"accumulate: expected parts as a list or any iterable, got {shown(parts)}.")
     listed = list(parts)
     if not listed:
         raise ShapeError("accumulate: expected at least one part, got none.")
@@ -56,7 +56,7 @@ def accumulate(
     if len(shares) != len(listed):
         raise ShapeError(f"accumulate: expected a weight for each of {len(listed)} parts, got {len(shares)}.")
     if model is not None and not isinstance(model, nn.Module):
-        raise UnitError(f"accumulate: expected model as a module, got {type(model).__name__}.")
+        raise ArgumentError(f"accumulate: expected model as a module, got {type(model).__name__}.")
     values = []
     for n, (part, share) in enumerate(zip(listed, shares, strict=True)):
         waits = isinstance(model, DistributedDataParallel) and n + 1 < len(listed)

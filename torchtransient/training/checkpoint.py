@@ -8,7 +8,7 @@ import warnings
 import zipfile
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,14 @@ from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 from torch.nn.parameter import is_lazy
 
-from torchtransient.errors import ShapeError, StorageError, TorchTransientError, TorchTransientWarning, UnitError
+from torchtransient.errors import (
+    ArgumentError,
+    ShapeError,
+    StorageError,
+    TorchTransientError,
+    TorchTransientWarning,
+    UnitError,
+)
 from torchtransient.quantities import count, shown
 from torchtransient.training.optimizer_states import check_optimizer
 from torchtransient.training.plain_state import plain
@@ -38,6 +45,7 @@ class Checkpoint:
     """
 
     step: int
+    _: KW_ONLY
     values: dict[str, Any] = field(default_factory=dict)
     libraries: dict[str, str] = field(default_factory=dict)
     ranks: int = 1
@@ -110,7 +118,7 @@ def load_checkpoint(path: str | os.PathLike[str], parts: Mapping[str, Any], *, r
             f"load_checkpoint: {where} has the parts {', '.join(states) or '(none)'}, expected {', '.join(given)}."
         )
     for name, part in given.items():
-        _check(name, part, states[name], content["libraries"].get("torch") == version("torch"))
+        _check(name, part, states[name], content["libraries"].get("torch") == torch.__version__)
     if random and ranks != _size():
         raise StorageError(
             f"load_checkpoint: {where} has the random numbers of {ranks} ranks, expected those of {_size()}. Start as "
@@ -124,7 +132,7 @@ def load_checkpoint(path: str | os.PathLike[str], parts: Mapping[str, Any], *, r
     # Last: putting other states back may draw.
     if random:
         set_random_state(content["random"][_rank()])
-    return Checkpoint(content["step"], content["values"], content["libraries"], ranks)
+    return Checkpoint(content["step"], values=content["values"], libraries=content["libraries"], ranks=ranks)
 
 
 # ------------------------------------------------------------------------------------------------------------ parts
@@ -144,7 +152,7 @@ def _content(parts: Any, step: Any, values: Mapping[str, Any] | None) -> dict[st
 
 def _plain_values(values: Any) -> Any:
     if values is not None and not isinstance(values, Mapping):
-        raise StorageError(f"save_checkpoint: expected values as a dictionary from names, got {shown(values)}.")
+        raise ArgumentError(f"save_checkpoint: expected values as a dictionary from names, got {shown(values)}.")
     try:
         return plain(dict(values or {}), "values")
     except RecursionError:
@@ -153,7 +161,7 @@ def _plain_values(values: Any) -> Any:
 
 def _named(parts: Any, who: str) -> dict[str, Any]:
     if not isinstance(parts, Mapping) or not all(isinstance(name, str) for name in parts):
-        raise StorageError(f"{who}: expected parts as a dictionary from names, got {shown(parts)}.")
+        raise ArgumentError(f"{who}: expected parts as a dictionary from names, got {shown(parts)}.")
     return dict(parts)
 
 
@@ -178,7 +186,7 @@ def _state_of(name: str, part: Any) -> Any:
     if isinstance(part, torch.Generator):
         return {"device": part.device.type}
     if not (hasattr(part, "state_dict") and hasattr(part, "load_state_dict")):
-        raise StorageError(
+        raise ArgumentError(
             f"save_checkpoint: expected the part {name!r} to have state_dict and load_state_dict, or to be a generator "
             f"of torch, got {type(part).__name__}. Plain data belong into values."
         )
@@ -304,8 +312,9 @@ def _read(path: Path) -> dict[str, Any]:
 def _libraries() -> dict[str, str]:
     import torchtransient
 
-    others = {name: version(name) for name in ("torch", "mitsuba", "drjit", "numpy", "kornia")}
-    return {"torchtransient": torchtransient.__version__, **others}
+    # torch itself says for which device it was built ("2.6.0+cu124"), what the metadata of some builds leave out.
+    others = {name: version(name) for name in ("mitsuba", "drjit", "numpy", "kornia")}
+    return {"torchtransient": torchtransient.__version__, "torch": str(torch.__version__), **others}
 
 
 def _compare(where: str, written: Mapping[str, str]) -> None:

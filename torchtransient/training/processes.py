@@ -6,7 +6,7 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from datetime import timedelta
 
 import torch
@@ -28,6 +28,7 @@ class Ranks:
 
     rank: int = 0
     size: int = 1
+    _: KW_ONLY
     local: int = 0
     local_size: int = 1
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
@@ -79,7 +80,7 @@ def ranks(
     Raises UnitError for other devices, threads and broken settings of torchrun, DeviceError for "cuda" where there is
     none, or where it is in use already.
     """
-    from torchtransient.render.threads import threads as set_threads
+    from torchtransient.rendering.threads import threads as set_threads
 
     if device not in ("cpu", "cuda"):
         raise UnitError(f"ranks: expected device 'cpu' or 'cuda', got {device!r}.")
@@ -104,7 +105,7 @@ def worker_init(worker: int) -> None:
     For data sets that render. Those processes have to be spawned, since Dr.Jit does not survive a fork
     (``multiprocessing_context="spawn"``), and are worth keeping (``persistent_workers=True``): they compile anew.
     """
-    from torchtransient.render.threads import threads as set_threads
+    from torchtransient.rendering.threads import threads as set_threads
 
     set_threads(1)
 
@@ -134,7 +135,7 @@ def _found(device: str) -> Ranks:
             f"ranks: expected RANK below WORLD_SIZE and LOCAL_RANK below LOCAL_WORLD_SIZE, got {rank} of {size} and "
             f"{local} of {local_size}; start the script with torchrun."
         )
-    return Ranks(rank, size, local, local_size, torch.device(device))
+    return Ranks(rank, size, local=local, local_size=local_size, device=torch.device(device))
 
 
 def _whole(text: str) -> int | str:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import torch
 
-from torchtransient.errors import UnitError
+from torchtransient.errors import ArgumentError, UnitError
 from torchtransient.quantities import count
 
 _BITS = 2**32
@@ -41,7 +41,7 @@ class Seeds:
     def __post_init__(self) -> None:
         object.__setattr__(self, "seed", count("Seeds: seed", self.seed, 0, UnitError))
         if not isinstance(self.purpose, str):
-            raise UnitError(f"Seeds: expected purpose as a text, got {self.purpose!r}.")
+            raise ArgumentError(f"Seeds: expected purpose as a text, got {self.purpose!r}.")
 
     def __call__(self, step: int, samples: Iterable[int] | torch.Tensor) -> list[int]:
         """One seed for each of the ``samples``, their numbers in the data set: what ``renderer(..., seed=)`` takes.

@@ -17,7 +17,7 @@ from torchtransient.vis.overview import light_curve as light_curve
 from torchtransient.vis.overview import median_pixel as median_pixel
 from torchtransient.vis.overview import peak_time as peak_time
 from torchtransient.vis.overview import plot_overview as plot_overview
-from torchtransient.vis.phasors import domain_colours as domain_colours
+from torchtransient.vis.phasors import domain_colors as domain_colors
 from torchtransient.vis.phasors import phasor_picture as phasor_picture
 from torchtransient.vis.phasors import phasor_video as phasor_video
 from torchtransient.vis.polarization import polarization_picture as polarization_picture

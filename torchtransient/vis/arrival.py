@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.quantities import real_array, shown
 from torchtransient.units import opl_to_seconds
 from torchtransient.vis import colour_maps
@@ -19,6 +19,9 @@ from torchtransient.vis.files import Image, picture_figure, save_figure, save_im
 from torchtransient.vis.overview import light_curve, peak_time
 from torchtransient.vis.sources import Source, axis_of, transient_of
 from torchtransient.vis.tone_mapping import BROKEN, exposure_of, tone_map
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 STYLES = ("peak", "fusion")
 
@@ -30,7 +33,7 @@ def peak_time_picture(
     axis: TimeAxis | None = None,
     limits: tuple[float, float] | None = None,
     title: str = "",
-) -> Any:
+) -> Figure:
     """A matplotlib figure of the `peak_time` of every pixel, with a colour bar in metres and in nanoseconds.
 
     `source` and `axis` as in `frames`; `limits` are the ends of the scale in metres (None: where 1 % and 99 % of the
@@ -69,10 +72,10 @@ def rainbow(
     99 % of the `light_curve`), or again and again every `period_opl` metres, which draws lines of equal time.
     Brightness is the steady intensity (sum over channels) on the sRGB curve; `exposure` None makes 5 % of it white.
     Pixels that are not finite are magenta. Without an axis, lengths are counted in bins. Writes the image when `path`
-    is given. Raises ShapeError, UnitError and StorageError.
+    is given. Raises ArgumentError, ShapeError, UnitError and StorageError.
     """
     if style not in STYLES:
-        raise UnitError(f"rainbow: expected style 'peak' or 'fusion', got {style!r}.")
+        raise ArgumentError(f"rainbow: expected style 'peak' or 'fusion', got {style!r}.")
     cube, axis = transient_of(source, axis, "rainbow")
     axis = axis or TimeAxis(0.0, 1.0, cube.shape[1])
     steady = cube.sum((0, 1))

@@ -6,10 +6,15 @@ Colours are made in Oklch (B. Ottosson, "A perceptual color space for image proc
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from torchtransient.vis.files import figure_type
+
+if TYPE_CHECKING:
+    from matplotlib.colors import ListedColormap
 
 Array = NDArray[np.float64]
 
@@ -63,12 +68,13 @@ def cyclic(turns: Any, value: Any = 1.0) -> Array:
     return oklch(0.75 * level, 0.125 * level, _FIRST_HUE + 360.0 * turn)
 
 
-def cyclic_map(kind: str = "even") -> Any:
+def cyclic_map(kind: str = "even") -> ListedColormap:
     """A cyclic matplotlib colour map for bars that run over one period with angle 0 in the middle.
 
     "even" is `cyclic`; "hsv" is the hue circle of HSV, which papers on polarization often use: its yellow and cyan are
     lighter than its blue.
     """
+    figure_type()  # says so where matplotlib is missing
     import matplotlib
     from matplotlib.colors import ListedColormap
 
@@ -77,8 +83,9 @@ def cyclic_map(kind: str = "even") -> Any:
     return ListedColormap(colours.tolist(), name=f"cyclic, {kind}")
 
 
-def rainbow_map() -> Any:
+def rainbow_map() -> ListedColormap:
     """`rainbow` as a matplotlib colour map, for colour bars."""
+    figure_type()
     from matplotlib.colors import ListedColormap
 
     return ListedColormap(rainbow(np.linspace(0, 1, 256)).tolist(), name="equal lightness, red to violet")

@@ -6,13 +6,16 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.errors import ShapeError
 from torchtransient.vis.files import figure_type, save_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # Sizes of one sample's pictures on paper, inches.
 _PICTURE, _CURVE, _TITLE = 1.35, 0.45, 0.2
@@ -39,7 +42,7 @@ def contact_sheet(
     columns: int | None = None,
     times: NDArray[Any] | None = None,
     title: str = "",
-) -> Any:
+) -> Figure:
     """Draw samples beside each other. ``times``: (T + 1,) edges of the bins of the curves, metres of optical path.
     Returns the matplotlib figure; written to ``path`` if given. Raises ShapeError for no cell, StorageError without
     matplotlib or where it cannot be written.

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from torchtransient.errors import ShapeError
+from torchtransient.quantities import Numbers
 from torchtransient.vis.files import figure_type, save_figure
 from torchtransient.vis.tone_mapping import exposure_of, tone_map
 
@@ -18,8 +19,9 @@ CHANNEL_COLORS = {"red": "tab:red", "green": "tab:green", "blue": "tab:blue"}
 
 def plot_fit(
     images: Mapping[str, Tensor],
-    loss: Sequence[float],
-    values: Mapping[str, Sequence[float]],
+    loss: Numbers,
+    values: Mapping[str, Numbers],
+    *,
     truth: Mapping[str, float],
     path: str | Path,
 ) -> None:
@@ -36,7 +38,7 @@ def plot_fit(
         if len(curve) != steps:
             raise ShapeError(f"plot_fit: expected {steps} values of '{name}', as many as losses, got {len(curve)}.")
     figure = figure_type()(figsize=(11.0, 6.6), layout="constrained")
-    upper, lower = figure.subfigures(2, 1)
+    upper, lower = figure.subfigures(2, 1, squeeze=False).flat
     exposure = exposure_of(list(images.values())[-1].cpu())
     panels = upper.subplots(1, len(images), squeeze=False)[0]
     for panel, (title, image) in zip(panels, images.items(), strict=True):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,6 +11,9 @@ from torchtransient.errors import ShapeError, UnitError
 from torchtransient.vis import colour_maps
 from torchtransient.vis.files import picture_figure, save_figure
 from torchtransient.vis.sources import Source, as_tensor
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def gradient_picture(
@@ -22,7 +25,7 @@ def gradient_picture(
     per_channel: bool = False,
     label: str = "",
     title: str = "",
-) -> Any:
+) -> Figure:
     """A matplotlib figure of a gradient (C, H, W) or (H, W): blue is negative, white zero, red positive.
 
     The scale is symmetric around zero and ends at `limit`, or at the given percentile of the absolute values: some
@@ -44,18 +47,18 @@ def gradient_picture(
         limit = colour_maps.symmetric_limit(images, percentile)
     elif not limit > 0:
         raise UnitError(f"gradient_picture: expected limit > 0, got {limit!r}.")
+    figure, panels = picture_figure(images.shape[1], images.shape[2], panels=len(images), side=4.4)
     import matplotlib
 
     colours = matplotlib.colormaps["RdBu_r"].with_extremes(bad="limegreen")
-    figure, panels = picture_figure(images.shape[1], images.shape[2], panels=len(images), side=4.4)
     names = ("red", "green", "blue") if len(images) == 3 else tuple(f"channel {n}" for n in range(len(images)))
-    shown = None
+    drawn: list[Any] = []
     for panel, image, name in zip(panels, images, names, strict=False):
-        shown = panel.imshow(image, cmap=colours, vmin=-limit, vmax=limit, interpolation="nearest")
+        drawn.append(panel.imshow(image, cmap=colours, vmin=-limit, vmax=limit, interpolation="nearest"))
         panel.set_title(name if per_channel else title, fontsize=10)
     outside = np.abs(images[np.isfinite(images)]) > limit
     extend = "both" if outside.any() else "neither"
-    figure.colorbar(shown, ax=panels[: len(images)], shrink=0.85, label=label, extend=extend)
+    figure.colorbar(drawn[-1], ax=panels[: len(images)], shrink=0.85, label=label, extend=extend)
     if title and per_channel:
         figure.suptitle(title, fontsize=11)
     return save_figure(figure, path, "gradient_picture")

@@ -100,8 +100,8 @@ def plot_overview(
     transient: Tensor,
     steady: Tensor,
     axis: TimeAxis,
-    path: str | Path,
     *,
+    path: str | Path,
     pixel: tuple[int, int] | None = None,
     title: str = "",
 ) -> Overview:
@@ -121,7 +121,7 @@ def plot_overview(
         raise ShapeError(f"plot_overview: pixel ({row}, {column}) lies outside of the image of {height} x {width}.")
     shown = Overview(tuple(moments_of_arrival(transient)), (row, column))
     figure = figure_type()(figsize=(12.0, 7.4), layout="constrained")
-    upper, lower = figure.subfigures(2, 1)
+    upper, lower = figure.subfigures(2, 1, squeeze=False).flat
     panels = upper.subplots(1, 3)
     _draw_steady(panels[0], steady, shown.pixel)
     _draw_peak_time(upper, panels[1], transient, axis)
@@ -138,7 +138,8 @@ def plot_overview(
 
 
 def check_picture(path: str | Path, who: str = "picture") -> None:
-    """Raise StorageError when matplotlib could not write to `path`. For before a long render."""
+    """Raise StorageError when matplotlib could not write to `path`, MissingPackageError without it. For before a long
+    render."""
     folder = Path(path).parent
     if not folder.is_dir():
         raise StorageError(f"{who}: the folder '{folder}' does not exist. Create it first.")

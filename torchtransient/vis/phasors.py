@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -14,13 +14,17 @@ from torch import Tensor
 
 from torchtransient.axes import FrequencyAxis
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.quantities import Numbers
 from torchtransient.units import SPEED_OF_LIGHT
 from torchtransient.vis import colour_maps
-from torchtransient.vis.files import enlarge, picture_figure, save_figure, to_bytes
+from torchtransient.vis.files import enlarge, figure_type, picture_figure, save_figure, to_bytes
 from torchtransient.vis.sources import Source, frequencies_of, phasor_of
 from torchtransient.vis.stamps import with_strip
 from torchtransient.vis.video import Frames
 from torchtransient.vis.video_file import check_video, write_video
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _UNITS = (("THz", 1e12), ("GHz", 1e9), ("MHz", 1e6), ("kHz", 1e3), ("Hz", 1.0))
 SHOWS = ("real", "imaginary", "amplitude", "phase", "domain")
@@ -32,10 +36,10 @@ def phasor_picture(
     *,
     show: Sequence[str] = ("real", "domain"),
     which: Sequence[int] = (0,),
-    frequencies: FrequencyAxis | Sequence[float] | None = None,
+    frequencies: FrequencyAxis | Numbers | None = None,
     percentile: float = 99.0,
     title: str = "",
-) -> Any:
+) -> Figure:
     """A matplotlib figure of phasor images: a row for each frequency of `which`, a panel for each of `show`.
 
     "real" and "imaginary": blue to red around zero, on one symmetric scale that holds `percentile` of the pixels;
@@ -69,7 +73,7 @@ def phasor_video(
     which: int = 0,
     steps: int = 48,
     fps: float = 24.0,
-    frequencies: FrequencyAxis | Sequence[float] | None = None,
+    frequencies: FrequencyAxis | Numbers | None = None,
     scale: int | None = None,
     progress: bool = False,
 ) -> Path:
@@ -99,7 +103,7 @@ def phasor_video(
     return write_video(path, Frames(steps, make), steps, fps=fps, progress=progress)
 
 
-def domain_colours(values: NDArray[Any], percentile: float = 99.0) -> NDArray[np.float64]:
+def domain_colors(values: NDArray[Any], percentile: float = 99.0) -> NDArray[np.float64]:
     """RGB (..., 3) in [0, 1] of complex values: hue by phase (0 is red), brightness by the root of the amplitude.
 
     White-balanced hues of equal lightness; the given percentile of the amplitudes is fully bright. Values that are not
@@ -133,7 +137,7 @@ def _draw(figure: Any, panel: Any, name: str, values: NDArray[Any], percentile: 
             # What is as good as dark has no phase.
             amplitude = np.where(np.isfinite(values), np.abs(values), 0)
             level[amplitude <= 1e-4 * colour_maps.symmetric_limit(amplitude, percentile)] = 0.5
-        panel.imshow(level if name == "phase" else domain_colours(values, percentile), interpolation="nearest")
+        panel.imshow(level if name == "phase" else domain_colors(values, percentile), interpolation="nearest")
         bar = figure.colorbar(
             ScalarMappable(Normalize(-1, 1), colour_maps.cyclic_map()), ax=panel, shrink=0.8, label="phase"
         )
@@ -165,6 +169,7 @@ def _label(index: int, frequencies: Sequence[float] | None, name: str) -> str:
 
 
 def _colours(name: str) -> Any:
+    figure_type()
     import matplotlib
 
     return matplotlib.colormaps[name].with_extremes(bad=(0.5, 0.5, 0.5))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -13,11 +13,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchtransient import stokes as st
-from torchtransient.errors import UnitError
+from torchtransient.errors import ArgumentError, UnitError
 from torchtransient.vis import colour_maps
 from torchtransient.vis.files import picture_figure, save_figure
 from torchtransient.vis.sources import Source, stokes_of
 from torchtransient.vis.tone_mapping import tone_map
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 QUANTITIES = ("intensity", "dop", "dolp", "aolp", "docp", "s1", "s2", "s3")
 _TITLES = {
@@ -42,7 +45,7 @@ def polarization_picture(
     floor: float | None = None,
     angle_map: str = "even",
     title: str = "",
-) -> Any:
+) -> Figure:
     """A matplotlib figure of polarization, a panel for each of `quantities`.
 
     Quantities: "intensity" (tone mapped), "dop", "dolp" (0 to 1, black to yellow), "aolp" (-90 to 90 degrees, cyclic,
@@ -52,14 +55,16 @@ def polarization_picture(
 
     `source`: Stokes vectors (4, C, T, H, W) or (4, C, H, W), or a RenderOutput or file with such; `frame` picks a bin,
     None shows the light of all times. `angle_map` "even" has hues of equal lightness, "hsv" the hue circle of many
-    papers. Writes the figure when `path` is given. Raises ShapeError for unpolarized sources, UnitError for unknown
-    names and a negative `floor`, StorageError.
+    papers. Writes the figure when `path` is given. Raises ShapeError for unpolarized sources, ArgumentError for
+    unknown names, UnitError for a negative `floor`, StorageError.
     """
     unknown = [q for q in quantities if q not in QUANTITIES]
     if unknown or not quantities:
-        raise UnitError(f"polarization_picture: expected quantities out of {', '.join(QUANTITIES)}, got {quantities}.")
+        raise ArgumentError(
+            f"polarization_picture: expected quantities out of {', '.join(QUANTITIES)}, got {quantities}."
+        )
     if angle_map not in ("even", "hsv"):
-        raise UnitError(f"polarization_picture: expected angle_map 'even' or 'hsv', got {angle_map!r}.")
+        raise ArgumentError(f"polarization_picture: expected angle_map 'even' or 'hsv', got {angle_map!r}.")
     vectors = stokes_of(source, frame, "polarization_picture").to(torch.float64)
     broken = ~torch.isfinite(vectors).all(0).all(0)
     vectors = torch.nan_to_num(vectors, posinf=0.0, neginf=0.0)

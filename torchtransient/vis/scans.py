@@ -5,7 +5,7 @@ along v upwards.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 import torch
@@ -16,13 +16,16 @@ from torchtransient import quantities
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
 from torchtransient.capture.arithmetic import computed
-from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.errors import ArgumentError, SceneError, ShapeError
 from torchtransient.quantities import shown
 from torchtransient.vis.arrival import checked_limits, peak_time_picture
 from torchtransient.vis.files import figure_type, save_figure
 from torchtransient.vis.hidden_shapes import SQUARE, hidden_polygons
 from torchtransient.vis.video import Frames, FrameSettings, frames
 from torchtransient.vis.video_file import check_video, write_video
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 STYLES = ("curves", "image")
 _COLOURS = {1: ("black",), 3: ("tab:red", "tab:green", "tab:blue")}
@@ -38,7 +41,7 @@ def transients_grid(
     laser: int | tuple[int, ...] | None = None,
     limits: tuple[float, float] | None = None,
     title: str = "",
-) -> Any:
+) -> Figure:
     """A matplotlib figure of the transients of a capture, point by point.
 
     `style` "curves" draws a small histogram for each of up to `rows` x `columns` sensor points, evenly chosen, where
@@ -46,7 +49,7 @@ def transients_grid(
     time, of which the channels are added up. None: curves of a grid, an image of a list of points. `laser` chooses the
     spot of an exhaustive capture, by its index (None: the middle one). `limits` in metres cut the time axis. Writes the
     figure when `path` is given. Raises ShapeError for a batch, more than 3 channels or no transient, UnitError for
-    limits without a bin or an unknown style, StorageError.
+    limits without a bin, ArgumentError for an unknown style, StorageError.
     """
     cube, axis, scan = _one_spot(capture, laser, "transients_grid")
     if limits is not None:
@@ -54,7 +57,7 @@ def transients_grid(
         cube, axis = _transient(part, "transients_grid")
     style = ("curves" if cube.ndim == 4 else "image") if style is None else style
     if not isinstance(style, str) or style not in STYLES:
-        raise UnitError(f"transients_grid: expected style 'curves' or 'image', got {shown(style)}.")
+        raise ArgumentError(f"transients_grid: expected style 'curves' or 'image', got {shown(style)}.")
     if style == "curves" and cube.ndim != 4:
         raise ShapeError(
             f"transients_grid: expected a grid of sensor points for curves, got a list of {scan.pairs}; style='image' "
@@ -105,7 +108,7 @@ def peak_time_map(
     laser: int | tuple[int, ...] | None = None,
     limits: tuple[float, float] | None = None,
     title: str = "",
-) -> Any:
+) -> Figure:
     """A matplotlib figure of the wall with the time of the most light at each sensor point, y up.
 
     `laser` as in `transients_grid`; `limits` in metres as in `peak_time_picture`. Errors as both.
@@ -122,12 +125,12 @@ def scan_layout(
     *,
     hidden: Any = None,
     title: str = "",
-) -> Any:
+) -> Figure:
     """A matplotlib figure of a scan in space: wall, sensor points, laser spots and both origins; lengths in metres.
 
     `hidden`: as in `tt.nlos.simulate`, drawn transparent: shapes by name, one shape, (vertices, faces) or an object
     with both, of meshes as arrays, rectangles, cubes, disks, spheres and cylinders. Writes the figure when `path` is
-    given. Raises ShapeError for what is no scan, SceneError for other shapes and mesh files, StorageError.
+    given. Raises ArgumentError for what is no scan, SceneError for other shapes and mesh files, StorageError.
     """
     scan = scan.scan if isinstance(scan, Capture) else scan
     if not isinstance(scan, Scan):
@@ -174,7 +177,7 @@ def scan_layout(
 def _transient(capture: Capture, who: str) -> tuple[Tensor, TimeAxis]:
     """(C, T, ...) on the CPU without gradients, S0 of polarized captures."""
     if not isinstance(capture, Capture):
-        raise ShapeError(f"{who}: expected a Capture, which knows its scan and axis, got {type(capture).__name__}.")
+        raise ArgumentError(f"{who}: expected a Capture, which knows its scan and axis, got {type(capture).__name__}.")
     if capture.transient is None or capture.axis is None:
         raise ShapeError(f"{who}: expected a capture with a transient, got phasors alone.")
     cube = computed(capture.transient.detach().cpu())
@@ -227,7 +230,7 @@ def _chosen(available: int, wanted: int) -> list[int]:
     return [int((k + 0.5) * available / count) for k in range(count)]
 
 
-def _curves(cube: Tensor, axis: TimeAxis, rows: list[int], columns: list[int]) -> Any:
+def _curves(cube: Tensor, axis: TimeAxis, rows: list[int], columns: list[int]) -> Figure:
     figure = figure_type()(figsize=(1.0 + 1.9 * len(columns), 0.8 + 1.3 * len(rows)), layout="constrained")
     panels = figure.subplots(len(rows), len(columns), sharex=True, sharey=True, squeeze=False)
     edges = axis.edges_opl.numpy()
@@ -243,7 +246,7 @@ def _curves(cube: Tensor, axis: TimeAxis, rows: list[int], columns: list[int]) -
     return figure
 
 
-def _image(cube: Tensor, axis: TimeAxis) -> Any:
+def _image(cube: Tensor, axis: TimeAxis) -> Figure:
     """All points against time, the brightest bin white."""
     lines = cube.sum(0).flatten(1).T
     figure = figure_type()(figsize=(8.0, 4.5), layout="constrained")

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from torch import Tensor
@@ -12,7 +12,11 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Scan, Wall
 from torchtransient.errors import SceneError, ShapeError
+from torchtransient.quantities import Numbers
 from torchtransient.vis.files import figure_type, save_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # Of meshes in their order; what is measured has none.
 COLOURS = ("0.55", "tab:blue", "tab:orange", "tab:purple")
@@ -25,12 +29,13 @@ def plot_shape_fit(
     scan: Scan,
     meshes: Mapping[str, Tensor],
     faces: Tensor,
+    *,
     transients: Mapping[str, Tensor],
     axis: TimeAxis,
-    losses: Sequence[float],
-    errors: Mapping[str, Sequence[float]],
+    losses: Numbers,
+    errors: Mapping[str, Numbers],
     path: str | Path | None = None,
-) -> Any:
+) -> Figure:
     """A matplotlib figure of a fit. Lengths in metres.
 
     `meshes`: name -> vertices (V, 3), the start first and the truth last, all with `faces` (F, 3). They are drawn as
@@ -53,7 +58,7 @@ def plot_shape_fit(
             )
     colours = dict(zip(meshes, COLOURS, strict=False)) | {list(meshes)[-1]: LAST_COLOUR}
     figure = figure_type()(figsize=(11.0, 7.4), layout="constrained")
-    upper, lower = figure.subfigures(2, 1, height_ratios=(1.25, 1.0))
+    upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=(1.25, 1.0)).flat
     front, above = upper.subplots(1, 2)
     _draw_views(front, above, scan, {name: _numbers(mesh) for name, mesh in meshes.items()}, _numbers(faces), colours)
     panels = lower.subplots(1, 4, width_ratios=(1.0, 1.0, 1.0, 1.2))
@@ -118,7 +123,7 @@ def _draw_transients(panels: Any, transients: Mapping[str, Tensor], axis: TimeAx
     panels[0].legend(fontsize=7, frameon=False)
 
 
-def _draw_curves(panel: Any, losses: Sequence[float], errors: Mapping[str, Sequence[float]]) -> None:
+def _draw_curves(panel: Any, losses: Numbers, errors: Mapping[str, Numbers]) -> None:
     for n, (name, values) in enumerate(errors.items()):
         panel.plot(values, color=f"C{n}", linewidth=1.2, label=name)
     panel.set_yscale("log")

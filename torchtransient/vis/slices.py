@@ -4,19 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
-from torchtransient.errors import ShapeError
+from torchtransient.errors import ArgumentError, ShapeError
 from torchtransient.units import opl_to_seconds
 from torchtransient.vis.files import figure_type, picture_figure, save_figure
 from torchtransient.vis.overview import moments_of_arrival
 from torchtransient.vis.sources import Source, images_of, transient_of
 from torchtransient.vis.stamps import moment
 from torchtransient.vis.tone_mapping import exposure_of, tone_map
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def streak(
@@ -28,7 +31,7 @@ def streak(
     axis: TimeAxis | None = None,
     exposure: float | None = None,
     curve: str = "log",
-) -> Any:
+) -> Figure:
     """A matplotlib figure as a streak camera sees it: one row (or one column) of pixels over time, time downwards.
 
     Give `row` or `column` (None: the middle row). `source` and `axis` as in `frames`; `exposure` and `curve` as in
@@ -37,7 +40,7 @@ def streak(
     """
     cube, axis = transient_of(source, axis, "streak")
     if row is not None and column is not None:
-        raise ShapeError("streak: expected row or column, got both.")
+        raise ArgumentError("streak: expected row or column, got both.")
     number, what = (column, "column") if column is not None else (row, "row")
     count = cube.shape[3] if what == "column" else cube.shape[2]
     number = count // 2 if number is None else number
@@ -72,7 +75,7 @@ def frame_grid(
     exposure: float | None = None,
     curve: str = "srgb",
     title: str = "",
-) -> Any:
+) -> Figure:
     """A matplotlib figure of moments, each with its time.
 
     `bins` names them; None takes `count` moments between which equal shares of the light arrive. `exposure` None lets
@@ -107,7 +110,7 @@ def histogram(
     axis: TimeAxis | None = None,
     log: bool = False,
     title: str = "",
-) -> Any:
+) -> Figure:
     """A matplotlib figure of what some pixels (row, column) see over time, a panel each.
 
     Three channels are red, green and blue lines, one is black, others go from violet to yellow; `log` takes a

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
-from torchtransient.errors import ShapeError, StorageError, TorchTransientError
+from torchtransient.errors import ArgumentError, MissingPackageError, ShapeError, StorageError, TorchTransientError
 
 Source = Any  # Tensor | NDArray | RenderOutput | Result | str | Path, told apart by what they offer
 _HDF5 = (".h5", ".hdf5")
@@ -156,7 +156,7 @@ def as_tensor(value: Any, who: str) -> Tensor:
     elif isinstance(value, Tensor):
         tensor = value.detach().cpu()
     else:
-        raise ShapeError(
+        raise ArgumentError(
             f"{who}: expected a tensor, an array, a RenderOutput or the path of a result, got {type(value).__name__}."
         )
     if tensor.is_complex() or tensor.dtype in (torch.float32, torch.float64):
@@ -259,7 +259,7 @@ def _hdf5_values(path: Path) -> dict[str, Any]:
     try:
         import h5py
     except ImportError as error:
-        raise StorageError(
+        raise MissingPackageError(
             "picture: HDF5 needs the package h5py. Install it with pip install 'torchtransient[data]'."
         ) from error
     with h5py.File(path, "r") as file:

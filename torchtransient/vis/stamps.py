@@ -8,7 +8,7 @@ import numpy as np
 
 from torchtransient.axes import TimeAxis
 from torchtransient.units import opl_to_seconds
-from torchtransient.vis.files import Image
+from torchtransient.vis.files import Image, missing
 
 INK, DIM, GROUND = (235, 235, 235), (95, 95, 95), (20, 20, 20)
 
@@ -39,8 +39,11 @@ def with_strip(image: Image, text: str, share: float | None = None) -> Image:
 
     The strip does not cover the picture. Its text is made smaller until it fits the width.
     """
-    from PIL import Image as Pillow
-    from PIL import ImageDraw
+    try:
+        from PIL import Image as Pillow
+        from PIL import ImageDraw
+    except ImportError as error:
+        raise missing("pillow") from error
 
     height, width = image.shape[:2]
     rows = max(16, round(0.075 * max(height, width)))

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
 
 BROKEN = (1.0, 0.0, 1.0)  # magenta: a pixel that is not finite must not pass for black or white
 CURVES = ("srgb", "gamma", "log", "linear")
@@ -105,7 +105,7 @@ def _curve(linear: Tensor, curve: str, gamma: float, stops: float) -> Tensor:
         # The ratio of the channels is shown on the scale of the eye, else every colour would turn to its primary.
         ratio = linear / torch.where(brightest > 0, brightest, 1.0)
         return level * _curve(ratio, "srgb", gamma, stops)
-    raise UnitError(f"tone_map: expected a curve out of {', '.join(CURVES)}, got {curve!r}.")
+    raise ArgumentError(f"tone_map: expected a curve out of {', '.join(CURVES)}, got {curve!r}.")
 
 
 def _check(image: Tensor) -> None:

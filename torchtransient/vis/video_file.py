@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from torchtransient.errors import ShapeError, StorageError, UnitError
+from torchtransient.errors import MissingPackageError, ShapeError, StorageError, UnitError
 from torchtransient.quantities import positive, shown
 from torchtransient.vis.files import Image
 from torchtransient.vis.stamps import DIM, GROUND, INK
@@ -147,7 +147,7 @@ def _ffmpeg() -> Any:
     try:
         import imageio_ffmpeg
     except ImportError as error:
-        raise StorageError(
+        raise MissingPackageError(
             "video: an .mp4 needs the package imageio-ffmpeg, which brings ffmpeg along. Install it with pip install "
             "'torchtransient[vis]', or choose a name that ends in .gif."
         ) from error
@@ -158,7 +158,7 @@ def _pillow() -> Any:
     try:
         from PIL import Image as Pillow
     except ImportError as error:
-        raise StorageError(
+        raise MissingPackageError(
             "video: a .gif needs the package pillow. Install it with pip install 'torchtransient[vis]'."
         ) from error
     return Pillow

@@ -6,16 +6,18 @@ begin at the wall.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.quantities import positive, real_array, shown
+from torchtransient.quantities import Numbers, positive, real_array, shown
 from torchtransient.vis.files import figure_type, save_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _PANEL = 3.4
 # Beside the picture of depth: no colour of the map.
@@ -30,13 +32,13 @@ def volume_views(
     path: str | Path | None = None,
     *,
     depths: Any = None,
-    extent: Sequence[float] | None = None,
+    extent: Numbers | None = None,
     depth: Any = None,
     mask: Any = None,
     normals: Any = None,
     gamma: float = 1.0,
     title: str = "",
-) -> Any:
+) -> Figure:
     """A matplotlib figure of a volume: the highest values seen from the front, from the top and from the side.
 
     ``volume`` (Z, Y, X), real, or complex of which the squared modulus is shown; values below zero are black, the
@@ -85,9 +87,9 @@ def depth_picture(
     path: str | Path | None = None,
     *,
     mask: Any = None,
-    extent: Sequence[float] | None = None,
+    extent: Numbers | None = None,
     title: str = "",
-) -> Any:
+) -> Figure:
     """A matplotlib figure of a depth map (Y, X) in metres, where ``mask`` (Y, X) is true, near dark and far light.
 
     ``extent`` (width, height) in metres scales the axes. Raises ShapeError, UnitError, StorageError.
@@ -101,9 +103,9 @@ def normals_picture(
     path: str | Path | None = None,
     *,
     mask: Any = None,
-    extent: Sequence[float] | None = None,
+    extent: Numbers | None = None,
     title: str = "",
-) -> Any:
+) -> Figure:
     """A matplotlib figure of unit normals (3, Y, X) as colours, (n + 1) / 2 for red, green and blue, where ``mask``
     (Y, X) is true.
 
@@ -116,7 +118,7 @@ def normals_picture(
 # ------------------------------------------------------------------------------------------------------------- parts
 
 
-def _one_panel(picture: Tensor, mask: Any, extent: Any, title: str, path: str | Path | None, who: str) -> Any:
+def _one_panel(picture: Tensor, mask: Any, extent: Any, title: str, path: str | Path | None, who: str) -> Figure:
     size = (picture.shape[-2], picture.shape[-1])
     kept = None if mask is None else _map("mask", mask, size).bool()
     _, (width, height) = _scales((1, *size), None, extent)

@@ -14,9 +14,9 @@ from torchtransient import geometry
 from torchtransient.data import Affine, Augment, Augmented, Crop, Flip, QuarterTurn
 from torchtransient.data.augmentation.augment import KINDS
 from torchtransient.data.augmentation.pixel_map import PixelMap
-from torchtransient.errors import SceneError, ShapeError, UnitError
-from torchtransient.render.cameras import camera_of
-from torchtransient.render.labels import LABELS, NUMBERED, first_return, scene_labels
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
+from torchtransient.rendering.cameras import camera_of
+from torchtransient.rendering.labels import LABELS, NUMBERED, first_return, scene_labels
 from torchtransient.scenes.transforms import look_at, rotate, scale, translate
 
 VARIANT = "llvm_ad_mono_polarized"
@@ -303,23 +303,23 @@ DEPTH, CUBE = torch.ones(4, 5), torch.ones(1, 3, 4, 5)
         (lambda: FLIP({"index": 3}), SceneError, "got none"),
         (lambda: FLIP({"depth": 3.0}), ShapeError, "image"),
         (lambda: FLIP({"normals": DEPTH, "to_world": torch.eye(4)}), ShapeError, r"\(\.\.\., 3, H, W\)"),
-        (lambda: FLIP((CUBE, DEPTH)), SceneError, "names="),
+        (lambda: FLIP((CUBE, DEPTH)), ArgumentError, "names="),
         (lambda: FLIP({"depth": DEPTH, "to_world": torch.eye(3)}), ShapeError, r"\(\.\.\., 4, 4\)"),
         (lambda: Augment(Flip(p=1.0), polarized=True)({"transient": CUBE}), ShapeError, "4 Stokes components"),
         (lambda: Augment(QuarterTurn(1), polarized=True)({"steady": torch.ones(4, 1, 4, 5)}), SceneError, "wants intr"),
         (lambda: Augment(Flip(p=1.0), polarized=True)({"measurement": CUBE}), SceneError, "measure afterwards"),
         (lambda: Augment(Crop((5, 5)))({"depth": DEPTH}), ShapeError, "do not fit"),
         (lambda: Augment(Crop((2, 2), (3, 3)))({"depth": DEPTH}), ShapeError, "do not fit"),
-        (lambda: Augment("flip"), SceneError, "Flip, QuarterTurn, Crop or Affine"),
-        (lambda: Augment(Flip(), fields={"mask": "mask"}), SceneError, "fields among"),
-        (lambda: Flip("diagonal"), SceneError, "'horizontal' or 'vertical'"),
+        (lambda: Augment("flip"), ArgumentError, "Flip, QuarterTurn, Crop or Affine"),
+        (lambda: Augment(Flip(), fields={"mask": "mask"}), ArgumentError, "fields among"),
+        (lambda: Flip("diagonal"), ArgumentError, "'horizontal' or 'vertical'"),
         (lambda: Flip(p=2.0), UnitError, "between 0 and 1"),
-        (lambda: QuarterTurn([]), SceneError, "got none"),
+        (lambda: QuarterTurn([]), ArgumentError, "got none"),
         (lambda: QuarterTurn([0.5]), SceneError, "whole number"),
         (lambda: Crop(3), ShapeError, "two numbers"),
         (lambda: Crop((0, 3)), ShapeError, "at least 1"),
-        (lambda: Affine("rotate"), SceneError, "of kornia that keeps the size"),
-        (lambda: Augmented([1], "flip"), SceneError, "expected an Augment"),
+        (lambda: Affine("rotate"), ArgumentError, "of kornia that keeps the size"),
+        (lambda: Augmented([1], "flip"), ArgumentError, "expected an Augment"),
     ],
 )  # fmt: skip
 def test_what_it_refuses(call, error, message):
@@ -332,5 +332,5 @@ def test_kornias_maps_that_are_no_cameras():
 
     with pytest.raises(SceneError, match="no affine map"):
         Augment(Affine(RandomPerspective(p=1.0)))({"depth": torch.ones(8, 8)})
-    with pytest.raises(SceneError, match="Windows are Crop's"):
+    with pytest.raises(ArgumentError, match="Windows are Crop's"):
         Affine(RandomCrop((3, 3)))

@@ -21,7 +21,7 @@ from torchtransient.data import (
     TransientDataset,
     TransientStream,
 )
-from torchtransient.errors import SceneError, TorchTransientError, UnitError
+from torchtransient.errors import ArgumentError, SceneError, TorchTransientError, UnitError
 
 N = 11
 
@@ -149,13 +149,13 @@ def test_an_epoch_is_one_of_the_data_set_too(data):
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [
-        (lambda data: Augmented(TransientStream(data), Augment(Flip())), SceneError, "AugmentedStream"),
-        (lambda data: AugmentedStream([1], Augment(Flip())), SceneError, "expected a stream.*Augmented"),
-        (lambda data: AugmentedStream(TransientStream(data), "flip"), SceneError, "expected an Augment"),
+        (lambda data: Augmented(TransientStream(data), Augment(Flip())), ArgumentError, "AugmentedStream"),
+        (lambda data: AugmentedStream([1], Augment(Flip())), ArgumentError, "expected a stream.*Augmented"),
+        (lambda data: AugmentedStream(TransientStream(data), "flip"), ArgumentError, "expected an Augment"),
         (lambda data: AugmentedStream(TransientStream(data), Augment(Flip()), seed=-1), UnitError, "seed"),
         (lambda data: Augmented([1], Augment(Flip()), seed=0.5), UnitError, "seed"),
         (lambda data: Augmented([1], Augment(Flip()), seed=-1), UnitError, "seed"),
-        (lambda data: Augmented(3, Augment(Flip())), SceneError, "samples by number"),
+        (lambda data: Augmented(3, Augment(Flip())), ArgumentError, "samples by number"),
         (lambda data: Augmented([1], Augment(Flip()), seed=0).sample(0, -1), UnitError, "epoch"),
         (lambda data: Augmented([1], Augment(Flip())).sample(0, 0.5), UnitError, "epoch"),
         (lambda data: Augmented([1, 2], Augment(Flip()))[1.7], IndexError, "from 0 to 1"),

@@ -10,6 +10,7 @@ import pytest
 import torch
 from kornia.augmentation import RandomAffine, RandomRotation
 
+from support.sweeps import together
 from torchtransient import plugins
 from torchtransient.data import Affine, Augment, Crop, Flip, QuarterTurn
 from torchtransient.data.augmentation.pixel_map import PixelMap
@@ -17,7 +18,7 @@ from torchtransient.data.augmentation.scene_values import OF_DEVICES, UNAFFECTED
 from torchtransient.errors import SceneError
 from torchtransient.plugins.parameter_effect import ANY_KEY, all_rows
 from torchtransient.plugins.parameters import ParameterTracker, can_carry_gradients
-from torchtransient.sensing.devices import KINDS
+from torchtransient.sensing.devices.devices import KINDS
 from torchtransient.testing.every_plugin import every_plugin
 
 N = 6
@@ -52,7 +53,7 @@ STAYS = {
     "cam.principal_point_offset_x": NEVER,
     **dict.fromkeys(
         ("cam.film.crop_offset", "meter.sensor.points", "scene", "scan", "letter", "$pose", "box.unheard_of", "sensor",
-         "device.LensBlur.fwhm_px", "device.linear_analysers.angles_deg", "to_world", "reflectance"),
+         "device.LensBlur.fwhm_px", "device.linear_analyzers.angles_deg", "to_world", "reflectance"),
         NEVER,
     ),
 }  # fmt: skip
@@ -63,8 +64,8 @@ def augmented(operation, key, **options):
     return Augment(operation, **options)(sample)
 
 
-@pytest.mark.parametrize("name", OPERATIONS)
 @pytest.mark.parametrize("key", STAYS)
+@together("name", OPERATIONS)
 def test_what_stays(key, name):
     if name in STAYS[key].split():
         assert augmented(OPERATIONS[name], key)["values"][key].tolist() == [1, 1, 1]

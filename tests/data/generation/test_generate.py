@@ -22,7 +22,7 @@ from torchtransient.data.generation.settings import Settings
 from torchtransient.data.generation.shard_making import ShardMaker
 from torchtransient.data.storage.manifest import verify
 from torchtransient.data.storage.shard_file import Shard
-from torchtransient.errors import SceneError, StorageError, UnitError
+from torchtransient.errors import ArgumentError, SceneError, StorageError, UnitError
 
 RECIPE = FakeRecipe()
 QUICK = {"n": 23, "per_shard": 4, "progress": False}
@@ -258,16 +258,16 @@ class Unpicklable(FakeRecipe):
     ("changes", "error", "words"),
     [
         ({"n": 0}, UnitError, "n: expected"), ({"n": 2.5}, UnitError, "n: expected"),
-        ({"n": None}, UnitError, "how many"),
+        ({"n": None}, ArgumentError, "how many"),
         ({"workers": 0}, UnitError, "workers"), ({"retries": -1}, UnitError, "retries"),
         ({"per_shard": 0}, UnitError, "per_shard"), ({"shard": (2, 2)}, UnitError, "shard"),
         ({"shard": "0/2"}, UnitError, "shard"), ({"shard": (True, 2)}, UnitError, "shard"),
         ({"n": True}, UnitError, "n: expected"), ({"shard": (0, 1, 2)}, UnitError, "shard"),
         ({"timeout_s": 0}, UnitError, "timeout_s"),
         ({"max_outside": -0.1}, UnitError, "max_outside"), ({"max_outside": float("nan")}, UnitError, "max_outside"),
-        ({"engine": "dask"}, UnitError, "engine"), ({"address": "auto"}, UnitError, "ray"),
-        ({"store": "half"}, StorageError, "store"), ({"compression": "lzma"}, StorageError, "compression"),
-        ({"recipe": {}}, SceneError, "recipe"), ({"recipe": Unpicklable()}, SceneError, "pickles"),
+        ({"engine": "dask"}, ArgumentError, "engine"), ({"address": "auto"}, UnitError, "ray"),
+        ({"store": "half"}, ArgumentError, "store"), ({"compression": "lzma"}, ArgumentError, "compression"),
+        ({"recipe": {}}, ArgumentError, "recipe"), ({"recipe": Unpicklable()}, SceneError, "pickles"),
         ({"folder": 3}, StorageError, "folder|name of a file"),
     ],
 )  # fmt: skip

@@ -11,7 +11,7 @@ import torch
 from torch.utils.data import DataLoader
 
 import torchtransient as tt
-from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.testing.small_room import COLOUR, VARIANT, make_room
 from torchtransient.training import Batches, worker_init
 
@@ -30,7 +30,7 @@ class Stored:
         return self
 
     def sample(self, index):
-        return tt.data.Sample(index, 0, self.arrays)
+        return tt.data.Sample(index, 0, arrays=self.arrays)
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +114,7 @@ def test_what_it_does_not_take(data, recipe):
         with pytest.raises(UnitError, match="seed"):
             tt.data.RecipeDataset(recipe, 1, transform=noisy, seed=seed)
     for transform in (None, lambda x: x, 3):
-        with pytest.raises(SceneError, match="takes generator="):
+        with pytest.raises(ArgumentError, match="takes generator="):
             tt.data.RecipeDataset(recipe, 1, transform=transform, seed=0)
     seeded = tt.data.RecipeDataset(recipe, 1, transform=noisy, seed=0)
     for epoch in (-1, 0.5, "first"):

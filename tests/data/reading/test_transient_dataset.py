@@ -13,7 +13,7 @@ from torch.utils.data import DataLoader
 import torchtransient as tt
 from support.stored_samples import AXIS, cube, folder, header, sample, write
 from torchtransient.data.reading.transient_dataset import TransientDataset
-from torchtransient.errors import StorageError, UnitError
+from torchtransient.errors import ArgumentError, StorageError, UnitError
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +98,9 @@ def test_a_window_reads_its_slabs_alone(tmp_path):
             raw[info.byte_offset + 50] ^= 255
     path.write_bytes(raw)
     x = cube(0, (1, 1024, 16, 16))
-    assert np.array_equal(TransientDataset(path, ["transient"], slice(130, 194))[0]["transient"], x[:, 130:194])
+    assert np.array_equal(
+        TransientDataset(path, fields=["transient"], window=slice(130, 194))[0]["transient"], x[:, 130:194]
+    )
     with pytest.raises(StorageError, match="damaged"):
         TransientDataset(path)[0]
 
@@ -115,14 +117,14 @@ def test_pixels(data):
 
 
 def test_fields(data):
-    assert set(TransientDataset(data, ["depth"])[0]) == {"depth", "index"}
-    assert set(TransientDataset(data, ["depth", "values", "index"])[0]) == {"depth", "values", "index"}
-    with pytest.raises(StorageError, match="expected fields among"):
-        TransientDataset(data, ["albedo"])
+    assert set(TransientDataset(data, fields=["depth"])[0]) == {"depth", "index"}
+    assert set(TransientDataset(data, fields=["depth", "values", "index"])[0]) == {"depth", "values", "index"}
+    with pytest.raises(ArgumentError, match="expected fields among"):
+        TransientDataset(data, fields=["albedo"])
 
 
 def test_transforms(data):
-    found = TransientDataset(data, ["depth"], window=slice(0, 64), transform=doubled)
+    found = TransientDataset(data, fields=["depth"], window=slice(0, 64), transform=doubled)
     assert set(found[2]) == {"depth", "measurement", "index"} == {*found.fields, "index"}
     assert np.array_equal(found[2]["measurement"].numpy(), 2 * cube(2)[:, :64])
     chain = tt.sensing.Compose([tt.sensing.ShotNoise()])
@@ -220,7 +222,7 @@ def test_not_more_than_some_files_are_open(data, monkeypatch):
     from torchtransient.data.reading import shard_table
 
     monkeypatch.setattr(shard_table, "_OPEN", 2)
-    found = TransientDataset(data, ["depth"])
+    found = TransientDataset(data, fields=["depth"])
     for i in (0, 4, 8, 0, 9, 5):
         assert found[i]["index"] == i
         assert len(found._table._open) <= 2

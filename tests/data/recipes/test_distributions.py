@@ -11,7 +11,7 @@ import torchtransient as tt
 from torchtransient.data.recipes.distribution import ANYTHING, NUMBERS, POSE, Place
 from torchtransient.data.recipes.streams import Extreme, Stream
 from torchtransient.data.recipes.written import read_distribution, written
-from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 
 D = tt.data
 DRAWS = 5000
@@ -47,7 +47,7 @@ def test_mean_and_deviation(distribution, mean, std):
 
 def test_ends_are_reached_and_not_left():
     for distribution, low, high in (
-        (D.Uniform(-1, 3), -1, 3), (D.LogUniform(0.1, 10), 0.1, 10), (D.Normal(0, 5, -1, 2), -1, 2),
+        (D.Uniform(-1, 3), -1, 3), (D.LogUniform(0.1, 10), 0.1, 10), (D.Normal(0, 5, low=-1, high=2), -1, 2),
         (D.Uniform(4, 4), 4, 4), (D.Normal(1, 0), 1, 1), (D.LogUniform(1e-300, 1e300), 1e-300, 1e300),
     ):  # fmt: skip
         drawn = many(distribution, count=2000)
@@ -141,10 +141,10 @@ WRONG = {
     "weights": (lambda: D.Choice([1, 2], weights=[1]), UnitError, "2 weights"),
     "no weight": (lambda: D.Choice([1, 2], weights=[0, 0]), UnitError, "greater than zero"),
     "axis": (lambda: D.Turn([0, 0, 0]), UnitError, "length"),
-    "about": (lambda: D.Turn(about="me"), SceneError, "self"),
+    "about": (lambda: D.Turn(about="me"), ArgumentError, "self"),
     "compose": (lambda: D.Compose([1]), SceneError, "distributions"),
     "scale": (lambda: D.Scale(-1, 1), UnitError, "at least 0"),
-    "same": (lambda: D.Uniform(0, 1, same="no"), SceneError, "True or False"),
+    "same": (lambda: D.Uniform(0, 1, same="no"), ArgumentError, "True or False"),
 }
 
 

@@ -17,6 +17,7 @@ import torch
 import torchtransient as tt
 from torchtransient.data.recipes.maker import MOST_KEPT
 from torchtransient.errors import (
+    ArgumentError,
     PhysicsError,
     SceneError,
     ShapeError,
@@ -25,7 +26,7 @@ from torchtransient.errors import (
     UnitError,
 )
 from torchtransient.files.scan_data import scan_from_data
-from torchtransient.render.variant import active_variant
+from torchtransient.rendering.variant import active_variant
 
 D = tt.data
 VARIANT = "llvm_ad_mono"
@@ -299,9 +300,9 @@ WRONG = {
     "unknown plugin": (lambda: small(vary={"small-box.type": D.Choice(["cube", "nonsense"])}), SceneError, "nonsense"),
     "label": (lambda: small(labels=("depht",)), SceneError, "unknown label 'depht'"),
     "labels": (lambda: small(labels="depth"), SceneError, "list of names"),
-    "what is kept": (lambda: small(keep=["depth"]), SceneError, "expected some of transient, steady, got .'depth'"),
+    "what is kept": (lambda: small(keep=["depth"]), ArgumentError, "expected some of transient, steady, got .'depth'"),
     "keep": (lambda: small(keep="steady"), SceneError, "list of names"),
-    "nothing kept": (lambda: small(keep=[]), SceneError, "expected some of transient"),
+    "nothing kept": (lambda: small(keep=[]), ArgumentError, "expected some of transient"),
     "device": (lambda: small(device="vl53l9"), SceneError, "vl53l8_like"),
     "device key": (lambda: small(vary={CYCLES: D.Uniform(1, 2)}), SceneError, "give device="),
     "device argument": (
@@ -325,9 +326,9 @@ WRONG = {
         lambda: small(vary={"small-box": D.Choice([box()["small-box"], nested()])}, labels=["material"]),
         SceneError, "would stand for another",
     ),
-    "gates": (lambda: small(gates=3), SceneError, "tt.Gate"),
-    "frequencies": (lambda: small(frequencies=3), SceneError, "cycles per metre"),
-    "vary": (lambda: small(vary=[1]), SceneError, "vary"),
+    "gates": (lambda: small(gates=3), ArgumentError, "tt.Gate"),
+    "frequencies": (lambda: small(frequencies=3), ArgumentError, "cycles per metre"),
+    "vary": (lambda: small(vary=[1]), ArgumentError, "vary"),
     "sensors": (lambda: small(sensors=1.5), SceneError, "sensors"),
     "key of one scene": (lambda: small(D.OneOf([box(), without_small_box()])), SceneError, "small-box"),
 }  # fmt: skip

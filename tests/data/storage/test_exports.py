@@ -23,7 +23,7 @@ from torchtransient.data.recipes.written import written_frequencies
 from torchtransient.data.storage.shard_writing import ShardWriter
 from torchtransient.data.storage.tal_export import export_tal
 from torchtransient.data.storage.web_dataset import decode_web_sample, export_web_dataset, read_web_dataset
-from torchtransient.errors import StorageError
+from torchtransient.errors import ArgumentError, MissingPackageError, StorageError
 from torchtransient.files.scan_data import scan_data, scan_from_data
 from torchtransient.tensor_record import same
 
@@ -77,7 +77,7 @@ def test_what_cannot_be_exported(data, tmp_path, monkeypatch):
     with pytest.raises(StorageError, match="expected a folder"):
         export_web_dataset(data, tmp_path / "none")
     monkeypatch.setitem(sys.modules, "zstandard", None)
-    with pytest.raises(StorageError, match="zstandard"):
+    with pytest.raises(MissingPackageError, match="zstandard"):
         export(data, tmp_path)
     assert list(tmp_path.iterdir()) == []
 
@@ -222,7 +222,7 @@ def test_each_capture_has_its_own_scan(tmp_path):
     axis = tt.TimeAxis(0, 0.02, 100)
     rendered(tmp_path, samples=8, time_axis=axis, vary={"scan": tt.data.Choice(scans)})
     paths = export_tal(tmp_path, tmp_path / "out", progress=False)
-    told = [int(one["values"]["scan"].removeprefix("#")) for one in TransientDataset(tmp_path, ["values"])]
+    told = [int(one["values"]["scan"].removeprefix("#")) for one in TransientDataset(tmp_path, fields=["values"])]
     assert set(told) == {0, 1}
     for path, number in zip(paths, told, strict=True):
         found = tt.nlos.read_capture(path).scan
@@ -250,7 +250,7 @@ def test_what_is_no_capture(data, tmp_path):
         export_tal(data, tmp_path)
     scan = grids()["confocal"]
     path = captures(tmp_path, scan, made(scan))
-    with pytest.raises(StorageError, match="expected field"):
+    with pytest.raises(ArgumentError, match="expected field"):
         export_tal(path, tmp_path, field="gated")
     with pytest.raises(StorageError, match="expected a folder"):
         export_tal(path, tmp_path / "none")

@@ -21,7 +21,7 @@ from support.stored_samples import header, sample, write
 from torchtransient.data.storage.chunks import COMPRESSIONS
 from torchtransient.data.storage.manifest import verify
 from torchtransient.data.storage.shard_file import Shard, ShardWriter
-from torchtransient.errors import StorageError
+from torchtransient.errors import MissingPackageError, StorageError
 
 
 def sources(folder):
@@ -202,9 +202,9 @@ def test_full_disks(tmp_path):
 def test_without_packages(tmp_path, monkeypatch, package, message):
     path = write(tmp_path / "a.h5", [sample(0)])
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(StorageError, match=f"package {package}.*{message}"):
+    with pytest.raises(MissingPackageError, match=f"package {package}.*{message}"):
         ShardWriter(tmp_path / "b.h5", 1, header())
-    with pytest.raises(StorageError, match=f"package {package}"), Shard(path) as shard:
+    with pytest.raises(MissingPackageError, match=f"package {package}"), Shard(path) as shard:
         shard.read("transient", 0)
     if package == "hdf5plugin":
         with Shard(write(path, [sample(0)], compression="gzip")) as shard:

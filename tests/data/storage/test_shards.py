@@ -21,7 +21,7 @@ from support.stored_samples import cube, header, sample, write
 from torchtransient.data.storage.chunks import COMPRESSIONS, chunk_shape
 from torchtransient.data.storage.part_files import sweep_parts
 from torchtransient.data.storage.shard_file import Shard, ShardWriter, stored_checksum
-from torchtransient.errors import StorageError
+from torchtransient.errors import ArgumentError, StorageError
 
 
 def digest(path):
@@ -129,17 +129,18 @@ def test_rows_come_once(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("arguments", "error", "message"),
     [
-        ({"rows": 0}, "rows"), ({"rows": 1.5}, "rows"), ({"store": "lossy"}, "store"),
-        ({"compression": "zip"}, "compression"), ({"header": {"a": object()}}, "plain data"),
-        ({"header": {"a": float("nan")}}, "plain data"),
-        ({"path": "missing/a.h5"}, "does not exist"), ({"path": "."}, "folder"),
+        ({"rows": 0}, StorageError, "rows"), ({"rows": 1.5}, StorageError, "rows"),
+        ({"store": "lossy"}, ArgumentError, "store"), ({"compression": "zip"}, ArgumentError, "compression"),
+        ({"header": {"a": object()}}, StorageError, "plain data"),
+        ({"header": {"a": float("nan")}}, StorageError, "plain data"),
+        ({"path": "missing/a.h5"}, StorageError, "does not exist"), ({"path": "."}, StorageError, "folder"),
     ],
 )  # fmt: skip
-def test_arguments(tmp_path, monkeypatch, arguments, message):
+def test_arguments(tmp_path, monkeypatch, arguments, error, message):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(StorageError, match=message):
+    with pytest.raises(error, match=message):
         ShardWriter(**{"path": "a.h5", "rows": 1, "header": {}, **arguments})
     assert list(tmp_path.iterdir()) == []
 
@@ -208,7 +209,7 @@ def test_a_shard_that_is_there_is_replaced_at_the_end(tmp_path):
 def test_windows_and_pixels(tmp_path):
     x = cube(0)
     with Shard(write(tmp_path / "a.h5", [sample(0)])) as shard:
-        found = shard.read("transient", 0, slice(100, 164), (slice(2, 4), slice(5, None)))
+        found = shard.read("transient", 0, window=slice(100, 164), pixels=(slice(2, 4), slice(5, None)))
         assert np.array_equal(found, x[:, 100:164, 2:4, 5:])
         assert np.array_equal(shard.read("depth", 0, pixels=(slice(3, 5), slice(None))), sample(0).arrays["depth"][3:5])
         for arguments, message in (

@@ -12,7 +12,7 @@ import torch
 import torchtransient as tt
 from support.capture_files import AXIS, FROM_ZERO, SQUARE, WALL, grids, holdable, listed, made
 from torchtransient.capture import Capture, files
-from torchtransient.errors import StorageError
+from torchtransient.errors import ArgumentError, StorageError
 from torchtransient.files.captures.formats import FORMATS, LAYOUTS, read_capture, write_capture
 from torchtransient.files.captures.mat_file import write_mat
 
@@ -85,7 +85,7 @@ def test_what_no_foreign_layout_holds(tmp_path, layout):
         capture.write(tmp_path / "a.exr", format=layout)
     with pytest.raises(StorageError, match="does not exist"):
         capture.write(tmp_path / "no" / path.name, format=layout)
-    with pytest.raises(StorageError, match=r"expected a tt\.nlos\.Capture"):
+    with pytest.raises(ArgumentError, match=r"expected a tt\.nlos\.Capture"):
         write_capture(path, torch.zeros(3), format=layout)
     with pytest.raises(StorageError, match="metadata="):
         write_capture(path, capture, {"a": 1}, format=layout)
@@ -122,9 +122,9 @@ def test_layouts_that_are_only_read(tmp_path, layout):
 
 
 def test_names_of_formats(tmp_path):
-    with pytest.raises(StorageError, match="expected format to be one of torchtransient, tal"):
+    with pytest.raises(ArgumentError, match="expected format to be one of torchtransient, tal"):
         read_capture(tmp_path / "a.h5", "exr")
-    with pytest.raises(StorageError, match="expected format"):
+    with pytest.raises(ArgumentError, match="expected format"):
         made(grids()["confocal"]).write(tmp_path / "a.h5", "exr")
     with pytest.raises(StorageError, match="does not exist"):
         read_capture(tmp_path / "a.h5")

@@ -8,7 +8,7 @@ import torch
 
 import torchtransient as tt
 from torchtransient.errors import SceneError
-from torchtransient.render.variant import active_variant
+from torchtransient.rendering.variant import active_variant
 from torchtransient.scenes.bottle import write_ply
 from torchtransient.scenes.transforms import rotate, scale, translate
 

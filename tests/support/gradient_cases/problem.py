@@ -1,7 +1,7 @@
 """A gradient case and its problem: one scalar unknown of a scene, the loss, its gradient in both modes.
 
-A case builds a scene and says how the unknown enters the scene's parameters. ``support`` is what the README's table
-prints: ``correct`` or ``biased where silhouettes move``.
+A case builds a scene and says how the unknown enters the scene's parameters. ``support`` is what the table of
+docs/gradients_table.md prints: ``correct`` or ``biased where silhouettes move``.
 """
 
 from __future__ import annotations

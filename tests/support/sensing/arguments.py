@@ -22,7 +22,7 @@ KERNEL = torch.tensor([0.25, 0.5, 0.25], dtype=torch.float64)
 COUNTS = (20 * LIGHT).round()
 STOKES = torch.cat([1.5 + rand(1, 1, 2, 2, 2), rand(3, 1, 2, 2, 2) - 0.5])
 TAPS = rand(1, 4, 2, 2)
-ROWS = sensing.linear_analysers([0.0, 45.0, 90.0, 135.0])
+ROWS = sensing.linear_analyzers([0.0, 45.0, 90.0, 135.0])
 PHASOR = torch.complex(rand(1, 2, 2, 2), rand(1, 2, 2, 2, seed=1))
 DELAYS = {"time_s": 1e-9 * rand(5), "mean_s": 1e-10 * rand(1), "sigma_s": 1e-10 * rand(1), "tau_s": 2e-10 * rand(1)}
 TIMED = {"axis": AXIS}
@@ -37,7 +37,7 @@ CALLS = {
     "Afterpulsing": (
         {"probability": number(0.1), "tau_s": number(1e-9), "dead_time_s": number(1e-10), "bin_width_s": number(1e-10),
          "period_s": number(2e-9), "background": rand(2, 3)}, {}),
-    "Analysers": ({"rows": ROWS}, {}),
+    "Analyzers": ({"rows": ROWS}, {}),
     "CodedHistogram": ({"codes": rand(3, 12)}, {}),
     "CoincidencePixel": (
         {"window_s": number(1e-9), "weights": rand(4), "bin_width_s": number(1e-10)},
@@ -105,12 +105,12 @@ CALLS = {
         {"albedo": rand(2, 3), "spectral_irradiance_w_m2_nm": number(1.3), "filter_bandwidth_m": number(1e-8),
          "wavelength_m": number(7e-7), "illumination": rand(2, 3)}, {"optics": OPTICS}),
     "amplitude_of": ({"phasor": PHASOR}, {}),
-    "analyse": ({"stokes": STOKES, "rows": ROWS}, {}),
+    "analyze": ({"stokes": STOKES, "rows": ROWS}, {}),
     "binary_code": (
         {"light_duty": number(0.5), "shifts": rand(3)}, {"gates": [[(0.0, 0.5)], [(0.2, 0.7)], [(0.4, 0.9)]]}),
     "blur_image": ({"x": LIGHT, "psf": rand(3, 3)}, {}),
-    "centre_of_mass": ({"histogram": COUNTS, "background": number(0.5)}, {}),
-    "circular_analysers": ({"extinction_ratio": number(100.0), "transmission": number(0.5)}, {}),
+    "center_of_mass": ({"histogram": COUNTS, "background": number(0.5)}, {}),
+    "circular_analyzers": ({"extinction_ratio": number(100.0), "transmission": number(0.5)}, {}),
     "coates": ({"counts": 0.1 * COUNTS, "dead_bins": number(3.0)}, {"cycles": 100}),
     "convolve_time": ({"x": LIGHT, "kernel": KERNEL}, {}),
     "correlate": ({"transient": LIGHT, "weights": rand(4, 12)}, {}),
@@ -142,7 +142,7 @@ CALLS = {
         {"median_hz": number(100.0), "log_std": number(0.5), "hot_fraction": number(0.1), "hot_factor": number(10.0)},
         {"height": 2, "width": 3}),
     "ktc_noise": ({"capacitance_f": number(1e-14), "temperature_k": number(300.0)}, {}),
-    "linear_analysers": (
+    "linear_analyzers": (
         {"angles_deg": 90 * rand(3), "extinction_ratio": number(100.0), "transmission": number(0.5)}, {}),
     "log_matched_filter": (
         {"histogram": COUNTS, "kernel": KERNEL, "signal_to_background": number(100.0)}, {}),

@@ -6,7 +6,7 @@ import torch
 
 from support.sensing.contract import Entry
 from torchtransient import sensing
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
 
 PS = 1e-12
 WIDTH = {"bin_width_s": 20 * PS}
@@ -54,7 +54,7 @@ ENTRIES = [
             (lambda: sensing.Afterpulsing(0.05, dead_time_s=0.0, delays=sensing.PowerLawDelays(1.0, 1e-8), **WIDTH),
              UnitError),
             (lambda: power_law(counted_from="avalanche"), UnitError),
-            (lambda: power_law(counted_from="photon"), ShapeError),
+            (lambda: power_law(counted_from="photon"), ArgumentError),
             (lambda: sensing.PowerLawDelays(-1.0, 1e-8), UnitError),
             (lambda: sensing.PowerLawDelays(1.0, 10.0), UnitError),
         ),

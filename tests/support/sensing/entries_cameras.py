@@ -8,7 +8,8 @@ from support.sensing.contract import Entry
 from torchtransient import sensing
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing import electronics, itof, itof_codes
+from torchtransient.sensing.cameras import electronics
+from torchtransient.sensing.itof import itof, itof_codes
 
 AXIS = TimeAxis(0.5, 0.2, 12)
 MAP_M = 0.2 * torch.arange(6.0).reshape(2, 3)
@@ -20,7 +21,9 @@ def itof_correlation():
 
 def two_tap_camera():
     """Pixels of two taps whose phases differ, by a code with corners."""
-    known = sensing.ItofCalibration(0.3, -1, 0.1 * torch.arange(6.0).reshape(2, 3))
+    known = sensing.ItofCalibration(
+        phase_offset_rad=0.3, direction=-1, phase_map_rad=0.1 * torch.arange(6.0).reshape(2, 3)
+    )
     return itof.ItofCorrelation(sensing.TwoTapCode(itof_codes.square_code(2)), (20e6, 60e6), AXIS, calibration=known)
 
 
@@ -95,7 +98,8 @@ ENTRIES: list[Entry] = [
             (20e6, 60e6),
             AXIS,
             calibration=sensing.ItofCalibration(
-                torch.nn.Parameter(torch.tensor([0.1, 0.2])), depth_map_m=torch.nn.Parameter(MAP_M.clone())
+                phase_offset_rad=torch.nn.Parameter(torch.tensor([0.1, 0.2])),
+                    depth_map_m=torch.nn.Parameter(MAP_M.clone())
             ),
         ),
         conserves=lambda y: y.sum() / (2 if y.shape[-3] == 8 else 1),
@@ -134,8 +138,8 @@ ENTRIES: list[Entry] = [
         errors=((lambda: sensing.PolarizationMosaic(torch.ones(4)), ShapeError),),
     ),
     Entry(
-        "Analysers",
-        lambda: sensing.Analysers(sensing.linear_analysers([0, 60, 120], 50.0)),
+        "Analyzers",
+        lambda: sensing.Analyzers(sensing.linear_analyzers([0, 60, 120], 50.0)),
         shape=(2, 4, 1, 3, 2, 2),
         input=stokes_like,
         # Half of the light passes an analyser: two thirds of three pictures of it are S0.

@@ -6,7 +6,7 @@ import torch
 
 from support.sensing.contract import Entry, counts_like
 from torchtransient import sensing
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
 
 PS = 1e-12
 MAP = torch.linspace(0.1, 0.9, 6, dtype=torch.float64).view(2, 3)  # one number for each pixel of the contract's input
@@ -61,7 +61,8 @@ ENTRIES = [
                 2.0, 0.5, spectral_irradiance_w_m2_nm=1.0, filter_bandwidth_m=1e-8, wavelength_m=9e-7
             ), UnitError),
             (lambda: sensing.ambient_photon_rate(
-                sensing.Optics(2.0), 0.5, spectral_irradiance_w_m2_nm=1.0, filter_bandwidth_m=10.0, wavelength_m=9e-7
+                sensing.Optics(f_number=2.0), 0.5, spectral_irradiance_w_m2_nm=1.0, filter_bandwidth_m=10.0,
+                    wavelength_m=9e-7
             ), UnitError),
         ),
     ),
@@ -76,8 +77,8 @@ ENTRIES = [
         random=True,
         errors=(
             (lambda: sensing.DetectionSkew(50.0, bin_width_s=20 * PS), UnitError),
-            (lambda: sensing.PixelSkew(50 * PS), UnitError),
-            (lambda: sensing.PixelSkew(50 * PS, bin_width_s=20 * PS, boundary="open"), ShapeError),
+            (lambda: sensing.PixelSkew(50 * PS), ArgumentError),
+            (lambda: sensing.PixelSkew(50 * PS, bin_width_s=20 * PS, boundary="open"), ArgumentError),
             (lambda: skew(sensing.PixelSkew)()(torch.ones(1, 12, 3, 3)), ShapeError),
         ),
     ),
@@ -104,28 +105,33 @@ ENTRIES = [
     ),
     Entry(
         "CoincidencePixel",
-        lambda **k: sensing.CoincidencePixel(sensing.SynchronousSPAD(300), 6, 2, 50 * PS, bin_width_s=20 * PS, **k),
+        lambda **k: sensing.CoincidencePixel(sensing.SynchronousSPAD(300), 6, coincidence=2, window_s=50 * PS,
+            bin_width_s=20 * PS, **k),
         shape=(2, 1, 8, 1, 2),
         random=True,
         errors=(
-            (lambda: sensing.CoincidencePixel(sensing.ShotNoise(), 6, 2, 50 * PS, bin_width_s=20 * PS), UnitError),
-            (lambda: sensing.CoincidencePixel(sensing.SynchronousSPAD(3), 2, 3, 5e-11, bin_width_s=2e-11), UnitError),
-            (lambda: sensing.CoincidencePixel(sensing.SynchronousSPAD(3), 2, 2, 50.0, bin_width_s=2e-11), UnitError),
+            (lambda: sensing.CoincidencePixel(sensing.ShotNoise(), 6, coincidence=2, window_s=50 * PS,
+             bin_width_s=20 * PS), UnitError),
+            (lambda: sensing.CoincidencePixel(sensing.SynchronousSPAD(3), 2, coincidence=3, window_s=5e-11,
+             bin_width_s=2e-11), UnitError),
+            (lambda: sensing.CoincidencePixel(sensing.SynchronousSPAD(3), 2, coincidence=2, window_s=50.0,
+             bin_width_s=2e-11), UnitError),
             (lambda: sensing.CoincidencePixel(
-                sensing.FreeRunningSPAD(9, 70 * PS, bin_width_s=20 * PS), 2, 2, 80 * PS, bin_width_s=20 * PS
+                sensing.FreeRunningSPAD(9, 70 * PS, bin_width_s=20 * PS), 2, coincidence=2, window_s=80 * PS,
+                    bin_width_s=20 * PS
             ), UnitError),
             (lambda: sensing.CoincidencePixel(
-                sensing.SynchronousSPAD(9), 2, 2, 80 * PS, bin_width_s=20 * PS
+                sensing.SynchronousSPAD(9), 2, coincidence=2, window_s=80 * PS, bin_width_s=20 * PS
             )(torch.ones(1, 2, 1, 1)), UnitError),
             (lambda: sensing.CoincidencePixel(
-                sensing.FreeRunningSPAD(9, 1e-8, bin_width_s=1e-8), 99, 1, 1e-10, bin_width_s=1e-8
+                sensing.FreeRunningSPAD(9, 1e-8, bin_width_s=1e-8), 99, coincidence=1, window_s=1e-10, bin_width_s=1e-8
             ).sample(torch.full((1, 8, 1, 1), 99.0)), UnitError),
         ),
     ),
     Entry(
         "CoincidencePixel-weights",
         lambda **k: sensing.CoincidencePixel(
-            paralyzable(300), 4, 2, 45 * PS, weights=[1, 2, 2, 5], bin_width_s=20 * PS, **k
+            paralyzable(300), 4, coincidence=2, window_s=45 * PS, weights=[1, 2, 2, 5], bin_width_s=20 * PS, **k
         ),
         shape=(2, 1, 8, 1, 2),
         random=True,
@@ -135,7 +141,7 @@ ENTRIES = [
         dead_times,
         random=True,
         errors=(
-            (lambda: sensing.PixelGroups([], MAP), ShapeError),
+            (lambda: sensing.PixelGroups([], MAP), ArgumentError),
             (lambda: sensing.PixelGroups([sensing.ShotNoise()], torch.ones(2, 3)), ShapeError),
             (lambda: sensing.PixelGroups([sensing.ShotNoise()], torch.zeros(3)), ShapeError),
             (lambda: sensing.PixelGroups([sensing.ShotNoise(), sensing.SynchronousSPAD(3)], 0 * MAP), UnitError),

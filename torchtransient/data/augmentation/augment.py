@@ -13,7 +13,7 @@ from torchtransient.data.augmentation.pixel_map import PixelMap
 from torchtransient.data.augmentation.sample_images import as_image, check_unknown, size_of
 from torchtransient.data.augmentation.scene_values import check_values
 from torchtransient.data.augmentation.stokes_fields import turned_stokes
-from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.geometry.pinhole import camera_matrices, transforms
 from torchtransient.quantities import flag, shown
 
@@ -83,7 +83,7 @@ class Augment:
         given = list(operations) if isinstance(operations, Sequence) else [operations]
         for one in given:
             if not isinstance(one, Operation):
-                raise SceneError(f"Augment: expected Flip, QuarterTurn, Crop or Affine, got {shown(one)}.")
+                raise ArgumentError(f"Augment: expected Flip, QuarterTurn, Crop or Affine, got {shown(one)}.")
         self.operations = tuple(given)
         # Copies: what is given may change afterwards.
         self.camera = {
@@ -99,11 +99,11 @@ class Augment:
     def __call__(self, sample: Any, *, generator: torch.Generator | None = None) -> Any:
         """A new sample, with one map drawn. ``generator``: None for torch's own."""
         if generator is not None and not isinstance(generator, torch.Generator):
-            raise SceneError(f"Augment: expected generator as a torch.Generator, got {shown(generator)}.")
+            raise ArgumentError(f"Augment: expected generator as a torch.Generator, got {shown(generator)}.")
         if isinstance(sample, Mapping):
             return self._augmented(dict(sample), generator)
         if self.names is None or not isinstance(sample, Sequence) or len(sample) != len(self.names):
-            raise SceneError(
+            raise ArgumentError(
                 f"Augment: expected a dictionary, or with names= a tuple of as many, got {shown(sample)} with "
                 f"names={self.names}."
             )
@@ -190,18 +190,20 @@ def _checked_fields(fields: Any) -> dict[str, Kind]:
     if fields is None:
         return {}
     if not isinstance(fields, Mapping):
-        raise SceneError(f'Augment: expected fields as a dictionary, {{"mask": "number"}}, got {shown(fields)}.')
+        raise ArgumentError(f'Augment: expected fields as a dictionary, {{"mask": "number"}}, got {shown(fields)}.')
     for name, kind in fields.items():
         if kind not in get_args(Kind):
-            raise SceneError(f"Augment: expected fields among {', '.join(get_args(Kind))}, got {shown(kind)}.")
+            raise ArgumentError(f"Augment: expected fields among {', '.join(get_args(Kind))}, got {shown(kind)}.")
         if name in _NAMED:
-            raise SceneError(f"Augment: {name!r} is no image: expected other names than {', '.join(_NAMED)} in fields.")
+            raise ArgumentError(
+                f"Augment: {name!r} is no image: expected other names than {', '.join(_NAMED)} in fields."
+            )
     return dict(fields)
 
 
 def _texts(what: str, given: Any) -> tuple[str, ...]:
     if isinstance(given, str) or not isinstance(given, Sequence) or not all(isinstance(one, str) for one in given):
-        raise SceneError(f"Augment: expected {what} as a sequence of names, got {shown(given)}.")
+        raise ArgumentError(f"Augment: expected {what} as a sequence of names, got {shown(given)}.")
     return tuple(given)
 
 

@@ -13,7 +13,7 @@ from torchtransient.data.reading.recipe_dataset import RecipeDataset
 from torchtransient.data.reading.sample_draws import Epochs, checked_seed, sample_generator, sample_number
 from torchtransient.data.reading.stream import TransientStream
 from torchtransient.data.reading.transient_dataset import TransientDataset
-from torchtransient.errors import SceneError
+from torchtransient.errors import ArgumentError, SceneError
 from torchtransient.quantities import count, shown
 
 
@@ -22,15 +22,15 @@ class Augmented(Epochs, Dataset[Any]):
 
     ``seed``: each sample has a generator of its own, so that it comes out the same whoever reads it, in every epoch
     until :meth:`set_epoch`; None draws from torch's, anew each time. Pickles; for workers that were forked or spawned.
-    Raises SceneError, UnitError for a seed or an epoch below zero, IndexError beyond the samples.
+    Raises ArgumentError, UnitError for a seed or an epoch below zero, IndexError beyond the samples.
     """
 
     def __init__(self, dataset: Any, augment: Augment, seed: int | None = None) -> None:
         super().__init__()
         if isinstance(dataset, IterableDataset):
-            raise SceneError(f"Augmented: {shown(dataset)} is a stream; use AugmentedStream.")
+            raise ArgumentError(f"Augmented: {shown(dataset)} is a stream; use AugmentedStream.")
         if not hasattr(dataset, "__len__") or not hasattr(dataset, "__getitem__"):
-            raise SceneError(f"Augmented: expected a data set of samples by number, got {shown(dataset)}.")
+            raise ArgumentError(f"Augmented: expected a data set of samples by number, got {shown(dataset)}.")
         self.dataset, self.augment = dataset, _checked(augment, "Augmented")
         self.seed = checked_seed("Augmented", seed)
 
@@ -57,13 +57,13 @@ class AugmentedStream(IterableDataset[Any]):
     ``seed``: the map depends on it, on the sample's ``index``, on the stream's ``epoch`` where it has one, and on how
     often the sample came before: among the samples of a TransientStream, or from this iterator; samples without an
     ``index`` are a SceneError then. None draws from torch's generator. What else the stream has (``set_epoch``,
-    ``close``, ``made``) is found here, too; a ``with`` block closes it. Raises SceneError, UnitError for a seed below
-    zero.
+    ``close``, ``made``) is found here, too; a ``with`` block closes it. Raises ArgumentError, UnitError for a seed
+    below zero.
     """
 
     def __init__(self, dataset: Any, augment: Augment, seed: int | None = None) -> None:
         if not isinstance(dataset, IterableDataset):
-            raise SceneError(f"AugmentedStream: expected a stream, got {shown(dataset)}; use Augmented.")
+            raise ArgumentError(f"AugmentedStream: expected a stream, got {shown(dataset)}; use Augmented.")
         self.dataset = dataset
         self.augment, self.seed = _checked(augment, "AugmentedStream"), checked_seed("AugmentedStream", seed)
 
@@ -106,5 +106,5 @@ class AugmentedStream(IterableDataset[Any]):
 
 def _checked(augment: Any, what: str) -> Augment:
     if not isinstance(augment, Augment):
-        raise SceneError(f"{what}: expected an Augment, got {shown(augment)}.")
+        raise ArgumentError(f"{what}: expected an Augment, got {shown(augment)}.")
     return augment

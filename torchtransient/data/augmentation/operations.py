@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from torchtransient.data.augmentation.pixel_map import PixelMap
-from torchtransient.errors import SceneError, ShapeError
+from torchtransient.errors import ArgumentError, SceneError, ShapeError
 from torchtransient.quantities import count, share, shown
 
 Direction = Literal["horizontal", "vertical"]
@@ -36,7 +36,7 @@ class Flip(Operation):
 
     def __post_init__(self) -> None:
         if self.direction not in get_args(Direction):
-            raise SceneError(f"Flip: expected 'horizontal' or 'vertical', got {shown(self.direction)}.")
+            raise ArgumentError(f"Flip: expected 'horizontal' or 'vertical', got {shown(self.direction)}.")
         share("Flip: p", self.p)
 
     def draw(self, size: tuple[int, int], generator: torch.Generator | None) -> PixelMap | None:
@@ -60,7 +60,7 @@ class QuarterTurn(Operation):
     def __post_init__(self) -> None:
         given = list(self.turns) if isinstance(self.turns, Sequence) else [self.turns]
         if not given:
-            raise SceneError("QuarterTurn: expected numbers of quarter turns, got none.")
+            raise ArgumentError("QuarterTurn: expected numbers of quarter turns, got none.")
         object.__setattr__(self, "turns", tuple(count("QuarterTurn: turns", one, -3) % 4 for one in given))
 
     def draw(self, size: tuple[int, int], generator: torch.Generator | None) -> PixelMap | None:
@@ -108,7 +108,7 @@ class Affine(Operation):
     ``RandomRotation``, ``RandomShear``, ``RandomTranslate``, flips. Images keep their size.
 
     Its settings of interpolation and rim do not count: light is interpolated linearly and labels are taken from the
-    nearest pixel, with nothing beyond the rim. Raises SceneError for what is no affine augmentation, UnitError for
+    nearest pixel, with nothing beyond the rim. Raises ArgumentError for what is no affine augmentation, UnitError for
     a map without an inverse when it is drawn.
     """
 
@@ -116,7 +116,7 @@ class Affine(Operation):
         from kornia.augmentation import GeometricAugmentationBase2D
 
         if not isinstance(augmentation, GeometricAugmentationBase2D) or "size" in augmentation.flags:
-            raise SceneError(
+            raise ArgumentError(
                 "Affine: expected an affine augmentation of kornia that keeps the size, as RandomAffine, got "
                 f"{type(augmentation).__name__}. Windows are Crop's."
             )

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from torchtransient.errors import ShapeError, UnitError
 from torchtransient.quantities import count, real_array, shown
 
 Matrix = NDArray[np.float64]
+_SIGNED = {torch.uint16: torch.int16, torch.uint32: torch.int32, torch.uint64: torch.int64}
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +36,15 @@ class PixelMap:
     matrix: Matrix
     size: tuple[int, int]
     new_size: tuple[int, int]
+
+    if TYPE_CHECKING:  # what is taken is more than what is kept
+
+        def __init__(
+            self,
+            matrix: Sequence[Sequence[float]] | NDArray[Any] | Tensor,
+            size: Sequence[int],
+            new_size: Sequence[int],
+        ) -> None: ...
 
     def __post_init__(self) -> None:
         matrix = real_array(self.matrix)
@@ -141,7 +151,9 @@ class PixelMap:
         without a rim take every type.
         """
         rows, columns, inside = (one.to(image.device) for one in self._sources)
-        taken = image[..., rows, columns]
+        # Bits are moved, no numbers: torch 2.6 has no index for these unsigned types.
+        signed = _SIGNED.get(image.dtype)
+        taken = (image if signed is None else image.view(signed))[..., rows, columns]
         has_rim = not bool(inside.all())
         # Also where this draw happens to have no rim: others of its kind do.
         if (has_rim or not self.is_exact) and not _holds(image.dtype, fill):
@@ -150,7 +162,8 @@ class PixelMap:
                 + ("convert it with .float(), or call it a number in fields=." if math.isnan(fill) else
                    "convert it with .long() or .float().")
             )  # fmt: skip
-        return torch.where(inside, taken, torch.tensor(fill).to(taken)) if has_rim else taken
+        placed = torch.where(inside, taken, torch.tensor(fill).to(taken)) if has_rim else taken
+        return placed if signed is None else placed.view(image.dtype)
 
     def smooth(self, image: Tensor, name: str = "image") -> Tensor:
         """(..., H, W) interpolated linearly between pixels, zero beyond the rim; every bin and channel by itself.

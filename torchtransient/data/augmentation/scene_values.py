@@ -24,7 +24,7 @@ UNAFFECTED = frozenset(
         "pheomelanin", "sigma_a", "eta", "k", "int_ior", "ext_ior", "material", "delta", "lifetime", "albedo",
         "sigma_t", "scale", "g", "radiance", "intensity", "irradiance", "energy", "sky_scale", "sun_scale", "turbidity",
         "temperature", "wavelengths", "cutoff_angle", "beam_width", "radius", "aperture_radius", "focus_distance",
-        "near_clip", "far_clip",
+        "near_clip", "far_clip", "share",
     )
 )  # fmt: skip
 # Pictures of these are thrown by a projector, and lie in its frame.

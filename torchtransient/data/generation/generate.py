@@ -9,7 +9,7 @@ import os
 import pickle
 import platform
 import time
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ from torchtransient.data.generation.settings import (
 from torchtransient.data.recipes.plugin_modules import plugins_here
 from torchtransient.data.storage.file_names import RECIPE_FILE, SHARD_FILES, shard_file_name
 from torchtransient.data.storage.part_files import check_system
-from torchtransient.errors import SceneError, StorageError, TorchTransientError, UnitError
+from torchtransient.errors import ArgumentError, SceneError, StorageError, TorchTransientError, UnitError
 from torchtransient.quantities import count, shown
 
 ENGINES = ("local", "ray")
@@ -44,6 +44,7 @@ class Generated:
     """
 
     folder: Path
+    _: KW_ONLY
     samples: int
     failed: int
     kept: int
@@ -71,8 +72,8 @@ def generate(
     recipe: Any,
     folder: str | Path,
     n: int | None = None,
-    workers: int = 2,
     *,
+    workers: int = 2,
     store: str = "exact",
     compression: str = "blosc2",
     max_outside: float | None = 0.01,
@@ -115,7 +116,7 @@ def generate(
     _check_process()
     n = getattr(recipe, "n", None) if n is None else n
     if n is None:
-        raise UnitError(f"{_WHAT}: neither the call nor the recipe says how many samples. Give n=.")
+        raise ArgumentError(f"{_WHAT}: neither the call nor the recipe says how many samples. Give n=.")
     n, workers, retries = _whole("n", n, 1), _whole("workers", workers, 1), _whole("retries", retries, 0)
     per_shard = None if per_shard is None else _whole("per_shard", per_shard, 1)
     shard = None if shard is None else _whole_pair(shard)
@@ -303,12 +304,12 @@ def _check_choices(store: Any, compression: Any, engine: Any, address: Any, reci
     check_store(store, _WHAT)
     check_compression(compression, _WHAT)
     if engine not in ENGINES:
-        raise UnitError(f"{_WHAT}: expected engine to be one of {', '.join(ENGINES)}, got {shown(engine)}.")
+        raise ArgumentError(f"{_WHAT}: expected engine to be one of {', '.join(ENGINES)}, got {shown(engine)}.")
     if address is not None and engine != "ray":
         raise UnitError(f"{_WHAT}: address={shown(address)} is for engine='ray', got engine={engine!r}.")
     lacking = [name for name in ("maker", "key", "to_dict") if not callable(getattr(recipe, name, None))]
     if lacking:
-        raise SceneError(f"{_WHAT}: expected a recipe, with {lacking[0]}(), got {shown(recipe)}.")
+        raise ArgumentError(f"{_WHAT}: expected a recipe, with {lacking[0]}(), got {shown(recipe)}.")
     if store == "counts" and getattr(recipe, "device", ...) is None:
         raise SceneError(f"{_WHAT}: store='counts' stores the measurement of recipes with a device; give one.")
     try:

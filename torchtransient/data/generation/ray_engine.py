@@ -16,8 +16,8 @@ from torchtransient.data.generation.ledger import Ledger
 from torchtransient.data.generation.settings import Settings
 from torchtransient.data.generation.shard_making import ShardMaker, fatal
 from torchtransient.data.generation.telling import Telling
-from torchtransient.errors import StorageError, TorchTransientError, TorchTransientWarning
-from torchtransient.render.physics import level_of_user
+from torchtransient.errors import MissingPackageError, TorchTransientError, TorchTransientWarning
+from torchtransient.rendering.physics import level_of_user
 
 
 class Board:
@@ -184,12 +184,12 @@ class RayCrew(Crew[RayWorker]):
 
 
 def ray_package() -> Any:
-    """The module ray. Raises StorageError where it is missing."""
+    """The module ray. Raises MissingPackageError where it is not installed."""
     try:
         import ray
         import ray.exceptions
     except ImportError as error:
-        raise StorageError(
+        raise MissingPackageError(
             "generate: engine='ray' needs the package ray. Install it with pip install 'torchtransient[ray]'."
         ) from error
     return ray

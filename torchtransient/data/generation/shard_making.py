@@ -60,7 +60,7 @@ class ShardMaker:
     """
 
     def __init__(self, settings: Settings) -> None:
-        from torchtransient.render.threads import threads
+        from torchtransient.rendering.threads import threads
 
         threads(1)
         add_plugins(settings.plugins, "generate")

@@ -76,7 +76,7 @@ def _samples(owners: dict[int, Shard], drawn: list[int]) -> Iterator[Sample]:
         row = shard.index[index]
         arrays = {name: shard.read(name, row) for name in shard.names}
         outside = (float(shard.outside[row, 0]), float(shard.outside[row, 1]))
-        yield Sample(index, int(shard.seeds[row]), arrays, shard.values(row), outside)
+        yield Sample(index, int(shard.seeds[row]), arrays=arrays, values=shard.values(row), outside=outside)
 
 
 def _array(name: str, array: Any) -> str:

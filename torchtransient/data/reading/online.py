@@ -51,8 +51,8 @@ class OnlineDataset(IterableDataset[dict[str, Any]]):
     """
 
     def __init__(
-        self, recipe: Any, capacity: int = 1024, workers: int = 1, uses: float = 5.0, seed: int = 0, warm: int = 64,
-        *, first: int = 0, transform: Callable[[torch.Tensor], Any] | None = None, timeout_s: float = 600.0,
+        self, recipe: Any, capacity: int = 1024, *, workers: int = 1, uses: float = 5.0, seed: int = 0, warm: int = 64,
+        first: int = 0, transform: Callable[[torch.Tensor], Any] | None = None, timeout_s: float = 600.0,
     ) -> None:  # fmt: skip
         super().__init__()
 

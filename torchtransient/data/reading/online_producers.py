@@ -27,7 +27,7 @@ from torchtransient.data.reading.online_schedule import Schedule
 from torchtransient.data.reading.online_worker import Layout, empty_ring, produce, said
 from torchtransient.data.recipes.plugin_modules import plugins_here
 from torchtransient.errors import ShapeError, StorageError, TorchTransientError, TorchTransientWarning
-from torchtransient.render.physics import level_of_user
+from torchtransient.rendering.physics import level_of_user
 
 WHAT = "OnlineDataset"
 _SHARED = Path("/dev/shm")

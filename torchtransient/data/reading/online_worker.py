@@ -51,7 +51,7 @@ def produce(connection: Connection, packed: bytes) -> None:
 
 
 def _one_thread() -> None:
-    from torchtransient.render.threads import threads
+    from torchtransient.rendering.threads import threads
 
     threads(1)
 

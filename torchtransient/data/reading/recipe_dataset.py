@@ -17,7 +17,7 @@ from torchtransient.data.reading.sample_draws import (
     takes_generator,
     transformed,
 )
-from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.quantities import count, shown
 
 _WHAT = "RecipeDataset"
@@ -41,8 +41,8 @@ class RecipeDataset(Epochs, Dataset[dict[str, Any]]):
     :meth:`sample` tell epochs apart. None draws from torch's, anew each time.
 
     It pickles, without what it has built. ``close()`` lets go of that; it is built again when a sample is read. Raises
-    UnitError for sizes, seeds and epochs, SceneError for a seed that the transform cannot take, IndexError beyond the
-    sizes, and what the render of a sample raises.
+    UnitError for sizes, seeds and epochs, ArgumentError for a seed that the transform cannot take, IndexError beyond
+    the sizes, and what the render of a sample raises.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class RecipeDataset(Epochs, Dataset[dict[str, Any]]):
         self.first = count(f"{_WHAT}: first", first, 0, UnitError)
         self.seed = checked_seed(_WHAT, seed)
         if seed is not None and not takes_generator(transform):
-            raise SceneError(
+            raise ArgumentError(
                 f"{_WHAT}: seed= is for a transform that takes generator=, as sensors do, got {shown(transform)}."
             )
         self._maker: Any = None

@@ -14,7 +14,7 @@ from torch.utils.data import IterableDataset, get_worker_info
 from torchtransient.axes import TimeAxis
 from torchtransient.data.reading.shard_table import WHAT
 from torchtransient.data.reading.transient_dataset import TransientDataset
-from torchtransient.errors import StorageError
+from torchtransient.errors import ArgumentError, StorageError
 from torchtransient.quantities import count, flag
 
 
@@ -43,7 +43,7 @@ class TransientStream(IterableDataset[dict[str, Any]]):
         self.shuffle, self.even = flag(f"{WHAT}: shuffle", shuffle), flag(f"{WHAT}: even", even)
         self.seed, self.buffer = count(f"{WHAT}: seed", seed, 0), count(f"{WHAT}: buffer", buffer)
         if (rank is None) != (world_size is None):
-            raise StorageError(f"{WHAT}: expected rank and world_size both or neither, got {rank} and {world_size}.")
+            raise ArgumentError(f"{WHAT}: expected rank and world_size both or neither, got {rank} and {world_size}.")
         self._rank = None if rank is None or world_size is None else _checked_rank(rank, world_size)
         # In shared memory: workers that stay for several epochs are told. Epoch, batches that are left out, their size.
         self._place = torch.tensor([0, 0, 1]).share_memory_()  # type: ignore[no-untyped-call]

@@ -22,7 +22,7 @@ from torchtransient.data.reading.sample_draws import (
 from torchtransient.data.reading.shard_table import WHAT, ShardTable
 from torchtransient.data.storage.encodings import measured_names
 from torchtransient.data.storage.shard_file import Shard
-from torchtransient.errors import StorageError
+from torchtransient.errors import ArgumentError, StorageError
 from torchtransient.files.array_file import tensor_in
 from torchtransient.quantities import shown
 
@@ -53,8 +53,8 @@ class TransientDataset(Epochs, Dataset[dict[str, Any]]):
     """
 
     def __init__(
-        self, where: Any, fields: Sequence[str] | None = None, window: Any = None, pixels: Any = None,
-        transform: Callable[..., Any] | None = None, as_stored: bool = False, *, seed: int | None = None,
+        self, where: Any, *, fields: Sequence[str] | None = None, window: Any = None, pixels: Any = None,
+        transform: Callable[..., Any] | None = None, as_stored: bool = False, seed: int | None = None,
     ) -> None:  # fmt: skip
         super().__init__()
         self._table = ShardTable(where)
@@ -140,7 +140,7 @@ class TransientDataset(Epochs, Dataset[dict[str, Any]]):
             made = (_INDEX,) if self.transform is None else (_INDEX, _MEASURED)
             unknown = [name for name in names if name not in (*known, *made)]
             if unknown:
-                raise StorageError(f"{WHAT}: expected fields among {', '.join(known)}, got {shown(unknown[0])}.")
+                raise ArgumentError(f"{WHAT}: expected fields among {', '.join(known)}, got {shown(unknown[0])}.")
         if self.transform is not None and _TRANSIENT not in shapes:
             raise StorageError(f"{WHAT}: transform= is for transients, and the samples have {', '.join(shapes)}.")
         left_out = (_INDEX,) if self.transform is None else (_INDEX, _MEASURED)
@@ -150,5 +150,5 @@ class TransientDataset(Epochs, Dataset[dict[str, Any]]):
         shape = self._table.arrays[name]
         bins = self._bins if name in self._timed and self._table.time_axes[name] is not None else None
         pixels = self._pixels if shape[-2:] == self._size else None
-        array = shard.read(name, row, bins, pixels, as_stored=self.as_stored)
+        array = shard.read(name, row, window=bins, pixels=pixels, as_stored=self.as_stored)
         return torch.from_numpy(array) if array.dtype.isnative else tensor_in(array)

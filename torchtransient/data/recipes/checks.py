@@ -18,8 +18,8 @@ from torchtransient.data.recipes.specification import Specification
 from torchtransient.data.recipes.streams import Draw, Extreme, Fixed, Stream
 from torchtransient.data.recipes.structures import Structure
 from torchtransient.errors import SceneError, TorchTransientError, TorchTransientWarning, UnitError
-from torchtransient.render.physics import is_singular, level_of_user, outside_message, singular_message
-from torchtransient.render.variant import active_variant
+from torchtransient.rendering.physics import is_singular, level_of_user, outside_message, singular_message
+from torchtransient.rendering.variant import active_variant
 
 # Samples that are drawn, and structures among them that are built, for a look.
 SAMPLES, STRUCTURES = 64, 8

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torchtransient.data.recipes.distribution import ANYTHING, NUMBERS, POSE, Distribution, Place, bounds, spread
 from torchtransient.data.recipes.streams import Draw
 from torchtransient.errors import SceneError, ShapeError, UnitError
-from torchtransient.quantities import as_number, flag, positive, real_array, shown, transform
+from torchtransient.quantities import Numbers, as_number, flag, positive, real_array, shown, transform
 
 # A truncated normal distribution keeps at least this share of the untruncated one: beyond, digits of it are lost.
 _LEAST_MASS = 1e-9
@@ -96,6 +96,7 @@ class Normal(Distribution):
 
     mean: Any
     std: Any
+    _: KW_ONLY
     low: float | None = None
     high: float | None = None
     same: bool = False
@@ -195,7 +196,7 @@ class Choice(Distribution):
     short: ClassVar[tuple[str, ...]] = ("values",)
 
     values: Sequence[Any]
-    weights: Sequence[float] | None = None
+    weights: Numbers | None = None
 
     def __post_init__(self) -> None:
         values, weights = checked_choices("Choice", self.values, self.weights)
@@ -253,7 +254,7 @@ def _plain(value: Any) -> Any:
     return transform("Choice", value) if hasattr(value, "matrix") else value
 
 
-def pick(random: Draw, count: int, weights: Sequence[float] | None) -> int:
+def pick(random: Draw, count: int, weights: Numbers | None) -> int:
     """A number below ``count``, by the weights."""
     u = float(random.random())
     if weights is None:

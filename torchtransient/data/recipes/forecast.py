@@ -15,7 +15,7 @@ from torchtransient.data.recipes.checks import SAMPLES, structures_of
 from torchtransient.data.recipes.sample import Sample
 from torchtransient.errors import StorageError
 from torchtransient.quantities import count
-from torchtransient.render.threads import threads
+from torchtransient.rendering.threads import threads
 
 if TYPE_CHECKING:
     from torchtransient.data.recipes.maker import Maker

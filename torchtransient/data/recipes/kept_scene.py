@@ -21,17 +21,17 @@ from torchtransient.data.recipes.specification import (
 from torchtransient.data.recipes.streams import Draw, Stream
 from torchtransient.data.recipes.structures import Structure
 from torchtransient.data.recipes.written import written_frequencies, written_shape
-from torchtransient.errors import GradientError, SceneError, ShapeError, TorchTransientError
+from torchtransient.errors import ArgumentError, GradientError, SceneError, ShapeError, TorchTransientError
 from torchtransient.files.scan_data import scan_data
 from torchtransient.plugins import versions_of_others
 from torchtransient.quantities import shown
-from torchtransient.render.labels import LABELS, first_return, label_names, material_names, scene_labels
-from torchtransient.render.output import RenderOutput
-from torchtransient.render.parameters import ParameterTable, unknown_key
-from torchtransient.render.renderer import TransientRenderer
-from torchtransient.render.scene_handle import Scene, load
-from torchtransient.render.variant import active_variant, stokes_components
-from torchtransient.sensing import Analysers, Compose, Device, PolarizationMosaic
+from torchtransient.rendering.labels import LABELS, first_return, label_names, material_names, scene_labels
+from torchtransient.rendering.output import RenderOutput
+from torchtransient.rendering.parameters import ParameterTable, unknown_key
+from torchtransient.rendering.renderer import TransientRenderer
+from torchtransient.rendering.scene_handle import Scene, load
+from torchtransient.rendering.variant import active_variant, stokes_components
+from torchtransient.sensing import Analyzers, Compose, Device, PolarizationMosaic
 
 if TYPE_CHECKING:
     from torchtransient.axes import TimeAxis
@@ -113,7 +113,8 @@ class Kept:
         bounces, energy, scan = settings.bounces, settings.energy, self.scan
         # What stands in the way of laser or sensor is no capture.
         common |= {"bounces": bounces, "energy": energy, "variant": self.recipe.variant, "physics": "error"}
-        with self._keys_told(lambda: load(capture_scene(given, scan, bounces, energy), variant=self.recipe.variant)):
+        with self._keys_told(lambda: load(capture_scene(given, scan, bounces=bounces, energy=energy),
+            variant=self.recipe.variant)):
             renderer = CaptureRenderer(given, scan, parameters=self.keys, **common).renderer
         if settings.physics == "ignore":
             # Of light outside of the window the share is told.
@@ -218,7 +219,7 @@ class Kept:
         names, keep = list(there), self.recipe.settings.keep
         unknown = [name for name in keep or () if name not in names]
         if unknown or keep == ():
-            raise SceneError(f"recipe: keep: expected some of {', '.join(names)}, got {shown(unknown or keep)}.")
+            raise ArgumentError(f"recipe: keep: expected some of {', '.join(names)}, got {shown(unknown or keep)}.")
         return names if keep is None else [name for name in names if name in keep]
 
     def light(self, drawn: Mapping[str, Any], seed: int) -> NDArray[Any]:
@@ -347,13 +348,16 @@ def changed(device: Device, key: str, value: Any) -> Device:
 
 def _is_polarized(chain: Compose) -> bool:
     """Whether a stage looks at the Stokes components."""
-    return any(isinstance(module, Analysers | PolarizationMosaic) for module in chain.modules())
+    return any(isinstance(module, Analyzers | PolarizationMosaic) for module in chain.modules())
 
 
 def versions() -> dict[str, str]:
     """Of the packages that decide about the numbers, and of plugins that others have added."""
-    found = {name: metadata.version(name) for name in ("torchtransient", "mitsuba", "drjit", "torch", "numpy")}
-    return found | versions_of_others()
+    # This package's own is that of the code which runs: a checkout on the path need not be the one that is installed.
+    from torchtransient import __version__
+
+    others = {name: metadata.version(name) for name in ("mitsuba", "drjit", "torch", "numpy")}
+    return {"torchtransient": __version__, **others, **versions_of_others()}
 
 
 def _outside(out: RenderOutput) -> tuple[float, float]:

@@ -78,7 +78,14 @@ class Maker:
         seed = Stream(self.recipe.seed, index, RENDER).seed()
         arrays, outside = kept.arrays(index, varied, seed)
         self._check(index, arrays, expected.name)
-        return Sample(index, seed, arrays, self._values(structure, varied), outside, structure.text)
+        return Sample(
+            index,
+            seed,
+            arrays=arrays,
+            values=self._values(structure, varied),
+            outside=outside,
+            structure=structure.text,
+        )
 
     def measures(self) -> Measures:
         """What sample 0 measures, and with it all."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from torchtransient.files.content_key import contents_of
-from torchtransient.render.description import Description, XmlDescription
+from torchtransient.rendering.description import Plain, XmlDescription
 
 # Longer texts name no file.
 _MOST_LETTERS = 1024
@@ -34,7 +34,7 @@ def _placeless(value: Any) -> Any:
     return value
 
 
-def files_of(description: Description, choices: Iterable[Any]) -> dict[str, str]:
+def files_of(description: Plain, choices: Iterable[Any]) -> dict[str, str]:
     """Hashes of the files that a scene names, by their names; ``choices``: plain data that may take the place of its
     entries.
     """

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from torchtransient.data.recipes.distribution import ANYTHING, NUMBERS, POSE, Distribution, Place, bounds, spread
 from torchtransient.data.recipes.streams import Draw
-from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.quantities import real_array, shown
 from torchtransient.scenes.transforms import look_at, rotate
 
@@ -37,6 +37,7 @@ class Turn(Distribution):
     axis: Any = (0.0, 1.0, 0.0)
     low: float = 0.0
     high: float = 360.0
+    _: KW_ONLY
     about: Any = "self"
 
     def __post_init__(self) -> None:
@@ -49,7 +50,7 @@ class Turn(Distribution):
         about = self.about
         if isinstance(about, str):
             if about not in _ABOUT:
-                raise SceneError(f"Turn: expected about='self', 'world' or a point [x, y, z], got {about!r}.")
+                raise ArgumentError(f"Turn: expected about='self', 'world' or a point [x, y, z], got {about!r}.")
         else:
             about = _three("Turn: about", about)
         for name, value in (("low", low), ("high", high), ("axis", axis), ("about", about)):

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Self
 
+from torchtransient.argument_names import own_init
 from torchtransient.data.recipes import recipe_file
 from torchtransient.data.recipes.checks import check_recipe
 from torchtransient.data.recipes.contact_sheet import contact_sheet
@@ -17,6 +18,7 @@ from torchtransient.data.recipes.specification import Specification
 from torchtransient.quantities import count
 
 
+@own_init
 class Recipe(Specification):
     """What may vary in a scene, and what is measured of it. Plain data: pickles, is equal to its copy, and stands in a
     YAML file (:meth:`to_yaml`, :meth:`read`).
@@ -29,8 +31,8 @@ class Recipe(Specification):
     - ``device.STAGE.ARGUMENT`` for an argument of a stage of ``device`` (a kind or a number);
     - ``scan``, of a capture: a :class:`Choice` of scans of one shape.
 
-    ``labels``: names of :func:`torchtransient.render.labels.scene_labels` and ``first_return``, of the same scene and
-    camera. ``keep``: names of what samples keep, of ``transient`` (``phasor``, ``gated``), ``steady``, labels and
+    ``labels``: names of :func:`torchtransient.rendering.labels.scene_labels` and ``first_return``, of the same scene
+    and camera. ``keep``: names of what samples keep, of ``transient`` (``phasor``, ``gated``), ``steady``, labels and
     ``measurement``; None for all. ``["measurement", "depth"]`` makes small data sets.
 
     ``time_axis``, ``frequencies``, ``gates``, ``max_depth``, ``spp``, ``sensors``, ``pulse``, ``irf``: as in

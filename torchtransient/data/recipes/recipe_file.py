@@ -32,12 +32,12 @@ from torchtransient.data.recipes.written import (
     written_frequencies,
     written_shape,
 )
-from torchtransient.errors import SceneError, StorageError, TorchTransientError
+from torchtransient.errors import MissingPackageError, SceneError, StorageError, TorchTransientError
 from torchtransient.files.scan_data import scan_data, scan_from_data
 from torchtransient.files.yaml_files import Section, read_yaml
 from torchtransient.quantities import shown
-from torchtransient.render.description import DictDescription, XmlDescription, describe_dict
-from torchtransient.render.scene_handle import Scene
+from torchtransient.rendering.description import DictDescription, XmlDescription, describe_dict
+from torchtransient.rendering.scene_handle import Scene
 
 FORMAT = "torchtransient recipe 1"
 # Entries that are the constructor's arguments as they are.
@@ -112,7 +112,7 @@ def to_yaml(recipe: Specification, path: str | Path | None) -> str:
     try:
         import yaml
     except ImportError as error:
-        raise StorageError(
+        raise MissingPackageError(
             "recipe: YAML needs PyYAML. Install it with pip install 'torchtransient[yaml]', or write "
             "json.dumps(recipe.to_dict())."
         ) from error
@@ -250,7 +250,7 @@ def _hidden(given: Any) -> Any:
 
 
 def _xml(given: Mapping[str, Any], folder: Path) -> Any:
-    from torchtransient.render.scene_handle import load
+    from torchtransient.rendering.scene_handle import load
 
     path = Path(given["xml"])
     path = path if path.is_absolute() else folder / path

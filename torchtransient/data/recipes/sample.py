@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,7 @@ class Sample:
 
     index: int
     seed: int
+    _: KW_ONLY
     arrays: dict[str, NDArray[Any]]
     values: dict[str, NDArray[Any] | str] = field(default_factory=dict)
     outside: tuple[float, float] = (0.0, 0.0)

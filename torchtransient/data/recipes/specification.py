@@ -20,12 +20,12 @@ from torchtransient.data.recipes.plugin_modules import check_plugins
 from torchtransient.data.recipes.streams import Stream
 from torchtransient.data.recipes.structures import Scenes, Structure
 from torchtransient.data.recipes.written import read_distribution
-from torchtransient.errors import SceneError, ShapeError
+from torchtransient.errors import ArgumentError, SceneError, ShapeError
 from torchtransient.files.content_key import content_key
 from torchtransient.gates import Gate
 from torchtransient.pulses import Pulse
-from torchtransient.quantities import count, real_array, shown
-from torchtransient.render.variant import resolve_variant
+from torchtransient.quantities import Numbers, count, real_array, shown
+from torchtransient.rendering.variant import resolve_variant
 from torchtransient.sensing import DEVICES, Device
 from torchtransient.sensing import device as device_by_name
 
@@ -66,7 +66,7 @@ class Specification:
         labels: Sequence[str] = (),
         keep: Sequence[str] | None = None,
         time_axis: TimeAxis | None = None,
-        frequencies: FrequencyAxis | Sequence[float] | None = None,
+        frequencies: FrequencyAxis | Numbers | None = None,
         gates: Sequence[Gate] | None = None,
         temporal_filter: str = "auto",
         spp: int | None = None,
@@ -89,21 +89,24 @@ class Specification:
         self.plugins = check_plugins(plugins)
         labels, keep = _names("labels", labels), None if keep is None else _names("keep", keep)
         if physics not in ("ignore", "error"):
-            raise SceneError(f"recipe: physics: expected 'ignore' or 'error', got {physics!r}.")
+            raise ArgumentError(f"recipe: physics: expected 'ignore' or 'error', got {physics!r}.")
         if scan is not None and not isinstance(scan, Scan):
-            raise SceneError(f"recipe: scan: expected a tt.nlos.Scan, got {shown(scan)}.")
+            raise ArgumentError(f"recipe: scan: expected a tt.nlos.Scan, got {shown(scan)}.")
         for name, given, kind in (
             ("time_axis", time_axis, TimeAxis), ("pulse", pulse, Pulse), ("irf", irf, Pulse), ("vary", vary, Mapping),
         ):  # fmt: skip
             if given is not None and not isinstance(given, kind):
-                raise SceneError(f"recipe: {name}: expected a {kind.__name__}, got {shown(given)}.")
+                what = "dictionary {key: distribution}" if name == "vary" else kind.__name__
+                raise ArgumentError(f"recipe: {name}: expected a {what}, got {shown(given)}.")
         if frequencies is not None and not isinstance(frequencies, FrequencyAxis):
             numbers = real_array(frequencies)
             if numbers is None or numbers.ndim != 1:
-                raise SceneError(f"recipe: frequencies: expected cycles per metre in a list, got {shown(frequencies)}.")
+                raise ArgumentError(
+                    f"recipe: frequencies: expected cycles per metre in a list, got {shown(frequencies)}."
+                )
             frequencies = FrequencyAxis(tuple(numbers.tolist()))
         if gates is not None and (isinstance(gates, Gate) or not all(isinstance(g, Gate) for g in _listed(gates))):
-            raise SceneError(f"recipe: gates: expected a list of tt.Gate, got {shown(gates)}.")
+            raise ArgumentError(f"recipe: gates: expected a list of tt.Gate, got {shown(gates)}.")
         self.seed = count("recipe: seed", seed, 0)
         self.n = None if n is None else count("recipe: n", n)
         self.variant = resolve_variant(variant)

@@ -20,9 +20,10 @@ from torchtransient.capture import Scan
 from torchtransient.data.recipes.distributions import checked_choices
 from torchtransient.errors import SceneError
 from torchtransient.files.content_key import content_key
-from torchtransient.quantities import shown
-from torchtransient.render.description import Description, DictDescription, XmlDescription, describe_dict
-from torchtransient.render.scene_handle import Scene, load
+from torchtransient.quantities import Numbers, shown
+from torchtransient.rendering.description import DictDescription, Plain, XmlDescription, describe_dict
+from torchtransient.rendering.scene_handle import Scene, load
+from torchtransient.rendering.taken import ReadyScene
 
 # The key that stands for the scan of a capture.
 SCAN = "scan"
@@ -33,7 +34,7 @@ class OneOf:
     comes, None for evenly. Raises SceneError for no scene, UnitError for weights that are none.
     """
 
-    def __init__(self, scenes: Sequence[Any] | Mapping[str, Any], weights: Sequence[float] | None = None) -> None:
+    def __init__(self, scenes: Sequence[Any] | Mapping[str, Any], weights: Numbers | None = None) -> None:
         names: list[str] = []
         values: Any = scenes
         if isinstance(scenes, Mapping):
@@ -87,7 +88,7 @@ class Scenes:
         if scan is not None:
             from torchtransient.nlos.scene import capture_scene
 
-            given = load(capture_scene(given, scan, bounces, energy), self.variant)
+            given = load(capture_scene(given, scan, bounces=bounces, energy=energy), self.variant)
         return frozenset(given.parameters().differentiable())
 
     def build(self, structure: Structure) -> tuple[Any, Scan | None]:
@@ -105,11 +106,13 @@ class Scenes:
         return Scene(description, self.variant), None
 
 
-def _description(given: Any, scan: Scan | None, parameters: Mapping[str, Any]) -> Description:
+def _description(given: Any, scan: Scan | None, parameters: Mapping[str, Any]) -> Plain:
     if scan is None:
         scene = load(given, **parameters) if isinstance(given, str | os.PathLike) else load(given)
         if parameters and not isinstance(scene._description, XmlDescription):
             raise SceneError("recipe: parameters fill the $names of XML files; a dictionary has none. Leave them out.")
+        scene._description.check_described("recipe")
+        assert not isinstance(scene._description, ReadyScene)
         return scene._description
     if parameters:
         raise SceneError("recipe: parameters fill the $names of XML files; a capture has none. Leave them out.")
@@ -119,7 +122,7 @@ def _description(given: Any, scan: Scan | None, parameters: Mapping[str, Any]) -
     return describe_dict({"type": "scene", **shapes_of(given)})
 
 
-def _has(description: Description, key: str, scan: Scan | None) -> bool:
+def _has(description: Plain, key: str, scan: Scan | None) -> bool:
     if key == SCAN:
         return scan is not None
     if isinstance(description, XmlDescription):
@@ -131,7 +134,7 @@ def _has(description: Description, key: str, scan: Scan | None) -> bool:
     return isinstance(node, dict) and last in node and key != "type"
 
 
-def _exchanged(description: Description, key: str, value: Any) -> Description:
+def _exchanged(description: Plain, key: str, value: Any) -> Plain:
     if isinstance(description, XmlDescription):
         parameters = dict(description.parameters) | {key.removeprefix("$"): str(_plain(value))}
         return replace(description, parameters=tuple(sorted(parameters.items())))

@@ -1,11 +1,12 @@
 """Recipes as plain data: what JSON and YAML can hold, and back.
 
 A distribution is a mapping of its name alone: ``{uniform: {low: 0.05, high: 0.9}}``, or shorter ``{uniform: [0.05,
-0.9]}``. Arrays of up to 64 numbers are nested lists; larger ones, and pixels, are their bytes in base64.
+0.9]}``. Arrays of up to 64 numbers are nested lists; larger ones, pixels and grids are their bytes in base64.
 """
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
@@ -22,13 +23,13 @@ from torchtransient.errors import SceneError
 from torchtransient.files.plain_data import plain, restored
 from torchtransient.files.scan_data import scan_data, scan_from_data
 from torchtransient.gates import Gate
+from torchtransient.plugins.dictionaries import Pixels, Voxels
 from torchtransient.pulses import Pulse
 from torchtransient.quantities import shown
-from torchtransient.render.description import Pixels
 
 _MOST_LISTED = 64
 # Keys of mappings that stand for what JSON does not have.
-_PIXELS, _SCAN, _DISTRIBUTION = "__pixels__", "__scan__", "__distribution__"
+_PIXELS, _VOXELS, _SCAN, _DISTRIBUTION = "__pixels__", "__voxels__", "__scan__", "__distribution__"
 
 
 def written(value: Any) -> Any:
@@ -43,7 +44,10 @@ def written(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {str(name): written(entry) for name, entry in value.items()}
     if isinstance(value, Pixels):
-        return {_PIXELS: plain(value.values, None, "pixels"), "srgb_gamma": value.srgb_gamma}
+        said = {"pixel_format": value.pixel_format} if value.pixel_format else {}
+        return {_PIXELS: plain(value.values, None, "pixels"), "srgb_gamma": value.srgb_gamma, **said}
+    if isinstance(value, Voxels):
+        return {_VOXELS: base64.b64encode(value.file).decode("ascii"), "maximum": value.maximum}
     if isinstance(value, Scan):
         return {_SCAN: scan_data(value)}
     if isinstance(value, np.generic):
@@ -64,7 +68,10 @@ def read(value: Any) -> Any:
     """What :func:`written` made plain data of; lists stay lists."""
     if isinstance(value, Mapping):
         if _PIXELS in value:
-            return Pixels(restored(dict(value[_PIXELS]), {}), bool(value.get("srgb_gamma", False)))
+            pixels, gamma = restored(dict(value[_PIXELS]), {}), bool(value.get("srgb_gamma", False))
+            return Pixels(pixels, gamma, str(value.get("pixel_format", "")))
+        if _VOXELS in value:
+            return Voxels(base64.b64decode(value[_VOXELS]), float(value["maximum"]))
         if set(value) == {_SCAN}:
             return scan_from_data(value[_SCAN])
         if set(value) == {"__numbers__", "dtype", "shape"}:
@@ -81,8 +88,8 @@ def read_distribution(where: str, value: Any) -> Distribution:
     known = ", ".join(Distribution.known)
     if not isinstance(value, Mapping) or len(value) != 1:
         raise SceneError(
-            f"{where}: expected a distribution, {{uniform: [0, 1]}} for instance, got {shown(value)}. Known ones are "
-            f"{known}."
+            f"{where}: expected a distribution, tt.data.Uniform(0, 1) or {{uniform: [0, 1]}} for instance, got "
+            f"{shown(value)}. Known ones are {known}."
         )
     name, given = next(iter(value.items()))
     made = Distribution.known.get(str(name))

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.errors import StorageError
+from torchtransient.errors import ArgumentError, MissingPackageError, StorageError
 from torchtransient.files.hdf5_writing import hdf5_package
 from torchtransient.quantities import shown
 
@@ -37,7 +37,7 @@ _BLOSC2 = 32026
 def check_compression(compression: Any, what: str) -> str:
     """`compression`, or StorageError for one that is unknown or lacks its package."""
     if compression not in COMPRESSIONS:
-        raise StorageError(
+        raise ArgumentError(
             f"{what}: expected compression as one of {', '.join(COMPRESSIONS)}, got {shown(compression)}."
         )
     _filters(compression, what)
@@ -134,12 +134,12 @@ def _filters(compression: str, what: str) -> dict[str, Any]:
 
 
 def blosc2_package(what: str) -> Any:
-    """The module hdf5plugin, which registers Blosc2 with h5py. Raises StorageError where it is missing."""
+    """The module hdf5plugin, which registers Blosc2 with h5py. Raises MissingPackageError where it is not installed."""
     hdf5_package(what)
     try:
         import hdf5plugin
     except ImportError as error:
-        raise StorageError(
+        raise MissingPackageError(
             f"{what}: Blosc2 needs the package hdf5plugin. Install it with pip install 'torchtransient[data]', or "
             "write with compression='gzip'."
         ) from error

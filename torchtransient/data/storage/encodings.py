@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.errors import StorageError
+from torchtransient.errors import ArgumentError, StorageError
 from torchtransient.quantities import shown
 
 STORES = ("exact", "rounded", "counts")
@@ -36,7 +36,7 @@ def measured_names(about: Any) -> tuple[str, ...]:
 def check_store(store: Any, what: str) -> str:
     """`store`, or StorageError for one that is unknown."""
     if store not in STORES:
-        raise StorageError(f"{what}: expected store as one of {', '.join(STORES)}, got {shown(store)}.")
+        raise ArgumentError(f"{what}: expected store as one of {', '.join(STORES)}, got {shown(store)}.")
     return str(store)
 
 

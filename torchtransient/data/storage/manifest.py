@@ -19,7 +19,7 @@ from torchtransient.data.storage.shard_file import Shard, stored_checksum
 from torchtransient.errors import StorageError
 from torchtransient.files.array_file import path_of
 from torchtransient.quantities import shown
-from torchtransient.render.progress import with_bar
+from torchtransient.rendering.progress import with_bar
 
 FORMAT = "torchtransient manifest 1"
 _WHAT = "data set"

@@ -68,8 +68,8 @@ class Shard:
         self._file.close()
 
     def read(
-        self, name: str, row: int, window: slice | None = None, pixels: tuple[slice, slice] | None = None,
-        *, as_stored: bool = False,
+        self, name: str, row: int, *, window: slice | None = None, pixels: tuple[slice, slice] | None = None,
+        as_stored: bool = False,
     ) -> NDArray[Any]:  # fmt: skip
         """One array of a row. ``window``: a slice of the bins, of which alone what is asked for is read. ``pixels``:
         slices of rows and columns of the image. Counts are float32, unless ``as_stored``.

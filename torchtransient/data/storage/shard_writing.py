@@ -69,6 +69,7 @@ class ShardWriter:
         path: str | Path,
         rows: int,
         header: Mapping[str, Any],
+        *,
         store: str = "exact",
         compression: str = "blosc2",
     ) -> None:

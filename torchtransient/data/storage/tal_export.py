@@ -9,12 +9,12 @@ from typing import Any
 from torchtransient.capture import Capture, Scan
 from torchtransient.data.reading.transient_dataset import TransientDataset
 from torchtransient.data.recipes.written import read_frequencies
-from torchtransient.errors import StorageError
+from torchtransient.errors import ArgumentError, StorageError
 from torchtransient.files.array_file import damage_said, path_of
 from torchtransient.files.captures import tal
 from torchtransient.files.scan_data import scan_from_data
 from torchtransient.quantities import shown
-from torchtransient.render.progress import with_bar
+from torchtransient.rendering.progress import with_bar
 
 _WHAT = "TAL export"
 # What captures can hold.
@@ -38,7 +38,7 @@ def export_tal(where: Any, folder: str | Path, *, field: str | None = None, prog
     have = [name for name in _MEASURED if name in data.fields]
     name = have[0] if field is None and have else field
     if name not in have:
-        raise StorageError(f"{_WHAT}: expected field as one of {', '.join(have) or 'none'}, got {field!r}.")
+        raise ArgumentError(f"{_WHAT}: expected field as one of {', '.join(have) or 'none'}, got {field!r}.")
     written = []
     for number in with_bar(range(len(data)), "export", progress):
         sample = data[number]

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from torchtransient.data.reading.transient_dataset import TransientDataset
 from torchtransient.data.storage.encodings import COUNTED, measured_names
 from torchtransient.data.storage.part_files import whole_file, writing_said
-from torchtransient.errors import StorageError
+from torchtransient.errors import MissingPackageError, StorageError
 from torchtransient.files.array_file import check_source, damage_said, path_of
 from torchtransient.files.hdf5_limits import check_memory
 from torchtransient.quantities import positive
-from torchtransient.render.progress import with_bar
+from torchtransient.rendering.progress import with_bar
 
 _WHAT = "WebDataset"
 _LEVEL = 3
@@ -210,7 +210,7 @@ def _zstandard() -> Any:
     try:
         import zstandard
     except ImportError as error:
-        raise StorageError(
+        raise MissingPackageError(
             f"{_WHAT}: needs the package zstandard. Install it with pip install 'torchtransient[webdataset]'."
         ) from error
     return zstandard

@@ -12,7 +12,7 @@ from typing import Any
 from torchtransient.axes import FrequencyAxis
 from torchtransient.capture import Capture
 from torchtransient.capture.files import register_files
-from torchtransient.errors import StorageError
+from torchtransient.errors import ArgumentError, StorageError
 from torchtransient.files import capture_file
 from torchtransient.files.array_file import HDF5, check_folder, damage_said, path_of
 from torchtransient.files.captures import cdt, dirac, keyhole, phasor_field, rect_data, tal, zaragoza
@@ -114,7 +114,7 @@ def write_capture(path: str | Path, capture: Capture, metadata: Any = None, *, f
     if metadata is not None:
         raise StorageError(f"{WHAT}: metadata= is for the library's own format; got it with format={format!r}.")
     if not isinstance(capture, Capture):
-        raise StorageError(f"{WHAT}: expected a tt.nlos.Capture, got {type(capture).__name__}.")
+        raise ArgumentError(f"{WHAT}: expected a tt.nlos.Capture, got {type(capture).__name__}.")
     target = path_of(path, WHAT)
     if target.suffix.lower() not in layout.endings:
         endings = ", ".join(layout.endings)
@@ -126,7 +126,7 @@ def write_capture(path: str | Path, capture: Capture, metadata: Any = None, *, f
 
 def _check_name(name: Any, names: tuple[str, ...]) -> None:
     if name is not None and name not in names:
-        raise StorageError(f"{WHAT}: expected format to be one of {', '.join(names)}, got {shown(name)}.")
+        raise ArgumentError(f"{WHAT}: expected format to be one of {', '.join(names)}, got {shown(name)}.")
 
 
 def _is_own(source: Path) -> bool:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from torchtransient.errors import StorageError
+from torchtransient.errors import MissingPackageError, StorageError
 
 # Ground truth of 1024 x 1024 points with normals takes 43 MB as text.
 MOST_CHARACTERS = 2**27
@@ -89,5 +89,7 @@ def _package(what: str) -> Any:
     try:
         import yaml
     except ImportError as error:
-        raise StorageError(f"{what}: YAML needs PyYAML. Install it with pip install 'torchtransient[yaml]'.") from error
+        raise MissingPackageError(
+            f"{what}: YAML needs PyYAML. Install it with pip install 'torchtransient[yaml]'."
+        ) from error
     return yaml

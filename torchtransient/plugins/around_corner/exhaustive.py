@@ -156,7 +156,7 @@ def _launch(
     pairs = Pairs(job, lasers, pixel, laser)
     wanted = pixel <= laser if mirrored else mi.Mask(True)
     base = film.pixel_base(local * film.entries_per_pixel(), laser)
-    target = film.create_block(Local(band=band), base, job.match, 1, exclusive=True, origin=pairs.origin)
+    target = film.create_event_block(Local(band=band), base, job.match, 1, exclusive=True, origin=pairs.origin)
     kept = {"L": mi.UnpolarizedSpectrum(0), "before": mi.Float(0), "after": mi.Float(0)}
     kept = sum_over_block(job, block, pairs, target, kept, wanted)
     _count(film, job.match, pixel, kept, wanted)

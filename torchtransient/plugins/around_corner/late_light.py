@@ -169,7 +169,7 @@ class LateLight:
         base = in_band * film.entries_per_pixel()
         if self.exhaustive:
             base = film.pixel_base(base, lanes.laser)
-        target = film.create_block(launch, base, self.job.match, EVENTS, exclusive=launch.spp == 1)
+        target = film.create_event_block(launch, base, self.job.match, EVENTS, exclusive=launch.spp == 1)
         kept = {"L": mi.UnpolarizedSpectrum(0), "before": mi.Float(0), "after": mi.Float(0), "block": target.begin()}
         kept = sum_over_links(self, part, lanes, target, kept)
         target.end(kept["block"])

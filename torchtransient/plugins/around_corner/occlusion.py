@@ -92,7 +92,7 @@ class MutualOcclusion:
             rays = self._start(job)
             match = self.integrator.channel_match(self.world.contents, film, rays)
             base, pixel = self.integrator.pixel_indices(film, job, rays)
-            block = film.create_block(job, base, match, 2, tangents=True)
+            block = film.create_event_block(job, base, match, 2, tangents=True)
             with dr.resume_grad():
                 terms = self._terms(rays, pixel, job)
                 tangents = tangents_of([term.outwards for term in terms])

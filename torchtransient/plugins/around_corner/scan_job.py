@@ -33,7 +33,9 @@ class ScanJob:
                 f"{sensors.width} points."
             )
         if film.steady is None:
-            raise SceneError(f"{name}: expected a film that is prepared; call film.prepare(samples=...) before.")
+            raise SceneError(
+                f"{name}: expected a film that a render was started on; call film.start_render(samples) before."
+            )
         self.scene, self.film, self.sensors = scene, film, sensors
         self.energy = mi.UnpolarizedSpectrum(energy)
         dr.make_opaque(self.energy)

@@ -23,6 +23,7 @@ from torchtransient.plugins.around_corner.third_bounce_gradients import ThirdBou
 from torchtransient.plugins.around_corner.wall_points import WallPoints, points_of
 from torchtransient.plugins.bsdfs.lambertian import is_lambertian
 from torchtransient.plugins.node_walk import objects_below
+from torchtransient.plugins.parameter_effect import class_of
 from torchtransient.plugins.sampling.area_elements import can_be_listed, has_shading_normals
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 from torchtransient.plugins.sampling.scan_tiles import ScanTiles, distance_to
@@ -37,7 +38,7 @@ def why_not(table: ScanTable, contents: Any, with_wall: bool) -> str | None:
     if sensor.film().exhaustive_scan and sensor.film().lanes_at_most(1) is not None:
         return f"the film of an exhaustive capture is a {sensor.film().plugin}, which lists events"
     if not table.looks_at_points:
-        return f"the sensor ({sensor.class_name()}) is no nlos_capture_meter, whose pixels are points"
+        return f"the sensor ({class_of(sensor)}) is no nlos_capture_meter, whose pixels are points"
     if contents.media is not None:
         return "there are participating media"
     if contents.delays is not None or contents.mixtures is not None:
@@ -47,7 +48,7 @@ def why_not(table: ScanTable, contents: Any, with_wall: bool) -> str | None:
         return f"not all surfaces are diffuse ({', '.join(others[:3])})"
     wall = sensor.get_shape()
     if wall is not None and has_shading_normals(wall):
-        return f"normals are interpolated on the relay wall ({wall.id() or wall.class_name()})"
+        return f"normals are interpolated on the relay wall ({wall.id() or class_of(wall)})"
     unlisted = [shape.id() or shape.class_name() for shape in scene.shapes() if not can_be_listed(shape)]
     if unlisted:
         return f"points cannot be drawn on {', '.join(unlisted[:3])}"

@@ -110,7 +110,7 @@ class ThirdBounce(ScanJob):
         pixel, first, last = launch.lanes()
         tile = mi.UInt32(0) if self.tile is None else dr.gather(mi.UInt32, self.tile, pixel)
         lane = ScanLanes(self, lasers, pixel, table.lit)
-        block = film.create_block(
+        block = film.create_event_block(
             launch,
             launch.base(film, pixel),
             self.match,

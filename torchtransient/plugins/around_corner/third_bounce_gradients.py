@@ -107,7 +107,7 @@ class ThirdBounceGradients:
         for launch in launches_of(self.film, self.points.count, self.samples.count):
             pixel, first, last = launch.lanes()
             base = launch.base(self.film, pixel)
-            block = self.film.create_block(launch, base, self.match, launch.most_events, tangents=True)
+            block = self.film.create_event_block(launch, base, self.match, launch.most_events, tangents=True)
             lane = Local(own=pixel, first=first, last=last, fields=self.points.load(pixel))
             lane.tangent = tangents[1].load(pixel)
             dr.eval(vars(lane.fields), vars(lane.tangent), pixel, first, last)

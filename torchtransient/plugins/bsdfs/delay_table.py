@@ -15,6 +15,7 @@ import numpy as np
 
 from torchtransient.errors import SceneError
 from torchtransient.plugins.node_walk import objects_below
+from torchtransient.plugins.parameter_effect import class_of
 from torchtransient.plugins.pointer_table import PointerTable, registry_number
 from torchtransient.plugins.polarized import attenuated
 
@@ -211,7 +212,7 @@ def delays_of(bsdfs):
     for bsdf in met:
         if any(_scatters_late(part) for part in [bsdf, *objects_below(bsdf, mi.BSDF)]):
             raise SceneError(
-                f"BSDF '{bsdf.id()}' has a delayed BSDF inside; expected it outermost: put {bsdf.class_name()} into "
+                f"BSDF '{bsdf.id()}' has a delayed BSDF inside; expected it outermost: put {class_of(bsdf)} into "
                 "the delayed one."
             )
     return met, DelayedBSDFs(delayed) if delayed else None

@@ -16,6 +16,7 @@ from torchtransient.plugins.bsdfs.delay_table import SpectralShift
 from torchtransient.plugins.bsdfs.ior import opaque
 from torchtransient.plugins.films.pulsed_filter import numbers_of
 from torchtransient.plugins.parameter_effect import VALUE, ParameterEffect, declare_effects
+from torchtransient.plugins.properties import number
 from torchtransient.pulses import Pulse
 from torchtransient.units import SPEED_OF_LIGHT
 
@@ -122,9 +123,9 @@ class DelayedBSDF(mi.BSDF):
     def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> Any:
         bs, weight = dr.zeros(mi.BSDFSample3f), mi.Spectrum(0)
         parts = self._sum()
-        for number, (part, factor) in enumerate(parts):
-            chosen = active & (mi.UInt32(dr.minimum(sample1 * len(parts), len(parts) - 1)) == number)
-            bs_part, w = part.sample(ctx, si, sample1 * len(parts) - number, sample2, chosen)
+        for index, (part, factor) in enumerate(parts):
+            chosen = active & (mi.UInt32(dr.minimum(sample1 * len(parts), len(parts) - 1)) == index)
+            bs_part, w = part.sample(ctx, si, sample1 * len(parts) - index, sample2, chosen)
             bs_part.pdf *= 1 / len(parts)
             bs = dr.select(chosen, bs_part, bs)
             weight = dr.select(chosen, w * (factor * len(parts)), weight)
@@ -166,7 +167,7 @@ def _children(props: Any) -> tuple[Any, Any]:
 
 
 def _number(props: Any, name: str, default: float, low: float, high: float) -> Any:
-    value = float(props.get(name, default))
+    value = number(props, name, default)
     if not (math.isfinite(value) and low <= value <= high):
         raise SceneError(f"delayed: expected {name} between {low:g} and {high:g}, got {value!r}.")
     return opaque(mi.Float(value))
@@ -200,7 +201,7 @@ def _lifetime(props: Any, mean: float | None) -> float:
             "delayed: expected one of lifetime (metres of optical path) and lifetime_s (seconds), got "
             f"{'both' if given else 'neither'}."
         )
-    value = mean if not given else float(props[given[0]]) * (SPEED_OF_LIGHT if given[0] == "lifetime_s" else 1.0)
+    value = mean if not given else number(props, given[0]) * (SPEED_OF_LIGHT if given[0] == "lifetime_s" else 1.0)
     if value is None or not (math.isfinite(value) and value >= 0):
         raise SceneError(f"delayed: expected a finite {given[0]} of zero or more, got {props[given[0]]!r}.")
     return value

@@ -29,6 +29,7 @@ import mitsuba as mi
 from torchtransient.errors import SceneError
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.parameter_effect import VALUE, declare_effects
+from torchtransient.plugins.properties import number
 
 from .bessel import scaled_i0
 from .fresnel import fresnel, sqrt_with_bounded_slope
@@ -83,13 +84,13 @@ class DiffHair(mi.BSDF):
         mi.BSDF.__init__(self, props)
         self.longitudinal_roughness = _roughness(props, "longitudinal_roughness")
         self.azimuthal_roughness = _roughness(props, "azimuthal_roughness")
-        self.scale_tilt = mi.Float(float(props.get("scale_tilt", 2.0)))
+        self.scale_tilt = mi.Float(number(props, "scale_tilt", 2.0))
         self.eta = relative_index(props, "diff_hair", "amber")
         given = [name for name in PIGMENTS if name in props]
-        self.eumelanin = mi.Float(float(props.get("eumelanin", 1.3)))
-        self.pheomelanin = mi.Float(float(props.get("pheomelanin", 0.2)))
+        self.eumelanin = mi.Float(number(props, "eumelanin", 1.3))
+        self.pheomelanin = mi.Float(number(props, "pheomelanin", 0.2))
         self.sigma_a = props.get_unbounded_texture("sigma_a") if "sigma_a" in props else None
-        self.scale = float(props.get("scale", 1.0))
+        self.scale = number(props, "scale", 1.0)
         if self.sigma_a is not None and given:
             raise SceneError(
                 f"diff_hair: expected either 'sigma_a' or pigments, got 'sigma_a' and '{given[0]}'. Remove one of them."
@@ -230,7 +231,7 @@ class DiffHair(mi.BSDF):
 
 
 def _roughness(props: Any, name: str) -> Any:
-    value = float(props.get(name, 0.3))
+    value = number(props, name, 0.3)
     if not 0 <= value <= 1:
         raise SceneError(f"diff_hair: '{name}' must be in [0, 1], got {value}.")
     return mi.Float(value)

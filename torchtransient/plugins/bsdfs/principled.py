@@ -14,6 +14,7 @@ from torchtransient.plugins.mitsuba_compat import LOST_AT
 from torchtransient.plugins.mitsuba_parameters import PRINCIPLED_INDEX
 from torchtransient.plugins.node_walk import attached_as, carries_derivatives
 from torchtransient.plugins.parameter_effect import declare_effects
+from torchtransient.plugins.properties import number
 
 from .ior import opaque
 
@@ -136,7 +137,7 @@ class DiffPrincipled(mi.BSDF):
         self.built = {name for name in self.slots if name in self.always or _is_given(props, name)}
         self.built |= {name for name in str(props.get("lobes", "")).split(",") if name in self.slots}
         self.textures = {name: self._texture(props, name, default) for name, default in self.slots.items()}
-        self.fixed = {name: float(props.get(name, 1.0)) for name in self.rates}
+        self.fixed = {name: number(props, name, 1.0) for name in self.rates}
         self.reading = Reading()
         self._build()
 
@@ -147,7 +148,7 @@ class DiffPrincipled(mi.BSDF):
     def _read_index(self, props: Any) -> None:
         # Mitsuba refuses both at once.
         self.index = "eta" if "eta" in props else "specular"
-        given = {name: float(props[name]) for name in ("eta", "specular") if name in props}
+        given = {name: number(props, name) for name in ("eta", "specular") if name in props}
         own = mi.load_dict({"type": self.plugin, **given})
         self.index_value = opaque(mi.Float(mi.traverse(own)[self.index]))
 

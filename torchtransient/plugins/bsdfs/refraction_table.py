@@ -16,6 +16,7 @@ from torchtransient.errors import SceneError
 from torchtransient.plugins.mitsuba_compat import has_equal_sides
 from torchtransient.plugins.node_walk import bsdfs_below as bsdfs_below
 from torchtransient.plugins.node_walk import bsdfs_of_scene as bsdfs_of_scene
+from torchtransient.plugins.parameter_effect import class_of
 from torchtransient.plugins.pointer_table import PointerTable
 
 
@@ -137,6 +138,6 @@ def index_of(leaf: Any) -> Any:
         # Burley 2015, Extending the Disney BRDF: reflectance 0.08 * specular at normal incidence.
         return 2 / (1 - dr.sqrt(0.08 * mi.Float(params["specular"]))) - 1
     raise SceneError(
-        f"BSDF '{leaf.id()}' ({leaf.class_name()}) has a refractive lobe but no parameter 'eta'. The optical "
+        f"BSDF '{leaf.id()}' ({class_of(leaf)}) has a refractive lobe but no parameter 'eta'. The optical "
         "length behind it cannot be known: expose the relative index as 'eta' in the plugin's traverse()."
     )

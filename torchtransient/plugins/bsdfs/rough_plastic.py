@@ -11,7 +11,7 @@ from torchtransient.errors import SceneError
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.node_walk import attached_as, carries_derivatives
 from torchtransient.plugins.parameter_effect import VALUE, declare_effects
-from torchtransient.plugins.properties import truth
+from torchtransient.plugins.properties import number, truth
 
 from .fresnel import fresnel
 from .ior import opaque, optional_texture, relative_index, specular_share, textured
@@ -50,7 +50,7 @@ class DiffRoughPlastic(mi.BSDF):
         if "alpha_u" in props or "alpha_v" in props:
             raise SceneError("diff_rough_plastic: coatings are isotropic, expected 'alpha', got 'alpha_u', 'alpha_v'.")
         self.ggx = _DISTRIBUTIONS[name]
-        self.alpha = opaque(mi.Float(max(float(props.get("alpha", 0.1)), _ALPHA_MIN)))
+        self.alpha = opaque(mi.Float(max(number(props, "alpha", 0.1), _ALPHA_MIN)))
         self.sample_visible = truth(props, "sample_visible", default=True)
         self.nonlinear = truth(props, "nonlinear", default=False)
         self.m_components = [

@@ -11,6 +11,7 @@ import mitsuba as mi
 from torchtransient.errors import SceneError
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.parameter_effect import ANY_KEY, VALUE, declare_effects
+from torchtransient.plugins.properties import number
 
 
 class AngularAreaLight(mi.Emitter):
@@ -31,8 +32,8 @@ class AngularAreaLight(mi.Emitter):
     def __init__(self, props: Any) -> None:
         super().__init__(props)
         self.radiance = props.get_emissive_texture("radiance", 1.0)
-        self.cutoff_angle = float(props.get("cutoff_angle", 10.0))
-        self.beam_width = float(props.get("beam_width", self.cutoff_angle))
+        self.cutoff_angle = number(props, "cutoff_angle", 10.0)
+        self.beam_width = number(props, "beam_width", self.cutoff_angle)
         if not 0 <= self.beam_width <= self.cutoff_angle <= 90 or self.cutoff_angle == 0:
             raise SceneError(
                 "angulararea: expected 0 <= beam_width <= cutoff_angle <= 90 degrees and a cutoff_angle above 0, got "

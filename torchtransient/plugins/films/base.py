@@ -10,10 +10,11 @@ from torchtransient.errors import SceneError, StorageError
 from torchtransient.interfaces import FilmInterface
 from torchtransient.plugins.described_scene import note_scene
 from torchtransient.plugins.films.block import AdjointBlock, FilmBlock
+from torchtransient.plugins.films.plain_image import bitmap_of, plain_image
 from torchtransient.plugins.films.response import SensorResponse
 from torchtransient.plugins.frozen_state import says_it_can_be_recorded
 from torchtransient.plugins.parameter_effect import ANY_KEY, VALUE, declare_effects
-from torchtransient.plugins.properties import truth, whole_number
+from torchtransient.plugins.properties import number, truth, whole_number
 
 # Dr.Jit arrays are indexed with 32 bits; a larger cube is stored in bands of whole rows.
 MAX_ARRAY_ENTRIES = 2**32 - 1
@@ -21,6 +22,8 @@ MAX_ARRAY_ENTRIES = 2**32 - 1
 # processors, which add up a packet first), 2^20 to 3e-4, 2^26 only to 1.5e-2. Larger jobs are summed in double
 # precision.
 MAX_SINGLE_PRECISION_SAMPLES = 2**16
+# Pixels that a reconstruction filter may reach: more is no filter of an image, and its table loses its digits.
+MOST_RADIUS = 4096
 # From this many values on zeros are written by all threads, in a kernel of their own.
 MANY_VALUES = 2**23
 
@@ -49,6 +52,9 @@ class TimeResolvedFilm(mi.Film):
     ``put_slope`` and its adjoint ``read``. A class that lacks one of them is refused where it is registered.
 
     Children that are spectra are the response curves of the film's channels (``curves``), see :mod:`.response`.
+
+    Integrators that know nothing of time (``path``, ``aov``, ``prb``, those of users) render an image to it, as to an
+    ``hdrfilm``: RGB whatever the response curves, luminance in monochromatic variants, then what ``aov`` adds.
     """
 
     exhaustive_scan = False
@@ -64,18 +70,17 @@ class TimeResolvedFilm(mi.Film):
 
     def __init__(self, props):
         super().__init__(props)
-        self.start_opl = float(props.get("start_opl", 0.0))
-        if not abs(self.start_opl) < float("inf"):
-            raise SceneError(f"{self.plugin}: start_opl must be a finite length in metres, got {self.start_opl}.")
+        self.start_opl = number(props, "start_opl", 0.0)
         self.exhaustive_scan = truth(props, "exhaustive_scan", default=False)
-        self.laser_scan_width = whole_number(props, "laser_scan_width", 0)
-        self.laser_scan_height = whole_number(props, "laser_scan_height", 0)
+        self.laser_scan_width = whole_number(props, "laser_scan_width", 0, least=0)
+        self.laser_scan_height = whole_number(props, "laser_scan_height", 0, least=0)
         self._check_laser_grid()
         self.curves = SensorResponse.of(props)
         self.bands = []
         self._lent = None
         self.steady = None
         self.outside = None
+        self._image = None  # where an integrator that knows nothing of time has rendered
         self._offset_distribution = None
 
     def _check_laser_grid(self):
@@ -98,8 +103,48 @@ class TimeResolvedFilm(mi.Film):
             for name, curve in zip(self.curves.names, self.curves.textures, strict=True):
                 cb.put(name, curve, mi.ParamFlags.NonDifferentiable)
 
+    # ---------------------------------------------------------- for integrators that know nothing of time
+
     def base_channels_count(self):
-        return self.channel_count()
+        return 1 if mi.is_monochromatic else 3
+
+    def prepare(self, aovs=()):
+        """Begin an image, with other channels of these names behind its own; returns the number of channels."""
+        self.clear()
+        self._image = plain_image(self)
+        return self._image.prepare(list(aovs))
+
+    def _begun_image(self):
+        if self._image is None:
+            raise SceneError(
+                f"{self.plugin}: expected an image that was begun, prepare(aovs); integrators that know of time take "
+                "start_render(samples) and create_event_block(...)."
+            )
+        return self._image
+
+    def create_block(self, size=(0, 0), normalize=False, borders=False):
+        """A block of the image, which :meth:`put_block` takes."""
+        return self._begun_image().create_block(mi.ScalarVector2u(size), normalize, borders)
+
+    def put_block(self, block):
+        """Add a block to the image."""
+        self._begun_image().put_block(block)
+
+    def bitmap(self, raw: bool = False):
+        """The image, or the steady image of a time-resolved render, as a ``mi.Bitmap``."""
+        if self._image is not None:
+            return self._image.bitmap(raw)
+        return bitmap_of(self.develop(raw)[0], self.channel_names())
+
+    def write(self, path):
+        """Write :meth:`bitmap` to a file; the time-resolved array is in no picture."""
+        self.bitmap().write(str(path))
+
+    def schedule_storage(self):
+        if self._image is not None:
+            self._image.schedule_storage()
+        elif self.steady is not None:
+            dr.schedule(self.steady, self.outside, *(band[2] for band in self.bands))
 
     # ------------------------------------------------------------------------------------- for integrators
 
@@ -121,7 +166,7 @@ class TimeResolvedFilm(mi.Film):
     def lanes_at_most(self, most_events: int) -> int | None:
         return None
 
-    def create_block(
+    def create_event_block(
         self, job, base, match, most_events: int, tangents=False, exclusive=False, origin=None
     ) -> FilmBlock:
         return FilmBlock(self, job.band, base, match, exclusive and self.knows_exclusive_lanes, origin)
@@ -176,12 +221,11 @@ class TimeResolvedFilm(mi.Film):
         height, rows = self.cube_shape()[0], self.band_rows()
         return [(first, min(rows, height - first)) for first in range(0, height, rows)]
 
-    def prepare(self, aovs=(), samples: int = 0):
-        if len(aovs):
-            raise SceneError(f"{self.plugin}: arbitrary output variables are not supported, got {list(aovs)}.")
+    def start_render(self, samples: int = 0):
         height, width = self.cube_shape()[:2]
         real = mi.Float64 if samples > MAX_SINGLE_PRECISION_SAMPLES else mi.Float
         per_row = width * self.entries_per_pixel()
+        self._image = None
         self.clear()  # the memory of the last render is that of this one
         if self._lent is None:
             self.bands = [(first, rows, zeros(real, rows * per_row)) for first, rows in self.band_layout()]
@@ -195,7 +239,6 @@ class TimeResolvedFilm(mi.Film):
         self.steady = dr.zeros(real, height * width * self.channel_count())
         # By pixel: one sum over all samples would drown small terms, and be one address that every thread waits for.
         self.outside = dr.zeros(real, height * width * 2) if self.has_window else None
-        return self.channel_count()
 
     def add_steady(self, pixel, channels):
         """Add to the steady image of pixels, unless the film sums it up of its array."""
@@ -229,6 +272,8 @@ class TimeResolvedFilm(mi.Film):
 
     def clear(self):
         self.bands, self.steady, self.outside = [], None, None
+        if self._image is not None:
+            self._image.clear()
 
     def can_borrow(self, samples):
         # Samplers may round up; a sum over the array needs one that starts with the film; classes made out of this one
@@ -266,10 +311,13 @@ class TimeResolvedFilm(mi.Film):
             )
 
     def develop(self, raw: bool = False):
-        """The pair (steady ``(H, W, C)``, array of shape ``cube_shape()``), without a copy.
+        """The pair (steady ``(H, W, C)``, array of shape ``cube_shape()``), without a copy; the image ``(H, W, C)``
+        alone where an integrator that knows nothing of time has rendered.
 
         A cube of more than 2^32 entries cannot be one Dr.Jit tensor: use :meth:`transient_bands`.
         """
+        if self._image is not None:
+            return self._image.develop(raw)
         if self.steady is None:
             raise SceneError(f"{self.plugin}: nothing was rendered yet; call render() first.")
         self.check_one_band()
@@ -302,6 +350,13 @@ class TimeResolvedFilm(mi.Film):
         x = dr.linspace(mi.Float, -radius, radius, 513)
         h = rfilter.eval(x)
         dr.eval(h)
+        largest = float(np.max(np.abs(np.array(h))))
+        if not (0 < radius <= MOST_RADIUS and 1e-6 < largest < 1e6):
+            raise SceneError(
+                f"{self.plugin}: expected a reconstruction filter with a radius above 0 and up to {MOST_RADIUS} pixels "
+                f"and values around one, got {rfilter.class_name()} of radius {radius:g} and values up to {largest:g}. "
+                "Mend its radius, stddev, lobes, B or C."
+            )
         # A floor keeps the density positive wherever the filter is not zero between two nodes.
         density = dr.maximum(dr.abs(h), 1e-4 * dr.max(dr.abs(h)))
         fine = np.array(rfilter.eval(dr.linspace(mi.Float, -radius, radius, (1 << 14) + 1)), dtype=np.float64)

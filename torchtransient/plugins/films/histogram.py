@@ -15,7 +15,7 @@ from torchtransient.plugins.films.long_kernel import read as read_long
 from torchtransient.plugins.films.pulsed_filter import PulsedFilter, pulse_of
 from torchtransient.plugins.films.temporal_filter import check_name, check_stddev, make_temporal_filter
 from torchtransient.plugins.films.window import ArrivalWindow
-from torchtransient.plugins.properties import truth, whole_number
+from torchtransient.plugins.properties import number, truth, whole_number
 
 # Kernels of more bins are looped over instead of written out.
 MAX_UNROLLED = 9
@@ -106,9 +106,9 @@ class TransientHDRFilm(TimeResolvedFilm):
     def __init__(self, props):
         super().__init__(props)
         self.temporal_bins = whole_number(props, "temporal_bins", 2048)
-        self.bin_width_opl = float(props.get("bin_width_opl", 0.003))
+        self.bin_width_opl = number(props, "bin_width_opl", 0.003)
         self._filter_name = str(props.get("temporal_filter", "box"))
-        self._gaussian_stddev = float(props.get("gaussian_stddev", 0.5))
+        self._gaussian_stddev = number(props, "gaussian_stddev", 0.5)
         self.keeps_steady = self.has_window = truth(props, "steady", default=True)
         self.pulses = [p for p in (pulse_of(props, name, self.plugin) for name in ("pulse", "irf")) if p is not None]
         self._check()
@@ -204,9 +204,9 @@ class TransientHDRFilm(TimeResolvedFilm):
         """Arrival in units of bins from ``opl - start_opl`` (``Float64``)."""
         return opl_from_start / mi.Float64(self.bin_width_opl)
 
-    def create_block(self, job, base, match, most_events, tangents=False, exclusive=False, origin=None):
+    def create_event_block(self, job, base, match, most_events, tangents=False, exclusive=False, origin=None):
         if origin is None or tangents or self._long:
-            return super().create_block(job, base, match, most_events, tangents, exclusive, origin)
+            return super().create_event_block(job, base, match, most_events, tangents, exclusive, origin)
         return HistogramBlock(self, job.band, base, match, exclusive, origin)
 
     def reduce_mode(self, cube, exclusive, crowded):

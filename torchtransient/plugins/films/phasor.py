@@ -131,7 +131,7 @@ class PhasorHDRFilm(TimeResolvedFilm):
 
     # ----------------------------------------------------------------------------------- splat and read
 
-    def create_block(self, job, base, match, most_events, tangents=False, exclusive=False, origin=None):
+    def create_event_block(self, job, base, match, most_events, tangents=False, exclusive=False, origin=None):
         return EventBlock(self, job, base, match, most_events, tangents, origin)
 
     def create_adjoint_block(self, response, base, steady, match):

@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 
 from torchtransient.errors import SceneError, TorchTransientWarning
-from torchtransient.plugins.properties import whole_number
+from torchtransient.plugins.properties import number, whole_number
 from torchtransient.transform_bins import transform_bins
 
 LIST = ("frequencies",)
@@ -29,15 +29,15 @@ def frequencies_of(props) -> np.ndarray:
             raise SceneError(
                 f"phasor_hdr_film: a uniform grid needs {', '.join(GRID)}; {', '.join(missing)} is missing."
             )
-        count = int(props["frequency_count"])
+        count = whole_number(props, "frequency_count", 0)
         if count < 1:
             raise SceneError(f"phasor_hdr_film: frequency_count must be at least 1, got {count}.")
-        return checked(float(props["frequency_first"]) + np.arange(count) * float(props["frequency_step"]))
+        return checked(number(props, "frequency_first") + np.arange(count) * number(props, "frequency_step"))
     found = transform_bins(
-        float(props.get("wl_mean", 100.0)),
-        float(props.get("wl_sigma", 1000.0)),
+        number(props, "wl_mean", 100.0),
+        number(props, "wl_sigma", 1000.0),
         whole_number(props, "temporal_bins", 4096),
-        float(props.get("bin_width_opl", 0.003)),
+        number(props, "bin_width_opl", 0.003),
     )
     if not given:
         numbers = ", ".join(f"{number:.4g}" for number in found)

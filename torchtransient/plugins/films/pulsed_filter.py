@@ -16,6 +16,7 @@ import numpy as np
 
 from torchtransient.errors import SceneError, TorchTransientError
 from torchtransient.plugins.films.temporal_filter import GaussianFilter, TentFilter
+from torchtransient.plugins.properties import number
 from torchtransient.pulses import FWHM_PER_STDDEV, KINDS, Pulse, cumulative_of_sum
 
 # Nodes of the table of F over the length of the kernel; it is linear in between.
@@ -45,7 +46,7 @@ class PulsedFilter:
             raise SceneError(
                 f"film: pulse and response together cover {high - low:.0f} bins of {bin_width_opl:g} m; at most "
                 f"{MAX_BINS} are spread while rendering. Use wider bins, or render without them and apply the pulse "
-                "afterwards (torchtransient.sensing.pulse.apply_pulse)."
+                "afterwards (torchtransient.sensing.apply_pulse)."
             )
         per_bin = 2 ** math.ceil(math.log2(NODES / (high - low)))
         self.nodes_per_bin = int(min(max(per_bin, 8), MAX_NODES_PER_BIN))
@@ -102,12 +103,12 @@ def pulse_of(props, prefix: str, plugin: str) -> Pulse | None:
     missing = [f"{prefix}_{name}" for name in needed if f"{prefix}_{name}" not in props]
     if missing:
         raise SceneError(f"{plugin}: {prefix}={kind!r} needs {' and '.join(missing)}.")
-    center = float(props.get(f"{prefix}_center_opl", 0.0))
+    center = number(props, f"{prefix}_center_opl", 0.0)
     try:
         if kind == "tabulated":
             opl, values = (numbers_of(props[f"{prefix}_{name}"], f"{prefix}_{name}", plugin) for name in needed)
             return Pulse.tabulated(opl, values, center)
-        width = float(props[f"{prefix}_{needed[0]}"])
+        width = number(props, f"{prefix}_{needed[0]}")
         return Pulse.gaussian(width, center) if kind == "gaussian" else Pulse.rectangular(width, center)
     except TorchTransientError as error:
         raise SceneError(f"{plugin}: {prefix}: {error}") from error

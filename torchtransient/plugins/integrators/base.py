@@ -17,8 +17,9 @@ from torchtransient.plugins.integrators.incoming_adjoint import IncomingAdjoint
 from torchtransient.plugins.integrators.launch import Job, Pass, laser_count, passes_of, seed_array
 from torchtransient.plugins.integrators.prepared import Prepared, state_of
 from torchtransient.plugins.integrators.seen_scene import SeenScene
+from torchtransient.plugins.parameter_effect import class_of
 from torchtransient.plugins.parameters import SILHOUETTES, ParameterTracker, check_slope, check_stand_ins, moving_names
-from torchtransient.plugins.properties import truth, whole_number
+from torchtransient.plugins.properties import number, truth, whole_number
 from torchtransient.plugins.sensors.origin import PrimaryRays, index_at_sensor, sample_rays, views
 from torchtransient.plugins.sensors.stokes_frame import sensor_rotation
 from torchtransient.plugins.transport.contents import SceneContents
@@ -56,7 +57,7 @@ class TransientIntegrator(mi.CppADIntegrator):
             check_name(self.temporal_filter)
         self.gaussian_stddev = None
         if "gaussian_stddev" in props:
-            self.gaussian_stddev = float(props["gaussian_stddev"])
+            self.gaussian_stddev = number(props, "gaussian_stddev")
             check_stddev(self.gaussian_stddev)
         self._seen = None
 
@@ -97,14 +98,14 @@ class TransientIntegrator(mi.CppADIntegrator):
             )
         if not self.walks_through_media and self.contents(scene, sensor).media is not None:
             raise SceneError(
-                f"{self.class_name()}: the scene has participating media, which this integrator would pass through as "
+                f"{class_of(self)}: the scene has participating media, which this integrator would pass through as "
                 "if they were empty. Use the integrator transient_prbvolpath, or remove the interior and exterior "
                 "media of the scene's shapes and sensors."
             )
         beams = [emitter.id() for emitter in scene.emitters() if getattr(emitter, "needs_aim", False)]
         if beams and not self.aims_lasers:
             raise SceneError(
-                f"{self.class_name()}: nothing but transient_nlos_path with nlos_laser_sampling sees the light of the "
+                f"{class_of(self)}: nothing but transient_nlos_path with nlos_laser_sampling sees the light of the "
                 f"laser_beam {beams[0]!r}. Use that, or describe the light as a 'spot', 'projector' or 'angulararea'."
             )
         film.take_filter(self.temporal_filter, self.gaussian_stddev)
@@ -301,7 +302,7 @@ class TransientIntegrator(mi.CppADIntegrator):
             return job.film.develop() if develop else None
 
     def _render(self, job, evaluate, progress):
-        job.film.prepare(self.aov_names(), job.samples)
+        job.film.start_render(job.samples)
         launches = Job(job.launches, job.seed, job.samples, evaluate, progress)
         self.add_light(job.world, job.sensor, job.film, launches)
         job.film.finish_render()
@@ -320,7 +321,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         rays = self.start(world.scene, world.contents, sensor, film, job)
         match = self.channel_match(world.contents, film, rays)
         base, pixel = self.pixel_indices(film, job, rays)
-        block = film.create_block(job, base, match, world.most_events())
+        block = film.create_event_block(job, base, match, world.most_events())
         _, kept = self.walk(world, film, rays, FilmSink(block))
         film.add_steady(pixel, match.to_channels(kept["L"]))
         film.add_outside(pixel, kept["before"], kept["after"])

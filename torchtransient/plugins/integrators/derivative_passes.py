@@ -28,7 +28,7 @@ def backward(job):
 def forward(job):
     """Carry out a prepared job in forward mode: its film holds the tangent then. As :func:`backward`."""
     world, film = job.world, job.film
-    film.prepare(job.integrator.aov_names(), job.samples)
+    film.start_render(job.samples)
     with world.contents.hidden_from_mitsuba():
         for launch in job.launches if world.walks else ():
             _forward_pass(job, launch)
@@ -70,7 +70,7 @@ def _backward_pass(job, launch):
 def _forward_pass(job, launch):
     world, film = job.world, job.film
     rays, match, base, pixel = _start(job, launch)
-    block = film.create_block(launch, base, match, world.most_events(), tangents=True)
+    block = film.create_event_block(launch, base, match, world.most_events(), tangents=True)
     tangent = tangent_of(world, rays)
     dL = forward_over(world, *_record(job, rays), block, dr.detach(rays.ray), tangent)
     film.add_steady(pixel, match.to_channels(dL))

@@ -25,7 +25,7 @@ from torchtransient.plugins.around_corner.shared_light import (
 from torchtransient.plugins.integrators import base
 from torchtransient.plugins.integrators.base import UNLIMITED
 from torchtransient.plugins.integrators.launch import share_of
-from torchtransient.plugins.properties import truth, whole_number
+from torchtransient.plugins.properties import number, truth, whole_number
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 from torchtransient.plugins.transport.connection.emitter_found import EmitterFound
 from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
@@ -120,7 +120,7 @@ class TransientNLOSPath(base.TransientIntegrator):
         self.equal_shares = truth(props, "nlos_hidden_geometry_sampling_do_rroulette", default=False)
         self.samples_wall = truth(props, "nlos_hidden_geometry_sampling_includes_relay_wall", default=False)
         self.equal_grids = truth(props, "force_equal_illumination_scanning", default=True)
-        self.laser_fov = float(props.get("illumination_scan_fov", 20.0))
+        self.laser_fov = number(props, "illumination_scan_fov", 20.0)
         self.discard_direct_paths = truth(props, "discard_direct_paths", default=False)
         self.third_bounce = _choice(props, "third_bounce", "shared")
         self.late_light = _choice(props, "late_light", "chains")

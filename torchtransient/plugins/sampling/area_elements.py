@@ -29,6 +29,7 @@ import numpy as np
 
 from torchtransient.plugins.mitsuba_compat import has_surface
 from torchtransient.plugins.node_walk import shown_by
+from torchtransient.plugins.parameter_effect import class_of
 
 TRIANGLE, DISK, SPHERE, CYLINDER = range(4)
 _KINDS = {"Disk": DISK, "Sphere": SPHERE, "Cylinder": CYLINDER}
@@ -65,7 +66,7 @@ class AreaElements:
         for number, shape in enumerate(shapes):
             rows = _rows_of(shape)
             if rows is None:
-                left_out.append(shape.id() or shape.class_name())
+                left_out.append(shape.id() or class_of(shape))
                 continue
             axes, kind, area, normal = rows
             count = len(area)

@@ -10,7 +10,7 @@ import numpy as np
 
 from torchtransient.errors import SceneError
 from torchtransient.plugins._registry import register
-from torchtransient.plugins.parameter_effect import ParameterEffect, declare_effects
+from torchtransient.plugins.parameter_effect import ParameterEffect, class_of, declare_effects
 from torchtransient.plugins.sensors.places_on_mesh import PlacesOnMesh
 from torchtransient.quantities import real_array, shown
 
@@ -21,10 +21,10 @@ class NLOSCaptureMeter(mi.Sensor):
     ``sensor_origin`` (point, (0, 0, 0))
         Where the sensor stands, metres.
     ``points`` (array (N, 3) or (H, W, 3); none)
-        The scanned points, in the order of the film's pixels. Without them pixel (i, j) of a film of W x H scans the
-        point of the shape with texture coordinates ((i + 1/2) / W, (j + 1/2) / H), so that no two pixels share one: of
-        a rectangle, or of a mesh with texture coordinates that say of all of them where they are. Other shapes need
-        ``points``.
+        The scanned points, in the order of the film's pixels; in a scene file a text of numbers. Without them pixel
+        (i, j) of a film of W x H scans the point of the shape with texture coordinates ((i + 1/2) / W, (j + 1/2) / H),
+        so that no two pixels share one: of a rectangle, or of a mesh with texture coordinates that say of all of them
+        where they are. Other shapes need ``points``.
     ``laser_points`` (array (M, 3) or (Lh, Lw, 3); none)
         Where the laser points, for captures of type single (M = 1) and exhaustive; without them as the integrator
         ``transient_nlos_path`` says.
@@ -112,7 +112,7 @@ class NLOSCaptureMeter(mi.Sensor):
             )
         if _is_rectangle(shape) or (shape.is_mesh() and shape.has_vertex_texcoords()):
             return shape
-        kind = "a mesh without texture coordinates" if shape.is_mesh() else f"the shape {shape.class_name()}"
+        kind = "a mesh without texture coordinates" if shape.is_mesh() else f"the shape {class_of(shape)}"
         raise SceneError(
             f"nlos_capture_meter: expected a rectangle, a mesh with texture coordinates, or 'points', got {kind}, "
             "which does not say where the points of a grid are. Give the points: an array (N, 3), one for each pixel, "
@@ -180,7 +180,15 @@ def _points_of(props: Any, name: str) -> Any:
     """An array of points of a sensor's properties as a Point3f in memory, None where there is none."""
     if name not in props:
         return None
-    values = np.asarray(props[name], dtype=np.float32)
+    given = props[name]
+    if isinstance(given, str):
+        # Scene files have no arrays: a text of numbers, point after point.
+        try:
+            given = np.array([float(number) for number in given.replace(",", " ").split()])
+        except ValueError as error:
+            raise SceneError(f"nlos_capture_meter: expected {name} as numbers with commas, {error}.") from error
+        given = given.reshape(-1, 3) if given.size % 3 == 0 else given
+    values = np.asarray(given, dtype=np.float32)
     if values.size == 0 or values.shape[-1] != 3 or not np.isfinite(values).all():
         raise SceneError(
             f"nlos_capture_meter: expected {name} as finite points of shape (N, 3) or (H, W, 3) in metres, got shape "

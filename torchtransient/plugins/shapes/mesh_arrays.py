@@ -1,4 +1,4 @@
-"""``mesh_arrays``: a triangle mesh whose vertices and faces stand in the scene dictionary itself."""
+"""``mesh_arrays``: a triangle mesh whose arrays stand in the scene dictionary itself."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ from torchtransient.plugins._registry import register
 
 
 def mesh_arrays(props: Any) -> Any:
-    """A Mitsuba mesh of arrays, with one normal a triangle.
+    """A Mitsuba mesh of arrays.
 
     ``vertices``: (V, 3), metres, before ``to_world``; ``faces``: (F, 3), whole numbers, wound against the clock as seen
-    from outside. ``to_world``, ``flip_normals`` and children (BSDF, emitter, sensor, media) as Mitsuba's meshes have
-    them. Parameters are those of every mesh, ``vertex_positions`` in world space among them. Raises SceneError for
-    missing arrays, sizes that are no multiples of three, numbers that are not finite and faces of vertices that are not
-    there. Not supported: normals and texture coordinates at vertices.
+    from outside. ``normals``: (V, 3), directions at the vertices before ``to_world``; without them there is one normal
+    a triangle. ``texcoords``: (V, 2). ``to_world``, ``face_normals``, ``flip_normals`` and children (BSDF, emitter,
+    sensor, media) as Mitsuba's meshes have them. Parameters are those of every mesh, ``vertex_positions`` in world
+    space among them. Raises SceneError for missing arrays, sizes that do not fit, numbers that are not finite and faces
+    of vertices that are not there. Not supported: other attributes of vertices and faces.
     """
     vertices = _rows(props, "vertices")
     faces = _rows(props, "faces")
@@ -30,28 +31,53 @@ def mesh_arrays(props: Any) -> Any:
             f"mesh_arrays: expected faces of whole numbers from 0 to {len(vertices) - 1}, one less than the vertices, "
             f"got numbers from {faces.min():g} to {faces.max():g}."
         )
+    normals, texcoords = _at_vertices(props, "normals", len(vertices)), _at_vertices(props, "texcoords", len(vertices))
     # As Mitsuba's own meshes: vertices are kept in world space, and a transform that mirrors turns the normals around.
     transform = np.array(props.get("to_world", mi.ScalarTransform4f()).matrix, dtype=np.float64)
     placed = vertices @ transform[:3, :3].T + transform[:3, 3]
-    mesh = mi.Mesh(props.id(), len(placed), len(faces), props)
+    mesh = mi.Mesh(props.id(), len(placed), len(faces), props, normals is not None, texcoords is not None)
     params = mi.traverse(mesh)
     params["vertex_positions"] = mi.Float(np.ravel(placed).astype(np.float32))
     params["faces"] = mi.UInt32(np.ravel(faces).astype(np.uint32))
+    if texcoords is not None:
+        params["vertex_texcoords"] = mi.Float(np.ravel(texcoords).astype(np.float32))
+    if normals is not None:
+        if "to_world" in props:
+            normals = normals @ np.linalg.inv(transform[:3, :3])
+            normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+        params["vertex_normals"] = mi.Float(np.ravel(normals).astype(np.float32))
     params.update()
     return mesh
 
 
+# Arrays of a mesh have rows of so many numbers.
+_COLUMNS = {"texcoords": 2}
+
+
+def _at_vertices(props: Any, name: str, count: int) -> np.ndarray | None:
+    if name not in props:
+        return None
+    rows = _rows(props, name)
+    if len(rows) != count or not np.isfinite(rows).all():
+        raise SceneError(
+            f"mesh_arrays: expected {name} as finite numbers, one row for each of the {count} vertices, got "
+            f"{len(rows)} rows{'' if np.isfinite(rows).all() else ' with NaN or infinity'}."
+        )
+    return rows
+
+
 def _rows(props: Any, name: str) -> np.ndarray:
-    value = props.get(name, None)
+    value, columns = props.get(name, None), _COLUMNS.get(name, 3)
     if value is None or not dr.is_array_v(value):
         raise SceneError(
-            f"mesh_arrays: expected {name} as an array (N, 3) in a scene dictionary, got "
+            f"mesh_arrays: expected {name} as an array (N, {columns}) in a scene dictionary, got "
             f"{'nothing' if value is None else type(value).__name__}. Scene files name a mesh file instead: type 'ply'."
         )
     array = np.asarray(value, dtype=np.float64).reshape(-1)
-    if not array.size or array.size % 3:
-        raise SceneError(f"mesh_arrays: expected {name} as rows of three numbers, got {array.size} numbers.")
-    return array.reshape(-1, 3)
+    if not array.size or array.size % columns:
+        words = {2: "two", 3: "three"}[columns]
+        raise SceneError(f"mesh_arrays: expected {name} as rows of {words} numbers, got {array.size} numbers.")
+    return array.reshape(-1, columns)
 
 
 register("shape", "mesh_arrays", mesh_arrays)

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 import torchtransient  # noqa: F401  finds an LLVM before Dr.Jit does
-from torchtransient.testing.gradient_sweep.page import write_files
+from torchtransient.testing.gradient_sweep.page import with_rows_of_the_page, write_files
 from torchtransient.testing.gradient_sweep.runner import ResultFile, sweep, work
 from torchtransient.testing.gradient_sweep.settings import all_settings
 
@@ -17,7 +17,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--results", type=Path, default=Path("build/gradient_sweep.jsonl"), help="JSON lines, resumed")
     parser.add_argument("--fresh", action="store_true", help="forget results of an earlier run")
-    parser.add_argument("--only", default="", help="regular expression for the names of settings")
+    parser.add_argument(
+        "--only",
+        default="",
+        help="regular expression for the names of settings; with --write the page keeps its rows of the others",
+    )
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--quick", action="store_true", help="one round of few samples")
     parser.add_argument("--list", action="store_true", help="names of the settings, and nothing else")
@@ -41,7 +45,10 @@ def main() -> None:
     with tqdm(total=len(chosen), initial=done, desc="gradients", unit="scene", smoothing=0.05) as bar:
         sweep(chosen, file, arguments.processes, arguments.quick, lambda name: bar.update())
     if arguments.write:
-        write_files(file.results(), arguments.write)
+        rows = file.results()
+        if arguments.only:
+            rows = with_rows_of_the_page(rows, file.done(), arguments.write)
+        write_files(rows, arguments.write)
 
 
 if __name__ == "__main__":

@@ -117,6 +117,7 @@ def surfaces() -> dict[str, Surface]:
         "polarizer": one("polarizer", {"theta": 20.0, "transmittance": 0.8}, **filters),
         "retarder": one("retarder", {"theta": 20.0, "delta": 70.0, "transmittance": 0.8}, **filters),
         "circular": one("circular", {"transmittance": 0.8}, **filters),
+        "retroreflector": one("retroreflector", {"reflectance": rgb(0.6, 0.5, 0.4), "share": 0.6, "alpha": 0.3}),
         "delayed": Surface(lambda: late() | {"elastic_fraction": 0.3, "quantum_yield": 0.8}, outermost=True),
         "delayed (elastic part)": Surface(
             lambda: late() | {"elastic": {"type": "conductor", **METAL}}, outermost=True

@@ -16,15 +16,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchtransient.render.build import BuildOptions
-from torchtransient.render.engine import jvp, primal, vjp
-from torchtransient.render.physics import PhysicsWatch
-from torchtransient.render.seeds import Item, Seeding
-from torchtransient.render.session import RenderJob
-from torchtransient.render.variant import active_variant
+from torchtransient.rendering.build_options import BuildOptions
+from torchtransient.rendering.engine import jvp, primal, vjp
+from torchtransient.rendering.physics import PhysicsWatch
+from torchtransient.rendering.seeds import Item, Seeding
+from torchtransient.rendering.session import RenderJob
+from torchtransient.rendering.variant import active_variant
 
 if TYPE_CHECKING:
-    from torchtransient.render.scene_handle import Scene
+    from torchtransient.rendering.scene_handle import Scene
 
 Array = NDArray[np.float64]
 # Of the loss weights, per metre.

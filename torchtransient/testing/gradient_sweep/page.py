@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +75,7 @@ def _cells(row: dict[str, Any]) -> list[str]:
 def _state(row: dict[str, Any]) -> str:
     """What the table of parameters says, in a few words."""
     if row["biased"] or row["verdict"] == "refused":
-        return row["table"]
+        return str(row["table"])
     if row["table"].startswith(SILHOUETTES):
         return "right, but for silhouettes"
     # Some integrators follow some silhouettes.
@@ -153,6 +153,16 @@ def write_files(results: Iterable[dict[str, Any]], folder: Path) -> None:
     compact = ",\n".join(json.dumps([row.get(column) for column in COLUMNS]) for row in rows)
     (folder / DATA).write_text(f'{{"columns": {json.dumps(COLUMNS)},\n"rows": [\n{compact}\n]}}\n', encoding="utf-8")
     FILE.write_text(json.dumps(swept(rows), indent=1) + "\n", encoding="utf-8")
+
+
+def with_rows_of_the_page(
+    results: Iterable[dict[str, Any]], done: Container[str], folder: Path
+) -> list[dict[str, Any]]:
+    """``results`` of the settings that are ``done``, and what the page has of the others, in the order of the sweep."""
+    order = {setting.name: number for number, setting in enumerate(all_settings())}
+    page_has = read_rows(folder) if (folder / DATA).exists() else []
+    kept = [row for row in page_has if row["setting"] in order and row["setting"] not in done]
+    return sorted([*results, *kept], key=lambda row: order[row["setting"]])
 
 
 def read_rows(folder: Path) -> list[dict[str, Any]]:

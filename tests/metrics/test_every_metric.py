@@ -1,0 +1,158 @@
+"""What holds for every metric: perfect answers, batches, masks, precisions, what is refused."""
+
+from __future__ import annotations
+
+import inspect
+import math
+
+import pytest
+import torch
+
+import torchtransient as tt
+from support.metric_cases import CASES
+from support.sweeps import together
+from torchtransient import metrics
+from torchtransient.errors import ArgumentError, ShapeError, TorchTransientError, UnitError
+
+every = together("case", CASES)
+# What is no metric of a pair with a mean: maps, a median, points, the accumulator.
+OTHERS = {"wrapped_difference", "front_view", "front_depth", "depth_median_error", "localization_rmse", "Running"}
+# Neighbors of a masked pixel see zeros, by windows.
+WINDOWED = ("ssim", "transient_ssim")
+# Half precision rounds the values at a threshold.
+SHARES = ("depth_delta", "depth_gross_errors", "picture_iou", "volume_iou")
+
+
+def test_no_metric_is_missed():
+    public = {name for name in vars(metrics) if not name.startswith("_") and callable(getattr(metrics, name))}
+    assert {case.function.__name__ for case in CASES} | OTHERS == public
+    assert tt.metrics is metrics
+
+
+@every
+def test_equal_tensors(case):
+    x, _ = case.pair()
+    found = float(case(x, x))
+    if case.options.get("smoothing"):
+        assert 0 < found < case.best
+    elif case.best == 1.0:
+        assert found == pytest.approx(1.0, abs=1e-6)
+    else:
+        assert found == case.best
+
+
+@every
+def test_what_is_worse_is_told(case):
+    x, y = case.pair()
+    found = float(case(x, y))
+    assert math.isfinite(found)
+    assert abs(found - case.best) > 1e-13 * (abs(found) < 1)  # seconds are small
+
+
+@every
+@pytest.mark.parametrize("masked", [False, True], ids=["all", "masked"])
+def test_running_sums_are_those_of_all_batches(case, masked):
+    """However the batches are cut, one of them empty."""
+    x, y = case.pair()
+    mask = case.mask() if masked else None
+    whole = case(x.double(), y.double(), mask=mask)
+    running = metrics.Running(case.function, **case.options)
+    assert math.isnan(float(running.compute()))
+    for part in (slice(0, 2), slice(2, 2), slice(2, 3)):
+        if part.stop == part.start and case.function in (metrics.front_depth_mae,):
+            continue
+        running.update(x[part].double(), y[part].double(), mask=None if mask is None else mask[part])
+    torch.testing.assert_close(running.compute(), whole, rtol=1e-12, atol=1e-15)
+    running.reset()
+    assert math.isnan(float(running.compute()))
+    first = running(x, y)
+    torch.testing.assert_close(running.compute().float(), first, rtol=1e-6, atol=1e-12)
+
+
+@every
+def test_items_and_elements(case):
+    x, y = (one.double() for one in case.pair())
+    mask = case.mask()
+    each = case(x, y, mask=mask, reduction="item")
+    assert len(each) == 3
+    alone = torch.stack([case(x[k : k + 1], y[k : k + 1], mask=mask[k : k + 1]) for k in range(3)])
+    if each.ndim == 1:
+        torch.testing.assert_close(each, alone, rtol=1e-12, atol=1e-15)
+    elements = case(x, y, reduction="none")
+    assert bool(elements.isfinite().all())
+    hidden = case(x, y, mask=torch.zeros_like(mask), reduction="none")
+    assert bool(hidden.isnan().all()) and hidden.shape == elements.shape
+
+
+@every
+def test_what_the_mask_leaves_out_has_no_part(case):
+    x, y = case.pair()
+    mask = case.mask()
+    clean = case(x, y, mask=mask)
+    where = mask.unsqueeze(1) if x.ndim > mask.ndim else mask
+    if case.function is metrics.front_depth_mae:
+        where = mask.unsqueeze(1)
+    for nothing in (torch.nan, torch.inf, -3.0):
+        if case.function is metrics.front_depth_mae and nothing != -3.0:
+            continue  # a column with NaN is no surface, which the volume's threshold does not see
+        a, b = (torch.where(where, one, torch.full_like(one, nothing)) for one in (x, y))
+        torch.testing.assert_close(case(a, b, mask=mask), clean, rtol=0, atol=0)
+    if case.function.__name__ not in WINDOWED:
+        assert float(clean) != float(case(x, y)) or case.function.__name__ in SHARES
+
+
+@every
+def test_nothing_counts(case):
+    x, y = case.pair()
+    assert math.isnan(float(case(x, y, mask=torch.zeros(case.counts, dtype=torch.bool))))
+
+
+@every
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16], ids=str)
+def test_half_precision_is_measured_in_single(case, dtype):
+    x, y = (one.to(dtype) for one in case.pair())
+    found = case(x, y)
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found, case(x.float(), y.float()), rtol=0, atol=0)
+    assert case(x.double(), y).dtype == torch.float64
+
+
+@every
+def test_estimates_that_are_none_are_refused(case):
+    x, y = case.pair()
+    for nothing in (torch.nan, torch.inf):
+        broken = x.clone().flatten()
+        broken[-1] = nothing
+        if case.function is metrics.front_depth_mae:
+            assert math.isfinite(float(case(broken.view_as(x), y)))  # an empty column, by `depth_map`
+            continue
+        with pytest.raises(UnitError, match=r"finite"):
+            case(broken.view_as(x), y)
+
+
+@every
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        (lambda x, y: ((x[..., :-1], y), {}), ShapeError),
+        (lambda x, y: ((x.tolist(), y), {}), ShapeError),
+        (lambda x, y: ((x, None), {}), ShapeError),
+        (lambda x, y: ((x.to(torch.complex64), y), {}), UnitError),
+        (lambda x, y: ((x, y), {"mask": torch.ones(1)}), UnitError),
+        (lambda x, y: ((x, y), {"mask": torch.ones(99, dtype=torch.bool)}), ShapeError),
+        (lambda x, y: ((x, y), {"reduction": "sum"}), ArgumentError),
+        (lambda x, y: ((x.to("meta"), y), {}), TorchTransientError),
+    ],
+    ids=["shape", "list", "nothing", "complex", "mask of numbers", "mask of another shape", "reduction", "device"],
+)  # fmt: skip
+def test_what_is_refused(case, change, error):
+    args, more = change(*case.pair())
+    with pytest.raises(error):
+        case(*args, **more)
+
+
+@every
+def test_arguments_by_name(case):
+    names = list(inspect.signature(case.function).parameters)
+    assert names[:2] == ["input", "target"]
+    assert "mask" in names and names[-1] == "reduction"

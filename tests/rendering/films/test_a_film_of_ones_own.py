@@ -1,0 +1,190 @@
+"""A new film is one plugin (`moments_film.py`), one class (`Moments`) and an entry in the list of films: renderer,
+gradients, plan, result files and command line follow.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import click
+import mitsuba as mi
+import pytest
+import torch
+from click.testing import CliRunner
+
+import torchtransient as tt
+from torchtransient import plugins
+from torchtransient.cli.options import scene_options
+from torchtransient.errors import ArgumentError, SceneError
+from torchtransient.files.result_file import read_result, write_result
+from torchtransient.plugins import _registry
+from torchtransient.rendering.films import choices
+from torchtransient.rendering.films.choice import CommandOption, FilmChoice, measured
+from torchtransient.rendering.films.histogram import Histogram
+from torchtransient.rendering.films.layout import cube_channels_first
+from torchtransient.testing.small_room import GREY, WALL_POSE, make_room
+
+VARIANT = "llvm_ad_rgb"
+
+
+@dataclass(frozen=True)
+class Moments(FilmChoice):
+    measures: ClassVar[str] = "moments"
+    plugin: ClassVar[str] = "moments_hdr_film"
+    letter: ClassVar[str] = "K"
+    argument: ClassVar[str] = "moments"
+    example: ClassVar[str] = "film=Moments(3)"
+    output: ClassVar[str] = "moments"
+    plan_name: ClassVar[str] = "moments"
+    noun: ClassVar[str] = "moments film"
+    plural: ClassVar[str] = "moments"
+    options: ClassVar[tuple[CommandOption, ...]] = (CommandOption("moments", int, "So many moments of the time."),)
+
+    number: int
+
+    @classmethod
+    def from_argument(cls, value: Any):
+        return cls(int(value))
+
+    @classmethod
+    def from_film(cls, film):
+        return cls(film.moments)
+
+    @classmethod
+    def from_output(cls, output):
+        number = measured(output, "number_of_moments")
+        return None if number is None else cls(number)
+
+    @classmethod
+    def from_entries(cls, values):
+        return cls(int(values["number_of_moments"])) if "number_of_moments" in values else None
+
+    @classmethod
+    def from_options(cls, options):
+        return None if options.get("moments") is None else cls(options["moments"])
+
+    @property
+    def count(self):
+        return self.number
+
+    def attributes(self):
+        return {"number_of_moments": self.number}
+
+    def numbers(self):
+        return self.attributes()
+
+    def argument_value(self):
+        return self.number
+
+    def plain(self):
+        return self.number
+
+    def describe(self, temporal_filter):
+        return f"moments={self.number}"
+
+    def write(self, props):
+        props["moments"] = self.number
+
+    def channels_first(self, cube, leading, components=1):
+        return cube_channels_first(cube, leading, components)
+
+    @classmethod
+    def film_of_pilot(cls, planned):
+        return Histogram.film_of_pilot(None)
+
+
+@pytest.fixture(autouse=True)
+def _listed(monkeypatch):
+    """As if the plugin stood in `PLUGIN_MODULES` and the class in `CHOICES`."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parent))
+    monkeypatch.setattr(choices, "CHOICES", (*choices.CHOICES, Moments))
+    mi.set_variant(VARIANT)
+    plugins.register_module("moments_film", (("film", "moments_hdr_film"),))
+    yield
+    _registry._state.third_party = []
+    _registry._state.variant = None
+    plugins.sync()
+
+
+def test_moments_are_those_of_a_fine_histogram():
+    scene, axis = tt.load(make_room(), variant=VARIANT), tt.TimeAxis(6.0, 0.005, 1600)
+    out = tt.render(scene, film=Moments(3), spp=64, seed=2)
+    assert out.transient is None and out.axis is None and out.others["number_of_moments"] == 3
+    found = out.others["moments"]
+    assert found.shape == (3, 3, 3, 4)
+    fine = tt.render(scene, time_axis=axis, spp=64, seed=2)
+    powers = torch.stack([axis.centers_opl**k for k in range(3)]).float()
+    torch.testing.assert_close(found, torch.einsum("cthw,kt->ckhw", fine.transient, powers), rtol=2e-3, atol=1e-5)
+    torch.testing.assert_close(found[:, 0], out.steady, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("key", [GREY, WALL_POSE])
+def test_derivatives_in_both_modes(key):
+    room = make_room()
+    del room["box"]  # whose outline on the wall makes difference quotients noisy
+    renderer = tt.TransientRenderer(room, parameters=[key], film=Moments(3), spp=64, grad_seed="same")
+    assert renderer.effective_filter == "" and "moments=3" in repr(renderer)
+    weights = torch.tensor([0.5, -1.0, 0.1])[:, None, None]
+
+    def loss(x):
+        return (renderer({key: x}, seed=1).others["moments"] * weights).sum().double()
+
+    x = renderer.values[key].detach()
+    tangent = torch.zeros_like(x)
+    tangent.view(-1)[11 if key == WALL_POSE else slice(None)] = 1.0
+    gradient = torch.autograd.functional.jacobian(loss, x)
+    forward = torch.func.jvp(loss, (x,), (tangent,))[1]
+    torch.testing.assert_close((gradient * tangent).sum().double(), forward, rtol=1e-3, atol=0)
+    h = 1e-2
+    difference = (loss(x + h * tangent) - loss(x - h * tangent)) / (2 * h)
+    assert float(forward) == pytest.approx(float(difference), rel=2e-3)
+
+
+def test_plan():
+    plan = tt.plan(make_room(), ("steady", "moments"), film=Moments(2))
+    assert plan.film == "moments" and plan.temporal_filter == "" and plan.time_axis is None
+    assert plan.to_dict()["moments"] == 2 and plan.to_dict()["time_axis"] is None
+    assert plan.renderer(spp=1)(seed=0).others["moments"].shape[1] == 2
+    with pytest.raises(SceneError, match=r"Give film=Moments\(3\)"):
+        tt.plan(make_room(), "moments")
+    with pytest.raises(ArgumentError, match="on which moments have no effect; ask for outputs"):
+        tt.plan(make_room(), film=Moments(2))
+
+
+def test_a_plan_keeps_the_settings_of_the_scene():
+    room = make_room()
+    room["sensor"]["film"] = {"type": "moments_hdr_film", "width": 4, "height": 3, "moments": 2}
+    plan = tt.plan(room, "moments", pilot=False)
+    assert "film: moments, since moments are asked for" in str(plan)
+    assert plan.renderer(spp=1)(seed=0).others["moments"].shape[1] == 2
+    with pytest.raises(ArgumentError, match="moments film has none"):
+        tt.TransientRenderer(room, temporal_filter="tent")
+
+
+@pytest.mark.parametrize("ending", ["h5", "npz"])
+def test_result_files(tmp_path, ending):
+    out = tt.render(make_room(), film=Moments(2), spp=2, seed=0)
+    back = read_result(write_result(tmp_path / f"a.{ending}", out))
+    assert torch.equal(back.others["moments"], out.others["moments"]) and back.others["number_of_moments"] == 2
+    assert back.transient is None and back.channels == out.channels
+
+
+def test_command_line():
+    @click.command()
+    @scene_options
+    def command(**options):
+        click.echo(repr(choices.from_options(options)))
+
+    # the options of this list of films; the commands of the package were made before it
+    result = CliRunner().invoke(command, ["scene.xml", "--moments", "4"])
+    assert result.output.strip() == repr(Moments(4)), result.output
+    result = CliRunner().invoke(command, ["scene.xml", "--moments", "4", "--frequencies", "1"])
+    assert "--frequencies and --moments" in str(result.exception)
+
+
+def test_accuracy():
+    renderer = tt.TransientRenderer(make_room(), film=Moments(2))
+    report = tt.cost_of_accuracy(renderer, spp=(4,), repeats=2, samplers=("independent",), progress=False)
+    assert {point.quantity for point in report.points} == {"moments"}

@@ -1,0 +1,245 @@
+"""Every film choice keeps the same promises: from argument to plugin and back, to files and back, as plain data."""
+
+from __future__ import annotations
+
+import copy
+import json
+import pickle
+from dataclasses import replace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+
+import torchtransient as tt
+from torchtransient import plugins
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, StorageError, TorchTransientError
+from torchtransient.files.result_file import read_result, write_result
+from torchtransient.rendering import films
+from torchtransient.rendering.films import choices
+from torchtransient.rendering.films.gates import Gates
+from torchtransient.rendering.films.histogram import Histogram
+from torchtransient.rendering.films.phasors import Phasors
+from torchtransient.rendering.output import RenderOutput, RenderStats
+
+VARIANT = "llvm_ad_rgb"
+STATS = RenderStats(
+    spp=16,
+    seconds=0.5,
+    samples_per_second=1e4,
+    variant=VARIANT,
+    integrator="transient_path",
+    temporal_filter="",
+    seeds=(0,),
+    energy_before=(0.0,),
+    energy_after=(0.0,),
+)
+GIVEN = {
+    "time_axis": tt.TimeAxis(3.5, 0.25, 5),
+    "frequencies": tt.FrequencyAxis((0.0, 0.5, -2.0), 1.5),
+    "gates": (tt.Gate.rectangular(3, 4), tt.Gate.gaussian(7.0, 0.5), tt.Gate.tabulated([1, 2, 4], [0, 1, 0])),
+}
+each = pytest.mark.parametrize("argument", GIVEN)
+
+
+def choice_for(argument):
+    return choices.chosen({argument: GIVEN[argument]})
+
+
+def film_node(choice):
+    props = mi.Properties(choice.plugin)
+    choice.write(props)
+    return {"type": choice.plugin, "width": 2, "height": 3, **{name: props[name] for name in list(props.keys())}}
+
+
+def output_of(choice, leading=(), components=1):
+    generator = torch.Generator().manual_seed(0)
+    entries = components * 3 * (2 if choice.is_complex else 1)
+    cube = torch.rand(*leading, 3, 2, choice.count, entries, generator=generator)
+    response = choice.channels_first(cube.reshape(-1, *cube.shape[-4:]).squeeze(0), leading, components)
+    shape = (*leading, *((components,) if components > 1 else ()), 3, choice.count, 3, 2)
+    assert tuple(response.shape) == shape
+    return RenderOutput.of(choice, torch.zeros(*shape[:-3], 3, 2), response, stats=STATS, channels=("R", "G", "B"))
+
+
+def test_the_list():
+    assert list(choices.all_films()) == [Histogram, Phasors, Gates]
+    assert [type(choice_for(argument)) for argument in GIVEN] == list(choices.all_films())
+    for name in ("measures", "plugin", "argument", "output", "letter"):
+        assert len({getattr(kind, name) for kind in choices.all_films()}) == 3, name
+    assert all(plugins.kind_of(kind.plugin) == "film" for kind in choices.all_films())
+
+
+@each
+def test_plugin_and_back(argument):
+    """What is written into a film node is what the plugin says that it measures."""
+    plugins.sync()
+    choice = choice_for(argument)
+    film = mi.load_dict(film_node(choice))
+    assert film.plugin == choice.plugin and film.measures == choice.measures
+    assert choices.of_film(film) == choice and choices.of_plugin(choice.plugin) is type(choice)
+    assert bool(film.temporal_filter) == choice.has_filter
+    assert film.cube_shape()[2] == choice.count
+
+
+@each
+def test_values_that_compare_travel_and_print(argument):
+    choice = choice_for(argument)
+    assert choice == choice_for(argument) and hash(choice) == hash(choice_for(argument))
+    assert pickle.loads(pickle.dumps(choice)) == copy.deepcopy(choice) == choice
+    assert choice.argument_value() == GIVEN[argument]
+    assert json.loads(json.dumps(choice.plain())) is not None
+    assert argument in repr(choice) or "axis" in repr(choice)
+
+
+@each
+@pytest.mark.parametrize("ending", ["h5", "npz"])
+@pytest.mark.parametrize("leading, components", [((), 1), ((2,), 1), ((), 4)])
+def test_output_and_file(tmp_path, argument, ending, leading, components):
+    choice = choice_for(argument)
+    out = output_of(choice, leading, components)
+    assert choices.of_output(out) == choice and not out.others
+    for name in ("transient", "phasor", "gated"):
+        assert (getattr(out, name) is None) == (name != choice.measures)
+    back = read_result(write_result(tmp_path / f"a.{ending}", out))
+    assert choices.of_output(back) == choice
+    assert torch.equal(choice.tensor(back), choice.tensor(out)) and torch.equal(back.steady, out.steady)
+
+
+@pytest.mark.parametrize("ending", ["h5", "npz"])
+def test_gated_files_of_earlier_versions(tmp_path, ending):
+    """They hold the images as a transient without an axis."""
+    from torchtransient.vis.sources import images_of, transient_of
+
+    out = output_of(choice_for("gates"))
+    path = write_result(tmp_path / f"a.{ending}", out)
+    if ending == "npz":
+        with np.load(path) as file:
+            values = {("transient" if name == "gated" else name): file[name] for name in file.files}
+        np.savez(path, **values)
+    else:
+        import h5py
+
+        with h5py.File(path, "r+") as file:
+            file.move("gated", "transient")
+    for back in (read_result(path), path):
+        images, axis, word = images_of(back)
+        assert torch.equal(images, out.gated) and axis is None and word == "gate"
+        with pytest.raises(ShapeError, match="3 images of time gates"):
+            transient_of(back)
+    assert read_result(path).gates == GIVEN["gates"] and read_result(path).transient is None
+
+
+def test_files_that_do_not_fit_together(tmp_path):
+    path = write_result(tmp_path / "a.npz", output_of(choice_for("gates")))
+    with np.load(path) as file:
+        values = {name: file[name] for name in file.files}
+    np.savez(path, **{**values, "gates": np.array("rectangular 1 2")})
+    with pytest.raises(StorageError, match=r"gated of shape .* G = 1"):
+        read_result(path)
+    np.savez(path, **{name: value for name, value in values.items() if name not in ("gates", "gated")})
+    with pytest.raises(StorageError, match="transient or phasor or gated"):
+        read_result(path)
+    with pytest.raises(StorageError, match="neither"):
+        write_result(path, replace(output_of(choice_for("gates")), gated=None))
+
+
+def test_one_film_is_asked_for():
+    assert choices.chosen({}) is None and choices.chosen({"gates": None}) is None
+    with pytest.raises(ArgumentError, match="a histogram, a phasor film or a gated film; give one of them"):
+        choices.chosen({"time_axis": GIVEN["time_axis"], "gates": GIVEN["gates"]})
+    room = tt.scenes.cornell_box(4)
+    with pytest.raises(ArgumentError, match="film, time_axis"):
+        tt.TransientRenderer(room, film=choice_for("gates"), time_axis=GIVEN["time_axis"])
+    with pytest.raises(ArgumentError, match=r"film: expected a film such as Histogram"):
+        tt.TransientRenderer(room, film=GIVEN["time_axis"])
+    for wrong in ({"time_axis": 3.0}, {"gates": ["rectangular 1 2"]}, {"frequencies": [float("nan")]}):
+        with pytest.raises(TorchTransientError):
+            tt.TransientRenderer(room, **wrong)
+
+
+def test_where_the_pages_say_that_they_are():
+    for kind in choices.all_films():
+        assert getattr(films, kind.__name__) is kind
+
+
+@pytest.mark.parametrize(
+    "given, argument",
+    [
+        (lambda: Gates(list(GIVEN["gates"])), "gates"),
+        (lambda: Gates(gate for gate in GIVEN["gates"]), "gates"),
+        (lambda: Phasors(GIVEN["frequencies"]), "frequencies"),
+    ],
+)
+def test_objects_take_what_their_keywords_take(given, argument):
+    choice = given()
+    assert choice == choice_for(argument) and hash(choice) == hash(choice_for(argument))
+
+
+def test_a_single_setting():
+    gate = GIVEN["gates"][0]
+    assert Gates(gate) == Gates([gate]) == choices.chosen({"gates": gate}) and Gates(gate).count == 1
+    for numbers in ([0.5], (0.5,), 0.5, torch.tensor([0.5]), np.array([0.5])):
+        assert Phasors(numbers) == Phasors(tt.FrequencyAxis((0.5,))) == choices.chosen({"frequencies": numbers})
+    axis = GIVEN["time_axis"]
+    assert tt.TransientRenderer(tt.scenes.cornell_box(4), film=Gates([gate])).gates == (gate,)
+    assert Histogram(axis).axis == axis
+
+
+@pytest.mark.parametrize(
+    "kind, wrong",
+    [
+        (Histogram, 3), (Histogram, None), (Histogram, (0.0, 1.0, 3)),
+        (Gates, 3), (Gates, []), (Gates, "rectangular 1 2"), (Gates, [GIVEN["gates"]]), (Gates, None),
+        (Phasors, []), (Phasors, None), (Phasors, "high"), (Phasors, [[0.5]]), (Phasors, GIVEN["time_axis"]),
+    ],
+)  # fmt: skip
+def test_objects_refuse_what_their_keywords_refuse(kind, wrong):
+    with pytest.raises(TorchTransientError, match="expected"):
+        kind(wrong)
+    if wrong is not None:
+        with pytest.raises(TorchTransientError, match="expected"):
+            tt.TransientRenderer(tt.scenes.cornell_box(4), **{kind.argument: wrong})
+
+
+@each
+def test_an_object_says_the_same_as_the_argument(argument):
+    scene = tt.load(tt.scenes.cornell_box(4, max_depth=2), variant=VARIANT)
+    named = tt.TransientRenderer(scene, **{argument: GIVEN[argument]}, spp=2)
+    plain = tt.TransientRenderer(scene, film=choice_for(argument), spp=2)
+    assert named.film == plain.film == choice_for(argument) and repr(named) == repr(plain)
+    a, b = (choice_for(argument).tensor(renderer(seed=1)) for renderer in (named, plain))
+    torch.testing.assert_close(a, b)
+
+
+@pytest.mark.parametrize(
+    "options, expected",
+    [
+        ({"start_opl": 3.5, "bin_width_opl": 0.25, "num_bins": 5}, "time_axis"),
+        ({"frequencies": "0, 0.5,-2", "gates": None}, Phasors(tt.FrequencyAxis((0.0, 0.5, -2.0)))),
+        ({"gates": "rectangular 3 4; gaussian 7.0 0.5; tabulated 1:0 2:1 4:0"}, "gates"),
+        ({"start_opl": None, "frequencies": None}, None),
+    ],
+)
+def test_command_line(options, expected):
+    assert choices.from_options(options) == (choice_for(expected) if isinstance(expected, str) else expected)
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"num_bins": 5}, "give all"),
+        ({"frequencies": "1", "gates": "rectangular 1 2"}, "--frequencies and --gates ask for different films"),
+        ({"gates": "round 1 2"}, "kind out of"),
+    ],
+)
+def test_command_lines_that_ask_for_nothing(options, message):
+    with pytest.raises(TorchTransientError, match=message):
+        choices.from_options(options)
+
+
+def test_films_that_are_not_ours():
+    mi.set_variant(VARIANT)
+    with pytest.raises(SceneError, match=r"transient_hdr_film, phasor_hdr_film, gated_hdr_film.*time_axis="):
+        choices.of_film(mi.load_dict({"type": "hdrfilm"}))

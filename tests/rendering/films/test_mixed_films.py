@@ -1,0 +1,234 @@
+"""Scenes whose sensors have different films: each renders as if alone, and a call leaves every film as it was."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+
+import mitsuba as mi
+import pytest
+import torch
+
+import torchtransient as tt
+from support.marks import long_pairs
+from torchtransient import plugins
+from torchtransient.errors import ArgumentError, GradientError, SceneError
+from torchtransient.plugins.films import pulsed_filter
+from torchtransient.rendering.filter_override import temporal_filter
+from torchtransient.testing.small_room import GREY, WALL_POSE, make_room
+
+VARIANT = "llvm_ad_rgb"
+SIZE = {"width": 4, "height": 3, "rfilter": {"type": "box"}}
+HISTOGRAM = {"type": "transient_hdr_film", **SIZE, "temporal_bins": 24, "start_opl": 6.0, "bin_width_opl": 0.25}
+FILMS = {
+    "histogram": HISTOGRAM,
+    "smooth histogram": {**HISTOGRAM, "temporal_filter": "gaussian", "gaussian_stddev": 0.8},
+    "gated": {"type": "gated_hdr_film", **SIZE, "gates": "gaussian 8 0.5; gaussian 9 0.5"},
+    "phasor": {"type": "phasor_hdr_film", **SIZE, "frequencies": "0.0, 0.5"},
+}
+PAIRS = [pair for pair in itertools.permutations(FILMS, 2) if "histogram" in pair[0] + pair[1]]
+
+
+def room_of(*films, **integrator):
+    """The small room seen through several films from one place."""
+    room = make_room()
+    room["integrator"] |= integrator
+    sensor = room.pop("sensor")
+    for number, film in enumerate(films):
+        room[f"sensor_{number}"] = {**copy.deepcopy(sensor), "film": film}
+    return room
+
+
+def filters_of(renderer):
+    """What the films and the integrator of a renderer's scene use now."""
+    scene = renderer.scene.built(renderer._options).scene
+    return scene.integrator().temporal_filter, [sensor.film().temporal_filter for sensor in scene.sensors()]
+
+
+def measured(out):
+    return next(tensor for tensor in (out.transient, out.phasor, out.gated) if tensor is not None)
+
+
+def grad_and_values(renderer):
+    out = renderer(seed=3)
+    tensor = measured(out)
+    loss = (tensor.abs().square().sum() if tensor.is_complex() else tensor[..., 0, :].square().sum()) + out.steady.sum()
+    loss.backward()
+    return tensor.detach(), renderer.values[WALL_POSE].grad, out.stats.temporal_filter
+
+
+# With a filter of the integrator's, every film once on either side.
+QUICK = {(pair, "") for pair in PAIRS} | {
+    (pair, "gaussian") for pair in PAIRS if pair[0] == "histogram" or pair[1] == "smooth histogram"
+}
+
+
+@pytest.mark.parametrize(("pair", "of_integrator"), long_pairs(PAIRS, ["", "gaussian"], QUICK))
+def test_each_sensor_renders_as_if_it_were_alone(pair, of_integrator):
+    settings = {"temporal_filter": of_integrator, "gaussian_stddev": 0.8} if of_integrator else {}
+    scene = tt.load(room_of(*(FILMS[name] for name in pair), **settings), variant=VARIANT)
+    for sensor, name in enumerate(pair):
+        alone = tt.load(room_of(FILMS[name], **settings), variant=VARIANT)
+        for wanted in ("auto", "tent") if "histogram" in name else ("auto",):
+            arguments = {"parameters": [WALL_POSE], "temporal_filter": wanted, "spp": 4, "grad_seed": "same"}
+            renderer = tt.TransientRenderer(scene, sensors=sensor, **arguments)
+            before = filters_of(renderer)
+            found = grad_and_values(renderer)
+            assert filters_of(renderer) == before and before[0] == of_integrator
+            expected = grad_and_values(tt.TransientRenderer(alone, **arguments))
+            torch.testing.assert_close(found[0], expected[0])
+            torch.testing.assert_close(found[1], expected[1], rtol=1e-4, atol=1e-5)
+            assert found[2] == expected[2] and bool(found[2]) == ("histogram" in name)
+
+
+def test_steady_gates_beside_a_window_that_cuts():
+    """`steady=False` speaks of histograms: a gated film beside one says so."""
+    scene = tt.load(room_of(HISTOGRAM, FILMS["gated"]), variant=VARIANT)
+    with pytest.raises(ArgumentError, match="gated_hdr_film"):
+        tt.TransientRenderer(scene, steady=False)
+
+
+def test_a_plan_is_about_the_film_of_its_sensor():
+    scene = tt.load(room_of(HISTOGRAM, FILMS["gated"], {**HISTOGRAM, "bin_width_opl": 0.5}), variant=VARIANT)
+    gated = tt.plan(scene, "gates", sensor=1)
+    assert gated.renderer(spp=1)(seed=0).gated.shape == (3, 2, 3, 4)
+    with pytest.raises(SceneError, match="neither the film nor the call has gates"):
+        tt.plan(scene, "gates")
+    plans = [tt.plan(scene, sensor=sensor, time_axis="scene", pilot=False) for sensor in (0, 2)]
+    assert [plan.time_axis.bin_width_opl for plan in plans] == [0.25, 0.5]
+
+
+# ---------------------------------------------------------------------------------------- changed and put back
+
+
+@pytest.fixture
+def loaded():
+    """An integrator with a filter of its own, three films that have one and one that has none."""
+    mi.set_variant(VARIANT)
+    plugins.sync()
+    bare = [mi.load_dict(FILMS[name]) for name in ("histogram", "gated", "smooth histogram")]
+    # A pulse and a filter that together cover more bins than are spread while rendering.
+    late = {**HISTOGRAM, "gaussian_stddev": 1e4, "pulse": "gaussian", "pulse_fwhm_opl": 0.5}
+    return mi.load_dict({"type": "transient_path", "temporal_filter": "tent"}), [*bare, mi.load_dict(late)]
+
+
+def state(loaded):
+    integrator, films = loaded
+    used = [(film.temporal_filter, film.filter.name) for film in films if film.temporal_filter]
+    return integrator.temporal_filter, used
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_a_filter_that_one_film_refuses_changes_none(loaded, backwards):
+    before, (integrator, films) = state(loaded), loaded
+    with (
+        pytest.raises(SceneError, match="4096"),
+        temporal_filter("gaussian", integrator, reversed(films) if backwards else films),
+    ):
+        pytest.fail("entered with a film that refused")
+    assert state(loaded) == before
+
+
+def test_what_fails_inside_leaves_no_filter_behind(loaded):
+    before, (integrator, films) = state(loaded), loaded
+
+    def work():
+        with temporal_filter("tent", integrator, films):
+            assert [film.temporal_filter for film in films] == ["tent", "", "tent", "tent"]
+            assert integrator.temporal_filter == ""  # it would replace that of a film
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        work()
+    assert state(loaded) == before
+    with temporal_filter(None, integrator, films):
+        assert state(loaded) == before
+
+
+def test_a_render_that_fails_leaves_no_filter_behind(monkeypatch):
+    scene = tt.load(room_of(HISTOGRAM, FILMS["gated"], FILMS["smooth histogram"]), variant=VARIANT)
+    renderer = tt.TransientRenderer(scene, parameters=[GREY], temporal_filter="tent", spp=2)
+    before = filters_of(renderer)
+    integrator = type(renderer.scene.built(renderer._options).scene.integrator())
+    with monkeypatch.context() as patch:
+        patch.setattr(integrator, "start", lambda *_a, **_k: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            renderer(seed=0)
+    assert filters_of(renderer) == before
+    assert renderer(seed=0).transient.sum() > 0
+
+
+# -------------------------------------------------------------------------------------- several films in one call
+
+
+@pytest.mark.parametrize(
+    "first, second, message",
+    [
+        ({**HISTOGRAM, "temporal_bins": 2}, FILMS["gated"], "Histogram.*Gates"),
+        (HISTOGRAM, {**HISTOGRAM, "start_opl": 5.0}, "start_opl=5.0"),
+        (HISTOGRAM, {**HISTOGRAM, "bin_width_opl": 0.125}, "bin_width_opl=0.125"),
+        (FILMS["gated"], {**FILMS["gated"], "gates": "gaussian 8 0.5; gaussian 9 0.6"}, "Gates"),
+        (FILMS["phasor"], {**FILMS["phasor"], "frequencies": "0.0, 0.75"}, "Phasors"),
+        (FILMS["phasor"], {**FILMS["phasor"], "start_opl": 1.0}, "start_opl=1"),
+        (HISTOGRAM, {**HISTOGRAM, "width": 3}, r"\(3, 3, 24, 3\)"),
+    ],
+)
+def test_films_of_one_call_measure_the_same(first, second, message):
+    """Equal shapes are not enough: one tensor would hold bins of different times, or gates beside bins."""
+    scene = tt.load(room_of(first, second), variant=VARIANT)
+    with pytest.raises(SceneError, match=f"measure the same.*{message}.*per sensor"):
+        tt.TransientRenderer(scene, sensors="all")
+    assert tt.TransientRenderer(scene, sensors=1, spp=1)(seed=0).steady.sum() > 0
+
+
+def test_channels_of_one_call_are_the_same():
+    curve = {"type": "regular", "wavelength_min": 400, "wavelength_max": 500, "values": "0, 1, 0"}
+    films = {**HISTOGRAM, "blue": curve}, {**HISTOGRAM, "violet": curve}
+    scene = tt.load(room_of(*films), variant="llvm_ad_spectral")
+    with pytest.raises(SceneError, match=r"channels blue.*channels violet"):
+        tt.TransientRenderer(scene, sensors="all")
+
+
+def test_filters_of_one_call_are_the_same():
+    """None of them is silently replaced by that of another film."""
+    scene = tt.load(room_of(HISTOGRAM, FILMS["smooth histogram"]), variant=VARIANT)
+    with pytest.raises(ArgumentError, match="different ones, box, gaussian"):
+        tt.TransientRenderer(scene, sensors="all")
+    out = tt.TransientRenderer(scene, sensors="all", temporal_filter="tent", spp=4)(seed=[5])
+    assert out.transient.shape == (2, 3, 24, 3, 4) and out.stats.temporal_filter == "tent"
+
+
+def test_every_film_of_a_call_needs_a_slope():
+    """A pulse in one film does not speak for the other."""
+    pulsed = {**HISTOGRAM, "pulse": "gaussian", "pulse_fwhm_opl": 0.5}
+    scene = tt.load(room_of(pulsed, HISTOGRAM), variant=VARIANT)
+    arguments = {"parameters": [WALL_POSE], "sensors": "all", "spp": 2}
+    assert tt.TransientRenderer(scene, **arguments).effective_filter == "tent"
+    with pytest.raises(GradientError, match="no slope"):
+        tt.TransientRenderer(scene, temporal_filter="box", **arguments)(seed=0).transient.sum().backward()
+
+
+# ------------------------------------------------------------------------------------------------- tables of pulses
+
+
+def test_a_render_makes_no_table_twice(monkeypatch):
+    """The kernel table of a pulse is made with the film and for every filter that is used, not for every render."""
+    calls, original = [], pulsed_filter.cumulative_of_sum
+
+    def counting(*arguments):
+        calls.append(arguments)
+        return original(*arguments)
+
+    monkeypatch.setattr(pulsed_filter, "cumulative_of_sum", counting)
+    pulsed = {**HISTOGRAM, "pulse": "gaussian", "pulse_fwhm_opl": 0.5}
+    scene = tt.load(room_of(pulsed, gaussian_stddev=0.5), variant=VARIANT)
+    renderer = tt.TransientRenderer(scene, parameters=[GREY], spp=2)
+    assert len(calls) == 1
+    for seed in range(3):
+        renderer(seed=seed).transient.sum().backward()
+    assert len(calls) == 1
+    tent = renderer.variation(temporal_filter="tent")
+    for seed in range(3):
+        tent(seed=seed).transient.sum().backward()
+        renderer(seed=seed)
+    assert len(calls) == 2

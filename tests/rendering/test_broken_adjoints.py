@@ -1,0 +1,161 @@
+"""NaN and infinity in adjoints and tangents arrive at the gradients, in every mode and in wrapped functions.
+
+Dr.Jit takes a sum of nothing but NaN for zero, so that a `GradScaler` saw nothing.
+"""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+import pytest
+import torch
+
+import torchtransient as tt
+from torchtransient.testing.small_room import COLOUR, GREY, WALL_POSE
+
+START = torch.tensor([0.8, 0.5, 0.2])
+NAN, INF = math.nan, math.inf
+
+
+@pytest.fixture(scope="module")
+def renderer(room_scene):
+    return tt.TransientRenderer(room_scene, [COLOUR], spp=4)
+
+
+def render(renderer, x):
+    return renderer({COLOUR: x}, seed=0).transient
+
+
+@pytest.mark.parametrize("number", [NAN, INF])
+@pytest.mark.parametrize("everywhere", [True, False])
+def test_adjoint_that_is_not_finite_makes_all_gradients_nan(renderer, number, everywhere):
+    x = START.clone().requires_grad_()
+    out = render(renderer, x)
+    adjoint = torch.full_like(out, number) if everywhere else torch.ones_like(out)
+    adjoint[0, -1, 0, 0] = number  # a bin without light: which bins have some differs from seed to seed
+    assert torch.autograd.grad(out, x, adjoint)[0].isnan().all()
+
+
+def test_scalar_that_is_not_a_number_reaches_parameters_through_expanded_adjoints(renderer):
+    renderer.zero_grad()
+    out = renderer(seed=0)
+    (out.transient.sum() * NAN + out.steady.sum()).backward()
+    assert renderer.values[COLOUR].grad.isnan().all()
+
+
+def test_adjoint_of_the_steady_image_counts_as_well(renderer):
+    x = START.clone().requires_grad_()
+    out = renderer({COLOUR: x}, seed=0)
+    (out.transient.sum() + (out.steady - out.steady.detach()).sqrt().sum()).backward()  # a slope of infinity
+    assert x.grad.isnan().all()
+
+
+def test_entries_of_a_batch_are_told_apart(renderer):
+    x = START.expand(3, 3).clone().requires_grad_()
+    out = render(renderer, x)
+    adjoint = torch.ones_like(out)
+    adjoint[1, 0, 0, 0, 0] = NAN
+    found = torch.autograd.grad(out, x, adjoint)[0]
+    assert found[1].isnan().all()
+    expected = torch.autograd.grad(render(renderer, x).sum(), x)[0]
+    torch.testing.assert_close(found[[0, 2]], expected[[0, 2]])
+
+
+def test_value_for_all_entries_is_touched_by_each(room_scene):
+    renderer = tt.TransientRenderer(room_scene, [COLOUR, GREY], spp=4)
+    x, grey = START.expand(2, 3).clone().requires_grad_(), torch.tensor(0.5, requires_grad=True)
+    out = renderer({COLOUR: x, GREY: grey}, seed=0).transient
+    adjoint = torch.ones_like(out)
+    adjoint[1] = NAN
+    of_x, of_grey = torch.autograd.grad(out, (x, grey), adjoint)
+    assert of_x[0].isfinite().all() and of_x[1].isnan().all() and of_grey.isnan().all()
+
+
+@pytest.mark.parametrize("number", [NAN, INF])
+def test_tangent_that_is_not_finite_makes_the_film_nan(renderer, number):
+    tangent = torch.tensor([0.0, number, 0.0])
+    found = torch.func.jvp(lambda x: renderer({COLOUR: x}, seed=0).transient, (START,), (tangent,))[1]
+    assert found.isnan().all()
+
+
+def test_functions_of_torch_func(renderer):
+    x, weights = START.expand(2, 3), torch.tensor([1.0, NAN])
+
+    def loss(x, weight):
+        return (render(renderer, x) * weight).sum()
+
+    found = torch.func.vmap(torch.func.grad(loss))(x, weights)
+    assert found[0].isfinite().all() and found[1].isnan().all()
+    tangents = torch.tensor([[1.0, 1.0, 1.0], [NAN, 1.0, 1.0]])
+    found = torch.func.vmap(lambda x, t: torch.func.jvp(lambda x: render(renderer, x), (x,), (t,))[1])(x, tangents)
+    assert found[0].isfinite().all() and found[1].isnan().all()
+
+
+def test_recorded_derivatives_do_the_same(renderer):
+    for _ in range(4):  # the third call is launched without tracing
+        x = START.clone().requires_grad_()
+        out = renderer({COLOUR: x}, seed=0)
+        out.transient.sum().backward()
+    assert out.stats.derivatives_recorded == ["launched"] and x.grad.isfinite().all()
+    found = torch.autograd.grad((out_again := render(renderer, x)), x, torch.full_like(out_again, NAN))[0]
+    assert found.isnan().all()
+    assert torch.autograd.grad(render(renderer, x).sum(), x)[0].isfinite().all()  # nothing of it stays behind
+
+
+def test_sensors_and_path_lengths(room):
+    room["second"] = dict(room["sensor"])
+    renderer = tt.TransientRenderer(room, [COLOUR, WALL_POSE], spp=4, sensors="all", temporal_filter="tent")
+    out = renderer(seed=0).transient
+    adjoint = torch.ones_like(out)
+    adjoint[1, 0, 0, 0, 0] = NAN
+    out.backward(adjoint)
+    assert all(value.grad.isnan().all() for value in renderer.values.values())
+
+
+def test_anomaly_detection_raises(renderer):
+    x = START.clone().requires_grad_()
+    out = render(renderer, x)
+    with torch.autograd.set_detect_anomaly(True), pytest.raises(RuntimeError, match=r"RunBackward.*nan"):
+        torch.autograd.grad(out, x, torch.full_like(out, INF))
+
+
+def test_grad_scaler_skips_the_step(renderer):
+    renderer.zero_grad()
+    optimizer = torch.optim.SGD(renderer.parameters(), lr=1.0)
+    scaler = torch.amp.GradScaler("cpu", init_scale=4.0)
+    before = renderer.values[COLOUR].detach().clone()
+    scaler.scale(renderer(seed=0).transient.sum() * INF).backward()
+    scaler.step(optimizer)
+    scaler.update()
+    assert torch.equal(renderer.values[COLOUR].detach(), before) and scaler.get_scale() == 2.0
+
+
+# ------------------------------------------------------------------------------------------------ wrapped functions
+
+
+@pytest.fixture(scope="module")
+def gathered(renderer):
+    return tt.wrap(lambda x: dr.gather(mi.Float, x.array, mi.UInt32([0, 1, 1, 2])))
+
+
+def test_wrapped_function_is_nan_where_the_adjoint_touches_it(gathered):
+    x = torch.arange(1.0, 5.0).requires_grad_()
+    found = torch.autograd.grad(gathered(x), x, torch.tensor([NAN, 1.0, 1.0, INF]))[0]
+    assert found[[0, 2]].isnan().all() and found[[1, 3]].tolist() == [2, 0]
+
+
+def test_tangents_of_wrapped_functions(gathered):
+    found = torch.func.jvp(gathered, (torch.arange(1.0, 5.0),), (torch.tensor([0.0, NAN, 1.0, 0.0]),))[1]
+    assert found[1:3].isnan().all() and found[[0, 3]].tolist() == [0, 1]
+
+
+def test_wrapped_render(room):
+    with tt.rendering.variant.active_variant("llvm_ad_rgb"):
+        scene = mi.load_dict(room)
+        params = mi.traverse(scene)
+    wrapped = tt.wrap(lambda params, seed: mi.render(scene, params, spp=4, seed=seed)[1], params)
+    x = START.clone().requires_grad_()
+    out = wrapped({COLOUR: x}, seed=0)
+    assert torch.autograd.grad(out, x, torch.full_like(out, NAN))[0].isnan().all()

@@ -1,0 +1,468 @@
+"""Recorded calls: the numbers of traced ones, whatever the scene, the order of calls and what goes wrong meanwhile."""
+
+from __future__ import annotations
+
+import gc
+import sys
+import threading
+import warnings
+import weakref
+
+import numpy as np
+import pytest
+import torch
+
+import torchtransient as tt
+from support.frozen_runs import Runs
+from torchtransient.rendering import recordings
+from torchtransient.rendering.recordings import FIRST, LAUNCHED, NO_FREEZING, PROGRESS, RECORDED, SEVERAL, SWITCHED_OFF
+from torchtransient.rendering.variant import active_variant
+from torchtransient.testing.gradient_sweep.measure import quiet
+from torchtransient.testing.gradient_sweep.settings import Setting, all_settings
+from torchtransient.testing.small_room import COLOUR, GREY, VARIANT, WALL_POSE, make_room
+
+# The same kernels but for the order of atomic sums: the last digits of single precision.
+TOLERANCE = 2e-5
+# One of each kind of thing that a scene can have, where recordings could go wrong in a way of its own.
+FEW = (
+    "bsdf roughdielectric in blendbsdf", "shape ply", "emitter area in sphere",
+    "spectrum regular in reflectance, spectral", "phase hg in homogeneous", "bsdf conductor, mono_polarized",
+)  # fmt: skip
+
+
+def settings(bare: bool) -> list[Setting]:
+    with active_variant(VARIANT):
+        found = all_settings()
+    return [one for one in found if (one.is_bare if bare else one.name in FEW)]
+
+
+def outcomes(setting, folder, most):
+    with active_variant(setting.variant), quiet(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        scene = tt.load(setting.make(folder), variant=setting.variant)
+        every = scene.parameters().differentiable()
+        # A plugin without numbers that move (a sky by its date) is recorded as a part of what others move.
+        keys = [key for key in every if setting.takes(key)] or list(every)
+        return {key: Runs(scene, key).outcome() for key in keys[:most]}
+
+
+def check(setting, folder, most):
+    found = outcomes(setting, folder, most)
+    assert found
+    for key, outcome in found.items():
+        assert max(outcome.differences.values()) < TOLERANCE, (key, outcome.differences, outcome.said)
+        assert outcome.launched or outcome.refused, (key, outcome.said)
+    return found
+
+
+@pytest.mark.parametrize("setting", settings(bare=False), ids=lambda one: one.name)
+def test_numbers_of_traced_calls(setting, tmp_path):
+    for key, outcome in check(setting, tmp_path, 1).items():
+        assert outcome.launched, (key, outcome.said)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("setting", settings(bare=True), ids=lambda one: one.name)
+def test_numbers_of_traced_calls_for_every_plugin(setting, tmp_path):
+    """Some plugins do not show Dr.Jit all of their arrays: their scenes are traced (docs/speed.md has a list)."""
+    if setting.plugin == "timed_sunsky":
+        # Not in Mitsuba's kernels either: it evaluates arrays while they are built.
+        with pytest.raises(tt.errors.SceneError, match="describe a 'sunsky' at its time"):
+            check(setting, tmp_path, 1)
+    else:
+        check(setting, tmp_path, 1)
+
+
+# ------------------------------------------------------------------------------------------- films, batches, sensors
+
+FILMS = {
+    "histogram": {},
+    "tent": {"temporal_filter": "tent"},
+    "gaussian": {"temporal_filter": "gaussian"},
+    "pulse": {"pulse": tt.Pulse.gaussian(0.3)},
+    "phasors": {"frequencies": [0.0, 0.25, 0.5, 1.0]},
+    "gates": {"gates": [tt.Gate.gaussian(8.0, 2.0), tt.Gate.gaussian(10.0, 2.0)]},
+    "without a steady image": {"steady": False},
+}
+
+
+def pair(scene, **arguments):
+    """The same renderer traced and recorded."""
+    return [tt.TransientRenderer(scene, physics="ignore", freeze=freeze, **arguments) for freeze in (False, True)]
+
+
+def measured(out):
+    return next(t for t in (out.transient, out.phasor, out.gated) if t is not None)
+
+
+def step(renderer, seed, **values):
+    """(render, gradients) of a squared loss."""
+    renderer.zero_grad()
+    out = renderer(values or None, seed=seed)
+    (measured(out).abs().square().sum() + out.steady.square().sum()).backward()
+    return out, [parameter.grad.clone() for parameter in renderer.parameters() if parameter.grad is not None]
+
+
+def same(a, b, black=False):
+    scale = float(a.detach().abs().max())
+    assert black or scale > 0
+    torch.testing.assert_close(b, a, rtol=TOLERANCE, atol=TOLERANCE * scale)
+
+
+@pytest.mark.parametrize("film", FILMS)
+def test_every_film(room_scene, film):
+    traced, recorded = pair(room_scene, parameters=[COLOUR, GREY], spp=4, **FILMS[film])
+    for seed in range(4):
+        expected, of_traced = step(traced, seed)
+        got, of_recorded = step(recorded, seed)
+        same(measured(expected), measured(got))
+        same(expected.steady, got.steady)
+        for a, b in zip(of_traced, of_recorded, strict=True):
+            same(a, b)
+        assert got.stats.energy_after == pytest.approx(expected.stats.energy_after, rel=1e-4)
+    assert got.stats.recorded == (LAUNCHED,) and got.stats.derivatives_recorded == [LAUNCHED]
+    assert expected.stats.recorded == (SWITCHED_OFF,) and expected.stats.derivatives_recorded == [SWITCHED_OFF]
+
+
+def test_what_is_said(room_scene):
+    renderer = tt.TransientRenderer(tt.load(make_room(), variant=VARIANT), parameters=[COLOUR], spp=4)
+    said = [renderer(seed=seed).stats.recorded[0] for seed in range(4)]
+    assert said == [FIRST, RECORDED, LAUNCHED, LAUNCHED]
+    # Other samples are other kernels; coming back needs nothing.
+    assert [renderer(seed=0, spp=n).stats.recorded[0] for n in (8, 8, 8, 4)] == [FIRST, RECORDED, LAUNCHED, LAUNCHED]
+    assert renderer(seed=0, progress=True).stats.recorded[0] == PROGRESS
+    renderer.freeze = False
+    assert renderer(seed=0).stats.recorded[0] == SWITCHED_OFF
+
+
+def test_batches_and_sensors(two_views):
+    traced, recorded = pair(two_views, parameters=[COLOUR, GREY], spp=4, sensors="all")
+    colours = torch.tensor([[0.9, 0.1, 0.3], [0.2, 0.8, 0.5], [0.4, 0.4, 0.4]])
+    for seed in range(4):
+        x, y = (colours.clone().requires_grad_() for _ in range(2))
+        expected, got = traced({COLOUR: x}, seed=seed), recorded({COLOUR: y}, seed=seed)
+        same(expected.transient, got.transient)
+        for out in (expected, got):
+            out.transient.square().sum().backward()
+        same(x.grad, y.grad)
+        same(traced.values[GREY].grad, recorded.values[GREY].grad)
+    assert set(got.stats.recorded) == {LAUNCHED} and len(got.stats.recorded) == 6
+    assert set(got.stats.derivatives_recorded) == {LAUNCHED}
+
+
+def test_forward_mode(room_scene):
+    traced, recorded = pair(room_scene, parameters=[COLOUR, WALL_POSE], spp=4)
+    tangent = torch.zeros(4, 4)
+    tangent[2, 3] = 1.0
+    for seed in range(4):
+        pairs = []
+        for renderer in (traced, recorded):
+            values = {key: value.detach() for key, value in renderer.values.items()}
+
+            def run(pose, renderer=renderer, values=values, seed=seed):
+                return renderer({**values, WALL_POSE: pose}, seed=seed).transient
+
+            pairs.append(torch.func.jvp(run, (values[WALL_POSE],), (tangent,)))
+        same(pairs[0][0], pairs[1][0])
+        same(pairs[0][1], pairs[1][1])
+
+
+@pytest.fixture(scope="module")
+def two_views():
+    room = make_room()
+    second = dict(room["sensor"])
+    pose = np.array(second["to_world"]).copy()
+    pose[0, 3] += 0.2
+    return tt.load(room | {"sensor_b": second | {"to_world": pose}}, variant=VARIANT)
+
+
+# -------------------------------------------------------------------------------------------------- orders of calls
+
+
+def test_two_scenes_by_turns():
+    rooms = [tt.load(make_room(), variant=VARIANT) for _ in range(2)]
+    pairs = [pair(room, parameters=[COLOUR], spp=4) for room in rooms]
+    with torch.no_grad():
+        for renderer in pairs[1]:
+            renderer.values[COLOUR].fill_(0.2)
+    for seed in range(4):
+        for traced, recorded in pairs:
+            expected, got = step(traced, seed), step(recorded, seed)
+            same(expected[0].transient, got[0].transient)
+            same(expected[1][0], got[1][0])
+
+
+def test_scenes_that_come_and_go():
+    alive = []
+    for number in range(6):
+        scene = tt.load(make_room(), variant=VARIANT)
+        renderer = tt.TransientRenderer(scene, parameters=[COLOUR], spp=4)
+        for seed in range(3):
+            out, _ = step(renderer, seed)
+        assert out.stats.recorded == (LAUNCHED,), number
+        alive.append(weakref.ref(scene))
+        del scene, renderer, out
+    gc.collect()
+    assert [one() for one in alive] == [None] * 6
+
+
+def test_several_renders_before_their_backward_passes(room_scene):
+    traced, recorded = pair(room_scene, parameters=[COLOUR, WALL_POSE], spp=4)
+    grads = []
+    for renderer in (traced, recorded):
+        for round_ in range(3):
+            renderer.zero_grad()
+            outs = [renderer(seed=3 * round_ + k) for k in range(3)]
+            for out in reversed(outs):
+                out.transient.square().sum().backward(retain_graph=True)
+            outs[1].steady.sum().backward()
+        grads.append([p.grad.clone() for p in renderer.parameters()])
+    for a, b in zip(*grads, strict=True):
+        same(a, b)
+
+
+def test_other_flags_of_gradients(room_scene):
+    """Which values need a derivative changes from call to call; so do the adjoint's layout and what it is of."""
+    traced, recorded = pair(room_scene, parameters=[COLOUR, GREY, WALL_POSE], spp=4)
+    losses = (
+        lambda out: out.transient.square().sum(),
+        lambda out: out.steady.sum(),
+        lambda out: (out.transient.permute(3, 2, 1, 0).contiguous() ** 2).sum() + out.steady.square().sum(),
+        lambda out: out.transient[:, 3:9, 1].sum(),
+    )
+    for round_ in range(3):
+        for n, loss in enumerate(losses):
+            grads = []
+            for renderer in (traced, recorded):
+                renderer.zero_grad()
+                for k, parameter in enumerate(renderer.parameters()):
+                    parameter.requires_grad_(k != n)
+                loss(renderer(seed=10 * round_ + n)).backward()
+                grads.append([p.grad for p in renderer.parameters() if p.grad is not None])
+            assert len(grads[0]) == len(grads[1]) >= 2
+            assert sum(float(a.abs().sum()) for a in grads[0]) > 0
+            for a, b in zip(*grads, strict=True):
+                same(a, b, black=True)
+
+
+def test_threads(room_scene):
+    traced, recorded = pair(room_scene, parameters=[COLOUR], spp=4)
+    expected = {seed: step(traced, seed)[0].transient for seed in range(4)}
+    got, failed = {}, []
+
+    def work(number):
+        try:
+            for seed in range(4):
+                with torch.no_grad():
+                    got[number, seed] = recorded(seed=seed).transient
+        except BaseException as error:  # noqa: BLE001
+            failed.append(error)
+
+    workers = [threading.Thread(target=work, args=(n,)) for n in range(4)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    assert not failed
+    for (_, seed), transient in got.items():
+        same(expected[seed], transient)
+
+
+@pytest.mark.parametrize("stage", ["recorded", "launched"])
+@pytest.mark.parametrize("kind", ["render", "backward"])
+def test_interrupts_leave_everything_as_it_was(stage, kind, monkeypatch):
+    scene = tt.load(make_room(), variant=VARIANT)
+    traced, recorded = pair(scene, parameters=[COLOUR, WALL_POSE], spp=4)
+    for seed in range(1 if stage == "recorded" else 3):
+        step(recorded, seed)
+    out = recorded(seed=7) if kind == "backward" else None
+    integrator = scene_integrator(recorded)
+
+    failed = []
+    walk = type(integrator).walk
+
+    def interrupt(*args, **kwargs):
+        if not failed:
+            failed.append(True)
+            raise KeyboardInterrupt
+        return walk(*args, **kwargs)
+
+    with monkeypatch.context() as patched:
+        if stage == "recorded":
+            # In the middle of it, once: a call that is tried again must not hide it.
+            patched.setattr(type(integrator), "walk", interrupt)
+        else:
+            patched.setattr(recordings.Recording, "run", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            recorded(seed=8) if out is None else out.transient.sum().backward()
+    for seed in range(4):
+        expected, got = step(traced, seed), step(recorded, seed)
+        same(expected[0].transient, got[0].transient)
+        for a, b in zip(expected[1], got[1], strict=True):
+            same(a, b)
+    assert got[0].stats.recorded == (LAUNCHED,) and got[0].stats.derivatives_recorded == [LAUNCHED]
+
+
+def scene_integrator(renderer):
+    with active_variant(VARIANT):
+        return renderer.scene.built(renderer._options).scene.integrator()
+
+
+# --------------------------------------------------------------------------------------------- what is not recorded
+
+
+def test_several_launches_are_traced(room_scene, monkeypatch):
+    monkeypatch.setattr("torchtransient.plugins.integrators.launch.MAX_LANES", 20)
+    traced, recorded = pair(room_scene, parameters=[COLOUR], spp=4)
+    for seed in range(3):
+        expected, got = step(traced, seed), step(recorded, seed)
+        same(expected[0].transient, got[0].transient)
+        same(expected[1][0], got[1][0])
+    assert got[0].stats.recorded == (SEVERAL,) and got[0].stats.derivatives_recorded == [SEVERAL]
+
+
+def test_a_large_batch_is_rendered_in_place(monkeypatch, room_scene):
+    # By the module: the package has a function of the name.
+    for name in ("carry_out", "batch"):
+        monkeypatch.setattr(sys.modules[f"torchtransient.rendering.{name}"], "LARGE_FILM", 1)
+    colours = torch.tensor([[0.9, 0.1, 0.3], [0.2, 0.8, 0.5]])
+    for film in ({}, {"frequencies": [0.0, 0.5]}, {"gates": [tt.Gate.gaussian(9.0, 2.0)]}, {"steady": False}):
+        renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=4, physics="ignore", **film)
+        out = renderer({COLOUR: colours}, seed=5)
+        for n, seed in enumerate(out.stats.seeds):
+            single = renderer({COLOUR: colours[n]}, seed=seed)
+            same(measured(single), measured(out)[n])
+            same(single.steady, out.steady[n])
+            assert out.stats.energy_after[n] == pytest.approx(single.stats.energy_after[0], rel=1e-4)
+
+
+def test_what_dr_jit_cannot_record_is_traced(room_scene, monkeypatch):
+    """A plugin that reads numbers while it is traced: said once, right every time."""
+    scene = tt.load(make_room(), variant=VARIANT)
+    traced, recorded = pair(scene, parameters=[COLOUR], spp=4)
+    cls = type(scene_integrator(recorded))
+    offset = cls.offset_in_pixel
+
+    def reading(self, film, sensor, sampler):
+        found = offset(self, film, sensor, sampler)
+        _number_in_memory()
+        return found
+
+    monkeypatch.setattr(cls, "offset_in_pixel", reading)
+    for seed in range(4):
+        expected, got = step(traced, seed), step(recorded, seed)
+        same(expected[0].transient, got[0].transient)
+        same(expected[1][0], got[1][0])
+    assert got[0].stats.recorded[0].startswith("traced: Dr.Jit cannot record it")
+
+
+def _number_in_memory():
+    import drjit as dr
+    import mitsuba as mi
+
+    return float(dr.opaque(mi.Float, 1.0)[0])
+
+
+def test_a_class_made_out_of_a_plugin_is_not_recorded():
+    recorded = pair(tt.load(make_room(), variant=VARIANT), parameters=[COLOUR], spp=4)[1]
+    integrator = scene_integrator(recorded)
+    integrator.__class__ = type("OfAUser", (type(integrator),), {"__module__": "of.a.user"})
+    said = [recorded(seed=seed).stats.recorded[0] for seed in range(3)]
+    assert all("does not say that it can be" in words for words in said)
+
+
+def test_numbers_of_a_plugin_in_python_count(room_scene):
+    """What is no array becomes part of the kernels: another number is another recording."""
+    scene = tt.load(make_room(), variant=VARIANT)
+    renderer = tt.TransientRenderer(scene, parameters=[COLOUR], spp=4)
+    before = [renderer(seed=0) for _ in range(3)][-1]
+    integrator = scene_integrator(renderer)
+    integrator.max_depth = 2
+    after = [renderer(seed=0) for _ in range(3)]
+    assert before.stats.recorded == (LAUNCHED,)
+    assert [out.stats.recorded[0] for out in after] == [FIRST, RECORDED, LAUNCHED]
+    assert float(after[0].steady.detach().sum()) < 0.995 * float(before.steady.detach().sum())
+    for out in after[1:]:
+        same(after[0].transient, out.transient)
+
+
+# ------------------------------------------------------------------------------------------------ bounds and warning
+
+
+def test_recordings_are_bounded_and_said(monkeypatch):
+    monkeypatch.setattr(recordings, "MAX_STRUCTURES", 3)
+    renderer = tt.TransientRenderer(tt.load(make_room(), variant=VARIANT), parameters=[COLOUR])
+
+    def take_turns():
+        for _ in range(5):
+            for spp in range(1, 7):
+                renderer(seed=0, spp=spp)
+
+    with torch.no_grad(), pytest.warns(UserWarning, match="more than 3 kinds of calls take turns"):
+        take_turns()
+    kept = renderer.scene.recordings((COLOUR,), renderer._options)
+    assert len(kept) == 3
+    with warnings.catch_warnings(), torch.no_grad():  # once
+        warnings.simplefilter("error")
+        for spp in range(1, 30):
+            renderer(seed=0, spp=spp)
+
+
+def test_calls_that_are_launched_do_not_warn(room_scene):
+    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for seed in range(30):
+            step(renderer, seed)
+
+
+@pytest.mark.slow
+def test_many_kinds_of_calls_by_turns_do_not_warn():
+    scene = tt.load(make_room(), variant=VARIANT)
+    renderer = tt.TransientRenderer(scene, parameters=[COLOUR])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for _ in range(4):
+            for spp in range(1, 21):
+                out = renderer(seed=0, spp=spp)
+                out.transient.sum().backward()
+    assert out.stats.recorded == (LAUNCHED,) and out.stats.derivatives_recorded == [LAUNCHED]
+
+
+@pytest.mark.slow
+def test_what_changes_is_said(room_scene):
+    """Another number in a plugin at every call."""
+    renderer = tt.TransientRenderer(tt.load(make_room(), variant=VARIANT), parameters=[COLOUR], spp=2)
+    integrator = scene_integrator(renderer)
+
+    def change():
+        for depth in range(2, 80):
+            integrator.max_depth = depth
+            renderer(seed=0)
+
+    with torch.no_grad(), pytest.warns(UserWarning, match=r"changed from \d+ to \d+"):
+        change()
+
+
+def test_a_second_filter_leaves_the_recordings_of_the_first(room_scene):
+    scene = tt.load(make_room(), variant=VARIANT)
+    first = tt.TransientRenderer(scene, parameters=[COLOUR], spp=2, temporal_filter="tent")
+    second = tt.TransientRenderer(scene, parameters=[COLOUR], spp=2, temporal_filter="gaussian")
+    for renderer in (first, second):
+        said = [renderer(seed=0).stats.recorded[0] for _ in range(3)]
+        assert said == [FIRST, RECORDED, LAUNCHED]
+    assert first(seed=0).stats.recorded == (LAUNCHED,)
+
+
+def test_flags_of_dr_jit(room_scene):
+    import drjit as dr
+
+    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=2)
+    with active_variant(VARIANT), dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False):
+        assert {renderer(seed=0).stats.recorded[0] for _ in range(4)} == {NO_FREEZING}
+    with (
+        active_variant(VARIANT),
+        dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False),
+        pytest.raises(tt.errors.VariantError, match="SymbolicLoops"),
+    ):
+        renderer(seed=0)

@@ -1,0 +1,799 @@
+"""Labels: closed forms of planes and spheres, every sensor, and the same scene as the transient beside them."""
+
+from __future__ import annotations
+
+import gc
+import threading
+import weakref
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+
+import torchtransient as tt
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
+from torchtransient.rendering.labels import (
+    LABELS,
+    NUMBERED,
+    _labels,
+    first_return,
+    label_names,
+    material_names,
+    scene_labels,
+)  # fmt: skip
+from torchtransient.rendering.recordings import FIRST, LAUNCHED, RECORDED, SWITCHED_OFF
+from torchtransient.scenes.transforms import look_at, rotate, scale, translate
+from torchtransient.testing.small_room import COLOUR, GREY, VARIANT, WALL_POSE, make_room
+
+FLOATS = [name for name in LABELS if name not in NUMBERED]
+DISTANCE, RADIUS = 5.0, 1.25
+W, H, FOV = 8, 6, 40.0
+DOWN_Z = look_at([0.0, 0.0, DISTANCE], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+
+
+def film(width=W, height=H, **more):
+    return {
+        "type": "transient_hdr_film", "width": width, "height": height, "rfilter": {"type": "box"},
+        "temporal_bins": 64, "start_opl": 0.0, "bin_width_opl": 0.25, **more,
+    }  # fmt: skip
+
+
+def camera(kind="perspective", to_world=DOWN_Z, of_film=None, **more):
+    return {"type": kind, "to_world": to_world, "film": of_film or film(), **more}
+
+
+def plane(**more):
+    return {"type": "rectangle", "to_world": scale(20.0), **more}
+
+
+def grey(value):
+    return {"type": "diffuse", "reflectance": value}
+
+
+def scene_of(sensor, **contents):
+    light = {"type": "point", "position": [0.0, 0.0, DISTANCE], "intensity": 10.0}
+    integrator = {"type": "transient_path", "max_depth": 2}
+    return {"type": "scene", "integrator": integrator, "sensor": sensor, "light": light, **contents}
+
+
+def renderer_of(sensor, variant=VARIANT, parameters=(), options=None, **contents):
+    loaded = tt.load(scene_of(sensor, **contents), variant=variant)
+    return tt.TransientRenderer(loaded, parameters=parameters, spp=16, physics="ignore", **options or {})
+
+
+def pinhole_directions(width=W, height=H, fov=FOV):
+    """(3, H, W) unit directions of a camera that looks along -z with y up: x of the film runs to the right."""
+    reach = np.tan(np.radians(fov) / 2)
+    x = ((np.arange(width) + 0.5) / width * 2 - 1) * reach
+    y = ((np.arange(height) + 0.5) / height * 2 - 1) * reach * height / width
+    x, y = np.meshgrid(x, -y)
+    found = np.stack([x, y, -np.ones_like(x)])
+    return found / np.linalg.norm(found, axis=0)
+
+
+def close(found, expected, atol=2e-5):
+    np.testing.assert_allclose(found.numpy(), expected, rtol=2e-5, atol=atol)
+
+
+# -------------------------------------------------------------------------------------------------- closed forms
+
+
+def test_plane_before_a_pinhole():
+    labels = scene_labels(renderer_of(camera(fov=FOV), wall=plane(bsdf=grey(0.3))), names=LABELS)
+    d = pinhole_directions()
+    close(labels["depth"], DISTANCE / -d[2])
+    close(labels["z_depth"], np.full((H, W), DISTANCE))
+    p = np.array([0, 0, DISTANCE])[:, None, None] + d * DISTANCE / -d[2]
+    close(labels["position"], p)
+    close(labels["normals"], np.broadcast_to(np.array([0, 0, 1.0])[:, None, None], (3, H, W)))
+    close(labels["uv"], p[:2] / 40 + 0.5)
+    close(labels["albedo"], np.full((3, H, W), 0.3))
+    for name in NUMBERED:
+        assert labels[name].dtype == torch.int32 and labels[name].shape == (H, W)
+    assert (labels["shape"] == 0).all() and (labels["material"] == 0).all()
+    for name in FLOATS:
+        assert labels[name].dtype == torch.float32 and not labels[name].requires_grad
+
+
+def test_sphere_before_a_pinhole():
+    labels = scene_labels(renderer_of(camera(fov=FOV), ball={"type": "sphere", "radius": RADIUS}), names=LABELS)
+    d = pinhole_directions()
+    along = DISTANCE * -d[2]
+    root = along**2 - DISTANCE**2 + RADIUS**2
+    hit = root > 0
+    assert 0 < hit.sum() < hit.size
+    t = along - np.sqrt(np.where(hit, root, 0))
+    close(labels["depth"], np.where(hit, t, np.nan))
+    p = np.where(hit, np.array([0, 0, DISTANCE])[:, None, None] + d * t, np.nan)
+    close(labels["position"], p)
+    close(labels["normals"], p / RADIUS)
+    assert (labels["shape"].numpy() == np.where(hit, 0, -1)).all()
+    for name in NUMBERED:
+        assert (labels[name].numpy()[~hit] == -1).all()
+    for name in FLOATS:
+        assert torch.isnan(labels[name])[..., torch.tensor(~hit)].all()
+
+
+def test_thin_lens_is_a_pinhole_in_the_middle():
+    pinhole, lens = (
+        scene_labels(renderer_of(camera(kind, fov=FOV, **more), wall=plane()), names=["depth", "z_depth"])
+        for kind, more in (("perspective", {}), ("thinlens", {"aperture_radius": 0.2, "focus_distance": 3.0}))
+    )
+    for name, expected in pinhole.items():
+        close(lens[name], expected.numpy())
+
+
+@pytest.mark.parametrize("near", [1e-2, 2.0])
+def test_depth_counts_from_the_origin_not_from_the_near_plane(near):
+    for kind in ("perspective", "orthographic"):
+        labels = scene_labels(renderer_of(camera(kind, near_clip=near), wall=plane()), names=["depth", "z_depth"])
+        close(labels["z_depth"], np.full((H, W), DISTANCE))
+        if kind == "orthographic":
+            close(labels["depth"], np.full((H, W), DISTANCE))
+        else:
+            assert (labels["depth"] > DISTANCE).all()
+
+
+def test_orthographic_pixels_lie_side_by_side():
+    labels = scene_labels(
+        renderer_of(camera("orthographic", to_world=DOWN_Z @ scale([3.0, 3.0, 1.0])), wall=plane()), names=["position"]
+    )
+    x = labels["position"][0].numpy()
+    np.testing.assert_allclose(np.abs(np.diff(x, axis=1)), 6.0 / W, rtol=1e-4)
+
+
+def test_crop_window_is_a_part():
+    crop = {"crop_width": 3, "crop_height": 2, "crop_offset_x": 4, "crop_offset_y": 1}
+    whole, part = (
+        scene_labels(renderer_of(camera(of_film=film(**more)), wall=plane()), names=["depth", "position"])
+        for more in ({}, crop)
+    )
+    for name, expected in whole.items():
+        close(part[name], expected[..., 1:3, 4:7].numpy())
+
+
+def test_radiance_meter_has_one_pixel():
+    meter = camera("radiancemeter", of_film=film(1, 1))
+    labels = scene_labels(renderer_of(meter, wall=plane()), names=["depth", "z_depth", "position"])
+    close(labels["depth"], [[DISTANCE]], atol=1e-3)
+    close(labels["z_depth"], [[DISTANCE]])
+    close(labels["position"].flatten(), [0, 0, 0])
+
+
+def test_batch_sensor_has_its_children_side_by_side():
+    other = look_at([1.0, 0.5, 3.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    square = film(4, 4)
+    batch = {
+        "type": "batch", "film": film(8, 4),
+        "first": camera(of_film=square), "second": camera(to_world=other, of_film=square),
+    }  # fmt: skip
+    names = ["depth", "z_depth", "position", "normals"]
+    both = scene_labels(renderer_of(batch, wall=plane()), names=names)
+    for half, pose in enumerate((DOWN_Z, other)):
+        one = scene_labels(renderer_of(camera(to_world=pose, of_film=square), wall=plane()), names=names)
+        for name in names:
+            close(both[name][..., 4 * half : 4 * half + 4], one[name].numpy(), atol=1e-4)
+
+
+def meter_scene(points=None):
+    meter = {"type": "nlos_capture_meter", "film": film(4, 3), "sensor_origin": [0.5, 0.0, 2.0]}
+    if points is not None:
+        meter["points"] = mi.TensorXf(points)
+    description = scene_of(None, wall={"type": "rectangle", "sensor": meter, "bsdf": grey(0.4)})
+    del description["sensor"]
+    return tt.TransientRenderer(tt.load(description, variant=VARIANT), spp=4, physics="ignore")
+
+
+def test_scan_has_its_wall_points():
+    labels = scene_labels(meter_scene(), names=["position", "normals", "depth", "shape", "albedo"])
+    x, y = np.meshgrid((np.arange(4) + 0.5) / 2 - 1, (np.arange(3) + 0.5) / 1.5 - 1)
+    p = np.stack([x, y, np.zeros_like(x)])
+    close(labels["position"], p)
+    close(labels["normals"], np.broadcast_to(np.array([0, 0, 1.0])[:, None, None], p.shape))
+    close(labels["depth"], np.linalg.norm(p - np.array([0.5, 0, 2.0])[:, None, None], axis=0))
+    assert (labels["shape"] == 0).all()
+    given = np.random.default_rng(1).uniform(-0.9, 0.9, (12, 3)).astype(np.float32) * [1, 1, 0]
+    close(scene_labels(meter_scene(given), names=["position"])["position"], given.T.reshape(3, 3, 4))
+    with pytest.raises(SceneError, match="no optical axis"):
+        scene_labels(meter_scene(), names=["z_depth"])
+
+
+@pytest.mark.parametrize("kind", ["irradiancemeter", "distant"])
+def test_sensors_without_pixels_are_refused(kind):
+    if kind == "distant":
+        renderer = renderer_of({"type": "distant", "film": film(1, 1)}, wall=plane())
+    else:
+        sensor = {"type": "irradiancemeter", "film": film(1, 1)}
+        description = scene_of(None, wall=plane(sensor=sensor))
+        del description["sensor"]
+        renderer = tt.TransientRenderer(tt.load(description, variant=VARIANT), spp=1, physics="ignore")
+    with pytest.raises(SceneError, match="looks along a line of its own"):
+        scene_labels(renderer)
+
+
+# ----------------------------------------------------------------------------------------------- what is looked at
+
+
+@pytest.mark.parametrize("opacity, seen", [(0.0, "wall"), (0.4, "wall"), (0.6, "pane"), (1.0, "pane")])
+def test_masks_are_looked_through_where_they_are_clear(opacity, seen):
+    mask = {"type": "mask", "opacity": opacity, "inner": grey(0.2)}
+    pane = plane(to_world=translate([0, 0, 1.0]) @ scale(20.0), bsdf=mask)
+    renderer = renderer_of(camera(), pane=pane, wall=plane(bsdf=grey(0.7)))
+    labels = scene_labels(renderer, names=["shape", "z_depth", "albedo"])
+    expected = {"pane": (0, DISTANCE - 1, 0.2), "wall": (1, DISTANCE, 0.7)}[seen]
+    assert label_names(renderer) == ("pane", "wall")
+    assert (labels["shape"] == expected[0]).all()
+    close(labels["z_depth"], np.full((H, W), expected[1]))
+    close(labels["albedo"], np.full((3, H, W), expected[2]))
+
+
+def test_boundaries_of_media_are_looked_through():
+    fog = {"type": "homogeneous", "sigma_t": 0.01, "albedo": 0.5}
+    box = {"type": "sphere", "radius": 2.0, "bsdf": {"type": "null"}, "interior": fog}
+    sensor = camera(fov=FOV, near_clip=1.0, far_clip=100.0)
+    description = scene_of(sensor, box=box, wall=plane(to_world=translate([0, 0, -3.0]) @ scale(20.0)))
+    description["integrator"] = {"type": "transient_prbvolpath", "max_depth": 2}
+    renderer = tt.TransientRenderer(tt.load(description, variant=VARIANT), spp=1, physics="ignore")
+    labels = scene_labels(renderer, names=["depth", "z_depth", "shape"])
+    assert (labels["shape"] == 1).all()
+    close(labels["z_depth"], np.full((H, W), DISTANCE + 3), atol=1e-4)
+    close(labels["depth"], (DISTANCE + 3) / -pinhole_directions()[2], atol=1e-4)
+
+
+def test_far_clip_holds_behind_a_pane():
+    pane = plane(to_world=translate([0, 0, 1.0]) @ scale(20.0), bsdf={"type": "null"})
+    labels = scene_labels(renderer_of(camera(far_clip=4.5), pane=pane, wall=plane()), names=["depth"])
+    assert torch.isnan(labels["depth"]).all()
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_hidden_lights_are_looked_through(hidden):
+    lamp = {"type": "rectangle", "to_world": translate([0, 0, 1.0]), "emitter": {"type": "area", "radiance": 1.0}}
+    description = scene_of(camera(fov=10.0), lamp=lamp, wall=plane())
+    description["integrator"]["hide_emitters"] = hidden
+    renderer = tt.TransientRenderer(tt.load(description, variant=VARIANT), spp=1, physics="ignore")
+    labels = scene_labels(renderer, names=["shape", "z_depth"])
+    assert (labels["shape"] == int(hidden)).all()
+    close(labels["z_depth"], np.full((H, W), DISTANCE if hidden else DISTANCE - 1), atol=1e-4)
+
+
+def test_instances_are_shapes_of_their_own():
+    group = {"type": "shapegroup", "part": {"type": "sphere", "radius": 0.5, "bsdf": grey(0.6)}}
+    copies = {
+        name: {"type": "instance", "group": {"type": "ref", "id": "group"}, "to_world": translate([x, 0, 0])}
+        for name, x in (("left", -1.0), ("right", 1.0))
+    }
+    wall = plane(to_world=translate([0, 0, -1]) @ scale(9.0))
+    renderer = renderer_of(camera(fov=FOV), group=group, **copies, wall=wall)
+    labels = scene_labels(renderer, names=LABELS)
+    names = label_names(renderer)
+    assert set(names) == {"left", "right", "wall"}
+    p = labels["position"]
+    for name, x in (("left", -1.0), ("right", 1.0)):
+        here = labels["shape"] == names.index(name)
+        assert here.sum() > 2
+        away = p[:, here] - torch.tensor([x, 0.0, 0.0])[:, None]
+        close(torch.linalg.norm(away, dim=0), np.full(int(here.sum()), 0.5), atol=1e-4)
+        close(labels["normals"][:, here], (away / 0.5).numpy(), atol=1e-3)
+        close(labels["albedo"][:, here], np.full((3, int(here.sum())), 0.6))
+
+
+def test_names_follow_the_description():
+    contents = {
+        name: {"type": "sphere", "to_world": translate([x, 0, 0]) @ scale(0.4), "bsdf": {"type": "ref", "id": paint}}
+        for name, x, paint in (("zebra", -1.0, "white"), ("apple", 0.0, "red"), ("moon", 1.0, "white"))
+    }
+    paints = {"red": {**grey(0.9)}, "white": {**grey(0.8)}}
+    description = scene_of(camera(fov=FOV), **paints, **contents)
+    for parameters in ((), ["red.reflectance.value"], ["moon.to_world"]):
+        renderer = tt.TransientRenderer(tt.load(description, variant=VARIANT), parameters=parameters, physics="ignore")
+        assert label_names(renderer) == ("zebra", "apple", "moon")
+        assert material_names(renderer) == ("white", "red")
+        labels = scene_labels(renderer, names=["shape", "position", "material"])
+        for n, x in enumerate((-1.0, 0.0, 1.0)):
+            here = labels["shape"] == n
+            assert here.any() and ((labels["position"][0, here] - x).abs() < 0.4).all()
+            assert (labels["material"][here] == (1 if n == 1 else 0)).all()
+
+
+def test_meshes_that_renders_merge_are_told_apart():
+    cubes = {f"cube_{n}": {"type": "cube", "to_world": translate([2.0 * n - 2, 0, 0]) @ scale(0.5)} for n in range(3)}
+    renderer = renderer_of(camera(fov=FOV), **cubes)
+    assert renderer._options.merge  # else this test would say nothing
+    labels = scene_labels(renderer, names=["shape", "primitive"])
+    assert label_names(renderer) == tuple(cubes)
+    assert set(labels["shape"].unique().tolist()) == {-1, 0, 1, 2}
+    assert labels["primitive"].max() < 12
+
+
+# ------------------------------------------------------------------------------------------------------- variants
+
+
+@pytest.mark.parametrize(
+    "variant, expected",
+    [
+        ("llvm_ad_rgb", [0.2, 0.5, 0.7]), ("llvm_ad_spectral", [0.2, 0.5, 0.7]),
+        ("llvm_ad_spectral_polarized", [0.2, 0.5, 0.7]),
+    ],
+)  # fmt: skip
+def test_albedo_of_a_colour_in_every_variant(variant, expected):
+    paint = {"type": "diffuse", "reflectance": {"type": "rgb", "value": expected}}
+    renderer = renderer_of(camera(), variant, wall=plane(bsdf=paint))
+    for _ in range(3):
+        labels = scene_labels(renderer, names=["albedo", "depth"])
+    # Mitsuba's spectra of colours give the colours back up to their fit.
+    close(labels["albedo"], np.broadcast_to(np.array(expected)[:, None, None], (3, H, W)), atol=5e-3)
+    close(labels["depth"], DISTANCE / -pinhole_directions(fov=50)[2], atol=0.5)
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_mono_polarized"])
+def test_albedo_of_grey_has_one_channel(variant):
+    renderer = renderer_of(camera(), variant, wall=plane(bsdf={"type": "twosided", "inner": grey(0.35)}))
+    close(scene_labels(renderer, names=["albedo"])["albedo"], np.full((1, H, W), 0.35))
+
+
+def test_albedo_in_the_films_own_channels():
+    bands = {
+        "low": {"type": "regular", "wavelength_min": 450.0, "wavelength_max": 500.0, "values": "1, 1"},
+        "high": {"type": "regular", "wavelength_min": 600.0, "wavelength_max": 650.0, "values": "2, 2"},
+    }
+    step = {"type": "irregular", "wavelengths": "360, 549, 551, 830", "values": "0.25, 0.25, 0.75, 0.75"}
+    wall = plane(bsdf={"type": "diffuse", "reflectance": step})
+    renderer = renderer_of(camera(of_film=film(**bands)), "llvm_ad_spectral", wall=wall)
+    for _ in range(3):
+        albedo = scene_labels(renderer, names=["albedo"])["albedo"]
+    close(albedo[:, 0, 0], [0.25, 0.75], atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["plastic", "roughplastic"])
+def test_albedo_does_not_depend_on_which_values_are_parameters(kind):
+    paint = {"type": kind, "diffuse_reflectance": {"type": "rgb", "value": [0.2, 0.5, 0.7]}}
+    key = "wall.bsdf.diffuse_reflectance.value"
+    described, asked = (
+        scene_labels(renderer_of(camera(), parameters=keys, wall=plane(bsdf=paint)), names=["albedo"])["albedo"]
+        for keys in ((), [key])
+    )
+    close(described[:, 0, 0], [0.2, 0.5, 0.7])
+    close(asked, described.numpy())
+
+
+def test_mirrors_have_no_albedo():
+    for kind in ("conductor", "roughconductor", "dielectric", "roughdielectric"):
+        labels = scene_labels(renderer_of(camera(), wall=plane(bsdf={"type": kind})), names=["albedo", "z_depth"])
+        assert (labels["albedo"] == 0).all()
+        close(labels["z_depth"], np.full((H, W), DISTANCE))
+
+
+# -------------------------------------------------------------------------------------------- values, batches, calls
+
+
+def room_renderer(**more):
+    return tt.TransientRenderer(tt.load(make_room(), variant=VARIANT), physics="ignore", spp=4, **more)
+
+
+def moved(x):
+    pose = torch.eye(4)
+    pose[2, 3] = x
+    pose[0, 0] = pose[1, 1] = pose[2, 2] = 3.0
+    return pose
+
+
+def test_batches_and_sensors_lead():
+    renderer = room_renderer(parameters=[COLOUR, WALL_POSE])
+    colours = torch.tensor([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6], [0.7, 0.8, 0.9]])
+    poses = torch.stack([moved(-0.1), moved(-0.2), moved(-0.3)])
+    labels = scene_labels(renderer, {COLOUR: colours, WALL_POSE: poses}, ["depth", "albedo", "shape"])
+    assert labels["depth"].shape == (3, 3, 4) and labels["albedo"].shape == (3, 3, 3, 4)
+    assert labels["shape"].shape == (3, 3, 4)
+    for n in range(3):
+        alone = scene_labels(renderer, {COLOUR: colours[n], WALL_POSE: poses[n]}, ["depth", "albedo", "shape"])
+        for name, value in alone.items():
+            assert torch.equal(labels[name][n], value)
+    assert not torch.equal(labels["depth"][0], labels["depth"][1])
+    listed = room_renderer(sensors="all")
+    assert scene_labels(listed, names=["depth", "normals"])["normals"].shape == (1, 3, 3, 4)
+
+
+def test_two_sensors_of_one_call():
+    second = look_at([0.5, 0.5, 3.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    description = scene_of(camera(), wall=plane())
+    description["other"] = camera(to_world=second)
+    scene = tt.load(description, variant=VARIANT)
+    both = scene_labels(tt.TransientRenderer(scene, sensors=[1, 0], physics="ignore"))["depth"]
+    for n, sensor in enumerate((1, 0)):
+        one = scene_labels(tt.TransientRenderer(scene, sensors=sensor, physics="ignore"))["depth"]
+        assert torch.equal(both[n], one)
+    assert not torch.equal(both[0], both[1])
+
+
+def test_recorded_calls_say_what_traced_ones_do():
+    recorded, traced = (room_renderer(parameters=[COLOUR, WALL_POSE], freeze=freeze) for freeze in (True, False))
+    said = []
+    for n in range(5):
+        values = {COLOUR: [0.1 * n, 0.5, 0.9], WALL_POSE: moved(-0.1 * n)}
+        a, how = _labels(recorded, values, LABELS, False, 16)
+        b, of_traced = _labels(traced, values, LABELS, False, 16)
+        said += how
+        assert of_traced == [SWITCHED_OFF]
+        for name in LABELS:
+            assert torch.equal(a[name], b[name]), (n, name)
+    assert said == [FIRST, RECORDED, LAUNCHED, LAUNCHED, LAUNCHED]
+
+
+def test_labels_of_a_call_stay_what_they_are():
+    renderer = room_renderer(parameters=[WALL_POSE])
+    kept = [scene_labels(renderer, {WALL_POSE: moved(-0.1 * n)})["depth"] for n in range(6)]
+    copies = [one.clone() for one in kept]
+    for n in range(6):
+        scene_labels(renderer, {WALL_POSE: moved(-1.0 - n)})
+        renderer({WALL_POSE: moved(-1.0)}, seed=n)
+    gc.collect()
+    for one, copy in zip(kept, copies, strict=True):
+        assert torch.equal(one, copy)
+    for n in range(5):
+        assert kept[n + 1][0, 0] > kept[n][0, 0]
+    kept[0].fill_(0.0)
+    assert (scene_labels(renderer, {WALL_POSE: moved(-0.1)})["depth"] > 1).all()
+
+
+def test_own_parameters_and_described_values_come_back():
+    renderer = room_renderer(parameters=[COLOUR, WALL_POSE])
+    before = scene_labels(renderer, names=["depth", "albedo"])
+    scene_labels(renderer, {COLOUR: [0.0, 0.0, 0.0], WALL_POSE: moved(-2.0)}, ["depth", "albedo"])
+    again = scene_labels(renderer, names=["depth", "albedo"])
+    # Other keys of the same scene find the described values.
+    beside = tt.TransientRenderer(renderer.scene, parameters=[GREY], physics="ignore")
+    other = scene_labels(beside, names=["depth", "albedo"])
+    for name, value in before.items():
+        assert torch.equal(again[name], value)
+        torch.testing.assert_close(other[name], value)
+    with torch.no_grad():
+        renderer.values[WALL_POSE].copy_(moved(-2.0))
+    assert (scene_labels(renderer)["depth"][:, 0] > before["depth"][:, 0] + 1).all()
+
+
+def test_interleaved_scenes_keys_and_renders():
+    """Two scenes, two sets of keys, labels and renders in turn: each call has its own values."""
+    near, far = make_room(), make_room()
+    far["box"]["to_world"] = far["box"]["to_world"] @ translate([0.0, 0.0, -1.0])
+    scenes = [tt.load(one, variant=VARIANT) for one in (near, far)]
+    renderers = [
+        tt.TransientRenderer(scene, parameters=keys, spp=4, physics="ignore")
+        for scene in scenes
+        for keys in ([WALL_POSE], [COLOUR, WALL_POSE])
+    ]
+    fresh = [
+        tt.TransientRenderer(scene, parameters=keys, spp=4, physics="ignore", freeze=False)
+        for scene in (tt.load(one, variant=VARIANT) for one in (near, far))
+        for keys in ([WALL_POSE], [COLOUR, WALL_POSE])
+    ]
+    for turn in range(4):
+        for n, (renderer, expected) in enumerate(zip(renderers, fresh, strict=True)):
+            values = {WALL_POSE: moved(-0.1 * (turn + n))}
+            found = scene_labels(renderer, values, ["depth", "shape", "normals"])
+            cube = renderer(values, seed=turn).transient.detach()
+            wanted = scene_labels(expected, values, ["depth", "shape", "normals"])
+            for name, value in wanted.items():
+                assert torch.equal(found[name], value)
+            torch.testing.assert_close(cube, expected(values, seed=turn).transient.detach(), rtol=1e-4, atol=1e-5)
+
+
+def test_threads_take_turns():
+    renderer = room_renderer(parameters=[WALL_POSE])
+    expected = [scene_labels(renderer, {WALL_POSE: moved(-0.1 * n)})["depth"] for n in range(4)]
+    right: list[int] = []
+    wrong: list[int] = []
+
+    def work(n):
+        for _ in range(10):
+            found = scene_labels(renderer, {WALL_POSE: moved(-0.1 * n)})["depth"]
+            (right if torch.equal(found, expected[n]) else wrong).append(n)
+
+    threads = [threading.Thread(target=work, args=(n,)) for n in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not wrong and len(right) == 40
+
+
+def test_values_that_need_gradients_give_none():
+    renderer = room_renderer(parameters=[WALL_POSE])
+    value = moved(-0.5).requires_grad_()
+    labels = scene_labels(renderer, {WALL_POSE: value}, LABELS)
+    assert not any(label.requires_grad for label in labels.values())
+    renderer({WALL_POSE: value}, seed=0).transient.sum().backward()
+    assert value.grad is not None
+
+
+def test_phasors_and_gates_have_labels():
+    plain = scene_labels(room_renderer())["depth"]
+    for more in ({"frequencies": [0.5, 1.0]}, {"gates": [tt.Gate.gaussian(8.0, 2.0)]}):
+        assert torch.equal(scene_labels(room_renderer(**more))["depth"], plain)
+
+
+# ---------------------------------------------------------------------------------------------------------- means
+
+
+def test_means_over_pixels():
+    """Of a slanted plane the mean depth of an orthographic camera is that of the centre; across an edge it is not."""
+    slanted = plane(to_world=rotate([0, 1, 0], 30.0) @ scale(20.0))
+    renderer = renderer_of(camera("orthographic"), wall=slanted)
+    centre = scene_labels(renderer, names=FLOATS)
+    mean = scene_labels(renderer, names=FLOATS, average=True, samples=256)
+    for name in ("depth", "z_depth", "position", "normals", "albedo"):
+        close(mean[name], centre[name].numpy(), atol=2e-3)
+    wall = plane(to_world=translate([0, 0, -3.0]) @ scale(20.0))
+    ball = renderer_of(camera(fov=FOV), ball={"type": "sphere", "radius": RADIUS}, wall=wall)
+    for _ in range(3):
+        mean = scene_labels(ball, names=["z_depth"], average=True, samples=64)["z_depth"]
+    front, back = DISTANCE - RADIUS, DISTANCE + 3
+    between = (mean > front + 1.5) & (mean < back - 0.2)
+    assert between.any() and torch.isfinite(mean).all()
+    alone = renderer_of(camera(fov=FOV), ball={"type": "sphere", "radius": RADIUS})
+    mean, centre = (scene_labels(alone, average=average)["depth"] for average in (True, False))
+    assert (mean[torch.isfinite(mean)] < DISTANCE).all()
+    assert torch.isfinite(mean).sum() > torch.isfinite(centre).sum()
+
+
+def test_mean_of_a_thin_lens_is_over_its_aperture():
+    lens = {"aperture_radius": 0.5, "focus_distance": 2.0}
+    renderer = renderer_of(camera("thinlens", fov=FOV, **lens), ball={"type": "sphere", "radius": RADIUS})
+    sharp, blurred = (scene_labels(renderer, average=average)["depth"] for average in (False, True))
+    assert torch.isfinite(blurred).sum() > torch.isfinite(sharp).sum()
+
+
+# -------------------------------------------------------------------------------------------- beside the transient
+
+
+FINER = 8
+
+
+def beside(sensor_film, light, **contents):
+    """A renderer whose ball can be moved, and one with pixels that are FINER times finer for labels."""
+    found = []
+    for factor in (1, FINER):
+        fine = film(16 * factor, 12 * factor, **sensor_film)
+        description = scene_of(camera(fov=FOV, of_film=fine), ball={"type": "sphere"}, **contents)
+        description["light"]["position"] = light
+        description["integrator"]["max_depth"] = 4
+        scene = tt.load(description, variant=VARIANT)
+        found.append(
+            tt.TransientRenderer(
+                scene, parameters=["ball.to_world"], spp=256, temporal_filter="box", physics="ignore"
+            )
+        )
+    return found
+
+
+def limits(fine):
+    """Least and largest of each pixel, of values (H, W) of pixels that are finer; with those around it, and a little
+    wider, since none lies on its rim.
+    """
+    high, low = (
+        sign * torch.nn.functional.max_pool2d(sign * fine[None], FINER + 2, FINER, padding=1)[0] for sign in (1, -1)
+    )
+    rim = 2 * (high - low) / FINER + 1e-4
+    return low - rim, high + rim
+
+
+def at(x, y, z, size=RADIUS):
+    return {"ball.to_world": (translate([x, y, z]) @ scale(size)).astype(np.float32)}
+
+
+def test_depth_lies_in_the_peak_bin():
+    """A light at the pinhole: the first bounce of a pixel arrives after twice its depth."""
+    width = 0.5
+    wall = plane(to_world=translate([0, 0, -1.0]) @ rotate([0, 1, 0], 20.0) @ scale(20.0), bsdf=grey(0.5))
+    axis = {"temporal_bins": 128, "bin_width_opl": width}
+    renderer, finer = beside(axis, [0.0, 0.0, DISTANCE], wall=wall)
+    alike = 0
+    for values in (at(0.0, 0.0, 0.0), at(0.5, 0.2, 1.0), at(-1.0, 0.5, 0.3, 0.5)):
+        depth = scene_labels(renderer, values)["depth"]
+        cube = renderer(values, seed=1).transient.detach().sum(0)
+        low, high = limits(scene_labels(finer, values)["depth"])
+        first, last = torch.floor(2 * low / width), torch.floor(2 * high / width)
+        peak = cube.argmax(0)
+        assert ((first <= peak) & (peak <= last)).all()
+        sure = first == last
+        assert (peak[sure] == torch.floor(2 * depth / width)[sure]).all()
+        alike += int(sure.sum())
+    assert alike > 60
+
+
+def test_nothing_arrives_before_the_shortest_way():
+    width, light = 0.1, [1.0, 2.0, 3.0]
+    renderer, finer = beside({"temporal_bins": 256, "bin_width_opl": width, "start_opl": 2.0}, light, wall=plane())
+    for values in (at(0.0, 0.0, 0.5), at(0.4, 0.3, 0.5)):
+        arrival = first_return(renderer(values, seed=3).transient, renderer.axis)
+        labels = scene_labels(finer, values, ["depth", "position"])
+        way = labels["depth"] + torch.linalg.norm(labels["position"] - torch.tensor(light)[:, None, None], dim=0)
+        low, high = limits(way)
+        lit = torch.isfinite(arrival)
+        assert lit.float().mean() > 0.9
+        # The bin that holds the shortest way may start before it.
+        assert (arrival + width > low)[lit].all()
+        assert (arrival <= high).float().mean() > 0.5  # the rest lies in the shadow of the ball
+
+
+def test_moved_poses_move_labels_and_light_together():
+    renderer = room_renderer(parameters=[WALL_POSE], temporal_filter="box")
+    for x in (0.0, -0.5, -1.0):
+        values = {WALL_POSE: moved(x)}
+        depth = scene_labels(renderer, values)["depth"][:, 0]
+        arrival = first_return(renderer(values, seed=0, spp=64).transient, renderer.axis)[:, 0]
+        p = scene_labels(renderer, values, ["position"])["position"][:, :, 0]
+        way = depth + torch.linalg.norm(p - torch.tensor([[-0.5], [0.25], [4.0]]), dim=0)
+        # Half of a pixel and a bin.
+        assert ((arrival - way).abs() < 0.4).all()
+
+
+# ---------------------------------------------------------------------------------------------------- first return
+
+
+def test_first_return_of_given_bins():
+    axis = tt.TimeAxis(1.0, 0.5, 6)
+    cube = torch.zeros(2, 6, 1, 3)
+    cube[0, 4, 0, 0] = cube[1, 2, 0, 0] = 1.0
+    cube[1, 0, 0, 1] = 1e-3
+    found = first_return(cube, axis)
+    assert found.dtype == torch.float32 and found.shape == (1, 3)
+    assert found[0, 0] == 2.0 and found[0, 1] == 1.0 and torch.isnan(found[0, 2])
+    assert torch.isnan(first_return(cube, axis, threshold=1e-2)[0, 1])
+    assert torch.equal(first_return(cube.expand(5, -1, -1, -1, -1), axis)[3, 0, :2], found[0, :2])
+    stokes = torch.zeros(4, *cube.shape)
+    stokes[0], stokes[1, :, 0] = cube, 1.0
+    assert torch.equal(first_return(stokes, axis, polarized=True)[0, :2], found[0, :2])
+
+
+@pytest.mark.parametrize("shape", [(6, 1, 3), (2, 5, 1, 3)])
+def test_first_return_refuses_other_shapes(shape):
+    with pytest.raises(ShapeError, match="bins of its axis"):
+        first_return(torch.zeros(shape), tt.TimeAxis(1.0, 0.5, 6))
+
+
+def test_first_return_refuses_mistakes():
+    axis = tt.TimeAxis(1.0, 0.5, 6)
+    with pytest.raises(ShapeError, match="4 Stokes"):
+        first_return(torch.zeros(3, 2, 6, 1, 3), axis, polarized=True)
+    with pytest.raises(ShapeError):
+        first_return(torch.zeros(2, 6, 1, 3, dtype=torch.complex64), axis)
+    with pytest.raises(UnitError, match="threshold"):
+        first_return(torch.zeros(2, 6, 1, 3), axis, threshold=-1.0)
+
+
+# ---------------------------------------------------------------------------------------------------------- errors
+
+
+def test_mistakes_have_typed_errors(room_scene):
+    renderer = tt.TransientRenderer(room_scene, parameters=[WALL_POSE], physics="ignore")
+    for names in ([], ["deepth"], ["depth", "depth"]):
+        with pytest.raises(ArgumentError, match="names: expected labels out of"):
+            scene_labels(renderer, names=names)
+    with pytest.raises(ArgumentError, match="have no mean"):
+        scene_labels(renderer, names=["depth", "shape"], average=True)
+    for samples in (0, 1.5, True, 10**6):
+        with pytest.raises(UnitError, match="samples"):
+            scene_labels(renderer, average=True, samples=samples)
+    with pytest.raises(SceneError, match="no parameter"):
+        scene_labels(renderer, {"walls.to_world": moved(0.0)})
+    with pytest.raises(ShapeError):
+        scene_labels(renderer, {WALL_POSE: [1.0, 2.0]})
+    with pytest.raises(UnitError, match="finite"):
+        scene_labels(renderer, {WALL_POSE: moved(float("nan"))})
+    assert torch.isfinite(scene_labels(renderer)["depth"]).all()
+    assert set(scene_labels(renderer, names="depth")) == {"depth"}
+
+
+# ------------------------------------------------------------------------------------- recorded calls of every kind
+
+
+# Of plugins that do not show Dr.Jit all of their arrays, renders and labels are traced (docs/speed.md).
+HIDDEN_ARRAYS = "does not show Dr.Jit all of its arrays"
+
+
+def same_recorded(make, values, names, hidden=False):
+    """Recorded calls with these values against traced ones of a scene of their own; the last two are launched, unless
+    arrays are ``hidden``.
+    """
+    recorded, traced = (make(freeze) for freeze in (True, False))
+    said, found = [], []
+    for given in values:
+        a, how = _labels(recorded, given, names, False, 16)
+        b = _labels(traced, given, names, False, 16)[0]
+        said += how
+        found.append(a)
+        for name in names:
+            torch.testing.assert_close(a[name], b[name], rtol=1e-5, atol=1e-5, equal_nan=True)
+    if hidden:
+        assert HIDDEN_ARRAYS in said[-1], said
+    else:
+        assert said[-2:] == [LAUNCHED] * 2, said
+    return found
+
+
+@pytest.mark.parametrize("kind", ["perspective", "thinlens", "orthographic"])
+def test_recorded_calls_follow_the_sensor(kind):
+    more = {"aperture_radius": 0.1, "focus_distance": 3.0} if kind == "thinlens" else {}
+    poses = [look_at([x, 0.2, DISTANCE - x], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]) for x in (0.0, 0.3, 0.6, 0.9, 1.2)]
+
+    def make(freeze):
+        contents = {"ball": {"type": "sphere", "radius": RADIUS}, "wall": plane()}
+        return renderer_of(
+            camera(kind, **more), parameters=["sensor.to_world"], options={"freeze": freeze}, **contents
+        )
+
+    values = [{"sensor.to_world": pose.astype(np.float32)} for pose in poses]
+    found = same_recorded(make, values, LABELS, hidden=kind != "perspective")
+    for pose, labels in zip(poses, found, strict=True):
+        axis = torch.from_numpy(pose[:3, 2].astype(np.float32))
+        away = labels["position"] - torch.from_numpy(pose[:3, 3].astype(np.float32))[:, None, None]
+        close(labels["z_depth"], (away * axis[:, None, None]).sum(0).numpy(), atol=1e-4)
+        if kind != "orthographic":
+            close(labels["depth"], torch.linalg.norm(away, dim=0).numpy(), atol=1e-4)
+
+
+def test_recorded_calls_follow_a_mask():
+    def make(freeze):
+        mask = {"type": "mask", "opacity": {"type": "uniform", "value": 0.2}, "inner": grey(0.2)}
+        pane = plane(to_world=translate([0, 0, 1.0]) @ scale(20.0), bsdf=mask)
+        key = "pane.bsdf.opacity.value"
+        return renderer_of(camera(), parameters=[key], options={"freeze": freeze}, pane=pane, wall=plane())
+
+    opacities = [0.2, 0.8, 0.3, 0.9, 0.1]
+    found = same_recorded(make, [{"pane.bsdf.opacity.value": x} for x in opacities], ["shape", "z_depth", "albedo"])
+    for x, labels in zip(opacities, found, strict=True):
+        assert (labels["shape"] == int(x < 0.5)).all()
+
+
+def test_recorded_calls_follow_a_scan():
+    def make(freeze):
+        meter = {"type": "nlos_capture_meter", "film": film(4, 3), "sensor_origin": [0.5, 0.0, 2.0]}
+        description = scene_of(None, wall={"type": "rectangle", "sensor": meter})
+        del description["sensor"]
+        scene = tt.load(description, variant=VARIANT)
+        key = next(key for key in scene.parameters() if key.endswith("sensor_origin"))
+        return tt.TransientRenderer(scene, parameters=[key], physics="ignore", freeze=freeze)
+
+    (key,) = make(True)._keys
+    origins = [[0.5, 0.0, 2.0], [0.6, 0.1, 1.0], [0.0, 0.0, 3.0], [0.1, 0.2, 2.5], [0.3, 0.3, 1.5]]
+    found = same_recorded(make, [{key: origin} for origin in origins], ["depth", "position", "normals"])
+    for origin, labels in zip(origins, found, strict=True):
+        away = labels["position"] - torch.tensor(origin)[:, None, None]
+        close(labels["depth"], torch.linalg.norm(away, dim=0).numpy(), atol=1e-4)
+
+
+def test_recorded_calls_follow_instances():
+    group = {"type": "shapegroup", "part": {"type": "sphere", "radius": 0.5}}
+
+    def make(freeze):
+        copied = {"type": "instance", "nested": {"type": "ref", "id": "group"}, "to_world": translate([0, 0, 0])}
+        return renderer_of(
+            camera(fov=FOV), parameters=["copied.to_world"], options={"freeze": freeze}, group=group, copied=copied
+        )
+
+    poses = [translate([x, 0, 0]).astype(np.float32) for x in (0.0, 0.2, 0.4, 0.6, 0.8)]
+    names = ["depth", "position", "shape", "normals"]
+    found = same_recorded(make, [{"copied.to_world": pose} for pose in poses], names)
+    for pose, labels in zip(poses, found, strict=True):
+        hit = labels["shape"] == 0
+        away = labels["position"][:, hit] - torch.from_numpy(pose[:3, 3])[:, None]
+        close(torch.linalg.norm(away, dim=0), np.full(int(hit.sum()), 0.5), atol=1e-4)
+
+
+def test_built_scenes_are_freed():
+    renderer = room_renderer(parameters=[WALL_POSE])
+    for n in range(3):
+        scene_labels(renderer, {WALL_POSE: moved(-0.1 * n)}, LABELS)
+    (built,) = [one for options, one in renderer.scene._builds.items() if one.label_tables is not None]
+    scene = weakref.ref(built.scene.integrator())
+    del built
+    renderer.scene._builds.clear()
+    renderer.scene._slots.clear()
+    renderer.scene._recordings.clear()
+    renderer.scene._unsettled.clear()
+    renderer.scene._table = None
+    gc.collect()
+    gc.collect()
+    assert scene() is None

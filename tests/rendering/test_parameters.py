@@ -1,0 +1,396 @@
+"""Parameters: the table, and that a torch value has the effect of the same value written in the scene."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch.autograd import forward_ad
+
+import torchtransient as tt
+from torchtransient.rendering.variant import active_variant
+from torchtransient.testing.small_room import CAMERA, COLOUR, GREY, VARIANT, WALL_POSE, make_room, pose
+
+TURN = np.array([[0.8, 0, 0.6, 0], [0, 1, 0, 0], [-0.6, 0, 0.8, 0], [0, 0, 0, 1.0]])
+
+
+def textured_room() -> dict:
+    room = make_room()
+    pixels = np.linspace(0.1, 0.9, 12, dtype=np.float32).reshape(2, 2, 3)
+    room["wall"]["bsdf"] = {"type": "diffuse", "reflectance": {"type": "bitmap", "data": pixels, "raw": True}}
+    room["box"]["bsdf"] = {"type": "roughconductor", "alpha": 0.4}
+    room["ball"] = {"type": "sphere", "to_world": pose(-0.4, 0.2, 0.4, 0.25)}
+    room["spot"] = {
+        "type": "spot",
+        "to_world": np.diag([1.0, -1, -1, 1]) + pose(-0.3, 0, 3) - np.eye(4),
+        "intensity": 3.0,
+    }
+    room["lamp"] = {
+        "type": "rectangle",
+        "to_world": np.diag([0.2, -0.2, -0.2, 1]) + pose(0.2, 0.8, 2.5) - np.eye(4),
+        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [4.0, 5.0, 6.0]}},
+    }
+    return room
+
+
+def set_pixels(room, value):
+    room["wall"]["bsdf"]["reflectance"]["data"] = value
+
+
+# key -> (new value, how the dictionary says the same)
+WRITTEN = {
+    "wall.bsdf.reflectance.data": (np.full((2, 2, 3), 0.35) + 0.1 * np.arange(3), set_pixels),
+    "box.bsdf.alpha.value": (np.array(0.2), lambda room, v: room["box"]["bsdf"].update(alpha=float(v))),
+    "wall.to_world": (pose(0.1, 0, -0.3, 3.0) @ TURN, lambda room, v: room["wall"].update(to_world=v)),
+    "ball.to_world": (pose(-0.3, 0.1, 0.6, 0.3), lambda room, v: room["ball"].update(to_world=v)),
+    "box.to_world": (pose(0.2, 0.1, 0.4, 0.35) @ TURN, lambda room, v: room["box"].update(to_world=v)),
+    "light.position": (np.array([-0.4, 0.1, 3.5]), lambda room, v: room["light"].update(position=v.tolist())),
+    "spot.to_world": (
+        np.diag([1.0, -1, -1, 1]) + pose(0.3, 0.1, 3.2) - np.eye(4),
+        lambda room, v: room["spot"].update(to_world=v),
+    ),
+    "lamp.emitter.radiance.value": (
+        np.array([1.0, 2.0, 3.0]),
+        lambda room, v: room["lamp"]["emitter"]["radiance"].update(value=v.tolist()),
+    ),
+    "lamp.to_world": (
+        np.diag([0.3, -0.3, -0.3, 1]) + pose(0.1, 0.7, 2.4) - np.eye(4),
+        lambda room, v: room["lamp"].update(to_world=v),
+    ),
+    "sensor.to_world": (CAMERA + pose(0.05, 0.1, 0.2) - np.eye(4), lambda room, v: room["sensor"].update(to_world=v)),
+    "sensor.x_fov": (np.array(15.0), lambda room, v: room["sensor"].update(fov=float(v))),
+}
+
+
+@pytest.fixture(scope="module")
+def textured():
+    return tt.load(textured_room(), variant=VARIANT)
+
+
+@pytest.mark.parametrize("key", list(WRITTEN))
+def test_value_has_the_effect_of_the_same_value_in_the_scene(textured, key):
+    value, write = WRITTEN[key]
+    renderer = tt.TransientRenderer(textured, parameters=[key], spp=16, temporal_filter="tent")
+    before = renderer(seed=2).transient.detach()
+    given = renderer({key: torch.tensor(value, dtype=torch.float32)}, seed=2).transient.detach()
+    room = textured_room()
+    write(room, value)
+    written = tt.TransientRenderer(tt.load(room, variant=VARIANT), parameters=[key], spp=16, temporal_filter="tent")(
+        seed=2
+    )
+    assert (given - before).abs().max() > 1e-3, "the value has no effect: the test would not notice anything"
+    # A few samples graze an edge and land on its other side when a matrix is rounded differently.
+    close = torch.isclose(given, written.transient.detach(), rtol=1e-3, atol=1e-4)
+    assert close.float().mean() > 0.99
+    torch.testing.assert_close(given.sum(), written.transient.detach().sum(), rtol=1e-3, atol=0)
+
+
+@pytest.mark.parametrize("key", [*WRITTEN, "box.vertex_positions", "box.vertex_normals", "light.intensity.value"])
+def test_start_value_is_the_scene_and_the_scene_is_restored(textured, key):
+    plain = tt.TransientRenderer(textured, parameters=["wall.bsdf.reflectance.data"], spp=8, temporal_filter="tent")
+    expected = plain(seed=1).transient.detach()
+    renderer = tt.TransientRenderer(textured, parameters=[key], spp=8, temporal_filter="tent")
+    own = renderer(seed=1).transient.detach()
+    close = torch.isclose(own, expected, rtol=1e-3, atol=1e-4)
+    assert close.float().mean() > 0.99
+    assert torch.equal(plain(seed=1).transient.detach(), expected)
+
+
+SLOW_TO_COMPILE = ("sensor.to_world", "lamp.to_world")
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        pytest.param(key, marks=pytest.mark.slow) if key in SLOW_TO_COMPILE else key
+        for key in (*WRITTEN, "box.vertex_positions", "box.vertex_normals", "light.intensity.value")
+    ],
+)
+def test_forward_and_reverse_mode_agree_and_restore_the_scene(textured, room_scene, key):
+    # The plain room for the sensor: its kernels carry the adjoint of the ray and take long to compile.
+    scene = room_scene if key.startswith("sensor") else textured
+    renderer = tt.TransientRenderer(scene, parameters=[key], spp=64, grad_seed="same", temporal_filter="tent")
+    x = renderer.values[key]
+    generator = torch.Generator().manual_seed(11)
+    tangent = torch.randn(x.shape, generator=generator)
+    out = renderer(seed=3).transient
+    weights = torch.rand(out.shape, generator=generator).cumsum(-3)
+    (out * weights).sum().backward()
+    with forward_ad.dual_level():
+        pushed = renderer({key: forward_ad.make_dual(x.detach(), tangent)}, seed=3).transient
+        along = forward_ad.unpack_dual((pushed * weights).sum()).tangent.item()
+    assert torch.equal(renderer(seed=3).transient, out)
+    scale = float((x.grad * tangent).abs().sum())
+    assert scale > 0
+    assert along == pytest.approx(float((x.grad * tangent).sum()), abs=2e-3 * scale)
+
+
+def test_flat_vertices_are_taken(room_scene):
+    renderer = tt.TransientRenderer(room_scene, parameters=["box.vertex_positions"], spp=8)
+    moved = renderer.values["box.vertex_positions"].detach() + 0.05
+    assert moved.shape == (24, 3)
+    flat = moved.reshape(-1).clone().requires_grad_()
+    out = renderer({"box.vertex_positions": flat}, seed=0).transient
+    assert torch.equal(out, renderer({"box.vertex_positions": moved}, seed=0).transient)
+    out.square().sum().backward()
+    assert flat.grad.shape == (72,) and flat.grad.abs().max() > 0
+    batch = renderer({"box.vertex_positions": flat.detach().expand(2, 72)}, seed=0).transient
+    assert torch.equal(batch[0], out.detach())
+
+
+def test_a_pattern_that_shifts_over_a_light_is_sampled_where_it_is(tmp_path):
+    """Mitsuba samples patterns by a map that it keeps when texture coordinates alone change."""
+    pixels = np.linspace(0.1, 9.0, 16, dtype=np.float32).reshape(4, 4, 1).repeat(3, axis=2)
+    corners = np.array([[0.1, 0.1], [0.6, 0.1], [0.6, 0.6], [0.1, 0.6]])
+
+    def lit_by(name, uv):
+        lines = [f"v {x} {y} 0" for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))] + [f"vt {u} {v}" for u, v in uv]
+        (tmp_path / name).write_text("\n".join([*lines, "f 1/1 2/2 3/3", "f 1/1 3/3 4/4", ""]))
+        radiance = {"type": "bitmap", "data": pixels, "raw": True}
+        room = make_room()
+        room["lamp"] = {
+            "type": "obj",
+            "filename": str(tmp_path / name),
+            "to_world": np.diag([0.5, -0.5, -0.5, 1]) + pose(0.2, 0.6, 2.0) - np.eye(4),
+            "emitter": {"type": "area", "radiance": radiance},
+        }
+        return tt.TransientRenderer(
+            tt.load(room, variant=VARIANT), parameters=["lamp.vertex_texcoords"], spp=64, temporal_filter="tent"
+        )
+
+    moved = corners + np.array([0.3, 0.25])
+    before, written = lit_by("before.obj", corners), lit_by("moved.obj", moved)
+    expected = written(seed=1).transient.detach()
+    # The loader of these files turns the second coordinate over.
+    uv = before.values["lamp.vertex_texcoords"].detach()
+    uv = uv + torch.tensor([0.3, -0.25]).repeat(4).reshape_as(uv)
+    given = before({"lamp.vertex_texcoords": uv}, seed=1).transient.detach()
+    torch.testing.assert_close(given.sum(), expected.sum(), rtol=1e-4, atol=0)
+    assert (before(seed=1).transient.sum() - expected.sum()).abs() > 0.01 * expected.sum()
+
+
+def test_mesh_pose_keeps_authored_normals(tmp_path):
+    import mitsuba as mi
+
+    with_normals = tmp_path / "smooth.ply"
+    with active_variant(VARIANT):
+        mesh = mi.Mesh("tri", 3, 1, has_vertex_normals=True)
+        params = mi.traverse(mesh)
+        params["vertex_positions"] = [-1, -1, 0, 1, -1, 0, 0, 1, 0]
+        params["faces"] = [0, 1, 2]
+        params.update()
+        params["vertex_normals"] = [0.6, 0, 0.8, -0.6, 0, 0.8, 0, 0.6, 0.8]
+        params.update()
+        mesh.write_ply(str(with_normals))
+    room = make_room()
+    room["box"] = {"type": "ply", "filename": str(with_normals), "to_world": pose(0, 0, 0.5, 0.5)}
+    scene = tt.load(room, variant=VARIANT)
+    plain = tt.TransientRenderer(scene, parameters=[GREY], spp=16, temporal_filter="tent")(seed=0).transient.detach()
+    posed = tt.TransientRenderer(scene, parameters=["box.to_world"], spp=16)(seed=0).transient.detach()
+    torch.testing.assert_close(posed, plain, rtol=1e-3, atol=1e-4)
+
+
+def test_table_says_what_is_differentiable(textured):
+    table = textured.parameters()
+    assert table[WALL_POSE].differentiable and "silhouettes" in table[WALL_POSE].reason
+    assert table["light.position"].differentiable and table["light.position"].moves_path_length
+    assert "silhouettes" in table["light.position"].reason, "shadows move with a light"
+    assert not table["lamp.emitter.radiance.value"].moves_path_length
+    assert not table["box.faces"].differentiable
+    assert not table["sensor.near_clip"].differentiable
+    assert table["wall.bsdf.reflectance.data"].shape == (2, 2, 3)
+    assert table["box.vertex_positions"].shape == (24, 3)
+    assert table["ball.to_world"].shape == (4, 4)
+    np.testing.assert_allclose(table["box.to_world"].value, pose(0.4, 0.0, 0.5, 0.3))
+    text = str(table)
+    for word in ("box.to_world", "(24, 3)", "no: ", "silhouettes"):
+        assert word in text
+    assert "sensor.near_clip" not in table.differentiable() and "box.to_world" in table.differentiable()
+
+
+def test_table_says_what_moves(textured):
+    table = textured.parameters()
+    for key in (WALL_POSE, "box.to_world", "box.vertex_positions", "light.position", "sensor.x_fov"):
+        assert table[key].moves_path_length and table[key].moves_silhouette and not table[key].moves_medium
+        assert "silhouettes" in table[key].reason
+    for key in ("lamp.emitter.radiance.value", "box.bsdf.alpha.value", "wall.bsdf.reflectance.data"):
+        assert not (table[key].moves_path_length or table[key].moves_silhouette or table[key].biased)
+
+
+def test_normals_of_a_mirror_take_a_filter_with_a_slope():
+    bumps = {"type": "bitmap", "raw": True, "data": np.full((2, 2, 3), 0.5, dtype=np.float32)}
+    key = "box.bsdf.normalmap.data"
+    for nested, filter_name in (("conductor", "tent"), ("diffuse", "box")):
+        room = make_room()
+        room["box"]["bsdf"] = {"type": "normalmap", "normalmap": bumps, "nested": {"type": nested}}
+        renderer = tt.TransientRenderer(tt.load(room, variant=VARIANT), parameters=[key], spp=4)
+        assert renderer.effective_filter == filter_name
+        assert renderer.has_slope_for([key])
+
+
+@pytest.mark.parametrize("plugin", ["thindielectric", "hair", "roughplastic"])
+def test_indices_that_bend_nothing_keep_the_box(plugin):
+    room = make_room()
+    room["box"]["bsdf"] = {"type": plugin}
+    scene = tt.load(room, variant=VARIANT)
+    assert scene.parameters()["box.bsdf.eta"].differentiable
+    assert tt.TransientRenderer(scene, parameters=["box.bsdf.eta"]).effective_filter == "box"
+
+
+@pytest.mark.parametrize("key", ["alpha", "eta"])
+def test_rough_plastic_is_built_with_its_derivative(key):
+    room = make_room()
+    room["box"]["bsdf"] = {"type": "twosided", "nested": {"type": "roughplastic", "alpha": 0.3}}
+    scene = tt.load(room, variant=VARIANT)
+    key = f"box.bsdf.brdf_0.{key}"
+    info = scene.parameters()[key]
+    assert info.differentiable and not info.biased and "diff_rough_plastic" in info.reason
+    renderer = tt.TransientRenderer(scene, parameters=[key], spp=64)
+    own = tt.TransientRenderer(scene, parameters=["light.intensity.value"], spp=64)
+    image = renderer(seed=0).steady
+    # Values and random numbers are those of Mitsuba's, up to the rounding of the tables.
+    torch.testing.assert_close(image.detach(), own(seed=0).steady.detach(), rtol=1e-3, atol=1e-4 * float(image.max()))
+    image.sum().backward()
+    assert renderer.values[key].grad.abs() > 1e-4
+
+
+def test_table_of_a_scene_with_a_parameter_that_is_not_set():
+    room = make_room()
+    room["box"]["bsdf"] = {"type": "hair"}
+    scene = tt.load(room, variant=VARIANT)
+    absorption = scene.parameters()["box.bsdf.sigma_a"]
+    assert absorption.value is None and absorption.shape is None and not absorption.differentiable
+    renderer = tt.TransientRenderer(scene, parameters=["light.intensity.value"], spp=4, grad_seed="same")
+    out = renderer(seed=0).transient
+    out.sum().backward()
+    intensity = renderer.values["light.intensity.value"]
+    # The image is proportional to the intensity.
+    slope = (intensity.grad * intensity.detach()).sum()
+    torch.testing.assert_close(slope, out.detach().sum(), rtol=1e-4, atol=0)
+
+
+def test_extinction_is_told_from_albedo():
+    room = make_room()
+    room["box"]["bsdf"] = {"type": "null"}
+    room["box"]["interior"] = {"type": "homogeneous", "albedo": 0.5, "sigma_t": 0.3}
+    room["integrator"]["type"] = "transient_prbvolpath"
+    table = tt.load(room, variant=VARIANT).parameters()
+    moving = [key for key, info in table.items() if info.moves_medium and info.differentiable]
+    assert moving == ["box.interior_medium.sigma_t.value.value"]
+    assert table["box.interior_medium.albedo.value.value"].differentiable
+
+
+def test_a_key_that_the_table_does_not_have(room_scene):
+    table = room_scene.parameters()
+    with pytest.raises(
+        tt.errors.SceneError, match=r"^the scene has no parameter 'box\.bsdf\.reflectanse.*Did you mean"
+    ):
+        table["box.bsdf.reflectanse.value"]
+    with pytest.raises(KeyError):
+        table["nope"]
+    assert "nope" not in table and table.get("nope") is None
+
+
+def test_unknown_key_suggests_the_right_one(room_scene):
+    with pytest.raises(tt.errors.SceneError, match=r"box\.bsdf\.reflectance\.value"):
+        tt.TransientRenderer(room_scene, parameters=["box.bsdf.reflectanse.value"])
+    for part in ("box", "bsdf", "reflectance"):
+        with pytest.raises(tt.errors.SceneError, match=r"Did you mean .*box\.bsdf\.reflectance\.value"):
+            tt.TransientRenderer(room_scene, parameters=[part])
+
+
+def test_key_without_derivative(room_scene):
+    with pytest.raises(tt.errors.GradientError, match=r"near_clip.*no derivative"):
+        tt.TransientRenderer(room_scene, parameters=["sensor.near_clip"])
+
+
+def test_two_keys_for_one_thing(room_scene):
+    with pytest.raises(tt.errors.SceneError, match="both set"):
+        tt.TransientRenderer(room_scene, parameters=["box.to_world", "box.vertex_positions"])
+
+
+def test_refused_value_names_the_key(room_scene):
+    renderer = tt.TransientRenderer(room_scene, parameters=["sensor.to_world"], spp=4)
+    good = renderer(seed=0).transient.detach()
+    with pytest.raises(tt.errors.SceneError, match=r"sensor\.to_world"):
+        renderer({"sensor.to_world": torch.eye(4) * 2}, seed=0)
+    assert torch.equal(renderer(seed=0).transient.detach(), good)
+
+
+def test_equal_materials_stay_apart():
+    room = make_room()
+    room["wall"]["bsdf"] = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.5, 0.5, 0.5]}}
+    room["box"]["bsdf"] = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.5, 0.5, 0.5]}}
+    keys = ["wall.bsdf.reflectance.value", COLOUR]
+    renderer = tt.TransientRenderer(tt.load(room, variant=VARIANT), parameters=keys, spp=16)
+    renderer(seed=0).steady.sum().backward()
+    a, b = (renderer.values[k].grad for k in keys)
+    assert a.abs().min() > 0 and b.abs().min() > 0 and not torch.allclose(a, b)
+
+
+def test_shared_material_collects_from_all_its_shapes():
+    def gradient(shared):
+        room = make_room()
+        paint = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.5, 0.5, 0.5]}}
+        keys = ["wall.bsdf.reflectance.value", COLOUR]
+        room["wall"]["bsdf"], room["box"]["bsdf"] = dict(paint), dict(paint)
+        if shared:
+            keys = ["paint.reflectance.value"]
+            # Mitsuba names a shared object after the first place where it is met.
+            room = {"type": "scene", "paint": paint, **room}
+            room["wall"]["bsdf"] = room["box"]["bsdf"] = {"type": "ref", "id": "paint"}
+        renderer = tt.TransientRenderer(tt.load(room, variant=VARIANT), parameters=keys, spp=64, grad_seed=1)
+        renderer(seed=0).steady.sum().backward()
+        return sum(renderer.values[k].grad for k in keys)
+
+    torch.testing.assert_close(gradient(True), gradient(False), rtol=1e-3, atol=1e-4)
+
+
+# ------------------------------------------------------------------------------------------- index of refraction
+
+
+def glass_room(plugin: str, **settings) -> dict:
+    room = make_room()
+    room["integrator"]["max_depth"] = 6
+    room["slab"] = {
+        "type": "cube",
+        "to_world": np.diag([0.7, 0.7, 0.1, 1.0]) + pose(0, 0, 1.6) - np.eye(4),
+        "bsdf": {"type": plugin, "int_ior": 1.5, "ext_ior": 1.0, **settings},
+    }
+    return room
+
+
+@pytest.mark.parametrize(("plugin", "settings"), [("dielectric", {}), ("roughdielectric", {"alpha": 0.3})])
+def test_index_of_refraction_becomes_differentiable(plugin, settings):
+    scene = tt.load(glass_room(plugin, **settings), variant=VARIANT)
+    info = scene.parameters()["slab.bsdf.eta"]
+    assert info.differentiable and info.moves_path_length and f"diff_{plugin.replace('rough', 'rough_')}" in info.reason
+    renderer = tt.TransientRenderer(scene, parameters=["slab.bsdf.eta"], spp=256)
+    assert renderer.effective_filter == "tent"
+    assert float(renderer.values["slab.bsdf.eta"].detach()) == pytest.approx(1.5)
+    arrival = torch.linspace(0, 1, 24).view(1, 24, 1, 1)
+    (renderer(seed=0).transient * arrival).sum().backward()
+    assert renderer.values["slab.bsdf.eta"].grad.abs() > 1e-4
+    # The plugin that is built for the derivative shows the same picture as Mitsuba's own.
+    own = tt.TransientRenderer(scene, parameters=["light.position"], spp=4096)(seed=0).steady.detach().sum()
+    twin = tt.TransientRenderer(scene, parameters=["slab.bsdf.eta"], spp=4096)(seed=1).steady.detach().sum()
+    assert float(twin) == pytest.approx(float(own), rel=0.03)
+
+
+def test_index_of_an_inline_material_in_xml(tmp_path):
+    xml = """<scene version="3.0.0">
+        <integrator type="transient_path"><integer name="max_depth" value="6"/></integrator>
+        <sensor type="perspective"><transform name="to_world"><translate z="-4"/></transform>
+            <film type="transient_hdr_film"><integer name="width" value="2"/><integer name="height" value="2"/>
+                <integer name="temporal_bins" value="8"/><float name="bin_width_opl" value="2"/></film></sensor>
+        <shape type="sphere" id="first"><bsdf type="dielectric"><float name="int_ior" value="1.2"/></bsdf></shape>
+        <shape type="sphere" id="second"><bsdf type="dielectric"><float name="int_ior" value="1.4"/></bsdf></shape>
+        <emitter type="constant"/></scene>"""
+    path = tmp_path / "glass.xml"
+    path.write_text(xml)
+    renderer = tt.TransientRenderer(tt.load(path, variant=VARIANT), parameters=["second.bsdf.eta"], spp=4)
+    assert float(renderer.values["second.bsdf.eta"].detach()) == pytest.approx(1.4 / 1.000277, rel=1e-6)
+    with active_variant(VARIANT):
+        shapes = renderer.scene.built(renderer._options).scene.shapes()
+        kinds = [type(shape.bsdf()).__name__ for shape in shapes]
+    assert sum(kind.startswith("Diff") for kind in kinds) == 1

@@ -1,0 +1,242 @@
+"""Phasors as torch tensors: shapes, derivatives of complex outputs, how a scene gets its frequencies."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+
+import pytest
+import torch
+
+import torchtransient as tt
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
+from torchtransient.testing.small_room import COLOUR, VARIANT, WALL_POSE, make_room
+
+AXIS = tt.FrequencyAxis.uniform(0.0, 0.15, 5)
+LIST = (0.3, 1.7, -0.4)
+
+
+def phasor_room(**film):
+    room = make_room()
+    size = {key: room["sensor"]["film"][key] for key in ("width", "height", "rfilter")}
+    room["sensor"]["film"] = {"type": "phasor_hdr_film", **size, **(film or {"frequencies": "0.3, 1.7, -0.4"})}
+    return room
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return tt.load(phasor_room(), variant=VARIANT)
+
+
+@pytest.fixture(scope="module")
+def histogram_scene():
+    return tt.load(make_room(), variant=VARIANT)
+
+
+@pytest.fixture(scope="module")
+def weights():
+    """A fixed complex functional of the phasors (3, 3, 3, 4)."""
+    generator = torch.Generator().manual_seed(0)
+    return torch.randn(3, 3, 3, 4, dtype=torch.complex64, generator=generator)
+
+
+def test_shapes_and_types(scene):
+    out = tt.render(scene, seed=0)
+    assert out.phasor.shape == (3, 3, 3, 4) and out.phasor.dtype == torch.complex64
+    assert out.steady.shape == (3, 3, 4) and out.steady.dtype == torch.float32
+    assert out.transient is None and out.axis is None
+    assert out.frequencies == tt.FrequencyAxis(LIST)
+    torch.testing.assert_close(out.frequencies.per_metre, torch.tensor(LIST, dtype=torch.float64))
+    assert out.stats.temporal_filter == "" and out.stats.energy_after == (0.0,)
+
+
+def test_frequency_zero_is_the_steady_image(histogram_scene):
+    out = tt.render(histogram_scene, seed=0, frequencies=AXIS)
+    torch.testing.assert_close(out.phasor[:, 0].real, out.steady)
+    assert torch.equal(out.steady, tt.render(histogram_scene, seed=0).steady)
+
+
+@pytest.mark.parametrize("given", [tt.FrequencyAxis(LIST), LIST, torch.tensor(LIST, dtype=torch.float64)])
+def test_frequencies_replace_the_film(scene, histogram_scene, given):
+    expected = tt.render(scene, seed=3)
+    found = tt.render(histogram_scene, seed=3, frequencies=given)
+    torch.testing.assert_close(found.phasor, expected.phasor)
+    assert found.frequencies == expected.frequencies
+    steady = make_room()
+    film = steady["sensor"]["film"]
+    steady["sensor"]["film"] = {"type": "hdrfilm", **{k: film[k] for k in ("width", "height", "rfilter")}}
+    steady["integrator"]["type"] = "path"
+    torch.testing.assert_close(tt.render(tt.load(steady, VARIANT), seed=3, frequencies=given).phasor, expected.phasor)
+
+
+def test_frequencies_and_time_axes_replace_each_other(histogram_scene):
+    given = {"wl_mean": 2.0, "wl_sigma": 4.0, "temporal_bins": 200, "bin_width_opl": 0.1}
+    scene = tt.load(phasor_room(**given), variant=VARIANT)
+    assert tt.render(scene, seed=0).frequencies.num_frequencies == 7
+    assert tt.render(scene, seed=0, frequencies=[0.25]).frequencies == tt.FrequencyAxis((0.25,))
+    axis = tt.TimeAxis(6.0, 0.25, 24)
+    back = tt.render(scene, seed=0, time_axis=axis)
+    assert back.phasor is None and back.frequencies is None and back.axis == axis
+    torch.testing.assert_close(back.transient, tt.render(histogram_scene, seed=0).transient)
+
+
+def test_the_origin_of_the_phase(histogram_scene):
+    late = tt.FrequencyAxis(LIST, start_opl=1.25)
+    a = tt.render(histogram_scene, seed=0, frequencies=LIST)
+    b = tt.render(histogram_scene, seed=0, frequencies=late)
+    assert b.frequencies == late
+    turned = a.phasor * torch.exp(2j * torch.pi * late.per_metre * 1.25)[:, None, None]
+    torch.testing.assert_close(b.phasor, turned.to(torch.complex64), rtol=1e-5, atol=1e-6)
+
+
+def test_bad_settings(scene, histogram_scene):
+    with pytest.raises(ArgumentError, match="one of them"):
+        tt.render(histogram_scene, frequencies=LIST, time_axis=tt.TimeAxis(0.0, 0.1, 10))
+    with pytest.raises(ArgumentError, match="phasor film has none"):
+        tt.render(scene, temporal_filter="tent")
+    with pytest.raises(UnitError, match="finite"):
+        tt.render(scene, frequencies=[float("nan")])
+    with pytest.raises(ShapeError, match="at least one"):
+        tt.render(scene, frequencies=[])
+    with pytest.raises(UnitError, match="one number"):
+        tt.render(scene, frequencies=["fast"])
+
+
+def test_batch_and_sensors_come_first():
+    room = phasor_room()
+    room["sensor_2"] = copy.deepcopy(room["sensor"])
+    renderer = tt.TransientRenderer(tt.load(room, variant=VARIANT), parameters=[COLOUR], spp=4, sensors="all")
+    values = torch.rand(5, 3, generator=torch.Generator().manual_seed(1))
+    out = renderer({COLOUR: values}, seed=0)
+    assert out.phasor.shape == (5, 2, 3, 3, 3, 4) and out.steady.shape == (5, 2, 3, 3, 4)
+    first = tt.TransientRenderer(tt.load(room, variant=VARIANT), parameters=[COLOUR], spp=4)
+    torch.testing.assert_close(first({COLOUR: values[0]}, seed=0).phasor, out.phasor[0, 0])
+
+
+def test_it_is_the_films_own_memory(scene):
+    out = tt.render(scene, seed=0)
+    storage = torch.view_as_real(out.phasor)
+    assert storage.permute(2, 3, 1, 0, 4).is_contiguous() and not out.phasor.is_contiguous()
+
+
+# ----------------------------------------------------------------------------------------------- derivatives
+
+
+def renderer_of(scene, *keys):
+    return tt.TransientRenderer(scene, parameters=list(keys), spp=16, grad_seed="same")
+
+
+def linear(out, weights):
+    """A real functional with another weight for every real and imaginary part, and for the steady image."""
+    return (out.phasor * weights.conj()).sum().real + 0.3 * out.steady.sum()
+
+
+@pytest.mark.parametrize("key", [COLOUR, WALL_POSE])
+def test_forward_and_reverse_mode_agree(scene, weights, key):
+    renderer = renderer_of(scene, key)
+    value = renderer.values[key].detach()
+    tangent = torch.zeros_like(value)
+    if key == WALL_POSE:
+        tangent[2, 3] = 1.0
+    else:
+        tangent[:] = torch.tensor([0.3, -0.2, 0.5])
+    _, (d_phasor, d_steady) = torch.func.jvp(
+        lambda x: (lambda out: (out.phasor, out.steady))(renderer({key: x}, seed=2)), (value,), (tangent,)
+    )
+    assert d_phasor.dtype == torch.complex64 and d_phasor.abs().max() > 0
+    forward = (d_phasor * weights.conj()).sum().real + 0.3 * d_steady.sum()
+    x = value.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(linear(renderer({key: x}, seed=2), weights), x)
+    torch.testing.assert_close((gradient * tangent).sum(), forward, rtol=1e-4, atol=1e-5)
+
+
+def test_reverse_mode_against_finite_differences(scene, weights):
+    """One bounce is linear in the colour: with common random numbers a difference quotient is exact."""
+    renderer = tt.TransientRenderer(scene, parameters=[COLOUR], spp=16, grad_seed="same", max_depth=2)
+    value = torch.tensor([0.5, 0.4, 0.3])
+    x = value.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(linear(renderer({COLOUR: x}, seed=1), weights), x)
+    for c in range(3):
+        step = torch.zeros(3)
+        step[c] = 0.1
+        above, below = (linear(renderer({COLOUR: value + s * step}, seed=1), weights) for s in (1, -1))
+        assert float((above - below) / 0.2) == pytest.approx(float(gradient[c]), rel=2e-3, abs=1e-4)
+
+
+@pytest.mark.parametrize("loss", ["abs", "angle", "real", "imag", "square"])
+def test_losses_of_complex_numbers(scene, loss):
+    """Torch's own rules meet ours at the complex output: reverse mode equals forward mode for each."""
+    functions = {
+        "abs": lambda p: p.abs().sum(),
+        "angle": lambda p: torch.sin(p[:, 0].angle()).sum(),
+        "real": lambda p: p.real.sum(),
+        "imag": lambda p: p.imag.square().sum(),
+        "square": lambda p: (p - 0.1j).abs().square().sum(),
+    }
+    renderer = renderer_of(scene, WALL_POSE)
+    value = renderer.values[WALL_POSE].detach()
+    tangent = torch.zeros(4, 4)
+    tangent[2, 3] = 1.0
+
+    def function(x):
+        return functions[loss](renderer({WALL_POSE: x}, seed=4).phasor)
+
+    x = value.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(function(x), x)
+    _, forward = torch.func.jvp(function, (value,), (tangent,))
+    assert float(forward) != 0
+    assert float((gradient * tangent).sum()) == pytest.approx(float(forward), rel=1e-3)
+
+
+def test_geometry_needs_no_temporal_filter(scene):
+    renderer = renderer_of(scene, WALL_POSE)
+    assert renderer.effective_filter == "" and renderer.has_slope_for([WALL_POSE])
+    renderer(seed=0).phasor.abs().square().sum().backward()
+    assert renderer.values[WALL_POSE].grad[2, 3] != 0
+
+
+def test_batches_have_their_own_gradients(scene, weights):
+    renderer = renderer_of(scene, COLOUR)
+    values = torch.rand(3, 3, generator=torch.Generator().manual_seed(2))
+    x = values.clone().requires_grad_()
+    out = renderer({COLOUR: x}, seed=[1, 2, 3])
+    (together,) = torch.autograd.grad((out.phasor * weights.conj()).sum().real, x)
+    for n in range(3):
+        y = values[n].clone().requires_grad_()
+        single = renderer({COLOUR: y}, seed=n + 1)
+        (alone,) = torch.autograd.grad((single.phasor * weights.conj()).sum().real, y)
+        torch.testing.assert_close(together[n], alone, rtol=1e-4, atol=1e-5)
+
+
+def test_vmap_and_jacobians(scene):
+    renderer = renderer_of(scene, COLOUR)
+    values = torch.rand(2, 3, generator=torch.Generator().manual_seed(3))
+    mapped = torch.func.vmap(lambda x: renderer({COLOUR: x}, seed=5).phasor)(values)
+    torch.testing.assert_close(mapped[1], renderer({COLOUR: values[1]}, seed=5).phasor)
+
+    def power(x):
+        return renderer({COLOUR: x}, seed=5).phasor[:, 0].abs().square().sum((-1, -2))
+
+    forward, reverse = torch.func.jacfwd(power)(values[0]), torch.func.jacrev(power)(values[0])
+    torch.testing.assert_close(forward, reverse, rtol=1e-3, atol=1e-6)
+
+
+def test_copies_and_pickles_keep_the_frequencies(histogram_scene):
+    renderer = tt.TransientRenderer(histogram_scene, parameters=[COLOUR], frequencies=AXIS, spp=4)
+    expected = renderer(seed=1).phasor
+    for twin in (copy.deepcopy(renderer), pickle.loads(pickle.dumps(renderer))):
+        torch.testing.assert_close(twin(seed=1).phasor, expected)
+    assert "frequencies=FrequencyAxis(5" in repr(renderer)
+
+
+def test_cotangents_in_any_layout(scene, weights):
+    """A cotangent that is conjugated lazily, expanded or strided is read as what it is."""
+    renderer = renderer_of(scene, COLOUR)
+    out = renderer(seed=0).phasor
+    plain = torch.autograd.grad(out, renderer.values[COLOUR], weights.conj().resolve_conj(), retain_graph=True)[0]
+    lazy = torch.autograd.grad(out, renderer.values[COLOUR], weights.conj(), retain_graph=True)[0]
+    strided = torch.empty(4, 3, 3, 3, dtype=torch.complex64).permute(1, 2, 3, 0)
+    strided.copy_(weights.conj())
+    transposed = torch.autograd.grad(out, renderer.values[COLOUR], strided)[0]
+    torch.testing.assert_close(lazy, plain)
+    torch.testing.assert_close(transposed, plain)

@@ -1,0 +1,152 @@
+"""Plugins of others under recorded calls: right whatever they keep and however they keep it, or traced."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+import torchtransient as tt
+from support import foreign_paint
+from torchtransient.rendering.recordings import LAUNCHED, OWN_ENTRY
+from torchtransient.rendering.variant import active_variant
+from torchtransient.testing.small_room import GREY, VARIANT, make_room
+
+KEY = "wall.bsdf.value"
+
+
+@pytest.fixture(autouse=True)
+def variant():
+    with active_variant(VARIANT):
+        yield
+
+
+def painted(kept, says=True, lazy=False):
+    """The same room with a wall in the paint, traced and recorded."""
+    room = make_room()
+    room["wall"]["bsdf"] = {"type": foreign_paint.register(kept, says, lazy)}
+    scene = tt.load(room, variant=VARIANT)
+    return [tt.TransientRenderer(scene, parameters=[KEY], spp=2, physics="ignore", freeze=f) for f in (False, True)]
+
+
+def steady(renderer, value):
+    with torch.no_grad():
+        out = renderer({KEY: torch.full_like(renderer.values[KEY], value)}, seed=0)
+    return float(out.steady.sum()), out.stats.recorded[0]
+
+
+@pytest.mark.parametrize("says", [False, True])
+@pytest.mark.parametrize("kept", foreign_paint.KEPT)
+def test_whatever_a_plugin_keeps(kept, says):
+    traced, recorded = painted(kept, says)
+    said = []
+    for value in (0.5, 0.5, 0.5, 0.9, 0.2):
+        expected, _ = steady(traced, value)
+        got, words = steady(recorded, value)
+        assert got == pytest.approx(expected, rel=1e-5), (value, words)
+        said.append(words)
+    if not says:
+        assert all("Paint does not say that it can be" in words for words in said)
+    elif kept == "generator":
+        assert all("cannot be told of a builtins.generator" in words for words in said)
+    else:
+        # Of the same number the kernels are launched; arrays that are handed over need not even be that.
+        assert said[2] == LAUNCHED
+        assert (said[3] == LAUNCHED) == (kept == "array of Dr.Jit in a plain object")
+
+
+def test_an_attribute_that_changes_its_type_is_an_error():
+    traced, recorded = painted("float", lazy=True)
+
+    def fail():
+        for value in (0.5, 0.5, 0.5, 0.9):
+            steady(recorded, value)
+
+    with pytest.raises(tt.errors.SceneError, match="changed the type of an attribute"):
+        fail()
+    # Nothing of it is left in the scene.
+    fresh = painted("float", lazy=True)[0]
+    assert steady(traced, 0.9)[0] == pytest.approx(steady(fresh, 0.9)[0], rel=1e-6)
+
+
+def test_a_film_with_storage_of_its_own_is_not_lent_another():
+    import drjit as dr
+    import mitsuba as mi
+
+    from torchtransient.plugins.films.histogram import TransientHDRFilm
+
+    class OwnStorage(TransientHDRFilm):
+        def prepare(self, aovs=(), samples=0):
+            height, width = self.cube_shape()[:2]
+            self.bands = [(0, height, dr.zeros(mi.Float, height * width * self.entries_per_pixel()))]
+            self.steady, self.outside = dr.zeros(mi.Float, height * width * 3), dr.zeros(mi.Float, height * width * 2)
+            return 3
+
+    built = tt.load(make_room(), variant=VARIANT)
+    renderer = tt.TransientRenderer(built, parameters=[GREY], spp=2)
+    film = renderer.scene.built(renderer._options).scene.sensors()[0].film()
+    assert film.can_borrow(2)
+    film.__class__ = OwnStorage
+    assert not film.can_borrow(2)
+    assert "OwnStorage does not say" in renderer(seed=0).stats.recorded[0]
+
+
+def test_a_render_of_an_integrators_own_is_called():
+    from torchtransient.plugins.integrators.path import TransientPath
+
+    calls = []
+
+    class Own(TransientPath):
+        def render(self, *args, **kwargs):
+            calls.append(kwargs["seed"])
+            return super().render(*args, **kwargs)
+
+    scene = tt.load(make_room(), variant=VARIANT)
+    renderer = tt.TransientRenderer(scene, parameters=[GREY], spp=2)
+    expected = [renderer(seed=seed).steady for seed in range(3)]
+    renderer.scene.built(renderer._options).scene.integrator().__class__ = Own
+    for seed in range(3):
+        out = renderer(seed=seed)
+        torch.testing.assert_close(out.steady, expected[seed], rtol=1e-5, atol=1e-6)
+        assert out.stats.recorded == (OWN_ENTRY,)
+    assert calls == [0, 1, 2]
+
+
+# -------------------------------------------------------------------------------------------- what is told apart
+
+
+def structure(value):
+    from torchtransient.plugins.frozen_state import state_below
+
+    return state_below(value)[0]
+
+
+@pytest.mark.parametrize(
+    ("a", "b"),
+    [
+        (0.0, -0.0), (1, 1.0), (1, True), ([1], (1,)), ({"a": 1}, {"b": 1}), ([[1], 2], [1, [2]]), ("1", 1),
+        ({1: {2}}, {1: {3}}), (0.5, math.nextafter(0.5, 1)), (range(3), range(4)), (b"a", b"b"), (1j, 2j),
+    ],
+)  # fmt: skip
+def test_structures_differ(a, b):
+    assert structure([a]) != structure([b])
+    assert structure([a]) == structure([a])
+
+
+def test_not_a_number_is_like_another():
+    assert structure([float("nan")]) == structure([float("inf") - float("inf")])
+
+
+INCOMPARABLE = {"iterator": iter([1]), "builtin": open, "object": {1: object()}, "set": {(1, 2)}, "lambda": lambda: 0}
+
+
+@pytest.mark.parametrize("value", INCOMPARABLE.values(), ids=INCOMPARABLE)
+def test_what_cannot_be_compared_is_refused(value):
+    from torchtransient.plugins.frozen_state import NotComparableError
+
+    if callable(value) and value.__class__.__name__ == "function":
+        assert structure(value)
+        return
+    with pytest.raises(NotComparableError):
+        structure(value)

@@ -1,0 +1,418 @@
+"""The layer: shapes, batches, sensors, seeds, statistics, and errors that say what to do."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import torchtransient as tt
+from torchtransient.rendering import memory
+from torchtransient.rendering.seeds import mix_seed
+from torchtransient.rendering.variant import active_variant
+from torchtransient.testing.small_room import CAMERA, COLOUR, GREY, VARIANT, WALL_POSE, make_room, pose
+
+START = torch.tensor([0.8, 0.5, 0.2])
+
+
+def test_output(room_scene):
+    out = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=16)(seed=0)
+    assert out.transient.shape == (3, 24, 3, 4) and out.transient.dtype == torch.float32
+    assert out.steady.shape == (3, 3, 4) and out.phasor is None
+    assert out.axis == tt.TimeAxis(start_opl=6.0, bin_width_opl=0.25, num_bins=24)
+    torch.testing.assert_close(out.transient.sum(1), out.steady)
+    assert out.steady.min() > 0
+
+
+def test_channels_and_pixels_are_where_they_belong(room_scene):
+    colour = torch.tensor([0.9, 0.0, 0.0])
+    steady = tt.render(room_scene, {COLOUR: colour}, spp=64, seed=0).steady
+    full = tt.render(room_scene, {COLOUR: torch.ones(3)}, spp=64, seed=0).steady
+    # The camera looks along -z with x to its right: the cube at x = 0.4 is in the right half of the picture.
+    blue_lost = (full - steady)[2]
+    assert blue_lost[:, 2:].sum() > 20 * blue_lost[:, :2].sum()
+    assert (full - steady)[0].sum() < 0.2 * blue_lost.sum()
+
+
+def test_statistics(room_scene):
+    out = tt.TransientRenderer(room_scene, spp=16, time_axis=tt.TimeAxis(8.0, 0.25, 2))(seed=5)
+    stats = out.stats
+    assert (stats.spp, stats.variant, stats.integrator, stats.seeds) == (16, VARIANT, "transient_path", (5,))
+    assert stats.temporal_filter == "box" and stats.seconds > 0
+    assert stats.samples_per_second == pytest.approx(16 * 12 / stats.seconds)
+    outside = stats.energy_before[0] + stats.energy_after[0]
+    inside = float(out.transient.mean(0).sum())
+    assert outside > 0
+    assert inside + outside == pytest.approx(float(out.steady.mean(0).sum()), rel=1e-4)
+
+
+def test_function_and_module_agree(room_scene):
+    x = torch.tensor([0.3, 0.6, 0.9])
+    module = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=16)
+    assert torch.equal(
+        module({COLOUR: x}, seed=4).transient, tt.render(room_scene, {COLOUR: x}, spp=16, seed=4).transient
+    )
+    y = x.clone().requires_grad_()
+    tt.render(room_scene, {COLOUR: y}, spp=16, seed=4).transient.sum().backward()
+    assert y.grad.abs().min() > 0
+
+
+def test_function_takes_a_dictionary_and_no_values():
+    out = tt.render(make_room(), spp=4, seed=0)
+    assert out.steady.min() > 0 and not out.steady.requires_grad
+
+
+def test_start_values_may_be_given(room_scene):
+    renderer = tt.TransientRenderer(room_scene, parameters={COLOUR: [0.1, 0.2, 0.3], GREY: None}, spp=4)
+    torch.testing.assert_close(renderer.values[COLOUR].detach(), torch.tensor([0.1, 0.2, 0.3]))
+    assert float(renderer.values[GREY].detach()) == 0.5
+    assert [name for name, _ in renderer.named_parameters()] == [
+        "box/bsdf/reflectance/value",
+        "wall/bsdf/reflectance/value",
+    ]
+
+
+# ------------------------------------------------------------------------------------------------- seeds, batches
+
+
+def test_same_seed_same_tensor(room_scene):
+    renderer = tt.TransientRenderer(room_scene, spp=4)
+    assert torch.equal(renderer(seed=3).transient, renderer(seed=3).transient)
+    assert not torch.equal(renderer(seed=3).transient, renderer(seed=4).transient)
+
+
+def test_derived_seeds_differ():
+    seeds = {mix_seed(seed, number) for seed in range(20) for number in range(50)}
+    assert len(seeds) == 20 + 20 * 49
+    assert all(0 <= s < 2**32 for s in seeds) and mix_seed(7, 0) == 7
+
+
+def test_entries_of_a_batch_have_their_own_noise(room_scene):
+    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=4)
+    x = renderer.values[COLOUR].detach()
+    out = renderer({COLOUR: x.expand(3, 3)}, seed=6)
+    assert torch.equal(out.transient[0], renderer({COLOUR: x}, seed=6).transient)
+    assert not torch.equal(out.transient[0], out.transient[1])
+    for seed, entry in zip(out.stats.seeds, out.transient, strict=True):
+        assert torch.equal(entry, renderer({COLOUR: x}, seed=seed).transient)
+
+
+def test_batch_of_one_keeps_its_dimension(room_scene):
+    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR, GREY], spp=4)
+    assert renderer({GREY: torch.tensor([0.4])}, seed=0).transient.shape == (1, 3, 24, 3, 4)
+    assert renderer({GREY: torch.tensor(0.4)}, seed=0).transient.shape == (3, 24, 3, 4)
+
+
+@pytest.mark.parametrize(("key", "shape"), [(GREY, ()), (COLOUR, (3,)), (WALL_POSE, (4, 4)), ("light.position", (3,))])
+def test_batches_of_every_shape(room_scene, key, shape):
+    renderer = tt.TransientRenderer(room_scene, parameters=[key], spp=4)
+    x = renderer.values[key].detach()
+    assert x.shape == shape
+    out = renderer({key: torch.stack([x, x])}, seed=[1, 2]).transient
+    assert out.shape == (2, 3, 24, 3, 4)
+    assert torch.equal(out[1], renderer({key: x}, seed=2).transient)
+
+
+# ------------------------------------------------------------------------------------------------------- sensors
+
+
+def two_sensor_room(second_width=4):
+    room = make_room()
+    second = {**room["sensor"], "to_world": CAMERA @ pose(0.3, 0.1, 0.5)}
+    second["film"] = {**room["sensor"]["film"], "width": second_width}
+    room["second"] = second
+    return room
+
+
+def test_several_sensors():
+    scene = tt.load(two_sensor_room(), variant=VARIANT)
+    both = tt.TransientRenderer(scene, parameters=[COLOUR], spp=16, sensors="all")
+    out = both(seed=2)
+    assert out.transient.shape == (2, 3, 24, 3, 4) and out.steady.shape == (2, 3, 3, 4)
+    for n, seed in enumerate(out.stats.seeds):
+        single = tt.TransientRenderer(scene, parameters=[COLOUR], spp=16, sensors=n)(seed=seed)
+        assert torch.equal(single.transient, out.transient[n])
+    batch = both({COLOUR: torch.rand(5, 3)}, seed=0)
+    assert batch.transient.shape == (5, 2, 3, 24, 3, 4)
+    assert tt.TransientRenderer(scene, sensors=[1], spp=4)(seed=0).transient.shape == (1, 3, 24, 3, 4)
+
+
+def test_gradients_of_several_sensors_add_up():
+    scene = tt.load(two_sensor_room(), variant=VARIANT)
+
+    def gradient(sensors, seed, weight):
+        renderer = tt.TransientRenderer(scene, parameters=[COLOUR], spp=16, sensors=sensors)
+        (renderer(seed=seed).transient * weight).sum().backward()
+        return renderer.values[COLOUR].grad
+
+    weight = torch.tensor([1.0, 3.0]).view(2, 1, 1, 1, 1)
+    expected = gradient(0, 2, 1.0) + gradient(1, mix_seed(2, 1), 3.0)
+    torch.testing.assert_close(gradient("all", 2, weight), expected)
+
+
+def test_sensors_of_different_size_are_refused():
+    scene = tt.load(two_sensor_room(second_width=5), variant=VARIANT)
+    assert tt.TransientRenderer(scene, sensors=1, spp=4)(seed=0).steady.shape == (3, 3, 5)
+    with pytest.raises(tt.errors.SceneError, match=r"one shape.*one TransientRenderer per sensor"):
+        tt.TransientRenderer(scene, sensors="all")
+
+
+@pytest.mark.parametrize("sensors", [1, -1, [0, 7]])
+def test_unknown_sensor(room_scene, sensors):
+    with pytest.raises(tt.errors.ArgumentError, match="the scene has 1"):
+        tt.TransientRenderer(room_scene, sensors=sensors)
+
+
+# ------------------------------------------------------------------------------------------------ temporal filter
+
+
+def test_automatic_filter(room_scene):
+    def chosen(keys, **settings):
+        return tt.TransientRenderer(room_scene, parameters=keys, **settings).effective_filter
+
+    assert chosen([]) == "box" and chosen([COLOUR]) == "box"
+    for key in (WALL_POSE, "light.position", "box.vertex_positions", "box.to_world", "sensor.to_world"):
+        assert chosen([COLOUR, key]) == "tent"
+    assert chosen([WALL_POSE], temporal_filter="gaussian") == "gaussian"
+
+
+def test_automatic_filter_keeps_a_smooth_one_of_the_scene(room):
+    room["sensor"]["film"]["temporal_filter"] = "gaussian"
+    scene = tt.load(room, variant=VARIANT)
+    assert tt.TransientRenderer(scene, parameters=[WALL_POSE]).effective_filter == "gaussian"
+    assert tt.TransientRenderer(scene).effective_filter == "gaussian"
+
+
+def test_filter_of_one_renderer_does_not_reach_another(room_scene):
+    box = tt.TransientRenderer(room_scene, parameters=[WALL_POSE], spp=16, temporal_filter="box")
+    tent = tt.TransientRenderer(room_scene, parameters=[WALL_POSE], spp=16)
+    with torch.no_grad():
+        first, other, again = box(seed=0), tent(seed=0), box(seed=0)
+    assert torch.equal(first.transient, again.transient)
+    assert not torch.equal(first.transient, other.transient)
+    assert other.stats.temporal_filter == "tent"
+
+
+def test_gradient_of_a_length_through_a_box_is_refused(room_scene):
+    renderer = tt.TransientRenderer(room_scene, parameters=[WALL_POSE, COLOUR], spp=4, temporal_filter="box")
+    with pytest.raises(tt.errors.GradientError, match=r"wall\.to_world.*'box' has no slope.*'tent'"):
+        renderer(seed=0)
+    with torch.no_grad():
+        renderer(seed=0)
+    renderer.values[WALL_POSE].requires_grad_(False)
+    renderer(seed=0).transient.sum().backward()
+    assert renderer.values[COLOUR].grad.abs().min() > 0
+
+
+def test_derivative_of_a_length_through_a_box_is_refused_in_functional_transforms(room_scene):
+    renderer = tt.TransientRenderer(room_scene, parameters=[WALL_POSE], spp=4, temporal_filter="box")
+    x = renderer.values[WALL_POSE].detach()
+
+    def total(value):
+        return renderer({WALL_POSE: value}, seed=0).steady.sum()
+
+    for derivative in (torch.func.grad(total), torch.func.jacfwd(total)):
+        with pytest.raises(tt.errors.GradientError, match="has no slope"):
+            derivative(x)
+
+
+# -------------------------------------------------------------------------------------------------------- errors
+
+
+def test_wrong_shapes(room_scene):
+    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR, WALL_POSE, GREY], spp=4)
+    cases = {
+        COLOUR: (torch.zeros(4), r"box\.bsdf\.reflectance\.value.*expected shape \(3,\), or \(B, 3\).*got \(4,\)"),
+        WALL_POSE: (torch.eye(3), r"expected shape \(4, 4\), or \(B, 4, 4\).*got \(3, 3\)"),
+        GREY: (torch.zeros(2, 2), r"expected shape \(\), or \(B,\).*got \(2, 2\)"),
+    }
+    for key, (value, message) in cases.items():
+        with pytest.raises(tt.errors.ShapeError, match=message):
+            renderer({key: value}, seed=0)
+    with pytest.raises(tt.errors.ShapeError, match="batch of 3, but another value has a batch of 2"):
+        renderer({COLOUR: torch.rand(2, 3), GREY: torch.rand(3)}, seed=0)
+    with pytest.raises(tt.errors.ShapeError, match="at least one entry"):
+        renderer({COLOUR: torch.rand(0, 3)}, seed=0)
+    with pytest.raises(tt.errors.ShapeError, match="one for each of 2 batch entries, got 3"):
+        renderer({COLOUR: torch.rand(2, 3)}, seed=[1, 2, 3])
+    with pytest.raises(tt.errors.UnitError, match="1 and 4294967297 are one seed"):
+        renderer({COLOUR: torch.rand(2, 3)}, seed=(1, 1 + 2**32))
+    with pytest.raises(tt.errors.ShapeError, match="start value"):
+        tt.TransientRenderer(room_scene, parameters={COLOUR: torch.rand(2, 3)})
+
+
+@pytest.mark.parametrize(
+    "value",
+    [[0.25, 0.5, 0.75], (0.25, 0.5, 0.75), np.array([0.25, 0.5, 0.75], np.float16), [torch.tensor(0.25), 0.5, 0.75]],
+)
+def test_values_that_are_no_tensors(room_scene, value):
+    renderer = tt.TransientRenderer(room_scene, parameters={COLOUR: value, GREY: 0.125}, spp=4)
+    expected = renderer({COLOUR: torch.tensor([0.25, 0.5, 0.75]), GREY: torch.tensor(0.125)}, seed=0)
+    assert torch.equal(renderer(seed=0).transient, expected.transient)
+    assert torch.equal(renderer({COLOUR: value, GREY: np.float64(0.125)}, seed=0).transient, expected.transient)
+    assert torch.equal(tt.render(room_scene, {COLOUR: value, GREY: 0.125}, spp=4, seed=0).steady, expected.steady)
+    batch = renderer({COLOUR: [[0.25, 0.5, 0.75], [0, 1, 0]], GREY: [0.125, 1]}, seed=0)
+    assert torch.equal(batch.transient[0], expected.transient)
+
+
+def test_gradients_reach_numbers_inside_lists(room_scene):
+    red = torch.tensor(0.25, requires_grad=True)
+    tt.render(room_scene, {COLOUR: [red, 0.5, 0.75]}, spp=4, seed=0).steady.sum().backward()
+    assert red.grad > 0
+
+
+@pytest.mark.parametrize(
+    "value",
+    [torch.zeros(3, dtype=torch.complex64), torch.zeros(3).bool(), [True, False], [[1, 2], [3]], "red", object()],
+)
+def test_values_that_are_no_real_numbers(room_scene, value):
+    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=4)
+    with pytest.raises(tt.errors.ShapeError, match=COLOUR.replace(".", r"\.")):
+        renderer({COLOUR: value}, seed=0)
+    with pytest.raises(tt.errors.ShapeError, match=COLOUR.replace(".", r"\.")):
+        tt.TransientRenderer(room_scene, parameters={COLOUR: value})
+
+
+def test_none_is_no_value(room_scene):
+    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=4)
+    with pytest.raises(tt.errors.ShapeError, match="got None"):
+        renderer({COLOUR: None}, seed=0)
+
+
+def test_parameters_are_set_by_their_keys(room_scene):
+    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=4)
+    before = renderer.values[COLOUR]
+    renderer.values[COLOUR] = [0.25, 0.5, 0.75]
+    assert renderer.values[COLOUR] is before and before.tolist() == [0.25, 0.5, 0.75] and before.requires_grad
+    with pytest.raises(tt.errors.ShapeError, match="has no batch"):
+        renderer.values[COLOUR] = torch.rand(2, 3)
+    with pytest.raises(tt.errors.SceneError, match=r"no parameter 'box\.colour'; it was made with"):
+        renderer.values["box.colour"] = 0.5
+    assert "box.colour" not in renderer.values and renderer.values.get("box.colour") is None
+
+
+def test_wrong_device(room_scene):
+    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=4)
+    with pytest.raises(tt.errors.DeviceError, match=r"expected a tensor on 'cpu'.*got 'meta'"):
+        renderer({COLOUR: torch.zeros(3, device="meta")}, seed=0)
+
+
+def test_values_that_are_not_finite(room_scene):
+    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=4)
+    with pytest.raises(tt.errors.UnitError, match="1 of 3 that are NaN or infinite"):
+        renderer({COLOUR: torch.tensor([0.1, math.nan, 0.2])}, seed=0)
+
+
+def test_undeclared_value(room_scene):
+    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=4)
+    with pytest.raises(tt.errors.SceneError, match=r"no parameter 'wall\.bsdf\.reflectance\.value'.*parameters=\["):
+        renderer({GREY: torch.tensor(0.1)}, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "message"),
+    [
+        ({"effects": "polarization"}, tt.errors.ArgumentError, "'auto' or a plan"),
+        ({"temporal_filter": "hat"}, tt.errors.ArgumentError, "box, tent, gaussian"),
+        ({"parameters": COLOUR}, tt.errors.ArgumentError, "expected a list of keys"),
+        ({"parameters": [COLOUR, COLOUR]}, tt.errors.SceneError, "both set"),
+        ({"spp": 0}, tt.errors.UnitError, "spp: expected a positive integer"),
+        ({"spp_grad": 2.5}, tt.errors.UnitError, "spp_grad: expected a positive integer"),
+        ({"grad_seed": "other"}, tt.errors.ArgumentError, "None, 'same' or an integer"),
+        ({"sensors": "some"}, tt.errors.ArgumentError, "an index, a list of indices or 'all'"),
+        ({"sensors": []}, tt.errors.ArgumentError, "an index, a list of indices or 'all'"),
+        ({"max_depth": -3}, tt.errors.ArgumentError, "max_depth"),
+        ({"time_axis": (6.0, 0.1, 8)}, tt.errors.ArgumentError, "expected a tt.TimeAxis, got tuple"),
+    ],
+)
+def test_bad_settings(room_scene, settings, error, message):
+    with pytest.raises(error, match=message):
+        tt.TransientRenderer(room_scene, **settings)
+
+
+def test_cube_that_does_not_fit_is_refused_before_it_is_allocated(room):
+    room["sensor"]["film"].update(width=4096, height=4096, temporal_bins=60000)
+    renderer = tt.TransientRenderer(tt.load(room, variant=VARIANT), spp=1)
+    with pytest.raises(tt.errors.StorageError, match=r"10\.99 TiB \(H x W x T x C = 4096 x 4096 x 60000 x 3"):
+        renderer(seed=0)
+
+
+def test_batch_that_does_not_fit_counts_all_its_films(monkeypatch):
+    cube = 3 * 4 * 24 * 3 * 4
+    monkeypatch.setattr(memory, "available_bytes", lambda variant: 3 * cube)
+    monkeypatch.setattr(memory, "_SMALL", 0)
+    memory.check_fits((3, 4, 24, 3), 1, VARIANT)
+    memory.check_fits((3, 4, 24, 3), 2, VARIANT)
+    with pytest.raises(tt.errors.StorageError, match="4 of them for 3 renders"):
+        memory.check_fits((3, 4, 24, 3), 3, VARIANT)
+
+
+def test_available_memory_is_known_here():
+    available = memory.available_bytes(VARIANT)
+    assert available is not None and 2**20 < available < 2**50
+
+
+def small_bands(monkeypatch):
+    """As if arrays were limited to two rows of pixels: two bands. Holds while the scene's variant stays active."""
+    from torchtransient.plugins.films import base
+
+    monkeypatch.setattr(base, "MAX_ARRAY_ENTRIES", 2 * 4 * 24 * 3)
+
+
+def small_launches(monkeypatch):
+    """At most 64 samples per pixel in one kernel launch. Holds while the scene's variant stays active."""
+    from torchtransient.plugins.integrators import launch
+
+    monkeypatch.setattr(launch, "MAX_LANES", 64 * 12)
+
+
+@pytest.mark.parametrize("split", [small_bands, small_launches])
+def test_jobs_of_several_passes(room_scene, monkeypatch, split):
+    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=512, grad_seed="same")
+    x = renderer.values[COLOUR]
+    with active_variant(VARIANT):
+        whole = renderer(seed=0).transient
+        whole_slope = torch.autograd.grad(whole.sum(), x)[0]
+        split(monkeypatch)
+        several = renderer(seed=0).transient
+        slope = torch.autograd.grad(several.sum(), x)[0]
+        pushed = torch.func.jvp(lambda y: renderer({COLOUR: y}, seed=0).transient.sum(), (START,), (torch.ones(3),))[1]
+    assert several.shape == whole.shape and not torch.equal(several, whole)
+    # Every pass has its own samples: amounts can be compared, row by row.
+    torch.testing.assert_close(several.sum((0, 1, 3)), whole.sum((0, 1, 3)), rtol=0.05, atol=0)
+    torch.testing.assert_close(slope, whole_slope, rtol=0.05, atol=0)
+    torch.testing.assert_close(pushed, slope.sum(), rtol=1e-4, atol=0)
+
+
+def test_statistics_tell_the_samples_that_are_drawn(room):
+    room["sensor"]["sampler"] = {"type": "stratified", "sample_count": 16}
+    stats = tt.TransientRenderer(tt.load(room, variant=VARIANT), spp=10)(seed=0).stats
+    assert stats.spp == 16
+
+
+def test_progress_bar(room_scene, capsys):
+    tt.TransientRenderer(room_scene, spp=4)(seed=0, progress=True)
+    assert "100%" in capsys.readouterr().err
+    tt.TransientRenderer(room_scene, spp=4)(seed=0)
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("seed", [np.int64(5), np.uint32(5), torch.tensor(5), 5 + 2**32, 5 - 2**32])
+def test_whole_numbers_of_any_type_are_seeds(room_scene, seed):
+    renderer = tt.TransientRenderer(room_scene, parameters=[], spp=2)
+    torch.testing.assert_close(renderer(seed=seed).transient, renderer(seed=5).transient)
+
+
+@pytest.mark.parametrize("seed", [1.5, "5", torch.tensor(1.5)])
+def test_other_seeds_are_refused(room_scene, seed):
+    with pytest.raises(ValueError, match="seed: expected a whole number"):
+        tt.TransientRenderer(room_scene, parameters=[], spp=2)(seed=seed)
+
+
+@pytest.mark.parametrize("values", [0, 1, False, [], (), [0.1, 0.2, 0.3], torch.ones(3), "seed"], ids=repr)
+def test_values_that_are_no_mapping(room_scene, values):
+    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=2)
+    with pytest.raises(tt.errors.ArgumentError, match="expected a mapping from keys to values"):
+        renderer(values)

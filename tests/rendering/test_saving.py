@@ -1,0 +1,302 @@
+"""``scene.save``: what is written loads again with the same parameters, the same keys and the same picture."""
+
+from __future__ import annotations
+
+import inspect
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+
+import torchtransient as tt
+from torchtransient.rendering.variant import active_variant
+from torchtransient.testing.every_plugin import every_plugin
+from torchtransient.testing.small_room import COLOUR, VARIANT, make_room, pose
+
+TEXTURE, VERTICES, PLACE = "wall.bsdf.reflectance.data", "box.vertex_positions", "wall.to_world"
+
+
+def textured_room():
+    room = make_room()
+    pixels = np.linspace(0.1, 0.9, 48, dtype=np.float32).reshape(4, 4, 3)
+    room["wall"]["bsdf"]["reflectance"] = {"type": "bitmap", "raw": True, "data": pixels}
+    return room
+
+
+def picture(scene, **more):
+    renderer = tt.TransientRenderer(scene, spp=16, temporal_filter="tent", physics="ignore", **more)
+    return renderer(seed=3).transient.detach()
+
+
+def changed(scene, keys):
+    """Other values than the described ones, where numbers may be anything between them and one half."""
+    table = scene.parameters()
+    start = tt.TransientRenderer(scene, parameters=keys, physics="ignore").values
+    assert all(table[key].differentiable for key in keys)
+    found = {}
+    for key in keys:
+        value = start[key].detach().clone()
+        noise = torch.rand(value.shape, generator=torch.Generator().manual_seed(1))
+        found[key] = value * (0.7 + 0.2 * noise) if not key.endswith("to_world") else value @ torch.tensor(
+            pose(0.1, 0.05, -0.2), dtype=torch.float32
+        )
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", [VARIANT, "llvm_ad_mono_polarized"])
+def test_an_optimised_scene_has_the_same_picture(tmp_path, variant):
+    scene = tt.load(textured_room(), variant=variant)
+    values = changed(scene, [TEXTURE, VERTICES, PLACE, "light.position", *([COLOUR] if variant == VARIANT else [])])
+    expected = picture(scene, parameters=values)
+    path = scene.save(tmp_path / "found.xml", values)
+    assert {file.suffix for file in (tmp_path / "found_files").iterdir()} == {".exr", ".ply"}
+    assert not torch.equal(picture(scene), expected)
+    again = tt.load(path, variant=variant)
+    assert list(again.parameters()) == list(scene.parameters())
+    torch.testing.assert_close(picture(again), expected, rtol=1e-4, atol=1e-5)
+    with active_variant(variant):
+        ready = mi.load_file(str(path))
+        torch.testing.assert_close(picture(ready), expected, rtol=1e-4, atol=1e-5)
+    # Once more to the same place, with nothing left of before.
+    again.save(path)
+    torch.testing.assert_close(picture(tt.load(path, variant=variant)), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_a_grid_is_a_file(tmp_path):
+    """And the values of it that were found."""
+    room = make_room()
+    room["integrator"]["type"] = "transient_prbvolpath"
+    values = np.linspace(0.5, 2.0, 24, dtype=np.float32).reshape(2, 3, 4, 1)
+    sigma = {"type": "gridvolume", "grid": values, "to_world": pose(0.1, -0.3, 0.2, 0.6)}
+    medium = {"type": "heterogeneous", "sigma_t": sigma, "albedo": 0.7}
+    room["box"] |= {"bsdf": {"type": "null"}, "interior": medium}
+    scene, key = tt.load(room, variant=VARIANT), "box.interior_medium.sigma_t.data"
+    path = scene.save(tmp_path / "fog.xml", {key: torch.tensor(values) * 2})
+    again = tt.TransientRenderer(tt.load(path, variant=VARIANT), parameters=[key])
+    assert torch.equal(again.values[key].detach(), torch.tensor(values) * 2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral", "llvm_ad_spectral_polarized"])
+def test_spectral_colours_that_were_found(tmp_path, variant):
+    """Values are coefficients of spectra there; the file has the colours that they belong to."""
+    room = textured_room()
+    room["wall"]["bsdf"]["reflectance"] = {
+        "type": "bitmap", "bitmap": np.random.default_rng(0).uniform(0.1, 0.9, (4, 4, 3)).astype(np.float32)
+    }  # fmt: skip
+    scene = tt.load(room, variant=variant)
+    with active_variant(variant):
+        colour = np.array(mi.srgb_model_fetch(mi.ScalarColor3f(0.2, 0.55, 0.4))).ravel()
+    texture = tt.TransientRenderer(scene, parameters=[TEXTURE], physics="ignore").values[TEXTURE].detach()
+    values = {COLOUR: torch.tensor(colour), TEXTURE: texture.flip(0)}
+    expected = picture(scene, parameters=values)
+    again = tt.load(scene.save(tmp_path / "found.xml", values), variant=variant)
+    torch.testing.assert_close(picture(again), expected, rtol=1e-3, atol=1e-5)
+    assert not torch.allclose(picture(scene), expected, rtol=1e-2)
+
+
+def test_a_scene_from_a_file(tmp_path):
+    """Children without a name keep the keys that they have; files come along; values of `$names` are in it."""
+    (tmp_path / "from").mkdir()
+    (tmp_path / "to").mkdir()
+    (tmp_path / "from" / "tri.obj").write_text("v -1 -1 0\nv 1 -1 0\nv 0 1 0\nf 1 2 3\n")
+    text = """<scene version="3.0.0"><default name="grey" value="0.5"/>
+    <integrator type="transient_path"><integer name="max_depth" value="3"/></integrator>
+    <sensor type="perspective"><transform name="to_world"><lookat origin="0, 0, 4" target="0, 0, 0" up="0, 1, 0"/>
+    </transform><film type="transient_hdr_film"><integer name="width" value="4"/><integer name="height" value="3"/>
+    <rfilter type="box"/><integer name="temporal_bins" value="24"/><float name="bin_width_opl" value="0.25"/>
+    <float name="start_opl" value="6"/></film></sensor>
+    <bsdf type="twosided" id="paint"><bsdf type="diffuse"><spectrum name="reflectance" value="$grey"/></bsdf></bsdf>
+    <shape type="obj"><string name="filename" value="tri.obj"/><ref id="paint"/></shape>
+    <shape type="sphere"><point name="center" x="0.4" y="0.1" z="0.5"/><float name="radius" value="0.3"/>
+    <ref id="paint"/></shape>
+    <emitter type="point"><point name="position" x="-0.5" y="0.25" z="4"/><rgb name="intensity" value="9, 8, 7"/>
+    </emitter>
+    </scene>"""
+    (tmp_path / "from" / "scene.xml").write_text(text)
+    scene = tt.load(tmp_path / "from" / "scene.xml", variant=VARIANT, grey=0.7)
+    place = torch.tensor([0.2, 0.3, 4.0])
+    path = scene.save(tmp_path / "to" / "scene.xml", {"emitter.position": place})
+    again = tt.load(path, variant=VARIANT)
+    assert list(again.parameters()) == list(scene.parameters())
+    assert np.allclose(again.parameters()["emitter.position"].value, place)
+    expected = picture(scene, parameters={"emitter.position": place})
+    assert expected.sum() > 0 and torch.equal(picture(again), expected)
+
+
+def scenes_of_the_library():
+    found = {name: make for name, make in vars(tt.scenes).items() if inspect.isfunction(make)}
+    return [name for name in sorted(found) if name not in ("bounds", "triangle_mesh")]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", scenes_of_the_library())
+@pytest.mark.parametrize("variant", [VARIANT, "llvm_ad_spectral_polarized"])
+def test_every_scene_of_the_library(tmp_path, name, variant):
+    made = getattr(tt.scenes, name)(*([tmp_path / "bottle.ply"] if name == "milk_bottle" else []))
+    made = made if made.get("type") == "scene" else {"type": "scene", "wall": made} if "type" in made else made
+    scene = tt.load({"type": "scene", **made}, variant=variant)
+    again = tt.load(scene.save(tmp_path / "scene.xml"), variant=variant)
+    assert list(again.parameters()) == list(scene.parameters())
+    if "sensor" in made and variant == VARIANT:
+        a, b = (tt.TransientRenderer(s, spp=1, max_depth=4, physics="ignore")(seed=0).transient for s in (scene, again))
+        scale = a.abs().max()
+        assert scale > 0 and float((a - b).abs().mean()) < 1e-4 * float(a.abs().mean())
+    mi.set_variant(variant)
+    assert isinstance(mi.load_file(str(tmp_path / "scene.xml")), mi.Scene)
+
+
+@pytest.mark.slow
+def test_every_plugin(tmp_path):
+    """All of them load, are written, and come back with the parameters that they had."""
+    mi.set_variant(VARIANT)
+    plugins = every_plugin(tmp_path)
+    assert len(plugins) > 80
+    refused = {}
+    for name, node in plugins.items():
+        scene = tt.load(node if node["type"] == "scene" else {"type": "scene", "thing": node}, variant=VARIANT)
+        try:
+            again = tt.load(scene.save(tmp_path / f"{name}_saved.xml"), variant=VARIANT)
+        except tt.errors.SceneError as error:
+            refused[name] = str(error)
+            continue
+        assert again.parameters().keys() == scene.parameters().keys(), name
+    # Their arrays have no file that Mitsuba reads them from.
+    assert set(refused) == {"ellipsoids", "ellipsoidsmesh"}, refused
+    assert all("cannot be said in XML" in text for text in refused.values())
+
+
+def numbers_said_by_others():
+    """Parameters that the description has no number of: Mitsuba makes them of names, of others, or of nothing."""
+    room = make_room()
+    room["sensor"]["fov_axis"] = "y"
+    room["box"]["bsdf"] = {"type": "roughdielectric", "int_ior": "bk7", "ext_ior": "water", "alpha": 0.3}
+    del room["wall"]["bsdf"]
+    ball = {"type": "sphere", "center": [0.4, 0.2, 0.5], "radius": 0.2}
+    room |= {
+        "ball": ball | {"bsdf": {"type": "principled", "base_color": 0.4, "clearcoat": 0.3}},
+        "gold": {"type": "disk", "bsdf": {"type": "roughconductor", "material": "Au", "alpha": 0.3}},
+        "torch": {"type": "spot", "to_world": pose(0.0, 0.0, 2.0), "cutoff_angle": 40.0},
+    }
+    table = {
+        "box.bsdf.eta": 1.31, "wall.bsdf.reflectance.value": 0.7, "ball.bsdf.clearcoat.value": 0.6,
+        "gold.bsdf.k.value": [2.0, 1.5, 1.1], "torch.cutoff_angle": 30.0, "torch.intensity.value": 2.0,
+        "sensor.x_fov": 35.0,
+    }  # fmt: skip
+    moved = torch.tensor(tt.load(room, variant=VARIANT).parameters()["ball.to_world"].value)
+    moved[:3, 3] += torch.tensor([0.1, 0.0, -0.2])
+    return room, {key: torch.tensor(value) for key, value in table.items()} | {"ball.to_world": moved}
+
+
+def test_numbers_that_the_description_says_otherwise(tmp_path):
+    room, values = numbers_said_by_others()
+    scene = tt.load(room, variant=VARIANT)
+    again = tt.load(scene.save(tmp_path / "found.xml", values), variant=VARIANT)
+    before, found = scene.parameters(), again.parameters()
+    assert list(found) == list(before)
+    for key, info in found.items():
+        wanted = values[key] if key in values else before[key].value
+        if isinstance(wanted, torch.Tensor | np.ndarray | float):
+            np.testing.assert_allclose(info.value, wanted, rtol=1e-5, atol=1e-6, err_msg=key)
+
+
+@pytest.mark.slow
+def test_their_picture_is_the_same(tmp_path):
+    room, values = numbers_said_by_others()
+    scene = tt.load(room, variant=VARIANT)
+    again = tt.load(scene.save(tmp_path / "found.xml", values), variant=VARIANT)
+    expected, found = picture(scene, parameters=values), picture(again, parameters=list(values))
+    assert expected.sum() > 0 and not torch.allclose(picture(scene), expected, rtol=0.1)
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_every_parameter_of_every_plugin(tmp_path):
+    """Each is written with another value and read back, and no other one with it."""
+    mi.set_variant(VARIANT)
+    refused = {}
+    for name, node in every_plugin(tmp_path).items():
+        scene = tt.load(node if node["type"] == "scene" else {"type": "scene", "thing": node}, variant=VARIANT)
+        table = scene.parameters()
+        for key in table.differentiable():
+            if key.endswith(("to_world", "normals", "direction")):
+                continue  # only some values are poses, or of length one
+            value = 0.83 * torch.as_tensor(table[key].value, dtype=torch.float32)
+            try:
+                path = scene.save(tmp_path / "scene.xml", {key: value})
+            except tt.errors.SceneError as error:
+                refused[f"{name}.{key.rsplit('.', 1)[-1]}"] = str(error)
+                continue
+            found = tt.load(path, variant=VARIANT).parameters()
+            np.testing.assert_allclose(found[key].value, value, rtol=1e-5, atol=1e-6, err_msg=f"{name}: {key}")
+    # Curves come as files, and there is none for ellipsoids.
+    blobs = {f"{kind}.{key}" for kind in ("ellipsoids", "ellipsoidsmesh") for key in ("data", "opacities")}
+    assert refused.keys() == blobs | {"bsplinecurve.control_points", "linearcurve.control_points"}
+    assert all("cannot be said in XML" in text and str(tmp_path) not in text for text in refused.values())
+
+
+
+def test_what_cannot_be_said_is_refused_and_nothing_is_written(tmp_path):
+    scene = tt.load(textured_room(), variant=VARIANT)
+    with pytest.raises(tt.errors.SceneError, match=r"name of an XML file.*found\.json"):
+        scene.save(tmp_path / "found.json")
+    with pytest.raises(tt.errors.SceneError, match="there is no folder"):
+        scene.save(tmp_path / "no" / "found.xml")
+    with pytest.raises(tt.errors.SceneError, match="has no parameter"):
+        scene.save(tmp_path / "found.xml", {"wall.colour": 1.0})
+    with pytest.raises(tt.errors.ShapeError, match=r"light.position"):
+        scene.save(tmp_path / "found.xml", {"light.position": torch.zeros(2, 3)})
+    room = make_room()
+    room["box"] = mi.load_dict({"type": "sphere"})
+    with pytest.raises(tt.errors.SceneError, match="was taken as it is"):
+        tt.load(room).save(tmp_path / "found.xml")
+    dollar = make_room()
+    dollar["sensor"]["film"]["irf"] = "$x"
+    with pytest.raises(tt.errors.SceneError):
+        tt.load(dollar, variant=VARIANT).save(tmp_path / "found.xml")
+    spectral = tt.load(make_room(), variant="llvm_ad_spectral")
+    with pytest.raises(tt.errors.SceneError, match=r"box\.bsdf\.reflectance\.value.*cannot be said in XML"):
+        spectral.save(tmp_path / "found.xml", {COLOUR: torch.tensor([0.001, -0.5, 20.0])})
+    assert not list(tmp_path.iterdir())
+
+
+RETRO = {"type": "retroreflector", "share": 0.6}
+# Surfaces with parameters that their descriptions say by another name, or that belong to plugins in Python inside.
+SURFACES = {
+    "twosided": (
+        {"type": "twosided", "nested": RETRO},
+        ("brdf_0.share", "brdf_0.alpha", "brdf_0.reflectance.value"),
+    ),
+    "blend": (
+        {"type": "blendbsdf", "weight": 0.4, "first": RETRO, "second": {"type": "diffuse"}},
+        ("bsdf_0.share", "bsdf_0.reflectance.value", "bsdf_1.reflectance.value", "weight.value"),
+    ),
+    "mask": (
+        {"type": "mask", "opacity": 0.5, "nested": {"type": "diff_rough_dielectric", "int_ior": "water"}},
+        ("nested_bsdf.eta", "nested_bsdf.alpha.value", "opacity.value"),
+    ),
+    "plastic": ({"type": "plastic", "int_ior": "water", "ext_ior": 1.1}, ("eta", "diffuse_reflectance.value")),
+    "roughplastic": ({"type": "roughplastic", "int_ior": 1.4}, ("eta", "alpha")),
+    "dielectric": ({"type": "dielectric"}, ("eta",)),
+}
+
+
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in SURFACES if name != "blend"]
+
+
+@pytest.mark.parametrize("name", ["blend", *SLOW])
+def test_numbers_of_surfaces(tmp_path, name):
+    surface, names = SURFACES[name]
+    room = make_room()
+    room["wall"]["bsdf"] = surface
+    room["sensor"]["fov_axis"] = "y"
+    scene = tt.load(room, variant=VARIANT)
+    values = changed(scene, [f"wall.bsdf.{each}" for each in names] + ["sensor.x_fov"])
+    again = tt.load(scene.save(tmp_path / "found.xml", values), variant=VARIANT)
+    table = again.parameters()
+    assert list(table) == list(scene.parameters())
+    for key, value in values.items():
+        np.testing.assert_allclose(np.ravel(table[key].value), value.numpy().ravel(), rtol=1e-6, err_msg=key)
+    torch.testing.assert_close(picture(again), picture(scene, parameters=values), rtol=1e-4, atol=1e-5)

@@ -1,0 +1,229 @@
+"""``tt.threads``: torch's and Dr.Jit's threads set together, and numbers that do not depend on them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import textwrap
+import threading
+
+import drjit as dr
+import pytest
+import torch
+
+import torchtransient as tt
+from torchtransient.errors import DeviceError, UnitError
+from torchtransient.rendering import threads as module
+from torchtransient.rendering.variant import engine_lock
+
+VARIANT = "llvm_ad_rgb"
+
+
+@pytest.fixture(autouse=True)
+def counts_come_back():
+    before = torch.get_num_threads(), dr.thread_count()
+    yield
+    dr.set_thread_count(before[1])
+    torch.set_num_threads(before[0])
+
+
+def run(script, *, code=0):
+    """What a fresh interpreter prints. Numbers of threads are the script's alone."""
+    own = {name: value for name, value in os.environ.items() if name not in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")}
+    command = [sys.executable, "-c", textwrap.dedent(script)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False, env=own)
+    assert done.returncode == code, f"exit code {done.returncode}: {done.stderr[-3000:]}"
+    return done.stdout.split()
+
+
+def test_counts_are_set_together_and_told():
+    assert tt.threads(3) == module.Threads(torch=3, drjit=3)
+    assert (torch.get_num_threads(), dr.thread_count()) == (3, 3)
+    assert tt.threads(1) == module.Threads(1, 1)
+    # Asking changes nothing, whatever each of them is set to.
+    torch.set_num_threads(2)
+    assert tt.threads() == module.Threads(torch=2, drjit=1)
+    assert (torch.get_num_threads(), dr.thread_count()) == (2, 1)
+    assert repr(tt.threads()) == "Threads(torch=2, drjit=1)"
+
+
+def test_a_context_puts_back_what_was():
+    torch.set_num_threads(2)
+    dr.set_thread_count(3)
+    with tt.threads(1) as counts:
+        assert counts == tt.threads() == module.Threads(1, 1)
+        with tt.threads(4):
+            assert tt.threads() == module.Threads(4, 4)
+        assert tt.threads() == module.Threads(1, 1)
+    assert tt.threads() == module.Threads(torch=2, drjit=3)
+    with pytest.raises(KeyError), tt.threads(1):
+        raise KeyError
+    assert tt.threads() == module.Threads(torch=2, drjit=3)
+    with tt.threads():
+        tt.threads(1)
+    assert tt.threads() == module.Threads(torch=2, drjit=3)
+
+
+@pytest.mark.parametrize("n", [0, -1, True, False, 1.0, 1.5, "2", 1025, 2**40, torch.tensor(2)])
+def test_what_is_no_number_of_threads(n):
+    before = tt.threads()
+    with pytest.raises(UnitError, match="whole number from 1 to 1024"):
+        tt.threads(n)
+    assert tt.threads() == before
+
+
+def test_what_the_system_refuses_is_taken_back(monkeypatch):
+    before = tt.threads(2)
+
+    def refuse(count):
+        set_count(count)
+        raise RuntimeError("Resource temporarily unavailable")
+
+    set_count = dr.set_thread_count
+    with monkeypatch.context() as patch:
+        # The second call puts back.
+        patch.setattr(dr, "set_thread_count", lambda n: refuse(n) if n == 5 else set_count(n))
+        with pytest.raises(DeviceError, match=r"5 threads cannot be had: Resource.*stays at 2"):
+            tt.threads(5)
+    assert tt.threads() == before
+    with monkeypatch.context() as patch:
+        patch.setattr(torch, "set_num_threads", lambda n: None)
+        with pytest.raises(DeviceError, match=r"asked for 5 of torch and 5 of Dr\.Jit, which took 2 and 5"):
+            tt.threads(5)
+    assert tt.threads() == before
+
+
+def test_renders_of_other_threads_end_first():
+    done = []
+    with engine_lock:
+        other = threading.Thread(target=lambda: done.append(tt.threads(3)))
+        other.start()
+        other.join(0.2)
+        assert not done
+    other.join(10)
+    assert done[0].drjit == 3
+
+
+NUMBERS = """
+    import torch
+    import torchtransient as tt
+
+    KEY = "red.reflectance.value"
+    scene = tt.load(tt.scenes.cornell_box(8, num_bins=16, bin_width_opl=0.4), variant="llvm_ad_rgb")
+    renderer = tt.TransientRenderer(scene, parameters=[KEY], spp=16, physics="ignore", freeze={freeze})
+    first, said = None, []
+    for n in (1, 1, 1, 4, 4, 4, 2, 16, 1):
+        tt.threads(n)
+        renderer.zero_grad()
+        out = renderer(seed=3)
+        out.transient.square().sum().backward()
+        found = out.transient.detach().clone(), renderer.values[KEY].grad.clone()
+        first = first or found
+        for a, b in zip(found, first):
+            # Sums are added in another order.
+            torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-5 * float(b.abs().max()))
+        said.append(out.stats.recorded[0])
+    print("done", said.count("launched"))
+"""
+
+
+@pytest.mark.parametrize("freeze", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_numbers_are_the_same_whatever_the_count(freeze):
+    """In a process of its own: memory that is sized for fewer threads than write to it ends the process."""
+    done, launched = run(NUMBERS.format(freeze=freeze))
+    assert done == "done"
+    # A render that came back to a count that has been recorded is launched.
+    assert int(launched) >= 3 if freeze else launched == "0"
+
+
+@pytest.mark.slow
+def test_drjit_computes_with_as_many_threads():
+    """Threads of the process, and those among them that have computed."""
+    if not os.path.isdir("/proc/self/task"):
+        pytest.skip("needs /proc")
+    script = """
+        import os, sys
+        import mitsuba
+        import torchtransient as tt
+        tt.threads(1)
+        assert mitsuba.variant() is None
+        import drjit as dr
+        import mitsuba as mi
+        mi.set_variant("llvm_ad_mono")
+
+        def ticks():
+            found = {}
+            for task in os.listdir("/proc/self/task"):
+                with open(f"/proc/self/task/{task}/stat") as file:
+                    fields = file.read().rpartition(")")[2].split()
+                found[task] = int(fields[11]) + int(fields[12])
+            return found
+
+        def busy():
+            i, x = mi.UInt32(0), dr.arange(mi.Float, 2**20)
+            before = ticks()
+            i, x = dr.while_loop((i, x), lambda i, x: i < 400, lambda i, x: (i + 1, dr.sin(x) + x))
+            dr.eval(x)
+            dr.sync_thread()
+            return sum(count - before.get(task, 0) > 2 for task, count in ticks().items())
+
+        busy()
+        found = []
+        for n in (1, 3, 1, 2):
+            tt.threads(n)
+            # Where other processes compute, too, a thread may come late: those that have worked in one of a few tries.
+            most = 0
+            for _ in range(8):
+                most = max(most, busy())
+                if most >= n:
+                    break
+            found.append((most, len(ticks())))
+        others = found[0][1] - 1
+        print(*[b for b, _ in found], *[total - others for _, total in found])
+    """
+    assert run(script) == ["1", "3", "1", "2", "1", "3", "1", "2"]
+
+
+def test_pictures_of_scenes_are_read_by_one_thread(tmp_path):
+    """Mitsuba alone waits for ever: it leaves an OpenEXR file to other threads of the pool, and there is none."""
+    script = f"""
+        import numpy as np
+        import torchtransient as tt
+        import mitsuba as mi
+        mi.set_variant("llvm_ad_rgb")
+        grey = np.full((40, 60, 3), 0.25, np.float32)
+        with tt.threads(2):
+            mi.Bitmap(grey).write({str(tmp_path / "grey.exr")!r})
+        tt.threads(1)
+        picture = {{"type": "bitmap", "filename": {str(tmp_path / "grey.exr")!r}}}
+        light = {{"type": "envmap", "filename": {str(tmp_path / "grey.exr")!r}}}
+        ball = {{"type": "sphere", "center": [0, 0, -9], "bsdf": {{"type": "diffuse", "reflectance": picture}}}}
+        scene = tt.load({{"type": "scene", "sensor": {{"type": "perspective"}}, "light": light, "ball": ball}})
+        renderer = tt.TransientRenderer(scene, time_axis=tt.TimeAxis(0.0, 1.0, 4))
+        print(round(float(renderer(spp=1, seed=0).steady.mean()), 2), tt.threads().drjit)
+        print(tt.plan(scene, time_axis=tt.TimeAxis(0.0, 1.0, 4)).variant, tt.threads().drjit)
+    """
+    assert run(script) == ["0.25", "1", "llvm_ad_mono", "1"]
+
+
+def test_a_forked_child_of_a_process_with_a_pool_is_told():
+    if not hasattr(os, "fork"):
+        pytest.skip("needs fork")
+    script = """
+        import os, warnings
+        warnings.simplefilter("ignore")
+        import torchtransient as tt
+        tt.threads({parent})
+        child = os.fork()
+        if child == 0:
+            try:
+                print(tt.threads({child}).drjit, flush=True)
+            except tt.errors.VariantError as error:
+                print("spawn" in str(error), flush=True)
+            os._exit(0)
+        print("ended", os.waitpid(child, 0)[1])
+    """
+    assert run(script.format(parent=3, child=1)) == ["True", "ended", "0"]
+    # A parent that has only asked has no threads to leave behind.
+    assert run(script.format(parent="", child=3)) == ["3", "ended", "0"]

@@ -1,0 +1,151 @@
+"""Which variant a scene is built in, and that the user's own choice is left alone."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+
+import pytest
+import torch
+
+import torchtransient as tt
+from torchtransient.rendering.variant import active_variant, is_differentiable, resolve_variant
+from torchtransient.testing.small_room import COLOUR, VARIANT, make_room
+
+
+def run(script: str) -> str:
+    """Run a script in a fresh interpreter; returns what it prints."""
+    result = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert result.returncode == 0, result.stderr[-3000:]
+    return result.stdout.strip()
+
+
+def test_import_and_load_need_no_variant():
+    printed = run("""
+        import torchtransient as tt
+        from torchtransient.testing.small_room import make_room
+        import mitsuba as mi
+        assert mi.variant() is None
+        scene = tt.load(make_room())
+        assert mi.variant() is None
+        renderer = tt.TransientRenderer(scene, spp=4)
+        print(float(renderer(seed=0).steady.sum()) > 0, scene.variant, mi.variant())
+    """)
+    # With no variant active there is none to go back to: the scene's stays.
+    assert printed == "True llvm_ad_rgb llvm_ad_rgb"
+
+
+@pytest.mark.slow
+def test_differentiable_active_variant_is_taken_and_scalar_one_is_not():
+    printed = run("""
+        import mitsuba as mi
+        mi.set_variant("llvm_ad_mono")
+        import torchtransient as tt
+        from torchtransient.testing.small_room import make_room
+        first = tt.TransientRenderer(make_room(), spp=4)
+        mi.set_variant("scalar_rgb")
+        second = tt.TransientRenderer(make_room(), spp=4)
+        shapes = tuple(first(seed=0).steady.shape), tuple(second(seed=0).steady.shape)
+        print(*shapes, first.scene.variant, second.scene.variant, mi.variant())
+    """)
+    assert printed == "(1, 3, 4) (3, 3, 4) llvm_ad_mono llvm_ad_rgb scalar_rgb"
+
+
+def test_other_active_variant_is_restored_and_does_not_matter(room_scene):
+    import mitsuba as mi
+
+    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=16)
+
+    def run_once():
+        x = renderer.values[COLOUR].detach().clone().requires_grad_()
+        out = renderer({COLOUR: x}, seed=0).transient
+        during = mi.variant()
+        out.square().sum().backward()
+        return out.detach(), x.grad, during
+
+    with active_variant(VARIANT):
+        expected, slope, _ = run_once()
+    with active_variant("llvm_ad_mono"):
+        for _ in range(2):
+            out, other_slope, during = run_once()
+            assert during == "llvm_ad_mono" and mi.variant() == "llvm_ad_mono"
+            assert torch.equal(out, expected)
+            torch.testing.assert_close(other_slope, slope)
+
+
+def test_variant_is_restored_after_an_error(room):
+    room["wall"]["type"] = "rectangel"
+    with active_variant("llvm_ad_mono"):
+        import mitsuba as mi
+
+        with pytest.raises(tt.errors.SceneError, match="rectangel"):
+            tt.TransientRenderer(tt.load(room, variant=VARIANT))
+        assert mi.variant() == "llvm_ad_mono"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral"])
+def test_scenes_of_several_variants_side_by_side(variant, room_scene):
+    other = tt.TransientRenderer(tt.load(make_room(), variant=variant), parameters=["light.position"], spp=64)
+    rgb = tt.TransientRenderer(room_scene, parameters=["light.position"], spp=64)
+    a, b = other(seed=0), rgb(seed=0)
+    assert a.stats.variant == variant and a.transient.shape[0] == (1 if variant.endswith("mono") else 3)
+    (a.transient.square().sum() + b.transient.square().sum()).backward()
+    for renderer in (other, rgb):
+        assert renderer.values["light.position"].grad.abs().max() > 0
+
+
+def test_unusable_variants():
+    with pytest.raises(tt.errors.VariantError, match=r"not part of this Mitsuba.*llvm_ad_rgb"):
+        tt.load(make_room(), variant="llvm_ad_rbg")
+    with pytest.raises(tt.errors.VariantError, match=r"scalar_rgb.*differentiates"):
+        tt.load(make_room(), variant="scalar_rgb")
+    assert is_differentiable(resolve_variant(None))
+
+
+@pytest.mark.slow
+def test_fork_before_rendering_is_fine_and_after_it_is_refused():
+    printed = run("""
+        import os, torchtransient as tt
+        from torchtransient.testing.small_room import make_room
+        scene = tt.load(make_room())
+        child = os.fork()
+        if child == 0:
+            os._exit(0 if float(tt.render(scene, spp=4, seed=0).steady.sum()) > 0 else 1)
+        before = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        renderer = tt.TransientRenderer(scene, spp=4)
+        renderer(seed=0)
+        child = os.fork()
+        if child == 0:
+            try:
+                renderer(seed=0)
+            except tt.errors.VariantError as error:
+                os._exit(7 if "spawn" in str(error) else 8)
+            os._exit(9)
+        print(before, os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+    """)
+    assert printed == "0 7"
+
+
+@pytest.mark.slow
+def test_many_switches_are_mentioned_once(monkeypatch):
+    import mitsuba as mi
+
+    from torchtransient.rendering import variant
+
+    monkeypatch.setattr(variant, "MANY_SWITCHES", 2)
+    monkeypatch.setitem(variant._switches, "count", 0)
+    mi.set_variant("llvm_ad_mono")
+
+    def switch(times):
+        for _ in range(times):
+            with active_variant(VARIANT):
+                pass
+
+    with pytest.warns(UserWarning, match="mitsuba.set_variant") as caught:
+        switch(4)
+    assert sum("mitsuba.set_variant" in str(warning.message) for warning in caught) == 1
+    assert mi.variant() == "llvm_ad_mono"

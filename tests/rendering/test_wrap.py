@@ -1,0 +1,313 @@
+"""``tt.wrap``: the bridge's promises for functions of a user's own; the list is that of test_dr_wrap.py."""
+
+from __future__ import annotations
+
+import threading
+
+import drjit as dr
+import mitsuba as mi
+import pytest
+import torch
+from torch import nn
+from torch.autograd import forward_ad
+
+import torchtransient as tt
+from support.mitsuba_room import load_room
+from torchtransient.errors import GradientError
+from torchtransient.testing.small_room import COLOUR
+from torchtransient.testing.small_room import VARIANT as VARIANT
+
+START = torch.tensor([0.8, 0.5, 0.2])
+TANGENT = torch.tensor([1.0, -0.5, 2.0])
+
+
+def room_function():
+    """(SceneParameters, the sum of squares of the transient as a function of the box's colour), as with ``dr.wrap``."""
+    scene, params = load_room()
+
+    def light(x, seed=0):
+        params[COLOUR] = dr.unravel(mi.Color3f, x.array)
+        params.update()
+        transient = mi.render(scene, params, spp=4, seed=seed)[1]
+        return dr.sum(transient * transient, axis=None)
+
+    return params, light
+
+
+@pytest.fixture(scope="module")
+def room():
+    params, light = room_function()
+    return params, tt.wrap(light)
+
+
+@pytest.fixture(scope="module")
+def render(room):
+    return room[1]
+
+
+@pytest.fixture(scope="module")
+def slope(render):
+    """The gradient at START, and at half of it."""
+    found = []
+    for factor in (1.0, 0.5):
+        x = (START * factor).requires_grad_()
+        render(x).backward()
+        found.append(x.grad)
+    return found
+
+
+@tt.wrap
+def moments(x):
+    """A vector function that costs nothing: three of three."""
+    return x * x, dr.sum(x * x * x)
+
+
+def test_gradients_are_those_of_dr_wrap_and_of_finite_differences(slope):
+    scene, params = load_room()
+
+    def light(x, seed=0):
+        params[COLOUR] = dr.unravel(mi.Color3f, x.array)
+        params.update()
+        return dr.sum(mi.render(scene, params, spp=1024, seed=seed)[1] * 0.01, axis=None)
+
+    x = START.clone().requires_grad_()
+    dr.wrap(source="torch", target="drjit")(light)(x).backward()
+    mi.traverse(scene)[COLOUR] = mi.Color3f(0.5)
+    params[COLOUR] = dr.detach(params[COLOUR])
+    params.update()
+    y, wrapped = START.clone().requires_grad_(), tt.wrap(light)
+    wrapped(y).backward()
+    torch.testing.assert_close(y.grad, x.grad, rtol=1e-4, atol=1e-6)
+    # Of the same samples; the light is a parabola of the colour, so that only the noise of the adjoint is left.
+    step = 0.1 * TANGENT
+    across = (wrapped(START + step) - wrapped(START - step)) / 2
+    assert float(y.grad @ step) == pytest.approx(float(across), rel=0.01)
+
+
+def test_second_backward_follows_its_own_cotangent(render, slope):
+    x = START.clone().requires_grad_()
+    loss = render(x)
+    torch.autograd.grad(loss, x, retain_graph=True)
+    again = torch.autograd.grad(3 * loss, x)[0]
+    torch.testing.assert_close(again, 3 * slope[0], rtol=1e-4, atol=1e-6)
+
+
+def test_several_calls_before_one_backward(render, slope):
+    first, last = START.clone().requires_grad_(), (START * 0.5).requires_grad_()
+    (render(first) + render(last)).backward()
+    torch.testing.assert_close(first.grad, slope[0], rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(last.grad, slope[1], rtol=1e-4, atol=1e-6)
+
+
+def test_gradients_of_two_calls_with_one_tensor_add_up(render, slope):
+    x = START.clone().requires_grad_()
+    (render(x) + render(x)).backward()
+    torch.testing.assert_close(x.grad, 2 * slope[0], rtol=1e-4, atol=1e-6)
+
+
+def test_edits_in_place_are_noticed(render):
+    x = START.clone().requires_grad_()
+    y = x * 1
+    loss = render(y)
+    with torch.no_grad():
+        y.mul_(0.5)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        loss.backward()
+
+
+@pytest.mark.parametrize("size", [3, 1000])
+def test_results_have_memory_of_their_own(size):
+    x = torch.ones(size)
+    same = tt.wrap(lambda x: (x, x))
+    first, second = same(x)
+    first.fill_(2.0)
+    assert torch.equal(x, torch.ones(size)) and torch.equal(second, x)
+
+
+def test_results_that_are_one_array_or_made_of_one_another():
+    def f(x):
+        y = x * x
+        return x, y, y, y * x
+
+    x, cotangents = START.clone().requires_grad_(), torch.rand(4, 3)
+    out = tt.wrap(f)(x)
+    grad = torch.autograd.grad(out, x, list(cotangents))[0]
+    d = x.detach()
+    slopes = torch.stack([torch.ones(3), 2 * d, 2 * d, 3 * d * d])
+    torch.testing.assert_close(grad, (slopes * cotangents).sum(0))
+    along = torch.func.jvp(tt.wrap(f), (d,), (TANGENT,))[1]
+    torch.testing.assert_close(torch.stack(along), slopes * TANGENT)
+    first, second = torch.autograd.grad(tt.wrap(lambda x, y: x + y)(x, y := x.detach().requires_grad_()).sum(), (x, y))
+    first.zero_()
+    assert torch.equal(second, torch.ones(3))
+
+
+def test_a_bare_parameter(render, slope):
+    x = nn.Parameter(START)
+    render(x).backward()
+    torch.testing.assert_close(x.grad, slope[0], rtol=1e-4, atol=1e-6)
+
+
+COMPUTED_IN = {
+    torch.float16: torch.float32,
+    torch.bfloat16: torch.float32,
+    torch.float32: torch.float32,
+    torch.float64: torch.float64,
+    torch.uint8: torch.int32,
+    torch.int8: torch.int32,
+    torch.int16: torch.int32,
+    torch.uint16: torch.int32,
+    torch.int32: torch.int32,
+    torch.int64: torch.int64,
+    torch.uint32: torch.uint32,
+    torch.uint64: torch.uint64,
+    torch.bool: torch.bool,
+}
+
+
+@pytest.mark.parametrize("size", [3, 100])
+@pytest.mark.parametrize("dtype", COMPUTED_IN, ids=str)
+def test_dtypes(dtype, size):
+    x = torch.arange(size).to(dtype)
+    weights, y = tt.wrap(lambda x, y: (x, y * mi.TensorXf(x))), torch.ones(size, requires_grad=True)
+    out, weighed = weights(x, y)
+    assert out.dtype == COMPUTED_IN[dtype] and torch.equal(out, x.to(out.dtype))
+    assert out.requires_grad == x.is_floating_point()  # as of every function of torch that has been given a leaf
+    weighed.sum().backward()
+    torch.testing.assert_close(y.grad, x.float())
+    if x.is_floating_point():
+        x.requires_grad_()
+        squares = moments(x)[0]
+        squares.sum().backward()
+        assert x.grad.dtype == dtype
+        torch.testing.assert_close(x.grad, 2 * x.detach())
+
+
+def test_shapes_without_entries_and_without_dimensions():
+    for shape in ((), (0,), (2, 0, 3), (1,), (2, 1, 3)):
+        x = torch.ones(shape, requires_grad=True)
+        out = moments(x)[0]
+        assert out.shape == shape
+        out.sum().backward()
+        assert torch.equal(x.grad, torch.full(shape, 2.0))
+
+
+def test_inputs_and_cotangents_that_are_not_contiguous(render, slope):
+    storage = torch.stack([START, torch.zeros(3)], dim=1).requires_grad_()
+    render(storage[:, 0]).backward()
+    torch.testing.assert_close(storage.grad[:, 0], slope[0], rtol=1e-4, atol=1e-6)
+    x = torch.rand(40, 30).t().requires_grad_()
+    for cotangent in (torch.rand(40, 30).t(), torch.ones(()).expand(30, 40)):
+        found = torch.autograd.grad(moments(x)[0], x, cotangent)[0]
+        torch.testing.assert_close(found, 2 * x.detach() * cotangent)
+
+
+def test_no_grad_records_nothing(render):
+    with torch.no_grad():
+        assert not render(START.clone().requires_grad_()).requires_grad
+
+
+def test_autocast(render, slope):
+    x = START.clone().requires_grad_()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        loss = render(x)
+        assert loss.dtype == torch.float32
+    loss.backward()
+    torch.testing.assert_close(x.grad, slope[0], rtol=1e-4, atol=1e-6)
+
+
+def test_the_scene_is_as_it_was_and_no_graph_is_left(room):
+    params, render = room
+    before = mi.Color3f(params[COLOUR])
+    x = (START * 0.5).requires_grad_()
+    render(x).backward()
+    assert dr.all(params[COLOUR] == before, axis=None) and not dr.grad_enabled(params[COLOUR])
+
+
+@pytest.mark.parametrize("requires_grad", [False, True])
+def test_forward_mode(render, slope, requires_grad):
+    x = START.clone().requires_grad_(requires_grad)
+    with forward_ad.dual_level():
+        found = forward_ad.unpack_dual(render(forward_ad.make_dual(x, TANGENT))).tangent.detach()
+    assert float(found) == pytest.approx(float(slope[0] @ TANGENT), rel=1e-3)
+
+
+def test_function_transforms(render, slope):
+    u = torch.tensor(2.0)
+    torch.testing.assert_close(torch.func.vjp(render, START)[1](u)[0], 2 * slope[0], rtol=1e-4, atol=1e-6)
+    each = torch.func.vmap(torch.func.grad(render))(torch.stack([START, START * 0.5]))
+    torch.testing.assert_close(each, torch.stack(slope), rtol=1e-4, atol=1e-6)
+
+
+def test_jacobians():
+    def f(x):
+        squares, cubes = moments(x)
+        return torch.cat([squares, cubes.reshape(1)])
+
+    expected = torch.cat([torch.diag(2 * START), 3 * START.square()[None]])
+    torch.testing.assert_close(torch.func.jacrev(f)(START), expected)
+    torch.testing.assert_close(torch.func.jacfwd(f)(START), expected)
+    functional = torch.autograd.functional
+    for options in ({}, {"vectorize": True}, {"vectorize": True, "strategy": "forward-mode"}):
+        torch.testing.assert_close(functional.jacobian(f, START, **options), expected)
+    torch.testing.assert_close(functional.jvp(f, START, TANGENT)[1], expected @ TANGENT)
+    xs = torch.stack([START, START * 0.5])
+    torch.testing.assert_close(torch.func.vmap(f)(xs), torch.stack([f(x) for x in xs]))
+    torch.testing.assert_close(torch.func.vmap(torch.func.jacrev(f))(xs)[0], expected)
+    # J^T J v: each factor a first derivative.
+    pull = torch.func.vjp(f, START)[1]
+    torch.testing.assert_close(
+        pull(torch.func.jvp(f, (START,), (TANGENT,))[1])[0], expected.T @ expected @ TANGENT
+    )
+
+
+SECOND = {
+    "hessian": lambda f: torch.func.hessian(f)(START),
+    "reverse over reverse": lambda f: torch.func.jacrev(torch.func.jacrev(f))(START),
+    "forward over forward": lambda f: torch.func.jacfwd(torch.func.jacfwd(f))(START),
+    "autograd": lambda f: torch.autograd.functional.hessian(f, START),
+}
+
+
+@pytest.mark.parametrize("way", SECOND)
+def test_second_derivatives_are_refused(way):
+    with pytest.raises(GradientError, match="second derivatives of the wrapped function moments are not available"):
+        SECOND[way](lambda x: moments(x)[1].sum())
+
+
+def test_threads(render, slope):
+    """Two with one scene and one with its own, calls of the others in between, and a backward in yet another thread."""
+    wrapped, halved = [render, render, tt.wrap(room_function()[1])], [0, 1, 0]
+    found = {}
+
+    def work(n):
+        x = (START * (1.0, 0.5)[halved[n]]).requires_grad_()
+        loss = sum(wrapped[n](x) for _ in range(2))
+        thread = threading.Thread(target=loss.backward)
+        thread.start()
+        thread.join()
+        found[n] = x.grad / 2
+
+    threads = [threading.Thread(target=work, args=(n,)) for n in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for n in range(3):
+        torch.testing.assert_close(found[n], slope[halved[n]], rtol=1e-4, atol=1e-6)
+
+
+def test_a_call_of_another_thread_takes_nothing_away():
+    def f(x):
+        thread = threading.Thread(target=lambda: None)
+        thread.start()
+        thread.join()
+        return {"x": x, "note": "kept"}
+
+    found = []
+    threads = [threading.Thread(target=lambda: found.append(tt.wrap(f)(torch.ones(1)))) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert [out["note"] for out in found] == ["kept"] * 8

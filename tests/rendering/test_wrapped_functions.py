@@ -1,0 +1,585 @@
+"""``tt.wrap``: what functions may be, what they take and return, and what is refused."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import gc
+import random
+import subprocess
+import sys
+import textwrap
+from collections import namedtuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+
+import torchtransient as tt
+from support.mitsuba_room import load_room
+from torchtransient.errors import (
+    ArgumentError,
+    GradientError,
+    ShapeError,
+    UnitError,
+    UnknownKeyError,
+    VariantError,
+)
+from torchtransient.testing.small_room import CAMERA, COLOUR, GREY
+from torchtransient.testing.small_room import VARIANT as VARIANT
+
+START = torch.tensor([0.8, 0.5, 0.2])
+POSITION, POSE = "light.position", "sensor.to_world"
+Pair = namedtuple("Pair", ["first", "second"])
+
+
+@pytest.fixture(scope="module")
+def texture():
+    """Parameters of a scene without rays: a bitmap, and a function that looks it up."""
+    bitmap = mi.load_dict({"type": "bitmap", "raw": True, "data": mi.TensorXf(np.full((2, 2, 3), 0.5, np.float32))})
+    params = mi.traverse(bitmap)
+
+    def look_up(params, uv, factor=1.0):
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        si.uv = mi.Point2f(uv.array[0], uv.array[1])
+        return mi.TensorXf(bitmap.eval(si)) * factor
+
+    return params, look_up
+
+
+# ------------------------------------------------------------------------------------------------------- parameters
+
+
+def test_values_by_key(texture):
+    params, look_up = texture
+    wrapped = tt.wrap(look_up, params)
+    data = torch.linspace(0, 1, 12).reshape(2, 2, 3).requires_grad_()
+    out = wrapped({"data": data}, torch.tensor([0.25, 0.25]), factor=2.0)
+    torch.testing.assert_close(out.squeeze(), 2 * data[0, 0])
+    out.sum().backward()
+    assert torch.equal(data.grad[0, 0], torch.full((3,), 2.0)) and data.grad.sum() == 6
+    assert np.all(np.array(params["data"]) == 0.5)
+    several = torch.rand(3, 2, 2, 3)
+    each = torch.func.vmap(lambda data: wrapped({"data": data}, torch.tensor([0.25, 0.25])))(several)
+    torch.testing.assert_close(each.squeeze(), several[:, 0, 0])
+
+
+def test_values_by_the_name_of_the_first_argument(texture):
+    params, look_up = texture
+    data, uv = torch.rand(2, 2, 3), torch.tensor([0.25, 0.25])
+    torch.testing.assert_close(tt.wrap(look_up, params)(params={"data": data}, uv=uv).squeeze(), data[0, 0])
+    with pytest.raises(ArgumentError, match="as the first argument, got no argument"):
+        tt.wrap(look_up, params)(values={"data": data}, uv=uv)
+
+
+def test_every_kind_of_value():
+    """Numbers, colours, points, poses and vertices arrive in the scene in the shapes of the table, and go back."""
+    _, params = load_room()
+    vertices = "box.vertex_positions"
+    seen = {}
+
+    def read(params):
+        for key in (GREY, COLOUR, POSITION, POSE, vertices):
+            seen[key] = np.array(params[key].matrix if key == POSE else params[key]).squeeze()
+        return 0
+
+    before = {key: mi.Float(dr.ravel(params[key])) for key in (GREY, COLOUR, POSITION, vertices)}
+    pose = torch.eye(4)
+    pose[:3, 3] = torch.tensor([0.1, 0.2, 5.0])
+    count = len(before[vertices]) // 3
+    corners = torch.rand(count, 3)
+    values = {GREY: 0.25, COLOUR: [0.1, 0.2, 0.3], POSITION: torch.ones(3), POSE: pose, vertices: corners}
+    assert tt.wrap(read, params)(values) == 0
+    np.testing.assert_allclose(seen[GREY], 0.25)
+    np.testing.assert_allclose(seen[COLOUR], [0.1, 0.2, 0.3], rtol=1e-6)
+    np.testing.assert_allclose(seen[POSE], pose)
+    np.testing.assert_allclose(seen[vertices], corners.reshape(-1))
+    for key, value in before.items():
+        assert dr.all(dr.ravel(params[key]) == value), key
+
+
+def test_gradients_of_a_render_by_key():
+    """A path length that changes, against central differences of the same samples."""
+    scene, params = load_room(without="box")
+    times = torch.arange(6.0)[:, None]
+
+    def render(params, seed):
+        return mi.render(scene, params, spp=256, seed=seed, seed_grad=seed + 1)
+
+    wrapped = tt.wrap(render, params)
+
+    def arrival(position):
+        _, transient = wrapped({POSITION: position}, 3)
+        return (transient * times).sum() / transient.sum()
+
+    x = torch.tensor([-0.5, 0.25, 4.0], requires_grad=True)
+    arrival(x).backward()
+    step = torch.tensor([0.0, 0.0, 0.05])
+    across = (arrival(x.detach() + step) - arrival(x.detach() - step)) / 0.1
+    assert float(x.grad[2]) == pytest.approx(float(across), rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("values", "error", "words"),
+    [
+        ({"dota": torch.ones(3)}, UnknownKeyError, "no parameter 'dota'.*Did you mean 'data'"),
+        ({"data": torch.ones(3)}, ShapeError, r"expected shape \(2, 2, 3\), got \(3,\)"),
+        ({"data": torch.ones(5, 2, 2, 3)}, ShapeError, "vmap, or a loop"),
+        ({"data": torch.full((2, 2, 3), torch.nan)}, UnitError, "expected finite numbers"),
+        ({"data": torch.ones(2, 2, 3, dtype=torch.complex64)}, ShapeError, "expected real numbers"),
+        (torch.ones(2, 2, 3), ArgumentError, "expected a mapping from keys .* got Tensor"),
+    ],
+)
+def test_values_that_do_not_fit(texture, values, error, words):
+    params, look_up = texture
+    with pytest.raises(error, match=words):
+        tt.wrap(look_up, params)(values, torch.tensor([0.25, 0.25]))
+    assert np.all(np.array(params["data"]) == 0.5)
+
+
+def test_other_values_of_the_scene_are_those_of_the_call(texture):
+    """A scene that is changed between a call and its derivative."""
+    params, look_up = texture
+    first = mi.TensorXf(np.array(params["data"]))
+
+    @tt.wrap
+    def product(x):
+        return x * look_up(params, mi.TensorXf([0.25, 0.25], (2,))).array[0]
+
+    x = torch.ones(1, requires_grad=True)
+    out = product(x)
+    params["data"] = first * 3
+    params.update()
+    out.backward()
+    held = np.array(params["data"])
+    params["data"] = first
+    params.update()
+    assert float(x.grad) == 0.5 and np.all(held == 1.5)
+
+
+def test_a_scene_that_raises_is_put_back(texture):
+    params, _ = texture
+
+    def fail(params):
+        raise KeyError("own")
+
+    with pytest.raises(KeyError, match="own"):
+        tt.wrap(fail, params)({"data": torch.ones(2, 2, 3)})
+    assert np.all(np.array(params["data"]) == 0.5)
+
+
+@pytest.mark.parametrize("way", ["closure", "argument", "method", "attribute", "entry", "state"])
+def test_scenes_are_found(texture, way):
+    params, _ = texture
+
+    class Holder:
+        held = params
+
+    def write(given, x):
+        (given or Holder.held)["data"] = mi.TensorXf(x)
+        (given or Holder.held).update()
+        return x
+
+    def closure(x):
+        return write(params, x)
+
+    class Model(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.params = params
+
+        def look(self, x):
+            return write(self.params, x)
+
+        wrapped = tt.wrap(look)
+
+    model, entries = Model(), [params]
+
+    x = torch.ones(2, 2, 3)
+    if way == "closure":
+        tt.wrap(closure)(x)
+    elif way == "argument":
+        tt.wrap(write)(params, x)
+    elif way == "method":
+        model.wrapped(x)
+        tt.wrap(model.look)(x)
+    elif way == "attribute":
+        tt.wrap(lambda x: model.look(x))(x)
+    elif way == "entry":
+        tt.wrap(lambda x: write(entries[0], x))(x)
+    else:
+        tt.wrap(write, state=params)(None, x)
+    assert np.all(np.array(params["data"]) == 0.5)
+
+
+def test_attached_parameters_are_constants():
+    params = mi.traverse(mi.load_dict({"type": "uniform", "value": 2.0}))
+    dr.enable_grad(params["value"])
+    params.update()
+    x = torch.ones(1, requires_grad=True)
+    tt.wrap(lambda x: x * params["value"])(x).backward()
+    assert x.grad == 2 and dr.grad_enabled(params["value"]) and dr.grad(params["value"]) == 0
+
+
+# ------------------------------------------------------------------------------------------------------------ seeds
+
+
+def draws(seed, x):
+    """A sampler of one's own: the mean of x over random places."""
+    sampler = mi.load_dict({"type": "independent", "sample_count": 1})
+    sampler.seed(seed, 64)
+    return dr.mean(dr.gather(mi.Float, x.array, mi.UInt32(sampler.next_1d() * 4)))
+
+
+def test_seeds_are_the_same_in_derivatives():
+    x = torch.rand(4, requires_grad=True)
+    out = tt.wrap(draws)(3, x)
+    out.backward()
+    # Linear in x: of the same samples the gradient gives the value back.
+    assert float((x.grad * x.detach()).sum()) == pytest.approx(out.item(), rel=1e-5)
+
+
+def test_a_seed_of_its_own_for_derivatives():
+    x = torch.rand(4, requires_grad=True)
+    wrapped = tt.wrap(draws, reseed="seed")
+    shares = []
+    for seed in (3, 3, 4):
+        out = wrapped(seed, x)
+        assert torch.equal(out, tt.wrap(draws)(seed, x))
+        shares.append(torch.autograd.grad(out, x)[0])
+    same = torch.autograd.grad(tt.wrap(draws)(3, x), x)[0]
+    assert torch.equal(shares[0], shares[1])
+    assert not torch.equal(shares[0], shares[2]) and not torch.equal(shares[0], same)
+    with pytest.raises(UnitError, match="whole number as a seed"):
+        wrapped(1.5, x)
+    with pytest.raises(ArgumentError, match=r"reseed='sead' is no argument of .*draws, which has seed, x"):
+        tt.wrap(draws, reseed="sead")
+
+
+def test_numbers_that_the_function_draws_are_drawn_again():
+    def noisy(x):
+        return x * torch.rand(3)[1].item()
+
+    def noisier(x):
+        return x * random.random() * np.random.rand()  # noqa: NPY002
+
+    x = torch.ones(1, requires_grad=True)
+    out = tt.wrap(noisier)(x)
+    out.backward()
+    assert torch.equal(x.grad, out.detach())
+
+    torch.manual_seed(2)
+    expected = torch.rand(3)[1]
+    torch.manual_seed(2)
+    x = torch.ones(1, requires_grad=True)
+    out = tt.wrap(noisy)(x)
+    after = torch.rand(1)
+    out.backward()
+    torch.testing.assert_close(x.grad, expected.reshape(1))
+    torch.manual_seed(2)
+    torch.rand(3)
+    assert torch.equal(after, torch.rand(1))
+
+
+# --------------------------------------------------------------------------------------------------------- PyTrees
+
+
+@dataclasses.dataclass
+class Data:
+    x: object
+    scale: float = 1.0
+
+
+class Struct:
+    DRJIT_STRUCT = {"x": object, "y": object}  # noqa: RUF012
+
+    def __init__(self):
+        self.x = self.y = None
+
+
+def test_trees_go_in_and_out():
+    def f(tree, *, more):
+        a, (b, *_), pair, data, struct = tree["a"], tree["b"], tree["pair"], tree["data"], tree["struct"]
+        assert isinstance(pair, Pair) and isinstance(data, Data) and isinstance(struct, Struct)
+        assert tree["note"] == "text" and more is None
+        found = Struct()
+        found.x, found.y = struct.x * 2, struct.y * 3
+        return {"sum": a + b, "pair": Pair(pair.first * 2, None), "data": Data(data.x * data.scale, 7), "struct": found}
+
+    struct = Struct()
+    struct.x, struct.y = torch.ones(2, requires_grad=True), torch.ones(2)
+    a, b, c, d = (torch.full((2,), n, requires_grad=True) for n in (1.0, 2.0, 3.0, 4.0))
+    tree = {"a": a, "b": [b, 5], "pair": Pair(c, 1), "data": Data(d, 0.5), "struct": struct, "note": "text"}
+    out = tt.wrap(f)(tree, more=None)
+    assert type(out["pair"]) is Pair and type(out["data"]) is Data and type(out["struct"]) is Struct
+    assert out["pair"].second is None and out["data"].scale == 7
+    total = out["sum"].sum() + out["pair"].first.sum() + out["data"].x.sum() + out["struct"].x.sum()
+    total.backward()
+    for x, slope in ((a, 1.0), (b, 1.0), (c, 2.0), (d, 0.5), (struct.x, 2.0)):
+        assert torch.equal(x.grad, torch.full((2,), slope))
+
+
+def test_results_of_every_type():
+    def f(x):
+        flat = x.array
+        return {
+            "number": dr.sum(flat),
+            "colour": dr.unravel(mi.Color3f, flat),
+            "points": mi.Point3f(flat, 2 * flat, 3 * flat),
+            "matrix": mi.Matrix3f(dr.gather(mi.Float, flat, mi.UInt32(0))),
+            "transform": mi.Transform4f().translate(mi.Vector3f(dr.gather(mi.Float, flat, mi.UInt32(1)), 0, 0)),
+            "mask": flat > 1,
+            "index": mi.UInt32(flat),
+            "double": mi.Float64(flat),
+            "half": mi.Float16(flat),
+            "plain": (1, 2.5, "text", None),
+        }
+
+    x = torch.tensor([1.0, 2.0, 3.0], requires_grad=True)
+    out = tt.wrap(f)(x)
+    shapes = {"number": (1,), "colour": (3, 1), "points": (3, 3), "matrix": (3, 3, 1), "transform": (4, 4, 1)}
+    assert {key: tuple(out[key].shape) for key in shapes} == shapes
+    dtypes = {"mask": torch.bool, "index": torch.uint32, "double": torch.float64, "half": torch.float16}
+    assert {key: out[key].dtype for key in dtypes} == dtypes
+    assert out["plain"] == (1, 2.5, "text", None)
+    assert torch.equal(out["points"][1], 2 * x) and out["transform"][0, 3] == 2
+    for key, expected in {
+        "number": [1, 1, 1], "colour": [1, 1, 1], "points": [6, 6, 6], "matrix": [3, 0, 0], "transform": [0, 1, 0],
+        "double": [1, 1, 1], "half": [1, 1, 1],
+    }.items():  # fmt: skip
+        grad = torch.autograd.grad(out[key].sum(), x, retain_graph=True)[0]
+        assert torch.equal(grad, torch.tensor(expected, dtype=torch.float32)), key
+    assert not out["mask"].requires_grad and not out["index"].requires_grad
+
+
+def test_what_is_no_tensor_passes_as_it_is():
+    bsdf, got, array = mi.load_dict({"type": "diffuse"}), [], np.arange(3)
+    assert tt.wrap(lambda *given: got.extend(given))(1, "two", array, bsdf, None, mi.Float(2.5)) is None
+    assert got[:2] == [1, "two"] and got[3] is bsdf and got[4] is None and got[5] == 2.5
+    assert np.array_equal(got[2], array)
+
+
+@pytest.mark.parametrize("kind", ["number", "array of Dr.Jit", "array of NumPy"])
+def test_a_function_that_changes_its_arguments(kind):
+    factor = {"number": 3.0, "array of Dr.Jit": mi.Float(3.0)}.get(kind, np.array([3.0], np.float32))
+
+    def f(x, factor):
+        before = x + 0
+        x *= float(np.ravel(factor)[0])
+        factor *= 2
+        return before + x
+
+    x = torch.ones(2, requires_grad=True)
+    wrapped = tt.wrap(f)
+    out = wrapped(x, factor)
+    torch.autograd.grad(out.sum(), x, retain_graph=True)
+    grad = torch.autograd.grad(out.sum(), x)[0]
+    assert torch.equal(out, torch.full((2,), 4.0)) and torch.equal(grad, torch.full((2,), 4.0))
+    along = torch.func.jvp(lambda x: wrapped(x, factor), (x.detach(),), (torch.ones(2),))[1]
+    assert torch.equal(along, torch.full((2,), 4.0)) and torch.equal(x, torch.ones(2)) and np.all(factor == 3.0)
+
+
+# ---------------------------------------------------------------------------------------------- functions of all kinds
+
+
+def test_decorators_methods_and_partial_functions():
+    class Scaled:
+        factor = 3.0
+
+        @tt.wrap(source="torch", target="drjit")
+        def times(self, x):
+            """What it does."""
+            return x * self.factor
+
+    x = torch.ones(2, requires_grad=True)
+    assert torch.equal(Scaled().times(x), torch.full((2,), 3.0)) and Scaled.times.__doc__ == "What it does."
+    assert torch.equal(tt.wrap(functools.partial(Scaled.times.__wrapped__, Scaled()))(x), torch.full((2,), 3.0))
+    assert torch.equal(tt.wrap(Scaled().times.__wrapped__, source=torch, target=dr)(Scaled(), x), torch.full((2,), 3.0))
+
+
+def test_loops_and_branches_of_drjit():
+    @tt.wrap
+    @dr.syntax
+    def power(x, n: int):
+        i, y = mi.UInt32(0), mi.Float(1)
+        while dr.hint(i < n, max_iterations=-1):
+            y *= x.array
+            i += 1
+        return y
+
+    x = torch.tensor([0.5, 2.0], requires_grad=True)
+    along = torch.func.jvp(lambda x: power(x, 3), (x.detach(),), (torch.ones(2),))[1]
+    torch.testing.assert_close(along, 3 * x.detach().square())
+
+
+def test_a_part_in_torch_inside():
+    @dr.wrap(source="drjit", target="torch")
+    def inner(x):
+        return torch.sin(x)
+
+    outer = tt.wrap(lambda x: inner(x * 2))
+    x = torch.tensor([0.1, 0.2], requires_grad=True)
+    outer(x).sum().backward()
+    torch.testing.assert_close(x.grad, 2 * torch.cos(2 * x.detach()))
+
+
+def test_an_integrator_of_ones_own_and_aovs():
+    scene, params = load_room()
+    aov = mi.load_dict({"type": "aov", "aovs": "depth:depth,albedo:albedo", "inner": {"type": "direct"}})
+    film = mi.load_dict({"type": "hdrfilm", "width": 4, "height": 3, "rfilter": {"type": "box"}})
+    pose = mi.ScalarTransform4f(CAMERA)
+    sensor = mi.load_dict({"type": "perspective", "fov": 20.0, "to_world": pose, "film": film})
+
+    def render(params, seed):
+        return mi.render(scene, params, sensor=sensor, integrator=aov, spp=4, seed=seed)
+
+    x = START.clone().requires_grad_()
+    image = tt.wrap(render, params)({COLOUR: x}, 0)
+    assert image.shape[:2] == (3, 4) and image.shape[2] > 4
+    image.sum().backward()
+    assert float(x.grad.min()) > 0
+
+
+# --------------------------------------------------------------------------------------------------- what is refused
+
+
+def test_what_the_function_knows_otherwise_is_refused_where_it_wants_a_gradient():
+    weight, attached = torch.ones(2, requires_grad=True), mi.Float(1.0)
+    x = torch.ones(2)
+    with pytest.raises(GradientError, match="variable 'weight', which is no argument"):
+        tt.wrap(lambda x: x * mi.TensorXf(weight))(x)
+    with torch.no_grad():
+        assert torch.equal(tt.wrap(lambda x: x * mi.TensorXf(weight))(x), x)
+    dr.enable_grad(attached)
+    with pytest.raises(GradientError, match="variable 'attached'"):
+        tt.wrap(lambda x: x * attached)(x)
+    with pytest.raises(GradientError, match="an argument wants a gradient"):
+        tt.wrap(lambda x, y: x * y)(x, attached)
+
+
+def test_results_that_do_not_depend_on_what_wants_a_gradient():
+    x = torch.ones(2, requires_grad=True)
+    out = tt.wrap(lambda x: mi.Float(x.array[0]) * 2)(x)
+    with pytest.raises(GradientError, match="nothing that the function returned depends on"):
+        out.backward()
+    with pytest.raises(GradientError, match="nothing that the function returned depends on"):
+        torch.func.jvp(tt.wrap(lambda x: dr.detach(x)), (x.detach(),), (x.detach(),))
+
+
+@pytest.mark.parametrize("where", ["function", "variable"])
+def test_frozen_functions_have_no_derivatives(where):
+    """Of Dr.Jit's own they are zero, without a word: where that changes, this is to be allowed."""
+
+    @dr.freeze
+    def frozen(x):
+        return x * x
+
+    y = mi.Float([1.0, 2.0])
+    dr.enable_grad(y)
+    dr.backward(frozen(y))
+    assert dr.all(dr.grad(y) == 0)
+    wrapped = tt.wrap(frozen if where == "function" else lambda x: frozen(x))
+    x = torch.tensor([1.0, 2.0], requires_grad=True)
+    for factor in (1.0, 3.0):
+        torch.testing.assert_close(wrapped(x.detach() * factor), (x.detach() * factor).square())
+    with pytest.raises(GradientError, match=f"the {where}.* is frozen"):
+        wrapped(x).sum().backward()
+
+
+def test_functions_that_do_something_else_when_they_are_replayed():
+    calls = []
+
+    def f(x):
+        calls.append(1)
+        return x if len(calls) == 1 else (x, x)
+
+    with pytest.raises(GradientError, match="returned another structure when it was replayed"):
+        tt.wrap(f)(torch.ones(2, requires_grad=True)).sum().backward()
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "words"),
+    [
+        (lambda: tt.wrap("torch", "drjit"), ArgumentError, "expected a function, got 'torch'"),
+        (lambda: tt.wrap(source="drjit", target="torch"), ArgumentError, "those of drjit.wrap"),
+        (lambda: tt.wrap(len, ["red"]), ArgumentError, "parameters: expected the mitsuba.SceneParameters"),
+        (lambda: tt.wrap(len, state={}), ArgumentError, "state: expected the mitsuba.SceneParameters"),
+        (lambda: tt.wrap(dr.sum)(torch.ones(2, dtype=torch.complex64)), ShapeError, "view_as_real"),
+        (lambda: tt.wrap(dr.sum)(torch.eye(2).to_sparse()), ShapeError, "dense tensor"),
+        (lambda: tt.wrap(lambda x: x.torch())(torch.ones(2)), GradientError, "got a torch tensor from the function"),
+        (lambda: tt.wrap(lambda x: dr.zeros(mi.SurfaceInteraction3f))(torch.ones(2)), ShapeError, "whose fields"),
+        (lambda: tt.wrap(lambda x: dr.zeros(mi.Ray3f))(torch.ones(2)), ShapeError, "a Ray3f, whose fields"),
+    ],
+)  # fmt: skip
+def test_what_is_refused(make, error, words):
+    with pytest.raises(error, match=words):
+        make()
+
+
+@pytest.mark.slow
+def test_another_variant_may_be_active_in_between(texture):
+    params, look_up = texture
+    wrapped = tt.wrap(look_up, params)
+    data = torch.rand(2, 2, 3, requires_grad=True)
+    out = wrapped({"data": data}, uv := torch.tensor([0.25, 0.25]))
+    mi.set_variant("llvm_ad_mono")
+    out.sum().backward()
+    assert torch.equal(wrapped({"data": data}, uv), out) and mi.variant() == "llvm_ad_mono"
+    assert torch.equal(data.grad[0, 0], torch.ones(3))
+
+
+@pytest.mark.slow
+def test_a_fork_is_refused():
+    script = """
+        import os
+        import torchtransient as tt
+        import torch
+        double = tt.wrap(lambda x: x * 2)
+        double(torch.ones(2))
+        if (child := os.fork()) == 0:
+            try:
+                double(torch.ones(2))
+            except tt.errors.VariantError as error:
+                os._exit(7 if "does not survive a fork" in str(error) else 1)
+            os._exit(0)
+        print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, timeout=240, check=False
+    )
+    assert done.stdout.split() == ["7"], done.stderr[-2000:]
+    assert issubclass(VariantError, RuntimeError)
+
+
+@pytest.mark.slow
+def test_memory_and_kernels_stay_what_they_are():
+    scene, params = load_room()
+    wrapped = tt.wrap(lambda params, seed: mi.render(scene, params, spp=4, seed=seed)[1], params)
+    x = START.clone().requires_grad_()
+
+    def step(seed):
+        wrapped({COLOUR: x}, seed).square().sum().backward()
+        x.grad = None
+
+    for seed in range(3):
+        step(seed)
+    gc.collect()
+    before = dr.whos(as_string=True).count("\n")
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        for seed in range(3, 40):
+            step(seed)
+        launched = dr.kernel_history((dr.KernelType.JIT,))
+    assert launched and all(kernel["cache_hit"] for kernel in launched)
+    assert dr.whos(as_string=True).count("\n") == before
+
+
+@pytest.mark.slow
+def test_the_compiler_leaves_a_call_as_it_is():
+    squares = tt.wrap(lambda x: x * x)
+    compiled = torch.compile(lambda x: squares(2 * x).sum() + x.sum(), backend="eager")
+    x = torch.rand(3, requires_grad=True)
+    compiled(x).backward()
+    torch.testing.assert_close(x.grad, 8 * x.detach() + 1)

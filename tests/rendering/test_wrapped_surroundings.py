@@ -1,0 +1,315 @@
+"""``tt.wrap``: what a function reaches otherwise than by its arguments, threads, graphs of torch, and odd arguments."""
+
+from __future__ import annotations
+
+import functools
+import subprocess
+import sys
+import textwrap
+import types
+from collections import UserDict, deque
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+from torch import nn
+from torch.autograd import forward_ad
+
+import torchtransient as tt
+from torchtransient.errors import GradientError, ShapeError
+from torchtransient.testing.small_room import VARIANT as VARIANT
+
+squares = tt.wrap(lambda x: x * x)
+
+# ------------------------------------------------------------------------------------------------------------ scenes
+
+GLOBAL: dict[str, mi.SceneParameters] = {}
+
+
+def write(params, x):
+    params["value"] = x.array
+    params.update()
+    return x * params["value"]
+
+
+def nested(x):
+    def inside():
+        return write(GLOBAL["params"], x)
+
+    return inside()
+
+
+def by_a_helper(x):
+    return nested(x)
+
+
+def decorated(function):
+    held = GLOBAL["params"]
+
+    @functools.wraps(function)
+    def call(x):
+        return write(held, function(x))
+
+    return call
+
+
+class Model:
+    def __init__(self, thing):
+        self.thing = thing
+
+    def __call__(self, x):
+        return write(self.thing, x)
+
+    def look(self, x):
+        return write(self.thing, x)
+
+
+class Network(nn.Module):
+    def forward(self, x):
+        return write(GLOBAL["params"], x)
+
+
+def ways(texture, params):
+    return {
+        "a function inside": nested,
+        "a helper": by_a_helper,
+        "an object that is called": Model(params),
+        "a part of a method": functools.partial(Model(params).look),
+        "a module": Network(),
+        "a default": lambda x, given=params: write(given, x),
+        "a default by name": lambda x, *, given=params: write(given, x),
+        "a decorator": decorated(lambda x: x),
+        "traversed inside": lambda x: write(mi.traverse(texture), x),
+    }
+
+
+@pytest.mark.parametrize("way", list(ways(None, GLOBAL.setdefault("params", None))))
+def test_scenes_are_found_and_put_back(way):
+    texture = mi.load_dict({"type": "uniform", "value": 2.0})
+    params = GLOBAL["params"] = mi.traverse(texture)
+    x = torch.tensor([3.0], requires_grad=True)
+    tt.wrap(ways(texture, params)[way])(x).backward()
+    assert x.grad == 6 and params["value"] == 2 and not dr.grad_enabled(params["value"])
+
+
+def test_a_scene_that_is_only_read_is_that_of_the_call():
+    texture = mi.load_dict({"type": "uniform", "value": 2.0})
+    x = torch.ones(1, requires_grad=True)
+    out = tt.wrap(lambda x: x * texture.eval(dr.zeros(mi.SurfaceInteraction3f)).x)(x)
+    params = mi.traverse(texture)
+    params["value"] = 5.0
+    params.update()
+    out.backward()
+    assert x.grad == 2 and params["value"] == 5
+
+
+# --------------------------------------------------------------------------------------- derivatives that would be lost
+
+HOLDERS = {
+    "list": lambda x: [x],
+    "dictionary": lambda x: {"x": x},
+    "deque": lambda x: deque([x]),
+    "set": lambda x: {x},
+    "namespace": lambda x: types.SimpleNamespace(x=x),
+    "proxy": lambda x: types.MappingProxyType({"x": x}),
+    "other dictionary": lambda x: UserDict(x=x),
+    "parameters": lambda x: nn.ParameterList([x]),
+    "parameters by name": lambda x: nn.ParameterDict({"x": x}),
+}
+
+
+@pytest.mark.parametrize("way", HOLDERS)
+def test_containers_of_tensors_that_want_gradients(way):
+    x, held = torch.ones(2, requires_grad=True), HOLDERS[way](nn.Parameter(torch.ones(2)))
+    with pytest.raises(GradientError, match="the variable 'held', which is no argument, wants a gradient"):
+        tt.wrap(lambda x: (x, held)[0])(x)
+    wrapped = tt.wrap(lambda x, held: x)
+    if way in ("list", "dictionary"):  # trees
+        assert torch.equal(wrapped(x, held), x)
+        return
+    with pytest.raises(GradientError, match="an argument wants a gradient"):
+        wrapped(x, held)
+    with torch.no_grad():
+        assert torch.equal(wrapped(x, held), x)
+
+
+TRANSFORMS = {
+    "grad": lambda f: torch.func.grad(f),
+    "vmap": lambda f: torch.func.vmap(f),
+    "jvp": lambda f: lambda x: torch.func.jvp(f, (x,), (x,)),
+}
+
+
+@pytest.mark.parametrize("way", TRANSFORMS)
+def test_transforms_reach_arguments_alone(way):
+    def f(a):
+        return tt.wrap(lambda x: dr.sum(x * mi.TensorXf(a), axis=None))(torch.ones(3))
+
+    with pytest.raises(GradientError, match="the variable 'a', which is no argument, wants a gradient"):
+        TRANSFORMS[way](f)(torch.ones(2, 3) if way == "vmap" else torch.ones(3))
+
+
+def test_tangents_reach_arguments_alone():
+    with forward_ad.dual_level():
+        dual = forward_ad.make_dual(torch.ones(3), torch.ones(3))
+        with pytest.raises(GradientError, match="the variable 'dual', which is no argument, wants a gradient"):
+            tt.wrap(lambda x: x * mi.TensorXf(dual))(torch.ones(3))
+
+
+def test_functions_that_differentiate_by_themselves():
+    def slope(y):
+        dr.enable_grad(y)
+        dr.backward(y * y)
+        return dr.grad(y)
+
+    def slope_forward(y):
+        dr.enable_grad(y)
+        z = y * y
+        dr.forward(y)
+        return dr.grad(z)
+
+    for inner in (slope, slope_forward):
+        x = torch.tensor([3.0], requires_grad=True)
+        out = tt.wrap(lambda x, inner=inner: inner(mi.Float(2)) * x.array)(x)
+        out.backward()
+        assert out == 12 and x.grad == 4
+        assert torch.func.jvp(tt.wrap(lambda x, inner=inner: inner(mi.Float(2)) * x.array), (x,), (x,))[1] == 12
+
+    def by_argument(x, constant):
+        y = mi.Float(2)
+        dr.enable_grad(y)
+        dr.backward(y * y * (dr.detach(x) if constant else x).array)
+        return dr.grad(y) * x.array
+
+    x = torch.tensor([3.0], requires_grad=True)
+    assert tt.wrap(by_argument)(x, False) == 36
+    with pytest.raises(GradientError, match="differentiates by itself"):
+        tt.wrap(by_argument)(x, False).backward()
+    tt.wrap(by_argument)(x, True).backward()
+    assert x.grad == 12
+
+
+# ---------------------------------------------------------------------------------------------------- graphs of torch
+
+
+@pytest.mark.slow
+def test_nothing_becomes_a_constant_of_a_graph():
+    from torch._subclasses.fake_tensor import FakeTensorMode
+    from torch.fx.experimental.proxy_tensor import make_fx
+
+    x = torch.tensor([1.0, 2.0, 3.0])
+    with pytest.raises(GradientError, match=r"cannot be traced.*linearize.*torch.func.jvp"):
+        torch.func.linearize(squares, x)
+    for f in (squares, torch.func.grad(lambda x: squares(x).sum())):
+        with pytest.raises(GradientError, match="cannot be traced"):
+            make_fx(f)(x)
+    with FakeTensorMode() as mode, pytest.raises(GradientError, match="tensors without memory"):
+        squares(mode.from_tensor(torch.ones(100)))
+
+
+def test_batches_without_entries():
+    with pytest.raises(ShapeError, match="a batch of at least one entry"):
+        torch.func.vmap(squares)(torch.ones(0, 3))
+
+
+def test_numbers_that_are_kept_with_the_other_sign():
+    turned = torch._neg_view(torch.arange(100.0))
+    x = torch.ones(100, requires_grad=True)
+    assert turned.is_contiguous() and torch.equal(tt.wrap(lambda x: x * 1)(turned), -torch.arange(100.0))
+    torch.testing.assert_close(torch.autograd.grad(squares(x), x, turned)[0], -2 * torch.arange(100.0))
+
+
+# ----------------------------------------------------------------------------------------------- arguments and results
+
+
+def test_structures_of_mitsuba_are_arguments():
+    ray = mi.Ray3f(mi.Point3f(1, 2, 3), mi.Vector3f(0, 0, 1))
+
+    def f(x, ray, pose):
+        ray.o *= 2  # of a copy
+        return (pose @ ray.o).z * x.array
+
+    x = torch.tensor([1.0], requires_grad=True)
+    out = tt.wrap(f)(x, ray, mi.Transform4f().translate(mi.Vector3f(0, 0, 1)))
+    out.backward()
+    assert out == 7 and x.grad == 7 and ray.o.z == 3
+    dr.enable_grad(ray.o)
+    with pytest.raises(GradientError, match="an argument wants a gradient"):
+        tt.wrap(f)(x, ray, mi.Transform4f())
+
+
+@pytest.mark.parametrize("kind", ["Ray3f", "SurfaceInteraction3f", "PCG32"])
+def test_structures_of_mitsuba_are_no_results(kind):
+    with pytest.raises(ShapeError, match=f"a {kind}, whose fields cannot be tensors. Return them in a dictionary"):
+        tt.wrap(lambda x: dr.zeros(getattr(mi, kind)))(torch.ones(1))
+
+
+def test_pointers_are_no_results():
+    with pytest.raises(ShapeError, match="got a BSDFPtr"):
+        tt.wrap(lambda x: dr.zeros(mi.BSDFPtr, 2))(torch.ones(1))
+
+
+def test_lists_and_tuples_keep_their_kind():
+    class Several(list):
+        note = "own"
+
+    highest, several = torch.max(torch.eye(2), 0), Several([torch.ones(2)])
+
+    def f(highest, several, size):
+        assert isinstance(size, torch.Size) and several.note == "own"
+        return highest.values, Several([several[0] * 2]), size
+
+    values, doubled, size = tt.wrap(f)(highest, several, torch.Size((2, 3)))
+    assert torch.equal(values, torch.ones(2)) and type(doubled) is Several and size == torch.Size((2, 3))
+    assert np.all(doubled[0].numpy() == 2) and torch.equal(several[0], torch.ones(2))
+
+
+def test_containers_that_change_between_a_call_and_its_derivative():
+    class Settings(dict):
+        factor = 2.0
+
+    def f(plain, own, several):
+        return sum(plain.values()) + sum(own.values()) * own.factor + sum(several)
+
+    x = torch.ones(1, requires_grad=True)
+    plain, own, several = {"x": x}, Settings(x=x), [x]
+    out = tt.wrap(f)(plain, own, several)
+    plain["y"] = own["y"] = torch.ones(1)
+    own.factor = 5.0
+    several.append(torch.ones(1))
+    out.backward()
+    assert out == 4 and x.grad == 4
+
+
+# ------------------------------------------------------------------------------------------------------------- threads
+
+
+@pytest.mark.slow
+def test_threads_do_not_wait_for_one_another():
+    """Graphs that are freed in one thread while another computes: a lock of Dr.Jit's and Python's own."""
+    script = """
+        import faulthandler, threading
+        faulthandler.dump_traceback_later(60, exit=True)
+        import torchtransient as tt
+        import mitsuba as mi
+        import torch
+        mi.set_variant("llvm_ad_rgb")
+        squares = tt.wrap(lambda x: x * x)
+        def work(size):
+            for _ in range(60):
+                x = torch.ones(size, requires_grad=True)
+                squares(x).sum().backward()
+                assert torch.equal(x.grad, torch.full((size,), 2.0))
+        threads = [threading.Thread(target=work, args=(size,)) for size in (3, 100)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        print("done")
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.stdout.split() == ["done"], done.stderr[-2000:]

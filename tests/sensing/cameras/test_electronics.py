@@ -1,0 +1,146 @@
+"""Pixel electronics: every noise against its closed form, saturation against sampling."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
+from torchtransient.sensing import ScoreFunction
+from torchtransient.sensing.cameras.electronics import (
+    PixelElectronics,
+    clipped_normal_mean,
+    clipped_normal_variance,
+    fixed_pattern,
+    ktc_noise,
+)
+
+COUNT = 200_000
+
+
+def pixels(mean):
+    return torch.full((1, 1, 1, COUNT), mean, dtype=torch.float64)
+
+
+def drawn(mean, **parts):
+    return PixelElectronics(**parts).sample(pixels(mean), torch.Generator().manual_seed(1))
+
+
+def test_ktc_noise():
+    assert abs(ktc_noise(10e-15, 300.0) - 40.2) < 0.05
+    with pytest.raises(UnitError, match="expected"):
+        ktc_noise(10.0)  # femtofarads given as farads
+
+
+@pytest.mark.parametrize("m", [-4.0, 0.0, 3.0, 9.0, 14.0, 40.0])
+def test_clipped_normal(m):
+    """Against quadrature over the density."""
+    v, low, high = 4.0, 1.0, 10.0
+    x = torch.linspace(-12, 12, 400_001, dtype=torch.float64)
+    p = torch.exp(-0.5 * x * x)
+    p = p / p.sum()
+    scale = math.sqrt(v + 1e-4)
+    values = (m + scale * x).clamp(low, high)
+    mean, variance = torch.tensor(m, dtype=torch.float64), torch.tensor(v, dtype=torch.float64)
+    assert abs(float(clipped_normal_mean(mean, variance, low, high)) - float((values * p).sum())) < 1e-9
+    upper = (m + 2.0 * x).clamp_max(high)
+    exact = float((upper**2 * p).sum() - (upper * p).sum() ** 2)
+    assert abs(float(clipped_normal_variance(mean, variance, high)) - exact) < 1e-3
+
+
+def test_clipped_normal_has_gradients():
+    m = torch.tensor([-3.0, 0.0, 9.9, 30.0], dtype=torch.float64, requires_grad=True)
+    v = torch.tensor([1.0, 2.0, 0.5, 4.0], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda m, v: clipped_normal_mean(m, v, 0.0, 10.0), (m, v))
+    assert torch.autograd.gradcheck(lambda m, v: clipped_normal_variance(m, v, 10.0), (m, v))
+
+
+@pytest.mark.parametrize(
+    "mean, parts, variance",
+    [
+        (50.0, {}, 50.0),
+        (50.0, {"read_noise_e": 6.0, "ktc_noise_e": 8.0}, 150.0),
+        (50.0, {"dark_e": 20.0}, 70.0),
+        (400.0, {"excess_noise": 2.0}, 800.0),
+        (400.0, {"gain_e_per_dn": 12.0, "bits": 10, "black_level_dn": 64.0}, 412.0),
+    ],
+)
+def test_variances_add(mean, parts, variance):
+    y = drawn(mean, **parts)
+    wanted = mean + parts.get("dark_e", 0.0)
+    assert abs(float(y.mean()) - wanted) < 5 * (variance / COUNT) ** 0.5
+    assert abs(float(y.var()) / variance - 1) < 0.02
+    model = PixelElectronics(**parts)
+    assert abs(float(model.expected(pixels(mean)[..., :1])) - wanted) < 1e-9
+    assert abs(float(model.variance(pixels(mean)[..., :1])) - variance) < 1e-9
+
+
+@pytest.mark.parametrize("mean", [900.0, 985.0, 1000.0, 1030.0, 1200.0])
+def test_saturation(mean):
+    """The expectation of a full well near its limit, within 5 standard errors and the skewness left out (0.01 e)."""
+    parts = {"full_well_e": 1000.0, "read_noise_e": 3.0}
+    y = drawn(mean, **parts)
+    model = PixelElectronics(**parts)
+    found = float(model.expected(pixels(mean)[..., :1]))
+    assert abs(float(y.mean()) - found) < 5 * float(y.std()) / COUNT**0.5 + 0.1
+    assert abs(float(y.var()) / float(model.variance(pixels(mean)[..., :1])) - 1) < 0.05
+    assert found < min(mean, 1000.0) + 1e-9
+
+
+def test_converter_reports_its_steps_and_range():
+    parts = {"gain_e_per_dn": 4.0, "bits": 8, "black_level_dn": 10.0, "read_noise_e": 30.0}
+    y = drawn(20.0, **parts)
+    assert float((y / 4.0 - (y / 4.0).round()).abs().max()) == 0.0
+    assert PixelElectronics(**parts).range_e == (-40.0, 980.0)
+    assert float(y.min()) == -40.0
+    assert float(drawn(5000.0, **parts).max()) == 980.0
+    # A third of the draws below: the mean of what is left is the clipped mean, with rounding to 1 e.
+    model = PixelElectronics(**parts)
+    assert abs(float(y.mean()) - float(model.expected(pixels(20.0)[..., :1]))) < 0.3
+
+
+@pytest.mark.parametrize("policy", ["expected", "gaussian", "straight_through", "score"])
+def test_gradient_of_a_linear_loss(policy):
+    """d E[y] / dm against finite differences of the expectation, in the middle and at the edge of the full well."""
+    for mean in (60.0, 100.0):
+        model = PixelElectronics(full_well_e=100.0, read_noise_e=2.0, gain_e_per_dn=0.5, bits=12, grad=policy)
+        m = torch.full((COUNT,), mean, dtype=torch.float64, requires_grad=True)
+        with ScoreFunction() as score:
+            y = model(m.reshape(-1, 1, 1, 1, 1), torch.Generator().manual_seed(0)).flatten()
+        loss = score.surrogate(y, baseline=mean) if policy == "score" else y
+        loss.sum().backward()
+        h = 1.0
+        up, down = (float(model.expected(pixels(mean + s)[..., :1])) for s in (h, -h))
+        error = 5 * float(m.grad.std()) / COUNT**0.5
+        assert abs(float(m.grad.mean()) - (up - down) / (2 * h)) < error + 0.01
+
+
+def test_fixed_pattern_is_fixed():
+    g = torch.Generator().manual_seed(3)
+    gain = fixed_pattern((4, 8, 8), 0.02, center=1.0, generator=g)
+    offset = fixed_pattern((4, 8, 8), 5.0, generator=g)
+    model = PixelElectronics(gain_map=gain, offset_map_e=offset)
+    x = torch.full((2, 1, 4, 8, 8), 1000.0)
+    torch.testing.assert_close(model.expected(x), 1000 * gain.expand(2, 1, 4, 8, 8) + offset)
+    assert abs(float(gain.std()) - 0.02) < 0.004
+
+
+@pytest.mark.parametrize(
+    "call, error",
+    [
+        (lambda: PixelElectronics(read_noise_e=-1.0), UnitError),
+        (lambda: PixelElectronics(full_well_e=0.0), UnitError),
+        (lambda: PixelElectronics(bits=12), UnitError),
+        (lambda: PixelElectronics(excess_noise=0.5), UnitError),
+        (lambda: PixelElectronics(gain_e_per_dn=1.0, bits=4, black_level_dn=40.0), UnitError),
+        (lambda: PixelElectronics(grad="none"), ArgumentError),
+        (lambda: PixelElectronics(gain_map=torch.ones(3, 3))(torch.ones(1, 1, 2, 2)), ShapeError),
+        (lambda: PixelElectronics()(torch.ones(2, 2)), ShapeError),
+        (lambda: fixed_pattern((2,), -1.0), UnitError),
+    ],
+)
+def test_errors(call, error):
+    with pytest.raises(error, match="expected"):
+        call()

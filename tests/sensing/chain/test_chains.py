@@ -1,0 +1,89 @@
+"""Chains from their parts: the order of the effects, whatever the order of the arguments."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torchtransient import TimeAxis, sensing
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
+
+PS, NS = 1e-12, 1e-9
+AXIS = TimeAxis.from_seconds(0.0, 100 * PS, 64)
+WIDTHS = sensing.random_code_widths(64, 0.05, torch.Generator().manual_seed(0))
+
+
+def budget(**changes):
+    numbers = {"pulse_energy_j": 1e-9, "wavelength_m": 532e-9, "repetition_rate_hz": 10e6, "cycles": 500}
+    return sensing.PhotonBudget(sensing.Optics(f_number=2.0), **{**numbers, **changes}, axis=AXIS)
+
+
+def parts():
+    return {
+        "converter": sensing.TDC(WIDTHS),
+        "crosstalk": sensing.Crosstalk(0.01),
+        "afterpulsing": sensing.Afterpulsing(0.02, 20 * NS, 10 * NS, axis=AXIS, period_s=100 * NS),
+        "skew": sensing.DetectionSkew(30 * PS, AXIS),
+        "jitter": sensing.emg_response(120 * PS, 90 * PS),
+        "pulse": sensing.GaussianResponse(200 * PS),
+        "optics": [sensing.LensBlur(0.8)],
+        "readout": [sensing.CodedHistogram(sensing.fourier_codes(64, 8))],
+    }
+
+
+def test_parts_stand_in_the_order_of_light():
+    chain = sensing.counting_chain(budget(), sensing.SynchronousSPAD(500), **parts(), grad="straight_through")
+    assert [type(s).__name__ for s in chain.stages] == [
+        "LensBlur", "ImpulseResponse", "PhotonBudget", "SynchronousSPAD", "DetectionJitter", "DetectionSkew",
+        "Afterpulsing", "Crosstalk", "TDC", "CodedHistogram",
+    ]  # fmt: skip
+    light = torch.rand(1, 64, 4, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) * 1e-5
+    by_hand = light
+    for stage in chain.stages:
+        by_hand = stage.expected(by_hand)
+    assert torch.equal(chain.expected(light), by_hand)
+    assert chain(light, generator=torch.Generator().manual_seed(0)).shape == (1, 8, 4, 5)
+    assert chain.stages[3].grad == "straight_through"
+
+
+def test_constant_light_stays_constant():
+    """A free-running detector in ambient light alone: whatever moves or adds detections, all bins are alike."""
+    whole = {k: v for k, v in parts().items() if k in ("jitter", "skew", "pulse", "optics", "crosstalk")}
+    period = sensing.Afterpulsing(0.02, 20 * NS, 10 * NS, axis=AXIS)
+    chain = sensing.counting_chain(
+        budget(repetition_rate_hz=1 / 6.4e-9, ambient_rate_hz=3e7),
+        sensing.FreeRunningSPAD(500, 10 * NS, axis=AXIS),
+        **whole,
+        afterpulsing=period,
+    )
+    counts = chain.expected(torch.zeros(1, 64, 4, 5, dtype=torch.float64))
+    middle = counts[:, 32:33].expand_as(counts)
+    assert float(counts.min()) > 0.5  # 500 periods, 64 bins, 0.19 photons a period, dead for 0.3 of the time
+    torch.testing.assert_close(counts, middle, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize(
+    "changes, error, words",
+    [
+        ({"jitter": 60e-12}, ShapeError, "jitter to be Response or DetectionJitter or None"),
+        ({"pulse": sensing.ShotNoise()}, ShapeError, "pulse to be Response or ImpulseResponse"),
+        ({"detector": sensing.ShotNoise()}, ShapeError, "detector to make counts of rates"),
+        ({"converter": WIDTHS}, ShapeError, "converter to be TDC"),
+        ({"budget": None}, ShapeError, "budget to be PhotonBudget"),
+        ({"detector": sensing.SynchronousSPAD(99)}, UnitError, "one number of cycles"),
+        ({"afterpulsing": sensing.Afterpulsing(0.1, 1e-9, 1e-9, axis=AXIS)}, UnitError, "one laser period"),
+    ],
+)
+def test_parts_that_do_not_fit(changes, error, words):
+    given = {"budget": budget(), "detector": sensing.SynchronousSPAD(500), **changes}
+    with pytest.raises(error, match=f"expected .*{words}"):
+        sensing.counting_chain(**given)
+
+
+def test_afterpulses_once():
+    after = sensing.Afterpulsing(0.02, 20 * NS, 10 * NS, axis=AXIS, period_s=100 * NS)
+    spad = sensing.SynchronousSPAD(500, dead_time_s=10 * NS, axis=AXIS)
+    both = sensing.AfterpulsingSPAD(spad, after)
+    assert len(sensing.counting_chain(budget(), both).stages) == 2
+    with pytest.raises(ArgumentError, match="afterpulsing=None"):
+        sensing.counting_chain(budget(), both, afterpulsing=after)

@@ -1,0 +1,429 @@
+"""What does not belong together is refused: bins, cycles, periods, units; and counts that a dtype cannot hold."""
+
+from __future__ import annotations
+
+import inspect
+from copy import deepcopy
+
+import pytest
+import torch
+
+from torchtransient import TimeAxis, sensing
+from torchtransient.errors import ShapeError, StorageError, UnitError
+
+PS, NS = 1e-12, 1e-9
+AXIS = TimeAxis.from_seconds(0.0, 100 * PS, 128)
+SHORT = TimeAxis.from_seconds(0.0, 100 * PS, 64)
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def budget(cycles=1000, rate_hz=10e6, **given):
+    given = {"pulse_energy_j": 1e-9, "wavelength_m": 532e-9, **(given or {"axis": AXIS})}
+    return sensing.PhotonBudget(sensing.Optics(f_number=2.0), repetition_rate_hz=rate_hz, cycles=cycles, **given)
+
+
+# ------------------------------------------------------------------------------------------------------------- bins
+
+# every sensor that can be made with an axis, made with one
+ON_AN_AXIS = {
+    "ImpulseResponse": lambda axis: sensing.ImpulseResponse(sensing.GaussianResponse(300 * PS), axis),
+    "PhotonBudget": lambda axis: budget(axis=axis),
+    "SynchronousSPAD": lambda axis: sensing.SynchronousSPAD(100, dead_time_s=1 * NS, axis=axis),
+    "FreeRunningSPAD": lambda axis: sensing.FreeRunningSPAD(100, 1 * NS, axis=axis),
+    "Afterpulsing": lambda axis: sensing.Afterpulsing(0.01, 1 * NS, 1 * NS, axis=axis),
+    "DetectionJitter": lambda axis: sensing.DetectionJitter(sensing.GaussianResponse(300 * PS), axis),
+    "PixelSkew": lambda axis: sensing.PixelSkew(50 * PS, axis),
+    "DetectionSkew": lambda axis: sensing.DetectionSkew(50 * PS, axis),
+    "CoincidencePixel": lambda axis: sensing.CoincidencePixel(sensing.SynchronousSPAD(9), 4, coincidence=2,
+        window_s=1 * NS, axis=axis),
+    "SweepJitter": lambda axis: sensing.SweepJitter(300 * PS, axis),
+    "StreakCamera": lambda axis: sensing.StreakCamera(axis, time_fwhm_s=300 * PS, jitter_fwhm_s=300 * PS),
+    "GatedIntegration": lambda axis: sensing.GatedIntegration([2 * NS], 1 * NS, axis),
+    "ItofCorrelation": lambda axis: sensing.ItofCorrelation(sensing.sine_code(4), 80e6, axis),
+}
+
+
+def sensors_with_an_axis():
+    classes = {c for c in vars(sensing).values() if inspect.isclass(c) and issubclass(c, sensing.Sensor)}
+    return {c.__name__ for c in classes if "axis" in inspect.signature(c.__init__).parameters}
+
+
+def test_no_sensor_with_an_axis_is_left_out():
+    assert set(ON_AN_AXIS) == sensors_with_an_axis()
+
+
+@pytest.mark.parametrize("make", ON_AN_AXIS.values(), ids=ON_AN_AXIS)
+def test_bins_are_those_of_the_axis(make):
+    """64 bins into a stage that was made for 128: of plain tensors too, alone, in a chain, and as a copy."""
+    sensor = make(AXIS)
+    assert sensor.expected(torch.zeros(1, 128, 2, 2)).isfinite().all()
+    for made in (sensor, sensing.Compose([sensor]), sensing.Compose([sensing.Compose([deepcopy(sensor)])])):
+        calls = [made.expected, made.forward]
+        calls += [made.sample] if hasattr(made, "sample") else []
+        for call in calls:
+            for bins in (64, 127, 129):
+                with pytest.raises(ShapeError, match=rf"expected .*128.* got .*{bins}.*Make "):
+                    call(torch.zeros(1, bins, 2, 2))
+
+
+def test_a_width_takes_any_number_of_bins():
+    response = sensing.ImpulseResponse(sensing.GaussianResponse(300 * PS), bin_width_s=100 * PS)
+    for bins in (1, 64, 128):
+        assert response(torch.ones(1, bins, 1, 1)).shape == (1, bins, 1, 1)
+
+
+def response(axis=AXIS, **keywords):
+    return sensing.ImpulseResponse(sensing.GaussianResponse(300 * PS), None if keywords else axis, **keywords)
+
+
+def test_one_axis_in_a_chain():
+    """Without a renderer's output to compare with."""
+    wide = TimeAxis.from_seconds(0.0, 200 * PS, 128)
+    after = sensing.Afterpulsing(0.01, 1 * NS, 1 * NS, axis=AXIS)
+    for other in (SHORT, wide):
+        spad = sensing.SynchronousSPAD(100, dead_time_s=1 * NS, axis=other)
+        for stages in ([response(), spad], [response(), sensing.Compose([spad])], [response(), spad, after]):
+            with pytest.raises(UnitError, match=r"expected one time axis .*128 bins of 1e-10 s in stage '0' \(Impulse"):
+                sensing.Compose(stages)
+    with pytest.raises(UnitError, match=r"bins of 2e-10 s in stage '0'"):
+        sensing.Compose([response(bin_width_s=200 * PS), sensing.SynchronousSPAD(100, dead_time_s=1 * NS, axis=AXIS)])
+    # a width goes with any number of bins, and what a module of another kind does to the bins is its own affair
+    sensing.Compose([response(bin_width_s=100 * PS), sensing.SynchronousSPAD(100, dead_time_s=1 * NS, axis=AXIS)])
+    rebinned = sensing.Compose([response(SHORT), torch.nn.AvgPool3d((2, 1, 1)), response(wide)])
+    assert len(rebinned.stages) == 3
+    # a later start is another axis for codes alone
+    later = TimeAxis.from_seconds(5 * NS, 100 * PS, 128)
+    sensing.Compose([response(later), sensing.ItofCorrelation(sensing.sine_code(4), 80e6, AXIS)])
+
+
+# ------------------------------------------------------------------------------------------ cycles, periods, quantities
+
+
+def test_cycles_of_all_stages_agree():
+    """A budget of 1000 cycles in front of a detector of 99."""
+    for spad in (sensing.SynchronousSPAD(99), sensing.Compose([response(), sensing.SynchronousSPAD(99)])):
+        with pytest.raises(UnitError, match=r"1000 in stage '0' \(PhotonBudget\) and 99 in stage '1.*budget\.cycles"):
+            sensing.Compose([budget(1000), spad])
+    assert sensing.Compose([budget(1000), sensing.SynchronousSPAD(1000)])(torch.ones(1, 128, 1, 1)).shape[1] == 128
+    changed = sensing.device("vl53l8_like").changed("SynchronousSPAD", cycles=1000)
+    with pytest.raises(UnitError, match="one number of cycles"):
+        changed.sensor()
+    assert changed.changed("PhotonBudget", cycles=1000).sensor()
+
+
+def test_a_free_running_window_is_one_period():
+    """12.8 ns of bins, a laser of 10 MHz."""
+    free = sensing.FreeRunningSPAD(1000, 20 * NS, axis=AXIS)
+    with pytest.raises(UnitError, match=r"one laser period of stage '0' \(PhotonBudget\), 1e-07 s, got 128 bins of"):
+        sensing.Compose([budget(rate_hz=10e6), free])
+    sensing.Compose([budget(rate_hz=1 / 12.8e-9), free])
+    # bins that only the light tells
+    width = {"bin_width_s": 100 * PS}
+    chain = sensing.Compose([budget(rate_hz=1 / 12.8e-9, **width), sensing.FreeRunningSPAD(1000, 20 * NS, **width)])
+    assert chain(torch.zeros(1, 128, 1, 1)).shape == (1, 128, 1, 1)
+    for bins in (64, 127):
+        for call in (chain.expected, chain.sample, chain):
+            with pytest.raises(UnitError, match="one laser period"):
+                call(torch.zeros(1, bins, 1, 1))
+
+
+def test_a_free_running_detector_is_told_its_period():
+    for axis, width in ((AXIS, None), (None, 100 * PS)):
+        free = sensing.FreeRunningSPAD(1000, 20 * NS, axis=axis, bin_width_s=width, period_s=12.8 * NS)
+        assert free(torch.zeros(1, 128, 1, 1)).shape == (1, 128, 1, 1)
+        for bins in (127, 129):
+            with pytest.raises(ShapeError, match="T = 128"):
+                free(torch.zeros(1, bins, 1, 1))
+    for given in ({"axis": AXIS, "period_s": 100 * NS}, {"bin_width_s": 100 * PS, "period_s": 12.85 * NS}):
+        with pytest.raises(UnitError, match="expected period_s to be"):
+            sensing.FreeRunningSPAD(1000, 20 * NS, **given)
+
+
+def afterpulsing(**keywords):
+    return sensing.Afterpulsing(0.01, 30 * NS, 20 * NS, axis=AXIS, **keywords)
+
+
+def test_afterpulses_go_round_the_laser_period():
+    spad = sensing.SynchronousSPAD(1000)
+    with pytest.raises(UnitError, match=r"one laser period .* period_s="):
+        sensing.Compose([budget(rate_hz=10e6), spad, afterpulsing()])
+    with pytest.raises(UnitError, match=r"the laser period of stage '0' .*1e-07 s, in stage '2' .*got 1\.28e-08"):
+        sensing.Compose([budget(rate_hz=10e6), spad, afterpulsing(period_s=12.8 * NS)])
+    sensing.Compose([budget(rate_hz=10e6), spad, afterpulsing(period_s=100 * NS)])
+    sensing.Compose([budget(rate_hz=1 / 12.8e-9), sensing.FreeRunningSPAD(1000, 20 * NS, axis=AXIS), afterpulsing()])
+
+
+def test_a_synchronous_detector_is_armed_when_a_cycle_begins():
+    spad = sensing.SynchronousSPAD(1000, dead_time_s=10 * NS, axis=AXIS)
+    with pytest.raises(UnitError, match=r"armed again before the next cycle .*2e-08 s later.*FreeRunningSPAD"):
+        sensing.Compose([budget(rate_hz=50e6), spad])
+    sensing.Compose([budget(rate_hz=40e6), spad])
+
+
+@pytest.mark.parametrize("behind", [False, True])
+def test_what_becomes_of_a_chain_in_the_order_of_before(behind):
+    """A response behind the budget held the pulse and the jitter: both have a place, and neither is a flag."""
+    spad, irf = sensing.SynchronousSPAD(1000), sensing.ImpulseResponse(sensing.emg_response(90 * PS, 80 * PS), AXIS)
+    bright = budget(ambient_rate_hz=1e6, axis=AXIS, pulse_energy_j=1e-9, wavelength_m=532e-9)
+    with pytest.raises(UnitError) as told:
+        sensing.Compose([bright, spad, irf] if behind else [bright, irf, spad])
+    words = str(told.value)
+    assert "stays an ImpulseResponse and goes in front of the PhotonBudget" in words
+    assert "becomes a DetectionJitter of the same response behind the detector" in words
+    assert "periodic" not in words  # jitter would go in front of pile-up again
+    with pytest.raises(UnitError, match="Use boundary='periodic'"):
+        sensing.Compose([bright, sensing.StreakCamera(AXIS, time_fwhm_s=300 * PS, boundary="zero")])
+
+
+MIXED = {
+    "two detectors": (lambda: [budget(), *(sensing.SynchronousSPAD(1000) for _ in "ab")], "counts that a"),
+    "a budget of counts": (lambda: [sensing.SynchronousSPAD(1000), budget()], "PhotonBudget takes what a renderer"),
+    "two budgets": (lambda: [budget(), response(), budget()], "PhotonBudget takes what a renderer"),
+    "afterpulses of rates": (lambda: [budget(), afterpulsing(period_s=100 * NS)], "Put the detector between"),
+    "crosstalk of rates": (lambda: [budget(), sensing.Crosstalk(0.01)], "Put the detector between"),
+    "counts of one cycle": (lambda: [budget(), response(), sensing.ShotNoise()], "one of 1000 cycles.*SynchronousSPAD"),
+    "frames of one cycle": (lambda: [budget(), sensing.BinaryFrames(255)], "one of 1000 cycles"),
+    "electrons of one cycle": (lambda: [budget(), sensing.PixelElectronics()], "one of 1000 cycles"),
+    "taps of one cycle": (
+        lambda: [budget(), sensing.ItofCorrelation(sensing.sine_code(4), 80e6, AXIS), sensing.PixelElectronics()],
+        "electrons_per_unit=1000",
+    ),
+    "gates of one cycle": (lambda: [budget(), sensing.GatedIntegration([1 * NS], 2 * NS, AXIS)], "electrons_per_unit"),
+    "shot noise twice": (lambda: [sensing.ShotNoise(), sensing.PixelElectronics()], "shot_noise=False"),
+    "shot noise of a detector": (lambda: [sensing.SynchronousSPAD(9), sensing.ShotNoise()], "counted once"),
+    "a detector of taps": (
+        lambda: [sensing.ItofCorrelation(sensing.sine_code(4), 80e6, AXIS), sensing.SynchronousSPAD(9)],
+        "no rates per cycle",
+    ),
+}
+
+
+@pytest.mark.parametrize("stages, words", MIXED.values(), ids=MIXED)
+def test_quantities_that_do_not_fit(stages, words):
+    for made in (stages(), [sensing.Compose(stages()[:1]), *stages()[1:]]):
+        with pytest.raises(UnitError, match=rf"Compose: expected .* got .*{words}"):
+            sensing.Compose(made)
+
+
+def test_quantities_that_fit():
+    for stages in (
+        [budget(1), sensing.ShotNoise()],  # one exposure of all the energy
+        [budget(9), sensing.GatedIntegration([1 * NS], 2 * NS, AXIS, electrons_per_unit=9), sensing.BinaryFrames(5)],
+        [sensing.ShotNoise(), sensing.PixelElectronics(shot_noise=False, read_noise_e=2.0)],
+        [budget(1000), sensing.SynchronousSPAD(1000), sensing.Crosstalk(0.01), sensing.Crosstalk(0.001)],
+        [budget(1000), torch.nn.Identity(), sensing.ShotNoise()],  # nobody knows what a module does
+    ):
+        assert sensing.Compose(stages).expected(torch.ones(1, 128, 2, 2)).isfinite().all()
+
+
+def test_one_change_of_a_device_reaches_all_stages():
+    kind = {"kind": "PhotonBudget", "optics": {"kind": "Optics", "f_number": 2.0}, "axis": "@axis"}
+    numbers = {"pulse_energy_j": 1e-9, "wavelength_m": 532e-9, "repetition_rate_hz": 10e6}
+    after = {"kind": "Afterpulsing", "probability": 0.01, "tau_s": 30e-9, "dead_time_s": 20e-9}
+    stages = (
+        {**kind, **numbers, "exposure_s": 1e-3},
+        {"kind": "SynchronousSPAD", "cycles": "@cycles"},
+        {**after, "axis": "@axis", "period_s": "@period_s", "background": "@background"},
+    )
+    device = sensing.Device("linked", description="", sources=(), stages=stages, bin_width_s=100e-12, num_bins=128)
+    sensor = sensing.Device.from_json(device.to_json()).sensor()
+    assert [s.cycles for s in list(sensor.stages)[:2]] == [10_000] * 2
+    assert sensor.stages[2].period_s == pytest.approx(100 * NS)
+    assert sensor.stages[2].background == 0
+    bright = device.changed("PhotonBudget", ambient_rate_hz=1e6, quantum_efficiency=0.5).sensor()
+    assert bright.stages[2].background == pytest.approx(0.5e6 * 10_000 * 100 * PS)
+    faster = device.changed("PhotonBudget", repetition_rate_hz=20e6).sensor()
+    assert faster.stages[1].cycles == 20_000 and faster.stages[2].period_s == pytest.approx(50 * NS)
+    for stage in stages[1:]:
+        with pytest.raises(StorageError, match="expected a PhotonBudget in the chain"):
+            sensing.Device(
+                "alone", description="", sources=(), stages=(stage,), bin_width_s=100e-12, num_bins=128
+            ).sensor()
+    with pytest.raises(StorageError, match="expected '@axis'"):
+        sensing.build_stage({"kind": "ShotNoise", "grad": "@policy"})
+
+
+@pytest.mark.parametrize("name", sorted(sensing.DEVICES))
+def test_devices_agree_with_themselves(name):
+    assert sensing.device(name).sensor() is not None
+
+
+# --------------------------------------------------------------------------------------------------- seconds and hertz
+
+COUNTS = torch.tensor([0.0, 1.0, 9.0, 3.0, 0.0, 0.0])
+SPAD = sensing.SynchronousSPAD(100, dead_time_s=2 * NS, axis=AXIS)
+GAUSS = sensing.GaussianResponse(300 * PS)
+# everything that takes seconds, as it is meant
+SECONDS = {
+    "Afterpulsing": {
+        "probability": 0.01, "tau_s": 30 * NS, "dead_time_s": 20 * NS, "bin_width_s": 100 * PS, "period_s": 100 * NS
+    },
+    "CoincidencePixel": {
+        "detector": SPAD, "spads": 4, "coincidence": 2, "window_s": 1 * NS, "bin_width_s": 100 * PS
+    },
+    "DetectionJitter": {"response": GAUSS, "bin_width_s": 100 * PS},
+    "DetectionSkew": {"delay_s": 70 * PS, "bin_width_s": 100 * PS},
+    "FreeRunningSPAD": {"cycles": 9, "dead_time_s": 20 * NS, "bin_width_s": 100 * PS, "period_s": 100 * NS},
+    "GatedIntegration": {"delays_s": [2 * NS], "widths_s": 1 * NS, "axis": AXIS, "rise_s": 200 * PS, "fall_s": 2 * NS},
+    "GaussianResponse": {"fwhm_s": 60 * PS, "delay_s": 1 * NS},
+    "ImpulseResponse": {"response": GAUSS, "bin_width_s": 100 * PS},
+    "MeasuredDelays": {"counts": COUNTS, "bin_width_s": 100 * PS, "start_s": 5 * NS},
+    "MeasuredResponse": {"counts": COUNTS, "bin_width_s": 4 * PS, "delay_s": 1 * NS},
+    "PhotonBudget": {
+        "optics": sensing.Optics(f_number=2.0), "pulse_energy_j": 1e-9, "wavelength_m": 532e-9,
+        "repetition_rate_hz": 10e6, "exposure_s": 1e-3, "bin_width_s": 100 * PS,
+    },
+    "PixelSkew": {"delay_s": -70 * PS, "bin_width_s": 100 * PS},
+    "PowerLawDelays": {"exponent": 1.1, "longest_s": 10e-6},
+    "StreakCamera": {"axis": AXIS, "time_fwhm_s": 200 * PS, "jitter_fwhm_s": 100 * PS},
+    "SweepJitter": {"jitter_fwhm_s": 100 * PS, "bin_width_s": 100 * PS},
+    "SynchronousSPAD": {"cycles": 9, "dead_time_s": 20 * NS, "bin_width_s": 100 * PS},
+    "TailedResponse": {"fwhm_s": 60 * PS, "tails_s": [80 * PS], "fractions": [0.1], "delay_s": 1 * NS},
+    "UniformResponse": {"width_s": 60 * PS, "delay_s": 1 * NS},
+    "emg_response": {"fwhm_s": 60 * PS, "tau_s": 80 * PS, "delay_s": 1 * NS},
+    "free_running_rate": {"rate_hz": torch.tensor(1e6), "dead_time_s": 20 * NS},
+    "ml_position": {
+        "histogram": torch.ones(1, 128, 1, 1), "response": GAUSS, "bin_width_s": 100 * PS, "signal_to_background": 9.0
+    },
+    "range_deviation_m": {"response_fwhm_s": 300 * PS, "detections": torch.ones(1)},
+}  # fmt: skip
+# formulas that hold in any unit, what others compute, and devices, which say it when they are built
+OTHERS = {
+    "BudgetReport", "CramerRaoBound", "Device", "Response", "afterpulse_kernel", "emg_cdf", "emg_density",
+    "emg_survival", "gate_profiles", "resample_counts",
+}  # fmt: skip
+
+
+def seconds_of(name):
+    made = getattr(sensing, name)
+    names = inspect.signature(made.__init__ if inspect.isclass(made) else made).parameters
+    return [n for n in names if n.endswith("_s")]
+
+
+def test_nothing_that_takes_seconds_is_left_out():
+    public = {n for n, v in vars(sensing).items() if callable(v) and not n.startswith("_")}
+    assert {n for n in public if seconds_of(n)} == set(SECONDS) | OTHERS
+
+
+@pytest.mark.parametrize("unit", [1e12, 1e9], ids=["picoseconds", "nanoseconds"])
+@pytest.mark.parametrize("name, argument", [(n, a) for n in SECONDS for a in seconds_of(n) if a in SECONDS[n]])
+def test_seconds_in_another_unit_are_told(name, argument, unit):
+    made, given = getattr(sensing, name), SECONDS[name]
+    assert made(**given) is not None
+    value = given[argument]
+    other = [v * unit for v in value] if isinstance(value, list) else value * unit
+    with pytest.raises(UnitError, match=r"expected .* got "):
+        made(**{**given, argument: other})
+
+
+NANOSECONDS = {
+    "jitter": lambda: sensing.GaussianResponse(0.06),
+    "width": lambda: sensing.UniformResponse(0.05),
+    "tail": lambda: sensing.TailedResponse(60 * PS, [0.08], [0.1]),
+    "delay": lambda: sensing.GaussianResponse(60 * PS, delay_s=-0.5),
+    "measured": lambda: sensing.MeasuredResponse(torch.tensor([0.0, 1.0, 9.0, 3.0, 0.0]), 0.004),
+    "bins": lambda: sensing.ImpulseResponse(sensing.GaussianResponse(60 * PS), bin_width_s=0.05),
+    "bins, microseconds": lambda: sensing.ImpulseResponse(sensing.GaussianResponse(60 * PS), bin_width_s=5e-5),
+    "dead time, microseconds": lambda: sensing.FreeRunningSPAD(100, 0.075, axis=AXIS),
+    "dead time": lambda: sensing.SynchronousSPAD(100, dead_time_s=75.0, axis=AXIS),
+    "afterpulses": lambda: sensing.Afterpulsing(0.01, 30.0, 75 * NS, axis=AXIS),
+    "afterpulses, microseconds": lambda: sensing.Afterpulsing(0.01, 30 * NS, 0.075, axis=AXIS),
+    "period": lambda: sensing.Afterpulsing(0.01, 30 * NS, 75 * NS, axis=AXIS, period_s=100.0),
+    "sweep": lambda: sensing.SweepJitter(0.001, AXIS),
+    "gate": lambda: sensing.GatedIntegration([0.5], 6 * NS, AXIS),
+    "gate width": lambda: sensing.GatedIntegration([6 * NS], 0.6, AXIS),
+    "range": lambda: sensing.range_deviation_m(0.5, torch.ones(1)),
+    "megahertz": lambda: budget(None, 10.0, axis=AXIS, exposure_s=0.01),
+    "megahertz, hours": lambda: budget(100_000, 10.0, axis=AXIS),
+    "nanojoules": lambda: budget(axis=AXIS, pulse_energy_j=0.2),
+    "micrometres": lambda: budget(axis=AXIS, wavelength_m=0.94),
+    "picometres": lambda: budget(axis=AXIS, wavelength_m=532e-12),
+    "millimetres": lambda: sensing.Optics.from_aperture(25.0, 12.5e-3, pixel_area_m2=1e-10),
+    "millimetres, aperture": lambda: sensing.Optics.from_aperture(25e-3, 12.5, pixel_area_m2=1e-10),
+    "codes in seconds": lambda: sensing.TDC(torch.full((128,), 100 * PS)),
+    "codes in picoseconds": lambda: sensing.TDC(torch.full((128,), 100.0)),
+    "millimetres of depth": lambda: sensing.read_itof(torch.ones(1, 8, 1, 1), (80e6, 60e6), 4, max_depth_m=7000.0),
+    "one frequency, two ranges": lambda: sensing.unwrap_depth(torch.ones(1, 1, 1, 1), (80e6,), max_depth_m=4.0),
+    "frames of another sensor": lambda: sensing.frames_to_rate(torch.tensor([10.0, 400.0]), 255),
+    "square micrometres": lambda: sensing.Optics(f_number=2.0, pixel_area_m2=100.0),
+}
+
+
+@pytest.mark.parametrize("make", NANOSECONDS.values(), ids=NANOSECONDS)
+def test_numbers_of_another_unit_are_told(make):
+    with pytest.raises(UnitError, match=r"expected .* got "):
+        make()
+
+
+def test_unusual_devices_are_taken():
+    """A flash lidar of 20 Hz, 1 J for the moon, InGaAs with tails of 0.1 ms, far infrared."""
+    assert budget(100, 20.0, axis=AXIS).exposure_s == 5.0
+    assert budget(100, 20.0, axis=AXIS, pulse_energy_j=1.0, wavelength_m=100e-6).cycles == 100
+    assert sensing.Afterpulsing(0.1, 1e-4, 5e-5, axis=AXIS, period_s=0.05).period_s == 0.05
+    assert budget(None, 10e6, axis=AXIS, exposure_s=0.01).cycles == 100_000
+
+
+# --------------------------------------------------------------------------------------- counts that halves cannot hold
+
+# sensors that count, of a light of 1 a bin; what comes is beyond 65504, the largest number of float16
+COUNTING = {
+    "SynchronousSPAD": sensing.SynchronousSPAD(10**6 + 1),
+    "SynchronousSPAD, gate": sensing.SynchronousSPAD(10**6 + 1, gate=torch.ones(4)),
+    "SynchronousSPAD, dead time": sensing.SynchronousSPAD(10**6 + 1, dead_time_s=2 * NS, bin_width_s=1 * NS),
+    "FreeRunningSPAD": sensing.FreeRunningSPAD(10**6 + 1, 2 * NS, bin_width_s=1 * NS),
+    "paralyzable": sensing.FreeRunningSPAD(10**6 + 1, 2 * NS, bin_width_s=1 * NS, kind="paralyzable"),
+    "BinaryFrames": sensing.BinaryFrames(10**6 + 1),
+    "GatedIntegration": sensing.GatedIntegration(
+        [-1 * NS], 9 * NS, TimeAxis.from_seconds(0, 1 * NS, 4), electrons_per_unit=1e5
+    ),
+    "ItofCorrelation": sensing.ItofCorrelation(
+        sensing.sine_code(3), 80e6, TimeAxis.from_seconds(0, 1 * NS, 4), electrons_per_unit=1e5
+    ),
+}
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16], ids=str)
+@pytest.mark.parametrize("sensor", COUNTING.values(), ids=COUNTING)
+def test_no_count_is_infinite_or_rounded(sensor, dtype):
+    light = torch.ones(1, 4, 2, 2, dtype=dtype)
+    mean = sensor.expected(light)
+    assert float(mean.max()) > 65504 and bool(mean.isfinite().all())
+    torch.testing.assert_close(mean.double(), sensor.expected(light.double()), rtol=1e-6, atol=0)
+    if hasattr(sensor, "sample"):
+        counts = sensor.sample(light, generator())
+        assert float(counts.max()) > 65504 and torch.equal(counts, counts.round())
+        # 7 and 10 bits of the two would leave multiples of 512 and more
+        assert bool((counts % 256 != 0).any())
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16], ids=str)
+def test_functions_that_count(dtype):
+    """Each of half-precision numbers is that of the same numbers in float32."""
+    x = torch.linspace(0.1, 1.0, 8).view(1, 8, 1, 1).to(dtype)
+    many, far = (x * 1e4).round(), 700 + x
+    kernel = sensing.afterpulse_kernel(2 * NS, 1 * NS, 1 * NS, period_bins=8)
+    for call in (
+        lambda v: sensing.sample_detections(v, 10**6, generator=generator()),
+        lambda v: sensing.poisson(many.to(v.dtype), generator()),
+        lambda v: sensing.first_photon_probabilities(v)[0],
+        lambda v: sensing.nonparalyzable_histogram(v, 2.5),
+        lambda v: sensing.paralyzable_histogram(v, 2.5),
+        lambda v: sensing.coates(many.to(v.dtype), 10**5).rate,
+        lambda v: sensing.add_afterpulses(many.to(v.dtype), 0.3, kernel),
+        lambda v: sensing.add_crosstalk(many.to(v.dtype), 0.2),
+        lambda v: sensing.frames_to_rate(many.to(v.dtype), 10**6),
+        lambda v: sensing.equi_depth_edges(v, 4),
+        lambda v: sensing.peak_position(v),
+        lambda v: sensing.ml_position(v, sensing.GaussianResponse(1 * NS), bin_width_s=1 * NS),
+        lambda v: sensing.soft_argmax(v),
+        lambda v: sensing.center_of_mass(v),
+        lambda v: sensing.first_return(v, 0.5).position,
+        lambda v: sensing.distance_of_position(far.to(v.dtype), AXIS),
+        lambda v: sensing.adjoint(sensing.BinaryFrames(10**6), v, v.shape),
+    ):
+        found = call(x)
+        assert found.dtype == torch.float32
+        assert torch.equal(found, call(x.float()))

@@ -1,0 +1,144 @@
+"""Threads that draw side by side: each works alone, the process keeps its number, and forks begin anew."""
+
+from __future__ import annotations
+
+import concurrent.futures.thread
+import multiprocessing
+import subprocess
+import sys
+import threading
+
+import pytest
+import torch
+
+from torchtransient import sensing
+from torchtransient.sensing.numerics import worker_threads
+from torchtransient.sensing.numerics.worker_threads import side_by_side
+
+
+@pytest.fixture(params=[1, 2, 3])
+def threads(request):
+    before = torch.get_num_threads()
+    torch.set_num_threads(request.param)
+    yield request.param
+    torch.set_num_threads(before)
+
+
+def of_thread(_):
+    return torch.get_num_threads()
+
+
+def nested(_):
+    return sum(side_by_side(of_thread, range(3)))
+
+
+def test_threads_beside_others_work_alone(threads):
+    assert side_by_side(of_thread, range(4)) == [1] * 4
+    assert torch.get_num_threads() == threads
+    assert side_by_side(lambda a, b: a - b, [5, 7], [1, 2]) == [4, 5]
+
+
+def test_threads_may_ask_for_threads(threads):
+    assert side_by_side(nested, range(8)) == [3] * 8
+
+
+def test_what_fails_in_a_thread_fails_outside(threads):
+    def fail(k):
+        raise KeyError(k)
+
+    with pytest.raises(KeyError):
+        side_by_side(fail, range(4))
+    assert side_by_side(of_thread, range(2)) == [1] * 2
+
+
+def _in_child(queue):
+    queue.put(side_by_side(of_thread, range(2)))
+
+
+def test_forks_begin_anew(threads):
+    side_by_side(of_thread, range(4))
+    context = multiprocessing.get_context("fork")
+    queue = context.SimpleQueue()
+    child = context.Process(target=_in_child, args=(queue,))
+    child.start()
+    child.join(30)
+    alive = child.is_alive()
+    if alive:
+        child.terminate()
+    assert not alive
+    assert queue.get() == [1, 1]
+
+
+def modes(_):
+    return torch.is_inference_mode_enabled(), torch.is_grad_enabled()
+
+
+def test_threads_are_in_the_mode_of_the_caller(threads):
+    assert side_by_side(modes, range(4)) == [(False, True)] * 4
+    with torch.no_grad():
+        assert side_by_side(modes, range(4)) == [(False, False)] * 4
+    with torch.inference_mode():
+        assert side_by_side(modes, range(4)) == [(True, False)] * 4
+    assert side_by_side(modes, range(4)) == [(False, True)] * 4
+
+
+@pytest.mark.parametrize(
+    "sensor",
+    [sensing.SynchronousSPAD(50), sensing.ShotNoise(), sensing.Crosstalk(0.05), sensing.Afterpulsing(
+        0.1, 1e-9, 0, bin_width_s=1e-10, period_s=1e-7, background=1.0
+    )],
+    ids=lambda sensor: type(sensor).__name__,
+)  # fmt: skip
+def test_large_images_are_drawn_in_inference_mode(threads, sensor):
+    light = torch.full((1, 32, 64, 65), 0.05 if "rate" in sensor.takes else 1.0)
+    expected = sensor.sample(light, torch.Generator().manual_seed(3))
+    with torch.inference_mode():
+        assert torch.equal(sensor.sample(light, torch.Generator().manual_seed(3)), expected)
+        assert torch.equal(sensor.sample(light.clone(), torch.Generator().manual_seed(3)), expected)
+
+
+def test_where_no_thread_can_be_had_the_caller_does_it_all(monkeypatch):
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    monkeypatch.setattr(worker_threads, "_POOLS", {})
+    start, started = threading.Thread.start, []
+
+    def only_one(thread):
+        if started:
+            raise RuntimeError("can't start new thread")
+        started.append(thread)
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", only_one)
+    try:
+        assert side_by_side(lambda k: k + 1, range(4)) == [1, 2, 3, 4]
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+    assert not worker_threads._POOLS
+
+
+_AT_THE_END = """
+import atexit, sys, threading
+import torch
+torch.set_num_threads(2)
+from torchtransient.sensing.numerics.worker_threads import side_by_side
+assert side_by_side(int, "12") == [1, 2]
+def late():
+    threading.main_thread().join()
+    print(side_by_side(int, "34"), flush=True)
+threading.Thread(target=late).start()
+atexit.register(lambda: print(side_by_side(int, "56"), flush=True))
+"""
+
+
+def test_no_thread_takes_a_job_at_the_end(threads, monkeypatch):
+    side_by_side(of_thread, range(4))
+    monkeypatch.setattr(concurrent.futures.thread, "_shutdown", True)
+    assert side_by_side(lambda k: k + 1, range(4)) == [1, 2, 3, 4]
+
+
+@pytest.mark.slow
+def test_draws_while_the_interpreter_ends():
+    ran = subprocess.run([sys.executable, "-c", _AT_THE_END], capture_output=True, text=True, timeout=60)
+    assert (ran.returncode, ran.stdout.split("\n")[:2]) == (0, ["[3, 4]", "[5, 6]"]), ran.stderr

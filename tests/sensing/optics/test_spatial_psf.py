@@ -1,0 +1,58 @@
+"""Spatial point spread functions: energy, symmetry, widths, gradients."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torchtransient.errors import ShapeError
+from torchtransient.sensing import LensBlur, SpatialPSF, blur_image, defocus_psf, gaussian_psf
+from torchtransient.sensing.response.response_shapes import FWHM_PER_SIGMA
+
+
+def point(height=15, width=15):
+    x = torch.zeros(1, 2, height, width, dtype=torch.float64)
+    x[..., height // 2, width // 2] = 1
+    return x
+
+
+def test_a_point_becomes_the_psf():
+    psf = torch.rand(5, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    y = SpatialPSF(psf)(point())
+    torch.testing.assert_close(y[0, 0, 5:10, 6:9], psf / psf.sum())
+    assert float(y[0, 1].sum()) == pytest.approx(1)
+
+
+def test_gaussian_blur_has_its_width_and_keeps_energy():
+    y = LensBlur(2.0, border="circular", size=13)(point())[0, 0]
+    i = torch.arange(15, dtype=torch.float64) - 7
+    # integrating over pixels adds 1/12
+    assert float((y.sum(1) * i**2).sum()) == pytest.approx((2 / FWHM_PER_SIGMA) ** 2 + 1 / 12, rel=1e-3)
+    x = torch.rand(2, 3, 4, 9, 9, dtype=torch.float64)
+    blurred = LensBlur(1.0, border="circular")(x)
+    torch.testing.assert_close(blurred.sum((-1, -2)), x.sum((-1, -2)))
+
+
+def test_defocus_disc():
+    disc = defocus_psf(3.0)
+    assert disc.shape == (7, 7)
+    assert float(disc.sum()) == pytest.approx(1)
+    assert float(disc.max()) == pytest.approx(1 / (torch.pi * 9), rel=5e-3)
+    assert defocus_psf(0.4).shape == (1, 1)
+
+
+def test_learnable_width():
+    layer = LensBlur(1.5, learnable=True)
+    x = torch.rand(1, 2, 11, 11, dtype=torch.float64)
+    assert torch.autograd.gradcheck(
+        lambda w: blur_image(x, gaussian_psf(w, 5)), layer.fwhm_px.detach().requires_grad_()
+    )
+    layer(x).square().sum().backward()
+    assert float(layer.log_fwhm_px.grad) < 0
+
+
+def test_errors():
+    with pytest.raises(ShapeError, match="odd"):
+        SpatialPSF(torch.ones(4, 4))
+    with pytest.raises(ShapeError, match="larger"):
+        blur_image(torch.ones(1, 1, 3, 3), torch.ones(9, 9))

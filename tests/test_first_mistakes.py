@@ -1,0 +1,203 @@
+"""What is done wrong first, and what the message says to do: arguments by another name, in another unit, by place."""
+
+from __future__ import annotations
+
+import copy
+import inspect
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from click.testing import CliRunner
+
+import torchtransient as tt
+from torchtransient.argument_names import arguments_of
+from torchtransient.cli.main import main
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, StorageError, UnitError, UnknownKeyError
+from torchtransient.files.result_file import read_result, write_result
+
+AXIS = tt.TimeAxis(0.0, 0.05, 40)
+LIGHT = torch.rand(1, 40, 4, 4, generator=torch.Generator().manual_seed(0))
+SPAD = tt.sensing.SynchronousSPAD(10)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return tt.load(tt.scenes.cornell_box(resolution=4, num_bins=20), variant="llvm_ad_rgb")
+
+
+@pytest.fixture(scope="module")
+def capture():
+    scan = tt.nlos.Scan.grid(tt.nlos.Wall.plane(1.0, 1.0), 4, kind="confocal")
+    return tt.nlos.Capture(LIGHT.clone(), AXIS, scan)
+
+
+def public_classes():
+    for room in ("data", "losses", "metrics", "nlos", "parametrize", "sensing", "training"):
+        for name, value in vars(getattr(tt, room)).items():
+            own = inspect.isclass(value) and value.__module__.startswith("torchtransient.")
+            if own and not inspect.isabstract(value) and not getattr(value, "_is_protocol", False):
+                yield pytest.param(value, id=f"{room}.{name}")
+
+
+@pytest.mark.parametrize("kind", list(public_classes()))
+def test_an_unknown_argument_is_said_of_the_class_that_was_called(kind):
+    with pytest.raises(TypeError, match=rf"^{kind.__name__}\."):
+        kind(no_such_argument=1)
+
+
+def test_functions_that_hand_arguments_on_say_what_was_called(scene, capture):
+    reconstructions = {name: getattr(tt.nlos, name) for name in ("fk", "lct", "directional_lct", "midpoint_fk")}
+    for name, function in reconstructions.items():
+        with pytest.raises(TypeError, match=rf"^{name}\(\) .*'targe'\. Did you mean 'target'\? Its other .* target, "):
+            function(capture, targe="diffuse")
+    with pytest.raises(TypeError, match=r"^render\(\) .*Did you mean 'temporal_filter'\?"):
+        tt.render(scene, spp=1, temporal_filte="box")
+    with pytest.raises(TypeError, match=r"^Plan.renderer\(\) .*'spps'. Did you mean 'spp'\?"):
+        tt.plan(scene, pilot=False, max_depth="scene").renderer(spps=1)
+    with pytest.raises(TypeError, match=r"^Capture.read\(\) .*'wallsize'. Did you mean 'wall_size'\?"):
+        tt.nlos.Capture.read("letter.mat", wallsize=0.6)
+
+
+def test_errors_inside_of_a_function_are_left_as_they_are():
+    def inner():
+        raise TypeError("of something else")
+
+    with pytest.raises(TypeError, match=r"^of something else$"), arguments_of("outer", inner):
+        inner()
+
+
+def test_depths_as_an_array(capture):
+    listed = tt.nlos.default_grid(capture, depths=(0.25, 0.5))
+    for depths in (torch.tensor([0.25, 0.5]), np.array([0.25, 0.5])):
+        assert torch.equal(tt.nlos.default_grid(capture, depths=depths).depths, listed.depths)
+
+
+def test_samples_by_place_are_no_values(scene):
+    with pytest.raises(ArgumentError, match=r"expected a mapping from keys to values, got int; write \{key: value\}"):
+        tt.render(scene, 4)
+
+
+def test_one_of_two_arguments():
+    with pytest.raises(ArgumentError, match=r"f_number= or solid_angle_sr=, got none of them; give one of them"):
+        tt.sensing.Optics()
+    with pytest.raises(ArgumentError, match=r"got f_number= and solid_angle_sr=; leave one of them out"):
+        tt.sensing.Optics(f_number=2.0, solid_angle_sr=1.0)
+    with pytest.raises(ArgumentError, match=r"axis= .* or bin_width_s=, got none of them"):
+        tt.sensing.SynchronousSPAD(10, dead_time_s=1e-9)
+
+
+def test_ranges_name_their_unit():
+    with pytest.raises(UnitError, match=r"frequencies_hz in \[1000, 1e\+12\] hertz \(20 MHz are 20e6\), got 20\.0"):
+        tt.sensing.read_itof(torch.rand(1, 4, 4, 4), 20, 4)
+    with pytest.raises(UnitError, match=r"pixel_area_m2 in \(0, 0.0001\] square metres .*, got 100\.0"):
+        tt.sensing.Optics(f_number=2.0, pixel_area_m2=100)
+    with pytest.raises(UnitError, match=r"every quantum_efficiency in \[0, 1\], got 2 to 40\."):
+        tt.sensing.PhotonBudget(
+            tt.sensing.Optics(f_number=2.0), pulse_energy_j=1e-9, wavelength_m=532e-9, repetition_rate_hz=10e6,
+            exposure_s=0.01, axis=AXIS, quantum_efficiency=torch.linspace(2, 40, 16).reshape(4, 4),
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize("width", [1e-10, torch.tensor(1e-10)], ids=["number", "tensor"])
+def test_widths_of_bins_in_seconds(width):
+    for loss in (tt.losses.wasserstein_loss, tt.losses.cumulative_loss):
+        with pytest.raises(UnitError, match=r"bin_width_opl in metres of optical path, .* Seconds\?"):
+            loss(LIGHT, LIGHT, bin_width_opl=width)
+    for module in (tt.losses.WassersteinLoss, tt.losses.CumulativeLoss):
+        with pytest.raises(UnitError, match=r"bin_width_opl in metres of optical path, .* Seconds\?"):
+            module(bin_width_opl=width)
+
+
+def test_one_frequency_needs_no_list():
+    assert tt.FrequencyAxis.from_hertz(20e6) == tt.FrequencyAxis.from_hertz([20e6])
+    with pytest.raises(UnitError, match="a frequency to be one number, got 'x'"):
+        tt.FrequencyAxis.from_hertz("x")
+
+
+
+@pytest.mark.parametrize(
+    ("given", "do"), [("a.h5", "tt.nlos.Capture.read reads files"), (LIGHT, r"a Tensor \(1, 40, 4, 4\)")]
+)
+def test_what_is_no_capture(given, do):
+    for function in (tt.nlos.reconstruct, tt.nlos.fk, tt.nlos.default_grid):
+        with pytest.raises(ShapeError, match=f"expected a tt.nlos.Capture, got .*{do}"):
+            function(given)
+    with pytest.raises(ArgumentError, match=f"expected a tt.nlos.Capture, got .*{do}"):
+        tt.nlos.choose_method(given)
+
+
+def test_files_of_another_kind_say_what_reads_them(scene, capture, tmp_path):
+    write_result(tmp_path / "render.npz", tt.render(scene, spp=1, physics="ignore"))
+    capture.write(tmp_path / "capture.npz")
+    with pytest.raises(StorageError, match=r"capture 1', not .*result 1'\. tt.nlos.Capture.read reads it"):
+        read_result(tmp_path / "capture.npz")
+    for read in (tt.nlos.Capture.read, tt.nlos.read_volume):
+        with pytest.raises(StorageError, match=r"result 1', not .*\. torchtransient\.\S+\.read_result reads it"):
+            read(tmp_path / "render.npz")
+
+
+def test_a_function_of_torch_in_wrap_is_told_of_arrays():
+    for function in (torch.sin, lambda x: x.mean()):
+        with pytest.raises((TypeError, AttributeError)) as told:
+            tt.wrap(function)(torch.ones(3))
+        assert any("arrays of Dr.Jit" in note and "dr.sin(x)" in note for note in told.value.__notes__)
+
+    def wrong(x):
+        return x + len(3)
+
+    with pytest.raises(TypeError) as told:
+        tt.wrap(wrong)(torch.ones(3))
+    assert not hasattr(told.value, "__notes__")
+
+
+def test_a_record_that_is_taken_for_a_tensor(scene, capture):
+    out = tt.render(scene, spp=1, physics="ignore")
+    for wrong in (lambda: torch.nn.functional.mse_loss(out, out), lambda: out.numpy(), lambda: out.backward()):
+        with pytest.raises(AttributeError, match=r"it is no tensor, it holds some \(transient, steady"):
+            wrong()
+    with pytest.raises(AttributeError, match=r"'Capture' .* 'mean': it is no tensor, it holds some \(transient"):
+        capture.mean()
+    with pytest.raises(AttributeError, match=r"^'RenderOutput' object has no attribute 'transients'$") as told:
+        out.transients  # noqa: B018
+    assert told.value.name == "transients" and told.value.obj is out  # of which Python makes its suggestion
+    assert copy.deepcopy(out) == out and pickle.loads(pickle.dumps(out)) == out
+
+
+def test_a_seed_is_no_generator():
+    for draw in (SPAD.sample, SPAD, SPAD.gaussian, tt.sensing.ShotNoise().sample):
+        for given in ((0,), (torch.manual_seed,)):
+            with pytest.raises(ArgumentError, match=r"expected generator to be a torch.Generator, got "):
+                draw(LIGHT, *given)
+        with pytest.raises(ArgumentError, match=r"got 0. Use torch.Generator\(\).manual_seed\("):
+            draw(LIGHT, generator=0)
+
+
+def test_sides_of_a_picture():
+    assert tt.scenes.cornell_box(resolution=np.array([5, 4]))["sensor"]["film"]["width"] == 5
+    for wrong in (16.5, (4, 4, 4), "16"):
+        with pytest.raises(SceneError, match=r"^resolution: expected "):
+            tt.scenes.cornell_box(resolution=wrong)
+
+
+def test_keys_are_named_as_they_are_written(scene):
+    renderer = tt.TransientRenderer(scene, ["red.reflectance.value"], spp=1)
+    with pytest.raises(UnknownKeyError, match=r"'red'; there are red\.reflectance\.value\."):
+        tt.parametrize.register(renderer, "red", tt.parametrize.Albedo())
+
+
+def test_recipes_name_what_is_written_in_python(scene):
+    box = tt.scenes.cornell_box(resolution=4, num_bins=20)
+    with pytest.raises(SceneError, match=r"expected a distribution, tt.data.Uniform\(0, 1\)"):
+        tt.data.Recipe(box, {"white.reflectance.value": (0.2, 0.8)}, spp=1)
+    with pytest.raises(ArgumentError, match=r"vary: expected a dictionary \{key: distribution\}, got \["):
+        tt.data.Recipe(box, ["white.reflectance.value"], spp=1)
+
+
+def test_a_misspelt_command_of_data_sets(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    said = CliRunner().invoke(main, ["dataset", "inf", "rooms"])
+    assert said.exit_code == 2 and "Did you mean 'info'?" in said.output
+    (tmp_path / "inf").write_text("scene: {}")  # a recipe by that name is a recipe
+    assert "Missing option" in CliRunner().invoke(main, ["dataset", "inf"]).output

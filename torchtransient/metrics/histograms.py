@@ -1,0 +1,160 @@
+"""Distances of histograms over time, pixel by pixel, as distributions: of records normalized to one.
+
+Transients are (..., C, T, Y, X), or other layouts with `dim`, as in `tt.losses`. Bins are not negative. A pixel whose
+target holds no light has no distribution and does not count; an input without light where the target has some is an
+error, since no distance of it is right: leave it out by `mask`, or measure by a loss that knows brightness.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchtransient.axes import TimeAxis
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
+from torchtransient.losses.comparison import check_mask, check_pair, counted, holds
+from torchtransient.losses.layouts import bins_dim
+from torchtransient.losses.results import TRANSIENT, Transient, reads
+from torchtransient.metrics.tally import Reduction, Tally, check_finite
+from torchtransient.quantities import share, shown
+
+
+@reads(input=TRANSIENT, target=TRANSIENT)
+def histogram_total_variation(
+    input: Transient,
+    target: Transient,
+    *,
+    dim: int | None = None,
+    mask: Tensor | None = None,
+    reduction: Reduction = "mean",
+) -> Tensor:
+    """Mean of `sum |p - q| / 2` over the pixels of two transients (..., C, T, Y, X), in [0, 1].
+
+    p and q are the records of a pixel over their sums: the share of the light that is in wrong bins. `dim`: where time
+    is (`tt.losses`). `mask` (broadcasts to the transients): bins that do not count are empty in both. `reduction`:
+    "mean" of all pixels, (); "item", of each item of a batch, its channels and pixels together, (...); "none", of each
+    pixel, (..., C, Y, X). NaN where nothing counts. Raises ShapeError, UnitError.
+    """
+    where = "histogram_total_variation"
+    p, q, lit, place = _distributions(input, target, dim, mask, where)
+    return Tally((p - q).abs().sum(place) / 2, lit, -place).result(reduction, where)
+
+
+@reads(input=TRANSIENT, target=TRANSIENT)
+def histogram_wasserstein_opl(
+    input: Transient,
+    target: Transient,
+    axis: TimeAxis | None = None,
+    *,
+    dim: int | None = None,
+    mask: Tensor | None = None,
+    reduction: Reduction = "mean",
+) -> Tensor:
+    """Mean Wasserstein-1 distance over time of the pixels of two transients (..., C, T, Y, X), metres of path.
+
+    How far light has to be moved to make one record of the other (Vallender 1974: the area between the cumulative
+    distributions). Light counts as at the middle of its bin. `axis`: None takes that of results. As
+    `histogram_total_variation` otherwise; `tt.losses.wasserstein_loss` fills dark pixels up instead.
+    """
+    where = "histogram_wasserstein_opl"
+    known = _axis(axis, where)
+    moved, lit, place = _moved(input, target, known, dim, mask, where)
+    return Tally(moved * known.bin_width_opl, lit, -place).result(reduction, where)
+
+
+@reads(input=TRANSIENT, target=TRANSIENT)
+def histogram_wasserstein_s(
+    input: Transient,
+    target: Transient,
+    axis: TimeAxis | None = None,
+    *,
+    dim: int | None = None,
+    mask: Tensor | None = None,
+    reduction: Reduction = "mean",
+) -> Tensor:
+    """`histogram_wasserstein_opl` in seconds."""
+    where = "histogram_wasserstein_s"
+    known = _axis(axis, where)
+    moved, lit, place = _moved(input, target, known, dim, mask, where)
+    return Tally(moved * known.bin_width_s, lit, -place).result(reduction, where)
+
+
+@reads(input=TRANSIENT, target=TRANSIENT)
+def histogram_kl(
+    input: Transient,
+    target: Transient,
+    *,
+    smoothing: float = 0.0,
+    dim: int | None = None,
+    mask: Tensor | None = None,
+    reduction: Reduction = "mean",
+) -> Tensor:
+    """Mean of `KL(q || p) = sum q log(q / p)` over the pixels of two transients (..., C, T, Y, X), nats.
+
+    p of the input, q of the target (Kullback and Leibler 1951). Infinite where the target has light in a bin that is
+    empty in the input. `smoothing` s, in [0, 1]: the input is taken as `(1 - s) p + s / T`, over the T bins that
+    count. As `histogram_total_variation` otherwise; not symmetric.
+    """
+    where = "histogram_kl"
+    part = share(f"{where}: smoothing", smoothing)
+    p, q, lit, place = _distributions(input, target, dim, mask, where)
+    if part:
+        bins = torch.ones_like(p) if mask is None else mask.expand(p.shape).to(p.dtype)
+        p = (1 - part) * p + part * bins / bins.sum(place, keepdim=True).clamp_min(1)
+    there = q > 0
+    # the difference of two logarithms is zero for equal ones, and finite where the quotient is not
+    logs = torch.where(there, q, torch.ones_like(q)).log() - torch.where(there, p, torch.ones_like(p)).log()
+    return Tally((q * logs).sum(place), lit, -place).result(reduction, where)
+
+
+def _axis(axis: TimeAxis | None, where: str) -> TimeAxis:
+    if not isinstance(axis, TimeAxis):
+        raise ArgumentError(f"{where}: expected axis=, a tt.TimeAxis, or results that have one, got {shown(axis)}.")
+    return axis
+
+
+def _moved(
+    input: object, target: object, axis: TimeAxis, dim: int | None, mask: Tensor | None, where: str
+) -> tuple[Tensor, Tensor, int]:
+    """Bins that light has to be moved by in each pixel."""
+    p, q, lit, place = _distributions(input, target, dim, mask, where)
+    if p.shape[place] != axis.num_bins:
+        raise ShapeError(
+            f"{where}: expected the {axis.num_bins} bins of the axis in dimension {place}, got {tuple(p.shape)}."
+        )
+    # without the last one, which is zero but for rounding
+    return (p - q).narrow(place, 0, axis.num_bins - 1).cumsum(place).abs().sum(place), lit, place
+
+
+def _distributions(
+    input: object, target: object, dim: int | None, mask: Tensor | None, where: str
+) -> tuple[Tensor, Tensor, Tensor, int]:
+    """Records over their sums (even ones for pixels that do not count), the pixels that count, the place of time."""
+    x, y = check_pair(input, target, where)
+    place = bins_dim(x, dim, where)
+    given = check_mask(mask, x, where)
+    records = []
+    for record, name in ((x, "input"), (y, "target")):
+        check_finite(record, given, name, where)
+        kept = counted(record, given)
+        if not holds(kept >= 0):
+            raise UnitError(
+                f"{where}: expected {name} without negative bins, got {int((kept < 0).sum())} of them. A record less "
+                "its background is no distribution: use .clamp_min(0), or a loss of tt.losses."
+            )
+        # over the highest bin first: sums of bins that single precision holds may be more than it holds
+        top = kept.amax(place, keepdim=True)
+        records.append(kept / torch.where(top > 0, top, torch.ones_like(top)))
+    ours, theirs = (record.sum(place, keepdim=True) for record in records)
+    lit = theirs > 0
+    dark = lit & (ours <= 0)
+    if not holds(~dark):
+        raise UnitError(
+            f"{where}: expected light in the input wherever the target has some, got {int(dark.sum())} pixels without. "
+            "Leave them out with mask=, and say how many those are; tt.losses.wasserstein_loss fills them up."
+        )
+    p, q = (
+        record / torch.where(mass > 0, mass, torch.ones_like(mass))
+        for record, mass in zip(records, (ours, theirs), strict=True)
+    )
+    return p, q, lit.squeeze(place), place

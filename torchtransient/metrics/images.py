@@ -1,0 +1,204 @@
+"""Pictures, and transients as pictures, by kornia's PSNR and SSIM.
+
+Pictures are (..., C, Y, X), of a result its `steady`. A transient (..., C, T, Y, X) is compared summed over time or bin
+by bin. The range of the values decides both metrics, so it is checked: a target beyond it is an error.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
+from torchtransient.losses.comparison import check_level, check_mask, check_pair, counted, holds
+from torchtransient.losses.layouts import time_dim
+from torchtransient.losses.results import STEADY, TRANSIENT, Picture, Transient, reads
+from torchtransient.losses.similarity import WINDOW, ssim_loss
+from torchtransient.metrics.tally import Reduction, Tally, check_finite
+
+View = Literal["sum", "bins"]
+_PICTURE = (-3, -2, -1)
+_IMAGES = -3
+
+
+@reads(input=STEADY, target=STEADY)
+def psnr(
+    input: Picture,
+    target: Picture,
+    *,
+    value_range: float | None = None,
+    mask: Tensor | None = None,
+    reduction: Reduction = "mean",
+) -> Tensor:
+    """Mean of `10 log10(value_range^2 / mean((input - target)^2))` over pictures (..., C, Y, X), decibels.
+
+    `value_range`: of the values; None: the highest value of each target. `mask` (broadcasts): pixels that count; of a
+    picture without any there is no value. Equal pictures are infinitely alike, and so is a mean with such. `reduction`:
+    "mean" of all pictures, (); "item" or "none", of each, (...). NaN where nothing counts. Raises ShapeError;
+    UnitError for NaN and infinite values, for a target that lies beyond its range, and without a range for dark ones.
+    """
+    where = "psnr"
+    x, y, given, limit = _pictures(input, target, value_range, mask, where)
+    return _psnr(x, y, given, limit).result(reduction, where)
+
+
+@reads(input=STEADY, target=STEADY)
+def ssim(
+    input: Picture,
+    target: Picture,
+    *,
+    window: int = WINDOW,
+    value_range: float | None = None,
+    mask: Tensor | None = None,
+    reduction: Reduction = "mean",
+) -> Tensor:
+    """Mean structural similarity of pictures (..., C, Y, X), in [-1, 1] (Wang, Bovik, Sheikh, Simoncelli 2004).
+
+    `1 - tt.losses.ssim_loss`: Gaussian windows of `window` pixels, reflected at the borders. `reduction`: "mean" of all
+    pixels, (); "item", of each picture, (...); "none", of each pixel. As `psnr` otherwise; pixels that `mask` leaves
+    out are 0 in both for the windows that reach them.
+    """
+    where = "ssim"
+    x, y, given, limit = _pictures(input, target, value_range, mask, where)
+    return _ssim(x, y, given, limit, window).result(reduction, where)
+
+
+@reads(input=TRANSIENT, target=TRANSIENT)
+def transient_psnr(
+    input: Transient,
+    target: Transient,
+    *,
+    view: View = "sum",
+    value_range: float | None = None,
+    dim: int | None = None,
+    mask: Tensor | None = None,
+    reduction: Reduction = "mean",
+) -> Tensor:
+    """`psnr` of transients (..., C, T, Y, X) as pictures.
+
+    `view`: "sum", the light of all bins, (..., C, Y, X); "bins", each bin a picture, (..., T, C, Y, X), with one range
+    for all bins of an item: `value_range`, or None: the highest value of the target. `mask` broadcasts to the
+    transients; pixels of a sum count where one of their bins does. As `psnr` otherwise.
+    """
+    where = "transient_psnr"
+    x, y, given, limit = _transients(input, target, view, (value_range, dim, mask), where)
+    return _psnr(x, y, given, limit).result(reduction, where)
+
+
+@reads(input=TRANSIENT, target=TRANSIENT)
+def transient_ssim(
+    input: Transient,
+    target: Transient,
+    *,
+    view: View = "sum",
+    window: int = WINDOW,
+    value_range: float | None = None,
+    dim: int | None = None,
+    mask: Tensor | None = None,
+    reduction: Reduction = "mean",
+) -> Tensor:
+    """`ssim` of transients (..., C, T, Y, X) as pictures, by `view` as in `transient_psnr`.
+
+    Empty bins are alike: over bins most of which are dark, a mean says little.
+    """
+    where = "transient_ssim"
+    x, y, given, limit = _transients(input, target, view, (value_range, dim, mask), where)
+    return _ssim(x, y, given, limit, window).result(reduction, where)
+
+
+def _psnr(x: Tensor, y: Tensor, mask: Tensor | None, limit: Tensor) -> Tally:
+    from kornia.metrics import psnr as decibels
+
+    shape = x.shape[:-3]
+    ours, theirs = ((picture / limit).double().reshape(-1, *x.shape[-3:]) for picture in (x, y))
+    masks = None if mask is None else mask.reshape(-1, *x.shape[-3:])
+    values, counts = [], []
+    for k in range(len(ours)):
+        # a picture without a pixel, whose mean would be none
+        there = masks is None or bool(masks[k].any())
+        a, b = (ours[k], theirs[k]) if masks is None else (ours[k][masks[k]], theirs[k][masks[k]])
+        values.append(decibels(a, b, 1.0) if there and a.numel() else x.new_zeros((), dtype=torch.float64))
+        counts.append(there and a.numel() > 0)
+    found = torch.stack(values) if values else ours.new_zeros(0)
+    weights = torch.tensor(counts, dtype=torch.bool, device=x.device).reshape(shape)
+    return Tally(found.to(x.dtype).reshape(shape), weights)
+
+
+def _ssim(x: Tensor, y: Tensor, mask: Tensor | None, limit: Tensor, window: int) -> Tally:
+    # in units of the range, which the loss would measure anew; what does not count is zero already
+    unlike = ssim_loss(x / limit, y / limit, window=window, value_range=1.0, reduction="none")
+    return Tally(1 - unlike, mask, -_IMAGES)
+
+
+def _pictures(
+    input: object, target: object, value_range: float | None, mask: Tensor | None, where: str
+) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
+    x, y = check_pair(input, target, where)
+    if x.ndim < -_IMAGES:
+        raise ShapeError(f"{where}: expected pictures (..., C, Y, X), got {tuple(x.shape)}.")
+    given = check_mask(mask, x, where)
+    x, y = _measured(x, y, given, where)
+    return x, y, given, _range(y, value_range, _PICTURE, given, where)
+
+
+def _transients(
+    input: object,
+    target: object,
+    view: View,
+    options: tuple[float | None, int | None, Tensor | None],
+    where: str,
+) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
+    """Pictures of transients, what counts of them and their ranges."""
+    value_range, dim, mask = options
+    if view not in get_args(View):
+        raise ArgumentError(f"{where}: expected view 'sum' or 'bins', got {view!r}.")
+    x, y = check_pair(input, target, where)
+    place = time_dim(x, dim, where)
+    if place != _IMAGES or x.ndim < 4:
+        raise ShapeError(
+            f"{where}: expected transients (..., C, T, Y, X), which are pictures, got {tuple(x.shape)} with time in "
+            f"dimension {place}."
+        )
+    given = check_mask(mask, x, where)
+    x, y = _measured(x, y, given, where)
+    if view == "sum":
+        x, y = x.sum(_IMAGES), y.sum(_IMAGES)
+        given = None if given is None else given.any(_IMAGES)
+        return x, y, given, _range(y, value_range, _PICTURE, given, where)
+    limit = _range(y, value_range, (-4, *_PICTURE), given, where)
+    given = None if given is None else given.movedim(_IMAGES, -4)
+    return x.movedim(_IMAGES, -4), y.movedim(_IMAGES, -4), given, limit
+
+
+def _measured(x: Tensor, y: Tensor, mask: Tensor | None, where: str) -> tuple[Tensor, Tensor]:
+    check_finite(x, mask, "input", where)
+    check_finite(y, mask, "target", where)
+    return counted(x, mask), counted(y, mask)
+
+
+def _range(
+    target: Tensor, value_range: float | None, dims: tuple[int, ...], mask: Tensor | None, where: str
+) -> Tensor:
+    """What values are divided by, broadcasting to the target."""
+    if value_range is not None:
+        limit = check_level("value_range", value_range, target.new_empty(()), where)
+        low, high = target.clamp(max=0), target.clamp_min(0)
+        spread = high.amax(dims, keepdim=True) - low.amin(dims, keepdim=True) if target.numel() else limit * 0
+        if not holds(spread <= limit * (1 + 1e-5)):
+            raise UnitError(
+                f"{where}: expected a target within value_range {value_range}, got values over "
+                f"{float(spread.max()):.4g}. Give the range of the data, or none."
+            )
+        return limit
+    if not target.numel():
+        return target.new_ones(())
+    top = target.amax(dims, keepdim=True)
+    needed = torch.ones_like(top, dtype=torch.bool) if mask is None else mask.to(top.dtype).amax(dims, keepdim=True) > 0
+    if not holds((top > 0) | ~needed):
+        raise UnitError(
+            f"{where}: expected targets with light, whose highest value is their range, got one without. Give "
+            "value_range=, that of the data."
+        )
+    return torch.where(top > 0, top, torch.ones_like(top))

@@ -1,0 +1,111 @@
+"""Where points of a hidden scene are found: distances in metres between peaks of a volume and the truth."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
+from torchtransient.losses.comparison import check_dense
+from torchtransient.losses.results import Volume
+from torchtransient.metrics.tally import Finish, Kind, Reduction, Tally, check_finite, check_reduction
+from torchtransient.quantities import positive, real_array, shown
+from torchtransient.reconstruction.voxels import VoxelGrid
+
+
+def localization_rmse(
+    input: Volume,
+    points: Any,
+    *,
+    radius_m: float,
+    grid: VoxelGrid | None = None,
+    reduction: Reduction = "mean",
+) -> Tensor:
+    """Root of the mean square of the distances of points (N, 3) from the peaks of volumes (..., Z, Y, X), metres.
+
+    The peak of a point is the highest voxel within `radius_m` metres of it, moved along each axis of the grid by the
+    parabola through it and its neighbors, at most half a voxel. Take a radius below half the distance of two points,
+    and look at the picture: what is searched near the truth is found near it. A point without anything above zero
+    within the radius is not found and counts with the radius. `points`: world coordinates, metres. `grid`: of the
+    voxels; None takes that of a `HiddenVolume`.
+
+    `reduction`: "mean" of all points, (); "item", of each volume, (...); "none", the distance of each point, (..., N).
+    Raises ShapeError, UnitError, also for a radius in which a point has no voxel; ArgumentError without a grid.
+    """
+    where = "localization_rmse"
+    check_reduction(reduction, where)
+    radius = positive(f"{where}: radius_m", radius_m)
+    grid = getattr(input, "grid", None) if grid is None else grid
+    if not isinstance(grid, VoxelGrid):
+        raise ArgumentError(f"{where}: expected grid=, a VoxelGrid, with a tensor, got {shown(grid)}.")
+    values = input if isinstance(input, Tensor) else getattr(input, "values", None)
+    (volume,) = check_dense((values,), where)
+    if volume.ndim < 3 or tuple(volume.shape[-3:]) != tuple(grid.shape) or volume.is_complex():
+        raise ShapeError(
+            f"{where}: expected a real volume (..., {', '.join(map(str, grid.shape))}) on its grid, got "
+            f"{tuple(volume.shape)} {volume.dtype}."
+        )
+    check_finite(volume, None, "input", where)
+    plain = real_array(points)
+    if plain is None or plain.ndim != 2 or plain.shape[-1] != 3 or not len(plain):
+        raise ShapeError(f"{where}: expected points (N, 3), metres, got {shown(points)}.")
+    truth = torch.from_numpy(plain)
+    check_finite(truth, None, "points", where)
+    flat = volume.detach().double().reshape(-1, *grid.shape)
+    distances = torch.stack([_distances(flat, grid, point, radius, where) for point in truth], -1)
+    squares = distances.square().reshape(*volume.shape[:-3], len(truth))
+    return Tally(squares, None, 1, Finish(Kind.ROOT)).result(reduction, where)
+
+
+def _distances(volumes: Tensor, grid: VoxelGrid, point: Tensor, radius: float, where: str) -> Tensor:
+    """(B,) metres between a point (3,) and its peak in each volume (B, Z, Y, X)."""
+    offset = point - grid.first
+    away = [
+        along - float(offset @ direction)
+        for along, direction in zip(_places(grid), (grid.normal, grid.along_y, grid.along_x), strict=True)
+    ]
+    # of the voxels in a cube around the point, those in the ball: the whole volume may be large
+    box = [torch.nonzero(one.abs() <= radius).flatten() for one in away]
+    z, y, x = (one[kept].square() for one, kept in zip(away, box, strict=True))
+    near = z[:, None, None] + y[:, None] + x <= radius**2
+    if not bool(near.any()):
+        raise UnitError(
+            f"{where}: expected a voxel within {radius:.4g} m of each point, got none near {point.tolist()} m. Take a "
+            "larger radius, or look whether the point is inside of the grid."
+        )
+    first = [int(one[0]) for one in box]
+    around = volumes[:, *(slice(start, start + len(one)) for start, one in zip(first, box, strict=True))]
+    peaks, indices = torch.where(near.to(volumes.device), around, -torch.inf).flatten(1).max(1)
+    found = []
+    for volume, peak, index in zip(volumes, peaks, indices, strict=True):
+        if float(peak) <= 0:
+            found.append(radius)
+            continue
+        inside = torch.unravel_index(index.cpu(), tuple(near.shape))
+        place = [start + int(k) for start, k in zip(first, inside, strict=True)]
+        parts = [float(away[k][place[k]]) + _step(volume, away[k], place, k) for k in range(3)]
+        found.append(math.hypot(*parts))
+    return volumes.new_tensor(found)
+
+
+def _places(grid: VoxelGrid) -> tuple[Tensor, Tensor, Tensor]:
+    """(Z,), (Y,), (X,): metres of voxels along the axes of a grid."""
+    rows, columns = (torch.arange(n, dtype=torch.float64) * step for n, step in zip(grid.size, grid.pitch, strict=True))
+    return grid.depths, rows, columns
+
+
+def _step(volume: Tensor, along: Tensor, place: list[int], axis: int) -> float:
+    """Metres from a voxel to the top of the parabola through it and its neighbors along an axis; 0 at the border."""
+    i = place[axis]
+    if not 0 < i < len(along) - 1:
+        return 0.0
+    low, middle, high = (float(volume[(*place[:axis], i + step, *place[axis + 1 :])]) for step in (-1, 0, 1))
+    before, after = float(along[i] - along[i - 1]), float(along[i + 1] - along[i])
+    # slopes to both sides: the top is where the line between them is zero
+    rise, fall = (middle - low) / before, (middle - high) / after
+    if rise + fall <= 0:
+        return 0.0
+    return min(max((rise * after - fall * before) / (2 * (rise + fall)), -before / 2), after / 2)

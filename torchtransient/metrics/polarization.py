@@ -1,0 +1,165 @@
+"""Degree and angle of polarization against the truth, of Stokes components.
+
+Tensors hold the four components along `stokes_dim`: -4 of a picture (..., 4, C, Y, X), which is what is read of a
+result (`steady`), and -5 of a transient (..., 4, C, T, Y, X). What is dark in the target has no polarization and does
+not count. Frames have to agree: see `tt.stokes`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+
+from torchtransient import stokes
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
+from torchtransient.losses.comparison import check_level, check_mask, check_pair, holds
+from torchtransient.losses.layouts import check_dim
+from torchtransient.losses.results import Picture
+from torchtransient.metrics.phase import phase_mae
+from torchtransient.metrics.tally import Finish, Kind, Reduction, Tally, check_finite, check_reduction
+from torchtransient.quantities import shown
+
+Part = Literal["total", "linear", "circular"]
+_DEGREES = {
+    "total": stokes.degree_of_polarization,
+    "linear": stokes.degree_of_linear_polarization,
+    "circular": stokes.degree_of_circular_polarization,
+}
+_PICTURE = 2
+_COMPONENTS = 4
+
+
+def dop_mae(
+    input: Picture,
+    target: Picture,
+    *,
+    stokes_dim: int = stokes.STEADY_DIM,
+    part: Part = "total",
+    floor: float = 0.0,
+    mask: Tensor | None = None,
+    reduction: Reduction = "mean",
+) -> Tensor:
+    """Mean of `|DoP(input) - DoP(target)|` of Stokes tensors, without unit.
+
+    `part`: of "total", "linear" or "circular" (signed) polarization. `floor`: in the unit of the light; entries whose
+    target is not brighter do not count, nor those that `mask` (shape without the components) leaves out. An estimate
+    without light there is an error. `reduction`: "mean" of all, (); "item", of each picture, without its last two
+    dimensions; "none", the shape without the components. NaN where nothing counts. Degrees above one, of noise, are
+    compared as they are. Raises ShapeError, UnitError, ArgumentError.
+    """
+    where = "dop_mae"
+    difference, counts = _degrees(input, target, stokes_dim, part, floor, mask, where)
+    return Tally(difference.abs(), counts, _PICTURE).result(reduction, where)
+
+
+def dop_rmse(
+    input: Picture,
+    target: Picture,
+    *,
+    stokes_dim: int = stokes.STEADY_DIM,
+    part: Part = "total",
+    floor: float = 0.0,
+    mask: Tensor | None = None,
+    reduction: Reduction = "mean",
+) -> Tensor:
+    """Root of the mean square of `DoP(input) - DoP(target)` of Stokes tensors, without unit; as `dop_mae`."""
+    where = "dop_rmse"
+    difference, counts = _degrees(input, target, stokes_dim, part, floor, mask, where)
+    return Tally(difference.square(), counts, _PICTURE, Finish(Kind.ROOT)).result(reduction, where)
+
+
+def aolp_mae(
+    input: Picture,
+    target: Picture,
+    *,
+    stokes_dim: int = stokes.STEADY_DIM,
+    weighted: bool = True,
+    floor: float = 0.0,
+    mask: Tensor | None = None,
+    reduction: Reduction = "mean",
+) -> Tensor:
+    """Mean of the modulus of the difference of angles of linear polarization modulo pi, radians, in [0, pi/2].
+
+    `weighted`: each entry counts with the linear part `|(S1, S2)|` of its target, since the angle of light that is
+    hardly polarized is noise; False: all count alike. Entries whose target has a linear part of `floor` (unit of the
+    light) or less have no angle and do not count; an estimate without linear part there is an error. For angles in
+    place of Stokes tensors: `phase_mae(..., period=math.pi)`. As `dop_mae` otherwise.
+    """
+    where = "aolp_mae"
+    check_reduction(reduction, where)
+    x, y, dim = _stokes_pair(input, target, stokes_dim, where)
+    linear = [torch.hypot(s.select(dim, 1), s.select(dim, 2)) for s in (x, y)]
+    counts = _counts(linear[1], floor, mask, where)
+    clean = _finite((x, y), counts, dim, where)
+    _check_there(linear[0], counts, "linear polarization", where)
+    angles = [stokes.angle_of_linear_polarization(s, dim) for s in clean]
+    weight = linear[1] if weighted else torch.ones_like(linear[1])
+    weight = torch.where(counts, weight, torch.zeros_like(weight))
+    return phase_mae(angles[0], angles[1], period=math.pi, weight=weight, reduction=reduction)
+
+
+def _degrees(
+    input: object, target: object, stokes_dim: int, part: Part, floor: float, mask: Tensor | None, where: str
+) -> tuple[Tensor, Tensor]:
+    if part not in get_args(Part):
+        raise ArgumentError(f"{where}: expected part 'total', 'linear' or 'circular', got {part!r}.")
+    x, y, dim = _stokes_pair(input, target, stokes_dim, where)
+    counts = _counts(y.select(dim, 0), floor, mask, where)
+    clean = _finite((x, y), counts, dim, where)
+    _check_there(x.select(dim, 0), counts, "light", where)
+    ours, theirs = (_DEGREES[part](s, dim) for s in clean)
+    return ours - theirs, counts
+
+
+def _stokes_pair(input: object, target: object, stokes_dim: int, where: str) -> tuple[Tensor, Tensor, int]:
+    x, y = check_pair(_picture("input", input, where), _picture("target", target, where), where)
+    dim = check_dim(stokes_dim, where)
+    if not -x.ndim <= dim < x.ndim or x.shape[dim] != _COMPONENTS:
+        raise ShapeError(
+            f"{where}: expected four Stokes components along stokes_dim={dim}, got {tuple(x.shape)}. They are along -4 "
+            "of a picture (..., 4, C, Y, X) and -5 of a transient (..., 4, C, T, Y, X) of polarized variants."
+        )
+    return x, y, dim % x.ndim
+
+
+def _picture(name: str, x: object, where: str) -> object:
+    """The tensor of a result. A batch of four renders without polarization would pass for one with it."""
+    if isinstance(x, Tensor):
+        return x
+    steady = getattr(x, "steady", None)
+    if not isinstance(steady, Tensor) or getattr(x, "polarized", True) is not True:
+        raise ShapeError(
+            f"{where}: expected {name} to be a tensor or a polarized result with steady, got {shown(x)}. Render with a "
+            "polarized variant."
+        )
+    return steady
+
+
+def _counts(level: Tensor, floor: float, mask: Tensor | None, where: str) -> Tensor:
+    least = check_level("floor", floor, level.new_empty(()), where, zero=True)
+    given = check_mask(mask, level, where)
+    check_finite(level, given, "target", where)
+    lit = level > least.clamp_min(torch.finfo(level.dtype).tiny)
+    return lit if given is None else given & lit
+
+
+def _finite(pair: tuple[Tensor, Tensor], counts: Tensor, dim: int, where: str) -> list[Tensor]:
+    """Both with horizontal light where nothing counts."""
+    found = []
+    for x, name in zip(pair, ("input", "target"), strict=True):
+        full = counts.unsqueeze(dim).expand(x.shape)
+        check_finite(x, full, name, where)
+        found.append(torch.where(full, x, torch.ones_like(x)))
+    return found
+
+
+def _check_there(level: Tensor, counts: Tensor, what: str, where: str) -> None:
+    missing = counts & ~(level > torch.finfo(level.dtype).tiny)
+    if not holds(~missing):
+        raise UnitError(
+            f"{where}: expected an input with {what} where the target has some, got {int(missing.sum())} entries of "
+            "none. Leave them out with mask=, and say how many those are."
+        )

@@ -1,0 +1,91 @@
+"""The colours whose smooth spectra have given coefficients: the inverse of ``mi.srgb_model_fetch``.
+
+Mitsuba keeps a reflectance in spectral variants as three coefficients of a smooth spectrum, which it looks up in a
+table by the colour (Jakob and Hanika 2019, A Low-Dimensional Function Space for Efficient Spectral Upsampling). The
+table is inverted here by Gauss-Newton steps with damping, on the spectrum at some wavelengths.
+"""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+
+from torchtransient.errors import SceneError
+
+_WAVELENGTHS = np.linspace(380.0, 740.0, 19)
+_STEP, _STEPS = 1e-3, 40
+# Largest difference of the spectra of a colour that counts as found.
+TOLERANCE = 2e-5
+
+
+def colours_of(coefficients: np.ndarray) -> tuple[np.ndarray, float]:
+    """(colours, error) for ``coefficients`` (..., 3): linear sRGB in [0, 1] of the same shape, and the largest
+    difference between the spectra that they have and those that are asked for. Above :data:`TOLERANCE` there is no
+    such colour. Needs a spectral variant.
+    """
+    rows = np.asarray(coefficients, dtype=np.float64).reshape(-1, 3)
+    found = np.array([_colour_of(row) for row in rows])
+    errors = [np.abs(_spectrum(_fetch(rgb)) - _spectrum(row)).max() for rgb, row in zip(found, rows, strict=True)]
+    return found.reshape(np.shape(coefficients)), float(max(errors, default=0.0))
+
+
+def as_colours(coefficients: np.ndarray, where: str) -> np.ndarray:
+    """The colours of ``coefficients`` (..., 3). Raises ``SceneError``, with the place ``where``, if there are none."""
+    found, error = colours_of(coefficients)
+    if error > TOLERANCE:
+        raise SceneError(
+            f"scene.save: {where!r} cannot be said in XML: its coefficients of a spectral model are those of no colour "
+            f"(nearest spectrum: {error:.2g} away). Leave it out of values, or keep the values themselves."
+        )
+    return found
+
+
+def same_spectra(a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether coefficients (..., 3) belong to the same spectra, as far as files keep them."""
+    if a.shape != b.shape or a.size % 3:
+        return False
+    pairs = zip(a.reshape(-1, 3), b.reshape(-1, 3), strict=True)
+    return all(np.abs(_spectrum(one) - _spectrum(other)).max() < 5 * TOLERANCE for one, other in pairs)
+
+
+def _fetch(rgb: np.ndarray) -> np.ndarray:
+    return np.array(mi.srgb_model_fetch(mi.ScalarColor3f(*rgb.tolist())), dtype=np.float64).ravel()
+
+
+def _spectrum(row: np.ndarray) -> np.ndarray:
+    x: np.ndarray = (row[0] * _WAVELENGTHS + row[1]) * _WAVELENGTHS + row[2]
+    return 0.5 + 0.5 * x / np.sqrt(1 + x * x)
+
+
+def _colour_of(row: np.ndarray) -> np.ndarray:
+    wanted = _spectrum(row)
+    if np.ptp(wanted) < 1e-6:
+        # Greys have no place in the table: their spectrum is flat.
+        return np.full(3, wanted.mean())
+    bands = [(600, 740), (500, 600), (380, 500)]
+    start = [wanted[_inside(low, high)].mean() for low, high in bands]
+    rgb, damping = np.clip(start, 0.005, 0.995), 1e-3
+    residual = _spectrum(_fetch(rgb)) - wanted
+    for _ in range(_STEPS):
+        if np.abs(residual).max() < 0.1 * TOLERANCE:
+            break
+        # Away from the nearer end of the range.
+        steps = np.where(rgb < 0.5, _STEP, -_STEP)
+        columns = [(_spectrum(_fetch(rgb + step * axis)) - wanted - residual) / step for step, axis in _axes(steps)]
+        slope = np.stack(columns, axis=1)
+        move = np.linalg.solve(slope.T @ slope + damping * np.eye(3), slope.T @ residual)
+        tried = np.clip(rgb - move, 0.0, 1.0)
+        after = _spectrum(_fetch(tried)) - wanted
+        if np.square(after).sum() < np.square(residual).sum():
+            rgb, residual, damping = tried, after, damping / 10
+        else:
+            damping *= 10
+    return rgb
+
+
+def _inside(low: float, high: float) -> np.ndarray:
+    return np.abs(_WAVELENGTHS - (low + high) / 2) <= (high - low) / 2
+
+
+def _axes(steps: np.ndarray) -> zip[tuple[float, np.ndarray]]:
+    return zip(steps.tolist(), np.eye(3), strict=True)

@@ -1,0 +1,189 @@
+"""Checks of what is passed to the renderer, values and settings."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+from torch.nn.utils import parametrize
+
+from torchtransient.errors import ArgumentError, DeviceError, ShapeError, UnitError, UnknownKeyError
+from torchtransient.rendering.films.choice import FilmChoice
+from torchtransient.rendering.films.choices import chosen
+
+TEMPORAL_FILTERS = ("auto", "box", "tent", "gaussian")
+
+
+def samples(name: str, value: int | None) -> int | None:
+    """A number of samples per pixel, or None. Raises ``UnitError``."""
+    if value is None:
+        return None
+    try:
+        number = 0 if isinstance(value, bool) or getattr(value, "dtype", None) == torch.bool else operator.index(value)
+    except TypeError:
+        number = 0
+    if number < 1:
+        raise UnitError(f"{name}: expected a positive integer or None, got {value!r}.")
+    return number
+
+
+def checked_filter(name: str) -> str:
+    """The name of a temporal filter, or "auto". Raises ``ArgumentError``."""
+    if name not in TEMPORAL_FILTERS:
+        raise ArgumentError(f"temporal_filter: expected one of {', '.join(TEMPORAL_FILTERS)}, got {name!r}.")
+    return name
+
+
+def checked_grad_seed(value: int | str | None) -> int | str | None:
+    """None, "same" or an integer. Raises ``ArgumentError``."""
+    if value is None or value == "same" or (isinstance(value, int) and not isinstance(value, bool)):
+        return value
+    raise ArgumentError(f"grad_seed: expected None, 'same' or an integer, got {value!r}.")
+
+
+def sensor_list(sensors: int | Sequence[int] | str, count: int) -> tuple[tuple[int, ...], bool]:
+    """The sensors to render out of ``count``, and whether they get a dimension of their own. Raises
+    ``ArgumentError``."""
+    if sensors == "all":
+        return tuple(range(count)), True
+    if isinstance(sensors, int) and not isinstance(sensors, bool):
+        return (sensors,), False
+    if isinstance(sensors, str) or not isinstance(sensors, Sequence) or not sensors:
+        raise ArgumentError(f"sensors: expected an index, a list of indices or 'all', got {sensors!r}.")
+    return tuple(int(sensor) for sensor in sensors), True
+
+
+def mangle(keys: Sequence[str]) -> dict[str, str]:
+    """Names that torch allows: slashes for dots."""
+    names = {key: key.replace(".", "/") for key in keys}
+    if len(set(names.values())) != len(keys):
+        raise ArgumentError(
+            f"parameters: every key once, and no two keys that differ only in '.' and '/', got {list(keys)}."
+        )
+    return names
+
+
+def as_float(key: str, value: Any, device: str) -> torch.Tensor:
+    """The value as float32, by an operation that gradients pass. Numbers, lists and arrays come to ``device``, tensors
+    must be there. Raises ``ShapeError`` for what is not real numbers, ``DeviceError`` for another device.
+    """
+    if value is None:  # which numpy takes for a number that is none
+        raise ShapeError(f"value of {key!r}: expected numbers, got None. Leave the key out to keep the current value.")
+    if not isinstance(value, torch.Tensor):
+        value = _tensor_of(key, value).to(device)
+    if value.is_complex() or value.dtype == torch.bool:
+        raise ShapeError(f"value of {key!r}: expected real numbers, got dtype {value.dtype}.")
+    if value.layout != torch.strided:
+        raise ShapeError(f"value of {key!r}: expected a dense tensor, got layout {value.layout}.")
+    if value.device.type != device:
+        raise DeviceError(
+            f"value of {key!r}: expected a tensor on {device!r}, where the scene's variant computes, got "
+            f"{str(value.device)!r}. Move it with .to({device!r}), or load the scene with a variant of the other kind."
+        )
+    found: torch.Tensor = value.to(torch.float32)
+    return found
+
+
+def _tensor_of(key: str, value: Any) -> torch.Tensor:
+    """A tensor of a number, of lists of them, also with tensors inside, or of an array of any library."""
+    try:
+        if isinstance(value, (list, tuple)) and any(isinstance(entry, torch.Tensor) for entry in value):
+            return torch.stack([entry if isinstance(entry, torch.Tensor) else torch.tensor(entry) for entry in value])
+        array = np.asarray(value)
+        # Numpy reads texts and objects too; arrays that may not be written to would be a warning of torch's.
+        return torch.from_numpy(array.copy() if array.dtype.kind in "biufc" else array.astype(np.float64, copy=True))
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ShapeError(
+            f"value of {key!r}: expected a torch tensor, an array, a list of numbers or a number, got "
+            f"{type(value).__name__}: {error}."
+        ) from error
+
+
+def fit_shape(key: str, value: torch.Tensor, shape: tuple[int, ...]) -> tuple[torch.Tensor, bool]:
+    """The value in its own shape, and whether it has a leading batch dimension. Flat vertex lists are taken too."""
+    got = tuple(value.shape)
+    if got == shape:
+        return value, False
+    if len(got) == len(shape) + 1 and got[1:] == shape:
+        return value, True
+    flat = 1
+    for n in shape:
+        flat *= n
+    if len(shape) == 2 and got == (flat,):
+        return value.reshape(shape), False
+    if len(shape) == 2 and len(got) == 2 and got[1] == flat:
+        return value.reshape(got[0], *shape), True
+    batch = ("B", *shape)
+    with_batch = f"({', '.join(str(n) for n in batch)}{',' if len(batch) == 1 else ''})"
+    raise ShapeError(f"value of {key!r}: expected shape {shape}, or {with_batch} with a batch, got {got}.")
+
+
+def film_asked_for(film: Any, named: Mapping[str, Any]) -> FilmChoice | None:
+    """The film of a call: an object, or one of the ``named`` arguments. Raises ``ArgumentError``."""
+    found = chosen(named)
+    if film is None:
+        return found
+    if found is not None:
+        raise ArgumentError(f"film, {', '.join(named)}: a film measures one thing; give one of them.")
+    if not isinstance(film, FilmChoice):
+        raise ArgumentError(
+            f"film: expected a film such as Histogram(axis) of torchtransient.rendering.films, got {film!r}."
+        )
+    return film
+
+
+def given_values(values: Any) -> dict[str, Any]:
+    """The values of a call. Raises ArgumentError for what is no mapping: a seed, most likely."""
+    if values is not None and not isinstance(values, Mapping):
+        raise ArgumentError(
+            f"values: expected a mapping from keys to values, got {type(values).__name__}; write {{key: value}}, and a "
+            "seed as seed=0."
+        )
+    return dict(values or {})
+
+
+class Values(Mapping[str, nn.Parameter]):
+    """The renderer's parameters under their Mitsuba keys. Setting one writes into it, as ``load_state_dict`` does.
+
+    Of a key with a parametrization the value is computed at each look: setting it writes the numbers behind, and what
+    is written into it in place (``clamp_``, ``fill_``, ``copy_``) is lost.
+    """
+
+    def __init__(self, module: nn.Module, names: Mapping[str, str]):
+        self._module, self._names = module, names
+
+    def __getitem__(self, key: str) -> nn.Parameter:
+        if key not in self._names:
+            raise UnknownKeyError(
+                f"this renderer has no parameter {key!r}; it was made with parameters={list(self._names)}. Keys are "
+                "given to TransientRenderer(..., parameters=[...])."
+            )
+        found: nn.Parameter = getattr(self._module, self._names[key])
+        return found
+
+    def __setitem__(self, key: str, value: Any) -> None:
+        parameter = self[key]
+        given, batched = fit_shape(key, as_float(key, value, parameter.device.type), tuple(parameter.shape))
+        if batched:
+            raise ShapeError(
+                f"value of {key!r}: expected shape {tuple(parameter.shape)}, got {tuple(given.shape)}: a parameter has "
+                "no batch; pass batches to the call, renderer({key: values})."
+            )
+        with torch.no_grad():
+            if parametrize.is_parametrized(self._module, self._names[key]):
+                setattr(self._module, self._names[key], given)  # torch's property: the numbers behind it
+            else:
+                parameter.copy_(given)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def __repr__(self) -> str:
+        return repr(dict(self))

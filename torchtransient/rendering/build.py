@@ -1,0 +1,401 @@
+"""From a description to a Mitsuba scene: what is overridden on the way, and the errors told in the user's terms.
+
+The description is parsed into Mitsuba's list of nodes, the nodes are edited (film, integrator, plugins with more
+derivatives, stable names), and the list is instantiated. The same edits serve XML files and dictionaries.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from torchtransient import plugins
+from torchtransient._collection import let_go
+from torchtransient.errors import ArgumentError, SceneError, TorchTransientError
+from torchtransient.interfaces import IntegratorInterface
+from torchtransient.plugins.described_scene import check_scene
+from torchtransient.plugins.mitsuba_compat import (
+    BUILDS_LOBES,
+    COMPLETED_PLUGINS,
+    DIFFERENTIABLE_PLUGINS,
+    POLARIZED_PLUGINS,
+    is_dark,
+)
+from torchtransient.plugins.parameter_effect import class_of
+from torchtransient.plugins.physical_ranges import described_ranges
+from torchtransient.rendering.build_options import BuildOptions
+from torchtransient.rendering.description import Description
+from torchtransient.rendering.films.choices import all_films, of_plugin, plugins_in_words
+from torchtransient.rendering.mitsuba_words import one_line
+from torchtransient.rendering.node_checks import check_nodes
+from torchtransient.rendering.node_names import (
+    name_instantiated,
+    name_nested,
+    name_nodes,
+    names_of_textures,
+    take_merged_apart,
+)
+from torchtransient.rendering.nodes import (
+    check_finite,
+    children,
+    descendants,
+    find_child,
+    is_film,
+    is_integrator,
+    is_transient_integrator,
+    media_in_use,
+)
+from torchtransient.rendering.physics import scene_findings
+from torchtransient.rendering.pulse_properties import PREFIXES, PROPERTIES, write_pulse
+from torchtransient.rendering.taken import ReadyScene, check_taken, pointers
+from torchtransient.rendering.threads import threads_for_files
+from torchtransient.rendering.unread_properties import unread_properties
+
+# Steady integrators, and the transient ones for which their parameters mean the same.
+_COUNTERPARTS = {
+    **dict.fromkeys(("path", "prb", "prb_basic", "prb_projective"), "transient_path"),
+    **dict.fromkeys(("volpath", "volpathmis", "prbvolpath"), "transient_prbvolpath"),
+}
+_PATH_PROPERTIES = ("max_depth", "rr_depth", "hide_emitters")
+_TRANSIENT_PROPERTIES = (
+    *_PATH_PROPERTIES, "camera_unwarp", "discard_direct_light", "temporal_filter", "gaussian_stddev",
+)  # fmt: skip
+# What a transient film takes over from a steady one; file formats and alpha have no meaning for it.
+_STEADY_FILMS = ("hdrfilm", "specfilm")
+_FILM_PROPERTIES = (
+    "width", "height", "crop_width", "crop_height", "crop_offset_x", "crop_offset_y", "sample_border",
+    "exhaustive_scan", "laser_scan_width", "laser_scan_height",
+)  # fmt: skip
+
+
+@dataclass
+class BuiltScene:
+    """A Mitsuba scene with what has to be known about its nodes. ``to_world``: all transforms as described, by key.
+    ``label_tables``: what labels look up, once they are asked for. ``taken``: addresses of the plugins that were taken
+    as they are, in whose place none can be built.
+    """
+
+    scene: Any
+    params: Any
+    mesh_to_world: dict[str, np.ndarray] = field(default_factory=dict)
+    integrator: str = ""
+    to_world: dict[str, np.ndarray] = field(default_factory=dict)
+    label_tables: Any = None
+    taken: frozenset[int] = frozenset()
+
+    def findings(self) -> dict[str, str]:
+        """What is unphysical in the description, by key."""
+        if self._findings is None:
+            dark = [emitter.id() for emitter in self.scene.emitters() if is_dark(emitter)]
+            self._findings = scene_findings(described_ranges(self.params), self.to_world, dark)
+        return self._findings
+
+    _findings: dict[str, str] | None = None
+
+    def __del__(self) -> None:
+        contents = list(self.__dict__.values())
+        self.__dict__.clear()
+        let_go(contents)
+
+
+# What constructors raise, Mitsuba's and those of plugins in Python.
+_OF_PLUGINS = (RuntimeError, ValueError, TypeError, ArithmeticError, AttributeError, LookupError, MemoryError)
+
+# Mitsuba merges meshes of one surface, and stops where their normals are made in different ways.
+_CANNOT_MERGE = "Mesh::merge()"
+
+
+def build(description: Description, variant: str, options: BuildOptions) -> BuiltScene:
+    """Instantiate a description under the active variant. Raises ``SceneError`` with file and line where Mitsuba
+    knows them.
+    """
+    import mitsuba as mi
+
+    if isinstance(description, ReadyScene):
+        return _as_it_is(description, options)
+    config = mi.parser.ParserConfig(variant)
+    config.merge_equivalent = options.merge
+    config.merge_meshes = options.merge
+    try:
+        with description.resolved_files(), plugins.plugin_errors(), threads_for_files():
+            state = description.parse(config)
+            _check_root(state)
+            check_nodes(state)
+            name_nodes(state)
+            if not options.merge:
+                take_merged_apart(state)
+                name_nested(state)
+            _override_films(state, options)
+            _override_integrator(state, options)
+            _override_samplers(state, options)
+            _substitute_plugins(state, options)
+            transforms = _mesh_transforms(state)
+            placed = _placed(state)
+            integrator = find_child(state, state.root, is_integrator)
+            plugin = "" if integrator is None else state.nodes[integrator].props.plugin_name()
+            check_finite(state)
+            _forget_queries(state)
+            textures = names_of_textures(state)
+            mi.parser.transform_all(config, state)
+            scene = mi.parser.instantiate(config, state)
+            if not isinstance(scene, mi.Scene):
+                raise SceneError(f"expected one <scene>, got {type(scene).__name__}.")
+            name_instantiated(scene, textures)
+            if description.taken:
+                check_taken(scene, description.taken, options)
+            _check_integrator(scene, options)
+            params = mi.traverse(scene)
+            check_scene(scene, params)
+    except TorchTransientError as error:
+        raise type(error)(f"{_location(error.__cause__) or description.name}: {error}") from error
+    except _OF_PLUGINS as error:
+        if options.merge and _CANNOT_MERGE in str(error):
+            return build(description, variant, replace(options, merge=False))
+        text = one_line(error).replace("While loading string", f"While loading {description.name}")
+        said = unread_properties(str(error), description.name)
+        raise SceneError(said or f"{description.name}: Mitsuba could not build the scene. {text}") from error
+    return BuiltScene(scene, params, transforms, plugin, placed, taken=pointers(description.taken))
+
+
+def _as_it_is(description: ReadyScene, options: BuildOptions) -> BuiltScene:
+    """A scene that is ready. Raises ``SceneError`` where ``options`` would change it."""
+    import mitsuba as mi
+
+    scene = description.scene
+    check_taken(scene, description.taken, options)
+    params = mi.traverse(scene)
+    check_scene(scene, params)
+    name = "" if scene.integrator() is None else class_of(scene.integrator())
+    return BuiltScene(scene, params, integrator=name, taken=pointers(description.taken))
+
+
+def _location(error: BaseException | None) -> str | None:
+    """File and line, or dictionary node, that a message of Mitsuba names."""
+    found = re.search(r'(?:At|While loading) (.+? \(line \d+, col \d+\)|dictionary node "[^"]+")', str(error or ""))
+    return found.group(1) if found else None
+
+
+def _check_root(state: Any) -> None:
+    if state.root.props.plugin_name() != "scene":
+        raise SceneError(f"expected a <scene> at the top, got <{state.root.props.plugin_name()}>.")
+
+
+# --------------------------------------------------------------------------------------------------------- nodes
+
+
+def _add_child(state: Any, parent: int, key: str, plugin: str, kind: Any, properties: Mapping[str, Any]) -> None:
+    import mitsuba as mi
+
+    there = dict(children(state, state.nodes[parent])).get(key)
+    if there is not None:  # a plugin that Mitsuba does not know; in its place another one would be rendered
+        unknown = state.nodes[there].props.plugin_name()
+        raise SceneError(
+            f"{key!r}: expected a plugin that Mitsuba or this library has as {key}, got {unknown!r}, which neither "
+            "knows. Check how it is spelt. One of your own is made known, in every variant, by "
+            "torchtransient.plugins.register_module of the module that registers it."
+        )
+    node = mi.parser.SceneNode()
+    node.type = kind
+    node.props = mi.Properties(plugin)
+    for name, value in properties.items():
+        node.props[name] = value
+    state.nodes.append(node)
+    if len(state.node_paths):
+        state.node_paths = [*state.node_paths, key]
+    state.nodes[parent].props[key] = mi.Properties.ResolvedReference(len(state.nodes) - 1)
+
+
+def _mesh_transforms(state: Any) -> dict[str, np.ndarray]:
+    """``to_world`` as described, by the name of the shape: meshes apply it while loading and forget it."""
+    import mitsuba as mi
+
+    result = {}
+    for node in state.nodes:
+        if node.type == mi.ObjectType.Shape and node.props.id():
+            matrix = np.eye(4)
+            if "to_world" in node.props:
+                matrix = np.array(node.props["to_world"].matrix, dtype=np.float64)
+            result[node.props.id()] = matrix
+    return result
+
+
+def _placed(state: Any) -> dict[str, np.ndarray]:
+    """Every ``to_world`` of the description, by its key."""
+    found = {}
+    for node in state.nodes:
+        if "to_world" in node.props:
+            name = node.props.id() or node.props.plugin_name()
+            found[f"{name}.to_world"] = np.array(node.props["to_world"].matrix, dtype=np.float64)
+    return found
+
+
+# ----------------------------------------------------------------------------------------------------- overrides
+
+
+def _override_films(state: Any, options: BuildOptions) -> None:
+    import mitsuba as mi
+
+    if options.film is None and not options.transient:
+        return
+    for index in range(len(state.nodes)):
+        node = state.nodes[index]
+        film = find_child(state, node, is_film)
+        if film is None and node.type == mi.ObjectType.Sensor:
+            _add_child(state, index, "film", "hdrfilm", mi.ObjectType.Film, {})
+            film = len(state.nodes) - 1
+        if film is not None:
+            _override_film(state, film, options)
+            props = state.nodes[film].props
+            for prefix in PREFIXES:
+                write_pulse(props, prefix, getattr(options, prefix))
+            if not options.steady:
+                _leave_out_steady(props)
+
+
+def _leave_out_steady(props: Any) -> None:
+    kind = of_plugin(props.plugin_name())
+    if kind is None or not kind.spares_steady:
+        raise ArgumentError(
+            f"steady=False spares a histogram the light outside of its window; the film is a {props.plugin_name()!r}. "
+            "Leave it out."
+        )
+    props["steady"] = False
+
+
+def _override_film(state: Any, index: int, options: BuildOptions) -> None:
+    props, film = state.nodes[index].props, options.film
+    plugin = props.plugin_name()
+    if film is None:
+        if options.transient and plugin in _STEADY_FILMS:
+            ways = " or ".join(f"TransientRenderer(..., {kind.example})" for kind in all_films())
+            raise SceneError(
+                f"the film is a steady {plugin!r}, which has no time axis. Give one: {ways}, or make the film one of "
+                f"{plugins_in_words()}."
+            )
+        return
+    if plugin in _STEADY_FILMS and not options.transient:
+        return
+    if plugin != film.plugin and (plugin in _STEADY_FILMS or of_plugin(plugin) is not None):
+        if not film.takes_pulse and any(prefix in props for prefix in PREFIXES):
+            raise SceneError(
+                f"the film {plugin!r} has a pulse or an irf, which a {film.plugin} would lose; take it out."
+            )
+        _become(state, index, film.plugin, keep=_FILM_PROPERTIES + PROPERTIES)
+        props = state.nodes[index].props
+    if not film.fits(props.plugin_name()):
+        raise SceneError(f"the film {plugin!r} cannot become a {film.plugin}; make it one of {plugins_in_words()}.")
+    film.write(props)
+
+
+def _become(state: Any, index: int, plugin: str, keep: tuple[str, ...], nested: bool = True) -> None:
+    """Turn a node into another plugin; keep the named properties and, if ``nested``, child objects and spectra."""
+    import mitsuba as mi
+
+    old = state.nodes[index].props
+    inner = {key for key, _ in children(state, state.nodes[index])}
+    inner |= {key for key in list(old.keys()) if old.type(key) == mi.Properties.Type.Spectrum}
+    new = mi.Properties(plugin)
+    new.set_id(old.id())
+    for key in list(old.keys()):
+        if key in keep or (nested and key in inner):
+            new[key] = old[key]
+    state.nodes[index].props = new
+
+
+def _override_integrator(state: Any, options: BuildOptions) -> None:
+    import mitsuba as mi
+
+    index = find_child(state, state.root, is_integrator)
+    if index is None and _takes_integrator(state):
+        return
+    if options.transient:
+        if index is None:
+            plugin = "transient_prbvolpath" if media_in_use(state) else "transient_path"
+            _add_child(state, 0, "integrator", plugin, mi.ObjectType.Integrator, {})
+            index = len(state.nodes) - 1
+        plugin = state.nodes[index].props.plugin_name()
+        if options.integrator is not None and plugin != options.integrator:
+            _become(state, index, options.integrator, keep=_TRANSIENT_PROPERTIES, nested=False)
+        elif plugin in _COUNTERPARTS:
+            wanted = "transient_prbvolpath" if media_in_use(state) else _COUNTERPARTS[plugin]
+            _become(state, index, wanted, keep=_PATH_PROPERTIES)
+        elif not is_transient_integrator(plugin):
+            raise SceneError(
+                f"integrator {plugin!r} has no transient counterpart. Expected transient_path, transient_prbvolpath, "
+                f"or one that they can stand in for: {', '.join(_COUNTERPARTS)}."
+            )
+    if options.max_depth is not None and index is not None:
+        state.nodes[index].props["max_depth"] = int(options.max_depth)
+
+
+def _check_integrator(scene: Any, options: BuildOptions) -> None:
+    """Raise ``SceneError`` for an integrator of a user's that knows nothing of time."""
+    integrator = scene.integrator()
+    if options.transient and not isinstance(integrator, IntegratorInterface):
+        raise SceneError(
+            f"the integrator {class_of(integrator)} renders images. Expected one that renders through time: "
+            "transient_path, transient_prbvolpath, or a subclass of their classes. mi.render takes it as it is."
+        )
+
+
+def _takes_integrator(state: Any) -> bool:
+    """Whether the scene holds an integrator as it was taken, which is looked at when the scene is built."""
+    import mitsuba as mi
+
+    return any(isinstance(value, mi.Integrator) for _, value in state.root.props.items())
+
+
+def _override_samplers(state: Any, options: BuildOptions) -> None:
+    """Another sampler with the same number of samples; parameters that only the old one had are dropped."""
+    import mitsuba as mi
+
+    if options.sampler is None:
+        return
+    for index in range(len(state.nodes)):
+        node = state.nodes[index]
+        if node.type != mi.ObjectType.Sensor:
+            continue
+        sampler = find_child(state, node, lambda child: child.type == mi.ObjectType.Sampler)
+        if sampler is None:
+            _add_child(state, index, "sampler", options.sampler, mi.ObjectType.Sampler, {})
+        else:
+            _become(state, sampler, options.sampler, keep=("sample_count", "seed"))
+
+
+def _substitute_plugins(state: Any, options: BuildOptions) -> None:
+    """Build plugins as their differentiable or complete twins, which take the same parameters, and bitmaps with a
+    derivative.
+    """
+    import mitsuba as mi
+
+    asked: dict[str, set[str]] = {}
+    for name, slot in options.substitute:
+        asked.setdefault(name, set()).add(slot)
+    for node in state.nodes:
+        plugin, name = node.props.plugin_name(), node.props.id()
+        if mi.is_polarized and plugin in POLARIZED_PLUGINS:
+            node.props.set_plugin_name(POLARIZED_PLUGINS[plugin])
+        elif plugin in DIFFERENTIABLE_PLUGINS and name in asked:
+            node.props.set_plugin_name(DIFFERENTIABLE_PLUGINS[plugin])
+            if plugin in BUILDS_LOBES:
+                node.props["lobes"] = ",".join(sorted(asked[name]))
+        elif plugin in COMPLETED_PLUGINS:
+            node.props.set_plugin_name(COMPLETED_PLUGINS[plugin])
+        elif plugin == "bitmap" and options.real_bitmaps:
+            node.props["format"] = "variant"
+        elif plugin == "twosided":
+            # A lobe that is built although its weight is zero may be one of transmission.
+            held = descendants(state, node)
+            if any(inner.props.id() in asked and inner.props.plugin_name() in BUILDS_LOBES for inner in held):
+                node.props["allow_transmission"] = True
+
+
+def _forget_queries(state: Any) -> None:
+    """Looking at a property counts as using it: take that back, so that Mitsuba still reports misspelt ones."""
+    for node in state.nodes:
+        for key in list(node.props.keys()):
+            node.props.mark_queried(key, False)

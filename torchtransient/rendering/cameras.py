@@ -1,0 +1,88 @@
+"""The pinhole camera of a renderer's sensor, with the values that it renders with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from torchtransient import geometry
+from torchtransient.errors import ArgumentError, SceneError
+from torchtransient.plugins.parameter_effect import class_of
+from torchtransient.rendering.opaque import opaque
+from torchtransient.rendering.renderer import TransientRenderer
+from torchtransient.rendering.variant import active_variant
+
+
+@dataclass(frozen=True)
+class Camera:
+    """`intrinsics` (3, 3) in pixels of the image, its `size` (height, width), and the sensor's `to_world` (4, 4): what
+    the functions of `tt.geometry` take. With gradients to values of the call.
+    """
+
+    intrinsics: torch.Tensor
+    to_world: torch.Tensor
+    size: tuple[int, int]
+
+
+# What Mitsuba's cameras say of their optics, by class.
+_OPTICS = {
+    "PerspectiveCamera": ("x_fov", "principal_point_offset_x", "principal_point_offset_y"),
+    "ThinLensCamera": ("x_fov",),
+}
+
+
+@opaque
+def camera_of(
+    renderer: TransientRenderer, values: Mapping[str, Any] | None = None, sensor: int | None = None
+) -> Camera:
+    """The camera of a renderer's sensor (`perspective`, `thinlens`), of a film with a crop window that of the window.
+
+    `values` as in a call of the renderer, without a batch: those of the sensor's own keys count, `x_fov`,
+    `principal_point_offset_x`, `_y` and `to_world`, with their gradients. `sensor`: its index in the scene, the
+    renderer's first by default. Raises SceneError for sensors without a pinhole, and as the renderer for values.
+    """
+    index = renderer._sensors[0] if sensor is None else sensor
+    tensors, _, batch = renderer._collect(values)
+    if batch is not None:
+        raise ArgumentError(f"camera_of: expected values without a batch, got one of {batch}; call it for each entry.")
+    given = dict(zip(renderer._keys, tensors, strict=True))
+    with active_variant(renderer.scene.variant):
+        import mitsuba as mi
+
+        sensors = renderer.scene.built(renderer._options).scene.sensors()
+        if isinstance(index, bool) or not isinstance(index, int) or not 0 <= index < len(sensors):
+            raise ArgumentError(f"camera_of: expected a sensor from 0 to {len(sensors) - 1}, got {index!r}.")
+        found = sensors[index]
+        params = mi.traverse(found)
+        if class_of(found) not in _OPTICS:
+            raise SceneError(
+                f"camera_of: expected a perspective or thinlens sensor, got {found.id()!r} ({class_of(found)}); "
+                "others have no pinhole."
+            )
+        name, film = found.id(), found.film()
+        # A thin lens has its axis in the middle of the film.
+        built = dict.fromkeys(_OPTICS["PerspectiveCamera"], 0.0)
+        built |= {key: _number(params, key) for key in _OPTICS[class_of(found)]}
+        matrix = torch.tensor(_matrix(found), dtype=torch.float32)
+        whole, crop, offset = ([int(n) for n in size] for size in (film.size(), film.crop_size(), film.crop_offset()))
+    x_fov, x, y = (given.get(f"{name}.{key}", torch.tensor(value)) for key, value in built.items())
+    inside = geometry.intrinsics(
+        x_fov, (whole[1], whole[0]), fov_axis="x", principal_point_offset=torch.stack([x, y], -1), crop_offset=offset
+    )
+    return Camera(inside, given.get(f"{name}.to_world", matrix), (crop[1], crop[0]))
+
+
+def _number(params: Any, key: str) -> float:
+    import numpy as np
+
+    return float(np.array(params[key]).reshape(-1)[0])
+
+
+def _matrix(sensor: Any) -> Any:
+    import numpy as np
+
+    matrix = np.array(sensor.world_transform().matrix)
+    return matrix.reshape(4, 4)

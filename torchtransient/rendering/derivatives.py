@@ -1,0 +1,262 @@
+"""The three autograd functions of anything that is replayed: a run, its reverse derivative and its forward derivative.
+
+``Run`` keeps no Dr.Jit graph. It saves its inputs, and its derivatives are runs of their own: ``Pullback`` and
+``Pushforward``, linear in the cotangents and tangents. They are functions of torch too, so that ``torch.func`` can
+batch them, and each is the other's derivative by what it is linear in (``torch.autograd.functional.jvp`` rests on
+that). Differentiating them by the *values* is refused (``OnceDifferentiable``), since Dr.Jit has no second derivatives.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NoReturn, Protocol
+
+import torch
+
+from torchtransient.errors import GradientError, ShapeError
+from torchtransient.rendering.older_vmap import each_of_older_vmap
+
+Tensors = tuple[torch.Tensor, ...]
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Which derivatives: ``needs[i]``, by tensor i of the inputs; ``given[k]``, of the k-th real output."""
+
+    needs: tuple[bool, ...]
+    given: tuple[bool, ...] = ()
+
+
+class Replayable(Protocol):
+    """What is run, and run again for its derivatives. ``what``: its name in messages."""
+
+    @property
+    def what(self) -> str: ...
+
+    def primal(self, tensors: Sequence[torch.Tensor]) -> Tensors:
+        """The outputs for some inputs."""
+
+    def pullback(self, asked: Asked, tensors: Sequence[torch.Tensor], cotangents: Sequence[torch.Tensor]) -> Tensors:
+        """Gradients of the sum over the given outputs of <cotangent, output>, of the tensors that need one."""
+
+    def pushforward(self, asked: Asked, tensors: Sequence[torch.Tensor], tangents: Sequence[torch.Tensor]) -> Tensors:
+        """Derivatives of all real outputs along tangents of the tensors that need one."""
+
+
+def run(job: Replayable, *tensors: torch.Tensor) -> Tensors:
+    """The outputs of a job, differentiable by the real ones of its tensors."""
+    outputs: Tensors = _apply(Run, job, *tensors)
+    return outputs
+
+
+def _apply(function: Any, *args: Any) -> Any:
+    return function.apply(*args)
+
+
+class OnceDifferentiable(torch.autograd.Function):
+    """The values of a derivative: a derivative by them would be a second one. Only where one is really asked for does
+    autograd come here; a derivative by the cotangent or tangent alone passes by.
+    """
+
+    @staticmethod
+    def forward(what: str, value: torch.Tensor) -> torch.Tensor:
+        return value.view_as(value)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+        ctx.what = inputs[0]
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Any) -> NoReturn:
+        _refuse_second(ctx.what, "reverse")
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> NoReturn:
+        _refuse_second(ctx.what, "forward")
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[Any, ...], what: str, value: torch.Tensor) -> tuple[Any, Any]:
+        return _apply(OnceDifferentiable, what, value), in_dims[1]
+
+
+def _refuse_second(what: str, mode: str) -> NoReturn:
+    raise GradientError(
+        f"second derivatives of {what} are not available: its gradient or tangent was differentiated again in {mode} "
+        "mode. Expected a first derivative; for curvature use finite differences of gradients, or a Gauss-Newton "
+        "product J^T J v from torch.func.jvp and torch.func.vjp."
+    )
+
+
+def _once(job: Replayable, tensors: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+    return [_apply(OnceDifferentiable, job.what, t) if t.is_floating_point() else t for t in tensors]
+
+
+def _check_runs(job: Replayable, tensors: Sequence[torch.Tensor]) -> None:
+    """Raise ``GradientError`` where a run would become a constant of a graph that torch is tracing."""
+    modes: Any = torch._ops
+    key = torch._C._TorchDispatchModeKey.PROXY
+    tracing = torch._C._get_dispatch_mode(key) or modes._get_dispatch_mode_pre_dispatch(key)
+    fake = sys.modules.get("torch._subclasses.fake_tensor")
+    if tracing is None and not (fake is not None and any(isinstance(tensor, fake.FakeTensor) for tensor in tensors)):
+        return
+    raise GradientError(
+        f"{job.what} cannot be traced: in the graphs of torch.func.linearize, torch.export and make_fx it would be a "
+        "constant, and tensors without memory have no values. Expected tensors with values: use torch.func.jvp and "
+        "torch.func.vjp, which are evaluated again for every tangent."
+    )
+
+
+def _given(tensors: Sequence[torch.Tensor | None]) -> list[torch.Tensor]:
+    return [tensor for tensor in tensors if tensor is not None]
+
+
+def _those(flags: Sequence[bool], asked: Sequence[torch.Tensor | None]) -> tuple[bool, ...]:
+    """Which flags stay, where ``asked`` has an entry for each of those that are set."""
+    remaining = iter(asked)
+    return tuple(flag and next(remaining) is not None for flag in flags)
+
+
+def _zeros(tensors: Sequence[torch.Tensor]) -> list[torch.Tensor | None]:
+    return [torch.zeros_like(tensor) if tensor.is_floating_point() else None for tensor in tensors]
+
+
+def _each(
+    function: Any, info: Any, in_dims: tuple[Any, ...], args: tuple[Any, ...]
+) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    """``vmap`` by one call per entry: what a loop over the entries would give."""
+    if not info.batch_size:
+        raise ShapeError(f"{args[0].what}: expected a batch of at least one entry under torch.func.vmap, got none.")
+    columns = []
+    for i in range(info.batch_size):
+        entry = [arg if dim is None else arg.select(dim, i) for arg, dim in zip(args, in_dims, strict=True)]
+        columns.append(function.apply(*entry))
+    outputs = tuple(torch.stack(column) for column in zip(*columns, strict=True))
+    return outputs, (0,) * len(outputs)
+
+
+class Run(torch.autograd.Function):
+    """(job, *tensors) -> outputs."""
+
+    @staticmethod
+    def forward(job: Replayable, *tensors: torch.Tensor) -> Tensors:
+        _check_runs(job, tensors)
+        return job.primal(tensors)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+        ctx.job, *tensors = inputs
+        ctx.is_real = [out.is_floating_point() for out in output]
+        ctx.mark_non_differentiable(*(out for out in output if not out.is_floating_point()))
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(*tensors)
+        ctx.save_for_forward(*tensors)
+
+    @staticmethod
+    def backward(ctx: Any, *cotangents: torch.Tensor | None) -> tuple[Any, ...]:
+        real = [g for g, is_real in zip(cotangents, ctx.is_real, strict=True) if is_real]
+        asked = Asked(tuple(ctx.needs_input_grad[1:]), tuple(g is not None for g in real))
+        if not any(asked.given) or not any(asked.needs):
+            return (None,) * (1 + len(asked.needs))
+        found = iter(_apply(Pullback, ctx.job, asked, *_given(real), *_once(ctx.job, ctx.saved_tensors)))
+        return (None, *(next(found) if need else None for need in asked.needs))
+
+    @staticmethod
+    def jvp(ctx: Any, _: None, *tangents: torch.Tensor | None) -> tuple[Any, ...]:
+        asked = Asked(tuple(tangent is not None for tangent in tangents))
+        found = iter(_apply(Pushforward, ctx.job, asked, *_given(tangents), *_once(ctx.job, ctx.saved_tensors)))
+        return tuple(next(found) if is_real else None for is_real in ctx.is_real)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[Any, Any]:
+        return _each(Run, info, in_dims, args)
+
+
+class Pullback(torch.autograd.Function):
+    """(job, asked, *cotangents that are given, *tensors) -> gradients of the tensors that need one."""
+
+    @staticmethod
+    def forward(job: Replayable, asked: Asked, *tensors: torch.Tensor) -> Tensors:
+        _check_runs(job, tensors)
+        count = sum(asked.given)
+
+        def run(*cotangents: torch.Tensor) -> Tensors:
+            return job.pullback(asked, tensors[count:], cotangents)
+
+        return each_of_older_vmap(run, *tensors[:count])
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+        ctx.job, ctx.asked, *tensors = inputs
+        ctx.set_materialize_grads(False)
+        values = tensors[sum(ctx.asked.given) :]
+        ctx.save_for_backward(*values)
+        ctx.save_for_forward(*values)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: torch.Tensor | None) -> tuple[Any, ...]:
+        values, asked = ctx.saved_tensors, replace(ctx.asked, needs=_those(ctx.asked.needs, grads))
+        found: Sequence[Any] = [None] * len(asked.given)
+        if any(asked.needs):
+            found = _apply(Pushforward, ctx.job, asked, *_given(grads), *values)
+        of_cotangents = [d for d, is_given in zip(found, asked.given, strict=True) if is_given]
+        wanted = ctx.needs_input_grad[2 : 2 + len(of_cotangents)]
+        return (
+            None,
+            None,
+            *(d if want else None for d, want in zip(of_cotangents, wanted, strict=True)),
+            *_zeros(values),
+        )
+
+    @staticmethod
+    def jvp(ctx: Any, _: None, __: None, *tangents: torch.Tensor | None) -> Tensors:
+        of_cotangents = tangents[: sum(ctx.asked.given)]
+        asked = replace(ctx.asked, given=_those(ctx.asked.given, of_cotangents))
+        found: Tensors = _apply(Pullback, ctx.job, asked, *_given(of_cotangents), *ctx.saved_tensors)
+        return found
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[Any, Any]:
+        return _each(Pullback, info, in_dims, args)
+
+
+class Pushforward(torch.autograd.Function):
+    """(job, asked, *tangents of the tensors that need one, *tensors) -> derivatives of the real outputs."""
+
+    @staticmethod
+    def forward(job: Replayable, asked: Asked, *tensors: torch.Tensor) -> Tensors:
+        _check_runs(job, tensors)
+        count = sum(asked.needs)
+
+        def run(*tangents: torch.Tensor) -> Tensors:
+            return job.pushforward(asked, tensors[count:], tangents)
+
+        return each_of_older_vmap(run, *tensors[:count])
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+        ctx.job, ctx.asked, *tensors = inputs
+        ctx.set_materialize_grads(False)
+        values = tensors[sum(ctx.asked.needs) :]
+        ctx.save_for_backward(*values)
+        ctx.save_for_forward(*values)
+
+    @staticmethod
+    def backward(ctx: Any, *cotangents: torch.Tensor | None) -> tuple[Any, ...]:
+        asked = replace(ctx.asked, given=tuple(g is not None for g in cotangents))
+        grads: Sequence[Any] = (None,) * sum(asked.needs)
+        if any(asked.given):
+            grads = _apply(Pullback, ctx.job, asked, *_given(cotangents), *ctx.saved_tensors)
+        return (None, None, *grads, *_zeros(ctx.saved_tensors))
+
+    @staticmethod
+    def jvp(ctx: Any, _: None, __: None, *tangents: torch.Tensor | None) -> Tensors:
+        of_tangents = tangents[: sum(ctx.asked.needs)]
+        asked = replace(ctx.asked, needs=_those(ctx.asked.needs, of_tangents))
+        found: Tensors = _apply(Pushforward, ctx.job, asked, *_given(of_tangents), *ctx.saved_tensors)
+        return found
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[Any, Any]:
+        return _each(Pushforward, info, in_dims, args)

@@ -1,0 +1,90 @@
+"""Interrupts inside of Mitsuba and Dr.Jit arrive as what they are, and leave nothing changed behind them.
+
+An exception that a signal raises while Python code runs below C++ (a loop that is traced, the constructor of a plugin)
+comes out as a ``RuntimeError`` that names it, and would be taken for an error of the scene.
+"""
+
+from __future__ import annotations
+
+import re
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+# Mitsuba hands on the printed traceback of a plugin that it builds, and not the exception.
+_PRINTED = re.compile(r"^KeyboardInterrupt\b", re.MULTILINE)
+
+
+def chain_of(error: BaseException) -> list[BaseException]:
+    """An exception and its causes, the first reason last."""
+    found = [error]
+    while (below := found[-1].__cause__ or found[-1].__context__) is not None and below not in found:
+        found.append(below)
+    return found
+
+
+def interrupt_behind(error: BaseException) -> BaseException | None:
+    """The interrupt (or another exception that is no ``Exception``) that an error came of, None where it did not."""
+    chain = chain_of(error)
+    own = next((cause for cause in reversed(chain) if not isinstance(cause, Exception)), None)
+    if own is None and any(_PRINTED.search(str(cause)) for cause in chain):
+        return KeyboardInterrupt()
+    return own
+
+
+@contextmanager
+def interrupts_pass() -> Iterator[None]:
+    """Raise the interrupt that ended what is inside, in place of the error that C++ has made of it."""
+    interrupt = None
+    try:
+        yield
+    except Exception as error:
+        interrupt = interrupt_behind(error)
+        if interrupt is None:
+            raise
+        clear_frames(error)
+        raise interrupt from None
+    finally:
+        # The frame that raises is in the traceback of what it raises: together they would stay until they are
+        # collected, and the scene with them.
+        del interrupt
+
+
+def clear_frames(error: BaseException) -> None:
+    """Let go of what the frames of a traceback hold: Dr.Jit would run into what is attached, and build calls into
+    plugins of scenes that nobody uses any more.
+    """
+    for cause in chain_of(error):
+        traceback.clear_frames(cause.__traceback__)
+
+
+# Mitsuba's level of messages while it is changed: an interrupt may come between a change and its end.
+_before: dict[str, Any] = {}
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Mitsuba warns of gradients through parameters it does not list as differentiable; which ones are right is
+    in our own table. To be called under the engine lock.
+    """
+    import mitsuba as mi
+
+    outermost = "level" not in _before
+    try:
+        if outermost:
+            _before["level"] = mi.logger().log_level()
+        mi.logger().set_log_level(mi.LogLevel.Error)
+        yield
+    finally:
+        if outermost:
+            put_back_log_level()
+
+
+def put_back_log_level() -> None:
+    """Mitsuba's level of messages as it was before :func:`quiet`; nothing where that has been done."""
+    import mitsuba as mi
+
+    if "level" in _before:
+        mi.logger().set_log_level(_before["level"])
+        _before.clear()

@@ -1,0 +1,76 @@
+"""Whether a cube fits, asked before it is allocated."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from torchtransient.errors import StorageError
+from torchtransient.rendering.variant import device_type
+
+_BYTES_PER_VALUE = 4
+# So little is not asked for: the question takes as long as a small render.
+_SMALL = 2**22
+
+
+def available_bytes(variant: str) -> int | None:
+    """Memory that can still be taken on the variant's device, None where the system does not say."""
+    if device_type(variant) == "cuda":
+        import torch
+
+        return int(torch.cuda.mem_get_info()[0])
+    limits = [limit for limit in (_meminfo_available(), _cgroup_available()) if limit is not None]
+    return min(limits) if limits else None
+
+
+def _meminfo_available() -> int | None:
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+    except OSError:
+        return None
+    for line in lines:
+        if line.startswith("MemAvailable:"):
+            return int(line.split()[1]) * 1024
+    return None
+
+
+def _cgroup_available() -> int | None:
+    root = Path("/sys/fs/cgroup")
+    try:
+        limit = (root / "memory.max").read_text(encoding="ascii").strip()
+        used = int((root / "memory.current").read_text(encoding="ascii"))
+        cache = 0
+        for line in (root / "memory.stat").read_text(encoding="ascii").splitlines():
+            if line.startswith("inactive_file "):
+                cache = int(line.split()[1])
+    except (OSError, ValueError):
+        return None
+    return None if limit == "max" else max(0, int(limit) - used + cache)
+
+
+def check_fits(cube_shape: tuple[int, ...], items: int, variant: str) -> None:
+    """Raise ``StorageError`` when ``items`` films of ``cube_shape`` (H, W, T, C) exceed the memory that is left.
+
+    Several items are gathered in one tensor while the next is rendered: one film more than there are items.
+    """
+    cube = math.prod(cube_shape) * _BYTES_PER_VALUE
+    films = items + 1 if items > 1 else 1
+    if cube * films <= _SMALL:
+        return
+    available = available_bytes(variant)
+    if available is None or cube * films <= available:
+        return
+    parts = " x ".join(str(n) for n in cube_shape)
+    batch = f", {films} of them for {items} renders" if items > 1 else ""
+    raise StorageError(
+        f"the transient cube would take {_human(cube)} (H x W x T x C = {parts} float32{batch}), "
+        f"{_human(cube * films)} in all, and {_human(available)} are available on this {device_type(variant)}. Use "
+        f"fewer bins, a smaller film or crop, or a smaller batch."
+    )
+
+
+def _human(size: int) -> str:
+    for unit, scale in (("TiB", 2**40), ("GiB", 2**30), ("MiB", 2**20)):
+        if size >= scale:
+            return f"{size / scale:.2f} {unit}"
+    return f"{size / 2**10:.1f} KiB"

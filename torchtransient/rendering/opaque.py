@@ -1,0 +1,58 @@
+"""What ``torch.compile`` leaves alone.
+
+The compiler follows Python calls into a function and runs them on tensors without data; a render is locks, objects of
+Mitsuba and kernels of Dr.Jit. An opaque function is called as it stands, between the compiled parts around it.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import sys
+from collections.abc import Callable
+from typing import Any, ParamSpec, TypeVar
+
+import torch
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+
+_REASON = (
+    "torchtransient renders with Mitsuba, which the compiler cannot trace: the call stays as it is between compiled "
+    "parts. Leave out fullgraph=True, or compile what comes before and after the render"
+)
+
+
+def opaque(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """``torch.compiler.disable``, without its price for those who do not compile: it imports the compiler, which takes
+    longer than everything else that is imported here.
+    """
+
+    @functools.wraps(function)
+    def call(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        if "torch._dynamo" not in sys.modules:
+            return function(*args, **kwargs)
+        return _untraced(function, args, kwargs)
+
+    return _stopping(call)
+
+
+def _stopping(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Where the compiler meets a call of the function it stops before it, as at one of ``torch.compiler.disable``."""
+    function._torchdynamo_disable = True  # type: ignore[attr-defined]
+    function._torchdynamo_disable_msg = _REASON  # type: ignore[attr-defined]
+    return function
+
+
+_disabled: dict[Any, Any] = {}
+
+
+@_stopping
+def _untraced(function: Callable[..., _R], args: tuple[Any, ...], kwargs: dict[str, Any]) -> _R:
+    disabled = _disabled.get(function)
+    if disabled is None:
+        # what is disabled says why from torch 2.7 on
+        why = {"reason": _REASON} if "reason" in inspect.signature(torch.compiler.disable).parameters else {}
+        disabled = _disabled[function] = torch.compiler.disable(function, **why)  # type: ignore[no-untyped-call]
+    result: _R = disabled(*args, **kwargs)
+    return result

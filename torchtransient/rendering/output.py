@@ -1,0 +1,146 @@
+"""What a render returns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field, replace
+from typing import Any, ClassVar
+
+import torch
+
+from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.errors import ShapeError
+from torchtransient.gates import Gate
+from torchtransient.rendering.films.choice import FilmChoice
+from torchtransient.rendering.variant import stokes_components
+from torchtransient.tensor_record import TensorRecord
+
+
+@dataclass(frozen=True)
+class RenderStats:
+    """How a result was made.
+
+    ``seconds`` is wall time, without loading and without the wait for other threads; ``samples_per_second``
+    counts camera paths. ``energy_before`` and ``energy_after`` hold, per rendered item, the light outside the time
+    axis: sum over pixels of the mean over channels; zero for films without a window (phasors, gates).
+    ``temporal_filter`` is empty for films without one. ``seeds`` are the items' seeds. ``recorded``: what became of
+    each item's recording, "launched", "recorded", or "traced: " and why; ``derivatives_recorded``: the same of the
+    derivatives that have been asked for since.
+    """
+
+    _: KW_ONLY
+    spp: int
+    seconds: float
+    samples_per_second: float
+    variant: str
+    integrator: str
+    temporal_filter: str
+    seeds: tuple[int, ...]
+    energy_before: tuple[float, ...]
+    energy_after: tuple[float, ...]
+    recorded: tuple[str, ...] = ()
+    derivatives_recorded: list[str] = field(default_factory=list, compare=False)
+
+    @classmethod
+    def of_batch(cls, several: Sequence[RenderStats]) -> RenderStats:
+        """Those of renders that are put into one batch: seeds and energies one behind another, times added up. Raises
+        ``ShapeError`` for renders that were not made alike.
+        """
+        first = several[0]
+        for name in ("spp", "variant", "integrator", "temporal_filter"):
+            values = list(dict.fromkeys(getattr(stats, name) for stats in several))
+            if len(values) > 1:
+                raise ShapeError(
+                    f"a batch of renders: expected the same {name} in all of them, got {values[0]!r} and "
+                    f"{values[1]!r}. Put together their tensors alone, out.transient for instance."
+                )
+        seconds = sum(stats.seconds for stats in several)
+        paths = sum(stats.samples_per_second * stats.seconds for stats in several)
+        return replace(
+            first,
+            seconds=seconds,
+            samples_per_second=paths / seconds,
+            seeds=tuple(seed for stats in several for seed in stats.seeds),
+            energy_before=tuple(energy for stats in several for energy in stats.energy_before),
+            energy_after=tuple(energy for stats in several for energy in stats.energy_after),
+            recorded=tuple(said for stats in several for said in stats.recorded),
+            derivatives_recorded=[said for stats in several for said in stats.derivatives_recorded],
+        )
+
+
+# Fields that belong to a film: None in the output of another one.
+_OF_FILMS = ("transient", "phasor", "gated", "axis", "frequencies", "gates")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RenderOutput(TensorRecord):
+    """A rendered scene.
+
+    ``steady``: float32 (C, H, W). Beside it, what the film measures, and None for what it does not:
+
+    - ``transient``: float32 (C, T, H, W), radiance integrated over each bin of ``axis``, so that its sum over T is
+      ``steady`` as far as the axis reaches;
+    - ``phasor``: complex64 (C, F, H, W), radiance times ``exp(-2 pi i nu (opl - start_opl))`` for each of
+      ``frequencies``, so that its value at zero frequency is ``steady``;
+    - ``gated``: float32 (C, G, H, W), the light as each of ``gates`` sees it; ``steady`` is the sum over the gates.
+
+    Leading dimensions come in the order (batch, sensor), each present only when asked for. C is 1 in monochromatic
+    variants, the number of response curves of a film that has some, and 3 (linear sRGB) otherwise; ``channels`` holds
+    their names. In polarized variants the Stokes components S0, S1, S2, S3 come before C in all of them, as (4, C, T,
+    H, W), in the sensor's frame: x to the right of the picture, y up, as the sensor sees it. ``transient``, ``phasor``
+    and ``gated`` are views of the film's own memory with the rows first: ``.contiguous()`` makes a copy in torch's
+    order. ``others``: tensors and settings of films that have no attribute here, by name.
+
+    ``to``, ``cpu``, ``detach``, ``clone`` and ``map`` make copies; ``stack`` and ``cat`` put several together, as
+    ``torch.utils.data.default_collate`` does. Torch's pytrees see the tensors.
+    """
+
+    notes: ClassVar[tuple[str, ...]] = ("stats",)
+
+    transient: torch.Tensor | None
+    steady: torch.Tensor
+    phasor: torch.Tensor | None
+    _: KW_ONLY
+    axis: TimeAxis | None
+    stats: RenderStats
+    frequencies: FrequencyAxis | None = None
+    channels: tuple[str, ...] = ()
+    gates: tuple[Gate, ...] | None = None
+    gated: torch.Tensor | None = None
+    others: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def polarized(self) -> bool:
+        """Whether the Stokes components come before the channels."""
+        return stokes_components(self.stats.variant) > 1
+
+    @classmethod
+    def merged_notes(cls, records: Sequence[RenderOutput]) -> dict[str, Any]:
+        return {"stats": RenderStats.of_batch([record.stats for record in records])}
+
+    def _shown_notes(self) -> dict[str, str]:
+        stats = self.stats
+        seeds = f"seed {stats.seeds[0]}" if len(stats.seeds) == 1 else f"{len(stats.seeds)} seeds"
+        made = f"{stats.spp} spp in {stats.seconds:.3g} s, {stats.integrator}, {stats.variant}, {seeds}"
+        outside = sum(stats.energy_before) + sum(stats.energy_after)
+        return {"stats": made + (f", energy outside of the window {outside:.4g}" if outside else "")}
+
+    @classmethod
+    def of(
+        cls,
+        film: FilmChoice,
+        steady: torch.Tensor,
+        response: torch.Tensor,
+        *,
+        stats: RenderStats,
+        channels: Sequence[str],
+    ) -> RenderOutput:
+        """The output of a film whose tensors are in torch's order already."""
+        return cls(steady=steady, stats=stats, channels=tuple(channels), **named_fields(film, response))
+
+
+def named_fields(film: FilmChoice, response: torch.Tensor) -> dict[str, Any]:
+    """What a film measured as arguments of a dataclass like ``RenderOutput``; what has no field goes to ``others``."""
+    found = {film.measures: response, **film.attributes()}
+    named = {name: found.pop(name, None) for name in _OF_FILMS}
+    return {**named, "others": found}

@@ -1,0 +1,400 @@
+"""The parameters of a scene: what they are, which of them have derivatives, and how torch values enter the scene.
+
+Keys are those of ``mitsuba.traverse``. Meshes apply ``to_world`` while loading and forget it; a key
+``<mesh>.to_world`` is offered for them all the same: the matrix replaces the one of the description, and vertices
+and normals follow.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from torchtransient.errors import SceneError, UnknownKeyError
+from torchtransient.interfaces import IntegratorInterface
+from torchtransient.plugins.mitsuba_numbers import check_pose, is_number_of_kernels, is_turned_by_reflections
+from torchtransient.plugins.node_walk import ShownValue, unshared
+from torchtransient.plugins.parameters import SILHOUETTES, ParameterEffect, ParameterTracker
+from torchtransient.plugins.swept_parameters import UNCHECKED, is_checked
+from torchtransient.rendering.build import BuiltScene
+from torchtransient.rendering.taken import without_stand_in
+
+_VERTEX_COLUMNS = {"vertex_positions": 3, "vertex_normals": 3, "vertex_texcoords": 2}
+_MAX_LISTED = 65536  # larger values are not copied: textures of a real scene would fill the memory once more
+
+
+@dataclass(frozen=True)
+class ParameterInfo:
+    """One parameter. ``shape`` is that of the torch value without a batch dimension, None for what is not numeric.
+    ``value`` is None for more than 65536 numbers: ask for the key and read ``renderer.values[key]``.
+
+    ``moves_path_length``, ``moves_silhouette``, ``moves_medium``: whether it can change an optical path length, move a
+    visibility edge, change an extinction. ``biased``: its derivative is known to be wrong somewhere, besides the
+    boundary term of moving silhouettes, which is missing. ``reason`` says why. ``substitute``: the materials built as
+    others when the key is asked for, by name, with the name of the texture in them ("" for a number).
+    ``place``: names of the parameter and of what its plugin is in. ``checked``: whether the sweep of gradients has
+    compared it with finite differences in such a place (``docs/gradients_sweep.md``); the reason says when it has not.
+    """
+
+    key: str
+    kind: str
+    shape: tuple[int, ...] | None
+    value: Any
+    differentiable: bool
+    moves_path_length: bool
+    reason: str
+    substitute: frozenset[tuple[str, str]] = frozenset()
+    moves_silhouette: bool = False
+    moves_medium: bool = False
+    biased: bool = False
+    place: tuple[str, ...] = ()
+    checked: bool = True
+
+
+class ParameterTable(Mapping[str, ParameterInfo]):
+    """The parameters of a scene by key. ``str(table)`` is a readable table."""
+
+    def __init__(self, entries: list[ParameterInfo]):
+        self._entries = {entry.key: entry for entry in entries}
+
+    def __getitem__(self, key: str) -> ParameterInfo:
+        if key not in self._entries:
+            raise UnknownKeyError(unknown_key(key, list(self._entries)))
+        return self._entries[key]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._entries)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def differentiable(self) -> list[str]:
+        """The keys that have a derivative."""
+        return [key for key, entry in self.items() if entry.differentiable]
+
+    def __str__(self) -> str:
+        rows = [("key", "shape", "value", "derivative")]
+        for entry in self._entries.values():
+            shape = "-" if entry.shape is None else str(entry.shape)
+            mark = "" if entry.differentiable else "no: "
+            rows.append((entry.key, shape, _short(entry.value), mark + entry.reason))
+        widths = [max(len(row[i]) for row in rows) for i in range(3)]
+        lines = [
+            "  ".join(cell.ljust(width) for cell, width in zip(row[:3], widths, strict=True)) + "  " + row[3]
+            for row in rows
+        ]
+        lines.insert(1, "-" * max(len(line) for line in lines))
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+
+def unknown_key(key: str, known: list[str], owner: str = "the scene") -> str:
+    """The message for a parameter key that a scene, or another ``owner``, does not have."""
+    inside = [other for other in known if f".{key}." in f".{other}."]
+    close = inside[:3] or difflib.get_close_matches(str(key), known, n=3, cutoff=0.5)
+    hint = f"Did you mean {', '.join(repr(c) for c in close)}? " if close else ""
+    return f"{owner} has no parameter {key!r}. {hint}print(scene.parameters()) lists all keys."
+
+
+def _short(value: Any) -> str:
+    if value is None:
+        return "(large)"
+    if isinstance(value, np.ndarray):
+        if value.size > 4:
+            return f"mean {float(np.mean(value)):.4g}"
+        return np.array2string(value, precision=4, separator=", ").replace("\n", "")
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+# ------------------------------------------------------------------------------------------------------ the table
+
+
+def parameter_table(built: BuiltScene) -> ParameterTable:
+    """Read the table off a built scene (unmerged, real bitmaps, no substitutions), inside its variant."""
+    tracker = ParameterTracker(built.scene)
+    entries = []
+    for key in built.params.properties:
+        node = built.params.properties[key][2]
+        entries.append(_placed(_describe(built, tracker, key, node), tracker, node))
+        if key.endswith(".vertex_positions"):
+            entries.append(_placed(_mesh_to_world(built, tracker, key, node), tracker, node))
+    # Some integrators follow some silhouettes.
+    integrator = built.scene.integrator()
+    here = integrator.silhouettes(built.scene) if isinstance(integrator, IntegratorInterface) else SILHOUETTES
+    return ParameterTable([replace(entry, reason=entry.reason.replace(SILHOUETTES, here)) for entry in entries])
+
+
+def _placed(info: ParameterInfo, tracker: ParameterTracker, node: Any) -> ParameterInfo:
+    """With the place of the parameter, and whether the sweep of gradients has been there."""
+    if not info.differentiable:
+        return info
+    place = tracker.location_of(node, info.key)
+    if is_checked(place):
+        return replace(info, place=place)
+    return replace(info, place=place, checked=False, reason=f"{info.reason}; {UNCHECKED}")
+
+
+def _info(key: str, kind: str, shape: tuple[int, ...] | None, value: Any, effect: ParameterEffect) -> ParameterInfo:
+    return ParameterInfo(
+        key,
+        kind,
+        shape,
+        value,
+        effect.supported,
+        effect.moves_length,
+        effect.reason,
+        moves_silhouette=effect.moves_silhouette,
+        moves_medium=effect.moves_medium,
+        biased=effect.biased,
+    )
+
+
+def _mesh_to_world(built: BuiltScene, tracker: ParameterTracker, key: str, node: Any) -> ParameterInfo:
+    name, value = f"{key.rsplit('.', 1)[0]}.to_world", built.mesh_to_world.get(node.id(), np.eye(4)).astype(np.float32)
+    return _info(name, "mesh_transform", (4, 4), value, tracker.effect_of(node, "to_world"))
+
+
+def _describe(built: BuiltScene, tracker: ParameterTracker, key: str, node: Any) -> ParameterInfo:
+    import mitsuba as mi
+
+    # Not by `built.params[key]`, which fails for parameters that are not set, such as the absorption of hair.
+    handle, cpptype, _, _ = built.params.properties[key]
+    current = ShownValue(key, handle, 0, cpptype).read(node)  # type: ignore[call-arg]
+    name = key.rsplit(".", 1)[-1]
+    kind, shape = classify(key, current)
+    value = read_value(current, shape) if shape is None or math.prod(shape) <= _MAX_LISTED else None
+    effect = tracker.effect_of(node, name, built.params.flags(key))
+    if effect.stand_in:
+        holders = tracker.stood_in_for(node, name)
+        if built.taken.intersection(plugin.ptr for plugin, _ in holders):
+            return _info(key, kind, shape, value, without_stand_in(effect, holders[0][0]))
+        if isinstance(node, mi.BSDF):
+            # What stands in for the plugin has a number there, whatever Mitsuba's has.
+            kind, shape, value = "number", (), float(np.reshape(np.asarray(value), ()))
+            effect = tracker.effect_of(node, name)
+        exchanged = frozenset((plugin.id(), slot) for plugin, slot in holders)
+        return replace(_info(key, kind, shape, value, effect), substitute=exchanged)
+    if kind == "plain":
+        effect = replace(effect, supported=False, reason="a plain value, fixed when the scene is built")
+    elif kind == "integer":
+        reason = "a list of vertex numbers" if name == "faces" else "not a real number"
+        effect = replace(effect, supported=False, reason=reason)
+    elif kind == "vertices" and shape is not None and shape[0] == 0:
+        effect = replace(effect, supported=False, reason="the mesh has none")
+    return _info(key, kind, shape, value, effect)
+
+
+def needing_slope(infos: Mapping[str, ParameterInfo], keys: Iterable[str]) -> list[str]:
+    """Those of ``keys`` that can change a path length: their derivatives need a response over time with a slope."""
+    return [key for key in keys if infos[key].moves_path_length]
+
+
+def is_transform(value: Any) -> bool:
+    """Whether a value is one of Mitsuba's transforms. By name: Dr.Jit arrays answer to any attribute made of
+    component letters.
+    """
+    return "Transform" in type(value).__name__
+
+
+def classify(key: str, current: Any) -> tuple[str, tuple[int, ...] | None]:
+    """(kind, shape of the torch value) of a Mitsuba value; the shape is None for what is not numeric."""
+    import drjit as dr
+
+    if current is None:
+        return "plain", None
+    if is_transform(current):
+        size = len(current.matrix)
+        return "transform" if dr.is_jit_v(current.matrix) else "plain", (size, size)
+    if not dr.is_jit_v(current):
+        if dr.is_array_v(current):
+            return "plain", (len(current),)
+        return "plain", () if isinstance(current, (bool, int, float)) else None
+    if dr.is_tensor_v(current):
+        return "tensor" if dr.is_float_v(current) else "integer", tuple(int(n) for n in current.shape)
+    if not dr.is_float_v(current):
+        return "integer", (dr.width(current),)
+    if dr.depth_v(current) == 2:
+        width = dr.width(current)
+        several = width > 1 or key.rsplit(".", 1)[-1] == "points"
+        return ("points", (width, len(current))) if several else ("vector", (len(current),))
+    size = dr.width(current)
+    columns = _VERTEX_COLUMNS.get(key.rsplit(".", 1)[-1])
+    if columns is not None:
+        return "vertices", (size // columns, columns)
+    return ("number", ()) if size == 1 else ("list", (size,))
+
+
+def read_value(current: Any, shape: tuple[int, ...] | None) -> Any:
+    """A Mitsuba value as numpy in the shape of its torch value; plain Python values as they are."""
+    import drjit as dr
+
+    if is_transform(current):
+        current = current.matrix
+    elif current is None:
+        return None
+    elif not dr.is_array_v(current):
+        return current if shape == () else type(current).__name__
+    current = unshared(current)
+    if dr.is_jit_v(current) and not dr.is_tensor_v(current) and len(shape or ()) == 2 and dr.depth_v(current) == 2:
+        return np.array(current).T.reshape(shape)
+    # Arrays of width one come with a trailing dimension of one.
+    return np.array(current).reshape(shape)
+
+
+# ---------------------------------------------------------------------------------------------- values in a scene
+
+
+class Slot:
+    """Where one torch value goes: its shape, and the Mitsuba parameters that are written from it."""
+
+    def __init__(self, built: BuiltScene, key: str):
+        self.key = key
+        self._built = built
+        params = built.params
+        if key in params:
+            self.kind, shape = classify(key, params[key])
+            self.initial = read_value(params[key], shape)
+            self.targets = [key]
+        else:
+            self.kind, shape = "mesh_transform", (4, 4)
+            prefix = key.rsplit(".", 1)[0]
+            node = params.properties[f"{prefix}.vertex_positions"][2]
+            self.initial = built.mesh_to_world.get(node.id(), np.eye(4))
+            self.targets = [f"{prefix}.vertex_positions", f"{prefix}.vertex_normals"]
+        if shape is None:
+            raise SceneError(f"parameter {key!r} is not numeric.")
+        self.shape: tuple[int, ...] = shape
+
+    def loses_black(self) -> bool:
+        """Whether derivatives are lost where the value is exactly zero."""
+        if self.kind == "mesh_transform":
+            return False
+        scene = self._built.scene
+        node = self._built.params.properties[self.key][2]
+        return bool(scene.integrator().parameters(scene).loses_black(node, self.key.rsplit(".", 1)[-1]))
+
+    def is_number_of_kernels(self) -> bool:
+        """Whether Mitsuba reads numbers of the value while it is installed, and keeps them as plain ones."""
+        return is_number_of_kernels(*self._class_and_name())
+
+    def check(self, value: Any) -> None:
+        """Raise SceneError for a value that Mitsuba would keep wrongly."""
+        if is_turned_by_reflections(*self._class_and_name()):
+            check_pose(self.key, self.initial, value)
+
+    def _class_and_name(self) -> tuple[str, str]:
+        if self.kind == "mesh_transform":
+            return "", "to_world"
+        return self._built.params.properties[self.key][2].class_name(), self.key.rsplit(".", 1)[-1]
+
+    @property
+    def size(self) -> int:
+        """Number of entries."""
+        return int(np.prod(self.shape, dtype=np.int64))
+
+    def write(self, leaf: Any, originals: Mapping[str, Any]) -> None:
+        """Set the Mitsuba parameters from the flat array ``leaf`` by operations that Dr.Jit can differentiate."""
+        if self.kind == "mesh_transform":
+            self._write_mesh(leaf, originals)
+            return
+        self._built.params[self.key] = as_mitsuba_value(self.kind, self.shape, originals[self.key], leaf)
+
+    def _write_mesh(self, leaf: Any, originals: Mapping[str, Any]) -> None:
+        """New vertices ``T inv(T0) v0``, normals by the inverse transpose; T0 is the transform of the description."""
+        import drjit as dr
+        import mitsuba as mi
+
+        params = self._built.params
+        positions_key, normals_key = self.targets
+        entries = [dr.gather(mi.Float, leaf, mi.UInt32(i)) for i in range(16)]
+        relative = mi.Matrix4f(*entries) @ mi.Matrix4f(np.linalg.inv(self.initial))
+        transform = mi.Transform4f(relative)
+        points = dr.unravel(mi.Point3f, originals[positions_key])
+        params[positions_key] = dr.ravel(transform @ points)
+        if len(originals[normals_key]):
+            normals = dr.unravel(mi.Normal3f, originals[normals_key])
+            params[normals_key] = dr.ravel(dr.normalize(transform @ normals))
+
+
+def as_mitsuba_value(kind: str, shape: tuple[int, ...], current: Any, leaf: Any) -> Any:
+    """The flat array ``leaf`` as a value like ``current``, by operations that Dr.Jit can differentiate."""
+    import drjit as dr
+    import mitsuba as mi
+
+    if kind == "tensor":
+        return type(current)(leaf, shape=shape)
+    if kind in ("vector", "points"):
+        return dr.unravel(type(current), leaf)
+    if kind == "transform":
+        n = shape[0]
+        entries = [dr.gather(mi.Float, leaf, mi.UInt32(i)) for i in range(n * n)]
+        matrix = mi.Matrix4f if n == 4 else mi.Matrix3f
+        return type(current)(matrix(*entries))
+    return type(current)(leaf)
+
+
+def changed_with(keys: Iterable[str], params: Any) -> list[str]:
+    """The parameters that Mitsuba has to be told have changed beside ``keys``.
+
+    A light with a texture is sampled by a map from texture coordinates to points, which Mitsuba keeps until positions
+    change; where those do and normals do not, it makes up new normals.
+    """
+    ending = ".vertex_texcoords"
+    meshes = [key.removesuffix(ending) for key in keys if key.endswith(ending)]
+    others = [f"{mesh}.{name}" for mesh in meshes for name in ("vertex_positions", "vertex_normals")]
+    return [key for key in others if key in params]
+
+
+class SlotTable:
+    """The slots of some keys in one built scene, with the values that the scene goes back to."""
+
+    def __init__(self, built: BuiltScene, keys: tuple[str, ...]):
+        self.built = built
+        self.slots = [Slot(built, key) for key in keys]
+        touched = dict.fromkeys(target for slot in self.slots for target in slot.targets)
+        for target in list(touched):
+            # Mitsuba recomputes normals when positions change: both have to go back.
+            normals = target.replace(".vertex_positions", ".vertex_normals")
+            if normals != target and normals in built.params:
+                touched[normals] = None
+        self._check_overlap()
+        self._changed_too = changed_with(touched, built.params)
+        # Copies: what `params` returns may be the plugin's own variable, which changes when it is written.
+        self.originals = {target: type(built.params[target])(built.params[target]) for target in touched}
+
+    def _check_overlap(self) -> None:
+        owner: dict[str, str] = {}
+        for slot in self.slots:
+            for target in slot.targets:
+                if target in owner:
+                    raise SceneError(
+                        f"parameters {owner[target]!r} and {slot.key!r} both set {target!r}; ask for one of them."
+                    )
+                owner[target] = slot.key
+
+    def install(self, leaves: list[Any]) -> None:
+        """Write one leaf per slot and let the scene follow."""
+        for slot, leaf in zip(self.slots, leaves, strict=True):
+            slot.write(leaf, self.originals)
+        self._update()
+
+    def restore(self) -> None:
+        """Put the described values back."""
+        if not self.originals:
+            return
+        params = self.built.params
+        for key, value in self.originals.items():
+            params[key] = value
+            params.set_dirty(key)
+        self._update()
+
+    def _update(self) -> None:
+        for key in self._changed_too:
+            self.built.params.set_dirty(key)
+        self.built.params.update()

@@ -1,0 +1,400 @@
+"""``tt.TransientRenderer`` and ``tt.render``: a scene as a function of torch tensors."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import nn
+
+from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.errors import ArgumentError, SceneError, ShapeError
+from torchtransient.gates import Gate
+from torchtransient.parametrize.copies import CopiesParametrized
+from torchtransient.plugins.parameters import check_slope
+from torchtransient.plugins.physical_ranges import physical_range
+from torchtransient.pulses import Pulse
+from torchtransient.quantities import Numbers
+from torchtransient.rendering import engine
+from torchtransient.rendering.arguments import (
+    Values,
+    as_float,
+    checked_filter,
+    checked_grad_seed,
+    film_asked_for,
+    fit_shape,
+    given_values,
+    mangle,
+    samples,
+    sensor_list,
+)
+from torchtransient.rendering.autograd import rendered
+from torchtransient.rendering.build_options import BuildOptions
+from torchtransient.rendering.effects import Effects
+from torchtransient.rendering.films.choice import FilmChoice
+from torchtransient.rendering.films.layout import steady_channels_first
+from torchtransient.rendering.opaque import opaque
+from torchtransient.rendering.output import RenderOutput, RenderStats
+from torchtransient.rendering.parameters import ParameterInfo, needing_slope, unknown_key
+from torchtransient.rendering.physics import PhysicsWatch
+from torchtransient.rendering.progress import Bar
+from torchtransient.rendering.pulse_properties import checked_pulse
+from torchtransient.rendering.scene_handle import Scene, load
+from torchtransient.rendering.seeds import Item, Seeding, drawn
+from torchtransient.rendering.session import RenderJob
+from torchtransient.rendering.slope import check_filter, filter_for, has_slope, response_of
+from torchtransient.rendering.variant import active_variant, device_type, stokes_components
+
+
+class TransientRenderer(CopiesParametrized):
+    """A scene as a differentiable layer.
+
+    ``scene``: what :func:`torchtransient.load` takes. A steady ``hdrfilm`` and ``path`` are taken too: with
+    ``time_axis`` they become a ``transient_hdr_film`` of its size and filter and a ``transient_path`` of its depth.
+
+    ``parameters``: keys of ``scene.parameters()`` that get an ``nn.Parameter`` each, starting at the scene's value,
+    or a mapping from keys to start values. In ``state_dict`` and ``named_parameters`` the dots of a key are slashes,
+    since torch forbids dots; ``renderer.values`` maps keys to parameters. ``tt.parametrize`` keeps them in range.
+
+    ``time_axis``: replaces the one of the scene's films; phasor films become histograms. ``frequencies``: a
+    :class:`FrequencyAxis`, or numbers in cycles per metre; the films become phasor films, and ``out.phasor`` takes the
+    place of ``out.transient``. ``gates``: :class:`Gate` objects; the films become gated films with ``out.gated``.
+    ``film``: the same as an object of ``torchtransient.rendering.films``, and how films of others are asked for. At
+    most one of the four. ``max_depth``: replaces the integrator's. ``spp``, ``spp_grad``: samples per pixel of the
+    render and of its derivatives; None takes the scene's and the render's.
+
+    ``temporal_filter``: "box", "tent", "gaussian", or "auto": the scene's own, except that a box becomes a tent as
+    soon as a parameter can change a path length (shapes, light position, sensor pose, index of refraction), because
+    a box has no slope in time. Asking for such a derivative through an explicit box raises ``GradientError``. Phasors
+    are smooth in time and take no filter.
+
+    ``steady``: False for a histogram without a steady image of its own: paths end with the window, and ``out.steady``
+    is the sum over the bins.
+
+    ``pulse``, ``irf``: shape of the light's pulse and impulse response of the sensor (:class:`Pulse`), for every film
+    instead of its own; each arrival is spread by both while rendering, what falls beyond the axis counts as outside,
+    and every filter has a slope then. After a render ``sensing.apply_pulse`` does the same to a transient.
+
+    ``sensors``: an index (None: the first, or a plan's), a list of indices, or "all": a list adds a leading sensor
+    dimension, and its films must measure the same in one shape. ``grad_seed``: None draws the samples of the derivative
+    independently of the render (which makes gradients of squared losses unbiased), "same" takes the render's seed, an
+    integer is taken as it is.
+
+    ``effects``: "auto" keeps the scene's transient film and integrator, and gives a steady scene the integrator that
+    its contents call for; a :class:`Plan` of :func:`torchtransient.plan` brings variant, integrator, depth, time axis
+    or frequencies, and temporal filter, where the arguments beside it do not say otherwise; it speaks of one sensor.
+    ``sampler``: plugin name of a Mitsuba sampler that replaces those of the sensors, with the same number of samples.
+
+    ``physics``: what becomes of what no physical system has: reflectances, albedos and other shares of the light
+    outside of [0, 1], described or given, transforms without an inverse, and windows that miss more than 5 % of the
+    light. "warn" says each once for a scene, as a ``PhysicsWarning`` with the key and the number; "error" raises
+    ``PhysicsError``; "ignore" does not look.
+
+    ``freeze``: True records what a call launches, so that later calls need no tracing, with the same values, gradients
+    and noise; ``out.stats.recorded`` says what became of it, ``docs/speed.md`` what makes a new recording.
+
+    Copies and pickles carry the description. One lock makes threads safe. Second derivatives raise ``GradientError``.
+    """
+
+    @opaque
+    def __init__(
+        self,
+        scene: Any,
+        parameters: Sequence[str] | Mapping[str, Any] = (),
+        *,
+        time_axis: TimeAxis | None = None,
+        spp: int | None = None,
+        spp_grad: int | None = None,
+        max_depth: int | None = None,
+        temporal_filter: str = "auto",
+        sensors: int | Sequence[int] | str | None = None,
+        effects: Effects | str = "auto",
+        grad_seed: int | str | None = None,
+        sampler: str | None = None,
+        frequencies: FrequencyAxis | Numbers | None = None,
+        pulse: Pulse | None = None,
+        irf: Pulse | None = None,
+        gates: Sequence[Gate] | None = None,
+        steady: bool = True,
+        film: FilmChoice | None = None,
+        physics: str = "warn",
+        freeze: bool = True,
+    ):
+        super().__init__()
+        film = film_asked_for(film, {"time_axis": time_axis, "frequencies": frequencies, "gates": gates})
+        if isinstance(effects, Effects):
+            scene = effects.planned_scene(scene)
+            film, temporal_filter = effects.film_settings(film, temporal_filter)
+            max_depth = effects.max_depth if max_depth is None else max_depth
+            pulse, irf = pulse or effects.pulse, irf or effects.irf
+            sensors = effects.sensor if sensors is None else sensors
+        elif effects != "auto":
+            raise ArgumentError(f"effects: expected 'auto' or a plan of tt.plan(...), got {effects!r}.")
+        if isinstance(parameters, str):
+            raise ArgumentError(f"parameters: expected a list of keys, got a string; write [{parameters!r}].")
+        self.scene: Scene = load(scene)
+        self.spp, self.spp_grad = samples("spp", spp), samples("spp_grad", spp_grad)
+        self.temporal_filter = checked_filter(temporal_filter)
+        self.grad_seed = checked_grad_seed(grad_seed)
+        self.freeze = bool(freeze)
+        self._watch = PhysicsWatch(physics, self.scene.told)
+        self._keys = tuple(parameters)
+        changes: dict[str, Any] = {"pulse": checked_pulse("pulse", pulse), "irf": checked_pulse("irf", irf)}
+        changes |= {"film": film, "steady": bool(steady)}
+        changes["integrator"] = effects.integrator if isinstance(effects, Effects) else None
+        self._options = self._build_options(max_depth, sampler, changes)
+        self._infos = self._parameter_infos()
+        with active_variant(self.scene.variant):
+            self._read_scene(0 if sensors is None else sensors)
+            if isinstance(effects, Effects):
+                effects.check_sensors(self._sensors)
+            start = self._initial_values(parameters)
+            self._look_at_scene()
+        self._names = mangle(self._keys)
+        for key in self._keys:
+            self.register_parameter(self._names[key], nn.Parameter(start[key]))
+
+    # --------------------------------------------------------------------------------------------------- set-up
+
+    def _build_options(self, max_depth: int | None, sampler: str | None, changes: dict[str, Any]) -> BuildOptions:
+        if max_depth is not None and (isinstance(max_depth, bool) or not isinstance(max_depth, int) or max_depth < -1):
+            raise ArgumentError(f"max_depth: expected an integer of at least -1, got {max_depth!r}.")
+        options = BuildOptions(max_depth=max_depth, transient=True, sampler=sampler, **changes)
+        return self.scene.options_for(self._keys, options)
+
+    def _parameter_infos(self) -> dict[str, ParameterInfo]:
+        table = self.scene.parameters() if self._keys else {}
+        return {key: table[key] for key in self._keys}
+
+    def _read_scene(self, sensors: int | Sequence[int] | str) -> None:
+        """Sensors, axis, film and samples of the built scene."""
+        built = self.scene.built(self._options)
+        found = built.scene.sensors()
+        if not found:
+            raise SceneError(f"{self.scene!r} has no sensor; add one.")
+        self._sensors, self._stack_sensors = sensor_list(sensors, len(found))
+        self.film = engine.check_items(found, [Item(0, sensor, 0, 0) for sensor in self._sensors])
+        films = [found[sensor].film() for sensor in self._sensors]
+        self._cube_shape = tuple(films[0].cube_shape())
+        self._channels = tuple(films[0].channel_names())
+        self._scene_spp = int(found[self._sensors[0]].sampler().sample_count())
+        self._pulsed = all(film.pulses for film in films)
+        self._response = response_of(films)
+        self._scene_filter = films[0].temporal_filter
+        if not self.film.has_filter:
+            if self.temporal_filter != "auto":
+                raise ArgumentError(
+                    f"temporal_filter: a {self.film.noun} has none, expected 'auto', got {self.temporal_filter!r}."
+                )
+            return
+        of_integrator = getattr(built.scene.integrator(), "temporal_filter", "")
+        self._scene_filter = of_integrator or self._scene_filter
+        names = sorted({film.temporal_filter for film in films})
+        if self.temporal_filter == "auto" and not of_integrator and len(names) > 1:
+            raise ArgumentError(
+                f"temporal_filter: the films of sensors {list(self._sensors)} have different ones, {', '.join(names)}. "
+                "Say which, for instance temporal_filter='box', or use one TransientRenderer per sensor."
+            )
+
+    def _look_at_scene(self) -> None:
+        if self._watch.looks:
+            built = self.scene.built(self._options)
+            slots = self.scene.slots(self._keys, self._options).slots
+            if self.film.count > 1 or self.effective_filter in ("", "box"):
+                # Of one bin for all times a wider filter spreads up to a half over the rim, and nobody looks there.
+                self._watch.window_name = f"window of {self.film.describe('')}"
+            ranges = {key: physical_range(built.params, key) for key in self._keys}
+            self._watch.ranges = {key: limits for key, limits in ranges.items() if limits is not None}
+            self._watch.transforms = frozenset(slot.key for slot in slots if slot.kind.endswith("transform"))
+            # What is given replaces what is described.
+            findings = self.scene.findings(self._options)
+            self._watch.scene({key: text for key, text in findings.items() if key not in self._keys})
+
+    def _initial_values(self, given: Sequence[str] | Mapping[str, Any]) -> dict[str, torch.Tensor]:
+        slots = self.scene.slots(self._keys, self._options).slots
+        self._shapes = {slot.key: slot.shape for slot in slots}
+        device = device_type(self.scene.variant)
+        start = {}
+        for slot in slots:
+            value = torch.tensor(slot.initial, dtype=torch.float32, device=device).reshape(slot.shape)
+            if isinstance(given, Mapping) and given[slot.key] is not None:
+                own = given[slot.key]
+                own = as_float(slot.key, own.to(device) if isinstance(own, torch.Tensor) else own, device)
+                value, batched = fit_shape(slot.key, own.detach().clone(), slot.shape)
+                if batched:
+                    raise ShapeError(
+                        f"start value of {slot.key!r}: expected shape {slot.shape}, got {tuple(value.shape)}."
+                    )
+            start[slot.key] = value
+        return start
+
+    # ------------------------------------------------------------------------------------------------------ use
+
+    @property
+    def axis(self) -> TimeAxis | None:
+        """The time axis; None for a film without one."""
+        return self.film.attributes().get("axis")
+
+    @property
+    def frequencies(self) -> FrequencyAxis | None:
+        """The frequencies of a phasor film, else None."""
+        return self.film.attributes().get("frequencies")
+
+    @property
+    def gates(self) -> tuple[Gate, ...] | None:
+        """The gates of a gated film, else None."""
+        return self.film.attributes().get("gates")
+
+    @property
+    def values(self) -> Values:
+        """The parameters under their Mitsuba keys; of a parametrized one its value, which is no leaf."""
+        return Values(self, self._names)
+
+    @property
+    def effective_filter(self) -> str:
+        """The temporal filter that renders use; empty for a film that has none."""
+        if self.temporal_filter != "auto":
+            return self.temporal_filter
+        return filter_for(needing_slope(self._infos, self._keys), self._scene_filter, self._pulsed)
+
+    @opaque
+    def variation(self, *, sampler: str | None = None, temporal_filter: str | None = None) -> TransientRenderer:
+        """A copy with the same parameter values and another sampler or temporal filter; None keeps what this one
+        has.
+        """
+        if temporal_filter is not None:
+            checked_filter(temporal_filter)
+        if not self.film.has_filter and temporal_filter not in (None, "auto"):
+            raise ArgumentError(f"temporal_filter: the film has none, expected 'auto', got {temporal_filter!r}.")
+        twin = copy.deepcopy(self)
+        if sampler is not None:
+            twin._options = replace(self._options, sampler=sampler)
+        if temporal_filter is not None:
+            twin.temporal_filter = temporal_filter
+        return twin
+
+    def has_slope_for(self, keys: Sequence[str]) -> bool:
+        """Whether gradients for ``keys`` exist with the filter or gates in use: a box has none of path lengths."""
+        there = has_slope(self.effective_filter, self._pulsed) and self._response[0]
+        return there or not needing_slope(self._infos, keys)
+
+    @opaque
+    def samples_drawn(self, spp: int) -> int:
+        """Samples per pixel that a render with ``spp`` really draws: stratified samplers round up to counts that
+        they can lay out.
+        """
+        with active_variant(self.scene.variant):
+            sampler = self.scene.built(self._options).scene.sensors()[self._sensors[0]].sampler().clone()
+            sampler.set_sample_count(spp)
+            return int(sampler.sample_count())
+
+    @opaque
+    def forward(
+        self,
+        values: Mapping[str, Any] | None = None,
+        *,
+        seed: int | Sequence[int] | None = None,
+        spp: int | None = None,
+        progress: bool = False,
+    ) -> RenderOutput:
+        """Render. ``values`` replaces the module's own parameters, key by key; keys are those of ``parameters``.
+
+        A value is a tensor, an array, a list or a number of the shape listed by ``scene.parameters()``, or with one
+        leading batch dimension B more; values without it are used for every entry. Any real dtype is taken and computed
+        in float32.
+
+        ``seed``: same seed, same tensor. None draws one from torch's generator (``torch.manual_seed``). In a batch
+        every entry has its own seed, derived from this one, the first entry the seed itself; or give one seed per
+        entry. ``spp``: instead of the renderer's. ``progress``: a bar.
+
+        Returns a :class:`RenderOutput` whose tensors carry gradients to the values. Raises ``SceneError`` for
+        unknown keys, ``ShapeError``, ``DeviceError``, ``UnitError`` for values that are not finite, ``StorageError``
+        when the cube would not fit into memory, ``GradientError`` for a derivative through a box.
+        """
+        tensors, batched, batch = self._collect(values)
+        temporal_filter = self.effective_filter
+        self._check_slope(temporal_filter, tensors)
+        used = samples("spp", spp) or self.spp or self._scene_spp
+        seeding = Seeding(self._sensors, 1 if batch is None else batch, self.grad_seed)
+        number, per_entry = drawn(seed)
+        bar = Bar() if progress else None
+        job = RenderJob(
+            scene=self.scene,
+            options=self._options,
+            keys=self._keys,
+            items=() if number is None else seeding.items(number),
+            seeding=seeding,
+            batched=tuple(batched),
+            spp=used,
+            spp_grad=self.spp_grad or used,
+            temporal_filter=temporal_filter or None,
+            watch=self._watch,
+            progress=bar,
+            freeze=self.freeze,
+        )
+        try:
+            steady, response = rendered(job, per_entry, tensors)
+        finally:
+            if bar is not None:
+                bar.close()
+        leading = (*(() if batch is None else (batch,)), *((len(self._sensors),) if self._stack_sensors else ()))
+        stats, components = self._stats(job), stokes_components(self.scene.variant)
+        steady = steady_channels_first(steady, leading, components)
+        return RenderOutput.of(
+            self.film, steady, self.film.channels_first(response, leading, components),
+            stats=stats, channels=self._channels,
+        )
+
+    def _collect(self, values: Mapping[str, Any] | None) -> tuple[list[torch.Tensor], list[bool], int | None]:
+        """The tensors of a call in the order of the keys, which of them are batched, and the batch size."""
+        given = given_values(values)
+        for key in given:
+            if key not in self._shapes:
+                hint = unknown_key(key, list(self._shapes), "this renderer")
+                raise SceneError(f"values: {hint} It was made with parameters={list(self._keys)}.")
+        tensors, batched, batch = [], [], None
+        for key in self._keys:
+            value = as_float(key, given.get(key, self.values[key]), device_type(self.scene.variant))
+            value, has_batch = fit_shape(key, value, self._shapes[key])
+            if has_batch:
+                if batch is not None and value.shape[0] != batch:
+                    raise ShapeError(
+                        f"value of {key!r}: batch of {value.shape[0]}, but another value has a batch of {batch}."
+                    )
+                batch = int(value.shape[0])
+            tensors.append(value)
+            batched.append(has_batch)
+        if batch == 0:
+            raise ShapeError("a batch must have at least one entry, got 0.")
+        return tensors, batched, batch
+
+    def _check_slope(self, temporal_filter: str, tensors: Sequence[torch.Tensor]) -> None:
+        if torch.is_grad_enabled():
+            wanted = [key for key, tensor in zip(self._keys, tensors, strict=True) if tensor.requires_grad]
+            moving = needing_slope(self._infos, wanted)
+            check_filter(moving, temporal_filter, self._pulsed)
+            check_slope(moving, *self._response)
+
+    def _stats(self, job: RenderJob) -> RenderStats:
+        runs, pixels = job.log, self._cube_shape[0] * self._cube_shape[1]
+        items, seconds = [item for run in runs for item in run.items], sum(run.seconds for run in runs)
+        return RenderStats(
+            spp=runs[0].spp,
+            seconds=seconds,
+            samples_per_second=runs[0].spp * pixels * len(items) / seconds,
+            variant=self.scene.variant,
+            integrator=runs[0].integrator,
+            temporal_filter=job.temporal_filter or "",
+            seeds=tuple(item.seed for item in items),
+            energy_before=tuple(energy for run in runs for energy in run.energy_before),
+            energy_after=tuple(energy for run in runs for energy in run.energy_after),
+            recorded=tuple(said for run in runs for said in run.recorded),
+            derivatives_recorded=job.derivative_log,
+        )
+
+    def extra_repr(self) -> str:
+        """Shown by ``print(renderer)``."""
+        return f"{self.scene!r}, parameters={list(self._keys)}, {self.film.describe(self.effective_filter)}"

@@ -1,0 +1,202 @@
+"""A built scene in use: values are installed for one run under one lock, and the described ones put back before
+anybody else looks.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from torchtransient._collection import no_collection
+from torchtransient.errors import SceneError, TorchTransientError, VariantError
+from torchtransient.plugins.black_textures import lifted
+from torchtransient.rendering.build_options import BuildOptions
+from torchtransient.rendering.filter_override import temporal_filter
+from torchtransient.rendering.interrupts import quiet
+from torchtransient.rendering.kernel_errors import named_errors
+from torchtransient.rendering.mitsuba_words import one_line
+from torchtransient.rendering.physics import PhysicsWatch
+from torchtransient.rendering.scene_state import detached, put_back, values_of
+from torchtransient.rendering.seeds import Item, Seeding
+from torchtransient.rendering.variant import active_variant
+
+if TYPE_CHECKING:
+    from torchtransient.rendering.parameters import SlotTable
+    from torchtransient.rendering.scene_handle import Scene
+
+
+@dataclass(frozen=True)
+class RunLog:
+    """What one primal run reports, item by item. ``energy_before``, ``energy_after``: outside of the window;
+    ``recorded``: what became of its recording.
+    """
+
+    items: tuple[Item, ...]
+    seconds: float
+    integrator: str
+    spp: int
+    energy_before: tuple[float, ...]
+    energy_after: tuple[float, ...]
+    recorded: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class RenderJob:
+    """Everything about a call that is not a tensor.
+
+    ``items``: the films to fill, where the seed is known; ``seeding`` makes them of a seed that is known later.
+    ``batched[i]``: value i has a leading batch dimension. ``needs[i]``: value i wants a derivative. ``watch``: says
+    what is unphysical. ``freeze``: calls are recorded. ``log`` collects what each primal run reports (seconds, seeds,
+    energy outside the window) and belongs to one call: under ``vmap`` a call is several runs. ``derivative_log``: what
+    became of the recordings of the call's derivatives. ``at_call``: of a scene that is shared, its values at the call.
+    """
+
+    scene: Scene
+    options: BuildOptions
+    keys: tuple[str, ...]
+    items: tuple[Item, ...]
+    seeding: Seeding
+    batched: tuple[bool, ...]
+    spp: int
+    spp_grad: int
+    temporal_filter: str | None
+    watch: PhysicsWatch
+    needs: tuple[bool, ...] = ()
+    progress: Callable[[float], None] | None = None
+    freeze: bool = True
+    at_call: list[Mapping[str, Any]] = field(default_factory=list)
+    log: list[RunLog] = field(default_factory=list)
+    derivative_log: list[str] = field(default_factory=list)
+
+    def seeded(self, seed: torch.Tensor | None) -> RenderJob:
+        """The job with the items of a seed; with its own ones for None."""
+        return self if seed is None else replace(self, items=self.seeding.items(int(seed)))
+
+
+class Session:
+    """A built scene in use."""
+
+    def __init__(self, job: RenderJob, slots: SlotTable):
+        self.job = job
+        self.slots = slots
+        self.scene = slots.built.scene
+        self.params = slots.built.params
+        self.integrator = self.scene.integrator()
+        self.recordings = job.scene.recordings(job.keys, job.options)
+        self.sensors = self.scene.sensors()
+
+    def film(self, item: Item) -> Any:
+        return self.sensors[item.sensor].film()
+
+    def entries(self, item: Item) -> int:
+        """Number of values behind the pixels of an item's film."""
+        return math.prod(self.film(item).cube_shape())
+
+    def install(self, item: Item, values: Sequence[torch.Tensor], needs: Sequence[bool]) -> list[Any]:
+        """Write the values of one batch entry into the scene; leaves that need it carry gradients."""
+        import drjit as dr
+
+        leaves = []
+        for slot, value, batched, need in zip(self.slots.slots, values, self.job.batched, needs, strict=True):
+            entry = value[item.entry] if batched else value
+            slot.check(entry)
+            leaf = own_array(entry)
+            if need and slot.loses_black():
+                leaf = lifted(leaf)
+            if need:
+                dr.enable_grad(leaf)
+            leaves.append(leaf)
+        try:
+            with quiet():
+                self.slots.install(leaves)
+        except (RuntimeError, ValueError, TypeError) as error:
+            if isinstance(error, TorchTransientError):
+                raise
+            keys = ", ".join(self.job.keys)
+            raise SceneError(f"values of {keys}: Mitsuba refuses them: {one_line(error)}") from error
+        return leaves
+
+
+# Of so few entries a list is taken over sooner than a kernel is launched.
+FEW = 64
+
+
+def own_array(tensor: torch.Tensor) -> Any:
+    """A flat Dr.Jit copy in Dr.Jit's own memory: the scene must not alias memory that belongs to the caller, and a
+    recorded kernel would go on reading memory that is not Dr.Jit's where the first call had it.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    flat = tensor.detach().resolve_neg().reshape(-1)
+    if flat.numel() <= FEW:
+        few = mi.Float(flat.tolist())
+        # A single number would be a literal of the kernels, and that of the first call for ever where a plugin does not
+        # show it to Dr.Jit.
+        dr.make_opaque(few)
+        return few
+    flat = flat.contiguous()
+    wait_for_torch(flat)
+    copy = mi.Float(flat) * dr.opaque(mi.Float, 1)
+    dr.eval(copy)
+    dr.sync_thread()
+    return copy
+
+
+def wait_for_torch(tensor: torch.Tensor) -> None:
+    """Dr.Jit works on a stream of its own: what torch has queued must be done before Dr.Jit reads or reuses memory."""
+    if tensor.is_cuda:
+        torch.cuda.current_stream(tensor.device).synchronize()
+
+
+def _check_flags() -> None:
+    import drjit as dr
+
+    if not dr.flag(dr.JitFlag.SymbolicLoops):
+        raise VariantError(
+            "the flag SymbolicLoops of Dr.Jit is off, without which gradients of a render are wrong; switch it on: "
+            "drjit.set_flag(drjit.JitFlag.SymbolicLoops, True)."
+        )
+
+
+@contextmanager
+def session_of(job: RenderJob) -> Iterator[Session]:
+    with active_variant(job.scene.variant), no_collection():
+        _check_flags()
+        with _as_at_call(job):
+            slots = job.scene.slots(job.keys, job.options)
+            session = Session(job, slots)
+            films = [sensor.film() for sensor in session.sensors]
+            try:
+                with named_errors(), temporal_filter(job.temporal_filter, session.integrator, films):
+                    yield session
+            except BaseException:
+                job.scene.leave(job.options, slots, attached=True)
+                raise
+            job.scene.leave(job.options, slots, attached=any(job.needs))
+
+
+@contextmanager
+def _as_at_call(job: RenderJob) -> Iterator[None]:
+    """A scene that others may change, as it was when the job was called, and without derivatives of theirs."""
+    import drjit as dr
+
+    if not job.scene.is_shared:
+        yield
+        return
+    params = job.scene.built(job.options).params
+    with dr.resume_grad():
+        now = values_of(params)
+        if not job.at_call:
+            job.at_call.append(detached(now))
+        put_back(params, job.at_call[0], now)
+    try:
+        yield
+    finally:
+        with dr.resume_grad():
+            put_back(params, now)

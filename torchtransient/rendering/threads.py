@@ -1,0 +1,151 @@
+"""``tt.threads``: how many threads torch and Dr.Jit compute with, set together."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from types import TracebackType
+
+import torch
+
+from torchtransient.errors import DeviceError, UnitError, VariantError
+from torchtransient.rendering.variant import check_process, engine_lock
+
+MOST_THREADS = 1024
+
+# The process that has changed Dr.Jit's pool: its threads do not come along in a fork, and waiting for them never ends.
+_pool = {"of": 0}
+
+
+@dataclass(frozen=True)
+class Threads:
+    """Numbers of threads in use, the calling one included: ``torch``'s for one operation, ``drjit``'s for one kernel.
+
+    As a context manager it puts back what was in use before the call of :func:`threads` that made it.
+    """
+
+    torch: int
+    drjit: int
+    _before: tuple[int, int] = field(default=(0, 0), repr=False, compare=False)
+
+    def __enter__(self) -> Threads:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with engine_lock:
+            _set(*self._before)
+
+
+def threads(n: int | None = None) -> Threads:
+    """Let torch and Dr.Jit, which has a pool of its own, compute with ``n`` threads each; None only asks.
+
+    Returns the counts in use. As a context manager it puts back what was there before::
+
+        with tt.threads(1):
+            out = renderer(seed=0)
+
+    ``n``: 1 to 1024, the calling thread included; 1 leaves no other one at work. More threads than cores are taken and
+    take turns, which is slower. Pools grow and shrink at any time; a call waits until renders of other threads are
+    done. Numbers of a render do not depend on the count but for the order of sums.
+
+    Dr.Jit's count is the process's. Torch's is that of the calling thread, and what threads begin with that compute
+    for the first time later; those that have computed before keep theirs. Neither reaches spawned processes: call it
+    there. Only CPU variants compute with Dr.Jit's threads. No variant is needed, and none is activated.
+
+    Mitsuba hands OpenEXR files to Dr.Jit's threads and waits for them, for ever where there is but one. What this
+    library loads gets a second one meanwhile; for Mitsuba's own calls on such files (``mi.Bitmap``, ``mi.load_dict``)
+    write ``with tt.threads(2):`` around them.
+
+    Raises ``UnitError`` for anything but such a number, ``DeviceError`` where the system or torch refuses so many
+    threads (the counts stay what they were), ``VariantError`` in a process that was forked from one whose threads of
+    Dr.Jit were at work.
+    """
+    _check(n)
+    with engine_lock:
+        before = _counts()
+        if n is not None:
+            _set(n, n)
+        return Threads(*_counts(), before)
+
+
+@contextmanager
+def threads_for_files() -> Iterator[None]:
+    """Hold the engine lock with at least two threads of Dr.Jit: for blocks in which Mitsuba may read or write pictures.
+
+    Mitsuba (3.9 at least) submits the blocks of an OpenEXR file to Dr.Jit's pool and waits on a semaphore, without
+    taking part: a pool that is the calling thread alone never gets to them. Also on machines of one core.
+    """
+    import drjit as dr
+
+    with engine_lock:
+        before = dr.thread_count()
+        if before > 1:
+            yield
+            return
+        _set_drjit(2)
+        try:
+            yield
+        finally:
+            _set_drjit(before)
+
+
+def _check(n: int | None) -> None:
+    if n is None:
+        return
+    if isinstance(n, bool) or not isinstance(n, int) or not 1 <= n <= MOST_THREADS:
+        raise UnitError(f"threads: expected a whole number from 1 to {MOST_THREADS}, or None to ask, got {n!r}.")
+
+
+def _counts() -> tuple[int, int]:
+    import drjit as dr
+
+    return torch.get_num_threads(), dr.thread_count()
+
+
+def _set(for_torch: int, for_drjit: int) -> None:
+    """Set both counts, or neither."""
+    before = _counts()
+    if (for_torch, for_drjit) == before:
+        return
+    try:
+        if for_drjit != before[1]:
+            _set_drjit(for_drjit)
+        if for_torch != before[0]:
+            torch.set_num_threads(for_torch)
+    except RuntimeError as error:
+        if isinstance(error, VariantError):
+            raise
+        _put_back(before)
+        raise DeviceError(f"threads: {for_drjit} threads cannot be had: {error}; it stays at {before[1]}.") from error
+    if _counts() != (for_torch, for_drjit):
+        found = _counts()
+        _put_back(before)
+        raise DeviceError(
+            f"threads: asked for {for_torch} of torch and {for_drjit} of Dr.Jit, which took {found[0]} and {found[1]}; "
+            f"it stays at {before[0]} and {before[1]}."
+        )
+
+
+def _set_drjit(count: int) -> None:
+    import drjit as dr
+
+    check_process()
+    if _pool["of"] not in (0, os.getpid()):
+        raise VariantError(
+            "threads: this process was forked from one that had set Dr.Jit's threads, which did not come along. "
+            "Expected a fresh process: use multiprocessing.get_context('spawn'), or set them in the child alone."
+        )
+    _pool["of"] = os.getpid()
+    dr.sync_thread()
+    dr.set_thread_count(count)
+
+
+def _put_back(before: tuple[int, int]) -> None:
+    import drjit as dr
+
+    dr.set_thread_count(before[1])
+    torch.set_num_threads(before[0])

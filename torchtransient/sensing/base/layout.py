@@ -1,0 +1,157 @@
+"""Checks that every sensor makes on its arguments: the layout (..., C, T, H, W), units, time axes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchtransient.axes import WIDEST_BIN_S, TimeAxis
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
+from torchtransient.floating import product as product
+from torchtransient.floating import without_autocast as without_autocast
+from torchtransient.quantities import as_number, shown, unit_of
+from torchtransient.sensing.base.given import refuse_cut_off
+
+TIME = -3  # the time dimension of (..., C, T, H, W)
+_OTHER_FILMS = (
+    "Render with time_axis=...; phasors (out.phasor) go to ItofCorrelation, as the first stage of Compose([...]), and "
+    "gated images (out.gated) are no bins: only what follows a gate may take them."
+)
+
+
+def check_tensor(x: object, where: str) -> Tensor:
+    """`x` when it is a tensor, else ShapeError: a renderer's output, or the transient that a film does not measure."""
+    if not isinstance(x, Tensor):
+        raise ShapeError(f"{where}: expected a tensor (..., C, T, H, W), got {not_a_transient(x)}")
+    return x
+
+
+def check_transient(x: Tensor, where: str) -> Tensor:
+    """`x` when it is a floating tensor (..., C, T, H, W), else ShapeError or UnitError."""
+    if check_tensor(x, where).ndim < 4:
+        raise ShapeError(
+            f"{where}: expected a tensor (..., C, T, H, W), got {tuple(x.shape)}. Add the missing dimensions."
+        )
+    if x.is_complex():
+        raise UnitError(
+            f"{where}: expected a transient, got complex numbers ({x.dtype}): a phasor image? Render with "
+            "time_axis=...; of the sensors ItofCorrelation alone takes phasors."
+        )
+    if not x.is_floating_point():
+        raise UnitError(f"{where}: expected a floating dtype, got {x.dtype}. Convert with .float().")
+    return x
+
+
+def not_a_transient(x: object) -> str:
+    """What was given instead of a transient, and what to do: the end of a message."""
+    if x is None:
+        return f"None, which is the transient of a render with a phasor or gated film. {_OTHER_FILMS}"
+    if getattr(x, "transient", None) is not None:
+        return f"{type(x).__name__}. Give its tensor, out.transient, or put the sensor into Compose([...])."
+    if hasattr(x, "transient"):
+        there = [name for name in ("phasor", "gated", "steady") if getattr(x, name, None) is not None]
+        there += [name for name, value in getattr(x, "others", {}).items() if isinstance(value, Tensor)]
+        held = f"holds {', '.join(there)} and no transient" if there else "holds no transient"
+        return f"{type(x).__name__}, which {held}. {_OTHER_FILMS}"
+    return f"{type(x).__name__}."
+
+
+def check_number(
+    value: float, name: str, where: str, *, low: float = 0.0, high: float = math.inf, open_low: bool = False
+) -> float:
+    """`value` as a float when it is finite and in [low, high] (or (low, high] with `open_low`), else UnitError.
+
+    GradientError for a tensor that requires a gradient, which a float cannot carry.
+    """
+    refuse_cut_off(value, name, where)
+    number = as_number(value)
+    if number is None:
+        raise UnitError(f"{where}: expected {name} to be one number, got {shown(value)}.")
+    below = number <= low if open_low else number < low
+    if not math.isfinite(number) or below or number > high:
+        left = "(" if open_low else "["
+        raise UnitError(f"{where}: expected {name} in {left}{low:g}, {high:g}]{unit_of(name)}, got {number!r}.")
+    return number
+
+
+def check_count(value: float, name: str, where: str, *, low: int = 1) -> int:
+    """`value` as an int when it is a whole number >= low, else UnitError."""
+    number = check_number(value, name, where, low=low)
+    if number != int(number):
+        raise UnitError(f"{where}: expected {name} to be a whole number, got {value!r}.")
+    return int(number)
+
+
+def check_one_of(where: str, given: Mapping[str, Any]) -> None:
+    """ArgumentError unless exactly one of the arguments named is there."""
+    there = [name for name, value in given.items() if value is not None]
+    if len(there) != 1:
+        got = " and ".join(there) if there else "none of them"
+        do = "leave one of them out" if there else "give one of them"
+        raise ArgumentError(f"{where}: expected either {' or '.join(given)}, got {got}; {do}.")
+
+
+def bin_width_of(axis: TimeAxis | None, bin_width_s: float | None, where: str) -> float:
+    """Bin width in seconds from a TimeAxis or a number; exactly one of them. UnitError otherwise.
+
+    A width of a microsecond or more is refused: it is most likely given in nanoseconds, picoseconds or bins. An axis in
+    metres may be that wide.
+    """
+    check_one_of(where, {"axis= (the TimeAxis of the light)": axis, "bin_width_s=": bin_width_s})
+    if axis is not None:
+        return check_time_axis(axis, where).bin_width_s
+    width = bin_width_s if bin_width_s is not None else 0.0
+    return check_seconds(width, "bin_width_s", where, open_low=True, high=WIDEST_BIN_S)
+
+
+def bins_of_period(period_s: float, bin_width_s: float, num_bins: int | None, where: str) -> int:
+    """How many bins a laser period has. UnitError unless it is a whole number, and `num_bins` where that is given."""
+    bins = check_seconds(period_s, "period_s", where, open_low=True, high=1.0) / bin_width_s
+    # 1 in 1e6 for periods such as 1/rate that were rounded on the way
+    if round(bins) < 1 or abs(bins - round(bins)) > 1e-6 * bins or num_bins not in (None, round(bins)):
+        have = "a whole number of bins" if num_bins is None else f"the {num_bins} bins of the axis"
+        raise UnitError(
+            f"{where}: expected period_s to be {have} of {bin_width_s:g} s, got {period_s:g} s, {bins:g} of them. Take "
+            "an axis of one whole laser period."
+        )
+    return round(bins)
+
+
+def check_time_axis(axis: object, where: str) -> TimeAxis:
+    """`axis` when it is a TimeAxis, else UnitError."""
+    if not isinstance(axis, TimeAxis):
+        raise ArgumentError(
+            f"{where}: expected axis to be a TimeAxis, got {type(axis).__name__}. Take the renderer's, or "
+            "TimeAxis.from_seconds(start, bin width, bins)."
+        )
+    return axis
+
+
+def check_generator(generator: object, where: str) -> None:
+    """UnitError for a generator that is none, a seed for instance."""
+    if generator is not None and not isinstance(generator, torch.Generator):
+        raise ArgumentError(
+            f"{where}: expected generator to be a torch.Generator, got {generator!r}. "
+            "Use torch.Generator().manual_seed(...)."
+        )
+
+
+def check_seconds(
+    value: float, name: str, where: str, *, open_low: bool = False, signed: bool = False, high: float = 1e-3
+) -> float:
+    """A duration in seconds, finite, not negative unless `signed`, below `high`; UnitError otherwise.
+
+    Widths, delays and dead times of detectors are far below the 1 ms that a picosecond is in nanoseconds; repetition
+    periods of lasers are not, and take `high` = 1 s.
+    """
+    number = check_number(value, name, where, low=-math.inf if signed else 0.0, open_low=open_low)
+    if abs(number) >= high:
+        raise UnitError(
+            f"{where}: expected {name} in seconds, below {high:g} s, got {number!r} s. Picoseconds, nanoseconds or "
+            "bins? 50 ps are 50e-12 s, 75 ns are 75e-9 s."
+        )
+    return number

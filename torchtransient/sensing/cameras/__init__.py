@@ -1,0 +1,1 @@
+"""Pixels that integrate: their electronics and gates."""

@@ -1,0 +1,1 @@
+"""Detections that others caused: afterpulses and crosstalk."""

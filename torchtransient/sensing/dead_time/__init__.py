@@ -1,0 +1,1 @@
+"""The arithmetic of dead time: cycles of several detections, detectors that run free, their stationary state."""

@@ -1,0 +1,1 @@
+"""Devices as data, and those that have a name."""

@@ -1,0 +1,275 @@
+"""From the taps of an indirect time-of-flight camera to phase, amplitude and depth.
+
+With taps ``I_n = (B + A cos(phi - 2 pi n / N)) / N`` the sum ``(2 / N) sum_n I_n exp(2 pi i n / N)`` is the *tap
+phasor* ``(A / N) exp(i phi)`` (its phase is minus that of a phasor image, whose exponent is negative). The differences
+of pixels with two taps (`itof_pixels.py`) have the same one. Depth is half the way there and back:
+``d = c phi / (4 pi f)``, unique up to ``c / (2 f)``. What a camera reports, with its noise, is in `itof_reading.py`.
+
+Gradients: a phase jumps by a turn at the end of its range, so that a loss on it (or on depth) pulls pixels near the
+jump the long way round. `phasor_loss` compares phasors and has no jump; `wrapped_difference` gives the short way. A
+pixel without modulated light has phase and derivative zero.
+
+Sources: Lange & Seitz (2001); Payne, Dorrington & Cree, "Illumination waveform optimization for time-of-flight range
+imaging cameras" (SPIE 2011); Jongenelen et al., "Analysis of errors in ToF range imaging with dual-frequency
+modulation" (IEEE TIM 2011).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Literal, get_args
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
+from torchtransient.floating import in_single
+from torchtransient.quantities import Numbers
+from torchtransient.sensing.base.given import refuse_cut_off, tensor_of
+from torchtransient.sensing.base.layout import check_count, product
+from torchtransient.sensing.itof.itof import Frequencies, check_frequencies
+from torchtransient.sensing.itof.itof_codes import phase_steps
+from torchtransient.units import SPEED_OF_LIGHT
+
+Readout = Literal["single", "two_tap", "differential"]
+Frames = Tensor | NDArray[Any]
+
+_TURN = 2 * math.pi
+
+
+def tap_phasor(taps: Frames, num_taps: int, readout: Readout = "single") -> Tensor:
+    """(..., C, F, H, W) complex: ``(2 / N) sum_n X_n exp(2 pi i n / N)`` of frames as `steps_of` takes them.
+
+    Steps of one function at equal shifts (sine, square); two steps are a quarter of a turn apart. Equal light gives
+    equal results in every readout. Harmonics ``m N +- 1`` alias into the result (wiggling; four steps for two).
+    Half precision becomes complex64. Errors as `steps_of`.
+    """
+    steps = steps_of(taps, num_taps, readout, "tap_phasor")
+    if num_taps > 2:
+        # The mean has no part in the sum; without it, equal taps give exactly zero and float32 keeps its digits.
+        steps = steps - steps.mean(-3, keepdim=True)
+    angles = _TURN * phase_steps(num_taps)
+    weights = (2 / num_taps) * torch.stack([angles.cos(), angles.sin()])
+    both = product(weights.to(steps), steps.flatten(-2))
+    real, imag = both.reshape(*both.shape[:-1], *steps.shape[-2:]).unbind(-3)
+    return torch.complex(real, imag)
+
+
+def offset_of(taps: Frames, num_taps: int, readout: Readout = "single") -> Tensor:
+    """(..., C, F, H, W): a pixel's level without modulation, the mean of its taps, or of ``A + B`` of two.
+
+    Half precision becomes float32. Errors as `steps_of`, and UnitError for differences, in which it has cancelled.
+    """
+    if readout == "differential":
+        raise UnitError("offset_of: expected frames of taps, got differences, in which the offset has cancelled.")
+    if readout == "two_tap":
+        return sums_of(taps, num_taps, "offset_of").mean(-3)
+    return steps_of(taps, num_taps, readout, "offset_of").mean(-3)
+
+
+def steps_of(taps: Frames, num_taps: int, readout: Readout, where: str) -> Tensor:
+    """(..., C, F, N, H, W): what each of the N = ``num_taps`` phase steps has measured, in float32 or better.
+
+    ``readout``: "single", frames (..., C, F N, H, W) of taps or of exposures of one tap, N >= 3; "two_tap", frames
+    (..., C, F 2N, H, W) of A and B in turn, N >= 2, whose difference it is; "differential", frames (..., C, F N, H, W)
+    of such differences. Raw frames of whole numbers are taken, as tensors or arrays; a black level has to be off
+    "single" frames only if their offset is to mean light. Raises ShapeError for another number of frames, UnitError
+    for numbers that are none of frames.
+    """
+    split = _split(taps, num_taps, readout, where)
+    return split[..., 0, :, :] - split[..., 1, :, :] if readout == "two_tap" else split[..., 0, :, :]
+
+
+def sums_of(taps: Frames, num_taps: int, where: str) -> Tensor:
+    """(..., C, F, N, H, W): ``A + B`` of frames of two taps. Errors as `steps_of`."""
+    split = _split(taps, num_taps, "two_tap", where)
+    return split[..., 0, :, :] + split[..., 1, :, :]
+
+
+def check_readout(readout: str, where: str) -> None:
+    """UnitError for what is no way of reading pixels out."""
+    if readout not in get_args(Readout):
+        raise ArgumentError(f"{where}: expected readout to be one of {', '.join(get_args(Readout))}, got {readout!r}.")
+
+
+def _split(taps: Frames, num_taps: int, readout: str, where: str) -> Tensor:
+    """(..., C, F, N, taps of a pixel, H, W)."""
+    check_readout(readout, where)
+    frames = _precise(as_frames(taps, where), where)
+    each, least = (2 if readout == "two_tap" else 1), (3 if readout == "single" else 2)
+    count = check_count(num_taps, "num_taps", where)
+    known = count >= least and frames.ndim >= 4 and frames.shape[-3] > 0 and frames.shape[-3] % (count * each) == 0
+    if not known:
+        frames_of = f"F x {each} x N" if each > 1 else "F x N"
+        raise ShapeError(
+            f"{where}: expected {readout} frames (..., C, {frames_of}, H, W) with N = {num_taps} >= {least} phase "
+            f"steps, got {tuple(frames.shape)}."
+        )
+    frequencies = frames.shape[-3] // (count * each)
+    return frames.reshape(*frames.shape[:-3], frequencies, count, each, *frames.shape[-2:])
+
+
+def as_frames(taps: Frames, where: str) -> Tensor:
+    """A tensor as it is, an array as one. UnitError for what holds no numbers."""
+    return taps if isinstance(taps, Tensor) else tensor_of(np.asarray(taps), where)
+
+
+def _precise(frames: Tensor, where: str) -> Tensor:
+    """Frames in float32 or better, in which differences of 16-bit numbers cannot wrap."""
+    if frames.is_complex() or frames.dtype == torch.bool:
+        raise UnitError(f"{where}: expected frames of real numbers, got {frames.dtype}.")
+    if not frames.is_floating_point():
+        # float32 holds every 16-bit number and the sum of two.
+        return frames.to(torch.float32 if frames.dtype.itemsize <= 2 else torch.float64)
+    return frames.float() if frames.dtype in (torch.float16, torch.bfloat16) else frames
+
+
+def phase_of(phasor: Tensor) -> Tensor:
+    """Angle of a complex tensor in [0, 2 pi), in its shape; zero, with derivative zero, where it is zero."""
+    real, imag = phasor.real, phasor.imag
+    # At scale one the squares in the derivative of atan2 cannot underflow; the angle does not depend on it.
+    largest = torch.maximum(real.abs(), imag.abs()).detach()
+    there = ~(largest <= torch.finfo(real.dtype).tiny)  # NaN is not darkness
+    scale = torch.where(there, largest, 1.0)
+    angle = torch.atan2(torch.where(there, imag, 0.0) / scale, torch.where(there, real, 1.0) / scale)
+    # Not where(..., turn, 0.0): two plain numbers make a float32 of the turn.
+    wrapped = angle + _TURN * (angle.detach() < 0).to(angle)
+    # The sum of a tiny negative angle and a turn rounds to the turn itself.
+    return torch.where(wrapped.detach() >= _TURN, wrapped - _TURN, wrapped)
+
+
+def amplitude_of(phasor: Tensor) -> Tensor:
+    """Modulus of a complex tensor, in its shape; derivative zero where it is zero."""
+    real, imag = phasor.real, phasor.imag
+    largest = torch.maximum(real.abs(), imag.abs()).detach()
+    there = ~(largest <= torch.finfo(real.dtype).tiny)  # NaN is not darkness
+    scale = torch.where(there, largest, 1.0)
+    square = (real / scale).square() + (imag / scale).square()
+    return torch.where(there, torch.where(there, square, 1.0).sqrt() * scale, 0.0)
+
+
+@in_single
+def depth_of_phase(phase: Tensor, frequency_hz: float) -> Tensor:
+    """``c phase / (4 pi f)`` in metres, in the shape of ``phase``."""
+    (f,) = check_frequencies(frequency_hz, "depth_of_phase")
+    return phase * (SPEED_OF_LIGHT / (2 * _TURN * f))
+
+
+def unambiguous_range_m(frequencies_hz: Frequencies) -> float:
+    """``c / (2 gcd)``: the depth after which all phases repeat. UnitError for frequencies that are not whole hertz."""
+    values = check_frequencies(frequencies_hz, "unambiguous_range_m")
+    if any(f != int(f) for f in values):
+        raise UnitError(
+            f"unambiguous_range_m: expected whole numbers of hertz, which have a common divisor, got {values}. Say "
+            "the largest depth instead."
+        )
+    return SPEED_OF_LIGHT / (2 * math.gcd(*(int(f) for f in values)))
+
+
+@in_single
+def wrapped_difference(a: Tensor, b: Tensor) -> Tensor:
+    """``a - b`` in radians, the short way round: in [-pi, pi), derivative one everywhere. Shapes broadcast."""
+    difference = a - b
+    turns = torch.floor((difference.detach() + math.pi) / _TURN)
+    return difference - _TURN * turns
+
+
+def phasor_loss(phasor: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
+    """``|z - target|^2`` elementwise, real, or with the given weights: the loss of phases that knows no branch cut.
+
+    Scale both to amplitude one (``z / amplitude``) for a loss on the phase alone, ``2 (1 - cos(difference))``.
+    """
+    difference = phasor - target
+    loss = difference.real.square() + difference.imag.square()
+    return loss if weight is None else loss * weight
+
+
+def shares_of_depth(frequencies_hz: Sequence[float], weights: Sequence[float] | None = None) -> list[float]:
+    """How much the depth of each frequency counts in that of all, by least squares: ``w f^2`` over their sum."""
+    given = [1.0] * len(frequencies_hz) if weights is None else weights
+    # A phase of frequency f measures depth with the weight w / period^2.
+    parts = [w * f**2 for w, f in zip(given, frequencies_hz, strict=True)]
+    return [part / sum(parts) for part in parts]
+
+
+@in_single
+def unwrap_depth(
+    phase: Tensor,
+    frequencies_hz: Frequencies,
+    *,
+    max_depth_m: float | None = None,
+    min_depth_m: float = 0.0,
+    weights: Numbers | None = None,
+) -> Tensor:
+    """Depth (..., C, H, W) from phases (..., C, F, H, W) of F frequencies: the lattice of wraps, searched.
+
+    For every number of turns of the highest frequency within [min_depth_m, max_depth_m] the other frequencies take
+    their nearest number of turns, and the weighted least-squares depth with the least residual wins. ``max_depth_m``:
+    None for one range after which everything repeats. ``weights``: one over the variance of each *phase*; equal by
+    default. With noise around zero depth give a ``min_depth_m`` a little below zero.
+
+    The whole turns are detached; the gradient is that of the least-squares depth in the phases. Memory does not grow
+    with the number of candidates. Raises ShapeError for a wrong F, UnitError for an empty range, and for one over which
+    the phases repeat.
+    """
+    me = "unwrap_depth"
+    values = check_frequencies(frequencies_hz, me)
+    if phase.ndim < 4 or phase.shape[-3] != len(values):
+        raise ShapeError(f"{me}: expected phases (..., C, {len(values)}, H, W), got {tuple(phase.shape)}.")
+    longest = float(min_depth_m + unambiguous_range_m(values) if max_depth_m is None else max_depth_m)
+    if not (math.isfinite(longest) and longest > min_depth_m):
+        raise UnitError(f"{me}: expected min_depth_m < max_depth_m in metres, got {min_depth_m!r} and {longest!r}.")
+    # a tenth more leaves room for noise at both ends
+    if longest - min_depth_m > 1.1 * unambiguous_range_m(values):
+        raise UnitError(
+            f"{me}: expected max_depth_m - min_depth_m of at most {unambiguous_range_m(values):.4g} m, after which the "
+            f"phases of {values} Hz repeat, got {longest - min_depth_m:.4g} m. Metres? Or add a frequency."
+        )
+    refuse_cut_off(weights, "weights", me)
+    weight = [1.0] * len(values) if weights is None else [float(w) for w in weights]
+    if len(weight) != len(values) or not all(w > 0 for w in weight):
+        raise UnitError(f"{me}: expected {len(values)} positive weights, got {weights!r}.")
+
+    turns = phase / _TURN
+    periods = [SPEED_OF_LIGHT / (2 * f) for f in values]  # metres per turn
+    share = shares_of_depth(values, weight)
+    reference = min(range(len(values)), key=lambda i: periods[i])
+    best, whole = _search(turns.detach(), periods, share, weight, reference, (float(min_depth_m), longest))
+    del best
+    metres = turns.new_tensor([s * p for s, p in zip(share, periods, strict=True)]).reshape(-1, 1, 1)
+    depth: Tensor = ((turns + whole) * metres).sum(-3)
+    return depth
+
+
+def _search(
+    turns: Tensor,
+    periods: list[float],
+    share: list[float],
+    weight: list[float],
+    reference: int,
+    limits: tuple[float, float],
+) -> tuple[Tensor, Tensor]:
+    """Least residual and the whole turns (..., F, H, W) that give it."""
+    shape = (-1, 1, 1)
+    period, part, importance = (turns.new_tensor(v).reshape(shape) for v in (periods, share, weight))
+    first = math.floor(limits[0] / periods[reference]) - 1
+    last = math.ceil(limits[1] / periods[reference])
+    best = torch.full_like(turns.select(-3, 0), math.inf)
+    whole = torch.zeros_like(turns)
+    for n in range(first, last + 1):
+        rough = (turns.select(-3, reference) + n) * periods[reference]
+        candidate = torch.round(rough.unsqueeze(-3) / period - turns)
+        candidate.select(-3, reference).fill_(n)
+        depths = (turns + candidate) * period
+        depth = (depths * part).sum(-3)
+        residual = (((depths - depth.unsqueeze(-3)) / period).square() * importance).sum(-3)
+        inside = (depth >= limits[0]) & (depth < limits[1])
+        residual = torch.where(inside, residual, math.inf)
+        # Rounding leaves residuals of 1e-14 that mean nothing; the nearer of two equal candidates stays.
+        better = residual < best - 1e-12
+        best = torch.where(better, residual, best)
+        whole = torch.where(better.unsqueeze(-3), candidate, whole)
+    return best, whole

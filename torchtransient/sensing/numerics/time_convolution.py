@@ -1,0 +1,146 @@
+"""Convolution along time with a kernel of bins, directly or by FFT, into an open or a periodic window."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from torchtransient.errors import ArgumentError, ShapeError
+from torchtransient.sensing.base.layout import TIME, check_transient, without_autocast
+from torchtransient.transform_bins import fast_length
+
+Boundary = Literal["zero", "periodic"]
+Method = Literal["auto", "direct", "fft"]
+
+# Up to here a direct convolution is as fast as the transform, and it keeps the relative precision of faint late bins.
+_DIRECT_TAPS = 192
+# Short kernels over images: whole images are added, shifted in time, which leaves the layout as it is.
+# A backward pass writes an image of zeros for every shift.
+_SHIFTED_TAPS = 96
+_SHIFTED_TAPS_BACKWARD = 24
+_SHIFTED_PIXELS = 64
+
+
+def check_choice(value: str, choices: object, name: str, where: str) -> None:
+    """ShapeError unless `value` is one of the strings of a Literal type."""
+    allowed = get_args(choices)
+    if value not in allowed:
+        raise ArgumentError(f"{where}: expected {name} to be one of {', '.join(allowed)}, got {value!r}.")
+
+
+@without_autocast
+def convolve_time(
+    x: Tensor, kernel: Tensor, first: int = 0, *, boundary: Boundary = "zero", method: Method = "auto"
+) -> Tensor:
+    """y[t] = sum over j of kernel[j] x[t - first - j], along the time axis of (..., C, T, H, W).
+
+    `kernel`: (K,), the share of a bin's light that arrives `first + j` bins later. Boundary "zero": what leaves the
+    window is lost, nothing comes in; "periodic": the window is one period of a repeating signal, sums are conserved.
+    "fft" works in float64, since the rounding of a float32 transform (1e-7 of the largest bin) would drown late bins,
+    and pads to T + K - 1 and more for "zero"; "direct" sums in the dtype given; "auto" chooses by the length of the
+    kernel. Half precision is computed in float32. Differentiable in both arguments; dtype and device of `x` are kept.
+
+    Raises ShapeError for wrong layouts, an empty kernel or an unknown choice.
+    """
+    check_transient(x, "convolve_time")
+    check_choice(boundary, Boundary, "boundary", "convolve_time")
+    check_choice(method, Method, "method", "convolve_time")
+    if kernel.ndim != 1 or kernel.numel() == 0:
+        raise ShapeError(f"convolve_time: expected a kernel (K,) with K >= 1, got {tuple(kernel.shape)}.")
+    bins, kernel = x.shape[TIME], kernel.to(x.device)
+    kernel, first = window_lags(kernel, first, bins, boundary)
+    if kernel.numel() == 0:
+        return x * 0
+    if method == "auto":
+        method = "direct" if kernel.numel() <= _DIRECT_TAPS else "fft"
+    backward = torch.is_grad_enabled() and (x.requires_grad or kernel.requires_grad)
+    shifts = _SHIFTED_TAPS_BACKWARD if backward else _SHIFTED_TAPS
+    if method == "direct" and kernel.numel() <= shifts and x.shape[-1] * x.shape[-2] >= _SHIFTED_PIXELS:
+        return _by_shifts(x, kernel, first, boundary)
+    rows = x.movedim(TIME, -1)
+    y = _direct(rows, kernel, first, boundary) if method == "direct" else _by_fft(rows, kernel, first, boundary)
+    return y.movedim(-1, TIME)
+
+
+def window_lags(kernel: Tensor, first: int, bins: int, boundary: Boundary) -> tuple[Tensor, int]:
+    """(kernel, first) as far as it matters in a window of `bins`: folded into one period, or cut to lags inside.
+
+    A kernel that misses the window altogether comes back empty.
+    """
+    return _fold(kernel, first, bins) if boundary == "periodic" else _crop(kernel, first, bins)
+
+
+def _fold(kernel: Tensor, first: int, period: int) -> tuple[Tensor, int]:
+    """The kernel modulo the period, when it is longer than one."""
+    if kernel.numel() <= period:
+        return kernel, first % period
+    lags = (torch.arange(kernel.numel(), device=kernel.device) + first) % period
+    return kernel.new_zeros(period).index_add(0, lags, kernel), 0
+
+
+def _crop(kernel: Tensor, first: int, bins: int) -> tuple[Tensor, int]:
+    """The part of the kernel whose lags lie in (-bins, bins); all others miss the window."""
+    begin = min(max(0, 1 - bins - first), kernel.numel())
+    end = max(min(kernel.numel(), bins - first), begin)
+    return kernel[begin:end], first + begin
+
+
+def _by_shifts(x: Tensor, kernel: Tensor, first: int, boundary: Boundary) -> Tensor:
+    bins, taps = x.shape[TIME], kernel.numel()
+    work = x.float() if x.dtype in (torch.float16, torch.bfloat16) else x
+    if boundary == "periodic":
+        work, first, left = work.roll(first, TIME), 0, taps - 1
+        padded = torch.cat([work.narrow(TIME, bins - left, left), work], TIME)
+    else:
+        left = max(first + taps - 1, 0)
+        padded = functional.pad(work, (0, 0, 0, 0, left, max(-first, 0)))
+    weights = kernel.to(work.dtype)
+    total = padded.narrow(TIME, left - first, bins) * weights[0]
+    for j in range(1, taps):
+        total.addcmul_(padded.narrow(TIME, left - first - j, bins), weights[j])
+    return total.to(x.dtype)
+
+
+def _direct(rows: Tensor, kernel: Tensor, first: int, boundary: Boundary) -> Tensor:
+    bins, taps = rows.shape[-1], kernel.numel()
+    work = torch.float32 if rows.dtype in (torch.float16, torch.bfloat16) else rows.dtype
+    flat = rows.reshape(-1, 1, bins).to(work)
+    weights = kernel.flip(0).to(work).view(1, 1, -1)
+    if boundary == "periodic":
+        # bins `first + taps - 1` before the start, taken from the end of the period
+        flat = torch.cat([flat.roll(first, -1)[..., bins - taps + 1 :], flat.roll(first, -1)], -1)
+        return functional.conv1d(flat, weights).to(rows.dtype).view(rows.shape)
+    left, right = first + taps - 1, -first
+    padded = functional.pad(flat, (max(left, 0), max(right, 0)))
+    y = functional.conv1d(padded, weights)
+    y = y[..., max(-left, 0) :][..., :bins]
+    return functional.pad(y, (0, bins - y.shape[-1])).to(rows.dtype).view(rows.shape)
+
+
+def _by_fft(rows: Tensor, kernel: Tensor, first: int, boundary: Boundary) -> Tensor:
+    bins, taps = rows.shape[-1], kernel.numel()
+    # Twice the bins hold every lag in (-bins, bins) without wrapping into the window: at least bins + taps - 1 if the
+    # lags lie on one side, and one side does not reach the other.
+    length = bins if boundary == "periodic" else fast_length(2 * bins + taps)
+    transfer = torch.fft.rfft(kernel.to(torch.float64), n=length)
+    return filter_rows(rows.to(torch.float64), transfer, length, first, bins).to(rows.dtype)
+
+
+def filter_rows(rows: Tensor, transfer: Tensor, length: int, first: int, keep: int) -> Tensor:
+    """Rows (..., T), float64, times a transfer function, circular in `length`, moved by `first`: (..., keep).
+
+    Results that rounding has put below zero are 0: a transform leaves 1e-17 of either sign where there is no light, and
+    a negative rate is none that a detector could draw from. The gradient is that of the transform alone.
+    """
+    if rows.numel() == 0:
+        return rows.new_zeros(*rows.shape[:-1], keep)
+    y: Tensor = torch.fft.irfft(torch.fft.rfft(rows, n=length) * transfer, n=length).roll(first, -1)[..., :keep]
+    # the rounding of a transform is about eps log2(length) of the length of the row (Higham, chapter 24)
+    scale = torch.linalg.vector_norm(rows.detach(), dim=-1, keepdim=True) * transfer.detach().abs().amax()
+    slack = 4 * torch.finfo(torch.float64).eps * math.log2(2 * length) * scale
+    value = y.detach()
+    return y - torch.where((value < 0) & (value >= -slack), value, 0.0)

@@ -1,0 +1,1 @@
+"""In front of the pixels: photon budget, lens blur, analyzers."""

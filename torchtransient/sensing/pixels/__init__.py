@@ -1,0 +1,1 @@
+"""Pixels of several SPADs, and the histograms that a pixel can afford."""

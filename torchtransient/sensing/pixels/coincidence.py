@@ -1,0 +1,278 @@
+"""Coincidences: detections of different SPADs of a pixel within a short window, which background rarely makes.
+
+Sources: Niclass et al., A 100-m range 10-frame/s 340 x 96-pixel time-of-flight depth sensor in 0.18-um CMOS (IEEE JSSC
+2013), macro-pixels and coincidence; Beer, Haase, Ruskowski, Kokozinski, Background light rejection in SPAD-based LiDAR
+sensors by adaptive photon coincidence detection (Sensors 2018), rates of coincidences in constant light.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchtransient.axes import TimeAxis
+from torchtransient.errors import UnitError
+from torchtransient.floating import in_single
+from torchtransient.quantities import Numbers
+from torchtransient.sensing.base.layout import (
+    TIME,
+    bin_width_of,
+    check_count,
+    check_seconds,
+    check_tensor,
+    check_transient,
+)
+from torchtransient.sensing.base.own_bins import common_bins
+from torchtransient.sensing.base.policies import GradPolicy
+from torchtransient.sensing.base.sensor import RandomSensor
+from torchtransient.sensing.base.wrapped_detector import cycles_of, several_of
+from torchtransient.sensing.correlated_noise.afterpulsing_spad import AfterpulsingSPAD
+from torchtransient.sensing.dead_time.dead_time_cycle import highest_level
+from torchtransient.sensing.dead_time.free_running_draws import log_likelihood
+from torchtransient.sensing.numerics.draws import check_rates
+from torchtransient.sensing.pixels.macro_pixel import checked_detector, groups_of
+from torchtransient.sensing.spad.free_running import FreeRunningSPAD
+from torchtransient.sensing.spad.spad import SynchronousSPAD
+
+# Gauss-Legendre, 8 points on [0, 1]: the lower half, and the weights of both halves
+_HALF = (0.019855071751231884, 0.10166676129318664, 0.23723379504183550, 0.40828267875217510)
+_SIDES = (0.050614268145188130, 0.11119051722668724, 0.15685332293894363, 0.18134189168918100)
+_PLACES = (*_HALF, *(1 - place for place in reversed(_HALF)))
+_WEIGHTS = (*_SIDES, *reversed(_SIDES))
+_PHOTONS = 4.0  # of all SPADs in a piece, which 8 points integrate
+_ROUNDED = 1e-6  # of a probability
+_FLOOD = 1e8  # photons of a bin, from which on first ones are where it begins
+
+
+@dataclass(frozen=True)
+class _Group:
+    """SPADs of an equal share: detections `one` (..., T, H, W) of each per cycle and bin, and how many there are.
+
+    `rate`: of SPADs that detect once per cycle; None where detections are spread evenly over a bin.
+    """
+
+    one: Tensor
+    rate: Tensor | None
+    number: int
+
+    def until(self, at: float) -> Tensor:
+        """Detections in the first share `at` of every bin."""
+        if self.rate is None:
+            return at * self.one
+        return self.one * at * _mean_survival(at * self.rate) / _mean_survival(self.rate)
+
+    def density(self, at: float) -> Tensor:
+        """Detections per bin at a share `at` of every bin."""
+        if self.rate is None:
+            return self.one
+        return self.one * torch.exp(-at * self.rate) / _mean_survival(self.rate)
+
+
+def _pieces(low: float, high: float, halvings: int) -> Iterator[tuple[float, float]]:
+    """A part of a bin in pieces that 8 points integrate to 1e-9.
+
+    First photons fall off as exp(-rate), others crowd at one end: pieces get shorter, by halves, to both ends.
+    """
+    if not high > low:
+        return
+    steps = [0.0, *(2.0**-k for k in range(halvings, 0, -1))]
+    shares = [*steps, *(1 - step for step in reversed(steps[:-1]))] if halvings else [0.0, 1.0]
+    for first, last in itertools.pairwise(shares):
+        yield low + (high - low) * first, low + (high - low) * last
+
+
+def _mean_survival(x: Tensor) -> Tensor:
+    """(1 - exp(-x)) / x."""
+    small = x < 1e-5
+    safe = torch.where(small, torch.ones_like(x), x)
+    return torch.where(small, 1 - x / 2, -torch.expm1(-safe) / safe)
+
+
+class CoincidencePixel(RandomSensor):
+    """Coincidences (..., C, T, H, W) of a pixel of several SPADs, in counts: `coincidence` of them within `window_s`.
+
+    Every detection raises its SPAD's line for `window_s`; a coincidence is counted when the number of lines that are up
+    reaches `coincidence`, at the detection that does so. All of a cycle are counted. Input, `detector`, `spads` and
+    `weights` as of `MacroPixel`; `window_s` is at most the dead time, so that a line goes up once in a window, and at
+    most the window of bins. A `coincidence` of 1 is an OR of all lines: detections of others are lost while it is up.
+
+    The mean is exact for independent SPADs in any light: detections of each SPAD times the chance that
+    `coincidence` - 1 of the others have detected within the window before. In constant light of r detections per second
+    of many SPADs it is r (r w)^(k - 1) exp(-r w) / (k - 1)!. Inside a bin the light is spread evenly; detections are
+    taken so too, except those of one per cycle, of which the first photons of a bin are the first: with a dead time,
+    use bins of at most one photon a SPAD. Integrals over a bin are right to 1e-6, however bright it is; a pixel with
+    thousands of photons in a bin takes ten times as long, for the whole image.
+    Lines are down at the start of a cycle of a SynchronousSPAD, and come round the period of a FreeRunningSPAD.
+
+    Samples are independent binomials of the cycles, with the exact mean: neighbouring bins of a cycle exclude each
+    other a little, which they leave out. Policies: all. Raises UnitError for more SPADs in coincidence than there are,
+    a window longer than the dead time, a detector
+    made for other bins, and light that has more than one coincidence per cycle in a bin.
+    """
+
+    takes, gives = ("rate",), "counts"
+
+    def __init__(
+        self,
+        detector: SynchronousSPAD | FreeRunningSPAD | AfterpulsingSPAD,
+        spads: int,
+        *,
+        coincidence: int,
+        window_s: float,
+        weights: Numbers | None = None,
+        axis: TimeAxis | None = None,
+        bin_width_s: float | None = None,
+        grad: GradPolicy = "expected",
+    ) -> None:
+        super().__init__(grad)
+        where = "CoincidencePixel"
+        self.detector = checked_detector(detector, where)
+        self.groups = groups_of(spads, weights, where)
+        self.spads = int(spads)
+        self.coincidence = check_count(coincidence, "coincidence", where)
+        if self.coincidence > sum(number for _, number in self.groups):
+            raise UnitError(f"{where}: expected a coincidence of at most {spads} SPADs with light, got {coincidence}.")
+        self.bin_width_s = bin_width_of(axis, bin_width_s, where)
+        given = None if axis is None else axis.num_bins
+        self.num_bins = common_bins([detector], where, (self.bin_width_s, given))[1]
+        self.window_s = check_seconds(window_s, "window_s", where, open_low=True)
+        inner = detector.detector if isinstance(detector, AfterpulsingSPAD) else detector
+        self.periodic = isinstance(inner, FreeRunningSPAD)
+        dead = inner.dead_time_s
+        if dead is not None and self.window_s > float(dead) * (1 + 1e-9):
+            raise UnitError(
+                f"{where}: expected window_s of at most the dead time of {float(dead):g} s, got {self.window_s:g} s. A "
+                "SPAD that fires twice in a window would count twice."
+            )
+
+    def check_bins(self, x: object) -> None:
+        super().check_bins(x)
+        self.detector.check_bins(x)
+
+    @property
+    def cycles(self) -> int:
+        """Laser cycles of an exposure."""
+        return cycles_of(self.detector)
+
+    @in_single
+    def probabilities(self, x: Tensor) -> Tensor:
+        """Expected coincidences per cycle and bin."""
+        check_transient(x, "CoincidencePixel")
+        bins, window = x.shape[TIME], self.window_s / self.bin_width_s
+        if window > bins:
+            raise UnitError(
+                f"CoincidencePixel: expected window_s within the {bins} bins of the light, got {window:g} bins."
+            )
+        parts = [self._one(x * share, share, number) for share, number in self.groups]
+        whole = math.floor(window)
+        total = torch.zeros_like(x, dtype=torch.float64)
+        photons = (x.detach().double() / _PHOTONS).clamp(1, _FLOOD * self.spads)
+        halvings = highest_level(photons.log2().ceil().long())
+        # the rear edge of the window passes a border of bins when its front edge has gone `window` - `whole` into one
+        for low, high in ((0.0, window - whole), (window - whole, 1.0)):
+            for begin, end in _pieces(low, high, halvings):
+                for place, weight in zip(_PLACES, _WEIGHTS, strict=True):
+                    at = begin + (end - begin) * place
+                    total = total + (end - begin) * weight * self._reached(parts, at, window)
+        return total.to(x.dtype)
+
+    def _one(self, rate: Tensor, share: float, number: int) -> _Group:
+        """A SPAD at its rate (..., T, H, W), one of `number` with a `share` of the pixel."""
+        inner = several_of(self.detector, 1, share)
+        if isinstance(inner, AfterpulsingSPAD):
+            rate, inner = inner.rate(rate), inner.detector
+        detections: Tensor = inner.probabilities(rate)  # type: ignore[operator]
+        once = isinstance(inner, SynchronousSPAD) and inner.dead_time_s is None
+        seen = inner._gated(rate).double().clamp_max(_FLOOD) if once else None  # type: ignore[operator]
+        return _Group(detections.double(), seen, number)
+
+    def _reached(self, parts: list[_Group], at: float, window: float) -> Tensor:
+        """Coincidences per bin and cycle at a share `at` of every bin."""
+        most = self.coincidence - 1
+        # by how many lines of the SPADs so far are up: its chance, and detections of one when so many others are up
+        up, hit = [torch.ones_like(parts[0].one)], [torch.zeros_like(parts[0].one)]
+        for group in parts:
+            number = group.number
+            q = self._fired_within(group, at, window).clamp(0, 1)
+            others, own = _binomials(q, number - 1, most), _binomials(q, number, most)
+            now = number * group.density(at)
+            with_one = _product(up, [now * chance for chance in others], most)
+            hit = _added(_product(hit, own, most), with_one)
+            up = _product(up, own, most)
+        return hit[most] if len(hit) > most else torch.zeros_like(parts[0].one)
+
+    def _fired_within(self, group: _Group, at: float, window: float) -> Tensor:
+        """Detections (..., T, H, W) of a SPAD in the window that ends a share `at` into every bin."""
+        one = group.one
+        bins = one.shape[TIME]
+        edges = torch.cat([torch.zeros_like(one.narrow(TIME, 0, 1)), one.cumsum(TIME)], TIME)
+        total = edges.narrow(TIME, bins, 1)
+        front = edges.narrow(TIME, 0, bins) + group.until(at)
+        back = at - window
+        index = torch.arange(bins, device=one.device) + math.floor(back)
+        rounds, inside = index.div(bins, rounding_mode="floor"), index % bins
+        rear = edges.index_select(TIME, inside) + group.until(back - math.floor(back)).index_select(TIME, inside)
+        over = rounds.view(-1, 1, 1)
+        rear = rear + over * total if self.periodic else torch.where(over < 0, torch.zeros_like(rear), rear)
+        return front - rear
+
+    def expected(self, x: Tensor) -> Tensor:
+        return self.probabilities(x) * self.cycles
+
+    def variance(self, x: Tensor) -> Tensor:
+        p = self.probabilities(x)
+        variance: Tensor = self.cycles * p * (1 - p)
+        return variance
+
+    def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        with torch.no_grad():
+            p = self._chances(check_tensor(x, "CoincidencePixel").detach().double())
+            return torch.binomial(torch.full_like(p, float(self.cycles)), p, generator=generator).to(x.dtype)
+
+    def _chances(self, x: Tensor) -> Tensor:
+        """`probabilities` when they are some, else UnitError."""
+        p = self.probabilities(check_rates(x, "CoincidencePixel"))
+        if p.numel() and float(p.max()) > 1 + _ROUNDED:
+            raise UnitError(
+                f"CoincidencePixel: expected at most one coincidence per cycle in a bin, got {float(p.max()):g}. Use "
+                "narrower bins to draw."
+            )
+        return p.clamp_max(1)
+
+    def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
+        """Of the draws as described: independent binomials."""
+        p, n = self.probabilities(x.double()).clamp_max(1), measurement.double()
+        quiet = self.cycles - n
+        value = log_likelihood(n, p) + log_likelihood(quiet, 1 - p)
+        ways = math.lgamma(self.cycles + 1) - torch.lgamma(n + 1) - torch.lgamma(quiet + 1)
+        return (value + ways).sum(TIME).to(x.dtype)
+
+    def extra_repr(self) -> str:
+        own = f"spads={self.spads}, coincidence={self.coincidence}, window_s={self.window_s:g}"
+        return f"{own}, {super().extra_repr()}"
+
+
+def _binomials(q: Tensor, number: int, most: int) -> list[Tensor]:
+    """Chance that 0, 1, ... up to `most` of `number` lines are up."""
+    return [math.comb(number, j) * q**j * (1 - q) ** (number - j) for j in range(min(number, most) + 1)]
+
+
+def _product(a: list[Tensor], b: list[Tensor], most: int) -> list[Tensor]:
+    """Of polynomials by their coefficients, up to the power `most`."""
+    found: list[Tensor | None] = [None] * min(len(a) + len(b) - 1, most + 1)
+    for i, left in enumerate(a):
+        for j, right in enumerate(b):
+            if i + j < len(found):
+                before = found[i + j]
+                found[i + j] = left * right if before is None else before + left * right
+    return [f for f in found if f is not None]
+
+
+def _added(a: list[Tensor], b: list[Tensor]) -> list[Tensor]:
+    longer, shorter = (a, b) if len(a) >= len(b) else (b, a)
+    return [v + shorter[i] if i < len(shorter) else v for i, v in enumerate(longer)]

@@ -1,0 +1,1 @@
+"""Instrument responses along time: their shapes, their composition, the modules that apply them."""

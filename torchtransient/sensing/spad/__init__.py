@@ -1,0 +1,1 @@
+"""Single-photon avalanche diodes: in step with the laser, running free, as binary frames."""

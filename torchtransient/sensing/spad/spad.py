@@ -1,0 +1,352 @@
+"""A single-photon avalanche diode (SPAD) in step with the laser: first-photon pile-up, gates, several hits per cycle.
+
+With `rate` the expected detections per cycle and bin of a detector that is never dead, the first photon of a cycle
+falls into bin k with probability (1 - exp(-rate[k])) exp(-sum of the rates before). The histogram of N cycles is
+multinomial. Sources: Coates, J. Phys. E 1 (1968); Gupta et al., Photon-flooded single-photon 3D cameras, CVPR 2019.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchtransient.axes import TimeAxis
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.floating import in_single
+from torchtransient.sensing.base.given import refuse_cut_off
+from torchtransient.sensing.base.layout import (
+    TIME,
+    bin_width_of,
+    check_count,
+    check_generator,
+    check_seconds,
+    check_transient,
+)
+from torchtransient.sensing.base.policies import GradPolicy, gaussian_noise, record_score
+from torchtransient.sensing.base.sensor import RandomSensor
+from torchtransient.sensing.dead_time.dead_time_cycle import check_dead_bins, double_detections
+from torchtransient.sensing.dead_time.dead_time_draws import (
+    DrawnRows,
+    draw_cycles,
+    gaussian_cycles,
+    sample_cycles,
+    score_of_cycles,
+)
+from torchtransient.sensing.dead_time.dead_time_inverse import armed_time, check_cycles, rates_of_counts
+from torchtransient.sensing.dead_time.dead_time_means import detected_columns
+from torchtransient.sensing.numerics.draws import check_rates, sample_first_photons
+from torchtransient.sensing.numerics.running_sums import sum_before
+
+
+@in_single
+def first_photon_probabilities(rate: Tensor) -> tuple[Tensor, Tensor]:
+    """Probability (..., C, T, H, W) that the first photon of a cycle falls into each bin, and (..., C, H, W) of none.
+
+    `rate`: expected detections per cycle and bin, >= 0. Sums over bins are made in float64, in the exponent, so that
+    1e4 bins lose no digits; in a saturated pixel the late bins get probability and gradient 0, as they should. Raises
+    UnitError for rates that are negative, infinite or NaN.
+    """
+    check_transient(rate, "first_photon_probabilities")
+    check_rates(rate, "first_photon_probabilities")
+    before = sum_before(rate)
+    p = -torch.expm1(-rate) * torch.exp(-before.to(rate.dtype))
+    none = torch.exp(-(before.select(TIME, -1) + rate.select(TIME, -1).double()))
+    return p, none.to(rate.dtype)
+
+
+class CoatesEstimate(NamedTuple):
+    """`rate`: detections per cycle and bin; `valid`: bool, where cycles were still armed and not all of them fired."""
+
+    rate: Tensor
+    valid: Tensor
+
+
+def _rows(x: Tensor) -> Tensor:
+    """(..., T, H, W) -> rows (P, T), float64."""
+    return x.to(torch.float64).movedim(TIME, -1).reshape(-1, x.shape[TIME])
+
+
+def _image(rows: Tensor, like: Tensor) -> Tensor:
+    return rows.view(like.movedim(TIME, -1).shape).movedim(-1, TIME)
+
+
+def _columns(x: Tensor) -> Tensor:
+    """(..., T, H, W) -> columns (T, P), float64."""
+    return x.to(torch.float64).movedim(TIME, 0).reshape(x.shape[TIME], -1)
+
+
+def _of_columns(columns: Tensor, like: Tensor) -> Tensor:
+    return columns.view(like.movedim(TIME, 0).shape).movedim(0, TIME)
+
+
+def detections_with_dead_time(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
+    """Detections per cycle and bin, armed at the start of each cycle, with dead time: float64 (..., C, T, H, W).
+
+    `rate`: expected detections per cycle and bin of a detector that is never dead, >= 0, constant inside a bin.
+    `dead_bins`: non-paralyzable dead time in bins, at least 1/2, a number or a scalar tensor; differentiable in both.
+    Dead times are exact to fractions of a bin, and a bin may hold any number of photons and detections: bins of more
+    than a photon are cut. Total variation from the exact mean: below 1e-5 (docs/photon_counting.md). Raises UnitError
+    for rates that are negative, infinite or NaN.
+    """
+    check_transient(rate, "detections_with_dead_time")
+    check_rates(rate, "detections_with_dead_time")
+    check_dead_bins(dead_bins)
+    if rate.numel() == 0:
+        return rate.to(torch.float64)
+    dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=rate.device)
+    return _of_columns(detected_columns(_columns(rate), dead), rate)
+
+
+@in_single
+def coates(counts: Tensor, cycles: int, dead_bins: float | None = None) -> CoatesEstimate:
+    """Undo pile-up: rate[k] = -log(1 - counts[k] / cycles still armed at k). The maximum likelihood estimate.
+
+    `counts`: (..., C, T, H, W) detections of `cycles` cycles; `dead_bins`: dead time in bins, at least 1, for several
+    detections per cycle, None for one. With it the cycles that come back inside a bin count for as long as they are
+    armed in it: the inverse of `detections_with_dead_time` (to 1e-6 in bins of up to 15 photons). Where no cycle was
+    armed any more the rate is 0, where every armed one fired it is that of a share 1 - 1/(2 cycles); both are marked
+    not valid. Differentiable in `counts`, with a dead time once. dtype and device are kept. Raises UnitError for a
+    dead time below one bin.
+    """
+    check_transient(counts, "coates")
+    number = check_count(cycles, "cycles", "coates")
+    if dead_bins is not None and counts.numel():
+        refuse_cut_off(dead_bins, "dead_bins", "coates")
+        rate, valid = rates_of_counts(_rows(counts), number, float(dead_bins))
+        return CoatesEstimate(_image(rate, counts).to(counts.dtype), _image(valid, counts))
+    armed = number - sum_before(counts)
+    usable = ~(armed <= 0.5)  # NaN stays NaN
+    safe = torch.where(usable, armed, torch.ones_like(armed))
+    share = torch.where(usable, counts.to(torch.float64) / safe, torch.zeros_like(armed))
+    highest = 1 - 1 / (2 * number)
+    valid = usable & (share <= highest)
+    return CoatesEstimate((-torch.log1p(-share.clamp(0, highest))).to(counts.dtype), valid)
+
+
+@in_single
+def sample_detections(
+    rate: Tensor, cycles: int, dead_bins: float | None = None, *, generator: torch.Generator | None = None
+) -> Tensor:
+    """A histogram of `cycles` cycles, without gradient, in the shape and dtype of `rate` (..., C, T, H, W).
+
+    `dead_bins` None: one detection per cycle, multinomial by a tree of binomials. Else bin by bin (pieces of bins where
+    they hold more than a photon): of the armed cycles a binomial share fires, and those that fired are armed again
+    after the dead time. Means are those of `detections_with_dead_time`, correlations those of the cycles.
+    """
+    check_transient(rate, "sample_detections")
+    number = check_count(cycles, "cycles", "sample_detections")
+    rate = rate.detach()
+    if dead_bins is None:
+        return sample_first_photons(number, rate, generator)
+    check_dead_bins(dead_bins)
+    check_rates(rate, "sample_detections")
+    if rate.numel() == 0:
+        return rate.clone()
+    dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=rate.device)
+    counts = sample_cycles(_columns(rate), dead, number, generator)
+    return _of_columns(counts, rate).to(rate.dtype)
+
+
+def _drawn(
+    rate: Tensor, cycles: int, dead_bins: float, generator: torch.Generator | None
+) -> tuple[Tensor, list[DrawnRows]]:
+    check_dead_bins(dead_bins)
+    check_rates(rate, "sample_detections")
+    if rate.numel() == 0:
+        return rate.clone(), []
+    dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=rate.device)
+    counts, drawn = draw_cycles(_rows(rate), dead, cycles, generator)
+    return _image(counts, rate).to(rate.dtype), drawn
+
+
+def multinomial_noise(probabilities: Tensor, trials: int, generator: torch.Generator | None = None) -> Tensor:
+    """Normal noise with the covariance of multinomial counts, trials (diag p - p p^T), differentiable in p."""
+    z = gaussian_noise(trials * probabilities, generator)
+    none = 1 - probabilities.sum(TIME, keepdim=True)
+    rest = gaussian_noise(trials * none, generator)
+    return z - probabilities * (z.sum(TIME, keepdim=True) + rest)
+
+
+class SynchronousSPAD(RandomSensor):
+    """Histogram (..., C, T, H, W), in counts, of `cycles` laser cycles from detections per cycle and bin.
+
+    The input is the rate of an always-armed detector: signal, ambient light and dark counts, as `PhotonBudget` gives
+    it. `gate`: (T,) profile between 0 and 1 that multiplies the rate (bins before the gate opens do not pile up).
+    `dead_time_s` with `axis` or `bin_width_s`: several detections per cycle (`detections_with_dead_time`), the detector
+    being armed at the start of each; without it, the first photon of a cycle is the only one (dead until the next).
+
+    Policies: all four. The normal surrogate has the covariance of the cycles, between bins too; the score is that of
+    the draws, bin by bin. With a dead time `log_prob` is that of every bin given those before it, exact but for where
+    in a bin detections lay; `inverse` needs a dead time of at least one bin. Afterpulses and crosstalk are modules of
+    their own, behind.
+    """
+
+    takes, gives = ("rate",), "counts"
+
+    gate: Tensor | None
+
+    def __init__(
+        self,
+        cycles: int,
+        *,
+        gate: Tensor | None = None,
+        dead_time_s: float | None = None,
+        axis: TimeAxis | None = None,
+        bin_width_s: float | None = None,
+        grad: GradPolicy = "expected",
+    ) -> None:
+        super().__init__(grad)
+        self.cycles = check_count(cycles, "cycles", "SynchronousSPAD")
+        self.bin_width_s: float | None = None
+        if axis is not None or bin_width_s is not None:
+            self.bin_width_s = bin_width_of(axis, bin_width_s, "SynchronousSPAD")
+        self.num_bins = None if axis is None else axis.num_bins
+        self.dead_time_s: float | None = None
+        self.dead_bins: float | None = None
+        if dead_time_s is not None:
+            self.dead_time_s = check_seconds(dead_time_s, "dead_time_s", "SynchronousSPAD")
+            self.dead_bins = self.dead_time_s / bin_width_of(axis, bin_width_s, "SynchronousSPAD")
+            check_dead_bins(self.dead_bins)
+        if gate is not None:
+            if not isinstance(gate, Tensor) or gate.ndim != 1:
+                shape = tuple(gate.shape) if isinstance(gate, Tensor) else type(gate).__name__
+                raise ShapeError(f"SynchronousSPAD: expected gate to be a tensor (T,), got {shape}.")
+            if not bool(((gate >= 0) & (gate <= 1)).all()):
+                raise UnitError("SynchronousSPAD: expected gate values between 0 and 1.")
+            gate = gate.detach().double()
+        self.register_buffer("gate", gate)
+
+    def _gated(self, x: Tensor) -> Tensor:
+        check_transient(x, "SynchronousSPAD")
+        if self.gate is None:
+            return x
+        if self.gate.shape[0] != x.shape[TIME]:
+            raise ShapeError(f"SynchronousSPAD: expected T = {self.gate.shape[0]} as in gate, got {x.shape[TIME]}.")
+        return x * self.gate.to(x.dtype).view(-1, 1, 1)
+
+    def probabilities(self, x: Tensor) -> Tensor:
+        """Expected detections per cycle and bin, after pile-up."""
+        rate = self._gated(x)
+        if self.dead_bins is None:
+            return first_photon_probabilities(rate)[0]
+        return detections_with_dead_time(rate, self.dead_bins).to(x.dtype)
+
+    def expected(self, x: Tensor) -> Tensor:
+        return self.probabilities(x) * self.cycles
+
+    def variance(self, x: Tensor) -> Tensor:
+        p = self.probabilities(x)
+        variance = p * (1 - p)
+        if self.dead_bins is not None and self.dead_bins < 1 and x.numel():
+            # a cycle may fire twice in a bin
+            dead = torch.as_tensor(self.dead_bins, dtype=torch.float64, device=x.device)
+            variance = variance + 2 * _image(double_detections(_rows(self._gated(x)), dead), x).to(x.dtype)
+        return variance * self.cycles
+
+    def gaussian(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        if self.dead_bins is not None:
+            rate = check_rates(self._gated(x), "SynchronousSPAD")
+            if rate.numel() == 0:
+                return rate * self.cycles
+            dead = torch.as_tensor(self.dead_bins, dtype=torch.float64, device=x.device)
+            return _image(gaussian_cycles(_rows(rate), dead, self.cycles, generator), x).to(x.dtype)
+        p = self.probabilities(x)
+        return p * self.cycles + multinomial_noise(p, self.cycles, generator)
+
+    def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        return sample_detections(self._gated(x), self.cycles, self.dead_bins, generator=generator)
+
+    def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
+        rate = check_rates(self._gated(x), "SynchronousSPAD")
+        return first_photon_log_prob(measurement, rate, self.cycles, dead_bins=self.dead_bins).sum(TIME)
+
+    def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        if self.grad != "score" or self.dead_bins is None:
+            return super().forward(x, generator)
+        check_generator(generator, "SynchronousSPAD")
+        with torch.no_grad():
+            measurement, drawn = _drawn(self._gated(x), self.cycles, self.dead_bins, generator)
+
+        def log_prob() -> Tensor:
+            rate, dead = _rows(self._gated(x)), torch.as_tensor(self.dead_bins, dtype=torch.float64, device=x.device)
+            return score_of_cycles(drawn, rate, dead, self.cycles).view(x.select(TIME, 0).shape)
+
+        record_score(log_prob, type(self).__name__)
+        return measurement
+
+    def inverse(self, counts: Tensor) -> CoatesEstimate:
+        """The rate behind a histogram (`coates`), divided by the gate; bins where the gate is shut are not valid."""
+        estimate = coates(counts, self.cycles, self.dead_bins)
+        if self.gate is None:
+            return estimate
+        gate = self.gate.to(counts.dtype).view(-1, 1, 1)
+        is_open = gate > 0
+        rate = torch.where(is_open, estimate.rate / gate.clamp_min(1e-12), torch.zeros_like(estimate.rate))
+        return CoatesEstimate(rate, estimate.valid & is_open)
+
+    def extra_repr(self) -> str:
+        return f"cycles={self.cycles}, dead_time_s={self.dead_time_s}, {super().extra_repr()}"
+
+
+def log_of_firing(rate: Tensor) -> Tensor:
+    """log(1 - exp(-rate)), the log-probability that an armed detector fires, with all digits of dark and bright bins.
+
+    Differentiable; -inf at rate 0. Source: Maechler, Accurately computing log(1 - exp(-|a|)) (2012).
+    """
+    bright = rate > math.log(2)
+    if not bool(bright.any()):  # as a rule: half the cost
+        return (-torch.expm1(-rate)).log()
+    half = torch.full_like(rate, 0.5)
+    dark = torch.where(bright, half, rate)
+    many = torch.where(bright, rate, 2 * half)
+    return torch.where(bright, torch.log1p(-torch.exp(-many)), (-torch.expm1(-dark)).log())
+
+
+def exposed_cycles(counts: Tensor, cycles: int, dead_bins: float | None) -> Tensor:
+    """Cycles that could fire in each bin (..., T, H, W), times the part of it in which they could, float64."""
+    if dead_bins is None:
+        return cycles - sum_before(counts)
+    return armed_time(counts, cycles, float(dead_bins)).exposed
+
+
+@in_single
+def first_photon_log_prob(
+    counts: Tensor,
+    rate: Tensor,
+    cycles: int,
+    *,
+    dead_bins: float | None = None,
+    constant: bool = True,
+    where: str = "first_photon_log_prob",
+) -> Tensor:
+    """Log-probability of every bin given the bins before: binomial(armed cycles, 1 - exp(-rate)). (..., C, T, H, W).
+
+    Its sum over time is that of the histogram. `constant` False leaves the binomial coefficient out, which does not
+    depend on the rate. Concave in the rate. With `dead_bins`, cycles that come back inside a bin count for the part of
+    it in which they could fire: linear in the counts, greatest where the mean is right, to second order in the photons
+    of a bin (the estimate of `coates` is closer). Values and gradients are finite wherever counts are possible; a count
+    at rate 0 has log-probability -inf. Raises UnitError, in the name of `where`, when the counts need more than
+    `cycles` cycles.
+    """
+    number = check_count(cycles, "cycles", where)
+    n, r = counts.to(torch.float64), rate.to(torch.float64)
+    if dead_bins is None:
+        sooner, exposed = torch.zeros_like(r), number - sum_before(n.detach())
+    else:
+        time = armed_time(n.detach(), number, float(dead_bins))
+        sooner, exposed = time.sooner(r), time.exposed
+    quiet = exposed - n
+    # with a dead time the armed cycles are known on average only
+    refuse_cut_off(dead_bins, "dead_bins", where)
+    check_cycles(quiet, number, -0.5 if dead_bins is None else -0.5 - 6 * number**0.5, where)
+    quiet = quiet.clamp_min(0)
+    hit = n != 0
+    # where on the input: the logarithm of 0 has no finite gradient
+    fire = log_of_firing(torch.where(hit, r, 0.5))
+    value = torch.where(hit, n * fire, torch.zeros_like(r)) - r * quiet - sooner
+    if constant:
+        value = value + (torch.lgamma(n + quiet + 1) - torch.lgamma(n + 1) - torch.lgamma(quiet + 1))
+    return value.to(rate.dtype)

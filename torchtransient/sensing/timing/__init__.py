@@ -1,0 +1,1 @@
+"""What moves time stamps: jitter of detections and sweeps, late pixels, converters."""
