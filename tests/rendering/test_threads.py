@@ -14,8 +14,8 @@ import torch
 
 import torchtransient as tt
 from torchtransient.errors import DeviceError, UnitError
+from torchtransient.plugins.drjit_pool import engine_lock
 from torchtransient.rendering import threads as module
-from torchtransient.rendering.variant import engine_lock
 
 VARIANT = "llvm_ad_rgb"
 
@@ -205,6 +205,21 @@ def test_pictures_of_scenes_are_read_by_one_thread(tmp_path):
         print(tt.plan(scene, time_axis=tt.TimeAxis(0.0, 1.0, 4)).variant, tt.threads().drjit)
     """
     assert run(script) == ["0.25", "1", "llvm_ad_mono", "1"]
+
+
+def test_films_write_pictures_by_one_thread(tmp_path):
+    script = f"""
+        import torchtransient as tt
+        import mitsuba as mi
+        mi.set_variant("llvm_ad_rgb")
+        scene = mi.load_dict(tt.scenes.cornell_box())
+        tt.threads(1)
+        mi.render(scene, spp=1)
+        scene.sensors()[0].film().write({str(tmp_path / "steady.exr")!r})
+        print(tt.threads().drjit)
+    """
+    assert run(script) == ["1"]
+    assert (tmp_path / "steady.exr").stat().st_size > 1000
 
 
 def test_a_forked_child_of_a_process_with_a_pool_is_told():

@@ -18,6 +18,7 @@ from torchtransient._collection import let_go
 from torchtransient.errors import ArgumentError, SceneError, TorchTransientError
 from torchtransient.interfaces import IntegratorInterface
 from torchtransient.plugins.described_scene import check_scene
+from torchtransient.plugins.drjit_pool import threads_for_files
 from torchtransient.plugins.mitsuba_compat import (
     BUILDS_LOBES,
     COMPLETED_PLUGINS,
@@ -50,9 +51,9 @@ from torchtransient.rendering.nodes import (
     media_in_use,
 )
 from torchtransient.rendering.physics import scene_findings
+from torchtransient.rendering.placements import mesh_transforms, placements
 from torchtransient.rendering.pulse_properties import PREFIXES, PROPERTIES, write_pulse
 from torchtransient.rendering.taken import ReadyScene, check_taken, pointers
-from torchtransient.rendering.threads import threads_for_files
 from torchtransient.rendering.unread_properties import unread_properties
 
 # Steady integrators, and the transient ones for which their parameters mean the same.
@@ -133,8 +134,8 @@ def build(description: Description, variant: str, options: BuildOptions) -> Buil
             _override_integrator(state, options)
             _override_samplers(state, options)
             _substitute_plugins(state, options)
-            transforms = _mesh_transforms(state)
-            placed = _placed(state)
+            transforms = mesh_transforms(state)
+            placed = placements(state)
             integrator = find_child(state, state.root, is_integrator)
             plugin = "" if integrator is None else state.nodes[integrator].props.plugin_name()
             check_finite(state)
@@ -207,30 +208,6 @@ def _add_child(state: Any, parent: int, key: str, plugin: str, kind: Any, proper
     if len(state.node_paths):
         state.node_paths = [*state.node_paths, key]
     state.nodes[parent].props[key] = mi.Properties.ResolvedReference(len(state.nodes) - 1)
-
-
-def _mesh_transforms(state: Any) -> dict[str, np.ndarray]:
-    """``to_world`` as described, by the name of the shape: meshes apply it while loading and forget it."""
-    import mitsuba as mi
-
-    result = {}
-    for node in state.nodes:
-        if node.type == mi.ObjectType.Shape and node.props.id():
-            matrix = np.eye(4)
-            if "to_world" in node.props:
-                matrix = np.array(node.props["to_world"].matrix, dtype=np.float64)
-            result[node.props.id()] = matrix
-    return result
-
-
-def _placed(state: Any) -> dict[str, np.ndarray]:
-    """Every ``to_world`` of the description, by its key."""
-    found = {}
-    for node in state.nodes:
-        if "to_world" in node.props:
-            name = node.props.id() or node.props.plugin_name()
-            found[f"{name}.to_world"] = np.array(node.props["to_world"].matrix, dtype=np.float64)
-    return found
 
 
 # ----------------------------------------------------------------------------------------------------- overrides

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from torchtransient.plugins.drjit_pool import threads_for_files
 from torchtransient.rendering.nodes import is_integrator
-from torchtransient.rendering.threads import threads_for_files
 
 COLOUR, MEASURED = "colour", "measured"
 # Wavelengths (nm) that a constant table has to cover to be grey.

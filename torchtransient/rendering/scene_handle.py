@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from torchtransient.errors import ArgumentError, GradientError, SceneError
+from torchtransient.plugins.drjit_pool import engine_lock
 from torchtransient.rendering.build import BuiltScene, build
 from torchtransient.rendering.build_options import BuildOptions
 from torchtransient.rendering.description import Description, describe_dict, describe_xml, same_description
@@ -19,7 +20,7 @@ from torchtransient.rendering.ready_scenes import described_for_time
 from torchtransient.rendering.recordings import Recordings
 from torchtransient.rendering.saving.save import save_scene
 from torchtransient.rendering.taken import ReadyScene
-from torchtransient.rendering.variant import active_variant, engine_lock, resolve_variant
+from torchtransient.rendering.variant import active_variant, resolve_variant
 
 # Built scenes kept per description: one for every combination of time axis, depth and substituted plugins in use.
 _MAX_BUILDS = 8

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from types import TracebackType
 
 import torch
 
 from torchtransient.errors import DeviceError, UnitError, VariantError
-from torchtransient.rendering.variant import check_process, engine_lock
+from torchtransient.plugins.drjit_pool import engine_lock, set_drjit_threads
 
 MOST_THREADS = 1024
-
-# The process that has changed Dr.Jit's pool: its threads do not come along in a fork, and waiting for them never ends.
-_pool = {"of": 0}
 
 
 @dataclass(frozen=True)
@@ -72,27 +66,6 @@ def threads(n: int | None = None) -> Threads:
         return Threads(*_counts(), before)
 
 
-@contextmanager
-def threads_for_files() -> Iterator[None]:
-    """Hold the engine lock with at least two threads of Dr.Jit: for blocks in which Mitsuba may read or write pictures.
-
-    Mitsuba (3.9 at least) submits the blocks of an OpenEXR file to Dr.Jit's pool and waits on a semaphore, without
-    taking part: a pool that is the calling thread alone never gets to them. Also on machines of one core.
-    """
-    import drjit as dr
-
-    with engine_lock:
-        before = dr.thread_count()
-        if before > 1:
-            yield
-            return
-        _set_drjit(2)
-        try:
-            yield
-        finally:
-            _set_drjit(before)
-
-
 def _check(n: int | None) -> None:
     if n is None:
         return
@@ -113,7 +86,7 @@ def _set(for_torch: int, for_drjit: int) -> None:
         return
     try:
         if for_drjit != before[1]:
-            _set_drjit(for_drjit)
+            set_drjit_threads(for_drjit)
         if for_torch != before[0]:
             torch.set_num_threads(for_torch)
     except RuntimeError as error:
@@ -128,20 +101,6 @@ def _set(for_torch: int, for_drjit: int) -> None:
             f"threads: asked for {for_torch} of torch and {for_drjit} of Dr.Jit, which took {found[0]} and {found[1]}; "
             f"it stays at {before[0]} and {before[1]}."
         )
-
-
-def _set_drjit(count: int) -> None:
-    import drjit as dr
-
-    check_process()
-    if _pool["of"] not in (0, os.getpid()):
-        raise VariantError(
-            "threads: this process was forked from one that had set Dr.Jit's threads, which did not come along. "
-            "Expected a fresh process: use multiprocessing.get_context('spawn'), or set them in the child alone."
-        )
-    _pool["of"] = os.getpid()
-    dr.sync_thread()
-    dr.set_thread_count(count)
 
 
 def _put_back(before: tuple[int, int]) -> None:

@@ -7,9 +7,6 @@ back afterwards. When no variant was active at all, there is nothing to go back 
 
 from __future__ import annotations
 
-import os
-import sys
-import threading
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,43 +14,17 @@ from contextlib import contextmanager
 from torchtransient import plugins
 from torchtransient._llvm import ensure_llvm
 from torchtransient.errors import VariantError
+from torchtransient.plugins.drjit_pool import check_process, engine_lock
 from torchtransient.rendering.interrupts import interrupts_pass, put_back_log_level
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 
-# One lock for everything that touches Mitsuba: the variant, the scenes' parameters and Dr.Jit's graph are shared state.
-engine_lock = threading.RLock()
-
 # How many calls, one inside the other, hold the lock.
 _holders = {"depth": 0}
-
-_process = {"parent_was_rendering": False}
 
 # A switch takes some 0.1 s and makes Dr.Jit translate every loop anew; once or twice is fine, at every step it is not.
 MANY_SWITCHES = 20
 _switches = {"count": 0}
-
-
-def _mark_fork() -> None:
-    """Runs in the child of a fork: Dr.Jit's threads did not come along, and waiting for them would never end."""
-    mitsuba = sys.modules.get("mitsuba")
-    active = None if mitsuba is None else mitsuba.variant()
-    if active is not None and not active.startswith("scalar"):
-        _process["parent_was_rendering"] = True
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_mark_fork)
-
-
-def check_process() -> None:
-    """Raise ``VariantError`` in a forked child whose parent had a JIT variant active."""
-    if _process["parent_was_rendering"]:
-        raise VariantError(
-            "this process was forked from one in which Mitsuba was already rendering, and Dr.Jit does not survive a "
-            "fork. Expected a fresh process: use multiprocessing.get_context('spawn'), or DataLoader(..., "
-            "multiprocessing_context='spawn')."
-        )
 
 
 @contextmanager

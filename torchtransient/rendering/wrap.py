@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from torchtransient.errors import ArgumentError, GradientError, ShapeError, UnitError
+from torchtransient.plugins.drjit_pool import engine_lock
 from torchtransient.rendering.arguments import as_float
 from torchtransient.rendering.arrays import computable, handle
 from torchtransient.rendering.derivatives import run
@@ -23,7 +24,7 @@ from torchtransient.rendering.replay import Call, ScenesAtCall, SeedLeaf, Tensor
 from torchtransient.rendering.scene_state import detached, shapes_of, values_of, variant_of
 from torchtransient.rendering.surroundings import entries_of, is_typed_structure, wants_derivative
 from torchtransient.rendering.trees import taken_apart
-from torchtransient.rendering.variant import device_type, engine_lock
+from torchtransient.rendering.variant import device_type
 
 
 def wrap(

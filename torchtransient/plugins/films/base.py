@@ -9,6 +9,7 @@ import numpy as np
 from torchtransient.errors import SceneError, StorageError
 from torchtransient.interfaces import FilmInterface
 from torchtransient.plugins.described_scene import note_scene
+from torchtransient.plugins.drjit_pool import threads_for_files
 from torchtransient.plugins.films.block import AdjointBlock, FilmBlock
 from torchtransient.plugins.films.plain_image import bitmap_of, plain_image
 from torchtransient.plugins.films.response import SensorResponse
@@ -138,7 +139,8 @@ class TimeResolvedFilm(mi.Film):
 
     def write(self, path):
         """Write :meth:`bitmap` to a file; the time-resolved array is in no picture."""
-        self.bitmap().write(str(path))
+        with threads_for_files():
+            self.bitmap().write(str(path))
 
     def schedule_storage(self):
         if self._image is not None:

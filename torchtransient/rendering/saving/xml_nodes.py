@@ -15,9 +15,9 @@ import numpy as np
 
 from torchtransient import plugins
 from torchtransient.errors import SceneError
+from torchtransient.plugins.drjit_pool import threads_for_files
 from torchtransient.plugins.spectral_colours import as_colours
 from torchtransient.rendering.nodes import children
-from torchtransient.rendering.threads import threads_for_files
 
 # Mitsuba's kinds, as its classes are called.
 _KINDS = (
