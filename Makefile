@@ -44,7 +44,8 @@ docs: $(READY)
 
 # As many processes as there are cores, up to four: most tests compute with one thread or wait for a compiler. A file
 # stays in one of them. Compiled sources are kept: modules of plugins are executed anew at every change of the variant.
-PARALLEL ?= -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+# A process that dies is not replaced: pytest-xdist (3.8) would wait for its tests for ever.
+PARALLEL ?= -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 test: $(READY)
 	env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -q $(PARALLEL)
