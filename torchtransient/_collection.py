@@ -16,29 +16,34 @@ from typing import Any
 
 # Reentrant: freeing objects runs finalizers that free others.
 _lock = threading.RLock()
-_traces = 0
-_was_enabled = False
+# One entry for each block that is inside, and whether it was we who have stopped the collector. An interrupt may come
+# between any two lines: what it leaves undone here is done by the next block that ends.
+_traces: list[object] = []
+_stopped = False
 _kept: list[Any] = []
 
 
 @contextmanager
 def no_collection() -> Iterator[None]:
     """No garbage collection and no :func:`let_go` inside, in any thread. May be nested; also a decorator."""
-    global _traces, _was_enabled
-    with _lock:
-        if _traces == 0:
-            _was_enabled = gc.isenabled()
-            gc.disable()
-        _traces += 1
+    global _stopped
+    trace = object()
     try:
+        with _lock:
+            _traces.append(trace)
+            if gc.isenabled():
+                _stopped = True
+                gc.disable()
         yield
     finally:
         with _lock:
-            _traces -= 1
-            if _traces == 0:
+            if trace in _traces:
+                _traces.remove(trace)
+            if not _traces:
                 _kept.clear()
-                if _was_enabled:
+                if _stopped:
                     gc.enable()
+                    _stopped = False
 
 
 def let_go(contents: list[Any]) -> None:

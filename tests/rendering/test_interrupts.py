@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import random
 import signal
 import time
@@ -12,6 +13,7 @@ import pytest
 import torch
 
 import torchtransient as tt
+from torchtransient._collection import no_collection
 from torchtransient.rendering.interrupts import quiet
 from torchtransient.rendering.variant import active_variant
 from torchtransient.testing.small_room import COLOUR, VARIANT, WALL_POSE, make_room
@@ -174,3 +176,36 @@ def test_at_random_moments(level):
     finally:
         signal.signal(signal.SIGALRM, previous)
     assert interrupted > 50
+
+
+def test_in_dictionaries_that_mitsuba_loads(monkeypatch, level):
+    """Also where the interrupt comes before the constructor's first line."""
+    for place in ("torchtransient.plugins.films.histogram.TransientHDRFilm._check", "traceback.clear_frames"):
+        with monkeypatch.context() as patched:
+            patched.setattr(place, interrupt)
+            room = make_room()
+            if place.startswith("traceback"):
+                room["sensor"]["film"]["temporal_bins"] = 0  # an error, and an interrupt on its way
+            with pytest.raises(KeyboardInterrupt):
+                mi.load_dict(room)
+    assert mi.load_dict(make_room()) is not None
+
+
+@pytest.mark.parametrize("switch", ["disable", "enable"])
+def test_the_collector_goes_on(monkeypatch, switch):
+    """An interrupt while the collector is stopped, or set going again: at the latest the next block makes it good."""
+    done = getattr(gc, switch)
+    for after in (False, True):
+
+        def cut_off(after=after):
+            if after:
+                done()
+            raise KeyboardInterrupt
+
+        with monkeypatch.context() as patched:
+            patched.setattr(gc, switch, cut_off)
+            with pytest.raises(KeyboardInterrupt), no_collection():
+                pass
+        with no_collection():
+            assert not gc.isenabled()
+        assert gc.isenabled()

@@ -115,7 +115,7 @@ class _State:
     constructors: dict[tuple[str, str], Callable[..., object]] = field(default_factory=dict)
     owner: dict[tuple[str, str], str] = field(default_factory=dict)
     loading: str | None = None  # the module that is being executed
-    raised: list[BaseException] = field(default_factory=list)  # by plugin constructors, see plugin_errors()
+    listeners: list[list[BaseException]] = field(default_factory=list)  # take what constructors raise
 
 
 _state = _State()
@@ -259,16 +259,19 @@ def plugin_errors() -> Iterator[None]:
 
     Use it around `mi.load_dict` and `mi.load_file`.
     """
-    with _state.lock:
-        _state.raised.clear()
-        try:
-            yield
-        except RuntimeError as error:
-            if _state.raised and not isinstance(error, TorchTransientError):
-                raise _state.raised[0] from error
-            raise
-        finally:
-            _state.raised.clear()
+    # No lock is held: an interrupt on the way into a block that holds one would leave it locked. Loads of other threads
+    # may be heard here, too: which error is ours stands in Mitsuba's text.
+    heard: list[BaseException] = []
+    try:
+        _state.listeners.append(heard)
+        yield
+    except RuntimeError as error:
+        own = [one for one in heard if str(one) in str(error)]
+        if own and not isinstance(error, TorchTransientError):
+            raise own[0] from error
+        raise
+    finally:
+        _state.listeners[:] = [other for other in _state.listeners if other is not heard]
 
 
 def _on_variant_change(_old: str | None, new: str | None) -> None:
@@ -345,7 +348,8 @@ def _keeping_errors(constructor: Callable[..., object]) -> Callable[[object], ob
             # later virtual call of the variant.
             traceback.clear_frames(error.__traceback__)
             if isinstance(error, TorchTransientError) or not isinstance(error, Exception):
-                _state.raised.append(error)
+                for heard in _state.listeners:
+                    heard.append(error)
             raise
 
     return construct

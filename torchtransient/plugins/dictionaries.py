@@ -17,6 +17,7 @@ import numpy as np
 
 from torchtransient.errors import SceneError
 from torchtransient.plugins._registry import kind_of
+from torchtransient.plugins.interrupted import interrupt_behind
 
 # Properties of this library's plugins that hold any number of numbers, which Mitsuba only knows as a text: its own
 # lists are vectors and colours of three.
@@ -184,7 +185,13 @@ def _taking_arrays(load_dict: Callable[..., Any]) -> Callable[..., Any]:
             args = (for_mitsuba(args[0]), *args[1:])
         elif isinstance(options.get("dict"), dict):
             options["dict"] = for_mitsuba(options["dict"])
-        return load_dict(*args, **options)
+        try:
+            return load_dict(*args, **options)
+        except RuntimeError as error:
+            interrupt = interrupt_behind(error)
+            if interrupt is None:
+                raise
+            raise interrupt from None
 
     taking_arrays.takes_arrays = True  # type: ignore[attr-defined]
     return taking_arrays

@@ -68,8 +68,8 @@ def threads_for_files() -> Iterator[None]:
         if before > 1:
             yield
             return
-        set_drjit_threads(2)
         try:
+            set_drjit_threads(2)
             yield
         finally:
             set_drjit_threads(before)

@@ -37,8 +37,8 @@ class Batch:
         if not able or not all(other.can_borrow(spp) for other in self.films):
             yield False
             return
-        self._lend(film, n, entries)
         try:
+            self._lend(film, n, entries)
             yield True
         finally:
             film.lend(None)

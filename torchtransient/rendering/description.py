@@ -155,8 +155,8 @@ def _search_path(folder: str) -> Iterator[None]:
     before = mi.file_resolver()
     resolver = mi.FileResolver(before)
     resolver.prepend(folder)
-    mi.set_file_resolver(resolver)
     try:
+        mi.set_file_resolver(resolver)
         yield
     finally:
         mi.set_file_resolver(before)

@@ -35,8 +35,8 @@ class Generators:
     def again(self) -> Iterator[None]:
         """These states inside, and afterwards those that were there before."""
         before = Generators.now()
-        self.set()
         try:
+            self.set()
             yield
         finally:
             before.set()

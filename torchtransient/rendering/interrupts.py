@@ -6,31 +6,12 @@ comes out as a ``RuntimeError`` that names it, and would be taken for an error o
 
 from __future__ import annotations
 
-import re
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-# Mitsuba hands on the printed traceback of a plugin that it builds, and not the exception.
-_PRINTED = re.compile(r"^KeyboardInterrupt\b", re.MULTILINE)
-
-
-def chain_of(error: BaseException) -> list[BaseException]:
-    """An exception and its causes, the first reason last."""
-    found = [error]
-    while (below := found[-1].__cause__ or found[-1].__context__) is not None and below not in found:
-        found.append(below)
-    return found
-
-
-def interrupt_behind(error: BaseException) -> BaseException | None:
-    """The interrupt (or another exception that is no ``Exception``) that an error came of, None where it did not."""
-    chain = chain_of(error)
-    own = next((cause for cause in reversed(chain) if not isinstance(cause, Exception)), None)
-    if own is None and any(_PRINTED.search(str(cause)) for cause in chain):
-        return KeyboardInterrupt()
-    return own
+from torchtransient.plugins.interrupted import chain_of, interrupt_behind
 
 
 @contextmanager

@@ -6,7 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from torchtransient.errors import GradientError, SceneError, TorchTransientError
-from torchtransient.rendering.interrupts import chain_of, clear_frames
+from torchtransient.plugins.interrupted import chain_of
+from torchtransient.rendering.interrupts import clear_frames
 
 # Dr.Jit's words for an exception inside a loop or call that it traces, and for forward mode that it cannot do.
 _INSIDE = "encountered an exception"

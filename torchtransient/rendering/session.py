@@ -192,10 +192,11 @@ def _as_at_call(job: RenderJob) -> Iterator[None]:
     params = job.scene.built(job.options).params
     with dr.resume_grad():
         now = values_of(params)
-        if not job.at_call:
-            job.at_call.append(detached(now))
-        put_back(params, job.at_call[0], now)
     try:
+        with dr.resume_grad():
+            if not job.at_call:
+                job.at_call.append(detached(now))
+            put_back(params, job.at_call[0], now)
         yield
     finally:
         with dr.resume_grad():

@@ -19,8 +19,8 @@ from torchtransient.rendering.interrupts import interrupts_pass, put_back_log_le
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 
-# How many calls, one inside the other, hold the lock.
-_holders = {"depth": 0}
+# The calls, one inside the other, that hold the lock.
+_holders: list[object] = []
 
 # A switch takes some 0.1 s and makes Dr.Jit translate every loop anew; once or twice is fine, at every step it is not.
 MANY_SWITCHES = 20
@@ -34,12 +34,15 @@ def at_work() -> Iterator[None]:
     """
     with engine_lock, interrupts_pass():
         check_process()
-        _holders["depth"] += 1
+        holder = object()
         try:
+            _holders.append(holder)
             yield
         finally:
-            _holders["depth"] -= 1
-            if _holders["depth"] == 0:
+            # With those above it, if an interrupt has kept them from it.
+            if holder in _holders:
+                del _holders[_holders.index(holder) :]
+            if not _holders:
                 put_back_log_level()
 
 
@@ -92,10 +95,10 @@ def active_variant(variant: str) -> Iterator[None]:
 
     with at_work():
         before = mi.variant()
-        if before != variant:
-            _set_variant(variant)
-            _count_switch(before, variant)
         try:
+            if before != variant:
+                _set_variant(variant)
+                _count_switch(before, variant)
             plugins.sync()
             yield
         finally:

@@ -57,15 +57,15 @@ def flags_of(wrapper: Any) -> dict[str, bool]:
 def _telling_values(wrapper: Any) -> Iterator[None]:
     """For the time of a question: random numbers in all textures below a BSDF, and a scale that is not zero."""
     rng, before = np.random.default_rng(0), []
-    with dr.resume_grad():
-        for node in (wrapper, *objects_below(wrapper, mi.Texture)):
-            params = mi.traverse(node)
-            for key in {"value", "data", "scale"} & set(params.keys()):
-                value = params[key]
-                before.append((params, key, type(value)(value)))
-                params[key] = _random(value, rng)
-            params.update()
     try:
+        with dr.resume_grad():
+            for node in (wrapper, *objects_below(wrapper, mi.Texture)):
+                params = mi.traverse(node)
+                for key in {"value", "data", "scale"} & set(params.keys()):
+                    value = params[key]
+                    before.append((params, key, type(value)(value)))
+                    params[key] = _random(value, rng)
+                params.update()
         yield
     finally:
         with dr.resume_grad():
