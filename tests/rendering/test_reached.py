@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import collections
+import contextvars
 import functools
+import threading
 import types
+import weakref
+from typing import ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -44,6 +49,32 @@ class Holder:
         return self(x)
 
 
+class Slots:
+    """An object without a dictionary, and with names that Python changes."""
+
+    __slots__ = ("__params", "unused")
+
+    def __init__(self, params):
+        self.__params = params
+
+    @property
+    def params(self):
+        return self.__params
+
+    def __call__(self, x):
+        return write(self.params, x)
+
+
+class Weak:
+    """An object that another one knows without keeping it."""
+
+    kept: ClassVar = []
+
+    def __init__(self, params):
+        self.params = params
+        self.kept.append(self)
+
+
 def ways(scene, params):
     """Functions that reach a scene, by how they do."""
     holder, module = Holder(params), types.ModuleType("setup_of_mine")
@@ -66,7 +97,43 @@ def ways(scene, params):
 
         return other
 
+    given = params
+
+    class Computed:
+        shared = given
+
+        @property
+        def params(self):
+            return params
+
+        @functools.cached_property
+        def once(self):
+            return (params,)
+
+        @staticmethod
+        def alone(x):
+            return write(params, x)
+
+        @classmethod
+        def of_class(cls, x):
+            return write(cls.shared, x)
+
+    computed, weak, local = Computed(), weakref.ref(Weak(params)), threading.local()
+    local.params, context = params, contextvars.ContextVar("params")
+    context.set(params)
+    row, view = collections.deque([params]), types.MappingProxyType({"params": params})
     return {
+        "slots": Slots(params),
+        "a property": lambda x: write(computed.params, x),
+        "a property that is kept": lambda x: write(computed.once[0], x),
+        "an attribute of the object's class": lambda x: write(computed.shared, x),
+        "a static method": lambda x: computed.alone(x),
+        "a method of the class": lambda x: computed.of_class(x),
+        "a weak reference": lambda x: write(weak().params, x),
+        "what is the thread's own": lambda x: write(local.params, x),
+        "what is the context's own": lambda x: write(context.get(), x),
+        "a deque": lambda x: write(row[0], x),
+        "a view of a dictionary": lambda x: write(view["params"], x),
         "a function that it calls": lambda x: helper(x),
         "a function that a function calls": lambda x: (lambda y: helper(y))(x),
         "an object that is called": holder,

@@ -7,6 +7,8 @@ user's.
 
 from __future__ import annotations
 
+import contextlib
+import contextvars
 import dis
 import functools
 import inspect
@@ -15,7 +17,8 @@ import site
 import sys
 import sysconfig
 import types
-from collections.abc import Iterable, Iterator
+import weakref
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any
 
@@ -82,9 +85,15 @@ class Reached:
         if _is_of_library(kind):
             return
         for name in (*attributes, "__call__"):
-            method = next((vars(base)[name] for base in kind.__mro__ if name in vars(base)), None)
-            if isinstance(method, types.FunctionType):
-                self._follow(method, is_named=False)
+            found = next((vars(base)[name] for base in kind.__mro__ if name in vars(base)), None)
+            if isinstance(found, (staticmethod, classmethod)):
+                found = found.__func__
+            elif isinstance(found, (property, functools.cached_property)):
+                found = found.fget if isinstance(found, property) else found.func
+            if isinstance(found, types.FunctionType):
+                self._follow(found, is_named=False)
+            else:
+                self._look_at(found, attributes, 1)
 
     def _look_at_variable(self, name: str, value: Any, attributes: frozenset[str], is_named: bool) -> None:
         if is_named:
@@ -125,10 +134,38 @@ class Reached:
 
 
 def _parts_of(value: Any) -> tuple[Any, ...]:
-    named = value if isinstance(value, dict) else getattr(value, "__dict__", {})
+    if isinstance(value, weakref.ref):
+        return (value(),)
+    if isinstance(value, contextvars.ContextVar):
+        return (value.get(None),)
+    if not isinstance(value, dict) and _is_container_of_python(value):
+        return tuple(value.values() if isinstance(value, Mapping) else value)
+    named = value if isinstance(value, dict) else _attributes_and_slots(value)
     if isinstance(value, torch.nn.Module):
         named = {name: part for name, part in named.items() if name not in _of_every_module()}
     return tuple(named.values() if named or not isinstance(value, _CONTAINERS) else value)
+
+
+def _is_container_of_python(value: Any) -> bool:
+    """A deque, a view of a dictionary and the like: what others call a sequence may be a file that is read."""
+    is_container = isinstance(value, (Mapping, Sequence, Set)) and not isinstance(value, _CONTAINERS)
+    return is_container and type(value).__module__.partition(".")[0] in sys.stdlib_module_names
+
+
+def _attributes_and_slots(value: Any) -> dict[str, Any]:
+    found = dict(getattr(value, "__dict__", {}))
+    for base in type(value).__mro__:
+        slots = vars(base).get("__slots__", ())
+        for name in (slots,) if isinstance(slots, str) else tuple(slots):
+            member = vars(base).get(f"_{base.__name__.lstrip('_')}{name}" if _is_private(name) else name)
+            if isinstance(member, types.MemberDescriptorType):
+                with contextlib.suppress(AttributeError):  # not assigned yet
+                    found[f"{base.__name__}.{name}"] = member.__get__(value)
+    return found
+
+
+def _is_private(name: str) -> bool:
+    return name.startswith("__") and not name.endswith("__")
 
 
 @functools.cache
