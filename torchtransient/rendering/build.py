@@ -31,6 +31,7 @@ from torchtransient.plugins.physical_ranges import described_ranges
 from torchtransient.rendering.build_options import BuildOptions
 from torchtransient.rendering.description import Description
 from torchtransient.rendering.films.choices import all_films, of_plugin, plugins_in_words
+from torchtransient.rendering.mesh_files import check_mesh_files, check_taken_meshes
 from torchtransient.rendering.mitsuba_words import one_line
 from torchtransient.rendering.node_checks import check_nodes
 from torchtransient.rendering.node_names import (
@@ -126,6 +127,8 @@ def build(description: Description, variant: str, options: BuildOptions) -> Buil
             state = description.parse(config)
             _check_root(state)
             check_nodes(state)
+            check_mesh_files(state)
+            check_taken_meshes(description.taken)
             name_nodes(state)
             if not options.merge:
                 take_merged_apart(state)

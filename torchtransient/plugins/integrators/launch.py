@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import operator
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.errors import GradientError, UnitError
+from torchtransient.errors import GradientError, TorchTransientWarning, UnitError
+from torchtransient.quantities import as_whole, shown
 
 # Lanes of one kernel launch. Larger jobs run in several passes, which keeps a progress bar moving and indices in 32
 # bits.
@@ -104,10 +105,17 @@ def seed_array(seed: Any) -> Any:
 
 
 def _whole(seed: Any) -> int:
-    try:
-        return operator.index(seed) % 2**32
-    except TypeError:
-        raise UnitError(f"seed: expected a whole number, got {seed!r}.") from None
+    number = as_whole(seed)
+    if number is None:
+        raise UnitError(f"seed: expected a whole number, got {shown(seed)}.")
+    if not 0 <= number < 2**32:
+        warnings.warn(
+            f"seed: expected whole numbers from 0 to 2^32 - 1, got {shown(seed)}, which counts as {number % 2**32}: "
+            "seeds count modulo 2^32.",
+            TorchTransientWarning,
+            stacklevel=2,
+        )
+    return number % 2**32
 
 
 def _launch_counts(sampler: Any, spp: int, most: int) -> list[int]:

@@ -19,8 +19,8 @@ from torchtransient.plugins.transport.strategy import Local
 class RecordSink(Sink):
     """Writes what every strategy says of itself. ``layout`` tells :class:`RecordedVertex` how to read it.
 
-    ``block``: the film's adjoint block, where arrivals are to be read ahead; None for no list of them. ``lanes``: number
-    of paths, where records lie in global memory.
+    ``block``: the film's adjoint block, where arrivals are to be read ahead; None for no list of them. ``lanes``:
+    number of paths, where records lie in global memory.
     """
 
     zeros = True

@@ -1,0 +1,74 @@
+"""Faces of mesh files: Mitsuba makes normals of vertices that are not there, and rays meet them, without a look."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+
+from torchtransient.errors import SceneError
+
+# Plugins that hand on what a file says; Mitsuba checks the faces of an 'obj' itself.
+_UNCHECKED = ("ply", "serialized")
+_READ = ("filename", "shape_index", "shape_name")
+# Files that were found to be right, by name, time and size: a scene is built several times.
+_right: dict[tuple[Any, ...], None] = {}
+_MOST_REMEMBERED = 4096
+
+
+def check_mesh_files(state: Any) -> None:
+    """Raise ``SceneError`` where a face of a mesh file is made of vertices that the file does not have. Must be called
+    where Mitsuba finds the files, before the scene is built; what cannot be read is left to Mitsuba to say. Not found:
+    negative numbers of PLY files, which Mitsuba reads as 0.
+    """
+    import mitsuba as mi
+
+    for node in state.nodes:
+        if node.props.plugin_name() not in _UNCHECKED or not isinstance(node.props.get("filename", None), str):
+            continue
+        given = {name: node.props[name] for name in _READ if name in node.props}
+        key = _state_of(str(mi.file_resolver().resolve(given["filename"])), node.props.plugin_name(), given)
+        if key is None or key in _right:
+            continue
+        try:
+            # Without normals of vertices a file is no more than read.
+            mesh = mi.load_dict({"type": node.props.plugin_name(), "face_normals": True, **given})
+        except (RuntimeError, TypeError, ValueError):
+            continue
+        check_faces(mesh, f"{given['filename']} ({node.props.plugin_name()})")
+        _right[key] = None
+        while len(_right) > _MOST_REMEMBERED:
+            del _right[next(iter(_right))]
+
+
+def check_faces(mesh: Any, name: str) -> None:
+    """Raise ``SceneError`` where a mesh has faces of vertices that are not there."""
+    import mitsuba as mi
+
+    count = mesh.vertex_count()
+    faces = np.array(mi.traverse(mesh)["faces"])
+    if faces.size and int(faces.max()) >= count:
+        raise SceneError(
+            f"{name}: expected faces of vertices from 0 to {count - 1}, got the number {int(faces.max())}. Mend the "
+            "file, or write it anew with the program that it comes from."
+        )
+
+
+def check_taken_meshes(taken: Any) -> None:
+    """The same of the meshes that were taken as they are."""
+    import mitsuba as mi
+
+    for one in taken:
+        if isinstance(one.value, mi.Mesh):
+            check_faces(one.value, str(one))
+
+
+def _state_of(path: str, plugin: str, given: dict[str, Any]) -> tuple[Any, ...] | None:
+    """What tells a file, as it is now, from others; None where it is not there."""
+    try:
+        found = os.stat(path)
+    except (OSError, ValueError):
+        return None
+    rest = tuple(sorted((key, str(value)) for key, value in given.items() if key != "filename"))
+    return (path, plugin, rest, found.st_mtime_ns, found.st_size, found.st_ino)
