@@ -82,8 +82,8 @@ def test_arrays_of_sensors():
 
 @together(
     "options",
-    [{"spp": "12"}, {"spp": 12}, {"spp": [1.5]}, {"spp": [2**32]}, {"repeats": 1.5}, {"reference_spp": "x"}, {"spp": []},
-     {"seed": 1.5}, {"seed": "x"}],
+    [{"spp": "12"}, {"spp": 12}, {"spp": [1.5]}, {"spp": [2**32]}, {"repeats": 1.5}, {"reference_spp": "x"},
+     {"spp": []}, {"seed": 1.5}, {"seed": "x"}],
 )
 def test_costs_of_accuracy(options):
     renderer = tt.TransientRenderer(make_room(), spp=1)
@@ -93,7 +93,7 @@ def test_costs_of_accuracy(options):
 
 def test_vmap_over_nothing():
     renderer = tt.TransientRenderer(make_room(), [COLOUR], spp=1)
-    with pytest.raises(ShapeError, match="at least one entry under torch.func.vmap, got none"):
+    with pytest.raises(ShapeError, match=r"at least one entry under torch\.func\.vmap, got none"):
         torch.func.vmap(lambda x: renderer({COLOUR: x}, seed=0).transient)(torch.zeros(0, 3))
 
 

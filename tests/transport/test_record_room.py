@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import threading
+from pathlib import Path
 
 import pytest
 import torch
@@ -12,6 +16,7 @@ from torchtransient.errors import GradientError
 from torchtransient.plugins.transport.sinks import record_room
 from torchtransient.testing.small_room import COLOUR, VARIANT, WALL_POSE, make_room, pose
 
+TESTS = Path(__file__).parents[1]
 ADJOINT = torch.linspace(0, 1, 24)[None, :, None, None]
 
 
@@ -97,20 +102,16 @@ def test_stacks_of_python_threads_are_asked_for():
     assert 2**10 < found[0] <= 2**19 < 16 * record_room.room_of_path()
 
 
-def test_paths_of_ten_thousand_bounces():
-    """A furnace of reflectance 0.999 and emission 1: the radiance is 1 / (1 - 0.999), its derivative the square."""
-    light = {"type": "area", "radiance": {"type": "uniform", "value": 1.0}}
-    grey = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.999}}
-    film = {"type": "transient_hdr_film", "width": 1, "height": 1, "temporal_bins": 1, "bin_width_opl": 1e6}
-    furnace = {
-        "type": "scene",
-        "integrator": {"type": "transient_path", "max_depth": 20_000, "rr_depth": 10**6},
-        "sensor": {"type": "perspective", "film": film},
-        "ball": {"type": "sphere", "flip_normals": True, "emitter": light, "bsdf": grey},
-    }
-    key = "ball.bsdf.reflectance.value"
-    renderer = tt.TransientRenderer(tt.load(furnace, variant=VARIANT), [key], spp=4)
-    out = renderer(seed=0)
-    out.steady.mean().backward()
-    assert out.steady.mean().item() == pytest.approx(1e3, rel=1e-2)
-    assert renderer.values[key].grad.sum().item() == pytest.approx(1e6, rel=2e-2)
+@pytest.mark.parametrize("variant", [VARIANT, pytest.param("llvm_ad_mono", marks=pytest.mark.slow)])
+def test_paths_of_twenty_thousand_bounces(variant):
+    """Of reflectance 0.999 and emission 1 the radiance is 1 / (1 - 0.999), its derivative the square. In a process of
+    its own, which died.
+    """
+    run = subprocess.run(
+        [sys.executable, "-m", "support.deep_paths", variant], cwd=TESTS, capture_output=True, text=True, timeout=300,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(TESTS.parent), str(TESTS)])},
+    )  # fmt: skip
+    assert run.returncode == 0, f"{run.returncode}: {run.stderr[-2000:]}"
+    radiance, slope = (float(number) for number in run.stdout.split()[-2:])
+    assert radiance == pytest.approx(1e3, rel=1e-2)
+    assert slope == pytest.approx(1e6, rel=2e-2)

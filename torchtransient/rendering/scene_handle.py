@@ -244,7 +244,7 @@ def load(
     sample, in a process of its own first (some seconds; 120 s at most), so that a damaged file, or one that is made to,
     ends that process and not this one. What is found is a ``SceneError``, which names the signal. Files that change
     afterwards, gradients, and other samples than those are not covered, and the process is no sandbox: what the scene
-    reads it may read. ``docs/scenes_of_strangers.md`` says what is checked in any case.
+    reads it may read. See ``docs/stability.md``.
 
     Raises ``SceneError`` for a missing or malformed file and for entries that cannot be described; faults inside the
     scene (unknown plugins, unknown or unused parameters) are reported when the scene is built, with file and line
