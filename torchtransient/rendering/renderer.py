@@ -305,7 +305,7 @@ class TransientRenderer(CopiesParametrized):
         leading batch dimension B more; values without it are used for every entry. Any real dtype is taken and computed
         in float32.
 
-        ``seed``: same seed, same tensor; seeds count modulo 2^32, and say so. None draws one from torch's generator (``torch.manual_seed``). In a batch
+        ``seed``: same seed, same tensor. None draws one from torch's generator (``torch.manual_seed``). In a batch
         every entry has its own seed, derived from this one, the first entry the seed itself; or give one seed per
         entry. ``spp``: instead of the renderer's. ``progress``: a bar.
 
