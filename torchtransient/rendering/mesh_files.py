@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from torchtransient.errors import SceneError
+from torchtransient.rendering.ply_faces import smallest_vertex
 
 # Plugins that hand on what a file says; Mitsuba checks the faces of an 'obj' itself.
 _UNCHECKED = ("ply", "serialized")
@@ -19,8 +20,7 @@ _MOST_REMEMBERED = 4096
 
 def check_mesh_files(state: Any) -> None:
     """Raise ``SceneError`` where a face of a mesh file is made of vertices that the file does not have. Must be called
-    where Mitsuba finds the files, before the scene is built; what cannot be read is left to Mitsuba to say. Not found:
-    negative numbers of PLY files, which Mitsuba reads as 0.
+    where Mitsuba finds the files, before the scene is built; what cannot be read is left to Mitsuba to say.
     """
     import mitsuba as mi
 
@@ -36,7 +36,10 @@ def check_mesh_files(state: Any) -> None:
             mesh = mi.load_dict({"type": node.props.plugin_name(), "face_normals": True, **given})
         except (RuntimeError, TypeError, ValueError):
             continue
-        check_faces(mesh, f"{given['filename']} ({node.props.plugin_name()})")
+        name = f"{given['filename']} ({node.props.plugin_name()})"
+        check_faces(mesh, name)
+        if node.props.plugin_name() == "ply" and (least := _smallest(key[0])) < 0:
+            raise SceneError(_wrong(name, mesh.vertex_count(), least))
         _right[key] = None
         while len(_right) > _MOST_REMEMBERED:
             del _right[next(iter(_right))]
@@ -49,10 +52,21 @@ def check_faces(mesh: Any, name: str) -> None:
     count = mesh.vertex_count()
     faces = np.array(mi.traverse(mesh)["faces"])
     if faces.size and int(faces.max()) >= count:
-        raise SceneError(
-            f"{name}: expected faces of vertices from 0 to {count - 1}, got the number {int(faces.max())}. Mend the "
-            "file, or write it anew with the program that it comes from."
-        )
+        raise SceneError(_wrong(name, count, int(faces.max())))
+
+
+def _smallest(path: str) -> int:
+    try:
+        return smallest_vertex(path)
+    except (ValueError, LookupError):  # a form of header that Mitsuba reads and this library does not
+        return 0
+
+
+def _wrong(name: str, count: int, number: int) -> str:
+    return (
+        f"{name}: expected faces of vertices from 0 to {count - 1}, got the number {number}. Mend the file, or write "
+        "it anew with the program that it comes from."
+    )
 
 
 def check_taken_meshes(taken: Any) -> None:
