@@ -140,7 +140,7 @@ def checked_counts(spp: Sequence[int], repeats: int, reference_spp: int | None) 
     found = [as_whole(n) for n in spp] if listed and not isinstance(spp, (str, bytes)) else []
     counts = [n for n in found if n is not None and 1 <= n < 2**32]
     if not counts or len(set(counts)) != len(found):
-        raise UnitError(f"spp: expected different sample counts from 1 to 2^32 - 1, in a list, got {shown(spp)}")
+        raise UnitError(f"spp: expected different sample counts of at least 1, below 2^32, got {shown(spp)}")
     for name, value in (("repeats", repeats), ("reference_spp", reference_spp)):
         if as_whole(value) is None and (value is not None or name == "repeats"):
             raise UnitError(f"{name}: expected a whole number, got {shown(value)}")

@@ -171,6 +171,7 @@ def _as_it_is(description: ReadyScene, options: BuildOptions) -> BuiltScene:
 
     scene = description.scene
     check_taken(scene, description.taken, options)
+    check_taken_meshes(description.taken)
     params = mi.traverse(scene)
     check_scene(scene, params)
     name = "" if scene.integrator() is None else class_of(scene.integrator())

@@ -9,6 +9,7 @@ import numpy as np
 
 from torchtransient.errors import SceneError
 from torchtransient.rendering.ply_faces import smallest_vertex
+from torchtransient.rendering.taken import ReadyScene
 
 # Plugins that hand on what a file says; Mitsuba checks the faces of an 'obj' itself.
 _UNCHECKED = ("ply", "serialized")
@@ -49,8 +50,10 @@ def check_faces(mesh: Any, name: str) -> None:
     """Raise ``SceneError`` where a mesh has faces of vertices that are not there."""
     import mitsuba as mi
 
-    count = mesh.vertex_count()
-    faces = np.array(mi.traverse(mesh)["faces"])
+    params = mi.traverse(mesh)
+    if "faces" not in params:  # a rectangle of Mitsuba is a mesh by its class
+        return
+    count, faces = mesh.vertex_count(), np.array(params["faces"])
     if faces.size and int(faces.max()) >= count:
         raise SceneError(_wrong(name, count, int(faces.max())))
 
@@ -70,12 +73,14 @@ def _wrong(name: str, count: int, number: int) -> str:
 
 
 def check_taken_meshes(taken: Any) -> None:
-    """The same of the meshes that were taken as they are."""
+    """The same of the meshes that were taken as they are, and of those of scenes that were."""
     import mitsuba as mi
 
     for one in taken:
-        if isinstance(one.value, mi.Mesh):
-            check_faces(one.value, str(one))
+        held = one.scene.shapes() if isinstance(one, ReadyScene) else [one.value]
+        for shape in held:
+            if isinstance(shape, mi.Mesh):
+                check_faces(shape, f"the mesh {shape.id()!r}")
 
 
 def _state_of(path: str, plugin: str, given: dict[str, Any]) -> tuple[Any, ...] | None:
