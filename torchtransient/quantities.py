@@ -87,6 +87,14 @@ def count(name: str, value: Any, least: int = 1, error: type[TorchTransientError
     return number
 
 
+def as_whole(value: Any) -> int | None:
+    """``value`` as an int, of any library that has whole numbers; None for what is none: 2.0, texts, truth values."""
+    try:
+        return None if _is_truth(value) else operator.index(value)
+    except TypeError:
+        return None
+
+
 def flag(name: str, value: Any) -> bool:
     """``value`` as a truth value. Raises ArgumentError for others: a text that says False would count as true."""
     if not _is_truth(value) or getattr(value, "ndim", None):

@@ -9,9 +9,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchtransient.accuracy.measure import Candidate, Estimates, Task, measure
+from torchtransient.accuracy.measure import Candidate, Estimates, Task, checked_counts, measure
 from torchtransient.accuracy.report import AccuracyReport, Choice
-from torchtransient.errors import ArgumentError, SceneError, ShapeError
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
+from torchtransient.quantities import as_whole, shown
 from torchtransient.rendering.films.choices import of_output
 from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.output import RenderOutput
@@ -86,6 +87,9 @@ def cost_of_accuracy(
             f"cost_of_accuracy: expected a tt.TransientRenderer, got {type(renderer).__name__}. Make one of a scene: "
             "tt.TransientRenderer(scene, parameters=[...])."
         )
+    counts = checked_counts(spp, repeats, reference_spp)
+    if (first := as_whole(seed)) is None:
+        raise UnitError(f"cost_of_accuracy: seed: expected a whole number, got {shown(seed)}.")
     missing = [key for key in gradients if key not in renderer.values]
     if missing:
         raise SceneError(
@@ -111,7 +115,7 @@ def cost_of_accuracy(
     settings = {
         "scene": repr(renderer.scene),
         "variant": renderer.scene.variant,
-        "spp": list(spp),
+        "spp": counts,
         "gradients": list(gradients),
         "loss": getattr(loss, "__name__", type(loss).__name__),
         "measured": repr(renderer.film.argument_value()),
@@ -122,10 +126,10 @@ def cost_of_accuracy(
     with active_variant(renderer.scene.variant):
         return measure(
             candidates,
-            spp,
+            counts,
             reference_spp=reference_spp,
             repeats=repeats,
-            seed=seed,
+            seed=first,
             progress=progress,
             settings=settings,
         )

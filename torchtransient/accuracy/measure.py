@@ -14,6 +14,7 @@ from tqdm import tqdm
 from torchtransient.accuracy.errors_of_estimates import ErrorTally, Reference
 from torchtransient.accuracy.report import AccuracyReport, Choice, CostPoint
 from torchtransient.errors import UnitError
+from torchtransient.quantities import as_whole, shown
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ def measure(
     itself: with its own reference of `reference_spp` samples (two independent halves), or, without one, in pairs of
     independent runs; then `repeats` must be even. Raises UnitError for values out of range.
     """
-    counts = _checked(spp, repeats, reference_spp)
+    counts = checked_counts(spp, repeats, reference_spp)
     total = len(candidates) * sum(counts) * (repeats + 1) + len(candidates) * (reference_spp or 0)
     points: list[CostPoint] = []
     with tqdm(total=total, unit="spp", disable=not progress, desc="cost of accuracy") as bar:
@@ -133,10 +134,16 @@ def _references(
     return references
 
 
-def _checked(spp: Sequence[int], repeats: int, reference_spp: int | None) -> list[int]:
-    counts = [int(n) for n in spp]
-    if not counts or min(counts) < 1 or len(set(counts)) != len(counts):
-        raise UnitError(f"spp: expected different sample counts of at least 1, got {list(spp)}")
+def checked_counts(spp: Sequence[int], repeats: int, reference_spp: int | None) -> list[int]:
+    """The sample counts of a measurement, in order. Raises UnitError."""
+    listed = isinstance(spp, Sequence) or getattr(spp, "ndim", None) == 1
+    found = [as_whole(n) for n in spp] if listed and not isinstance(spp, (str, bytes)) else []
+    counts = [n for n in found if n is not None and 1 <= n < 2**32]
+    if not counts or len(set(counts)) != len(found):
+        raise UnitError(f"spp: expected different sample counts of at least 1, below 2^32, got {shown(spp)}")
+    for name, value in (("repeats", repeats), ("reference_spp", reference_spp)):
+        if as_whole(value) is None and (value is not None or name == "repeats"):
+            raise UnitError(f"{name}: expected a whole number, got {shown(value)}")
     if repeats < 2 or (reference_spp is None and repeats % 2):
         raise UnitError(
             "repeats: expected at least 2, and an even number without a reference (runs are compared in pairs), "
@@ -144,7 +151,7 @@ def _checked(spp: Sequence[int], repeats: int, reference_spp: int | None) -> lis
         )
     if reference_spp is not None and reference_spp < 4 * max(counts):
         raise UnitError(
-            f"reference_spp: expected at least four times the largest spp ({4 * max(counts)}), got {reference_spp}; "
-            "use None to compare independent runs instead"
+            f"reference_spp: expected at least four times the largest spp ({4 * max(counts)}), got "
+            f"{shown(reference_spp)}; use None to compare independent runs instead"
         )
     return sorted(counts)

@@ -72,4 +72,5 @@ def load_scene(scene: Path, variant: str | None, params: Sequence[str]) -> Scene
     """The scene of a command line."""
     import torchtransient as tt
 
-    return tt.load(scene, variant=variant, **assignments(params, "--param"))
+    values: dict[str, Any] = dict(assignments(params, "--param"))
+    return tt.load(scene, variant=variant, **values)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -10,19 +9,16 @@ import torch
 from torch import nn
 
 from torchtransient.capture import Scan
-from torchtransient.errors import ArgumentError, SceneError, UnitError
-from torchtransient.quantities import shown
+from torchtransient.errors import ArgumentError, SceneError
+from torchtransient.quantities import as_whole, shown
 from torchtransient.rendering.arguments import samples
 from torchtransient.rendering.seeds import SEED_RANGE
 from torchtransient.sensing import Device
 
-# What samplers count with has 32 bits.
-MOST_SAMPLES = 2**32 - 1
-
 
 def checked_count(who: str, name: str, value: Any) -> int:
     """A whole number of at least 1. Raises ArgumentError."""
-    number = _whole(value)
+    number = as_whole(value)
     if number is None or number < 1:
         raise ArgumentError(f"{who}: {name}: expected a whole number of at least 1, got {shown(value)}.")
     return number
@@ -30,14 +26,12 @@ def checked_count(who: str, name: str, value: Any) -> int:
 
 def checked_samples(who: str, value: Any) -> int | None:
     """Samples of a sensor point, or None. Raises UnitError."""
-    if samples("spp", value) is not None and value > MOST_SAMPLES:
-        raise UnitError(f"{who}: spp: expected at most {MOST_SAMPLES} samples, got {value}. Add up several captures.")
-    return None if value is None else int(value)
+    return samples(f"{who}: spp", value)
 
 
 def checked_seed(who: str, value: Any) -> int:
     """A seed. Those that samplers cannot tell from others are refused: they have 32 bits. Raises ArgumentError."""
-    number = _whole(value)
+    number = as_whole(value)
     if number is None or not 0 <= number < SEED_RANGE:
         raise ArgumentError(
             f"{who}: seed: expected a whole number from 0 to {SEED_RANGE - 1}, got {shown(value)}. Others would count "
@@ -85,10 +79,3 @@ def keys_and_values(who: str, name: str, given: Any) -> dict[str, Any]:
         raise SceneError(f"{who}: {name}: expected keys of scene.parameters(), or values by key, got {shown(given)}.")
     return dict(given) if isinstance(given, Mapping) else dict.fromkeys(keys)
 
-
-def _whole(value: Any) -> int | None:
-    """A whole number of any library; None for what is none. True is not one."""
-    try:
-        return None if "bool" in str(getattr(value, "dtype", type(value))) else operator.index(value)
-    except TypeError:
-        return None

@@ -18,7 +18,7 @@ from torchtransient.rendering.scene_handle import load
 _WALL_TO_WALL, _AROUND_A_CORNER = 2, 3
 
 
-def read_setup(path: str | Path, **xml_parameters: str) -> dict[str, Any]:
+def read_setup(path: str | Path, **xml_parameters: Any) -> dict[str, Any]:
     """The arguments of ``simulate`` that a file stands for: ``simulate(**read_setup("capture.yaml"))``.
 
     ``path``: a YAML file of this library (:mod:`.description`), a scene file of y-tal's renderer or its folder

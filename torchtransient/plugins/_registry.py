@@ -116,6 +116,7 @@ class _State:
     owner: dict[tuple[str, str], str] = field(default_factory=dict)
     loading: str | None = None  # the module that is being executed
     listeners: list[list[BaseException]] = field(default_factory=list)  # take what constructors raise
+    interrupted: bool = False  # a change of the variant, before all who wait for one had been told
 
 
 _state = _State()
@@ -228,6 +229,8 @@ def sync() -> str | None:
         variant = active_variant()
         if variant is None:
             return None
+        if _state.interrupted:
+            _tell_all(variant)
         if variant.startswith("llvm_"):
             ensure_llvm()  # a bad LLVM would end the process at the first kernel
         warn_of_untested()
@@ -283,6 +286,17 @@ def _on_variant_change(_old: str | None, new: str | None) -> None:
             # Under "-W error" the warning itself raises; sync() reports the same problem at the next library call.
             with contextlib.suppress(RuntimeWarning):
                 warnings.warn(f"torchtransient: {error}", RuntimeWarning, stacklevel=2)
+        except BaseException as error:
+            # An interrupt: the callbacks of others, Mitsuba's own plugins among them, are not called any more.
+            _state.interrupted = not isinstance(error, Exception)
+            raise
+
+
+def _tell_all(variant: str) -> None:
+    """Change the variant to and fro, so that all callbacks are called that an interrupt has cut off."""
+    _state.interrupted = False
+    mi.set_variant(next(name for name in mi.variants() if name != variant and name.startswith("scalar")))
+    mi.set_variant(variant)
 
 
 def _load_all(variant: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -12,9 +11,12 @@ from torch import nn
 from torch.nn.utils import parametrize
 
 from torchtransient.errors import ArgumentError, DeviceError, ShapeError, UnitError, UnknownKeyError
+from torchtransient.quantities import as_whole, shown
 from torchtransient.rendering.films.choice import FilmChoice
 from torchtransient.rendering.films.choices import chosen
 
+# What samplers count with has 32 bits, and a depth of all ones stands for no limit.
+MOST_SAMPLES, MOST_DEPTH = 2**32 - 1, 2**32 - 2
 TEMPORAL_FILTERS = ("auto", "box", "tent", "gaussian")
 
 
@@ -22,12 +24,26 @@ def samples(name: str, value: int | None) -> int | None:
     """A number of samples per pixel, or None. Raises ``UnitError``."""
     if value is None:
         return None
-    try:
-        number = 0 if isinstance(value, bool) or getattr(value, "dtype", None) == torch.bool else operator.index(value)
-    except TypeError:
-        number = 0
-    if number < 1:
-        raise UnitError(f"{name}: expected a positive integer or None, got {value!r}.")
+    number = as_whole(value)
+    if number is None or number < 1:
+        raise UnitError(f"{name}: expected a positive integer or None, got {shown(value)}.")
+    if number > MOST_SAMPLES:
+        raise UnitError(
+            f"{name}: expected at most {MOST_SAMPLES} samples, got {shown(value)}. Average several renders of "
+            "different seeds."
+        )
+    return number
+
+
+def checked_depth(value: Any) -> int | None:
+    """A ``max_depth``, or None. Raises ``ArgumentError``."""
+    if value is None:
+        return None
+    number = as_whole(value)
+    if number is None or not -1 <= number <= MOST_DEPTH:
+        raise ArgumentError(
+            f"max_depth: expected an integer of at least -1 (no limit) and at most 2^32 - 2, got {shown(value)}."
+        )
     return number
 
 
@@ -40,21 +56,29 @@ def checked_filter(name: str) -> str:
 
 def checked_grad_seed(value: int | str | None) -> int | str | None:
     """None, "same" or an integer. Raises ``ArgumentError``."""
-    if value is None or value == "same" or (isinstance(value, int) and not isinstance(value, bool)):
+    if value is None or (isinstance(value, str) and value == "same"):
         return value
-    raise ArgumentError(f"grad_seed: expected None, 'same' or an integer, got {value!r}.")
+    number = as_whole(value)
+    if number is None:
+        raise ArgumentError(f"grad_seed: expected None, 'same' or an integer, got {shown(value)}.")
+    return number
 
 
 def sensor_list(sensors: int | Sequence[int] | str, count: int) -> tuple[tuple[int, ...], bool]:
     """The sensors to render out of ``count``, and whether they get a dimension of their own. Raises
     ``ArgumentError``."""
-    if sensors == "all":
+    if isinstance(sensors, str) and sensors == "all":
         return tuple(range(count)), True
-    if isinstance(sensors, int) and not isinstance(sensors, bool):
-        return (sensors,), False
-    if isinstance(sensors, str) or not isinstance(sensors, Sequence) or not sensors:
-        raise ArgumentError(f"sensors: expected an index, a list of indices or 'all', got {sensors!r}.")
-    return tuple(int(sensor) for sensor in sensors), True
+    array = getattr(sensors, "ndim", None) == 1
+    if not array and (number := as_whole(sensors)) is not None:
+        return (number,), False
+    given: Any = sensors
+    listed = array or (isinstance(given, Sequence) and not isinstance(given, (str, bytes)))
+    indices = [as_whole(sensor) for sensor in given] if listed else []
+    whole = tuple(index for index in indices if index is not None)
+    if not whole or len(whole) < len(indices):
+        raise ArgumentError(f"sensors: expected an index, a list of indices or 'all', got {shown(sensors)}.")
+    return whole, True
 
 
 def mangle(keys: Sequence[str]) -> dict[str, str]:

@@ -31,6 +31,7 @@ from torchtransient.plugins.physical_ranges import described_ranges
 from torchtransient.rendering.build_options import BuildOptions
 from torchtransient.rendering.description import Description
 from torchtransient.rendering.films.choices import all_films, of_plugin, plugins_in_words
+from torchtransient.rendering.mesh_files import check_mesh_files, check_taken_meshes
 from torchtransient.rendering.mitsuba_words import one_line
 from torchtransient.rendering.node_checks import check_nodes
 from torchtransient.rendering.node_names import (
@@ -126,6 +127,8 @@ def build(description: Description, variant: str, options: BuildOptions) -> Buil
             state = description.parse(config)
             _check_root(state)
             check_nodes(state)
+            check_mesh_files(state)
+            check_taken_meshes(description.taken)
             name_nodes(state)
             if not options.merge:
                 take_merged_apart(state)
@@ -168,6 +171,7 @@ def _as_it_is(description: ReadyScene, options: BuildOptions) -> BuiltScene:
 
     scene = description.scene
     check_taken(scene, description.taken, options)
+    check_taken_meshes(description.taken)
     params = mi.traverse(scene)
     check_scene(scene, params)
     name = "" if scene.integrator() is None else class_of(scene.integrator())

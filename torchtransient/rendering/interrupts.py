@@ -6,6 +6,8 @@ comes out as a ``RuntimeError`` that names it, and would be taken for an error o
 
 from __future__ import annotations
 
+import signal
+import threading
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -30,6 +32,25 @@ def interrupts_pass() -> Iterator[None]:
         # The frame that raises is in the traceback of what it raises: together they would stay until they are
         # collected, and the scene with them.
         del interrupt
+
+
+@contextmanager
+def interrupts_wait() -> Iterator[None]:
+    """Let an interrupt from the keyboard wait until what is inside is done: for changes of the process that would be
+    left half made. Other threads than the main one are never interrupted.
+    """
+    handler = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(handler):
+        yield
+        return
+    came: list[tuple[int, Any]] = []
+    signal.signal(signal.SIGINT, lambda number, frame: came.append((number, frame)))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
+        if came:
+            handler(*came[0])
 
 
 def clear_frames(error: BaseException) -> None:

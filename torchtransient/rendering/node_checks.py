@@ -69,7 +69,8 @@ def check_nesting(state: Any) -> None:
     """
     levels: dict[int, int] = {}
     sizes: dict[int, int] = {}
-    below = {index: [child for _, child in children(state, node)] for index, node in enumerate(state.nodes)}
+    by_id = state.id_to_index
+    below = {index: [child for _, child in children(state, node, by_id)] for index, node in enumerate(state.nodes)}
     entered: set[int] = set()
     for start in below:
         waiting = [start]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from torchtransient.plugins import kind_of
@@ -17,25 +17,29 @@ _PYTHON_INTEGRATORS = (
 )  # fmt: skip
 
 
-def children(state: Any, node: Any) -> list[tuple[str, int]]:
-    """(property, node index) for every child object of a node, references by id included."""
+def children(state: Any, node: Any, by_id: Mapping[str, int] | None = None) -> list[tuple[str, int]]:
+    """(property, node index) for every child object of a node, references by id included. ``by_id``: the state's
+    ``id_to_index``, which is a copy of all of it at each look.
+    """
     import mitsuba as mi
 
-    result, by_id = [], state.id_to_index
+    result = []
     for key, value in node.props.items():
         if isinstance(value, mi.Properties.ResolvedReference):
             result.append((key, value.index()))
-        elif isinstance(value, mi.Properties.Reference) and value.id() in by_id:
-            result.append((key, by_id[value.id()]))
+        elif isinstance(value, mi.Properties.Reference):
+            by_id = state.id_to_index if by_id is None else by_id
+            if value.id() in by_id:
+                result.append((key, by_id[value.id()]))
     return result
 
 
 def descendants(state: Any, node: Any) -> list[Any]:
     """The nodes below a node, each once."""
     found: dict[int, Any] = {}
-    waiting = [node]
+    waiting, by_id = [node], state.id_to_index
     while waiting:
-        for _, index in children(state, waiting.pop()):
+        for _, index in children(state, waiting.pop(), by_id):
             if index not in found:
                 found[index] = state.nodes[index]
                 waiting.append(found[index])
@@ -45,14 +49,14 @@ def descendants(state: Any, node: Any) -> list[Any]:
 def check_finite(state: Any) -> None:
     """Raise ``SceneError`` with the keys of all numbers of a parsed scene that are NaN or infinite."""
     bad: dict[str, str] = {}
-    waiting, seen = [(state.root, "")], set()
+    waiting, seen, by_id = [(state.root, "")], set(), state.id_to_index
     while waiting:
         node, path = waiting.pop()
         for key, value in node.props.items():
             array = numbers_of(value)
             if array is not None:
                 count_bad(bad, f"{path}{key}", array)
-        for key, index in children(state, node):
+        for key, index in children(state, node, by_id):
             if index not in seen:
                 seen.add(index)
                 waiting.append((state.nodes[index], f"{path}{key}."))
@@ -109,12 +113,12 @@ def roots(state: Any) -> list[int]:
 def reachable(state: Any, starts: list[int]) -> list[int]:
     """Nodes that can be met from some nodes, those included, through nested plugins and references."""
     seen: dict[int, None] = {}
-    waiting = list(reversed(starts))
+    waiting, by_id = list(reversed(starts)), state.id_to_index
     while waiting:
         index = waiting.pop()
         if index not in seen:
             seen[index] = None
-            waiting.extend(child for _, child in reversed(children(state, state.nodes[index])))
+            waiting.extend(child for _, child in reversed(children(state, state.nodes[index], by_id)))
     return list(seen)
 
 

@@ -16,9 +16,9 @@ from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import ArgumentError, SceneError, TorchTransientError, UnitError
 from torchtransient.gates import Gate
 from torchtransient.pulses import Pulse
-from torchtransient.quantities import Numbers
+from torchtransient.quantities import Numbers, as_whole, count, shown
 from torchtransient.rendering import plan_choices as choices
-from torchtransient.rendering.arguments import film_asked_for
+from torchtransient.rendering.arguments import checked_depth, film_asked_for
 from torchtransient.rendering.effects import Effects
 from torchtransient.rendering.films.choice import FilmChoice
 from torchtransient.rendering.films.choices import all_films, planned
@@ -166,6 +166,12 @@ def plan(
     for name, share in (("tail", tail), ("missed", missed)):
         if not 0 < share < 1:
             raise UnitError(f"tt.plan: {name} is a share of the light between 0 and 1, got {share!r}.")
+    if not isinstance(max_depth, str):
+        max_depth = checked_depth(max_depth)
+    num_bins = None if num_bins is None else count("tt.plan: num_bins", num_bins, 1, ArgumentError)
+    if (index := as_whole(sensor)) is None:
+        raise ArgumentError(f"tt.plan: sensor: expected the index of a sensor, got {shown(sensor)}.")
+    sensor = index
     loaded = load(scene)
     asked = choices.checked_outputs(outputs)
     inventory = inventory_of(loaded, sensor)

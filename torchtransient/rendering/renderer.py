@@ -22,6 +22,7 @@ from torchtransient.rendering import engine
 from torchtransient.rendering.arguments import (
     Values,
     as_float,
+    checked_depth,
     checked_filter,
     checked_grad_seed,
     film_asked_for,
@@ -160,9 +161,7 @@ class TransientRenderer(CopiesParametrized):
     # --------------------------------------------------------------------------------------------------- set-up
 
     def _build_options(self, max_depth: int | None, sampler: str | None, changes: dict[str, Any]) -> BuildOptions:
-        if max_depth is not None and (isinstance(max_depth, bool) or not isinstance(max_depth, int) or max_depth < -1):
-            raise ArgumentError(f"max_depth: expected an integer of at least -1, got {max_depth!r}.")
-        options = BuildOptions(max_depth=max_depth, transient=True, sampler=sampler, **changes)
+        options = BuildOptions(max_depth=checked_depth(max_depth), transient=True, sampler=sampler, **changes)
         return self.scene.options_for(self._keys, options)
 
     def _parameter_infos(self) -> dict[str, ParameterInfo]:
@@ -288,7 +287,7 @@ class TransientRenderer(CopiesParametrized):
         """
         with active_variant(self.scene.variant):
             sampler = self.scene.built(self._options).scene.sensors()[self._sensors[0]].sampler().clone()
-            sampler.set_sample_count(spp)
+            sampler.set_sample_count(samples("spp", spp) or sampler.sample_count())
             return int(sampler.sample_count())
 
     @opaque

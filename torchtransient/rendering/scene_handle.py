@@ -11,11 +11,13 @@ from typing import Any
 
 from torchtransient.errors import ArgumentError, GradientError, SceneError
 from torchtransient.plugins.drjit_pool import engine_lock
+from torchtransient.quantities import flag
 from torchtransient.rendering.build import BuiltScene, build
 from torchtransient.rendering.build_options import BuildOptions
 from torchtransient.rendering.description import Description, describe_dict, describe_xml, same_description
 from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.parameters import ParameterTable, SlotTable, parameter_table, unknown_key
+from torchtransient.rendering.probe import probe
 from torchtransient.rendering.ready_scenes import described_for_time
 from torchtransient.rendering.recordings import Recordings
 from torchtransient.rendering.saving.save import save_scene
@@ -217,6 +219,8 @@ class Scene:
 def load(
     scene: str | os.PathLike[str] | Mapping[str, Any] | Scene | Any,
     variant: str | None = None,
+    *,
+    trusted: bool = True,
     **xml_parameters: Any,
 ) -> Scene:
     """Describe a scene: the path of a Mitsuba XML file, a scene dictionary, another :class:`Scene` or a ``mi.Scene``.
@@ -236,12 +240,25 @@ def load(
     so that they take a time axis. Scenes written for mitransient 1.x load unchanged. Children of an XML scene without
     an id are named after their kind: ``sensor``, ``shape_0``, ``shape_1``.
 
+    ``trusted``: False for scenes of strangers: they are built, and a few pixels of each sensor are rendered with one
+    sample, in a process of its own first (some seconds; 120 s at most), so that a damaged file, or one that is made to,
+    ends that process and not this one. What is found is a ``SceneError``, which names the signal. Files that change
+    afterwards, gradients, and other samples than those are not covered, and the process is no sandbox: what the scene
+    reads it may read. See ``docs/stability.md``.
+
     Raises ``SceneError`` for a missing or malformed file and for entries that cannot be described; faults inside the
     scene (unknown plugins, unknown or unused parameters) are reported when the scene is built, with file and line
     where Mitsuba knows them. Raises ``VariantError`` for a variant that cannot be used.
     """
     if variant is not None:
         resolve_variant(variant)
+    loaded = _described(scene, variant, xml_parameters)
+    if not flag("tt.load: trusted", trusted):
+        probe(loaded)
+    return loaded
+
+
+def _described(scene: Any, variant: str | None, xml_parameters: Mapping[str, Any]) -> Scene:
     if isinstance(scene, (str, os.PathLike)):
         return Scene(describe_xml(scene, xml_parameters), variant)
     if xml_parameters:

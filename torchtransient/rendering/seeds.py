@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import operator
-from collections.abc import Sequence
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import ShapeError, TorchTransientWarning, UnitError
+from torchtransient.quantities import as_whole, shown
+from torchtransient.rendering.physics import level_of_user
 
 SEED_RANGE = 2**32
 
@@ -39,6 +41,7 @@ class Seeding:
         """One item for each entry and sensor. ``seed``: a whole number, or one for each entry."""
         per_entry = len(self.sensors)
         if (number := whole_number(seed)) is not None:
+            _say_what_counts([number])
             seeds = [mix_seed(number, n) for n in range(self.entries * per_entry)]
         else:
             given = [_each_number(one) for one in seed]
@@ -47,6 +50,7 @@ class Seeding:
                     f"seed: expected one integer, or one for each of {self.entries} batch entries, got {len(given)}."
                 )
             _check_apart(given)
+            _say_what_counts(given)
             seeds = [mix_seed(s, n) for s in given for n in range(per_entry)]
         return tuple(
             Item(n // per_entry, self.sensors[n % per_entry], value, self._of_gradient(value, n))
@@ -59,6 +63,18 @@ class Seeding:
         if isinstance(self.grad_seed, int):
             return mix_seed(self.grad_seed, number)
         return mix_seed(seed, 0x5EED)
+
+
+def _say_what_counts(seeds: list[int]) -> None:
+    """Warn of seeds that count as others."""
+    beyond = [seed for seed in seeds if not 0 <= seed < SEED_RANGE]
+    if beyond:
+        warnings.warn(
+            f"seed: expected whole numbers from 0 to 2^32 - 1, got {shown(beyond[0])}, which counts as "
+            f"{beyond[0] % SEED_RANGE}: seeds count modulo 2^32.",
+            TorchTransientWarning,
+            stacklevel=level_of_user(),
+        )
 
 
 def _check_apart(seeds: list[int]) -> None:
@@ -87,7 +103,7 @@ def drawn(seed: int | Sequence[int] | torch.Tensor | None) -> tuple[Any, torch.T
                 "seed=..., which every entry uses, or say what is meant: vmap(..., randomness='same') draws one seed "
                 "for all entries, randomness='different' one for each."
             ) from error
-    if not isinstance(seed, torch.Tensor) or seed.ndim != 0 or seed.is_floating_point():
+    if not isinstance(seed, torch.Tensor) or seed.ndim != 0 or seed.is_floating_point() or seed.dtype == torch.bool:
         return seed, None
     try:
         return int(seed), None
@@ -98,24 +114,23 @@ def drawn(seed: int | Sequence[int] | torch.Tensor | None) -> tuple[Any, torch.T
 
 def whole_number(seed: Any) -> int | None:
     """A seed as one number; None for a sequence of them. Raises ``UnitError`` for what is neither."""
+    number = as_whole(seed)
+    if number is not None:
+        return number
     try:
-        return operator.index(seed)
-    except TypeError:
-        pass
-    try:
-        several = len(seed) >= 0 and not isinstance(seed, str)
+        several = len(seed) >= 0 and not isinstance(seed, (str, bytes, Mapping))
     except TypeError:
         several = False
     if not several:
-        raise UnitError(f"seed: expected a whole number, or one for each batch entry, got {seed!r}.")
+        raise UnitError(f"seed: expected a whole number, or one for each batch entry, got {shown(seed)}.")
     return None
 
 
 def _each_number(seed: Any) -> int:
-    try:
-        return operator.index(seed)
-    except TypeError as error:
-        raise UnitError(f"seed: expected whole numbers, one for each batch entry, got {seed!r} among them.") from error
+    number = as_whole(seed)
+    if number is None:
+        raise UnitError(f"seed: expected whole numbers, one for each batch entry, got {shown(seed)} among them.")
+    return number
 
 
 def mix_seed(seed: int, number: int) -> int:

@@ -15,7 +15,7 @@ from torchtransient import plugins
 from torchtransient._llvm import ensure_llvm
 from torchtransient.errors import VariantError
 from torchtransient.plugins.drjit_pool import check_process, engine_lock
-from torchtransient.rendering.interrupts import interrupts_pass, put_back_log_level
+from torchtransient.rendering.interrupts import interrupts_pass, interrupts_wait, put_back_log_level
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 
@@ -103,7 +103,8 @@ def active_variant(variant: str) -> Iterator[None]:
             yield
         finally:
             if before is not None and mi.variant() != before:
-                mi.set_variant(before)
+                with interrupts_wait():
+                    mi.set_variant(before)
 
 
 def _count_switch(before: str | None, variant: str) -> None:
@@ -126,7 +127,8 @@ def _set_variant(variant: str) -> None:
     if variant.startswith("llvm"):
         ensure_llvm()
     try:
-        mi.set_variant(variant)
+        with interrupts_wait():
+            mi.set_variant(variant)
     except (ImportError, RuntimeError) as error:
         raise VariantError(
             f"variant {variant!r} could not be activated: {error}. Run `torchtransient doctor` to see what is missing."

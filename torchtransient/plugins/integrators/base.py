@@ -151,7 +151,8 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     def passes(self, world, sensor, film, seed, spp) -> tuple[list[Pass], int]:
         """The launches of a job, and the largest number of samples per pixel."""
-        return passes_of(sensor.sampler().clone(), film, seed, spp, world.most_events())
+        lanes = None if world.record_room is None else world.record_room.lanes
+        return passes_of(sensor.sampler().clone(), film, seed, spp, world.most_events(), lanes)
 
     def start(self, scene, contents, sensor, film, job: Pass) -> PrimaryRays:
         """The primary rays of one pass."""
@@ -269,6 +270,8 @@ class TransientIntegrator(mi.CppADIntegrator):
         for plugin in job.plugins:
             if not says_it_can_be_recorded(plugin):
                 return f"the plugin {type(plugin).__name__} does not say that it can be (can_be_recorded)"
+        if job.world.record_room is not None and job.world.record_room.in_memory:
+            return "records of so many bounces lie in global memory"
         return "derivatives beside paths read numbers of the scene" if job.beside else None
 
     @staticmethod

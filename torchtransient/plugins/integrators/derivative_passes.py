@@ -50,7 +50,7 @@ def _record(job, rays, block=None):
     """Record the paths of one pass, with their arrivals for the adjoint ``block``: (layout of the record, the record,
     number of vertices).
     """
-    sink = RecordSink(block)
+    sink = RecordSink(block, dr.width(rays.ray) if job.world.record_room.in_memory else None)
     count, store = job.integrator.walk(job.world, job.film, rays, sink)
     return sink.layout, store, count
 

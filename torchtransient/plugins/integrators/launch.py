@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import operator
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.errors import UnitError
+from torchtransient.errors import GradientError, TorchTransientWarning, UnitError
+from torchtransient.quantities import as_whole, shown
 
 # Lanes of one kernel launch. Larger jobs run in several passes, which keeps a progress bar moving and indices in 32
 # bits.
@@ -48,9 +49,12 @@ def laser_count(film: Any) -> int:
     return film.laser_count() if film.exhaustive_scan else 1
 
 
-def passes_of(sampler: Any, film: Any, seed: Any, spp: int, most_events: int) -> tuple[list[Pass], int]:
+def passes_of(
+    sampler: Any, film: Any, seed: Any, spp: int, most_events: int, record_lanes: int | None = None
+) -> tuple[list[Pass], int]:
     """The launches of a job of ``spp`` samples per pixel (0: the sampler's own number), and the largest number of
-    samples of a pixel. ``sampler`` is changed. ``most_events``: of one path.
+    samples of a pixel. ``sampler`` is changed. ``most_events``: of one path. ``record_lanes``: paths of a launch whose
+    records there is memory for, None for any number. Raises GradientError where it is less than a row of the film.
 
     Some samplers round the number of samples of a launch, so that storage bands of different heights may get different
     totals.
@@ -59,7 +63,9 @@ def passes_of(sampler: Any, film: Any, seed: Any, spp: int, most_events: int) ->
         sampler.set_sample_count(spp)
     spp = sampler.sample_count()
     width = int(film.crop_size()[0]) * laser_count(film)
-    most = min(MAX_LANES, film.lanes_at_most(most_events) or MAX_LANES)
+    most = min(MAX_LANES, film.lanes_at_most(most_events) or MAX_LANES, record_lanes or MAX_LANES)
+    if record_lanes is not None:
+        _check_row(width, record_lanes)
     result = []
     for band, (first_row, rows) in enumerate(film.band_layout()):
         counts = _launch_counts(sampler, spp, max(1, most // (width * rows)))
@@ -70,6 +76,15 @@ def passes_of(sampler: Any, film: Any, seed: Any, spp: int, most_events: int) ->
     for i, p in enumerate(result):
         p.seed = _seed_of_pass(seed, i, len(result))
     return result, max(p.total for p in result)
+
+
+def _check_row(width: int, lanes: int) -> None:
+    if width > lanes:
+        raise GradientError(
+            f"gradients keep a record of every bounce, and with this max_depth there is memory for those of {lanes} "
+            f"paths at once: expected films at most so wide (times the laser positions), got {width}. Set max_depth to "
+            "where the throughput that remains no longer matters, or crop the film."
+        )
 
 
 def _seed_of_pass(seed: Any, number: int, count: int) -> Any:
@@ -90,10 +105,17 @@ def seed_array(seed: Any) -> Any:
 
 
 def _whole(seed: Any) -> int:
-    try:
-        return operator.index(seed) % 2**32
-    except TypeError:
-        raise UnitError(f"seed: expected a whole number, got {seed!r}.") from None
+    number = as_whole(seed)
+    if number is None:
+        raise UnitError(f"seed: expected a whole number, got {shown(seed)}.")
+    if not 0 <= number < 2**32:
+        warnings.warn(
+            f"seed: expected whole numbers from 0 to 2^32 - 1, got {shown(seed)}, which counts as {number % 2**32}: "
+            "seeds count modulo 2^32.",
+            TorchTransientWarning,
+            stacklevel=2,
+        )
+    return number % 2**32
 
 
 def _launch_counts(sampler: Any, spp: int, most: int) -> list[int]:

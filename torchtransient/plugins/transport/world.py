@@ -11,6 +11,7 @@ import mitsuba as mi
 from torchtransient.errors import SceneError
 from torchtransient.plugins.sampling.light_box import LightBox
 from torchtransient.plugins.transport.instances import AttachedSurfaces
+from torchtransient.plugins.transport.sinks.record import record_room
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,8 @@ class World:
                 strategy.prepare(self)
         # The fields of the Carry that derivatives go through.
         self.carried = () if wanted is None else wanted.carried + self.segment.carried
+        # Where derivatives keep what they record.
+        self.record_room = None if wanted is None else record_room(self)
         self._built = True
 
     def __setattr__(self, name: str, value: Any) -> None:

@@ -27,12 +27,19 @@ class Arrivals:
         """Types of what a vertex records."""
         return {"first": mi.UInt32} | dict.fromkeys(self.connections, mi.Bool)
 
+    def _size(self):
+        # What is read at once may end behind the last one.
+        return -(-self.most // self.together) * self.together
+
+    def bytes_of_path(self):
+        """Bytes of the list."""
+        return self._size() * (8 + 4 * self.channels * (2 if self.with_slope else 1))
+
     def allocate(self):
         """Thread-local memory of a path."""
         numbers = [f"A.{c}" for c in range(self.channels)]
         numbers += [f"slope.{c}" for c in range(self.channels)] if self.with_slope else []
-        # What is read at once may end behind the last one.
-        size = -(-self.most // self.together) * self.together
+        size = self._size()
         kept = {name: dr.alloc_local(mi.Float, size) for name in numbers}
         # As wide as the lanes: Dr.Jit takes an index of one entry to be the same in all of them.
         return kept | {"arrivals": dr.zeros(mi.UInt32, self.lanes), "opl": dr.alloc_local(mi.Float64, size)}

@@ -1,7 +1,7 @@
 """Vertices into thread-local memory, and back: what the derivative modes cannot recompute cheaply.
 
 The record's size is per lane in flight, not per path, and it lives in the kernel's stack: global memory does not grow
-with the depth.
+with the depth. Only a record that is too large for a stack goes to global memory (:mod:`.record_room`).
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import mitsuba as mi
 
 from torchtransient.errors import SceneError
 from torchtransient.plugins.transport.sinks.arrivals import Arrivals
+from torchtransient.plugins.transport.sinks.record_room import GlobalArray, RecordRoom, bytes_of
 from torchtransient.plugins.transport.sinks.sink import Sink
 from torchtransient.plugins.transport.strategy import Local
 
@@ -18,17 +19,30 @@ from torchtransient.plugins.transport.strategy import Local
 class RecordSink(Sink):
     """Writes what every strategy says of itself. ``layout`` tells :class:`RecordedVertex` how to read it.
 
-    ``block``: the film's adjoint block, where arrivals are to be read ahead; None for no list of them.
+    ``block``: the film's adjoint block, where arrivals are to be read ahead; None for no list of them. ``lanes``:
+    number of paths, where records lie in global memory.
     """
 
     zeros = True
 
-    def __init__(self, block=None):
-        self.block = block
+    def __init__(self, block=None, lanes=None):
+        self.block, self.lanes = block, lanes
 
     def begin(self, world):
-        self.layout = RecordLayout(world, None if self.block is None else Arrivals(world, self.block))
-        return self.layout.allocate(world.max_depth + 1)
+        self.layout = self._layout(world)
+        return self.layout.allocate(world.max_depth + 1, self.lanes)
+
+    def _layout(self, world):
+        if self.block is not None and self.lanes is None:
+            layout = RecordLayout(world, Arrivals(world, self.block))
+            if layout.bytes_of(world.max_depth + 1) <= world.record_room.room:
+                return layout
+        # Arrivals are read one after the other where a list of them has no room.
+        return RecordLayout(world)
+
+    def end(self, kept):
+        if self.lanes is not None:
+            dr.eval([array.numbers for array in kept.values()])
 
     def vertex(self, kept, path, samples):
         self.layout.write(kept, path, samples)
@@ -59,12 +73,22 @@ class RecordLayout:
         fields = {"β": mi.Spectrum, "τ": mi.Float64, "rr": mi.Float, "goes_on": mi.Bool}
         return fields | ({"η": mi.Float} if world.index_changes else {})
 
-    def allocate(self, size):
-        """Local arrays for ``size`` vertices."""
-        arrays = {f"{s}.{name}": dr.alloc_local(kind, size) for (s, name), kind in self.types.items()}
-        if self.arrivals is not None:
-            arrays |= self.arrivals.allocate()
-        return arrays | {"flags": dr.alloc_local(mi.UInt32, size)}
+    def bytes_of_vertex(self):
+        """Bytes that a vertex takes, without the list of arrivals."""
+        return sum(bytes_of(kind) for kind in [*self.types.values(), mi.UInt32])
+
+    def bytes_of(self, size):
+        """Bytes of the local arrays for ``size`` vertices."""
+        listed = 0 if self.arrivals is None else self.arrivals.bytes_of_path()
+        return size * self.bytes_of_vertex() + listed
+
+    def allocate(self, size, lanes=None):
+        """Local arrays for ``size`` vertices; in global memory where ``lanes`` is given."""
+        kinds = {f"{s}.{name}": kind for (s, name), kind in self.types.items()} | {"flags": mi.UInt32}
+        if lanes is not None:
+            return {name: GlobalArray(kind, size, lanes) for name, kind in kinds.items()}
+        arrays = {name: dr.alloc_local(kind, size) for name, kind in kinds.items()}
+        return arrays if self.arrivals is None else arrays | self.arrivals.allocate()
 
     def write(self, store, path, samples):
         """Write the vertex that ``path`` has reached."""
@@ -137,3 +161,8 @@ class RecordedVertex(Local):
     def after(self):
         """The next vertex, where the path goes on."""
         return RecordedVertex(self.layout, self.store, self.k + 1, self.goes_on, self.primary_ray)
+
+
+def record_room(world):
+    """The :class:`RecordRoom` of a job's records. Raises GradientError where there is none."""
+    return RecordRoom.of(RecordLayout(world).bytes_of_vertex(), world.max_depth + 1)
