@@ -87,6 +87,8 @@ class Reached:
         for name in (*attributes, "__call__"):
             found = next((vars(base)[name] for base in kind.__mro__ if name in vars(base)), None)
             if isinstance(found, (staticmethod, classmethod)):
+                for base in kind.__mro__ if isinstance(found, classmethod) else ():
+                    self._look_at(base, _attributes_of(found.__func__.__code__))
                 found = found.__func__
             elif isinstance(found, (property, functools.cached_property)):
                 found = found.fget if isinstance(found, property) else found.func
