@@ -133,10 +133,10 @@ def test_thousands_of_references_are_counted_at_once(kind):
         else:
             room[f"n{n}"] = {"type": kind, "shape": {"type": "instance", "group": inside}}
     room["n3000"] = {"type": "hg"} if kind == "blendphase" else {"type": kind, "shape": {"type": "cube"}}
-    started = time.perf_counter()
+    started = time.process_time()
     with pytest.raises(SceneError, match="at most 32 deep"):
         render(room)
-    assert time.perf_counter() - started < 6  # 15 s before
+    assert time.process_time() - started < 6  # 15 s of the processor where every look copies all nodes; now 0.2
 
 
 def test_angle_of_light_whose_components_are_each_below_the_floor():
