@@ -52,7 +52,11 @@ def test_sequence_and_seconds():
     assert Gate.gaussian_s(2e-8, 1e-9) == Gate.gaussian(2e-8 * SPEED_OF_LIGHT, 1e-9 * SPEED_OF_LIGHT)
 
 
-@pytest.mark.parametrize("pulse", [Pulse.gaussian(0.1), Pulse.rectangular(0.3, 0.2)], ids=lambda p: p.kind)
+# A pulse that is the same both ways round would not notice one that is mirrored.
+PULSES = [Pulse.gaussian(0.1), Pulse.rectangular(0.3, 0.2), Pulse.tabulated([-0.05, 0.02, 0.3], [0.2, 1.0, 0.0])]
+
+
+@pytest.mark.parametrize("pulse", PULSES, ids=lambda p: p.kind)
 @pytest.mark.parametrize("gate", GATES[:3], ids=lambda g: g.kind)
 def test_spread_by_a_pulse(gate, pulse):
     seen = gate.spread(pulse)
