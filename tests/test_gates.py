@@ -21,7 +21,14 @@ def test_profiles():
     np.testing.assert_allclose(GATES[1].value([6.9, 7.0, 7.1]), [0.5, 1, 0.5], atol=2e-4)
     assert GATES[1].value(GATES[1].start_opl) == 0
     np.testing.assert_allclose(RAGGED.value([5.9, 6.05, 6.3, 6.6]), [0, 0.4, 0.4, 0])
+    # A table that does not end at zero ends with a jump.
+    np.testing.assert_allclose(GATES[3].value([0.999, 1.0, 1.5, 1.999, 2.0]), [0, 1, 2, 2.998, 0])
     assert [gate.is_continuous for gate in GATES] == [False, True, True, False]
+
+
+def test_nodes_end_where_a_table_ends():
+    nodes = Gate.tabulated([1.0, 1.2, 2.0], [1.0, 4.0, 3.0]).nodes()
+    assert (nodes[0], nodes[-1]) == (1.0, 3.0) and Gate.gaussian(7.0, 0.2).nodes()[-1] == 0
 
 
 @pytest.mark.parametrize("gate", GATES, ids=str)
