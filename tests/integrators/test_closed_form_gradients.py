@@ -248,9 +248,9 @@ def test_a_camera_that_changes_under_either_clock(unwarp, unknown):
     for sign in (1, -1):
         apply(params, mi.Float(value + sign * step))
         params.update()
-        sides.append(moments(lit, lit.integrator().render(lit, seed=0, spp=4096)[1]))
+        sides.append(moments(lit, lit.integrator().render(lit, seed=0, spp=256)[1]))
         _put_back(params, base, list(base))
-    rows = both_modes(lit, (apply, value), 4096)
+    rows = both_modes(lit, (apply, value), 256)
     np.testing.assert_allclose(rows[0], (sides[0] - sides[1]) / (2 * step), rtol=5e-3)
 
 
@@ -285,6 +285,23 @@ def test_the_index_of_a_block_counts_along_the_shadow_ray(lamp_inside):
     check_mean(rows, (exact(1.5 + 1e-4) - exact(1.5 - 1e-4)) / 2e-4, 5e-3)
 
 
+def test_the_index_that_the_sensor_stands_in():
+    """Where all stands in one block, its index does not change what is seen, but every length: I n (d + r)."""
+    lit = scene_of(
+        beam((0, 0, 1.5), (0, 0, -1)), 2, wall=wall(pose=T().scale(0.4)),
+        lamp={"type": "point", "position": [0.5, 0, 0.8], "intensity": 10.0},
+        block={"type": "cube", "to_world": T().scale([20, 20, 2]),
+               "bsdf": {"type": "diff_dielectric", "int_ior": 1.5, "ext_ior": 1.0}},
+    )  # fmt: skip
+    r = np.hypot(0.5, 0.8)
+    value = RHO / np.pi * 10.0 * 0.8 / r**3
+    np.testing.assert_allclose(
+        moments(lit, lit.integrator().render(lit, seed=0, spp=16)[1]), [value, value * 1.5 * (1.5 + r)], rtol=1e-4
+    )
+    rows = both_modes(lit, (set_color("block.bsdf.eta"), 1.5), 16)
+    np.testing.assert_allclose(rows[0], [0, value * (1.5 + r)], rtol=1e-3, atol=1e-5)
+
+
 # ---------------------------------------------------------------------------------------------- spherical lights
 
 
@@ -297,10 +314,10 @@ def test_a_large_sphere_over_a_wall_that_moves(ratio):
     lamp = {"type": "sphere", "center": [0, 0, d], "radius": ratio * d, "emitter": {"type": "area", "radiance": radiance}}
     lit = scene_of(beam((0.05, 0, 0.05), (-1, 0, -1), bins=200, width=0.05), 2, wall=wall(), lamp=lamp)
     albedo, moving = albedo_of("wall", RHO), (move("wall.to_world", (0, 0, 1)), 0.0)
-    found = np.array([reverse(lit, albedo, moving, spp=1 << 15, seed=seed) for seed in range(8)])
+    found = np.array([reverse(lit, albedo, moving, spp=1 << 13, seed=seed) for seed in range(8)])
     exact = np.array([radiance * ratio**2, 2 * RHO * radiance * ratio**2 / d])
-    check_mean(found, exact, 0.02)
-    rows = both_modes(lit, moving, 1 << 15, seeds=1)
+    check_mean(found, exact, 0.03)
+    rows = both_modes(lit, moving, 1 << 13, seeds=1)
     assert rows[0, 0] == pytest.approx(found[0, 1], rel=2e-3)
-    lone = np.array([forward(lit, albedo, 1 << 15, seed) for seed in range(8)])
-    check_mean(lone[:, :1], exact[:1], 0.02)
+    lone = np.array([forward(lit, albedo, 1 << 13, seed) for seed in range(8)])
+    check_mean(lone[:, :1], exact[:1], 0.03)
