@@ -54,6 +54,15 @@ def test_seconds():
     assert Pulse.tabulated_s([0, 1e-9], [1, 1]).opl == (0.0, pytest.approx(0.299792458))
 
 
+def test_every_time_is_turned_into_a_length():
+    """Both numbers of every constructor in seconds."""
+    c = SPEED_OF_LIGHT
+    assert Pulse.rectangular_s(1e-9, -2e-9) == Pulse.rectangular(1e-9 * c, -2e-9 * c)
+    assert Pulse.tabulated_s([0, 1e-9], [1, 2], 3e-9) == Pulse.tabulated([0, 1e-9 * c], [1, 2], 3e-9 * c)
+    assert Gate.rectangular_s(1e-9, 4e-9) == Gate.rectangular(1e-9 * c, 4e-9 * c)
+    assert Gate.gaussian_s(3e-9, 1e-10) == Gate.gaussian(3e-9 * c, 1e-10 * c)
+
+
 def test_pulses_are_values():
     again = pickle.loads(pickle.dumps(MEASURED))
     assert again == MEASURED and hash(again) == hash(MEASURED) and again != MEASURED.shifted(0.1)
@@ -132,9 +141,13 @@ def test_errors(make, error, message):
         lambda: Pulse.gaussian_s(60.0),  # picoseconds
         lambda: Pulse.gaussian_s(0.06),  # nanoseconds
         lambda: Pulse.rectangular_s(1e-9, center_s=4.0),
+        lambda: Pulse.gaussian_s(1e-9, center_s=-0.5),
         lambda: Pulse.tabulated_s([0.0, 50.0], [0.0, 1.0]),
         lambda: Gate.rectangular(10e-9, 14e-9),
         lambda: Gate.rectangular_s(10.0, 14.0),
+        lambda: Gate.rectangular_s(-10.0, 1e-9),
+        lambda: Gate.rectangular_s(1e-9, 14.0),
+        lambda: Gate.gaussian_s(4e-9, 0.02),
         lambda: Gate.gaussian_s(0.02, 4e-9),
     ],
 )

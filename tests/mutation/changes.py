@@ -131,6 +131,13 @@ class _Finder:
         if kind is ast.Pow and isinstance(node.right, ast.Constant):
             self.add("factor", node, f"({a})")
 
+        if kind in FACTORS:
+            for side in (node.left, node.right):
+                if isinstance(side, ast.Constant) and type(side.value) in (int, float):
+                    self.add("unit factor", side, repr(side.value * 2 if side.value else 1))
+                elif isinstance(side, ast.Attribute | ast.Name) and _name(side) in CONSTANTS:
+                    self.add("unit factor", side, f"(2 * {self.text(side)})")
+
     def _of_unary(self, node: ast.UnaryOp) -> None:
         inner = self.text(node.operand)
         if isinstance(node.op, ast.USub) and not isinstance(node.operand, ast.Constant):
@@ -207,14 +214,6 @@ def in_file(path: str, source: bytes) -> list[Change]:
     tree = ast.parse(source)
     for node in tree.body:
         finder.visit(node)
-    # Numbers that carry a unit or a scale: constants with a name, and those that stand in products.
-    for node in ast.walk(tree):
-        if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Mult | ast.Div):
-            for side in (node.left, node.right):
-                if isinstance(side, ast.Constant) and type(side.value) in (int, float):
-                    finder.add("unit factor", side, repr(side.value * 2 if side.value else 1))
-                elif (isinstance(side, ast.Attribute | ast.Name)) and _name(side) in CONSTANTS:
-                    finder.add("unit factor", side, f"(2 * {finder.text(side)})")
     return sorted(set(finder.found), key=lambda change: (change.start, change.end, change.text))
 
 
