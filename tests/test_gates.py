@@ -52,6 +52,11 @@ def test_notation_and_pickles(gate):
     assert pickle.loads(pickle.dumps(gate)) == gate and hash(gate) == hash(pickle.loads(pickle.dumps(gate)))
 
 
+def test_gates_before_the_start():
+    gate = Gate.rectangular(-2.0, -1.0)
+    np.testing.assert_array_equal(gate.value([-2.5, -1.5, -0.5]), [0, 1, 0])
+
+
 def test_sequence_and_seconds():
     first, second, third = Gate.rectangular(1, 1.5).sequence(0.25, 3)
     assert (first.start_opl, second.start_opl, third.end_opl) == (1, 1.25, 2.0)
@@ -81,6 +86,7 @@ def test_spread_by_a_pulse(gate, pulse):
         (lambda: Gate.rectangular(2, 1), UnitError, "start before"),
         (lambda: Gate.gaussian(1, 0), UnitError, "fwhm_opl > 0"),
         (lambda: Gate.tabulated([1, 2], [0, 0]), UnitError, "not all zero"),
+        (lambda: Gate.tabulated([1, 2, 3], [0, -0.1, 1]), UnitError, "none negative"),
         (lambda: Gate.tabulated([1, 2, 3], [0, 0]), ShapeError, "3 and 2"),
         (lambda: Gate.tabulated([2, 1], [0, 1]), UnitError, "rising"),
         (lambda: gates_from_text("rectangular 1"), UnitError, "rectangular START END"),

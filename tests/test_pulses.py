@@ -95,6 +95,7 @@ def test_sum_of_two_boxes_is_a_trapezium():
     # of second order in the step: h^2 / 24 times the largest slope of the density, 1 / (0.2 * 0.1)
     np.testing.assert_allclose(values, expected, atol=50 * h**2)
     assert values[0] == 0 and values[-1] == 1
+    assert (start * h, at[-1]) == (pytest.approx(0.15), pytest.approx(0.45))  # and no node beyond
 
 
 def test_transform():
@@ -105,8 +106,8 @@ def test_transform():
     np.testing.assert_allclose(transform(Pulse.gaussian(0.2, center_opl=0.1), nu), gaussian, atol=2e-4)
     box = np.sinc(nu * 0.25) * np.exp(-2j * np.pi * nu * 0.7)
     np.testing.assert_allclose(transform(Pulse.rectangular(0.25, center_opl=0.7), nu), box, atol=1e-9)
-    # Frequencies of many cycles in a pulse, which is a saw tooth around zero: 2 / u^2 (exp(-i u) (1 + i u) - 1) from its
-    # start, with u = 2 pi nu width.
+    # Frequencies of many cycles in a pulse, a saw tooth around zero: 2 / u^2 (exp(-i u) (1 + i u) - 1) from its start,
+    # with u = 2 pi nu width.
     saw, u = Pulse.tabulated([-0.5, 0.5], [0.0, 1.0]), 2 * np.pi * np.array([7.3, 2000.3])
     tooth = 2 / u**2 * (np.exp(-1j * u) * (1 + 1j * u) - 1) * np.exp(0.5j * u)
     np.testing.assert_allclose(transform(saw, u / (2 * np.pi)), tooth, rtol=5e-3)

@@ -183,3 +183,14 @@ def test_an_ideal_polarizer_has_a_derivative_by_its_extinction():
     assert slope.item() == pytest.approx(0.0)  # (1 + e) / 2 + (1 - e) / 2
     (slope,) = torch.autograd.grad(st.linear_polarizer(0.3, extinction)[0, 0], extinction)
     assert slope.item() == pytest.approx(0.5)
+
+
+def test_an_ideal_polarizer_lets_nothing_through_across():
+    """At 0 and 90 degrees, element by element."""
+    for angle, sign in ((0.0, 1.0), (math.pi / 2, -1.0)):
+        expected = torch.zeros(4, 4)
+        expected[0, 0] = expected[1, 1] = 0.5
+        expected[0, 1] = expected[1, 0] = 0.5 * sign
+        torch.testing.assert_close(st.linear_polarizer(angle), expected, rtol=0, atol=1e-6)
+    half = st.linear_polarizer(math.pi / 4)
+    torch.testing.assert_close(half[2], torch.tensor([0.5, 0.0, 0.5, 0.0]), rtol=0, atol=1e-6)

@@ -118,7 +118,8 @@ class Counted:
 def test_no_two_runs_share_a_seed(reference_spp):
     """Nor do those of different counts, the reference and the warm-up, however many there are."""
     counted = Counted()
-    measure({FIRST: counted.candidate()}, (4, 8, 16, 32), reference_spp=reference_spp, repeats=400, seed=5, progress=False)
+    options = {"reference_spp": reference_spp, "repeats": 400, "seed": 5, "progress": False}
+    measure({FIRST: counted.candidate()}, (4, 8, 16, 32), **options)
     seeds = [seed for _, seed in counted.calls]
     assert len(seeds) == len(set(seeds)) == 4 * 401 + (2 if reference_spp else 0)
     assert min(seeds) >= 5

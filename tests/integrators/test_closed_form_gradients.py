@@ -1,7 +1,7 @@
 """Derivatives against closed forms, in both modes: black walls, lights that are found, clocks, indices, large spheres.
 
-The film's tent filter keeps the mean arrival of what lies inside its window: the sum of all bins, each times its
-centre, is the sum of all values, each times its optical length. So ``I`` and ``I τ`` have closed forms, and where a beam
+The film's tent filter keeps the mean arrival of what lies inside of its window: the sum of all bins, each times its
+centre, is that of all values, each times its optical length. So ``I`` and ``I τ`` have closed forms, and where a beam
 of no width sees a point light they have no noise.
 """
 
@@ -257,8 +257,8 @@ def test_a_camera_that_changes_under_either_clock(unwarp, unknown):
 @pytest.mark.parametrize("lamp_inside", [True, False])
 def test_the_index_of_a_block_counts_along_the_shadow_ray(lamp_inside):
     """A beam enters a block of index n upright and meets a wall in it, which a point lights from inside of the block:
-    I = T(n) / n^2 ..., τ = 2 + n (1 + r), all of which change with n. Or the beam leaves the block by its back side, and
-    wall and lamp stand in the air behind it.
+    I = T(n) / n^2 ..., τ = 2 + n (1 + r), all of which change with n. Or the beam leaves the block by its back side,
+    and wall and lamp stand in the air behind it.
     """
     r = np.hypot(0.5, 0.8)
     block = {
@@ -311,7 +311,8 @@ def test_a_large_sphere_over_a_wall_that_moves(ratio):
     connections alone; those of the reflectance, too, and nothing is counted twice.
     """
     d, radiance = 3.0, 2.0
-    lamp = {"type": "sphere", "center": [0, 0, d], "radius": ratio * d, "emitter": {"type": "area", "radiance": radiance}}
+    lamp = {"type": "sphere", "center": [0, 0, d], "radius": ratio * d}
+    lamp["emitter"] = {"type": "area", "radiance": radiance}
     lit = scene_of(beam((0.05, 0, 0.05), (-1, 0, -1), bins=200, width=0.05), 2, wall=wall(), lamp=lamp)
     albedo, moving = albedo_of("wall", RHO), (move("wall.to_world", (0, 0, 1)), 0.0)
     found = np.array([reverse(lit, albedo, moving, spp=1 << 13, seed=seed) for seed in range(8)])

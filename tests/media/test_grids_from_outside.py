@@ -1,4 +1,4 @@
-"""Grids whose shape reaches farther than they do: a line enters the density inside of the shape, from its empty part."""
+"""Grids whose shape reaches farther than they do: lines enter the density from the shape's empty part."""
 
 from __future__ import annotations
 

@@ -3,8 +3,8 @@
     make mutants ROOM=losses SEED=1        (or, from tests/: python -m mutation losses 1 [--count 60])
 
 The package is changed in a copy. Results are appended to build/mutants/ROOM-SEED.jsonl, a line each, and a run that was
-stopped goes on behind the last of them; ``--again`` repeats the survivors of an earlier run, for tests that were written
-since. Not a part of the tests: a room takes minutes to hours.
+stopped goes on behind the last of them; ``--again`` repeats the survivors of an earlier run, for tests that were
+written since. Not a part of the tests: a room takes minutes to hours.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ from . import changes, equivalent, rooms
 
 ROOT = Path(__file__).resolve().parents[2]
 COPIED = ("torchtransient", "tests", "docs", "training_examples", "benchmarks", "pyproject.toml", "README.md",
-          "CHANGELOG.md", "LICENSE", "Makefile", "constraints.txt", "constraints-lowest.txt", "hatch_build.py")  # fmt: skip
+          "CHANGELOG.md", "LICENSE", "Makefile", "constraints.txt", "constraints-lowest.txt",
+          "hatch_build.py")  # fmt: skip
 # A change that makes a loop endless is noticed, too: the tests would not end.
 PATIENCE, LEAST_SECONDS = 4.0, 60.0
 FIRST = 4  # test files
@@ -51,7 +52,7 @@ def preload() -> None:
     import torch
 
     torch.set_num_threads(1)
-    np.zeros(1) @ np.zeros(1)
+    scipy.signal.fftconvolve(scipy.stats.norm.pdf(np.zeros(1)), np.zeros(1))
 
 
 def run_tests(folder: Path, tests: list[str], seconds: float) -> tuple[str, str]:
@@ -153,7 +154,8 @@ def tell(results: list[dict[str, object]]) -> None:
     same = len(survivors) - len(unnoticed)
     counted = len(results) - same
     caught = counted - len(unnoticed)
-    print(f"\n{caught} of {counted} changes were noticed ({100 * caught / max(1, counted):.0f} %), {same} more are none.")
+    share = 100 * caught / max(1, counted)
+    print(f"\n{caught} of {counted} changes were noticed ({share:.0f} %), {same} more change nothing.")
 
 
 def main() -> None:

@@ -63,12 +63,7 @@ class _Finder:
 
     def add(self, operator: str, node: ast.AST, text: str) -> None:
         start, end = self.span(node)
-        change = Change(operator, self.path, node.lineno, start, end, text)
-        try:
-            ast.parse(change.apply(self.source))
-        except SyntaxError:
-            return
-        self.found.append(change)
+        self.found.append(Change(operator, self.path, node.lineno, start, end, text))
 
     # -------------------------------------------------------------------------------------------------- the walk
 
@@ -148,7 +143,8 @@ class _Finder:
     def _of_boolean(self, node: ast.BoolOp) -> None:
         word = " and " if isinstance(node.op, ast.And) else " or "
         for k in range(len(node.values)):
-            self.add("term dropped", node, f"({word.join(self.text(v) for v in node.values[:k] + node.values[k + 1 :])})")
+            kept = node.values[:k] + node.values[k + 1 :]
+            self.add("term dropped", node, f"({word.join(map(self.text, kept))})")
 
     def _of_comparison(self, node: ast.Compare) -> None:
         kind = type(node.ops[0])
@@ -227,6 +223,16 @@ def drawn(root: Path, files: list[Path], seed: int) -> Iterator[Change]:
     while kinds:
         operator = generator.choice(sorted(kinds))
         changes = kinds[operator]
-        yield changes.pop(generator.randrange(len(changes)))
+        change = changes.pop(generator.randrange(len(changes)))
         if not changes:
             del kinds[operator]
+        if _can_be_read(change.apply((root / change.path).read_bytes())):
+            yield change
+
+
+def _can_be_read(source: bytes) -> bool:
+    try:
+        ast.parse(source)
+    except SyntaxError:
+        return False
+    return True

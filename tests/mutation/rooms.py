@@ -34,7 +34,8 @@ def _files(root: Path, names: tuple[str, ...], pattern: str) -> Iterator[Path]:
 ROOMS = {
     "axes": Room(
         ("axes.py", "gates.py", "pulses.py", "stokes.py", "transform_bins.py", "units.py"),
-        ("test_axes.py", "test_gates.py", "test_pulses.py", "test_stokes.py", "test_transform_bins.py", "test_units.py"),
+        ("test_axes.py", "test_gates.py", "test_pulses.py", "test_stokes.py", "test_transform_bins.py",
+         "test_units.py"),
     ),
     "accuracy": Room(("accuracy",), ("accuracy",)),
     "losses": Room(("losses",), ("losses",)),
