@@ -1,0 +1,89 @@
+"""What losses make of numbers that can be counted by hand, at the ends of what they take."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from torchtransient import FrequencyAxis, losses
+from torchtransient.errors import ShapeError, TorchTransientWarning, UnitError
+from torchtransient.losses.surface_distance import _middles
+from torchtransient.reconstruction.hidden_volume import HiddenVolume
+from torchtransient.reconstruction.voxels import VoxelGrid
+
+
+def volume(planes, depth=1.0):
+    grid = VoxelGrid.bounds([[-1, -1, 0.5], [1, 1, 0.5 + depth]], (4, 5, planes))
+    return HiddenVolume(torch.rand(1, planes, 5, 4, generator=torch.Generator().manual_seed(0)), grid, "f-k migration")
+
+
+@pytest.mark.parametrize("planes", [1, 2, 3])
+def test_volumes_of_few_planes(planes):
+    """Two planes are evenly spaced, whatever lies between them, and one plane has no spacing: voxels are cubes then."""
+    given = volume(planes)
+    spacing = (1.0 / planes if planes > 1 else 0.4, 0.4, 0.5)
+    expected = losses.total_variation(given.values, spacing=spacing)
+    torch.testing.assert_close(losses.total_variation(given), expected)
+    if planes == 3:
+        uneven = dataclasses.replace(given.grid, depths=given.grid.depths + torch.tensor([0.0, 0.0, 1e-3]))
+        with pytest.raises(ShapeError, match="evenly spaced planes"):
+            losses.total_variation(dataclasses.replace(given, grid=uneven))
+
+
+@pytest.mark.parametrize("cells", [1, 2, 5])
+def test_middles_of_the_parts_of_a_triangle(cells):
+    """As many as there are parts, the same whichever corner comes first, and exact for what is linear."""
+    weights = _middles(cells)
+    assert weights.shape == (cells**2, 3) and bool((weights > 0).all())
+    torch.testing.assert_close(weights.sum(1), torch.ones(cells**2, dtype=torch.float64))
+    torch.testing.assert_close(weights.mean(0), torch.full((3,), 1 / 3, dtype=torch.float64))
+    rows = {tuple(row) for row in (weights * 3 * cells).round(decimals=6).tolist()}
+    assert rows == {(b, c, a) for a, b, c in rows} == {(b, a, c) for a, b, c in rows}
+    # Parts are upright or turned: their middles are whole thirds of a cell.
+    assert all(float(x).is_integer() for row in rows for x in row)
+
+
+def test_the_root_of_counts_has_no_gradient():
+    """bin sum |C| / sqrt(n): by the target, that of the running sum alone."""
+    a = torch.tensor([1.0, 0.0, 5.0]).reshape(1, 3, 1, 1)
+    b = torch.tensor([4.0, 8.0, 4.0]).reshape(1, 3, 1, 1).requires_grad_()
+    found = losses.cumulative_loss(a, b, 0.5, per_root_count=True, dim=-3)
+    # running sums of the difference: -3, -11, -10, over the root of 16
+    assert found.item() == pytest.approx(0.5 * 24 / 4)
+    found.backward()
+    torch.testing.assert_close(b.grad.flatten(), torch.tensor([3.0, 2.0, 1.0]) * 0.5 / 4)
+
+
+def phasors(frequencies, start):
+    axis = FrequencyAxis(frequencies, start)
+    return SimpleNamespace(
+        transient=None, gated=None, steady=None, axis=None, frequencies=axis, phasor=torch.ones(1, 2, 2, 2) + 0j
+    )
+
+
+@pytest.mark.parametrize(("frequencies", "shift", "one"), [((0.5, 900.0), 1e-4, False), ((1e-4, 1e-3), 0.5, True)])
+def test_starts_of_frequency_axes_are_told_apart_by_phase(frequencies, shift, one):
+    """What a start turns is the start times the highest frequency, in cycles."""
+    a, b = phasors(frequencies, 1.0), phasors(frequencies, 1.0 + shift)
+    if one:
+        assert losses.phasor_loss(a, b).item() == 0
+        return
+    with pytest.raises(UnitError, match="one axis"):
+        losses.phasor_loss(a, b)
+
+
+def test_predictions_that_are_whole_here_and_there_are_no_counts():
+    """A model that is dark in most bins: every bin is looked at before anybody is warned."""
+    model = torch.zeros(4, 1, 64, 8, 8)
+    model[..., 1::2] = 0.37
+    target = torch.rand(model.shape) + 0.5
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", TorchTransientWarning)
+        losses.poisson_nll(model.clamp_min(1e-6), target)
+        losses.poisson_nll(model, target, floor=1e-3)
+    with pytest.warns(TorchTransientWarning, match="holds counts"):
+        losses.poisson_nll((10 * model).round(), target, floor=1e-3)
