@@ -87,3 +87,15 @@ def test_predictions_that_are_whole_here_and_there_are_no_counts():
         losses.poisson_nll(model, target, floor=1e-3)
     with pytest.warns(TorchTransientWarning, match="holds counts"):
         losses.poisson_nll((10 * model).round(), target, floor=1e-3)
+
+
+@pytest.mark.parametrize("spacing", [(0.1, 0.5, 0.2), (0.4, 0.2, 0.1), (0.3, 0.2, 0.7)])
+def test_smoothing_that_is_not_given(spacing):
+    """A thousandth of the mean modulus of each volume over the smallest spacing."""
+    both = torch.rand(2, 4, 5, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    both[1] *= 30
+    found = losses.total_variation(both, spacing=spacing, reduction="none")
+    for volume, own in zip(both, found, strict=True):
+        given = 1e-3 * float(volume.mean()) / min(spacing)
+        wanted = losses.total_variation(volume, spacing=spacing, smoothing=given, reduction="none")
+        torch.testing.assert_close(own, wanted, rtol=1e-12, atol=1e-12)
