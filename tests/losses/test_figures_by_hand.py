@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from torchtransient import FrequencyAxis, losses
+from torchtransient import FrequencyAxis, TimeAxis, losses
 from torchtransient.errors import ShapeError, TorchTransientWarning, UnitError
 from torchtransient.losses.surface_distance import _middles
 from torchtransient.reconstruction.hidden_volume import HiddenVolume
@@ -99,3 +99,30 @@ def test_smoothing_that_is_not_given(spacing):
         given = 1e-3 * float(volume.mean()) / min(spacing)
         wanted = losses.total_variation(volume, spacing=spacing, smoothing=given, reduction="none")
         torch.testing.assert_close(own, wanted, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("other", "one"),
+    [
+        (TimeAxis(1.0, 0.1, 10), True),
+        (TimeAxis(1.00005, 0.1, 10), True),
+        (TimeAxis(1.0, 0.101, 10), False),  # ends later
+        (TimeAxis(0.99, 0.101, 10), False),  # begins sooner, ends alike
+        (TimeAxis(1.01, 0.1, 10), False),
+        (TimeAxis(1.0005, 0.1, 10), False),
+        (TimeAxis(1.0, 0.1, 11), False),
+        (TimeAxis(1.0, 1.0 / 11, 11), False),  # as long, in other bins
+    ],
+)
+def test_axes_that_are_one(other, one):
+    """Start, end and number of bins, each to a thousandth of a bin."""
+    cubes = [torch.rand(1, axis.num_bins, 2, 2) for axis in (TimeAxis(1.0, 0.1, 10), other)]
+    a, b = (
+        SimpleNamespace(transient=cube, phasor=None, gated=None, steady=None, frequencies=None, gates=None, axis=axis)
+        for cube, axis in zip(cubes, (TimeAxis(1.0, 0.1, 10), other), strict=True)
+    )
+    if one:
+        assert losses.wasserstein_loss(a, b).item() > 0
+    else:
+        with pytest.raises((UnitError, ShapeError), match=r"one axis|shape"):
+            losses.wasserstein_loss(a, b)
