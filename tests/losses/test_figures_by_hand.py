@@ -11,7 +11,10 @@ import torch
 
 from torchtransient import FrequencyAxis, TimeAxis, losses
 from torchtransient.errors import ShapeError, TorchTransientWarning, UnitError
+from torchtransient.losses.likelihoods import LEAST_MEAN
+from torchtransient.losses.mesh_smoothness import _edges
 from torchtransient.losses.surface_distance import _middles
+from torchtransient.losses.triangles import SHARPEST
 from torchtransient.reconstruction.hidden_volume import HiddenVolume
 from torchtransient.reconstruction.voxels import VoxelGrid
 
@@ -126,3 +129,28 @@ def test_axes_that_are_one(other, one):
     else:
         with pytest.raises((UnitError, ShapeError), match=r"one axis|shape"):
             losses.wasserstein_loss(a, b)
+
+
+@pytest.mark.parametrize("corner", [0, 1, 2])
+@pytest.mark.parametrize("short", [1e-3, 1e-12])
+def test_cotangents_of_sides_of_all_lengths(corner, short):
+    """An angle of 45 degrees between a short side and one of 1: of a triangle whose area is less than a limit, over the
+    longest side squared, the limit takes its place. In any unit.
+    """
+    index = torch.tensor([[0, 1, 2]]).roll(corner, 1)
+    for unit in (1e-9, 1.0, 1e9):
+        places = unit * torch.tensor([[0.0, 0, 0], [short, 0, 0], [1, 1, 0]], dtype=torch.float64)
+        first, second, weight = _edges(places, index, "cotangent")
+        opposite = (first == 1) & (second == 2)
+        assert weight[opposite].item() == pytest.approx(min(1.0, short / SHARPEST))
+
+
+def test_counts_in_the_dark_have_the_gradient_of_the_tangent():
+    """n log m goes on below a level l as n (log l + (m - l) / l): by n, at m = 0, that is log l - 1. The level follows
+    the counts, without gradient.
+    """
+    mean = torch.zeros(1, 4, 1, 1, dtype=torch.float64, requires_grad=True)
+    counts = torch.tensor([1.5, 2.0, 3.5, 8.0], dtype=torch.float64).reshape(1, 4, 1, 1).requires_grad_()
+    losses.poisson_nll(mean, counts, reduction="sum").backward()
+    torch.testing.assert_close(counts.grad, 1 - (LEAST_MEAN * counts.detach()).log())
+    torch.testing.assert_close(mean.grad, torch.full_like(mean, 1 - 1 / LEAST_MEAN))
