@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import warnings
 from types import SimpleNamespace
 
 import numpy as np
@@ -98,6 +99,25 @@ def test_gain_and_slope_of_given_points():
     assert report.slope("transient", OTHER) is None  # two points with an error
     noiseless = AccuracyReport(points(FIRST, [(4, 1.0, 0.0), (8, 1.0, 1.0), (16, 1.0, 0.5), (32, 1.0, 0.25)]), "")
     assert noiseless.slope("transient", FIRST).slope == pytest.approx(-1)
+
+
+@pytest.mark.parametrize("broken", [{"squared_error": 0.0}, {"squared_error": -1.0}, {"seconds": 0.0}])
+@pytest.mark.parametrize("whose", [FIRST, OTHER], ids=str)
+def test_a_gain_leaves_out_what_has_no_error_or_took_no_time(broken, whose):
+    """Of either curve: the other run alone counts, 1 x 4 over 0.5 x 4."""
+    both = points(FIRST, [(16, 1.0, 3.0), (64, 4.0, 1.0)]) + points(OTHER, [(16, 1.0, 1.0), (64, 4.0, 0.5)])
+    given = [dataclasses.replace(p, **broken) if p.choice == whose and p.spp == 16 else p for p in both]
+    assert AccuracyReport(given, "").gain("transient", OTHER) == pytest.approx(2.0)
+    assert math.isnan(AccuracyReport([p for p in given if p.spp == 16], "").gain("transient", OTHER))
+
+
+def test_a_single_run_has_no_spread_and_no_warning():
+    tally = ErrorTally(None, Reference(np.ones(3), np.ones(3)))
+    tally.add(np.full(3, 1.5))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = tally.result()
+    assert found.squared == pytest.approx(0.25) and math.isnan(found.squared_standard_error)
 
 
 class Counted:
