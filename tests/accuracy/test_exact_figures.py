@@ -17,7 +17,7 @@ from torchtransient.accuracy.cost import cosine_over_the_window
 from torchtransient.accuracy.errors_of_estimates import ErrorTally, Reference
 from torchtransient.accuracy.measure import Estimates, Task, measure
 from torchtransient.accuracy.report import AccuracyReport, Choice, CostPoint
-from torchtransient.errors import UnitError
+from torchtransient.errors import ShapeError, UnitError
 
 FIRST, OTHER = Choice("independent", "box"), Choice("multijitter", "box")
 
@@ -44,6 +44,11 @@ def test_default_loss_of_phasors(renders):
     cube = torch.complex(torch.ones(1, 3, 2, 5), torch.full((1, 3, 2, 5), 7.0))
     found = cosine_over_the_window(dataclasses.replace(renders[1], phasor=cube))
     assert found.item() == pytest.approx(3.0)
+
+
+def test_a_steady_image_alone_is_no_measurement(renders):
+    with pytest.raises(ShapeError, match="got a steady image alone"):
+        cosine_over_the_window(dataclasses.replace(renders[0], transient=None))
 
 
 @pytest.mark.parametrize("time_dim", [None, 0, -3])
