@@ -11,6 +11,7 @@ import torch
 
 from torchtransient import FrequencyAxis, TimeAxis, losses
 from torchtransient.errors import ShapeError, TorchTransientWarning, UnitError
+from torchtransient.losses.comparison import holds
 from torchtransient.losses.likelihoods import LEAST_MEAN
 from torchtransient.losses.mesh_smoothness import _edges
 from torchtransient.losses.surface_distance import _middles
@@ -168,3 +169,20 @@ def test_the_range_of_a_target_has_no_gradient():
         losses.ssim_loss(a, target, window=3, value_range=value_range).backward()
         slopes.append(target.grad)
     torch.testing.assert_close(*slopes, rtol=1e-9, atol=1e-12)
+
+
+def test_what_cannot_be_looked_at_for_another_reason_is_an_error():
+    """Out of memory, say: in `torch.vmap` alone a question is left open."""
+
+    class Condition:
+        is_meta = False
+
+        def all(self):
+            raise RuntimeError(self.words)
+
+    condition = Condition()
+    condition.words = "vmap: it looks like you are calling .item() on a Tensor"
+    assert holds(condition)
+    condition.words = "not enough memory"
+    with pytest.raises(RuntimeError, match="not enough memory"):
+        holds(condition)
