@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from torchtransient import metrics
-from torchtransient.errors import UnitError
+from torchtransient.errors import ShapeError, UnitError
 from torchtransient.reconstruction import HiddenVolume, VoxelGrid
 
 
@@ -72,3 +72,66 @@ def test_every_number_of_a_grid_says_where_voxels_are(change):
     assert metrics.volume_iou(here, here).item() == 1
     with pytest.raises(UnitError, match="on one grid"):
         metrics.volume_iou(here, there)
+
+
+@pytest.mark.parametrize(("share", "one"), [(0.9, True), (1.1, False)])
+def test_grids_are_one_to_a_thousandth_of_a_voxel(share, one):
+    """By planes as by the corner: metres are metres along each direction."""
+    values = torch.rand(1, 12, 6, 8, generator=torch.Generator().manual_seed(0))
+    step = share * 1e-3 * min(GRID.pitch)
+    for change in ({"depths": GRID.depths + step}, {"first": GRID.first + step * GRID.along_x}):
+        here, there = (HiddenVolume(values, grid, "fk") for grid in (GRID, dataclasses.replace(GRID, **change)))
+        if one:
+            assert metrics.volume_iou(here, there).item() == 1
+            continue
+        with pytest.raises(UnitError, match="on one grid"):
+            metrics.volume_iou(here, there)
+
+
+def test_dimensions_that_are_missing():
+    line, picture = torch.rand(5), torch.rand(4, 5)
+    for metric in (metrics.picture_iou, metrics.picture_correlation):
+        with pytest.raises(ShapeError, match=r"tensors \(\.\.\., Y, X\), got \(5,\)"):
+            metric(line, line)
+    for metric in (metrics.volume_iou, metrics.volume_correlation):
+        with pytest.raises(ShapeError, match=r"tensors \(\.\.\., Z, Y, X\), got \(4, 5\)"):
+            metric(picture, picture)
+
+
+def test_a_floor_of_polarization_has_to_be_exceeded():
+    """Light as dim as the floor does not count."""
+    stokes = torch.tensor([[0.5, 1.0], [0.5, 0.0], [0.0, 0.0], [0.0, 0.0]]).reshape(4, 1, 1, 2)
+    other = torch.zeros(4, 1, 1, 2)
+    other[0] = stokes[0]
+    each = metrics.dop_mae(other, stokes, floor=0.5, reduction="none")
+    assert each.isnan().flatten().tolist() == [True, False]
+    each = metrics.dop_mae(other, stokes, floor=0.499, reduction="none")
+    assert each.flatten().tolist() == [1.0, 0.0]
+
+
+# Voxels of a quarter of a metre, whose numbers are exact.
+COARSE = VoxelGrid.bounds([[-1.0, -1.0, 1.0], [1.0, 1.0, 3.0]], (8, 8, 8))
+
+
+def test_a_voxel_at_the_radius_is_found():
+    """And the next one is not: the point is in the middle of a voxel, the light three voxels beside it."""
+    z, y, x = (int(n) // 2 for n in COARSE.shape)
+    for axis in range(3):
+        place, point = [z, y, x], COARSE.points[z, y, x]
+        place[axis] -= 3
+        values = torch.zeros(1, 8, 8, 8)
+        values[(0, *place)] = 1.0
+        given = HiddenVolume(values, COARSE, "fk")
+        found = metrics.localization_rmse(given, point[None].numpy(), radius_m=0.75)
+        assert found.item() == pytest.approx(0.75)
+        # what is not found counts with the radius
+        missed = metrics.localization_rmse(given, point[None].numpy(), radius_m=0.5)
+        assert missed.item() == pytest.approx(0.5)
+
+
+def test_a_plateau_is_found_at_its_highest_voxel():
+    """Nothing rises or falls there: no parabola has a top."""
+    values = torch.ones(1, 8, 8, 8)
+    point = COARSE.points[4, 4, 4]
+    found = metrics.localization_rmse(HiddenVolume(values, COARSE, "fk"), point[None].numpy(), radius_m=0.2)
+    assert found.item() == 0

@@ -30,7 +30,7 @@ COPIED = ("torchtransient", "tests", "docs", "training_examples", "benchmarks", 
           "CHANGELOG.md", "LICENSE", "Makefile", "constraints.txt", "constraints-lowest.txt",
           "hatch_build.py")  # fmt: skip
 # A change that makes a loop endless is noticed, too: the tests would not end.
-PATIENCE, LEAST_SECONDS = 4.0, 60.0
+PATIENCE, LEAST_SECONDS = 6.0, 240.0
 FIRST = 4  # test files
 
 
