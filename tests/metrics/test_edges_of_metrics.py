@@ -138,3 +138,16 @@ def test_a_plateau_is_found_at_its_highest_voxel():
     point = COARSE.points[4, 4, 4]
     found = metrics.localization_rmse(HiddenVolume(values, COARSE, "fk"), point[None].numpy(), radius_m=0.2)
     assert found.item() == 0
+
+
+@pytest.mark.parametrize("axes", [(0, 1), (0, 2), (1, 2)])
+def test_the_radius_is_that_of_a_ball(axes):
+    """Bright light in the cube around it alone, 0.71 m away, is not looked at; dim light beside the point is."""
+    values, place = torch.zeros(1, 8, 8, 8), [4, 4, 4]
+    values[0, 4, 4, 4] = 0.5
+    for axis in axes:
+        place[axis] -= 2
+    values[(0, *place)] = 1.0
+    given, point = HiddenVolume(values, COARSE, "fk"), COARSE.points[4, 4, 4]
+    assert metrics.localization_rmse(given, point[None].numpy(), radius_m=0.6).item() == 0
+    assert metrics.localization_rmse(given, point[None].numpy(), radius_m=0.71).item() == pytest.approx(0.5**0.5)
