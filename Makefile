@@ -7,7 +7,7 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 BIN := $(VENV)/bin
 READY := $(VENV)/.installed
 
-.PHONY: demo test test-slow test-lowest release-check audit lint doctor docs sweep environment clean help
+.PHONY: demo test test-slow test-lowest release-check audit lint doctor docs sweep mutants environment clean help
 
 help:
 	@echo "make demo       render a scene, fit a parameter, write pictures to demo_output/"
@@ -17,6 +17,7 @@ help:
 	@echo "make release-check  wheel and sdist, in dist/, and the wheel in an empty environment"
 	@echo "make audit      known vulnerabilities of what is installed (asks the server of PyPI)"
 	@echo "make docs       the documentation as a site, in build/site/html"
+	@echo "make mutants ROOM= SEED=  sixty changes of a room's sources, and whether its tests notice; see docs/reliability.md"
 	@echo "make sweep      every parameter of every plugin against finite differences; writes docs/gradients_sweep.md"
 
 environment: $(READY)
@@ -95,6 +96,10 @@ audit: $(READY)
 # page's rows of the others: make sweep ONLY=retroreflector
 sweep: $(READY)
 	$(BIN)/python -m torchtransient.testing.gradient_sweep --write docs $(if $(ONLY),--only '$(ONLY)')
+
+# ROOM: a name in tests/mutation/rooms.py. A run that was stopped goes on; its record is build/mutants/ROOM-SEED.jsonl.
+mutants: $(READY)
+	cd tests && OMP_NUM_THREADS=1 $(abspath $(BIN))/python -m mutation $(ROOM) $(SEED)
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -131,6 +131,7 @@ def test_refused(arguments, error, message):
 
 
 def test_frequencies_and_wavelengths():
+    assert FrequencyAxis.uniform(1.5, -0.5, 4, start_opl=2.0) == FrequencyAxis((1.5, 1.0, 0.5, 0.0), 2.0)
     axis = FrequencyAxis.uniform(0.0, 0.25, 5)
     assert axis.num_frequencies == 5 and axis.frequencies == (0.0, 0.25, 0.5, 0.75, 1.0)
     assert axis.per_metre.dtype == axis.hertz.dtype == torch.float64

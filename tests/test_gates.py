@@ -21,7 +21,14 @@ def test_profiles():
     np.testing.assert_allclose(GATES[1].value([6.9, 7.0, 7.1]), [0.5, 1, 0.5], atol=2e-4)
     assert GATES[1].value(GATES[1].start_opl) == 0
     np.testing.assert_allclose(RAGGED.value([5.9, 6.05, 6.3, 6.6]), [0, 0.4, 0.4, 0])
+    # A table that does not end at zero ends with a jump.
+    np.testing.assert_allclose(GATES[3].value([0.999, 1.0, 1.5, 1.999, 2.0]), [0, 1, 2, 2.998, 0])
     assert [gate.is_continuous for gate in GATES] == [False, True, True, False]
+
+
+def test_nodes_end_where_a_table_ends():
+    nodes = Gate.tabulated([1.0, 1.2, 2.0], [1.0, 4.0, 3.0]).nodes()
+    assert (nodes[0], nodes[-1]) == (1.0, 3.0) and Gate.gaussian(7.0, 0.2).nodes()[-1] == 0
 
 
 @pytest.mark.parametrize("gate", GATES, ids=str)
@@ -45,6 +52,11 @@ def test_notation_and_pickles(gate):
     assert pickle.loads(pickle.dumps(gate)) == gate and hash(gate) == hash(pickle.loads(pickle.dumps(gate)))
 
 
+def test_gates_before_the_start():
+    gate = Gate.rectangular(-2.0, -1.0)
+    np.testing.assert_array_equal(gate.value([-2.5, -1.5, -0.5]), [0, 1, 0])
+
+
 def test_sequence_and_seconds():
     first, second, third = Gate.rectangular(1, 1.5).sequence(0.25, 3)
     assert (first.start_opl, second.start_opl, third.end_opl) == (1, 1.25, 2.0)
@@ -52,7 +64,11 @@ def test_sequence_and_seconds():
     assert Gate.gaussian_s(2e-8, 1e-9) == Gate.gaussian(2e-8 * SPEED_OF_LIGHT, 1e-9 * SPEED_OF_LIGHT)
 
 
-@pytest.mark.parametrize("pulse", [Pulse.gaussian(0.1), Pulse.rectangular(0.3, 0.2)], ids=lambda p: p.kind)
+# A pulse that is the same both ways round would not notice one that is mirrored.
+PULSES = [Pulse.gaussian(0.1), Pulse.rectangular(0.3, 0.2), Pulse.tabulated([-0.05, 0.02, 0.3], [0.2, 1.0, 0.0])]
+
+
+@pytest.mark.parametrize("pulse", PULSES, ids=lambda p: p.kind)
 @pytest.mark.parametrize("gate", GATES[:3], ids=lambda g: g.kind)
 def test_spread_by_a_pulse(gate, pulse):
     seen = gate.spread(pulse)
@@ -70,6 +86,7 @@ def test_spread_by_a_pulse(gate, pulse):
         (lambda: Gate.rectangular(2, 1), UnitError, "start before"),
         (lambda: Gate.gaussian(1, 0), UnitError, "fwhm_opl > 0"),
         (lambda: Gate.tabulated([1, 2], [0, 0]), UnitError, "not all zero"),
+        (lambda: Gate.tabulated([1, 2, 3], [0, -0.1, 1]), UnitError, "none negative"),
         (lambda: Gate.tabulated([1, 2, 3], [0, 0]), ShapeError, "3 and 2"),
         (lambda: Gate.tabulated([2, 1], [0, 1]), UnitError, "rising"),
         (lambda: gates_from_text("rectangular 1"), UnitError, "rectangular START END"),

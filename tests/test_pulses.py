@@ -54,6 +54,15 @@ def test_seconds():
     assert Pulse.tabulated_s([0, 1e-9], [1, 1]).opl == (0.0, pytest.approx(0.299792458))
 
 
+def test_every_time_is_turned_into_a_length():
+    """Both numbers of every constructor in seconds."""
+    c = SPEED_OF_LIGHT
+    assert Pulse.rectangular_s(1e-9, -2e-9) == Pulse.rectangular(1e-9 * c, -2e-9 * c)
+    assert Pulse.tabulated_s([0, 1e-9], [1, 2], 3e-9) == Pulse.tabulated([0, 1e-9 * c], [1, 2], 3e-9 * c)
+    assert Gate.rectangular_s(1e-9, 4e-9) == Gate.rectangular(1e-9 * c, 4e-9 * c)
+    assert Gate.gaussian_s(3e-9, 1e-10) == Gate.gaussian(3e-9 * c, 1e-10 * c)
+
+
 def test_pulses_are_values():
     again = pickle.loads(pickle.dumps(MEASURED))
     assert again == MEASURED and hash(again) == hash(MEASURED) and again != MEASURED.shifted(0.1)
@@ -86,6 +95,7 @@ def test_sum_of_two_boxes_is_a_trapezium():
     # of second order in the step: h^2 / 24 times the largest slope of the density, 1 / (0.2 * 0.1)
     np.testing.assert_allclose(values, expected, atol=50 * h**2)
     assert values[0] == 0 and values[-1] == 1
+    assert (start * h, at[-1]) == (pytest.approx(0.15), pytest.approx(0.45))  # and no node beyond
 
 
 def test_transform():
@@ -96,6 +106,11 @@ def test_transform():
     np.testing.assert_allclose(transform(Pulse.gaussian(0.2, center_opl=0.1), nu), gaussian, atol=2e-4)
     box = np.sinc(nu * 0.25) * np.exp(-2j * np.pi * nu * 0.7)
     np.testing.assert_allclose(transform(Pulse.rectangular(0.25, center_opl=0.7), nu), box, atol=1e-9)
+    # Frequencies of many cycles in a pulse, a saw tooth around zero: 2 / u^2 (exp(-i u) (1 + i u) - 1) from its start,
+    # with u = 2 pi nu width.
+    saw, u = Pulse.tabulated([-0.5, 0.5], [0.0, 1.0]), 2 * np.pi * np.array([7.3, 2000.3])
+    tooth = 2 / u**2 * (np.exp(-1j * u) * (1 + 1j * u) - 1) * np.exp(0.5j * u)
+    np.testing.assert_allclose(transform(saw, u / (2 * np.pi)), tooth, rtol=5e-3)
     assert transform(MEASURED, 0.0) == pytest.approx(1) and transform(MEASURED, 40.0).shape == (1,)
 
 
@@ -127,9 +142,13 @@ def test_errors(make, error, message):
         lambda: Pulse.gaussian_s(60.0),  # picoseconds
         lambda: Pulse.gaussian_s(0.06),  # nanoseconds
         lambda: Pulse.rectangular_s(1e-9, center_s=4.0),
+        lambda: Pulse.gaussian_s(1e-9, center_s=-0.5),
         lambda: Pulse.tabulated_s([0.0, 50.0], [0.0, 1.0]),
         lambda: Gate.rectangular(10e-9, 14e-9),
         lambda: Gate.rectangular_s(10.0, 14.0),
+        lambda: Gate.rectangular_s(-10.0, 1e-9),
+        lambda: Gate.rectangular_s(1e-9, 14.0),
+        lambda: Gate.gaussian_s(4e-9, 0.02),
         lambda: Gate.gaussian_s(0.02, 4e-9),
     ],
 )

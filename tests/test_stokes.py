@@ -166,3 +166,31 @@ def test_errors():
         st.degree_of_polarization(good, 0, floor=-1.0)
     with pytest.raises(UnitError, match="extinction"):
         st.linear_polarizer(0.0, 1.5)
+
+
+def test_a_floor_has_to_be_exceeded():
+    """A linear part, or an intensity, that is the floor itself has no angle and no degree."""
+    s = torch.tensor([0.5, -0.5, 0.0, 0.0])
+    assert st.angle_of_linear_polarization(s, 0, 0.5).item() == 0
+    assert st.angle_of_linear_polarization(s, 0, 0.49).item() == pytest.approx(math.pi / 2)
+    assert st.degree_of_polarization(s, 0, 0.5).item() == 0 and st.degree_of_polarization(s, 0, 0.49).item() == 1
+
+
+def test_an_ideal_polarizer_has_a_derivative_by_its_extinction():
+    """The diagonal: half of what is let through, along and across; the root of the cross terms is left out."""
+    extinction = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(st.linear_polarizer(0.0, extinction)[0].sum(), extinction)
+    assert slope.item() == pytest.approx(0.0)  # (1 + e) / 2 + (1 - e) / 2
+    (slope,) = torch.autograd.grad(st.linear_polarizer(0.3, extinction)[0, 0], extinction)
+    assert slope.item() == pytest.approx(0.5)
+
+
+def test_an_ideal_polarizer_lets_nothing_through_across():
+    """At 0 and 90 degrees, element by element."""
+    for angle, sign in ((0.0, 1.0), (math.pi / 2, -1.0)):
+        expected = torch.zeros(4, 4)
+        expected[0, 0] = expected[1, 1] = 0.5
+        expected[0, 1] = expected[1, 0] = 0.5 * sign
+        torch.testing.assert_close(st.linear_polarizer(angle), expected, rtol=0, atol=1e-6)
+    half = st.linear_polarizer(math.pi / 4)
+    torch.testing.assert_close(half[2], torch.tensor([0.5, 0.0, 0.5, 0.0]), rtol=0, atol=1e-6)

@@ -32,6 +32,13 @@ def test_expected_roots_are_means_over_counts():
     torch.testing.assert_close(single.double(), found.detach(), rtol=4 * 2**-24, atol=4 * 2**-24)
 
 
+def test_the_series_from_its_first_mean_on():
+    """To 1e-11, as it is said: with all of its terms."""
+    mean = torch.linspace(63.7, 66.0, 24, dtype=torch.float64)
+    wanted = over_counts(mean, losses.anscombe)
+    torch.testing.assert_close(losses.expected_anscombe(mean), wanted, rtol=0, atol=1e-11)
+
+
 def test_expected_roots_of_many_counts():
     """Anscombe's expansion, whose next term is 1/(64 m^1.5) of the root."""
     mean = torch.tensor([1e3, 1e5, 1e8], dtype=torch.float64)

@@ -165,3 +165,20 @@ def test_refusals():
     for wrong in ((vertices.to("meta"), faces.to("meta")), (vertices, faces.to("meta"))):
         with pytest.raises(DeviceError, match="one device"):
             tt.losses.surface_distance(vertices, faces, *wrong)
+
+
+WRONG = {
+    "vertices": [TRIANGLE[0], TRIANGLE[None], TRIANGLE[:, :2], torch.zeros(3, 4)],
+    "faces": [FACES[0], FACES[None], FACES[:, :2], torch.zeros(1, 4, dtype=torch.int64), FACES[:0]],
+}
+
+
+@pytest.mark.parametrize("place", [0, 2])
+@pytest.mark.parametrize(("name", "wrong"), [(name, w) for name, all_wrong in WRONG.items() for w in all_wrong])
+def test_every_shape_that_is_no_mesh(name, wrong, place):
+    """Of the one mesh and of the other, which the message names."""
+    arguments = [TRIANGLE, FACES, TRIANGLE, FACES]
+    arguments[place + (name == "faces")] = wrong
+    which = "others" if place else "vertices"
+    with pytest.raises(ShapeError, match=rf"expected {which} \(V, 3\) with one or more faces"):
+        tt.losses.surface_distance(*arguments)

@@ -76,7 +76,9 @@ def test_items_and_elements(case):
     each = case(x, y, mask=mask, reduction="item")
     assert len(each) == 3
     alone = torch.stack([case(x[k : k + 1], y[k : k + 1], mask=mask[k : k + 1]) for k in range(3)])
-    if each.ndim == 1:
+    # An item of polarization is a picture of one channel and time, and one of pictures of bins is a bin.
+    if not str(case).startswith(("dop_", "aolp_")) and not str(case).endswith(", bins"):
+        assert each.ndim == 1
         torch.testing.assert_close(each, alone, rtol=1e-12, atol=1e-15)
     elements = case(x, y, reduction="none")
     assert bool(elements.isfinite().all())

@@ -287,6 +287,56 @@ def test_pruning_leaves_every_counted_event(kind):
     assert np.count_nonzero(full.sum((0, 1, 3, 4))) > 10
 
 
+def seen_through(index, steady, around):
+    """A lamp seen through a block of another index, 2 m thick and 1 m away: the bins, the third of which is ``around``
+    an arrival.
+    """
+    sensor = {
+        "type": "radiancemeter", "origin": [0, 0, 4], "direction": [0, 0, -1],
+        "film": {"type": "transient_hdr_film", "width": 1, "height": 1, "rfilter": {"type": "box"},
+                 "start_opl": around - 0.125, "temporal_bins": 5, "bin_width_opl": 0.05, "steady": steady},
+    }  # fmt: skip
+    block = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([0, 0, 2]).scale([9, 9, 1])}
+    lamp = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 0.5])}
+    scene = mi.load_dict({
+        "type": "scene", "integrator": {"type": "transient_path", "max_depth": 3}, "sensor": sensor,
+        "block": block | {"bsdf": {"type": "diff_dielectric", "int_ior": index, "ext_ior": 1.0}},
+        "lamp": lamp | {"emitter": {"type": "area", "radiance": 2.0}},
+    })  # fmt: skip
+    _, cube = scene.integrator().render(scene, seed=3, spp=4096)
+    return np.array(cube, dtype=float)[0, 0, :, 0]
+
+
+@pytest.mark.parametrize("steady", [False, True])
+def test_glass_that_light_crosses_sooner_than_the_way_is_long(steady):
+    """1 + 2 n + 0.5 m, less than the 3.5 m between camera and lamp: the straight line is no bound where a film without
+    a steady image ends the paths that are too long for its window.
+    """
+    for index in (0.85, 1.1):
+        values = seen_through(index, steady, 1.5 + 2 * index)
+        through = (1 - ((index - 1) / (index + 1)) ** 2) ** 2
+        assert values.sum() == values[2] == pytest.approx(2.0 * through, rel=0.01)
+
+
+@pytest.mark.parametrize("steady", [False, True])
+@pytest.mark.parametrize("lamp", [None, {"type": "point", "position": [0, 0, 30], "intensity": 1e-6}])
+def test_a_sky_over_a_wall(steady, lamp):
+    """ρ L, whatever the film keeps beside its bins; and where a lamp that is far from all else has a place, the sky has
+    none.
+    """
+    film_of_one = {"type": "transient_hdr_film", "width": 1, "height": 1, "rfilter": {"type": "box"}, "start_opl": 0.0,
+                   "temporal_bins": 60, "bin_width_opl": 0.1, "steady": steady}  # fmt: skip
+    sensor = {"type": "radiancemeter", "origin": [0, 0, 0.5], "direction": [0, 0, -1], "film": film_of_one}
+    scene = mi.load_dict({
+        "type": "scene", "integrator": {"type": "transient_path", "max_depth": 2}, "sensor": sensor,
+        "wall": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": 0.4}},
+        "sky": {"type": "constant", "radiance": 3.0}, **({"lamp": lamp} if lamp else {}),
+    })  # fmt: skip
+    totals = [np.array(scene.integrator().render(scene, seed=k, spp=8192)[1]).sum() / 3 for k in range(6)]
+    assert np.std(totals) < 0.01 * 1.2
+    assert np.mean(totals) == pytest.approx(1.2, rel=0.01)
+
+
 def test_light_box():
     with mi.variant_context(VARIANT):
         plugins.sync()
@@ -298,3 +348,6 @@ def test_light_box():
         glass = mi.load_dict({"type": "dielectric"})
         assert LightBox.of(scene, [glass]) is None
         assert LightBox.of(mi.load_dict({"type": "scene", "sky": {"type": "constant"}}), []) is None
+        assert LightBox.of(mi.load_dict({"type": "scene", "sky": {"type": "constant"}, "lamp": lamp}), []) is None
+        sun = {"type": "directional", "direction": [0, 0, -1]}
+        assert LightBox.of(mi.load_dict({"type": "scene", "sun": sun, "lamp": lamp}), []) is None

@@ -1,0 +1,190 @@
+"""The arithmetic of `cost_of_accuracy`, number by number: losses, errors, gains, counts, seeds, the bar."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import warnings
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+import torchtransient as tt
+from torchtransient.accuracy import measure as measure_module
+from torchtransient.accuracy.cost import cosine_over_the_window
+from torchtransient.accuracy.errors_of_estimates import ErrorTally, Reference
+from torchtransient.accuracy.measure import Estimates, Task, measure
+from torchtransient.accuracy.report import AccuracyReport, Choice, CostPoint
+from torchtransient.errors import ShapeError, UnitError
+
+FIRST, OTHER = Choice("independent", "box"), Choice("multijitter", "box")
+
+
+@pytest.fixture(scope="module")
+def renders():
+    """One of a histogram, one of phasors."""
+    scene = tt.load(tt.scenes.moving_wall(resolution=2, num_bins=64, bin_width_opl=0.05), variant="llvm_ad_mono")
+    with torch.no_grad():
+        return [tt.TransientRenderer(scene, spp=1, **film)(seed=0) for film in ({}, {"frequencies": [0.0, 0.4, 0.8]})]
+
+
+@pytest.mark.parametrize("bins", [1, 6, 64])
+def test_default_loss_bin_by_bin(renders, bins):
+    """cos(2 pi (k + 1/2) / T) for light in bin k alone, mean over pixels."""
+    for k in {0, bins // 3, bins - 1}:
+        cube = torch.zeros(2, bins, 3, 5)
+        cube[1, k, 2, 4] = 30.0
+        found = cosine_over_the_window(dataclasses.replace(renders[0], transient=cube))
+        assert found.item() == pytest.approx(2.0 * math.cos(2 * math.pi * (k + 0.5) / bins), abs=1e-6)
+
+
+def test_default_loss_of_phasors(renders):
+    cube = torch.complex(torch.ones(1, 3, 2, 5), torch.full((1, 3, 2, 5), 7.0))
+    found = cosine_over_the_window(dataclasses.replace(renders[1], phasor=cube))
+    assert found.item() == pytest.approx(3.0)
+
+
+def test_a_steady_image_alone_is_no_measurement(renders):
+    with pytest.raises(ShapeError, match="got a steady image alone"):
+        cosine_over_the_window(dataclasses.replace(renders[0], transient=None))
+
+
+@pytest.mark.parametrize("time_dim", [None, 0, -3])
+def test_errors_of_given_numbers(time_dim):
+    """By the formulas of the module: against two halves, their own noise taken out, and in pairs."""
+    rng = np.random.default_rng(0)
+    a, b, *runs = rng.normal(3.0, 1.0, (6, 4, 2, 3)).astype(np.float32).astype(float)
+    bins = (lambda x: x.mean((1, 2))) if time_dim is not None else (lambda x: np.array([x.mean()]))
+    for reference in (None, Reference(a, b)):
+        tally = ErrorTally(time_dim, reference)
+        for run in runs:
+            tally.add(run)
+        if reference is None:
+            pairs = list(zip(runs[::2], runs[1::2], strict=True))
+            squared = np.stack([bins((x - y) ** 2 / 2) for x, y in pairs])
+            power = np.stack([bins(x * y) for x, y in pairs])
+        else:
+            squared = np.stack([bins((x - (a + b) / 2) ** 2 - (a - b) ** 2 / 4) for x in runs])
+            power = np.stack([bins(a * b)] * len(runs))
+        found = tally.result()
+        assert found.squared == pytest.approx(squared.mean(), rel=1e-5)
+        totals = squared.mean(1)
+        assert found.squared_standard_error == pytest.approx(totals.std(ddof=1) / len(totals) ** 0.5, rel=1e-4)
+        assert found.relative == pytest.approx(math.sqrt(squared.mean() / power.mean()), rel=1e-5)
+        of_bins = np.sqrt(np.maximum(squared.mean(0), 0) / power.mean(0))
+        assert found.median_bin == pytest.approx(np.median(of_bins[power.mean(0) > 0]), rel=1e-5)
+
+
+def test_no_light_at_all():
+    tally = ErrorTally(0)
+    for _ in range(2):
+        tally.add(np.zeros((3, 2, 2)))
+    found = tally.result()
+    assert found.squared == 0 and math.isnan(found.relative) and math.isnan(found.median_bin)
+
+
+def points(choice, figures, quantity="transient"):
+    return [CostPoint(choice, quantity, spp, seconds, error, 0.0, 0.1, 0.1, 2) for spp, seconds, error in figures]
+
+
+def test_gain_and_slope_of_given_points():
+    first = points(FIRST, [(64, 4.0, 0.25), (16, 1.0, 1.0), (256, 16.0, 0.0625)])
+    other = points(OTHER, [(16, 0.5, 0.5), (64, 4.0, 0.03125), (256, 8.0, 0.0)])
+    elsewhere = points(OTHER, [(16, 9.0, 9.0)], "d loss / d x")
+    report = AccuracyReport(first + other + elsewhere, "in pairs")
+    assert report.quantities() == ["transient", "d loss / d x"]
+    assert report.gain("transient", FIRST) == 1
+    # (1 x 1) / (0.5 x 0.5) = 4 and (0.25 x 4) / (0.03125 x 4) = 8; the third one has no error to compare
+    assert report.gain("transient", OTHER) == pytest.approx(math.sqrt(4 * 8))
+    assert math.isnan(report.gain("transient", Choice("stratified", "box")))
+    slope = report.slope("transient", FIRST)
+    assert slope.slope == pytest.approx(-1) and slope.factor == pytest.approx(16)
+    assert report.slope("transient", OTHER) is None  # two points with an error
+    noiseless = AccuracyReport(points(FIRST, [(4, 1.0, 0.0), (8, 1.0, 1.0), (16, 1.0, 0.5), (32, 1.0, 0.25)]), "")
+    assert noiseless.slope("transient", FIRST).slope == pytest.approx(-1)
+
+
+@pytest.mark.parametrize("broken", [{"squared_error": 0.0}, {"squared_error": -1.0}, {"seconds": 0.0}])
+@pytest.mark.parametrize("whose", [FIRST, OTHER], ids=str)
+def test_a_gain_leaves_out_what_has_no_error_or_took_no_time(broken, whose):
+    """Of either curve: the other run alone counts, 1 x 4 over 0.5 x 4."""
+    both = points(FIRST, [(16, 1.0, 3.0), (64, 4.0, 1.0)]) + points(OTHER, [(16, 1.0, 1.0), (64, 4.0, 0.5)])
+    given = [dataclasses.replace(p, **broken) if p.choice == whose and p.spp == 16 else p for p in both]
+    assert AccuracyReport(given, "").gain("transient", OTHER) == pytest.approx(2.0)
+    assert math.isnan(AccuracyReport([p for p in given if p.spp == 16], "").gain("transient", OTHER))
+
+
+def test_a_single_run_has_no_spread_and_no_warning():
+    tally = ErrorTally(None, Reference(np.ones(3), np.ones(3)))
+    tally.add(np.full(3, 1.5))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = tally.result()
+    assert found.squared == pytest.approx(0.25) and math.isnan(found.squared_standard_error)
+
+
+class Counted:
+    """A task that is done at once, and what it was asked for."""
+
+    def __init__(self):
+        self.calls = []
+
+    def candidate(self):
+        def run(spp, seed):
+            self.calls.append((spp, seed))
+            return Estimates({"transient": np.random.default_rng(seed).normal(size=4)}, spp)
+
+        return {"values": Task(run)}
+
+
+@pytest.mark.parametrize("reference_spp", [None, 4096])
+def test_no_two_runs_share_a_seed(reference_spp):
+    """Nor do those of different counts, the reference and the warm-up, however many there are."""
+    counted = Counted()
+    options = {"reference_spp": reference_spp, "repeats": 400, "seed": 5, "progress": False}
+    measure({FIRST: counted.candidate()}, (4, 8, 16, 32), **options)
+    seeds = [seed for _, seed in counted.calls]
+    assert len(seeds) == len(set(seeds)) == 4 * 401 + (2 if reference_spp else 0)
+    assert min(seeds) >= 5
+    asked = [spp for spp, _ in counted.calls]
+    assert asked.count(8) == 401 and asked.count(2048) == (2 if reference_spp else 0)
+
+
+@pytest.mark.parametrize("reference_spp", [None, 256])
+def test_the_bar_ends_where_it_says(monkeypatch, reference_spp):
+    """Samples per pixel of all runs, warm-up and reference."""
+    said, done = [], []
+
+    class Bar(SimpleNamespace):
+        def __enter__(self):
+            said.append((self.total, self.disable))
+            return self
+
+        def __exit__(self, *_):
+            return None
+
+        def update(self, n):
+            done.append(n)
+
+    monkeypatch.setattr(measure_module, "tqdm", Bar)
+    candidates = {choice: Counted().candidate() for choice in (FIRST, OTHER)}
+    measure(candidates, (4, 8), reference_spp=reference_spp, repeats=2, progress=True)
+    measure(candidates, (4,), repeats=2, progress=False)
+    assert [total for total, _ in said] == [2 * 12 * 3 + 2 * (reference_spp or 0), 2 * 4 * 3]
+    assert sum(done) == sum(total for total, _ in said) and [off for _, off in said] == [False, True]
+
+
+def test_bounds_of_counts():
+    """Four times the largest count is enough of a reference, which any number of runs is compared with."""
+    candidates = {FIRST: Counted().candidate()}
+    report = measure(candidates, (64, 8), reference_spp=256, repeats=3, progress=False)
+    assert [(p.spp, p.repeats) for p in report.points] == [(8, 3), (64, 3)]
+    assert report.method == "against a reference of 256 spp"
+    assert measure(candidates, (1,), repeats=2, progress=False).method == "in pairs of independent runs"
+    with pytest.raises(UnitError, match=r"\(256\), got 255"):
+        measure(candidates, (8, 64), reference_spp=255, repeats=3, progress=False)
+    for repeats in (1, 3):
+        with pytest.raises(UnitError, match="even number"):
+            measure(candidates, (8,), repeats=repeats, progress=False)

@@ -1,0 +1,210 @@
+"""Sixty changes of a room's sources, one after the other, and whether its default tests notice.
+
+    make mutants ROOM=losses SEED=1        (or, from tests/: python -m mutation losses 1 [--count 60])
+
+The package is changed in a copy. Results are appended to build/mutants/ROOM-SEED.jsonl, a line each, and a run that was
+stopped goes on behind the last of them; ``--again`` repeats the survivors of an earlier run, for tests that were
+written since. Not a part of the tests: a room takes minutes to hours.
+"""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import json
+import os
+import re
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import pytest
+
+from . import changes, equivalent, rooms
+
+ROOT = Path(__file__).resolve().parents[2]
+COPIED = ("torchtransient", "tests", "docs", "training_examples", "benchmarks", "pyproject.toml", "README.md",
+          "CHANGELOG.md", "LICENSE", "Makefile", "constraints.txt", "constraints-lowest.txt",
+          "hatch_build.py")  # fmt: skip
+# A change that makes a loop endless is noticed, too: the tests would not end.
+PATIENCE, LEAST_SECONDS = 6.0, 240.0
+FIRST = 4  # test files
+
+
+def copied(folder: Path) -> None:
+    """What tests read, beside the package."""
+    for name in COPIED:
+        source = ROOT / name
+        if source.is_dir():
+            shutil.copytree(source, folder / name, ignore=shutil.ignore_patterns("__pycache__", "build"))
+        elif source.exists():
+            shutil.copy2(source, folder / name)
+
+
+def preload() -> None:
+    """What every run imports and no change touches: each is a fork of this process. Dr.Jit would start a thread."""
+    import numpy as np
+    import scipy.signal
+    import scipy.stats
+    import torch
+
+    torch.set_num_threads(1)
+    scipy.signal.fftconvolve(scipy.stats.norm.pdf(np.zeros(1)), np.zeros(1))
+
+
+def run_tests(folder: Path, tests: list[str], seconds: float) -> tuple[str, str]:
+    """('caught', what noticed) or ('survived', ''), from the room's tests in a copy."""
+    output = folder / "output.txt"
+    process = os.fork()
+    if process == 0:
+        _be_tested(folder, tests, output)
+    until = time.monotonic() + seconds
+    while (ended := os.waitpid(process, os.WNOHANG)) == (0, 0):
+        if time.monotonic() > until:
+            os.killpg(process, signal.SIGKILL)
+            os.waitpid(process, 0)
+            return "caught", f"not done after {seconds:.0f} s"
+        time.sleep(0.02)
+    code = os.waitstatus_to_exitcode(ended[1])
+    if code in (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED):
+        return "survived", ""
+    failed = re.findall(r"^(?:FAILED|ERROR) (\S+)", output.read_text(encoding="utf-8", errors="replace"), re.MULTILINE)
+    return "caught", failed[0] if failed else f"exit code {code}"
+
+
+def _be_tested(folder: Path, tests: list[str], output: Path) -> None:
+    code = 1
+    try:
+        os.setsid()
+        file = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        os.dup2(file, 1)
+        os.dup2(file, 2)
+        os.chdir(folder)
+        os.environ["PYTHONPATH"] = sys.path[0] = str(folder)
+        code = int(pytest.main(["-x", "-q", "--tb=no", "-p", "no:cacheprovider", *tests]))
+        if Path(sys.modules["torchtransient"].__file__).parent != folder / "torchtransient":
+            code = 99
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+
+
+def ordered(folder: Path, room: rooms.Room, change: changes.Change) -> list[str]:
+    """The test files of a room, those that speak of the changed module first."""
+    module = (folder / change.path).read_text(encoding="utf-8")
+    names = set(re.findall(r"^(?:def|class) (\w{4,})", module, re.MULTILINE))
+    around = re.findall(r"^(?:def|class) (\w+)", module.encode()[: change.start].decode(), re.MULTILINE)
+    stem = Path(change.path).stem
+
+    def related(path: Path) -> tuple[int, str]:
+        text = path.read_text(encoding="utf-8")
+        words = set(re.findall(r"\w+", text))
+        score = 4 * (stem in path.stem) + 3 * (stem in words) + len(names & words)
+        return -(score + 5 * bool(around and around[-1] in words)), str(path)
+
+    found = sorted(room.test_files(folder), key=related)
+    return [path.relative_to(folder).as_posix() for path in found]
+
+
+def difference(source: bytes, changed: bytes, path: str) -> str:
+    """The lines of a change, without those around it."""
+    before, after = source.decode().splitlines(), changed.decode().splitlines()
+    lines = list(difflib.unified_diff(before, after, path, path, n=0, lineterm=""))[2:]
+    return "\n".join(line for line in lines if not line.startswith("@@"))
+
+
+def try_change(folder: Path, room: rooms.Room, change: changes.Change, seconds: float) -> dict[str, object]:
+    """The outcome of one change; the copy is as it was afterwards."""
+    target = folder / change.path
+    source = target.read_bytes()
+    changed = change.apply(source)
+    tests = ordered(folder, room, change)
+    begun = time.monotonic()
+    # Compiled files are told apart by their second and size, which a change may leave as they were.
+    compiled = [target.parent / "__pycache__" / f"{target.stem}.{sys.implementation.cache_tag}.pyc"]
+    try:
+        target.write_bytes(changed)
+        for path in compiled:
+            path.unlink(missing_ok=True)
+        # Most changes are noticed by the tests that speak of them: the others are not even collected.
+        outcome, by = run_tests(folder, tests[:FIRST], seconds)
+        if outcome == "survived" and tests[FIRST:]:
+            outcome, by = run_tests(folder, tests[FIRST:], seconds)
+    finally:
+        target.write_bytes(source)
+        for path in compiled:
+            path.unlink(missing_ok=True)
+    return {
+        "outcome": outcome, "by": by, "operator": change.operator, "path": change.path, "line": change.line,
+        "seconds": round(time.monotonic() - begun, 1), "diff": difference(source, changed, change.path),
+    }  # fmt: skip
+
+
+def tell(results: list[dict[str, object]]) -> None:
+    """Score and survivors."""
+    proofs = equivalent.proofs()
+    survivors = [result for result in results if result["outcome"] == "survived"]
+    unnoticed = [result for result in survivors if (result["path"], result["diff"]) not in proofs]
+    for result in unnoticed:
+        print(f"\n{result['path']}:{result['line']} ({result['operator']})\n{result['diff']}")
+    same = len(survivors) - len(unnoticed)
+    counted = len(results) - same
+    caught = counted - len(unnoticed)
+    share = 100 * caught / max(1, counted)
+    print(f"\n{caught} of {counted} changes were noticed ({share:.0f} %), {same} more change nothing.")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="mutation", description=__doc__)
+    parser.add_argument("room", choices=sorted(rooms.ROOMS))
+    parser.add_argument("seed", type=int)
+    parser.add_argument("--count", type=int, default=60)
+    parser.add_argument("--again", action="store_true", help="repeat the survivors that are recorded")
+    parser.add_argument("--show", action="store_true", help="print what is recorded")
+    arguments = parser.parse_args()
+    room = rooms.ROOMS[arguments.room]
+    record = ROOT / "build" / "mutants" / f"{arguments.room}-{arguments.seed}.jsonl"
+    record.parent.mkdir(parents=True, exist_ok=True)
+    results = [json.loads(line) for line in record.read_text().splitlines()] if record.exists() else []
+    if arguments.show:
+        tell(results)
+        return
+    with tempfile.TemporaryDirectory(prefix="mutants-") as name:
+        folder = Path(name)
+        copied(folder)
+        preload()
+        tests = [path.relative_to(folder).as_posix() for path in room.test_files(folder)]
+        begun = time.monotonic()
+        outcome, by = run_tests(folder, tests, 3600.0)
+        if outcome != "survived":
+            sys.exit(f"mutation: the tests have to pass before anything is changed, failed: {by}.")
+        seconds = max(LEAST_SECONDS, PATIENCE * (time.monotonic() - begun))
+        chosen = changes.drawn(folder, room.files(folder), arguments.seed)
+        chosen = [change for change, _ in zip(chosen, range(arguments.count), strict=False)]
+        if arguments.again:
+            left = {(r["path"], r["diff"]) for r in results if r["outcome"] == "survived"}
+            every = [c for path in room.files(folder) for c in changes.in_file(path.relative_to(folder).as_posix(),
+                                                                               path.read_bytes())]  # fmt: skip
+            chosen, results = [c for c in every if (c.path, _of(folder, c)) in left], []
+        for number, change in enumerate(chosen[len(results) :], start=len(results) + 1):
+            result = try_change(folder, room, change, seconds)
+            results.append(result)
+            if not arguments.again:
+                with record.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(result) + "\n")
+            print(f"{number} {result['outcome']} {result['path']}:{result['line']} {result['operator']} "
+                  f"{result['seconds']} s {result['by']}", flush=True)  # fmt: skip
+    tell(results)
+
+
+def _of(folder: Path, change: changes.Change) -> str:
+    source = (folder / change.path).read_bytes()
+    return difference(source, change.apply(source), change.path)
+
+
+if __name__ == "__main__":
+    main()
