@@ -17,6 +17,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_state_machine_as_test
 
 from support.call_orders import CASES, FACTORS, SEEDS, VARIANTS, Calls
+from torchtransient import _collection
+from torchtransient.plugins import _registry
 from torchtransient.plugins.drjit_pool import engine_lock
 
 pytestmark = pytest.mark.filterwarnings("ignore")
@@ -28,18 +30,21 @@ COPIES = ("deepcopy", "pickle", "state_dict")
 
 
 def at_rest() -> None:
-    """What every call leaves behind it: nobody holds the engine, messages and the collector are as they were."""
-    free: list[bool] = []
+    """What every call leaves behind it: nobody holds a lock, messages and the collector are as they were."""
+    locked: list[str] = []
 
     def ask() -> None:
-        free.append(engine_lock.acquire(timeout=5))
-        if free[-1]:
-            engine_lock.release()
+        locks = {"engine": engine_lock, "registry": _registry._state.lock, "collection": _collection._lock}
+        for name, lock in locks.items():
+            if lock.acquire(timeout=5):
+                lock.release()
+            else:
+                locked.append(f"{name}: {lock}")
 
     asking = threading.Thread(target=ask)
     asking.start()
     asking.join()
-    assert free == [True], "a call that has ended holds the engine's lock"
+    assert not locked, f"a call that has ended holds {locked}; the main thread is {threading.main_thread().ident}"
     assert gc.isenabled(), "a call that has ended has stopped the collector"
     assert mi.logger().log_level() == mi.LogLevel.Warn
 
@@ -196,7 +201,7 @@ def with_interrupts(seed: int, steps: int) -> int:
                 took[kind] = time.perf_counter() - started
             at_rest()
         except BaseException as error:
-            error.add_note(f"seed {seed}, after {said[-12:]}")
+            error.add_note(f"seed {seed}, after {said[-12:]}; the last interrupt came at\n{calls.stopped_at}")
             raise
     return interrupts
 

@@ -12,6 +12,7 @@ import gc
 import pickle
 import signal
 import threading
+import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -92,7 +93,7 @@ class Calls:
     def __init__(self) -> None:
         self.renderers: dict[str, tt.TransientRenderer] = {}
         self.pending: list[tuple[str, int, int, torch.Tensor, dict[str, torch.Tensor]]] = []
-        self.done: list[str] = []
+        self.stopped_at = ""
 
     # ------------------------------------------------------------------------------------------------- expectations
 
@@ -313,8 +314,9 @@ class Calls:
     def interrupted(self, call: Callable[[], None], after: float) -> bool:
         """A timer in place of a user who presses control and C; whether it came in time."""
 
-        def stop(*_: Any) -> None:
-            raise KeyboardInterrupt
+        def stop(_number: int, frame: Any) -> None:
+            self.stopped_at = "".join(traceback.format_stack(frame, limit=8))
+            signal.raise_signal(signal.SIGINT)  # as the keyboard does: a change of the variant lets it wait
 
         previous = signal.signal(signal.SIGALRM, stop)
         try:
