@@ -19,9 +19,9 @@ import pytest
 
 from support.stored_samples import cube, header, sample, write
 from torchtransient.data.storage.chunks import COMPRESSIONS, chunk_shape
-from torchtransient.data.storage.part_files import sweep_parts
 from torchtransient.data.storage.shard_file import Shard, ShardWriter, stored_checksum
 from torchtransient.errors import ArgumentError, StorageError
+from torchtransient.files.part_files import sweep_parts
 
 
 def digest(path):

@@ -27,8 +27,8 @@ from torchtransient.data.generation.settings import (
 )
 from torchtransient.data.recipes.plugin_modules import plugins_here
 from torchtransient.data.storage.file_names import RECIPE_FILE, SHARD_FILES, shard_file_name
-from torchtransient.data.storage.part_files import check_system
 from torchtransient.errors import ArgumentError, SceneError, StorageError, TorchTransientError, UnitError
+from torchtransient.files.part_files import check_system
 from torchtransient.quantities import count, shown
 
 ENGINES = ("local", "ray")
@@ -257,7 +257,7 @@ def _engine(
 
 
 def _sweep(place: Path) -> None:
-    from torchtransient.data.storage.part_files import sweep_parts
+    from torchtransient.files.part_files import sweep_parts
 
     with contextlib.suppress(OSError):
         sweep_parts(place)

@@ -12,8 +12,8 @@ from torchtransient.data.generation.plan import Plan
 from torchtransient.data.recipes.places import without_places
 from torchtransient.data.recipes.plugin_modules import PluginNames
 from torchtransient.data.storage.file_names import RECIPE_FILE
-from torchtransient.data.storage.part_files import whole_file, writing_said
 from torchtransient.errors import StorageError
+from torchtransient.files.part_files import whole_file, writing_said
 
 FORMAT = "torchtransient data set"
 _WHAT = "generate"
