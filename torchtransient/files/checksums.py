@@ -2,8 +2,8 @@
 
 They stand in the file as one text, JSON: ``{"entries": {name: digest}, "arrays": {name: [rows, digest]}}``, digests in
 hexadecimal. A digest is the SHA-256 of what the value is (its dtype, little-endian, and its shape; of texts nothing but
-the text) and of its bytes in order; arrays of two and more dimensions are taken ``rows`` of their last but one axis at a
-time, so that large ones are hashed as they are written, a part after the other.
+the text) and of its bytes in order; arrays of two and more dimensions are taken ``rows`` of their last but one axis at
+a time, so that large ones are hashed as they are written, a part after the other.
 """
 
 from __future__ import annotations

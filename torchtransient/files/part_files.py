@@ -34,8 +34,8 @@ def whole_file(target: Path, what: str, *, over: bool = True, synchronized: bool
     failed.
 
     ``over``: in place of one that is there; otherwise, that one stays. ``synchronized``: the file and its folder are
-    on the disk before it ends, so that what is in its place survives a loss of power, which takes 10 ms. Raises StorageError for a
-    disk that is full or closed to us and on Windows; errors of the block stay what they are.
+    on the disk before it ends, so that what is in its place survives a loss of power, which takes 10 ms. Raises
+    StorageError for a disk that is full or closed to us and on Windows; errors of the block stay what they are.
     """
     check_system(what)
     with writing_said(target, what):
