@@ -22,7 +22,7 @@ BENCHMARKS = sorted((TESTS.parent / "benchmarks").glob("*.py"))
 LEVEL = {
     "errors": 0, "_llvm": 0, "_collection": 0, "units": 0, "axes": 0, "capture": 0, "interfaces": 0, "pulses": 0,
     "gates": 0, "stokes": 0, "tensor_record": 0, "quantities": 0, "volume_methods": 0,
-    "transform_bins": 0, "yaml_numbers": 0, "floating": 0, "scalar_state": 0, "argument_names": 0,
+    "transform_bins": 0, "plain_texts": 0, "floating": 0, "scalar_state": 0, "argument_names": 0,
     "plugins": 1, "sensing": 1, "reconstruction": 1, "losses": 1, "metrics": 1, "vis": 1,
     "parametrize": 1, "geometry": 1,
     "scenes": 2,
@@ -41,7 +41,7 @@ FORBIDDEN = {
     "argument_names": {"torch", *MITSUBA},
     "volume_methods": {"torch", *MITSUBA},
     "transform_bins": {"torch", *MITSUBA},
-    "yaml_numbers": {"torch", *MITSUBA},
+    "plain_texts": {"torch", *MITSUBA},
     "floating": MITSUBA,
     "scalar_state": MITSUBA,
     "units": MITSUBA,

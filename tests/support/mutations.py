@@ -13,14 +13,15 @@ from pathlib import Path
 import numpy as np
 
 NUMBERS = (
-    "0", "-1", "1", "3.7", "1e400", "-1e308", "1e-320", ".nan", "nan", ".inf", "-.inf", "Infinity", "NaN", "2147483648",
-    "4294967296", "9223372036854775808", "1" + "0" * 30, "9" * 5000, "1e12", "0x10", "1_000", "1:30", "true", "null", "~",
+    "0", "-1", "1", "3.7", "1e400", "-1e308", "1e-320", ".nan", "nan", ".inf", "-.inf", "Infinity", "NaN",
+    "2147483648", "4294967296", "9223372036854775808", "1" + "0" * 30, "9" * 5000, "1e12", "0x10", "1_000", "1:30",
+    "true", "null", "~",
 )  # fmt: skip
 WORDS = (
-    "[]", "{}", '""', "''", "[1, 2]", "{a: 1}", '{"a": 1}', "[[]]", "None", "False", "ü", "\x00", "\x85", "\ufeff", "&a",
-    "*a", "!!binary", "!!python/object/apply:os.getcwd []", "<<: *a", "- ", ": ", "? ", "|", ">", "#", "%", "'", '"', "{",
-    "}", "[", "]", "<", ">", "/>", "&amp;", "&#0;", "<!DOCTYPE a [<!ENTITY b SYSTEM 'file:///etc/passwd'>]>", "$name",
-    "../../../etc/passwd", "[" * 3000, "{a: " * 2000, "<a>" * 2000, "2020-01-01", "1e5", "x" * 5000,
+    "[]", "{}", '""', "''", "[1, 2]", "{a: 1}", '{"a": 1}', "[[]]", "None", "False", "ü", "\x00", "\x85", "\ufeff",
+    "&a", "*a", "!!binary", "!!python/object/apply:os.getcwd []", "<<: *a", "- ", ": ", "? ", "|", ">", "#", "%", "'",
+    '"', "{", "}", "[", "]", "<", ">", "/>", "&amp;", "&#0;", "$name", "../../../etc/passwd", "2020-01-01", "1e5",
+    "<!DOCTYPE a [<!ENTITY b SYSTEM 'file:///etc/passwd'>]>", "[" * 3000, "{a: " * 2000, "<a>" * 2000, "x" * 5000,
 )  # fmt: skip
 _NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 _TOKEN = re.compile(r"[A-Za-z_][\w.]*|-?\d+(?:\.\d+)?|[^\s\w]")
@@ -119,7 +120,8 @@ def archive_mutated(data: bytes, rng: random.Random) -> bytes:
             members[number], members[other] = (name, members[other][1]), (members[other][0], content)
         case _:
             array = np.load(io.BytesIO(content), allow_pickle=False)
-            text = str(array) if array.dtype.kind == "U" else json.dumps(array.tolist() if array.dtype.kind != "c" else 0)
+            plain = array.tolist() if array.dtype.kind != "c" else 0
+            text = str(array) if array.dtype.kind == "U" else json.dumps(plain)
             changed = text_mutated(text.encode(), rng).decode("utf-8", "replace")
             members[number] = (name, _npy(np.array(changed)))
     stream = io.BytesIO()

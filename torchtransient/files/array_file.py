@@ -28,6 +28,7 @@ from torchtransient.files.checksums import CHECKSUMS, Digest, array_digest, chec
 from torchtransient.files.hdf5_limits import check_size, read_attributes, read_dataset
 from torchtransient.files.hdf5_writing import hdf5_package, new_hdf5
 from torchtransient.files.part_files import sweep_parts, whole_file
+from torchtransient.plain_texts import said_in_short
 from torchtransient.quantities import shown
 
 HDF5 = (".h5", ".hdf5")
@@ -39,7 +40,6 @@ READERS = {
     "torchtransient volume": "tt.nlos.read_volume",
 }
 _PART_BYTES = 2**26
-_REASON = 160
 # What the readers of NumPy and h5py raise for files that are damaged or something else.
 _DAMAGED = (
     OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile, RuntimeError, AttributeError, IndexError,
@@ -165,13 +165,7 @@ def damage_said(source: Path, what: str, kind: str = "") -> Iterator[None]:
         if isinstance(error, TorchTransientError) and kind:
             raise StorageError(f"{what}: '{source}': {error}") from error
         kind = kind or f"a {what.removesuffix(' file')} of torchtransient"
-        raise StorageError(f"{what}: '{source}' is not {kind}, or is damaged: {reason(error)}.") from error
-
-
-def reason(error: BaseException) -> str:
-    """What an error of another package says, in no more than a line."""
-    said = " ".join(str(error).split()).rstrip(".")
-    return said if len(said) <= _REASON else f"{said[: _REASON - 3]}..."
+        raise StorageError(f"{what}: '{source}' is not {kind}, or is damaged: {said_in_short(error)}.") from error
 
 
 def array_of(tensor: torch.Tensor, what: str) -> NDArray[Any]:

@@ -20,6 +20,8 @@ from torchtransient.rendering.memory import available_bytes
 
 # Deflate, the filter that all of these files use, makes at most 1032 bytes of one.
 MOST_BYTES_OF_ONE = 1032
+# Gzip, shuffle, Fletcher's checksum, szip, n-bit and scale-offset are HDF5's own, and LZF is that of h5py.
+_FILTERS = {1, 2, 3, 4, 5, 6, 32000}
 # Never written, and small enough to be made of fill values.
 _FREE_BYTES = 2**20
 # Below, memory is not asked about: files are read in a moment.
@@ -43,6 +45,7 @@ def read_dataset(parent: Any, name: str, what: str, part: tuple[Any, ...] = ()) 
     # MATLAB writes the size of an empty array in its place.
     if dataset is None or dataset.shape is None or "MATLAB_empty" in dataset.attrs:
         return None
+    _check_filters(dataset, name, what)
     if is_text(dataset):
         return _text(dataset, what)
     if dataset.dtype.kind not in "biufc":
@@ -78,6 +81,18 @@ def dataset_of(parent: Any, name: str, what: str) -> Any:
     if found.is_virtual or found.external:
         raise StorageError(f"{what}: '{name}' lies in other files, which are not read.")
     return found
+
+
+def _check_filters(dataset: Any, name: str, what: str) -> None:
+    """Filters that are no part of HDF5 would be looked for and loaded as code, wherever HDF5_PLUGIN_PATH leads."""
+    settings = dataset.id.get_create_plist()
+    for number in range(settings.get_nfilters()):
+        code = settings.get_filter(number)[0]
+        if code not in _FILTERS:
+            raise StorageError(
+                f"{what}: '{name}' is packed by the filter {code}, which is no part of HDF5 and is not loaded. Write "
+                "the file with gzip or without compression."
+            )
 
 
 def is_text(dataset: Any) -> bool:

@@ -18,6 +18,7 @@ from torchtransient.errors import StorageError
 from torchtransient.files.array_file import path_of
 from torchtransient.files.part_files import sweep_parts as sweep_parts
 from torchtransient.files.part_files import whole_file, writing_said
+from torchtransient.plain_texts import json_data
 from torchtransient.quantities import shown
 from torchtransient.rendering.progress import with_bar
 
@@ -213,10 +214,7 @@ def _difference(name: str, expected: Any, found: Any) -> str:
 def _expected(folder: Path) -> dict[str, Any]:
     """What ``recipe.json`` says, nothing where it is missing or no such file."""
     text = _text_of(folder / RECIPE_FILE)
-    try:
-        found = json.loads(text) if text is not None else {}
-    except ValueError:
-        raise StorageError(f"{_WHAT}: '{folder / RECIPE_FILE}' is no JSON: it was cut or changed.") from None
+    found = {} if text is None else json_data(text, f"{_WHAT}: '{folder / RECIPE_FILE}', which was cut or changed")
     return found if isinstance(found, dict) else {}
 
 

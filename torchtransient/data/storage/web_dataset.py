@@ -93,7 +93,8 @@ def decode_web_sample(members: Mapping[str, Any], *, as_stored: bool = False) ->
 def read_web_dataset(path: str | Path, *, as_stored: bool = False) -> Iterator[dict[str, Any]]:
     """The samples of a tar one by one, without the package webdataset. Raises StorageError for damaged files."""
     source = check_source(path, _WHAT)
-    with damage_said(source, _WHAT, "a WebDataset of torchtransient"), _tar_said(source), tarfile.open(source, "r:") as tar:
+    kind = "a WebDataset of torchtransient"
+    with damage_said(source, _WHAT, kind), _tar_said(source), tarfile.open(source, "r:") as tar:
         members: dict[str, Any] = {}
         for member in tar:
             key, _, ending = member.name.partition(".")
