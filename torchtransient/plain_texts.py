@@ -28,7 +28,7 @@ def said_in_short(error: BaseException) -> str:
 
 def some_of(names: Any, letters: int = 240) -> str:
     """Names in a message: as many as there is place for, and how many more there are."""
-    names = [str(name) for name in names]
+    names = [name if len(name) <= 60 else f"{name[:57]}..." for name in map(str, names)]
     text = ", ".join(names)
     if len(text) <= letters:
         return text
@@ -42,7 +42,8 @@ def text_of_file(path: Any, what: str) -> str:
     try:
         return Path(path).read_text(encoding="utf-8")
     except (OSError, ValueError, TypeError) as error:
-        raise StorageError(f"{what}: expected a text, but '{str(path)[:200]}' cannot be read: {said_in_short(error)}.") from error
+        said = said_in_short(error)
+        raise StorageError(f"{what}: expected a text, but '{str(path)[:200]}' cannot be read: {said}.") from error
 
 
 def json_data(text: str | bytes, what: str) -> Any:

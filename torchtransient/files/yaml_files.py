@@ -124,7 +124,7 @@ class Section:
         """One of some texts."""
         value = self.get(name, default)
         if value not in choices:
-            raise SceneError(f"{self._at(name)}: expected one of {', '.join(choices)}, got {shown(value)}.")
+            raise SceneError(f"{self._at(name)}: expected one of {some_of(choices)}, got {shown(value)}.")
         return value
 
     def numbers(self, name: str, counts: Sequence[int], default: Any = _MISSING) -> Any:

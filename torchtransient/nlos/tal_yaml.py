@@ -15,6 +15,8 @@ from torchtransient.capture.scan import KINDS
 from torchtransient.errors import SceneError
 from torchtransient.files.yaml_files import Section, as_number, file_beside, read_yaml
 from torchtransient.nlos.tal_materials import material, spectrum
+from torchtransient.plain_texts import some_of
+from torchtransient.quantities import shown
 from torchtransient.scenes.transforms import rotate, scale, translate
 from torchtransient.transform_bins import transform_bins
 
@@ -152,10 +154,10 @@ def _geometry(section: Section, folders: Sequence[Path]) -> tuple[Wall, dict[str
     names = [part.text("name") for part in parts]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise SceneError(f"y-tal scene: geometry: {', '.join(twice)} stands there more than once; names must differ.")
+        raise SceneError(f"y-tal scene: geometry: {some_of(twice)} stands there more than once; names must differ.")
     wall_name = section.text("relay_wall")
     if wall_name not in names:
-        raise SceneError(f"y-tal scene: relay_wall: expected one of {', '.join(names)}, got {wall_name!r}.")
+        raise SceneError(f"y-tal scene: relay_wall: expected one of {some_of(names)}, got {shown(wall_name)}.")
     shapes = {name: _shape(part, name, folders) for name, part in zip(names, parts, strict=True)}
     wall = shapes.pop(wall_name)
     if wall["type"] != "rectangle":

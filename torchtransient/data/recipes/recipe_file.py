@@ -265,7 +265,7 @@ def _builtin(given: Mapping[str, Any]) -> Any:
     name = given["builtin"]
     known = [made for made in dir(scenes) if inspect.isfunction(getattr(scenes, made))]
     if name not in known:
-        raise SceneError(f"recipe: scene: unknown builtin {name!r}. Known ones are {', '.join(known)}.")
+        raise SceneError(f"recipe: scene: unknown builtin {shown(name)}. Known ones are {', '.join(known)}.")
     arguments = {key: read(value) for key, value in given.items() if key != "builtin"}
     try:
         return getattr(scenes, name)(**arguments)
