@@ -85,6 +85,6 @@ def test_tiles_have_to_be_told(arm):
         with pytest.raises(ShapeError, match="tile"):
             ThirdBounce(scene, film, samples, sensors, tile=tile)
     pairs = film_of(GRID, GRID, exhaustive_scan=True, laser_scan_width=GRID, laser_scan_height=GRID)
-    pairs.prepare()
+    pairs.start_render()
     with pytest.raises(SceneError, match="16 tiles"):
         add_exhaustive(ThirdBounce(scene, pairs, many, sensors, tile=tiles.of_points()), sensors)
