@@ -6,6 +6,8 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,8 @@ MOST_LEVELS = 100
 # Of a text with fewer characters, which aliases may repeat.
 _NODES = 2**16
 _LETTERS = 160
+# Of a message that repeats what a file says: all of it, or its beginning and its end.
+_MOST, _BEGINNING, _END = 360, 220, 120
 _WITHOUT_POINT = re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+")
 # What PyYAML's constructors and Python's own parsers raise of texts that are something else.
 _WRONG = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, RecursionError, MemoryError)
@@ -54,15 +58,33 @@ def json_data(text: str | bytes, what: str) -> Any:
         raise StorageError(f"{what}: expected JSON, got what cannot be read: {said_in_short(error)}.") from error
 
 
-def yaml_data(text: str, what: str, yaml: Any, loader: Any = None) -> Any:
+@contextmanager
+def told_shortly(what: str) -> Iterator[None]:
+    """Errors of the library that repeat what a file says, as long as it is, cut to a line; errors of the disk, where a
+    file names others, as StorageError.
+    """
+    try:
+        yield
+    except TorchTransientError as error:
+        said = str(error)
+        if len(said) <= _MOST and "\n" not in said:
+            raise
+        line = " ".join(said.split())
+        raise type(error)(line if len(line) <= _MOST else f"{line[:_BEGINNING]} ... {line[-_END:]}") from error
+    except OSError as error:
+        raise StorageError(f"{what}: a file that it names cannot be read: {said_in_short(error)}.") from error
+
+
+def yaml_data(text: str, what: str, yaml: Any, loader: Any = None, most_nodes: int | None = None) -> Any:
     """The data of a YAML text, with 1e-10 as a number. ``yaml``: the package. ``loader``: one of its safe loaders.
 
-    Raises StorageError for what is no YAML, for more than 100 levels, and for more nodes than the text has characters
-    (65536 at least) once aliases are written out; the library's own errors pass.
+    Raises StorageError for what is no YAML, for more than 100 levels, and for more nodes than ``most_nodes``, by
+    default as many as the text has characters and 65536 at least, once aliases are written out; the library's own
+    errors pass.
     """
     loader = loader or safe_loader(yaml)
     try:
-        _check_events(yaml, text, what)
+        _check_events(yaml, text, what, most_nodes or max(_NODES, len(text)))
         return yaml.load(text, Loader=reads_exponents(type("Loader", (loader,), {})))
     except TorchTransientError:
         raise
@@ -95,9 +117,8 @@ def _place(error: Any) -> str:
     return f" in line {mark.line + 1}, column {mark.column + 1}: {said_in_short(ValueError(said))}"
 
 
-def _check_events(yaml: Any, text: str, what: str) -> None:
+def _check_events(yaml: Any, text: str, what: str, most: int) -> None:
     """Count nodes as aliases repeat them, and levels, before anything is built."""
-    most = max(_NODES, len(text))
     sizes: list[int] = [0]
     anchors: dict[str, int] = {}
     names: list[str | None] = [None]

@@ -11,10 +11,10 @@ import pytest
 import torch
 
 from support.sealed_files import as_first_version
+from torchtransient.array_files import array_file
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
 from torchtransient.errors import ArgumentError, StorageError
-from torchtransient.files import array_file
 from torchtransient.files.capture_file import read_capture, write_capture
 
 ENDINGS = ("h5", "hdf5", "npz")

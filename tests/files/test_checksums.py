@@ -18,9 +18,9 @@ import torchtransient as tt
 from support.capture_files import grids, made
 from support.killed_writers import output
 from support.sealed_files import as_first_version
+from torchtransient.array_files import array_file, hdf5_limits
+from torchtransient.array_files.part_files import whole_file
 from torchtransient.errors import StorageError
-from torchtransient.files import array_file, hdf5_limits
-from torchtransient.files.part_files import whole_file
 from torchtransient.files.result_file import read_result, write_result
 
 SEED = 3

@@ -11,9 +11,9 @@ import pytest
 import torch
 
 from support.sealed_files import as_first_version
+from torchtransient.array_files import array_file
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import ArgumentError, MissingPackageError, StorageError
-from torchtransient.files import array_file
 from torchtransient.files.result_file import check_target, read_result, write_result
 from torchtransient.rendering.output import RenderOutput, RenderStats
 

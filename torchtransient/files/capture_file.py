@@ -21,12 +21,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchtransient.array_files import array_file
+from torchtransient.array_files.array_file import array_of, damage_said, read_arrays, tensor_in, write_arrays
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.capture.metadata import metadata_text
 from torchtransient.errors import ArgumentError
-from torchtransient.files import array_file
-from torchtransient.files.array_file import array_of, damage_said, read_arrays, tensor_in, write_arrays
 from torchtransient.files.entries import flag_of, names_of, notes_of, number_of, text_of, whole_of
 from torchtransient.files.plain_data import plain, restored
 

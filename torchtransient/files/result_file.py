@@ -20,11 +20,11 @@ from typing import Any, ClassVar
 
 import torch
 
+from torchtransient.array_files import array_file
+from torchtransient.array_files.array_file import array_of, damage_said, read_arrays, tensor_in, write_arrays
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture.metadata import metadata_text
 from torchtransient.errors import ArgumentError, StorageError
-from torchtransient.files import array_file
-from torchtransient.files.array_file import array_of, damage_said, read_arrays, tensor_in, write_arrays
 from torchtransient.files.entries import names_of, notes_of, number_of, text_of, whole_of
 from torchtransient.gates import Gate
 from torchtransient.rendering.films.choices import all_films, of_entries, of_output

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import difflib
 import math
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -54,7 +55,7 @@ def _text(source: str | Path, who: str) -> tuple[str, Path]:
     if isinstance(source, str) and "\n" in source:
         return source, Path.cwd()
     path = Path(source)
-    if path.is_dir():
+    if os.path.isdir(path):
         # y-tal's experiments are folders that hold a file of their name.
         path = path / f"{path.resolve().name}.yaml"
     return text_of_file(path, who), path.resolve().parent
@@ -156,7 +157,7 @@ def file_beside(name: str, folders: Sequence[Path], where: str) -> Path:
     """The first of `folders` that has a file of that name. Raises SceneError where none does."""
     for folder in folders:
         path = folder / name
-        if path.is_file():
+        if os.path.isfile(path):
             return path.resolve()
     looked = ", ".join(f"'{folder}'" for folder in dict.fromkeys(folders))
     raise SceneError(f"{where}: no file '{name}' in {looked}. Give a path from the folder of the YAML file.")

@@ -15,7 +15,7 @@ from torchtransient.capture.scan import KINDS
 from torchtransient.errors import SceneError
 from torchtransient.files.yaml_files import Section, as_number, file_beside, read_yaml
 from torchtransient.nlos.tal_materials import material, spectrum
-from torchtransient.plain_texts import some_of
+from torchtransient.plain_texts import some_of, told_shortly
 from torchtransient.quantities import shown
 from torchtransient.scenes.transforms import rotate, scale, translate
 from torchtransient.transform_bins import transform_bins
@@ -80,6 +80,11 @@ def read_tal_yaml(source: str | Path) -> TalSettings:
     what is not supported: a laser that is not sampled as a spot, bins that are found automatically, spots laid out by
     a field of view, walls that are no rectangle.
     """
+    with told_shortly("y-tal scene"):
+        return _settings(source)
+
+
+def _settings(source: str | Path) -> TalSettings:
     data, folder = read_yaml(source, "y-tal scene")
     section = Section(data, "y-tal scene", _KNOWN)
     _refuse_unsupported(section)

@@ -35,7 +35,7 @@ from torchtransient.data.recipes.written import (
 from torchtransient.errors import MissingPackageError, SceneError, StorageError, TorchTransientError
 from torchtransient.files.scan_data import scan_data, scan_from_data
 from torchtransient.files.yaml_files import Section, read_yaml
-from torchtransient.plain_texts import json_data, said_in_short, text_of_file
+from torchtransient.plain_texts import json_data, said_in_short, text_of_file, told_shortly
 from torchtransient.quantities import shown
 from torchtransient.rendering.description import DictDescription, XmlDescription, describe_dict
 from torchtransient.rendering.scene_handle import Scene
@@ -184,7 +184,8 @@ def faults_said() -> Iterator[None]:
     where they are used.
     """
     try:
-        yield
+        with told_shortly("recipe"):
+            yield
     except (TypeError, KeyError, ValueError, AttributeError, IndexError, OverflowError, RecursionError) as error:
         if isinstance(error, TorchTransientError):
             raise

@@ -13,6 +13,9 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from torchtransient.array_files.array_file import check_source, damage_said
+from torchtransient.array_files.hdf5_limits import check_memory, dataset_of, read_dataset
+from torchtransient.array_files.hdf5_writing import hdf5_package
 from torchtransient.data.storage.chunks import check_chunks, time_axis
 from torchtransient.data.storage.encodings import ENCODINGS, decoded
 from torchtransient.data.storage.shard_writing import (
@@ -25,9 +28,6 @@ from torchtransient.data.storage.shard_writing import (
 )
 from torchtransient.data.storage.shard_writing import ShardWriter as ShardWriter
 from torchtransient.errors import StorageError
-from torchtransient.files.array_file import check_source, damage_said
-from torchtransient.files.hdf5_limits import check_memory, dataset_of, read_dataset
-from torchtransient.files.hdf5_writing import hdf5_package
 from torchtransient.quantities import shown
 
 _TEXTS = ("format", "store", "compression")

@@ -9,17 +9,17 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from torchtransient.array_files.array_file import HDF5, check_folder, damage_said, path_of
+from torchtransient.array_files.hdf5_limits import read_attributes
+from torchtransient.array_files.hdf5_writing import hdf5_package
 from torchtransient.axes import FrequencyAxis
 from torchtransient.capture import Capture
 from torchtransient.capture.files import register_files
 from torchtransient.errors import ArgumentError, StorageError
 from torchtransient.files import capture_file
-from torchtransient.files.array_file import HDF5, check_folder, damage_said, path_of
 from torchtransient.files.captures import cdt, dirac, keyhole, phasor_field, rect_data, tal, zaragoza
 from torchtransient.files.captures.contents import WHAT, Contents, opened
 from torchtransient.files.captures.gaps import Gaps
-from torchtransient.files.hdf5_limits import read_attributes
-from torchtransient.files.hdf5_writing import hdf5_package
 from torchtransient.plain_texts import some_of
 from torchtransient.quantities import shown
 

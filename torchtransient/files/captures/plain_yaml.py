@@ -24,7 +24,7 @@ def read_plain_yaml(text: str, what: str) -> Any:
     yaml = _package(what)
     if len(text) > MOST_CHARACTERS:
         raise StorageError(f"{what}: expected a YAML text below {MOST_CHARACTERS:,} characters, got {len(text):,}.")
-    return yaml_data(text, what, yaml, _loader(yaml))
+    return yaml_data(text, what, yaml, _loader(yaml), MOST_NODES)
 
 
 def write_plain_yaml(data: Any, what: str) -> str:

@@ -27,7 +27,7 @@ from torch import nn
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import MissingPackageError, StorageError, TorchTransientError
-from torchtransient.plain_texts import json_data, some_of, text_of_file, yaml_data
+from torchtransient.plain_texts import json_data, some_of, text_of_file, told_shortly, yaml_data
 from torchtransient.quantities import shown
 from torchtransient.sensing.base.layout import check_number
 from torchtransient.sensing.base.policies import GradPolicy
@@ -219,6 +219,11 @@ class Device:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Device:
         """What `to_dict` made. Raises StorageError for missing or unknown entries."""
+        with told_shortly("Device"):
+            return cls._from_dict(data)
+
+    @classmethod
+    def _from_dict(cls, data: Mapping[str, Any]) -> Device:
         wanted = {"name", "description", "sources", "stages"}
         found = set(data) if isinstance(data, Mapping) else set()
         if not wanted <= found or found - wanted - {"bin_width_s", "num_bins"}:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.errors import StorageError
-from torchtransient.rendering.memory import available_bytes
+from torchtransient.free_memory import available_memory
 
 # Deflate, the filter that all of these files use, makes at most 1032 bytes of one.
 MOST_BYTES_OF_ONE = 1032
@@ -113,7 +113,7 @@ def check_memory(declared: int, what: str) -> None:
     """Raise StorageError where an array of ``declared`` bytes does not fit into memory."""
     if declared < _LARGE_BYTES:
         return
-    available = available_bytes("scalar_rgb")
+    available = available_memory()
     if available is not None and declared > available:
         raise StorageError(
             f"{what} takes {declared / 1e9:.3g} GB, and {available / 1e9:.3g} GB of memory are left. Free some memory, "

@@ -23,11 +23,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchtransient.array_files.checksums import CHECKSUMS, Digest, array_digest, check, checksums_text, parts_of
+from torchtransient.array_files.hdf5_limits import check_size, read_attributes, read_dataset
+from torchtransient.array_files.hdf5_writing import hdf5_package, new_hdf5
+from torchtransient.array_files.part_files import sweep_parts, whole_file
 from torchtransient.errors import StorageError, TorchTransientError
-from torchtransient.files.checksums import CHECKSUMS, Digest, array_digest, check, checksums_text, parts_of
-from torchtransient.files.hdf5_limits import check_size, read_attributes, read_dataset
-from torchtransient.files.hdf5_writing import hdf5_package, new_hdf5
-from torchtransient.files.part_files import sweep_parts, whole_file
 from torchtransient.plain_texts import said_in_short
 from torchtransient.quantities import shown
 
@@ -116,7 +116,7 @@ def write_arrays(target: Path, arrays: Mapping[str, NDArray[Any]], entries: Mapp
 
 def read_arrays(path: str | Path, forms: Sequence[str], what: str, known: Callable[[str], bool]) -> dict[str, Any]:
     """Arrays and entries by name, of the names that are ``known``, of a file whose entry `format` is one of `forms`.
-    The last of these has checksums, which are compared; of the others what is there.
+    They are compared with their checksums, which files of the first version of a format do not have.
 
     Raises StorageError for a file that is missing, of another format, or damaged.
     """
@@ -125,21 +125,50 @@ def read_arrays(path: str | Path, forms: Sequence[str], what: str, known: Callab
         raise StorageError(f"{what}: expected a name that ends in {', '.join(ENDINGS)}, got '{source}'.")
     check_source(source, what)
 
-    def wanted(name: str) -> bool:
-        return name == CHECKSUMS or known(name)
-
     with damage_said(source, what):
-        read = _read_hdf5 if source.suffix.lower() in HDF5 else _read_npz
-        found = str(np.asarray(read(source, what, "format".__eq__)["format"]).reshape(-1)[0])
+        found = _format_of(source, what)
         if found not in forms:
-            raise StorageError(f"{what}: '{source}' is {other_kind(found, forms[-1])}")
-        values = read(source, what, wanted)
-        checksums = values.pop(CHECKSUMS, None)
-        if checksums is not None:
-            check(values, checksums, f"{what}: '{source}'", known)
-        elif found == forms[-1]:
-            raise StorageError(f"{what}: '{source}' has lost its checksums: it is damaged. Take a copy.")
-        return values
+            raise StorageError(f"{what}: '{source}' is {other_kind(found or 'nothing', forms[-1])}")
+        return _values(source, what, known, found)
+
+
+def read_some(path: Path, what: str, known: Callable[[str], bool]) -> dict[str, Any]:
+    """Arrays and entries of the names that are ``known``, of a file of any program. Files of this library that have
+    checksums are compared with them. Raises StorageError for what is missing, damaged or too large.
+    """
+    check_source(path, what)
+    with damage_said(path, what, "a file of arrays"):
+        return _values(path, what, known, _format_of(path, what))
+
+
+def read_npy(path: Path, what: str) -> NDArray[Any]:
+    """The array of a `.npy`. Raises StorageError for what is none, for objects, and for more than the file holds."""
+    check_source(path, what)
+    with damage_said(path, what, "an array of NumPy"), path.open("rb") as stream:
+        _check_array(stream, path.stat().st_size, f"{what}: '{path}'", packed=False)
+        stream.seek(0)
+        array: NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
+        return array
+
+
+def _format_of(source: Path, what: str) -> str:
+    """What a file says that it is, "" where it says nothing."""
+    found = _read(source, what, "format".__eq__).get("format", "")
+    return str(np.asarray(found).reshape(-1)[0]) if np.size(found) else ""
+
+
+def _values(source: Path, what: str, known: Callable[[str], bool], form: str) -> dict[str, Any]:
+    values = _read(source, what, lambda name: name == CHECKSUMS or known(name))
+    checksums = values.pop(CHECKSUMS, None)
+    if checksums is not None:
+        check(values, checksums, f"{what}: '{source}'", known)
+    elif form.startswith("torchtransient ") and not form.endswith(" 1"):
+        raise StorageError(f"{what}: '{source}' has lost its checksums: it is damaged. Take a copy.")
+    return values
+
+
+def _read(source: Path, what: str, known: Callable[[str], bool]) -> dict[str, Any]:
+    return (_read_hdf5 if source.suffix.lower() in HDF5 else _read_npz)(source, what, known)
 
 
 def other_kind(found: str, form: str) -> str:
@@ -262,13 +291,21 @@ def _check_member(file: zipfile.ZipFile, entry: zipfile.ZipInfo, what: str, size
     """Compare the shape that an array declares with what is stored of it, before there is memory for it."""
     if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise StorageError(f"{what} is packed as NumPy packs nothing (method {entry.compress_type}). Use np.savez.")
+    # What it says of its size, but no more than there is.
     with file.open(entry) as stream:
-        read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-        version = np.lib.format.read_magic(stream)
-        if version not in read_header:
-            raise StorageError(f"{what} is an array of version {version}, which NumPy writes for none of numbers.")
-        shape, _, dtype = read_header[version](stream)
+        _check_array(stream, min(entry.compress_size, size), what)
+
+
+def _check_array(stream: Any, stored: int, what: str, *, packed: bool = True) -> None:
+    """Compare what the head of an array declares with the bytes that are ``stored`` of it."""
+    read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    version = np.lib.format.read_magic(stream)
+    if version not in read_header:
+        raise StorageError(f"{what} is an array of version {version}, which NumPy writes for none of numbers.")
+    shape, _, dtype = read_header[version](stream)
     if dtype.kind not in "biufcU":
         raise StorageError(f"{what} holds {str(dtype)[:60]}; expected numbers or a text. No pickle is read.")
-    # What it says of its size, but no more than there is.
-    check_size(math.prod(shape) * dtype.itemsize, min(entry.compress_size, size), f"{what} {shape}")
+    declared = math.prod(shape) * dtype.itemsize
+    if not packed and declared > stored:
+        raise StorageError(f"{what} declares {declared:,} bytes of numbers and stores {stored:,}: it is damaged.")
+    check_size(declared, stored, f"{what} {shape}")
