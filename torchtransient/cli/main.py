@@ -1,7 +1,7 @@
 """The command `torchtransient`: its subcommands, and how errors leave it.
 
-An error that the library raises on purpose, or that the system does, is one line on stderr and exit status 2; any other
-is a fault of the library, one line and status 70. With `--debug` both are tracebacks.
+An error that the library raises on purpose, or that the system does, is one line on stderr and exit status 2; any
+other is a fault of the library, one line and status 70. With `--debug` both are tracebacks.
 Commands are imported when they are called, so that `torchtransient --help` needs no torch.
 """
 
@@ -34,6 +34,9 @@ COMMANDS = {
 
 
 _FAULT = 300
+_FAULTS = (
+    ArithmeticError, AssertionError, AttributeError, LookupError, MemoryError, TypeError, ValueError, RuntimeError,
+)  # fmt: skip
 
 
 class Commands(click.Group):
@@ -75,8 +78,7 @@ class Commands(click.Group):
                 raise
             click.echo(f"error: {' '.join(str(error).split())}.", err=True)
             sys.exit(2)
-        except (ArithmeticError, AssertionError, AttributeError, LookupError, MemoryError, TypeError, ValueError,
-                RuntimeError) as error:  # fmt: skip
+        except _FAULTS as error:
             # What click itself ends commands with is a RuntimeError too.
             if ctx.params.get("debug") or isinstance(error, click.exceptions.Exit | click.exceptions.Abort):
                 raise
