@@ -8,7 +8,8 @@ from support.killed_writers import in_child
 from support.mutated_files import run
 from support.read_files import READERS
 
-QUICK = {name: 100 for name in READERS if name != "built scene"} | {"data set": 30}
+_TEXTS = ("WebDataset", "device", "setup", "scene", "capture of cdt", "capture of keyhole", "result")
+QUICK = {name: 100 if name in _TEXTS else 40 for name in READERS if name not in ("built scene", "data set")}
 
 
 def test_mutants(tmp_path):
@@ -19,10 +20,10 @@ def test_mutants(tmp_path):
         for name, report in run(names, folder, count).items():
             assert report.findings == []
             assert report.read + report.refused == count, name
-            assert report.read > 0 or name == "shard"
+            assert report.read > 0 or name in ("shard", "recipe")
             assert report.refused > 0
 
 
 def test_killed_writers(tmp_path):
-    found = in_child(tmp_path, kills=8, seed=0)
-    assert found["old"] + found["new"] == 8
+    found = in_child(tmp_path, kills=5, seed=0)
+    assert found["old"] + found["new"] == 5

@@ -50,7 +50,7 @@ def _in_child(names: list[str], folder: Path, first: int, last: int) -> None:
     """Mutants ``first`` to ``last`` - 1 of each reader; what comes of it in ``report.jsonl``, what is being read in
     ``now``.
     """
-    import torchtransient  # noqa: F401  # before Mitsuba
+    import torchtransient.nlos  # noqa: F401  # before Mitsuba, and with the layouts of captures
 
     warnings.simplefilter("ignore")
     now = os.open(folder / "now", os.O_CREAT | os.O_RDWR)

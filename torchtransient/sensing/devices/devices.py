@@ -27,7 +27,7 @@ from torch import nn
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import MissingPackageError, StorageError, TorchTransientError
-from torchtransient.plain_texts import json_data, some_of, text_of_file, told_shortly, yaml_data
+from torchtransient.plain_texts import json_data, said_in_short, some_of, text_of_file, told_shortly, yaml_data
 from torchtransient.quantities import shown
 from torchtransient.sensing.base.layout import check_number
 from torchtransient.sensing.base.policies import GradPolicy
@@ -288,7 +288,8 @@ def build_stage(spec: Any, axis: TimeAxis | None = None, budget: Mapping[str, An
         raise
     except TypeError as error:
         raise StorageError(
-            f"build_stage: expected arguments of {spec['kind']}, got {sorted(arguments)}: {error}."
+            f"build_stage: expected arguments of {spec['kind']}, got {some_of(sorted(arguments))}: "
+            f"{said_in_short(error)}."
         ) from error
 
 
