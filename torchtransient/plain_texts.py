@@ -58,6 +58,12 @@ def json_data(text: str | bytes, what: str) -> Any:
         raise StorageError(f"{what}: expected JSON, got what cannot be read: {said_in_short(error)}.") from error
 
 
+def line_of(text: str) -> str:
+    """A text as one line, its beginning and its end where it is long."""
+    line = " ".join(text.split())
+    return line if len(line) <= _MOST else f"{line[:_BEGINNING]} ... {line[-_END:]}"
+
+
 @contextmanager
 def told_shortly(what: str) -> Iterator[None]:
     """Errors of the library that repeat what a file says, as long as it is, cut to a line; errors of the disk, where a
@@ -69,8 +75,7 @@ def told_shortly(what: str) -> Iterator[None]:
         said = str(error)
         if len(said) <= _MOST and "\n" not in said:
             raise
-        line = " ".join(said.split())
-        raise type(error)(line if len(line) <= _MOST else f"{line[:_BEGINNING]} ... {line[-_END:]}") from error
+        raise type(error)(line_of(said)) from error
     except OSError as error:
         raise StorageError(f"{what}: a file that it names cannot be read: {said_in_short(error)}.") from error
 

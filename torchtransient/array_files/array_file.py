@@ -132,12 +132,13 @@ def read_arrays(path: str | Path, forms: Sequence[str], what: str, known: Callab
         return _values(source, what, known, found)
 
 
-def read_some(path: Path, what: str, known: Callable[[str], bool]) -> dict[str, Any]:
+def read_some(path: Path, what: str, known: Callable[[str], bool], kind: str = "a file of arrays") -> dict[str, Any]:
     """Arrays and entries of the names that are ``known``, of a file of any program. Files of this library that have
-    checksums are compared with them. Raises StorageError for what is missing, damaged or too large.
+    checksums are compared with them. ``kind``: what is expected, for messages. Raises StorageError for what is missing,
+    damaged or too large.
     """
     check_source(path, what)
-    with damage_said(path, what, "a file of arrays"):
+    with damage_said(path, what, kind):
         return _values(path, what, known, _format_of(path, what))
 
 

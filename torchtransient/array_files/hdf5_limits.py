@@ -48,8 +48,8 @@ def read_dataset(parent: Any, name: str, what: str, part: tuple[Any, ...] = ()) 
     _check_filters(dataset, name, what)
     if is_text(dataset):
         return _text(dataset, what)
-    if dataset.dtype.kind not in "biufc":
-        raise StorageError(f"{what}: '{name}' holds {dataset.dtype}; expected numbers.")
+    if not is_number(dataset.dtype):
+        raise StorageError(f"{what}: '{name}' holds {str(dataset.dtype)[:60]}; expected numbers of up to 64 bits.")
     left = [n for axis, n in enumerate(dataset.shape) if axis >= len(part) or not isinstance(part[axis], int)]
     wanted = math.prod(left) * dataset.dtype.itemsize
     check_size(wanted, dataset.id.get_storage_size(), f"{what}: '{name}' {dataset.shape}")
@@ -93,6 +93,11 @@ def _check_filters(dataset: Any, name: str, what: str) -> None:
                 f"{what}: '{name}' is packed by the filter {code}, which is no part of HDF5 and is not loaded. Write "
                 "the file with gzip or without compression."
             )
+
+
+def is_number(dtype: np.dtype[Any]) -> bool:
+    """Whether an array is of numbers that tensors can have, complex ones of two of them."""
+    return dtype.kind in "biufc" and dtype.itemsize <= (16 if dtype.kind == "c" else 8)
 
 
 def is_text(dataset: Any) -> bool:

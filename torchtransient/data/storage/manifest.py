@@ -24,6 +24,8 @@ from torchtransient.rendering.progress import with_bar
 
 FORMAT = "torchtransient manifest 1"
 _WHAT = "data set"
+# Of samples, whose numbers stand in memory.
+_MOST_MISSING = 10**8
 
 
 @dataclass(frozen=True)
@@ -114,7 +116,11 @@ def verify(folder: str | Path, progress: bool = False) -> Verified:
             faults[MANIFEST_FILE] = ["did not tell what the shards hold; it was made again"]
     have = {number for entry in sound for number in (*entry.index, *entry.failed)}
     n = expected.get("n")
-    missing = sorted(set(range(n if isinstance(n, int) else max(have, default=-1) + 1)) - have)
+    count = n if isinstance(n, int) else max(have, default=-1) + 1
+    if count - len(have) > _MOST_MISSING:
+        where = f"'{Path(folder) / RECIPE_FILE}' counts" if isinstance(n, int) else "the numbers of its samples ask for"
+        raise StorageError(f"{_WHAT}: {where} {shown(count)} samples, and {len(have)} are there: it is damaged.")
+    missing = sorted(set(range(count)) - have)
     return Verified(
         Path(folder), sum(len(entry.index) for entry in sound), len(paths), dict(sorted(faults.items())),
         tuple(missing), {number: entry.failed[number] for entry in sound for number in entry.failed},
