@@ -7,11 +7,12 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 BIN := $(VENV)/bin
 READY := $(VENV)/.installed
 
-.PHONY: demo test test-slow test-lowest release-check audit lint doctor docs sweep mutants environment clean help
+.PHONY: demo test test-slow soak test-lowest release-check audit lint doctor docs sweep mutants environment clean help
 
 help:
 	@echo "make demo       render a scene, fit a parameter, write pictures to demo_output/"
 	@echo "make test       default tests          make test-slow  the long ones"
+	@echo "make soak       sweeps: ten thousand mutated files for each reader, a thousand kills (up to 3 h)"
 	@echo "make lint       ruff and mypy          make doctor     check the machine"
 	@echo "make test-lowest  smoke tests with the lowest versions that are allowed, in an environment of its own (6 GB)"
 	@echo "make release-check  wheel and sdist, in dist/, and the wheel in an empty environment"
@@ -53,6 +54,10 @@ test: $(READY)
 
 test-slow: $(READY)
 	env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -q -m slow $(PARALLEL)
+
+# Each sweep in processes of its own; -s shows what was found.
+soak: $(READY)
+	env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -q -m soak -s
 
 # PyPI's build of torch 2.6 for Linux brings CUDA. The one for the CPU alone is on a server of its own:
 # make test-lowest TORCH_FROM="--index-url https://download.pytorch.org/whl/cpu"

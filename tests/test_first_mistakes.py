@@ -131,10 +131,10 @@ def test_what_is_no_capture(given, do):
 def test_files_of_another_kind_say_what_reads_them(scene, capture, tmp_path):
     write_result(tmp_path / "render.npz", tt.render(scene, spp=1, physics="ignore"))
     capture.write(tmp_path / "capture.npz")
-    with pytest.raises(StorageError, match=r"capture 1', not .*result 1'\. tt.nlos.Capture.read reads it"):
+    with pytest.raises(StorageError, match=r"capture 2', not .*result 2'\. tt.nlos.Capture.read reads it"):
         read_result(tmp_path / "capture.npz")
     for read in (tt.nlos.Capture.read, tt.nlos.read_volume):
-        with pytest.raises(StorageError, match=r"result 1', not .*\. torchtransient\.\S+\.read_result reads it"):
+        with pytest.raises(StorageError, match=r"result 2', not .*\. torchtransient\.\S+\.read_result reads it"):
             read(tmp_path / "render.npz")
 
 

@@ -294,7 +294,7 @@ def test_nothing_else_is_deleted(folder):
 
 
 def test_an_output_that_cannot_be_written_keeps_the_parts(folder, monkeypatch):
-    from torchtransient.files import array_file
+    from torchtransient.array_files import array_file
 
     def full(*_):
         raise OSError(28, "No space left on device")

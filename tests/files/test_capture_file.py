@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 import torch
 
+from support.sealed_files import as_first_version
+from torchtransient.array_files import array_file
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
 from torchtransient.errors import ArgumentError, StorageError
-from torchtransient.files import array_file
 from torchtransient.files.capture_file import read_capture, write_capture
 
 ENDINGS = ("h5", "hdf5", "npz")
@@ -161,7 +162,7 @@ def test_files_that_are_no_captures(tmp_path, ending):
 def test_a_result_of_a_render_is_no_capture(tmp_path):
     path = tmp_path / "a.npz"
     np.savez(path, format=np.array("torchtransient result 1"))
-    with pytest.raises(StorageError, match=r"format 'torchtransient result 1'.*capture 1"):
+    with pytest.raises(StorageError, match=r"format 'torchtransient result 1'.*capture 2"):
         read_capture(path)
 
 
@@ -170,5 +171,8 @@ def test_parts_that_do_not_fit_together(tmp_path):
     with np.load(path) as file:
         changed = {name: file[name] for name in file.files} | {"num_bins": np.array(3)}
     np.savez(path, **changed)
+    with pytest.raises(StorageError, match=r"'num_bins' is not what was written"):
+        read_capture(path)
+    as_first_version(path)
     with pytest.raises(StorageError, match=r"damaged.*axis"):
         read_capture(path)

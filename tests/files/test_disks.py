@@ -21,9 +21,11 @@ import torch
 
 import torchtransient as tt
 from support.capture_files import grids, holdable, made
+from support.killed_writers import output
+from torchtransient.array_files import hdf5_limits
 from torchtransient.errors import ArgumentError, ShapeError, StorageError, UnitError
-from torchtransient.files import hdf5_limits
 from torchtransient.files.captures.formats import LAYOUTS
+from torchtransient.files.result_file import write_result
 
 ENDINGS = {"torchtransient": "h5"} | {layout.name: layout.endings[0][1:] for layout in LAYOUTS}
 ONE_OF_EACH = {layout: capture for layout, _, capture in holdable()}
@@ -43,9 +45,10 @@ def capture():
 WRITERS = {
     **{layout: lambda path, c=c, name=layout: c.write(path, format=name) for layout, c in ONE_OF_EACH.items()},
     "volume": lambda path: tt.nlos.write_volume(path, volume()),
+    "result": lambda path: write_result(path, output(0)),
     "npz": lambda path: capture().write(path),
 }
-SUFFIX = ENDINGS | {"volume": "h5", "npz": "npz"}
+SUFFIX = ENDINGS | {"volume": "h5", "result": "h5", "npz": "npz"}
 
 
 def full_disks(folder):
@@ -171,7 +174,7 @@ def test_the_memory_that_is_left(tmp_path, monkeypatch, ending, name):
     write, read = WRITTEN[name]
     path = write(tmp_path / f"a.{ending}")
     monkeypatch.setattr(hdf5_limits, "_LARGE_BYTES", 100)
-    monkeypatch.setattr(hdf5_limits, "available_bytes", lambda *_: 300)
+    monkeypatch.setattr(hdf5_limits, "available_memory", lambda *_: 300)
     with pytest.raises(StorageError, match="of memory are left"):
         read(path)
 

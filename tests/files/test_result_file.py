@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 import torch
 
+from support.sealed_files import as_first_version
+from torchtransient.array_files import array_file
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import ArgumentError, MissingPackageError, StorageError
-from torchtransient.files import array_file
 from torchtransient.files.result_file import check_target, read_result, write_result
 from torchtransient.rendering.output import RenderOutput, RenderStats
 
@@ -82,6 +83,9 @@ def test_a_phasor_file_that_does_not_fit_together(tmp_path):
     with np.load(path) as file:
         changed = {name: file[name] for name in file.files} | {"frequencies_per_metre": np.array([1.0])}
     np.savez(path, **changed)
+    with pytest.raises(StorageError, match="'frequencies_per_metre' is not what was written"):
+        read_result(path)
+    as_first_version(path)
     with pytest.raises(StorageError, match="F = 1"):
         read_result(path)
 
@@ -158,7 +162,7 @@ def test_a_truncated_result(tmp_path, ending):
 def test_pickles_inside_are_not_executed(tmp_path):
     path = tmp_path / "a.npz"
     np.savez(path, transient=np.array([{"a": 1}], dtype=object), format=np.array("torchtransient result 1"))
-    with pytest.raises(StorageError, match="not a result"):
+    with pytest.raises(StorageError, match="No pickle is read"):
         read_result(path)
 
 

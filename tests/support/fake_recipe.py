@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
+from torchtransient.array_files import hdf5_writing
 from torchtransient.errors import SceneError
-from torchtransient.files import hdf5_writing
 
 TROUBLES = ("raising", "hanging", "crashing", "dying")
 

@@ -99,7 +99,7 @@ def test_phasors():
 def test_broken_files(tmp_path, stored):
     for name in ("a.h5", "a.npz", "a.npy"):
         (tmp_path / name).write_bytes(b"nonsense")
-        with pytest.raises(StorageError, match="cannot be read"):
+        with pytest.raises(StorageError, match="is damaged"):
             transient_of(tmp_path / name)
     with pytest.raises(StorageError, match="does not exist"):
         transient_of(tmp_path / "b.h5")

@@ -21,9 +21,12 @@ class Counts(click.ParamType):  # type: ignore[type-arg]  # a parameter of newer
         if isinstance(value, tuple):
             return value
         try:
-            return tuple(int(part) for part in value.split(","))
+            found = tuple(int(part) for part in value.split(","))
         except ValueError:
-            self.fail(f"expected whole numbers such as 16,64,256, got '{value}'", param, ctx)
+            found = ()
+        if not found or not all(1 <= number < 2**32 for number in found):
+            self.fail(f"expected whole numbers from 1 to 4294967295 such as 16,64,256, got '{value[:60]}'", param, ctx)
+        return found
 
 
 @click.command()
@@ -32,7 +35,7 @@ class Counts(click.ParamType):  # type: ignore[type-arg]  # a parameter of newer
 @click.option("--gradient", "gradients", multiple=True, metavar="KEY", help="Also the derivative by this parameter.")
 @click.option("--sampler", "samplers", multiple=True, default=("independent", "multijitter"), show_default=True)
 @click.option("--temporal-filter", "filters", multiple=True, type=click.Choice(["box", "tent", "gaussian"]))
-@click.option("--reference-spp", type=click.IntRange(min=1), help="Compare with a long render, not pairs of runs.")
+@click.option("--reference-spp", type=click.IntRange(1, 2**32 - 1), help="Compare with a long one, not in pairs.")
 @click.option("--repeats", type=click.IntRange(min=2), default=4, show_default=True, help="Runs of each kind.")
 @click.option("--plot", type=click.Path(path_type=Path), help="Write the log-log picture (.png).")
 @click.option("--json", "json_path", type=click.Path(path_type=Path), help="Write the numbers (.json).")

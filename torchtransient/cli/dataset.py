@@ -83,9 +83,13 @@ def generate(recipe: Path, out: Path, **options: Any) -> None:
 @click.option("--quiet", is_flag=True, help="No progress bar.")
 def verify(folder: Path, quiet: bool) -> None:
     """Compare every byte of the data set in FOLDER with its checksums. Status 1 where something is wrong or missing."""
+    from torchtransient.data.storage.file_names import RECIPE_FILE
     from torchtransient.data.storage.manifest import verify as check
+    from torchtransient.errors import StorageError
 
     found = check(folder, progress=not quiet)
+    if not found.shards and not (folder / RECIPE_FILE).exists():
+        raise StorageError(f"data set: '{folder}' holds no shard and no {RECIPE_FILE}: expected the folder of one.")
     click.echo(str(found))
     if not found.complete:
         sys.exit(FAULTY)

@@ -1,6 +1,7 @@
 """The command `torchtransient`: its subcommands, and how errors leave it.
 
-An error that the library raises on purpose is one line on stderr and exit status 2; with `--debug` it is a traceback.
+An error that the library raises on purpose, or that the system does, is one line on stderr and exit status 2; any
+other is a fault of the library, one line and status 70. With `--debug` both are tracebacks.
 Commands are imported when they are called, so that `torchtransient --help` needs no torch.
 """
 
@@ -30,6 +31,12 @@ COMMANDS = {
     "dataset": "Make a data set of a recipe, going on where it was stopped; check it, show it.",
     "demo": "Render the Cornell box, fit a colour to it, write pictures.",
 }
+
+
+_FAULT = 300
+_FAULTS = (
+    ArithmeticError, AssertionError, AttributeError, LookupError, MemoryError, TypeError, ValueError, RuntimeError,
+)  # fmt: skip
 
 
 class Commands(click.Group):
@@ -62,8 +69,22 @@ class Commands(click.Group):
         except TorchTransientError as error:
             if ctx.params.get("debug"):
                 raise
-            click.echo(f"error: {_in_options(error)}", err=True)
+            click.echo(f"error: {' '.join(_in_options(error).split())}", err=True)
             sys.exit(2)
+        except BrokenPipeError:
+            raise  # whoever reads the output has left, which click knows
+        except OSError as error:
+            if ctx.params.get("debug"):
+                raise
+            click.echo(f"error: {' '.join(str(error).split())}.", err=True)
+            sys.exit(2)
+        except _FAULTS as error:
+            # What click itself ends commands with is a RuntimeError too.
+            if ctx.params.get("debug") or isinstance(error, click.exceptions.Exit | click.exceptions.Abort):
+                raise
+            said = " ".join(f"{type(error).__name__}: {error}".split())[:_FAULT]
+            click.echo(f"error: a fault of torchtransient, not of yours: {said} (--debug shows where).", err=True)
+            sys.exit(70)
 
 
 def _in_options(message: Any) -> str:

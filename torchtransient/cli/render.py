@@ -20,7 +20,7 @@ from torchtransient.rendering.films.choices import from_options, of_output
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Result, .h5 or .npz.  [default: SCENE.h5]")
 @picture_options
 @click.option("--pixel", type=(int, int), metavar="ROW COLUMN", help="Pixel whose histogram the picture shows.")
-@click.option("--spp", type=click.IntRange(min=1), help="Samples per pixel.  [default: the scene's]")
+@click.option("--spp", type=click.IntRange(1, 2**32 - 1), help="Samples per pixel.  [default: the scene's]")
 @click.option("--set", "values", multiple=True, metavar="KEY=VALUE", help="Change a parameter of the scene.")
 @click.option("--temporal-filter", type=click.Choice(["auto", "box", "tent", "gaussian"]), default="auto")
 @click.option("--sensor", type=click.IntRange(min=0), default=0, show_default=True, help="Which of several sensors.")

@@ -21,16 +21,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchtransient.array_files import array_file
+from torchtransient.array_files.array_file import array_of, damage_said, read_arrays, tensor_in, write_arrays
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.capture.metadata import metadata_text
 from torchtransient.errors import ArgumentError
-from torchtransient.files import array_file
-from torchtransient.files.array_file import array_of, damage_said, read_arrays, tensor_in, write_arrays
 from torchtransient.files.entries import flag_of, names_of, notes_of, number_of, text_of, whole_of
 from torchtransient.files.plain_data import plain, restored
 
-FORMAT = "torchtransient capture 1"
+FORMAT = "torchtransient capture 2"
+# Those of the first version have no checksums.
+FORMATS = ("torchtransient capture 1", FORMAT)
 _WHAT = "capture file"
 _MEASURED = ("transient", "phasor", "steady")
 _ENTRIES = (
@@ -85,7 +87,7 @@ def read_capture(path: str | Path) -> Capture:
 
     Raises StorageError when the file is missing, damaged or not a capture.
     """
-    values = read_arrays(path, FORMAT, _WHAT, _is_known)
+    values = read_arrays(path, FORMATS, _WHAT, _is_known)
     with damage_said(Path(path), _WHAT):
         return _capture(values)
 

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchtransient.array_files.array_file import array_of
 from torchtransient.errors import StorageError
-from torchtransient.files.array_file import array_of
 
 _WHAT = "capture file"
 # Keys of JSON objects that stand for what JSON does not have.

@@ -5,9 +5,9 @@ Both hold the same names. Arrays have torch's order: `steady` float32 (..., C, H
 (..., C, F, H, W) with `frequencies_per_metre` float64 (F,), cycles per metre of optical path; or `gated` float32 (...,
 C, G, H, W) with `gates` (the text of scene files), where files of earlier versions say `transient`. Polarized variants
 have the four Stokes components before C. The numbers of the axis (`start_opl`, and for a transient `bin_width_opl`, in
-metres, `num_bins`), `channels` (JSON: the names of the C channels), `format` and `metadata` (JSON) are attributes of
-the HDF5 file and zero-dimensional arrays of the `.npz`. A cube is written in parts, so that no second copy of it is
-needed.
+metres, `num_bins`), `channels` (JSON: the names of the C channels), `format`, `metadata` (JSON) and `checksums` (JSON,
+see `checksums.py`) are attributes of the HDF5 file and zero-dimensional arrays of the `.npz`. A cube is written in
+parts, so that no second copy of it is needed.
 """
 
 from __future__ import annotations
@@ -20,18 +20,23 @@ from typing import Any, ClassVar
 
 import torch
 
+from torchtransient.array_files import array_file
+from torchtransient.array_files.array_file import array_of, damage_said, read_arrays, tensor_in, write_arrays
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture.metadata import metadata_text
 from torchtransient.errors import ArgumentError, StorageError
-from torchtransient.files import array_file
-from torchtransient.files.array_file import array_of, damage_said, read_arrays, write_arrays
+from torchtransient.files.entries import names_of, notes_of, number_of, text_of, whole_of
 from torchtransient.gates import Gate
-from torchtransient.rendering.films.choices import of_entries, of_output
+from torchtransient.rendering.films.choices import all_films, of_entries, of_output
 from torchtransient.rendering.output import RenderOutput, named_fields
 from torchtransient.tensor_record import TensorRecord
 
-FORMAT = "torchtransient result 1"
+FORMAT = "torchtransient result 2"
+# Those of the first version have no checksums.
+FORMATS = ("torchtransient result 1", FORMAT)
 _WHAT = "result file"
+_READ = {"start_opl": number_of, "bin_width_opl": number_of, "num_bins": whole_of, "gates": text_of}
+_KNOWN = {"format", "metadata", "channels", "steady", "edges_opl", "frequencies_per_metre", *_READ}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -104,24 +109,39 @@ def write_result(path: str | Path, output: RenderOutput | Result, metadata: Mapp
 
 
 def read_result(path: str | Path) -> Result:
-    """Read what `write_result` wrote, as tensors on the CPU.
+    """Read what `write_result` wrote, as tensors on the CPU. What somebody put beside it is left alone.
 
-    Raises StorageError when the file is missing, damaged or not a result.
+    Every number and text is compared with its checksum. Files of the first version of the format have none: they are
+    read all the same. Raises StorageError when the file is missing, damaged, changed by another program or not a
+    result.
     """
-    values = read_arrays(path, FORMAT, _WHAT)
+    values = read_arrays(path, FORMATS, _WHAT, _is_known)
     with damage_said(Path(path), _WHAT):
         return _result(values, Path(path))
 
 
+def _is_known(name: str) -> bool:
+    return name in _KNOWN or any(name == film.measures for film in all_films())
+
+
 def _result(values: Mapping[str, Any], source: Path) -> Result:
-    metadata, steady = json.loads(str(values["metadata"])), torch.from_numpy(values["steady"])
+    metadata, steady = notes_of(values, "metadata"), tensor_in(values["steady"])
     # Files of earlier versions have no names of channels.
-    channels = tuple(json.loads(str(values.get("channels", "[]"))))
-    film = of_entries(values)
-    response = torch.from_numpy(film.tensor_in(values))
+    channels = names_of(values, "channels") if "channels" in values else ()
+    film = of_entries({**values, **{name: read(values, name) for name, read in _READ.items() if name in values}})
+    response = tensor_in(film.tensor_in(values))
     if response.ndim < 4 or response.shape[-3] != film.count:
         raise StorageError(
             f"result file: '{source}' holds a {film.measures} of shape {tuple(response.shape)}; expected "
             f"(..., C, {film.letter}, H, W) with {film.letter} = {film.count}."
         )
+    if response.is_complex() != (film.measures == "phasor") or steady.is_complex() or torch.bool in (
+        response.dtype, steady.dtype
+    ):  # fmt: skip
+        raise ValueError(f"{film.measures} is of {response.dtype}, steady of {steady.dtype}")
+    image = (*response.shape[:-3], *response.shape[-2:])
+    if steady.shape != image:
+        raise ValueError(f"steady is of shape {tuple(steady.shape)}, {film.measures} of {tuple(response.shape)}")
+    if channels and len(channels) != steady.shape[-3]:
+        raise ValueError(f"{len(channels)} names of channels, {steady.shape[-3]} channels")
     return Result(steady=steady, metadata=metadata, channels=channels, **named_fields(film, response))

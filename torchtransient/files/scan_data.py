@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from torchtransient.array_files.array_file import damage_said
 from torchtransient.capture import Scan
 from torchtransient.errors import StorageError
-from torchtransient.files.array_file import damage_said
 from torchtransient.files.plain_data import plain, restored
 
 _WHAT = "scan"

@@ -13,15 +13,17 @@ from pathlib import Path
 
 import numpy as np
 
+from torchtransient.array_files import array_file
+from torchtransient.array_files.array_file import array_of, damage_said, read_arrays, tensor_in, write_arrays
 from torchtransient.capture.metadata import metadata_text
 from torchtransient.errors import ArgumentError
-from torchtransient.files import array_file
-from torchtransient.files.array_file import array_of, damage_said, read_arrays, tensor_in, write_arrays
 from torchtransient.files.entries import notes_of, text_of
 from torchtransient.reconstruction.hidden_volume import HiddenVolume
 from torchtransient.reconstruction.voxels import VoxelGrid
 
-FORMAT = "torchtransient volume 1"
+FORMAT = "torchtransient volume 2"
+# Those of the first version have no checksums.
+FORMATS = ("torchtransient volume 1", FORMAT)
 _WHAT = "volume file"
 _VECTORS = ("first", "along_x", "along_y", "normal")
 
@@ -57,7 +59,7 @@ def read_volume(path: str | Path) -> HiddenVolume:
     """
     needed, optional = ("values", "depths", "pitch", *_VECTORS), ("times", "directions")
     known = {*needed, *optional, "format", "method", "metadata"}
-    found = read_arrays(path, FORMAT, _WHAT, known.__contains__)
+    found = read_arrays(path, FORMATS, _WHAT, known.__contains__)
     with damage_said(Path(path), _WHAT):
         values = {name: tensor_in(found[name]) for name in needed}
         more = {name: tensor_in(found[name]) for name in optional if name in found}

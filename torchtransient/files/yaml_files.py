@@ -5,13 +5,14 @@ from __future__ import annotations
 import contextlib
 import difflib
 import math
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from torchtransient.errors import MissingPackageError, SceneError, StorageError
+from torchtransient.errors import MissingPackageError, SceneError
+from torchtransient.plain_texts import safe_loader, some_of, text_of_file, yaml_data
 from torchtransient.quantities import shown
-from torchtransient.yaml_numbers import reads_exponents
 
 _MISSING = object()
 
@@ -31,7 +32,7 @@ def read_yaml(source: str | Path, who: str) -> tuple[dict[str, Any], Path]:
             f"{who}: YAML needs PyYAML. Install it with pip install 'torchtransient[yaml]'."
         ) from error
 
-    class Loader(yaml.SafeLoader):  # type: ignore[misc]  # the package has no types
+    class Loader(safe_loader(yaml)):  # type: ignore[misc]  # the package has no types
         """Says so where a later entry would silently replace an earlier one."""
 
         def construct_mapping(self, node: Any, deep: bool = False) -> Any:
@@ -40,14 +41,11 @@ def read_yaml(source: str | Path, who: str) -> tuple[dict[str, Any], Path]:
             twice = [str(name) for number, name in enumerate(names) if name in names[:number]]
             if twice:
                 line = node.start_mark.line + 1
-                raise SceneError(f"{who}: {', '.join(twice)} stands twice in the mapping at line {line}; keep one.")
+                raise SceneError(f"{who}: {some_of(twice, 100)} stands twice in the mapping at line {line}; keep one.")
             return super().construct_mapping(node, deep)
 
     text, folder = _text(source, who)
-    try:
-        data = yaml.load(text, Loader=reads_exponents(Loader))
-    except yaml.YAMLError as error:
-        raise StorageError(f"{who}: expected YAML, got what cannot be read: {error}.") from error
+    data = yaml_data(text, who, yaml, Loader)
     if not isinstance(data, dict):
         raise SceneError(f"{who}: expected names and values, 'name: value' in each line, got {type(data).__name__}.")
     return data, folder
@@ -57,13 +55,10 @@ def _text(source: str | Path, who: str) -> tuple[str, Path]:
     if isinstance(source, str) and "\n" in source:
         return source, Path.cwd()
     path = Path(source)
-    if path.is_dir():
+    if os.path.isdir(path):
         # y-tal's experiments are folders that hold a file of their name.
         path = path / f"{path.resolve().name}.yaml"
-    try:
-        return path.read_text(encoding="utf-8"), path.resolve().parent
-    except (OSError, UnicodeDecodeError) as error:
-        raise StorageError(f"{who}: '{path}' cannot be read: {error}.") from error
+    return text_of_file(path, who), path.resolve().parent
 
 
 class Section:
@@ -81,7 +76,7 @@ class Section:
             if name not in names:
                 close = difflib.get_close_matches(str(name), names, n=1, cutoff=0.5)
                 hint = f"Did you mean {close[0]!r}? " if close else ""
-                raise SceneError(f"{where}: unknown entry {name!r}. {hint}Known ones are {', '.join(names)}.")
+                raise SceneError(f"{where}: unknown entry {shown(name)}. {hint}Known ones are {some_of(names)}.")
         self.data = data
 
     def __contains__(self, name: str) -> bool:
@@ -130,7 +125,7 @@ class Section:
         """One of some texts."""
         value = self.get(name, default)
         if value not in choices:
-            raise SceneError(f"{self._at(name)}: expected one of {', '.join(choices)}, got {shown(value)}.")
+            raise SceneError(f"{self._at(name)}: expected one of {some_of(choices)}, got {shown(value)}.")
         return value
 
     def numbers(self, name: str, counts: Sequence[int], default: Any = _MISSING) -> Any:
@@ -162,7 +157,7 @@ def file_beside(name: str, folders: Sequence[Path], where: str) -> Path:
     """The first of `folders` that has a file of that name. Raises SceneError where none does."""
     for folder in folders:
         path = folder / name
-        if path.is_file():
+        if os.path.isfile(path):
             return path.resolve()
     looked = ", ".join(f"'{folder}'" for folder in dict.fromkeys(folders))
     raise SceneError(f"{where}: no file '{name}' in {looked}. Give a path from the folder of the YAML file.")

@@ -30,6 +30,7 @@ from torchtransient.files.yaml_files import Section, as_number, file_beside, rea
 from torchtransient.nlos import defaults
 from torchtransient.nlos.described_shapes import albedo_of, described_shapes
 from torchtransient.nlos.mesh_file import mesh_of_npz
+from torchtransient.plain_texts import told_shortly
 from torchtransient.quantities import shown
 from torchtransient.scenes import bounds
 from torchtransient.sensing import Device
@@ -72,6 +73,11 @@ def read_description(source: str | Path) -> CaptureDescription:
     Names of files are looked up from the YAML file's folder. Raises SceneError for unknown, missing and wrong entries,
     StorageError for files that cannot be read, and the errors of Scan, Wall, TimeAxis and Device.
     """
+    with told_shortly("capture description"):
+        return _description(source)
+
+
+def _description(source: str | Path) -> CaptureDescription:
     data, folder = read_yaml(source, "capture description")
     section = Section(data, "capture description", ENTRIES)
     hidden = described_shapes(section.get("hidden"), folder)

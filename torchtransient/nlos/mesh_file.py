@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from torchtransient import scenes
+from torchtransient.array_files.array_file import read_some
 from torchtransient.errors import SceneError, StorageError, TorchTransientError
 
 # Plugins of Mitsuba by what names of files end with; .npz is read here.
@@ -43,11 +41,12 @@ def mesh_file(path: Path, where: str) -> dict[str, Any]:
 
 def mesh_of_npz(path: Path, where: str) -> tuple[Any, Any]:
     """`vertices` and `faces` of an .npz file. Raises StorageError where they cannot be read."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return file["vertices"], file["faces"]
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise StorageError(f"{where}: expected 'vertices' and 'faces' in '{path}': {error}.") from error
+    kind = "an archive of 'vertices' and 'faces' in NumPy's .npz"
+    found = read_some(path, where, ("vertices", "faces").__contains__, kind)
+    if len(found) < 2:
+        had = " alone".join([*found, ""]) or "neither"
+        raise StorageError(f"{where}: expected 'vertices' and 'faces' in '{path}', got {had}.")
+    return found["vertices"], found["faces"]
 
 
 def mesh_arrays_shape(vertices: Any, faces: Any, where: str) -> dict[str, Any]:

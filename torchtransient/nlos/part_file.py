@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.errors import StorageError
+from torchtransient.plain_texts import said_in_short
 
 FORMAT = "torchtransient part 2"
 Rows = NDArray[np.float32]
@@ -68,10 +69,12 @@ class PartFile:
             form, key, about = said["format"], said["key"], dict(said["about"])
             rows, columns = (int(n) for n in said["shape"])
             seconds = float(said["seconds"])
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            if any(first < 0 or count < 0 or first + count > rows for first, count, _ in done.values()):
+                raise ValueError("rows beyond the last one")
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
             raise StorageError(
-                f"part file: '{self.path}' is not the part file of a simulation ({FORMAT}), or is damaged: {error!r}. "
-                "Give another name, or delete it to start anew."
+                f"part file: '{self.path}' is not the part file of a simulation ({FORMAT}), or is damaged: "
+                f"{said_in_short(error)}. Give another name, or delete it to start anew."
             ) from error
         if form == FORMAT and not self._key:
             return
@@ -118,7 +121,8 @@ class PartFile:
         assert self._file is not None
         size = 4 * self._shape[1]
         self._file.seek(self._start() + first * size)
-        return self._file.read(count * size)
+        # No more than there is: a number that is damaged asks for any memory.
+        return self._file.read(min(count * size, os.fstat(self._file.fileno()).st_size))
 
     # -------------------------------------------------------------------------------------------------------- writing
 

@@ -134,7 +134,7 @@ def _check_shapes(shapes: Mapping[str, Any]) -> None:
         raise SceneError("hidden: expected at least one shape, got an empty dictionary.")
     for name, node in shapes.items():
         if not isinstance(node, Mapping) or "type" not in node:
-            raise SceneError(f"hidden: expected {name!r} as a dictionary with a type, got {node!r}.")
+            raise SceneError(f"hidden: expected {name!r} as a dictionary with a type, got {shown(node)}.")
         found = [key for key in ("sensor", "integrator") if key == name]
         kind = str(node["type"])
         if found or kind.startswith("transient_") or kind.endswith("_capture_meter"):

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from torchtransient.array_files.array_file import path_of
 from torchtransient.errors import SceneError
-from torchtransient.files.array_file import path_of
 from torchtransient.files.yaml_files import read_yaml
 from torchtransient.nlos.description import read_description
 from torchtransient.nlos.scene import ALL_BOUNCES
 from torchtransient.nlos.tal_yaml import TalSettings, read_tal_yaml
+from torchtransient.plain_texts import told_shortly
 from torchtransient.rendering.scene_handle import load
 
 # Bounces of light that goes from spot to scan point, and around one corner.
@@ -32,6 +33,11 @@ def read_setup(path: str | Path, **xml_parameters: Any) -> dict[str, Any]:
 
     Raises StorageError for files that cannot be read, SceneError for what they say.
     """
+    with told_shortly("read_setup"):
+        return _setup(path, xml_parameters)
+
+
+def _setup(path: str | Path, xml_parameters: Mapping[str, str]) -> dict[str, Any]:
     source = path_of(path, "read_setup")
     if source.suffix.lower() == ".xml":
         return {"hidden": load(source, **xml_parameters)}

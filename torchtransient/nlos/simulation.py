@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from torchtransient.array_files.array_file import path_of
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import ArgumentError
-from torchtransient.files.array_file import path_of
 from torchtransient.nlos import defaults
 from torchtransient.nlos.answers import checked_module, measured, say_black
 from torchtransient.nlos.arguments import check_is_scan, check_sensor, checked_count, checked_samples, checked_seed

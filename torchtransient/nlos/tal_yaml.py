@@ -15,6 +15,8 @@ from torchtransient.capture.scan import KINDS
 from torchtransient.errors import SceneError
 from torchtransient.files.yaml_files import Section, as_number, file_beside, read_yaml
 from torchtransient.nlos.tal_materials import material, spectrum
+from torchtransient.plain_texts import some_of, told_shortly
+from torchtransient.quantities import shown
 from torchtransient.scenes.transforms import rotate, scale, translate
 from torchtransient.transform_bins import transform_bins
 
@@ -78,6 +80,11 @@ def read_tal_yaml(source: str | Path) -> TalSettings:
     what is not supported: a laser that is not sampled as a spot, bins that are found automatically, spots laid out by
     a field of view, walls that are no rectangle.
     """
+    with told_shortly("y-tal scene"):
+        return _settings(source)
+
+
+def _settings(source: str | Path) -> TalSettings:
     data, folder = read_yaml(source, "y-tal scene")
     section = Section(data, "y-tal scene", _KNOWN)
     _refuse_unsupported(section)
@@ -152,10 +159,10 @@ def _geometry(section: Section, folders: Sequence[Path]) -> tuple[Wall, dict[str
     names = [part.text("name") for part in parts]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise SceneError(f"y-tal scene: geometry: {', '.join(twice)} stands there more than once; names must differ.")
+        raise SceneError(f"y-tal scene: geometry: {some_of(twice)} stands there more than once; names must differ.")
     wall_name = section.text("relay_wall")
     if wall_name not in names:
-        raise SceneError(f"y-tal scene: relay_wall: expected one of {', '.join(names)}, got {wall_name!r}.")
+        raise SceneError(f"y-tal scene: relay_wall: expected one of {some_of(names)}, got {shown(wall_name)}.")
     shapes = {name: _shape(part, name, folders) for name, part in zip(names, parts, strict=True)}
     wall = shapes.pop(wall_name)
     if wall["type"] != "rectangle":

@@ -278,6 +278,7 @@ def plugin_errors() -> Iterator[None]:
 
 
 def _on_variant_change(_old: str | None, new: str | None) -> None:
+    _check_nothing_was_raised()
     with _state.lock:
         try:
             if new is not None and new != _state.variant:
@@ -290,6 +291,19 @@ def _on_variant_change(_old: str | None, new: str | None) -> None:
             # An interrupt: the callbacks of others, Mitsuba's own plugins among them, are not called any more.
             _state.interrupted = not isinstance(error, Exception)
             raise
+
+
+def _check_nothing_was_raised() -> None:
+    """Mitsuba (3.9) goes on with its callbacks when one was interrupted, and calls them with the exception still set.
+    What C functions return then is taken for an error: a lock, once taken, would never be let go of. Raises what was
+    raised before; a lock that nobody else has finds it.
+    """
+    try:
+        with threading.RLock():
+            pass
+    except SystemError as error:
+        _state.interrupted = True
+        raise error.__cause__ or error.__context__ or error from None
 
 
 def _tell_all(variant: str) -> None:

@@ -17,6 +17,7 @@ from torchtransient import plugins
 from torchtransient._collection import let_go
 from torchtransient.errors import ArgumentError, SceneError, TorchTransientError
 from torchtransient.interfaces import IntegratorInterface
+from torchtransient.plain_texts import line_of
 from torchtransient.plugins.described_scene import check_scene
 from torchtransient.plugins.drjit_pool import threads_for_files
 from torchtransient.plugins.mitsuba_compat import (
@@ -161,7 +162,7 @@ def build(description: Description, variant: str, options: BuildOptions) -> Buil
             return build(description, variant, replace(options, merge=False))
         text = one_line(error).replace("While loading string", f"While loading {description.name}")
         said = unread_properties(str(error), description.name)
-        raise SceneError(said or f"{description.name}: Mitsuba could not build the scene. {text}") from error
+        raise SceneError(said or f"{description.name}: Mitsuba could not build the scene. {line_of(text)}") from error
     return BuiltScene(scene, params, transforms, plugin, placed, taken=pointers(description.taken))
 
 

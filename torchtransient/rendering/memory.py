@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 from torchtransient.errors import StorageError
+from torchtransient.free_memory import available_memory
 from torchtransient.rendering.variant import device_type
 
 _BYTES_PER_VALUE = 4
@@ -19,33 +19,7 @@ def available_bytes(variant: str) -> int | None:
         import torch
 
         return int(torch.cuda.mem_get_info()[0])
-    limits = [limit for limit in (_meminfo_available(), _cgroup_available()) if limit is not None]
-    return min(limits) if limits else None
-
-
-def _meminfo_available() -> int | None:
-    try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-    except OSError:
-        return None
-    for line in lines:
-        if line.startswith("MemAvailable:"):
-            return int(line.split()[1]) * 1024
-    return None
-
-
-def _cgroup_available() -> int | None:
-    root = Path("/sys/fs/cgroup")
-    try:
-        limit = (root / "memory.max").read_text(encoding="ascii").strip()
-        used = int((root / "memory.current").read_text(encoding="ascii"))
-        cache = 0
-        for line in (root / "memory.stat").read_text(encoding="ascii").splitlines():
-            if line.startswith("inactive_file "):
-                cache = int(line.split()[1])
-    except (OSError, ValueError):
-        return None
-    return None if limit == "max" else max(0, int(limit) - used + cache)
+    return available_memory()
 
 
 def check_fits(cube_shape: tuple[int, ...], items: int, variant: str) -> None:

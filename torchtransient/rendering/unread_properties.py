@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 
+from torchtransient.plain_texts import some_of
+
 _REPORT = re.compile(
     r'While loading (?P<where>.*): Found \d+ unreferenced propert(?:y|ies) in \w+ plugin of type "(?P<plugin>[^"]*)":'
     r"(?P<list>(?:\n  - .*)+)"
@@ -27,7 +29,7 @@ def unread_properties(text: str, description: str) -> str | None:
     plugin, found = report["plugin"], dict(_ONE.findall(report["list"]))
     # In files the place begins with the name of the file.
     where = report["where"] if report["where"].startswith(description) else f"{description}: {report['where']}"
-    named = ", ".join(f"{name!r} = {value}" for name, value in found.items())
+    named = some_of([f"{name!r} = {value}" for name, value in found.items()])
     hints = [f"Leave {name!r} out: {_INSTEAD[name]}." for name in found if name in _INSTEAD]
     if plugin != "transient_nlos_path":
         nlos = [name for name in found if name.startswith("nlos_") and name not in _INSTEAD]

@@ -99,7 +99,8 @@ def active_variant(variant: str) -> Iterator[None]:
             if before != variant:
                 _set_variant(variant)
                 _count_switch(before, variant)
-            plugins.sync()
+            with interrupts_wait():
+                plugins.sync()
             yield
         finally:
             if before is not None and mi.variant() != before:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,15 +9,19 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from torchtransient.array_files.array_file import damage_said, read_npy, read_some
 from torchtransient.axes import FrequencyAxis, TimeAxis
-from torchtransient.errors import ArgumentError, MissingPackageError, ShapeError, StorageError, TorchTransientError
+from torchtransient.errors import ArgumentError, ShapeError, StorageError
+from torchtransient.plain_texts import json_data
 
 Source = Any  # Tensor | NDArray | RenderOutput | Result | str | Path, told apart by what they offer
 _HDF5 = (".h5", ".hdf5")
 _TENSORS = ("transient", "steady", "phasor", "gated")
+_KNOWN = {
+    *_TENSORS, "start_opl", "bin_width_opl", "num_bins", "gates", "metadata", "frequencies_per_metre",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -223,44 +225,23 @@ def read_file(path: Path) -> Any:
     """A file as a source: a result (`.h5`, `.hdf5`, `.npz`) with its axis, or the one array of a `.npy`.
 
     Of a result, the names `transient`, `steady`, `phasor`, `gated` and the numbers of the axis are read, each if it is
-    there. Raises StorageError for a missing, damaged or unknown file.
+    there, and compared with their checksums. Raises StorageError for a missing, damaged or unknown file.
     """
     if path.suffix.lower() not in (*_HDF5, ".npz", ".npy"):
         raise StorageError(f"picture: expected a result, .h5, .npz or .npy, got '{path}'.")
-    if not path.is_file():
-        raise StorageError(f"picture: '{path}' does not exist.")
-    try:
-        if path.suffix.lower() == ".npy":
-            return np.load(path, allow_pickle=False)
-        values = _hdf5_values(path) if path.suffix.lower() in _HDF5 else _npz_values(path)
+    if path.suffix.lower() == ".npy":
+        return read_npy(path, "picture")
+    values = read_some(path, "picture", _KNOWN.__contains__)
+    with damage_said(path, "picture", "a result"):
         axis = None
         if "num_bins" in values:
             axis = TimeAxis(float(values["start_opl"]), float(values["bin_width_opl"]), int(values["num_bins"]))
         if "gates" in values and "gated" not in values:
             values["gated"] = values.pop("transient")  # as files of earlier versions call it
         arrays = {key: as_tensor(values[key], key) for key in _TENSORS if key in values}
-    except (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        if isinstance(error, TorchTransientError):
-            raise
-        raise StorageError(f"picture: '{path}' cannot be read: {error}.") from error
     if any(arrays[key].ndim > 4 for key in ("transient", "gated") if key in arrays) and "metadata" in values:
-        _refuse_batch(SimpleNamespace(**arrays, metadata=json.loads(str(values["metadata"]))))
+        _refuse_batch(SimpleNamespace(**arrays, metadata=json_data(str(values["metadata"]), f"picture: '{path}'")))
     if not arrays:
         raise StorageError(f"picture: '{path}' holds none of {', '.join(_TENSORS[:-1])} and {_TENSORS[-1]}.")
     return Loaded(**arrays, axis=axis, frequencies=frequencies_of(values.get("frequencies_per_metre")))
 
-
-def _npz_values(path: Path) -> dict[str, NDArray[Any]]:
-    with np.load(path, allow_pickle=False) as file:
-        return {name: file[name] for name in file.files}
-
-
-def _hdf5_values(path: Path) -> dict[str, Any]:
-    try:
-        import h5py
-    except ImportError as error:
-        raise MissingPackageError(
-            "picture: HDF5 needs the package h5py. Install it with pip install 'torchtransient[data]'."
-        ) from error
-    with h5py.File(path, "r") as file:
-        return {**{name: file[name][()] for name in file}, **dict(file.attrs)}

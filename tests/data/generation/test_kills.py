@@ -145,6 +145,7 @@ def test_two_runs_at_once(tmp_path, calm):
 
 
 @pytest.mark.slow
+@pytest.mark.soak
 def test_a_hundred_kills(tmp_path, calm):
     """Of workers and of supervisors, starting, rendering and between the first and the last byte of a shard."""
     chance = random.Random(7)

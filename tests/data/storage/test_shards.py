@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 
 from support.stored_samples import cube, header, sample, write
+from torchtransient.array_files.part_files import sweep_parts
 from torchtransient.data.storage.chunks import COMPRESSIONS, chunk_shape
-from torchtransient.data.storage.part_files import sweep_parts
 from torchtransient.data.storage.shard_file import Shard, ShardWriter, stored_checksum
 from torchtransient.errors import ArgumentError, StorageError
 

@@ -305,7 +305,7 @@ def test_counts_of_few_photons(tmp_path):
 def test_structures_count_for_memory_too(tmp_path, monkeypatch):
     import scipy.io
 
-    from torchtransient.files import hdf5_limits
+    from torchtransient.array_files import hdf5_limits
 
     for compressed in (False, True):
         scipy.io.savemat(tmp_path / "a.mat", {"dataset": {"data": np.ones((50, 50))}}, do_compression=compressed)
@@ -313,7 +313,7 @@ def test_structures_count_for_memory_too(tmp_path, monkeypatch):
         assert contents.array("dataset/data").shape == (50, 50)
         with monkeypatch.context() as patched:
             patched.setattr(hdf5_limits, "_LARGE_BYTES", 100)
-            patched.setattr(hdf5_limits, "available_bytes", lambda *_: 10_000)
+            patched.setattr(hdf5_limits, "available_memory", lambda *_: 10_000)
             with pytest.raises(StorageError, match="of memory are left"):
                 MatContents(tmp_path / "a.mat").array("dataset/data")
 

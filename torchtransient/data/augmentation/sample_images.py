@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
+from torchtransient.array_files.array_file import tensor_in
 from torchtransient.errors import SceneError, ShapeError
-from torchtransient.files.array_file import tensor_in
 
 # Samples are flat but for a dictionary or two.
 _DEEPEST = 4

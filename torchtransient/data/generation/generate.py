@@ -13,6 +13,7 @@ from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any
 
+from torchtransient.array_files.part_files import check_system
 from torchtransient.data.generation.ledger import Ledger, facts
 from torchtransient.data.generation.plan import Plan, samples_per_shard
 from torchtransient.data.generation.run_log import RunLog, SampleBar
@@ -27,7 +28,6 @@ from torchtransient.data.generation.settings import (
 )
 from torchtransient.data.recipes.plugin_modules import plugins_here
 from torchtransient.data.storage.file_names import RECIPE_FILE, SHARD_FILES, shard_file_name
-from torchtransient.data.storage.part_files import check_system
 from torchtransient.errors import ArgumentError, SceneError, StorageError, TorchTransientError, UnitError
 from torchtransient.quantities import count, shown
 
@@ -257,7 +257,7 @@ def _engine(
 
 
 def _sweep(place: Path) -> None:
-    from torchtransient.data.storage.part_files import sweep_parts
+    from torchtransient.array_files.part_files import sweep_parts
 
     with contextlib.suppress(OSError):
         sweep_parts(place)
@@ -296,9 +296,9 @@ def _check_limits(timeout_s: Any, max_outside: Any) -> None:
 
 
 def _check_choices(store: Any, compression: Any, engine: Any, address: Any, recipe: Any) -> None:
+    from torchtransient.array_files.hdf5_writing import hdf5_package
     from torchtransient.data.storage.chunks import check_compression
     from torchtransient.data.storage.encodings import check_store
-    from torchtransient.files.hdf5_writing import hdf5_package
 
     hdf5_package(_WHAT)
     check_store(store, _WHAT)
@@ -319,7 +319,7 @@ def _check_choices(store: Any, compression: Any, engine: Any, address: Any, reci
 
 
 def _folder(folder: Any) -> Path:
-    from torchtransient.files.array_file import path_of
+    from torchtransient.array_files.array_file import path_of
 
     place = path_of(folder, _WHAT).absolute()
     try:

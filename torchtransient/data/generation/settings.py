@@ -8,12 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from torchtransient.array_files.part_files import whole_file, writing_said
 from torchtransient.data.generation.plan import Plan
 from torchtransient.data.recipes.places import without_places
 from torchtransient.data.recipes.plugin_modules import PluginNames
 from torchtransient.data.storage.file_names import RECIPE_FILE
-from torchtransient.data.storage.part_files import whole_file, writing_said
 from torchtransient.errors import StorageError
+from torchtransient.plain_texts import json_data, said_in_short
 
 FORMAT = "torchtransient data set"
 _WHAT = "generate"
@@ -81,11 +82,11 @@ def read_description(folder: Path) -> dict[str, Any] | None:
     """What is in the folder's ``recipe.json``, None where there is none. Raises StorageError for a damaged one."""
     path = folder / RECIPE_FILE
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = json_data(path.read_text(encoding="utf-8"), f"{_WHAT}: '{path}'")
     except FileNotFoundError:
         return None
-    except (OSError, ValueError) as error:
-        raise StorageError(f"{_WHAT}: '{path}' cannot be read, or is damaged: {error}. Take another.") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise StorageError(f"{_WHAT}: '{path}' cannot be read, or is damaged: {said_in_short(error)}.") from error
     missing = [name for name in (*DECIDING, "about") if not isinstance(found, dict) or name not in found]
     if missing:
         raise StorageError(f"{_WHAT}: '{path}' is none of a data set: it lacks {missing[0]!r}. Choose another folder.")

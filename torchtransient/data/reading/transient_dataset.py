@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from torchtransient.array_files.array_file import tensor_in
 from torchtransient.axes import TimeAxis
 from torchtransient.data.reading.parts import axis_of, bins_of, cut_axis, image_size, pixels_of
 from torchtransient.data.reading.sample_draws import (
@@ -23,7 +24,6 @@ from torchtransient.data.reading.shard_table import WHAT, ShardTable
 from torchtransient.data.storage.encodings import measured_names
 from torchtransient.data.storage.shard_file import Shard
 from torchtransient.errors import ArgumentError, StorageError
-from torchtransient.files.array_file import tensor_in
 from torchtransient.quantities import shown
 
 _MEASURED = "measurement"

@@ -35,6 +35,7 @@ from torchtransient.data.recipes.written import (
 from torchtransient.errors import MissingPackageError, SceneError, StorageError, TorchTransientError
 from torchtransient.files.scan_data import scan_data, scan_from_data
 from torchtransient.files.yaml_files import Section, read_yaml
+from torchtransient.plain_texts import json_data, said_in_short, text_of_file, told_shortly
 from torchtransient.quantities import shown
 from torchtransient.rendering.description import DictDescription, XmlDescription, describe_dict
 from torchtransient.rendering.scene_handle import Scene
@@ -144,11 +145,7 @@ def read_file(source: str | Path) -> tuple[Mapping[str, Any], Path]:
     """What a file says, and its folder; see :meth:`Recipe.read`."""
     is_text = isinstance(source, str) and "\n" in source
     if not is_text and Path(source).suffix.lower() == ".json":
-        try:
-            data = json.loads(Path(source).read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise StorageError(f"recipe: '{source}' cannot be read: {error}.") from error
-        return data, Path(source).resolve().parent
+        return json_data(text_of_file(source, "recipe"), "recipe"), Path(source).resolve().parent
     return read_yaml(source, "recipe")
 
 
@@ -187,11 +184,13 @@ def faults_said() -> Iterator[None]:
     where they are used.
     """
     try:
-        yield
+        with told_shortly("recipe"):
+            yield
     except (TypeError, KeyError, ValueError, AttributeError, IndexError, OverflowError, RecursionError) as error:
         if isinstance(error, TorchTransientError):
             raise
-        raise SceneError(f"recipe: an entry is not what it should be: {type(error).__name__}: {error}.") from error
+        said = f"{type(error).__name__}: {said_in_short(error)}"
+        raise SceneError(f"recipe: an entry is not what it should be: {said}.") from error
 
 
 def _axis(section: Section) -> TimeAxis | None:
@@ -267,7 +266,7 @@ def _builtin(given: Mapping[str, Any]) -> Any:
     name = given["builtin"]
     known = [made for made in dir(scenes) if inspect.isfunction(getattr(scenes, made))]
     if name not in known:
-        raise SceneError(f"recipe: scene: unknown builtin {name!r}. Known ones are {', '.join(known)}.")
+        raise SceneError(f"recipe: scene: unknown builtin {shown(name)}. Known ones are {', '.join(known)}.")
     arguments = {key: read(value) for key, value in given.items() if key != "builtin"}
     try:
         return getattr(scenes, name)(**arguments)

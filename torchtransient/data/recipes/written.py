@@ -23,6 +23,7 @@ from torchtransient.errors import SceneError
 from torchtransient.files.plain_data import plain, restored
 from torchtransient.files.scan_data import scan_data, scan_from_data
 from torchtransient.gates import Gate
+from torchtransient.plain_texts import said_in_short
 from torchtransient.plugins.dictionaries import Pixels, Voxels
 from torchtransient.pulses import Pulse
 from torchtransient.quantities import shown
@@ -110,12 +111,12 @@ def read_distribution(where: str, value: Any) -> Distribution:
         raise SceneError(f"{where}: {name}: expected {wanted}, got {shown(given)}.")
     unknown = [entry for entry in arguments if entry not in fields]
     if unknown:
-        raise SceneError(f"{where}: {name}: unknown entry {unknown[0]!r}. Known ones are {', '.join(fields)}.")
+        raise SceneError(f"{where}: {name}: unknown entry {shown(unknown[0])}. Known ones are {', '.join(fields)}.")
     nested = {entry: _nested(f"{where}: {name}", content) for entry, content in arguments.items()}
     try:
         return made(**nested)
     except TypeError as error:
-        raise SceneError(f"{where}: {name}: {error}. Its entries are {', '.join(fields)}.") from error
+        raise SceneError(f"{where}: {name}: {said_in_short(error)}. Its entries are {', '.join(fields)}.") from error
 
 
 def _nested(where: str, content: Any) -> Any:

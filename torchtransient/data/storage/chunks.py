@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchtransient.array_files.hdf5_writing import hdf5_package
 from torchtransient.errors import ArgumentError, MissingPackageError, StorageError
-from torchtransient.files.hdf5_writing import hdf5_package
 from torchtransient.quantities import shown
 
 COMPRESSIONS = ("blosc2", "gzip", "none")

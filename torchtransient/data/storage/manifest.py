@@ -12,17 +12,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from torchtransient.array_files.array_file import path_of
+from torchtransient.array_files.part_files import sweep_parts as sweep_parts
+from torchtransient.array_files.part_files import whole_file, writing_said
 from torchtransient.data.storage.file_names import MANIFEST_FILE, RECIPE_FILE, SHARD_FILES, shard_file_name
-from torchtransient.data.storage.part_files import sweep_parts as sweep_parts
-from torchtransient.data.storage.part_files import whole_file, writing_said
 from torchtransient.data.storage.shard_file import Shard, stored_checksum
 from torchtransient.errors import StorageError
-from torchtransient.files.array_file import path_of
+from torchtransient.plain_texts import json_data
 from torchtransient.quantities import shown
 from torchtransient.rendering.progress import with_bar
 
 FORMAT = "torchtransient manifest 1"
 _WHAT = "data set"
+# Of samples, whose numbers stand in memory.
+_MOST_MISSING = 10**8
 
 
 @dataclass(frozen=True)
@@ -113,7 +116,11 @@ def verify(folder: str | Path, progress: bool = False) -> Verified:
             faults[MANIFEST_FILE] = ["did not tell what the shards hold; it was made again"]
     have = {number for entry in sound for number in (*entry.index, *entry.failed)}
     n = expected.get("n")
-    missing = sorted(set(range(n if isinstance(n, int) else max(have, default=-1) + 1)) - have)
+    count = n if isinstance(n, int) else max(have, default=-1) + 1
+    if count - len(have) > _MOST_MISSING:
+        where = f"'{Path(folder) / RECIPE_FILE}' counts" if isinstance(n, int) else "the numbers of its samples ask for"
+        raise StorageError(f"{_WHAT}: {where} {shown(count)} samples, and {len(have)} are there: it is damaged.")
+    missing = sorted(set(range(count)) - have)
     return Verified(
         Path(folder), sum(len(entry.index) for entry in sound), len(paths), dict(sorted(faults.items())),
         tuple(missing), {number: entry.failed[number] for entry in sound for number in entry.failed},
@@ -213,10 +220,7 @@ def _difference(name: str, expected: Any, found: Any) -> str:
 def _expected(folder: Path) -> dict[str, Any]:
     """What ``recipe.json`` says, nothing where it is missing or no such file."""
     text = _text_of(folder / RECIPE_FILE)
-    try:
-        found = json.loads(text) if text is not None else {}
-    except ValueError:
-        raise StorageError(f"{_WHAT}: '{folder / RECIPE_FILE}' is no JSON: it was cut or changed.") from None
+    found = {} if text is None else json_data(text, f"{_WHAT}: '{folder / RECIPE_FILE}', which was cut or changed")
     return found if isinstance(found, dict) else {}
 
 

@@ -13,6 +13,9 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from torchtransient.array_files.array_file import check_source, damage_said
+from torchtransient.array_files.hdf5_limits import check_memory, dataset_of, is_number, read_dataset
+from torchtransient.array_files.hdf5_writing import hdf5_package
 from torchtransient.data.storage.chunks import check_chunks, time_axis
 from torchtransient.data.storage.encodings import ENCODINGS, decoded
 from torchtransient.data.storage.shard_writing import (
@@ -25,9 +28,6 @@ from torchtransient.data.storage.shard_writing import (
 )
 from torchtransient.data.storage.shard_writing import ShardWriter as ShardWriter
 from torchtransient.errors import StorageError
-from torchtransient.files.array_file import check_source, damage_said
-from torchtransient.files.hdf5_limits import check_memory, dataset_of, read_dataset
-from torchtransient.files.hdf5_writing import hdf5_package
 from torchtransient.quantities import shown
 
 _TEXTS = ("format", "store", "compression")
@@ -181,7 +181,7 @@ class Shard:
                 f"{WHAT}: '{self.path}' has no '{name}'; it has {', '.join(self.names) or 'no sample at all'}."
             )
         dataset = dataset_of(self._file, f"arrays/{name}", WHAT)
-        if dataset is None or dataset.shape[:1] != (self.rows,) or dataset.dtype.kind not in "biufc":
+        if dataset is None or dataset.shape[:1] != (self.rows,) or not is_number(dataset.dtype):
             raise ValueError(f"'arrays/{name}' is missing or of another kind")
         check_chunks(dataset, int(self._there.sum()), f"{WHAT}: '{self.path}': '{name}' {dataset.shape}")
         self._datasets[name] = dataset

@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchtransient.array_files.array_file import check_source, damage_said, path_of
+from torchtransient.array_files.hdf5_limits import check_memory
+from torchtransient.array_files.part_files import whole_file, writing_said
 from torchtransient.data.reading.transient_dataset import TransientDataset
 from torchtransient.data.storage.encodings import COUNTED, measured_names
-from torchtransient.data.storage.part_files import whole_file, writing_said
 from torchtransient.errors import MissingPackageError, StorageError
-from torchtransient.files.array_file import check_source, damage_said, path_of
-from torchtransient.files.hdf5_limits import check_memory
 from torchtransient.quantities import positive
 from torchtransient.rendering.progress import with_bar
 
@@ -93,7 +93,8 @@ def decode_web_sample(members: Mapping[str, Any], *, as_stored: bool = False) ->
 def read_web_dataset(path: str | Path, *, as_stored: bool = False) -> Iterator[dict[str, Any]]:
     """The samples of a tar one by one, without the package webdataset. Raises StorageError for damaged files."""
     source = check_source(path, _WHAT)
-    with damage_said(source, _WHAT, "a WebDataset of torchtransient"), _tar_said(source), tarfile.open(source) as tar:
+    kind = "a WebDataset of torchtransient"
+    with damage_said(source, _WHAT, kind), _tar_said(source), tarfile.open(source, "r:") as tar:
         members: dict[str, Any] = {}
         for member in tar:
             key, _, ending = member.name.partition(".")

@@ -14,11 +14,11 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from torchtransient.array_files.array_file import check_source, damage_said
+from torchtransient.array_files.hdf5_limits import read_attributes, read_dataset
+from torchtransient.array_files.hdf5_writing import hdf5_package
 from torchtransient.errors import StorageError
-from torchtransient.files.array_file import check_source, damage_said
 from torchtransient.files.captures.mat5 import HEADER_BYTES, Mat5File, Other
-from torchtransient.files.hdf5_limits import read_attributes, read_dataset
-from torchtransient.files.hdf5_writing import hdf5_package
 
 WHAT = "capture file"
 

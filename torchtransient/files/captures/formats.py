@@ -9,17 +9,18 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from torchtransient.array_files.array_file import HDF5, check_folder, damage_said, path_of
+from torchtransient.array_files.hdf5_limits import read_attributes
+from torchtransient.array_files.hdf5_writing import hdf5_package
 from torchtransient.axes import FrequencyAxis
 from torchtransient.capture import Capture
 from torchtransient.capture.files import register_files
 from torchtransient.errors import ArgumentError, StorageError
 from torchtransient.files import capture_file
-from torchtransient.files.array_file import HDF5, check_folder, damage_said, path_of
 from torchtransient.files.captures import cdt, dirac, keyhole, phasor_field, rect_data, tal, zaragoza
 from torchtransient.files.captures.contents import WHAT, Contents, opened
 from torchtransient.files.captures.gaps import Gaps
-from torchtransient.files.hdf5_limits import read_attributes
-from torchtransient.files.hdf5_writing import hdf5_package
+from torchtransient.plain_texts import some_of
 from torchtransient.quantities import shown
 
 OWN = "torchtransient"
@@ -149,7 +150,7 @@ def _asked_for(contents: Contents, name: str) -> Layout:
     if others and not layout.recognises(contents):
         raise StorageError(
             f"{WHAT}: expected '{contents.source}' in the layout {name!r}, got one of {others[0]!r} (it holds "
-            f"{', '.join(sorted(contents.shapes))}). Leave format= out, or give format={others[0]!r}."
+            f"{some_of(sorted(contents.shapes), 120)}). Leave format= out, or give format={others[0]!r}."
         )
     return layout
 
@@ -159,10 +160,10 @@ def _found(contents: Contents) -> Layout:
         if layout.recognises(contents):
             return layout
     held = (f"{name} (a link, which is not followed)" if name in contents.links else name for name in contents.shapes)
-    names = ", ".join(sorted(held)) or "nothing"
+    names = some_of(sorted(held), 120) or "nothing"
     raise StorageError(
         f"{WHAT}: '{contents.source}' has no known layout ({', '.join(FORMATS)}); it holds {names}. Give format= if it "
-        "is one of these; read it with h5py and make a tt.nlos.Capture if it is not."
+        "is one of these; read it with h5py if it is not."
     )
 
 

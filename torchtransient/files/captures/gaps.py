@@ -11,10 +11,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchtransient.array_files.array_file import array_of
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import StorageError
-from torchtransient.files.array_file import array_of
 from torchtransient.files.captures.contents import WHAT
 from torchtransient.quantities import finite, positive, real_array, shown
 from torchtransient.units import seconds_to_opl

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.files.hdf5_limits import check_memory, check_size
+from torchtransient.array_files.hdf5_limits import check_memory, check_size
 
 HEADER_BYTES = 128
 # How numbers are stored, by the types of elements; texts have their letters in some of these.

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.files.array_file import replacing
+from torchtransient.array_files.array_file import replacing
+from torchtransient.array_files.hdf5_writing import new_hdf5
 from torchtransient.files.captures.contents import WHAT
-from torchtransient.files.hdf5_writing import new_hdf5
 
 _HEADER = b"MATLAB 7.3 MAT-file, Platform: torchtransient, HDF5 schema 1.00 ."
 _USER_BLOCK = 512

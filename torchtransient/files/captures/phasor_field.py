@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchtransient.array_files.array_file import array_of
 from torchtransient.capture import Capture
-from torchtransient.files.array_file import array_of
 from torchtransient.files.captures.contents import WHAT, Contents
 from torchtransient.files.captures.gaps import (
     Gaps,

@@ -18,9 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchtransient.array_files.array_file import array_of, replacing
+from torchtransient.array_files.hdf5_writing import hdf5_package, new_hdf5
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import StorageError
-from torchtransient.files.array_file import array_of, replacing
 from torchtransient.files.captures import tal_scene_info
 from torchtransient.files.captures.contents import WHAT, Contents
 from torchtransient.files.captures.gaps import (
@@ -35,7 +36,6 @@ from torchtransient.files.captures.gaps import (
     time_axis,
 )
 from torchtransient.files.captures.mat_file import write_parts
-from torchtransient.files.hdf5_writing import hdf5_package, new_hdf5
 
 NAME = "tal"
 _STOKES = 4

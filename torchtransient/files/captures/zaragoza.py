@@ -15,9 +15,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchtransient.array_files.array_file import array_of, replacing
+from torchtransient.array_files.hdf5_writing import new_hdf5
 from torchtransient.capture import Capture
 from torchtransient.errors import StorageError
-from torchtransient.files.array_file import array_of, replacing
 from torchtransient.files.captures.contents import WHAT, Contents
 from torchtransient.files.captures.gaps import (
     Gaps,
@@ -30,7 +31,6 @@ from torchtransient.files.captures.gaps import (
     time_axis,
 )
 from torchtransient.files.captures.mat_file import write_parts
-from torchtransient.files.hdf5_writing import new_hdf5
 from torchtransient.quantities import shown
 
 NAME = "zaragoza"

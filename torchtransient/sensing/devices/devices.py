@@ -27,6 +27,7 @@ from torch import nn
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import MissingPackageError, StorageError, TorchTransientError
+from torchtransient.plain_texts import json_data, said_in_short, some_of, text_of_file, told_shortly, yaml_data
 from torchtransient.quantities import shown
 from torchtransient.sensing.base.layout import check_number
 from torchtransient.sensing.base.policies import GradPolicy
@@ -76,7 +77,6 @@ from torchtransient.sensing.spad.spad import SynchronousSPAD
 from torchtransient.sensing.timing.detection_jitter import DetectionJitter
 from torchtransient.sensing.timing.pixel_skew import DetectionSkew, PixelSkew
 from torchtransient.sensing.timing.tdc import TDC, random_code_widths
-from torchtransient.yaml_numbers import reads_exponents
 
 
 def _seeded_code_widths(num_bins: int, dnl_std: float, seed: int = 0) -> torch.Tensor:
@@ -142,10 +142,17 @@ class Device:
     num_bins: int | None = None
 
     def __post_init__(self) -> None:
+        for name in ("name", "description"):
+            text: Any = getattr(self, name)
+            if not isinstance(text, str):
+                raise StorageError(f"Device: expected {name} as a text, got {shown(text)}.")
         for name in ("sources", "stages"):
             given = getattr(self, name)
             if not isinstance(given, (list, tuple)):
                 raise StorageError(f"Device '{self.name}': expected {name} as a list, got {shown(given)}.")
+        for source in self.sources:
+            if not isinstance(source, str):
+                raise StorageError(f"Device '{self.name}': expected sources as texts, got {shown(source)}.")
         object.__setattr__(self, "sources", tuple(self.sources))
         object.__setattr__(self, "stages", tuple(copy.deepcopy(s) for s in self.stages))
         if not self.stages:
@@ -212,10 +219,16 @@ class Device:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Device:
         """What `to_dict` made. Raises StorageError for missing or unknown entries."""
+        with told_shortly("Device"):
+            return cls._from_dict(data)
+
+    @classmethod
+    def _from_dict(cls, data: Mapping[str, Any]) -> Device:
         wanted = {"name", "description", "sources", "stages"}
         found = set(data) if isinstance(data, Mapping) else set()
         if not wanted <= found or found - wanted - {"bin_width_s", "num_bins"}:
-            raise StorageError(f"Device: expected the entries {sorted(wanted)}, got {sorted(found)}.")
+            got = shown(data) if not found else some_of(sorted(shown(name) for name in found), 160)
+            raise StorageError(f"Device: expected the entries {', '.join(sorted(wanted))}, got {got}.")
         return cls(
             data["name"], description=data["description"], sources=data["sources"], stages=data["stages"],
             bin_width_s=data.get("bin_width_s"), num_bins=data.get("num_bins"),
@@ -234,10 +247,7 @@ class Device:
     @classmethod
     def from_json(cls, source: str | Path) -> Device:
         """A device from a file (a `Path`, or a name without a brace) or from JSON text. Raises StorageError."""
-        try:
-            return cls.from_dict(json.loads(_text(source, "{")))
-        except (OSError, ValueError) as error:
-            raise StorageError(f"Device.from_json: expected a JSON file or text: {error}.") from error
+        return cls.from_dict(json_data(_text(source, "{", "Device.from_json"), "Device.from_json"))
 
     def to_yaml(self, path: str | Path | None = None) -> str:
         """YAML text, also written to ``path`` when given. Needs PyYAML (``pip install torchtransient[yaml]``)."""
@@ -250,11 +260,7 @@ class Device:
     def from_yaml(cls, source: str | Path) -> Device:
         """A device from a YAML file or text, read by the safe loader. Raises StorageError."""
         yaml = _yaml()
-        try:
-            loader = reads_exponents(type("Loader", (yaml.SafeLoader,), {}))
-            return cls.from_dict(yaml.load(_text(source, "\n"), Loader=loader))
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-            raise StorageError(f"Device.from_yaml: expected a YAML file or text: {error}.") from error
+        return cls.from_dict(yaml_data(_text(source, "\n", "Device.from_yaml"), "Device.from_yaml", yaml))
 
 
 def build_stage(spec: Any, axis: TimeAxis | None = None, budget: Mapping[str, Any] | None = None) -> Any:
@@ -282,7 +288,8 @@ def build_stage(spec: Any, axis: TimeAxis | None = None, budget: Mapping[str, An
         raise
     except TypeError as error:
         raise StorageError(
-            f"build_stage: expected arguments of {spec['kind']}, got {sorted(arguments)}: {error}."
+            f"build_stage: expected arguments of {spec['kind']}, got {some_of(sorted(arguments))}: "
+            f"{said_in_short(error)}."
         ) from error
 
 
@@ -325,8 +332,10 @@ def _placeholder(name: str, axis: TimeAxis | None, budget: Mapping[str, Any] | N
 def _check_spec(spec: Any, where: str) -> None:
     kind = spec.get("kind") if isinstance(spec, dict) else None
     if not isinstance(kind, str) or kind not in KINDS:
-        known = ", ".join(sorted(KINDS))
-        raise StorageError(f"Device '{where}': expected a dictionary with a kind out of {known}; got {kind or spec!r}.")
+        raise StorageError(
+            f"Device '{where}': expected a dictionary with a kind, one of {some_of(sorted(KINDS))}; got "
+            f"{shown(kind or spec)}."
+        )
     for value in spec.values():
         _check_value(value, kind, where)
 
@@ -355,8 +364,8 @@ def _parts(spec: Any) -> list[dict[str, Any]]:
     return own + [part for value in spec.values() for part in _parts(value)]
 
 
-def _text(source: str | Path, mark: str) -> str:
-    return source if isinstance(source, str) and mark in source else Path(source).read_text(encoding="utf-8")
+def _text(source: str | Path, mark: str, who: str) -> str:
+    return source if isinstance(source, str) and mark in source else text_of_file(source, who)
 
 
 def _yaml() -> Any:

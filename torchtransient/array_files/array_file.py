@@ -1,20 +1,20 @@
 """Arrays and entries by name in one file: HDF5 (`.h5`, `.hdf5`) or NumPy's `.npz`, chosen by the file's ending.
 
 Entries are attributes of an HDF5 file and zero-dimensional arrays of an `.npz`. Large arrays are written in parts, so
-that no second copy of them is needed, and a file takes its place once it is whole.
+that no second copy of them is needed, and a file takes its place once it is whole. It carries a checksum of everything
+that it holds (`checksums.py`); files of the first version, which have none, are read without a word.
 """
 
 from __future__ import annotations
 
 import math
 import os
-import secrets
 import shutil
 import struct
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -23,9 +23,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchtransient.array_files.checksums import CHECKSUMS, Digest, array_digest, check, checksums_text, parts_of
+from torchtransient.array_files.hdf5_limits import check_size, read_attributes, read_dataset
+from torchtransient.array_files.hdf5_writing import hdf5_package, new_hdf5
+from torchtransient.array_files.part_files import sweep_parts, whole_file
 from torchtransient.errors import StorageError, TorchTransientError
-from torchtransient.files.hdf5_limits import check_size, read_attributes, read_dataset
-from torchtransient.files.hdf5_writing import hdf5_package, new_hdf5
+from torchtransient.plain_texts import said_in_short
 from torchtransient.quantities import shown
 
 HDF5 = (".h5", ".hdf5")
@@ -103,16 +106,17 @@ def write_arrays(target: Path, arrays: Mapping[str, NDArray[Any]], entries: Mapp
         if target.suffix.lower() in HDF5:
             _write_hdf5(unfinished, arrays, entries, what)
             return
+        digests = {name: (_rows(array), array_digest(array, _rows(array))) for name, array in arrays.items()}
+        said = {**entries, CHECKSUMS: checksums_text(entries, digests)}
         with unfinished.open("wb") as file:
             # numpy writes arrays that are not contiguous through a small buffer
-            everything: dict[str, Any] = {**arrays, **{name: np.array(value) for name, value in entries.items()}}
+            everything: dict[str, Any] = {**arrays, **{name: np.array(value) for name, value in said.items()}}
             np.savez(file, **everything)
 
 
-def read_arrays(
-    path: str | Path, form: str, what: str, known: Callable[[str], bool] = lambda name: True
-) -> dict[str, Any]:
-    """Arrays and entries by name, of the names that are ``known``, of a file whose entry `format` is `form`.
+def read_arrays(path: str | Path, forms: Sequence[str], what: str, known: Callable[[str], bool]) -> dict[str, Any]:
+    """Arrays and entries by name, of the names that are ``known``, of a file whose entry `format` is one of `forms`.
+    They are compared with their checksums, which files of the first version of a format do not have.
 
     Raises StorageError for a file that is missing, of another format, or damaged.
     """
@@ -120,21 +124,60 @@ def read_arrays(
     if source.suffix.lower() not in ENDINGS:
         raise StorageError(f"{what}: expected a name that ends in {', '.join(ENDINGS)}, got '{source}'.")
     check_source(source, what)
+
     with damage_said(source, what):
-        hdf5 = source.suffix.lower() in HDF5
-        values = _read_hdf5(source, what, known) if hdf5 else _read_npz(source, what, known)
-        found = str(values["format"])
-        if found != form:
-            raise StorageError(f"{what}: '{source}' is {other_kind(found, form)}")
-        return values
+        found = _format_of(source, what)
+        if found not in forms:
+            raise StorageError(f"{what}: '{source}' is {other_kind(found or 'nothing', forms[-1])}")
+        return _values(source, what, known, found)
+
+
+def read_some(path: Path, what: str, known: Callable[[str], bool], kind: str = "a file of arrays") -> dict[str, Any]:
+    """Arrays and entries of the names that are ``known``, of a file of any program. Files of this library that have
+    checksums are compared with them. ``kind``: what is expected, for messages. Raises StorageError for what is missing,
+    damaged or too large.
+    """
+    check_source(path, what)
+    with damage_said(path, what, kind):
+        return _values(path, what, known, _format_of(path, what))
+
+
+def read_npy(path: Path, what: str) -> NDArray[Any]:
+    """The array of a `.npy`. Raises StorageError for what is none, for objects, and for more than the file holds."""
+    check_source(path, what)
+    with damage_said(path, what, "an array of NumPy"), path.open("rb") as stream:
+        _check_array(stream, path.stat().st_size, f"{what}: '{path}'", packed=False)
+        stream.seek(0)
+        array: NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
+        return array
+
+
+def _format_of(source: Path, what: str) -> str:
+    """What a file says that it is, "" where it says nothing."""
+    found = _read(source, what, "format".__eq__).get("format", "")
+    return str(np.asarray(found).reshape(-1)[0]) if np.size(found) else ""
+
+
+def _values(source: Path, what: str, known: Callable[[str], bool], form: str) -> dict[str, Any]:
+    values = _read(source, what, lambda name: name == CHECKSUMS or known(name))
+    checksums = values.pop(CHECKSUMS, None)
+    if checksums is not None:
+        check(values, checksums, f"{what}: '{source}'", known)
+    elif form.startswith("torchtransient ") and not form.endswith(" 1"):
+        raise StorageError(f"{what}: '{source}' has lost its checksums: it is damaged. Take a copy.")
+    return values
+
+
+def _read(source: Path, what: str, known: Callable[[str], bool]) -> dict[str, Any]:
+    return (_read_hdf5 if source.suffix.lower() in HDF5 else _read_npz)(source, what, known)
 
 
 def other_kind(found: str, form: str) -> str:
     """What a file is that is not of the format ``form``, and what reads it: the end of a message."""
     kind = found.rpartition(" ")[0]
     if kind == form.rpartition(" ")[0] or kind not in READERS:
-        return f"of format '{found}'; this version reads '{form}'."
-    return f"of format '{found}', not '{form}'. {READERS[kind]} reads it."
+        return f"of format {shown(found)}; this version reads '{form}'."
+    return f"of format {shown(found)}, not '{form}'. {READERS[kind]} reads it."
 
 
 @contextmanager
@@ -152,7 +195,7 @@ def damage_said(source: Path, what: str, kind: str = "") -> Iterator[None]:
         if isinstance(error, TorchTransientError) and kind:
             raise StorageError(f"{what}: '{source}': {error}") from error
         kind = kind or f"a {what.removesuffix(' file')} of torchtransient"
-        raise StorageError(f"{what}: '{source}' is not {kind}, or is damaged: {str(error).rstrip('.')}.") from error
+        raise StorageError(f"{what}: '{source}' is not {kind}, or is damaged: {said_in_short(error)}.") from error
 
 
 def array_of(tensor: torch.Tensor, what: str) -> NDArray[Any]:
@@ -188,38 +231,41 @@ def replacing(target: Path, what: str) -> Iterator[Path]:
     link, the file that it points to is replaced; permissions stay.
     """
     place = Path(os.path.realpath(target))
-    # No longer than names may be.
-    unfinished = place.with_name(f".{place.name[:40]}.{secrets.token_hex(4)}.part")
-    try:
+    sweep_parts(place.parent)
+    with whole_file(place, what, synchronized=False) as unfinished, _disk_said(target, what):
         yield unfinished
         if place.exists():
             shutil.copymode(place, unfinished)
-        unfinished.replace(place)
+
+
+@contextmanager
+def _disk_said(target: Path, what: str) -> Iterator[None]:
+    try:
+        yield
     except OSError as error:
         raise StorageError(f"{what}: '{target}' could not be written: {error}.") from error
-    finally:
-        unfinished.unlink(missing_ok=True)
 
 
 def _write_hdf5(path: Path, arrays: Mapping[str, NDArray[Any]], entries: Mapping[str, Any], what: str) -> None:
+    digests: dict[str, tuple[int, str]] = {}
     with new_hdf5(path, what) as file:
         for name, value in entries.items():
             file.attrs[name] = value
         for name, array in arrays.items():
             dataset = file.create_dataset(name, shape=array.shape, dtype=array.dtype)
-            for part in _parts(array):
-                dataset[part] = array[part]
+            digest, rows = Digest(array.dtype, array.shape), _rows(array)
+            for part in parts_of(array.shape, rows):
+                # One copy for both.
+                block = np.ascontiguousarray(array[part])
+                dataset[part] = block.reshape(array[part].shape)
+                digest.add(block)
+            digests[name] = (rows, digest.text())
+        file.attrs[CHECKSUMS] = checksums_text(entries, digests)
 
 
-def _parts(array: NDArray[Any]) -> Iterator[Any]:
-    """Indices of rows of an image: the film keeps H first, so they are read in order, and only they are copied."""
-    if array.ndim < 2:
-        yield ...
-        return
-    rows = array.shape[-2]
-    step = max(1, _PART_BYTES * rows // max(1, array.nbytes))
-    for row in range(0, rows, step):
-        yield ..., slice(row, row + step), slice(None)
+def _rows(array: NDArray[Any]) -> int:
+    """So many rows of an image are written at a time."""
+    return max(1, _PART_BYTES * array.shape[-2] // max(1, array.nbytes)) if array.ndim >= 2 else 1
 
 
 def _read_hdf5(path: Path, what: str, known: Callable[[str], bool]) -> dict[str, Any]:
@@ -234,20 +280,33 @@ def _read_npz(path: Path, what: str, known: Callable[[str], bool]) -> dict[str, 
         for entry in file.infolist():
             name = entry.filename.removesuffix(".npy")
             if known(name):
-                _check_member(file, entry, f"{what}: '{name}'")
+                if name in found:
+                    raise StorageError(f"{what}: '{name}' stands twice in '{path}': the file is damaged.")
+                _check_member(file, entry, f"{what}: '{name}'", path.stat().st_size)
                 with file.open(entry) as stream:
                     found[name] = np.lib.format.read_array(stream, allow_pickle=False)
     return found
 
 
-def _check_member(file: zipfile.ZipFile, entry: zipfile.ZipInfo, what: str) -> None:
+def _check_member(file: zipfile.ZipFile, entry: zipfile.ZipInfo, what: str, size: int) -> None:
     """Compare the shape that an array declares with what is stored of it, before there is memory for it."""
     if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise StorageError(f"{what} is packed as NumPy packs nothing (method {entry.compress_type}). Use np.savez.")
+    # What it says of its size, but no more than there is.
     with file.open(entry) as stream:
-        read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-        version = np.lib.format.read_magic(stream)
-        if version not in read_header:
-            raise StorageError(f"{what} is an array of version {version}, which NumPy writes for none of numbers.")
-        shape, _, dtype = read_header[version](stream)
-    check_size(math.prod(shape) * dtype.itemsize, entry.compress_size, f"{what} {shape}")
+        _check_array(stream, min(entry.compress_size, size), what)
+
+
+def _check_array(stream: Any, stored: int, what: str, *, packed: bool = True) -> None:
+    """Compare what the head of an array declares with the bytes that are ``stored`` of it."""
+    read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    version = np.lib.format.read_magic(stream)
+    if version not in read_header:
+        raise StorageError(f"{what} is an array of version {version}, which NumPy writes for none of numbers.")
+    shape, _, dtype = read_header[version](stream)
+    if dtype.kind not in "biufcU":
+        raise StorageError(f"{what} holds {str(dtype)[:60]}; expected numbers or a text. No pickle is read.")
+    declared = math.prod(shape) * dtype.itemsize
+    if not packed and declared > stored:
+        raise StorageError(f"{what} declares {declared:,} bytes of numbers and stores {stored:,}: it is damaged.")
+    check_size(declared, stored, f"{what} {shape}")

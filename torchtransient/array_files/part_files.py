@@ -7,6 +7,7 @@ from __future__ import annotations
 import errno
 import os
 import platform
+import re
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,6 +16,8 @@ from pathlib import Path
 from torchtransient.errors import StorageError
 
 _SUFFIX = ".part"
+# Names that this module gives.
+_OURS = re.compile(r"\..{1,40}\.[0-9a-f]{8}\.part", re.DOTALL)
 # What file systems without locks answer.
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
@@ -22,18 +25,17 @@ _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 def check_system(what: str) -> None:
     """Raise StorageError where files can be neither locked nor replaced while they are open."""
     if platform.system() == "Windows":
-        raise StorageError(f"{what}: data sets are generated and written on Linux and macOS, this is Windows.")
+        raise StorageError(f"{what}: files and data sets are written on Linux and macOS, this is Windows.")
 
 
 @contextmanager
-def whole_file(target: Path, what: str, *, over: bool = True) -> Iterator[Path]:
+def whole_file(target: Path, what: str, *, over: bool = True, synchronized: bool = True) -> Iterator[Path]:
     """A locked neighbour of `target`, on the disk and in its place when the block has succeeded, removed when it
     failed.
 
-    ``over``: in place of one that is there; otherwise, that one stays.
-
-    The file and its folder are synchronized: what is in its place survives a loss of power. Raises StorageError for a
-    disk that is full or closed to us and on Windows; errors of the block stay what they are.
+    ``over``: in place of one that is there; otherwise, that one stays. ``synchronized``: the file and its folder are
+    on the disk before it ends, so that what is in its place survives a loss of power, which takes 10 ms. Raises
+    StorageError for a disk that is full or closed to us and on Windows; errors of the block stay what they are.
     """
     check_system(what)
     with writing_said(target, what):
@@ -41,9 +43,11 @@ def whole_file(target: Path, what: str, *, over: bool = True) -> Iterator[Path]:
     try:
         yield unfinished
         with writing_said(target, what):
-            os.fsync(lock)
+            if synchronized:
+                os.fsync(lock)
             _put(unfinished, target, over)
-            _sync_folder(target.parent)
+            if synchronized:
+                _sync_folder(target.parent)
     finally:
         unfinished.unlink(missing_ok=True)
         os.close(lock)
@@ -62,13 +66,16 @@ def sweep_parts(folder: str | Path) -> list[Path]:
     """Remove what writers that are gone left unfinished in a folder. Returns what was removed.
 
     Files whose writer lives are locked and stay; those of writers on other machines too, where the file system carries
-    locks between machines (NFS from version 4 on does). Where it has no locks at all, everything stays.
+    locks between machines (NFS from version 4 on does). Where it has no locks at all, everything stays. So does what
+    has another kind of name, and what is not ours to open.
     """
     removed = []
     for path in sorted(Path(folder).glob(f".*{_SUFFIX}")):
+        if not _OURS.fullmatch(path.name):
+            continue
         try:
-            descriptor = os.open(path, os.O_RDWR)
-        except FileNotFoundError:
+            descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK)
+        except OSError:
             continue
         try:
             if _lock(descriptor) == "ours":

@@ -16,10 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.errors import StorageError
-from torchtransient.rendering.memory import available_bytes
+from torchtransient.free_memory import available_memory
 
 # Deflate, the filter that all of these files use, makes at most 1032 bytes of one.
 MOST_BYTES_OF_ONE = 1032
+# Gzip, shuffle, Fletcher's checksum, szip, n-bit and scale-offset are HDF5's own, and LZF is that of h5py.
+_FILTERS = {1, 2, 3, 4, 5, 6, 32000}
 # Never written, and small enough to be made of fill values.
 _FREE_BYTES = 2**20
 # Below, memory is not asked about: files are read in a moment.
@@ -43,10 +45,11 @@ def read_dataset(parent: Any, name: str, what: str, part: tuple[Any, ...] = ()) 
     # MATLAB writes the size of an empty array in its place.
     if dataset is None or dataset.shape is None or "MATLAB_empty" in dataset.attrs:
         return None
+    _check_filters(dataset, name, what)
     if is_text(dataset):
         return _text(dataset, what)
-    if dataset.dtype.kind not in "biufc":
-        raise StorageError(f"{what}: '{name}' holds {dataset.dtype}; expected numbers.")
+    if not is_number(dataset.dtype):
+        raise StorageError(f"{what}: '{name}' holds {str(dataset.dtype)[:60]}; expected numbers of up to 64 bits.")
     left = [n for axis, n in enumerate(dataset.shape) if axis >= len(part) or not isinstance(part[axis], int)]
     wanted = math.prod(left) * dataset.dtype.itemsize
     check_size(wanted, dataset.id.get_storage_size(), f"{what}: '{name}' {dataset.shape}")
@@ -80,6 +83,23 @@ def dataset_of(parent: Any, name: str, what: str) -> Any:
     return found
 
 
+def _check_filters(dataset: Any, name: str, what: str) -> None:
+    """Filters that are no part of HDF5 would be looked for and loaded as code, wherever HDF5_PLUGIN_PATH leads."""
+    settings = dataset.id.get_create_plist()
+    for number in range(settings.get_nfilters()):
+        code = settings.get_filter(number)[0]
+        if code not in _FILTERS:
+            raise StorageError(
+                f"{what}: '{name}' is packed by the filter {code}, which is no part of HDF5 and is not loaded. Write "
+                "the file with gzip or without compression."
+            )
+
+
+def is_number(dtype: np.dtype[Any]) -> bool:
+    """Whether an array is of numbers that tensors can have, complex ones of two of them."""
+    return dtype.kind in "biufc" and dtype.itemsize <= (16 if dtype.kind == "c" else 8)
+
+
 def is_text(dataset: Any) -> bool:
     """Whether a dataset holds one text."""
     import h5py
@@ -98,7 +118,7 @@ def check_memory(declared: int, what: str) -> None:
     """Raise StorageError where an array of ``declared`` bytes does not fit into memory."""
     if declared < _LARGE_BYTES:
         return
-    available = available_bytes("scalar_rgb")
+    available = available_memory()
     if available is not None and declared > available:
         raise StorageError(
             f"{what} takes {declared / 1e9:.3g} GB, and {available / 1e9:.3g} GB of memory are left. Free some memory, "

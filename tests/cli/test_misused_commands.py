@@ -1,0 +1,62 @@
+"""Whatever somebody gets wrong on a command line is one line and status 2; what the library gets wrong, one and 70."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from torchtransient.cli.main import Commands, main
+
+TESTS = Path(__file__).parents[1]
+
+
+def misused(folder, part, parts):
+    """Each of the commands of `support/misused_commands.py` whose turn it is, in a process of its own."""
+    arguments = [sys.executable, "-m", "support.misused_commands", str(folder), str(part), str(parts)]
+    environment = {**os.environ, "PYTHONPATH": f"{TESTS}:{TESTS.parent}"}
+    child = subprocess.run(arguments, capture_output=True, text=True, env=environment, cwd=folder)
+    assert child.returncode == 0, (child.returncode, child.stderr[-2000:])
+    return json.loads(child.stdout.splitlines()[-1])
+
+
+def test_one_of_sixty_commands(tmp_path):
+    found = misused(tmp_path, 7, 60)
+    assert found["count"] > 5 and found["faults"] == {}
+
+
+@pytest.mark.slow
+def test_every_command(tmp_path):
+    found = misused(tmp_path, 0, 1)
+    assert found["count"] > 400 and found["faults"] == {}
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "words"),
+    [
+        (PermissionError(13, "Permission denied", "a.h5"), 2, "Permission denied"), (TypeError("a\nb"), 70, "a b"),
+        (KeyError("a"), 70, "KeyError"), (RecursionError("deep"), 70, "a fault of torchtransient"),
+        (RuntimeError("x" * 9000), 70, "--debug shows where"),
+    ],
+)  # fmt: skip
+def test_errors_of_others(monkeypatch, error, status, words):
+    @click.command()
+    def broken():
+        raise error
+
+    monkeypatch.setattr(Commands, "get_command", lambda self, ctx, name: broken)
+    found = CliRunner().invoke(main, ["plan"])
+    assert found.exit_code == status and words in found.stderr
+    assert found.stderr.startswith("error: ") and found.stderr.count("\n") == 1 and len(found.stderr) < 500
+    assert type(CliRunner().invoke(main, ["--debug", "plan"]).exception) is type(error)
+
+
+def test_a_folder_that_is_no_data_set(tmp_path):
+    found = CliRunner().invoke(main, ["dataset", "verify", str(tmp_path)])
+    assert found.exit_code == 2 and "holds no shard" in found.stderr
