@@ -37,7 +37,7 @@ def read_setup(path: str | Path, **xml_parameters: Any) -> dict[str, Any]:
         return _setup(path, xml_parameters)
 
 
-def _setup(path: str | Path, xml_parameters: Mapping[str, str]) -> dict[str, Any]:
+def _setup(path: str | Path, xml_parameters: Mapping[str, Any]) -> dict[str, Any]:
     source = path_of(path, "read_setup")
     if source.suffix.lower() == ".xml":
         return {"hidden": load(source, **xml_parameters)}
