@@ -114,7 +114,8 @@ class Pulse:
         for time in times.ravel().tolist():
             near_seconds(time, "times_s", "Pulse.tabulated_s")
         lengths = seconds_to_opl(times)
-        return cls.tabulated(lengths.tolist(), tuple(values), seconds_to_opl(center_s))
+        center = near_seconds(_number(center_s, "center_s"), "center_s", "Pulse.tabulated_s")
+        return cls.tabulated(lengths.tolist(), tuple(values), seconds_to_opl(center))
 
     def shifted(self, opl: float) -> Pulse:
         """The same shape, ``opl`` metres later."""

@@ -112,8 +112,10 @@ def _psnr(x: Tensor, y: Tensor, mask: Tensor | None, limit: Tensor) -> Tally:
     from kornia.metrics import psnr as decibels
 
     shape = x.shape[:-3]
-    ours, theirs = ((picture / limit).double().reshape(-1, *x.shape[-3:]) for picture in (x, y))
-    masks = None if mask is None else mask.reshape(-1, *x.shape[-3:])
+    # in full, as -1 says nothing of pictures without pixels
+    stacked = (shape.numel(), *x.shape[-3:])
+    ours, theirs = ((picture / limit).double().reshape(stacked) for picture in (x, y))
+    masks = None if mask is None else mask.reshape(stacked)
     values, counts = [], []
     for k in range(len(ours)):
         # a picture without a pixel, whose mean would be none

@@ -164,9 +164,10 @@ def _correlation(
         x, y = (torch.where(kept, one - one.sum(-1, keepdim=True) / number, 0.0) for one in (x, y))
     else:
         flat_x, flat_y = ((one == 0).all(-1) for one in (x, y))
-    norms = (x.square().sum(-1) * y.square().sum(-1)).sqrt()
     defined = ~flat_x & ~flat_y
-    found = torch.where(defined, (x * y).sum(-1) / torch.where(defined, norms, 1.0), 0.0).clamp(-1, 1)
+    # chosen before the root, whose slope at 0 would be infinite
+    norms = torch.where(defined, x.square().sum(-1) * y.square().sum(-1), 1.0).sqrt()
+    found = torch.where(defined, (x * y).sum(-1) / norms, 0.0).clamp(-1, 1)
     return Tally(found.to(dtype), ~flat_y)
 
 
