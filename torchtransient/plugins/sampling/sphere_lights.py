@@ -22,6 +22,9 @@ from torchtransient.plugins.pointer_table import PointerTable
 
 # How many numbers of a light kernels load at once.
 _PACKET = 4
+# Lights that are chosen more rarely (`sampling_weight`) are left to the paths that hit them when derivatives are taken:
+# those of directions over the cone would come from a sample in a thousand, or from none.
+_LEAST_CHOICE = 1e-3
 
 
 class SphereLights:
@@ -122,6 +125,11 @@ class SphereLightTable:
     def lists(self, emitter: Any, active: Any = True) -> Any:
         """Which of an array of emitter pointers are spherical lights."""
         return self._marks.look_up(emitter, active) > 0
+
+    def draws(self, emitter: Any) -> Any:
+        """Which of an array of emitter pointers are spherical lights that :meth:`sample` chooses often enough."""
+        listed = self.lists(emitter)
+        return listed & (dr.detach(self.numbers(emitter, listed)[7]) >= _LEAST_CHOICE)
 
     def sample(self, scene: Any, ref: Any, u: Any, active: Any) -> tuple[Any, Any]:
         """(direction sample, emission over density) towards an emitter of the scene, as

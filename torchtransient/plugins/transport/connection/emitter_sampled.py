@@ -113,7 +113,7 @@ class EmitterSampled(Connection):
     def claims(self, world, emitter, d, wanted):
         # The limb of a sphere turns away from the vertex: in area measure its derivative has infinite variance. A
         # sphere is sampled over the cone that it fills, which moves with it, and by this strategy alone. So is the sun.
-        claimed = self.spheres.lists(emitter) if wanted.sphere_lights else None
+        claimed = self.spheres.draws(emitter) if wanted.sphere_lights else None
         if self.sun is not None:
             shines = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite) & self.sun.contains(d)
             claimed = shines if claimed is None else claimed | shines
