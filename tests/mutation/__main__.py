@@ -23,7 +23,7 @@ from pathlib import Path
 
 import pytest
 
-from . import changes, equivalent, rooms
+from . import changes, equivalent, executed, rooms
 
 ROOT = Path(__file__).resolve().parents[2]
 COPIED = ("torchtransient", "tests", "docs", "training_examples", "benchmarks", "pyproject.toml", "README.md",
@@ -55,12 +55,12 @@ def preload() -> None:
     scipy.signal.fftconvolve(scipy.stats.norm.pdf(np.zeros(1)), np.zeros(1))
 
 
-def run_tests(folder: Path, tests: list[str], seconds: float) -> tuple[str, str]:
-    """('caught', what noticed) or ('survived', ''), from the room's tests in a copy."""
+def run_tests(folder: Path, tests: list[str], seconds: float, data: Path | None = None) -> tuple[str, str]:
+    """('caught', what noticed) or ('survived', ''), from the room's tests in a copy; ``data``: what they execute."""
     output = folder / "output.txt"
     process = os.fork()
     if process == 0:
-        _be_tested(folder, tests, output)
+        _be_tested(folder, tests, output, data)
     until = time.monotonic() + seconds
     while (ended := os.waitpid(process, os.WNOHANG)) == (0, 0):
         if time.monotonic() > until:
@@ -75,7 +75,7 @@ def run_tests(folder: Path, tests: list[str], seconds: float) -> tuple[str, str]
     return "caught", failed[0] if failed else f"exit code {code}"
 
 
-def _be_tested(folder: Path, tests: list[str], output: Path) -> None:
+def _be_tested(folder: Path, tests: list[str], output: Path, data: Path | None) -> None:
     code = 1
     try:
         os.setsid()
@@ -84,7 +84,12 @@ def _be_tested(folder: Path, tests: list[str], output: Path) -> None:
         os.dup2(file, 2)
         os.chdir(folder)
         os.environ["PYTHONPATH"] = sys.path[0] = str(folder)
-        code = int(pytest.main(["-x", "-q", "--tb=no", "-p", "no:cacheprovider", *tests]))
+        # One thread of Dr.Jit, as where tests run side by side: several runs share the cores.
+        os.environ["PYTEST_XDIST_WORKER_COUNT"] = str(os.cpu_count() or 1)
+        recorders = [executed.Recorder(data, folder / "torchtransient")] if data else []
+        code = int(pytest.main(["-x", "-q", "--tb=no", "-p", "no:cacheprovider", *tests], plugins=recorders))
+        for recorder in recorders:
+            recorder.save()
         if Path(sys.modules["torchtransient"].__file__).parent != folder / "torchtransient":
             code = 99
     finally:
@@ -93,21 +98,22 @@ def _be_tested(folder: Path, tests: list[str], output: Path) -> None:
         os._exit(code)
 
 
-def ordered(folder: Path, room: rooms.Room, change: changes.Change) -> list[str]:
-    """The test files of a room, those that speak of the changed module first."""
+def ordered(folder: Path, tests: list[str], seconds: dict[str, float], change: changes.Change) -> list[str]:
+    """Test files, those that speak of the changed module first, then those that are soon done."""
     module = (folder / change.path).read_text(encoding="utf-8")
     names = set(re.findall(r"^(?:def|class) (\w{4,})", module, re.MULTILINE))
     around = re.findall(r"^(?:def|class) (\w+)", module.encode()[: change.start].decode(), re.MULTILINE)
     stem = Path(change.path).stem
 
-    def related(path: Path) -> tuple[int, str]:
+    def related(test: str) -> tuple[int, float]:
+        path = folder / test
         text = path.read_text(encoding="utf-8")
         words = set(re.findall(r"\w+", text))
         score = 4 * (stem in path.stem) + 3 * (stem in words) + len(names & words)
-        return -(score + 5 * bool(around and around[-1] in words)), str(path)
+        return -(score + 5 * bool(around and around[-1] in words)), seconds[test]
 
-    found = sorted(room.test_files(folder), key=related)
-    return [path.relative_to(folder).as_posix() for path in found]
+    found = sorted(tests, key=related)
+    return found[:FIRST] + sorted(found[FIRST:], key=lambda test: seconds[test])
 
 
 def difference(source: bytes, changed: bytes, path: str) -> str:
@@ -117,12 +123,12 @@ def difference(source: bytes, changed: bytes, path: str) -> str:
     return "\n".join(line for line in lines if not line.startswith("@@"))
 
 
-def try_change(folder: Path, room: rooms.Room, change: changes.Change, seconds: float) -> dict[str, object]:
+def try_change(folder: Path, known: executed.Executed, change: changes.Change, seconds: float) -> dict[str, object]:
     """The outcome of one change; the copy is as it was afterwards."""
     target = folder / change.path
     source = target.read_bytes()
     changed = change.apply(source)
-    tests = ordered(folder, room, change)
+    tests = ordered(folder, known.files(change.path, *executed.statement(source, change.line)), known.seconds, change)
     begun = time.monotonic()
     # Compiled files are told apart by their second and size, which a change may leave as they were.
     compiled = [target.parent / "__pycache__" / f"{target.stem}.{sys.implementation.cache_tag}.pyc"]
@@ -140,7 +146,8 @@ def try_change(folder: Path, room: rooms.Room, change: changes.Change, seconds: 
             path.unlink(missing_ok=True)
     return {
         "outcome": outcome, "by": by, "operator": change.operator, "path": change.path, "line": change.line,
-        "seconds": round(time.monotonic() - begun, 1), "diff": difference(source, changed, change.path),
+        "seconds": round(time.monotonic() - begun, 1), "files": len(tests),
+        "diff": difference(source, changed, change.path),
     }  # fmt: skip
 
 
@@ -178,11 +185,9 @@ def main() -> None:
         copied(folder)
         preload()
         tests = [path.relative_to(folder).as_posix() for path in room.test_files(folder)]
-        begun = time.monotonic()
-        outcome, by = run_tests(folder, tests, 3600.0)
-        if outcome != "survived":
-            sys.exit(f"mutation: the tests have to pass before anything is changed, failed: {by}.")
-        seconds = max(LEAST_SECONDS, PATIENCE * (time.monotonic() - begun))
+        known = executed.measured(folder, tests, record.with_name(f"{arguments.room}-executed.json"),
+                                  lambda test, data: _seconds_unchanged(folder, test, data))  # fmt: skip
+        seconds = max(LEAST_SECONDS, PATIENCE * sum(known.seconds.values()))
         chosen = changes.drawn(folder, room.files(folder), arguments.seed)
         chosen = [change for change, _ in zip(chosen, range(arguments.count), strict=False)]
         if arguments.again:
@@ -191,7 +196,7 @@ def main() -> None:
                                                                                path.read_bytes())]  # fmt: skip
             chosen, results = [c for c in every if (c.path, _of(folder, c)) in left], []
         for number, change in enumerate(chosen[len(results) :], start=len(results) + 1):
-            result = try_change(folder, room, change, seconds)
+            result = try_change(folder, known, change, seconds)
             results.append(result)
             if not arguments.again:
                 with record.open("a", encoding="utf-8") as file:
@@ -199,6 +204,14 @@ def main() -> None:
             print(f"{number} {result['outcome']} {result['path']}:{result['line']} {result['operator']} "
                   f"{result['seconds']} s {result['by']}", flush=True)  # fmt: skip
     tell(results)
+
+
+def _seconds_unchanged(folder: Path, test: str, data: Path) -> float:
+    begun = time.monotonic()
+    outcome, by = run_tests(folder, [test], 3600.0, data)
+    if outcome != "survived":
+        sys.exit(f"mutation: the tests have to pass before anything is changed, failed: {by}.")
+    return time.monotonic() - begun
 
 
 def _of(folder: Path, change: changes.Change) -> str:

@@ -57,5 +57,19 @@ ROOMS = {
     "data": Room(("data",), ("data",)),
     "nlos": Room(("nlos",), ("nlos",)),
     "reconstruction": Room(("reconstruction",), ("reconstruction",)),
-    "files": Room(("capture", "files"), ("capture", "files")),
+    "files": Room(("capture", "files", "array_files"), ("capture", "files")),
+    "around_corner": Room(("plugins/around_corner",), ("around_corner", "integrators/test_nlos_path.py", "nlos")),
+    "plugins": Room(
+        ("plugins/bsdfs", "plugins/emitters", "plugins/sensors", "plugins/shapes", "plugins/sampling",
+         *(f"plugins/{name}.py" for name in (
+             "black_textures", "finite_values", "mitsuba_compat", "mitsuba_numbers", "mitsuba_parameters", "mixtures",
+             "parameter_effect", "parameters", "physical_ranges", "pointer_table", "polarized", "properties",
+             "spectral_colours", "swept_parameters", "texture_uses"))),
+        ("plugins", "stability", "integrators"),
+    ),
+    "scenes": Room(("scenes",), ("scenes",)),
+    "parametrize": Room(("parametrize", "geometry"), ("parametrize", "geometry")),
+    "training": Room(("training",), ("training",)),
+    "vis": Room(("vis",), ("vis",)),
+    "cli": Room(("cli",), ("cli",)),
 }  # fmt: skip
