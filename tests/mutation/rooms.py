@@ -57,5 +57,5 @@ ROOMS = {
     "data": Room(("data",), ("data",)),
     "nlos": Room(("nlos",), ("nlos",)),
     "reconstruction": Room(("reconstruction",), ("reconstruction",)),
-    "files": Room(("capture", "files"), ("capture", "files")),
+    "files": Room(("array_files", "capture", "files"), ("capture", "files")),
 }  # fmt: skip
