@@ -1,24 +1,47 @@
-"""Derivatives of light from spheres that are never drawn, or hardly ever: the paths that hit them have to do."""
+"""Derivatives of light from spheres and suns that are hardly ever drawn, or never: paths that hit them have to do."""
 
 from __future__ import annotations
 
+import drjit as dr
+import mitsuba as mi
+import numpy as np
 import pytest
 import torch
 
 import torchtransient as tt
+from torchtransient import plugins
+from torchtransient.plugins.sampling.sphere_lights import SphereLights
+from torchtransient.plugins.sampling.sun import MovingSun
 from torchtransient.testing.small_room import GREY, WALL_POSE, make_room
 
 VARIANT = "llvm_ad_mono"
+SUN, SUN_VARIANT = "light.sun_direction", "llvm_ad_rgb"
 
 
-def renderer(weight, keys, spp=2048):
+def lit_by(light, two):
     room = make_room()
     del room["box"]
     room["integrator"]["max_depth"] = 2
+    return room | {"light": light, "two": two}
+
+
+def under_a_sphere(weight, keys, spp=2048):
     lamp = {"type": "area", "radiance": 5.0, "sampling_weight": weight}
-    room["light"] = {"type": "sphere", "center": [-1.0, 0.5, 3.0], "radius": 0.6, "emitter": lamp}
-    room["two"] = {"type": "point", "position": [0.5, 0.5, 4.0], "intensity": 1.0}
+    ball = {"type": "sphere", "center": [-1.0, 0.5, 3.0], "radius": 0.6, "emitter": lamp}
+    room = lit_by(ball, {"type": "point", "position": [0.5, 0.5, 4.0], "intensity": 1.0})
     return tt.TransientRenderer(tt.load(room, variant=VARIANT), keys, spp=spp)
+
+
+def wide_sun(weight):
+    """So large that paths find it."""
+    return {
+        "type": "sunsky", "sun_direction": [0.3, 0.4, 0.7], "sun_aperture": 40.0, "sampling_weight": weight,
+    }  # fmt: skip
+
+
+def under_a_sun(weight, keys, spp=64):
+    room = lit_by(wide_sun(weight), {"type": "point", "position": [0.5, 0.5, 4.0], "intensity": 1.0})
+    return tt.TransientRenderer(tt.load(room, variant=SUN_VARIANT), keys, spp=spp)
 
 
 def gradients(lit):
@@ -26,19 +49,67 @@ def gradients(lit):
     return {key: value.grad for key, value in lit.values.items()}
 
 
-@pytest.mark.parametrize("weight", [0.0, 1e-6])
-def test_a_length_beside_it_changes_no_derivative_by_an_albedo(weight):
+@pytest.mark.parametrize(
+    ("lit", "other", "weight"),
+    [
+        (under_a_sphere, WALL_POSE, 0.0),
+        (under_a_sphere, WALL_POSE, 1e-6),
+        pytest.param(under_a_sun, SUN, 0.0, marks=pytest.mark.slow),
+        pytest.param(under_a_sun, SUN, 1e-6, marks=pytest.mark.slow),
+    ],
+)
+def test_a_length_beside_it_changes_no_derivative_by_an_albedo(lit, other, weight):
     """With the same random numbers; in both modes. The light was gone from the one, or 20 times too bright."""
-    beside = renderer(weight, [GREY, WALL_POSE])
-    expected = gradients(renderer(weight, [GREY]))[GREY]
+    beside = lit(weight, [GREY, other])
+    expected = gradients(lit(weight, [GREY]))[GREY]
     torch.testing.assert_close(gradients(beside)[GREY], expected, rtol=0.01, atol=0)
 
     values = {key: value.detach().clone() for key, value in beside.values.items()}
-    towards = {GREY: torch.ones_like(values[GREY]), WALL_POSE: torch.zeros(4, 4)}
+    towards = {GREY: torch.ones_like(values[GREY]), other: torch.zeros_like(values[other])}
     _, slope = torch.func.jvp(lambda values: beside(values, seed=0).steady.sum(), (values,), (towards,))
     torch.testing.assert_close(slope, expected.sum(), rtol=0.01, atol=0)
 
 
 def test_a_length_is_that_of_a_light_that_is_drawn():
-    drawn, hit = (gradients(renderer(weight, [WALL_POSE]))[WALL_POSE][2, 3] for weight in (1.0, 0.0))
+    drawn, hit = (gradients(under_a_sphere(weight, [WALL_POSE]))[WALL_POSE][2, 3] for weight in (1.0, 0.0))
     assert float(hit) == pytest.approx(float(drawn), rel=0.1)  # of area measure, which is noisy at the limb: 2 to 5 %
+
+
+@pytest.mark.slow
+def test_the_direction_of_a_sun_is_that_of_one_that_is_drawn():
+    """Its disk turns with it along the paths that hit it; at fixed directions hardly anything changed."""
+    drawn, hit = (gradients(under_a_sun(weight, [SUN], spp=16384))[SUN].numpy() for weight in (1.0, 0.0))
+    np.testing.assert_allclose(hit, drawn, atol=0.08 * np.abs(drawn).max())  # of one, 1.2 %; lost, a twentieth was left
+
+
+def test_each_of_a_thousand_lights_is_drawn_often_enough():
+    """What is rare is told from an even share: all of them together would be left to paths otherwise."""
+    mi.set_variant(VARIANT)
+    plugins.sync()
+    lights = {f"point{n}": {"type": "point"} for n in range(1000)}
+    for name, weight in (("drawn", 1.0), ("rare", 1e-4)):
+        lights[name] = {"type": "sphere", "emitter": {"type": "area", "sampling_weight": weight}}
+    scene = mi.load_dict({"type": "scene", **lights}, optimize=False)
+    draws = np.array(SphereLights.of(scene).read(scene).draws(scene.emitters_dr()))
+    spheres = [light.get_shape() is not None for light in scene.emitters()]
+    expected = [light.sampling_weight() == 1 for light in scene.emitters()]
+    np.testing.assert_array_equal(draws, np.logical_and(spheres, expected))
+
+
+@pytest.mark.parametrize(("weight", "rare"), [(0.0, True), (1e-6, True), (0.01, False), (1.0, False)])
+def test_a_sun_is_rare_by_the_weight_of_its_sky(weight, rare):
+    mi.set_variant(SUN_VARIANT)
+    plugins.sync()
+    scene = mi.load_dict({"type": "scene", "sky": wide_sun(weight), "two": {"type": "point"}})
+    assert MovingSun(scene, scene.environment()).rare is rare
+
+
+def test_a_directional_light_before_the_sun_is_not_the_sun():
+    mi.set_variant(SUN_VARIANT)
+    plugins.sync()
+    beam = {"type": "directional", "direction": [-0.3, -0.4, -0.7]}
+    scene = mi.load_dict({"type": "scene", "sky": wide_sun(1.0), "beam": beam}, optimize=False)
+    sun = MovingSun(scene, scene.environment())
+    assert dr.all(sun.contains(sun.direction))
+    shines = np.array(sun.shines(scene.emitters_dr(), dr.detach(sun.direction)))
+    np.testing.assert_array_equal(shines, [light.class_name() == "SunskyEmitter" for light in scene.emitters()])

@@ -14,6 +14,7 @@ import torch
 
 import torchtransient as tt
 from torchtransient._collection import no_collection
+from torchtransient.plugins import _registry
 from torchtransient.rendering.interrupts import quiet
 from torchtransient.rendering.variant import active_variant
 from torchtransient.testing.small_room import COLOUR, VARIANT, WALL_POSE, make_room
@@ -209,3 +210,46 @@ def test_the_collector_goes_on(monkeypatch, switch):
         with no_collection():
             assert not gc.isenabled()
         assert gc.isenabled()
+
+
+# --------------------------------------------------------------------------------------- interrupted changes of variant
+
+
+def test_an_interrupted_change_of_the_variant_leaves_all_plugins_whole(monkeypatch):
+    """Mitsuba calls nobody after a callback that raises, its own plugins among them."""
+    mi.set_variant(VARIANT)
+    plugins_of_all = _registry._load_all
+
+    def once(variant):
+        monkeypatch.setattr(_registry, "_load_all", plugins_of_all)
+        _registry._state.variant = None
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(_registry, "_load_all", once)
+    with pytest.raises(KeyboardInterrupt), active_variant("llvm_ad_mono"):
+        raise AssertionError("never reached")
+    assert mi.variant() == VARIANT
+    assert tt.render(make_room(), spp=1, seed=0).transient.sum() > 0
+    monkeypatch.setattr(_registry, "_load_all", once)
+    with pytest.raises(KeyboardInterrupt):
+        mi.set_variant("llvm_ad_mono")
+    scene = tt.load(make_room(), variant="llvm_ad_mono")
+    assert tt.render(scene, spp=1, seed=0).transient.sum() > 0
+    for plugin in ("prb", "transient_path"):
+        assert mi.load_dict({"type": plugin}).variant_name() == "llvm_ad_mono"
+
+
+def test_an_interrupt_waits_for_a_change_of_the_variant(monkeypatch):
+    mi.set_variant(VARIANT)
+    done, before, change = [], signal.getsignal(signal.SIGINT), mi.set_variant
+
+    def interrupted(variant):
+        signal.raise_signal(signal.SIGINT)
+        change(variant)
+        done.append(variant)
+
+    monkeypatch.setattr(mi, "set_variant", interrupted)
+    with pytest.raises(KeyboardInterrupt), active_variant("llvm_ad_mono"):
+        raise AssertionError("never reached")
+    assert done == ["llvm_ad_mono", VARIANT] and mi.variant() == VARIANT
+    assert signal.getsignal(signal.SIGINT) is before

@@ -10,49 +10,15 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.text_files import SCENE
 from torchtransient.rendering.variant import active_variant
 from torchtransient.testing.small_room import CAMERA, COLOUR, VARIANT, make_room, pose
-
-# As the scenes of mitransient 1.x are written: its plugin and parameter names, and an older version number.
-PEER_XML = """<scene version="3.0.0">
-    <default name="spp" value="8"/>
-    <default name="depth" value="3"/>
-    <integrator type="transient_path">
-        <integer name="max_depth" value="$depth"/>
-        <boolean name="camera_unwarp" value="false"/>
-        <string name="temporal_filter" value="box"/>
-    </integrator>
-    <sensor type="perspective" id="eye">
-        <float name="fov" value="20"/>
-        <transform name="to_world"><lookat origin="0, 0, 4" target="0, 0, 0" up="0, 1, 0"/></transform>
-        <sampler type="independent"><integer name="sample_count" value="$spp"/></sampler>
-        <film type="transient_hdr_film">
-            <integer name="width" value="4"/> <integer name="height" value="3"/>
-            <integer name="temporal_bins" value="24"/>
-            <float name="bin_width_opl" value="0.25"/> <float name="start_opl" value="6"/>
-            <rfilter type="box"/>
-        </film>
-    </sensor>
-    <bsdf type="diffuse" id="grey"><spectrum name="reflectance" value="0.5"/></bsdf>
-    <shape type="rectangle" id="wall">
-        <transform name="to_world"><scale value="3"/></transform>
-        <ref id="grey"/>
-    </shape>
-    <shape type="cube">
-        <transform name="to_world"><scale value="0.3"/><translate x="0.4" z="0.5"/></transform>
-        <bsdf type="diffuse"><rgb name="reflectance" value="0.8, 0.5, 0.2"/></bsdf>
-    </shape>
-    <emitter type="point" id="light">
-        <point name="position" x="-0.5" y="0.25" z="4"/> <rgb name="intensity" value="10, 10, 10"/>
-    </emitter>
-</scene>
-"""
 
 
 @pytest.fixture
 def xml(tmp_path):
     path = tmp_path / "peer.xml"
-    path.write_text(PEER_XML)
+    path.write_text(SCENE)
     return path
 
 
@@ -86,7 +52,7 @@ def test_xml_text_of_loading_time_counts(xml):
     scene = tt.load(xml, variant=VARIANT)
     expected = show(tt.load(xml, variant=VARIANT))
     stored = pickle.dumps(scene)
-    xml.write_text(PEER_XML.replace("10, 10, 10", "1, 1, 1"))
+    xml.write_text(SCENE.replace("10, 10, 10", "1, 1, 1"))
     assert torch.equal(show(scene), expected)
     xml.unlink()
     assert torch.equal(show(pickle.loads(stored)), expected)
@@ -95,7 +61,7 @@ def test_xml_text_of_loading_time_counts(xml):
 def test_files_beside_the_xml_are_found(xml, tmp_path, monkeypatch):
     (tmp_path / "tri.obj").write_text("v -1 -1 0\nv 1 -1 0\nv 0 1 0\nf 1 2 3\n")
     shape = '<shape type="obj" id="tri"><string name="filename" value="tri.obj"/></shape></scene>'
-    xml.write_text(PEER_XML.replace("</scene>", shape))
+    xml.write_text(SCENE.replace("</scene>", shape))
     monkeypatch.chdir("/")
     assert tt.load(xml, variant=VARIANT).parameters()["tri.vertex_positions"].shape == (3, 3)
 
@@ -258,7 +224,7 @@ def test_missing_file():
 
 
 def test_malformed_xml_names_line(xml):
-    xml.write_text(PEER_XML.replace("</integrator>", "</integrater>"))
+    xml.write_text(SCENE.replace("</integrator>", "</integrater>"))
     with pytest.raises(tt.errors.SceneError, match=r"peer\.xml is not well-formed XML at line 8"):
         tt.load(xml)
 
@@ -275,8 +241,8 @@ def test_malformed_xml_names_line(xml):
     ids=["unknown plugin", "unknown property", "broken reference", "undefined parameter", "value out of range"],
 )
 def test_faults_in_xml_name_file_and_line(xml, old, new, message):
-    assert old in PEER_XML
-    xml.write_text(PEER_XML.replace(old, new))
+    assert old in SCENE
+    xml.write_text(SCENE.replace(old, new))
     with pytest.raises(tt.errors.SceneError, match=f"(?s){message}"):
         tt.TransientRenderer(tt.load(xml, variant=VARIANT))
 

@@ -30,7 +30,8 @@ def mesh_file(folder, form, face):
         path = folder / "mesh.serialized"
         path.write_bytes(struct.pack("<HH", 0x041C, 4) + zlib.compress(body) + struct.pack("<QI", 0, 1))
         return {"type": "serialized", "filename": str(path)}
-    head = f"ply\nformat {form} 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    head = f"ply\nformat {form} 1.0\ncomment end_header\nelement vertex 3\n"
+    head += "property float x\nproperty float y\nproperty float z\n"
     head += "element face 1\nproperty list uchar int vertex_index\nend_header\n"
     if form == "ascii":
         body = "".join(f"{x} {y} {z}\n" for x, y, z in VERTICES) + f"3 {face[0]} {face[1]} {face[2]}\n"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 
-import mitsuba as mi
 import numpy as np
 import pytest
 import torch
@@ -12,9 +11,7 @@ import torch
 import torchtransient as tt
 from support.sweeps import together
 from torchtransient.errors import ArgumentError, ShapeError, TorchTransientError, TorchTransientWarning, UnitError
-from torchtransient.plugins import _registry
-from torchtransient.rendering.variant import active_variant
-from torchtransient.testing.small_room import COLOUR, VARIANT, make_room
+from torchtransient.testing.small_room import COLOUR, make_room
 
 WHOLE = [np.int64(3), np.uint8(3), np.array(3), torch.tensor(3), torch.tensor(3, dtype=torch.uint8)]
 NONE = [0.5, 1.5, float("nan"), "x", "3", True, np.bool_(True), torch.tensor(True), 1j, [], {}, b"3", torch.tensor(3.0)]
@@ -101,48 +98,3 @@ def test_depths_are_bounded_by_what_stands_for_no_limit():
     assert CALLS["max_depth"](2**32 - 2) == 2**32 - 2
     with pytest.raises(ArgumentError, match=r"at most 2\^32 - 2, got 4294967295\."):
         CALLS["max_depth"](2**32 - 1)
-
-
-# --------------------------------------------------------------------------------------- interrupted changes of variant
-
-
-def test_an_interrupted_change_of_the_variant_leaves_all_plugins_whole(monkeypatch):
-    """Mitsuba calls nobody after a callback that raises, its own plugins among them."""
-    mi.set_variant(VARIANT)
-    plugins_of_all = _registry._load_all
-
-    def once(variant):
-        monkeypatch.setattr(_registry, "_load_all", plugins_of_all)
-        _registry._state.variant = None
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(_registry, "_load_all", once)
-    with pytest.raises(KeyboardInterrupt), active_variant("llvm_ad_mono"):
-        raise AssertionError("never reached")
-    assert mi.variant() == VARIANT
-    assert tt.render(make_room(), spp=1, seed=0).transient.sum() > 0
-    monkeypatch.setattr(_registry, "_load_all", once)
-    with pytest.raises(KeyboardInterrupt):
-        mi.set_variant("llvm_ad_mono")
-    scene = tt.load(make_room(), variant="llvm_ad_mono")
-    assert tt.render(scene, spp=1, seed=0).transient.sum() > 0
-    for plugin in ("prb", "transient_path"):
-        assert mi.load_dict({"type": plugin}).variant_name() == "llvm_ad_mono"
-
-
-def test_an_interrupt_waits_for_a_change_of_the_variant(monkeypatch):
-    import signal
-
-    mi.set_variant(VARIANT)
-    done, before, change = [], signal.getsignal(signal.SIGINT), mi.set_variant
-
-    def interrupted(variant):
-        signal.raise_signal(signal.SIGINT)
-        change(variant)
-        done.append(variant)
-
-    monkeypatch.setattr(mi, "set_variant", interrupted)
-    with pytest.raises(KeyboardInterrupt), active_variant("llvm_ad_mono"):
-        raise AssertionError("never reached")
-    assert done == ["llvm_ad_mono", VARIANT] and mi.variant() == VARIANT
-    assert signal.getsignal(signal.SIGINT) is before

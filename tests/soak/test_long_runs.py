@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import itertools
 import threading
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from support.call_orders import CASES, Calls
 pytestmark = [pytest.mark.soak, pytest.mark.filterwarnings("ignore")]
 
 STEPS = 10_000
+ROUNDS = 300
 GROWTH = 0.01
 
 
@@ -57,15 +57,14 @@ def test_ten_thousand_steps_on_a_schedule_of_scenes():
 
 def test_four_threads_with_two_variants():
     Calls.prepare()
-    calls, errors, rounds = Calls(), [], itertools.repeat(0, 300)
+    calls, errors = Calls(), []
     names = ["colours", "poses", "phasors", "fog"]
     for name in names:
         calls.load(name)
-    todo = list(rounds)
 
     def work(name: str) -> None:
         try:
-            for n in range(len(todo)):
+            for n in range(ROUNDS):
                 calls.backward(name, n % 3, 0)
         except BaseException as error:  # noqa: BLE001 - raised by the thread that has started this one
             errors.append(error)

@@ -62,6 +62,7 @@ relay_wall: relay_wall
 """,
 }
 
+# As the scenes of mitransient 1.x are written: its plugin and parameter names, and an older version number.
 SCENE = """<scene version="3.0.0">
     <default name="spp" value="8"/>
     <default name="depth" value="3"/>

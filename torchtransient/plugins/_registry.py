@@ -6,8 +6,9 @@ changes. Mitsuba tells us of a change through a callback. Three of its habits sh
 
 - the callbacks are a set without order, and fire on a change only, so a variant that was active before this module was
   imported is caught up with in `attach()`;
-- an exception in a callback leaves the new variant active and stops the callbacks of others, so ours never raises: it
-  warns, and `sync()` raises at the next library call;
+- an exception in a callback leaves the new variant active and stops the callbacks of others, so ours raises nothing
+  but an interrupt, after which `sync()` has all callbacks called anew; of what else goes wrong it warns, and `sync()`
+  raises at the next library call;
 - a plugin constructor that raises reaches the caller as a `RuntimeError` with the traceback as text, so the typed error
   is kept aside and `plugin_errors()` raises it again.
 
@@ -107,7 +108,9 @@ PLUGIN_MODULES: tuple[PluginModule, ...] = (
 
 @dataclass
 class _State:
-    """What is registered. Guarded by `lock`, since scenes are loaded from several threads."""
+    """What is registered. Guarded by `lock`, since scenes are loaded from several threads; but for `listeners`, which
+    need none (:func:`plugin_errors`).
+    """
 
     lock: threading.RLock = field(default_factory=threading.RLock)
     third_party: list[PluginModule] = field(default_factory=list)
@@ -249,7 +252,9 @@ def attach_callback() -> None:
 
 
 def attach() -> None:
-    """Follow the variant from now on, and catch up with one that is active already. Never raises (see `sync`)."""
+    """Follow the variant from now on, and catch up with one that is active already. Raises nothing but an
+    interrupt, see `sync`.
+    """
     attach_callback()
     if active_variant() is not None:
         _on_variant_change(None, active_variant())
@@ -287,9 +292,9 @@ def _on_variant_change(_old: str | None, new: str | None) -> None:
             # Under "-W error" the warning itself raises; sync() reports the same problem at the next library call.
             with contextlib.suppress(RuntimeWarning):
                 warnings.warn(f"torchtransient: {error}", RuntimeWarning, stacklevel=2)
-        except BaseException as error:
+        except BaseException:
             # An interrupt: the callbacks of others, Mitsuba's own plugins among them, are not called any more.
-            _state.interrupted = not isinstance(error, Exception)
+            _state.interrupted = True
             raise
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,8 @@ _TYPES = {
 }  # fmt: skip
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 _LISTS = ("vertex_index", "vertex_indices")
+# A line of its own: comments may say it, too.
+_END = re.compile(rb"^end_header\s*?\n", re.MULTILINE)
 
 # (name of an element, how many, its properties as (name, type, whether it is a list))
 Element = tuple[str, int, list[tuple[str, str, bool]]]
@@ -23,9 +26,11 @@ def smallest_vertex(path: str) -> int:
     triangles. 0 where none is negative, or numbers have no sign.
     """
     data = Path(path).read_bytes()
-    end = data.index(b"end_header")
-    begin = data.index(b"\n", end) + 1
-    order, elements = _header(data[:end].decode("latin-1"))
+    end = _END.search(data)
+    if end is None:
+        return 0
+    begin = end.end()
+    order, elements = _header(data[: end.start()].decode("latin-1"))
     before = 0
     for name, count, properties in elements:
         if name == "face":

@@ -9,33 +9,13 @@ import numpy as np
 import pytest
 
 import torchtransient as tt
+from support.text_files import RECIPES
 from torchtransient.data.recipes.places import without_places
 from torchtransient.errors import SceneError, StorageError, UnitError
 
 D = tt.data
 
-TEXT = """
-scene: {builtin: cornell_box, resolution: 8}
-variant: llvm_ad_mono
-time_axis: {start_opl: 2.0, bin_width_opl: 0.2, num_bins: 60}
-spp: 4
-n: 12
-labels: [depth]
-device: vl53l8_like
-vary:
-  red.reflectance.value: {uniform: [0.05, 0.9]}
-  small-box.to_world: {compose: [{turn: {axis: [0, 1, 0]}}, {offset: [[-0.2, 0, 0], [0.2, 0, 0]]}]}
-  small-box.type: {choice: [cube, sphere]}
-"""
-
-CAPTURE = """
-hidden: {letter: {shape: rectangle, scale: 0.2, rotate: [[0, 1, 0], 180], translate: [0, 0, 1]}}
-wall: {width: 1, height: 1}
-scan: {kind: confocal, size: [4, 4]}
-variant: llvm_ad_mono
-time_axis: {start_opl: 0, bin_width_opl: 0.02, num_bins: 200}
-vary: {letter.to_world: {offset: [[-0.1, -0.1, 0], [0.1, 0.1, 0]]}}
-"""
+TEXT, CAPTURE = RECIPES["scene"], RECIPES["capture"]
 
 
 def test_a_file_is_its_recipe(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -32,7 +33,8 @@ def lamp_under_a_sky(integrator="transient_path"):
 def color_beside_a_pose(params, x):
     """The pose is asked for beside the colour, and stays."""
     set_color("wall.bsdf.reflectance.value")(params, x)
-    move("light.to_world", (1, 0, 0))(params, 0 * x)
+    # Opaque: Dr.Jit detaches what is multiplied by a zero that it knows.
+    move("light.to_world", (1, 0, 0))(params, dr.opaque(mi.Float, 0) * x)
 
 
 def angular_light():

@@ -19,23 +19,22 @@ from torchtransient.plugins.kept import Kept
 from torchtransient.plugins.mitsuba_compat import is_sphere, samples_its_shape
 from torchtransient.plugins.node_walk import objects_below, shown_by
 from torchtransient.plugins.pointer_table import PointerTable
+from torchtransient.plugins.sampling.rare_lights import least_probability
 
 # How many numbers of a light kernels load at once.
 _PACKET = 4
-# Lights that are chosen more rarely (`sampling_weight`) are left to the paths that hit them when derivatives are taken:
-# those of directions over the cone would come from a sample in a thousand, or from none.
-_LEAST_CHOICE = 1e-3
 
 
 class SphereLights:
     """The spherical lights among ``lights``, the emitters of one scene; ``numbers``: which ones. ``all``: there are no
     others. ``textured``: one of them has a texture. ``marks``: one plus the place of each in the table, zero for all
-    others.
+    others. ``least_pmf``: of lights that are hardly ever drawn less (:mod:`.rare_lights`).
     """
 
     def __init__(self, lights: list[Any], numbers: list[int]) -> None:
         emitters = [lights[n] for n in numbers]
         self._numbers, self.all = numbers, len(numbers) == len(lights)
+        self.least_pmf = least_probability(len(lights))
         self._shapes = [emitter.get_shape() for emitter in emitters]
         self._to_world = [next(v for v in shown_by(shape)[0] if v.key == "to_world") for shape in self._shapes]
         self.textured = any(t.is_spatially_varying() for e in emitters for t in objects_below(e, mi.Texture))
@@ -59,7 +58,8 @@ class SphereLights:
     def _detached(self, scene: Any) -> SphereLightTable:
         with dr.suspend_grad():
             rows = [self._numbers_of(scene, n) for n in range(len(self._shapes))]
-            dr.make_opaque(rows)
+            for row in rows:  # by one kernel after the other, all alike: one of all rows takes minutes to compile
+                dr.make_opaque(row)
             return SphereLightTable(self, rows)
 
     def _matrix(self, n: int) -> Any:
@@ -71,7 +71,7 @@ class SphereLights:
         """
         matrix = self._matrix(n)
         outward = -1.0 if self._shapes[n].has_flipped_normals() else 1.0
-        pmf = scene.pdf_emitter(mi.UInt32(self._numbers[n]))
+        pmf = scene.pdf_emitter(dr.opaque(mi.UInt32, self._numbers[n]))
         r = dr.norm(mi.Vector3f(matrix[0, 0], matrix[1, 0], matrix[2, 0]))
         # Points on the surface itself see it from the side that shines.
         edge = dr.detach(r) * (1 - outward * mi.math.RayEpsilon)
@@ -93,7 +93,7 @@ class SphereLightTable:
     """
 
     def __init__(self, lights: SphereLights, rows: list[list[Any]]) -> None:
-        self._marks, self.all = lights.marks, lights.all
+        self._marks, self.all, self._least_pmf = lights.marks, lights.all, lights.least_pmf
         self._rows, self._width = rows, len(rows[0])
         # Where there is only one, kernels read its numbers as they are instead of looking them up.
         self._only = rows[0] if len(rows) == 1 else None
@@ -129,7 +129,7 @@ class SphereLightTable:
     def draws(self, emitter: Any) -> Any:
         """Which of an array of emitter pointers are spherical lights that :meth:`sample` chooses often enough."""
         listed = self.lists(emitter)
-        return listed & (dr.detach(self.numbers(emitter, listed)[7]) >= _LEAST_CHOICE)
+        return listed & (dr.detach(self.numbers(emitter, listed)[7]) >= self._least_pmf)
 
     def sample(self, scene: Any, ref: Any, u: Any, active: Any) -> tuple[Any, Any]:
         """(direction sample, emission over density) towards an emitter of the scene, as

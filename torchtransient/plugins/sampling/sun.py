@@ -12,18 +12,21 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.mitsuba_compat import sun_half_angle
+from torchtransient.plugins.sampling.rare_lights import is_rare
 
 # The disk is taken this much wider than Mitsuba's, whose own test of its edge rounds in single precision.
 _MARGIN = 1.001
 
 
 class MovingSun:
-    """The disk of one sky.
+    """The disk of one sky. ``rare``: it is hardly ever drawn, and paths that escape into it have to do
+    (:mod:`.rare_lights`).
 
     A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
     """
 
-    def __init__(self, emitter: Any) -> None:
+    def __init__(self, scene: Any, emitter: Any) -> None:
+        self.rare = is_rare(scene, emitter)
         params = mi.traverse(emitter)
         to_world = mi.AffineTransform4f(params["to_world"])
         # Mitsuba keeps two angles, taken as those of a unit vector whatever its length: where the sun is seen follows
@@ -32,9 +35,23 @@ class MovingSun:
         self.direction = dr.normalize(to_world @ mi.sph_to_dir(*angles))
         self._cosine = float(dr.cos(_MARGIN * sun_half_angle(emitter)))
 
+    @staticmethod
+    def of(world: Any) -> MovingSun | None:
+        """The one that a job asks the derivative of, if it does."""
+        sky = None if world.wanted is None else world.wanted.sky
+        return None if sky is None else MovingSun(world.scene, sky)
+
     def contains(self, d: Any) -> Any:
         """Whether the unit direction ``d`` points into the disk."""
         return dr.dot(dr.detach(self.direction), d) >= self._cosine
+
+    def shines(self, emitter: Any, d: Any) -> Any:
+        """Whether light of ``emitter`` from the direction ``d`` is the sun's: of the light without a place that comes
+        from all around, which a scene has one of, and not of a directional one before it.
+        """
+        flags = emitter.flags()
+        around = mi.has_flag(flags, mi.EmitterFlags.Infinite) & ~mi.has_flag(flags, mi.EmitterFlags.DeltaDirection)
+        return around & self.contains(d)
 
     def followed(self, d: Any, active: Any) -> Any:
         """``d``, turning with the sun where ``active``."""

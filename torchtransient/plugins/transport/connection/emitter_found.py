@@ -4,7 +4,7 @@ The point of a found light belongs to the vertex that scattered towards it. Wher
 there (``_ahead``) as a material point, as it is for connections: both strategies must move their samples alike, or the
 weights between them would no longer sum to one under the motion. Where the sensor or a delta lobe led to it, no other
 strategy could have: the ray decides, and it is attached at the light's own vertex (``_here``). So is light without a
-shape, from infinitely far away.
+shape, from infinitely far away, but for a sun that moves and is hardly ever drawn (``_sun_ahead``).
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.polarized import first_column, product, scatter_unpolarized
+from torchtransient.plugins.sampling.sun import MovingSun
 from torchtransient.plugins.transport.carry import slope_only
 from torchtransient.plugins.transport.scattering.geometry_terms import (
     damped_motion,
@@ -30,8 +31,12 @@ class EmitterFound(Connection):
     name = "emitter_found"
     light_of_scene_alone = True
 
+    def prepare(self, world):
+        sun = MovingSun.of(world)
+        self.sun = sun if sun is not None and sun.rare else None
+
     def events(self, wanted):
-        return 2 if wanted is not None and wanted.emitter_shape else 1
+        return 1 if wanted is None else 1 + wanted.emitter_shape + (self.sun is not None)
 
     # ------------------------------------------------------------------------------------------------- primal
 
@@ -69,7 +74,11 @@ class EmitterFound(Connection):
 
     def attached(self, world, vertex, step, wanted):
         terms = [self._here(world, vertex, wanted)]
-        return [*terms, self._ahead(world, vertex, step, wanted)] if wanted.emitter_shape else terms
+        if wanted.emitter_shape:
+            terms.append(self._ahead(world, vertex, step, wanted))
+        if self.sun is not None:
+            terms.append(self._sun_ahead(world, vertex, step))
+        return terms
 
     def _here(self, world, vertex, wanted):
         v, si = vertex.v, vertex.si
@@ -80,6 +89,9 @@ class EmitterFound(Connection):
         if wanted.emitter_shape:  # the vertex before counts what has a shape, whether it claims it or not
             shaped = vertex.sid.is_valid()
             elsewhere = shaped if elsewhere is None else elsewhere | shaped
+        if self.sun is not None:
+            shines = self.sun.shines(emitter, v.ray.d)
+            elsewhere = shines if elsewhere is None else elsewhere | shines
         if elsewhere is not None:
             hit &= v.before(world.scattering.name, "delta", at_sensor=True) | ~elsewhere
         Le = dr.select(hit, mis * mi.unpolarized_spectrum(emitter.eval(si, hit)), 0)
@@ -121,4 +133,23 @@ class EmitterFound(Connection):
         T = world.segment.weight(following) * world.segment.attached_transmittance(world, vertex, end, lit)
         value = product(vertex.carry.β, dr.select(lit, value * T, 0))
         slope = vertex.scattered_slope + slope_only(step.carry.η * distance(si.p, light.p, lit))
+        return EventTerm(value=value, slope=slope, opl=following.τ, active=lit, arrival=following.arrival(self.name))
+
+    def _sun_ahead(self, world, vertex, step):
+        """Light of the sun along a path that escapes into it: the direction that was drawn turns with it."""
+        following = vertex.v.after()
+        mis = following.of(self.name)["mis"]
+        lit = (step.inv_pdf > 0) & ~step.ahead & (mis > 0)
+        with dr.suspend_grad():
+            sky = following.pi.compute_surface_interaction(following.ray, mi.RayFlags.Minimal, lit)
+            emitter = sky.emitter(world.scene)
+            lit &= self.sun.shines(emitter, following.ray.d)
+        d = self.sun.followed(mi.Vector3f(following.ray.d), lit)
+        sky.wi = -d
+        towards = world.scattering.evaluate(world, vertex, d, lit)
+        Le = mi.unpolarized_spectrum(emitter.eval(sky, lit))
+        value = scatter_unpolarized(towards.value, vertex.rotation) * (step.inv_pdf * mis) * Le
+        value = product(vertex.carry.β, dr.select(lit, value, 0))
+        length = world.contents.distant.length(vertex.scattered_si.p, d)
+        slope = vertex.scattered_slope + slope_only(step.carry.η * length)
         return EventTerm(value=value, slope=slope, opl=following.τ, active=lit, arrival=following.arrival(self.name))

@@ -28,8 +28,7 @@ class EmitterSampled(Connection):
     def prepare(self, world):
         lights = world.contents.sphere_lights
         self.spheres = None if lights is None else lights.read(world.scene)
-        sky = None if world.wanted is None else world.wanted.sky
-        self.sun = None if sky is None else MovingSun(sky)
+        self.sun = MovingSun.of(world)
         # A light without attached numbers is dark where it is dark.
         self.lights_change = world.wanted is not None and any(map(carries_derivatives, world.scene.emitters()))
 
@@ -114,8 +113,8 @@ class EmitterSampled(Connection):
         # The limb of a sphere turns away from the vertex: in area measure its derivative has infinite variance. A
         # sphere is sampled over the cone that it fills, which moves with it, and by this strategy alone. So is the sun.
         claimed = self.spheres.draws(emitter) if wanted.sphere_lights else None
-        if self.sun is not None:
-            shines = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite) & self.sun.contains(d)
+        if self.sun is not None and not self.sun.rare:
+            shines = self.sun.shines(emitter, d)
             claimed = shines if claimed is None else claimed | shines
         return claimed
 
@@ -132,7 +131,10 @@ class EmitterSampled(Connection):
             d = self.sun.followed(d, light.sun)
         Le = self._emission(world, si, light, d, lit, wanted)
         towards = world.scattering.evaluate(world, vertex, d, lit, ds=light.ds)
-        pdf = dr.select(light.ds.delta | light.cone | light.sun, 0, dr.detach(towards.pdf))
+        alone = light.ds.delta | light.cone
+        if self.sun is not None and not self.sun.rare:
+            alone |= light.sun
+        pdf = dr.select(alone, 0, dr.detach(towards.pdf))
         with dr.suspend_grad():
             mis = self.weight(world, dr.detach(si), light.ds, light.ds.pdf, pdf, lit)
         value = scatter_unpolarized(towards.value, vertex.rotation) * Le * mis
@@ -164,7 +166,7 @@ class EmitterSampled(Connection):
         light.longer, light.found = mi.Float(0), None
         light.cone, light.cone_weight, light.sun = mi.Bool(False), None, mi.Bool(False)
         if self.sun is not None:
-            light.sun = far & self.sun.contains(ds.d)
+            light.sun = lit & self.sun.shines(ds.emitter, ds.d)
         if wanted.light:
             at_point = lit & mi.has_flag(flags, mi.EmitterFlags.DeltaPosition)
             moving, _ = scene.sample_emitter_direction(si, u, False, at_point)
