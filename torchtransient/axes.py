@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torchtransient.errors import ShapeError, UnitError
 from torchtransient import quantities
+from torchtransient.errors import ShapeError, UnitError
 from torchtransient.quantities import Numbers, shown
 from torchtransient.units import LATEST_S, SHORTEST_OPL, SPEED_OF_LIGHT, near_seconds, opl_to_seconds, seconds_to_opl
 
@@ -162,7 +162,7 @@ class FrequencyAxis:
     @classmethod
     def uniform(cls, first: float, step: float, count: int, *, start_opl: float = 0.0) -> FrequencyAxis:
         """`count` frequencies `first + k step`, in cycles per metre. Equal steps render faster than arbitrary ones."""
-        low, width = (_finite(value, name, "FrequencyAxis.uniform") for value, name in ((first, "first"), (step, "step")))
+        low, width = _finite(first, "first", "FrequencyAxis.uniform"), _finite(step, "step", "FrequencyAxis.uniform")
         number = quantities.count("FrequencyAxis.uniform: count", count, 0, ShapeError)
         return cls(tuple(low + k * width for k in range(number)), start_opl)
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.quantities import Numbers, as_number, numbers, positive, finite, shown
+from torchtransient.quantities import Numbers, as_number, finite, numbers, positive, shown
 from torchtransient.units import LONGEST_PULSE_S, SHORTEST_OPL, near_seconds, seconds_to_opl
 
 Array = NDArray[np.float64]

@@ -206,8 +206,8 @@ def _components(stokes: Tensor, dim: int) -> tuple[Tensor, ...]:
     place = as_whole(dim)
     if place is None or not -stokes.ndim <= place < stokes.ndim or stokes.shape[place] != 4:
         raise ShapeError(
-            f"stokes: expected four components along dim={shown(dim)}, got shape {tuple(stokes.shape)}. They are along -5 in "
-            "a transient (..., 4, C, T, H, W) and along -4 in a steady image (..., 4, C, H, W); only polarized "
+            f"stokes: expected four components along dim={shown(dim)}, got shape {tuple(stokes.shape)}. They are along "
+            "-5 in a transient (..., 4, C, T, H, W) and along -4 in a steady image (..., 4, C, H, W); only polarized "
             "variants render them."
         )
     return torch.unbind(stokes, place)

@@ -35,7 +35,11 @@ def moving_wall(
         "integrator": transient_path(max_depth),
         "sensor": perspective(look_at([0.0, 0.0, 4.0], [0.0, 0.0, 0.0]), 10.0, film, spp),
         "light": {"type": "point", "position": [0.5, 0.0, 4.0], "intensity": finite("intensity", intensity)},
-        "wall": {"type": "rectangle", "to_world": translate([0.0, 0.0, finite("z", z)]), "bsdf": diffuse(wall_reflectance)},
+        "wall": {
+            "type": "rectangle",
+            "to_world": translate([0.0, 0.0, finite("z", z)]),
+            "bsdf": diffuse(wall_reflectance),
+        },
     }
     panel = diffuse(panel_reflectance)
     if side_panel:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import operator
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -107,7 +106,7 @@ class Specification:
             frequencies = FrequencyAxis(tuple(numbers.tolist()))
         if gates is not None and (isinstance(gates, Gate) or not all(isinstance(g, Gate) for g in _listed(gates))):
             raise ArgumentError(f"recipe: gates: expected a list of tt.Gate, got {shown(gates)}.")
-        self.seed = count("recipe: seed", seed, 0)
+        self.seed = count("recipe: seed", seed, 0, most=None)
         self.n = None if n is None else count("recipe: n", n)
         self.variant = resolve_variant(variant)
         self.settings = Settings(
@@ -197,7 +196,7 @@ def _counts(what: str, given: Any, least: int = 1) -> Any:
     """A number, a text, or a tuple of numbers."""
     if isinstance(given, str):
         return given
-    if not isinstance(given, Sequence | np.ndarray):
+    if not (isinstance(given, Sequence) and not isinstance(given, bytes)) and not getattr(given, "ndim", 0):
         return count(f"recipe: {what}", given, least)
     return tuple(count(f"recipe: {what}", one, least) for one in given)
 
@@ -236,11 +235,5 @@ def label_of(distribution: Distribution, value: Any) -> str:
 
 def samples_of(indices: Iterable[int]) -> list[int]:
     """Numbers of samples, checked. Raises ShapeError."""
-    try:
-        found = [operator.index(index) for index in indices]
-    except TypeError as error:
-        raise ShapeError(f"recipe: expected whole numbers of samples: {error}.") from None
-    if any(index < 0 for index in found):
-        raise ShapeError(f"recipe: expected sample numbers of at least 0, got {min(found)}.")
-    return found
+    return [count("recipe: number of a sample", index, 0, ShapeError) for index in indices]
 
