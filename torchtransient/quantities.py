@@ -124,6 +124,8 @@ def real_array(values: Any) -> NDArray[np.float64] | None:
     of different lengths, and numbers that float64 cannot hold.
     """
     try:
+        if _has_truth(values):  # which numpy makes ones and zeros of, beside numbers
+            return None
         plain = np.asarray(values.detach().cpu() if hasattr(values, "detach") else values)
         if plain.dtype.kind in "iuf":
             return plain.astype(np.float64)
@@ -139,6 +141,12 @@ def numbers(name: str, values: Any) -> NDArray[np.float64]:
     if array is None:
         raise UnitError(f"{name}: expected real numbers, got {shown(values)}.")
     return array.ravel()
+
+
+def _has_truth(values: Any) -> bool:
+    return isinstance(values, (list, tuple)) and any(
+        _has_truth(one) if isinstance(one, (list, tuple)) else _is_truth(one) for one in values
+    )
 
 
 def _are_numbers(objects: NDArray[Any]) -> bool:

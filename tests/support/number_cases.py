@@ -1,83 +1,36 @@
-"""Every public function and class that takes numbers, with arguments that are right: what tests write wrong ones into."""
+"""Every public function and class that takes numbers, with right arguments: what tests write wrong ones into."""
 
 from __future__ import annotations
-
-import functools
-import inspect
-import tempfile
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
 import torchtransient as tt
-from support.capture_files import grids, made
+from support import stored_samples
 from support.fake_recipe import FakeRecipe
 from support.loss_cases import CASES as LOSSES
 from support.metric_cases import CASES as METRICS
+from support.number_case import (
+    Case,
+    Stream,
+    Table,
+    capture,
+    capture_volume,
+    entered,
+    folder,
+    noisy,
+    recipe,
+    until,
+)
+from torchtransient.errors import TorchTransientError
 from torchtransient.testing.small_room import make_room
-
-
-class Case:
-    """``call(**given)`` with arguments in the place of those of ``base``, which are right."""
-
-    def __init__(self, call: Callable[..., Any], *places: Any, **base: Any) -> None:
-        self.call, self.places, self.base = call, places, base
-
-    def __call__(self, **given: Any) -> Any:
-        return self.call(*self.places, **{**self.base, **given})
-
-
-@functools.cache
-def capture(kind="confocal", size=(4, 4)):
-    return made(grids(size=size)[kind], axis=tt.TimeAxis(2.0, 0.2, 32))
-
-
-@functools.cache
-def folder() -> Path:
-    return Path(tempfile.mkdtemp())
-
-
-@functools.cache
-def recipe():
-    return tt.data.Recipe(make_room(), vary={"box.bsdf.reflectance.value": tt.data.Uniform(0.1, 0.9)}, spp=1)
-
-
-class Table:
-    """A data set of four samples."""
-
-    def __len__(self):
-        return 4
-
-    def __getitem__(self, number):
-        return {"transient": torch.ones(1, 8, 4, 4), "index": number}
-
-
-class Stream(torch.utils.data.IterableDataset):
-    """Of the same."""
-
-    def __iter__(self):
-        return iter([Table()[n] for n in range(4)])
-
-
-def noisy(x, generator=None):
-    """As a sensor."""
-    return x
-
-
-def capture_volume():
-    grid = tt.nlos.VoxelGrid.before(capture().scan, [0.8, 0.9, 1.0], size=3)
-    return tt.nlos.HiddenVolume(torch.rand(1, 3, 3, 3), grid, "fk")
-
 
 AXIS, LIGHT = tt.TimeAxis(1.0, 0.05, 8), 0.1 + torch.rand(1, 8, 16, 16, generator=torch.Generator().manual_seed(0))
 PICTURE, STOKES = LIGHT[:, :3], torch.tensor([2.0, 0.3, 0.4, 0.5]).view(4, 1, 1, 1, 1).expand(4, 1, 8, 16, 16)
 GATE, BAND = tt.Gate.rectangular(1.0, 2.0), tt.FrequencyAxis.uniform(1.0, 0.5, 3)
 K = torch.tensor([[4.0, 0, 2], [0, 4, 2], [0, 0, 1]])
 MESH = (torch.eye(3), torch.tensor([[0, 1, 2]]))
-SPHERE = {"type": "sphere"}
+SPHERE, FOAM = {"type": "sphere"}, (262.0, 0.53, 1.12, 0.0036)
 
 
 def _of_losses() -> dict[str, Case]:
@@ -103,20 +56,8 @@ def _scenes() -> dict[str, Case]:
         "glass_slab_before_wall light_over_plane moving_wall nlos_corner nlos_plates nlos_z relay_wall"
     )
     found = {f"scenes.{name}": Case(getattr(s, name)) for name in names.split()}
-    found["scenes.milk_bottle"] = Case(s.milk_bottle, folder() / "bottle.ply")
-    return {name: with_defaults(case) for name, case in found.items()}
-
-
-def with_defaults(case: Case) -> Case:
-    """The same, with the numbers that stand in the signature in its base."""
-    own = {p.name: p.default for p in inspect.signature(case.call).parameters.values()}
-    numbers = {name: value for name, value in own.items() if is_number(value)}
-    return Case(case.call, *case.places, **{**numbers, **case.base})
-
-
-def is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
+    found["scenes.milk_bottle"] = Case(s.milk_bottle, folder() / "bottle.ply", resolution=8)
+    return found
 
 
 def _tensors() -> dict[str, Case]:
@@ -163,10 +104,12 @@ def _tensors() -> dict[str, Case]:
         "metrics.wrapped_difference": Case(metric.wrapped_difference, x, x + 1, period=3.0),
         "metrics.front_depth": Case(metric.front_depth, LIGHT, torch.arange(1.0, 9.0), threshold=0.1),
         "metrics.localization_rmse": Case(metric.localization_rmse, capture_volume(), MESH[0], radius_m=1.0),
-        "parametrize.Bounded": Case(p.Bounded, 0.0, 1.0, **bound),
-        **{f"parametrize.{name}": Case(getattr(p, name), **bound)
-           for name in ("Albedo", "Anisotropy", "IndexOfRefraction", "PrincipledRoughness", "Roughness", "Simplex")},
-        "parametrize.bounded_inverse": Case(p.bounded_inverse, x, 0.0, 1.0, **bound),
+        "parametrize.Bounded": Case(p.Bounded, low=0.0, high=1.0, **bound),
+        **{
+            f"parametrize.{name}": Case(getattr(p, name), **bound)
+            for name in ("Albedo", "Anisotropy", "IndexOfRefraction", "PrincipledRoughness", "Roughness", "Simplex")
+        },
+        "parametrize.bounded_inverse": Case(p.bounded_inverse, x, low=0.0, high=1.0, **bound),
         "parametrize.AxisAnglePose": Case(p.AxisAnglePose, length_scale=2.0),
         "parametrize.SE3Pose": Case(p.SE3Pose, length_scale=2.0),
         "parametrize.Positive": Case(p.Positive, low=0.1, scale=2.0),
@@ -177,15 +120,22 @@ def _tensors() -> dict[str, Case]:
         "parametrize.PositiveSpectrum": Case(p.PositiveSpectrum, [400.0, 500, 600, 700], coefficients=4, scale=2.0),
         "parametrize.ReflectanceSpectrum": Case(p.ReflectanceSpectrum, [400.0, 500, 600, 700], coefficients=4, **bound),
         "parametrize.spline_basis": Case(p.spline_basis, [400.0, 500, 600, 700], coefficients=4),
-        **{f"stokes.{name}": Case(getattr(stokes, name), STOKES, dim=0, floor=0.1)
-           for name in ("degree_of_polarization", "degree_of_linear_polarization", "degree_of_circular_polarization",
-                        "angle_of_linear_polarization", "normalized_components")},
+        **{
+            f"stokes.{name}": Case(getattr(stokes, name), STOKES, dim=0, floor=0.1)
+            for name in (
+                "degree_of_polarization",
+                "degree_of_linear_polarization",
+                "degree_of_circular_polarization",
+                "angle_of_linear_polarization",
+                "normalized_components",
+            )
+        },
         "stokes.rotate_frame": Case(stokes.rotate_frame, STOKES, angle=0.3, dim=0),
         "stokes.apply_mueller": Case(stokes.apply_mueller, torch.eye(4), STOKES, dim=0),
         "stokes.rotator": Case(stokes.rotator, angle=0.3),
         "stokes.linear_polarizer": Case(stokes.linear_polarizer, angle=0.3, extinction=0.1),
         "stokes.linear_retarder": Case(stokes.linear_retarder, angle=0.3, delay=0.1),
-    }  # fmt: skip
+    }
 
 
 def _scans() -> dict[str, Case]:
@@ -196,10 +146,16 @@ def _scans() -> dict[str, Case]:
     planes = n.VoxelGrid.before(capture().scan, [0.8, 0.9, 1.0])
     without, pairs = (tt.nlos.subtract_legs(capture(kind)) for kind in ("confocal", "exhaustive"))
     exhaustive = capture("exhaustive")
-    planar = {"first": torch.zeros(3), "along_x": torch.tensor([1.0, 0, 0]), "along_y": torch.tensor([0.0, 1, 0]),
-              "normal": torch.tensor([0.0, 0, 1]), "size": (3, 3), "pitch": (0.1, 0.1)}  # fmt: skip
+    planar = {
+        "first": torch.zeros(3),
+        "along_x": torch.tensor([1.0, 0, 0]),
+        "along_y": torch.tensor([0.0, 1, 0]),
+        "normal": torch.tensor([0.0, 0, 1]),
+        "size": (3, 3),
+        "pitch": (0.1, 0.1),
+    }
     scan, light = capture().scan, torch.rand(1, 32, 4, 4)
-    rows, laplacian, band = torch.rand(4, 32), r.LaplacianFilter(), r.PhasorFilter(wavelength=1.0)
+    laplacian, band = r.LaplacianFilter(), r.PhasorFilter(wavelength=1.0)
     volume = torch.rand(1, 3, 3, 3)
     single = capture("single")
     return {
@@ -211,6 +167,7 @@ def _scans() -> dict[str, Case]:
         "nlos.Wall.grid": Case(wall.grid, size=3),
         "nlos.Wall.plane": Case(n.Wall.plane, width=2.0, height=2.0, albedo=0.5),
         "nlos.Wall.mesh": Case(n.Wall.mesh, *MESH, albedo=0.5),
+        "nlos.capture_scene": Case(n.capture_scene, SPHERE, n.Scan.grid(wall, 3, kind="confocal"), bounces=(3,)),
         "nlos.sum_bins": Case(n.sum_bins, capture(), number=3),
         "nlos.default_grid": Case(n.default_grid, capture(), size=3, planes=3, extent=1.0),
         "nlos.without_slab": Case(n.without_slab, capture(), thickness=0.02, snr=10.0),
@@ -225,46 +182,79 @@ def _scans() -> dict[str, Case]:
         "nlos.MidpointFK": Case(n.MidpointFK, pairs.scan, time_axis=pairs.axis, floor=0.1, taps=4),
         "nlos.LCT": Case(n.LCT, without.scan, time_axis=without.axis, snr=10.0, v_bins=8),
         "nlos.DirectionalLCT": Case(n.DirectionalLCT, without.scan, time_axis=without.axis, snr=10.0, v_bins=8),
-        "nlos.DiffusionDeconvolution": Case(n.DiffusionDeconvolution, without.scan, time_axis=without.axis, passes=2, thickness=0.02, snr=10.0),
+        "nlos.DiffusionDeconvolution": Case(
+            n.DiffusionDeconvolution, without.scan, time_axis=without.axis, passes=2, properties=FOAM
+        ),
         "nlos.LaplacianFilter": Case(n.LaplacianFilter, sigma=1.0),
         "nlos.PhasorFilter": Case(n.PhasorFilter, wavelength=1.0, cycles=4.0),
-        **{f"nlos.{kind}.{name}": Case(getattr(one, name), *given, bin_width_opl=0.02, **more)
-           for kind, one in (("LaplacianFilter", laplacian), ("PhasorFilter", band))
-           for name, given, more in (("rows", (rows,), {"samples": 1}), ("rows_adjoint", (rows,), {"samples": 1}),
-                                     ("check", (), {"grid": grid, "who": "x"}), ("samples", (), {}))},
-        "nlos.PlanarScan": Case(r.PlanarScan, **planar),
         "nlos.VoxelGrid": Case(r.VoxelGrid, torch.tensor([0.5, 0.6]), **planar),
         "nlos.VoxelGrid.before": Case(r.VoxelGrid.before, scan, [0.8, 0.9], size=3, extent=1.0),
         "nlos.VoxelGrid.bounds": Case(r.VoxelGrid.bounds, [[0, 0, 0.5], [1, 1, 1]], size=3),
         "nlos.Backprojection": Case(r.Backprojection, scan, grid, time_axis=axis, falloff=1.0),
-        "nlos.FilteredBackprojection": Case(r.FilteredBackprojection, scan, grid, time_axis=axis, filter=laplacian, falloff=1.0),
+        "nlos.FilteredBackprojection": Case(
+            r.FilteredBackprojection, scan, grid, time_axis=axis, filter=laplacian, falloff=1.0
+        ),
         "nlos.PhasorField": Case(r.PhasorField, scan, planes, time_axis=axis, pulse=band, falloff=1.0),
-    }  # fmt: skip
+    }
+
+
+def _of_a_folder() -> dict[str, Case]:
+    """Of a data set of four samples on the disk."""
+    d, place = tt.data, stored_samples.folder(folder() / "set", 4)
+    stream, dataset, shard = d.TransientStream(place), d.TransientDataset(place), d.Shard(next(place.glob("*.h5")))
+    noisy_too = {"transform": noisy}
+    return {
+        "data.TransientStream": Case(d.TransientStream, place, transform=noisy, seed=3, buffer=3, rank=0, world_size=3),
+        "data.TransientStream.set_epoch": Case(stream.set_epoch, epoch=3, batches=3, batch_size=1),
+        "data.TransientStream.order": Case(stream.order, epoch=3),
+        "data.TransientDataset": Case(d.TransientDataset, place, seed=3, **noisy_too),
+        "data.TransientDataset.sample": Case(
+            dataset.sample, number=3, epoch=3, errors=(TorchTransientError, IndexError)
+        ),
+        "data.Shard.read": Case(shard.read, "transient", row=0),
+        "data.Shard.values": Case(shard.values, row=0),
+    }
+
+
+DATA = "torchtransient.data"
 
 
 def _runs() -> dict[str, Case]:
     """Of data sets and training."""
     d, t = tt.data, tt.training
     batches, table = t.Batches(4, 2), Table()
-    size = {"size": (4, 4), "generator": None}
     return {
         "data.Augmented": Case(d.Augmented, table, d.Augment(d.Flip()), seed=3),
-        "data.Augmented.sample": Case(d.Augmented(table, d.Augment(d.Flip()), seed=0).sample, number=3, epoch=3),
+        "data.Augmented.sample": Case(
+            d.Augmented(table, d.Augment(d.Flip()), seed=0).sample,
+            number=3,
+            epoch=3,
+            errors=(TorchTransientError, IndexError),
+        ),
         "data.AugmentedStream": Case(d.AugmentedStream, Stream(), d.Augment(d.Flip()), seed=3),
         "data.Crop": Case(d.Crop, size=(3, 3), offset=(1, 1)),
-        "data.Crop.draw": Case(d.Crop((3, 3)).draw, **size),
         "data.Flip": Case(d.Flip, p=0.5),
-        "data.Flip.draw": Case(d.Flip().draw, **size),
         "data.QuarterTurn": Case(d.QuarterTurn, turns=(1, 3)),
-        "data.QuarterTurn.draw": Case(d.QuarterTurn().draw, **size),
         "data.PixelMap": Case(d.PixelMap, np.eye(3), size=(4, 4), new_size=(4, 4)),
         "data.PixelMap.nearest": Case(d.PixelMap(np.eye(3), (4, 4), (4, 4)).nearest, LIGHT[..., :4, :4], fill=0.5),
         "data.SpatialFilter": Case(d.SpatialFilter, torch.nn.Identity(), images_at_once=3),
         "data.spatial_filter": Case(d.spatial_filter, torch.nn.Identity(), LIGHT, images_at_once=3),
-        "data.generate": Case(d.generate, FakeRecipe(), folder(), n=3, workers=1, per_shard=3, retries=1),
-        "data.OnlineDataset": Case(d.OnlineDataset, FakeRecipe(), capacity=8, workers=1, seed=3, warm=3, first=3),
+        "data.generate": Case(
+            until(f"{DATA}.generation.generate._folder", d.generate), FakeRecipe(), "x", n=3, workers=1, per_shard=3
+        ),
+        "data.OnlineDataset": Case(
+            until(f"{DATA}.reading.online.Producers", d.OnlineDataset),
+            FakeRecipe(),
+            capacity=8,
+            workers=1,
+            seed=3,
+            warm=3,
+            first=3,
+        ),
         "data.RecipeDataset": Case(d.RecipeDataset, recipe(), transform=noisy, size=3, first=3, seed=3),
-        "data.RecipeDataset.sample": Case(d.RecipeDataset(recipe(), 4).sample, number=3, epoch=3),
+        "data.RecipeDataset.sample": Case(
+            d.RecipeDataset(recipe(), 4).sample, number=3, epoch=3, errors=(TorchTransientError, IndexError)
+        ),
         "data.Normal": Case(d.Normal, 0.0, 1.0, low=-1.0, high=1.0),
         "data.Turn": Case(d.Turn, [0, 0, 1], low=0.0, high=90.0),
         "data.Choice.share": Case(d.Choice([1.0, 2.0, 3.0, 4.0]).share, number=3),
@@ -274,17 +264,22 @@ def _runs() -> dict[str, Case]:
         "data.Recipe.cost": Case(recipe().cost, samples=3),
         "data.Recipe.preview": Case(recipe().preview, samples=3),
         "data.ShardWriter": Case(d.ShardWriter, folder() / "rows.h5", rows=3, header={}),
+        **_of_a_folder(),
         "training.Batches": Case(t.Batches, size=9, batch_size=3, seed=3, rank=0, world_size=3),
         "training.Batches.places": Case(batches.places, step=3),
         "training.Batches.samples": Case(batches.samples, step=3),
         "training.Batches.epoch": Case(batches.epoch, step=3),
         "training.Batches.loader": Case(batches.loader, table, workers=0),
-        "training.save_checkpoint": Case(t.save_checkpoint, folder() / "run.pt", {"model": torch.nn.Linear(1, 1)}, step=3),
-        "training.ranks": Case(lambda **given: t.ranks(**given).__enter__(), threads=1, timeout_s=10.0),
+        "training.save_checkpoint": Case(
+            t.save_checkpoint, folder() / "run.pt", {"model": torch.nn.Linear(1, 1)}, step=3
+        ),
+        "training.ranks": Case(entered(t.ranks), threads=1),
+        "threads": Case(until("torchtransient.rendering.threads._set", tt.threads), n=1),
+        "data.export_web_dataset": Case(until(f"{DATA}.storage.web_dataset.path_of", d.export_web_dataset), "x", "y"),
         "training.Seeds": Case(t.Seeds, seed=3),
         "training.Seeds.generator": Case(t.Seeds(0).generator, step=3, sample=3),
         "training.Ranks.mean": Case(t.Ranks().mean, value=1.0),
-    }  # fmt: skip
+    }
 
 
 def _pictures() -> dict[str, Case]:
@@ -312,6 +307,8 @@ def _pictures() -> dict[str, Case]:
         "vis.side_by_side": Case(v.side_by_side, [frames, frames], gap=3),
         "vis.write_video": Case(v.write_video, video, list(frames), count=8, fps=10.0),
         "vis.video": Case(v.video, transient, video, fps=10.0),
+        "vis.Frames": Case(v.Frames, make=len, count=3),
+        "vis.peak_time_picture": Case(v.peak_time_picture, transient, axis=AXIS, limits=(1.0, 2.0)),
         "vis.rainbow": Case(v.rainbow, transient, axis=AXIS, exposure=1.0, period_opl=1.0),
         "vis.gradient_picture": Case(v.gradient_picture, steady, percentile=90.0, limit=1.0),
         "vis.domain_colors": Case(v.domain_colors, phasor[0, 0].numpy(), percentile=90.0),
@@ -319,7 +316,46 @@ def _pictures() -> dict[str, Case]:
         "vis.exposure_of_video": Case(v.exposure_of_video, transient, quantile=0.9),
         "vis.tone_map": Case(v.tone_map, steady, exposure=1.0, gamma=2.0, stops=5.0),
         "vis.volume_views": Case(v.volume_views, torch.rand(4, 4, 4), gamma=2.0),
-    }  # fmt: skip
+    }
 
 
 CASES: dict[str, Case] = {**_of_losses(), **_scenes(), **_tensors(), **_scans(), **_runs(), **_pictures()}
+
+# What takes longer than a few milliseconds a call.
+SLOW = {name for name in CASES if name.startswith("vis.")} | {
+    "data.Recipe.cost",
+    "data.Recipe.preview",
+    "data.Recipe.sample",
+    "data.Recipe.draw",
+    "data.RecipeDataset.sample",
+    "metrics.localization_rmse",
+    "scenes.milk_bottle",
+    "scenes.nlos_mannequin",
+    "scenes.nlos_room",
+    "data.TransientStream",
+    "data.TransientDataset",
+    "nlos.DiffusionDeconvolution",
+    "nlos.MidpointFK",
+    "nlos.without_slab",
+    "nlos.LCT",
+    "nlos.DirectionalLCT",
+    "metrics.ssim",
+    "geometry.pinhole_camera",
+    "losses.ssim_loss",
+    "losses.projection_ssim_loss",
+    "metrics.transient_ssim",
+}
+# Arguments that are not in CASES, as patterns of name(argument), and why.
+LEFT = {
+    r"(RenderStats|Plan|Overview|data\.(Generated|Sample|Shard)|training\.(Checkpoint|Ranks))\(.*\)": "results",
+    r"(data|nlos)\..*\.draw\(size\)": "what augmentation gives its operations",
+    r"nlos\.(Laplacian|Phasor)Filter\.\w+\(.*\)": "what reconstruction gives its filters",
+    r"nlos\.PlanarScan\(.*\)": "what is found of a scan",
+    r"(TransientRenderer|plan|render|cost_of_accuracy)\b.*": "rendering/test_whole_numbers.py",
+    r"(Gate|Pulse)\((opl|values)\)": "rows of a table, which `tabulated` checks",
+    r"nlos\.(CaptureRenderer|simulate|forecast)\b.*": "nlos/test_arguments.py",
+    r"nlos\.read_capture\(.*\)": "files/captures",
+    r"data\.ShardWriter\.(put|fail)\(.*\)": "what tt.data.generate gives",
+    r"training\.worker_init\(worker\)|vis\.Frames\(make\)|vis\.plot_fit\(truth\)": "given by torch; no number",
+    r"sensing\..*": "sensing/test_given.py and the tests of each sensor",
+}

@@ -217,10 +217,11 @@ class SlabInverse(InverseOperator):
 
 
 def _slab_properties(properties: tuple[float, float, float, float], who: str) -> tuple[float, float, float, float]:
-    if not isinstance(properties, tuple) or len(properties) != len(FOAM):
+    given: object = properties
+    if not (isinstance(given, (list, tuple)) or getattr(given, "ndim", 0) == 1) or len(given) != len(FOAM):
         raise UnitError(
             f"{who}: expected properties as (reduced scattering 1/m, absorption 1/m, index, extrapolation length m), "
-            f"got {properties!r}."
+            f"got {shown(properties)}."
         )
     scattering, absorption, index, extrapolation = properties
     absorption = finite(f"{who}: absorption", absorption)

@@ -41,6 +41,9 @@ class Frames:
     count: int
     make: Callable[[int], Image]
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "count", quantities.count("Frames: count", self.count, 0, ShapeError))
+
     def __len__(self) -> int:
         return self.count
 

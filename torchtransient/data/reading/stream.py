@@ -99,7 +99,7 @@ class TransientStream(IterableDataset[dict[str, Any]]):
 
     def order(self, epoch: int) -> NDArray[np.int64]:
         """(n,) int64: the numbers of the samples that this process, or worker of a DataLoader, reads in an epoch."""
-        return self._order(epoch, *_worker())
+        return self._order(count(f"{WHAT}: epoch", epoch, 0), *_worker())
 
     def _order(self, epoch: int, part: int, parts: int) -> NDArray[np.int64]:
         rank, ranks = self._ranks()

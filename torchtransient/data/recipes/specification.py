@@ -114,8 +114,8 @@ class Specification:
             gates=None if gates is None else tuple(gates), temporal_filter=temporal_filter,
             spp=None if spp is None else count("recipe: spp", spp),
             max_depth=None if max_depth is None else count("recipe: max_depth", max_depth, -1),
-            sensors=_counts("sensors", sensors, 0), pulse=pulse, irf=irf, bounces=_counts("bounces", bounces),
-            energy=energy, physics=physics,
+            sensors=_counts("sensors", sensors, 0, "all"), bounces=_counts("bounces", bounces, 1, "all"),
+            pulse=pulse, irf=irf, energy=energy, physics=physics,
         )  # fmt: skip
         self.scan = scan
         self.device = _device(device)
@@ -192,13 +192,15 @@ def _names(what: str, given: Any) -> tuple[str, ...]:
     return found
 
 
-def _counts(what: str, given: Any, least: int = 1) -> Any:
-    """A number, a text, or a tuple of numbers."""
-    if isinstance(given, str):
+def _counts(what: str, given: Any, least: int, text: str) -> Any:
+    """A number, a text, or a tuple of one or more numbers."""
+    if isinstance(given, str) and given == text:
         return given
-    if not (isinstance(given, Sequence) and not isinstance(given, bytes)) and not getattr(given, "ndim", 0):
-        return count(f"recipe: {what}", given, least)
-    return tuple(count(f"recipe: {what}", one, least) for one in given)
+    several = (isinstance(given, Sequence) and not isinstance(given, (str, bytes))) or getattr(given, "ndim", 0)
+    whole = tuple(count(f"recipe: {what}", one, least) for one in (given if several else [given]))
+    if not whole:
+        raise SceneError(f"recipe: {what}: expected one or more whole numbers, or {text!r}, got {shown(given)}.")
+    return whole if several else whole[0]
 
 
 def _device(given: Any) -> Device | None:
