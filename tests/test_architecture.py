@@ -180,6 +180,7 @@ def is_below(other, room):
         ("floating", "quantities"), ("metrics", "losses"), ("metrics", "reconstruction"), ("axes", "quantities"),
         ("gates", "quantities"), ("pulses", "quantities"), ("capture", "argument_names"),
         ("array_files", "quantities"), ("array_files", "plain_texts"), ("array_files", "free_memory"),
+        ("units", "quantities"), ("stokes", "quantities"),
     }  # fmt: skip
     return other in {"errors", "units"} or (room, other) in within
 

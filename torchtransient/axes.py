@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import operator
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -11,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from torchtransient import quantities
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.quantities import Numbers
+from torchtransient.quantities import Numbers, shown
 from torchtransient.units import LATEST_S, SHORTEST_OPL, SPEED_OF_LIGHT, near_seconds, opl_to_seconds, seconds_to_opl
 
 # What a number in another unit looks like. The bins of real records are 1 ps to 1 us wide: in nanoseconds, picoseconds
@@ -42,14 +42,11 @@ class TimeAxis:
         width = _finite(self.bin_width_opl, "bin_width_opl")
         if width <= 0:
             raise UnitError(f"TimeAxis: expected bin_width_opl > 0 metres, got {width!r}.")
-        try:
-            if isinstance(self.num_bins, bool):
-                raise TypeError
-            bins = operator.index(self.num_bins)
-        except TypeError:
-            raise ShapeError(f"TimeAxis: expected num_bins to be a whole number, got {self.num_bins!r}.") from None
+        bins = quantities.as_whole(self.num_bins)
+        if bins is None or bins > quantities.MOST:
+            raise ShapeError(f"TimeAxis: expected num_bins to be a whole number, got {shown(self.num_bins)}.")
         if bins < 1:
-            raise ShapeError(f"TimeAxis: expected num_bins >= 1, got {bins}.")
+            raise ShapeError(f"TimeAxis: expected num_bins >= 1, got {shown(bins)}.")
         end = start + bins * width
         if not math.isfinite(end) or width < 4 * max(math.ulp(start), math.ulp(end)):
             raise UnitError(
@@ -121,7 +118,11 @@ class TimeAxis:
         `opl` in metres, a number or a tensor on any device; compared in float64 with `edges_opl`, so that an edge
         belongs to the bin that starts there. Raises UnitError for NaN.
         """
-        lengths = torch.as_tensor(opl).detach().to(torch.float64)
+        array = None if isinstance(opl, Tensor) else quantities.real_array(opl)
+        given = opl if isinstance(opl, Tensor) else None if array is None else torch.from_numpy(array)
+        if given is None or given.is_complex() or given.dtype == torch.bool:
+            raise UnitError(f"TimeAxis.bin_index: expected lengths in metres, got {shown(opl)}.")
+        lengths = given.detach().to(torch.float64)
         if bool(torch.isnan(lengths).any()):
             raise UnitError("TimeAxis.bin_index: expected lengths in metres, got NaN.")
         edges = self.edges_opl.to(lengths.device)
@@ -161,7 +162,9 @@ class FrequencyAxis:
     @classmethod
     def uniform(cls, first: float, step: float, count: int, *, start_opl: float = 0.0) -> FrequencyAxis:
         """`count` frequencies `first + k step`, in cycles per metre. Equal steps render faster than arbitrary ones."""
-        return cls(tuple(float(first) + k * float(step) for k in range(count)), start_opl)
+        low, width = _finite(first, "first", "FrequencyAxis.uniform"), _finite(step, "step", "FrequencyAxis.uniform")
+        number = quantities.count("FrequencyAxis.uniform: count", count, 0, ShapeError)
+        return cls(tuple(low + k * width for k in range(number)), start_opl)
 
     @classmethod
     def from_hertz(cls, frequencies_hz: float | Iterable[float] | Numbers, start_opl: float = 0.0) -> FrequencyAxis:
@@ -205,16 +208,15 @@ class FrequencyAxis:
 
 def _row(given: Any, owner: str) -> tuple[float, ...]:
     """The numbers of one frequency or of several: any iterable, an array, a tensor."""
-    plain = given.tolist() if isinstance(given, Tensor) else given
-    values = tuple(plain) if isinstance(plain, Iterable) and not isinstance(plain, str) else (plain,)
+    plain = given.tolist() if hasattr(given, "tolist") else given
+    values = tuple(plain) if isinstance(plain, Iterable) and not isinstance(plain, (str, bytes)) else (plain,)
     return tuple(_finite(value, "a frequency", owner) for value in values)
 
 
 def _finite(value: float, name: str, owner: str = "TimeAxis") -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError, OverflowError, RuntimeError):
-        raise UnitError(f"{owner}: expected {name} to be one number, got {value!r}.") from None
+    number = quantities.as_number(value)
+    if number is None:
+        raise UnitError(f"{owner}: expected {name} to be one number, got {shown(value)}.")
     if not math.isfinite(number):
         raise UnitError(f"{owner}: expected {name} to be finite, got {number!r}.")
     return number

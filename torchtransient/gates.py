@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchtransient import quantities
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.pulses import CUT_STDDEVS, FWHM_PER_STDDEV, Pulse
-from torchtransient.quantities import Numbers
+from torchtransient.quantities import Numbers, finite, numbers
 from torchtransient.units import SHORTEST_OPL, near_seconds, seconds_to_opl
 
 Array = NDArray[np.float64]
@@ -49,8 +50,8 @@ class Gate:
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise ArgumentError(f"Gate: expected one of {', '.join(KINDS)}, got {self.kind!r}.")
-        start, end = float(self.start_opl), float(self.end_opl)
-        if not (math.isfinite(start) and math.isfinite(end) and start < end):
+        start, end = (finite(f"Gate: {name}", getattr(self, name)) for name in ("start_opl", "end_opl"))
+        if not start < end:
             raise UnitError(f"Gate: expected a finite start before a finite end, got {start!r} m to {end!r} m.")
         if end - start < SHORTEST_OPL:
             raise UnitError(
@@ -70,9 +71,9 @@ class Gate:
     @classmethod
     def gaussian(cls, center_opl: float, fwhm_opl: float) -> Gate:
         """Fully open at ``center_opl``; closes like a Gaussian, to zero at four standard deviations."""
-        if not fwhm_opl > 0:
-            raise UnitError(f"Gate.gaussian: expected fwhm_opl > 0 metres, got {fwhm_opl!r}.")
-        center, fwhm = float(center_opl), float(fwhm_opl)
+        center, fwhm = finite("Gate.gaussian: center_opl", center_opl), finite("Gate.gaussian: fwhm_opl", fwhm_opl)
+        if not fwhm > 0:
+            raise UnitError(f"Gate.gaussian: expected fwhm_opl > 0 metres, got {fwhm!r}.")
         half = CUT_STDDEVS * fwhm / FWHM_PER_STDDEV
         # Center and width are kept too: start and end would give them back with a rounding error.
         return cls("gaussian", center - half, center + half, opl=(center, fwhm))
@@ -80,8 +81,7 @@ class Gate:
     @classmethod
     def tabulated(cls, opl: Numbers, values: Numbers) -> Gate:
         """A measured profile: linear between ``values`` at the lengths ``opl`` (rising), zero outside them."""
-        lengths = np.asarray(opl, dtype=np.float64).ravel()
-        heights = np.asarray(values, dtype=np.float64).ravel()
+        lengths, heights = numbers("Gate.tabulated: opl", opl), numbers("Gate.tabulated: values", values)
         if lengths.size != heights.size or lengths.size < 2:
             raise ShapeError(
                 f"Gate.tabulated: expected two or more lengths and as many values, got {lengths.size} and "
@@ -111,6 +111,7 @@ class Gate:
 
     def shifted(self, opl: float) -> Gate:
         """The same gate, opened ``opl`` metres later."""
+        opl = finite("Gate.shifted: opl", opl)
         if self.kind == "gaussian":
             return Gate.gaussian(self.opl[0] + opl, self.opl[1])
         moved = tuple(length + opl for length in self.opl)
@@ -118,7 +119,9 @@ class Gate:
 
     def sequence(self, step_opl: float, count: int) -> tuple[Gate, ...]:
         """``count`` gates of this shape, each ``step_opl`` metres after the one before."""
-        return tuple(self.shifted(k * step_opl) for k in range(count))
+        step = finite("Gate.sequence: step_opl", step_opl)
+        number = quantities.count("Gate.sequence: count", count, 0, ShapeError)
+        return tuple(self.shifted(k * step) for k in range(number))
 
     # ------------------------------------------------------------------------------------------------ the profile
 

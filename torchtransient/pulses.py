@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.quantities import Numbers
+from torchtransient.quantities import Numbers, as_number, finite, numbers, positive, shown
 from torchtransient.units import LONGEST_PULSE_S, SHORTEST_OPL, near_seconds, seconds_to_opl
 
 Array = NDArray[np.float64]
@@ -59,8 +59,7 @@ class Pulse:
         object.__setattr__(self, "width_opl", width)
 
     def _check_table(self) -> None:
-        opl = np.asarray(self.opl, dtype=np.float64).ravel()
-        values = np.asarray(self.values, dtype=np.float64).ravel()
+        opl, values = numbers("Pulse.tabulated: opl", self.opl), numbers("Pulse.tabulated: values", self.values)
         if opl.size != values.size or opl.size < 2:
             raise ShapeError(
                 f"Pulse.tabulated: expected two or more lengths and as many values, got {opl.size} and {values.size}."
@@ -91,7 +90,8 @@ class Pulse:
     @classmethod
     def tabulated(cls, opl: Numbers, values: Numbers, center_opl: float = 0.0) -> Pulse:
         """A measured shape: linear between ``values`` at the lengths ``opl`` (metres, rising), zero outside them."""
-        return cls("tabulated", 0.0, center_opl, opl=tuple(opl), values=tuple(values))
+        lengths, heights = numbers("Pulse.tabulated: opl", opl), numbers("Pulse.tabulated: values", values)
+        return cls("tabulated", 0.0, center_opl, opl=tuple(lengths.tolist()), values=tuple(heights.tolist()))
 
     @classmethod
     def gaussian_s(cls, fwhm_s: float, center_s: float = 0.0) -> Pulse:
@@ -110,16 +110,16 @@ class Pulse:
     @classmethod
     def tabulated_s(cls, times_s: Numbers, values: Numbers, center_s: float = 0.0) -> Pulse:
         """As :meth:`tabulated`, with times in seconds."""
-        times = np.asarray(times_s, dtype=np.float64)
-        for time in times.ravel().tolist():
+        times = numbers("Pulse.tabulated_s: times_s", times_s)
+        for time in times.tolist():
             near_seconds(time, "times_s", "Pulse.tabulated_s")
         lengths = seconds_to_opl(times)
         center = near_seconds(_number(center_s, "center_s"), "center_s", "Pulse.tabulated_s")
-        return cls.tabulated(lengths.tolist(), tuple(values), seconds_to_opl(center))
+        return cls.tabulated(lengths.tolist(), values, seconds_to_opl(center))
 
     def shifted(self, opl: float) -> Pulse:
         """The same shape, ``opl`` metres later."""
-        return replace(self, center_opl=self.center_opl + opl)
+        return replace(self, center_opl=self.center_opl + finite("Pulse.shifted: opl", opl))
 
     # ------------------------------------------------------------------------------------------------ the density
 
@@ -178,7 +178,7 @@ def cumulative_of_sum(pulses: Sequence[Pulse], step: float) -> tuple[int, Array]
     """
     if not pulses:
         raise UnitError("cumulative_of_sum: expected at least one pulse, got none.")
-    first, masses = 0, np.ones(1)
+    first, masses, step = 0, np.ones(1), positive("cumulative_of_sum: step", step)
     for pulse in pulses:
         low, high = pulse.support_opl
         a, b = math.floor(low / step), math.ceil(high / step)
@@ -211,10 +211,9 @@ def _check_metres(width: float) -> None:
 
 
 def _number(value: Any, name: str) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        raise UnitError(f"Pulse: expected {name} to be one number in metres, got {value!r}.") from None
+    number = as_number(value)
+    if number is None:
+        raise UnitError(f"Pulse: expected {name} to be one number in metres, got {shown(value)}.")
     if not math.isfinite(number):
         raise UnitError(f"Pulse: expected a finite {name}, got {number!r}.")
     return number

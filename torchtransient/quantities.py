@@ -36,6 +36,8 @@ _UNITS = {
     "rad": "radians",
     "e": "electrons",
 }
+# Files and tensors count in 64 bits.
+MOST = 2**63 - 1
 # So many numbers of an array are written in messages.
 _WRITTEN = 16
 
@@ -75,23 +77,38 @@ def shares(name: str, values: Any) -> float | tuple[float, float, float]:
     return red, green, blue
 
 
-def count(name: str, value: Any, least: int = 1, error: type[TorchTransientError] = SceneError) -> int:
-    """``value`` as an int. Raises ``error`` unless it is a whole number of at least ``least``."""
-    try:
-        number = None if _is_truth(value) else operator.index(value)
-    except TypeError:
+def count(
+    name: str, value: Any, least: int | None = 1, error: type[TorchTransientError] = SceneError, most: int | None = MOST
+) -> int:
+    """``value`` as an int. Raises ``error`` unless it is a whole number from ``least`` to ``most``; None: no bound."""
+    number = as_whole(value)
+    if number is None:
         whole = _number(value)
         number = int(whole) if math.isfinite(whole) and whole == round(whole) else None
-    if number is None or number < least:
-        raise error(f"{name}: expected a whole number of at least {least}, got {shown(value)}.")
+    if number is None or number < (-MOST if least is None else least):
+        bound = "" if least is None else f" of at least {least}"
+        raise error(f"{name}: expected a whole number{bound}, got {shown(value)}.")
+    if most is not None and number > most:
+        raise error(f"{name}: expected a whole number of at most {'2^63 - 1' if most == MOST else most}, got "
+                    f"{shown(value)}.")  # fmt: skip
     return number
+
+
+def index(name: str, value: Any, size: int, error: type[TorchTransientError] = ArgumentError) -> int:
+    """``value`` as a place among ``size`` things, from 0 on; below zero it counts from the end. Raises ``error``."""
+    number = as_whole(value)
+    if number is None or not -size <= number < size:
+        raise error(f"{name}: expected a whole number from {-size} to {size - 1}, got {shown(value)}.")
+    return number % size
 
 
 def as_whole(value: Any) -> int | None:
     """``value`` as an int, of any library that has whole numbers; None for what is none: 2.0, texts, truth values."""
+    if _is_truth(value) or getattr(value, "ndim", None):
+        return None
     try:
-        return None if _is_truth(value) else operator.index(value)
-    except TypeError:
+        return operator.index(value)
+    except (TypeError, RuntimeError):  # of torch: a number that is nowhere, as on "meta" or inside of vmap
         return None
 
 
@@ -107,6 +124,8 @@ def real_array(values: Any) -> NDArray[np.float64] | None:
     of different lengths, and numbers that float64 cannot hold.
     """
     try:
+        if _has_truth(values):  # which numpy makes ones and zeros of, beside numbers
+            return None
         plain = np.asarray(values.detach().cpu() if hasattr(values, "detach") else values)
         if plain.dtype.kind in "iuf":
             return plain.astype(np.float64)
@@ -114,6 +133,20 @@ def real_array(values: Any) -> NDArray[np.float64] | None:
         return np.asarray(plain.tolist(), dtype=np.float64) if plain.dtype == object and _are_numbers(plain) else None
     except (TypeError, ValueError, OverflowError, RuntimeError):
         return None
+
+
+def numbers(name: str, values: Any) -> NDArray[np.float64]:
+    """Real numbers of any library in a row, float64 (N,). Raises UnitError for what is none."""
+    array = real_array(values)
+    if array is None:
+        raise UnitError(f"{name}: expected real numbers, got {shown(values)}.")
+    return array.ravel()
+
+
+def _has_truth(values: Any) -> bool:
+    return isinstance(values, (list, tuple)) and any(
+        _has_truth(one) if isinstance(one, (list, tuple)) else _is_truth(one) for one in values
+    )
 
 
 def _are_numbers(objects: NDArray[Any]) -> bool:
@@ -157,7 +190,7 @@ def with_article(word: str) -> str:
 
 def as_number(value: Any) -> float | None:
     """``value`` as a float, infinities and NaN too; None for what is no real number."""
-    if _is_truth(value) or isinstance(value, (str, bytes)) or getattr(value, "ndim", None):
+    if _is_truth(value) or isinstance(value, (str, bytes)) or getattr(value, "ndim", None) or _is_complex(value):
         return None
     try:
         return float(value)
@@ -175,3 +208,8 @@ def _number(value: Any) -> float:
 
 def _is_truth(value: Any) -> bool:
     return isinstance(value, bool) or "bool" in str(getattr(value, "dtype", ""))
+
+
+def _is_complex(value: Any) -> bool:
+    """Numpy takes the real part of those, with a warning."""
+    return "complex" in str(getattr(value, "dtype", ""))

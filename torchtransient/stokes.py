@@ -14,10 +14,12 @@ derivative zero, where the functions themselves have no derivative. Second deriv
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.quantities import as_whole, finite, index, real_array, shown
 
 TRANSIENT_DIM = -5
 STEADY_DIM = -4
@@ -45,7 +47,7 @@ def degree_of_linear_polarization(stokes: Tensor, dim: int, floor: float = 0.0) 
 
 def degree_of_circular_polarization(stokes: Tensor, dim: int, floor: float = 0.0) -> Tensor:
     """``S3 / S0`` in [-1, 1], positive for right circular light; otherwise as :func:`degree_of_polarization`."""
-    return normalized_components(stokes, dim, floor).select(dim, 2)
+    return normalized_components(stokes, dim, floor).select(_axis(stokes, dim), 2)
 
 
 def angle_of_linear_polarization(stokes: Tensor, dim: int, floor: float = 0.0) -> Tensor:
@@ -56,7 +58,7 @@ def angle_of_linear_polarization(stokes: Tensor, dim: int, floor: float = 0.0) -
     part; a loss on :func:`normalized_components` has neither problem. Errors as for :func:`degree_of_polarization`.
     """
     part = _components(stokes, dim)
-    _check_floor(floor)
+    floor = _checked_floor(floor)
     s1, s2 = part[1], part[2]
     largest = torch.maximum(s1.abs(), s2.abs()).detach()
     # The angle does not depend on the scale; at scale one the squares in its derivative cannot underflow.
@@ -93,8 +95,7 @@ def _degree(stokes: Tensor, dim: int, which: tuple[int, ...], floor: float) -> T
 
 def _intensity(s0: Tensor, floor: float) -> tuple[Tensor, Tensor]:
     """Where there is light, and a divisor that is one elsewhere."""
-    _check_floor(floor)
-    lit = s0 > max(floor, torch.finfo(s0.dtype).tiny)
+    lit = s0 > max(_checked_floor(floor), torch.finfo(s0.dtype).tiny)
     return lit, torch.where(lit, s0, 1.0)
 
 
@@ -108,7 +109,7 @@ def rotate_frame(stokes: Tensor, angle: Tensor | float, dim: int) -> Tensor:
     against ``stokes`` without ``dim``. Raises ``ShapeError``.
     """
     s0, s1, s2, s3 = _components(stokes, dim)
-    double = 2 * torch.as_tensor(angle, dtype=stokes.dtype, device=stokes.device)
+    double = 2 * _floating("angle", angle).to(stokes.device, stokes.dtype)
     c, s = torch.cos(double), torch.sin(double)
     turned = c * s1 + s * s2, c * s2 - s * s1
     if turned[0].shape != s0.shape:
@@ -125,9 +126,10 @@ def apply_mueller(matrix: Tensor, stokes: Tensor, dim: int) -> Tensor:
     Several elements: multiply their matrices, the one that the light meets first on the right. Raises ``ShapeError``.
     """
     _components(stokes, dim)
+    dim = _axis(stokes, dim)
     if matrix.shape != (4, 4):
         raise ShapeError(f"matrix: expected a Mueller matrix of shape (4, 4), got {tuple(matrix.shape)}.")
-    return (matrix.to(stokes) @ stokes.movedim(dim, -1).unsqueeze(-1)).squeeze(-1).movedim(-1, _axis(stokes, dim))
+    return (matrix.to(stokes) @ stokes.movedim(dim, -1).unsqueeze(-1)).squeeze(-1).movedim(-1, dim)
 
 
 # ------------------------------------------------------------------------------------------------ ideal elements
@@ -135,7 +137,7 @@ def apply_mueller(matrix: Tensor, stokes: Tensor, dim: int) -> Tensor:
 
 def rotator(angle: Tensor | float) -> Tensor:
     """Change to a frame turned counter-clockwise by ``angle`` (a number or a tensor ``(...)``), shape (..., 4, 4)."""
-    double = 2 * _floating(angle)
+    double = 2 * _floating("angle", angle)
     c, s = torch.cos(double), torch.sin(double)
     o, i = torch.zeros_like(c), torch.ones_like(c)
     return _matrix(((i, o, o, o), (o, c, s, o), (o, -s, c, o), (o, o, o, i)))
@@ -147,9 +149,9 @@ def linear_polarizer(angle: Tensor | float = 0.0, extinction: Tensor | float = 0
     ``extinction``: power transmitted of the light across it, relative to that along it, in [0, 1]: 0 is ideal, real
     sensors have 1/100 to 1/400. Raises ``UnitError`` outside of that range.
     """
-    double, e = _together(2 * _floating(angle), _floating(extinction))
-    if bool(((e < 0) | (e > 1)).any()):
-        raise UnitError(f"extinction: expected numbers in [0, 1], got {extinction!r}.")
+    double, e = _together(2 * _floating("angle", angle), _floating("extinction", extinction))
+    if not bool(((e >= 0) & (e <= 1)).all()):
+        raise UnitError(f"extinction: expected numbers in [0, 1], got {shown(extinction)}.")
     c, s = torch.cos(double), torch.sin(double)
     plus, minus = 0.5 * (1 + e), 0.5 * (1 - e)
     # The root has no slope at zero; an ideal polarizer's derivative by its extinction leaves the cross terms out.
@@ -165,7 +167,7 @@ def linear_retarder(angle: Tensor | float, delay: Tensor | float) -> Tensor:
 
     A quarter-wave plate has pi/2, a half-wave plate pi.
     """
-    double, phase = _together(2 * _floating(angle), _floating(delay))
+    double, phase = _together(2 * _floating("angle", angle), _floating("delay", delay))
     c, s, cd, sd = torch.cos(double), torch.sin(double), torch.cos(phase), torch.sin(phase)
     o, i = torch.zeros_like(c), torch.ones_like(c)
     m = (1 - cd) * s * c
@@ -201,27 +203,38 @@ def depolarizer() -> Tensor:
 def _components(stokes: Tensor, dim: int) -> tuple[Tensor, ...]:
     if not stokes.dtype.is_floating_point:
         raise ShapeError(f"stokes: expected real floating point numbers, got {stokes.dtype}.")
-    if not -stokes.ndim <= dim < stokes.ndim or stokes.shape[dim] != 4:
+    place = as_whole(dim)
+    if place is None or not -stokes.ndim <= place < stokes.ndim or stokes.shape[place] != 4:
         raise ShapeError(
-            f"stokes: expected four components along dim={dim}, got shape {tuple(stokes.shape)}. They are along -5 in "
-            "a transient (..., 4, C, T, H, W) and along -4 in a steady image (..., 4, C, H, W); only polarized "
+            f"stokes: expected four components along dim={shown(dim)}, got shape {tuple(stokes.shape)}. They are along "
+            "-5 in a transient (..., 4, C, T, H, W) and along -4 in a steady image (..., 4, C, H, W); only polarized "
             "variants render them."
         )
-    return torch.unbind(stokes, dim)
+    return torch.unbind(stokes, place)
 
 
 def _axis(stokes: Tensor, dim: int) -> int:
-    return dim % stokes.ndim
+    return index("dim", dim, stokes.ndim)
 
 
-def _check_floor(floor: float) -> None:
-    if not floor >= 0:
+def _checked_floor(floor: float) -> float:
+    number = finite("floor", floor)
+    if not number >= 0:
         raise UnitError(f"floor: expected a number of at least 0, got {floor!r}.")
+    return number
 
 
-def _floating(value: Tensor | float) -> Tensor:
-    tensor = torch.as_tensor(value)
-    return tensor if tensor.dtype.is_floating_point else tensor.to(torch.get_default_dtype())
+def _floating(name: str, value: Tensor | float) -> Tensor:
+    """A number or a tensor in floating point, with its gradient. Raises UnitError for what is no real number."""
+    if isinstance(value, Tensor):
+        if value.is_complex() or value.dtype == torch.bool:
+            raise UnitError(f"{name}: expected real numbers, got {value.dtype}.")
+        return value if value.dtype.is_floating_point else value.to(torch.get_default_dtype())
+    array = real_array(value)
+    if array is None or not np.isfinite(array).all():
+        raise UnitError(f"{name}: expected finite numbers, got {shown(value)}.")
+    precise = getattr(value, "dtype", None) == np.float64
+    return torch.from_numpy(array.copy()).to(torch.float64 if precise else torch.get_default_dtype())
 
 
 def _together(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:

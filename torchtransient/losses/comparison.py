@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from torchtransient.errors import ArgumentError, DeviceError, ShapeError, TorchTransientError, UnitError
-from torchtransient.quantities import finite, flag, shown
+from torchtransient.quantities import MOST, finite, flag, shown
 from torchtransient.units import SHORTEST_OPL
 
 Reduction = Literal["none", "sum", "mean"]
@@ -189,7 +189,7 @@ def _tangent(x: Tensor) -> Tensor | None:
 def check_whole(name: str, value: object, where: str, error: type[TorchTransientError] = ShapeError) -> int:
     """A number of things, 1 or more; 3.0 is three. Raises UnitError for no number, `error` for others."""
     number = math.nan if isinstance(value, bool) else check_number(name, value, where)
-    if not number >= 1 or number != int(number):
+    if not 1 <= number <= MOST or number != int(number):
         raise error(f"{where}: expected {name} to be a whole number of at least 1, got {shown(value)}.")
     return int(number)
 

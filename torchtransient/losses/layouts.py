@@ -10,13 +10,12 @@ bins or more: fewer may be channels. What is left to say is a batch of lists of 
 from __future__ import annotations
 
 import math
-import operator
 
 from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.losses.comparison import Reduction, check_level, check_reduction
-from torchtransient.quantities import shown
+from torchtransient.quantities import MOST, as_whole, shown
 
 _IMAGES = -3
 # One or three numbers before points are channels of a list rather than bins.
@@ -45,11 +44,8 @@ def time_dim(x: Tensor, dim: int | None, where: str, instead: str = "") -> int:
 
 def check_dim(dim: int, where: str) -> int:
     """Raises ShapeError for what is no number of a dimension."""
-    try:
-        number = None if isinstance(dim, bool) else operator.index(dim)
-    except TypeError:
-        number = None
-    if number is None:
+    number = as_whole(dim)
+    if number is None or abs(number) > MOST:
         raise ShapeError(
             f"{where}: expected dim, the dimension of time, to be a whole number, got {shown(dim)}. It is {_LAYOUTS}."
         )

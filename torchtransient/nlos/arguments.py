@@ -10,7 +10,7 @@ from torch import nn
 
 from torchtransient.capture import Scan
 from torchtransient.errors import ArgumentError, SceneError
-from torchtransient.quantities import as_whole, shown
+from torchtransient.quantities import as_whole, count, shown
 from torchtransient.rendering.arguments import samples
 from torchtransient.rendering.seeds import SEED_RANGE
 from torchtransient.sensing import Device
@@ -18,10 +18,7 @@ from torchtransient.sensing import Device
 
 def checked_count(who: str, name: str, value: Any) -> int:
     """A whole number of at least 1. Raises ArgumentError."""
-    number = as_whole(value)
-    if number is None or number < 1:
-        raise ArgumentError(f"{who}: {name}: expected a whole number of at least 1, got {shown(value)}.")
-    return number
+    return count(f"{who}: {name}", value, 1, ArgumentError)
 
 
 def checked_samples(who: str, value: Any) -> int | None:

@@ -15,7 +15,7 @@ from torchtransient.errors import SceneError, UnitError
 from torchtransient.nlos import defaults
 from torchtransient.nlos.arguments import check_is_scan
 from torchtransient.nlos.mesh_file import mesh_file
-from torchtransient.quantities import shown
+from torchtransient.quantities import MOST, as_whole, shown
 from torchtransient.rendering.build_options import BuildOptions
 from torchtransient.rendering.scene_handle import load
 from torchtransient.rendering.variant import active_variant
@@ -176,15 +176,16 @@ def _range(bounces: Sequence[int] | str) -> tuple[int, int]:
     """The first and the last number that counts; -1 for no limit."""
     if isinstance(bounces, str) and bounces == ALL_BOUNCES:
         return 0, -1
-    given: list[Any] = list(bounces) if isinstance(bounces, (tuple, list, range)) else [bounces]
-    whole = all(isinstance(n, int) and not isinstance(n, bool) and n >= 2 for n in given)
-    numbers = sorted(given) if whole else []
+    several = isinstance(bounces, (tuple, list, range)) or getattr(bounces, "ndim", 0) == 1
+    given = [as_whole(n) for n in (bounces if several else [bounces])]
+    numbers = sorted(n for n in given if n is not None and 2 <= n < MOST)
+    numbers = numbers if len(numbers) == len(given) else []
     if not numbers or numbers != list(range(numbers[0], numbers[0] + len(numbers))):
         raise SceneError(
             "bounces: expected whole numbers of at least 2 without gaps, such as (3,) or (3, 4, 5), or 'all', "
-            f"got {bounces!r}. The laser's spot is the first bounce, so light around one corner has 3."
+            f"got {shown(bounces)}. The laser's spot is the first bounce, so light around one corner has 3."
         )
-    return int(numbers[0]), int(numbers[-1])
+    return numbers[0], numbers[-1]
 
 
 def _numbers(values: Any) -> np.ndarray:

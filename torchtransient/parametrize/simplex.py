@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import operator
 from typing import Any
 
 import torch
@@ -12,7 +11,7 @@ from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import floating, holds, without_autocast
 from torchtransient.parametrize.bounded import checked_margin
 from torchtransient.parametrize.settings import Settings
-from torchtransient.quantities import shown
+from torchtransient.quantities import count
 
 # What single precision makes of a sum of some hundred weights.
 _SLACK = 1e-4
@@ -21,7 +20,8 @@ _SLACK = 1e-4
 @without_autocast
 def simplex(x: Tensor, dim: int = -1) -> Tensor:
     """Weights between 0 and 1 with the sum 1 along `dim`, by softmax, of any real `x`. Raises ShapeError."""
-    return torch.softmax(_checked(x, _dim(dim, "simplex"), "simplex"), dim)
+    dim = _dim(dim, "simplex")
+    return torch.softmax(_checked(x, dim, "simplex"), dim)
 
 
 @without_autocast
@@ -82,12 +82,7 @@ class Simplex(Settings):
 
 
 def _dim(dim: Any, where: str) -> int:
-    try:
-        if not isinstance(dim, bool):
-            return operator.index(dim)
-    except TypeError:
-        pass
-    raise ShapeError(f"{where}: expected dim as a whole number, got {shown(dim)}.")
+    return count(f"{where}: dim", dim, None, ShapeError)
 
 
 def _checked(x: Tensor, dim: int, where: str) -> Tensor:

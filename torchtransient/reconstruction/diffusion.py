@@ -18,7 +18,7 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import UnitError
-from torchtransient.quantities import finite, positive
+from torchtransient.quantities import as_whole, finite, positive, shown
 from torchtransient.reconstruction.capture_checks import SNR, within
 from torchtransient.reconstruction.confocal_operator import ConfocalOperator, InverseOperator
 from torchtransient.reconstruction.linear import each
@@ -104,9 +104,10 @@ class DiffusionDeconvolution(ConfocalOperator):
         who = type(self).__name__
         self.thickness = positive(f"{who}: thickness", thickness)
         self.properties = _slab_properties(properties, who)
-        if isinstance(passes, bool) or not isinstance(passes, int) or passes not in (1, 2):
-            raise UnitError(f"{who}: expected light that crosses the slab once or twice, got passes={passes!r}.")
-        self.passes, self.snr = passes, within(f"{who}: snr", snr, *SNR)
+        number = as_whole(passes)
+        if number not in (1, 2):
+            raise UnitError(f"{who}: expected light that crosses the slab once or twice, got passes={shown(passes)}.")
+        self.passes, self.snr = number, within(f"{who}: snr", snr, *SNR)
         self._set_tables()
 
     def tables(self) -> dict[str, Tensor]:
@@ -216,10 +217,11 @@ class SlabInverse(InverseOperator):
 
 
 def _slab_properties(properties: tuple[float, float, float, float], who: str) -> tuple[float, float, float, float]:
-    if not isinstance(properties, tuple) or len(properties) != len(FOAM):
+    given: object = properties
+    if not (isinstance(given, (list, tuple)) or getattr(given, "ndim", 0) == 1) or len(given) != len(FOAM):
         raise UnitError(
             f"{who}: expected properties as (reduced scattering 1/m, absorption 1/m, index, extrapolation length m), "
-            f"got {properties!r}."
+            f"got {shown(properties)}."
         )
     scattering, absorption, index, extrapolation = properties
     absorption = finite(f"{who}: absorption", absorption)

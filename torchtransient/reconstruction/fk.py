@@ -26,6 +26,7 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
+from torchtransient.quantities import count
 from torchtransient.reconstruction.capture_checks import one_of
 from torchtransient.reconstruction.capture_roots import checked_floor, stabilized_root
 from torchtransient.reconstruction.confocal_operator import ConfocalOperator, chunk_rows
@@ -74,7 +75,8 @@ class FK(ConfocalOperator):
         dtype: torch.dtype = torch.float32,
     ) -> None:
         super().__init__(scan, time_axis=time_axis, dtype=dtype)
-        self.target, self.taps = one_of("FK: target", target, TARGETS), one_of("FK: taps", taps, TAPS)
+        self.target = one_of("FK: target", target, TARGETS)
+        self.taps = one_of("FK: taps", count("FK: taps", taps), TAPS)
         self.floor = checked_floor(floor, dtype)
         self._set_tables()
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.errors import SceneError, UnitError
-from torchtransient.quantities import positive
-from torchtransient.scenes.parts import SceneDict, diffuse, perspective, transient_film
+from torchtransient.quantities import finite, positive
+from torchtransient.scenes.parts import SceneDict, checked_depth, diffuse, perspective, transient_film
 from torchtransient.scenes.transforms import look_at, rotate, scale, translate
 
 # Radius and height of the bottle's outline from the middle of its base to the middle of its lid.
@@ -113,10 +113,11 @@ def milk_bottle(
     `bottle.interior_medium.albedo.value.value`, `bottle.bsdf.alpha`. Raises
     UnitError or SceneError for numbers out of range.
     """
-    if not 0 < beam_degrees < 90:
-        raise UnitError(f"beam_degrees: expected an angle between 0 and 90 degrees, got {beam_degrees!r}")
-    if not abs(anisotropy) < 1:
-        raise UnitError(f"anisotropy: expected a mean cosine between -1 and 1, got {anisotropy!r}")
+    beam, mean_cosine = finite("beam_degrees", beam_degrees), finite("anisotropy", anisotropy)
+    if not 0 < beam < 90:
+        raise UnitError(f"beam_degrees: expected an angle between 0 and 90 degrees, got {beam!r}")
+    if not abs(mean_cosine) < 1:
+        raise UnitError(f"anisotropy: expected a mean cosine between -1 and 1, got {mean_cosine!r}")
     vertices, faces = lathe(_smooth(PROFILE, 2), 96)
     write_ply(Path(mesh), vertices, faces)
     scattering = np.array(SCATTERING) * positive("milk", milk)
@@ -128,7 +129,7 @@ def milk_bottle(
         "type": "scene",
         "integrator": {
             "type": "transient_prbvolpath",
-            "max_depth": max_depth,
+            "max_depth": checked_depth(max_depth),
             "rr_depth": 1000,
             "camera_unwarp": True,
         },
@@ -143,7 +144,7 @@ def milk_bottle(
                 "scale": EXTINCTION_UNIT,
                 "sigma_t": {"type": "rgb", "value": (extinction / EXTINCTION_UNIT).tolist()},
                 "albedo": {"type": "rgb", "value": (scattering / extinction).tolist()},
-                "phase": {"type": "hg", "g": float(anisotropy)},
+                "phase": {"type": "hg", "g": mean_cosine},
             },
         },
         "laser": {
@@ -152,8 +153,8 @@ def milk_bottle(
             "bsdf": diffuse(0.0),
             "emitter": {
                 "type": "angulararea",
-                "cutoff_angle": float(beam_degrees),
-                "beam_width": 0.8 * float(beam_degrees),
+                "cutoff_angle": beam,
+                "beam_width": 0.8 * beam,
                 "radiance": {"type": "rgb", "value": [1e6, 1e6, 1e6]},
             },
         },

@@ -5,7 +5,7 @@ The solutions are in `torchtransient.testing.closed_forms` under the same names.
 
 from __future__ import annotations
 
-from torchtransient.quantities import positive
+from torchtransient.quantities import finite, positive
 from torchtransient.scenes.parts import SceneDict, diffuse, perspective, transient_film, transient_path
 from torchtransient.scenes.transforms import look_at, rotate, scale, translate
 
@@ -26,7 +26,7 @@ def furnace(
     bin_width_opl: float = 0.05,
     spp: int = 256,
     max_depth: int = 64,
-    rr_depth: int = 1000,
+    rr_depth: int | None = 1000,
     emitter_sampling: bool = False,
 ) -> SceneDict:
     """A diffuse sphere that emits `radiance` from its whole inner side, seen from its centre. Lengths in metres.
@@ -50,7 +50,7 @@ def furnace(
             "radius": positive("radius", radius),
             "flip_normals": True,
             "bsdf": diffuse(reflectance),
-            "emitter": {"type": "area", "radiance": float(radiance)},
+            "emitter": {"type": "area", "radiance": finite("radiance", radiance)},
         },
     }
     if not emitter_sampling:
@@ -72,7 +72,7 @@ def integrating_sphere(
     bin_width_opl: float = 0.05,
     spp: int = 256,
     max_depth: int = 64,
-    rr_depth: int = 1000,
+    rr_depth: int | None = 1000,
 ) -> SceneDict:
     """A diffuse sphere lit by a point source of `intensity` (W/sr) at its centre and seen from there. Lengths in
     metres.
@@ -84,7 +84,7 @@ def integrating_sphere(
         "type": "scene",
         "integrator": transient_path(max_depth, rr_depth),
         "sensor": _camera(resolution, num_bins, start_opl, bin_width_opl, spp, 45.0),
-        "light": {"type": "point", "position": [0.0, 0.0, 0.0], "intensity": float(intensity)},
+        "light": {"type": "point", "position": [0.0, 0.0, 0.0], "intensity": finite("intensity", intensity)},
         "wall": {
             "type": "sphere",
             "radius": positive("radius", radius),
@@ -106,7 +106,7 @@ def parallel_plates(
     bin_width_opl: float = 0.05,
     spp: int = 256,
     max_depth: int = 64,
-    rr_depth: int = 1000,
+    rr_depth: int | None = 1000,
 ) -> SceneDict:
     """Two emitting diffuse squares facing each other, the camera half-way between them. Lengths in metres.
 
@@ -123,7 +123,7 @@ def parallel_plates(
             "type": "rectangle",
             "to_world": to_world,
             "bsdf": diffuse(reflectance),
-            "emitter": {"type": "area", "radiance": float(radiance)},
+            "emitter": {"type": "area", "radiance": finite("radiance", radiance)},
         }
 
     return {

@@ -38,12 +38,12 @@ def cornell_box(
     """
     if mirror and glass:
         raise ArgumentError("cornell_box: expected at most one of mirror=True and glass=True, got both; choose one")
-    white = {"type": "ref", "id": "white"}
+    white, ior = {"type": "ref", "id": "white"}, positive("index", index)
     large: SceneDict = white
     if mirror:
         large = {"type": "conductor", "material": "none"}
     elif glass:
-        large = {"type": "dielectric", "int_ior": positive("index", index), "ext_ior": 1.0}
+        large = {"type": "dielectric", "int_ior": ior, "ext_ior": 1.0}
     film = transient_film(resolution, num_bins, start_opl, bin_width_opl)
     camera = perspective(look_at([0.0, 0.0, 3.90], [0.0, 0.0, 0.0]), 39.3077, film, spp, sampler)
 

@@ -22,7 +22,8 @@ def transient_film(
     finite.
     """
     given: Any = resolution
-    several = isinstance(given, Iterable) and not isinstance(given, str)
+    array = getattr(given, "ndim", None)
+    several = array != 0 and isinstance(given, Iterable) and not isinstance(given, (str, bytes))
     sides = list(given) if several else [given, given]
     if len(sides) != 2:
         raise SceneError(f"resolution: expected one side in pixels or (width, height), got {shown(resolution)}.")
@@ -60,12 +61,15 @@ def transient_path(max_depth: int, rr_depth: int | None = None) -> SceneDict:
 
     `rr_depth=None` keeps the plugin's own start of Russian roulette.
     """
-    if isinstance(max_depth, bool) or int(max_depth) != max_depth or max_depth < -1:
-        raise ArgumentError(f"max_depth: expected -1 or a whole number of at least 0, got {max_depth!r}")
-    integrator: SceneDict = {"type": "transient_path", "max_depth": int(max_depth)}
+    integrator: SceneDict = {"type": "transient_path", "max_depth": checked_depth(max_depth)}
     if rr_depth is not None:
         integrator["rr_depth"] = count("rr_depth", rr_depth)
     return integrator
+
+
+def checked_depth(max_depth: int) -> int:
+    """Segments of the longest path. Raises ArgumentError unless it is a whole number, -1 for no limit."""
+    return count("max_depth", max_depth, -1, ArgumentError)
 
 
 def diffuse(reflectance: float | Numbers) -> SceneDict:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from torchtransient.errors import ArgumentError
-from torchtransient.quantities import positive
+from torchtransient.quantities import count, finite, positive
 from torchtransient.scenes.parts import SceneDict, diffuse, perspective, transient_film, transient_path
 from torchtransient.scenes.transforms import look_at, rotate, scale, translate
 
@@ -34,12 +34,17 @@ def moving_wall(
         "type": "scene",
         "integrator": transient_path(max_depth),
         "sensor": perspective(look_at([0.0, 0.0, 4.0], [0.0, 0.0, 0.0]), 10.0, film, spp),
-        "light": {"type": "point", "position": [0.5, 0.0, 4.0], "intensity": float(intensity)},
-        "wall": {"type": "rectangle", "to_world": translate([0.0, 0.0, z]), "bsdf": diffuse(wall_reflectance)},
+        "light": {"type": "point", "position": [0.5, 0.0, 4.0], "intensity": finite("intensity", intensity)},
+        "wall": {
+            "type": "rectangle",
+            "to_world": translate([0.0, 0.0, finite("z", z)]),
+            "bsdf": diffuse(wall_reflectance),
+        },
     }
+    panel = diffuse(panel_reflectance)
     if side_panel:
         to_world = translate([1.6, 0.0, 1.2]) @ rotate([0, 1, 0], -60) @ scale(0.4)
-        scene["side"] = {"type": "rectangle", "to_world": to_world, "bsdf": diffuse(panel_reflectance)}
+        scene["side"] = {"type": "rectangle", "to_world": to_world, "bsdf": panel}
     return scene
 
 
@@ -65,7 +70,7 @@ def light_over_plane(
     return {
         "type": "scene",
         "integrator": transient_path(2),
-        "light": {"type": "point", "position": [0.0, 0.0, h * (1 - 1e-4)], "intensity": float(intensity)},
+        "light": {"type": "point", "position": [0.0, 0.0, h * (1 - 1e-4)], "intensity": finite("intensity", intensity)},
         "plane": {
             "type": "rectangle",
             "to_world": scale(positive("half_extent", half_extent)),
@@ -77,7 +82,7 @@ def light_over_plane(
             "bsdf": diffuse(0.0),
             "sensor": {
                 "type": "irradiancemeter",
-                "sampler": {"type": "independent", "sample_count": spp},
+                "sampler": {"type": "independent", "sample_count": count("spp", spp)},
                 "film": transient_film(1, num_bins, start_opl, bin_width_opl),
             },
         },
@@ -96,7 +101,7 @@ def etalon_slab(
     bin_width_opl: float = 0.05,
     spp: int = 1024,
     max_depth: int = 32,
-    rr_depth: int = 1000,
+    rr_depth: int | None = 1000,
 ) -> SceneDict:
     """A smooth glass slab met head-on by the camera, with an area light behind or in front of it. Lengths in metres.
 
@@ -129,7 +134,7 @@ def etalon_slab(
             "type": "rectangle",
             "to_world": emitter_to_world @ scale(10.0),
             "bsdf": diffuse(0.0),
-            "emitter": {"type": "area", "radiance": float(radiance)},
+            "emitter": {"type": "area", "radiance": finite("radiance", radiance)},
         },
     }
 
@@ -159,7 +164,7 @@ def glass_slab_before_wall(
         "type": "scene",
         "integrator": transient_path(max_depth),
         "sensor": perspective(look_at([0.0, 0.0, 4.0], [0.0, 0.0, 0.0]), 6.0, film, spp),
-        "light": {"type": "point", "position": [1.8, 0.0, 2.0], "intensity": float(intensity)},
+        "light": {"type": "point", "position": [1.8, 0.0, 2.0], "intensity": finite("intensity", intensity)},
         "slab": {
             "type": "cube",
             "to_world": slab,

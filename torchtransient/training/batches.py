@@ -46,7 +46,7 @@ class Batches(Sampler[list[int]]):
     ) -> None:  # fmt: skip
         self.size = count(f"{_WHAT}: size", size, 1, UnitError)
         self.batch_size = count(f"{_WHAT}: batch_size", batch_size, 1, UnitError)
-        self.seed, self.shuffle = count(f"{_WHAT}: seed", seed, 0, UnitError), flag(f"{_WHAT}: shuffle", shuffle)
+        self.seed, self.shuffle = count(f"{_WHAT}: seed", seed, 0, UnitError, None), flag(f"{_WHAT}: shuffle", shuffle)
         self.world_size = count(f"{_WHAT}: world_size", world_size, 1, UnitError)
         self.rank = count(f"{_WHAT}: rank", rank, 0, UnitError)
         if self.rank >= self.world_size:
@@ -113,7 +113,7 @@ class Batches(Sampler[list[int]]):
 
     def epoch(self, step: int) -> float:
         """How many times the data set has been gone through when a step begins."""
-        return step * self.batch_size / self.size
+        return count(f"{_WHAT}: step", step, 0, UnitError) * self.batch_size / self.size
 
     def __iter__(self) -> Iterator[list[int]]:
         self._check_position("an iterator")

@@ -13,7 +13,7 @@ import torch
 import torch.distributed as dist
 
 from torchtransient.errors import DeviceError, UnitError
-from torchtransient.quantities import as_number, count, shown
+from torchtransient.quantities import as_number, count, positive, shown
 
 _TORCHRUN = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
 
@@ -84,6 +84,7 @@ def ranks(
 
     if device not in ("cpu", "cuda"):
         raise UnitError(f"ranks: expected device 'cpu' or 'cuda', got {device!r}.")
+    timeout_s = positive("ranks: timeout_s", timeout_s)
     found = _found(device)
     if device == "cuda":
         _take_device(found)

@@ -39,7 +39,7 @@ class Seeds:
     purpose: str = "render"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "seed", count("Seeds: seed", self.seed, 0, UnitError))
+        object.__setattr__(self, "seed", count("Seeds: seed", self.seed, 0, UnitError, None))
         if not isinstance(self.purpose, str):
             raise ArgumentError(f"Seeds: expected purpose as a text, got {self.purpose!r}.")
 

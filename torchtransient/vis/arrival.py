@@ -18,7 +18,7 @@ from torchtransient.vis import colour_maps
 from torchtransient.vis.files import Image, picture_figure, save_figure, save_image, to_bytes
 from torchtransient.vis.overview import light_curve, peak_time
 from torchtransient.vis.sources import Source, axis_of, transient_of
-from torchtransient.vis.tone_mapping import BROKEN, exposure_of, tone_map
+from torchtransient.vis.tone_mapping import BROKEN, checked_positive, exposure_of, tone_map
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -109,8 +109,7 @@ def bar_in_metres_and_nanoseconds(figure: Any, image: Any, panel: Any, low: floa
 def _hue(opl: NDArray[np.float64], low: float, high: float, period: float | None) -> NDArray[np.float64]:
     if period is None:
         return np.asarray((opl - low) / (high - low))
-    if not period > 0:
-        raise UnitError(f"rainbow: expected period_opl > 0 metres, got {period!r}.")
+    period = checked_positive("period_opl", period, "rainbow")
     return np.asarray(np.mod((opl - low) / period, 1.0))
 
 

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchtransient.errors import UnitError
+from torchtransient.quantities import as_number, shown
 from torchtransient.vis.files import figure_type
 
 if TYPE_CHECKING:
@@ -94,9 +96,12 @@ def rainbow_map() -> ListedColormap:
 def symmetric_limit(values: Any, percentile: float = 99.0) -> float:
     """Half the width of a scale centred at zero: the percentile of |values|; their maximum where that is zero; 1 where
     all are zero or not finite."""
+    share = as_number(percentile)
+    if share is None or not 0 <= share <= 100:
+        raise UnitError(f"percentile: expected a number from 0 to 100, got {shown(percentile)}.")
     size = np.abs(np.asarray(values, dtype=np.float64)).ravel()
     size = size[np.isfinite(size)]
     if not size.size or size.max() == 0:
         return 1.0
-    limit = float(np.percentile(size, percentile))
+    limit = float(np.percentile(size, share))
     return limit if limit > 0 and math.isfinite(1 / limit) else float(size.max())

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.errors import ShapeError
+from torchtransient.quantities import count
 from torchtransient.vis.files import figure_type, save_figure
 
 if TYPE_CHECKING:
@@ -53,7 +54,8 @@ def contact_sheet(
     curves = any(cell.curve is not None for cell in cells)
     cell = (len(names) * _PICTURE + 0.15, _PICTURE + _TITLE + (_CURVE if curves else 0.0))
     # About as high as it is wide.
-    across = columns or max(1, min(len(cells), round(math.sqrt(len(cells) * cell[1] / cell[0]))))
+    given = None if columns is None else count("contact_sheet: columns", columns, 1, ShapeError)
+    across = given or max(1, min(len(cells), round(math.sqrt(len(cells) * cell[1] / cell[0]))))
     down = -(-len(cells) // across)
     width, height = across * cell[0], down * cell[1]
     top = 0.2 if title else 0.0

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.errors import MissingPackageError, ShapeError, StorageError
+from torchtransient.quantities import count
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -86,8 +87,7 @@ def picture_figure(height: int, width: int, panels: int = 1, side: float = 4.2, 
 
 def enlarge(image: Image, factor: int) -> Image:
     """Every pixel as a square of `factor` pixels. Raises ShapeError when `factor` is not a whole number >= 1."""
-    if factor < 1 or int(factor) != factor:
-        raise ShapeError(f"picture: expected a whole number of at least 1 for scale, got {factor!r}.")
+    factor = count("picture: scale", factor, 1, ShapeError)
     return image.repeat(factor, axis=0).repeat(factor, axis=1) if factor > 1 else image
 
 

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.quantities import as_number, shown
 from torchtransient.vis import colour_maps
 from torchtransient.vis.files import picture_figure, save_figure
 from torchtransient.vis.sources import Source, as_tensor
+from torchtransient.vis.tone_mapping import checked_positive
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -40,13 +42,14 @@ def gradient_picture(
         values = values[None]
     if values.ndim != 3 or values.numel() == 0 or values.is_complex():
         raise ShapeError(f"gradient_picture: expected (C, H, W) or (H, W), got {tuple(values.shape)}.")
-    if not 0 < percentile <= 100:
-        raise UnitError(f"gradient_picture: expected 0 < percentile <= 100, got {percentile!r}.")
+    share = as_number(percentile)
+    if share is None or not 0 < share <= 100:
+        raise UnitError(f"gradient_picture: expected 0 < percentile <= 100, got {shown(percentile)}.")
     images = values.double().numpy() if per_channel else values.double().sum(0, keepdim=True).numpy()
     if limit is None:
         limit = colour_maps.symmetric_limit(images, percentile)
-    elif not limit > 0:
-        raise UnitError(f"gradient_picture: expected limit > 0, got {limit!r}.")
+    else:
+        limit = checked_positive("limit", limit, "gradient_picture")
     figure, panels = picture_figure(images.shape[1], images.shape[2], panels=len(images), side=4.4)
     import matplotlib
 

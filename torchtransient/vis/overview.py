@@ -13,6 +13,7 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, StorageError
 from torchtransient.vis.files import figure_type, save_figure
+from torchtransient.vis.sources import pixel_of
 from torchtransient.vis.tone_mapping import tone_map
 
 _NANOSECONDS = 1e9
@@ -116,9 +117,7 @@ def plot_overview(
     if tuple(steady.shape) != (transient.shape[0], height, width):
         expected = (transient.shape[0], height, width)
         raise ShapeError(f"plot_overview: expected steady of shape {expected}, got {tuple(steady.shape)}.")
-    row, column = median_pixel(steady) if pixel is None else pixel
-    if not (0 <= row < height and 0 <= column < width):
-        raise ShapeError(f"plot_overview: pixel ({row}, {column}) lies outside of the image of {height} x {width}.")
+    row, column = pixel_of(median_pixel(steady) if pixel is None else pixel, (height, width), "plot_overview")
     shown = Overview(tuple(moments_of_arrival(transient)), (row, column))
     figure = figure_type()(figsize=(12.0, 7.4), layout="constrained")
     upper, lower = figure.subfigures(2, 1, squeeze=False).flat

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchtransient.axes import FrequencyAxis
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.quantities import Numbers
+from torchtransient.quantities import Numbers, as_whole, count, shown
 from torchtransient.units import SPEED_OF_LIGHT
 from torchtransient.vis import colour_maps
 from torchtransient.vis.files import enlarge, figure_type, picture_figure, save_figure, to_bytes
@@ -53,7 +53,7 @@ def phasor_picture(
         raise UnitError(f"phasor_picture: expected panels out of {', '.join(SHOWS)}, got {tuple(show)}.")
     images, known = _images(source, "phasor_picture")
     frequencies = known if frequencies is None else frequencies_of(frequencies)
-    _check_indices(which, images, frequencies)
+    which = _indices(which, images, frequencies)
     height, width = images.shape[1:]
     figure, panels = picture_figure(height, width, panels=len(show) * len(which), side=3.6, columns=len(show))
     for row, index in enumerate(which):
@@ -86,13 +86,13 @@ def phasor_video(
     check_video(path)
     images, known = _images(source, "phasor_video")
     frequencies = known if frequencies is None else frequencies_of(frequencies)
-    _check_indices((which,), images, frequencies)
-    if steps < 1:
-        raise ShapeError(f"phasor_video: expected at least one step, got {steps!r}.")
+    (which,) = _indices((which,), images, frequencies)
+    steps = count("phasor_video: steps", steps, 1, ShapeError)
     values = np.nan_to_num(images[which].numpy(), posinf=0.0, neginf=0.0)
     limit = colour_maps.symmetric_limit(np.abs(values))
     colours = _colours("RdBu_r")
     factor = max(1, round(320 / max(values.shape))) if scale is None else scale
+    factor = count("phasor_video: scale", factor, 1, ShapeError)
     label = _label(which, frequencies, "real")
 
     def make(index: int) -> Any:
@@ -149,12 +149,14 @@ def _images(source: Source, who: str) -> tuple[Tensor, tuple[float, ...] | None]
     return phasor.to(torch.complex128).sum(0), frequencies
 
 
-def _check_indices(which: Sequence[int], images: Tensor, frequencies: Sequence[float] | None) -> None:
-    count = images.shape[0]
-    if not len(which) or any(not 0 <= index < count for index in which):
-        raise ShapeError(f"phasor picture: expected indices out of {count} frequencies, got {tuple(which)}.")
-    if frequencies is not None and len(frequencies) != count:
-        raise ShapeError(f"phasor picture: expected {count} frequencies, got {len(frequencies)}.")
+def _indices(which: Sequence[int], images: Tensor, frequencies: Sequence[float] | None) -> list[int]:
+    many = images.shape[0]
+    found = [place for one in which if (place := as_whole(one)) is not None and 0 <= place < many]
+    if not found or len(found) < len(which):
+        raise ShapeError(f"phasor picture: expected indices out of {many} frequencies, got {shown(which)}.")
+    if frequencies is not None and len(frequencies) != many:
+        raise ShapeError(f"phasor picture: expected {many} frequencies, got {len(frequencies)}.")
+    return found
 
 
 def _label(index: int, frequencies: Sequence[float] | None, name: str) -> str:

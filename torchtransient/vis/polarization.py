@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchtransient import stokes as st
 from torchtransient.errors import ArgumentError, UnitError
+from torchtransient.quantities import finite
 from torchtransient.vis import colour_maps
 from torchtransient.vis.files import picture_figure, save_figure
 from torchtransient.vis.sources import Source, stokes_of
@@ -73,7 +74,7 @@ def polarization_picture(
         # Of the median, which lamps in the picture do not decide.
         lit = total[0][total[0] > 0]
         floor = 0.01 * lit.median().item() if lit.numel() else 0.0
-    elif not floor >= 0:
+    elif (floor := finite("polarization_picture: floor", floor)) < 0:
         raise UnitError(f"polarization_picture: expected floor >= 0, got {floor!r}.")
     dark = ((total[0] <= floor) | broken).numpy()
     figure, panels = picture_figure(total.shape[1], total.shape[2], panels=len(quantities), side=3.4)

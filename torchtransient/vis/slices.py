@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from torch import Tensor
 
+from torchtransient import quantities
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ArgumentError, ShapeError
 from torchtransient.units import opl_to_seconds
 from torchtransient.vis.files import figure_type, picture_figure, save_figure
 from torchtransient.vis.overview import moments_of_arrival
-from torchtransient.vis.sources import Source, images_of, transient_of
+from torchtransient.vis.sources import Source, images_of, pixel_of, transient_of
 from torchtransient.vis.stamps import moment
 from torchtransient.vis.tone_mapping import exposure_of, tone_map
 
@@ -44,9 +45,12 @@ def streak(
     number, what = (column, "column") if column is not None else (row, "row")
     count = cube.shape[3] if what == "column" else cube.shape[2]
     number = count // 2 if number is None else number
-    if not -count <= number < count:
-        raise ShapeError(f"streak: {what} {number} lies outside of an image of {cube.shape[2]} x {cube.shape[3]}.")
-    number %= count
+    place = quantities.as_whole(number)
+    if place is None or not -count <= place < count:
+        raise ShapeError(
+            f"streak: {what} {quantities.shown(number)} lies outside of an image of {cube.shape[2]} x {cube.shape[3]}."
+        )
+    number = place % count
     line: Tensor = cube[:, :, :, number] if what == "column" else cube[:, :, number]
     shown = tone_map(line, exposure_of(line, 0.999) if exposure is None else exposure, curve).numpy()
     figure = figure_type()(figsize=(6.2, 5.2), layout="constrained")
@@ -85,14 +89,19 @@ def frame_grid(
     """
     cube, axis, word = images_of(source, axis, "frame_grid")
     total = cube.shape[1]
+    columns, number = (
+        quantities.count(f"frame_grid: {name}", value, 1, ShapeError)
+        for name, value in (("columns", columns), ("count", count))
+    )
     if bins is None:
-        shares = tuple(float(s) for s in (np.arange(max(count, 0)) + 0.5) / max(count, 1))
+        shares = tuple(float(s) for s in (np.arange(number) + 0.5) / number)
         bins = moments_of_arrival(cube.nan_to_num(posinf=0.0, neginf=0.0), shares)
-    if not len(bins) or columns < 1:
-        raise ShapeError(f"frame_grid: expected some bins and columns, got {len(bins)} and {columns}.")
+    if not len(bins):
+        raise ShapeError("frame_grid: expected some bins, got none.")
     for index in bins:
-        if not 0 <= index < total:
-            raise ShapeError(f"frame_grid: bin {index} lies outside of {total} bins.")
+        if (place := quantities.as_whole(index)) is None or not 0 <= place < total:
+            raise ShapeError(f"frame_grid: bin {quantities.shown(index)} lies outside of {total} bins.")
+    bins = [int(index) for index in bins]
     figure, panels = picture_figure(cube.shape[2], cube.shape[3], panels=len(bins), side=2.4, columns=columns)
     for panel, index in zip(panels, bins, strict=False):
         panel.imshow(tone_map(cube[:, index], exposure, curve).numpy(), interpolation="nearest")
@@ -121,9 +130,7 @@ def histogram(
     height, width = cube.shape[2:]
     if not len(pixels):
         raise ShapeError("histogram: expected at least one pixel (row, column), got none.")
-    for row, column in pixels:
-        if not (0 <= row < height and 0 <= column < width):
-            raise ShapeError(f"histogram: pixel ({row}, {column}) lies outside of an image of {height} x {width}.")
+    pixels = [pixel_of(pixel, (height, width), "histogram") for pixel in pixels]
     figure = figure_type()(figsize=(7.0, 0.5 + 2.1 * len(pixels)), layout="constrained")
     panels = figure.subplots(len(pixels), 1, sharex=True, squeeze=False)[:, 0]
     edges = np.arange(cube.shape[1] + 1) if axis is None else axis.edges_opl.numpy()

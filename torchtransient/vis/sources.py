@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,6 +16,7 @@ from torchtransient.array_files.array_file import damage_said, read_npy, read_so
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import ArgumentError, ShapeError, StorageError
 from torchtransient.plain_texts import json_data
+from torchtransient.quantities import as_whole, shown
 
 Source = Any  # Tensor | NDArray | RenderOutput | Result | str | Path, told apart by what they offer
 _HDF5 = (".h5", ".hdf5")
@@ -116,9 +118,10 @@ def stokes_of(source: Source, frame: int | None = None, who: str = "picture") ->
     if image is not None and (cube is None or frame is None) and image.ndim == 4 and image.shape[0] == 4:
         result = image
     elif cube is not None and cube.ndim == 5 and cube.shape[0] == 4:
-        if frame is not None and not -cube.shape[2] <= frame < cube.shape[2]:
-            raise ShapeError(f"{who}: bin {frame} of {cube.shape[2]} does not exist.")
-        result = cube.sum(2) if frame is None else cube[:, :, frame]
+        place = as_whole(frame)
+        if frame is not None and (place is None or not -cube.shape[2] <= place < cube.shape[2]):
+            raise ShapeError(f"{who}: bin {shown(frame)} of {cube.shape[2]} does not exist.")
+        result = cube.sum(2) if place is None else cube[:, :, place]
     else:
         found = cube if cube is not None else image
         shape = "neither" if found is None else tuple(found.shape)
@@ -129,6 +132,17 @@ def stokes_of(source: Source, frame: int | None = None, who: str = "picture") ->
     if result.numel() == 0:
         raise ShapeError(f"{who}: expected Stokes vectors of some pixels, got {tuple(result.shape)}.")
     return result
+
+
+def pixel_of(pixel: Any, size: tuple[int, int], who: str) -> tuple[int, int]:
+    """(row, column) of a pixel in an image of ``size``. Raises ShapeError for one outside, and for what is none."""
+    several = isinstance(pixel, Sequence) or getattr(pixel, "ndim", 0) == 1
+    row, column = [as_whole(n) for n in pixel] if several and len(pixel) == 2 else (None, None)
+    if row is None or column is None:
+        raise ShapeError(f"{who}: expected a pixel (row, column), got {shown(pixel)}.")
+    if not (0 <= row < size[0] and 0 <= column < size[1]):
+        raise ShapeError(f"{who}: pixel ({row}, {column}) lies outside of an image of {size[0]} x {size[1]}.")
+    return row, column
 
 
 def phasor_of(source: Source, who: str = "picture") -> tuple[Tensor, tuple[float, ...] | None]:

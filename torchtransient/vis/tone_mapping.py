@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
+from torchtransient.quantities import as_number, shown
 
 BROKEN = (1.0, 0.0, 1.0)  # magenta: a pixel that is not finite must not pass for black or white
 CURVES = ("srgb", "gamma", "log", "linear")
@@ -21,8 +22,7 @@ def exposure_of(image: Tensor, quantile: float = 0.99) -> float:
     `image`: (C, H, W) linear radiance. Values that are not finite are left out. Raises ShapeError and UnitError.
     """
     _check(image)
-    if not 0 < quantile <= 1:
-        raise UnitError(f"exposure_of: expected 0 < quantile <= 1, got {quantile!r}.")
+    quantile = _quantile(quantile, "exposure_of")
     brightest = image.amax(0).flatten().to(torch.float64)
     brightest = brightest[torch.isfinite(brightest)]
     if not bool((brightest > 0).any()):
@@ -42,8 +42,7 @@ def exposure_of_video(transient: Tensor, quantile: float = 0.99) -> float:
     """
     if transient.ndim != 4 or transient.shape[0] not in (1, 3):
         raise ShapeError(f"exposure_of_video: expected (C, T, H, W) with C = 1 or 3, got {tuple(transient.shape)}.")
-    if not 0 < quantile <= 1:
-        raise UnitError(f"exposure_of_video: expected 0 < quantile <= 1, got {quantile!r}.")
+    quantile = _quantile(quantile, "exposure_of_video")
     parts = list(range(0, transient.shape[1], _FRAMES_AT_ONCE))
     highest = max((_lit(transient, start).max().item() for start in parts if _lit(transient, start).numel()), default=0)
     if highest <= 0:
@@ -58,6 +57,21 @@ def exposure_of_video(transient: Tensor, quantile: float = 0.99) -> float:
     reached = counts.cumsum(0) / counts.sum()
     step = min(int(torch.searchsorted(reached, torch.tensor(quantile, dtype=torch.float64))), _LOG_STEPS - 1)
     return 1.0 / math.exp(low + (step + 1) * (high - low) / _LOG_STEPS)
+
+
+def _quantile(given: float, who: str) -> float:
+    number = as_number(given)
+    if number is None or not 0 < number <= 1:
+        raise UnitError(f"{who}: expected 0 < quantile <= 1, got {shown(given)}.")
+    return number
+
+
+def checked_positive(name: str, given: float, who: str = "tone_map") -> float:
+    """A finite number above zero. Raises UnitError."""
+    number = as_number(given)
+    if number is None or not (math.isfinite(number) and number > 0):
+        raise UnitError(f"{who}: expected {name} > 0, got {shown(given)}.")
+    return number
 
 
 def _lit(transient: Tensor, start: int) -> Tensor:
@@ -77,17 +91,15 @@ def tone_map(
     UnitError for an unknown curve, or an exposure, gamma or number of stops that is not positive.
     """
     _check(image)
-    scale = exposure_of(image) if exposure is None else float(exposure)
-    for name, value in (("exposure", scale), ("gamma", gamma), ("stops", stops)):
-        if not (math.isfinite(value) and value > 0):
-            raise UnitError(f"tone_map: expected {name} > 0, got {value!r}.")
-    shown = image.detach().to(torch.float64) * scale
-    broken = ~torch.isfinite(shown).all(0)
-    shown = torch.nan_to_num(shown, nan=0.0, posinf=1.0, neginf=0.0).clamp(min=0)
-    shown = _curve(shown, curve, gamma, stops).clamp(0, 1)
-    shown = shown.expand(3, -1, -1).permute(1, 2, 0).contiguous()
-    shown[broken] = shown.new_tensor(BROKEN)
-    return shown
+    factor = checked_positive("exposure", exposure_of(image) if exposure is None else exposure)
+    gamma, stops = checked_positive("gamma", gamma), checked_positive("stops", stops)
+    mapped = image.detach().to(torch.float64) * factor
+    broken = ~torch.isfinite(mapped).all(0)
+    mapped = torch.nan_to_num(mapped, nan=0.0, posinf=1.0, neginf=0.0).clamp(min=0)
+    mapped = _curve(mapped, curve, gamma, stops).clamp(0, 1)
+    mapped = mapped.expand(3, -1, -1).permute(1, 2, 0).contiguous()
+    mapped[broken] = mapped.new_tensor(BROKEN)
+    return mapped
 
 
 def _curve(linear: Tensor, curve: str, gamma: float, stops: float) -> Tensor:

@@ -13,11 +13,11 @@ from torch import Tensor
 
 from torchtransient import quantities
 from torchtransient.axes import TimeAxis
-from torchtransient.errors import SceneError, ShapeError
+from torchtransient.errors import ShapeError
 from torchtransient.vis.files import Image, enlarge, to_bytes
 from torchtransient.vis.sources import Source, images_of
 from torchtransient.vis.stamps import moment, with_strip
-from torchtransient.vis.tone_mapping import exposure_of, exposure_of_video, tone_map
+from torchtransient.vis.tone_mapping import checked_positive, exposure_of, exposure_of_video, tone_map
 from torchtransient.vis.video_file import check_video, write_video
 
 _VISIBLE = 320  # pixels: smaller pictures are enlarged to about this, else a player shows a stamp
@@ -40,6 +40,9 @@ class Frames:
 
     count: int
     make: Callable[[int], Image]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "count", quantities.count("Frames: count", self.count, 0, ShapeError))
 
     def __len__(self) -> int:
         return self.count
@@ -74,17 +77,15 @@ def frames(
     ShapeError and UnitError.
     """
     cube, axis, word = images_of(source, axis, "frames")
-    try:
-        every = quantities.count("every", every)
-    except SceneError:
-        raise ShapeError(
-            f"frames: expected every to be a whole number of at least 1, got {quantities.shown(every)}."
-        ) from None
+    every = quantities.count("frames: every", every, 1, ShapeError)
     bins, (height, width) = cube.shape[1], cube.shape[2:]
     count = -(-bins // every)
-    if exposure is None:
+    if exposure is not None:
+        exposure = checked_positive("exposure", exposure, "frames")
+    else:
         exposure = exposure_of(cube.sum(1)) if accumulate else exposure_of_video(_added(cube, every))
     factor = max(1, round(_VISIBLE / max(height, width))) if scale is None else scale
+    factor = quantities.count("frames: scale", factor, 1, ShapeError)
     running = _Running(cube) if accumulate else None
 
     def make(index: int) -> Image:
@@ -124,6 +125,7 @@ def side_by_side(parts: Sequence[Frames], gap: int = 4) -> Frames:
     """
     if not parts:
         raise ShapeError("side_by_side: expected at least one sequence of frames, got none.")
+    between = quantities.count("side_by_side: gap", gap, 0, ShapeError)
 
     def make(index: int) -> Image:
         images = [part[index] for part in parts]
@@ -131,7 +133,7 @@ def side_by_side(parts: Sequence[Frames], gap: int = 4) -> Frames:
         row = []
         for image in images:
             row += [np.pad(image, ((0, height - image.shape[0]), (0, 0), (0, 0)))]
-            row += [np.full((height, gap, 3), 255, np.uint8)]
+            row += [np.full((height, between, 3), 255, np.uint8)]
         return np.concatenate(row[:-1], axis=1)
 
     return Frames(min(len(part) for part in parts), make)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from torchtransient import quantities
 from torchtransient.errors import MissingPackageError, ShapeError, StorageError, UnitError
 from torchtransient.quantities import positive, shown
 from torchtransient.vis.files import Image
@@ -58,16 +59,17 @@ def write_video(
         fps = positive("fps", fps)
     except UnitError:
         raise UnitError(f"video: expected fps > 0, got {shown(fps)}.") from None
-    if count < 1:
+    many = quantities.count("video: count", count, 0, ShapeError)
+    if not many:
         raise ShapeError("video: expected at least one frame, got none.")
     try:
         if target.suffix.lower() == ".mp4":
-            _write_mp4(target, _followed(frames, count, progress), fps)
+            _write_mp4(target, _followed(frames, many, progress), fps)
         else:
             if fps > 50:
                 raise UnitError(f"video: a GIF shows at most 50 frames a second, got fps={fps!r}. Write an .mp4.")
-            palette = _palette(frames, count)
-            _write_gif(target, _followed(frames, count, progress), palette, fps)
+            palette = _palette(frames, many)
+            _write_gif(target, _followed(frames, many, progress), palette, fps)
     except OSError as error:
         with suppress(OSError):
             target.unlink(missing_ok=True)

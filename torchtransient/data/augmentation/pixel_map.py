@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.quantities import count, real_array, shown
+from torchtransient.quantities import as_number, count, real_array, shown
 
 Matrix = NDArray[np.float64]
 _SIGNED = {torch.uint16: torch.int16, torch.uint32: torch.int32, torch.uint64: torch.int64}
@@ -150,6 +150,9 @@ class PixelMap:
         Raises UnitError for a type that cannot hold ``fill``, NaN in whole numbers or -1 in unsigned ones; exact maps
         without a rim take every type.
         """
+        if (number := as_number(fill)) is None:
+            raise UnitError(f"PixelMap.nearest: expected fill as one number, got {shown(fill)}.")
+        fill = number
         rows, columns, inside = (one.to(image.device) for one in self._sources)
         # Bits are moved, no numbers: torch 2.6 has no index for these unsigned types.
         signed = _SIGNED.get(image.dtype)

@@ -29,7 +29,7 @@ from torchtransient.data.generation.settings import (
 from torchtransient.data.recipes.plugin_modules import plugins_here
 from torchtransient.data.storage.file_names import RECIPE_FILE, SHARD_FILES, shard_file_name
 from torchtransient.errors import ArgumentError, SceneError, StorageError, TorchTransientError, UnitError
-from torchtransient.quantities import count, shown
+from torchtransient.quantities import as_number, count, shown
 
 ENGINES = ("local", "ray")
 # Samples that are tried until one tells how large all are.
@@ -289,8 +289,8 @@ def _whole_pair(shard: Any) -> tuple[int, int]:
 def _check_limits(timeout_s: Any, max_outside: Any) -> None:
     limits: tuple[tuple[str, Any, float], ...] = (("timeout_s", timeout_s, math.inf), ("max_outside", max_outside, 1.0))
     for name, value, most in limits:
-        number = isinstance(value, int | float) and not isinstance(value, bool)
-        if value is not None and not (number and 0 <= value <= most and (value > 0 or name == "max_outside")):
+        number = as_number(value)
+        if value is not None and (number is None or not 0 <= number <= most or (name == "timeout_s" and number == 0)):
             wanted = "in [0, 1]" if name == "max_outside" else "above 0"
             raise UnitError(f"{_WHAT}: expected {name} to be a number {wanted}, or None, got {shown(value)}.")
 

@@ -47,7 +47,7 @@ def sample_number(what: str, number: Any, size: int) -> int:
 
 def checked_seed(what: str, seed: Any) -> int | None:
     """A seed from zero on, or None. Raises UnitError."""
-    return None if seed is None else count(f"{what}: seed", seed, 0, UnitError)
+    return None if seed is None else count(f"{what}: seed", seed, 0, UnitError, None)
 
 
 def sample_generator(what: str, seed: int | None, number: int, epoch: Any = None, *more: int) -> torch.Generator | None:

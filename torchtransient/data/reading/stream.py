@@ -41,7 +41,7 @@ class TransientStream(IterableDataset[dict[str, Any]]):
     ) -> None:  # fmt: skip
         self.dataset = TransientDataset(where, **reading, seed=noise_seed)
         self.shuffle, self.even = flag(f"{WHAT}: shuffle", shuffle), flag(f"{WHAT}: even", even)
-        self.seed, self.buffer = count(f"{WHAT}: seed", seed, 0), count(f"{WHAT}: buffer", buffer)
+        self.seed, self.buffer = count(f"{WHAT}: seed", seed, 0, most=None), count(f"{WHAT}: buffer", buffer)
         if (rank is None) != (world_size is None):
             raise ArgumentError(f"{WHAT}: expected rank and world_size both or neither, got {rank} and {world_size}.")
         self._rank = None if rank is None or world_size is None else _checked_rank(rank, world_size)
@@ -99,7 +99,7 @@ class TransientStream(IterableDataset[dict[str, Any]]):
 
     def order(self, epoch: int) -> NDArray[np.int64]:
         """(n,) int64: the numbers of the samples that this process, or worker of a DataLoader, reads in an epoch."""
-        return self._order(epoch, *_worker())
+        return self._order(count(f"{WHAT}: epoch", epoch, 0), *_worker())
 
     def _order(self, epoch: int, part: int, parts: int) -> NDArray[np.int64]:
         rank, ranks = self._ranks()

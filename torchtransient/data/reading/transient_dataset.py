@@ -23,8 +23,8 @@ from torchtransient.data.reading.sample_draws import (
 from torchtransient.data.reading.shard_table import WHAT, ShardTable
 from torchtransient.data.storage.encodings import measured_names
 from torchtransient.data.storage.shard_file import Shard
-from torchtransient.errors import ArgumentError, StorageError
-from torchtransient.quantities import shown
+from torchtransient.errors import ArgumentError, StorageError, UnitError
+from torchtransient.quantities import count, shown
 
 _MEASURED = "measurement"
 _VALUES, _INDEX, _TRANSIENT = "values", "index", "transient"
@@ -109,6 +109,7 @@ class TransientDataset(Epochs, Dataset[dict[str, Any]]):
     def sample(self, number: int, epoch: int | None = None) -> dict[str, Any]:
         """A sample; ``epoch`` tells the noise of ``seed`` of one epoch from that of another; None is 0."""
         number = sample_number(WHAT, number, len(self._table))
+        epoch = 0 if epoch is None else count(f"{WHAT}: epoch", epoch, 0, UnitError)
         place, row = int(self._table.shard[number]), int(self._table.row[number])
         shard = self._table.open(place)
         found: dict[str, Any] = {name: self._read(shard, name, row) for name in self._fields if name != _VALUES}
@@ -117,7 +118,7 @@ class TransientDataset(Epochs, Dataset[dict[str, Any]]):
             given = found[_TRANSIENT] if _TRANSIENT in found else self._read(shard, _TRANSIENT, row)
             # Samples of several folders may have one number in their recipes.
             repeat = int(self._table.repeat[number])
-            generator = sample_generator(WHAT, self.seed, index, epoch or 0, repeat)
+            generator = sample_generator(WHAT, self.seed, index, epoch, repeat)
             found[_MEASURED] = transformed(self.transform, given, generator)
         if _VALUES in self._fields:
             values = shard.values(row)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torchtransient.data.recipes.distribution import ANYTHING, NUMBERS, POSE, Distribution, Place, bounds, spread
 from torchtransient.data.recipes.streams import Draw
 from torchtransient.errors import SceneError, ShapeError, UnitError
-from torchtransient.quantities import Numbers, as_number, flag, positive, real_array, shown, transform
+from torchtransient.quantities import Numbers, as_number, flag, index, positive, real_array, shown, transform
 
 # A truncated normal distribution keeps at least this share of the untruncated one: beyond, digits of it are lost.
 _LEAST_MASS = 1e-9
@@ -205,6 +205,7 @@ class Choice(Distribution):
 
     def share(self, number: int) -> float:
         """A number in [0, 1) that draws the value of that ``number``; any, for one of weight zero."""
+        number = index("Choice.share: number", number, len(self.values))
         weights = np.ones(len(self.values)) if self.weights is None else np.asarray(self.weights, dtype=np.float64)
         return float((weights[:number].sum() + weights[number] / 2) / weights.sum())
 

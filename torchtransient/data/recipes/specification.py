@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import operator
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -107,7 +106,7 @@ class Specification:
             frequencies = FrequencyAxis(tuple(numbers.tolist()))
         if gates is not None and (isinstance(gates, Gate) or not all(isinstance(g, Gate) for g in _listed(gates))):
             raise ArgumentError(f"recipe: gates: expected a list of tt.Gate, got {shown(gates)}.")
-        self.seed = count("recipe: seed", seed, 0)
+        self.seed = count("recipe: seed", seed, 0, most=None)
         self.n = None if n is None else count("recipe: n", n)
         self.variant = resolve_variant(variant)
         self.settings = Settings(
@@ -115,8 +114,8 @@ class Specification:
             gates=None if gates is None else tuple(gates), temporal_filter=temporal_filter,
             spp=None if spp is None else count("recipe: spp", spp),
             max_depth=None if max_depth is None else count("recipe: max_depth", max_depth, -1),
-            sensors=_counts("sensors", sensors, 0), pulse=pulse, irf=irf, bounces=_counts("bounces", bounces),
-            energy=energy, physics=physics,
+            sensors=_counts("sensors", sensors, 0, "all"), bounces=_counts("bounces", bounces, 1, "all"),
+            pulse=pulse, irf=irf, energy=energy, physics=physics,
         )  # fmt: skip
         self.scan = scan
         self.device = _device(device)
@@ -193,13 +192,15 @@ def _names(what: str, given: Any) -> tuple[str, ...]:
     return found
 
 
-def _counts(what: str, given: Any, least: int = 1) -> Any:
-    """A number, a text, or a tuple of numbers."""
-    if isinstance(given, str):
+def _counts(what: str, given: Any, least: int, text: str) -> Any:
+    """A number, a text, or a tuple of one or more numbers."""
+    if isinstance(given, str) and given == text:
         return given
-    if not isinstance(given, Sequence | np.ndarray):
-        return count(f"recipe: {what}", given, least)
-    return tuple(count(f"recipe: {what}", one, least) for one in given)
+    several = (isinstance(given, Sequence) and not isinstance(given, (str, bytes))) or getattr(given, "ndim", 0)
+    whole = tuple(count(f"recipe: {what}", one, least) for one in (given if several else [given]))
+    if not whole:
+        raise SceneError(f"recipe: {what}: expected one or more whole numbers, or {text!r}, got {shown(given)}.")
+    return whole if several else whole[0]
 
 
 def _device(given: Any) -> Device | None:
@@ -236,11 +237,5 @@ def label_of(distribution: Distribution, value: Any) -> str:
 
 def samples_of(indices: Iterable[int]) -> list[int]:
     """Numbers of samples, checked. Raises ShapeError."""
-    try:
-        found = [operator.index(index) for index in indices]
-    except TypeError as error:
-        raise ShapeError(f"recipe: expected whole numbers of samples: {error}.") from None
-    if any(index < 0 for index in found):
-        raise ShapeError(f"recipe: expected sample numbers of at least 0, got {min(found)}.")
-    return found
+    return [count("recipe: number of a sample", index, 0, ShapeError) for index in indices]
 
