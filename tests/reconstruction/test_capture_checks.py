@@ -1,4 +1,4 @@
-"""What operators ask of numbers, choices, captures and states: the last value that is taken and the first that is not."""
+"""What operators ask of numbers, choices, captures and states: the last value that is taken, the first that is not."""
 
 import math
 from dataclasses import replace
@@ -34,7 +34,9 @@ def test_choices_are_texts_or_whole_numbers():
             capture_checks.one_of("taps", value, (1, 2, 4))
 
 
-@pytest.mark.parametrize("points", [torch.zeros(3), torch.zeros(0, 3), torch.zeros(5, 2), torch.zeros(3, 4), [[0, 0, 1]]])
+@pytest.mark.parametrize(
+    "points", [torch.zeros(3), torch.zeros(0, 3), torch.zeros(5, 2), torch.zeros(3, 4), [[0, 0, 1]]]
+)
 def test_points_that_are_none(points):
     with pytest.raises(ShapeError, match=r"Method: expected a VoxelGrid or points \(\.\.\., 3\)"):
         capture_checks.checked_points(points, "Method")
@@ -70,7 +72,8 @@ def test_time_axes_may_begin_a_millionth_of_a_bin_early():
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_axes_are_the_same_to_a_millionth_of_a_bin(sign):
     def taken(axis):
-        return capture_checks.checked_intensities(Capture(torch.ones(1, axis.num_bins, 6, 5), axis, SCAN), AXIS, "Method")
+        capture = Capture(torch.ones(1, axis.num_bins, 6, 5), axis, SCAN)
+        return capture_checks.checked_intensities(capture, AXIS, "Method")
 
     step = sign * 1e-6 * 0.25
     # The start alone, the width alone: eight bins end eight steps later.
@@ -146,7 +149,8 @@ def says(mine, theirs, words):
 @pytest.mark.parametrize("mine, theirs, words", [
     ({"floor": 2.0}, {"floor": 2.0 * (1 + 0.9e-6)}, None), ({"floor": 2.0}, {"floor": 2.0 * (1 + 1.1e-6)}, "floor"),
     ({"floor": 0.0}, {"floor": 0.9e-9}, None), ({"floor": 0.0}, {"floor": 1.1e-9}, "floor"),
-    ({"floor": 1}, {"floor": 1.0}, None), ({"floor": True}, {"floor": 1}, None), ({"floor": True}, {"floor": 0}, "floor"),
+    ({"floor": 1}, {"floor": 1.0}, None), ({"floor": True}, {"floor": 1}, None),
+    ({"floor": True}, {"floor": 0}, "floor"),
     ({"floor": 0}, {"floor": False}, None), ({"floor": 1e-10}, {"floor": False}, "floor"),
     ({"floor": "a"}, {"floor": "b"}, "floor"), ({"floor": None}, {"floor": 0.0}, "floor"),
     ({"axis": [1.0, 2.0]}, {"axis": [1.0, 2.0]}, None), ({"axis": [1.0, 2.0]}, {"axis": [1.0, 3.0]}, "axis"),

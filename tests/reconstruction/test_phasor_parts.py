@@ -44,7 +44,9 @@ def lengths_by_all_pairs(operator):
     return (low, high), record
 
 
-CAMERAS = {"still": None, "confocal camera": ConfocalCamera([-0.2, 0.7, 0.1]), "transient camera": TransientCamera([0.3, 0.9])}
+CAMERAS = {
+    "still": None, "confocal camera": ConfocalCamera([-0.2, 0.7, 0.1]), "transient camera": TransientCamera([0.3, 0.9])
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", SCANS)
@@ -109,7 +111,7 @@ def test_planes_have_the_pitch_of_the_wall_to_a_thousandth_over_their_width(dim,
         if taken:
             PhasorField(scan, other, time_axis=AXIS, pulse=PULSE)
             continue
-        with pytest.raises(ShapeError, match="with its pitch of 0.066667 x 0.06 m"):
+        with pytest.raises(ShapeError, match=r"with its pitch of 0\.066667 x 0\.06 m"):
             PhasorField(scan, other, time_axis=AXIS, pulse=PULSE)
 
 

@@ -1,4 +1,4 @@
-"""Scans and points that carry gradients: operators take them as they are, and nothing of them is lost without a word."""
+"""Scans and points that carry gradients: operators take them as they are, and lose nothing without a word."""
 
 from dataclasses import replace
 
@@ -85,7 +85,7 @@ def test_operators_take_them_as_they_are(name):
         state = operator.state_dict()
         picture = operator.reconstruct(Capture(data, operator.axis, given))
     assert torch.equal(found, expected.adjoint(data)) and not found.requires_grad and not picture.requires_grad
-    parts = [part for part in operator.modules()]
+    parts = list(operator.modules())
     assert not any(table.requires_grad for part in parts for table in (*part.buffers(), *tensors_of(part)))
     assert not operator.points.requires_grad
     expected.load_state_dict(state)

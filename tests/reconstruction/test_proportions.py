@@ -11,8 +11,8 @@ from torchtransient.errors import UnitError
 from torchtransient.reconstruction import PlanarScan, VoxelGrid, proportions
 
 F64 = torch.float64
-UP, NORTH = {"sensor_origin": (0.0, 4.0, 0.0), "laser_origin": (3.0, 4.0, 12.0)}, {"sensor_origin": (0.0, 0.0, 2.0),
-                                                                                  "laser_origin": (0.0, 0.0, 3.0)}  # fmt: skip
+UP = {"sensor_origin": (0.0, 4.0, 0.0), "laser_origin": (3.0, 4.0, 12.0)}
+NORTH = {"sensor_origin": (0.0, 0.0, 2.0), "laser_origin": (0.0, 0.0, 3.0)}
 # Five metres wide with its spot, three without; legs of 12 + 4 and of 12 + 5 m.
 PAIR = Scan.points([[0, 0, 0], [3, 0, 0]], kind="single", laser_points=[3, 4, 0], **UP)
 LEGS = replace(PAIR, first_and_last_leg=True)
@@ -148,7 +148,7 @@ def test_waves_of_a_record_or_ten_walls(scan, axis, longest):
 @pytest.mark.parametrize("scan", [PAIR, GRID], ids=["scan", "grid"])
 def test_slabs_twice_as_thick_as_the_scan_is_wide(scan):
     proportions.check_thickness(10.0, scan, "test")
-    with pytest.raises(UnitError, match="scan is wide, 5 m, got 10.25 m"):
+    with pytest.raises(UnitError, match=r"scan is wide, 5 m, got 10\.25 m"):
         proportions.check_thickness(10.25, scan, "test")
 
 

@@ -205,7 +205,8 @@ def test_vectors_of_other_shapes(name):
 
 def test_lists_of_points_have_no_number_of_voxels_and_no_cells():
     points = SCAN.sensor_points.reshape(-1, 3)
-    listed = Scan.points(points, kind="confocal", sensor_origin=(1.6, 2.0, 3.8), laser_origin=(1.6, 2.0, 3.8), wall=WALL)
+    origins = {"sensor_origin": (1.6, 2.0, 3.8), "laser_origin": (1.6, 2.0, 3.8)}
+    listed = Scan.points(points, kind="confocal", wall=WALL, **origins)
     with pytest.raises(ShapeError, match=r"expected size= for a list of points, got None"):
         VoxelGrid.before(listed, [0.5], extent=0.4)
     # From the first to the last point, six and four of them 0.2 m apart.
