@@ -90,7 +90,9 @@ def test_waves_have_sixteen_samples(shape, per_bin):
     assert LaplacianFilter().samples(0.25) == 1
 
 
-@pytest.mark.parametrize("bins, samples, places", [(5, 1, (0, 5)), (5, 2, (-1, 10)), (5, 3, (-1, 14)), (2, 8, (-4, 13))])
+@pytest.mark.parametrize(
+    "bins, samples, places", [(5, 1, (0, 5)), (5, 2, (-1, 10)), (5, 3, (-1, 14)), (2, 8, (-4, 13))]
+)
 def test_samples_reach_from_end_to_end(bins, samples, places):
     assert sample_places(bins, samples) == places
 

@@ -9,7 +9,7 @@ import torch
 from support.scan_operators import AXIS, DEPTHS, PULSE, SCANS, WALL
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Scan
-from torchtransient.errors import ShapeError
+from torchtransient.errors import ShapeError, UnitError
 from torchtransient.reconstruction import (
     ConfocalCamera,
     PhasorField,
@@ -146,3 +146,13 @@ def test_without_normals_planes_are_on_either_side():
     for depths in ([-0.1, 0.1], [0.0, 0.1], [-0.1, 0.0]):
         with pytest.raises(ShapeError, match="planes before the wall"):
             PhasorField(scan, grid.at_depths(depths), time_axis=AXIS, pulse=PULSE)
+
+
+@pytest.mark.parametrize("camera", [ConfocalCamera, TransientCamera])
+def test_times_of_cameras_are_a_list_of_finite_numbers(camera):
+    assert camera([0.1, 0.2]).times.tolist() == [0.1, 0.2] and camera(torch.tensor([1, 2])).times.dtype == F64
+    for times in ([], [[0.1]], 0.1, None, "now"):
+        with pytest.raises(ShapeError, match=rf"{camera.__name__}: expected times \(N,\)"):
+            camera(times)
+    with pytest.raises(UnitError, match=rf"{camera.__name__}: expected finite times"):
+        camera([0.1, math.nan])
