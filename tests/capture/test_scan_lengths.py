@@ -44,7 +44,7 @@ def test_points_with_gradients_have_lengths(kind):
         with pytest.raises(SceneError, match="behind them by up to"):
             replace(given, sensor_origin=given.sensor_origin - 3 * torch.tensor([0.6, 0.0, 0.8], dtype=F64))
         side = hidden_side(given)
-        assert content_key(given.sensor_points, given.laser_origin) == content_key(scan.sensor_points, scan.laser_origin)
+        assert content_key(given.sensor_points) == content_key(scan.sensor_points)
     assert side == pytest.approx([0.6, 0.0, 0.8])
     plain = given.detach()
     assert plain == scan and not any(getattr(plain, name).requires_grad for name in TENSORS)
@@ -91,7 +91,7 @@ def test_grids_are_regular_to_a_millionth_of_their_extent(axis):
         if taken:
             assert lined(moved).spacing == (2.0, 1.5)
             continue
-        with pytest.raises(ShapeError, match="regular grid, got points up to 9.4e-06 m off it"):
+        with pytest.raises(ShapeError, match=r"regular grid, got points up to 9\.4e-06 m off it"):
             _ = lined(moved).spacing
     for shape in ((1, 5), (3, 1)):
         with pytest.raises(ShapeError, match="at least 2 x 2"):
@@ -183,7 +183,7 @@ def test_normals_of_length_one_keep_their_digits():
 
 
 @pytest.mark.parametrize(("make", "error", "words"), [
-    (lambda: Scan.grid(WALL, 2, kind="single", laser="middle"), ShapeError, r"expected \(u, v\) on the wall or a point"),
+    (lambda: Scan.grid(WALL, 2, kind="single", laser="middle"), ShapeError, r"expected \(u, v\) on the wall or"),
     (lambda: Scan.grid(WALL, 2, kind="single", laser=(0.1, 0.2, 0.3, 0.4)), ShapeError, "expected .u, v. on the wall"),
     (lambda: lined([[0, 0, 0]], sensor_origin=[[0, 0, 4.0]]), ShapeError, r"sensor_origin \(3,\), got \(1, 3\)"),
     (lambda: lined([[0, 0, 0]], laser_origin=[[0, 0, 4.0]]), ShapeError, r"laser_origin \(3,\), got \(1, 3\)"),
