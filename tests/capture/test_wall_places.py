@@ -191,7 +191,7 @@ def test_grids_run_along_their_own_sides():
     np.testing.assert_allclose(alone[..., 0], [[0], [0]], atol=1e-12)
 
 
-# ---------------------------------------------------------------------------------------------------- rays and triangles
+# ------------------------------------------------------------------------------------------------- rays and triangles
 
 
 def test_normals_of_triangles_are_of_length_one_or_zero():
