@@ -283,7 +283,7 @@ def test_structures_of_old_files(tmp_path):
         found.array("m/one/more")
     for variable, words in (
         (matrix(2, fields(b"one", length=0), NUMBER), "names of a letter or more, got 0"),
-        (matrix(2, fields(b"one"), element(9, struct.pack("<d", 2.5))), "array in a structure, got an element of type 9"),
+        (matrix(2, fields(b"one"), element(9, struct.pack("<d", 2.5))), "in a structure, got an element of type 9"),
         (matrix(6, element(9, struct.pack("<dd", 1, 2))), r"expected 1 numbers \(1, 1\), got 2"),
         (matrix(6, element(1, b"abc"), shape=(1, 4)), r"expected 4 numbers \(4, 1\), got 3"),
         (matrix(6, element(14, b"abc")), "expected numbers, got an element of type 14"),
