@@ -93,6 +93,13 @@ def test_grids_are_regular_to_a_millionth_of_their_extent(axis):
             continue
         with pytest.raises(ShapeError, match=r"regular grid, got points up to 9\.4e-06 m off it"):
             _ = lined(moved).spacing
+    # Off by a length in space, whichever other points are.
+    some, far = points.clone(), points.clone()
+    some[1, 1:4, axis] += 0.8e-6 * math.hypot(8.0, 3.0)
+    far[1, 2] += 0.8e-6 * math.hypot(8.0, 3.0)
+    assert lined(some).spacing == (2.0, 1.5)
+    with pytest.raises(ShapeError, match="regular grid"):
+        _ = lined(far).spacing
     for shape in ((1, 5), (3, 1)):
         with pytest.raises(ShapeError, match="at least 2 x 2"):
             _ = lined(points[: shape[0], : shape[1]]).spacing

@@ -68,6 +68,17 @@ def test_points_may_be_a_thousandth_of_the_smaller_pitch_off(axis, place, pitche
             of(points)
 
 
+def test_points_are_off_by_a_length_in_space():
+    some, far = points_of(4, 5), points_of(4, 5)
+    some[1, 1:4] += 0.8e-3 * 0.25 * TURN[:, 1]
+    assert of(some).size == (4, 5)
+    far[1, 2] += 0.8e-3 * 0.25 * (TURN[:, 0] + TURN[:, 1])
+    with pytest.raises(ShapeError, match=r"0\.0002828 m off it|0\.000283 m off it"):
+        of(far)
+    wall = of(points_of())
+    assert not wall.matches(of(points_of() + 0.8e-3 * 0.25 * (TURN[:, 0] + TURN[:, 1])))
+
+
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_rows_and_columns_may_lean_by_a_thousandth(sign):
     wall = of(points_of(lean=0.9e-3 * sign))
