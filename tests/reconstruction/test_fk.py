@@ -10,7 +10,7 @@ from support.marks import long
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.reconstruction import FK, PlanarScan, fk
+from torchtransient.reconstruction import FK, PlanarScan, confocal_operator, fk
 
 F64 = torch.float64
 BINS, SIDE, WIDTH = 128, 16, 0.04
@@ -191,3 +191,19 @@ def test_gradients_of_a_batch_by_torch_func():
     assert float(tangent) == pytest.approx(float((together[0] * light[1]).sum()), rel=1e-9)
     curved = torch.func.jvp(torch.func.grad(objective), (light[0],), (light[1],))[1]
     assert torch.isfinite(curved).all()
+
+
+def test_rows_of_a_piece_fill_it(monkeypatch):
+    monkeypatch.setattr(confocal_operator, "CPU_CHUNK", 100)
+    monkeypatch.setattr(confocal_operator, "GPU_CHUNK", 1000)
+    for device, rows in (("cpu", (100, 100, 14, 1, 1)), ("meta", (1000, 1000, 142, 1, 4))):
+        found = [confocal_operator.chunk_rows(n, torch.device(device)) for n in (0, 1, 7, 2000, 250)]
+        assert tuple(found) == rows
+
+
+def test_voxels_stand_at_half_the_middle_of_each_bin():
+    operator = FK(SCAN, time_axis=TimeAxis(0.5, 0.25, 4))
+    assert operator.depths.tolist() == [0.3125, 0.4375, 0.5625, 0.6875]
+    assert operator.data_shape == operator.volume_shape == (4, SIDE, SIDE)
+    with pytest.raises(ShapeError, match="4 bins at least, got 3"):
+        FK(SCAN, time_axis=TimeAxis(0.5, 0.25, 3))

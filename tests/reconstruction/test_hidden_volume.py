@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch.utils import _pytree
 from torch.utils.data import DataLoader
 
 import torchtransient as tt
-from torchtransient.errors import ShapeError
+from torchtransient.errors import ArgumentError, ShapeError, StorageError, UnitError
 
 N = tt.nlos
 SCAN = N.Scan.grid(N.Wall.plane(1.0, 1.0), (4, 3), kind="confocal")
@@ -97,3 +99,57 @@ def test_the_same_after_a_file(tmp_path, kind, ending):
     assert back == one and back.metadata == one.metadata
     assert "HiddenVolume(values=float32" in repr(one) and "method=fk" in repr(one)
     assert "<table>" in one._repr_html_()
+
+
+def test_pictures_are_sums_over_channels_and_the_highest_of_a_film():
+    sizes = (2, 4, 3)
+    values = torch.rand(5, 3, *sizes, generator=torch.Generator().manual_seed(0))
+    grid = replace(GRID.at_depths([0.3, 0.4]), size=sizes[1:])
+    torch.testing.assert_close(N.HiddenVolume(values, grid, "fk").picture(), values[0].sum(0))
+    torch.testing.assert_close(N.HiddenVolume(values[1], grid, "fk").picture(), values[1].sum(0))
+    times = torch.tensor([0.1, 0.2, 0.3, 0.5])
+    film = torch.rand(5, 3, 4, *sizes, generator=torch.Generator().manual_seed(1))
+    # One channel, three channels, a batch: the highest value of all times at each voxel.
+    for one, expected in ((film, film[0].sum(0).amax(0)), (film[2], film[2].sum(0).amax(0)),
+                          (film[2, 1:2], film[2, 1].amax(0))):  # fmt: skip
+        found = N.HiddenVolume(one, grid, "phasor_field", times=times).picture()
+        assert found.shape == sizes
+        torch.testing.assert_close(found, expected)
+    assert "times=4 of them" in repr(N.HiddenVolume(film, grid, "phasor_field", times=times))
+
+
+@pytest.mark.parametrize("change, error, words", [
+    ({"grid": None}, ArgumentError, "expected grid as a VoxelGrid, got None"),
+    ({"method": 3}, ArgumentError, "expected method as a name, got 3"),
+    ({"method": "f\0k"}, ArgumentError, "expected method as a name"),
+    ({"values": torch.ones(2, 3, 4)}, ShapeError, r"expected values \(\.\.\., C, 2, 3, 4\) .* got \(2, 3, 4\)"),
+    ({"values": torch.ones(1, 2, 4, 3)}, ShapeError, "expected values"),
+    ({"values": torch.ones(1, 3, 3, 4)}, ShapeError, "expected values"),
+    ({"values": torch.ones(0, 2, 3, 4)}, ShapeError, "expected values"),
+    ({"values": torch.ones(1, 2, 3, 4, dtype=torch.bool)}, ShapeError, "torch.bool"),
+    ({"values": torch.ones(1, 2, 3, 4, dtype=torch.complex64)}, ShapeError, "torch.complex64"),
+    ({"values": [1.0]}, ShapeError, r"expected values .* got \[1"),
+    ({"times": [0.1, 0.2]}, ShapeError, r"expected times as a tensor \(N,\) .* got \[0\.1, 0\.2\]"),
+    ({"times": torch.ones(1, 2)}, ShapeError, r"expected times .* got \(1, 2\) torch.float32"),
+    ({"times": torch.ones(2, dtype=torch.complex64)}, ShapeError, "expected times"),
+    ({"times": torch.tensor([0.1, float("inf")])}, UnitError, "expected finite times"),
+    ({"times": torch.ones(2)}, ShapeError, r"expected values \(\.\.\., C, 2, 2, 3, 4\)"),
+    ({"directions": torch.ones(1, 2, 2, 3, 4)}, ShapeError, r"expected directions \(\.\.\., C, 3, 2, 3, 4\)"),
+    ({"directions": torch.ones(2, 3, 2, 3, 4)}, ShapeError, r"expected directions \(1, 3, 2, 3, 4\), one for each"),
+    ({"directions": torch.ones(1, 1, 3, 2, 3, 4)}, ShapeError, "one for each of the values"),
+    ({"directions": torch.ones(1, 3, 2, 3, 4).bool()}, ShapeError, "expected directions"),
+    ({"metadata": {"a": object()}}, StorageError, "HiddenVolume"),
+])  # fmt: skip
+def test_parts_that_do_not_belong_together(change, error, words):
+    parts = {"values": torch.ones(1, 2, 3, 4), "grid": replace(GRID.at_depths([0.3, 0.4]), size=(3, 4)), "method": "fk"}
+    N.HiddenVolume(**parts)
+    with pytest.raises(error, match=words):
+        N.HiddenVolume(**{**parts, **change})
+
+
+def test_films_have_one_direction_for_all_of_their_times():
+    grid = replace(GRID.at_depths([0.3, 0.4]), size=(3, 4))
+    film, vectors = torch.ones(2, 5, 2, 3, 4), torch.ones(2, 3, 2, 3, 4)
+    N.HiddenVolume(film, grid, "fk", times=torch.arange(5), directions=vectors)
+    with pytest.raises(ShapeError, match=r"expected directions \(2, 3, 2, 3, 4\)"):
+        N.HiddenVolume(film, grid, "fk", times=torch.arange(5), directions=vectors[:1])

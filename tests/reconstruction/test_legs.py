@@ -72,3 +72,81 @@ def test_what_it_cannot_take_is_refused():
         subtract_legs(both)
     with pytest.raises(ShapeError, match=r"tt\.nlos\.Capture"):
         subtract_legs(None)
+
+
+def of_legs(spots, sensors, axis, light):
+    """A single or exhaustive capture on a line whose points have legs of as many metres; one channel."""
+    kind = "exhaustive" if len(spots) > 1 else "single"
+    lasers = torch.tensor([[0.0, 0.0, float(s)] for s in spots], dtype=torch.float64)
+    points = torch.tensor([[0.0, float(s), 0.0] for s in sensors], dtype=torch.float64)
+    scan = Scan.points(
+        points, kind=kind, laser_points=lasers if kind == "exhaustive" else lasers[0], sensor_origin=(0, 0, 0),
+        laser_origin=(0, 0, 0), first_and_last_leg=True,
+    )  # fmt: skip
+    return Capture(light.reshape(1, axis.num_bins, *scan.shape), axis, scan)
+
+
+@pytest.mark.parametrize("start, first, kept", [
+    # Bins of half a metre, the shortest legs of a metre: a record from a metre on loses nothing, one from zero on two
+    # bins; one from 0.75 m on its first bin, which began before time zero.
+    (1.0, 0.0, 8), (0.0, 0.0, 6), (2.5, 1.5, 8), (0.75, 0.25, 7), (0.5, 0.0, 7), (1.25, 0.25, 8),
+])  # fmt: skip
+def test_legs_of_whole_bins_move_histograms_by_bins(start, first, kept):
+    axis = TimeAxis(start, 0.5, 8)
+    light = torch.arange(1.0, 17.0, dtype=torch.float64).reshape(8, 2) ** 2
+    # Legs of 1 m and 1.5 m.
+    found = subtract_legs(of_legs([0.75], [0.25, 0.75], axis, light))
+    assert found.axis == TimeAxis(first, 0.5, kept)
+    expected = torch.zeros(kept, 2, dtype=torch.float64)
+    expected[:, 0] = light[8 - kept :, 0]
+    # A bin more: what would come from behind the record is zero.
+    expected[:-1, 1] = light[9 - kept :, 1]
+    assert torch.equal(found.transient[0], expected)
+
+
+def test_legs_of_parts_of_bins_are_read_between_bins():
+    axis = TimeAxis(1.0, 0.5, 4)
+    light = torch.tensor([[4.0, 8.0], [0.0, 12.0], [2.0, 4.0], [6.0, 2.0]], dtype=torch.float64)
+    # 1 m and 1.125 m: a quarter of a bin.
+    found = subtract_legs(of_legs([0.75], [0.25, 0.375], axis, light))
+    assert found.axis == TimeAxis(0.0, 0.5, 4) and found.scan.first_and_last_leg is False
+    assert found.transient[0, :, 0].tolist() == [4.0, 0.0, 2.0, 6.0]
+    assert found.transient[0, :, 1].tolist() == [9.0, 10.0, 3.5, 1.5]
+
+
+def test_legs_of_every_pair_of_an_exhaustive_scan():
+    axis = TimeAxis(1.0, 0.5, 5)
+    light = torch.rand(5, 2, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    found = subtract_legs(of_legs([0.25, 0.75], [0.75, 1.25, 2.25], axis, light)).transient[0]
+    for spot, sensor in ((a, b) for a in range(2) for b in range(3)):
+        later = spot + (0, 1, 3)[sensor]
+        expected = torch.cat([light[later:, spot, sensor], torch.zeros(later, dtype=torch.float64)])
+        torch.testing.assert_close(found[:, spot, sensor], expected, rtol=0, atol=1e-12)
+
+
+def test_a_bin_that_is_left_and_none():
+    light = torch.tensor([[1.0], [2.0], [3.0]], dtype=torch.float64)
+    found = subtract_legs(of_legs([0.75], [0.25], TimeAxis(0.0, 0.5, 3), light))
+    assert found.axis == TimeAxis(0.0, 0.5, 1) and found.transient.flatten().tolist() == [3.0]
+    with pytest.raises(UnitError, match="shortest legs, 1 m, got one up to 1 m"):
+        subtract_legs(of_legs([0.75], [0.25], TimeAxis(0.0, 0.5, 2), light[:2]))
+
+
+@pytest.mark.parametrize("off, first", [(0.9e-6, 0.0), (-0.9e-6, 0.0), (1.1e-6, 0.55e-6), (-1.1e-6, 0.5 - 0.55e-6)])
+def test_zeros_to_a_millionth_of_a_bin_are_zero(off, first):
+    light = torch.ones(8, 1, dtype=torch.float64)
+    found = subtract_legs(of_legs([0.75], [0.25], TimeAxis(1.0 + 0.5 * off, 0.5, 8), light))
+    assert found.axis.start_opl == pytest.approx(first, abs=1e-12)
+    assert (found.axis.start_opl == 0.0) is (first == 0.0) and found.axis.num_bins == (7 if first > 0.1 else 8)
+
+
+def test_batches_and_channels_are_moved_alike():
+    axis = TimeAxis(1.0, 0.5, 6)
+    light = torch.rand(3, 2, 6, 1, 2, dtype=torch.float32, generator=torch.Generator().manual_seed(0))
+    scan = of_legs([0.75], [0.25, 0.375], axis, light[0, 0]).scan
+    found = subtract_legs(Capture(light.reshape(3, 2, 6, 2), axis, scan)).transient
+    assert found.dtype == torch.float32
+    one = subtract_legs(Capture(light[2, 1].reshape(1, 6, 2), axis, scan)).transient[0]
+    torch.testing.assert_close(found[2, 1], one, rtol=0, atol=0)
+    counts = (8 * light).to(torch.int32).reshape(3, 2, 6, 2)
+    assert subtract_legs(Capture(counts, axis, scan)).transient.dtype == torch.float32

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -257,3 +258,127 @@ def test_normals_where_nothing_is_above_zero_are_the_walls(level):
     volume = level + torch.rand(*grid.shape, dtype=F64, generator=torch.Generator().manual_seed(0)) * (level < 0)
     found = normals_from_volume(volume, grid)
     torch.testing.assert_close(found, -grid.normal[:, None, None].expand_as(found))
+
+
+def lumpy(seed=0, size=(6, 5, 7)):
+    """A volume on uneven planes of a grid whose rows and columns are not as far apart."""
+    wall = Wall.plane(0.9, 0.4, center=(1.0, 2.0, 3.0), normal=(0.6, 0.0, 0.8))
+    grid = VoxelGrid.before(Scan.grid(wall, size[:0:-1], kind="confocal"), UNEVEN[: size[0]])
+    return torch.rand(size, dtype=F64, generator=torch.Generator().manual_seed(seed)), grid
+
+
+def test_normals_of_any_volume_are_sums_up_to_the_highest_value():
+    volume, grid = lumpy()
+    volume[:, 2, 3] -= 2.0
+    volume[:, 1, 1] -= volume[:, 1, 1].max().clone()
+    plain, steps = volume.numpy(), np.gradient(grid.depths.numpy())
+    slopes = [
+        np.gradient(plain, grid.pitch[1], axis=2), np.gradient(plain, grid.pitch[0], axis=1),
+        np.gradient(plain, grid.depths.numpy(), axis=0),
+    ]  # fmt: skip
+    axes = torch.stack([grid.along_x, grid.along_y, grid.normal]).numpy()
+    expected = np.zeros((3, *grid.size))
+    for j, i in np.ndindex(*grid.size):
+        last = plain[:, j, i].argmax()
+        sums = [sum(slope[k, j, i] * steps[k] for k in range(last + 1)) for slope in slopes]
+        vector = -np.array(sums) @ axes if plain[:, j, i].max() > 0 else -axes[2]
+        expected[:, j, i] = vector / np.linalg.norm(vector)
+    assert sum(plain.argmax(0).flatten() == 0) > 2
+    torch.testing.assert_close(normals_from_volume(volume, grid), torch.from_numpy(expected), rtol=0, atol=1e-12)
+    depth = 0.6 + 0.1 * volume[0]
+    slopes = np.gradient(depth.numpy(), *grid.pitch)
+    vectors = slopes[1][..., None] * axes[0] + slopes[0][..., None] * axes[1] - axes[2]
+    expected = torch.from_numpy(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)).movedim(-1, 0)
+    torch.testing.assert_close(normals_from_depth(depth, grid), expected, rtol=0, atol=1e-12)
+
+
+def test_two_of_everything_have_normals_and_one_row_has_depths():
+    volume, grid = lumpy(1, (2, 2, 2))
+    assert normals_from_volume(volume, grid).isfinite().all()
+    (dy, dx), depth = grid.pitch, torch.tensor([[0.5, 0.6], [0.8, 0.7]], dtype=F64)
+    expected = (0.1 / dx * grid.along_x + 0.3 / dy * grid.along_y - grid.normal)
+    found = normals_from_depth(depth, grid)[:, 0, 0]
+    torch.testing.assert_close(found, expected / expected.norm(), rtol=0, atol=1e-12)
+    for size in ((1, 3, 3), (3, 1, 3), (3, 3, 1)):
+        _, flat = lumpy(0, (3, 3, 3))
+        flat = VoxelGrid(flat.depths[: size[0]], size[1:], flat.pitch, first=flat.first, along_x=flat.along_x,
+                         along_y=flat.along_y, normal=flat.normal)  # fmt: skip
+        with pytest.raises(ShapeError, match="two planes, rows and columns at least"):
+            normals_from_volume(torch.rand(size), flat)
+        if size[0] == 1:
+            continue
+        # One row has no slope along y.
+        normal = normals_from_depth(torch.linspace(0.3, 0.9, 3, dtype=F64).reshape(size[1:]), flat)
+        across = flat.along_y if size[1] == 1 else flat.along_x
+        assert float((normal * across[:, None, None]).sum(0).abs().max()) < 1e-15
+        assert float((normal * flat.normal[:, None, None]).sum(0).max()) > -0.99
+
+
+def test_depths_of_any_volume_are_tops_of_parabolas():
+    volume, grid = lumpy(2, (8, 5, 7))
+    z, plain = grid.depths.numpy(), volume.numpy()
+    found = depth_map(volume, grid, threshold=0.9)
+    for j, i in np.ndindex(*grid.size):
+        k = int(plain[:, j, i].argmax())
+        expected = z[k]
+        if 0 < k < 7:
+            a, b, _ = np.polyfit(z[k - 1 : k + 2] - z[k], plain[k - 1 : k + 2, j, i], 2)
+            expected = z[k] - b / (2 * a)
+        assert float(found.depth[j, i]) == pytest.approx(expected, abs=1e-12)
+    share = volume.amax(0) / volume.max()
+    torch.testing.assert_close(found.confidence, share, rtol=0, atol=1e-15)
+    assert torch.equal(found.mask, share >= 0.9) and 0 < int(found.mask.sum()) < 35
+
+
+def test_masks_at_the_threshold_and_below_zero():
+    volume = torch.tensor([1.0, 0.25, 0.125, 0.0, -3.0]).reshape(1, 1, 5)
+    found = depth_map(volume, [0.1], threshold=0.25)
+    assert found.mask[0].tolist() == [True, True, False, False, False]
+    assert found.confidence[0].tolist() == [1.0, 0.25, 0.125, 0.0, 0.0]
+    # A threshold of zero takes what is above zero.
+    assert depth_map(volume, [0.1], threshold=0.0).mask[0].tolist() == [True, True, True, False, False]
+
+
+def test_tops_of_the_smallest_numbers_are_within_half_a_step():
+    # Where products are rounded to whole units of 1.4e-45, a top would be half a metre behind its plane.
+    one = torch.tensor(1.4e-45)
+    volume = torch.stack([0 * one, one, one]).reshape(3, 1, 1)
+    assert float(depth_map(volume, [0.0, 1.0, 1.6]).depth) == pytest.approx(1.3, abs=1e-6)
+
+
+def test_soft_depths_are_means_under_their_weights():
+    volume, grid = lumpy(3)
+    volume[:, 0, 1] = -volume[:, 0, 1]
+    z = grid.depths[:, None, None]
+    weights = torch.exp(5.0 * volume / volume.amax(0))
+    expected = (weights * z).sum(0) / weights.sum(0)
+    # Nothing above zero: the mean of all planes.
+    expected[0, 1] = grid.depths.mean()
+    torch.testing.assert_close(soft_depth(volume, grid, sharpness=5.0), expected, rtol=0, atol=1e-13)
+    torch.testing.assert_close(
+        soft_depth(volume, grid), soft_depth(volume, grid.depths, sharpness=20.0), rtol=0, atol=0
+    )
+
+
+def test_volumes_and_depths_that_do_not_fit():
+    grid = grid_of(UNEVEN)
+    for function in (depth_map, soft_depth, normals_from_volume):
+        for shape in ((8, 9, 8), (8, 8, 9), (7, 9, 9), (8, 9)):
+            with pytest.raises(ShapeError, match=r"expected a volume \(\.\.\., 8, 9, 9\), got \("):
+                function(torch.zeros(shape), grid)
+        with pytest.raises(ShapeError, match="got None"):
+            function(None, grid)
+        with pytest.raises(ShapeError, match=r"got torch.int64\. Give volume\.float\(\)"):
+            function(torch.zeros(grid.shape, dtype=torch.int64), grid)
+    for function in (depth_map, soft_depth):
+        assert function(torch.ones(2, 3, 1), [0.1, 0.2]) is not None
+        for shape in ((3, 2), (3, 2, 1), (2, 3)):
+            with pytest.raises(ShapeError, match=r"expected a volume \(\.\.\., 2, Y, X\), got \("):
+                function(torch.ones(shape), [0.1, 0.2])
+    for depth in (torch.zeros(9), torch.zeros(9, 8), None):
+        with pytest.raises(ShapeError, match=r"expected depths \(\.\.\., 9, 9\), got"):
+            normals_from_depth(depth, grid)
+    with pytest.raises(ShapeError, match=r"depths of real numbers, got torch\.int64"):
+        normals_from_depth(torch.zeros(9, 9, dtype=torch.int64), grid)
+    with pytest.raises(ShapeError, match="normals_from_volume: expected a VoxelGrid, which knows its axes"):
+        normals_from_volume(torch.zeros(8, 9, 9), UNEVEN)

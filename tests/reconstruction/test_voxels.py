@@ -155,3 +155,101 @@ def test_numbers_of_other_kinds():
     for name in ("first", "along_x", "normal"):
         with pytest.raises(UnitError, match=f"{name} of finite"):
             replace(grid, **{name: [math.nan, 0.0, 0.0]})
+
+
+def test_voxels_stand_where_their_axes_say():
+    # Along axes of the world in another order, so that nothing can be exchanged.
+    grid = VoxelGrid(
+        [0.25, 1.0, 4.0], (2, 3), (0.5, 2.0), first=[10.0, 20.0, 30.0], along_x=[0, 1, 0], along_y=[0, 0, 1],
+        normal=[1, 0, 0],
+    )  # fmt: skip
+    assert grid.shape == (3, 2, 3) and grid.points.shape == (3, 2, 3, 3) and grid.extent == (6.0, 1.0)
+    for k, j, i in np.ndindex(3, 2, 3):
+        depth = (0.25, 1.0, 4.0)[k]
+        assert grid.points[k, j, i].tolist() == [10.0 + depth, 20.0 + 2.0 * i, 30.0 + 0.5 * j]
+    assert repr(grid) == "VoxelGrid((3, 2, 3), 0.5 x 2 m apart, depths 0.25 to 4 m)"
+
+
+def test_grids_are_equal_when_all_of_them_is():
+    grid = VoxelGrid([0.25, 1.0], (2, 3), (0.5, 2.0), first=[0, 0, 0], along_x=[1, 0, 0], along_y=[0, 1, 0],
+                     normal=[0, 0, 1])  # fmt: skip
+    assert grid == replace(grid) and grid != "grid"
+    for change in (
+        {"depths": [0.25, 1.5]}, {"depths": [0.25]}, {"size": (3, 2)}, {"pitch": (0.5, 1.0)}, {"pitch": (1.0, 2.0)},
+        {"first": [0, 0, 1e-9]}, {"along_x": [-1, 0, 0]}, {"along_y": [0, -1, 0]}, {"normal": [0, 0, -1]},
+        {"along_x": [0, 1, 0], "along_y": [1, 0, 0]},
+    ):  # fmt: skip
+        assert grid != replace(grid, **change)
+
+
+@pytest.mark.parametrize("name", ["along_x", "along_y", "normal"])
+def test_axes_are_of_length_one_at_right_angles_to_a_millionth(name):
+    axes = dict(zip(("along_x", "along_y", "normal"), torch.eye(3, dtype=F64), strict=True))
+    for off, taken in ((0.4e-6, True), (-0.4e-6, True), (2e-5, False), (-2e-5, False)):
+        given = dict(axes)
+        given[name] = given[name] * (1 + off)
+        if taken:
+            VoxelGrid([1.0], (1, 1), (1.0, 1.0), first=[0, 0, 0], **given)
+            continue
+        with pytest.raises(ShapeError, match="length one at right angles"):
+            VoxelGrid([1.0], (1, 1), (1.0, 1.0), first=[0, 0, 0], **given)
+
+
+@pytest.mark.parametrize("name", ["first", "along_x", "along_y", "normal"])
+def test_vectors_of_other_shapes(name):
+    grid = VoxelGrid.before(SCAN, [0.1])
+    for value in ([0.0, 1.0], 1.0, "x", [[0.0, 0.0, 1.0]]):
+        with pytest.raises(ShapeError, match=rf"expected {name} as a vector \(3,\)"):
+            replace(grid, **{name: value})
+
+
+def test_lists_of_points_have_no_number_of_voxels_and_no_cells():
+    points = SCAN.sensor_points.reshape(-1, 3)
+    origins = {"sensor_origin": (1.6, 2.0, 3.8), "laser_origin": (1.6, 2.0, 3.8)}
+    listed = Scan.points(points, kind="confocal", wall=WALL, **origins)
+    with pytest.raises(ShapeError, match=r"expected size= for a list of points, got None"):
+        VoxelGrid.before(listed, [0.5], extent=0.4)
+    # From the first to the last point, six and four of them 0.2 m apart.
+    grid = VoxelGrid.before(listed, [0.5], size=(5, 2))
+    assert grid.extent == pytest.approx((1.0, 0.6)) and grid.pitch == pytest.approx((0.3, 0.2))
+    # With a cell around each where they are a grid.
+    assert VoxelGrid.before(SCAN, [0.5], size=(5, 2)).extent == pytest.approx((1.2, 0.8))
+
+
+def test_one_row_of_points_takes_the_axes_of_its_wall():
+    row = Scan.points(SCAN.sensor_points[:1], kind="confocal", sensor_origin=(1.6, 2.0, 3.8),
+                      laser_origin=(1.6, 2.0, 3.8), wall=WALL)  # fmt: skip
+    grid = VoxelGrid.before(row, [0.5], extent=(1.2, 0.2))
+    expected = SCAN.sensor_points[:1] + 0.5 * NORMAL
+    torch.testing.assert_close(grid.points[0], expected, rtol=0, atol=1e-12)
+    assert VoxelGrid.before(row, [0.5], size=3, extent=(1.2, 0.2)).pitch == pytest.approx((0.2 / 3, 0.4))
+    with pytest.raises(UnitError, match="extent"):
+        VoxelGrid.before(row, [0.5], size=3)
+
+
+def test_planes_of_a_bent_wall_are_parallel_to_its_mean_one():
+    across, up = torch.tensor([0.0, 1.0, 2.0, 4.0], dtype=F64), torch.tensor([-1.0, 0.0, 2.0], dtype=F64)
+    x, y = torch.meshgrid(across, up, indexing="xy")
+    points = torch.stack([x, y, 0.1 * x * y + 0.05 * x], -1)
+    scan = Scan.points(points, kind="confocal", sensor_origin=(0, 0, 9.0), laser_origin=(0, 0, 9.0))
+    across, up = (points[:, -1] - points[:, 0]).mean(0), (points[-1] - points[0]).mean(0)
+    along_x = across / across.norm()
+    along_y = torch.nn.functional.normalize(up - (up @ along_x) * along_x, dim=0)
+    normal = torch.linalg.cross(along_x, along_y)
+    grid = VoxelGrid.before(scan, [0.5, 0.75], size=(5, 4), extent=(2.0, 6.0))
+    for found, expected in ((grid.along_x, along_x), (grid.along_y, along_y), (grid.normal, normal)):
+        torch.testing.assert_close(found, expected, rtol=0, atol=1e-14)
+    # Around the middle between the outermost points, depths from the mean of all.
+    u, v, w = (points.reshape(-1, 3) @ axis for axis in (along_x, along_y, normal))
+    middle = (u.max() + u.min()) / 2 * along_x + (v.max() + v.min()) / 2 * along_y + w.mean() * normal
+    expected = middle + torch.tensor([[0.5], [0.75]]) * normal
+    torch.testing.assert_close(grid.points.mean((1, 2)), expected, rtol=0, atol=1e-13)
+    assert grid.pitch == pytest.approx((1.5, 0.4)) and grid.size == (4, 5)
+    with pytest.raises(ShapeError, match="without size and extent: expected sensor points on a regular"):
+        VoxelGrid.before(scan, [0.5])
+
+
+@pytest.mark.parametrize("depths", [[0.1, math.inf], [-math.inf, 0.1], [math.nan, 0.1], [0.1, 0.3, 0.2]])
+def test_depths_are_finite_and_increase(depths):
+    with pytest.raises(UnitError, match="finite depths that increase"):
+        VoxelGrid.before(SCAN, [0.1]).at_depths(depths)

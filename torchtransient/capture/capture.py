@@ -146,7 +146,7 @@ class Capture(TensorRecord):
         """Centre of the bin in which most light (sum over channels, S0 of a polarized capture) arrives at each pair,
         metres, float64 in the scan's shape; NaN where there is none. Raises ShapeError without a transient.
         """
-        cube = self._cube("peak_time").detach()
+        cube = self._cube("peak_time")
         if self.polarized:
             cube = cube.select(self._time - _CHANNEL_AND_TIME, 0)
         highest, index = summed(cube, self._time - 1).max(self._time)

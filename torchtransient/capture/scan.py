@@ -201,7 +201,7 @@ class Scan:
     @property
     def is_planar(self) -> bool:
         """Whether all laser and sensor points lie in one plane, to 1e-6 of their extent."""
-        points = torch.cat([self.sensor_points.detach().reshape(-1, 3), self.laser_points.detach().reshape(-1, 3)])
+        points = torch.cat([self.sensor_points.reshape(-1, 3), self.laser_points.reshape(-1, 3)])
         spread = torch.linalg.svdvals((points - points.mean(0)).cpu())
         return bool(len(spread) < 3 or spread[2] <= 1e-6 * spread[0])
 
@@ -289,7 +289,7 @@ class Scan:
     def confocal(self) -> Scan:
         """The confocal scan in an exhaustive one whose spots are its sensor points. Raises SceneError for others."""
         same = self.laser_points.shape == self.sensor_points.shape and bool(
-            torch.allclose(self.laser_points.detach(), self.sensor_points.detach(), rtol=0, atol=1e-9)
+            torch.allclose(self.laser_points, self.sensor_points, rtol=0, atol=1e-9)
         )
         if self.kind != "exhaustive" or not same:
             raise SceneError(

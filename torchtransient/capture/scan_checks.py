@@ -29,7 +29,7 @@ def float64_points(name: str, values: Any, device: torch.device | None = None) -
     ):
         raise ShapeError(f"Scan: expected {name} as points (..., 3), got {tensor.dtype} of {tuple(tensor.shape)}.")
     tensor = tensor.to(device=device or tensor.device, dtype=torch.float64)
-    if not bool(torch.isfinite(tensor.detach()).all()):
+    if not bool(torch.isfinite(tensor).all()):
         raise UnitError(f"Scan: expected {name} in finite metres, got NaN or infinity.")
     return tensor
 
@@ -37,9 +37,9 @@ def float64_points(name: str, values: Any, device: torch.device | None = None) -
 def unit_normals(name: str, normals: Tensor) -> Tensor:
     """Normals (..., 3) of length 1; those that have it keep every digit. Raises UnitError for zero vectors."""
     length: Tensor = torch.linalg.vector_norm(normals, dim=-1, keepdim=True)
-    if not bool((length.detach() > 0).all()):
+    if not bool((length > 0).all()):
         raise UnitError(f"Scan: expected {name} with a direction, got a zero vector.")
-    off = (length.detach() - 1).abs() > 1e-12
+    off = (length - 1).abs() > 1e-12
     return torch.where(off, normals / length, normals)
 
 
@@ -59,7 +59,7 @@ def check_shapes(scan: Scan) -> None:
     }[scan.kind]
     if laser.ndim not in allowed or (scan.kind == "confocal" and laser.shape != sensor.shape):
         raise ShapeError(f"Scan: expected laser_points {words} for kind={scan.kind!r}, got {tuple(laser.shape)}.")
-    if scan.kind == "confocal" and not bool(torch.equal(laser.detach(), sensor.detach())):
+    if scan.kind == "confocal" and not bool(torch.equal(laser, sensor)):
         raise SceneError("Scan: expected the laser points of a confocal scan to be its sensor points, got others.")
     for name in ("sensor", "laser"):
         points, normals = getattr(scan, f"{name}_points"), getattr(scan, f"{name}_normals")

@@ -321,10 +321,6 @@ def grid_size(size: int | Sequence[int], who: str) -> tuple[int, int]:
     return nx, ny
 
 
-def _detached(values: Any) -> Any:
-    return values.detach().cpu().numpy() if hasattr(values, "detach") else values
-
-
 def _frame(normal: Array, up: Array, who: str) -> tuple[Array, Array, Array]:
     length = np.linalg.norm(normal)
     if not length > 0:

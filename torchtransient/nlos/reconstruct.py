@@ -133,7 +133,8 @@ def default_grid(
     else:
         near, far = checked_depths(depths)
     if planes is None:
-        planes = max(2, min(MOST_PLANES, math.ceil((far - near) / (axis.bin_width_opl / 2))))
+        # Depths that are whole bins to rounding are as many planes.
+        planes = max(2, min(MOST_PLANES, math.ceil((far - near) / (axis.bin_width_opl / 2) - 1e-6)))
     planes = count("reconstruct: planes", planes)
     middles = near + (far - near) * (torch.arange(planes, dtype=torch.float64, device="cpu") + 0.5) / planes
     if extent is None and not _spans_area(capture.scan):

@@ -157,7 +157,7 @@ def same_light(a: Scan, b: Scan) -> bool:
     if (a.kind, a.shape, a.first_and_last_leg) != (b.kind, b.shape, b.first_and_last_leg):
         return False
     pairs = zip(telling(a)[2:], telling(b)[2:], strict=True)
-    return all(torch.equal(one.detach().cpu(), other.detach().cpu()) for one, other in pairs)
+    return all(torch.equal(one.cpu(), other.cpu()) for one, other in pairs)
 
 
 def telling(scan: Scan) -> list[Any]:

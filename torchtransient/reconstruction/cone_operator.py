@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from typing import cast
 
@@ -13,7 +14,7 @@ from torchtransient.capture import Capture, Scan
 from torchtransient.quantities import count
 from torchtransient.reconstruction.capture_checks import SNR, one_of, within
 from torchtransient.reconstruction.confocal_operator import ConfocalOperator, InverseOperator, chunk_rows
-from torchtransient.reconstruction.light_cone import ConeGrid, Resampling
+from torchtransient.reconstruction.light_cone import ConeGrid, Resampling, offset_powers
 from torchtransient.reconstruction.linear import each
 from torchtransient.reconstruction.planar_scan import PlanarScan
 
@@ -194,16 +195,14 @@ class ConeOperator(ConfocalOperator):
 
     def mean_power(self) -> float:
         """Mean of the kernels' power over all frequencies."""
-        rows, columns = self.grid.size
-        offsets = [
-            torch.fft.fftfreq(2 * n, 1 / (2 * n), dtype=torch.float64, device="cpu") * pitch
-            for n, pitch in zip(self.grid.size, self.grid.pitch, strict=True)
+        sums = [
+            scale**2 * math.prod(
+                float(offset_powers(n, pitch, power).square().sum())
+                for n, pitch, power in zip(self.grid.size, self.grid.pitch, powers, strict=True)
+            )
+            for powers, scale in zip(self.moments, self.scales, strict=True)
         ]
-        means = [
-            scale**2 * float((offsets[0] ** (2 * y)).mean() * (offsets[1] ** (2 * x)).mean())
-            for (y, x), scale in zip(self.moments, self.scales, strict=True)
-        ]
-        return 4 * rows * columns * sum(means) * float(self.cone.window().square().mean())
+        return sum(sums) * float(self.cone.window().square().mean())
 
     def _frequencies(self, spectrum: Tensor) -> list[tuple[Tensor, int, int]]:
         rows, columns = self.grid.size

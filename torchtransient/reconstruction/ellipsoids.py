@@ -79,16 +79,16 @@ class EllipsoidOperator(ScanOperator):
         zero of a sensor point falls into, and how many samples the leg of each spot adds.
         """
         scan, width = self.scan, self.step
-        sensors = scan.sensor_points.detach().to("cpu", torch.float64).reshape(-1, 3)
-        lasers = scan.laser_points.detach().to("cpu", torch.float64).reshape(-1, 3)
+        sensors = scan.sensor_points.cpu().reshape(-1, 3)
+        lasers = scan.laser_points.cpu().reshape(-1, 3)
         middle = sensors.mean(0)
         first, _ = sample_places(self.axis.num_bins, self.samples)
         zero = _BEFORE - first - self.samples / 2 - self.axis.start_opl / width
         bins = torch.full((len(sensors),), zero, dtype=torch.float64, device="cpu")
         spots = torch.zeros(len(lasers), dtype=torch.float64, device="cpu")
         if scan.first_and_last_leg:
-            bins = bins + scan.sensor_legs.detach().cpu().reshape(-1) / width
-            spots = scan.laser_legs.detach().cpu().reshape(-1) / width
+            bins = bins + scan.sensor_legs.cpu().reshape(-1) / width
+            spots = scan.laser_legs.cpu().reshape(-1) / width
         if scan.kind == "confocal":
             bins = bins + spots
         voxels = self.points.reshape(-1, 3)

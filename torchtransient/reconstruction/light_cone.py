@@ -87,12 +87,20 @@ class ConeGrid:
         """
         w = torch.arange(self.padded // 2 + 1, dtype=torch.float64, device="cpu")
         w = w * (2 * math.pi / (self.padded * self.width))
-        q = torch.fft.fftfreq(2 * count, 1 / (2 * count), dtype=torch.float64, device="cpu") * pitch
-        size = (q**moment) * (self.window()[:, None] if windowed else 1.0)
-        size = size.expand(len(w), -1).clone()
-        if moment % 2:
-            size[:, count] = 0  # the farthest offset stands for both signs
-        return torch.view_as_real(torch.fft.fft(torch.polar(torch.ones_like(size), -w[:, None] * q**2) * size))
+        turns = -w[:, None] * offset_powers(count, pitch, 2)
+        size = offset_powers(count, pitch, moment) * (self.window()[:, None] if windowed else torch.ones_like(turns))
+        return torch.view_as_real(torch.fft.fft(torch.polar(torch.ones_like(turns), turns) * size))
+
+
+def offset_powers(count: int, pitch: float, moment: int) -> Tensor:
+    """q^moment (2 count,) float64 of the offsets q along one side of the wall, in the order of transforms. The farthest
+    one stands for both signs: its odd powers are zero.
+    """
+    q = torch.fft.fftfreq(2 * count, 1 / (2 * count), dtype=torch.float64, device="cpu") * pitch
+    powers = q**moment
+    if moment % 2:
+        powers[count] = 0
+    return powers
 
 
 @dataclass(frozen=True)

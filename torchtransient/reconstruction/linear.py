@@ -122,7 +122,7 @@ class LinearOperator(nn.Module, ABC):
         who = type(self).__name__
         if not isinstance(x, Tensor):
             raise ShapeError(f"{who}: expected {name} as a tensor (..., {_words(shape)}), got {type(x).__name__}.")
-        if tuple(x.shape[x.ndim - len(shape) :]) != shape or x.ndim < len(shape):
+        if tuple(x.shape[x.ndim - len(shape) :]) != shape:
             raise ShapeError(f"{who}: expected {name} (..., {_words(shape)}), got {tuple(x.shape)}.")
         if real and x.is_complex():
             raise ShapeError(f"{who}: expected {name} of real numbers, got {x.dtype}. Give its real part or modulus.")

@@ -26,7 +26,7 @@ def packed(described: dict[str, Any]) -> Tensor:
 def unpacked(state: Any, who: str) -> Any:
     """The plain data of :func:`packed`. Raises StorageError."""
     try:
-        return json.loads(bytes(state.detach().cpu().tolist()).decode())
+        return json.loads(bytes(state.cpu().tolist()).decode())
     except (AttributeError, TypeError, ValueError) as error:
         raise StorageError(f"{who}: expected the state of an operator, as state_dict() gives it: {error}.") from None
 

@@ -139,7 +139,7 @@ class PhasorField(ScanOperator):
         if not self.scan.first_and_last_leg:
             lengths = torch.zeros(len(self.lasers) + math.prod(self.wall.size), dtype=torch.float64, device="cpu")
             return lengths[: len(self.lasers)], lengths[len(self.lasers) :]
-        spots, points = (legs.detach().cpu().reshape(-1) for legs in (self.scan.laser_legs, self.scan.sensor_legs))
+        spots, points = (legs.cpu().reshape(-1) for legs in (self.scan.laser_legs, self.scan.sensor_legs))
         if self.scan.kind != "confocal":
             return spots, points
         return torch.zeros(1, dtype=torch.float64, device="cpu"), points + spots

@@ -58,7 +58,7 @@ def depth_map(volume: Tensor, depths: VoxelGrid | Any, *, threshold: float = 0.1
         before, after = steps[middle - 1], steps[middle]
         # Slopes to both sides of the maximum: the top is where the line between them is zero.
         rise, fall = (mid - low) / before, (mid - high) / after
-        inside = (index == middle) & (rise >= 0) & (fall >= 0) & (rise + fall > 0)
+        inside = (index == middle) & (rise + fall > 0)
         curvature = torch.where(inside, rise + fall, torch.ones_like(mid))
         # f' at the middle is (rise after - fall before) / (before + after), f'' is -2 (rise + fall) / (before + after).
         offset = (rise * after - fall * before) / (2 * curvature)

@@ -1,0 +1,262 @@
+"""Memory of methods, default grids, wavelengths and cameras in numbers that were counted by hand."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+import torchtransient as tt
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
+from torchtransient.nlos import volume_memory
+from torchtransient.nlos.methods import default_wavelength, pitch_of
+from torchtransient.nlos.reconstruct import camera_of, checked_depths
+from torchtransient.nlos.volume_memory import least_bytes
+
+N = tt.nlos
+F64 = torch.float64
+AXIS = tt.TimeAxis(0.0, 0.02, 64)
+WALL = N.Wall.plane(1.0, 0.6)
+SCANS = {kind: N.Scan.grid(WALL, (5, 6), kind=kind) for kind in ("confocal", "single")}
+
+
+def captured(kind="confocal", lead=(), dtype=torch.float32, axis=AXIS, channels=1):
+    scan = SCANS[kind]
+    return N.Capture(torch.zeros(*lead, channels, axis.num_bins, *scan.shape, dtype=dtype), axis, scan)
+
+
+def grid(depths, size):
+    return N.VoxelGrid.before(SCANS["confocal"], torch.linspace(0.1, 0.5, depths), size=size, extent=0.5)
+
+
+@pytest.mark.parametrize(("name", "capture", "voxels", "options", "expected"), [
+    # A complex volume and its intensity: of 2 x 3 items, 7 frames, 3 planes of 4 x 5.
+    ("phasor", captured(lead=(2,), channels=3), grid(3, (5, 4)), {"camera": N.ConfocalCamera([0.1] * 7)}, 12 * 42 * 60),
+    ("phasor", captured(dtype=F64), grid(3, (5, 4)), {}, 24 * 60),
+    # A volume, and 40 bytes for each point of three planes; of many items the volume twice; of 20 planes 16 count.
+    ("bp", captured(), grid(3, (5, 4)), {}, 4 * 60 + 40 * 60),
+    ("fbp", captured(), grid(3, (5, 4)), {}, 4 * 60 + 40 * 60),
+    ("bp", captured(lead=(4,), channels=3), grid(3, (5, 4)), {}, 2 * 4 * 720),
+    ("bp", captured(), grid(20, (5, 4)), {}, 4 * 400 + 40 * 16 * 20),
+    ("bp", captured(dtype=F64), grid(3, (5, 4)), {}, 8 * 60 + 40 * 60),
+    # 7 x 6 frequencies of 64 bins: 36 bytes of tables, 64 more while they are made; of two taps 20 and 32.
+    ("fk", captured(), None, {}, 100 * 2688), ("fk", captured(), None, {"taps": 2}, 52 * 2688),
+    # In double precision two taps are less than a spectrum of 2 x 30 x 65 and a field of 30 x 64.
+    ("fk", captured(dtype=F64), None, {"taps": 2}, 36 * 2688 + 16 * (3900 + 1920)),
+    ("fk", captured(dtype=F64), None, {}, 132 * 2688),
+    ("midpoint-fk", captured("single"), None, {}, 100 * 13 * 11 * 64),
+    # Two spectra of 65 x 30, and a volume in v and one in time; 101 of 100 bins; four spectra and four volumes.
+    ("lct", captured(), None, {}, 8 * 2 * 65 * 30 + 4 * 128 * 30),
+    ("lct", captured(dtype=F64), None, {"v_bins": 100}, 16 * 2 * 101 * 30 + 8 * 164 * 30),
+    ("directional-lct", captured(), None, {}, 8 * 4 * 65 * 30 + 4 * (64 + 192) * 30),
+])  # fmt: skip
+def test_bytes_that_a_method_takes_at_least(name, capture, voxels, options, expected):
+    assert least_bytes(name, capture, voxels, options) == expected
+
+
+@pytest.mark.parametrize("taps", [2, 4])
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_tables_of_migration_are_as_large_as_they_are_said_to_be(taps, dtype):
+    operator = N.FK(SCANS["confocal"], time_axis=AXIS, taps=taps, dtype=dtype)
+    held = sum(table.nbytes for table in operator.buffers()) - operator.taper.nbytes
+    assert held == (4 + 2 * dtype.itemsize * taps) * 2688
+    # While they are made in double precision, pairs of cosine and sine for each tap.
+    assert least_bytes("fk", captured(dtype=dtype), None, {"taps": taps}) >= held + 16 * taps * 2688
+
+
+def test_what_is_asked_of_memory(monkeypatch):
+    asked = []
+
+    def available(variant):
+        asked.append(variant)
+        return 6000
+
+    monkeypatch.setattr(volume_memory, "available_bytes", available)
+    capture, voxels = captured(), grid(3, (5, 4))
+    volume_memory.check_volume_fits("bp", capture, voxels, {})
+    large = grid(6, (5, 5))
+    words = r"'bp' would take 6\.445 KiB at least for 6 x 5 x 5 numbers, and 5\.859 KiB .* cpu\. Take fewer voxels"
+    with pytest.raises(tt.errors.StorageError, match=words):
+        volume_memory.check_volume_fits("bp", capture, large, {})
+    with pytest.raises(tt.errors.StorageError, match=r"at least for 64 x 6 x 5 numbers, .*\. Crop the capture"):
+        volume_memory.check_volume_fits("fk", capture, None, {})
+    assert set(asked) == {"llvm"}
+    volume_memory.check_volume_fits("fk", capture.to("meta"), None, {})
+
+
+# -------------------------------------------------------------------------------------------------------- default grids
+
+
+@pytest.mark.parametrize(("start", "depths", "planes", "first", "last", "count"), [
+    # Half the record, a plane for each bin; from a fiftieth of its end on where it begins at zero.
+    (1.0, None, None, 0.5, 0.9, 20), (0.0, None, None, 0.008, 0.4, 20), (-0.2, None, None, 0.006, 0.3, 15),
+    (1.0, (0.25, 0.5), None, 0.25, 0.5, 13), (1.0, (0.25, 0.5), 4, 0.25, 0.5, 4), (1.0, (0.0, 9.0), None, 0.0, 9.0, 64),
+    (1.0, (0.25, 0.26), None, 0.25, 0.26, 2), (1.0, (0.25, 0.5), 1, 0.25, 0.5, 1),
+])  # fmt: skip
+def test_planes_that_nobody_gave(start, depths, planes, first, last, count):
+    capture = captured(axis=tt.TimeAxis(start, 0.04, 20))
+    found = N.default_grid(capture, depths=depths, planes=planes)
+    expected = first + (last - first) * (torch.arange(count, dtype=F64) + 0.5) / count
+    torch.testing.assert_close(found.depths, expected, rtol=0, atol=1e-12)
+    assert found.size == (6, 5)
+
+
+def test_legs_come_off_the_depths():
+    scan = replace(SCANS["confocal"], first_and_last_leg=True)
+    legs = float(scan.legs.min())
+    axis = tt.TimeAxis(legs + 0.4, 0.04, 10)
+    found = N.default_grid(N.Capture(torch.zeros(1, 10, *scan.shape), axis, scan))
+    torch.testing.assert_close(found.depths, 0.2 + 0.02 * (torch.arange(10, dtype=F64) + 0.5), rtol=0, atol=1e-12)
+    for start in (-1.0, legs - 0.41):
+        early = N.Capture(torch.zeros(1, 10, *scan.shape), tt.TimeAxis(start, 0.04, 10), scan)
+        with pytest.raises(UnitError, match=f"longer than its legs, {legs:.4g} m"):
+            N.default_grid(early)
+
+
+def listed(points, **changes):
+    origins = {"sensor_origin": (0.0, 0.0, 1.0), "laser_origin": (0.0, 0.0, 1.0)}
+    return N.Scan.points(torch.as_tensor(points, dtype=F64), kind="confocal", **{**origins, **changes})
+
+
+@pytest.mark.parametrize(("count", "side"), [(4, 2), (5, 3), (9, 3), (10, 4)])
+def test_lists_have_as_many_voxels_as_a_square_of_them(count, side):
+    points = SCANS["confocal"].sensor_points.reshape(-1, 3)[7 : 7 + count]
+    scan = listed(points, wall=WALL)
+    capture = N.Capture(torch.zeros(1, 64, count), AXIS, scan)
+    assert N.default_grid(capture, depths=(0.2, 0.4)).size == (side, side)
+    assert N.default_grid(capture, depths=(0.2, 0.4), size=(7, 2)).size == (2, 7)
+    assert N.default_grid(capture, depths=(0.2, 0.4), size=3, extent=(0.3, 0.6)).pitch == pytest.approx((0.2, 0.1))
+
+
+@pytest.mark.parametrize(("off", "spans"), [(0.9e-6, False), (1.1e-6, True)])
+def test_points_on_one_line_to_a_millionth(off, spans):
+    # Two pairs of points: spreads of 2 along the line, and of twice the height across.
+    scan = listed([[-0.5, -0.5 * off, 0], [-0.5, 0.5 * off, 0], [0.5, -0.5 * off, 0], [0.5, 0.5 * off, 0]], wall=WALL)
+    capture = N.Capture(torch.zeros(1, 64, 4), AXIS, scan)
+    if spans:
+        assert N.default_grid(capture, depths=(0.2, 0.4)).size == (2, 2)
+        return
+    with pytest.raises(SceneError, match="lie on one line"):
+        N.default_grid(capture, depths=(0.2, 0.4))
+
+
+def test_depths_are_near_and_far():
+    assert checked_depths((0, 1)) == (0.0, 1.0) and checked_depths(torch.tensor([0.25, 0.5])) == (0.25, 0.5)
+    for depths in ((0.5, 0.5), (0.5, 0.25), (-1e-9, 1.0), (0.0, math.inf), (math.nan, 1.0)):
+        with pytest.raises(UnitError, match="depths"):
+            checked_depths(depths)
+    for depths in (1.0, (1.0,), (0.0, 1.0, 2.0), "near", None):
+        with pytest.raises(UnitError, match=r"expected depths as \(near, far\) in metres"):
+            checked_depths(depths)
+
+
+def test_captures_without_a_transient_have_no_grid():
+    phasors = N.Capture(None, None, SCANS["single"], phasor=torch.zeros(1, 1, 6, 5, dtype=torch.complex64),
+                        frequencies=tt.FrequencyAxis((1.0,)))  # fmt: skip
+    for call in (lambda: N.default_grid(phasors), lambda: default_wavelength(phasors), lambda: N.reconstruct(phasors)):
+        with pytest.raises(ShapeError, match="reconstruct: expected a capture with a transient, got phasors alone"):
+            call()
+    with pytest.raises(ArgumentError, match=r"choose_method: expected a tt\.nlos\.Capture"):
+        N.choose_method(None)
+
+
+# ---------------------------------------------------------------------------------------------- pitches and wavelengths
+
+
+def test_neighbours_of_points():
+    # The larger pitch of a grid.
+    assert pitch_of(SCANS["confocal"]) == pytest.approx(0.2)
+    # Of a list the mean over its points of the way to the nearest: 1, 1, 2; points of two visits are one.
+    assert pitch_of(listed([[0, 0, 0], [1, 0, 0], [3, 0, 0]])) == pytest.approx(4 / 3)
+    assert pitch_of(listed([[0, 0, 0], [1, 0, 0], [1, 0, 0], [3, 0, 0]])) == pytest.approx(5 / 4)
+    assert pitch_of(listed([[0.5, 0, 0]])) == 0.0 and pitch_of(listed([[0.5, 0, 0]] * 3)) == 0.0
+    # Every second of 600 points is asked, of which the others are neighbours.
+    x = torch.arange(600, dtype=F64)
+    line = torch.stack([x + 0.25 * (x % 2), 0 * x, 0 * x], -1)
+    assert pitch_of(listed(line)) == pytest.approx((0.75 * 299 + 1.25) / 300)
+
+
+@pytest.mark.parametrize(("kind", "width", "expected"), [
+    ("confocal", 0.02, 0.8), ("single", 0.02, 0.4), ("single", 0.125, 0.5), ("confocal", 0.25, 1.0),
+])  # fmt: skip
+def test_wavelengths_of_pitches_and_of_bins(kind, width, expected):
+    assert default_wavelength(captured(kind, axis=tt.TimeAxis(0.0, width, 64))) == pytest.approx(expected)
+
+
+# ----------------------------------------------------------------------------------------------- cameras, normals, bins
+
+
+def test_times_of_a_film():
+    film = camera_of("transient", (0.25, 1.0, 4))
+    assert isinstance(film, N.TransientCamera) and film.times.tolist() == [0.25, 0.5, 0.75, 1.0]
+    assert isinstance(camera_of("confocal", [0, 1, 2]), N.ConfocalCamera)
+    assert camera_of("direct", None) == N.DirectLight()
+    for name, times, error, words in (
+        ("direct", (0, 1, 2), ArgumentError, "times are for the cameras"),
+        ("transient", None, ArgumentError, "got none"),
+        ("film", None, ArgumentError, "a camera direct, confocal or transient, got 'film'"),
+        (None, (0, 1, 2), ArgumentError, "a camera direct"), ("confocal", (0, 1), UnitError, "start, stop, count"),
+    ):  # fmt: skip
+        with pytest.raises(error, match=words):
+            camera_of(name, times)
+
+
+def test_normals_are_those_of_the_brightest_voxel_behind_a_pixel():
+    voxels = replace(N.VoxelGrid.before(SCANS["confocal"], [0.1, 0.2]), size=(1, 2))
+    vectors = torch.zeros(5, 2, 3, 2, 1, 2)
+    # Of the first item both channels together: (0, 3, -4) in the second plane, (0, 0, -2) in the first.
+    vectors[0, 0, :, 1, 0, 0], vectors[0, 1, :, 1, 0, 0] = torch.tensor([0, 3.0, 0]), torch.tensor([0, 0, -4.0])
+    vectors[0, 0, :, 0, 0, 0] = torch.tensor([0, 0, 4.5])
+    vectors[0, 1, :, 0, 0, 1] = torch.tensor([0, 0, -2.0])
+    vectors[1] = 7.0
+    volume = N.HiddenVolume(vectors.norm(dim=2), voxels, "directional-lct", directions=vectors)
+    found = N.normals_of(volume)
+    torch.testing.assert_close(found[:, 0], torch.tensor([[0.0, 0], [0.6, 0], [-0.8, -1]]))
+    one = N.HiddenVolume(vectors[0].norm(dim=1), voxels, "directional-lct", directions=vectors[0])
+    torch.testing.assert_close(N.normals_of(one), found)
+    dark = N.HiddenVolume(torch.zeros(1, 2, 1, 2), voxels, "x", directions=torch.zeros(1, 3, 2, 1, 2))
+    assert not N.normals_of(dark).any()
+    with pytest.raises(ShapeError, match="normals_of: expected a volume with directions"):
+        N.normals_of(None)
+
+
+@pytest.mark.parametrize("kind", ["confocal", "exhaustive"])
+def test_neighbouring_bins_are_added_up(kind):
+    scan = N.Scan.grid(WALL, (3, 2), kind=kind, laser_grid=(1, 2) if kind == "exhaustive" else None)
+    light = torch.rand(2, 7, *scan.shape, generator=torch.Generator().manual_seed(0))
+    capture = N.Capture(light, tt.TimeAxis(0.5, 0.25, 7), scan)
+    found = N.sum_bins(capture, 3)
+    assert found.axis == tt.TimeAxis(0.5, 0.75, 2)
+    torch.testing.assert_close(found.transient, torch.stack([light[:, :3].sum(1), light[:, 3:6].sum(1)], 1))
+    assert N.sum_bins(capture, 1) is capture and N.sum_bins(capture, 7).axis == tt.TimeAxis(0.5, 1.75, 1)
+    with pytest.raises(ShapeError, match="expected 7 bins at most, got 8"):
+        N.sum_bins(capture, 8)
+
+
+@pytest.mark.parametrize(("start", "kept"), [(-0.1, 59), (-0.09, 59), (-1e-9, 64), (0.0, 64), (-0.02, 63)])
+def test_light_before_time_zero_is_left_out(start, kept):
+    axis = tt.TimeAxis(start, 0.02, 64)
+    light = torch.rand(1, 64, *SCANS["confocal"].shape, generator=torch.Generator().manual_seed(0))
+    found = N.reconstruct(N.Capture(light, axis, SCANS["confocal"]), "fk", progress=False)
+    assert len(found.grid.depths) == kept and found.grid.depths[0] > 0
+    cut = tt.TimeAxis(max(0.0, start + 0.02 * (64 - kept)), 0.02, kept)
+    expected = N.FK(SCANS["confocal"], time_axis=cut).reconstruct(light[:, 64 - kept :])
+    torch.testing.assert_close(found.values, expected, rtol=1e-4, atol=1e-4 * float(expected.max()))
+
+
+def test_records_before_time_zero_hold_nothing():
+    for start, words in ((-1.28, "light after time zero, got TimeAxis"), (-1.3, "light after time zero")):
+        capture = captured(axis=tt.TimeAxis(start, 0.02, 64))
+        with pytest.raises(UnitError, match=words):
+            N.reconstruct(capture, "fk", progress=False)
+
+
+def test_planes_within_the_depths_are_kept():
+    capture = captured(axis=tt.TimeAxis(0.0, 0.5, 8))
+    found = N.reconstruct(capture, "lct", depths=(0.375, 0.875), progress=False)
+    # Of 0.125, 0.375, ... those from the one to the other, both of them too.
+    assert found.grid.depths.tolist() == [0.375, 0.625, 0.875] and found.values.shape == (1, 3, 6, 5)
+    with pytest.raises(UnitError, match=r"within the record's, 0\.125 to 1\.875 m, got"):
+        N.reconstruct(capture, "lct", depths=(0.4, 0.6), progress=False)

@@ -1,0 +1,192 @@
+"""Light cones on grids where squared distances are whole bins: convolutions and resampling in closed form."""
+
+import itertools
+import math
+
+import pytest
+import torch
+
+from torchtransient.axes import TimeAxis
+from torchtransient.capture import Scan, Wall
+from torchtransient.errors import ShapeError
+from torchtransient.reconstruction import LCT, DiffusionDeconvolution, DirectionalLCT
+from torchtransient.reconstruction.cone_operator import ConeOperator
+from torchtransient.transform_bins import fast_length
+
+F64 = torch.float64
+# v = r^2 from 0 to 4 m^2 in bins of 0.25 m^2; steps of 0.5 m along x are one of them, of 1 m along y four.
+AXIS = TimeAxis(0.0, 0.5, 8)
+SCAN = Scan.grid(Wall.plane(2.0, 3.0), (4, 3), kind="confocal")
+TAPS = torch.tensor([1.0, 4.0, 6.0, 4.0, 1.0], dtype=F64) / 16
+
+
+def made(kind, **options):
+    return kind(SCAN, time_axis=AXIS, v_bins=16, dtype=F64, **options)
+
+
+@pytest.mark.parametrize("place", [(3, 0, 0), (2, 1, 3), (5, 2, 1), (0, 1, 2)])
+@pytest.mark.parametrize("kind", [LCT, DirectionalLCT])
+def test_a_point_of_v_lights_the_wall_at_its_squared_distance(kind, place):
+    operator = made(kind)
+    assert operator.cone.width == 0.25 and operator.grid.pitch == pytest.approx((1.0, 0.5))
+    v, j, i = place
+    # The components of vectors: along x, along y and towards the wall.
+    for component, ((power_y, power_x), scale) in enumerate(zip(operator.moments, operator.scales, strict=True)):
+        parts = [torch.zeros(16, 3, 4, dtype=F64) for _ in operator.moments]
+        parts[component][v, j, i] = 1.0
+        found = operator._convolved(parts, regularised=False)
+        expected = torch.zeros(16, 3, 4, dtype=F64)
+        for row, column in itertools.product(range(3), range(4)):
+            dy, dx = 1.0 * (row - j), 0.5 * (column - i)
+            at = v + round((dx**2 + dy**2) / 0.25)
+            for tap, weight in zip(range(at - 2, at + 3), TAPS, strict=True):
+                if 0 <= tap < 16:
+                    expected[tap, row, column] += weight * dy**power_y * dx**power_x * scale
+        torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
+
+
+def test_components_of_vectors_are_x_y_and_the_depth_in_the_middle():
+    operator = made(DirectionalLCT)
+    assert operator.moments == ((0, 1), (1, 0), (0, 0))
+    # Depths of 0.125 to 1.875 m.
+    assert operator.scales == pytest.approx((1.0, 1.0, 1.0))
+    torch.testing.assert_close(operator.relative_depth, operator.depths, rtol=1e-14, atol=0)
+
+
+def test_frequencies_are_means_of_five_neighbours():
+    window = made(LCT).cone.window()
+    taps = torch.fft.irfft(window.to(torch.complex128), n=2 * (len(window) - 1))
+    torch.testing.assert_close(taps[:3], TAPS[2:], rtol=0, atol=1e-15)
+    torch.testing.assert_close(taps[-2:], TAPS[:2], rtol=0, atol=1e-15)
+    assert float(taps[3:-2].abs().max()) < 1e-15
+
+
+@pytest.mark.parametrize("start", [0.0, 0.75])
+@pytest.mark.parametrize("target, power", [("diffuse", 4), ("retroreflective", 2)])
+def test_resampling_of_constants(start, target, power):
+    axis = TimeAxis(start, 0.5, 8)
+    operator = LCT(SCAN, time_axis=axis, v_bins=13, target=target, dtype=F64)
+    edges = torch.linspace((start / 2) ** 2, ((start + 4) / 2) ** 2, 14, dtype=F64)
+    radii = (start + 0.5 * torch.arange(9, dtype=F64)) / 2
+
+    def resampled(rows, values, transposed, to_v):
+        return operator._resampled(torch.ones(rows, 3, 4, dtype=F64), values, transposed=transposed, to_v=to_v)[:, 2, 1]
+
+    # Strengths of one per m^3: means of 1 / (2 sqrt u) over bins of u.
+    torch.testing.assert_close(resampled(8, "volume", False, True), edges.sqrt().diff() / edges.diff())
+    # Their light: r^-p dv of a voxel's area, 0.5 m^2, in bins of time; and back to one.
+    middle = (radii[1:] + radii[:-1]) / 2
+    light = middle**-power * (radii**2).diff() * 0.5
+    torch.testing.assert_close(resampled(13, "data", True, False), light)
+    torch.testing.assert_close(operator._resampled(
+        light[:, None, None].expand(-1, 3, 4), "data_inverse", transposed=False, to_v=True
+    )[:, 2, 1], torch.ones(13, dtype=F64))  # fmt: skip
+    # One for each bin of u: 2 z of every depth.
+    torch.testing.assert_close(resampled(13, "volume_inverse", True, False), 2 * middle)
+
+
+def test_entries_of_resampling_are_overlaps_of_intervals():
+    axis = TimeAxis(0.75, 0.5, 8)
+    cone = LCT(SCAN, time_axis=axis, v_bins=13, dtype=F64).cone
+    squares = ((0.75 + 0.5 * torch.arange(9, dtype=F64)) / 2) ** 2
+    edges = torch.linspace(float(squares[0]), float(squares[-1]), 14, dtype=F64)
+    low = torch.maximum(edges[:-1, None], squares[:-1])
+    high = torch.minimum(edges[1:, None], squares[1:])
+    for of_depth, expected in ((False, high - low), (True, high.clamp_min(0).sqrt() - low.sqrt())):
+        v, t, size = cone.overlaps(of_depth=of_depth)
+        dense = torch.zeros(13, 8, dtype=F64).index_put((v, t), size, accumulate=True)
+        torch.testing.assert_close(dense, expected.clamp_min(0), rtol=0, atol=1e-14)
+        assert len(size) == 20 and (size > 0).all()
+
+
+@pytest.mark.parametrize("kind", [LCT, DirectionalLCT])
+def test_noise_is_the_mean_power_of_the_kernels_over_the_ratio(kind):
+    operator = made(kind, snr=4.0)
+    count = operator.cone.padded // 2 + 1
+    power = sum((y.abs() * x.abs()).square() for y, x in operator.kernels(0, count))
+    assert power.shape == (count, 6, 8)
+    assert operator.mean_power() == pytest.approx(float(power.mean()), rel=1e-12)
+    torch.testing.assert_close(operator._power(2, 5), power[2:5] + float(power.mean()) / 4, rtol=1e-12, atol=0)
+
+
+def with_kernels(operator, along_y, along_x):
+    """The operator with one number at all frequencies for each power of an offset."""
+    for name, values in (("along_y", along_y), ("along_x", along_x)):
+        for power, value in enumerate(values):
+            if hasattr(operator, f"{name}{power}"):
+                table = getattr(operator, f"{name}{power}")
+                table.copy_(torch.tensor([value, 0.0], dtype=F64).expand_as(table))
+    return operator
+
+
+def test_inverses_of_numbers_are_numbers_over_power_and_noise():
+    # Constant light, that of strengths of 1 per m^3 in each bin of u, times 2 z of the depth.
+    operator = with_kernels(made(LCT, snr=3.0), [0.5], [1.5])
+    middle = operator.depths[:, None, None]
+    light = (middle**-4 * (operator.cone.radii**2).diff()[:, None, None] * 0.5).expand(2, 8, 3, 4)
+    number = 0.75 / (0.75**2 + operator.mean_power() / 3.0)
+    torch.testing.assert_close(operator.reconstruct(light), (number * 2 * middle).expand(2, 8, 3, 4))
+
+
+def test_inverses_of_vectors_of_numbers_are_vectors():
+    wall = Wall.plane(2.0, 3.0, center=(1.0, 2.0, 3.0), normal=(0.6, 0.0, 0.8))
+    scan = Scan.grid(wall, (4, 3), kind="confocal")
+    operator = DirectionalLCT(scan, time_axis=TimeAxis(0.25, 0.5, 8), v_bins=16, snr=3.0, dtype=F64)
+    # The depth in the middle is 1.125 m.
+    assert operator.scales == (1.0, 1.0, 1.125)
+    with_kernels(operator, [0.5, 0.75], [1.5, 2.0])
+    kernels = 0.5 * 2.0, 0.75 * 1.5, 0.5 * 1.5 * 1.125
+    over = sum(a**2 for a in kernels) + operator.mean_power() / 3.0
+    middle = operator.depths[:, None, None]
+    light = (middle**-5 * (operator.cone.radii**2).diff()[:, None, None] * 0.5).expand(8, 3, 4)
+    x, y, towards = (a / over * 2 * middle for a in kernels)
+    grid = operator.grid
+    expected = sum(
+        part * axis[:, None, None, None]
+        for part, axis in ((x, grid.along_x), (y, grid.along_y), (towards / (middle / 1.125), -grid.normal))
+    )
+    torch.testing.assert_close(operator.reconstruct(light), expected.expand(3, 8, 3, 4))
+    # The model multiplies what points towards the wall by the depth, over that in the middle.
+    parts = operator.components(expected.expand(3, 8, 3, 4), "volume")
+    alone = operator._resampled((towards * torch.ones(8, 3, 4)), "volume", transposed=False, to_v=True)
+    torch.testing.assert_close(parts[2], alone)
+
+
+@pytest.mark.parametrize("kind, target, powers", [
+    (LCT, "diffuse", 4), (LCT, "retroreflective", 2), (DirectionalLCT, "diffuse", 5),
+    (DirectionalLCT, "retroreflective", 3),
+])  # fmt: skip
+def test_light_falls_by_the_target_and_the_length_of_offsets(kind, target, powers):
+    assert made(kind, target=target).fall() == powers
+
+
+def test_transforms_hold_the_cone_behind_the_record():
+    # 4 x 0.5 m and 3 x 1 m: 13 m^2 behind 4 m^2, 4.25 times as many bins.
+    assert made(LCT).cone.padded == fast_length(68, multiple=2)
+    # A narrow wall: twice the record, and no less.
+    narrow = Scan.grid(Wall.plane(0.5, 0.75), (4, 3), kind="confocal")
+    assert LCT(narrow, time_axis=AXIS, v_bins=16).cone.padded == 32
+    # Seven times the record is the most that a wall may be wide: 3 x 3 m^2 and 4.3589 m of 28 m^2.
+    for width, taken in ((math.sqrt(19.0) - 1e-9, True), (math.sqrt(19.0) + 1e-6, False)):
+        wide = Scan.grid(Wall.plane(width, 3.0), (4, 3), kind="confocal")
+        if taken:
+            assert LCT(wide, time_axis=AXIS, v_bins=16).cone.padded == 128
+            continue
+        with pytest.raises(ShapeError, match=r"one of 4 m\^2 .* squared is 28 m\^2"):
+            LCT(wide, time_axis=AXIS, v_bins=16)
+
+
+@pytest.mark.parametrize("passes", [1, 2])
+def test_slabs_that_only_weaken_are_undone_up_to_noise(passes):
+    # With the same power at every frequency the inverse is a number: a / (a^2 + 1 / snr).
+    operator = DiffusionDeconvolution(SCAN, time_axis=TimeAxis(0.0, 0.25, 8), thickness=0.3, passes=passes, snr=5.0,
+                                      dtype=F64)  # fmt: skip
+    operator.kernel.copy_(torch.tensor([0.75, 0.0], dtype=F64).expand_as(operator.kernel))
+    light = torch.rand(2, *operator.data_shape, dtype=F64, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(operator(light), 0.75 * light)
+    torch.testing.assert_close(operator.reconstruct(light), 0.75 / (0.75**2 + 0.2) * light)
+
+
+def test_operators_of_cones_say_what_their_volumes_are_made_of():
+    with pytest.raises(TypeError, match="abstract"):
+        ConeOperator(SCAN, time_axis=AXIS, dtype=F64, target="diffuse", snr=1.0, v_bins=None)
