@@ -311,8 +311,8 @@ class ItofCorrelation(Sensor):
         """The calibration that has these phases."""
         direction = 1 if self.calibration is None else self.calibration.direction
         if phases.shape[1:] == (1, 1):
-            return ItofCalibration(phase_offset_rad=phases.detach().flatten().tolist(), direction=direction)
-        return ItofCalibration(direction=direction, phase_map_rad=phases.detach())
+            return ItofCalibration(phase_offset_rad=phases.flatten().tolist(), direction=direction)
+        return ItofCalibration(direction=direction, phase_map_rad=phases)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *others: Any) -> None:
         """Phases of another size come with the state; what else is another camera's is an error."""

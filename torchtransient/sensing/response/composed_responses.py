@@ -87,7 +87,7 @@ class MeasuredResponse(Response):
         start = self._start_s(shares)
         flat = time_s.reshape(-1)
         # resample_counts from far before the response to each time, as one running sum
-        edges = torch.cat([(start.detach() - self.bin_width_s).reshape(1), flat])
+        edges = torch.cat([(start - self.bin_width_s).reshape(1), flat])
         total = resample_counts(shares, self.bin_width_s, edges, start_s=start).cumsum(0)
         return total.reshape(time_s.shape)
 
@@ -100,7 +100,7 @@ class MeasuredResponse(Response):
         return integrated_counts(shares, self.bin_width_s, time_s, start), above
 
     def support_s(self) -> tuple[float, float]:
-        shares = self._shares().detach()
+        shares = self._shares()
         start = float(self._start_s(shares).detach())
         kept = torch.nonzero(shares > 1e-12).flatten()
         return start + int(kept[0]) * self.bin_width_s, start + (int(kept[-1]) + 1) * self.bin_width_s
