@@ -37,7 +37,7 @@ def test_matched_filter_by_hand():
 
 
 def test_top_of_a_parabola():
-    """1, 4, 2: (2 - 1) / (2 (2 4 - 1 - 2)) of a bin late. None at the ends, on a plateau, and never beyond half a bin."""
+    """1, 4, 2: (2 - 1) / (2 (2 4 - 1 - 2)) of a bin late. None at the ends and on a plateau; half a bin at most."""
     rows = [1, 4, 2, 0, 0], [5, 4, 2, 0, 0], [0, 1, 2, 4, 5], [3, 3, 3, 3, 3], [0, 2, 2, 2, 0]
     assert flat(depth.peak_position(histogram(*rows))) == [1.5 + 0.1, 0.5, 4.5, 0.5, 1.5 + 0.5]
     assert flat(depth.peak_position(histogram(*rows), refine=False)) == [1.5, 0.5, 4.5, 0.5, 1.5]
@@ -147,5 +147,5 @@ def test_bound_of_a_distance_by_hand():
     [((5,), (3, 3)), ((2, 4, 5), (3, 3, 3)), ((4, 5), (2, 3, 3)), ((4, 5), (3, 4)), ((4, 5), (1, 1, 3, 3))],
 )
 def test_shapes_that_are_no_camera(distance, intrinsics):
-    with pytest.raises(ShapeError, match="^distance_to_points: expected"):
+    with pytest.raises(ShapeError, match=r"^distance_to_points: expected"):
         depth.distance_to_points(torch.ones(distance), torch.ones(intrinsics))

@@ -356,8 +356,6 @@ class ItofCorrelation(Sensor):
     def _of_pixels(self, x: Tensor, phases: Tensor) -> Tensor:
         """Taps of pixels whose phases differ."""
         check_transient(x, type(self).__name__)
-        if x.shape[-3] != self.axis.num_bins:
-            raise ShapeError(f"ItofCorrelation: expected {self.axis.num_bins} bins, got {tuple(x.shape)}.")
         _fitting(phases, x, "ItofCorrelation")
         code, harmonics = self._turned, self._turned.harmonics
         if harmonics is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 
 import torch
@@ -191,13 +192,9 @@ class ComposedResponse(Response):
             if last - first <= CLOSED_BINS:
                 return super().kernel(bin_width_s)
         fine = self.oversampling
-        first, total = 0, None
-        for response in self.responses:
-            begin, weights = kernel_of(response, bin_width_s / fine, within_bin)  # type: ignore[arg-type]
-            first += begin
-            total = weights if total is None else _full_convolution(total, weights)
-        if total is None:
-            raise ShapeError("ComposedResponse: expected at least one response, got none.")
+        parts = [kernel_of(r, bin_width_s / fine, within_bin) for r in self.responses]  # type: ignore[arg-type]
+        first = sum(begin for begin, _ in parts)
+        total = functools.reduce(_full_convolution, [weights for _, weights in parts])
         # a fine lag goes to the bin round(lag/fine), or, where light is spread evenly, to two bins by linear shares,
         # which are `fine` such roundings from all places of a bin
         places = [(fine - 1) // 2] if within_bin == "center" else range(fine)
