@@ -13,6 +13,9 @@ from torchtransient.errors import TorchTransientError
 from torchtransient.sensing.correlated_noise.trapped_ring import trapped_lines
 from torchtransient.sensing.dead_time import stationary_phases as phases
 from torchtransient.sensing.dead_time.banded_solve import solve_banded
+from torchtransient.sensing.dead_time.dead_time_cycle import Cycle, cycle_of_rows
+from torchtransient.sensing.dead_time.dead_time_draws import _bins, _steps, _wider_pieces, _width
+from torchtransient.sensing.dead_time.free_running_state import late_lines
 from torchtransient.sensing.dead_time.renewal_chain import RenewalChain
 
 ROOT = math.sqrt(3.0)
@@ -175,3 +178,75 @@ def test_carriers_on_a_ring_are_those_of_the_matrix(whole, part):
     one = [v.detach() for v in leaves]
     found = torch.autograd.grad(trapped_lines(*one[:1], leaves[1], *one[2:], whole).sum(), leaves[1])[0]
     assert bool(found.isfinite().all()) and not any(v.requires_grad for v in one)
+
+
+# ------------------------------------------------------------------------- who is armed again one piece later
+
+
+def late_of(count, slope, part, number=100_000):
+    """Detections on a line in the last `part` of their piece."""
+    y = (np.arange(number) + 0.5) / number
+    return float(((count + ROOT * slope * (2 * y - 1)) * (y > 1 - part)).sum() / number)
+
+
+LINES = torch.tensor([[0.5, 0.2, 0.8, 0.3, 0.6, 0.4]], dtype=torch.float64), torch.tensor(
+    [[0.1, -0.1, 0.3, 0.05, -0.2, 0.0]], dtype=torch.float64
+)
+
+
+@pytest.mark.parametrize("part", [0.0, 0.3, 0.8])
+def test_late_detections_of_lines(part):
+    """Of a line, and none below zero or beyond all: in the cycle and in the stationary state."""
+    count, slope = LINES
+    wanted = [late_of(float(c), float(s), part) for c, s in zip(count[0], slope[0], strict=True)]
+    of_cycle = Cycle(count, count, slope, 2, torch.tensor(part, dtype=torch.float64), 1).late
+    on_ring = late_lines(torch.cat(LINES, -1), torch.tensor(part, dtype=torch.float64))
+    for found in (of_cycle, on_ring):
+        assert found[0].tolist() == pytest.approx(wanted, abs=1e-5)
+    steep = Cycle(count, count, 90 * slope.abs(), 2, torch.tensor(0.3, dtype=torch.float64), 1).late
+    assert bool((steep <= count).all()) and float(steep[0, 0]) == 0.5
+    falling = Cycle(count, count, -90 * slope.abs(), 2, torch.tensor(0.3, dtype=torch.float64), 1).late
+    assert bool((falling >= 0).all()) and float(falling[0, 0]) == 0.0
+
+
+@pytest.mark.parametrize("whole, wider", [(4, 1), (4, 2), (5, 2), (7, 3), (6, 3), (8, 3)])
+def test_pieces_that_are_drawn_as_one(whole, wider):
+    """Fine piece j is armed again in j + whole, its late ones in the next: wide ones are told by what they hold."""
+    count, slope = LINES
+    part = 0.3
+    late = Cycle(count, count, slope, whole, torch.tensor(part, dtype=torch.float64), 1).late[0]
+    wanted_late, wanted_count = np.zeros(6 // wider), np.zeros(6 // wider)
+    for j in range(6):
+        wanted_count[j // wider] += float(count[0, j])
+        for again, number in ((j + whole, float(count[0, j] - late[j])), (j + whole + 1, float(late[j]))):
+            wanted_late[j // wider] += number * (again // wider - j // wider - whole // wider)
+    states = torch.zeros(7, 3, 1, dtype=torch.float64)
+    states[1:, 1, 0], states[1:, 2, 0], states[:-1, 0, 0] = count[0], slope[0], torch.arange(6.0).double()
+    found, armed, late_rows = _wider_pieces(states, part, whole, wider)
+    assert found[:, 0].tolist() == pytest.approx(wanted_count.tolist())
+    assert late_rows[:, 0].tolist() == pytest.approx([0.0, *wanted_late])
+    assert armed[:, 0].tolist() == [float(j) for j in range(0, 6, wider)]
+
+
+def test_how_many_pieces_are_drawn_as_one():
+    """Four at most, as many as divide a bin, no longer than a dead time."""
+    given = (1, 9), (2, 9), (4, 9), (8, 9), (8, 4), (8, 3), (8, 2), (8, 1)
+    assert [_width(*pair) for pair in given] == [1, 2, 4, 4, 4, 2, 2, 1]
+
+
+@pytest.mark.parametrize("dead, pieces", [(1.3, 1), (1.3, 4), (2.6, 2), (3.4, 4)])
+def test_steps_of_a_cycle_hold_what_the_cycle_does(dead, pieces):
+    """Counts of bins, who is armed, and everybody comes back a dead time later, in the piece that it ends in."""
+    rate = rates(5, 2)
+    bins = torch.tensor(dead, dtype=torch.float64)
+    steps, cycle = _steps(rate, bins, pieces), cycle_of_rows(rate, bins, pieces)
+    wider = pieces // steps.pieces
+    torch.testing.assert_close(_bins(steps.count, steps.pieces), cycle.count.view(2, 5, pieces).sum(-1))
+    torch.testing.assert_close(steps.armed.squeeze(-1).T, cycle.armed[:, ::wider])
+    back = torch.zeros(2, 5 * pieces // wider, dtype=torch.float64)
+    for j in range(5 * pieces):
+        for again, number in ((j + cycle.whole, cycle.count[:, j] - cycle.late[:, j]),
+                              (j + cycle.whole + 1, cycle.late[:, j])):  # fmt: skip
+            if again // wider < back.shape[1]:
+                back[:, again // wider] += number
+    torch.testing.assert_close(steps.back.squeeze(-1).T, back, rtol=1e-10, atol=1e-12)
