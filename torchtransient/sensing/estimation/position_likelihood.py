@@ -63,7 +63,7 @@ def ml_position(
         best = scores.argmax(TIME)
     rows, start = counts.movedim(TIME, -1).reshape(-1, bins), best.reshape(-1, 1)
     # bins that the response may reach from any place around the best one, counted from that
-    low, high = max(first - 1 - _AROUND, -bins), min(first + kernel.numel() + _AROUND + 1, bins)
+    low, high = max(first - _AROUND, -bins), min(first + kernel.numel() + _AROUND, bins)
     places = torch.arange(-_AROUND * _STEPS, (1 + _AROUND) * _STEPS + 1, device=rows.device) / _STEPS
     edges = (torch.arange(low, high + 1, device=rows.device) - places.double().unsqueeze(-1)) * width
     table = torch.log1p(ratio * shares_between(response, edges, width))
