@@ -107,6 +107,15 @@ def test_a_floor_of_polarization_has_to_be_exceeded():
     assert each.isnan().flatten().tolist() == [True, False]
     each = metrics.dop_mae(other, stokes, floor=0.499, reduction="none")
     assert each.flatten().tolist() == [1.0, 0.0]
+    # nor does light of fewer digits than numbers have, whatever the floor
+    tiny = torch.finfo(torch.float32).tiny
+    for metric in (metrics.dop_mae, metrics.aolp_mae):
+        faint = stokes.clone()
+        faint[:2, ..., 0] = tiny
+        each = metric(faint, faint, floor=0.0, reduction="none")
+        assert each.isnan().flatten().tolist()[0]
+        faint[:2, ..., 0] = 4 * tiny
+        assert metric(faint, faint, floor=0.0, reduction="none").flatten().tolist()[0] == 0.0
 
 
 # Voxels of a quarter of a metre, whose numbers are exact.

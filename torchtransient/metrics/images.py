@@ -186,8 +186,10 @@ def _range(
     """What values are divided by, broadcasting to the target."""
     if value_range is not None:
         limit = check_level("value_range", value_range, target.new_empty(()), where)
+        if not target.numel():
+            return limit
         low, high = target.clamp(max=0), target.clamp_min(0)
-        spread = high.amax(dims, keepdim=True) - low.amin(dims, keepdim=True) if target.numel() else limit * 0
+        spread = high.amax(dims, keepdim=True) - low.amin(dims, keepdim=True)
         if not holds(spread <= limit * (1 + 1e-5)):
             raise UnitError(
                 f"{where}: expected a target within value_range {value_range}, got values over "

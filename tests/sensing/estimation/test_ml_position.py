@@ -142,3 +142,31 @@ def test_mistakes():
         sensing.ml_position(counts, response, AXIS, signal_to_background=0.0)
     with pytest.raises(ShapeError, match="ml_position"):
         sensing.ml_position(counts[0, 0], response, AXIS)
+
+
+@pytest.mark.parametrize("delay", [0.0, 370 * PS, -640 * PS])
+@pytest.mark.parametrize("shape", ["tail", "even", "narrow"])
+def test_few_photons_against_every_place(shape, delay):
+    """The greatest likelihood of all places of the bins around the best one, looked at one by one, at both ends too."""
+    bins, ratio = 20, 50.0
+    response = {"tail": sensing.emg_response(150 * PS, 300 * PS, delay_s=delay),
+                "even": sensing.UniformResponse(230 * PS, delay_s=delay),
+                "narrow": sensing.GaussianResponse(90 * PS, delay_s=delay)}[shape]  # fmt: skip
+    mean = torch.full((1, bins, 1, 150), 0.3, dtype=torch.float64)
+    counts = torch.poisson(mean, generator=torch.Generator().manual_seed(0))
+    found = sensing.ml_position(counts, response, bin_width_s=100 * PS, signal_to_background=ratio).flatten()
+    first, kernel = response.kernel(100 * PS)
+    best = sensing.log_matched_filter(counts, kernel, first, signal_to_background=ratio).argmax(-3).flatten()
+    places = torch.arange(bins * 64 + 1, dtype=torch.float64) / 64
+    edges = (torch.arange(bins + 1, dtype=torch.float64) - places.unsqueeze(1)) * 100 * PS
+    shares = response.cdf(edges.flatten()).view(edges.shape).diff(dim=1)
+    likely = torch.log1p(ratio * shares) @ counts[0, :, 0]
+    apart = places.unsqueeze(1) - best
+    likely = likely.masked_fill((apart < -1) | (apart > 2), -math.inf)
+    highest = likely.amax(0)
+    # between the places that were looked at the likelihood is hardly higher; light outside of a response says nothing
+    at = (found * 64).round().long().clamp(0, bins * 64)
+    seen = counts.sum(1).flatten() > 0
+    assert bool((likely.gather(0, at.unsqueeze(0))[0] >= highest - 0.05 * (1 + highest.abs()))[seen].all())
+    strict = likely.gather(0, at.unsqueeze(0))[0] >= highest - 1e-3
+    assert float(strict[seen].double().mean()) > 0.9

@@ -23,6 +23,7 @@ Source: Mohamed et al., Monte Carlo gradient estimation in machine learning, JML
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from contextvars import ContextVar, Token
@@ -106,18 +107,15 @@ class ScoreFunction:
                 "ScoreFunction: no sensor with grad='score' and a differentiable input ran inside the context, so "
                 "there is nothing to differentiate. Run the sensor inside the `with` block."
             )
-        total: Tensor | None = None
+        parts: list[Tensor] = []
         for value in self._log_probs:
             if tuple(value.shape[: len(shape)]) != tuple(shape):
                 raise ShapeError(
                     f"ScoreFunction.surrogate: expected losses whose shape begins that of the log-probabilities "
                     f"{tuple(value.shape)}, got {tuple(shape)}. Reduce the losses to one number per item or pixel."
                 )
-            part = value.reshape((*shape, -1)).sum(-1)
-            total = part if total is None else total + part
-        if total is None:
-            raise GradientError("ScoreFunction: nothing was collected.")
-        return total
+            parts.append(value.reshape((*shape, -1)).sum(-1))
+        return functools.reduce(torch.add, parts)
 
     def surrogate(self, losses: Tensor, baseline: Tensor | float | Literal["leave_one_out"] | None = None) -> Tensor:
         """The losses, value unchanged, whose gradient is unbiased for the gradient of their expectation.

@@ -50,7 +50,7 @@ def remembered(module: nn.Module, arguments: Hashable, compute: Callable[[], Res
     if seen is not None and seen.plain == plain and _same(seen.numbers, numbers):
         result: Result = seen.result
         return result
-    copies = [number.detach().clone() for number in numbers]
+    copies = [number.clone() for number in numbers]
     # a tensor made in inference mode could not be used in training afterwards
     with torch.inference_mode(False), torch.no_grad():
         result = compute()

@@ -230,7 +230,7 @@ class PixelElectronics(RandomSensor):
         if self.gain_e_per_dn is None or self.bits is None:
             return charge
         level = charge / self.gain_e_per_dn + self.black_level_dn
-        level = straight_through(level.detach().round(), level) if level.requires_grad else level.round()
+        level = straight_through(level.round(), level) if level.requires_grad else level.round()
         return (level.clamp(*self.range_dn) - self.black_level_dn) * self.gain_e_per_dn
 
     def _map(self, values: Tensor, name: str, x: Tensor) -> Tensor:

@@ -46,8 +46,8 @@ class PixelGroups(RandomSensor):
         if not isinstance(which, Tensor) or which.ndim != 2 or which.is_complex():
             shape = tuple(which.shape) if isinstance(which, Tensor) else type(which).__name__
             raise ShapeError(f"PixelGroups: expected which as (H, W) numbers of sensors, got {shape}.")
-        numbers = which.detach().long()
-        inside = (numbers == which.detach()) & (numbers >= 0) & (numbers < len(sensors))
+        numbers = which.long()
+        inside = (numbers == which) & (numbers >= 0) & (numbers < len(sensors))
         if not bool(inside.all()):
             raise ShapeError(f"PixelGroups: expected numbers of {len(sensors)} sensors, 0 to {len(sensors) - 1}.")
         check_draws(sensors, "PixelGroups")

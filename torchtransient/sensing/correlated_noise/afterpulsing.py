@@ -321,7 +321,10 @@ class Afterpulsing(AddedCounts):
         if counts.device.type == "cpu" and counts.numel() >= _WORTH_TABLE and period <= _MOST_LAGS:
             kernel = self._kernel(period).detach().cpu()
             return LagTable(kernel / kernel.sum()).draw
-        longest = self.delays.end_s() if self.delays is not None else 20 * float(self.tau_s.max()) + self.dead_time_s
+        if self.delays is None:
+            longest = self.dead_time_s + 20 * float(self.tau_s.detach().max())
+        else:
+            longest = self.delays.end_s()
         # bins are told apart to 1e-3 of a bin, and delays have as many steps
         real = torch.float32 if max(period, longest / self.bin_width_s) < _FINE else torch.float64
 

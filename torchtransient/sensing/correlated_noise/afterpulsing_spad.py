@@ -77,9 +77,10 @@ class AfterpulsingSPAD(WrappedDetector):
         if not isinstance(afterpulsing, Afterpulsing):
             raise UnitError(f"{where}: expected afterpulsing to be an Afterpulsing, got {afterpulsing!r}.")
         own = detector.dead_time_s
-        if own is not None and not math.isclose(float(own), afterpulsing.dead_time_s, rel_tol=1e-6):
+        own = float(own.detach()) if isinstance(own, Tensor) else own
+        if own is not None and not math.isclose(own, afterpulsing.dead_time_s, rel_tol=1e-6):
             raise UnitError(
-                f"{where}: expected the detector's dead time of {float(own):g} s in afterpulsing, got "
+                f"{where}: expected the detector's dead time of {own:g} s in afterpulsing, got "
                 f"{afterpulsing.dead_time_s:g} s. One detector has one dead time."
             )
         super().__init__(detector, grad)

@@ -94,14 +94,15 @@ class Crosstalk(AddedCounts):
         return add_crosstalk(x, near * (1 - near), far * (1 - far), only_added=True)
 
     def share(self) -> float:
-        return 4 * float(self.probability) * (1 + self.diagonal_ratio)
+        return 4 * float(self.probability.detach()) * (1 + self.diagonal_ratio)
 
     def trigger(self, counts: Tensor, generator: torch.Generator | None) -> Tensor:
         check_transient(counts, "Crosstalk")
         *_, height, width = counts.shape
         frames = counts.reshape(-1, height, width)
         result = frames.clone(memory_format=torch.contiguous_format)
-        rings = [(_EDGES, float(self._probabilities()[0])), (_CORNERS, float(self._probabilities()[1]))]
+        near, far = self._probabilities()
+        rings = [(_EDGES, float(near.detach())), (_CORNERS, float(far.detach()) if isinstance(far, Tensor) else far)]
         together = max(_BLOCK // max(height * width, 1), 1)
 
         def follow(piece: Tensor, begin: int, own: torch.Generator | None) -> None:

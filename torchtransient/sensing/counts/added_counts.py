@@ -85,7 +85,7 @@ class AddedCounts(RandomSensor):
 
     def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         with torch.no_grad():
-            counts = check_transient(x, type(self).__name__).detach()
+            counts = check_transient(x, type(self).__name__)
             if not counts.numel():
                 return counts.clone()
             followed, totals = look_at_items(counts)

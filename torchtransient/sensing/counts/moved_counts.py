@@ -307,7 +307,7 @@ class MovedCounts(RandomSensor):
 
     def _drawn(self, x: Tensor, generator: torch.Generator | None, tally: bool) -> tuple[Tensor, Tensor | None, Tensor]:
         """Items moved, how many of the whole ones went each way, and which are whole; see `whole_items`."""
-        given = check_transient(x, type(self).__name__).detach()
+        given = check_transient(x, type(self).__name__)
         counts = given.float() if x.dtype in (torch.float16, torch.bfloat16) else given
         highest = float(counts.abs().amax()) if counts.numel() else 0.0
         if not math.isfinite(highest):

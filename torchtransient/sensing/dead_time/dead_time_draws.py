@@ -64,8 +64,8 @@ def _columns(x: Tensor) -> Tensor:
 
 def _width(pieces: int, whole: int) -> int:
     """Pieces that are drawn as one; a dead time is one of these at least."""
-    wider = min(_WIDER, pieces, max(whole, 1))
-    while pieces % wider or whole < wider:
+    wider = min(_WIDER, pieces, whole)
+    while pieces % wider:
         wider -= 1
     return wider
 

@@ -54,7 +54,7 @@ def walks(rate: Tensor, dead_bins: Tensor) -> Iterator[tuple[Tensor | slice, Wal
     for k in present:
         pieces = least << k
         columns = None if len(present) == 1 else (level == k).nonzero().squeeze(-1)
-        whole, part = whole_and_part(dead_bins.detach().double() * pieces)
+        whole, part = whole_and_part(dead_bins.double() * pieces)
         number = rate.shape[1] if columns is None else columns.numel()
         few = max(1, _STATES // (3 * pieces * rate.shape[0]))
         for begin in range(0, number, few):

@@ -43,7 +43,7 @@ def stationary_state(rate: Tensor, dead_bins: Tensor) -> FreeRunningState:
     in 2, 4, ..., until counts settle. Raises TorchTransientError when they do not with 32 pieces.
     """
     # a dark pixel has no phases; its limit is one photon, at most, per many periods
-    dark = rate.detach().sum(-1, keepdim=True) < DARK
+    dark = rate.sum(-1, keepdim=True) < DARK
     safe = torch.where(dark, torch.full_like(rate, 1.0 / rate.shape[-1]), rate)
     state = _settled(safe, dead_bins, 1)
     inside = _armed_in_the_light(safe, state).nonzero().flatten()
@@ -59,9 +59,9 @@ def stationary_state(rate: Tensor, dead_bins: Tensor) -> FreeRunningState:
 
 def _armed_in_the_light(rate: Tensor, state: FreeRunningState) -> Tensor:
     """(P,) whether a share of detections ends being dead in bins far brighter than the darkest."""
-    detected, late = state.detected.detach(), state.late.detach()
+    detected, late = state.detected, state.late
     armed_anew = (detected - late).roll(state.whole, -1) + late.roll(state.whole + 1, -1)
-    bright = rate.detach() - rate.detach().amin(-1, keepdim=True) > _CONTRAST
+    bright = rate - rate.amin(-1, keepdim=True) > _CONTRAST
     return torch.where(bright, armed_anew, 0.0).sum(-1) > _BRIGHT * detected.sum(-1)
 
 
@@ -70,7 +70,7 @@ def rows_by_contrast(rate: Tensor) -> Iterator[tuple[Tensor | None, int]]:
 
     What all bins have in common is left out: constant light is exact in bins of any width.
     """
-    peak = torch.nan_to_num((rate.amax(-1) - rate.amin(-1)).detach()) / _CONTRAST
+    peak = torch.nan_to_num(rate.amax(-1) - rate.amin(-1)) / _CONTRAST
     level = torch.ceil(torch.log2(peak.clamp(1, _FINEST / 2)) - 1e-9).long()
     for k in range(int(_FINEST).bit_length()):
         rows = (level == k).nonzero().flatten()
@@ -91,10 +91,10 @@ def _placed(whole: FreeRunningState, part: FreeRunningState, rows: Tensor) -> Fr
 def _settled(safe: Tensor, dead_bins: Tensor, pieces: int) -> FreeRunningState:
     """Of rows above 0, bins cut in `pieces` or as many more as they need."""
     state = _solved(safe, dead_bins, pieces)
-    low, high = state.detected.detach().aminmax(dim=-1)
+    low, high = state.detected.aminmax(dim=-1)
     rows = (~(low >= -_BELOW_ZERO * high)).nonzero().flatten()
     while rows.numel():
-        before = state.detected.detach()[rows]
+        before = state.detected[rows]
         pieces *= 2
         if pieces > _FINEST:
             raise TorchTransientError(
@@ -104,7 +104,7 @@ def _settled(safe: Tensor, dead_bins: Tensor, pieces: int) -> FreeRunningState:
             )
         finer = _solved(safe[rows], dead_bins, pieces)
         state = _placed(state, finer, rows)
-        now = finer.detected.detach()
+        now = finer.detected
         low, high = now.aminmax(dim=-1)
         settled = (now - before).abs().sum(-1) <= _SETTLED * now.sum(-1)
         rows = rows[~(settled & (low >= -_BELOW_ZERO * high))]

@@ -166,13 +166,13 @@ def covariance_bound(
             )
         slopes.append(slope.movedim(TIME, -1).to(torch.float64))
     counts = value.movedim(TIME, -1).to(torch.float64)
-    if bool((counts.detach() < 0).any()):
+    if bool((counts < 0).any()):
         raise UnitError(f"{where}: expected mean counts >= 0, got negative ones.")
     each = torch.stack(slopes, -1)
     information = torch.einsum("...ti,...t,...tj->...ij", each, 1 / counts.clamp_min(_DARK), each)
     if number is not None:
         rest, total = number - counts.sum(-1), each.sum(-2)
-        if bool((rest.detach() < -1e-6 * number).any()):
+        if bool((rest < -1e-6 * number).any()):
             raise UnitError(f"{where}: expected at most one detection in each of {number} cycles, got a mean of more.")
         # as many cycles as rounding leaves of those that saw nothing
         rest = rest.clamp_min(number * torch.finfo(value.dtype).eps)[..., None, None]
@@ -216,7 +216,7 @@ def _inverse(information: Tensor) -> Tensor:
     scaled = information / size.unsqueeze(-1) / size.unsqueeze(-2)
     scaled = scaled + torch.diag_embed((~known).to(own))
     factor, failed = torch.linalg.cholesky_ex(scaled)
-    told = (failed == 0) & (factor.detach().diagonal(dim1=-2, dim2=-1).square() > _SAME).all(-1)
+    told = (failed == 0) & (factor.diagonal(dim1=-2, dim2=-1).square() > _SAME).all(-1)
     unit = torch.eye(own.shape[-1], dtype=own.dtype, device=own.device)
     inverse = torch.cholesky_inverse(torch.where(told[..., None, None], factor, unit))
     inverse = inverse / size.unsqueeze(-1) / size.unsqueeze(-2)
@@ -246,7 +246,7 @@ def _pixels(values: tuple[Tensor | float, ...], response: Response, where: str) 
         if tensor.is_complex() or tensor.dtype == torch.bool:
             raise UnitError(f"{where}: expected {name} of real numbers, got {tensor.dtype}.")
         tensor = tensor.to(torch.float64)
-        if not bool((torch.isfinite(tensor.detach()) & (tensor.detach() >= 0)).all()):
+        if not bool((torch.isfinite(tensor) & (tensor >= 0)).all()):
             raise UnitError(f"{where}: expected {name} to be finite and >= 0, got other numbers.")
         tensors.append(tensor)
     try:

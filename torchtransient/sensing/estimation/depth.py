@@ -65,11 +65,11 @@ def peak_position(scores: Tensor, refine: bool = True) -> Tensor:
     or last bin and where the three entries are equal, it is the middle of the bin with derivative zero.
     """
     check_transient(scores, "peak_position")
-    index = scores.detach().argmax(TIME, keepdim=True)
+    index = scores.argmax(TIME, keepdim=True)
     middle = index.squeeze(TIME).to(scores.dtype) + 0.5
     position = middle + _parabola(scores, index).squeeze(TIME) if refine else middle
     # argmax takes NaN for the largest entry; a position from it would look like any other
-    return torch.where(scores.detach().gather(TIME, index).squeeze(TIME).isnan(), math.nan, position)
+    return torch.where(scores.gather(TIME, index).squeeze(TIME).isnan(), math.nan, position)
 
 
 def _parabola(scores: Tensor, index: Tensor) -> Tensor:
@@ -107,16 +107,16 @@ def center_of_mass(
     excess = histogram - _per_pixel(background, histogram, "center_of_mass", "background")
     bins = _positions(histogram)
     if half_width_bins is None:
-        reference = torch.full_like(histogram.detach().select(TIME, 0).unsqueeze(TIME), bins.numel() / 2)
+        reference = torch.full_like(histogram.select(TIME, 0).unsqueeze(TIME), bins.numel() / 2)
     else:
         check_count(half_width_bins, "half_width_bins", "center_of_mass", low=0)
-        reference = histogram.detach().argmax(TIME, keepdim=True).to(histogram.dtype) + 0.5
+        reference = histogram.argmax(TIME, keepdim=True).to(histogram.dtype) + 0.5
         excess = torch.where((bins - reference).abs() <= half_width_bins + 0.25, excess, 0.0)
     # Shares of the largest entry, whose squares do not overflow.
     largest = excess.detach().abs().amax(TIME, keepdim=True)
     excess = excess / torch.where(largest > 0, largest, 1.0)
     total = excess.sum(TIME, keepdim=True)
-    weight = (histogram.detach().abs() / torch.where(largest > 0, largest, 1.0)).sum(TIME, keepdim=True)
+    weight = (histogram.abs() / torch.where(largest > 0, largest, 1.0)).sum(TIME, keepdim=True)
     # "not below" lets NaN through
     there = ~(total <= torch.finfo(histogram.dtype).eps * weight)
     # Around the reference, so that float32 does not cancel far from the start of the axis.
@@ -170,7 +170,7 @@ def first_return(histogram: Tensor, threshold: Tensor | float) -> Returns:
     check_transient(histogram, "first_return")
     level = _per_pixel(threshold, histogram, "first_return", "threshold")
     # NaN counts as reached, and is then what is found
-    reached = ~((histogram.detach() < level.detach()) | (histogram.detach() <= 0))
+    reached = ~((histogram < level) | (histogram <= 0))
     valid = reached.any(TIME, keepdim=True)
     index = reached.to(torch.uint8).argmax(TIME, keepdim=True)
     here, before = histogram.gather(TIME, index), histogram.gather(TIME, (index - 1).clamp(min=0))
@@ -196,14 +196,13 @@ def multi_return(scores: Tensor, max_returns: int, *, threshold: float, min_sepa
     check_count(max_returns, "max_returns", me)
     separation = check_count(min_separation_bins, "min_separation_bins", me)
     # NaN is no maximum anywhere: a histogram with one has no returns that could be told
-    unknown = scores.detach().isnan().any(TIME, keepdim=True)
-    values = scores.detach()
-    low = torch.full_like(values.select(TIME, 0).unsqueeze(TIME), -math.inf)
-    before = torch.cat([low, values.narrow(TIME, 0, values.shape[TIME] - 1)], TIME)
-    after = torch.cat([values.narrow(TIME, 1, values.shape[TIME] - 1), low], TIME)
-    above = (values >= threshold) & (values > values.amin(TIME, keepdim=True))
-    left = torch.where((values >= before) & (values > after) & above, values, -math.inf)
-    bins = torch.arange(values.shape[TIME], device=values.device).reshape(-1, 1, 1)
+    unknown = scores.isnan().any(TIME, keepdim=True)
+    low = torch.full_like(scores.select(TIME, 0).unsqueeze(TIME), -math.inf)
+    before = torch.cat([low, scores.narrow(TIME, 0, scores.shape[TIME] - 1)], TIME)
+    after = torch.cat([scores.narrow(TIME, 1, scores.shape[TIME] - 1), low], TIME)
+    above = (scores >= threshold) & (scores > scores.amin(TIME, keepdim=True))
+    left = torch.where((scores >= before) & (scores > after) & above, scores, -math.inf)
+    bins = torch.arange(scores.shape[TIME], device=scores.device).reshape(-1, 1, 1)
     found = []
     for _ in range(max_returns):
         best = left.argmax(TIME, keepdim=True)
@@ -271,7 +270,7 @@ def range_deviation_m(response_fwhm_s: float, detections: Tensor) -> Tensor:
     from torchtransient.sensing.response.response_shapes import FWHM_PER_SIGMA
     from torchtransient.units import SPEED_OF_LIGHT
 
-    if not isinstance(detections, Tensor) or bool((detections.detach() < 0).any()):
+    if not isinstance(detections, Tensor) or bool((detections < 0).any()):
         got = "negative ones" if isinstance(detections, Tensor) else type(detections).__name__
         raise UnitError(f"range_deviation_m: expected a tensor of detections >= 0, got {got}. Give expected numbers.")
     width = check_number(response_fwhm_s, "response_fwhm_s", "range_deviation_m", open_low=True, high=1e-3)

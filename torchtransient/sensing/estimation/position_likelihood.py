@@ -59,11 +59,11 @@ def ml_position(
     first, kernel = response.kernel(width)
     counts = histogram.to(torch.float64)
     with torch.no_grad():
-        scores = log_matched_filter(counts, kernel.detach(), first, signal_to_background=ratio)
+        scores = log_matched_filter(counts, kernel, first, signal_to_background=ratio)
         best = scores.argmax(TIME)
     rows, start = counts.movedim(TIME, -1).reshape(-1, bins), best.reshape(-1, 1)
     # bins that the response may reach from any place around the best one, counted from that
-    low, high = max(first - 1 - _AROUND, -bins), min(first + kernel.numel() + _AROUND + 1, bins)
+    low, high = max(first - _AROUND, -bins), min(first + kernel.numel() + _AROUND, bins)
     places = torch.arange(-_AROUND * _STEPS, (1 + _AROUND) * _STEPS + 1, device=rows.device) / _STEPS
     edges = (torch.arange(low, high + 1, device=rows.device) - places.double().unsqueeze(-1)) * width
     table = torch.log1p(ratio * shares_between(response, edges, width))
@@ -73,16 +73,15 @@ def ml_position(
     found = start + places
     likely = (seen @ table.T).masked_fill((found < 0) | (found > bins), -math.inf)
     position = start.squeeze(1) + places[0] + _top(likely) / _STEPS
-    position = torch.where((rows.detach() == 0).all(1), 0.5, position)
-    position = torch.where(rows.detach().isnan().any(1), math.nan, position)
+    position = torch.where((rows == 0).all(1), 0.5, position)
+    position = torch.where(rows.isnan().any(1), math.nan, position)
     return position.reshape(best.shape).to(histogram.dtype)
 
 
 def _top(values: Tensor) -> Tensor:
     """Index (N,) of the largest entry of (N, M), between entries by a parabola, or the middle of a flat top."""
-    plain = values.detach()
-    highest = plain.amax(1, keepdim=True)
-    top = plain >= highest - _EQUAL * highest.abs()
+    highest = values.amax(1, keepdim=True)
+    top = values >= highest - _EQUAL * highest.abs()
     # the flat part that the first largest entry is in
     begin = top.to(torch.uint8).argmax(1, keepdim=True)
     number = torch.arange(values.shape[1], device=values.device)
@@ -91,7 +90,7 @@ def _top(values: Tensor) -> Tensor:
     last = values.shape[1] - 1
     here = values.gather(1, begin)
     left, right = values.gather(1, (begin - 1).clamp(min=0)), values.gather(1, (begin + 1).clamp(max=last))
-    usable = ~flat & (begin > 0) & (begin < last) & left.detach().isfinite() & right.detach().isfinite()
+    usable = ~flat & (begin > 0) & (begin < last) & left.isfinite() & right.isfinite()
     one = torch.ones_like(here)
     bend = torch.where(usable, 2 * here - left - right, one)
     offset = torch.where(usable, 0.5 * (right - left) / torch.where(bend > 0, bend, one), torch.zeros_like(here))

@@ -311,8 +311,8 @@ class ItofCorrelation(Sensor):
         """The calibration that has these phases."""
         direction = 1 if self.calibration is None else self.calibration.direction
         if phases.shape[1:] == (1, 1):
-            return ItofCalibration(phase_offset_rad=phases.detach().flatten().tolist(), direction=direction)
-        return ItofCalibration(direction=direction, phase_map_rad=phases.detach())
+            return ItofCalibration(phase_offset_rad=phases.flatten().tolist(), direction=direction)
+        return ItofCalibration(direction=direction, phase_map_rad=phases)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *others: Any) -> None:
         """Phases of another size come with the state; what else is another camera's is an error."""
@@ -356,8 +356,6 @@ class ItofCorrelation(Sensor):
     def _of_pixels(self, x: Tensor, phases: Tensor) -> Tensor:
         """Taps of pixels whose phases differ."""
         check_transient(x, type(self).__name__)
-        if x.shape[-3] != self.axis.num_bins:
-            raise ShapeError(f"ItofCorrelation: expected {self.axis.num_bins} bins, got {tuple(x.shape)}.")
         _fitting(phases, x, "ItofCorrelation")
         code, harmonics = self._turned, self._turned.harmonics
         if harmonics is None:

@@ -139,9 +139,9 @@ class PiecewiseLinearCode(CorrelationCode):
     def _locate(self, turns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Whole periods, index of the line, and distance from its first knot, each (N, M) for turns (M,)."""
         x = turns.to(torch.float64).cpu() - self._start
-        periods = torch.floor(x.detach())
+        periods = torch.floor(x)
         x = x - periods
-        index = torch.searchsorted(self._x, x.detach().contiguous(), right=True) - 1
+        index = torch.searchsorted(self._x, x.contiguous(), right=True) - 1
         index = index.clamp(0, self._slope.shape[1] - 1)
         return periods, index, x - self._x.gather(1, index)
 

@@ -136,9 +136,9 @@ def phase_of(phasor: Tensor) -> Tensor:
     scale = torch.where(there, largest, 1.0)
     angle = torch.atan2(torch.where(there, imag, 0.0) / scale, torch.where(there, real, 1.0) / scale)
     # Not where(..., turn, 0.0): two plain numbers make a float32 of the turn.
-    wrapped = angle + _TURN * (angle.detach() < 0).to(angle)
+    wrapped = angle + _TURN * (angle < 0).to(angle)
     # The sum of a tiny negative angle and a turn rounds to the turn itself.
-    return torch.where(wrapped.detach() >= _TURN, wrapped - _TURN, wrapped)
+    return torch.where(wrapped >= _TURN, wrapped - _TURN, wrapped)
 
 
 def amplitude_of(phasor: Tensor) -> Tensor:
@@ -173,7 +173,7 @@ def unambiguous_range_m(frequencies_hz: Frequencies) -> float:
 def wrapped_difference(a: Tensor, b: Tensor) -> Tensor:
     """``a - b`` in radians, the short way round: in [-pi, pi), derivative one everywhere. Shapes broadcast."""
     difference = a - b
-    turns = torch.floor((difference.detach() + math.pi) / _TURN)
+    turns = torch.floor((difference + math.pi) / _TURN)
     return difference - _TURN * turns
 
 
@@ -237,8 +237,8 @@ def unwrap_depth(
     periods = [SPEED_OF_LIGHT / (2 * f) for f in values]  # metres per turn
     share = shares_of_depth(values, weight)
     reference = min(range(len(values)), key=lambda i: periods[i])
-    best, whole = _search(turns.detach(), periods, share, weight, reference, (float(min_depth_m), longest))
-    del best
+    with torch.no_grad():
+        _, whole = _search(turns, periods, share, weight, reference, (float(min_depth_m), longest))
     metres = turns.new_tensor([s * p for s, p in zip(share, periods, strict=True)]).reshape(-1, 1, 1)
     depth: Tensor = ((turns + whole) * metres).sum(-3)
     return depth

@@ -219,9 +219,9 @@ def _numbers(given: object, name: str, dims: tuple[int, ...], most: float = math
     if numbers.ndim not in dims or not numbers.numel():
         got = tuple(numbers.shape)
         raise ShapeError(f"ItofCalibration: expected {name} of {dims} dimensions, got the shape {got}.")
-    if not holds(torch.isfinite(numbers.detach())):
+    if not holds(torch.isfinite(numbers)):
         raise UnitError(f"ItofCalibration: expected {name} as finite numbers, got {shown(given)}.")
-    if not holds(numbers.detach().abs() <= most):
+    if not holds(numbers.abs() <= most):
         raise UnitError(
             f"ItofCalibration: expected {name} between -{most:.4g} and {most:.4g}, got up to "
             f"{float(numbers.detach().abs().max()):g}. {why}"

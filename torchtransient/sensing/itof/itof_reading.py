@@ -120,7 +120,7 @@ class ItofNoise:
             if given is not None and not isinstance(given, Tensor):
                 # no light at all has no phase, and no noise no deviation
                 given = check_number(given, name, me, open_low=True)
-            elif given is not None and not holds(given.detach() >= 0):
+            elif given is not None and not holds(given >= 0):
                 raise UnitError(f"{me}: expected every {name} to be a number >= 0, got {shown(given)}.")
             object.__setattr__(self, name, given)
 
@@ -169,7 +169,7 @@ def _by_shape(steps: Tensor, code: CorrelationCode, num_phases: int, readout: st
     unit = torch.where(there, centred, 0.0) / torch.where(there, length, 1.0)
     x = torch.arange(num_phases, dtype=torch.float64) / num_phases
     table = _unit_shapes(code, x, single).to(unit)
-    best = _best_match(unit.detach(), table)
+    best = _best_match(unit, table)
     step = 0.5 / num_phases
     slope = ((_unit_shapes(code, x + step, single) - _unit_shapes(code, x - step, single)) / (2 * step)).to(unit)
     here, direction = table[best], slope[best]
@@ -177,7 +177,7 @@ def _by_shape(steps: Tensor, code: CorrelationCode, num_phases: int, readout: st
     speed = direction.square().sum(-1).clamp_min(1e-12)
     shift = ((unit - here) * direction).sum(-1) / speed
     turns = x.to(unit)[best] + shift.clamp(-2 / num_phases, 2 / num_phases)
-    phase = (turns - torch.floor(turns.detach())) * _TURN
+    phase = (turns - torch.floor(turns)) * _TURN
     slopes = _TURN * direction / (torch.where(there, length, 1.0) * speed.unsqueeze(-1))
     slopes = torch.where(there, slopes, math.inf)
     return torch.where(there.squeeze(-1), phase, 0.0), slopes.movedim(-1, -3)
@@ -272,8 +272,8 @@ def _without_offsets(phase: Tensor, calibration: ItofCalibration, frequencies: t
         )
     # In [0, 2 pi) before the dtype of the frames rounds it.
     phase = phase - (added % _TURN).to(phase)
-    phase = phase - _TURN * torch.floor(phase.detach() / _TURN)
-    return torch.where(phase.detach() >= _TURN, phase - _TURN, phase)
+    phase = phase - _TURN * torch.floor(phase / _TURN)
+    return torch.where(phase >= _TURN, phase - _TURN, phase)
 
 
 def _slopes(phasor: Tensor, num_taps: int) -> Tensor:
@@ -361,7 +361,7 @@ def _depth_std(
         offset = steps * gain  # signs and all
     elif readout == "two_tap":
         offset = sums_of(taps, steps.shape[-3], "read_itof") * gain
-    lit = _can_be(steps.detach() * gain, offset.detach(), readout == "differential", read + rounding)
+    lit = _can_be(steps * gain, offset, readout == "differential", read + rounding)
     if lit.numel() and not holds(lit.double().mean() >= 0.5):
         warnings.warn(
             f"read_itof: most of these {readout} frames have more amplitude than their light can have, and no "

@@ -38,7 +38,7 @@ def taps_by_pixel(
 ) -> Tensor:
     """Taps (..., N, H, W) of light (..., T, H, W), each pixel with weights of its own, at phases (H, W)."""
     light, bins = x.flatten(-2), axis.num_bins
-    turns = (phase.detach().to("cpu", torch.float64) / _TURN % 1.0).flatten()
+    turns = (phase.to("cpu", torch.float64) / _TURN % 1.0).flatten()
     turns = turns.expand(light.shape[-1]) if turns.numel() == 1 else turns
     places = axis.edges_s * f if within_bin == "uniform" else axis.centers_s * f
     apart = math.ceil(float(places[-1] - places[0])) + 2.0

@@ -140,7 +140,7 @@ def filter_rows(rows: Tensor, transfer: Tensor, length: int, first: int, keep: i
         return rows.new_zeros(*rows.shape[:-1], keep)
     y: Tensor = torch.fft.irfft(torch.fft.rfft(rows, n=length) * transfer, n=length).roll(first, -1)[..., :keep]
     # the rounding of a transform is about eps log2(length) of the length of the row (Higham, chapter 24)
-    scale = torch.linalg.vector_norm(rows.detach(), dim=-1, keepdim=True) * transfer.detach().abs().amax()
+    scale = torch.linalg.vector_norm(rows, dim=-1, keepdim=True) * transfer.abs().amax()
     slack = 4 * torch.finfo(torch.float64).eps * math.log2(2 * length) * scale
     value = y.detach()
     return y - torch.where((value < 0) & (value >= -slack), value, 0.0)

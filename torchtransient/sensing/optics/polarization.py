@@ -169,7 +169,7 @@ class PolarizationMosaic(Sensor):
         _check_stokes(x, "PolarizationMosaic")
         weights = self.weights(*x.shape[-2:]).to(x)
         raw = _behind_mosaic(x, weights)
-        slack = -_ROUNDING * x.detach().select(TRANSIENT_DIM, 0)
+        slack = -_ROUNDING * x.select(TRANSIENT_DIM, 0)
         return torch.where((raw < 0) & (raw >= slack), 0.0, raw)
 
     def demosaic(self, raw: Tensor) -> Tensor:
@@ -245,7 +245,7 @@ class Analyzers(Sensor):
 
     def expected(self, x: Tensor) -> Tensor:
         light = analyze(x, self.rows)
-        slack = -_ROUNDING * x.detach().select(TRANSIENT_DIM, 0).unsqueeze(TRANSIENT_DIM)
+        slack = -_ROUNDING * x.select(TRANSIENT_DIM, 0).unsqueeze(TRANSIENT_DIM)
         return torch.where((light < 0) & (light >= slack), 0.0, light)
 
     def stokes(self, measurements: Tensor) -> Tensor:

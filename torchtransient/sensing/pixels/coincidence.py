@@ -171,7 +171,7 @@ class CoincidencePixel(RandomSensor):
         parts = [self._one(x * share, share, number) for share, number in self.groups]
         whole = math.floor(window)
         total = torch.zeros_like(x, dtype=torch.float64)
-        photons = (x.detach().double() / _PHOTONS).clamp(1, _FLOOD * self.spads)
+        photons = (x.double() / _PHOTONS).clamp(1, _FLOOD * self.spads)
         halvings = highest_level(photons.log2().ceil().long())
         # the rear edge of the window passes a border of bins when its front edge has gone `window` - `whole` into one
         for low, high in ((0.0, window - whole), (window - whole, 1.0)):
@@ -231,7 +231,7 @@ class CoincidencePixel(RandomSensor):
 
     def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         with torch.no_grad():
-            p = self._chances(check_tensor(x, "CoincidencePixel").detach().double())
+            p = self._chances(check_tensor(x, "CoincidencePixel").double())
             return torch.binomial(torch.full_like(p, float(self.cycles)), p, generator=generator).to(x.dtype)
 
     def _chances(self, x: Tensor) -> Tensor:

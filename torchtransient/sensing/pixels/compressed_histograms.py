@@ -34,7 +34,7 @@ def equi_depth_edges(counts: Tensor, depth: int) -> Tensor:
     goals = torch.arange(1, parts, dtype=torch.float64, device=h.device).view(-1, 1, 1) / parts * total
     # rows of time last, as searchsorted wants them
     rows, wanted = cumulative.movedim(TIME, -1).contiguous(), goals.movedim(TIME, -1).contiguous()
-    index = torch.searchsorted(rows.detach(), wanted.detach()).clamp_max(bins - 1)
+    index = torch.searchsorted(rows, wanted).clamp_max(bins - 1)
     inside = torch.gather(h.movedim(TIME, -1), -1, index)
     above = torch.gather(rows, -1, index)
     edges = index + 1 - (above - wanted) / inside

@@ -25,7 +25,7 @@ def groups_of(spads: int, weights: Numbers | None, where: str) -> Groups:
     number = check_count(spads, "spads", where)
     if weights is None:
         return [(1.0 / number, number)]
-    given = weights.detach().double().tolist() if isinstance(weights, Tensor) else list(weights)
+    given = weights.double().tolist() if isinstance(weights, Tensor) else list(weights)
     values = [check_number(w, "weights", where) for w in given]
     if len(values) != number:
         raise ShapeError(f"{where}: expected weights of {number} SPADs, got {len(values)}.")

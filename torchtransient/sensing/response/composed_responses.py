@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 
 import torch
@@ -87,7 +88,7 @@ class MeasuredResponse(Response):
         start = self._start_s(shares)
         flat = time_s.reshape(-1)
         # resample_counts from far before the response to each time, as one running sum
-        edges = torch.cat([(start.detach() - self.bin_width_s).reshape(1), flat])
+        edges = torch.cat([(start - self.bin_width_s).reshape(1), flat])
         total = resample_counts(shares, self.bin_width_s, edges, start_s=start).cumsum(0)
         return total.reshape(time_s.shape)
 
@@ -100,7 +101,7 @@ class MeasuredResponse(Response):
         return integrated_counts(shares, self.bin_width_s, time_s, start), above
 
     def support_s(self) -> tuple[float, float]:
-        shares = self._shares().detach()
+        shares = self._shares()
         start = float(self._start_s(shares).detach())
         kept = torch.nonzero(shares > 1e-12).flatten()
         return start + int(kept[0]) * self.bin_width_s, start + (int(kept[-1]) + 1) * self.bin_width_s
@@ -191,13 +192,9 @@ class ComposedResponse(Response):
             if last - first <= CLOSED_BINS:
                 return super().kernel(bin_width_s)
         fine = self.oversampling
-        first, total = 0, None
-        for response in self.responses:
-            begin, weights = kernel_of(response, bin_width_s / fine, within_bin)  # type: ignore[arg-type]
-            first += begin
-            total = weights if total is None else _full_convolution(total, weights)
-        if total is None:
-            raise ShapeError("ComposedResponse: expected at least one response, got none.")
+        parts = [kernel_of(r, bin_width_s / fine, within_bin) for r in self.responses]  # type: ignore[arg-type]
+        first = sum(begin for begin, _ in parts)
+        total = functools.reduce(_full_convolution, [weights for _, weights in parts])
         # a fine lag goes to the bin round(lag/fine), or, where light is spread evenly, to two bins by linear shares,
         # which are `fine` such roundings from all places of a bin
         places = [(fine - 1) // 2] if within_bin == "center" else range(fine)

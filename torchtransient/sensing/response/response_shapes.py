@@ -90,7 +90,7 @@ def integrated_counts(counts: Tensor, width_s: float, time_s: Tensor, start_s: f
     bins = counts.shape[0]
     position = (time_s.to(torch.float64) - start_s) / width_s
     inside = position.clamp(0, bins)
-    k = inside.detach().floor().clamp_max(bins - 1).long()
+    k = inside.floor().clamp_max(bins - 1).long()
     part = inside - k
     beyond = (position - inside).clamp_min(0) * before[-1]
     return width_s * (area[k] + part * (before[k] + 0.5 * part * values[k]) + beyond)
@@ -105,7 +105,7 @@ def resample_counts(counts: Tensor, width_s: float, edges_s: Tensor, *, start_s:
     cumulative = torch.nn.functional.pad(counts.to(torch.float64).cumsum(0), (1, 0))
     bins = counts.shape[0]
     position = ((edges_s.to(torch.float64) - start_s) / width_s).clamp(0, bins)
-    below = position.detach().floor().clamp_max(bins - 1).long()
+    below = position.floor().clamp_max(bins - 1).long()
     value = cumulative[below] + (position - below) * (cumulative[below + 1] - cumulative[below])
     return value.diff()
 

@@ -23,7 +23,7 @@ def frames_to_rate(counts: Tensor, frames: int) -> Tensor:
     """
     number = check_count(frames, "frames", "frames_to_rate")
     # a normal surrogate goes beyond all frames by some standard deviations, of which half the root is the largest
-    if not holds(~(counts.detach() > number + 1 + 3 * number**0.5)):
+    if not holds(~(counts > number + 1 + 3 * number**0.5)):
         raise UnitError(
             f"frames_to_rate: expected at most as many counts as the {number} frames, got {float(counts.max()):g}. "
             "Give the frames of the sensor that counted: BinaryFrames.frames."

@@ -232,16 +232,16 @@ class FreeRunningSPAD(RandomSensor):
     def _path(self, x: Tensor, generator: torch.Generator | None) -> Path:
         """Periods of the non-paralyzable detector, each drawn on its own, step by step."""
         with torch.no_grad():
-            self._check_dead_time(float(self.dead_time_s.detach()))
-            rate = check_rates(check_tensor(x, "FreeRunningSPAD").detach().double(), "FreeRunningSPAD")
+            self._check_dead_time(float(self.dead_time_s))
+            rate = check_rates(check_tensor(x, "FreeRunningSPAD").double(), "FreeRunningSPAD")
             return draw_path(bin_chances(rate, state_image(rate, self._dead_bins)), self.cycles, generator)
 
     def _train(self, x: Tensor, generator: torch.Generator | None, normal: bool) -> Tensor:
         with torch.no_grad():
-            self._check_dead_time(float(self.dead_time_s.detach()))
-            rate = check_rates(check_tensor(x, "FreeRunningSPAD").detach().double(), "FreeRunningSPAD")
+            self._check_dead_time(float(self.dead_time_s))
+            rate = check_rates(check_tensor(x, "FreeRunningSPAD").double(), "FreeRunningSPAD")
             if rate.numel() == 0:
-                return x.detach().clone()
+                return x.clone()
             wide = rate.movedim(TIME, -1)
             rows = wide.reshape(-1, wide.shape[-1])
             dead, periods = self._dead_bins.to(rate.device), self.cycles // self.trains
@@ -263,7 +263,7 @@ class FreeRunningSPAD(RandomSensor):
         if self.kind == "non_paralyzable":
             return self._train(x, generator, normal=False)
         with torch.no_grad():
-            p = self.probabilities(check_rates(check_tensor(x, "FreeRunningSPAD").detach().double(), "FreeRunningSPAD"))
+            p = self.probabilities(check_rates(check_tensor(x, "FreeRunningSPAD").double(), "FreeRunningSPAD"))
             return torch.binomial(torch.full_like(p, float(self.cycles)), p, generator=generator).to(x.dtype)
 
     def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:

@@ -26,9 +26,9 @@ def _whole_and_part(delay_bins: Tensor | float, x: Tensor) -> tuple[Tensor, Tens
     """Whole bins (int64) and the rest, differentiable, over the time of `x`: (..., 1, H, W) or ()."""
     delay = torch.as_tensor(delay_bins, dtype=torch.float64, device=x.device)
     delay = delay.unsqueeze(TIME) if delay.ndim >= 2 else delay
-    whole = delay.detach().floor()
+    whole = delay.floor()
     # less than a rounding below a whole bin is that bin: 1 - 1e-30 is 1, and no share of a bin
-    whole = whole + (delay.detach() - whole >= 1).to(whole)
+    whole = whole + (delay - whole >= 1).to(whole)
     return whole.long(), delay - whole
 
 
@@ -109,7 +109,7 @@ class Delayed:
     def draw(self, counts: Tensor, generator: torch.Generator | None, tally: bool) -> tuple[Tensor, Tensor | None]:
         """Each goes to the earlier or the later bin; tallies are (2, ..., H, W)."""
         counts = counts.contiguous()
-        late = halve(counts, self.part.detach().to(counts.dtype).expand(counts.shape).contiguous(), generator)
+        late = halve(counts, self.part.to(counts.dtype).expand(counts.shape).contiguous(), generator)
         early = counts - late
         moved = _moved(early, self.whole, self.boundary) + _moved(late, self.whole + 1, self.boundary)
         return moved, torch.stack([early.sum(TIME), late.sum(TIME)]) if tally else None

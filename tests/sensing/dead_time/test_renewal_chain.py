@@ -1,0 +1,252 @@
+"""The chain of detection phases as a matrix: against quadrature, its transpose, dense solutions and derivatives."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch.autograd import forward_ad
+
+from torchtransient.errors import TorchTransientError
+from torchtransient.sensing.correlated_noise.trapped_ring import trapped_lines
+from torchtransient.sensing.dead_time import stationary_phases as phases
+from torchtransient.sensing.dead_time.banded_solve import solve_banded
+from torchtransient.sensing.dead_time.dead_time_cycle import Cycle, cycle_of_rows
+from torchtransient.sensing.dead_time.dead_time_draws import _bins, _steps, _wider_pieces, _width
+from torchtransient.sensing.dead_time.free_running_state import late_lines
+from torchtransient.sensing.dead_time.renewal_chain import RenewalChain
+
+ROOT = math.sqrt(3.0)
+
+
+def rates(bins, pixels=2, high=1.5, seed=0):
+    g = torch.Generator().manual_seed(seed)
+    return 0.05 + high * torch.rand(pixels, bins, generator=g, dtype=torch.float64)
+
+
+def chain_of(rate, whole=2, part=0.3):
+    return RenewalChain(rate, whole, torch.tensor(part, dtype=torch.float64))
+
+
+def matrices(rate, whole, part, *, transposed=False):
+    """(P, 2 T, 2 T): the step, or its transpose, applied to one after the other of all lines."""
+    columns = []
+    for line in torch.eye(2 * rate.shape[1], dtype=torch.float64):
+        chain = chain_of(rate, whole, part)
+        given = line.expand(rate.shape[0], -1)
+        columns.append(chain.transposed(given) if transposed else chain.step(given))
+    return torch.stack(columns, -1)
+
+
+def step_by_quadrature(rate, whole, part, lines, number=400):
+    """The step of one pixel by midpoint rules: (counts, slopes) and bins waited."""
+    bins = len(rate)
+    flux = np.concatenate([[0.0], np.cumsum(rate)])
+    y = (np.arange(number) + 0.5) / number
+    starts = (np.arange(bins)[:, None] + y).ravel()
+    density = (lines[:bins, None] + ROOT * lines[bins:, None] * (2 * y - 1)).ravel() / number
+
+    def until(t):
+        return np.floor(t / bins) * flux[-1] + np.interp(t % bins, np.arange(bins + 1.0), flux)
+
+    armed = starts + whole + part
+    counts, slopes, waited = np.zeros(bins), np.zeros(bins), 0.0
+    for k in range(60 * bins):
+        begin, end = np.maximum(armed, k), k + 1.0
+        inside = begin < end
+        alive = density[inside] * np.exp(until(armed[inside]) - until(begin[inside]))
+        length, r = end - begin[inside], rate[k % bins]
+        fired = alive * -np.expm1(-r * length)
+        # mean time to the detection among those that fire in the rest of the bin
+        late = begin[inside] - k + 1 / r - length * np.exp(-r * length) / -np.expm1(-r * length)
+        counts[k % bins] += fired.sum()
+        slopes[k % bins] += (ROOT * fired * (2 * late - 1)).sum()
+        waited += (alive * -np.expm1(-r * length) / r).sum()
+    return np.concatenate([counts, slopes]), waited
+
+
+@pytest.mark.parametrize("whole, part", [(0, 0.7), (1, 0.0), (2, 0.3), (3, 0.85), (5, 0.4)])
+def test_a_step_against_quadrature(whole, part):
+    """Any lines, those below zero too: exact in the light, whatever the place of the dead time in its bin."""
+    rate = rates(3, 1)
+    lines = torch.tensor([[0.2, 0.5, 0.3, 0.1, -0.2, 0.15]], dtype=torch.float64)
+    chain = chain_of(rate, whole, part)
+    counts, waited = step_by_quadrature(rate[0].numpy(), whole, part, lines[0].numpy())
+    np.testing.assert_allclose(chain.step(lines)[0].numpy(), counts, atol=2e-5)
+    assert float(chain.waiting(lines)) == pytest.approx(waited, rel=1e-5)
+    assert float(chain.step(lines)[0, :3].sum()) == pytest.approx(1.0, rel=1e-12)  # nothing is lost
+
+
+@pytest.mark.parametrize("bins, whole, part, high", [(3, 1, 0.3, 1.5), (5, 7, 0.8, 1.5), (4, 0, 0.6, 900.0)])
+def test_the_transpose_is_one(bins, whole, part, high):
+    """In several blocks, too, where the flux of a period is more than a double's exponent."""
+    rate = rates(bins, high=high)
+    forwards, back = (matrices(rate, whole, part, transposed=t) for t in (False, True))
+    torch.testing.assert_close(back, forwards.mT, rtol=1e-11, atol=1e-13)
+
+
+@pytest.mark.parametrize("bins, whole, part", [(5, 2, 0.3), (7, 0, 0.6), (40, 3, 0.2), (41, 38, 0.9)])
+@pytest.mark.parametrize("transposed", [False, True])
+def test_the_banded_solution_is_that_of_the_dense_matrix(bins, whole, part, transposed):
+    rate = rates(bins)
+    right = torch.rand(2, 2 * bins, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    pinned = torch.tensor([1, 3])
+    found = solve_banded(chain_of(rate, whole, part), right, pinned, transposed=transposed)
+    matrix = torch.eye(2 * bins, dtype=torch.float64) - matrices(rate, whole, part, transposed=transposed)
+    matrix = matrix + torch.diag_embed(torch.nn.functional.one_hot(pinned, 2 * bins).double())
+    torch.testing.assert_close(found, torch.linalg.solve(matrix, right), rtol=1e-9, atol=1e-10)
+
+
+def solved(rate, part, whole):
+    """Stationary lines, their derivatives in both modes by light and dead time, and what becomes of a change."""
+    leaves = rate.clone().requires_grad_(), part.clone().requires_grad_()
+    pi = phases.stationary_phases(*leaves, whole)
+    weights = torch.rand(pi.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    slopes = torch.autograd.grad((pi * weights).sum(), leaves)
+    along = torch.ones_like(rate) / 7 + rate.square(), torch.full_like(part, 0.3)
+    with forward_ad.dual_level():
+        duals = [forward_ad.make_dual(*pair) for pair in zip((rate, part), along, strict=True)]
+        dual = phases.stationary_phases(*duals, whole)
+        forwards = forward_ad.unpack_dual(dual).tangent.clone()
+    total = sum((s * a).sum() for s, a in zip(slopes, along, strict=True))
+    torch.testing.assert_close((forwards * weights).sum(), total, rtol=1e-7, atol=1e-9)
+    change = weights.clone()
+    change[:, 0] -= change[:, : rate.shape[1]].sum(-1)
+    change[0] = 0.0  # one that does not change
+    after = phases.tangent_phases(RenewalChain(rate, whole, part), pi.detach(), change)
+    return [pi.detach(), *slopes, forwards, after]
+
+
+def test_stationary_lines_are_those_of_the_matrix():
+    rate, part = rates(5, 3), torch.tensor(0.3, dtype=torch.float64)
+    pi, *_, after = solved(rate, part, 2)
+    step = matrices(rate, 2, 0.3)
+    torch.testing.assert_close((step @ pi.unsqueeze(-1)).squeeze(-1), pi, rtol=1e-9, atol=1e-11)
+    torch.testing.assert_close(pi[:, :5].sum(-1), torch.ones(3, dtype=torch.float64))
+    assert bool((after[0] == 0).all())
+    # all that becomes of a change is the change and, a step later, all of it once more
+    weights = torch.rand(pi.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    weights[:, 0] -= weights[:, :5].sum(-1)
+    change = after - (step @ after.unsqueeze(-1)).squeeze(-1)
+    torch.testing.assert_close(change[1:], weights[1:], rtol=1e-8, atol=1e-9)
+    torch.testing.assert_close(after[:, :5].sum(-1), torch.zeros(3, dtype=torch.float64), rtol=0, atol=1e-10)
+
+
+def test_rows_that_do_not_converge_are_solved_directly(monkeypatch):
+    """Those alone: lines, derivatives and changes are the same, to what iterations leave."""
+    rate, part = rates(6, 3), torch.tensor(0.4, dtype=torch.float64)
+    wanted = solved(rate, part, 3)
+    converging = phases.gmres
+
+    def stuck(operator, right, start, *others):
+        found, residual = converging(operator, right, start, *others)
+        found, residual = found.clone(), residual.clone()
+        found[1], residual[1] = math.nan, 1e-3
+        return found, residual
+
+    monkeypatch.setattr(phases, "gmres", stuck)
+    for found, exact in zip(solved(rate, part, 3), wanted, strict=True):
+        torch.testing.assert_close(found, exact, rtol=1e-7, atol=1e-9)
+    monkeypatch.setattr(phases, "solve_banded", lambda chain, right, *_, **__: right + 0.1)
+    with pytest.raises(TorchTransientError, match="stationary_phases: expected a relative residual"):
+        phases.stationary_phases(rate, part, 3)
+    monkeypatch.setattr(phases, "gmres", converging)
+    leaf = rate.clone().requires_grad_()
+    pi = phases.stationary_phases(leaf, part, 3)
+    monkeypatch.setattr(phases, "gmres", stuck)
+    with pytest.raises(TorchTransientError, match="relative residual"):
+        torch.autograd.grad(pi[:, 0].sum(), leaf)
+
+
+@pytest.mark.parametrize("whole, part", [(0, 0.7), (2, 0.3), (6, 0.1)])
+def test_carriers_on_a_ring_are_those_of_the_matrix(whole, part):
+    """x = F (kept x + source), F the step of the losses; differentiable in all that is given, in both modes."""
+    bins, g = 4, torch.Generator().manual_seed(3)
+    loss, kept = rates(bins), 0.2 + 0.6 * torch.rand(2, bins, generator=g, dtype=torch.float64)
+    source = torch.rand(2, 2 * bins, generator=g, dtype=torch.float64)
+    dead = torch.tensor(part, dtype=torch.float64)
+    step = matrices(loss, whole, part)
+    matrix = torch.eye(2 * bins, dtype=torch.float64) - step * torch.cat([kept, kept], -1).unsqueeze(1)
+    wanted = torch.linalg.solve(matrix, (step @ source.unsqueeze(-1)).squeeze(-1))
+    torch.testing.assert_close(trapped_lines(loss, kept, source, dead, whole), wanted, rtol=1e-8, atol=1e-9)
+    leaves = [v.clone().requires_grad_() for v in (loss, kept, source, dead)]
+    assert torch.autograd.gradcheck(
+        lambda *v: trapped_lines(*v, whole), leaves, atol=1e-6, fast_mode=True, check_forward_ad=True
+    )
+    one = [v.detach() for v in leaves]
+    found = torch.autograd.grad(trapped_lines(*one[:1], leaves[1], *one[2:], whole).sum(), leaves[1])[0]
+    assert bool(found.isfinite().all()) and not any(v.requires_grad for v in one)
+
+
+# ------------------------------------------------------------------------- who is armed again one piece later
+
+
+def late_of(count, slope, part, number=100_000):
+    """Detections on a line in the last `part` of their piece."""
+    y = (np.arange(number) + 0.5) / number
+    return float(((count + ROOT * slope * (2 * y - 1)) * (y > 1 - part)).sum() / number)
+
+
+LINES = torch.tensor([[0.5, 0.2, 0.8, 0.3, 0.6, 0.4]], dtype=torch.float64), torch.tensor(
+    [[0.1, -0.1, 0.3, 0.05, -0.2, 0.0]], dtype=torch.float64
+)
+
+
+@pytest.mark.parametrize("part", [0.0, 0.3, 0.8])
+def test_late_detections_of_lines(part):
+    """Of a line, and none below zero or beyond all: in the cycle and in the stationary state."""
+    count, slope = LINES
+    wanted = [late_of(float(c), float(s), part) for c, s in zip(count[0], slope[0], strict=True)]
+    of_cycle = Cycle(count, count, slope, 2, torch.tensor(part, dtype=torch.float64), 1).late
+    on_ring = late_lines(torch.cat(LINES, -1), torch.tensor(part, dtype=torch.float64))
+    for found in (of_cycle, on_ring):
+        assert found[0].tolist() == pytest.approx(wanted, abs=1e-5)
+    steep = Cycle(count, count, 90 * slope.abs(), 2, torch.tensor(0.3, dtype=torch.float64), 1).late
+    assert bool((steep <= count).all()) and float(steep[0, 0]) == 0.5
+    falling = Cycle(count, count, -90 * slope.abs(), 2, torch.tensor(0.3, dtype=torch.float64), 1).late
+    assert bool((falling >= 0).all()) and float(falling[0, 0]) == 0.0
+
+
+@pytest.mark.parametrize("whole, wider", [(4, 1), (4, 2), (5, 2), (7, 3), (6, 3), (8, 3)])
+def test_pieces_that_are_drawn_as_one(whole, wider):
+    """Fine piece j is armed again in j + whole, its late ones in the next: wide ones are told by what they hold."""
+    count, slope = LINES
+    part = 0.3
+    late = Cycle(count, count, slope, whole, torch.tensor(part, dtype=torch.float64), 1).late[0]
+    wanted_late, wanted_count = np.zeros(6 // wider), np.zeros(6 // wider)
+    for j in range(6):
+        wanted_count[j // wider] += float(count[0, j])
+        for again, number in ((j + whole, float(count[0, j] - late[j])), (j + whole + 1, float(late[j]))):
+            wanted_late[j // wider] += number * (again // wider - j // wider - whole // wider)
+    states = torch.zeros(7, 3, 1, dtype=torch.float64)
+    states[1:, 1, 0], states[1:, 2, 0], states[:-1, 0, 0] = count[0], slope[0], torch.arange(6.0).double()
+    found, armed, late_rows = _wider_pieces(states, part, whole, wider)
+    assert found[:, 0].tolist() == pytest.approx(wanted_count.tolist())
+    assert late_rows[:, 0].tolist() == pytest.approx([0.0, *wanted_late])
+    assert armed[:, 0].tolist() == [float(j) for j in range(0, 6, wider)]
+
+
+def test_how_many_pieces_are_drawn_as_one():
+    """Four at most, as many as divide a bin, no longer than a dead time."""
+    given = (1, 9), (2, 9), (4, 9), (8, 9), (8, 4), (8, 3), (8, 2), (8, 1)
+    assert [_width(*pair) for pair in given] == [1, 2, 4, 4, 4, 2, 2, 1]
+
+
+@pytest.mark.parametrize("dead, pieces", [(1.3, 1), (1.3, 4), (2.6, 2), (3.4, 4)])
+def test_steps_of_a_cycle_hold_what_the_cycle_does(dead, pieces):
+    """Counts of bins, who is armed, and everybody comes back a dead time later, in the piece that it ends in."""
+    rate = rates(5, 2)
+    bins = torch.tensor(dead, dtype=torch.float64)
+    steps, cycle = _steps(rate, bins, pieces), cycle_of_rows(rate, bins, pieces)
+    wider = pieces // steps.pieces
+    torch.testing.assert_close(_bins(steps.count, steps.pieces), cycle.count.view(2, 5, pieces).sum(-1))
+    torch.testing.assert_close(steps.armed.squeeze(-1).T, cycle.armed[:, ::wider])
+    back = torch.zeros(2, 5 * pieces // wider, dtype=torch.float64)
+    for j in range(5 * pieces):
+        for again, number in ((j + cycle.whole, cycle.count[:, j] - cycle.late[:, j]),
+                              (j + cycle.whole + 1, cycle.late[:, j])):  # fmt: skip
+            if again // wider < back.shape[1]:
+                back[:, again // wider] += number
+    torch.testing.assert_close(steps.back.squeeze(-1).T, back, rtol=1e-10, atol=1e-12)

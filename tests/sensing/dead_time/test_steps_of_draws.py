@@ -1,0 +1,217 @@
+"""Draws of a period step by step: their means, their probabilities, and where they leave every detector."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import distributions
+
+from torchtransient.errors import UnitError
+from torchtransient.sensing.dead_time import free_running_draws as draws
+from torchtransient.sensing.dead_time.dead_time_draws import _steps, draw_cycles, score_of_cycles
+from torchtransient.sensing.dead_time.dead_time_inverse import armed_time, check_cycles
+from torchtransient.sensing.dead_time.free_running_events import begin_places
+from torchtransient.sensing.dead_time.free_running_state import _solved, per_period, stationary_state
+from torchtransient.sensing.dead_time.renewal_chain import RenewalChain
+from torchtransient.sensing.dead_time.stationary_phases import stationary_phases
+
+BINS, PERIODS = 5, 40
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def rates(pixels=3, high=0.6, bins=BINS, seed=0):
+    return 0.05 + high * torch.rand(pixels, bins, generator=generator(seed), dtype=torch.float64)
+
+
+def number(x):
+    return torch.tensor(x, dtype=torch.float64)
+
+
+def of_free_running(rate, dead):
+    """Chances (T, P, 1) of a detector that runs free."""
+    state = stationary_state(rate, number(dead))
+    columns = [v.T.unsqueeze(-1) for v in (rate, state.detected, state.armed, state.late)]
+    placed = type(state)(columns[1], columns[2], columns[3], state.whole)
+    return draws.bin_chances(columns[0], placed)
+
+
+def mean_of(many, chance, generator):
+    return many * chance
+
+
+def steps_by_distributions(path, chances, periods):
+    """The sum of what torch says of every step, by pixel."""
+    total = 0.0
+    if path.begin is not None:
+        whole = torch.cat([path.begin, periods - path.begin.sum(-3, keepdim=True)], -3)
+        p = torch.cat([chances.begin, 1 - chances.begin.sum(-3, keepdim=True)], -3).clamp_min(0)
+        begins = distributions.Multinomial(periods, p.movedim(-3, -1), validate_args=False)
+        total = begins.log_prob(whole.movedim(-3, -1))
+    for hits, trials, chance in ((path.fired, path.armed, chances.fire), (path.soon, path.back, chances.soon),
+                                 (path.late, path.fired + path.soon, chances.late)):  # fmt: skip
+        inner = chance.clamp(1e-300, 1 - 1e-16)
+        total = total + distributions.Binomial(trials, inner, validate_args=False).log_prob(hits).sum(-3)
+    return total
+
+
+@pytest.mark.parametrize("dead", [1.3, 2.0, 7.6])
+def test_scores_of_detectors_that_run_free(dead):
+    """Derivatives of the log-probability of the steps, beginning included; nobody is lost on the way."""
+    rate = rates().requires_grad_()
+    chances = of_free_running(rate, dead)
+    with torch.no_grad():
+        path = draws.draw_path(chances, PERIODS, generator())
+    weights = number([1.0, 2.0, -0.5]).unsqueeze(-1)
+    found = (draws.path_log_prob(path, chances, PERIODS) * weights).sum()
+    wanted = (steps_by_distributions(path, chances, PERIODS) * weights).sum()
+    slopes = [torch.autograd.grad(v, rate, retain_graph=True)[0] for v in (found, wanted)]
+    torch.testing.assert_close(slopes[0], slopes[1], rtol=1e-7, atol=1e-7)
+    # those that are dead all period long stay so
+    torch.testing.assert_close(path.end + path.wrapped.sum(-3), path.begin.sum(-3))
+    assert torch.equal(path.counts, path.fired + path.soon)
+    starts = torch.cat([path.armed.narrow(-3, 0, 1), path.back], -3)
+    began = path.begin.sum(-3) + path.counts.sum(-3) - path.wrapped.sum(-3)
+    torch.testing.assert_close(starts.sum(-3), began)
+    # of 7.6 bins in a period of 5 all come back after one start of a period, or after two
+    rounds = (path.missed / path.wrapped.sum(-3).clamp_min(1)).flatten().tolist()
+    assert all(1 <= r <= 2 if dead > BINS else r == 1 for r in rounds)
+    assert chances.whole == math.floor(dead)
+    assert bool((chances.begin.sum(-3) <= 1 + 1e-12).all())
+
+
+@pytest.mark.parametrize("dead", [0.6, 1.3, 3.0])
+def test_scores_of_cycles(dead):
+    rate = rates(3, 2.0).requires_grad_()
+    counts, drawn = draw_cycles(rate, number(dead), PERIODS, generator())
+    assert sum(len(one.rows) if one.rows is not None else 3 for one in drawn) == 3
+    found = score_of_cycles(drawn, rate, number(dead), PERIODS)
+    wanted = torch.zeros(3, dtype=torch.float64)
+    for one in drawn:
+        rows = torch.arange(3) if one.rows is None else one.rows
+        chances = _steps(rate[rows], number(dead), one.pieces).chances
+        wanted = wanted.index_copy(0, rows, steps_by_distributions(one.path, chances, PERIODS).flatten())
+    weights = number([1.0, 2.0, -0.5])
+    slopes = [torch.autograd.grad((v * weights).sum(), rate, retain_graph=True)[0] for v in (found, wanted)]
+    torch.testing.assert_close(slopes[0], slopes[1], rtol=1e-7, atol=1e-7)
+    assert bool((counts.sum(-1) > 0).all())
+
+
+@pytest.mark.parametrize("dead", [0.6, 1.3, 2.7, 9.0])
+def test_the_mean_of_all_steps_is_the_mean(dead):
+    """Each step taken by its share: detections, those that come back, those that are armed."""
+    rate = rates(3, 2.0)
+    for pieces in (2, 4):
+        steps = _steps(rate, number(dead), pieces)
+        path = draws.draw_path(steps.chances, 1, None, draw=mean_of)
+        torch.testing.assert_close(path.counts, steps.count)
+        torch.testing.assert_close(path.back, steps.back)
+        torch.testing.assert_close(path.armed, steps.armed, rtol=1e-5, atol=1e-7)
+        torch.testing.assert_close(path.end + path.wrapped.sum(-3), torch.ones(3, 1).double())
+    chances = of_free_running(rates(), max(dead, 1.0))
+    begin = draws.BinChances(None, chances.fire, chances.soon, chances.late, chances.whole)
+    assert torch.equal(draws.draw_path(begin, 7, None, draw=mean_of).armed[0], torch.full((3, 1), 7.0).double())
+
+
+def test_shares_by_hand():
+    found = draws.share(number([1.0, 3.0, 0.0, -1.0, 5.0, 1e-14]), number([4.0, 4.0, 0.0, 2.0, 4.0, 1e-14]))
+    assert found.tolist() == [0.25, 0.75, 0.0, 0.0, 1.0, 0.0]
+    # armed 0.5 of which 0.4 fire, 0.3 come back: of 0.26 detections 0.06 are theirs; of 0.1 or 0.6 one chance for both
+    fire, detected = number([0.4, 0.4, 0.4]), number([0.26, 0.1, 0.6])
+    shares = draws.step_shares(fire, detected, number([0.5] * 3), number([0.3] * 3))
+    assert shares[0].tolist() == pytest.approx([0.4, 0.1 / 0.8, 0.6 / 0.8])
+    assert shares[1].tolist() == pytest.approx([0.2, 0.1 / 0.8, 0.6 / 0.8])
+    ends = draws.step_shares(fire[:2], number([0.2, 0.5]), number([0.5] * 2), number([0.3] * 2))
+    assert ends[0].tolist() == pytest.approx([0.4, 0.4]) and ends[1].tolist() == pytest.approx([0.0, 1.0])
+
+
+def test_normal_steps():
+    """n p and the root of n p (1 - p), of numbers below zero the mean alone."""
+    many, chance = number([100.0, 40.0, -3.0]), number([0.2, 0.5, 0.5])
+    z = torch.randn(3, dtype=torch.float64, generator=generator())
+    found = draws.normal_share(many, chance, generator())
+    assert found.tolist() == pytest.approx([20 + 4 * float(z[0]), 20 + math.sqrt(10) * float(z[1]), -1.5])
+
+
+@pytest.mark.parametrize("dead", [1.3, 2.0, 6.4])
+def test_a_state_from_finer_pieces_is_the_same(dead):
+    """Bins of dim light, whole or cut: detected, armed and late ones agree to the third order of their photons."""
+    rate = rates(2, 0.2)
+    coarse, *others = (_solved(rate, number(dead), pieces) for pieces in (1, 2, 3, 4))
+    for finer in others:
+        assert finer.whole == coarse.whole == math.floor(dead)
+        for name in ("detected", "armed", "late"):
+            torch.testing.assert_close(getattr(finer, name), getattr(coarse, name), rtol=5e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("whole, part", [(1, 0.6), (2, 0.0), (9, 0.3)])
+def test_places_where_detectors_begin(whole, part):
+    """Armed with the chance that the state has; else after what is left of a dead time that began in its light."""
+    many, rate = 40_000, rates(1, 1.2, 4)
+    chain = RenewalChain(rate, whole, number(part))
+    lines = per_period(chain, stationary_phases(rate, number(part), whole))
+    several = RenewalChain(rate.expand(many, -1), whole, number(part))
+    start = begin_places(several, lines.expand(many, -1), generator()).flatten().numpy()
+    armed = float(chain.at_start(chain.inflow(lines))[0, 0])
+    assert np.mean(start == 0) == pytest.approx(armed, abs=5 * math.sqrt(armed * (1 - armed) / many))
+    # a detection at time t < 0 arms again at t + dead: light of the last dead time, seen backwards
+    dead = whole + part
+    free = (np.arange(100_000) + 0.5) / 100_000 * dead
+    at = (free - dead) % 4
+    k, y = at.astype(int), at % 1
+    density = lines[0, :4].numpy()[k] + math.sqrt(3) * lines[0, 4:].numpy()[k] * (2 * y - 1)
+    mean = (free * density).sum() / density.sum()
+    spread = math.sqrt((free**2 * density).sum() / density.sum() - mean**2)
+    later = start[start > 0]
+    assert later.max() <= dead
+    # inside of a stretch the place is even: of second order in the slope of the light
+    assert later.mean() == pytest.approx(mean, abs=5 * spread / math.sqrt(len(later)) + 0.01)
+
+
+# ------------------------------------------------------------------------------------------ what a histogram tells
+
+
+@pytest.mark.parametrize("dead", [0.6, 1.0, 1.3, 2.7])
+def test_cycles_that_could_fire(dead):
+    """Of detections that lie evenly in their bins: armed at the start, joining later, and for how long."""
+    counts = number([5.0, 0.0, 7.0, 2.0, 4.0, 1.0]).reshape(1, 6, 1, 1)
+    found = armed_time(counts, 50, dead)
+    y = (np.arange(20_000) + 0.5) / 20_000
+    armed, exposed = np.full(6, 50.0), np.full(6, 50.0)
+    for k, n in enumerate(counts.flatten().tolist()):
+        again = k + y + dead
+        for b in range(6):
+            if b > k:
+                dead_at_start = (again > b).mean()
+                armed[b] -= n * dead_at_start
+                exposed[b] -= n * np.clip(again - b, 0, 1).mean()
+            elif b == k:
+                exposed[b] += n * np.clip(1 - (y + dead), 0, None).mean()  # back in the bin itself
+    np.testing.assert_allclose(found.armed.flatten().numpy(), armed, atol=1e-3)
+    np.testing.assert_allclose(found.exposed.flatten().numpy(), exposed, atol=1e-3)
+
+
+def test_short_stays_saturate_less():
+    """Of 8 that join evenly in a bin a share 1 - (1 - exp(-r)) / r fires; half of 1 - exp(-r) is counted without."""
+    time = armed_time(number([8.0, 0.0, 0.0]).reshape(1, 3, 1, 1), 8, 1.0)
+    for r in (0.01, 0.1, 0.4):
+        rate = torch.full((1, 3, 1, 1), r, dtype=torch.float64).requires_grad_()
+        (slope,) = torch.autograd.grad(time.sooner(rate).sum(), rate)
+        fired = 1 - (1 - math.exp(-r)) / r
+        rise = 8 * (fired / (1 - math.exp(-r)) - 0.5)
+        assert float(slope[0, 1]) == pytest.approx(rise, rel=r / 6 + 1e-4)
+        assert float(slope[0, 2]) == pytest.approx(0.0, abs=1e-12)
+    dark = torch.zeros(1, 3, 1, 1, dtype=torch.float64)
+    assert not bool(time.sooner(dark).any())
+
+
+def test_cycles_that_are_left():
+    """As many as are said, and not fewer."""
+    check_cycles(number([-0.5, 3.0]), 10, -0.5, "here")
+    with pytest.raises(UnitError, match="at most 10 cycles"):
+        check_cycles(number([-0.51, 3.0]), 10, -0.5, "here")

@@ -1,0 +1,284 @@
+"""What has no gradient: draws, choices of a bin, plain numbers. And that nothing else loses its own on the way."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from support.sensing.all_entries import each
+from support.sensing.contract import nothing_with_a_gradient_as_a_number, parts
+from torchtransient import TimeAxis, sensing
+from torchtransient.errors import TorchTransientError, UnitError
+from torchtransient.sensing.base.pixel_maps import check_map, kept_map
+from torchtransient.sensing.base.policies import straight_through
+from torchtransient.sensing.chain.first_photon_moves import multinomial_log_prob
+from torchtransient.sensing.counts.moved_counts import Moves, move_counts
+from torchtransient.sensing.dead_time.dead_time_cycle import row_levels, whole_and_part
+from torchtransient.sensing.dead_time.stationary_phases import stationary_phases
+from torchtransient.sensing.estimation.depth import background_per_bin
+from torchtransient.sensing.numerics.draws import check_rates, sample_first_photons, sample_multinomial
+from torchtransient.sensing.numerics.thinning import halve, thin
+from torchtransient.sensing.numerics.time_convolution import convolve_time
+from torchtransient.sensing.spad.spad import sample_detections
+
+PS = 1e-12
+AXIS = TimeAxis.from_seconds(0.0, 100 * PS, 12)
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def light(seed=0, high=0.5, dtype=torch.float64):
+    return (high * torch.rand(1, 12, 2, 3, generator=generator(seed), dtype=dtype)).requires_grad_()
+
+
+def counts_of(mean, seed=0):
+    return torch.poisson(torch.full((1, 12, 2, 3), mean, dtype=torch.float64), generator=generator(seed))
+
+
+# --------------------------------------------------------------------------------------------------- plain numbers
+
+
+@each
+def test_sensors_make_no_number_of_what_has_a_gradient(entry):
+    """torch warns of it, once in a process; and draws have no gradient, whoever asks for them."""
+    x = entry.x(torch.float32)[:1].requires_grad_()
+    with nothing_with_a_gradient_as_a_number():
+        for policy in entry.policies if entry.random else [None]:
+            module = entry.module(torch.float32, **({"grad": policy} if policy else {}))
+            with sensing.ScoreFunction():
+                module(x, generator=generator())
+        if entry.random:
+            assert not any(value.requires_grad for value in parts(module.sample(x, generator())))
+
+
+def learnt_afterpulses(probability=0.05, tau_s=300 * PS, **keywords):
+    return sensing.Afterpulsing(probability, tau_s, 150 * PS, axis=AXIS, learnable=True, **keywords)
+
+
+CHAINS = {
+    "free running": lambda: [
+        sensing.FreeRunningSPAD(50, 150 * PS, axis=AXIS, learnable=True),
+        sensing.DetectionJitter(sensing.UniformResponse(70 * PS, learnable=True), AXIS),
+        learnt_afterpulses(),
+    ],
+    "carriers of a cycle": lambda: [
+        sensing.AfterpulsingSPAD(
+            sensing.SynchronousSPAD(50, dead_time_s=150 * PS, axis=AXIS),
+            learnt_afterpulses([0.05, 0.02], [3e-10, 2e-9]),
+        )
+    ],
+    "first photons, carriers": lambda: [
+        sensing.AfterpulsingSPAD(sensing.SynchronousSPAD(50, axis=AXIS), learnt_afterpulses())
+    ],
+    "free running, carriers": lambda: [
+        sensing.AfterpulsingSPAD(
+            sensing.FreeRunningSPAD(50, 150 * PS, axis=AXIS, learnable=True),
+            learnt_afterpulses(counted_from="avalanche"),
+        )
+    ],
+}
+
+
+@pytest.mark.parametrize("name", CHAINS)
+def test_chains_make_no_number_of_what_is_learnt(name):
+    x = light(high=0.2)
+    with nothing_with_a_gradient_as_a_number():
+        chain = sensing.Compose(CHAINS[name]())
+        mean = chain.expected(x)
+        slopes = torch.autograd.grad(mean.square().sum(), [x, *chain.parameters()], allow_unused=True)
+        chain.sample(x, generator())
+    assert all(s is not None and bool(s.isfinite().all()) and bool((s != 0).any()) for s in slopes)
+
+
+TRIGGERS = {
+    "one exponential": learnt_afterpulses,
+    "two": lambda: learnt_afterpulses([0.05, 0.02], [3e-10, 2e-9]),
+    "power law": lambda: sensing.Afterpulsing(
+        0.1, dead_time_s=150 * PS, delays=sensing.PowerLawDelays(1.2, 5e-9, learnable=True), axis=AXIS, learnable=True
+    ),
+    "crosstalk": lambda: sensing.Crosstalk(0.05, diagonal_ratio=0.3, learnable=True),
+    "crosstalk over edges": lambda: sensing.Crosstalk(0.05, learnable=True),
+}
+
+
+@pytest.mark.parametrize("name", TRIGGERS)
+def test_draws_of_what_detections_trigger_have_no_gradient(name):
+    """Whether grad mode is on or off; one by one and, of a large image, by a table."""
+    module = TRIGGERS[name]()
+    large = torch.poisson(torch.full((1, 12, 80, 80), 2.0), generator=generator())
+    with nothing_with_a_gradient_as_a_number():
+        for counts in (counts_of(5.0).float(), large):
+            drawn = module.trigger(counts, generator(1))
+            assert not drawn.requires_grad and bool((drawn >= counts).all()) and bool((drawn > counts).any())
+        assert 0 < module.share() < 0.5
+
+
+def test_values_that_are_refused_are_told_with_a_gradient_too():
+    """The number in the message is made of no tensor with a gradient."""
+    negative = torch.full((2, 2), -1.0, requires_grad=True)
+    budget = sensing.PixelElectronics()
+    budget.gain = torch.nn.Parameter(torch.tensor([[1.0, 2.0], [3.0, -4.0]]))
+    with nothing_with_a_gradient_as_a_number():
+        with pytest.raises(UnitError, match="got -1"):
+            check_map(negative, "gain", "here")
+        with pytest.raises(UnitError, match=r"gain in .*got -4"):
+            kept_map(budget, "gain")
+        with pytest.raises(UnitError, match="got -1 to -1"):
+            check_rates(negative, "here")
+        with pytest.raises(TorchTransientError, match="photons in a bin, got 1e"):
+            row_levels(torch.full((2, 3), 1e12, requires_grad=True), 1)
+
+
+# ----------------------------------------------------------------------------------------------------------- draws
+
+
+def test_functions_that_draw():
+    rate = light()
+    share = torch.rand(1, 12, 2, 3, generator=generator(1), dtype=torch.float64).requires_grad_()
+    counts = counts_of(4.0).requires_grad_()
+    few, all_ = torch.tensor([0.3, 0.2]).double().requires_grad_(), torch.tensor([0.3, 0.7]).double().requires_grad_()
+    with nothing_with_a_gradient_as_a_number():
+        drawn = [
+            sensing.poisson(rate, generator()),
+            sensing.poisson(rate.float() + 1e7, generator()),
+            sample_detections(rate, 50, generator=generator()),
+            sample_detections(rate, 50, 1.5, generator=generator()),
+            sample_first_photons(50, rate, generator()),
+            sample_multinomial(50, rate / 10, generator()),
+            thin(counts, share, generator()).number,
+            thin(counts, share.flatten()[:1], generator()).number,
+            halve(counts, share, generator()),
+            *(move_counts(counts, Moves(-1, shares, "zero"), generator())[0] for shares in (few, all_)),
+            *(move_counts(counts, Moves(-1, shares, "periodic"), generator(), tally=True)[0] for shares in (few, all_)),
+            move_counts(counts * 1000, Moves(-1, all_, "periodic"), generator())[0],
+        ]
+    assert not any(value.requires_grad for value in drawn)
+
+
+def test_the_background_of_a_histogram_has_no_gradient():
+    x = light()
+    level = background_per_bin(x)
+    assert not level.requires_grad and torch.equal(level, x.detach().median(-3).values)
+
+
+def test_straight_through_has_the_gradient_of_the_mean_alone():
+    sample, mean = (torch.tensor([2.0, 5.0], requires_grad=True) for _ in range(2))
+    y = straight_through(3 * sample, 7 * mean)
+    assert torch.equal(y, 3 * sample)
+    slopes = torch.autograd.grad(y.sum(), [sample, mean], allow_unused=True)
+    assert slopes[0] is None and slopes[1].tolist() == [7.0, 7.0]
+
+
+def test_a_baseline_has_no_gradient():
+    """It is subtracted in front of the score; what it depends on learns nothing by it."""
+    x, level = torch.full((5, 1, 4, 1, 1), 2.0, requires_grad=True), torch.tensor(3.0, requires_grad=True)
+    with sensing.ScoreFunction() as score:
+        losses = sensing.ShotNoise(grad="score")(x, generator=generator()).sum((1, 2, 3, 4)).square()
+    for baseline in (level, 2 * level):
+        total = score.surrogate(losses, baseline=baseline).sum()
+        slopes = torch.autograd.grad(total, [x, level], allow_unused=True, retain_graph=True)
+        assert slopes[1] is None
+        numbers = torch.autograd.grad(score.surrogate(losses, float(baseline.detach())).sum(), x, retain_graph=True)
+        assert torch.equal(slopes[0], numbers[0])
+
+
+# ------------------------------------------------------------------------------------ what a likelihood is asked for
+
+
+def test_likelihoods_have_no_gradient_by_what_was_measured():
+    """Of added counts and of moved first photons the measurement is a number."""
+    x, n = counts_of(6.0).requires_grad_(), (counts_of(6.0) + 2).requires_grad_()
+    module = sensing.Crosstalk(0.05)
+    found = torch.autograd.grad(module.log_prob(n, x).sum(), [x, n], allow_unused=True)
+    assert found[1] is None
+    extra = module.extra(x)
+    exact = torch.distributions.Poisson(extra, validate_args=False).log_prob((n - x).detach().clamp_min(0)).sum()
+    torch.testing.assert_close(found[0], torch.autograd.grad(exact, x)[0])
+    p = (light() / 10).detach().requires_grad_()
+    value = multinomial_log_prob(n, p, 500).sum()
+    assert torch.autograd.grad(value, n, allow_unused=True)[0] is None
+
+
+@pytest.mark.parametrize("dead_bins", [None, 1.5])
+def test_armed_cycles_are_counted_without_gradient(dead_bins):
+    """By a detection of bin k, log p changes by log(1 - exp(-r_k)) and what one armed cycle less makes there alone."""
+    rate = light().detach()
+    n = counts_of(1.0)[..., :1, :1].requires_grad_()
+    r = rate[..., :1, :1]
+    value = sensing.first_photon_log_prob(n, r, 100, dead_bins=dead_bins, constant=False)
+    (slope,) = torch.autograd.grad(value.sum(), n)
+    wanted = torch.log(-torch.expm1(-r)) + r
+    torch.testing.assert_close(slope, torch.where(n > 0, wanted, r))
+
+
+# ------------------------------------------------------------------------------------- derivatives that are to stay
+
+
+def test_moves_under_a_score_have_no_gradient_of_their_mean():
+    """What is learnt pulls by the score alone, the light by the mean: of jitter and of skew."""
+    counts = counts_of(5.0).requires_grad_()
+    weight = torch.arange(12.0).square().view(-1, 1, 1)
+    for module in (
+        sensing.DetectionJitter(sensing.GaussianResponse(300 * PS, learnable=True), AXIS, grad="score"),
+        sensing.DetectionSkew(130 * PS, AXIS, learnable=True, grad="score"),
+    ):
+        with sensing.ScoreFunction() as score:
+            y = module(counts, generator=generator())
+        (own,) = torch.autograd.grad((module.expected(counts) * weight).sum(), counts)
+        learnt = [p for p in module.parameters() if p.requires_grad]
+        found = torch.autograd.grad((y * weight).sum(), [counts, *learnt], allow_unused=True, retain_graph=True)
+        torch.testing.assert_close(found[0], own)
+        assert all(slope is None for slope in found[1:])
+        assert all(bool((g != 0).any()) for g in torch.autograd.grad(score.log_prob(()), learnt))
+
+
+def test_a_dead_time_just_below_a_whole_number_keeps_its_derivative():
+    dead = torch.tensor(3 - 1e-10, dtype=torch.float64, requires_grad=True)
+    whole, part = whole_and_part(dead)
+    assert whole == 3 and float(part.detach()) == 0.0
+    assert float(torch.autograd.grad(part, dead)[0]) == 1.0
+
+
+def test_what_is_rounded_to_zero_keeps_its_derivative():
+    """A transform leaves 1e-17 where there is no light: its derivative is that of the plain sum, everywhere."""
+    kernel = torch.tensor([0.5, 0.3, 0.2], dtype=torch.float64)
+    x = torch.zeros(1, 12, 1, 1, dtype=torch.float64)
+    x[0, 3], x[0, 7] = 5.0, 3e3
+    direct, by_fft = (
+        torch.autograd.functional.jacobian(lambda v, m=m: convolve_time(v, kernel, -1, method=m), x)
+        for m in ("direct", "fft")
+    )
+    torch.testing.assert_close(by_fft, direct)
+    assert bool((convolve_time(x, kernel, -1, method="fft") >= 0).all())
+
+
+def test_the_normal_surrogate_of_a_free_running_detector():
+    """Its derivative is that of the mean, and of the size of what is beside it as of independent bins."""
+    spad = sensing.FreeRunningSPAD(400, 150 * PS, axis=AXIS, grad="gaussian")
+    x = light()
+    y, mean = spad(x, generator=generator()), spad.expected(x)
+    size = (spad.variance(x) + 1e-4).log() / 2
+    wanted = torch.autograd.grad((mean + (y - mean).detach() * size).sum(), x)[0]
+    torch.testing.assert_close(torch.autograd.grad(y.sum(), x)[0], wanted)
+
+
+def test_a_solve_leaves_its_arguments_as_they_are():
+    """The derivative by the light alone: the dead time requires no gradient afterwards."""
+    rate = torch.rand(2, 5, dtype=torch.float64, generator=generator()).requires_grad_()
+    part = torch.tensor(0.3, dtype=torch.float64)
+    lines = stationary_phases(rate, part, 2)
+    assert bool(torch.autograd.grad(lines[:, 0].sum(), rate)[0].isfinite().all())
+    assert not part.requires_grad
+
+
+def test_codes_hold_no_gradient():
+    """Where no gradient is asked for they are made of parameters, and hold copies."""
+    knots = torch.tensor([[0.0, 0.4], [0.1, 0.7]], dtype=torch.float64)
+    values = torch.tensor([[1.0, -1.0], [0.5, -0.5]], dtype=torch.float64)
+    shifts = torch.nn.Parameter(torch.tensor([0.0, 0.25], dtype=torch.float64))
+    with torch.no_grad():
+        code = sensing.PiecewiseLinearCode(torch.nn.Parameter(knots), torch.nn.Parameter(values), shifts)
+    assert not code.shifts.requires_grad
+    assert not code.evaluate(torch.tensor([0.2, 0.9])).requires_grad
