@@ -1,28 +1,11 @@
 """What is read off a list of arrivals, in numbers that can be followed by hand: shares, blocks, depth, window, axis."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 import torchtransient as tt
-from torchtransient.rendering.plan_pilot import Arrivals, axis_over
-
-
-def arrivals(opl, energy, depth=None, path=None, pixel=None, paths=None, size=(1, 1)):
-    count = len(opl)
-    path = np.arange(count) if path is None else np.asarray(path)
-    return Arrivals(
-        SimpleNamespace(
-            opl=np.asarray(opl, float),
-            energy=np.asarray(energy, float),
-            depth=np.ones(count, int) if depth is None else np.asarray(depth),
-            path=path,
-            pixel=np.zeros(count, int) if pixel is None else np.asarray(pixel),
-            paths=paths or int(path.max()) + 1,
-            size=size,
-        )
-    )
+from support.pilot_arrivals import arrivals
+from torchtransient.rendering.plan_pilot import axis_over
 
 
 def at_random(seed, size=(20, 3), paths=400, count=700):
@@ -140,6 +123,23 @@ def test_a_block_may_lose_ten_times_as_much_and_two_of_its_errors():
     assert late.share(lost)[0] < 1e-3
     assert late.negligible(lost, 0.025)
     assert not late.negligible(lost, 0.025 * (1 - 1e-9))
+
+
+@pytest.mark.parametrize("unit", [1 / 1024, 1.0, 1024.0])
+def test_a_block_whose_paths_all_lose_the_same(unit):
+    """A quarter of a block in 64, in whatever unit the light is."""
+    pixel = np.arange(512) // 8
+    energy = np.where(pixel == 0, 0.75, 16.0) * unit
+    late = arrivals(
+        [*np.full(512, 2.0), *np.full(8, 3.0)],
+        [*energy, *np.full(8, 0.25 * unit)],
+        path=[*range(512), *range(8)],
+        pixel=[*pixel, *np.zeros(8, int)],
+        size=(8, 8),
+        paths=512,
+    )
+    assert late.negligible(late.opl == 3.0, 0.025)
+    assert not late.negligible(late.opl == 3.0, 0.025 * (1 - 1e-9))
 
 
 def test_a_block_without_light_loses_none():
