@@ -95,6 +95,10 @@ def test_depth_that_is_kept(own, known):
     plan = finder(None, inventory=around, integrator="transient_nlos_path")
     assert plan._depth(None) is None
     assert plan.reasons[-1].startswith(f"max_depth: {known}, kept; what albedos leave")
+    # A pilot run knows more; and of other integrators albedos say enough.
+    plan = finder(by_depth(), tail=0.006, inventory=around, integrator="transient_nlos_path")
+    assert plan._depth(None) == 3
+    assert finder(None, inventory={"integrator": "transient_path", "albedo": 0.0})._depth(None) == 2
     # An integrator for corners that the plan has put in the place of another one knows no corner.
     plan = finder(None, inventory=around | {"integrator": "path", "albedo": 0.0}, integrator="transient_nlos_path")
     assert plan._depth(None) == 2
@@ -193,6 +197,11 @@ def test_light_before_the_window_is_missed_too():
     plan.spread = (0.5, 0.0)
     assert plan._axis(None, (1, 0.8), 2) == tt.TimeAxis(2.4, 0.8, 1)
     assert plan.report.missed == pytest.approx(26 / 103)
+
+
+def test_300_bins_where_nobody_has_said_a_width():
+    found = finder(by_time(), missed=0.04)._axis(None, (None, None), 2)
+    assert (found.bin_width_opl, found.start_opl, found.num_bins) == pytest.approx((0.00335, 1.99995, 299))
 
 
 @pytest.mark.parametrize(("width", "bins"), [(1 / 4096, 4097), (1 / 8192, 4096)])
