@@ -128,7 +128,7 @@ def test_a_sheet_of_samples(monkeypatch):
     monkeypatch.setattr(contact_sheets, "draw", lambda cells, path, **more: drawn.append((cells, path, more)))
     axis = {"start_opl": 1.0, "bin_width_opl": 0.5, "num_bins": 3}
     for given in (axis, None):
-        sheet_of([sample(transient=numbers(3, 7)), sample(index=9)], "path", given, "title", 0)
+        sheet_of([sample(transient=numbers(3, 7, 2)), sample(index=9)], "path", given, "title", 1)
         (first, second), path, more = drawn.pop()
         assert (first.title, second.title, path, more["title"]) == ("7  ", "9  ", "path", "title")
         assert first.curve.shape == (7,)
