@@ -217,7 +217,8 @@ def test_broken_numbers_go_on_to_what_they_touch():
 
     def derivative(given):
         runs.append(given)
-        (x,) = given
+        # As Dr.Jit's sums do, which take NaN for nothing.
+        x = given[0].nan_to_num(0.0, 0.0, 0.0)
         return x[:2] * 3, x[2] - x[3], x[0]
 
     assert [one.tolist() for one in carried_on(derivative, [torch.tensor([1.0, 2.0, 3.0, 5.0])])] == [[3, 6], -2, 1]

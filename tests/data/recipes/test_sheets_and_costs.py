@@ -169,11 +169,15 @@ def test_the_last_picture_is_written_every_ten_seconds(tmp_path, monkeypatch):
     picture("d")
     assert (tmp_path / "latest.png").read_text() == "d"
     # Another process has just written one, or has a clock that is behind.
-    for offset, expected in ((9.9, "d"), (-9.9, "d"), (10.0, "e")):
+    for offset, expected in ((9.9, "d"), (-9.9, "d"), (-10.0, "e")):
         clock.now += 10
         monkeypatch.setattr(latest_picture.time, "time", lambda by=offset: latest_time(tmp_path) + by)
         picture("e")
         assert (tmp_path / "latest.png").read_text() == expected
+    clock.now += 10
+    monkeypatch.setattr(latest_picture.time, "time", lambda: latest_time(tmp_path) + 10)
+    picture("f")
+    assert (tmp_path / "latest.png").read_text() == "f"
 
 
 def latest_time(folder):
