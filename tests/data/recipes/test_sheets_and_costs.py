@@ -143,6 +143,7 @@ def test_the_last_picture_is_about_256_pixels_wide():
     """Every pixel as a square of whole pixels; pictures that are larger stay as they are."""
     assert picture_of(sample(steady=numbers(3, 20, 33))).shape == (140, 231, 3)
     assert picture_of(sample(steady=numbers(3, 300, 2))).shape == (300, 2, 3)
+    assert picture_of(sample(steady=numbers(3, 2, 1))).shape == (256, 128, 3)
 
 
 def test_the_last_picture_is_written_every_ten_seconds(tmp_path, monkeypatch):
