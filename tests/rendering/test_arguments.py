@@ -24,6 +24,8 @@ from torchtransient.rendering.arguments import (
 )
 from torchtransient.rendering.films import Histogram
 
+NO_NUMBERS = "expected a torch tensor, an array, a list of numbers or a number, got "
+
 
 def test_numbers_of_samples():
     assert samples("spp", None) is None
@@ -76,8 +78,8 @@ def test_names_that_torch_allows():
 @pytest.mark.parametrize(
     "value",
     [
-        [1, 2.5], (1.0, 2.5), np.array([1.0, 2.5]), torch.tensor([1.0, 2.5], dtype=torch.float64), [torch.tensor(1.0), 2.5],
-        [np.float32(1), torch.tensor(2.5)],
+        [1, 2.5], (1.0, 2.5), np.array([1.0, 2.5]), torch.tensor([1.0, 2.5], dtype=torch.float64),
+        [torch.tensor(1.0), 2.5], [np.float32(1), torch.tensor(2.5)],
     ],
 )  # fmt: skip
 def test_numbers_of_every_library(value):
@@ -103,11 +105,15 @@ def test_values_are_copies_of_arrays_and_gradients_pass_tensors():
         (None, ShapeError, "expected numbers, got None. Leave the key out"),
         (1j, ShapeError, "expected real numbers, got dtype torch.complex"),
         (True, ShapeError, "expected real numbers, got dtype torch.bool"),
-        ("abc", ShapeError, "expected a torch tensor, an array, a list of numbers or a number, got str"),
-        ([[1, 2], [3]], ShapeError, "expected a torch tensor, an array, a list of numbers or a number, got list"),
-        ([torch.ones(2), torch.ones(3)], ShapeError, "expected a torch tensor, an array, a list of numbers or a number, got list"),
+        ("abc", ShapeError, NO_NUMBERS + "str"),
+        ([[1, 2], [3]], ShapeError, NO_NUMBERS + "list"),
+        ([torch.ones(2), torch.ones(3)], ShapeError, NO_NUMBERS + "list"),
         (torch.eye(2).to_sparse(), ShapeError, "expected a dense tensor, got layout torch.sparse_coo"),
-        (torch.ones(2, device="meta"), DeviceError, "expected a tensor on 'cpu', where the scene's variant computes, got"),
+        (
+            torch.ones(2, device="meta"),
+            DeviceError,
+            "expected a tensor on 'cpu', where the scene's variant computes, got",
+        ),
     ],
 )
 def test_what_are_no_values(value, error, words):

@@ -82,7 +82,11 @@ def test_few_digits_are_computed_with_more(kind, wider):
 @pytest.mark.parametrize(
     ("tensor", "error", "message"),
     [
-        (torch.ones(2, dtype=torch.complex64), ShapeError, r"x: expected real numbers, got dtype torch.complex64. Pass"),
+        (
+            torch.ones(2, dtype=torch.complex64),
+            ShapeError,
+            r"x: expected real numbers, got dtype torch.complex64. Pass",
+        ),
         (torch.eye(2).to_sparse(), ShapeError, "x: expected a dense tensor, got layout torch.sparse_coo"),
         (torch.ones(2, device="meta"), DeviceError, "x: expected a tensor on 'cpu' or 'cuda', got 'meta'"),
         (torch.ones(2, dtype=torch.float8_e5m2), ShapeError, "expected real numbers, whole numbers or truth values"),
@@ -149,10 +153,14 @@ def test_cubes_that_fit(monkeypatch):
     """Up to 4 MiB nobody asks; of several renders one film more than there are renders is held at a time."""
     monkeypatch.setattr(memory, "available_bytes", lambda variant: 10 * 2**20)
     memory.check_fits((2**9, 2**10, 5, 1), 1, VARIANT)
-    with pytest.raises(StorageError, match=r"take 12\.00 MiB \(H x W x T x C = 512 x 1024 x 6 x 1 float32\), 12\.00 Mi"):
+    with pytest.raises(
+        StorageError, match=r"take 12\.00 MiB \(H x W x T x C = 512 x 1024 x 6 x 1 float32\), 12\.00 Mi"
+    ):
         memory.check_fits((2**9, 2**10, 6, 1), 1, VARIANT)
     memory.check_fits((2**9, 2**8, 5, 1), 3, VARIANT)
-    with pytest.raises(StorageError, match=r"float32, 5 of them for 4 renders\), 12\.50 MiB in all, and 10\.00 MiB are"):
+    with pytest.raises(
+        StorageError, match=r"float32, 5 of them for 4 renders\), 12\.50 MiB in all, and 10\.00 MiB are"
+    ):
         memory.check_fits((2**9, 2**8, 5, 1), 4, VARIANT)
     monkeypatch.setattr(memory, "available_bytes", lambda variant: 1536)
     memory.check_fits((2**9, 2**10, 2, 1), 1, VARIANT)
@@ -235,7 +243,9 @@ def test_broken_numbers_go_on_to_what_they_touch():
 def test_statistics_of_a_batch():
     """Paths over time: 10 a second for 2 s and 40 for 6 s are 260 in 8 s."""
     made = {"spp": 4, "variant": VARIANT, "integrator": "i", "temporal_filter": "box"}
-    one = RenderStats(seconds=2.0, samples_per_second=10.0, seeds=(1,), energy_before=(0.5,), energy_after=(3.0,), **made)
+    one = RenderStats(
+        seconds=2.0, samples_per_second=10.0, seeds=(1,), energy_before=(0.5,), energy_after=(3.0,), **made
+    )
     two = RenderStats(
         seconds=6.0, samples_per_second=40.0, seeds=(2, 3), energy_before=(1.0, 2.0), energy_after=(4.0, 5.0), **made
     )
@@ -248,7 +258,8 @@ def test_statistics_of_a_batch():
 def test_numbers_that_went_through_a_file(scale):
     """A millionth of the largest one, or of one, beside a hundred thousandth of each."""
     a = np.array([-scale, 0.0, 0.5 * scale])
-    assert _same(a, a + [0, 0.9e-6 * scale, 0]) and not _same(a, a + [0, 1.2e-6 * scale, 0])
+    step = np.array([0, 1e-6 * scale, 0])
+    assert _same(a, a + 0.9 * step) and not _same(a, a + 1.2 * step)
     assert _same(a, a * (1 + 1e-5)) and not _same(a, a * (1 + 1.3e-5))
     small = np.array([1e-7, 0.0])
     assert _same(small, small + 0.9e-6) and not _same(small, small + 1.2e-6)

@@ -175,7 +175,7 @@ def test_windows_are_errors_each_time():
     each = watch("error")
     each.window_name = "window"
     for _ in range(2):
-        with pytest.raises(PhysicsError, match="misses 25.0% of the light.*With physics='warn'"):
+        with pytest.raises(PhysicsError, match=r"misses 25\.0% of the light.*With physics='warn'"):
             each.window(steady(40.0), 3, 3.0, 7.0)
 
 

@@ -70,7 +70,9 @@ def test_dark_is_what_has_no_light():
     assert not arrivals([1.0], [1e-300]).dark
 
 
-@pytest.mark.parametrize(("size", "across", "down"), [((20, 3), 8, 3), ((3, 20), 3, 8), ((5, 2), 5, 2), ((9, 16), 8, 8)])
+@pytest.mark.parametrize(
+    ("size", "across", "down"), [((20, 3), 8, 3), ((3, 20), 3, 8), ((5, 2), 5, 2), ((9, 16), 8, 8)]
+)
 def test_blocks_of_the_image(size, across, down):
     """At most eight along a side, of the same size up to a pixel, numbered row by row."""
     width, height = size
@@ -79,7 +81,9 @@ def test_blocks_of_the_image(size, across, down):
     expected = [int(y * down / height) * across + int(x * across / width) for y in range(height) for x in range(width)]
     assert found.blocks == across * down
     assert found.block.tolist() == expected
-    assert found.block_total.tolist() == [sum(1.0 + p for p in pixels if expected[p] == b) for b in range(across * down)]
+    assert found.block_total.tolist() == [
+        sum(1.0 + p for p in pixels if expected[p] == b) for b in range(across * down)
+    ]
 
 
 def test_gates_weigh_each_arrival():
@@ -203,4 +207,8 @@ def test_nothing_is_left_out_where_all_counts():
 )
 def test_axes_over_a_window(arguments, axis):
     found = axis_over(*arguments)
-    assert (found.start_opl, found.bin_width_opl, found.num_bins) == (axis[0], pytest.approx(axis[1], rel=1e-11), axis[2])
+    assert (found.start_opl, found.bin_width_opl, found.num_bins) == (
+        axis[0],
+        pytest.approx(axis[1], rel=1e-11),
+        axis[2],
+    )

@@ -160,7 +160,7 @@ def test_window_of_what_was_found():
     found = by_time()
     plan = finder(found, missed=0.1, inventory={"film_axis": tt.TimeAxis(0.0, 0.5, 7)})
     assert plan._axis(None, (None, None), 2) == tt.TimeAxis(2.0, 0.5, 3)
-    part, error = found.share((found.opl == 8.0))
+    part, error = found.share(found.opl == 8.0)
     assert part == pytest.approx(1 / 103)
     assert plan.reasons[-1] == (
         f"time axis: {tt.TimeAxis(2.0, 0.5, 3)}, bin width of the scene's film; {part:.2g} +- {error:.1g} of the light "
@@ -274,7 +274,12 @@ def test_films_without_a_time_axis():
     [
         ({}, None, "box", "box, since no parameter changes a path length"),
         ({"parameters": ("colour",)}, "gaussian", "gaussian", "gaussian, the scene's own"),
-        ({"parameters": ("colour", "wall.to_world")}, None, "tent", "tent, since wall.to_world changes path lengths and"),
+        (
+            {"parameters": ("colour", "wall.to_world")},
+            None,
+            "tent",
+            "tent, since wall.to_world changes path lengths and",
+        ),
         ({"parameters": ("wall.to_world",)}, "gaussian", "gaussian", "gaussian, the scene's own"),
         ({"parameters": ("wall.to_world",), "irf": tt.Pulse.gaussian(0.2)}, "box", "box", "box, the scene's own"),
         ({"parameters": ("wall.to_world",), "pulse": tt.Pulse.gaussian(0.2)}, "box", "box", "box, the scene's own"),
@@ -310,7 +315,7 @@ def test_gates_have_a_slope_of_their_own_or_a_pulse():
     assert finder(film=film, parameters=moving)._filter(None) == ""
     assert finder(film=film, film_choice=sharp, pulse=tt.Pulse.gaussian(0.2), parameters=moving)._filter(None) == ""
     for settings in ({"film_choice": sharp}, {"inventory": {"film_settings": sharp}}):
-        with pytest.raises(GradientError, match="'rectangular gate' has no slope.*Use gates that rise from zero"):
+        with pytest.raises(GradientError, match=r"'rectangular gate' has no slope.*Use gates that rise from zero"):
             finder(film=film, parameters=moving, **settings)._filter(None)
     # The gates of the call count, not those of the scene.
     settings = {"film_choice": smooth, "inventory": {"film_settings": sharp}}

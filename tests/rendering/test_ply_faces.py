@@ -30,7 +30,9 @@ def ply(form, kind="int", *, faces=FACES, before="list", name="vertex_indices", 
     rows = np.array([(40000, 3, at) + (-60.0,) * behind for at in faces], face)
     if form != "ascii":
         return "\n".join(head).encode() + vertices.tobytes() + edges.tobytes() + rows.tobytes()
-    lines = [" ".join(str(number) for number in _flat(row.tolist())) for part in (vertices, edges, rows) for row in part]
+    lines = [
+        " ".join(str(number) for number in _flat(row.tolist())) for part in (vertices, edges, rows) for row in part
+    ]
     return ("\n".join(head) + "\n".join(lines) + "\n").encode()
 
 

@@ -70,18 +70,19 @@ def ready(crew, *numbers):
 
 def test_shards_are_handed_to_who_is_ready(clock, logged):
     """As many workers as there is work for, each with one shard at a time and what is known of it."""
-    ledger, lines = logged
+    ledger, _ = logged
+    held = []
     ledger.skipped[4] = {9: "why"}
     steps = [
         lambda c: ready(c, 1),
-        lambda c: c.heard(c.started[1], "begin", 4, 8),
+        lambda c: (c.heard(c.started[1], "begin", 4, 8), held.append(c.started[1].shard)),
         lambda c: (c.heard(c.started[1], "end", 4, 8, None), c.heard(c.started[1], "wrote", 4, 1, 0, 50)),
         lambda c: c.heard(c.started[1], "wrote", 5, 2, 1, 70),
         lambda c: c.heard(c.started[1], "wrote", 6, 2, 0, 90),
     ]
     with Played(ledger, 2, script=steps) as crew:
         crew.make([4, 5, 6], {"about": 1})
-    assert len(crew.started) == 2 and crew.closed is False
+    assert len(crew.started) == 2 and crew.closed is False and held == [4]
     assert crew.started[1].tasks == [
         ("shard", 4, {"about": 1}, {9: "why"}, []), ("shard", 5, {"about": 1}, {}, []),
         ("shard", 6, {"about": 1}, {}, []),
@@ -94,11 +95,17 @@ def test_shards_are_handed_to_who_is_ready(clock, logged):
 
 def test_measuring(clock, logged):
     ledger, _ = logged
-    told = SimpleNamespace()
-    crew = Played(ledger, 3, script=[lambda c: ready(c, 0), lambda c: c.heard(c.started[0], "measured", told)])
-    assert crew.measure(range(5)) is told and len(crew.started) == 1
+    told, held = SimpleNamespace(), []
+    steps = [
+        lambda c: ready(c, 0),
+        lambda c: (held.append(c.started[0].shard), c.heard(c.started[0], "measured", told)),
+    ]
+    crew = Played(ledger, 3, script=steps)
+    assert crew.measure(range(5)) is told and len(crew.started) == 1 and held == [MEASURING]
     assert crew.started[0].tasks == [("measure", range(5), {})]
-    silent = Played(ledger, 1, script=[lambda c: ready(c, 0), lambda c: c.heard(c.started[0], "wrote", MEASURING, 0, 0, 0)])
+    silent = Played(
+        ledger, 1, script=[lambda c: ready(c, 0), lambda c: c.heard(c.started[0], "wrote", MEASURING, 0, 0, 0)]
+    )
     with pytest.raises(TorchTransientError, match="no sample was measured"):
         silent.measure(range(5))
 
@@ -216,6 +223,12 @@ def test_starts_that_come_to_nothing(clock, logged):
     other.workers.append(other.start())
     with pytest.raises(TorchTransientError, match="while it started"):
         other.bury(other.workers[0], "by test", own_fault=False, for_good=True)
+
+
+def test_engines_say_what_a_worker_is():
+    for method, arguments in ((Member.send, [()]), (Member.end, [])):
+        with pytest.raises(NotImplementedError):
+            method(Member(), *arguments)
 
 
 def test_a_crew_that_is_stopped(logged):

@@ -22,7 +22,8 @@ AXIS = tt.TimeAxis(3.0, 0.5, 10)
     [
         ((3.0, 8.0), (0, 10)), ((None, None), (0, 10)), ((4.0, None), (2, 10)), ((None, 4.0), (0, 2)),
         # All bins that are touched; the border of a bin is not beyond it, up to a millionth of one.
-        ((4.1, 5.1), (2, 5)), ((4.0, 5.0), (2, 4)), ([4.0 - 4e-7, 5.0 + 4e-7], (2, 4)), ((4.0 - 6e-7, 5.0 + 6e-7), (1, 5)),
+        ((4.1, 5.1), (2, 5)), ((4.0, 5.0), (2, 4)), ([4.0 - 4e-7, 5.0 + 4e-7], (2, 4)),
+        ((4.0 - 6e-7, 5.0 + 6e-7), (1, 5)),
         ((3.0 - 4e-7, 8.0 + 4e-7), (0, 10)), ((4.0, 4.0 + 1e-7), (2, 3)), ((7.9999999, 8.0), (9, 10)),
         (slice(2, 5), (2, 5)), (slice(None), (0, 10)), (slice(-3, None), (7, 10)), (slice(8, 99), (8, 10)),
     ],
@@ -70,7 +71,13 @@ def test_rectangles():
     for wrong in ((rows, slice(0, 4, 2)), (slice(2, 2), rows), (rows, slice(6, 7))):
         with pytest.raises(StorageError, match=r"some of \(4, 6\) without steps"):
             pixels_of(wrong, (4, 6))
-    for wrong, size in ((rows, (4, 6)), ((rows,), (4, 6)), ((rows, 2), (4, 6)), ((rows, rows), (4,)), ((rows,) * 3, (4, 6))):
+    for wrong, size in (
+        (rows, (4, 6)),
+        ((rows,), (4, 6)),
+        ((rows, 2), (4, 6)),
+        ((rows, rows), (4,)),
+        ((rows,) * 3, (4, 6)),
+    ):
         with pytest.raises(StorageError, match=r"slices \(rows, columns\)"):
             pixels_of(wrong, size)
 
@@ -105,9 +112,9 @@ class Alone(TransientStream):
 @pytest.mark.parametrize(
     ("batches", "given", "turn"),
     [
-        # Shares of 3, 4 and 4 samples, by two: 2, 2 and 2 batches, the last one of the first worker a smaller one.
-        (0, [0, 0, 0], 0), (1, [2, 0, 0], 1), (2, [2, 2, 0], 2), (3, [2, 2, 2], 0), (4, [4, 2, 2], 1), (6, [4, 4, 4], 0),
-        (9, [4, 4, 4], 0),
+        # Shares of 3, 4 and 4 samples, by two: two batches each, the last one of the first worker a smaller one.
+        (0, [0, 0, 0], 0), (1, [2, 0, 0], 1), (2, [2, 2, 0], 2), (3, [2, 2, 2], 0), (4, [4, 2, 2], 1),
+        (6, [4, 4, 4], 0), (9, [4, 4, 4], 0),
     ],
 )  # fmt: skip
 def test_workers_take_turns(batches, given, turn):

@@ -141,10 +141,14 @@ def test_what_is_not_looked_at():
         assert leaves(built, of, drawn) is None
 
 
+def _moved(box, *by):
+    return box + np.array(by)
+
+
 def test_boxes():
     box = np.array([[0.0, 1, 2], [1.0, 3, 5]])
-    assert _between(box, box + [0.5, 1, 1]) == 0
-    assert _between(box, box + [2, 0, 0]) == _between(box + [2, 0, 0], box) == 1
-    assert _between(box, box + [4, 6, 3]) == 5
+    assert _between(box, _moved(box, 0.5, 1, 1)) == 0
+    assert _between(box, _moved(box, 2, 0, 0)) == _between(_moved(box, 2, 0, 0), box) == 1
+    assert _between(box, _moved(box, 4, 6, 3)) == 5
     turned = _transformed(box, translate([10.0, 0, 0]) @ rotate([0, 0, 1], 90) @ scale(2.0))
     np.testing.assert_allclose(turned, [[10 - 6, 0, 4], [10 - 2, 2, 10]], atol=1e-12)

@@ -96,7 +96,7 @@ def test_without_light_the_picture_is_black():
 
 
 def test_labels():
-    normals, albedo = numbers(3, 4, 5) * 2 - 1.2, numbers(3, 4, 5) * 2 - 0.5
+    normals, albedo = numbers(3, 4, 5) * 3 - 1.7, numbers(3, 4, 5) * 2 - 0.5
     two, depth = numbers(2, 4, 5), numbers(3, 4, 5)
     images = cell_of(
         sample(normals=np.stack([normals, -normals]), albedo=albedo, depth=depth, shape=depth[0], uv=two, position=two,
@@ -191,8 +191,8 @@ def latest_time(folder):
 def cost(**more):
     settings = {
         "values": ("a", "b"), "exchanged": ("c",), "seen": 2, "sample_bytes": 2000, "outside": (0.0123, 0.25),
-        "structures": (StructureCost("c=x", 3.0, 0.5), StructureCost("", 1.0, 0.25)), "standard_error": 0.125, "n": 7200,
-        "stored_bytes": {"exact": 1500.0, "rounded": 500.0, "counts": None},
+        "structures": (StructureCost("c=x", 3.0, 0.5), StructureCost("", 1.0, 0.25)), "n": 7200,
+        "standard_error": 0.125, "stored_bytes": {"exact": 1500.0, "rounded": 500.0, "counts": None},
     }  # fmt: skip
     return Cost(**settings | more)
 
@@ -225,7 +225,13 @@ def test_a_forecast_in_words():
 
 @pytest.mark.parametrize(
     ("hours", "words"),
-    [(1.0, "1.00 hours"), (30.5, "30.50 hours"), (0.75, "45.0 minutes"), (1 / 60, "1.0 minutes"), (0.005, "18 seconds")],
+    [
+        (1.0, "1.00 hours"),
+        (30.5, "30.50 hours"),
+        (0.75, "45.0 minutes"),
+        (1 / 60, "1.0 minutes"),
+        (0.0125, "45 seconds"),
+    ],
 )
 def test_durations(hours, words):
     assert _duration(hours) == words
@@ -244,26 +250,33 @@ def test_a_forecast_is_of_what_was_measured(monkeypatch):
     monkeypatch.setattr(forecasts.time, "perf_counter", lambda: clock.now)
     monkeypatch.setattr(forecasts, "_stored", lambda samples, maker: {"exact": float(len(samples))})
     called = []
-    seconds = iter([9.0, 5.0, 4.0, 1.0, 2.0, 4.0, 8.0, 5.0, 4.0, 3.0, 0.5, 0.25])
+    seconds = iter([9.0, 5.0, 4.0, 1.0, 2.0, 4.0, 8.0, 5.0, 4.0, 3.0, 0.5, 0.25, 7.0, 1.0, 1.0, 2.0, 2.0, 2.0])
 
     def make(index):
         clock.now += next(seconds)
         called.append(index)
-        return Sample(index, 0, arrays={"a": np.zeros((2, 3), np.float32), "b": np.zeros(5)},
+        return Sample(index, 0, arrays={"a": np.zeros((2, 3 + index), np.float32), "b": np.zeros(5)},
                       outside=(0.01 * index, 0.25))  # fmt: skip
 
+    def of(index):
+        return 2 if index == 63 else index % 2
+
+    bars = []
+    bar = SimpleNamespace(update=lambda: bars.append("one more"), close=lambda: bars.append("closed"))
+    monkeypatch.setattr("tqdm.auto.tqdm", lambda total, **more: bars.append(total) or bar)
     recipe = SimpleNamespace(
         vary={"a": 1, "c": 2}, exchanged=["c"], n=5, scenes=SimpleNamespace(names=[""]),
-        structure=lambda index: Structure("", f"c={index % 2}", (("c", index % 2),)),
+        structure=lambda index: Structure("", f"c={of(index)}", (("c", of(index)),)),
     )  # fmt: skip
     maker = SimpleNamespace(sample=make, forget=lambda structure: called.append(structure.text),
                             standard_error=lambda index: 0.5 + index)  # fmt: skip
-    found = forecast(recipe, maker, 3, progress=False)
-    assert called == ["c=0", 0, 2, 4, 6, 8, 10, "c=1", 1, 3, 5, 7, 9, 11]
+    found = forecast(recipe, maker, 3, progress=True)
+    assert called == ["c=0", 0, 2, 4, 6, 8, 10, "c=1", 1, 3, 5, 7, 9, 11, "c=2", *[63] * 6]
+    assert bars == [18, *["one more"] * 18, "closed"]
     assert found == Cost(
-        values=("a",), exchanged=("c",), seen=2, sample_bytes=24 + 40, stored_bytes={"exact": 12.0}, n=5,
-        structures=(StructureCost("c=0", 9.0, 2.0), StructureCost("c=1", 8.0, 0.5)),
-        outside=(pytest.approx(0.25 + 0.01 * 66 / 12), pytest.approx(0.36)), standard_error=0.5,
+        values=("a",), exchanged=("c",), seen=3, sample_bytes=24 + 40, stored_bytes={"exact": 18.0}, n=5,
+        structures=(StructureCost("c=0", 9.0, 2.0), StructureCost("c=1", 8.0, 0.5), StructureCost("c=2", 7.0, 2.0)),
+        outside=(pytest.approx(0.25 + 0.01 * (66 + 6 * 63) / 18), pytest.approx(0.88)), standard_error=0.5,
     )  # fmt: skip
 
 
