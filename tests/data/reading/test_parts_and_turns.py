@@ -187,6 +187,13 @@ def test_readers_wait_for_enough_samples():
     assert not schedule.can_draw() and schedule.drawn == 4
 
 
+def test_the_last_readable_sample_stays():
+    """Whoever has one place writes it once, without a bound of the uses, too."""
+    schedule = Schedule(1, 1, float("inf"), 1, first=0, seed=0)
+    schedule.finished(schedule.order(0).index)
+    assert schedule.order(0) is None and schedule.can_draw() and schedule.draw() == 0
+
+
 def test_the_oldest_is_replaced_once_it_has_served():
     """Of two uses: at the third draw one that has gone would not be missed."""
     schedule = filled(2.0)
