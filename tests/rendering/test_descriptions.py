@@ -238,7 +238,8 @@ def test_ready_scenes_that_stay_as_they_are():
         # In the middle of what is shown.
         ({"width": 100, "height": 60}, {"x": (100, (100 - PIXELS) // 2), "y": (60, (60 - PIXELS) // 2)}),
         ({}, {"x": (768, (768 - PIXELS) // 2), "y": (576, (576 - PIXELS) // 2)}),
-        ({"width": 100, "height": PIXELS, "crop_width": 50, "crop_offset_x": 20}, {"x": (100, 20 + (50 - PIXELS) // 2)}),
+        ({"width": 100, "height": 1, "crop_width": 50, "crop_offset_x": 20}, {"x": (100, 20 + (50 - PIXELS) // 2)}),
+        ({"width": PIXELS + 1, "height": PIXELS}, {"x": (PIXELS + 1, 0)}),
         ({"width": 100, "height": 1, "crop_width": 50, "crop_offset_x": 50}, {"x": (100, 50 + (50 - PIXELS) // 2)}),
         # What is wrong is refused as it is.
         ({"width": 100, "height": 1, "crop_width": 50, "crop_offset_x": 51}, {}),

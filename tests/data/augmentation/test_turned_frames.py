@@ -122,5 +122,7 @@ def test_affine_maps_of_kornia_with_a_derivative_of_their_own():
     assert Affine(RandomAffine(30.0, p=0.0)).draw((5, 5), None) is None
     first, again = (Affine(RandomAffine(30.0, p=1.0)).draw((5, 5), torch.Generator().manual_seed(n)) for n in (4, 4))
     assert np.array_equal(first.matrix, again.matrix)
+    eight = [Affine(RandomAffine(30.0, p=1.0)).draw((5, 5), torch.Generator().manual_seed(n)) for n in range(8)]
+    assert len({drawn.matrix.tobytes() for drawn in eight}) == 8
     with pytest.raises(SceneError, match="RandomPerspective is no affine map"):
         Affine(RandomPerspective(0.5, p=1.0)).draw((5, 5), torch.Generator().manual_seed(0))
