@@ -76,8 +76,8 @@ class Making:
 def making(tmp_path, monkeypatch):
     def made(recipe, retries=1, max_outside=None, n=5):
         settings = SimpleNamespace(
-            recipe=recipe, folder=str(tmp_path), plugins=(), retries=retries, max_outside=max_outside, n=n, store="exact",
-            compression="none",
+            recipe=recipe, folder=str(tmp_path), plugins=(), retries=retries, max_outside=max_outside, n=n,
+            store="exact", compression="none",
         )  # fmt: skip
         monkeypatch.setattr(shard_making, "shard_header", lambda *_: {"about": {"spp": 4}})
         monkeypatch.setattr(shard_making, "LatestPicture", lambda folder: pictures.append)

@@ -112,6 +112,8 @@ def test_normal_distributions_end_where_floats_do():
     ends = [float(D.Normal(1, 2).draw(Extreme(upper), NUMBER)) for upper in (False, True)]
     assert ends == pytest.approx([1 - 2 * most, 1 + 2 * most], rel=1e-6)
     assert D.Normal(0, 1, low=-np.inf, high=np.inf) == D.Normal(0, 1)
+    # Nor does a logarithm bring numbers beyond their ends: that of 10 gives 10.000000000000002 back.
+    assert all(float(D.LogUniform(10, 10).draw(Fixed(u), NUMBER)) == 10 for u in (0.0, 0.25, 0.5, 0.75))
     # A deviation of zero is its mean, at an end too.
     for mean in (0.0, 1.0):
         assert float(D.Normal(mean, 0, low=0, high=1).draw(Fixed(0.25), NUMBER)) == mean

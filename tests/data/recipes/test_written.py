@@ -24,7 +24,8 @@ def test_numbers_of_every_library_are_plain():
     for given, plain in (
         (torch.tensor([1.0, 2.5], requires_grad=True), [1.0, 2.5]), (np.float32(0.5), 0.5), (range(2, 4), [2, 3]),
         ((1, [True, None]), [1, [True, None]]), ({3: np.int64(4)}, {"3": 4}), (np.eye(2), [[1, 0], [0, 1]]),
-        (SimpleNamespace(matrix=pose), pose.tolist()), (D.Uniform(0, 1), {"uniform": {"low": 0, "high": 1, "same": False}}),
+        (SimpleNamespace(matrix=pose), pose.tolist()),
+        (D.Uniform(0, 1), {"uniform": {"low": 0, "high": 1, "same": False}}),
     ):  # fmt: skip
         assert written(given) == plain
     for wrong in (object(), np.array(["a"]), {"a": [object()]}):
@@ -45,7 +46,8 @@ def test_many_numbers_are_not_listed(count):
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        (3, "expected a distribution"), ({}, "expected a distribution"), ({"uniform": [0, 1], "turn": {}}, "expected a dist"),
+        (3, "expected a distribution"), ({}, "expected a distribution"),
+        ({"uniform": [0, 1], "turn": {}}, "expected a dist"),
         ({"unifrm": 1}, "unknown distribution 'unifrm'. Known ones are uniform"),
         ({"uniform": [0]}, r"uniform: expected \[low, high\] or a mapping of low, high, same, got"),
         ({"uniform": 0}, r"uniform: expected \[low, high\]"), ({"uniform": {"low": 0, "hi": 1}}, "unknown entry 'hi'"),
