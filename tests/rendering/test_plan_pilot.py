@@ -1,6 +1,7 @@
 """What a plan finds by tracing: depth and window hold the light that they promise, and nothing else is paid."""
 
 import json
+import time
 
 import mitsuba as mi
 import numpy as np
@@ -195,7 +196,10 @@ def test_the_sensor_that_was_planned_for():
     far = plan_scenes.grey_room()["sensor"]
     far["to_world"] = plan_scenes.look_at([0.0, 0.0, 9.0], [0.0, 0.0, 0.0])
     scene = plan_scenes.grey_room(far=far)
+    started = time.perf_counter()
     near, distant = tt.plan(scene), tt.plan(scene, sensor=1)
+    assert 0 < near.pilot.seconds < time.perf_counter() - started
+    assert near.time_axis.start_opl <= near.pilot.first_opl < near.time_axis.edges_opl[1] < near.pilot.last_opl
     assert distant.time_axis.start_opl == pytest.approx(near.time_axis.start_opl + 5.0, abs=0.1)
     output = distant.renderer()(seed=0)
     assert float(output.transient.sum()) == pytest.approx(float(output.steady.sum()), rel=1e-3)

@@ -206,10 +206,10 @@ class _Levels:
 
 
 def _xml_value(key: str, value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
     if isinstance(value, np.generic):
         value = value.item()
+    if isinstance(value, bool):
+        return str(value).lower()
     if isinstance(value, (str, int, float)):
         return str(value)
     raise SceneError(f"tt.load: XML parameter {key!r} must be a string or a number, got {type(value).__name__}.")

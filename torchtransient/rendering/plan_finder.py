@@ -184,7 +184,7 @@ class Finder:
         return depth
 
     def _note_tail(self, depth: int) -> None:
-        if self.arrivals is not None and self.report is not None and not self.arrivals.dark and depth > 0:
+        if self.arrivals is not None and self.report is not None and not self.arrivals.dark and depth >= 0:
             part, error = self.arrivals.share(self.arrivals.depth > depth)
             self.report = replace(self.report, tail=part, tail_error=error)
 

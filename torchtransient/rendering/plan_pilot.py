@@ -148,7 +148,7 @@ def axis_over(first: float, last: float, bin_width_opl: float | None, num_bins: 
         # Light of a single moment still needs a width: a thousandth of its age, at least a micrometre.
         shortest = max(abs(last) * 1e-3 / count, 1e-6)
         # One bin is lost to the start at a multiple of the width.
-        bin_width_opl = _round_up(max((last - first) / max(count - 1, 1), shortest))
+        bin_width_opl = _round_up(max((last - first) / (count - 1), shortest))
     start_bin = math.floor(first / bin_width_opl + 1e-9)
     while start_bin * bin_width_opl > first:
         start_bin -= 1

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import pickle
+from statistics import NormalDist
 
 import numpy as np
 import pytest
+import torch
 
 import torchtransient as tt
 from torchtransient.data.recipes.distribution import ANYTHING, NUMBERS, POSE, Place
-from torchtransient.data.recipes.streams import Extreme, Stream
+from torchtransient.data.recipes.streams import Extreme, Fixed, Stream
 from torchtransient.data.recipes.written import read_distribution, written
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 
@@ -81,6 +83,77 @@ def test_choice_of_weight_zero_never_comes():
     assert D.Choice([1, 2], weights=[0, 1]).draw(Extreme(False), NUMBER) == 2
 
 
+@pytest.mark.parametrize("u", [0.25, 0.75])
+def test_numbers_of_one_draw(u):
+    """Quantiles: of the logarithm, of what is left of a normal distribution between its ends."""
+    normal = NormalDist(3.0, 2.0)
+    below, above = normal.cdf(2.0), normal.cdf(7.0)
+    for distribution, expected in (
+        (D.Uniform(2, 10), 2 + 8 * u),
+        (D.LogUniform(2, 32), 2 * 16**u),
+        (D.Normal(3, 2), normal.inv_cdf(u)),
+        (D.Normal(3, 2, low=2), normal.inv_cdf(below + u * (1 - below))),
+        (D.Normal(3, 2, high=7), normal.inv_cdf(u * above)),
+        (D.Normal(3, 2, low=2, high=7), normal.inv_cdf(below + u * (above - below))),
+        (D.Choice([5, 7, 11], weights=[1, 1, 2]), 7 if u == 0.25 else 11),
+        (D.Choice([5, 7, 11, 13]), 7 if u == 0.25 else 13),
+    ):
+        assert float(distribution.draw(Fixed(u), NUMBER)) == pytest.approx(expected, rel=1e-12)
+    assert D.Scale(2, 10).draw(Fixed(u), COLOUR) == pytest.approx((2 + 8 * u) * COLOUR.described)
+    assert D.Scale(2, 10).draw(Fixed(u), AT) == pytest.approx(T0 @ np.diag([*[2 + 8 * u] * 3, 1]))
+    assert D.Offset(2, 10).draw(Fixed(u), COLOUR) == pytest.approx(COLOUR.described + 2 + 8 * u)
+    turned = D.Turn([0, 0, 1], 20, 100).draw(Fixed(u), AT)
+    assert turned == pytest.approx(D.Turn([0, 0, 1], 20 + 80 * u, 20 + 80 * u).draw(Fixed(0.0), AT))
+
+
+def test_normal_distributions_end_where_floats_do():
+    """2^-53 of the light of a draw is left out at both sides; an end at infinity is none."""
+    most = NormalDist().inv_cdf(1 - 2.0**-53)
+    ends = [float(D.Normal(1, 2).draw(Extreme(upper), NUMBER)) for upper in (False, True)]
+    assert ends == pytest.approx([1 - 2 * most, 1 + 2 * most], rel=1e-6)
+    assert D.Normal(0, 1, low=-np.inf, high=np.inf) == D.Normal(0, 1)
+    # Nor does a logarithm bring numbers beyond their ends: that of 10 gives 10.000000000000002 back.
+    assert all(float(D.LogUniform(10, 10).draw(Fixed(u), NUMBER)) == 10 for u in (0.0, 0.25, 0.5, 0.75))
+    # A deviation of zero is its mean, at an end too.
+    for mean in (0.0, 1.0):
+        assert float(D.Normal(mean, 0, low=0, high=1).draw(Fixed(0.25), NUMBER)) == mean
+    # A billionth of the distribution has to be left.
+    for mean in (5.99, -5.99):
+        D.Normal(0, 1, low=mean if mean > 0 else None, high=mean if mean < 0 else None)
+        with pytest.raises(UnitError, match="next to nothing"):
+            D.Normal([0, 0], 1, low=mean + 0.02 if mean > 0 else None, high=mean - 0.02 if mean < 0 else None)
+
+
+def test_a_number_that_draws_each_choice():
+    """In the middle of its share."""
+    weighted, even = D.Choice([1, 2, 3], weights=[1, 2, 5]), D.Choice([1, 2, 3, 4])
+    assert [weighted.share(n) for n in range(3)] == [1 / 16, 2 / 8, 11 / 16]
+    assert [even.share(n) for n in range(4)] == [1 / 8, 3 / 8, 5 / 8, 7 / 8]
+    for one in (weighted, even):
+        assert [float(one.draw(Fixed(one.share(n)), NUMBER)) for n in range(len(one.values))] == one.values
+    # At the border of two shares the second one begins.
+    assert float(weighted.draw(Fixed(1 / 8), NUMBER)) == 2 and float(even.draw(Fixed(0.5), NUMBER)) == 3
+    assert float(even.draw(Fixed(np.nextafter(1.0, 0.0)), NUMBER)) == 4
+
+
+def test_choices_are_copies_in_plain_numbers():
+    colour = torch.tensor([1.0, 2.0, 3.0], requires_grad=True)
+    array, nested = np.arange(3.0), {"radius": np.float32(0.5), "places": (np.int64(2), [torch.tensor(3)])}
+    choice = D.Choice([colour, array, np.float64(4.0), nested, "text"])
+    array += 1
+    assert choice.values[1].tolist() == [0, 1, 2] and type(choice.values[2]) is float
+    assert choice.values[3] == {"radius": 0.5, "places": [2, [3]]} and choice.values[4] == "text"
+    assert choice.draw(Fixed(0.5), Place("x", ANYTHING)) == 4.0
+    first = D.Choice([colour]).draw(Fixed(0.0), COLOUR)
+    assert first.tolist() == [1, 2, 3] and first.dtype == np.float64
+    # One number for all entries; what is drawn is its receiver's.
+    same = D.Choice([2])
+    drawn = same.draw(Fixed(0.0), COLOUR)
+    drawn += 1
+    assert drawn.tolist() == [3, 3, 3] and same.draw(Fixed(0.0), COLOUR).tolist() == [2, 2, 2]
+    assert D.Choice([T0.tolist()]).draw(Fixed(0.0), AT) == pytest.approx(T0)
+
+
 # --------------------------------------------------------------------------------------------------------------- poses
 
 
@@ -139,6 +212,19 @@ WRONG = {
     "empty choice": (lambda: D.Choice([]), SceneError, "at least one"),
     "choice of a text": (lambda: D.Choice("abc"), SceneError, "list of values"),
     "weights": (lambda: D.Choice([1, 2], weights=[1]), UnitError, "2 weights"),
+    "negative weight": (lambda: D.Choice([1, 2], weights=[2, -1]), UnitError, "weights of at least 0"),
+    "weight without end": (lambda: D.Choice([1, 2], weights=[1, np.inf]), UnitError, "2 weights"),
+    "mean that is none": (lambda: D.Normal(np.nan, 1), UnitError, "mean as finite numbers, got"),
+    "mean without end": (lambda: D.Normal(np.inf, 1), UnitError, "mean as finite numbers, got"),
+    "end that is none": (lambda: D.Normal(0, 1, low=np.nan), UnitError, "low as a number or None"),
+    "end in words": (lambda: D.Normal(0, 1, high="much"), UnitError, "high as a number or None"),
+    "ends in turns": (lambda: D.Normal(0, 1, low=2, high=1), UnitError, "low <= high, got 2 and 1"),
+    "mean over the end": (lambda: D.Normal([0, 5], [1, 0], high=1), UnitError, "outside of"),
+    "mean under the end": (lambda: D.Normal(-1, 0, low=0), UnitError, "outside of"),
+    "log of a colour": (lambda: D.LogUniform([1, 0], [2, 2]), UnitError, "greater than zero"),
+    "three angles": (lambda: D.Turn(low=[0, 1, 2], high=[3, 3, 3]), ShapeError, "single angles"),
+    "two numbers for a point": (lambda: D.LookAt([1, 2], [0, 0, 0]), ShapeError, "three finite numbers"),
+    "nothing to compose": (lambda: D.Compose([]), SceneError, "list of distributions"),
     "no weight": (lambda: D.Choice([1, 2], weights=[0, 0]), UnitError, "greater than zero"),
     "axis": (lambda: D.Turn([0, 0, 0]), UnitError, "length"),
     "about": (lambda: D.Turn(about="me"), ArgumentError, "self"),

@@ -50,6 +50,18 @@ def test_our_decoder(data, tmp_path):
     assert about["axis"] == AXIS and about["about"]["spp"] == 16
 
 
+@pytest.mark.parametrize("megabytes", [0.2, 0.5])
+def test_a_tar_ends_with_the_sample_that_fills_it(data, tmp_path, megabytes):
+    """Members lie in blocks of 512 bytes, behind one each; two empty ones and what fills 10 KiB end a tar."""
+    paths = export(data, tmp_path, megabytes=megabytes)
+    assert len(paths) > 1
+    for path in paths[:-1]:
+        with tarfile.open(path) as tar:
+            ends = {member.name.split(".")[0]: member.offset_data + -(-member.size // 512) * 512 for member in tar}
+        *before, last = ends.values()
+        assert max(before, default=0) < megabytes * 1e6 <= last
+
+
 def test_the_package_webdataset(data, tmp_path):
     wds = pytest.importorskip("webdataset")
     paths = export(data, tmp_path, window=slice(0, 64))

@@ -54,7 +54,7 @@ def bins_of(window: Any, axis: TimeAxis | None) -> slice | None:
             f"{_WHAT}: expected window to lie between {axis.start_opl:g} m and {axis.end_opl:g} m, got "
             f"{shown(window)}. None is an end that is open."
         )
-    start = max(0, math.floor(first + _SAME_EDGE))
+    start = min(axis.num_bins - 1, max(0, math.floor(first + _SAME_EDGE)))
     return slice(start, min(axis.num_bins, max(start + 1, math.ceil(last - _SAME_EDGE))))
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Mapping
 from dataclasses import asdict
+from dataclasses import fields as entries_of
 from typing import Any
 
 import numpy as np
@@ -99,7 +100,7 @@ def read_distribution(where: str, value: Any) -> Distribution:
             f"{where}: unknown distribution {name!r}. Known ones are {known}; one of your own is known once its module "
             "is imported."
         )
-    fields = [entry for entry in made.__dataclass_fields__ if entry not in ("name", "short")]
+    fields = [entry.name for entry in entries_of(made)]
     if isinstance(given, Mapping):
         arguments = {str(entry): content for entry, content in given.items()}
     elif len(made.short) == 1:

@@ -1,0 +1,272 @@
+"""Numbers on their way between torch and Dr.Jit, memory that is asked for, and what is told on the way."""
+
+from types import SimpleNamespace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+
+from torchtransient.errors import DeviceError, ShapeError, StorageError
+from torchtransient.rendering import arrays, batch, engine, memory, progress, session
+from torchtransient.rendering.batch import Batch
+from torchtransient.rendering.broken_numbers import all_finite, broken_entries, carried_on
+from torchtransient.rendering.output import RenderStats
+from torchtransient.rendering.saving.save import _same
+
+VARIANT = "llvm_ad_mono"
+KINDS = (torch.float16, torch.float32, torch.float64, torch.int32, torch.int64, torch.bool)
+
+
+# ------------------------------------------------------------------------------------------------------------ arrays
+
+
+@pytest.mark.parametrize("rows", [5, 100])
+@pytest.mark.parametrize("kind", KINDS)
+def test_copies_of_few_and_of_many_numbers(kind, rows):
+    """In their shape, of memory that the caller has not, whatever he holds: a transposed view, one with a gradient."""
+    given = (torch.arange(rows * 3).reshape(3, rows) % 7).to(kind).T
+    if kind.is_floating_point:
+        given = given.clone().requires_grad_().T.T
+    copied = arrays.own(given)
+    assert tuple(copied.shape) == (rows, 3)
+    (back,) = arrays.as_torch([copied])
+    assert back.dtype == kind and torch.equal(back, given)
+    if kind == torch.float32:
+        with torch.no_grad():
+            given += 1
+        assert torch.equal(back + 1, given)
+        flat = session.own_array(given)
+        assert type(flat) is mi.Float and np.array_equal(np.array(flat), given.detach().numpy().ravel())
+        assert session.own_array(torch.tensor(3.0, requires_grad=True))[0] == 3
+
+
+def test_negative_views_are_their_numbers():
+    """What torch notes at a view and has not carried out, of few numbers and of many."""
+    for count in (3, 100):
+        view = torch.view_as_complex(torch.arange(2.0 * count).reshape(count, 2)).conj().imag
+        assert view.is_neg()
+        expected = -np.arange(1.0, 2 * count, 2)
+        assert np.array_equal(np.array(arrays.own(view)), expected)
+        assert np.array_equal(np.array(session.own_array(view)), expected)
+        flat, offset, strides = engine._cube_adjoint(view)
+        assert np.array_equal(np.array(flat)[offset :: strides[0]][:count], expected)
+        assert np.array_equal(np.array(engine._steady_adjoint(view)), expected)
+
+
+def test_fresh_arrays_are_nobody_else_s():
+    for given in (mi.TensorXf([1.5, -2.0]), mi.TensorXb([True, False]), mi.TensorXf(), mi.Float(1.5, -2.0)):
+        dr.eval(given)
+        copied = arrays.fresh(given)
+        assert dr.is_tensor_v(copied) and np.array_equal(np.array(copied), np.array(given))
+        if dr.width(given):
+            dr.eval(copied)
+            assert copied.torch().data_ptr() != given.torch().data_ptr()
+    attached = mi.Float(2.0, 3.0)
+    dr.enable_grad(attached)
+    (found,) = arrays.as_torch([arrays.fresh(attached * attached)])
+    assert found.tolist() == [4, 9] and not found.requires_grad
+    dr.backward(arrays.fresh(attached * attached))
+    assert np.array_equal(np.array(dr.grad(attached)), [4, 6])
+
+
+@pytest.mark.parametrize(("kind", "wider"), arrays._WIDER.items(), ids=str)
+def test_few_digits_are_computed_with_more(kind, wider):
+    found = arrays.computable(torch.ones(2, dtype=kind), "x")
+    assert found.dtype == wider
+    same = torch.ones(2, dtype=wider)
+    assert arrays.computable(same, "x") is same
+
+
+@pytest.mark.parametrize(
+    ("tensor", "error", "message"),
+    [
+        (
+            torch.ones(2, dtype=torch.complex64),
+            ShapeError,
+            r"x: expected real numbers, got dtype torch.complex64. Pass",
+        ),
+        (torch.eye(2).to_sparse(), ShapeError, "x: expected a dense tensor, got layout torch.sparse_coo"),
+        (torch.ones(2, device="meta"), DeviceError, "x: expected a tensor on 'cpu' or 'cuda', got 'meta'"),
+        (torch.ones(2, dtype=torch.float8_e5m2), ShapeError, "expected real numbers, whole numbers or truth values"),
+    ],
+)
+def test_what_drjit_does_not_compute_with(tensor, error, message):
+    with pytest.raises(error, match=message):
+        arrays.computable(tensor, "x")
+
+
+def test_pointers_are_no_numbers():
+    with pytest.raises(ShapeError, match="expected arrays of numbers, got a ShapePtr: pointers are no tensor"):
+        arrays.as_tensor(mi.ShapePtr())
+
+
+# ---------------------------------------------------------------------------------------------------------- adjoints
+
+
+@pytest.mark.parametrize("axes", [(0, 1, 2), (2, 0, 1), (1, 2, 0)])
+def test_an_adjoint_is_read_where_it_is(axes):
+    """The numbers between its first and its last one, and the steps of each dimension, however torch has laid it."""
+    whole = torch.arange(7.0 * 3 * 5 * 2).reshape(7, 3, 5, 2).requires_grad_()
+    g = whole[2:4].permute(3, 0, 1, 2)[1].permute(axes)
+    flat, offset, strides = engine._cube_adjoint(g)
+    flat = np.array(flat)
+    assert offset == 0 and len(flat) == 1 + sum((n - 1) * s for n, s in zip(g.shape, strides, strict=True))
+    places = np.einsum("i,i...->...", strides, np.indices(g.shape))
+    assert np.array_equal(flat[places], g.detach().numpy())
+    assert np.array_equal(np.array(engine._steady_adjoint(g)), g.detach().numpy())
+
+
+# ------------------------------------------------------------------------------------------------------------ memory
+
+
+@pytest.mark.parametrize(
+    ("count", "rows", "lent"),
+    [(2, 2**16, True), (2, 2**16 - 1, False), (1, 2**16, False), (2**14 - 1, 2**16, True), (2**14, 2**16, False)],
+)
+def test_large_films_of_a_batch_write_to_their_place(monkeypatch, count, rows, lent):
+    """From 2^18 values on, as far as 32 bits number all of them."""
+    monkeypatch.setattr(batch, "says_it_can_be_recorded", lambda integrator: integrator == "ours")
+    monkeypatch.setattr(Batch, "_lend", lambda self, film, n, entries: film.lend((n, entries)))
+    places = []
+    film = SimpleNamespace(cube_shape=lambda: (rows, 2, 2, 1), can_borrow=lambda spp: spp == 3, lend=places.append)
+    for integrator, spp in (("ours", 3), ("ours", 4), ("theirs", 3)):
+        with Batch(count, [film], integrator).lent_to(film, 1, spp) as given:
+            assert given == (lent and integrator == "ours" and spp == 3)
+    assert places == ([(1, 4 * rows), None] if lent else [])
+
+
+def test_places_of_a_batch():
+    given = []
+    film = SimpleNamespace(cube_shape=lambda: (2, 3, 5, 1), lend=given.append)
+    films = Batch(4, [film], None)
+    for n in (0, 3):
+        films._lend(film, n, 30)
+    assert [place for _, place in given] == [0, 90]
+    assert given[0][0] is given[1][0] and dr.width(given[0][0]) == 120
+    with pytest.raises(ShapeError, match="at least one entry, got 0"):
+        Batch(0, [], None).tensors()
+
+
+def test_cubes_that_fit(monkeypatch):
+    """Up to 4 MiB nobody asks; of several renders one film more than there are renders is held at a time."""
+    monkeypatch.setattr(memory, "available_bytes", lambda variant: 10 * 2**20)
+    memory.check_fits((2**9, 2**10, 5, 1), 1, VARIANT)
+    with pytest.raises(
+        StorageError, match=r"take 12\.00 MiB \(H x W x T x C = 512 x 1024 x 6 x 1 float32\), 12\.00 Mi"
+    ):
+        memory.check_fits((2**9, 2**10, 6, 1), 1, VARIANT)
+    memory.check_fits((2**9, 2**8, 5, 1), 3, VARIANT)
+    with pytest.raises(
+        StorageError, match=r"float32, 5 of them for 4 renders\), 12\.50 MiB in all, and 10\.00 MiB are"
+    ):
+        memory.check_fits((2**9, 2**8, 5, 1), 4, VARIANT)
+    monkeypatch.setattr(memory, "available_bytes", lambda variant: 1536)
+    memory.check_fits((2**9, 2**10, 2, 1), 1, VARIANT)
+    with pytest.raises(StorageError, match=r"and 1\.5 KiB are available on this cpu"):
+        memory.check_fits((2**9, 2**10, 2, 1), 2, VARIANT)
+    monkeypatch.setattr(memory, "available_bytes", lambda variant: None)
+    memory.check_fits((2**9, 2**30, 2, 1), 2, VARIANT)
+
+
+@pytest.mark.parametrize(
+    ("size", "words"),
+    [(1000, "1.0 KiB"), (2**20 - 1, "1024.0 KiB"), (2**20, "1.00 MiB"), (3 * 2**29, "1.50 GiB"), (2**40, "1.00 TiB")],
+)
+def test_sizes_in_words(size, words):
+    assert memory._human(size) == words
+
+
+# ---------------------------------------------------------------------------------------------------------- progress
+
+
+def test_fractions_of_renders_add_up():
+    told = []
+    job = SimpleNamespace(progress=told.append, items=[0, 1, 2, 3])
+    for n, fraction in ((0, 0.0), (0, 0.5), (2, 0.25), (3, 1.0)):
+        engine._fraction(job, n)(fraction)
+    assert told == [0, 0.125, 0.5625, 1]
+    assert engine._fraction(SimpleNamespace(progress=None, items=[0]), 0) is None
+
+
+def test_a_bar_moves_by_what_is_new(monkeypatch):
+    made = []
+
+    class Fake(progress.Bar):
+        def __init__(self, name):
+            made.append(name)
+            self._bar = SimpleNamespace(n=0.0, close=lambda: made.append("closed"), update=self.update)
+
+        def update(self, step):
+            self._bar.n += step
+            made.append(self._bar.n)
+
+    monkeypatch.setattr(progress, "Bar", Fake)
+    assert list(progress.with_bar("abcd", "letters", progress=True)) == list("abcd")
+    assert made == ["letters", 0.25, 0.5, 0.75, 1.0, "closed"]
+    assert list(progress.with_bar("ab", "letters", progress=False)) == ["a", "b"] and len(made) == 6
+
+
+# ----------------------------------------------------------------------------------------------------- broken numbers
+
+
+def test_what_holds_numbers_alone():
+    tensor = torch.ones(2, 3).expand(4, 2, 3)
+    assert all_finite(tensor) and broken_entries(torch.ones(3, 2), 3) == [False] * 3
+    several = torch.tensor([[1.0, 2.0], [np.inf, 0.0], [0.0, np.nan]])
+    assert broken_entries(several, 3) == [False, True, True]
+    assert not all_finite(several[1:2].expand(5, 2)) and not all_finite(several[:, :1].expand(3, 4))
+
+
+def test_broken_numbers_go_on_to_what_they_touch():
+    """Differences of two broken places touch, too; what is right stays as it is."""
+    runs = []
+
+    def derivative(given):
+        runs.append(given)
+        # As Dr.Jit's sums do, which take NaN for nothing.
+        x = given[0].nan_to_num(0.0, 0.0, 0.0)
+        return x[:2] * 3, x[2] - x[3], x[0]
+
+    assert [one.tolist() for one in carried_on(derivative, [torch.tensor([1.0, 2.0, 3.0, 5.0])])] == [[3, 6], -2, 1]
+    assert len(runs) == 1
+    found = carried_on(derivative, [torch.tensor([1.0, np.nan, np.inf, np.inf])])
+    assert found[0][0] == 3 and torch.isnan(found[0][1]) and torch.isnan(found[1]) and found[2] == 1
+    marks = runs[2][0]
+    assert marks[0] == 0 and ((marks[1:] >= 1) & (marks[1:] < 2)).all() and len(set(marks.tolist())) == 4
+
+
+# ---------------------------------------------------------------------------------------------------------- numbers of
+
+
+def test_statistics_of_a_batch():
+    """Paths over time: 10 a second for 2 s and 40 for 6 s are 260 in 8 s."""
+    made = {"spp": 4, "variant": VARIANT, "integrator": "i", "temporal_filter": "box"}
+    one = RenderStats(
+        seconds=2.0, samples_per_second=10.0, seeds=(1,), energy_before=(0.5,), energy_after=(3.0,), **made
+    )
+    two = RenderStats(
+        seconds=6.0, samples_per_second=40.0, seeds=(2, 3), energy_before=(1.0, 2.0), energy_after=(4.0, 5.0), **made
+    )
+    both = RenderStats.of_batch([one, two])
+    assert (both.seconds, both.samples_per_second, both.seeds) == (8, 32.5, (1, 2, 3))
+    assert (both.energy_before, both.energy_after) == ((0.5, 1.0, 2.0), (3.0, 4.0, 5.0))
+
+
+@pytest.mark.parametrize("scale", [1.0, 1000.0])
+def test_numbers_that_went_through_a_file(scale):
+    """A millionth of the largest one, or of one, beside a hundred thousandth of each."""
+    a = np.array([-scale, 0.0, 0.5 * scale])
+    step = np.array([0, 1e-6 * scale, 0])
+    assert _same(a, a + 0.9 * step) and not _same(a, a + 1.2 * step)
+    assert _same(a, a * (1 + 1e-5)) and not _same(a, a * (1 + 1.3e-5))
+    small = np.array([1e-7, 0.0])
+    assert _same(small, small + 0.9e-6) and not _same(small, small + 1.2e-6)
+
+
+def test_other_things_that_went_through_a_file():
+    assert _same(np.array(["a"]), np.array(["a"])) and not _same(np.array(["a"]), np.array(["b"]))
+    assert not _same(np.zeros(2), np.zeros(3)) and not _same(np.array(["a"]), np.array(["a", "a"]))
+    assert _same(np.zeros(0), np.zeros(0)) and _same(np.array([1, 2]), np.array([1, 2]))
+    assert not _same(np.array([True]), np.array([False]))
