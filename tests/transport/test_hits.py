@@ -10,7 +10,7 @@ import scipy.interpolate
 import scipy.spatial.transform
 
 from support.gradient_cases.cases_curves import DIFFUSE, ellipsoid, file_of, seen_wall
-from torchtransient.plugins.transport.hits import DetachedHits, _spline
+from torchtransient.plugins.transport.hits import DetachedHits, _spline, _starts
 from torchtransient.plugins.transport.instances import AttachedSurfaces, Instances, surface_interaction
 from torchtransient.plugins.transport.strategy import Local
 
@@ -169,7 +169,7 @@ def read_fields(scene, ray, fields):
     surfaces = AttachedSurfaces.of(contents_of(scene))
     pi = scene.ray_intersect_preliminary(dr.detach(ray))
     si = surface_interaction(surfaces, pi, ray, mi.RayFlags.All, mi.Bool(ACTIVE))
-    found = {"t": si.t, "p": si.p, "n": si.n, "shading": si.sh_frame.n, "uv": si.uv, "dp_du": si.dp_du, "s": si.sh_frame.s}
+    found = {"t": si.t, "n": si.n, "shading": si.sh_frame.n, "s": si.sh_frame.s, "uv": si.uv, "dp_du": si.dp_du}
     return [dr.select(si.is_valid(), found[name], 0) for name in fields]
 
 
@@ -184,7 +184,7 @@ STEP = 1e-3
 def directions_of(start):
     """Some motion of parameters, by key; quaternions stay of length one."""
     rng = np.random.default_rng(5)
-    found = {key: rng.normal(size=dr.width(value)) * 0.4 for key, value in start.items()}
+    found = {key: rng.normal(size=dr.width(value)) * (4 if "opacit" in key else 0.4) for key, value in start.items()}
     for key in found:
         if key.endswith("data"):
             turned, q = found[key].reshape(-1, 10)[:, 6:], np.array(start[key]).reshape(-1, 10)[:, 6:]
@@ -211,7 +211,8 @@ def slopes_of(scene, keys, moves_rays, fields):
     attached = fields_at(x)
     dr.enqueue(dr.ADMode.Forward, x)
     dr.traverse(dr.ADMode.Forward)
-    return numbers([dr.grad(part) for part in attached]), [(a - b) / (2 * STEP) for a, b in zip(above, below, strict=True)]
+    differences = [(a - b) / (2 * STEP) for a, b in zip(above, below, strict=True)]
+    return numbers([dr.grad(part) for part in attached]), differences
 
 
 def numbers(parts):
@@ -278,6 +279,20 @@ def test_slopes_backwards_are_finite(kind):
     assert np.isfinite(slope).all() and slope.any()
 
 
+def test_a_spline_that_bends_as_its_surface_has_no_slope():
+    """At the centre of its curvature every place along it is as near: nothing is divided by zero."""
+    points = np.array([[-3, 0, 0, 1], [0, 1.5, 0, 1], [3, 0, 0, 1], [6, 0, 0, 1]])
+    scene = mi.load_dict({"type": "scene", "shape": curve_of("bsplinecurve", "bent as far.txt", points)})
+    pi, si = dr.zeros(mi.PreliminaryIntersection3f), dr.zeros(mi.SurfaceInteraction3f)
+    x = mi.Float(0)
+    dr.enable_grad(x)
+    # The curve begins at (0, 1, 0) with the slope (3, 0, 0) and bends by (0, -3, 0).
+    si.p, si.shape, si.uv, si.dp_du = mi.Point3f(x, -2, 0), mi.ShapePtr(scene.shapes()[0]), mi.Point2f(0.5), [0, 0, 1]
+    DetachedHits.of(scene).read().put_right(si, pi, mi.Bool(True))
+    dr.backward(si.uv.y + si.n.x + si.n.y)
+    assert dr.grad(x)[0] == 0
+
+
 @pytest.mark.parametrize("kind", ["ellipsoids", "linearcurve"])
 def test_a_ray_along_a_surface_has_no_slope(kind):
     """Where it touches the shape, nothing is divided by zero."""
@@ -307,3 +322,8 @@ def test_the_place_on_a_spline():
         expected = spline(v, nu=order) if order else spline(v)
         np.testing.assert_allclose(np.array(place).T, expected[:, :3], rtol=1e-5, atol=1e-5)
         np.testing.assert_allclose(np.array(radius), expected[:, 3], rtol=1e-5, atol=1e-5)
+
+
+def test_where_shapes_begin_in_a_table_of_all():
+    arrays = [dr.zeros(mi.Float, width) for width in (8, 12, 4, 0)]
+    assert _starts(arrays, 4) == [0, 2, 5, 6]
