@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from support.gradient_cases.cases_curves import file_of
 from torchtransient.plugins.transport import instances as module
 from torchtransient.plugins.transport.hits import DetachedHits
 from torchtransient.plugins.transport.instances import AttachedSurfaces, Instances
@@ -21,10 +22,13 @@ POSES = {
     "second": np.array([[-0.9, 0.1, 0.2, 2.1], [0.2, 1.2, -0.1, -0.3], [0.1, 0.2, 0.8, -0.2], [0, 0, 0, 1.0]]),
 }
 DATA = np.array([[0.1, 1.1, 0.2, 0.3, 0.4, 0.25, 0.1, 0.2, 0.3, 0.92]], dtype=np.float32)
-# In the space of the group: on the ball, the sheet and the ellipsoid.
-PLACES = np.array([[0.2, -0.1, 0.4], [-0.5, -0.6, -0.3], [0.15, 1.2, 0.3]])
+TUBE = "-1.5 -1.5 0 0.2\n-0.6 -1.3 0.1 0.25\n0.2 -1.5 0 0.2\n1.1 -1.4 0.2 0.3\n"
+# In the space of the group: on the ball, the sheet, the ellipsoid and the curve.
+PLACES = np.array([[0.2, -0.1, 0.4], [-0.5, -0.6, -0.3], [0.15, 1.2, 0.3], [-0.25, -1.4, 0.15]])
 # Mitsuba's distances of ellipsoids are too coarse for differences of much else.
-OTHERS = [0, 1, 3, 4, 6, 7]
+OTHERS = [0, 1, 3, 4, 5, 7, 8, 9]
+# Its tangents along curves have wrong derivatives, which bump maps alone would ask for.
+STRAIGHT = [0, 1, 4, 5, 8, 9]
 
 
 def scene_of():
@@ -33,6 +37,7 @@ def scene_of():
         "ball": {"type": "sphere", "center": [0.1, -0.2, 0.1], "radius": 0.5},
         "sheet": {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([-0.4, -0.5, -0.3]).scale(0.9)},
         "egg": {"type": "ellipsoids", "data": mi.TensorXf(DATA), "extent": 1.2},
+        "tube": {"type": "bsplinecurve", "filename": file_of("tube in a group.txt", TUBE)},
     }
     copies = {
         name: {"type": "instance", "to_world": mi.ScalarTransform4f(pose), "group": {"type": "ref", "id": "group"}}
@@ -101,7 +106,7 @@ def unknown():
     return x
 
 
-@pytest.mark.parametrize("names", [("first",), ("second", "rays"), ("shapes",)], ids=lambda names: names[0])
+@pytest.mark.parametrize("names", [("first",), ("second", "rays", "shapes")], ids=lambda names: names[0])
 def test_interactions_follow_what_moves(names):
     scene = scene_of()
     params = mi.traverse(scene)
@@ -116,12 +121,13 @@ def test_interactions_follow_what_moves(names):
     found = derivative(x, attached)
     for name, one, a, b in zip(FIELDS, found, above, below, strict=True):
         expected = (a - b) / (2 * STEP)
-        np.testing.assert_allclose(one[..., OTHERS], expected[..., OTHERS], rtol=1e-2, atol=1e-2, err_msg=name)
+        lanes = STRAIGHT if name == "dp_dv" else OTHERS
+        np.testing.assert_allclose(one[..., lanes], expected[..., lanes], rtol=1e-2, atol=1e-2, err_msg=name)
         if name == "t":
             np.testing.assert_allclose(one, expected, rtol=0.1, atol=0.02)
-    still = {"first": [3, 4, 5, 6, 7], "second": [7], "shapes": [0, 1, 3, 4, 6, 7]}[names[0]]
-    assert not any(part[..., still].any() for part in found)
-    assert np.abs(found[0][2 if names[0] != "second" else 5]) > 0.01
+    if names == ("first",):
+        assert not any(part[..., 4:].any() for part in found)
+    assert np.abs(found[0][2 if names[0] != "second" else 6]) > 0.01
 
 
 def test_points_of_a_sheet_are_carried_along():
@@ -142,7 +148,7 @@ def test_points_of_a_sheet_are_carried_along():
     np.testing.assert_allclose(moved[:, 1], expected, rtol=1e-3, atol=1e-4)
     d = np.array(ray.d)[:, 1]
     assert longer[1] == pytest.approx(expected @ d / (d @ d), rel=1e-3)
-    assert not moved[:, 3:].any() and not longer[3:].any()
+    assert not moved[:, 4:].any() and not longer[4:].any()
 
 
 def test_slopes_backwards_are_finite():
@@ -151,8 +157,8 @@ def test_slopes_backwards_are_finite():
     params = mi.traverse(scene)
     dr.enable_grad(x)
     move(params, x, ("first",))
-    t, p, n, shading, s, uv, *_, wi = fields_of(interaction(scene, rays(0.0), mi.RayFlags.All))
-    dr.backward(dr.sum(t) + sum(dr.sum(v.x) for v in (p, n, shading, s, uv, wi)))
+    si = interaction(scene, rays(0.0), mi.RayFlags.All)
+    dr.backward(dr.sum(dr.select(si.is_valid(), si.t + si.n.x + si.sh_frame.s.y + si.wi.z, 0)))
     assert np.isfinite(dr.grad(x)[0]) and dr.grad(x)[0] != 0
 
 
@@ -169,7 +175,16 @@ def test_frames_of_normals_and_tangents():
     np.testing.assert_array_equal(np.array(frame.n), np.array(n))
 
 
-def test_no_surface_needs_help_without_instances_and_curves():
-    scene = mi.load_dict({"type": "scene", "wall": {"type": "rectangle"}})
-    assert surfaces_of(scene) is None
-    assert surfaces_of(scene_of()).tables()[0].shape[0] == 2 * 16 * (1 + max(Instances.of(scene_of())._numbers))
+def test_surfaces_need_help_with_instances_or_curves():
+    """Each alone, too."""
+    both = scene_of()
+    group = {"type": "shapegroup", "ball": {"type": "sphere"}}
+    copy = {"type": "instance", "group": {"type": "ref", "id": "group"}}
+    instance = mi.load_dict({"type": "scene", "group": group, "copy": copy})
+    tube = {"type": "bsplinecurve", "filename": file_of("tube in a group.txt", TUBE)}
+    curve = mi.load_dict({"type": "scene", "tube": tube})
+    assert surfaces_of(mi.load_dict({"type": "scene", "wall": {"type": "rectangle"}})) is None
+    assert [len(surfaces_of(scene).tables()) for scene in (instance, curve, both)] == [1, 1, 4]
+    ray = mi.Ray3f(mi.Point3f(-0.25, -1.4, 5), mi.Vector3f(0, 0, -1))
+    assert interaction(curve, ray, mi.RayFlags.All).t[0] == pytest.approx(5 - 0.3, abs=0.1)
+    assert not interaction(instance, ray, mi.RayFlags.All).is_valid()[0]
