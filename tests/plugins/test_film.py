@@ -13,6 +13,7 @@ from scipy.special import erf
 from torchtransient import plugins
 from torchtransient.errors import SceneError, StorageError
 from torchtransient.plugins.films.temporal_filter import make_temporal_filter
+from torchtransient.plugins.transport.strategy import Local
 from torchtransient.testing.film_storage import storage
 
 FILTERS = [("box", 0.5), ("tent", 0.5), ("gaussian", 0.2), ("gaussian", 0.5), ("gaussian", 1.3), ("gaussian", 3.0)]
@@ -237,6 +238,45 @@ def test_channels_of_the_variant(variant, channels):
     steady, transient = film.develop()
     assert steady.shape == (2, 3, channels) and transient.shape == (2, 3, BINS, channels)
     assert "temporal_filter = box" in str(film)
+
+
+@pytest.mark.parametrize("name, stddev", [("box", 0.5), ("tent", 0.5), ("gaussian", 0.5)])
+def test_lengths_from_an_origin_are_lengths(name, stddev):
+    """Events whose lengths are counted from an origin of their sample, before, in and behind the window, go where those
+    of the whole length do: bins and what is lost.
+    """
+    film = make_film(temporal_filter=name, gaussian_stddev=stddev)
+    n, per_pixel = 9, film.entries_per_pixel()
+    origin = np.array([-3.3, -0.1, 0.0, 0.7, 4.9, 9.7, 9.99, 10.6, -2e12])
+    opl = np.array([1.9, 0.45, 0.3, 5.2, 3.1, 0.2, 0.3, 0.7, 5.0])
+    value, active = [mi.Float(np.arange(2.0, 11.0) * k) for k in (1, 2, 3)], mi.Bool([True] * 8 + [False])
+    job, base = Local(band=0), dr.arange(mi.UInt32, n) * per_pixel
+    found = []
+    for start, lengths in ((mi.Float64(origin), opl), (None, origin + opl)):
+        cube = storage(film, n * per_pixel)
+        match = Local(to_channels=lambda spectrum: spectrum)
+        block = film.create_event_block(job, base, match, 1, origin=start)
+        assert type(block).__name__ == ("FilmBlock" if start is None else "HistogramBlock")
+        lost = block.put(block.begin(), mi.Float64(lengths), value, active)
+        found.append([np.array(cube, dtype=float), *(np.array(part) for part in lost)])
+    assert all(np.abs(part).sum() > 0 for part in found[1])
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-4)
+
+
+def test_events_from_an_origin_as_films_can_take_them():
+    """Long kernels and tangents do without the short cut."""
+
+    def block_of(*given, **how):
+        return film.create_event_block(Local(band=0), mi.UInt32(0), None, 1, origin=(*given, origin)[0], **how)
+
+    film, origin = make_film(temporal_filter="tent"), mi.Float64([1.0, 2.0])
+    assert type(block_of(tangents=True)).__name__ == "FilmBlock"
+    assert block_of(exclusive=True).exclusive and not block_of().exclusive
+    film = make_film(temporal_filter="tent", pulse="gaussian", pulse_fwhm_opl=2.0)
+    assert type(block_of()).__name__ == "FilmBlock"
+    assert list(np.array(block_of().counted(mi.Float([0.5, 0.25])))) == [1.5, 2.25]
+    assert block_of(None).counted(7) == 7
 
 
 def test_factory_names():

@@ -4,14 +4,17 @@ is still one of ours.
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
+import numpy as np
 import pytest
 
 from torchtransient import plugins
-from torchtransient.errors import PluginRegistrationError, SceneError
+from torchtransient.errors import PluginRegistrationError, SceneError, StorageError
 from torchtransient.interfaces import FilmInterface, is_time_resolved, missing_members
 from torchtransient.plugins import _registry
 from torchtransient.plugins.films import pulsed_filter
+from torchtransient.plugins.films.plain_image import bitmap_of, plain_image
 from torchtransient.rendering.films import choices
 
 FILMS = {
@@ -144,3 +147,114 @@ def test_films_without_a_temporal_filter():
         assert film.temporal_filter == ""
         with pytest.raises(AttributeError):
             film.temporal_filter = "tent"
+
+
+# ------------------------------------------------------------------------------------------------- arrays of others
+
+
+@pytest.mark.parametrize("kind", ["transient_hdr_film", "phasor_hdr_film"])
+def test_films_add_to_an_array_that_was_lent(kind):
+    """From its first entry on, where nothing else is touched."""
+    film = make(kind)
+    wall, lamp = {"type": "rectangle"}, {"type": "point", "position": [0.3, 0.2, 0.8]}
+    sensor = {"type": "perspective", "film": film}
+    sensor["to_world"] = mi.ScalarTransform4f().look_at([0, 0, 0.9], [0, 0, 0], [0, 1, 0])
+    node = {"type": "transient_path", "max_depth": 2}
+    scene = mi.load_dict({"type": "scene", "integrator": node, "sensor": sensor, "wall": wall, "lamp": lamp})
+    film = scene.sensors()[0].film()
+    expected = np.array(scene.integrator().render(scene, seed=2, spp=8)[1]).ravel()
+    film.lend((dr.zeros(mi.Float, 7 + expected.size + 4), 7))
+    scene.integrator().render(scene, seed=2, spp=8, develop=False)
+    found = np.array(film.taken()[-1])
+    film.lend(None)
+    assert np.abs(expected).sum() > 0
+    np.testing.assert_allclose(found[7:-4], expected, rtol=1e-5, atol=1e-6)
+    assert not found[:7].any() and not found[-4:].any()
+    assert film.taken() == [None, None]
+
+
+def test_what_can_be_lent_an_array(monkeypatch):
+    """Films whose sums stay in single precision, whatever a sampler rounds up to, in one band, with a steady image."""
+    from torchtransient.plugins.films import base
+
+    film = make("transient_hdr_film")
+    most = base.MAX_SINGLE_PRECISION_SAMPLES
+    assert film.can_borrow(most // 4) and not film.can_borrow(most // 4 + 1)
+    assert not make("gated_hdr_film").can_borrow(1)
+    film.lend((dr.zeros(mi.Float, 99), 0))
+    film.start_render(most)
+    with pytest.raises(StorageError, match=rf"up to {most} samples per pixel; got {most + 1}\."):
+        film.start_render(most + 1)
+    monkeypatch.setattr(base, "MAX_ARRAY_ENTRIES", 2 * film.entries_per_pixel())
+    assert film.band_layout() == [(0, 1), (1, 1)] and not film.can_borrow(1)
+
+
+# -------------------------------------------------------------------------------------------------------- pictures
+
+
+def test_the_picture_of_a_steady_image():
+    film = make("transient_hdr_film")
+    with pytest.raises(SceneError, match="nothing was rendered yet"):
+        film.bitmap()
+    film.schedule_storage()  # of nothing yet
+    film.start_render()
+    film.add_steady(mi.UInt32([0, 1, 2, 3]), [mi.Float([3, 5, 7, 11])])
+    film.add_outside(mi.UInt32([1, 2]), mi.Float([1, 2]), mi.Float([10, 20]))
+    film.schedule_storage()
+    film.finish_render()
+    assert np.array(film.bitmap()).squeeze().tolist() == [[3, 5], [7, 11]]
+    assert film.energies_outside() == (3, 30)
+    assert (film.energy_before, film.energy_after) == (3, 30)
+    assert film.base_channels_count() == 1
+    with mi.variant_context("llvm_ad_rgb"):
+        assert make("transient_hdr_film").base_channels_count() == 3
+
+
+def test_sums_in_double_precision_are_handed_over_in_single():
+    """Ones that are lost beside 2^24 in single precision."""
+    film = make("transient_hdr_film")
+    for samples, expected in ((2**16, 2**24), (2**16 + 1, 2**24 + 2)):
+        film.start_render(samples)
+        film.add_steady(mi.UInt32(3), [mi.Float(2**24)])
+        for _ in range(2):
+            film.add_steady(mi.UInt32(3), [mi.Float(1)])
+            dr.eval(film.steady)
+        film.finish_render()
+        assert dr.type_v(film.steady) == dr.type_v(mi.Float)
+        assert np.array(film.develop()[0]).ravel().tolist() == [0, 0, 0, expected]
+
+
+def test_films_without_a_steady_image_sum_up_their_bins():
+    film = mi.load_dict({"type": "transient_hdr_film", "width": 3, "height": 2, "steady": False, "temporal_bins": 5})
+    film.start_render()
+    assert film.outside is None and film.energies_outside() == (0, 0)
+    values = np.arange(1.0, 31.0).reshape(2, 3, 5, 1) ** 2
+    film.bands = [(0, 2, mi.Float(values.ravel()))]
+    film.finish_render()
+    np.testing.assert_array_equal(np.array(film.develop()[0]), values.sum(2))
+
+
+@pytest.mark.parametrize(("variant", "pixels"), [("llvm_ad_mono", "Y"), ("llvm_ad_rgb", "RGB")])
+def test_the_image_of_integrators_that_know_nothing_of_time(variant, pixels):
+    """As large as the film, with its crop and its filter."""
+    mi.set_variant(variant)
+    size = {"width": 7, "height": 6, "crop_width": 4, "crop_height": 3, "crop_offset_x": 2, "crop_offset_y": 1}
+    node = {"type": "transient_hdr_film", "sample_border": True, "rfilter": {"type": "tent", "radius": 1.5}}
+    image = plain_image(mi.load_dict(node | size))
+    assert [list(part) for part in (image.size(), image.crop_size(), image.crop_offset())] == [[7, 6], [4, 3], [2, 1]]
+    assert image.rfilter().radius() == 1.5 and image.sample_border()
+    image.prepare([])
+    assert (image.bitmap(raw=False).pixel_format().name, image.bitmap().component_format().name) == (pixels, "Float32")
+
+
+@pytest.mark.parametrize(("names", "channels", "pixels"), [
+    (("L",), ["Y"], "Y"), (("R", "G", "B"), ["R", "G", "B"], "RGB"), (("a", "b"), ["a", "b"], "MultiChannel"),
+    (("L",), ["L.S0", "L.S1", "L.S2", "L.S3"], "MultiChannel"),
+    (("a", "b"), [f"{name}.S{s}" for s in range(4) for name in "ab"], "MultiChannel"),
+])  # fmt: skip
+def test_names_of_a_picture_s_channels(names, channels, pixels):
+    values = np.arange(6.0 * len(channels), dtype=np.float32).reshape(2, 3, -1)
+    bitmap = bitmap_of(mi.TensorXf(values), names)
+    assert bitmap.pixel_format().name == pixels
+    assert [field.name for field in bitmap.struct_()] == channels
+    np.testing.assert_array_equal(np.array(bitmap).reshape(values.shape), values)

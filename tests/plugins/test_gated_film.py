@@ -12,6 +12,9 @@ import torchtransient as tt
 from torchtransient import plugins
 from torchtransient.errors import ArgumentError, GradientError, SceneError
 from torchtransient.files.result_file import read_result, write_result
+from torchtransient.gates import Gate
+from torchtransient.plugins.films.gate_table import GateTable
+from torchtransient.plugins.films.window import ArrivalWindow, GappedWindow
 from torchtransient.plugins.sampling.light_box import LightBox
 from torchtransient.testing.film_storage import storage
 from torchtransient.testing.small_room import GREY, WALL_POSE, make_room
@@ -106,6 +109,37 @@ def test_slopes():
     A, slope = read(0.0)
     want = sum((np.array(A[c]) * df[c] + np.array(slope[c]) * fdtau[c]).sum() for c in range(3))
     assert (np.array(cube).reshape(3, 3) * g).sum() == pytest.approx(want, rel=1e-4)
+
+
+def test_gates_see_nothing_before_and_behind_them():
+    """From its start on, until before its end; nor what never arrives. No gate is asked where none is open."""
+    ramp = Gate.tabulated([3.0, 5.0, 9.0], [2.0, 4.0, 8.0])
+    table = GateTable([ramp, Gate.rectangular(12.0, 13.0)], 1.0)
+    at = np.array([3.0, np.nextafter(3.0, 0), 4.0, 7.0, np.nextafter(9.0, 0), 9.0, np.inf, -np.inf])
+    value, slope = table.value(mi.UInt32(0), mi.Float64(at - 1.0), mi.Bool([True] * 8))
+    np.testing.assert_allclose(np.array(value), [2, 0, 3, 6, 8, 0, 0, 0], rtol=1e-5)
+    np.testing.assert_allclose(np.array(slope), [1, 0, 1, 1, 1, 0, 0, 0], rtol=1e-5)
+    value, slope = table.value(mi.UInt32(0), mi.Float64(4.0), mi.Bool([True, False]))
+    assert (list(np.array(value)), list(np.array(slope))) == ([4, 0], [1, 0])
+    asked = np.array([2.9, 3.0, 6.0, 12.5, np.nextafter(13.0, 0), 13.0, np.inf])
+    low, high = (np.array(part) for part in table.candidates(mi.Float64(asked - 1.0), mi.Bool(True)))
+    np.testing.assert_array_equal(high - low, [0, 1, 1, 1, 1, 0, 0])
+    np.testing.assert_array_equal(low[[1, 2, 3, 4]], [0, 0, 1, 1])
+    low, high = table.candidates(mi.Float64(5.0), mi.Bool([True, False]))
+    assert list(np.array(high)) == [1, 0]
+    assert table.open_cells[[0, 2000, -1]].tolist() == [1, 1, 1] and not table.open_cells[2500:3600].any()
+
+
+def test_windows_count_from_their_start_until_before_their_end():
+    """With gaps, cells of equal length count or not."""
+    at = np.array([1.9999, 2.0, 3.4999, 3.5, 4.9999, 5.0, 6.4999, 6.5, 7.0, 7.9999, 8.0, np.inf])
+    window = ArrivalWindow(2, 8)
+    assert np.array(window.counts(mi.Float64(at))).tolist() == [False] + [True] * 9 + [False] * 2
+    assert np.array(window.over(mi.Float64(at))).tolist() == [False] * 10 + [True] * 2
+    gapped = GappedWindow(2, 8, [1, 0, 0, 1])
+    expected = [False, True, True] + [False] * 4 + [True] * 3 + [False] * 2
+    assert np.array(gapped.counts(mi.Float64(at))).tolist() == expected
+    assert np.array(gapped.over(mi.Float64(at))).tolist() == [False] * 10 + [True] * 2
 
 
 def test_a_pulse_opens_a_gate_softly():

@@ -12,7 +12,9 @@ import torchtransient as tt
 from torchtransient import plugins
 from torchtransient.errors import SceneError
 from torchtransient.files.result_file import read_result, write_result
+from torchtransient.plugins.films.colour import ChannelMatch, StandardObserver, mean_of
 from torchtransient.plugins.films.response import SensorResponse
+from torchtransient.plugins.polarized import FrameRotation
 from torchtransient.testing.statistics import two_sample_z_test, z_test
 
 VARIANT = "llvm_ad_spectral"
@@ -179,3 +181,98 @@ def test_names_of_plain_channels(variant, names):
     lamp, wall = {"type": "uniform", "value": 1.0}, {"type": "uniform", "value": 0.5}
     scene = tt.load(description(film(bands={}), lamp=lamp, wall=wall), variant=variant)
     assert tt.TransientRenderer(scene, spp=1)(seed=0).channels == names
+
+
+# ------------------------------------------------------------------------------------------- samples and channels
+
+
+def light(rng):
+    """A Stokes vector of spectra, or a spectrum, of some numbers."""
+    if mi.is_polarized:
+        return mi.SpectrumEntry(*(spectrum(rng) for _ in range(4)))
+    return spectrum(rng)
+
+
+def spectrum(rng):
+    return mi.UnpolarizedSpectrum(*(mi.Float(row) for row in rng.uniform(-1, 1, (len(mi.UnpolarizedSpectrum()), 3))))
+
+
+def numbers(value):
+    """A sample as an array (components, wavelengths, lanes)."""
+    parts = [value[i] for i in range(4)] if mi.is_polarized else [value]
+    return np.array([[np.broadcast_to(np.array(part[k], dtype=float), 3) for k in range(len(part))] for part in parts])
+
+
+SAMPLES = [(variant, False) for variant in ("mono", "rgb", "spectral", "mono_polarized", "spectral_polarized")]
+
+
+@pytest.mark.parametrize(("variant", "curves"), [*SAMPLES, ("spectral", True), ("spectral_polarized", True)])
+def test_channels_and_spectra_are_transposes(variant, curves):
+    """Of each other; channels are those of the weight, summed over wavelengths, in the sensor's frame."""
+    mi.set_variant(f"llvm_ad_{variant}")
+    plugins.sync()
+    polarized = mi.is_polarized
+    rng = np.random.default_rng(2)
+    weight, wavelengths = spectrum(rng), spectrum(rng) * 200 + 590 if mi.is_spectral else None
+    response = StandardObserver.of_variant()
+    if curves:
+        response = mi.load_dict(film()).curves
+    rotation = FrameRotation(mi.Float(0.6), mi.Float(0.8)) if polarized else None
+    match = ChannelMatch(wavelengths, weight, response, rotation)
+    value = light(rng)
+    channels = match.to_channels(value)
+    matrix = np.eye(len(weight)) if response is None else None
+    if matrix is None:
+        rows = [[np.broadcast_to(np.array(x, dtype=float), 3) for x in row] for row in response.matrix(wavelengths)]
+        shares = np.array(rows)  # wavelength, channel, lane
+    else:
+        shares = np.repeat(matrix[:, :, None], 3, axis=2)
+    power = numbers(value) * np.array([np.array(weight[k], dtype=float) for k in range(len(weight))])
+    expected = np.einsum("ikn,kcn->icn", power, shares)
+    if polarized:
+        turned = expected.copy()
+        turned[1], turned[2] = 0.6 * expected[1] + 0.8 * expected[2], 0.6 * expected[2] - 0.8 * expected[1]
+        expected = turned
+    np.testing.assert_allclose(np.array(channels), expected.reshape(-1, 3), rtol=1e-4, atol=1e-6)
+    adjoint = [mi.Float(rng.uniform(-1, 1, 3)) for _ in channels]
+    back = numbers(match.to_spectrum(adjoint))
+    forth = sum(np.array(a, dtype=float) * np.array(c, dtype=float) for a, c in zip(adjoint, channels, strict=True))
+    np.testing.assert_allclose((back * numbers(value)).sum((0, 1)), forth, rtol=1e-4, atol=1e-4 * np.abs(forth).max())
+    power_alone = expected[0] if polarized else expected.reshape(-1, 3)
+    np.testing.assert_allclose(np.array(mean_of(channels)), power_alone.mean(0), rtol=1e-4, atol=1e-6)
+
+
+def test_the_observer_is_mitsuba_s():
+    """At wavelengths between its nodes, at both ends, and none beyond them."""
+    mi.set_variant("llvm_ad_spectral")
+    at = np.array([360.0, 361.3, 447.0, 555.5, 700.1, 829.9, 830.0, 359.9, 830.1])
+    wavelengths = mi.UnpolarizedSpectrum(*(mi.Float(np.roll(at, k)) for k in range(4)))
+    rows = StandardObserver().matrix(wavelengths)
+    for k in range(4):
+        unit = mi.UnpolarizedSpectrum(0)
+        unit[k] = 1
+        # Mitsuba takes the mean over the wavelengths, a row the share of one.
+        expected = np.array(mi.spectrum_to_srgb(unit, wavelengths))
+        outside = (np.roll(at, k) < 360) | (np.roll(at, k) > 830)
+        np.testing.assert_allclose(np.array(rows[k])[:, ~outside], expected[:, ~outside], rtol=1e-3, atol=1e-6)
+        assert not np.array(rows[k])[:, outside].any()
+
+
+def test_how_finely_curves_are_tabulated():
+    """As their finest step, at least 65 nodes, at most 4096, over what all of them reach; a floor under all of it."""
+    mi.set_variant("llvm_ad_spectral")
+
+    def density(**values):
+        return SensorResponse({name: mi.load_dict(node) for name, node in values.items()})
+
+    coarse = {"type": "regular", "wavelength_min": 400, "wavelength_max": 500, "values": "0, 1, 0"}
+    other = {"type": "regular", "wavelength_min": 450, "wavelength_max": 700, "values": "1, 2"}
+    fine = {"type": "regular", "wavelength_min": 600, "wavelength_max": 610,
+            "values": ", ".join(str(1 + k % 3) for k in range(101))}  # fmt: skip
+    finest = fine | {"values": ", ".join(str(1 + k % 3) for k in range(9001))}
+    found = [density(a=coarse), density(a=coarse, b=other), density(a=coarse, b=fine), density(a=coarse, b=finest)]
+    assert [one.range for one in found] == [(400, 500), (400, 700), (400, 610), (400, 610)]
+    assert [one._density.pdf.shape[0] for one in found] == [65, 65, 2101, 4096]
+    assert found[0].tabulate(np.array([399.0, 425.0, 450.0])).tolist() == [[0, 0.5, 1]]
+    pdf = np.array(found[0]._density.pdf)
+    np.testing.assert_allclose(pdf, np.maximum(1 - np.abs(np.linspace(-1, 1, 65)), 0.01), rtol=1e-4)

@@ -17,7 +17,8 @@ from torchtransient import plugins
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, StorageError, TorchTransientError
 from torchtransient.files.result_file import read_result, write_result
 from torchtransient.rendering import films
-from torchtransient.rendering.films import choices
+from torchtransient.rendering.films import choices, layout
+from torchtransient.rendering.films.choice import FilmChoice
 from torchtransient.rendering.films.gates import Gates
 from torchtransient.rendering.films.histogram import Histogram
 from torchtransient.rendering.films.phasors import Phasors
@@ -238,6 +239,10 @@ def test_command_line(options, expected):
     "options, message",
     [
         ({"num_bins": 5}, "give all"),
+        ({"start_opl": 0.0, "bin_width_opl": 1.0}, "give all"),
+        ({"start_opl": 0.0, "num_bins": 5}, "give all"),
+        ({"bin_width_opl": 1.0, "num_bins": 5}, "give all"),
+        ({"frequencies": "1, two"}, r"--frequencies: expected numbers with commas, got '1, two'"),
         ({"frequencies": "1", "gates": "rectangular 1 2"}, "--frequencies and --gates ask for different films"),
         ({"gates": "round 1 2"}, "kind out of"),
     ],
@@ -247,7 +252,89 @@ def test_command_lines_that_ask_for_nothing(options, message):
         choices.from_options(options)
 
 
-def test_films_that_are_not_ours():
+def test_films_that_are_not_ours(monkeypatch):
     mi.set_variant(VARIANT)
+    ours = mi.load_dict(film_node(choice_for("gates")))
+    with monkeypatch.context() as patch:
+        patch.setattr(type(ours), "measures", "colour of time", raising=False)
+        with pytest.raises(SceneError, match=r"'gated_hdr_film' measures 'colour of time', expected one of transient"):
+            choices.of_film(ours)
     with pytest.raises(SceneError, match=r"transient_hdr_film, phasor_hdr_film, gated_hdr_film.*time_axis="):
         choices.of_film(mi.load_dict({"type": "hdrfilm"}))
+
+
+def test_what_a_film_has_no_video_of():
+    class Still(Histogram):
+        write_video = FilmChoice.write_video
+
+    with pytest.raises(ArgumentError, match="--video shows nothing of transients"):
+        Still(GIVEN["time_axis"]).write_video(None, "a.mp4", False)
+
+
+def test_settings_in_a_scene():
+    assert Gates.settings_in({}) is None
+    assert Gates.settings_in({"gates": "rectangular 3 4"}) == Gates(GIVEN["gates"][0])
+    with pytest.raises(SceneError, match=r"gated_hdr_film: .*kind out of"):
+        Gates.settings_in({"gates": "round 1 2"})
+    assert Histogram.axis_in({}) == tt.TimeAxis(0.0, 0.003, 2048)
+    assert Histogram.axis_in({"start_opl": 2, "bin_width_opl": 0.5, "temporal_bins": 7}) == tt.TimeAxis(2.0, 0.5, 7)
+
+
+@each
+def test_outputs_and_files_without_the_film(argument):
+    """Settings without an array, or an array without settings, are none of it."""
+    choice = choice_for(argument)
+    kind, output = type(choice), output_of(choice)
+    assert kind.from_output(output) == choice
+    without = replace(output, **{kind.measures: None})
+    assert kind.from_output(without) is None and choices.of_output(without) is None
+    for other in GIVEN:
+        if other != argument:
+            assert type(choice_for(other)).from_output(output) is None
+    assert kind.from_entries({}) is None
+    assert kind.from_entries({"start_opl": 0.0, "bin_width_opl": 1.0}) is None
+
+
+@pytest.mark.parametrize("leading", [(), (7,), (7, 1)])
+@pytest.mark.parametrize("components", [1, 4])
+def test_layouts_of_torch(leading, components):
+    """Channels first, behind batch and sensors; of pairs the laser's rows and columns before the sensor's."""
+    generator = np.random.default_rng(3)
+    items, shape = leading[:1], {"h": 2, "w": 3, "l": 5, "m": 6, "t": 4, "s": components, "c": 11}
+
+    def drawn(letters):
+        return generator.normal(size=(*items, *(shape[letter] for letter in letters)))
+
+    def expected(values, letters, order):
+        axes = [letters.index(letter) - len(letters) for letter in order]
+        moved = np.moveaxis(values, axes, range(-len(order), 0))
+        moved = moved.reshape(*leading, *moved.shape[len(items) :])
+        return moved if components > 1 else moved.squeeze(-len(order))
+
+    def joined(values):
+        return torch.from_numpy(values.reshape(*values.shape[:-2], -1))
+
+    steady, cube, pairs = drawn("hwsc"), drawn("hwtsc"), drawn("hwlmtsc")
+    layouts = (
+        (layout.steady_channels_first, steady, "hwsc", "schw"),
+        (layout.cube_channels_first, cube, "hwtsc", "scthw"),
+        (layout.cube_channels_first, pairs, "hwlmtsc", "sctlmhw"),
+    )
+    for function, values, letters, order in layouts:
+        found = function(joined(values), leading, components).numpy()
+        np.testing.assert_array_equal(found, expected(values, letters, order))
+    waves = cube[..., None] * np.array([2.0, -3.0])
+    found = layout.phasor_channels_first(torch.from_numpy(waves.reshape(*items, 2, 3, 4, -1)), leading, components)
+    np.testing.assert_allclose(found.numpy(), expected(cube * (2 - 3j), "hwtsc", "scthw"), rtol=1e-12)
+
+
+def test_what_is_planned_for_outputs():
+    """A histogram unless something else is asked for; one bin for all times where nothing over time is."""
+    for outputs, name, words, all_times in (
+        (("steady",), "steady", "one bin for all times", True),
+        (("transient",), "transient", "transients are asked for", False),
+        (("steady", "transient"), "transient", "transients are asked for", False),
+        (("peak_time",), "transient", "peak_time over time is asked for", False),
+    ):
+        found = Histogram.planned(outputs)
+        assert (found.name, found.all_times) == (name, all_times) and words in found.reason

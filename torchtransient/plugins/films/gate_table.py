@@ -58,7 +58,7 @@ class GateTable:
         inside = active & (opl >= start) & (opl < end)
         scale = dr.gather(mi.Float, self._scale, gate, inside)
         x = mi.Float(opl - start) * scale
-        i = dr.minimum(mi.UInt32(dr.select(inside, x, 0)), dr.gather(mi.UInt32, self._last_interval, gate, inside))
+        i = dr.minimum(mi.UInt32(x), dr.gather(mi.UInt32, self._last_interval, gate, inside))
         at = dr.gather(mi.UInt32, self._offset, gate, inside) + i
         a, b = dr.gather(mi.Float, self._values, at, inside), dr.gather(mi.Float, self._values, at + 1, inside)
         return dr.select(inside, dr.fma(b - a, x - mi.Float(i), a), 0), dr.select(inside, (b - a) * scale, 0)

@@ -178,10 +178,6 @@ class TransientHDRFilm(TimeResolvedFilm):
         first, last = self.filter.reach
         return ArrivalWindow(-last * self.bin_width_opl, (self.temporal_bins - first) * self.bin_width_opl)
 
-    def end_opl(self) -> float:
-        """End of the last bin in metres."""
-        return self.start_opl + self.bin_width_opl * self.temporal_bins
-
     def traverse(self, cb):
         super().traverse(cb)
         for name in ("temporal_bins", "bin_width_opl", "start_opl"):

@@ -69,7 +69,8 @@ def passes_of(
     result = []
     for band, (first_row, rows) in enumerate(film.band_layout()):
         counts = _launch_counts(sampler, spp, max(1, most // (width * rows)))
-        rows_per_pass = rows if width * rows * max(counts) <= most else max(1, most // width)
+        # Samplers may round up to more samples than fit for all rows.
+        rows_per_pass = min(rows, max(1, most // (width * max(counts))))
         for row in range(first_row, first_row + rows, rows_per_pass):
             some = min(rows_per_pass, first_row + rows - row)
             result += [Pass(band, row, some, count, sum(counts), None) for count in counts]

@@ -154,7 +154,7 @@ class CurveTable(_Kind):
             [dr.gather(mi.Float, self._points, (segment + end) * _POINT + k, here) for k in range(_POINT)]
             for end in (0, 1)
         )
-        v = dr.detach(pi.prim_uv.x)
+        v = pi.prim_uv.x
         along, r_slope = mi.Vector3f(*b[:3]) - mi.Vector3f(*a[:3]), b[3] - a[3]
         c, r = mi.Vector3f(*a[:3]) + along * v, a[3] + r_slope * v
         o, d = dr.select(here, mi.Vector3f(ray.o), 0), dr.select(here, ray.d, 0)
@@ -195,7 +195,7 @@ class SplineTable(_Kind):
         points = [
             [dr.gather(mi.Float, self._points, (piece + i) * _POINT + k, here) for k in range(_POINT)] for i in range(4)
         ]
-        v = dr.detach(pi.prim_uv.x)
+        v = pi.prim_uv.x
         (c, _), (slope, _), (bend, _) = _spline(points, v)
         away = dr.select(here, mi.Vector3f(si.p) - c, 0)
         rate = dr.detach(dr.squared_norm(slope) - dr.dot(away, bend))
@@ -209,8 +209,12 @@ class SplineTable(_Kind):
         si.n = dr.select(meets, dr.replace_grad(si.n, n), si.n)
         along = v / dr.gather(mi.Float, self._counts, number, meets)
         si.uv.y = dr.select(meets, dr.replace_grad(si.uv.y, along), si.uv.y)
-        frame = mi.Frame3f(dr.normalize(si.dp_du - n * dr.dot(n, si.dp_du)), mi.Vector3f(0), n)
-        frame.t = dr.cross(frame.n, frame.s)
+        # The circle runs across both, and is as long as its radius says.
+        across = dr.select(meets, dr.cross(slope, away), mi.Vector3f(0, 0, 1))
+        s = dr.normalize(dr.mulsign(across, dr.dot(across, si.dp_du)))
+        around = s * dr.norm(dr.detach(si.dp_du)) * dr.relative_grad(dr.select(meets, r, 1))
+        si.dp_du = dr.select(meets, dr.replace_grad(si.dp_du, around), si.dp_du)
+        frame = mi.Frame3f(s, dr.cross(n, s), n)
         si.sh_frame = dr.select(meets, dr.replace_grad(si.sh_frame, frame), si.sh_frame)
 
 
@@ -240,8 +244,9 @@ def _starts(arrays: Sequence[Any], size: int) -> list[int]:
 
 
 def _extents(shape: Any, values: dict[str, Any]) -> Any:
-    """By how much the axes of each ellipsoid are stretched: Mitsuba clamps where an opacity has faded to 1 %."""
-    extent = values["extent"].read(shape)
+    """By how much the axes of each ellipsoid are stretched: Mitsuba clamps where an opacity has faded to 1 %. Up to a
+    factor, which slopes of distances do not depend on.
+    """
     if values["extent_adaptive_clamping"].read(shape):
-        return dr.sqrt(2 * dr.log(_floats(values["opacities"].read(shape)) / 0.01)) * extent / 3
-    return dr.full(mi.Float, extent, dr.width(_floats(values["data"].read(shape))) // _ELLIPSOID)
+        return dr.sqrt(dr.log(_floats(values["opacities"].read(shape)) / 0.01))
+    return dr.full(mi.Float, 1, dr.width(_floats(values["data"].read(shape))) // _ELLIPSOID)

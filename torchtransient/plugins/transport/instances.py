@@ -95,10 +95,10 @@ class InstanceTable:
         local_ray.o = _point(inverse, dr.select(valid, ray.o, 0))
         local_ray.d = _vector(inverse, dr.select(valid, ray.d, mi.Vector3f(0, 0, 1)))
         if hits is not None:
-            pi = hits.attach(pi, si.shape, local_ray, active & valid)
-        local = si.shape.compute_surface_interaction(local_ray, pi, flags, active & valid)
+            pi = hits.attach(pi, si.shape, local_ray, valid)
+        local = si.shape.compute_surface_interaction(local_ray, pi, flags, valid)
         if hits is not None and not mi.has_flag(flags, mi.RayFlags.FollowShape):
-            hits.put_right(local, pi, active & valid)
+            hits.put_right(local, pi, valid)
 
         # What Mitsuba found keeps its value to the bit.
         si.p = dr.replace_grad(si.p, _point(M, dr.select(valid, local.p, 0)))
@@ -142,7 +142,7 @@ class AttachedSurfaces:
         pi = self._hits.attach(pi, pi.shape, ray, active & pi.is_valid())
         si = pi.compute_surface_interaction(ray, flags, active)
         if not mi.has_flag(flags, mi.RayFlags.FollowShape):
-            self._hits.put_right(si, pi, active & si.is_valid())
+            self._hits.put_right(si, pi, si.is_valid())
         return si
 
 
