@@ -199,6 +199,8 @@ def depolarizer() -> Tensor:
 
 
 def _components(stokes: Tensor, dim: int) -> tuple[Tensor, ...]:
+    if not isinstance(stokes, Tensor):
+        raise ShapeError(f"stokes: expected a tensor (..., 4, C, T, H, W), got {type(stokes).__name__}.")
     if not stokes.dtype.is_floating_point:
         raise ShapeError(f"stokes: expected real floating point numbers, got {stokes.dtype}.")
     if not -stokes.ndim <= dim < stokes.ndim or stokes.shape[dim] != 4:
@@ -220,7 +222,10 @@ def _check_floor(floor: float) -> None:
 
 
 def _floating(value: Tensor | float) -> Tensor:
-    tensor = torch.as_tensor(value)
+    try:
+        tensor = torch.as_tensor(value)
+    except (TypeError, ValueError, RuntimeError):
+        raise UnitError(f"stokes: expected a number or a tensor, got {type(value).__name__}.") from None
     return tensor if tensor.dtype.is_floating_point else tensor.to(torch.get_default_dtype())
 
 

@@ -46,6 +46,8 @@ def seconds_to_opl(time_s: Quantity) -> Quantity:
 
 def near_seconds(time_s: float, name: str, where: str, *, limit_s: float = LATEST_S) -> float:
     """A time in seconds. UnitError from `limit_s` on, either side of zero: picoseconds, nanoseconds or metres."""
+    if not hasattr(time_s, "__float__"):
+        raise UnitError(f"{where}: expected {name} in seconds, got {type(time_s).__name__}.")
     if abs(time_s) >= limit_s:
         raise UnitError(
             f"{where}: expected {name} in seconds, below {limit_s:g} s, got {time_s!r} s, which is "
@@ -57,5 +59,7 @@ def near_seconds(time_s: float, name: str, where: str, *, limit_s: float = LATES
 
 def _refuse_half(value: object, name: str) -> None:
     dtype = str(getattr(value, "dtype", ""))
+    if not dtype and not hasattr(value, "__float__"):  # texts, None, and lists, which arrays are made of
+        raise UnitError(f"{name}: expected a number, a tensor or an array, got {type(value).__name__}.")
     if dtype.endswith(("float16", "bfloat16")):
         raise UnitError(f"{name}: expected float32 or float64, got {dtype}, which cannot hold nanoseconds in seconds.")

@@ -107,7 +107,7 @@ def _write_mp4(target: Path, frames: Iterator[Image], fps: float) -> None:
         if writer is not None:
             writer.close()
     if not _is_whole(target):  # which ffmpeg says on stderr alone
-        raise OSError("ffmpeg ended before the file was whole, as on a full disk")
+        raise StorageError("video: ffmpeg ended before the file was whole. Is the disk full?")
 
 
 def _is_whole(mp4: Path) -> bool:
