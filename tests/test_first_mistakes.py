@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import inspect
 import pickle
@@ -14,7 +15,15 @@ from click.testing import CliRunner
 import torchtransient as tt
 from torchtransient.argument_names import arguments_of
 from torchtransient.cli.main import main
-from torchtransient.errors import ArgumentError, SceneError, ShapeError, StorageError, UnitError, UnknownKeyError
+from torchtransient.errors import (
+    ArgumentError,
+    SceneError,
+    ShapeError,
+    StorageError,
+    TorchTransientError,
+    UnitError,
+    UnknownKeyError,
+)  # fmt: skip
 from torchtransient.files.result_file import read_result, write_result
 
 AXIS = tt.TimeAxis(0.0, 0.05, 40)
@@ -201,3 +210,37 @@ def test_a_misspelt_command_of_data_sets(tmp_path, monkeypatch):
     assert said.exit_code == 2 and "Did you mean 'info'?" in said.output
     (tmp_path / "inf").write_text("scene: {}")  # a recipe by that name is a recipe
     assert "Missing option" in CliRunner().invoke(main, ["dataset", "inf"]).output
+
+
+ROOMS = (tt.sensing, tt.stokes, tt.units, tt.losses, tt.metrics, tt.geometry)
+NOT_NUMBERS = (None, "a", object(), [[1.0, 2.0], [3.0]], {"a": 1})
+
+
+def _functions():
+    for room in ROOMS:
+        for name, value in vars(room).items():
+            ours = inspect.isfunction(value) and value.__module__.startswith("torchtransient.")
+            if ours and not name.startswith("_"):
+                yield pytest.param(value, id=f"{room.__name__.rpartition('.')[2]}.{name}")
+
+
+@pytest.mark.parametrize("function", list(_functions()))
+def test_what_is_no_number_is_a_typed_error_of_every_function(function):
+    every = inspect.signature(function).parameters.values()
+    needed = [p for p in every if p.default is p.empty and p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+    for given in NOT_NUMBERS:
+        by_place = [given for p in needed if p.kind != p.KEYWORD_ONLY]
+        by_name = {p.name: given for p in needed if p.kind == p.KEYWORD_ONLY}
+        with contextlib.suppress(TorchTransientError):  # and what is taken, as a name is, is no mistake
+            function(*by_place, **by_name)
+
+
+def test_what_is_no_record_function_or_mapping_is_a_typed_error(scene, tmp_path):
+    one = torch.ones((), requires_grad=True)
+    for call in (
+        lambda: tt.RenderOutput.stack(5), lambda: tt.RenderOutput.cat([5]), lambda: tt.TransientRenderer(scene, 5),
+        lambda: tt.training.accumulate(5, range(2)), lambda: scene.save(tmp_path / "a.xml", 5),
+        lambda: tt.training.accumulate(lambda part: one, range(2), scaler=5), lambda: tt.sensing.device(["a"]),
+    ):  # fmt: skip
+        with pytest.raises(ArgumentError, match="expected"):
+            call()

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from torchtransient.errors import StorageError, TorchTransientError
+from torchtransient.file_places import check_special, path_of
 
 MOST_LEVELS = 100
 # Of a text with fewer characters, which aliases may repeat.
@@ -42,7 +43,10 @@ def some_of(names: Any, letters: int = 240) -> str:
 
 
 def text_of_file(path: Any, what: str) -> str:
-    """The text of a file in UTF-8. Raises StorageError where there is none."""
+    """The text of a file in UTF-8. Raises StorageError where there is none, and for devices and pipes, which may have
+    no end.
+    """
+    check_special(path_of(path, what), what)
     try:
         return Path(path).read_text(encoding="utf-8")
     except (OSError, ValueError, TypeError) as error:

@@ -201,6 +201,8 @@ def depolarizer() -> Tensor:
 
 
 def _components(stokes: Tensor, dim: int) -> tuple[Tensor, ...]:
+    if not isinstance(stokes, Tensor):
+        raise ShapeError(f"stokes: expected a tensor (..., 4, C, T, H, W), got {type(stokes).__name__}.")
     if not stokes.dtype.is_floating_point:
         raise ShapeError(f"stokes: expected real floating point numbers, got {stokes.dtype}.")
     place = as_whole(dim)

@@ -17,7 +17,7 @@ import torch
 from torch.utils import _pytree
 from torch.utils.data._utils.collate import collate, default_collate_fn_map
 
-from torchtransient.errors import ShapeError
+from torchtransient.errors import ArgumentError, ShapeError
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +109,8 @@ class TensorRecord:
 
     @classmethod
     def _joined(cls, records: Sequence[Self], join: Callable[[Sequence[torch.Tensor]], torch.Tensor]) -> Self:
+        if not isinstance(records, Sequence) or not all(isinstance(record, cls) for record in records):
+            raise ArgumentError(f"a batch of {cls.__name__}: expected a list of them, got {type(records).__name__}.")
         if len(records) == 0:
             raise ShapeError(f"a batch of {cls.__name__}: expected at least one, got none.")
         first = records[0]

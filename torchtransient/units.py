@@ -62,5 +62,7 @@ def near_seconds(time_s: float, name: str, where: str, *, limit_s: float = LATES
 
 def _refuse_half(value: object, name: str) -> None:
     dtype = str(getattr(value, "dtype", ""))
+    if not dtype and not hasattr(value, "__float__"):  # texts, None, and lists, which arrays are made of
+        raise UnitError(f"{name}: expected a number, a tensor or an array, got {type(value).__name__}.")
     if dtype.endswith(("float16", "bfloat16")):
         raise UnitError(f"{name}: expected float32 or float64, got {dtype}, which cannot hold nanoseconds in seconds.")

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from torchtransient.errors import StorageError
+from torchtransient.array_files.part_files import write_text
 from torchtransient.testing.statistics import Slope, log_log_slope
 
 
@@ -133,10 +133,7 @@ class AccuracyReport:
 
     def to_json(self, path: str | Path) -> None:
         """Write `to_dict()` to `path`; StorageError when the file cannot be written."""
-        try:
-            Path(path).write_text(json.dumps(self.to_dict(), indent=2) + "\n", encoding="utf-8")
-        except OSError as error:
-            raise StorageError(f"accuracy report: cannot write {path}: {error}; choose a writable place") from error
+        write_text(path, json.dumps(self.to_dict(), indent=2) + "\n", "accuracy report")
 
     def plot(self, path: str | Path) -> None:
         """Log-log picture of relative error squared against seconds and spp, a row per quantity, with a guide of slope

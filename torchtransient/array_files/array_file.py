@@ -8,8 +8,6 @@ that it holds (`checksums.py`); files of the first version, which have none, are
 from __future__ import annotations
 
 import math
-import os
-import shutil
 import struct
 import tokenize
 import zipfile
@@ -26,8 +24,11 @@ from numpy.typing import NDArray
 from torchtransient.array_files.checksums import CHECKSUMS, Digest, array_digest, check, checksums_text, parts_of
 from torchtransient.array_files.hdf5_limits import check_size, read_attributes, read_dataset
 from torchtransient.array_files.hdf5_writing import hdf5_package, new_hdf5
-from torchtransient.array_files.part_files import sweep_parts, whole_file
+from torchtransient.array_files.part_files import replacing as replacing
 from torchtransient.errors import StorageError, TorchTransientError
+from torchtransient.file_places import check_folder as check_folder
+from torchtransient.file_places import check_source as check_source
+from torchtransient.file_places import path_of as path_of
 from torchtransient.plain_texts import said_in_short
 from torchtransient.quantities import shown
 
@@ -47,28 +48,6 @@ _DAMAGED = (
 )  # fmt: skip
 
 
-def path_of(path: Any, what: str) -> Path:
-    """`path` as a Path. Raises StorageError for what is no name of a file, on this disk for instance."""
-    try:
-        found = Path(path)
-        os.lstat(found)
-    except (FileNotFoundError, NotADirectoryError):
-        return found
-    except (TypeError, ValueError, OSError) as error:
-        reason = "" if isinstance(error, TypeError) else f": {error}"
-        raise StorageError(f"{what}: expected the name of a file, got {shown(path)}{reason}.") from None
-    return found
-
-
-def check_source(path: Any, what: str) -> Path:
-    """`path`, or StorageError where there is no file to read: nothing, a folder, a device or a pipe."""
-    source = path_of(path, what)
-    if source.is_file():
-        return source
-    problem = "is a folder" if source.is_dir() else "is no file on a disk" if source.exists() else "does not exist"
-    raise StorageError(f"{what}: '{source}' {problem}. Give the name of a file.")
-
-
 def check_target(path: str | Path, what: str) -> Path:
     """Return `path`, or raise StorageError when a file could not be written there. For before long computations.
 
@@ -81,21 +60,6 @@ def check_target(path: str | Path, what: str) -> Path:
     if target.suffix.lower() in HDF5:
         hdf5_package(what)
     return target
-
-
-def check_folder(path: str | Path, what: str) -> None:
-    """Raise StorageError when the folder of `path` is missing or closed to us, or `path` is there and no file that may
-    be written: a folder, a device, a pipe, a file without permission.
-    """
-    target = path_of(path, what)
-    # What a link points to is replaced, not the link.
-    place = Path(os.path.realpath(target)) if target.is_symlink() else target
-    if not place.parent.is_dir():
-        raise StorageError(f"{what}: the folder '{place.parent}' does not exist. Create it first.")
-    closed = next((p for p in (place.parent, place) if p.exists() and not os.access(p, os.W_OK)), None)
-    if place.is_dir() or closed or (place.exists() and not place.is_file()):
-        problem = f"cannot be written: no permission for '{closed}'" if closed else "is no file on a disk"
-        raise StorageError(f"{what}: '{target}' {'is a folder' if place.is_dir() else problem}. Choose another place.")
 
 
 def write_arrays(target: Path, arrays: Mapping[str, NDArray[Any]], entries: Mapping[str, Any], what: str) -> None:
@@ -223,27 +187,6 @@ def tensor_in(array: Any) -> torch.Tensor:
     """An array of a file as a tensor, on its memory where its bytes have this machine's order."""
     found = np.asarray(array)
     return torch.from_numpy(found.astype(found.dtype.newbyteorder("="), copy=False))
-
-
-@contextmanager
-def replacing(target: Path, what: str) -> Iterator[Path]:
-    """A temporary neighbour of `target` that takes its place when the block succeeds and disappears when it fails. Of a
-    link, the file that it points to is replaced; permissions stay.
-    """
-    place = Path(os.path.realpath(target))
-    sweep_parts(place.parent)
-    with whole_file(place, what, synchronized=False) as unfinished, _disk_said(target, what):
-        yield unfinished
-        if place.exists():
-            shutil.copymode(place, unfinished)
-
-
-@contextmanager
-def _disk_said(target: Path, what: str) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise StorageError(f"{what}: '{target}' could not be written: {error}.") from error
 
 
 def _write_hdf5(path: Path, arrays: Mapping[str, NDArray[Any]], entries: Mapping[str, Any], what: str) -> None:

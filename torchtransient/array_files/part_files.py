@@ -9,11 +9,14 @@ import os
 import platform
 import re
 import secrets
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from torchtransient.errors import StorageError
+from torchtransient.file_places import check_folder
 
 _SUFFIX = ".part"
 # Names that this module gives.
@@ -60,6 +63,27 @@ def writing_said(target: Path, what: str) -> Iterator[None]:
         yield
     except OSError as error:
         raise StorageError(f"{what}: '{target}' could not be written: {error}.") from error
+
+
+@contextmanager
+def replacing(target: Path, what: str) -> Iterator[Path]:
+    """A temporary neighbour of `target` that takes its place when the block succeeds and disappears when it fails. Of a
+    link, the file that it points to is replaced; permissions stay.
+    """
+    place = Path(os.path.realpath(target))
+    sweep_parts(place.parent)
+    with whole_file(place, what, synchronized=False) as unfinished, writing_said(target, what):
+        yield unfinished
+        if place.exists():
+            shutil.copymode(place, unfinished)
+
+
+def write_text(path: Any, text: str, what: str) -> None:
+    """Write a file of text, whole or not at all. Raises StorageError for a place that cannot be written, and for a full
+    disk, which leaves the old file.
+    """
+    with replacing(check_folder(path, what), what) as unfinished:
+        unfinished.write_text(text, encoding="utf-8")
 
 
 def sweep_parts(folder: str | Path) -> list[Path]:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from torchtransient.errors import MissingPackageError, SceneError
+from torchtransient.file_places import path_of
 from torchtransient.plain_texts import safe_loader, some_of, text_of_file, yaml_data
 from torchtransient.quantities import shown
 
@@ -54,7 +55,7 @@ def read_yaml(source: str | Path, who: str) -> tuple[dict[str, Any], Path]:
 def _text(source: str | Path, who: str) -> tuple[str, Path]:
     if isinstance(source, str) and "\n" in source:
         return source, Path.cwd()
-    path = Path(source)
+    path = path_of(source, who)
     if os.path.isdir(path):
         # y-tal's experiments are folders that hold a file of their name.
         path = path / f"{path.resolve().name}.yaml"

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,11 +18,15 @@ from typing import Any
 import numpy as np
 
 from torchtransient import plugins
-from torchtransient.errors import SceneError
+from torchtransient.errors import SceneError, StorageError
+from torchtransient.file_places import check_special, path_of
 from torchtransient.plugins.dictionaries import NUMBERS_IN_TEXT, Pixels, Voxels, for_mitsuba, is_ours, numbers_in_text
 from torchtransient.quantities import shown
 from torchtransient.rendering.node_checks import MOST_LEVELS
 from torchtransient.rendering.taken import ReadyScene, Taken, check_variant, describe_object, refuse, taken_below
+
+# Files in files: Mitsuba takes fewer.
+_MOST_INCLUDES = 16
 
 
 @dataclass(frozen=True)
@@ -164,17 +168,18 @@ def _search_path(folder: str) -> Iterator[None]:
 
 def describe_xml(path: str | os.PathLike[str], parameters: Mapping[str, Any]) -> XmlDescription:
     """Read an XML scene. Raises ``SceneError`` for a missing, unreadable or malformed file."""
-    file = Path(path)
+    try:
+        file = path_of(path, "tt.load")
+    except StorageError as error:
+        raise SceneError(str(error)) from None
     if not file.is_file():
-        kind = "a folder" if file.is_dir() else "no such file"
+        kind = "a folder" if file.is_dir() else "a device or a pipe" if file.exists() else "no such file"
         raise SceneError(
             f"tt.load: expected the path of an XML scene, got {str(path)!r} ({kind} seen from {os.getcwd()})."
         )
     try:
         text = file.read_text(encoding="utf-8")
-        parser = ElementTree.XMLParser(target=_Levels(file))
-        parser.feed(text)
-        parser.close()
+        _look_at(text, _Levels(file, parameters))
     except (OSError, UnicodeDecodeError) as error:
         raise SceneError(f"tt.load: {file} cannot be read as text: {error}.") from error
     except ElementTree.ParseError as error:
@@ -189,12 +194,16 @@ def describe_xml(path: str | os.PathLike[str], parameters: Mapping[str, Any]) ->
 class _Levels:
     """What the parser tells of an XML file: Mitsuba takes one level after the other on its stack."""
 
-    def __init__(self, file: Path):
-        self.file, self.level = file, 0
+    def __init__(self, file: Path, given: Mapping[str, Any], level: int = 0, includes: int = 0):
+        self.file, self.given, self.level, self.includes = file, dict(given), level, includes
 
     def start(self, tag: str, attributes: Mapping[str, str]) -> None:
         """An element begins."""
         self.level += 1
+        if tag == "default":
+            self.given.setdefault(attributes.get("name", ""), attributes.get("value", ""))
+        if tag == "include":
+            self._look_into(attributes.get("filename", ""))
         if self.level > 2 * MOST_LEVELS:  # a node of the last level may hold a transform of several parts
             raise SceneError(
                 f"tt.load: {self.file}: expected elements at most {2 * MOST_LEVELS} levels deep, got more at <{tag}>."
@@ -203,6 +212,22 @@ class _Levels:
     def end(self, tag: str) -> None:
         """An element ends."""
         self.level -= 1
+
+    def _look_into(self, name: str) -> None:
+        """A file that is included: Mitsuba opens what is there, and would wait for the other end of a pipe."""
+        for parameter in sorted(self.given, key=len, reverse=True):
+            name = name.replace(f"${parameter}", str(self.given[parameter]))
+        path = self.file.parent / name
+        check_special(path, f"tt.load: {self.file}: <include>", SceneError)
+        if self.includes < _MOST_INCLUDES:
+            with suppress(OSError, UnicodeDecodeError, ElementTree.ParseError):  # which Mitsuba says, with the line
+                _look_at(path.read_text(encoding="utf-8"), _Levels(path, self.given, self.level, self.includes + 1))
+
+
+def _look_at(text: str, levels: _Levels) -> None:
+    parser = ElementTree.XMLParser(target=levels)
+    parser.feed(text)
+    parser.close()
 
 
 def _xml_value(key: str, value: Any) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from torchtransient.errors import SceneError
+from torchtransient.file_places import check_special
 from torchtransient.rendering.ply_faces import smallest_vertex
 from torchtransient.rendering.taken import ReadyScene
 
@@ -20,12 +21,17 @@ _MOST_REMEMBERED = 4096
 
 
 def check_mesh_files(state: Any) -> None:
-    """Raise ``SceneError`` where a face of a mesh file is made of vertices that the file does not have. Must be called
-    where Mitsuba finds the files, before the scene is built; what cannot be read is left to Mitsuba to say.
+    """Raise ``SceneError`` where a face of a mesh file is made of vertices that the file does not have, and where any
+    file is a device or a pipe, which may have no end. Must be called where Mitsuba finds the files, before the scene is
+    built; what cannot be read is left to Mitsuba to say.
     """
     import mitsuba as mi
 
     for node in state.nodes:
+        for name in [name for name in node.props.keys() if "file" in name]:  # noqa: SIM118  # of Mitsuba's properties
+            if isinstance(node.props[name], str):
+                place = str(mi.file_resolver().resolve(node.props[name]))
+                check_special(place, f"{name} of {node.props.plugin_name()}", SceneError)
         if node.props.plugin_name() not in _UNCHECKED or not isinstance(node.props.get("filename", None), str):
             continue
         given = {name: node.props[name] for name in _READ if name in node.props}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -17,7 +17,7 @@ from torchtransient.parametrize.copies import CopiesParametrized
 from torchtransient.plugins.parameters import check_slope
 from torchtransient.plugins.physical_ranges import physical_range
 from torchtransient.pulses import Pulse
-from torchtransient.quantities import Numbers
+from torchtransient.quantities import Numbers, shown
 from torchtransient.rendering import engine
 from torchtransient.rendering.arguments import (
     Values,
@@ -136,6 +136,8 @@ class TransientRenderer(CopiesParametrized):
             raise ArgumentError(f"effects: expected 'auto' or a plan of tt.plan(...), got {effects!r}.")
         if isinstance(parameters, str):
             raise ArgumentError(f"parameters: expected a list of keys, got a string; write [{parameters!r}].")
+        if not isinstance(parameters, Iterable):
+            raise ArgumentError(f"parameters: expected a list of keys, got {shown(parameters)}.")
         self.scene: Scene = load(scene)
         self.spp, self.spp_grad = samples("spp", spp), samples("spp_grad", spp_grad)
         self.temporal_filter = checked_filter(temporal_filter)

@@ -11,7 +11,7 @@ from typing import Any
 
 from torchtransient.errors import ArgumentError, GradientError, SceneError
 from torchtransient.plugins.drjit_pool import engine_lock
-from torchtransient.quantities import flag
+from torchtransient.quantities import flag, shown
 from torchtransient.rendering.build import BuiltScene, build
 from torchtransient.rendering.build_options import BuildOptions
 from torchtransient.rendering.description import Description, describe_dict, describe_xml, same_description
@@ -191,6 +191,8 @@ class Scene:
         file in a folder that is there; ``ShapeError`` and ``GradientError`` for values as a renderer does. Nothing is
         written then.
         """
+        if values is not None and not isinstance(values, Mapping):
+            raise ArgumentError(f"scene.save: expected values by key, got {shown(values)}.")
         return save_scene(self, path, dict(values or {}), load)
 
     def same_description(self, other: Scene) -> bool:

@@ -57,6 +57,10 @@ def accumulate(
         raise ShapeError(f"accumulate: expected a weight for each of {len(listed)} parts, got {len(shares)}.")
     if model is not None and not isinstance(model, nn.Module):
         raise ArgumentError(f"accumulate: expected model as a module, got {type(model).__name__}.")
+    if not callable(loss_of):
+        raise ArgumentError(f"accumulate: expected loss_of as a function of a part, got {shown(loss_of)}.")
+    if scaler is not None and not callable(getattr(scaler, "scale", None)):
+        raise ArgumentError(f"accumulate: expected scaler as a torch.amp.GradScaler, got {shown(scaler)}.")
     values = []
     for n, (part, share) in enumerate(zip(listed, shares, strict=True)):
         waits = isinstance(model, DistributedDataParallel) and n + 1 < len(listed)

@@ -27,6 +27,7 @@ from torchtransient.errors import (
     TorchTransientWarning,
     UnitError,
 )
+from torchtransient.file_places import check_folder, check_special, path_of
 from torchtransient.quantities import count, shown
 from torchtransient.training.optimizer_states import check_optimizer
 from torchtransient.training.plain_state import plain
@@ -73,6 +74,7 @@ def save_checkpoint(
     state, and attributes. Raises StorageError for parts without a state, for states that could not be read without
     executing something, and where nothing can be written.
     """
+    place = path_of(path, "save_checkpoint")
     failure: str | None = "its parts or values are no state; see its own error."
     # All ranks learn what went wrong in one of them: none is left waiting for the others.
     try:
@@ -83,14 +85,14 @@ def save_checkpoint(
         told = _of_all_ranks({"random": random_state(), "generators": own_generators, "failure": failure})
     failures = [f"rank {rank}: {one['failure']}" for rank, one in enumerate(told) if one["failure"] is not None]
     if failures:
-        raise StorageError(f"save_checkpoint: {os.fspath(path)} was not written. {' '.join(failures)}")
+        raise StorageError(f"save_checkpoint: {place} was not written. {' '.join(failures)}")
     content["random"] = [one["random"] for one in told]
     for name in _generators(parts):
         content["parts"][name]["generators"] = [one["generators"].get(name) for one in told]
-    own = _written(Path(path), content) if _rank() == 0 else None
+    own = _written(place, content) if _rank() == 0 else None
     failure = _told_by_first(None if own is None else str(own))
     if failure is not None:
-        raise StorageError(f"save_checkpoint: {os.fspath(path)} cannot be written: {failure}") from own
+        raise StorageError(f"save_checkpoint: {place} cannot be written: {failure}") from own
 
 
 def load_checkpoint(path: str | os.PathLike[str], parts: Mapping[str, Any], *, random: bool = True) -> Checkpoint:
@@ -110,8 +112,9 @@ def load_checkpoint(path: str | os.PathLike[str], parts: Mapping[str, Any], *, r
     one). What a part still refuses afterwards is an error that says so. Every rank reads it. Raises
     StorageError for a file that is not there, torn, or something else; ShapeError for tensors of other shapes.
     """
-    given, where = _named(parts, "load_checkpoint"), os.fspath(path)
-    content = _read(Path(path))
+    source = path_of(path, "load_checkpoint")
+    given, where = _named(parts, "load_checkpoint"), str(source)
+    content = _read(source)
     states, ranks = content["parts"], len(content["random"])
     if states.keys() != given.keys():
         raise StorageError(
@@ -255,6 +258,10 @@ def _written(path: Path, content: dict[str, Any]) -> Exception | None:
     """What went wrong, None for nothing. A full disk is an OSError of ours, or a RuntimeError of torch's."""
     if not path.name:
         return OSError(f"{os.fspath(path)!r} is no name of a file")
+    try:
+        check_folder(path, "save_checkpoint")
+    except StorageError as error:
+        return error
     part = path.with_name(path.name + ".part")
     try:
         _write(path, part, content)
@@ -285,6 +292,7 @@ def _read(path: Path) -> dict[str, Any]:
         found.__cause__ = error
         return found
 
+    check_special(path, "load_checkpoint")
     try:
         with zipfile.ZipFile(path) as archive:
             damaged = archive.testzip()

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from torchtransient.errors import ShapeError, StorageError
+from torchtransient.errors import ShapeError
+from torchtransient.vis.files import save_figure
 
 
 @dataclass(frozen=True)
@@ -48,10 +49,7 @@ def plot_accuracy(curves: Sequence[Curve], path: str | Path) -> None:
         row[1].legend(fontsize=8, frameon=False)
     for axis, label in zip(axes[-1], ("seconds per render", "samples per pixel"), strict=True):
         axis.set_xlabel(label)
-    try:
-        figure.savefig(path, dpi=100)
-    except OSError as error:
-        raise StorageError(f"plot_accuracy: cannot write {path}: {error}; choose a writable place") from error
+    save_figure(figure, path, "plot_accuracy", dpi=100)
 
 
 def _draw(axis: Any, lines: Sequence[Curve], unit: str) -> None:

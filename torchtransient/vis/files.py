@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from torchtransient.array_files.part_files import replacing
 from torchtransient.errors import MissingPackageError, ShapeError, StorageError
 from torchtransient.quantities import count
+from torchtransient.file_places import check_folder
+from torchtransient.plain_texts import said_in_short
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,10 +36,8 @@ def save_image(image: Image, path: str | Path | None, who: str) -> Image:
         from PIL import Image as Pillow
     except ImportError as error:
         raise missing("pillow") from error
-    try:
-        Pillow.fromarray(image).save(path)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:  # an unknown ending is a ValueError
-        raise StorageError(f"{who}: cannot write '{path}': {error}. Choose a writable .png.") from error
+    with _place_of(path, who) as (unfinished, ending):
+        Pillow.fromarray(image).save(unfinished, format=Pillow.registered_extensions().get(f".{ending}", ending))
     return image
 
 
@@ -42,11 +45,26 @@ def save_figure(figure: Figure, path: str | Path | None, who: str, dpi: int = 12
     """Write a matplotlib figure, unless `path` is None; returns it. Raises StorageError."""
     if path is None:
         return figure
-    try:
-        figure.savefig(path, dpi=dpi)
-    except (OSError, ValueError, TypeError, AttributeError) as error:  # an unknown ending is a ValueError
-        raise StorageError(f"{who}: cannot write '{path}': {error}. Choose a writable .png.") from error
+    if isinstance(path, (str, Path)) and not Path(path).suffix:  # as matplotlib has it
+        path = f"{path}.png"
+    with _place_of(path, who) as (unfinished, ending):
+        figure.savefig(unfinished, dpi=dpi, format=ending)
     return figure
+
+
+@contextmanager
+def _place_of(path: Any, who: str) -> Iterator[tuple[Path, str]]:
+    """A name to write a picture to that takes the place of `path` once it is whole, and the ending of `path`."""
+    try:
+        target = check_folder(path, who)
+        with replacing(target, who) as unfinished:
+            yield unfinished, target.suffix.lstrip(".").lower()
+    except StorageError as error:
+        said = str(error).removeprefix(f"{who}: ").removeprefix(f"'{path}' could not be written: ")
+        raise StorageError(f"{who}: cannot write '{path}': {said}") from error
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:  # of an unknown ending, too
+        said = said_in_short(error)
+        raise StorageError(f"{who}: cannot write '{path}': {said}. Choose a writable .png.") from error
 
 
 def to_palette(path: str | Path) -> None:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, StorageError
+from torchtransient.file_places import check_folder
 from torchtransient.vis.files import figure_type, save_figure
 from torchtransient.vis.sources import pixel_of
 from torchtransient.vis.tone_mapping import tone_map
@@ -139,9 +140,7 @@ def plot_overview(
 def check_picture(path: str | Path, who: str = "picture") -> None:
     """Raise StorageError when matplotlib could not write to `path`, MissingPackageError without it. For before a long
     render."""
-    folder = Path(path).parent
-    if not folder.is_dir():
-        raise StorageError(f"{who}: the folder '{folder}' does not exist. Create it first.")
+    check_folder(path, who)
     figure_type()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 

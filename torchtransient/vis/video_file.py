@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from torchtransient import quantities
+from torchtransient.array_files.part_files import replacing
 from torchtransient.errors import MissingPackageError, ShapeError, StorageError, UnitError
+from torchtransient.file_places import check_folder, path_of
+from torchtransient.plain_texts import said_in_short
 from torchtransient.quantities import positive, shown
 from torchtransient.vis.files import Image
 from torchtransient.vis.stamps import DIM, GROUND, INK
@@ -26,14 +29,10 @@ _KEPT = (GROUND, DIM, INK, (0, 0, 0), (255, 255, 255), *_GREYS)
 
 def check_video(path: str | Path) -> Path:
     """Return `path`, or raise StorageError when `write_video` could not write there. For before a long render."""
-    try:
-        target = Path(path)
-    except TypeError:
-        raise StorageError(f"video: expected the name of a file, got {shown(path)}.") from None
+    target = path_of(path, "video")
     if target.suffix.lower() not in ENDINGS:
         raise StorageError(f"video: expected a name that ends in .mp4 or .gif, got '{path}'.")
-    if not target.parent.is_dir():
-        raise StorageError(f"video: the folder '{target.parent}' does not exist. Create it first.")
+    check_folder(target, "video")
     if target.suffix.lower() == ".mp4":
         _ffmpeg()
     else:
@@ -62,18 +61,17 @@ def write_video(
     many = quantities.count("video: count", count, 0, ShapeError)
     if not many:
         raise ShapeError("video: expected at least one frame, got none.")
-    try:
-        if target.suffix.lower() == ".mp4":
-            _write_mp4(target, _followed(frames, many, progress), fps)
-        else:
-            if fps > 50:
-                raise UnitError(f"video: a GIF shows at most 50 frames a second, got fps={fps!r}. Write an .mp4.")
-            palette = _palette(frames, many)
-            _write_gif(target, _followed(frames, many, progress), palette, fps)
-    except OSError as error:
-        with suppress(OSError):
-            target.unlink(missing_ok=True)
-        raise StorageError(f"video: cannot write '{target}': {error}.") from error
+    if target.suffix.lower() != ".mp4" and fps > 50:
+        raise UnitError(f"video: a GIF shows at most 50 frames a second, got fps={fps!r}. Write an .mp4.")
+    with replacing(target, "video") as unfinished:
+        try:
+            if target.suffix.lower() == ".mp4":
+                _write_mp4(unfinished, _followed(frames, many, progress), fps)
+            else:
+                palette = _palette(frames, many)
+                _write_gif(unfinished, _followed(frames, many, progress), palette, fps)
+        except OSError as error:  # with the command and its output, where it is ffmpeg's
+            raise StorageError(f"video: '{target}' could not be written: {said_in_short(error)}.") from error
     return target
 
 
@@ -102,16 +100,32 @@ def _write_mp4(target: Path, frames: Iterator[Image], fps: float) -> None:
                 # yuv420p is what browsers and slides play; crf 18 keeps small pixels sharp.
                 writer = _ffmpeg().write_frames(
                     str(target), (width, height), fps=fps, codec="libx264", pix_fmt_in="rgb24", pix_fmt_out="yuv420p",
-                    macro_block_size=2, quality=None, output_params=["-crf", "18", "-movflags", "+faststart"],
-                    ffmpeg_log_level="error",
+                    macro_block_size=2, quality=None, ffmpeg_log_level="error",
+                    output_params=["-crf", "18", "-movflags", "+faststart", "-f", "mp4"],
                 )  # fmt: skip
                 writer.send(None)
             writer.send(np.ascontiguousarray(even))
     finally:
         if writer is not None:
             writer.close()
-    if not target.is_file() or target.stat().st_size == 0:
-        raise StorageError(f"video: ffmpeg wrote nothing to '{target}'. Is the folder writable?")
+    if not _is_whole(target):  # which ffmpeg says on stderr alone
+        raise StorageError("video: ffmpeg ended before the file was whole. Is the disk full?")
+
+
+def _is_whole(mp4: Path) -> bool:
+    """Whether the boxes that an MP4 consists of, each with its length before it, fill the file, with a table."""
+    kinds, place, size = set(), 0, mp4.stat().st_size
+    with mp4.open("rb") as file:
+        while place + 8 <= size:
+            file.seek(place)
+            length, kind = struct.unpack(">I4s", file.read(8))
+            if length == 1:  # it follows, in 64 bits
+                length = int.from_bytes(file.read(8), "big")
+            if length < 8:
+                return False
+            kinds.add(kind)
+            place += length
+    return place == size and kinds >= {b"moov", b"mdat"}
 
 
 def _palette(frames: Iterable[Image], count: int) -> Any:
@@ -142,7 +156,7 @@ def _write_gif(target: Path, frames: Iterator[Image], palette: Any, fps: float) 
     if first is None:
         raise ShapeError("video: expected frames that can be iterated twice for a GIF, got none the second time.")
     duration = max(2, round(100 / fps)) * 10
-    first.save(target, save_all=True, append_images=images, duration=duration, loop=0, optimize=False)
+    first.save(target, format="GIF", save_all=True, append_images=images, duration=duration, loop=0, optimize=False)
 
 
 def _ffmpeg() -> Any:

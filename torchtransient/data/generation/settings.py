@@ -14,6 +14,7 @@ from torchtransient.data.recipes.places import without_places
 from torchtransient.data.recipes.plugin_modules import PluginNames
 from torchtransient.data.storage.file_names import RECIPE_FILE
 from torchtransient.errors import StorageError
+from torchtransient.file_places import check_special
 from torchtransient.plain_texts import json_data, said_in_short
 
 FORMAT = "torchtransient data set"
@@ -82,6 +83,7 @@ def read_description(folder: Path) -> dict[str, Any] | None:
     """What is in the folder's ``recipe.json``, None where there is none. Raises StorageError for a damaged one."""
     path = folder / RECIPE_FILE
     try:
+        check_special(path, _WHAT)
         found = json_data(path.read_text(encoding="utf-8"), f"{_WHAT}: '{path}'")
     except FileNotFoundError:
         return None

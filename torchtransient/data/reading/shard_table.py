@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torchtransient.data.storage.manifest import shards_of
 from torchtransient.data.storage.shard_file import Shard
 from torchtransient.errors import StorageError
+from torchtransient.file_places import path_of
 from torchtransient.quantities import shown
 
 WHAT = "data set"
@@ -90,7 +91,7 @@ def shard_paths(where: Any) -> list[Path]:
     """The shards that a folder, a pattern, a file, or a list of them means. Raises StorageError for none."""
     if isinstance(where, str | os.PathLike):
         text = os.fspath(where)
-        path = Path(text)
+        path = path_of(text, WHAT)
         if path.is_dir():
             found = shards_of(path)
         elif path.is_file():

@@ -17,6 +17,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from torchtransient.array_files.part_files import write_text
 from torchtransient.axes import TimeAxis
 from torchtransient.data.recipes.places import files_of, without_places
 from torchtransient.data.recipes.specification import Specification
@@ -32,7 +33,8 @@ from torchtransient.data.recipes.written import (
     written_frequencies,
     written_shape,
 )
-from torchtransient.errors import MissingPackageError, SceneError, StorageError, TorchTransientError
+from torchtransient.errors import MissingPackageError, SceneError, TorchTransientError
+from torchtransient.file_places import path_of
 from torchtransient.files.scan_data import scan_data, scan_from_data
 from torchtransient.files.yaml_files import Section, read_yaml
 from torchtransient.plain_texts import json_data, said_in_short, text_of_file, told_shortly
@@ -119,10 +121,7 @@ def to_yaml(recipe: Specification, path: str | Path | None) -> str:
         ) from error
     text: str = yaml.safe_dump(to_dict(recipe), sort_keys=False, width=120)
     if path is not None:
-        try:
-            Path(path).write_text(text, encoding="utf-8")
-        except OSError as error:
-            raise StorageError(f"recipe: '{path}' cannot be written: {error}.") from error
+        write_text(path, text, "recipe")
     return text
 
 
@@ -144,7 +143,7 @@ def key_of(recipe: Specification) -> str:
 def read_file(source: str | Path) -> tuple[Mapping[str, Any], Path]:
     """What a file says, and its folder; see :meth:`Recipe.read`."""
     is_text = isinstance(source, str) and "\n" in source
-    if not is_text and Path(source).suffix.lower() == ".json":
+    if not is_text and path_of(source, "recipe").suffix.lower() == ".json":
         return json_data(text_of_file(source, "recipe"), "recipe"), Path(source).resolve().parent
     return read_yaml(source, "recipe")
 

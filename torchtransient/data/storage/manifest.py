@@ -12,12 +12,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from torchtransient.array_files.array_file import path_of
 from torchtransient.array_files.part_files import sweep_parts as sweep_parts
 from torchtransient.array_files.part_files import whole_file, writing_said
 from torchtransient.data.storage.file_names import MANIFEST_FILE, RECIPE_FILE, SHARD_FILES, shard_file_name
 from torchtransient.data.storage.shard_file import Shard, stored_checksum
 from torchtransient.errors import StorageError
+from torchtransient.file_places import check_special, path_of
 from torchtransient.plain_texts import json_data
 from torchtransient.quantities import shown
 from torchtransient.rendering.progress import with_bar
@@ -276,6 +276,7 @@ def ranges_text(numbers: Iterable[int], most: int = 8) -> str:
 
 
 def _text_of(path: Path) -> str | None:
+    check_special(path, _WHAT)
     try:
         return path.read_text(encoding="utf-8")
     except FileNotFoundError:

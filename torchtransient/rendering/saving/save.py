@@ -13,7 +13,9 @@ import numpy as np
 import torch
 
 from torchtransient import plugins
+from torchtransient.array_files.part_files import writing_said
 from torchtransient.errors import SceneError, ShapeError, TorchTransientError
+from torchtransient.file_places import check_folder, path_of
 from torchtransient.plugins.mitsuba_compat import keeps_coefficients
 from torchtransient.plugins.node_walk import ShownValue, objects_below
 from torchtransient.plugins.spectral_colours import same_spectra
@@ -40,13 +42,14 @@ def save_scene(
 ) -> Path:
     """Write a scene with ``values``, load it, and compare. ``load``: ``tt.load``."""
     scene._description.check_described("scene.save")
-    target = Path(path)
+    target = path_of(path, "scene.save")
     if target.suffix != ".xml":
         raise SceneError(f"scene.save: expected the name of an XML file, such as scene.xml, got {str(target)!r}.")
     if not target.parent.is_dir():
         raise SceneError(f"scene.save: there is no folder {str(target.parent)!r}; make it first.")
+    check_folder(target, "scene.save")
     files = f"{target.stem}_files"
-    with tempfile.TemporaryDirectory(dir=target.parent) as place:
+    with writing_said(target, "scene.save"), tempfile.TemporaryDirectory(dir=target.parent) as place:
         draft = Path(place) / target.name
         with active_variant(scene.variant):
             wanted = _write(scene, draft, Path(place) / files, values)

@@ -30,6 +30,13 @@ def check_tensor(x: object, where: str) -> Tensor:
     return x
 
 
+def check_tensors(where: str, **given: object) -> None:
+    """ShapeError that names the first argument that is no tensor."""
+    for name, value in given.items():
+        if not isinstance(value, Tensor):
+            raise ShapeError(f"{where}: expected {name} as a tensor, got {shown(value)}. torch.as_tensor makes one.")
+
+
 def check_transient(x: Tensor, where: str) -> Tensor:
     """`x` when it is a floating tensor (..., C, T, H, W), else ShapeError or UnitError."""
     if check_tensor(x, where).ndim < 4:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
-from torchtransient.quantities import Numbers
+from torchtransient.quantities import Numbers, as_number, shown
 from torchtransient.sensing.base.given import numbers_of
 from torchtransient.sensing.base.layout import TIME, bin_width_of, check_number, check_seconds, check_transient
 from torchtransient.sensing.base.pixel_maps import check_map, keep_map, kept_map, over_time
@@ -46,6 +46,8 @@ def afterpulse_kernel(tau_s: Tensor | float, dead_time_s: float, bin_width_s: fl
     The delay is the dead time plus an exponential time of mean `tau_s` (differentiable); detections are spread evenly
     over their bins. Bins are integrated exactly, and so are all later periods.
     """
+    if as_number(tau_s) is None:
+        raise UnitError(f"afterpulse_kernel: expected tau_s as one number of seconds, got {shown(tau_s)}.")
     tau = torch.as_tensor(tau_s, dtype=torch.float64) / bin_width_s
     return exponential_kernel(tau.reshape(1), dead_time_s / bin_width_s, period_bins)[0]
 

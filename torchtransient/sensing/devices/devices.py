@@ -25,6 +25,7 @@ from typing import Any
 import torch
 from torch import nn
 
+from torchtransient.array_files.part_files import write_text
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import MissingPackageError, StorageError, TorchTransientError
 from torchtransient.plain_texts import json_data, said_in_short, some_of, text_of_file, told_shortly, yaml_data
@@ -241,7 +242,7 @@ class Device:
         except (TypeError, ValueError) as error:
             raise StorageError(f"Device '{self.name}': expected numbers, strings and lists only: {error}.") from error
         if path is not None:
-            Path(path).write_text(text + "\n", encoding="utf-8")
+            write_text(path, text + "\n", "Device.to_json")
         return text
 
     @classmethod
@@ -253,7 +254,7 @@ class Device:
         """YAML text, also written to ``path`` when given. Needs PyYAML (``pip install torchtransient[yaml]``)."""
         text: str = _yaml().safe_dump(json.loads(self.to_json()), sort_keys=False)
         if path is not None:
-            Path(path).write_text(text, encoding="utf-8")
+            write_text(path, text, "Device.to_yaml")
         return text
 
     @classmethod

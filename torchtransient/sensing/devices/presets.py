@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from torchtransient.errors import ArgumentError
+from torchtransient.quantities import shown
 from torchtransient.sensing.devices.devices import Device
 
 _AXIS = "@axis"
@@ -361,6 +362,6 @@ DEVICES = {d.name: d for d in _DEVICES}
 
 def device(name: str) -> Device:
     """The device of that name; `DEVICES` holds them all. Raises ArgumentError for another name."""
-    if name not in DEVICES:
-        raise ArgumentError(f"device: expected one of {', '.join(sorted(DEVICES))}, got {name!r}.")
+    if not isinstance(name, str) or name not in DEVICES:
+        raise ArgumentError(f"device: expected one of {', '.join(sorted(DEVICES))}, got {shown(name)}.")
     return DEVICES[name]

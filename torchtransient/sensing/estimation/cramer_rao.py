@@ -21,6 +21,7 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ArgumentError, DeviceError, GradientError, ShapeError, UnitError
+from torchtransient.quantities import shown
 from torchtransient.sensing.base.given import no_arrays
 from torchtransient.sensing.base.layout import TIME, check_count, check_time_axis
 from torchtransient.sensing.response.impulse_response import Response
@@ -144,7 +145,9 @@ def covariance_bound(
     Raises ShapeError, UnitError, GradientError for a chain without forward derivatives.
     """
     where = "covariance_bound"
-    given = tuple(parameters)
+    given = tuple(parameters) if isinstance(parameters, Sequence) else ()
+    if not callable(mean):
+        raise ArgumentError(f"{where}: expected mean as a function of the parameters, got {shown(mean)}.")
     if not given or any(not isinstance(p, Tensor) or not p.is_floating_point() for p in given):
         raise ShapeError(f"{where}: expected one or more floating tensors (..., C, H, W) as parameters.")
     number = None if cycles is None else check_count(cycles, "cycles", where)

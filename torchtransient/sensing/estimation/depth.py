@@ -19,7 +19,14 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
-from torchtransient.sensing.base.layout import TIME, check_count, check_number, check_time_axis, check_transient
+from torchtransient.sensing.base.layout import (
+    TIME,
+    check_count,
+    check_number,
+    check_tensors,
+    check_time_axis,
+    check_transient,
+)
 from torchtransient.sensing.numerics.time_convolution import Boundary, convolve_time
 from torchtransient.tensor_record import TensorRecord
 
@@ -243,6 +250,7 @@ def distance_to_points(distance_m: Tensor, intrinsics: Tensor) -> Tensor:
     centres at *integer* coordinates, so that the middle of a picture is ``((W - 1) / 2, (H - 1) / 2)``. Distances are
     Euclidean, as times of flight are; not depths along z. Differentiable in both. Raises ShapeError.
     """
+    check_tensors("distance_to_points", distance_m=distance_m, intrinsics=intrinsics)
     if intrinsics.shape[-2:] != (3, 3) or intrinsics.ndim not in (2, 3):
         raise ShapeError(f"distance_to_points: expected intrinsics (3, 3) or (B, 3, 3), got {tuple(intrinsics.shape)}.")
     batched = intrinsics.ndim == 3

@@ -7,8 +7,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchtransient.errors import GradientError, ShapeError
+from torchtransient.errors import ArgumentError, GradientError, ShapeError
 from torchtransient.floating import in_single
+from torchtransient.quantities import shown
+from torchtransient.sensing.base.layout import check_tensors
 from torchtransient.sensing.base.sensor import Sensor
 
 
@@ -21,6 +23,7 @@ def adjoint(sensor: Sensor, y: Tensor, input_shape: Sequence[int]) -> Tensor:
     so that an unrolled reconstruction can be trained through it. Raises ShapeError when ``y`` is no output for that
     shape.
     """
+    _check("adjoint", sensor, y=y)
     learnt = any(p.requires_grad for p in sensor.parameters())
     onwards = torch.is_grad_enabled() and (y.requires_grad or learnt)
     with torch.inference_mode(False), torch.enable_grad():
@@ -39,7 +42,14 @@ def adjoint(sensor: Sensor, y: Tensor, input_shape: Sequence[int]) -> Tensor:
 
 def linearity_error(sensor: Sensor, x: Tensor) -> float:
     """``|A(2 x) - 2 A(x)| / |A(2 x)|`` of the mean without its offset: rounding for a linear sensor."""
+    _check("linearity_error", sensor, x=x)
     with torch.no_grad():
         offset = sensor.expected(torch.zeros_like(x))
         once, twice = sensor.expected(x) - offset, sensor.expected(2 * x) - offset
         return float((twice - 2 * once).abs().max() / twice.abs().max().clamp_min(torch.finfo(x.dtype).tiny))
+
+
+def _check(where: str, sensor: object, **given: object) -> None:
+    if not isinstance(sensor, Sensor):
+        raise ArgumentError(f"{where}: expected a sensor of tt.sensing, got {shown(sensor)}.")
+    check_tensors(where, **given)

@@ -31,7 +31,7 @@ from torchtransient.errors import GradientError, ShapeError, UnitError
 from torchtransient.floating import in_single
 from torchtransient.quantities import real_array, shown
 from torchtransient.sensing.base.given import refuse_cut_off
-from torchtransient.sensing.base.layout import check_number, check_time_axis, check_transient, product
+from torchtransient.sensing.base.layout import check_number, check_tensors, check_time_axis, check_transient, product
 from torchtransient.sensing.base.sensor import Sensor
 from torchtransient.sensing.itof.itof_codes import CorrelationCode
 from torchtransient.sensing.itof.itof_pixels import ItofCalibration, in_direction
@@ -164,6 +164,7 @@ def taps_from_phasor(
 
     Raises ShapeError for a phasor that does not fit its axis, UnitError for a missing frequency.
     """
+    check_tensors("taps_from_phasor", phasor=phasor)
     me = "taps_from_phasor"
     if not phasor.is_complex() or phasor.ndim < 4 or phasor.shape[-3] != phasor_axis.num_frequencies:
         raise ShapeError(

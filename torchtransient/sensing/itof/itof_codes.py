@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.quantities import real_array, shown
 from torchtransient.sensing.base.given import no_arrays, refuse_cut_off
 from torchtransient.sensing.base.layout import check_number
 
@@ -258,6 +259,8 @@ def measured_code(samples: Tensor, closed: bool = False) -> PiecewiseLinearCode:
 def _plain(given: object, name: str, where: str) -> Tensor:
     """float64 on the CPU, of a tensor, an array or rows of numbers. GradientError: codes are not learnt."""
     refuse_cut_off(given, name, where)
+    if not isinstance(given, Tensor) and real_array(given) is None:
+        raise ShapeError(f"{where}: expected {name} as rows of numbers of one length, got {shown(given)}.")
     return torch.as_tensor(no_arrays(given, where)).detach().to("cpu", torch.float64)
 
 

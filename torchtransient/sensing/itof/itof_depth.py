@@ -27,9 +27,9 @@ from torch import Tensor
 
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.floating import in_single
-from torchtransient.quantities import Numbers
+from torchtransient.quantities import Numbers, real_array, shown
 from torchtransient.sensing.base.given import refuse_cut_off, tensor_of
-from torchtransient.sensing.base.layout import check_count, product
+from torchtransient.sensing.base.layout import check_count, check_tensors, product
 from torchtransient.sensing.itof.itof import Frequencies, check_frequencies
 from torchtransient.sensing.itof.itof_codes import phase_steps
 from torchtransient.units import SPEED_OF_LIGHT
@@ -114,6 +114,8 @@ def _split(taps: Frames, num_taps: int, readout: str, where: str) -> Tensor:
 
 def as_frames(taps: Frames, where: str) -> Tensor:
     """A tensor as it is, an array as one. UnitError for what holds no numbers."""
+    if not isinstance(taps, (Tensor, np.ndarray)) and real_array(taps) is None:
+        raise UnitError(f"{where}: expected frames of numbers as a tensor or an array, got {shown(taps)}.")
     return taps if isinstance(taps, Tensor) else tensor_of(np.asarray(taps), where)
 
 
@@ -129,6 +131,7 @@ def _precise(frames: Tensor, where: str) -> Tensor:
 
 def phase_of(phasor: Tensor) -> Tensor:
     """Angle of a complex tensor in [0, 2 pi), in its shape; zero, with derivative zero, where it is zero."""
+    check_tensors("phase_of", phasor=phasor)
     real, imag = phasor.real, phasor.imag
     # At scale one the squares in the derivative of atan2 cannot underflow; the angle does not depend on it.
     largest = torch.maximum(real.abs(), imag.abs()).detach()
@@ -143,6 +146,7 @@ def phase_of(phasor: Tensor) -> Tensor:
 
 def amplitude_of(phasor: Tensor) -> Tensor:
     """Modulus of a complex tensor, in its shape; derivative zero where it is zero."""
+    check_tensors("amplitude_of", phasor=phasor)
     real, imag = phasor.real, phasor.imag
     largest = torch.maximum(real.abs(), imag.abs()).detach()
     there = ~(largest <= torch.finfo(real.dtype).tiny)  # NaN is not darkness
@@ -172,6 +176,7 @@ def unambiguous_range_m(frequencies_hz: Frequencies) -> float:
 @in_single
 def wrapped_difference(a: Tensor, b: Tensor) -> Tensor:
     """``a - b`` in radians, the short way round: in [-pi, pi), derivative one everywhere. Shapes broadcast."""
+    check_tensors("wrapped_difference", a=a, b=b)
     difference = a - b
     turns = torch.floor((difference + math.pi) / _TURN)
     return difference - _TURN * turns
@@ -182,6 +187,7 @@ def phasor_loss(phasor: Tensor, target: Tensor, weight: Tensor | None = None) ->
 
     Scale both to amplitude one (``z / amplitude``) for a loss on the phase alone, ``2 (1 - cos(difference))``.
     """
+    check_tensors("phasor_loss", phasor=phasor, target=target)
     difference = phasor - target
     loss = difference.real.square() + difference.imag.square()
     return loss if weight is None else loss * weight

@@ -14,7 +14,7 @@ polarimeters" (Opt. Express 2011).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor
@@ -22,9 +22,9 @@ from torch.nn import functional
 
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
-from torchtransient.quantities import Numbers, as_number
+from torchtransient.quantities import Numbers, as_number, shown
 from torchtransient.sensing.base.given import refuse_cut_off
-from torchtransient.sensing.base.layout import check_number, check_tensor, product, without_autocast
+from torchtransient.sensing.base.layout import check_number, check_tensor, check_tensors, product, without_autocast
 from torchtransient.sensing.base.sensor import Sensor
 from torchtransient.stokes import TRANSIENT_DIM, circular_polarizer, linear_polarizer
 
@@ -46,6 +46,8 @@ def linear_analyzers(
     me = "linear_analyzers"
     share = _extinction(extinction_ratio, me)
     factor = check_number(transmission, "transmission", me, high=1.0)
+    if not isinstance(angles_deg, Iterable) or getattr(angles_deg, "ndim", 1) == 0:
+        raise ShapeError(f"{me}: expected a list of angles, got {shown(angles_deg)}.")
     angles = [math.radians(check_number(a, "angles_deg", me, low=-360.0, high=360.0)) for a in angles_deg]
     if not angles:
         raise ShapeError(f"{me}: expected at least one angle, got none.")
@@ -79,6 +81,7 @@ def stokes_from(measurements: Tensor, rows: Tensor) -> Tensor:
     ``S0 = sum / 2, S1 = I0 - I90, S2 = I45 - I135``. Not constrained: noise can make S0 < |S123|, see
     `project_physical`. Raises ShapeError.
     """
+    check_tensors("stokes_from", measurements=measurements, rows=rows)
     if rows.ndim != 2 or rows.shape[1] != 4 or measurements.ndim < 5 or measurements.shape[-5] != rows.shape[0]:
         raise ShapeError(
             f"stokes_from: expected measurements (..., A, C, T, H, W) and rows (A, 4), got "
@@ -100,6 +103,7 @@ def _by_rows(matrix: Tensor, x: Tensor) -> Tensor:
 @in_single
 def unphysical_part(stokes: Tensor, dim: int = TRANSIENT_DIM) -> Tensor:
     """``max(|S123| - S0, 0)``, without ``dim``: zero for every Stokes vector that light can have. ShapeError."""
+    check_tensors("unphysical_part", stokes=stokes)
     s0, length = _parts(stokes, dim)
     return (length - s0).clamp_min(0)
 
@@ -111,6 +115,7 @@ def project_physical(stokes: Tensor, dim: int = TRANSIENT_DIM) -> Tensor:
     Euclidean projection onto the cone: with excess ``|S123| > S0`` both become ``(S0 + |S123|) / 2``, and zero where
     that is negative. Continuous, with gradients that are finite everywhere (zero in dark). ShapeError.
     """
+    check_tensors("project_physical", stokes=stokes)
     s0, length = _parts(stokes, dim)
     inside = length <= s0
     nearest = ((s0 + length) / 2).clamp_min(0)
@@ -193,6 +198,9 @@ def mosaic_rows(
     angles_deg: Sequence[Sequence[float]], extinction_ratio: float = math.inf, transmission: float = 1.0
 ) -> Tensor:
     """(P, Q, 4): rows of linear analysers at the angles of a block of pixels; arguments as `linear_analyzers`."""
+    rows = angles_deg.tolist() if hasattr(angles_deg, "tolist") else angles_deg
+    if not isinstance(rows, Sequence) or not all(isinstance(line, Sequence) for line in rows):
+        raise ShapeError(f"mosaic_rows: expected rows of angles, got {shown(angles_deg)}.")
     flat = [a for line in angles_deg for a in line]
     if not flat or any(len(line) != len(angles_deg[0]) for line in angles_deg):
         raise ShapeError("mosaic_rows: expected a block of angles with rows of equal length.")
@@ -208,6 +216,7 @@ def demosaic(raw: Tensor, block: tuple[int, int] = (2, 2)) -> Tensor:
     same. A constant picture stays constant, and the pixels themselves keep their values for 2 x 2. Order: row by row
     within the block. Linear in the light. Raises ShapeError for less than one block.
     """
+    check_tensors("demosaic", raw=raw)
     p, q = block
     if raw.ndim < 4 or raw.shape[-2] < p or raw.shape[-1] < q:
         raise ShapeError(f"demosaic: expected raw light (..., C, T, H >= {p}, W >= {q}), got {tuple(raw.shape)}.")

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.base.layout import check_number, check_transient, without_autocast
+from torchtransient.sensing.base.layout import check_number, check_tensors, check_transient, without_autocast
 from torchtransient.sensing.base.sensor import Sensor
 from torchtransient.sensing.numerics.time_convolution import check_choice
 from torchtransient.sensing.response.response_shapes import FWHM_PER_SIGMA
@@ -47,6 +47,7 @@ def blur_image(x: Tensor, psf: Tensor, border: Border = "reflect") -> Tensor:
 
 def gaussian_psf(fwhm_px: Tensor, size: int) -> Tensor:
     """(size, size) float64 normal spot of `fwhm_px` pixels, integrated over pixels, sum 1; differentiable in fwhm."""
+    check_tensors("gaussian_psf", fwhm_px=fwhm_px)
     sigma = fwhm_px.double() / FWHM_PER_SIGMA
     edges = torch.arange(size + 1, dtype=torch.float64, device=fwhm_px.device) - size / 2
     line = 0.5 * torch.special.erf(edges / (sigma * math.sqrt(2))).diff()

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.pulses import Pulse, cumulative_of_sum
-from torchtransient.sensing.base.layout import check_tensor, without_autocast
+from torchtransient.sensing.base.layout import check_tensor, check_time_axis, without_autocast
 
 # Longer kernels are applied by a Fourier transform in double precision, whose rounding stays 1e-12 below the largest
 # bin where one in single precision would drown the late ones.
@@ -49,6 +49,7 @@ def pulse_kernel(bin_width_opl: float, *pulses: Pulse) -> tuple[int, Tensor]:
 
 def axis_with_margin(axis: TimeAxis, *pulses: Pulse) -> TimeAxis:
     """``axis`` with the bins around it whose light the pulses bring into it: render on it, then keep ``axis``."""
+    check_time_axis(axis, "axis_with_margin")
     first, kernel = pulse_kernel(axis.bin_width_opl, *pulses)
     before, after = max(first + kernel.numel() - 1, 0), max(-first, 0)
     start = axis.start_opl - before * axis.bin_width_opl
@@ -66,6 +67,7 @@ def apply_pulse(transient: Tensor, axis: TimeAxis, *pulses: Pulse, keep: TimeAxi
     Differentiable in ``transient``, in both modes and twice. Raises ShapeError where T is not that of ``axis``, or
     ``keep`` does not consist of its bins; UnitError without a pulse or for whole numbers.
     """
+    check_time_axis(axis, "apply_pulse")
     if check_tensor(transient, "apply_pulse").ndim < 3 or transient.shape[-3] != axis.num_bins:
         raise ShapeError(
             f"apply_pulse: expected (..., T, H, W) with T = {axis.num_bins}, got {tuple(transient.shape)}."
