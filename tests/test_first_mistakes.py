@@ -219,7 +219,7 @@ NOT_NUMBERS = (None, "a", object(), [[1.0, 2.0], [3.0]], {"a": 1})
 def _functions():
     for room in ROOMS:
         for name, value in vars(room).items():
-            ours = inspect.isfunction(value) and value.__module__.startswith("torchtransient.")
+            ours = inspect.isfunction(value) and value.__module__.startswith(room.__name__)
             if ours and not name.startswith("_"):
                 yield pytest.param(value, id=f"{room.__name__.rpartition('.')[2]}.{name}")
 

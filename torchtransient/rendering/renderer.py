@@ -134,10 +134,9 @@ class TransientRenderer(CopiesParametrized):
             sensors = effects.sensor if sensors is None else sensors
         elif effects != "auto":
             raise ArgumentError(f"effects: expected 'auto' or a plan of tt.plan(...), got {effects!r}.")
-        if isinstance(parameters, str):
-            raise ArgumentError(f"parameters: expected a list of keys, got a string; write [{parameters!r}].")
-        if not isinstance(parameters, Iterable):
-            raise ArgumentError(f"parameters: expected a list of keys, got {shown(parameters)}.")
+        if isinstance(parameters, str) or not isinstance(parameters, Iterable):
+            got = f"a string; write [{parameters!r}]" if isinstance(parameters, str) else shown(parameters)
+            raise ArgumentError(f"parameters: expected a list of keys, got {got}.")
         self.scene: Scene = load(scene)
         self.spp, self.spp_grad = samples("spp", spp), samples("spp_grad", spp_grad)
         self.temporal_filter = checked_filter(temporal_filter)
