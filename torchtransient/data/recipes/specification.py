@@ -23,7 +23,7 @@ from torchtransient.errors import ArgumentError, SceneError, ShapeError
 from torchtransient.files.content_key import content_key
 from torchtransient.gates import Gate
 from torchtransient.pulses import Pulse
-from torchtransient.quantities import Numbers, count, real_array, shown
+from torchtransient.quantities import MOST, Numbers, as_whole, count, real_array, shown
 from torchtransient.rendering.variant import resolve_variant
 from torchtransient.sensing import DEVICES, Device
 from torchtransient.sensing import device as device_by_name
@@ -237,5 +237,11 @@ def label_of(distribution: Distribution, value: Any) -> str:
 
 def samples_of(indices: Iterable[int]) -> list[int]:
     """Numbers of samples, checked. Raises ShapeError."""
-    return [count("recipe: number of a sample", index, 0, ShapeError) for index in indices]
+    found = []
+    for index in indices:
+        number = as_whole(index)
+        if number is None or not 0 <= number <= MOST:
+            raise ShapeError(f"recipe: expected whole numbers of samples of at least 0, got {shown(index)}.")
+        found.append(number)
+    return found
 
