@@ -279,7 +279,7 @@ def test_rectified_points_are_off_by_a_length_in_space(tmp_path):
 
 def test_sizes_of_grids_stand_beside_their_points(tmp_path):
     with h5py.File(FILES["zaragoza pairs"][1].write(tmp_path / "a.h5", "zaragoza")) as file:
-        # Four by three sensor points of 0.5 m and 1.6 / 3 m, two by five spots of 1 m and 0.32 m: between the outermost.
+        # Four by three sensor points of 0.5 m and 1.6 / 3 m, two by five spots of 1 m and 0.32 m.
         assert file["cameraGridPoints"][()].tolist() == [4, 3] and file["laserGridPoints"][()].tolist() == [2, 5]
         np.testing.assert_allclose(file["cameraGridSize"][()], [1.5, 3.2 / 3])
         np.testing.assert_allclose(file["laserGridSize"][()], [1.0, 1.28])
