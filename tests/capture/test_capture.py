@@ -221,3 +221,49 @@ def test_captures_are_records():
         assert leaf is anything
     grown = made.map(lambda t: t.requires_grad_())
     assert grown.transient.requires_grad and not grown.detach().transient.requires_grad
+
+
+def test_edges_of_a_crop_are_meant_to_a_millionth_of_a_bin():
+    scan = SCANS["single"]
+    capture = Capture(torch.arange(8.0)[None, :, None, None].expand(1, 8, 3, 4), TimeAxis(1.0, 0.5, 8), scan)
+
+    def bins(start, end):
+        part = capture.crop(start, end)
+        assert part.axis.num_bins == part.transient.shape[1]
+        return part.transient[0, :, 0, 0].tolist(), part.axis.start_opl
+
+    near, far = 0.9e-6 * 0.5, 1.1e-6 * 0.5
+    assert bins(2.0, 3.0) == ([2.0, 3.0], 2.0)
+    # An edge is that of a bin, and keeps its digits; beyond, the bin is there in part.
+    assert bins(2.0 - near, 3.0 + near) == ([2.0, 3.0], 2.0 - near)
+    assert bins(2.0 + near, 3.0 - near) == ([2.0, 3.0], 2.0 + near)
+    assert bins(2.0 - far, 3.0 + far) == ([1.0, 2.0, 3.0, 4.0], 1.5)
+    assert bins(2.0 + far, 3.0 - far) == ([2.0, 3.0], 2.0)
+    assert bins(2.25, 2.26) == ([2.0], 2.0) and bins(-9.0, 1.25) == ([0.0], 1.0) and bins(4.75, 9.0) == ([7.0], 4.5)
+    for start, end in ((5.0, 6.0), (0.0, 1.0), (0.0, 1.0 + near), (5.0 - near, 6.0)):
+        with pytest.raises(UnitError, match=r"lengths between 1 and 5 m, got .* which hold no bin"):
+            capture.crop(start, end)
+
+
+def test_leading_dimensions_are_channels_polarization_and_a_batch():
+    scan = SCANS["single"]
+    cube = torch.rand(5, 2, 8, 3, 4)
+    assert Capture(cube, AXIS, scan).total().shape == (5, 2, 3, 4)
+    for shape in ((8, 3, 4), (2, 9, 3, 4), (2, 8, 4, 3), (2, 0, 8, 3, 4), (2, 8, 3, 4, 1)):
+        with pytest.raises(ShapeError, match=r"expected transient \(C, 8, 3, 4\)"):
+            Capture(torch.zeros(shape), AXIS, scan)
+    polarized = Capture(torch.rand(5, 4, 2, 8, 3, 4), AXIS, scan, polarized=True, steady=torch.rand(5, 4, 2, 3, 4))
+    # Of the first Stokes component alone, all channels together.
+    light = polarized.transient[:, 0].sum(1)
+    assert torch.equal(polarized.peak_time(), AXIS.centers_opl[light.argmax(1)])
+    for steady in (torch.zeros(5, 3, 2, 3, 4), torch.zeros(2, 3, 4), torch.zeros(5, 4, 2, 4, 3)):
+        with pytest.raises(ShapeError, match=r"expected steady \(4, C, 3, 4\)"):
+            replace(polarized, steady=steady)
+
+
+def test_one_spot_of_a_batch_of_grids():
+    made = capture("exhaustive")
+    batch = Capture.stack([made, made.map(lambda t: t + 1)])
+    assert torch.equal(batch.single((1, 2)).transient, batch.transient[:, :, :, 1, 2])
+    expected = torch.stack([batch.transient[..., r, c, r, c] for r in range(3) for c in range(4)], -1)
+    assert torch.equal(batch.confocal().transient.flatten(-2), expected)

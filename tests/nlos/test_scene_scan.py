@@ -56,6 +56,16 @@ def test_rays_past_the_wall_end_where_it_would_go_on():
     assert found.points[3][2] != 0.0 and found.shapes == ends.shapes
 
 
+def test_rays_past_a_wall_that_is_higher_than_wide():
+    tall = np.array([[x, y, 0.0] for y in range(6) for x in range(2)], dtype=float)
+    ends = looking(tall, met=[k != 11 for k in range(12)])
+    ends.points[9] = [1.0, 4.0, 0.5]
+    with pytest.warns(TorchTransientWarning, match="1 of the sensor's 12 rays"):
+        found, _ = scene_scan._on_extended_wall(ends, (6, 2))
+    # Number 9 is the pixel before it in its column, number 10 the one beside it, which comes later.
+    assert found.points[11][2] == pytest.approx(0.5)
+
+
 @pytest.mark.parametrize("target, words", [
     # Upwards, along the plane, and towards the back of what the neighbour is on.
     ((3.0, 0.0, 5.0), "1 of them not even"), ((3.0, 0.25, 2.0), "1 of them not even"),

@@ -264,6 +264,32 @@ def test_rectified_grids_are_regular_to_a_thousandth(tmp_path, kind, how, words)
         capture.write(tmp_path / "a.mat", "rect_data")
 
 
+def test_rectified_points_are_off_by_a_length_in_space(tmp_path):
+    some, far = (SQUARES["confocal"].sensor_points.clone() for _ in range(2))
+    some[1, 1:3, 0] += 0.8e-3 * 0.5
+    far[1, 1, :2] += 0.8e-3 * 0.5
+    for points, taken in ((some, True), (far, False)):
+        capture = made(replace(SQUARES["confocal"], sensor_points=points, laser_points=points), axis=FROM_ZERO)
+        if taken:
+            capture.write(tmp_path / "a.mat", "rect_data")
+            continue
+        with pytest.raises(StorageError, match="regular grids at right angles"):
+            capture.write(tmp_path / "a.mat", "rect_data")
+
+
+def test_sizes_of_grids_stand_beside_their_points(tmp_path):
+    with h5py.File(FILES["zaragoza pairs"][1].write(tmp_path / "a.h5", "zaragoza")) as file:
+        # Four by three sensor points of 0.5 m and 1.6 / 3 m, two by five spots of 1 m and 0.32 m.
+        assert file["cameraGridPoints"][()].tolist() == [4, 3] and file["laserGridPoints"][()].tolist() == [2, 5]
+        np.testing.assert_allclose(file["cameraGridSize"][()], [1.5, 3.2 / 3])
+        np.testing.assert_allclose(file["laserGridSize"][()], [1.0, 1.28])
+        assert file["data"].shape == (1, 7, 6, 4, 3, 2, 5) and file["isConfocal"][()] == 0
+        # All light stands in the second of the bounces.
+        assert not file["data"][:, :, [0, 2, 3, 4, 5]].any() and file["data"][:, :, 1].all()
+        assert file["t"][()] == 7 and file["t0"][()] == 1.1 and file["deltaT"][()] == 0.003
+        assert np.isnan(file["hiddenVolumeSize"][()]).all()
+
+
 def test_spots_are_sensor_points_to_a_thousandth(tmp_path):
     for off, taken in ((0.9e-3, True), (1.1e-3, False)):
         spot = SQUARES["single"].sensor_points[1, 2] + torch.tensor([0.0, off * 0.5, 0.0], dtype=torch.float64)
