@@ -12,8 +12,10 @@ import torch
 from torchtransient import FrequencyAxis, TimeAxis, losses
 from torchtransient.errors import ShapeError, TorchTransientWarning, UnitError
 from torchtransient.losses.comparison import holds
+from torchtransient.losses.dead_time_likelihoods import armed_periods
 from torchtransient.losses.likelihoods import LEAST_MEAN
 from torchtransient.losses.mesh_smoothness import _edges
+from torchtransient.losses.results import _same_axis
 from torchtransient.losses.surface_distance import _middles
 from torchtransient.losses.triangles import SHARPEST
 from torchtransient.reconstruction.hidden_volume import HiddenVolume
@@ -186,3 +188,34 @@ def test_what_cannot_be_looked_at_for_another_reason_is_an_error():
     condition.words = "not enough memory"
     with pytest.raises(RuntimeError, match="not enough memory"):
         holds(condition)
+
+
+def test_histograms_of_detectors_that_run_free():
+    """Of (2, 0, 1) in 10 periods, dead for 1.5 bins: what is left of the bin, the next, and a part of the one behind."""
+    counts = torch.tensor([2.0, 0.0, 1.0], dtype=torch.float64).reshape(3, 1, 1)
+    found = armed_periods(counts, 10, 1.5).flatten().tolist()
+    y = (torch.arange(10_000, dtype=torch.float64) + 0.5) / 10_000
+    wanted = [10.0] * 3
+    for k, n in ((0, 2.0), (2, 1.0)):
+        for ahead in range(4):
+            shut = (torch.clamp(y + 1.5 - ahead, 0, 1) - torch.clamp(y - ahead, 0, 1)).mean().item()
+            wanted[(k + ahead) % 3] -= n * shut
+    assert found == pytest.approx(wanted, abs=1e-3)
+    with pytest.raises(ShapeError, match=r"armed_periods: expected counts \(\.\.\., T, H, W\), got \(3, 1\)"):
+        armed_periods(counts[..., 0], 10, 1.5)
+    with pytest.raises(UnitError, match="armed_periods: expected counts, got complex numbers"):
+        armed_periods(counts + 0j, 10, 1.5)
+
+
+def test_frequencies_that_are_none():
+    with pytest.raises(UnitError, match="TransientPhasorLoss: expected frequencies, a FrequencyAxis, got 2"):
+        losses.TransientPhasorLoss(frequencies=20e6)
+
+
+def test_axes_of_two_kinds_are_two():
+    """And so are those of other numbers of frequencies."""
+    time, two, three = TimeAxis(0.0, 0.1, 2), FrequencyAxis((1.0, 2.0), 0.0), FrequencyAxis((1.0, 2.0, 3.0), 0.0)
+    for a, b in ((time, two), (two, time), (two, three), (three, two)):
+        assert not _same_axis(a, b)
+    for one in (time, two, three):
+        assert _same_axis(one, dataclasses.replace(one))

@@ -100,7 +100,7 @@ def check_level(
     if isinstance(value, Tensor):
         _check_fit(name, value, like, where)
         # of whole numbers and narrower ones in the precision they are used in
-        level = value.detach() if value.dtype == torch.float64 else value.detach().to(dtype)
+        level = value if value.dtype == torch.float64 else value.to(dtype)
         fits = holds((level >= least) & (level <= most) | (level == 0 if zero else torch.zeros_like(level).bool()))
     else:
         number = check_number(name, value, where)

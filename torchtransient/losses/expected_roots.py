@@ -76,7 +76,7 @@ def _correction(mean: Tensor) -> Tensor:
     for coefficient in reversed(_TAIL[:-1]):
         series = torch.addcmul(s.new_full((), coefficient), series, near)
     place = ((torch.where(s < _LAST, s, torch.full_like(s, _FIRST)) - _FIRST) / _SPACING).clamp_min(0)
-    number = place.detach().floor().clamp_max(_PIECES.shape[1] - 1).nan_to_num(0).long()
+    number = place.floor().clamp_max(_PIECES.shape[1] - 1).nan_to_num(0).long()
     # one row a power: gathered from a line of its own, which is twice as fast as along the columns of a table
     rows = [row.index_select(0, number.flatten()).reshape(s.shape) for row in _PIECES.to(s)]
     part, value = place - number, rows[-1]

@@ -101,7 +101,6 @@ def check_prediction(input: object, target: object, where: str) -> tuple[Tensor,
 
 def _are_counts(x: Tensor) -> bool:
     """Whole numbers, not all alike, of a record, as far as it can be looked at."""
-    x = x.detach()
     if x.numel() < _A_RECORD or not x.is_floating_point():
         return x.numel() >= _A_RECORD
     # of predictions as a rule a few entries say enough
@@ -111,7 +110,7 @@ def _are_counts(x: Tensor) -> bool:
 
 def check_rates(model: Tensor, where: str) -> None:
     """Rates cannot be negative. NaN passes and is what comes out."""
-    if bool((model.detach() < 0).any()):
+    if bool((model < 0).any()):
         raise UnitError(f"{where}: expected rates >= 0, got negative ones. Clamp or use softplus upstream.")
 
 

@@ -60,7 +60,7 @@ def _one_way(triangles: Tensor, others: Tensor, cells: int) -> Tensor:
     longest = edges.detach().abs().amax()
     edges = edges / torch.where(longest > 0, longest, torch.ones_like(longest))
     area = _length(torch.linalg.cross(edges[:, 0], edges[:, 1]))
-    if not holds((area.detach().sum() > 0) | area.detach().isnan().any()):
+    if not holds((area.sum() > 0) | area.isnan().any()):
         raise ShapeError("surface_distance: expected meshes with an area, got one of whose triangles none has any.")
     mean: Tensor = (distance.mean(1) * area).sum() / area.sum()
     return mean
