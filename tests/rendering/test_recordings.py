@@ -163,6 +163,16 @@ def test_a_recording_that_was_refused_stays_refused():
     assert one.calls == 3
 
 
+def test_drjit_itself_warns_of_nothing(monkeypatch):
+    """Not before the largest number of calls: what is in vain is said by the scene."""
+    import drjit as dr
+
+    made = []
+    monkeypatch.setattr(dr, "freeze", lambda call, **settings: made.append(settings))
+    Recording()._made()
+    assert made == [{"limit": 8, "warn_after": 2**31 - 1}]
+
+
 def test_errors_of_a_call_are_its_own():
     """And no reason against recordings: the next call is recorded anew."""
     one = Recording()
