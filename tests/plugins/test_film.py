@@ -279,6 +279,19 @@ def test_events_from_an_origin_as_films_can_take_them():
     assert block_of(None).counted(7) == 7
 
 
+@pytest.mark.parametrize("stddev", [0.0, -0.5, np.nan, np.inf, -np.inf])
+def test_widths_of_no_gaussian(stddev):
+    with pytest.raises(SceneError, match="positive number of bins"):
+        make_temporal_filter("gaussian", stddev)
+
+
+def test_how_far_filters_reach():
+    """In bins before and behind an arrival."""
+    reaches = {name: make_temporal_filter(name, 0.75).reach for name in ("box", "tent", "gaussian")}
+    assert reaches == {"box": (0, 0), "tent": (-0.5, 0.5), "gaussian": (-3, 3)}
+    assert make_temporal_filter("gaussian", 0.75).radius == 3 and make_temporal_filter("gaussian", 0.8).radius == 4
+
+
 def test_factory_names():
     with pytest.raises(SceneError, match="lanczos"):
         make_temporal_filter("lanczos")
