@@ -157,6 +157,10 @@ def test_forecasts_take_the_arguments_of_simulate():
     scan = N.Scan.grid(WALL, 2, kind="confocal")
     with pytest.raises(ArgumentError, match="forecast: expected the arguments of simulate, got more, other"):
         N.forecast(Z, scan, other=1, seed=0, more=2)
+    # Those that change nothing about what it takes are taken too.
+    others = {"seed": 1, "sensor": None, "keep_part": True, "progress": False, "generator": None}
+    found = N.forecast(Z, scan, time_axis=tt.TimeAxis(1.9, 0.05, 20), spp=16, variant="llvm_ad_mono", **others)
+    assert found.shape == (1, 20, 2, 2) and found.spp == 16 and found.parts == 1 and found.bytes == 320
 
 
 # ---------------------------------------------------------------------------------------------------------------- files
