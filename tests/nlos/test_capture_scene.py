@@ -157,6 +157,10 @@ def test_forecasts_take_the_arguments_of_simulate():
     scan = N.Scan.grid(WALL, 2, kind="confocal")
     with pytest.raises(ArgumentError, match="forecast: expected the arguments of simulate, got more, other"):
         N.forecast(Z, scan, other=1, seed=0, more=2)
+    # Those that change nothing about what it takes are taken too.
+    others = {"seed": 1, "sensor": None, "keep_part": True, "progress": False, "generator": None}
+    found = N.forecast(Z, scan, time_axis=tt.TimeAxis(1.9, 0.05, 20), spp=16, variant="llvm_ad_mono", **others)
+    assert found.shape == (1, 20, 2, 2) and found.spp == 16 and found.parts == 1 and found.bytes == 320
 
 
 # ---------------------------------------------------------------------------------------------------------------- files
@@ -280,3 +284,21 @@ def test_what_tals_laser_emits(entries, emission):
             read_tal_yaml(TAL + entries + "\n")
         return
     assert read_tal_yaml(TAL + entries + "\n").laser_emission == emission
+
+
+def test_normals_of_points_that_move_are_those_of_a_flat_wall():
+    from torchtransient.nlos.renderer import _lasting, _lasting_normals
+
+    flat = N.Scan.grid(WALL, (4, 3), kind="single")
+    kept = _lasting(flat)
+    assert kept["sensor_normals"] is flat.sensor_normals and kept["laser_normals"] is flat.laser_normals
+    roof = np.array([[-1, -1, 0], [0, -1, 0.2], [1, -1, 0], [-1, 1, 0], [0, 1, 0.2], [1, 1, 0]], float)
+    bent = N.Scan.grid((roof, [[0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4]]), (4, 3), kind="confocal")
+    assert _lasting(bent) == {"sensor_normals": None, "laser_normals": None}
+    bare = N.Scan.points(flat.sensor_points, kind="confocal", sensor_origin=(0, 0, 1), laser_origin=(0, 0, 1))
+    assert _lasting(bare) == {"sensor_normals": None, "laser_normals": None} and _lasting_normals(bare, ()) is None
+    # Known while nothing of the wall or its points moves; origins and hidden things may.
+    found = _lasting_normals(flat, ["letter.vertex_positions", "wall.sensor.sensor_origin"])
+    assert found.shape == (12, 3) and (found == [0, 0, 1]).all()
+    for key in ("wall.to_world", "wall.sensor.points", "wall.vertex_positions"):
+        assert _lasting_normals(flat, ["letter.to_world", key]) is None

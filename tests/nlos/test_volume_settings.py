@@ -260,3 +260,19 @@ def test_planes_within_the_depths_are_kept():
     assert found.grid.depths.tolist() == [0.375, 0.625, 0.875] and found.values.shape == (1, 3, 6, 5)
     with pytest.raises(UnitError, match=r"within the record's, 0\.125 to 1\.875 m, got"):
         N.reconstruct(capture, "lct", depths=(0.4, 0.6), progress=False)
+
+
+@pytest.mark.parametrize("value", [3, None, {}, torch.zeros(2).numpy()])
+def test_options_that_are_names(value):
+    for name, option in (("fk", "target"), ("lct", "target"), ("fbp", "filter")):
+        if value is None:
+            # As if nobody had given it.
+            assert N.reconstruct(captured(), name, depths=(0.2, 0.4), progress=False, **{option: value}).method == name
+            continue
+        with pytest.raises(ArgumentError, match=f"reconstruct: expected {option} as a name, got"):
+            N.reconstruct(captured(), name, progress=False, **{option: value})
+    for options in ({"wavelength": 0.5}, {"cycles": 3.0}):
+        with pytest.raises(ArgumentError, match="have no meaning for filter='laplacian'"):
+            N.reconstruct(captured(), "fbp", filter="laplacian", progress=False, **options)
+    with pytest.raises(ArgumentError, match=r"expected grid as a tt\.nlos\.VoxelGrid, got 3"):
+        N.reconstruct(captured(), "bp", grid=3, progress=False)

@@ -84,7 +84,6 @@ def _seconds(work: Work) -> float:
     of_part = max(1, work.film.spp // work.count) if work.sums else work.film.spp
     few, some = max(LEAST, of_part // FEW), max(LEAST, of_part // SOME)
     few, some = (few, some) if some > few else (of_part, of_part)
-    first, last = work.run(0)
     times = {}
     told = work.renderer(0).scene.told
     before = set(told)
@@ -100,13 +99,17 @@ def _seconds(work: Work) -> float:
     of_one = times[some] + slope * (of_part - some)
     if work.sums:
         return work.count * of_one
-    return of_one * math.prod(work.scan.sensor_shape) / (last - first)
+    return of_one / _share(work)
+
+
+def _share(work: Work) -> float:
+    """The sensor points of the first part, of all."""
+    return work.run(0)[1] / math.prod(work.scan.sensor_shape)
 
 
 def _check_fits(taken: int, shape: tuple[int, ...], work: Work) -> None:
     # The whole on the host, and what is being rendered: a part of it, or as much again.
-    first, last = work.run(0)
-    share = (last - first) / math.prod(work.scan.sensor_shape) if work.count > 1 else 0.0
+    share = _share(work) if work.count > 1 else 0.0
     available = available_bytes("llvm")
     if available is not None and taken * (1 + share) > available:
         numbers = " x ".join(map(str, shape))

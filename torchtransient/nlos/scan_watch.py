@@ -38,11 +38,11 @@ class ScanWatch:
 
         sensor, capture = scene.sensors()[number], scene.integrator().capture
         with dr.suspend_grad():
-            points, origin = dr.detach(scanned_points(scene, sensor)), dr.detach(mi.Point3f(sensor.origin))
-            laser = dr.detach(origin_of(scene, sensor))
+            points, origin = scanned_points(scene, sensor), mi.Point3f(sensor.origin)
+            laser = origin_of(scene, sensor)
             rays = {"sensor": _rays(origin, points - origin)}
             if capture is not CaptureType.CONFOCAL or not np.array_equal(laser, origin):
-                rays["laser"] = _rays(laser, dr.detach(aims_of(scene, sensor, capture, None)))
+                rays["laser"] = _rays(laser, aims_of(scene, sensor, capture, None))
             tolerance = dr.opaque(mi.Float, self.tolerance)
             off = {who: _end_elsewhere(scene, *ray, tolerance) for who, ray in rays.items()}
             normals = None if self.normals is not None else _normals(scene, rays["sensor"][0])

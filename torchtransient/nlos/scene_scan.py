@@ -144,7 +144,6 @@ def _ends(scene: Any, ray: Any) -> Ends:
     import mitsuba as mi
 
     with dr.suspend_grad():
-        ray = dr.detach(ray)
         si = scene.ray_intersect(ray)
         # A surface without a back side scatters nothing to those behind it.
         behind = si.is_valid() & (si.wi.z < 0) & ~mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.BackSide)
@@ -181,10 +180,9 @@ def _array(points: Any) -> NDArray[np.float64]:
 
 
 def _origin(sensor: Any) -> NDArray[np.float64]:
-    import drjit as dr
     import mitsuba as mi
 
-    return _array(dr.detach(mi.Point3f(sensor.world_transform().translation()))).reshape(3)
+    return _array(mi.Point3f(sensor.world_transform().translation())).reshape(3)
 
 
 # -------------------------------------------------------------------------------------------------------------- checks

@@ -97,7 +97,7 @@ def offset_powers(count: int, pitch: float, moment: int) -> Tensor:
     one stands for both signs: its odd powers are zero.
     """
     q = torch.fft.fftfreq(2 * count, 1 / (2 * count), dtype=torch.float64, device="cpu") * pitch
-    powers = q**moment
+    powers: Tensor = q**moment
     if moment % 2:
         powers[count] = 0
     return powers

@@ -204,6 +204,16 @@ def test_frequencies_of_a_render_of_tal(change, known):
     assert tal_scene_info.frequencies(info, own, 2, 0.7) == FrequencyAxis((1.0, 2.0), 0.25)
 
 
+def test_spectra_of_many_more_lines_than_rows_are_not_made(monkeypatch):
+    asked = []
+    monkeypatch.setattr(tal_scene_info, "transform_bins", lambda *given: asked.append(given) or np.zeros(99))
+    # Bins times width over sigma, against a thousand lines for each row and ten more.
+    for bins, count in ((20479, 10), (20480, 10), (20480, 11), (10240, 0), (10239, 0)):
+        config = {**CONFIG, "wl_mean": 3, "wl_sigma": 0.5, "bin_width_opl": 0.48828125, "num_bins": bins}
+        assert tal_scene_info.frequencies({"config": config}, None, count, 0.0) is None
+    assert asked == [(3.0, 0.5, bins, 0.48828125) for bins in (20479, 20480, 10239)]
+
+
 def test_own_parts_of_scene_info():
     own = {"wall": None, "steady": None, "channels": ["a"]}
     assert tal_scene_info.own_part({"torchtransient": json.dumps(own)}) == own
