@@ -191,7 +191,7 @@ def test_what_cannot_be_looked_at_for_another_reason_is_an_error():
 
 
 def test_histograms_of_detectors_that_run_free():
-    """Of (2, 0, 1) in 10 periods, dead for 1.5 bins: what is left of the bin, the next, and a part of the one behind."""
+    """Of (2, 0, 1) in 10 periods, dead for 1.5 bins: the rest of the bin, the next, and a part of the one behind."""
     counts = torch.tensor([2.0, 0.0, 1.0], dtype=torch.float64).reshape(3, 1, 1)
     found = armed_periods(counts, 10, 1.5).flatten().tolist()
     y = (torch.arange(10_000, dtype=torch.float64) + 0.5) / 10_000
