@@ -15,8 +15,9 @@ from torchtransient.sensing.dead_time import stationary_phases as phases
 from torchtransient.sensing.dead_time.banded_solve import solve_banded
 from torchtransient.sensing.dead_time.dead_time_cycle import Cycle, cycle_of_rows
 from torchtransient.sensing.dead_time.dead_time_draws import _bins, _steps, _wider_pieces, _width
+from torchtransient.sensing.dead_time.dead_time_walk import degree_of, response_series
 from torchtransient.sensing.dead_time.free_running_state import late_lines
-from torchtransient.sensing.dead_time.renewal_chain import RenewalChain
+from torchtransient.sensing.dead_time.renewal_chain import RenewalChain, bin_response
 
 ROOT = math.sqrt(3.0)
 
@@ -251,3 +252,22 @@ def test_steps_of_a_cycle_hold_what_the_cycle_does(dead, pieces):
             if again // wider < back.shape[1]:
                 back[:, again // wider] += number
     torch.testing.assert_close(steps.back.squeeze(-1).T, back, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("part", [0.0, 0.35, 0.9])
+def test_power_series_of_a_bin(part):
+    """Their first terms are those of longer ones, and their sums are what a bin does; the derivative follows."""
+    short, long = response_series(part, 5), response_series(part, 16)
+    torch.testing.assert_close(short[0], long[0][..., :6], rtol=1e-13, atol=1e-16)
+    torch.testing.assert_close(short[1][..., :5], long[1][..., :5], rtol=1e-13, atol=1e-16)
+    assert not bool(short[1][..., 5].any())
+    rate = torch.tensor([[0.05, 0.4, 1.1]], dtype=torch.float64)
+    exact = bin_response(rate, torch.tensor(part, dtype=torch.float64))
+    powers = rate[0] ** torch.arange(17, dtype=torch.float64).unsqueeze(1)
+    kept, hit, slope = (long[0] @ powers).unbind(0)
+    order = [2, 3, 0, 1]  # younger lines first
+    for found, wanted, armed in ((kept, exact.kept, exact.decay), (hit, exact.hit, exact.fire),
+                                 (slope, exact.hit_slope, exact.slope)):  # fmt: skip
+        torch.testing.assert_close(found[order], wanted[0], rtol=1e-10, atol=1e-12)
+        torch.testing.assert_close(found[4], armed[0], rtol=1e-10, atol=1e-12)
+    assert degree_of(0.25) == next(d for d in range(3, 40) if 0.25**d / math.factorial(d) <= 1e-15)
