@@ -271,3 +271,14 @@ def test_noise_of_moves_has_the_covariance_of_multinomials(lost):
             for j, b in enumerate(at):
                 wanted[a, b] += cover[i, j]
     torch.testing.assert_close(found, wanted, rtol=0.04, atol=0.6)
+
+
+def test_two_even_delays_one_after_the_other():
+    """Of 2 and of 1 ns: a trapezium from 0.5 to 3.5 ns, by its table."""
+    parts = [sensing.UniformResponse(2 * NS, 1.5 * NS), sensing.UniformResponse(1 * NS, 0.5 * NS)]
+    both = sensing.ComposedResponse(parts)
+    t = number(0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5)
+    wanted = [0, 1 / 16, 0.25, 0.5, 0.75, 15 / 16, 1]
+    assert flat(both.cdf(t * NS)) == pytest.approx(wanted, abs=1e-3)
+    assert flat(both.survival(t * NS)) == pytest.approx([1 - w for w in wanted], abs=1e-3)
+    assert both.support_s() == pytest.approx((0.5 * NS, 3.5 * NS))
