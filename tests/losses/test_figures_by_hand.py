@@ -191,7 +191,7 @@ def test_what_cannot_be_looked_at_for_another_reason_is_an_error():
 
 
 def test_histograms_of_detectors_that_run_free():
-    """Of (2, 0, 1) in 10 periods, dead for 1.5 bins: what is left of the bin, the next, and a part of the one behind."""
+    """Of (2, 0, 1) in 10 periods, dead for 1.5 bins: the rest of the bin, the next, and a part of the one behind."""
     counts = torch.tensor([2.0, 0.0, 1.0], dtype=torch.float64).reshape(3, 1, 1)
     found = armed_periods(counts, 10, 1.5).flatten().tolist()
     y = (torch.arange(10_000, dtype=torch.float64) + 0.5) / 10_000
@@ -219,3 +219,12 @@ def test_axes_of_two_kinds_are_two():
         assert not _same_axis(a, b)
     for one in (time, two, three):
         assert _same_axis(one, dataclasses.replace(one))
+
+
+def test_how_many_counts_fit_into_periods():
+    """100 detections that are dead for a whole period each: 61 more than there are is noise, 63 more are not."""
+    counts = torch.tensor([100.0, 0.0, 0.0], dtype=torch.float64).reshape(1, 3, 1, 1)
+    rate = torch.full_like(counts, 0.3)
+    assert losses.free_running_nll(rate, counts, periods=39, dead_bins=3.0, dim=-3).isfinite()
+    with pytest.raises(UnitError, match="fit into"):
+        losses.free_running_nll(rate, counts, periods=37, dead_bins=3.0, dim=-3)

@@ -29,6 +29,7 @@ def test_front_views_and_depths():
     volume[4, 2, 3], volume[7, 2, 3], volume[6, 1, 1], volume[2, 5, 5] = 1.0, 2.0, -5.0, 0.1
     view = metrics.front_view(volume)
     assert view[2, 3] == 2 and view[1, 1] == 0 and view.sum() == pytest.approx(2.1)
+    assert not metrics.front_view(-1 - volume.abs()).any()
     depth = metrics.front_depth(found(volume), threshold=0.06)
     assert depth.isfinite().sum() == 1
     assert float(depth[0, 2, 3]) == pytest.approx(float(GRID.depths[7]), abs=0.01)

@@ -8,9 +8,9 @@ import torch
 from torchtransient import TimeAxis, sensing
 from torchtransient.sensing.spad.spad import exposed_cycles
 
-BINS, WIDTH = 8, 100e-12
+BINS, WIDTH = 5, 100e-12
 AXIS = TimeAxis.from_seconds(0.0, WIDTH, BINS)
-GATE = torch.tensor([0.0, 0.3, 1.0, 1.0, 0.6, 1.0, 0.2, 0.0])
+GATE = torch.tensor([0.0, 0.3, 1.0, 0.6, 0.0])
 
 
 def light(high=0.4, pixels=2):
@@ -46,9 +46,9 @@ def test_a_gate_dims_photons_and_carriers_alike():
 
 @pytest.mark.parametrize("kind", ["cycles", "gated", "free"])
 def test_bins_in_parts_are_finer_bins(kind):
-    """Carriers of a quarter of a bin are followed in parts of bins: as where the bins are cut by hand."""
+    """Carriers of a part of a bin are followed in parts of bins: as where the bins are cut by hand."""
     gated, free = kind == "gated", kind == "free"
-    x, parts = light(), 4
+    x, parts, tau = (light(0.4, 1), 2, 60e-12) if free else (light(0.4, 1), 4, 30e-12)
     fine_axis = TimeAxis.from_seconds(0.0, WIDTH / parts, BINS * parts)
     gate = GATE if gated else None
     fine_gate = GATE.repeat_interleave(parts) if gated else None
@@ -56,13 +56,13 @@ def test_bins_in_parts_are_finer_bins(kind):
         detectors = [sensing.FreeRunningSPAD(100, 150e-12, axis=a) for a in (AXIS, fine_axis)]
     else:
         detectors = [spad(AXIS, gate), spad(fine_axis, fine_gate)]
-    coarse, fine = (obeyed(d, tau_s=30e-12, axis=a) for d, a in zip(detectors, (AXIS, fine_axis), strict=True))
+    coarse, fine = (obeyed(d, tau_s=tau, axis=a) for d, a in zip(detectors, (AXIS, fine_axis), strict=True))
     assert coarse._steps() > 1
-    by_hand = fine((x / parts).repeat_interleave(parts, 1)).view(1, BINS, parts, 1, 2).sum(2)
+    by_hand = fine((x / parts).repeat_interleave(parts, 1)).view(1, BINS, parts, 1, 1).sum(2)
     # detections are taken to be even in their bins, which are narrower by hand
     torch.testing.assert_close(coarse(x), by_hand, rtol=6e-3, atol=1e-4)
     torch.testing.assert_close(coarse.probabilities(x) * 100, coarse(x), rtol=1e-10, atol=0)
-    drawn = coarse.sample(x.expand(1, BINS, 20, 2), torch.Generator().manual_seed(0)).mean(2, keepdim=True)
+    drawn = coarse.sample(x.expand(1, BINS, 20, 1), torch.Generator().manual_seed(0)).mean(2, keepdim=True)
     assert bool(((drawn - coarse(x)).abs() < 5 * (coarse(x) / 20).sqrt() + 0.5).all())
 
 
@@ -87,10 +87,10 @@ def test_transforms_of_detectors_with_dead_time():
         return (detector.expected(v) * weights).sum()
 
     for bright in (0.2, 9.0):
-        x = torch.cat([light(0.1, 1), light(bright, 1), light(0.3, 1)], -1).movedim(-1, 0).unsqueeze(-1)
+        x = torch.cat([light(0.1, 1), light(bright, 1)], -1).movedim(-1, 0).unsqueeze(-1)
         mapped = torch.func.vmap(torch.func.grad(value))(x)
         along = torch.func.vmap(lambda v: torch.func.jvp(value, (v,), (torch.ones_like(v),))[1])(x)
-        for i in range(3):
+        for i in range(2):
             leaf = x[i].clone().requires_grad_()
             (exact,) = torch.autograd.grad(value(leaf), leaf)
             torch.testing.assert_close(mapped[i], exact, rtol=1e-9, atol=1e-11)

@@ -14,6 +14,7 @@ from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.correlated_noise.afterpulse_delays import exponential_kernel, exponential_shares
 from torchtransient.sensing.counts.moved_counts import Moves, move_counts, shifted
 from torchtransient.sensing.response import response_shapes as shapes
+from torchtransient.sensing.response.composed_responses import _full_convolution, _gathered
 from torchtransient.sensing.response.responses import _between
 
 NS = 1e-9
@@ -96,6 +97,12 @@ def test_even_responses_by_hand():
     assert first == 0 and flat(kernel) == pytest.approx([0.25, 0.5, 0.25], abs=1e-12)
     first, kernel = even.kernel(NS, within_bin="center")
     assert first == 0 and flat(kernel) == pytest.approx([0.25, 0.5, 0.25])
+
+
+def test_convolutions_are_whole():
+    a, b = number(1, 4, 2), number(3, 0, 5, 1)
+    assert flat(_full_convolution(a, b)) == pytest.approx(np.convolve(a.numpy(), b.numpy()).tolist())
+    assert flat(_gathered(number(1, 2, 3, 4, 5), 2, 3, 4)) == [1.0, 9.0, 5.0, 0.0]
 
 
 def test_shares_of_responses_on_both_sides_of_their_median():
@@ -264,3 +271,14 @@ def test_noise_of_moves_has_the_covariance_of_multinomials(lost):
             for j, b in enumerate(at):
                 wanted[a, b] += cover[i, j]
     torch.testing.assert_close(found, wanted, rtol=0.04, atol=0.6)
+
+
+def test_two_even_delays_one_after_the_other():
+    """Of 2 and of 1 ns: a trapezium from 0.5 to 3.5 ns, by its table."""
+    parts = [sensing.UniformResponse(2 * NS, 1.5 * NS), sensing.UniformResponse(1 * NS, 0.5 * NS)]
+    both = sensing.ComposedResponse(parts)
+    t = number(0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5)
+    wanted = [0, 1 / 16, 0.25, 0.5, 0.75, 15 / 16, 1]
+    assert flat(both.cdf(t * NS)) == pytest.approx(wanted, abs=1e-3)
+    assert flat(both.survival(t * NS)) == pytest.approx([1 - w for w in wanted], abs=1e-3)
+    assert both.support_s() == pytest.approx((0.5 * NS, 3.5 * NS))

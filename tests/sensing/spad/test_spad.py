@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import mpmath
 import numpy as np
 import pytest
@@ -300,3 +302,12 @@ def test_likelihood_of_certain_detections_keeps_its_digits(make):
     assert x.grad.flatten().tolist() == pytest.approx([cycles * v for v in slopes], rel=1e-14, abs=0)
     none = make(cycles).log_prob(torch.zeros_like(x), torch.zeros_like(x))
     assert none.tolist() == torch.zeros_like(none).tolist()
+
+
+def test_counts_behind_a_shut_gate_say_nothing():
+    """The rate there is 0 and not valid, whatever was counted; half open, it is twice that of the counts."""
+    spad = SynchronousSPAD(10, gate=torch.tensor([1.0, 0.0, 0.5]))
+    found = spad.inverse(torch.tensor([2.0, 3.0, 1.0], dtype=torch.float64).reshape(1, 3, 1, 1))
+    wanted = [-math.log(1 - 2 / 10), 0.0, -2 * math.log(1 - 1 / 5)]
+    assert found.rate.flatten().tolist() == pytest.approx(wanted)
+    assert found.valid.flatten().tolist() == [True, False, True]

@@ -194,7 +194,7 @@ class AfterpulsingSPAD(WrappedDetector):
         """Parts of a bin in which the rate of carriers is taken as constant."""
         if not self._follows_carriers:
             return 1
-        seen, tau = self.afterpulsing.seen().detach(), self.afterpulsing.tau_s.detach().reshape(-1)
+        seen, tau = self.afterpulsing.seen(), self.afterpulsing.tau_s.detach().reshape(-1)
         tau_bins = float(tau[seen > _FEW].min()) / self.afterpulsing.bin_width_s if bool((seen > _FEW).any()) else 1e9
         return 1 << min(_MOST_STEPS, max(0, math.ceil(math.log2(_STEP / tau_bins))))
 
