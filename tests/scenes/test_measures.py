@@ -318,6 +318,12 @@ def test_a_body_of_revolution():
     assert vertices[10:].tolist() == [[0, -1, 0], [0, 5, 0]] and faces.shape == (20, 3)
     base = 5 / 2 * 4 * np.sin(2 * np.pi / 5)
     assert volume(vertices.astype(float), faces) == pytest.approx(base * (1 / 3 + 3 + 2 / 3), rel=1e-6)
+    # Of more rings, each with its neighbours: of the straight side it changes nothing.
+    more = lathe([[0, -1], [2, 0], [2, 1], [2, 2.5], [2, 3], [0, 5]], 5)
+    assert more[1].shape == (40, 3) and volume(more[0].astype(float), more[1]) == pytest.approx(4 * base, rel=1e-6)
+    for wrong in ([[0, -1], [2, 0], [0, 3], [0, 5]], [[0, -1], [-2, 0], [2, 3], [0, 5]]):
+        with pytest.raises(SceneError, match="positive radii between the two ends"):
+            lathe(wrong, 5)
 
 
 def test_meshes_as_files(tmp_path):
