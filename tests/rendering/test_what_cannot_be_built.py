@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
 
 import torchtransient as tt
 from torchtransient.errors import ArgumentError, SceneError
+from torchtransient.rendering.films.choices import of_entries
+from torchtransient.rendering.saving import values
 from torchtransient.testing.small_room import VARIANT, make_room
 
 GATES = [tt.Gate.gaussian(8.0, 0.5)]
@@ -62,3 +67,27 @@ def test_files_of_something_else(tmp_path):
     file.write_text('<shape version="3.0.0" type="cube"/>', encoding="utf-8")
     with pytest.raises(SceneError, match=r"cube\.xml: expected a <scene> at the top, got <cube>"):
         tt.load(file, variant=VARIANT).parameters()
+
+
+def test_scenes_without_a_sensor(room):
+    del room["sensor"]
+    with pytest.raises(SceneError, match="has no sensor; add one"):
+        rendered(room)
+
+
+def test_files_without_a_film():
+    with pytest.raises(KeyError, match="transient or phasor or gated"):
+        of_entries({"steady": 1})
+
+
+def test_values_without_a_place_in_a_file(room):
+    """Of plugins that Mitsuba has made where nothing is described, and of those inside of these."""
+    state = SimpleNamespace(nodes=[SimpleNamespace(props={})])
+    made = SimpleNamespace(node=0, names=("first", "second"), made=None)
+    with pytest.raises(SceneError, match=r"'k' has no place in the description, and cannot be said in XML"):
+        values._put_into_made(state, made, None, np.zeros(3), "k")
+    owner = SimpleNamespace(ptr=1)
+    built = SimpleNamespace(params=SimpleNamespace(properties={"a.b": (None, None, owner, None)}))
+    slot = SimpleNamespace(key="k", targets=["a.b"], kind="number")
+    with pytest.raises(SceneError, match=r"'k' has no place in the description"):
+        values.write_value(SimpleNamespace(state=state), built, {2: made}, slot, np.zeros(3))
