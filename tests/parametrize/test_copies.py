@@ -11,7 +11,7 @@ import torch
 from torch import nn
 from torch.nn.utils import parametrize as torch_parametrize
 
-from torchtransient.parametrize import Albedo, CopiesParametrized, register
+from torchtransient.parametrize import Albedo, AxisAnglePose, Bounded, CopiesParametrized, SE3Pose, register
 
 
 class Locked(CopiesParametrized):
@@ -51,3 +51,16 @@ def test_deep_copies_keep_what_is_shared():
     register(module, "share", Albedo())
     twins = copy.deepcopy(pair)
     assert twins[0] is twins[1] and twins[0] is not module
+
+
+def test_what_is_given_is_kept_without_its_derivative():
+    """A setting is a number: bounds and bases that have a gradient of their own get none from here."""
+    low, pose = torch.zeros(3, requires_grad=True), torch.eye(4, dtype=torch.float64, requires_grad=True)
+    for made in (Bounded(low, low + 1), AxisAnglePose(pose), SE3Pose(pose * 1.0)):
+        assert all(not buffer.requires_grad for buffer in made.buffers())
+        value = made(torch.zeros(6 if "Pose" in type(made).__name__ else 3, requires_grad=True))
+        value.sum().backward()
+    assert low.grad is None and pose.grad is None
+    with torch.no_grad():
+        low += 5
+    assert Bounded(low, low + 1).low.tolist() == [5, 5, 5]

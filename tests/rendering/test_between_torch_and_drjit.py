@@ -12,7 +12,7 @@ from torchtransient.errors import DeviceError, ShapeError, StorageError
 from torchtransient.rendering import arrays, batch, engine, memory, progress, session
 from torchtransient.rendering.batch import Batch
 from torchtransient.rendering.broken_numbers import all_finite, broken_entries, carried_on
-from torchtransient.rendering.output import RenderStats
+from torchtransient.rendering.output import RenderOutput, RenderStats
 from torchtransient.rendering.saving.save import _same
 
 VARIANT = "llvm_ad_mono"
@@ -252,6 +252,18 @@ def test_statistics_of_a_batch():
     both = RenderStats.of_batch([one, two])
     assert (both.seconds, both.samples_per_second, both.seeds) == (8, 32.5, (1, 2, 3))
     assert (both.energy_before, both.energy_after) == ((0.5, 1.0, 2.0), (3.0, 4.0, 5.0))
+
+
+def test_how_a_result_shows_its_statistics():
+    """With all light outside of the window, before and after it, in all items."""
+    made = {"spp": 4, "variant": VARIANT, "integrator": "path", "temporal_filter": "box", "samples_per_second": 1.0}
+    for before, after, seeds, said in (
+        ((0.5, 1.0), (3.0, 0.25), (7, 8), "2 seeds, energy outside of the window 4.75"),
+        ((0.0,), (0.0,), (7,), "seed 7"),
+    ):
+        stats = RenderStats(seconds=2.5, seeds=seeds, energy_before=before, energy_after=after, **made)
+        shown = RenderOutput._shown_notes(SimpleNamespace(stats=stats))
+        assert shown == {"stats": f"4 spp in 2.5 s, path, {VARIANT}, {said}"}
 
 
 @pytest.mark.parametrize("scale", [1.0, 1000.0])

@@ -90,6 +90,20 @@ def test_several_transforms_are_no_transform():
         plain(several)
 
 
+def test_matrices_that_are_no_transforms():
+    """And arrays of Mitsuba whose numbers cannot be read."""
+    odd = type("OddTransform", (), {"matrix": np.zeros((3, 4))})()
+    with pytest.raises(SceneError, match=r"expected one transform at x, got matrices of shape \(3, 4\)"):
+        plain(odd)
+
+    def unreadable(self, dtype=None, copy=None):
+        raise TypeError("no numbers")
+
+    strange = type("Strange", (), {"__module__": "mitsuba.strange", "__array__": unreadable})()
+    with pytest.raises(SceneError, match="the Strange at x cannot be described as an array"):
+        plain(strange)
+
+
 def nested(levels):
     tree = {"type": "scene"}
     for _ in range(levels - 1):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -144,6 +146,18 @@ def test_a_triangle_cut_in_four():
         meshes.subdivided(mesh, 9)
 
 
+# Of whole numbers, so that what lies on a line stays there.
+SHEARS = (np.eye(2), np.array([[2.0, 1], [1, 3]]), np.array([[1.0, -2], [3, 1]]))
+
+
+def test_corners_against_the_clock_wherever_they_lie():
+    square = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+    for middle in ([0, 0], [100, 50], [-100, 50], [100, -50], [-100, -50]):
+        assert len(meshes.sheet(square + np.array(middle))[1]) == 2
+        with pytest.raises(SceneError, match="against the clock"):
+            meshes.sheet(square[::-1] + np.array(middle))
+
+
 @pytest.mark.parametrize(
     "corners",
     [
@@ -154,8 +168,9 @@ def test_a_triangle_cut_in_four():
 )  # fmt: skip
 def test_polygons_that_touch_themselves(corners):
     for shift in range(len(corners)):
-        with pytest.raises(SceneError, match="cross or touch"):
-            meshes.sheet(np.roll(corners, shift, axis=0))
+        for shear in SHEARS:
+            with pytest.raises(SceneError, match="cross or touch"):
+                meshes.sheet(np.roll(corners, shift, axis=0) @ shear)
 
 
 @pytest.mark.parametrize(
@@ -167,8 +182,8 @@ def test_polygons_that_touch_themselves(corners):
     ],
 )  # fmt: skip
 def test_polygons_that_do_not(corners):
-    for shift in range(len(corners)):
-        points = np.roll(np.array(corners, float), shift, axis=0)
+    for shift, shear in itertools.product(range(len(corners)), SHEARS):
+        points = np.roll(np.array(corners, float), shift, axis=0) @ shear
         vertices, faces = meshes.sheet(points, 2.0)
         assert len(faces) == len(corners) - 2 and (vertices[:, 2] == 2).all()
         a, b, c = (vertices[faces[:, k], :2] for k in (2, 1, 0))
@@ -259,6 +274,16 @@ def test_furniture_stands_where_it_is_told(name):
     np.testing.assert_allclose(scenes.bounds({"a": room()[name]}), boxes(*BLOCKS[name]), atol=1e-12)
 
 
+def test_the_faces_of_the_room_are_whole():
+    found = {name: scenes.bounds({"a": shape}) for name, shape in room().items()}
+    for name, low, high in (
+        ("floor", [LEFT, FLOOR, 0], [RIGHT, FLOOR, BACK]), ("ceiling", [LEFT, -FLOOR, 0], [RIGHT, -FLOOR, BACK]),
+        ("left_wall", [LEFT, FLOOR, 0], [LEFT, -FLOOR, BACK]), ("right_wall", [RIGHT, FLOOR, 0], [RIGHT, -FLOOR, BACK]),
+        ("back_wall", [LEFT, FLOOR, BACK], [RIGHT, -FLOOR, BACK]),
+    ):  # fmt: skip
+        np.testing.assert_allclose(found[name], [low, high], atol=1e-12)
+
+
 def test_things_stand_on_each_other():
     """Legs and the post on the floor, the desk on its legs, the seat on its post, books on the upper boards."""
     found = {name: scenes.bounds({"a": shape}) for name, shape in room().items()}
@@ -318,6 +343,12 @@ def test_a_body_of_revolution():
     assert vertices[10:].tolist() == [[0, -1, 0], [0, 5, 0]] and faces.shape == (20, 3)
     base = 5 / 2 * 4 * np.sin(2 * np.pi / 5)
     assert volume(vertices.astype(float), faces) == pytest.approx(base * (1 / 3 + 3 + 2 / 3), rel=1e-6)
+    # Of more rings, each with its neighbours: of the straight side it changes nothing.
+    more = lathe([[0, -1], [2, 0], [2, 1], [2, 2.5], [2, 3], [0, 5]], 5)
+    assert more[1].shape == (40, 3) and volume(more[0].astype(float), more[1]) == pytest.approx(4 * base, rel=1e-6)
+    for wrong in ([[0, -1], [2, 0], [0, 3], [0, 5]], [[0, -1], [-2, 0], [2, 3], [0, 5]]):
+        with pytest.raises(SceneError, match="positive radii between the two ends"):
+            lathe(wrong, 5)
 
 
 def test_meshes_as_files(tmp_path):

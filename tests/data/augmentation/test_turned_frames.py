@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from torchtransient.data import Affine, Crop, Flip, QuarterTurn
+from torchtransient.data import Affine, Augment, Crop, Flip, QuarterTurn
 from torchtransient.data.augmentation.pixel_map import PixelMap
 from torchtransient.data.augmentation.stokes_fields import turned_stokes
-from torchtransient.errors import SceneError, ShapeError
+from torchtransient.errors import SceneError, ShapeError, UnitError
 
 SIZE = (2, 3)
 CAMERAS = torch.tensor([
@@ -70,6 +70,16 @@ def test_half_turns_and_windows_leave_the_frames():
         assert torch.equal(turned_stokes(light, -4, drawn, None), light)
     with pytest.raises(SceneError, match="wants intrinsics= of the camera"):
         turned_stokes(light, -4, QuarterTurn(1).draw(SIZE, None), None)
+
+
+def test_points_are_three_images():
+    for image, words in (
+        (torch.zeros(2, 3), r"'p' as \(..., 3, H, W\)"),
+        (torch.zeros(2, 2, 3), r"'p' as \(..., 3, H, W\)"),
+        (torch.zeros(3, 2, 3, dtype=torch.int32), "'p' as a floating dtype"),
+    ):
+        with pytest.raises((ShapeError, UnitError), match=words):
+            Augment(Flip(p=1.0), fields={"p": "point"}, to_world=np.eye(4))({"p": image})
 
 
 def test_maps_of_operations():

@@ -9,11 +9,11 @@ import pytest
 
 from torchtransient.data.generation import crew as crews
 from torchtransient.data.generation.crew import Crew, Member
-from torchtransient.data.generation.generate import Generated, _check_limits, _size, _whole_pair
+from torchtransient.data.generation.generate import Generated, _check_choices, _check_limits, _size, _whole_pair
 from torchtransient.data.generation.ledger import MEASURING, Ledger
 from torchtransient.data.generation.ray_engine import RayCrew
 from torchtransient.data.generation.run_log import RunLog, SampleBar
-from torchtransient.errors import TorchTransientError, UnitError
+from torchtransient.errors import ArgumentError, SceneError, TorchTransientError, UnitError
 
 
 class Worker(Member):
@@ -262,6 +262,29 @@ def test_what_a_run_has_done():
 )
 def test_sizes(count, words):
     assert _size(count) == words
+
+
+def test_choices_that_do_not_go_together():
+    """An address is that of a cluster; a recipe makes samples, and pickles."""
+    recipe = SimpleNamespace(maker=len, key=len, to_dict=len, device=None)
+    _check_choices("exact", "none", "ray", "host:1", recipe)
+    for arguments, error, words in (
+        (
+            ("exact", "none", "local", "host:1", recipe),
+            UnitError,
+            r"address='host:1' is for engine='ray', got engine='lo",
+        ),
+        (("exact", "none", "remote", None, recipe), ArgumentError, "expected engine to be one of"),
+        (("exact", "none", "local", None, object()), ArgumentError, r"expected a recipe, with maker\(\), got"),
+        (("counts", "none", "local", None, recipe), SceneError, "of recipes with a device; give one"),
+        (
+            ("exact", "none", "local", None, SimpleNamespace(maker=len, key=len, to_dict=lambda: 1)),
+            SceneError,
+            "pickles",
+        ),
+    ):
+        with pytest.raises(error, match=words):
+            _check_choices(*arguments)
 
 
 def test_shares_and_limits():

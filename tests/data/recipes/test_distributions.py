@@ -117,6 +117,7 @@ def test_normal_distributions_end_where_floats_do():
     # A deviation of zero is its mean, at an end too.
     for mean in (0.0, 1.0):
         assert float(D.Normal(mean, 0, low=0, high=1).draw(Fixed(0.25), NUMBER)) == mean
+    assert float(D.Normal(1, 0, low=1, high=1).draw(Fixed(0.25), NUMBER)) == 1
     # A billionth of the distribution has to be left.
     for mean in (5.99, -5.99):
         D.Normal(0, 1, low=mean if mean > 0 else None, high=mean if mean < 0 else None)
