@@ -57,6 +57,20 @@ def test_arrivals_of_a_lit_wall():
     assert not np.array_equal(other.opl, events.opl)
 
 
+def test_a_pilot_of_a_scene_whose_sensor_is_attached():
+    """It asks for no derivatives, and leaves none behind."""
+    expected, scene = events_of(lit_wall()), lit_wall()
+    params, x = mi.traverse(scene), mi.Float(0)
+    dr.enable_grad(x)
+    pose = params["sensor.to_world"]
+    shift = mi.Transform4f().translate(mi.Vector3f(x, 0, 0))
+    params["sensor.to_world"] = mi.AffineTransform4f(pose.matrix @ shift.matrix)
+    params.update()
+    found = events_of(scene)
+    np.testing.assert_allclose(found.opl, expected.opl, rtol=1e-6)
+    np.testing.assert_allclose(found.energy, expected.energy, rtol=1e-5)
+
+
 def test_at_least_one_sample_a_pixel():
     events = events_of(lit_wall(), paths=1, pixels=1000)
     assert (events.size, events.paths) == ((6, 4), 24)

@@ -11,7 +11,9 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.gradient_cases.cases_curves import file_of
 from torchtransient.errors import PhysicsWarning, SceneError, UnitError
+from torchtransient.plugins.sensors.places_on_mesh import PlacesOnMesh
 from torchtransient.rendering.build_options import BuildOptions
 
 VARIANT = "llvm_ad_mono"
@@ -205,3 +207,30 @@ def test_energy_below_zero_as_a_value():
     renderer = tt.nlos.CaptureRenderer(tt.scenes.nlos_z(), scan, [key], time_axis=AXIS, spp=16)
     with pytest.warns(PhysicsWarning, match="laser.energy.value' is the light of an emitter and reaches -1"):
         assert float(renderer({key: -1.0}, seed=0).total().sum()) < 0
+
+
+SHEET = "v 0 0 1\nv 2 0 1\nv 2 3 1.5\nv 0 3 1\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nf 1/1 2/2 3/3\nf 1/1 3/3 4/4\n"
+
+
+def test_places_of_a_texture_on_a_mesh():
+    """Of the triangles that have their coordinates, as their vertices are now."""
+    node = {"type": "obj", "filename": file_of("places.obj", SHEET), "id": "sheet", "flip_tex_coords": False}
+    mesh = mi.load_dict(node)
+    places = np.array([[0.5, 0.25], [0.25, 0.75], [0.9, 0.2]])
+    found = PlacesOnMesh(mesh, places)
+    vertices = np.array([line.split()[1:] for line in SHEET.splitlines() if line.startswith("v ")], dtype=float)
+    lower = [True, False, True]
+    for motion in (np.zeros((4, 3)), np.random.default_rng(1).normal(size=(4, 3))):
+        params = mi.traverse(mesh)
+        params["vertex_positions"] = mi.Float((vertices + motion).ravel())
+        params.update()
+        a, b, c, d = vertices + motion
+        # u runs along the lower edge; the upper triangle has the corner at (0, 1) in place of that at (1, 0).
+        expected = [
+            a + (b - a) * (u - v) + (c - a) * v if below else a + (c - a) * u + (d - a) * (v - u)
+            for (u, v), below in zip(places, lower, strict=True)
+        ]
+        np.testing.assert_allclose(np.array(found.points(mesh, mi.UInt32([0, 1, 2]))).T, expected, rtol=1e-5, atol=1e-5)
+    assert np.array(found.points(mesh, mi.UInt32(2))).shape == (3, 1)
+    with pytest.raises(SceneError, match=r"mesh 'sheet' that fill the square .* got none at 2 of 3 places"):
+        PlacesOnMesh(mesh, np.array([[0.5, 0.5], [1.5, 0.5], [0.5, -0.1]]))

@@ -8,6 +8,9 @@ import sys
 import threading
 from pathlib import Path
 
+import drjit as dr
+import mitsuba as mi
+import numpy as np
 import pytest
 import torch
 
@@ -115,3 +118,54 @@ def test_paths_of_twenty_thousand_bounces(variant):
     radiance, slope = (float(number) for number in run.stdout.split()[-2:])
     assert radiance == pytest.approx(1e3, rel=1e-2)
     assert slope == pytest.approx(1e6, rel=2e-2)
+
+
+# ------------------------------------------------------------------------------------------------- arrays in memory
+
+
+def test_bytes_of_what_is_recorded():
+    mi.set_variant("llvm_ad_rgb")
+    assert [record_room.bytes_of(kind) for kind in (mi.Float, mi.Float64, mi.UInt32)] == [4, 8, 4]
+    assert [record_room.bytes_of(kind) for kind in (mi.Point2f, mi.Vector3f, mi.Spectrum)] == [8, 12, 12]
+    mi.set_variant("llvm_ad_mono_polarized")
+    assert record_room.bytes_of(mi.Spectrum) == 4 * 4 * 4
+
+
+@pytest.mark.parametrize("kind", ["Float64", "Vector3f", "UInt32"])
+def test_arrays_of_all_lanes_in_memory(kind):
+    """Every lane has its own entries; those of idle lanes stay as they are, and are read as zero."""
+    mi.set_variant("llvm_ad_rgb")
+    kind = getattr(mi, kind)
+    array = record_room.GlobalArray(kind, 4, 3)
+    assert dr.width(array.numbers) == 4 * 3 * (3 if kind is mi.Vector3f else 1)
+    everywhere = mi.Bool([True] * 3)
+    for index in range(4):
+        array.write(kind(0), index, everywhere)
+    array.write(kind(mi.Float([5, 6, 7])), mi.UInt32([0, 2, 3]), everywhere)
+    array.write(kind(mi.Float([50, 60, 70])), mi.UInt32([1, 2, 0]), mi.Bool([True, False, True]))
+    rows = np.array([np.atleast_2d(np.array(array.read(index, everywhere)))[0] for index in range(4)])
+    assert rows.tolist() == [[5, 0, 70], [50, 0, 0], [0, 6, 0], [0, 0, 7]]
+    found = np.atleast_2d(np.array(array.read(mi.UInt32([0, 2, 3]), mi.Bool([True, False, True]))))[0]
+    assert found.tolist() == [5, 0, 7]
+
+
+def test_room_of_other_devices_and_systems(monkeypatch):
+    monkeypatch.setattr(record_room.mi, "variant", lambda: "cuda_ad_rgb")
+    assert record_room.room_of_path() == record_room.CUDA_ROOM
+    monkeypatch.setattr(record_room.mi, "variant", lambda: "llvm_ad_rgb")
+    monkeypatch.setattr(record_room, "_lanes_of_vector", lambda: 8)
+    for platform, stack in (("darwin", record_room._STACKS["darwin"]), ("plan9", record_room._STACK_UNKNOWN)):
+        monkeypatch.setattr(record_room.sys, "platform", platform)
+        assert record_room.room_of_path() == int(record_room.SHARE * stack) // 8
+
+
+def test_where_a_record_lies(monkeypatch):
+    """On the stack up to its room, in memory up to as much as all paths may take, at most so many at once."""
+    monkeypatch.setattr(record_room, "room_of_path", lambda: 1000)
+    monkeypatch.setattr(record_room, "MEMORY", 2300)
+    of = record_room.RecordRoom.of
+    assert of(100, 10) == record_room.RecordRoom(in_memory=False, lanes=None, room=1000)
+    assert of(100, 11) == record_room.RecordRoom(in_memory=True, lanes=2, room=1000)
+    assert of(100, 23) == record_room.RecordRoom(in_memory=True, lanes=1, room=1000)
+    with pytest.raises(GradientError, match=r"100 bytes a bounce.*max_depth up to 22 .*, got 23\."):
+        of(100, 24)

@@ -172,7 +172,7 @@ class DiffuseSpot:
 
     def __init__(self, p, n, value, leg):
         self.p, self.n, self.value, self.leg = p, mi.Normal3f(n), value, leg
-        self.valid = dr.any(dr.detach(self.n) != 0)
+        self.valid = dr.any(self.n != 0)
 
     def light(self, d, active):
         """As :meth:`GeneralSpot.light`."""

@@ -86,8 +86,7 @@ def _side(bsdf, si):
     """1 where light comes from the front, -1 from the back, 0 where nothing scatters: on the back of a one-sided
     surface.
     """
-    wi_z = dr.detach(si.wi.z)
-    return dr.select(wi_z > 0, 1, dr.select(scatters_behind(bsdf) & (wi_z < 0), -1, 0))
+    return dr.select(si.wi.z > 0, 1, dr.select(scatters_behind(bsdf) & (si.wi.z < 0), -1, 0))
 
 
 def _albedo(bsdf, si, active):

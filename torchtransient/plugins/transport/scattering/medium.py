@@ -106,7 +106,7 @@ class SurfaceOrMedium(Surface):
         surface_value, surface_pdf = super().eval_pdf(vertex, wo, out, active, sampled)
         ctx, scatter = mi.PhaseFunctionContext(None), vertex.scatter
         value, pdf = vertex.phase.eval_pdf(ctx, vertex.mei, out, active & scatter)
-        usable = dr.isfinite(dr.detach(pdf)) & (dr.detach(pdf) > 0)
+        usable = dr.isfinite(pdf) & (pdf > 0)
         other = 1 if sampled else 0
         value = unpolarizing(dr.select(usable, mi.unpolarized_spectrum(value), other) * vertex.σ_s)
         return dr.select(scatter, value, surface_value), dr.select(scatter, dr.select(usable, pdf, other), surface_pdf)

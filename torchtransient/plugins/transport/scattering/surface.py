@@ -329,4 +329,4 @@ def strayed(wi, bs):
 
 def is_black(weight):
     """Whether scattering by ``weight`` leaves nothing of the light."""
-    return dr.max(dr.detach(mi.unpolarized_spectrum(weight))) == 0
+    return dr.max(mi.unpolarized_spectrum(weight)) == 0

@@ -1,0 +1,155 @@
+"""Where a scan looks and where its laser falls, by geometry; and which light is found how, in words."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from support.nlos_scenes import film, plane, scan_scene, transform
+from support.plain_scenes import camera
+from torchtransient.errors import SceneError, TorchTransientWarning
+from torchtransient.interfaces import CaptureType
+from torchtransient.plugins.around_corner import scan_table
+from torchtransient.plugins.around_corner.division import Division
+from torchtransient.plugins.around_corner.explanation import explanation
+from torchtransient.plugins.transport.strategy import Local
+
+VARIANT = "llvm_ad_mono"
+
+
+def test_a_grid_around_the_laser_s_axis():
+    """Of a horizontal field of view, column by column to the right and row by row down, as a camera looks."""
+    laser = {"exhaustive_scan": True, "laser_scan_width": 5, "laser_scan_height": 3}
+    scene = mi.load_dict(scan_scene({"a": plane()}, "exhaustive", film(bins=2) | laser))
+    sensor = scene.sensors()[0]
+    aims = np.array(scan_table.aims_of(scene, sensor, CaptureType.EXHAUSTIVE, 40.0), dtype=np.float64)
+    assert aims.shape == (3, 15)
+    to_world = np.array(scene.emitters()[0].world_transform().matrix, dtype=np.float64).reshape(4, 4)[:3, :3]
+    local = np.linalg.inv(to_world) @ aims
+    np.testing.assert_allclose(local[2], 1, rtol=1e-5)
+    half = np.tan(np.radians(20))
+    across = -half * np.array([-0.8, -0.4, 0.0, 0.4, 0.8])
+    down = -half * 3 / 5 * np.array([-2 / 3, 0.0, 2 / 3])
+    np.testing.assert_allclose(local[0].reshape(3, 5), np.tile(across, (3, 1)), rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(local[1].reshape(3, 5), np.tile(down[:, None], (1, 5)), rtol=1e-4, atol=1e-6)
+    for fov in (0.0, 180.0, -5.0):
+        with pytest.raises(SceneError, match=f"between 0 and 180 degrees, got {fov}"):
+            scan_table.aims_of(scene, sensor, CaptureType.EXHAUSTIVE, fov)
+
+
+def test_one_direction_or_those_of_scanned_points():
+    scene = mi.load_dict(scan_scene({"a": plane()}, "confocal"))
+    sensor = scene.sensors()[0]
+    single = np.array(scan_table.aims_of(scene, sensor, CaptureType.SINGLE, None)).ravel()
+    np.testing.assert_allclose(single / np.linalg.norm(single), np.array([0.3, 0.1, -0.25]) / 0.4031129, rtol=1e-4)
+    aims = np.array(scan_table.aims_of(scene, sensor, CaptureType.CONFOCAL, None))
+    points = np.array(scan_table.scanned_points(scene, sensor))
+    np.testing.assert_allclose(aims, points - np.array([[-0.5], [0.0], [0.25]]), rtol=1e-5, atol=1e-6)
+
+
+def test_laser_positions_are_said_once():
+    sensor = Local(laser_points="given")
+    with pytest.raises(SceneError, match="a confocal capture lights its scanned points"):
+        scan_table._check_said_once(sensor, CaptureType.CONFOCAL, None)
+    with pytest.raises(SceneError, match="both say where the laser points"):
+        scan_table._check_said_once(sensor, CaptureType.EXHAUSTIVE, 20.0)
+    scan_table._check_said_once(sensor, CaptureType.EXHAUSTIVE, None)
+    scan_table._check_said_once(Local(laser_points=None), CaptureType.CONFOCAL, None)
+    scan_table._check_said_once(Local(), CaptureType.EXHAUSTIVE, 179.0)
+
+
+def test_as_many_aims_as_a_capture_asks_for():
+    grid = Local(laser_scan_width=2, laser_scan_height=3, laser_count=lambda: 6)
+    sensor = Local(film=lambda: grid)
+    right = [(CaptureType.SINGLE, 1), (CaptureType.EXHAUSTIVE, 6), (CaptureType.CONFOCAL, 1), (CaptureType.CONFOCAL, 7)]
+    for capture, count in right:
+        scan_table.check_count(mi.Vector3f(mi.Float([1.0] * count), 0, 0), sensor, capture)
+    seven = mi.Vector3f(mi.Float([1.0] * 7), 0, 0)
+    with pytest.raises(SceneError, match="one laser spot, got 7"):
+        scan_table.check_count(seven, sensor, CaptureType.SINGLE)
+    with pytest.raises(SceneError, match=r"2 x 3 laser positions, and the laser 7 points"):
+        scan_table.check_count(seven, sensor, CaptureType.EXHAUSTIVE)
+
+
+def test_rays_that_meet_nothing():
+    scan_table._check_hit(np.array([1.0, 2.0]), "laser")
+    with pytest.warns(TorchTransientWarning, match="2 of the laser's 3 rays meet nothing"):
+        scan_table._check_hit(np.array([1.0, np.inf, np.inf]), "laser")
+    with pytest.raises(SceneError, match="sensor meets nothing in the scene with any of its 2 rays"):
+        scan_table._check_hit(np.array([np.inf, np.inf]), "sensor")
+    scan_table._check_not_at(mi.Float([0.1, 2.0]), "laser", "to_world")
+    with pytest.raises(SceneError, match="the laser stands in a point that it aims at; move it by its to_world"):
+        scan_table._check_not_at(mi.Float([0.0, 2.0]), "laser", "to_world")
+
+
+def test_points_that_a_camera_sees():
+    """At the centres of its pixels; a metre along the axis where a pixel sees nothing."""
+    wall = {"type": "rectangle", "to_world": transform().translate([0.6, 0, 0])}
+    scene = mi.load_dict({"type": "scene", "sensor": camera(3, 2, bins=2, fov=50.0), "wall": wall})
+    sensor = scene.sensors()[0]
+    ray = scan_table.scan_rays(sensor)
+    o, d = np.array(ray.o, dtype=np.float64), np.array(ray.d, dtype=np.float64)
+    half = np.tan(np.radians(25))
+    across = d[:2] / -d[2]
+    # A camera that looks along -z with y up has +x to its right.
+    np.testing.assert_allclose(across[0], np.tile(half * np.array([-2 / 3, 0, 2 / 3]), 2), rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(across[1], np.repeat(half * np.array([1 / 3, -1 / 3]), 3), rtol=1e-4, atol=1e-6)
+    points = np.array(scan_table.scanned_points(scene, sensor), dtype=np.float64)
+    at_wall = o - d * o[2] / d[2]
+    seen = (np.abs(at_wall[0] - 0.6) < 1) & (np.abs(at_wall[1]) < 1)
+    assert 0 < seen.sum() < 6
+    np.testing.assert_allclose(points, np.where(seen, at_wall, o + d), rtol=1e-4, atol=1e-4)
+
+
+def test_walls_that_lie_in_one_plane():
+    """Points that span flat shapes; of curved ones there are none."""
+    pose = transform().translate([0.3, 0.2, 0.5]).rotate([1, 2, 0.5], 40).scale([2, 3, 1])
+    disk, sheet = (mi.load_dict({"type": kind, "to_world": pose}) for kind in ("disk", "rectangle"))
+    matrix = np.array(pose.matrix)
+    expected = np.stack([matrix[:3, 3], matrix[:3, 3] + matrix[:3, 0], matrix[:3, 3] + matrix[:3, 1]])
+    np.testing.assert_allclose(scan_table._corners(disk), expected, rtol=1e-5, atol=1e-6)
+    assert scan_table._corners(mi.load_dict({"type": "sphere"})) is None
+    assert scan_table._in_one_plane([disk, sheet]) and not scan_table._in_one_plane([])
+    tilted = mi.load_dict({"type": "rectangle", "to_world": transform().translate([0.3, 0.2, 0.5])})
+    assert not scan_table._in_one_plane([disk, tilted])
+    assert not scan_table._in_one_plane([disk, mi.load_dict({"type": "sphere"})])
+
+
+THIRD, CHAINS = "three bounces from hidden samples", "4 to 7 bounces from chains"
+
+
+@pytest.mark.parametrize(("asked", "shared", "words"), [
+    ((0, None), range(3, 8), [THIRD, CHAINS, "8 and more bounces from paths"]),
+    ((0, None), range(3, 4), [THIRD, "4 and more bounces from paths"]),
+    ((0, 9), range(3, 8), [THIRD, CHAINS, "8 to 9 bounces from paths"]),
+    ((0, 8), range(3, 8), [THIRD, CHAINS, "8 bounces from paths"]),
+    ((0, 7), range(3, 8), [THIRD, CHAINS]),
+    ((0, 3), range(3, 4), [THIRD, "no later light"]),
+    ((3, 3), range(0), ["three bounces from paths, since reasons", "no later light"]),
+    ((0, 4), range(0), ["three bounces from paths, since reasons", "4 bounces from paths"]),
+    ((4, 5), range(4, 6), ["three bounces is not asked for", "4 to 5 bounces from chains"]),
+    ((5, 6), range(0), ["three bounces is not asked for", "5 to 6 bounces from paths"]),
+    ((0, 2), range(0), ["three bounces is not asked for", "no later light"]),
+])  # fmt: skip
+def test_which_light_is_found_how(asked, shared, words):
+    division = Division(shared, 0, "reasons")
+    integrator = Local(division=lambda *_: division, asked_bounces=lambda: asked, third_bounce="auto")
+    said = explanation(integrator, None, None).split("; ")
+    assert len(said) == len(words)
+    assert all(word in one for word, one in zip(words, said, strict=True)), said
+    integrator.third_bounce = "paths"
+    asks = "as third_bounce asks for" in explanation(integrator, None, None)
+    assert asks == ("since reasons" in words[0])
+
+
+@pytest.mark.parametrize(("shared", "first", "last", "lights_itself", "longest"), [
+    (range(3, 8), 0, 8, False, 8), (range(3, 8), 0, 7, False, 0), (range(3, 8), 0, 7, True, 2),
+    (range(3, 8), 3, 7, True, 0), (range(4, 8), 0, 7, False, 3), (range(5, 8), 4, 6, True, 4),
+    (range(5, 8), 5, 6, True, 0), (range(3, 4), 0, 4, True, 4),
+])  # fmt: skip
+def test_what_is_left_for_paths(shared, first, last, lights_itself, longest):
+    """What comes before the shared light: two bounces only where a wall lights itself; or all of it, up to the last."""
+    division = Division.of(shared, first, last, lights_itself)
+    assert (division.longest, division.walks, division.third_bounce) == (longest, longest > 0, 3 in shared)
+    assert division.chained == range(max(shared.start, 4), max(shared.stop, 4))
