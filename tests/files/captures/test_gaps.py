@@ -266,3 +266,44 @@ def test_scene_infos_that_were_read_are_written_again(tmp_path):
             found = text_of(replace(read, **change).write(tmp_path / "b.hdf5", "tal"))
             assert found is not None and "torchtransient:" in found and found != text
             assert Capture.read(tmp_path / "b.hdf5") == replace(read, **change)
+
+
+NEEDED = {
+    "tal": ("H", "H_format", "sensor_grid_xyz"), "dirac": ("data_t", "xg", "yg", "da", "offset_laser"),
+    "zaragoza": ("data", "cameraGridPositions", "laserGridPositions", "deltaT"), "keyhole": ("data", "xpos", "zpos"),
+}  # fmt: skip
+
+
+class Names:
+    """Contents of which the names alone are known."""
+
+    def __init__(self, shapes, fields=()):
+        self.shapes, self._fields = shapes, frozenset(fields)
+
+    def fields(self, name):
+        return self._fields
+
+
+@pytest.mark.parametrize("layout", NEEDED)
+def test_layouts_are_known_by_what_they_need(layout):
+    (module,) = (one for one in formats.LAYOUTS if one.name == layout)
+    names = NEEDED[layout]
+    assert module.recognises(Names(dict.fromkeys(names))) and module.recognises(Names(dict.fromkeys((*names, "more"))))
+    for left_out in names:
+        assert not module.recognises(Names(dict.fromkeys(set(names) - {left_out})))
+
+
+def test_layouts_are_known_by_the_shapes_of_their_arrays():
+    by_name = {layout.name: layout.recognises for layout in formats.LAYOUTS}
+    fields = ("data", "laserPos", "cameraPos", "deltat")
+    assert by_name["phasor_field"](Names({"dataset": None}, fields))
+    assert not by_name["phasor_field"](Names({"dataset": None}, fields[1:]))
+    assert not by_name["phasor_field"](Names({}, fields)) and by_name["keyhole"](Names({"direct_after": (9, 1)}))
+    assert by_name["rect_data"](Names({"rect_data": (1,)})) and not by_name["rect_data"](Names({"data": (9, 4, 4)}))
+    for shape, cdt, rect in (
+        ((4, 4, 9), True, False), ((9, 4, 4), False, True), ((4, 4, 4), False, False), ((4, 9, 4), False, False),
+        ((4, 4), False, False), (None, False, False),
+    ):  # fmt: skip
+        assert by_name["cdt"](Names({"meas": shape})) is cdt and by_name["rect_data"](Names({"meas": shape})) is rect
+    for shape, cdt in (((9, 1), True), ((9, 2), False), ((9, 1, 1), False), (None, False)):
+        assert by_name["cdt"](Names({"out": shape})) is cdt
