@@ -11,7 +11,8 @@ import torch
 
 from torchtransient import FrequencyAxis, TimeAxis, losses
 from torchtransient.errors import ShapeError, TorchTransientWarning, UnitError
-from torchtransient.losses.comparison import holds
+from torchtransient.losses import phasors as losses_of_phasors
+from torchtransient.losses.comparison import check_level, holds
 from torchtransient.losses.dead_time_likelihoods import armed_periods
 from torchtransient.losses.likelihoods import LEAST_MEAN
 from torchtransient.losses.mesh_smoothness import _edges
@@ -228,3 +229,26 @@ def test_how_many_counts_fit_into_periods():
     assert losses.free_running_nll(rate, counts, periods=39, dead_bins=3.0, dim=-3).isfinite()
     with pytest.raises(UnitError, match="fit into"):
         losses.free_running_nll(rate, counts, periods=37, dead_bins=3.0, dim=-3)
+
+
+def test_numbers_at_the_ends_of_a_precision():
+    """Its largest and its least normal number are taken, what is beyond them is not; zero where it is allowed."""
+    like = torch.ones(2)
+    limits = torch.finfo(torch.float32)
+    for value in (limits.max, limits.tiny):
+        for given in (value, torch.tensor(value)):
+            assert float(check_level("floor", given, like, "here")) == value
+    for value in (float("inf"), limits.tiny / 2, 0.0, -1.0):
+        for given in (value, torch.tensor(value)):
+            with pytest.raises(UnitError, match="floor"):
+                check_level("floor", given, like, "here")
+    assert float(check_level("floor", torch.tensor(0.0), like, "here", zero=True)) == 0
+
+
+def test_frequencies_that_bins_just_tell():
+    """One wavelength of two bins, to a rounding."""
+    axis = TimeAxis(0.0, 0.3, 4)
+    most = 0.5 / axis.bin_width_opl * (1 + losses_of_phasors._ROUNDING)
+    assert losses_of_phasors._check_axes(axis, FrequencyAxis((-most,), 0.0), "here")[0] == axis
+    with pytest.raises(UnitError, match="a wavelength of two bins at least"):
+        losses_of_phasors._check_axes(axis, FrequencyAxis((0.0, 1.00001 * most), 0.0), "here")
