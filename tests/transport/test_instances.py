@@ -31,14 +31,14 @@ OTHERS = [0, 1, 3, 4, 5, 7, 8, 9]
 STRAIGHT = [0, 1, 4, 5, 8, 9]
 
 
-def scene_of():
-    group = {
-        "type": "shapegroup",
+def scene_of(*without):
+    shapes = {
         "ball": {"type": "sphere", "center": [0.1, -0.2, 0.1], "radius": 0.5},
         "sheet": {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([-0.4, -0.5, -0.3]).scale(0.9)},
         "egg": {"type": "ellipsoids", "data": mi.TensorXf(DATA), "extent": 1.2},
         "tube": {"type": "bsplinecurve", "filename": file_of("tube in a group.txt", TUBE)},
     }
+    group = {"type": "shapegroup", **{name: shape for name, shape in shapes.items() if name not in without}}
     copies = {
         name: {"type": "instance", "to_world": mi.ScalarTransform4f(pose), "group": {"type": "ref", "id": "group"}}
         for name, pose in POSES.items()
@@ -153,7 +153,7 @@ def test_points_of_a_sheet_are_carried_along():
 
 def test_slopes_backwards_are_finite():
     """What no ray meets leaves no NaN at the poses, which all lanes share."""
-    scene, x = scene_of(), mi.Float(0)
+    scene, x = scene_of("egg", "tube"), mi.Float(0)
     params = mi.traverse(scene)
     dr.enable_grad(x)
     move(params, x, ("first",))

@@ -108,9 +108,10 @@ class InstanceTable:
         si.t = dr.replace_grad(si.t, dr.select(valid, t, 0))
         si.n = dr.replace_grad(si.n, _normal(inverse, local.n, valid))
         if mi.has_flag(flags, mi.RayFlags.ShadingFrame):
-            si.uv = dr.replace_grad(si.uv, dr.select(valid, local.uv, 0))
-            si.dp_du = dr.replace_grad(si.dp_du, _vector(M, dr.select(valid, local.dp_du, 0)))
-            si.dp_dv = dr.replace_grad(si.dp_dv, _vector(M, dr.select(valid, local.dp_dv, 0)))
+            # Zero where nothing was hit, as all that a masked call answers.
+            si.uv = dr.replace_grad(si.uv, local.uv)
+            si.dp_du = dr.replace_grad(si.dp_du, _vector(M, local.dp_du))
+            si.dp_dv = dr.replace_grad(si.dp_dv, _vector(M, local.dp_dv))
             n = _normal(inverse, local.sh_frame.n, valid)
             si.sh_frame = dr.replace_grad(si.sh_frame, _frame(n, si.dp_du))
         si.wi = dr.replace_grad(si.wi, dr.select(valid, si.to_local(-ray.d), -ray.d))
