@@ -335,6 +335,8 @@ def test_what_the_pilot_run_was(paths, overlooked):
         f"{overlooked} meets may have been overlooked"
     )
     assert "2 arrivals, no light at all;" in finder(dark())._pilot_line()
+    with pytest.raises(SceneError, match="no pilot run was made"):
+        finder(None)._pilot_line()
 
 
 @pytest.mark.parametrize(
