@@ -217,8 +217,8 @@ class SlabInverse(InverseOperator):
 
 
 def _slab_properties(properties: tuple[float, float, float, float], who: str) -> tuple[float, float, float, float]:
-    given: object = properties
-    if not (isinstance(given, (list, tuple)) or getattr(given, "ndim", 0) == 1) or len(given) != len(FOAM):
+    several = isinstance(properties, (list, tuple)) or getattr(properties, "ndim", 0) == 1
+    if not several or len(properties) != len(FOAM):
         raise UnitError(
             f"{who}: expected properties as (reduced scattering 1/m, absorption 1/m, index, extrapolation length m), "
             f"got {shown(properties)}."

@@ -196,7 +196,7 @@ def _counts(what: str, given: Any, least: int, text: str) -> Any:
     """A number, a text, or a tuple of one or more numbers."""
     if isinstance(given, str) and given == text:
         return given
-    several = (isinstance(given, Sequence) and not isinstance(given, (str, bytes))) or getattr(given, "ndim", 0)
+    several = (isinstance(given, Sequence) and not isinstance(given, (str, bytes))) or bool(getattr(given, "ndim", 0))
     whole = tuple(count(f"recipe: {what}", one, least) for one in (given if several else [given]))
     if not whole:
         raise SceneError(f"recipe: {what}: expected one or more whole numbers, or {text!r}, got {shown(given)}.")
