@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import operator
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -12,13 +11,14 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.quantities import Numbers
+from torchtransient.quantities import Numbers, array, as_number, as_whole, how_many, shown
 from torchtransient.units import LATEST_S, SHORTEST_OPL, SPEED_OF_LIGHT, near_seconds, opl_to_seconds, seconds_to_opl
 
 # What a number in another unit looks like. The bins of real records are 1 ps to 1 us wide: in nanoseconds, picoseconds
 # or femtoseconds that is 1e-3 to 1e9, and in seconds taken for metres at most 1e-6.
 WIDEST_BIN_S = 1e-6  # 300 m of path; a picosecond in microseconds is as much
 LOWEST_HERTZ = 1e3  # 1 GHz in megahertz
+MOST_BINS = 2**62  # beyond that an index of a bin has no 64 bits
 MOST_PER_METRE = 5e6  # a wavelength of 200 nm; 5 MHz taken for cycles per metre
 
 
@@ -42,14 +42,11 @@ class TimeAxis:
         width = _finite(self.bin_width_opl, "bin_width_opl")
         if width <= 0:
             raise UnitError(f"TimeAxis: expected bin_width_opl > 0 metres, got {width!r}.")
-        try:
-            if isinstance(self.num_bins, bool):
-                raise TypeError
-            bins = operator.index(self.num_bins)
-        except TypeError:
-            raise ShapeError(f"TimeAxis: expected num_bins to be a whole number, got {self.num_bins!r}.") from None
-        if bins < 1:
-            raise ShapeError(f"TimeAxis: expected num_bins >= 1, got {bins}.")
+        bins = as_whole(self.num_bins)
+        if bins is None:
+            raise ShapeError(f"TimeAxis: expected num_bins to be a whole number, got {shown(self.num_bins)}.")
+        if not 1 <= bins <= MOST_BINS:
+            raise ShapeError(f"TimeAxis: expected num_bins >= 1 and at most 2^62, got {shown(bins)}.")
         end = start + bins * width
         if not math.isfinite(end) or width < 4 * max(math.ulp(start), math.ulp(end)):
             raise UnitError(
@@ -121,7 +118,8 @@ class TimeAxis:
         `opl` in metres, a number or a tensor on any device; compared in float64 with `edges_opl`, so that an edge
         belongs to the bin that starts there. Raises UnitError for NaN.
         """
-        lengths = torch.as_tensor(opl).detach().to(torch.float64)
+        known = isinstance(opl, Tensor) and not opl.is_complex()
+        lengths = (opl if known else torch.from_numpy(array("TimeAxis.bin_index: opl", opl))).detach().to(torch.float64)
         if bool(torch.isnan(lengths).any()):
             raise UnitError("TimeAxis.bin_index: expected lengths in metres, got NaN.")
         edges = self.edges_opl.to(lengths.device)
@@ -161,7 +159,9 @@ class FrequencyAxis:
     @classmethod
     def uniform(cls, first: float, step: float, count: int, *, start_opl: float = 0.0) -> FrequencyAxis:
         """`count` frequencies `first + k step`, in cycles per metre. Equal steps render faster than arbitrary ones."""
-        return cls(tuple(float(first) + k * float(step) for k in range(count)), start_opl)
+        start, distance = (_finite(value, name, "FrequencyAxis") for value, name in ((first, "first"), (step, "step")))
+        number = how_many("FrequencyAxis.uniform: count", count)
+        return cls(tuple(start + k * distance for k in range(number)), start_opl)
 
     @classmethod
     def from_hertz(cls, frequencies_hz: float | Iterable[float] | Numbers, start_opl: float = 0.0) -> FrequencyAxis:
@@ -206,15 +206,15 @@ class FrequencyAxis:
 def _row(given: Any, owner: str) -> tuple[float, ...]:
     """The numbers of one frequency or of several: any iterable, an array, a tensor."""
     plain = given.tolist() if isinstance(given, Tensor) else given
-    values = tuple(plain) if isinstance(plain, Iterable) and not isinstance(plain, str) else (plain,)
+    alone = isinstance(plain, (str, bytes)) or not isinstance(plain, Iterable) or getattr(plain, "ndim", None) == 0
+    values = (plain,) if alone else tuple(plain)
     return tuple(_finite(value, "a frequency", owner) for value in values)
 
 
 def _finite(value: float, name: str, owner: str = "TimeAxis") -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError, OverflowError, RuntimeError):
-        raise UnitError(f"{owner}: expected {name} to be one number, got {value!r}.") from None
+    number = as_number(value)
+    if number is None:
+        raise UnitError(f"{owner}: expected {name} to be one number, got {shown(value)}.")
     if not math.isfinite(number):
         raise UnitError(f"{owner}: expected {name} to be finite, got {number!r}.")
     return number

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.pulses import CUT_STDDEVS, FWHM_PER_STDDEV, Pulse
-from torchtransient.quantities import Numbers
+from torchtransient.quantities import Numbers, array, as_number, how_many, shown
 from torchtransient.units import SHORTEST_OPL, near_seconds, seconds_to_opl
 
 Array = NDArray[np.float64]
@@ -47,9 +47,9 @@ class Gate:
     values: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ArgumentError(f"Gate: expected one of {', '.join(KINDS)}, got {self.kind!r}.")
-        start, end = float(self.start_opl), float(self.end_opl)
+        if not isinstance(self.kind, str) or self.kind not in KINDS:
+            raise ArgumentError(f"Gate: expected one of {', '.join(KINDS)}, got {shown(self.kind)}.")
+        start, end = _number("start", self.start_opl), _number("end", self.end_opl)
         if not (math.isfinite(start) and math.isfinite(end) and start < end):
             raise UnitError(f"Gate: expected a finite start before a finite end, got {start!r} m to {end!r} m.")
         if end - start < SHORTEST_OPL:
@@ -70,9 +70,9 @@ class Gate:
     @classmethod
     def gaussian(cls, center_opl: float, fwhm_opl: float) -> Gate:
         """Fully open at ``center_opl``; closes like a Gaussian, to zero at four standard deviations."""
-        if not fwhm_opl > 0:
-            raise UnitError(f"Gate.gaussian: expected fwhm_opl > 0 metres, got {fwhm_opl!r}.")
-        center, fwhm = float(center_opl), float(fwhm_opl)
+        center, fwhm = _number("center_opl", center_opl), _number("fwhm_opl", fwhm_opl)
+        if not fwhm > 0:
+            raise UnitError(f"Gate.gaussian: expected fwhm_opl > 0 metres, got {fwhm!r}.")
         half = CUT_STDDEVS * fwhm / FWHM_PER_STDDEV
         # Center and width are kept too: start and end would give them back with a rounding error.
         return cls("gaussian", center - half, center + half, opl=(center, fwhm))
@@ -80,8 +80,7 @@ class Gate:
     @classmethod
     def tabulated(cls, opl: Numbers, values: Numbers) -> Gate:
         """A measured profile: linear between ``values`` at the lengths ``opl`` (rising), zero outside them."""
-        lengths = np.asarray(opl, dtype=np.float64).ravel()
-        heights = np.asarray(values, dtype=np.float64).ravel()
+        lengths, heights = array("Gate.tabulated: opl", opl).ravel(), array("Gate.tabulated: values", values).ravel()
         if lengths.size != heights.size or lengths.size < 2:
             raise ShapeError(
                 f"Gate.tabulated: expected two or more lengths and as many values, got {lengths.size} and "
@@ -111,6 +110,7 @@ class Gate:
 
     def shifted(self, opl: float) -> Gate:
         """The same gate, opened ``opl`` metres later."""
+        opl = _number("opl", opl)
         if self.kind == "gaussian":
             return Gate.gaussian(self.opl[0] + opl, self.opl[1])
         moved = tuple(length + opl for length in self.opl)
@@ -118,21 +118,25 @@ class Gate:
 
     def sequence(self, step_opl: float, count: int) -> tuple[Gate, ...]:
         """``count`` gates of this shape, each ``step_opl`` metres after the one before."""
-        return tuple(self.shifted(k * step_opl) for k in range(count))
+        step = _number("step_opl", step_opl)
+        number = how_many("Gate.sequence: count", count, least=0)
+        return tuple(self.shifted(k * step) for k in range(number))
 
     # ------------------------------------------------------------------------------------------------ the profile
 
     def value(self, opl: Any) -> Array:
-        """Sensitivity to light that arrives at ``opl``, in double precision."""
-        x = np.asarray(opl, dtype=np.float64)
+        """Sensitivity to light that arrives at ``opl``, in double precision; NaN where that is NaN."""
+        x = array("Gate.value: opl", opl)
         inside = (x >= self.start_opl) & (x < self.end_opl)
+        outside = np.where(np.isnan(x), np.nan, 0.0)
         if self.kind == "rectangular":
-            return np.asarray(inside, dtype=np.float64)
+            return np.where(inside, 1.0, outside)
         if self.kind == "tabulated":
-            return np.where(inside, np.interp(x, self.opl, self.values), 0.0)
-        u = (x - 0.5 * (self.start_opl + self.end_opl)) * (2 * CUT_STDDEVS / (self.end_opl - self.start_opl))
+            return np.where(inside, np.interp(x, self.opl, self.values), outside)
+        near = np.clip(x, self.start_opl, self.end_opl)
+        u = (near - 0.5 * (self.start_opl + self.end_opl)) * (2 * CUT_STDDEVS / (self.end_opl - self.start_opl))
         floor = math.exp(-0.5 * CUT_STDDEVS**2)
-        return np.where(inside, np.maximum((np.exp(-0.5 * u * u) - floor) / (1 - floor), 0.0), 0.0)
+        return np.where(inside, np.maximum((np.exp(-0.5 * u * u) - floor) / (1 - floor), 0.0), outside)
 
     @property
     def is_continuous(self) -> bool:
@@ -178,6 +182,13 @@ class Gate:
         if self.kind == "gaussian":
             return f"gaussian {self.opl[0]!r} {self.opl[1]!r}"
         return f"rectangular {self.start_opl!r} {self.end_opl!r}"
+
+
+def _number(name: str, value: Any) -> float:
+    number = as_number(value)
+    if number is None:
+        raise UnitError(f"Gate: expected {name} to be one number in metres, got {shown(value)}.")
+    return number
 
 
 def jump_in(gates: Sequence[Gate]) -> str:

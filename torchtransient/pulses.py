@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.quantities import Numbers
+from torchtransient.quantities import Numbers, array, as_number, shown
 from torchtransient.units import LONGEST_PULSE_S, SHORTEST_OPL, near_seconds, seconds_to_opl
 
 Array = NDArray[np.float64]
@@ -59,8 +59,8 @@ class Pulse:
         object.__setattr__(self, "width_opl", width)
 
     def _check_table(self) -> None:
-        opl = np.asarray(self.opl, dtype=np.float64).ravel()
-        values = np.asarray(self.values, dtype=np.float64).ravel()
+        opl = array("Pulse.tabulated: opl", self.opl).ravel()
+        values = array("Pulse.tabulated: values", self.values).ravel()
         if opl.size != values.size or opl.size < 2:
             raise ShapeError(
                 f"Pulse.tabulated: expected two or more lengths and as many values, got {opl.size} and {values.size}."
@@ -91,35 +91,35 @@ class Pulse:
     @classmethod
     def tabulated(cls, opl: Numbers, values: Numbers, center_opl: float = 0.0) -> Pulse:
         """A measured shape: linear between ``values`` at the lengths ``opl`` (metres, rising), zero outside them."""
-        return cls("tabulated", 0.0, center_opl, opl=tuple(opl), values=tuple(values))
+        table: Any = (opl, values)  # made plain where they are checked
+        return cls("tabulated", 0.0, center_opl, opl=table[0], values=table[1])
 
     @classmethod
     def gaussian_s(cls, fwhm_s: float, center_s: float = 0.0) -> Pulse:
         """As :meth:`gaussian`, in seconds."""
-        width = near_seconds(_number(fwhm_s, "fwhm_s"), "fwhm_s", "Pulse.gaussian_s", limit_s=LONGEST_PULSE_S)
-        center = near_seconds(_number(center_s, "center_s"), "center_s", "Pulse.gaussian_s")
+        width = near_seconds(fwhm_s, "fwhm_s", "Pulse.gaussian_s", limit_s=LONGEST_PULSE_S)
+        center = near_seconds(center_s, "center_s", "Pulse.gaussian_s")
         return cls.gaussian(seconds_to_opl(width), seconds_to_opl(center))
 
     @classmethod
     def rectangular_s(cls, width_s: float, center_s: float = 0.0) -> Pulse:
         """As :meth:`rectangular`, in seconds."""
-        width = near_seconds(_number(width_s, "width_s"), "width_s", "Pulse.rectangular_s", limit_s=LONGEST_PULSE_S)
-        center = near_seconds(_number(center_s, "center_s"), "center_s", "Pulse.rectangular_s")
+        width = near_seconds(width_s, "width_s", "Pulse.rectangular_s", limit_s=LONGEST_PULSE_S)
+        center = near_seconds(center_s, "center_s", "Pulse.rectangular_s")
         return cls.rectangular(seconds_to_opl(width), seconds_to_opl(center))
 
     @classmethod
     def tabulated_s(cls, times_s: Numbers, values: Numbers, center_s: float = 0.0) -> Pulse:
         """As :meth:`tabulated`, with times in seconds."""
-        times = np.asarray(times_s, dtype=np.float64)
-        for time in times.ravel().tolist():
+        times = array("Pulse.tabulated_s: times_s", times_s).ravel()
+        for time in times.tolist():
             near_seconds(time, "times_s", "Pulse.tabulated_s")
-        lengths = seconds_to_opl(times)
-        center = near_seconds(_number(center_s, "center_s"), "center_s", "Pulse.tabulated_s")
-        return cls.tabulated(lengths.tolist(), tuple(values), seconds_to_opl(center))
+        center = near_seconds(center_s, "center_s", "Pulse.tabulated_s")
+        return cls.tabulated(seconds_to_opl(times), values, seconds_to_opl(center))
 
     def shifted(self, opl: float) -> Pulse:
         """The same shape, ``opl`` metres later."""
-        return replace(self, center_opl=self.center_opl + opl)
+        return replace(self, center_opl=self.center_opl + _number(opl, "opl"))
 
     # ------------------------------------------------------------------------------------------------ the density
 
@@ -135,7 +135,7 @@ class Pulse:
 
     def cumulative(self, opl: Any) -> Array:
         """Share of the pulse up to the lengths ``opl``: 0 before the support and 1 after it, in double precision."""
-        x = np.asarray(opl, dtype=np.float64) - self.center_opl
+        x = array("Pulse.cumulative: opl", opl) - self.center_opl
         if self.kind == "rectangular":
             return np.asarray(np.clip(x / self.width_opl + 0.5, 0, 1), dtype=np.float64)
         if self.kind == "gaussian":
@@ -159,7 +159,9 @@ def transform(pulse: Pulse, frequencies: Any) -> NDArray[np.complex128]:
     measure under the pulse. One at frequency zero.
     """
     low, high = pulse.support_opl
-    wanted = np.atleast_1d(np.asarray(frequencies, dtype=np.float64)).ravel()
+    wanted = array("transform: frequencies", frequencies).ravel()
+    if not np.isfinite(wanted).all():
+        raise UnitError("transform: expected finite frequencies in cycles per metre, got NaN or infinity.")
     # Sixteen steps for every cycle of the highest frequency, and a factor for the width of a step.
     count = max(4096, math.ceil(16 * (high - low) * float(np.abs(wanted).max(initial=0.0))))
     edges = np.linspace(low, high, count + 1)
@@ -211,10 +213,9 @@ def _check_metres(width: float) -> None:
 
 
 def _number(value: Any, name: str) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        raise UnitError(f"Pulse: expected {name} to be one number in metres, got {value!r}.") from None
+    number = as_number(value)
+    if number is None:
+        raise UnitError(f"Pulse: expected {name} to be one number in metres, got {shown(value)}.")
     if not math.isfinite(number):
         raise UnitError(f"Pulse: expected a finite {name}, got {number!r}.")
     return number

@@ -1,7 +1,7 @@
 """Numbers as people give them, checked: finite, positive, shares, counts, arrays, transforms.
 
-What is none is a typed error that names it. A number is what Python, numpy or torch have for one; truth values and
-texts are none, although Python takes them.
+What is none is a typed error that names it. A number is what Python, numpy or torch have for one; truth values,
+texts, dates and entries that a mask hides are none, although Python or numpy take them.
 """
 
 from __future__ import annotations
@@ -95,6 +95,14 @@ def as_whole(value: Any) -> int | None:
         return None
 
 
+def how_many(name: str, value: Any, least: int = 1, most: int = 2**24) -> int:
+    """How many of something are to be made, as an int. Raises ShapeError unless it is a whole number in the range."""
+    number = as_whole(value)
+    if number is None or not least <= number <= most:
+        raise ShapeError(f"{name}: expected a whole number from {least} to {most}, got {shown(value)}.")
+    return number
+
+
 def flag(name: str, value: Any) -> bool:
     """``value`` as a truth value. Raises ArgumentError for others: a text that says False would count as true."""
     if not _is_truth(value) or getattr(value, "ndim", None):
@@ -104,9 +112,11 @@ def flag(name: str, value: Any) -> bool:
 
 def real_array(values: Any) -> NDArray[np.float64] | None:
     """Real numbers of any library as a float64 array, detached; None for what is none: texts, None, truth values, rows
-    of different lengths, and numbers that float64 cannot hold.
+    of different lengths, entries behind a mask, and numbers that float64 cannot hold.
     """
     try:
+        if np.ma.is_masked(values):  # type: ignore[no-untyped-call]
+            return None
         plain = np.asarray(values.detach().cpu() if hasattr(values, "detach") else values)
         if plain.dtype.kind in "iuf":
             return plain.astype(np.float64)
@@ -116,8 +126,16 @@ def real_array(values: Any) -> NDArray[np.float64] | None:
         return None
 
 
+def array(name: str, values: Any) -> NDArray[np.float64]:
+    """:func:`real_array` of numbers of any shape. Raises ShapeError for what is none."""
+    plain = real_array(values)
+    if plain is None:
+        raise ShapeError(f"{name}: expected numbers, got {shown(values)}.")
+    return plain
+
+
 def _are_numbers(objects: NDArray[Any]) -> bool:
-    return all(hasattr(value, "__float__") for value in objects.reshape(-1))
+    return all(hasattr(value, "__float__") and not _is_no_number(value) for value in objects.reshape(-1))
 
 
 def transform(name: str, given: Any) -> NDArray[np.float64]:
@@ -141,6 +159,7 @@ def shown(value: Any) -> str:
         text = f"a {type(value).__name__} that is too long to be written"
     except RecursionError:
         text = f"a {type(value).__name__} that is nested too deeply to be written"
+    text = " ".join(text.split()) if "\n" in text else text
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
@@ -157,7 +176,7 @@ def with_article(word: str) -> str:
 
 def as_number(value: Any) -> float | None:
     """``value`` as a float, infinities and NaN too; None for what is no real number."""
-    if _is_truth(value) or isinstance(value, (str, bytes)) or getattr(value, "ndim", None):
+    if _is_no_number(value) or getattr(value, "ndim", None):
         return None
     try:
         return float(value)
@@ -171,6 +190,14 @@ def _number(value: Any) -> float:
     """NaN for what is no real number."""
     number = as_number(value)
     return math.nan if number is None else number
+
+
+def _is_no_number(value: Any) -> bool:
+    """Whether Python makes a number of what is none."""
+    if isinstance(value, (str, bytes)) or value is np.ma.masked:
+        return True
+    dtype = getattr(value, "dtype", None)
+    return _is_truth(value) or "complex" in str(dtype) or getattr(dtype, "kind", None) in {"m", "M", "S", "U", "V"}
 
 
 def _is_truth(value: Any) -> bool:

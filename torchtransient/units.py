@@ -7,9 +7,11 @@ speed of light in vacuum gives the time of flight, in any medium.
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from torchtransient.errors import UnitError
+from torchtransient.quantities import as_number, shown
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -45,14 +47,19 @@ def seconds_to_opl(time_s: Quantity) -> Quantity:
 
 
 def near_seconds(time_s: float, name: str, where: str, *, limit_s: float = LATEST_S) -> float:
-    """A time in seconds. UnitError from `limit_s` on, either side of zero: picoseconds, nanoseconds or metres."""
-    if abs(time_s) >= limit_s:
+    """A time in seconds. UnitError from `limit_s` on, either side of zero: picoseconds, nanoseconds or metres, and for
+    what is no number.
+    """
+    number = as_number(time_s)
+    if number is None or math.isnan(number):
+        raise UnitError(f"{where}: expected {name} to be one finite number in seconds, got {shown(time_s)}.")
+    if abs(number) >= limit_s:
         raise UnitError(
-            f"{where}: expected {name} in seconds, below {limit_s:g} s, got {time_s!r} s, which is "
-            f"{seconds_to_opl(float(time_s)):.4g} m of optical path. 50 ps are 50e-12 s, 4 ns are 4e-9 s. If it is "
+            f"{where}: expected {name} in seconds, below {limit_s:g} s, got {shown(time_s)} s, which is "
+            f"{seconds_to_opl(number):.4g} m of optical path. 50 ps are 50e-12 s, 4 ns are 4e-9 s. If it is "
             "meant, say it in metres of optical path."
         )
-    return time_s
+    return number
 
 
 def _refuse_half(value: object, name: str) -> None:

@@ -146,3 +146,32 @@ def test_an_interrupt_waits_for_a_change_of_the_variant(monkeypatch):
         raise AssertionError("never reached")
     assert done == ["llvm_ad_mono", VARIANT] and mi.variant() == VARIANT
     assert signal.getsignal(signal.SIGINT) is before
+
+
+# ----------------------------------------------------------------------------------------------- values of parameters
+
+
+def test_values_of_every_library():
+    renderer = tt.TransientRenderer(make_room(), [COLOUR], spp=1)
+    expected = renderer({COLOUR: torch.tensor([0.5, 0.25, 0.75])}, seed=0).transient
+    row = [0.5, 0.25, 0.75]
+    half = torch.tensor(0.5, requires_grad=True)
+    for value in (row, np.array(row, ">f8"), np.array(row, np.longdouble), np.array(row, object), [half, *row[1:]]):
+        assert torch.equal(renderer({COLOUR: value}, seed=0).transient, expected)
+    out = renderer({COLOUR: [[half, 0.25, 0.75], [0.5, half, 0.75]]}, seed=0).transient
+    assert torch.autograd.grad(out.sum(), half)[0] > 0 and torch.equal(out[0], expected)
+
+
+@pytest.mark.filterwarnings("ignore:.*(quantized|nested) tensor")
+def test_values_that_are_no_numbers():
+    renderer = tt.TransientRenderer(make_room(), [COLOUR], spp=1)
+    ones = torch.ones(3)
+    wrong = [
+        np.array(["2020"] * 3, "datetime64[s]"), ["0.5"] * 3, np.array(["1"] * 3), [10**400] * 3, [True] * 3,
+        np.ma.array([0.5] * 3, mask=[False, True, False]), torch.nested.nested_tensor([ones, ones]), ones.to_sparse(),
+        torch.quantize_per_tensor(ones, 0.1, 0, torch.qint8), [ones[0], "x", 1.0], [ones, ones[:2]], [1j] * 3,
+    ]  # fmt: skip
+    for value in wrong:
+        with pytest.raises(ShapeError, match="expected") as failure:
+            renderer({COLOUR: value}, seed=0)
+        assert "\n" not in str(failure.value)
