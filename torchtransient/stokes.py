@@ -10,14 +10,19 @@ steady image ``(..., 4, C, H, W)`` (``STEADY_DIM``). Angles are radians. Any rea
 
 Nothing here divides zero by zero, forwards or backwards: dark entries and unpolarised ones have the value and the
 derivative zero, where the functions themselves have no derivative. Second derivatives exist away from these entries.
+NaN in the light is NaN in what is made of it.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import torch
 from torch import Tensor
 
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
+from torchtransient.quantities import array, as_number, as_whole, shown
 
 TRANSIENT_DIM = -5
 STEADY_DIM = -4
@@ -56,12 +61,12 @@ def angle_of_linear_polarization(stokes: Tensor, dim: int, floor: float = 0.0) -
     part; a loss on :func:`normalized_components` has neither problem. Errors as for :func:`degree_of_polarization`.
     """
     part = _components(stokes, dim)
-    _check_floor(floor)
+    floor = _checked_floor(floor)
     s1, s2 = part[1], part[2]
     largest = torch.maximum(s1.abs(), s2.abs()).detach()
     # The angle does not depend on the scale; at scale one the squares in its derivative cannot underflow.
     # The larger one alone may stay below the floor where both together do not.
-    there = (largest > torch.finfo(stokes.dtype).tiny) & (torch.hypot(s1, s2).detach() > floor)
+    there = ~((largest <= torch.finfo(stokes.dtype).tiny) | (torch.hypot(s1, s2).detach() <= floor))
     scale = torch.where(there, largest, 1.0)
     s1, s2 = torch.where(there, s1, 1.0) / scale, torch.where(there, s2, 0.0) / scale
     return 0.5 * torch.atan2(s2, s1)
@@ -83,7 +88,7 @@ def _degree(stokes: Tensor, dim: int, which: tuple[int, ...], floor: float) -> T
     lit, s0 = _intensity(part[0], floor)
     used = torch.stack([part[i] for i in which])
     largest = used.abs().amax(0).detach()
-    polarized = lit & (largest > torch.finfo(stokes.dtype).tiny)
+    polarized = lit & ~(largest <= torch.finfo(stokes.dtype).tiny)
     # At scale one no square underflows, and the root is taken of a number between one and three.
     scale = torch.where(polarized, largest, 1.0)
     unit = torch.where(polarized, used, 0.0) / scale
@@ -93,8 +98,8 @@ def _degree(stokes: Tensor, dim: int, which: tuple[int, ...], floor: float) -> T
 
 def _intensity(s0: Tensor, floor: float) -> tuple[Tensor, Tensor]:
     """Where there is light, and a divisor that is one elsewhere."""
-    _check_floor(floor)
-    lit = s0 > max(floor, torch.finfo(s0.dtype).tiny)
+    floor = _checked_floor(floor)
+    lit = ~(s0 <= max(floor, torch.finfo(s0.dtype).tiny))
     return lit, torch.where(lit, s0, 1.0)
 
 
@@ -108,7 +113,7 @@ def rotate_frame(stokes: Tensor, angle: Tensor | float, dim: int) -> Tensor:
     against ``stokes`` without ``dim``. Raises ``ShapeError``.
     """
     s0, s1, s2, s3 = _components(stokes, dim)
-    double = 2 * torch.as_tensor(angle, dtype=stokes.dtype, device=stokes.device)
+    double = 2 * _real("angle", angle).to(stokes)
     c, s = torch.cos(double), torch.sin(double)
     turned = c * s1 + s * s2, c * s2 - s * s1
     if turned[0].shape != s0.shape:
@@ -125,9 +130,10 @@ def apply_mueller(matrix: Tensor, stokes: Tensor, dim: int) -> Tensor:
     Several elements: multiply their matrices, the one that the light meets first on the right. Raises ``ShapeError``.
     """
     _components(stokes, dim)
-    if matrix.shape != (4, 4):
-        raise ShapeError(f"matrix: expected a Mueller matrix of shape (4, 4), got {tuple(matrix.shape)}.")
-    return (matrix.to(stokes) @ stokes.movedim(dim, -1).unsqueeze(-1)).squeeze(-1).movedim(-1, _axis(stokes, dim))
+    mueller = _real("matrix", matrix)
+    if mueller.shape != (4, 4):
+        raise ShapeError(f"matrix: expected a Mueller matrix of shape (4, 4), got {tuple(mueller.shape)}.")
+    return (mueller.to(stokes) @ stokes.movedim(dim, -1).unsqueeze(-1)).squeeze(-1).movedim(-1, _axis(stokes, dim))
 
 
 # ------------------------------------------------------------------------------------------------ ideal elements
@@ -135,7 +141,7 @@ def apply_mueller(matrix: Tensor, stokes: Tensor, dim: int) -> Tensor:
 
 def rotator(angle: Tensor | float) -> Tensor:
     """Change to a frame turned counter-clockwise by ``angle`` (a number or a tensor ``(...)``), shape (..., 4, 4)."""
-    double = 2 * _floating(angle)
+    double = 2 * _floating("angle", angle)
     c, s = torch.cos(double), torch.sin(double)
     o, i = torch.zeros_like(c), torch.ones_like(c)
     return _matrix(((i, o, o, o), (o, c, s, o), (o, -s, c, o), (o, o, o, i)))
@@ -147,9 +153,9 @@ def linear_polarizer(angle: Tensor | float = 0.0, extinction: Tensor | float = 0
     ``extinction``: power transmitted of the light across it, relative to that along it, in [0, 1]: 0 is ideal, real
     sensors have 1/100 to 1/400. Raises ``UnitError`` outside of that range.
     """
-    double, e = _together(2 * _floating(angle), _floating(extinction))
-    if bool(((e < 0) | (e > 1)).any()):
-        raise UnitError(f"extinction: expected numbers in [0, 1], got {extinction!r}.")
+    double, e = _together(2 * _floating("angle", angle), _floating("extinction", extinction))
+    if not bool(((e >= 0) & (e <= 1)).all()):
+        raise UnitError(f"extinction: expected numbers in [0, 1], got {shown(extinction)}.")
     c, s = torch.cos(double), torch.sin(double)
     plus, minus = 0.5 * (1 + e), 0.5 * (1 - e)
     # The root has no slope at zero; an ideal polarizer's derivative by its extinction leaves the cross terms out.
@@ -165,7 +171,7 @@ def linear_retarder(angle: Tensor | float, delay: Tensor | float) -> Tensor:
 
     A quarter-wave plate has pi/2, a half-wave plate pi.
     """
-    double, phase = _together(2 * _floating(angle), _floating(delay))
+    double, phase = _together(2 * _floating("angle", angle), _floating("delay", delay))
     c, s, cd, sd = torch.cos(double), torch.sin(double), torch.cos(phase), torch.sin(phase)
     o, i = torch.zeros_like(c), torch.ones_like(c)
     m = (1 - cd) * s * c
@@ -199,29 +205,45 @@ def depolarizer() -> Tensor:
 
 
 def _components(stokes: Tensor, dim: int) -> tuple[Tensor, ...]:
+    given: Any = stokes
+    if not isinstance(given, Tensor):
+        raise ShapeError(f"stokes: expected a tensor, got {shown(given)}.")
     if not stokes.dtype.is_floating_point:
         raise ShapeError(f"stokes: expected real floating point numbers, got {stokes.dtype}.")
-    if not -stokes.ndim <= dim < stokes.ndim or stokes.shape[dim] != 4:
+    if (axis := as_whole(dim)) is None:
+        raise ArgumentError(f"dim: expected a whole number, got {shown(dim)}.")
+    if not -stokes.ndim <= axis < stokes.ndim or stokes.shape[axis] != 4:
         raise ShapeError(
             f"stokes: expected four components along dim={dim}, got shape {tuple(stokes.shape)}. They are along -5 in "
             "a transient (..., 4, C, T, H, W) and along -4 in a steady image (..., 4, C, H, W); only polarized "
             "variants render them."
         )
-    return torch.unbind(stokes, dim)
+    return torch.unbind(stokes, axis)
 
 
 def _axis(stokes: Tensor, dim: int) -> int:
     return dim % stokes.ndim
 
 
-def _check_floor(floor: float) -> None:
-    if not floor >= 0:
-        raise UnitError(f"floor: expected a number of at least 0, got {floor!r}.")
+def _checked_floor(floor: float) -> float:
+    number = as_number(floor)
+    if number is None or not number >= 0:
+        raise UnitError(f"floor: expected a number of at least 0, got {shown(floor)}.")
+    return number
 
 
-def _floating(value: Tensor | float) -> Tensor:
-    tensor = torch.as_tensor(value)
-    return tensor if tensor.dtype.is_floating_point else tensor.to(torch.get_default_dtype())
+def _real(name: str, value: Any) -> Tensor:
+    tensor = value if isinstance(value, Tensor) else torch.from_numpy(array(name, value))
+    if tensor.is_complex() or tensor.dtype == torch.bool:
+        raise ShapeError(f"{name}: expected real numbers, got {tensor.dtype}.")
+    return tensor
+
+
+def _floating(name: str, value: Any) -> Tensor:
+    """Numbers without a precision of their own have that of torch."""
+    tensor, given = _real(name, value), getattr(value, "dtype", None)
+    own = tensor.dtype.is_floating_point and (given == tensor.dtype or given == np.float64)
+    return tensor if own else tensor.to(torch.get_default_dtype())
 
 
 def _together(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
