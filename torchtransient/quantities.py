@@ -77,9 +77,8 @@ def shares(name: str, values: Any) -> float | tuple[float, float, float]:
 
 def count(name: str, value: Any, least: int = 1, error: type[TorchTransientError] = SceneError) -> int:
     """``value`` as an int. Raises ``error`` unless it is a whole number of at least ``least``."""
-    try:
-        number = None if _is_truth(value) else operator.index(value)
-    except TypeError:
+    number = as_whole(value)
+    if number is None:
         whole = _number(value)
         number = int(whole) if math.isfinite(whole) and whole == round(whole) else None
     if number is None or number < least:
@@ -93,6 +92,8 @@ def as_whole(value: Any) -> int | None:
         return None if _is_truth(value) else operator.index(value)
     except TypeError:
         return None
+    except RuntimeError:  # of torch, for unsigned numbers of 64 bits; `item` of a number under `vmap` raises as well
+        return int(value.item())
 
 
 def how_many(name: str, value: Any, least: int = 1, most: int = 2**24) -> int:

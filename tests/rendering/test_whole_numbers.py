@@ -12,8 +12,12 @@ import torch
 import torchtransient as tt
 from support.sweeps import together
 from torchtransient.errors import ArgumentError, ShapeError, TorchTransientError, TorchTransientWarning, UnitError
+from torchtransient.nlos.scene import _range as bounces_of
 from torchtransient.plugins import _registry
+from torchtransient.rendering.cameras import camera_of
+from torchtransient.rendering.labels import scene_labels
 from torchtransient.rendering.variant import active_variant
+from torchtransient.sensing.itof.itof_codes import phase_steps
 from torchtransient.testing.small_room import COLOUR, VARIANT, make_room
 
 WHOLE = [np.int64(3), np.uint8(3), np.array(3), torch.tensor(3), torch.tensor(3, dtype=torch.uint8)]
@@ -175,3 +179,88 @@ def test_values_that_are_no_numbers():
         with pytest.raises(ShapeError, match="expected") as failure:
             renderer({COLOUR: value}, seed=0)
         assert "\n" not in str(failure.value)
+
+
+# --------------------------------------------------------------------------------------------------- calls of others
+
+
+def confocal(size):
+    return tt.nlos.Scan.grid(tt.nlos.Wall.plane(1.0, 1.0), size, kind="confocal")
+
+
+def spot(n):
+    scan = tt.nlos.Scan.grid(tt.nlos.Wall.plane(1.0, 1.0), 4, kind="exhaustive")
+    return bool(np.array_equal(scan.single((n, 0)).laser_points, scan.single((3, 0)).laser_points)) * int(n)
+
+
+def passes(n):
+    return tt.nlos.DiffusionDeconvolution(confocal(2), time_axis=AXIS, thickness=0.025, passes=n).passes
+
+
+def counted(n):
+    with tt.threads(n) as found:
+        return found.drjit
+
+
+def seed_of_a_function(n):
+    mi.set_variant(VARIANT)
+    seeds = []
+
+    def function(seed, x):
+        seeds.append(seed)
+        return x * 2
+
+    tt.wrap(function, reseed="seed")(n, torch.ones(1))
+    return seeds[0]
+
+
+def samples_of_labels(n):
+    renderer = tt.TransientRenderer(make_room(), spp=1)
+    found = scene_labels(renderer, names=("depth",), average=True, samples=n)["depth"]
+    return int(n) * torch.equal(found, scene_labels(renderer, names=("depth",), average=True, samples=4)["depth"])
+
+
+AXIS, DEVICE = tt.TimeAxis(0.0, 0.1, 8), tt.sensing.device("mpd_spad_like")
+STAGE = [stage["kind"] for stage in DEVICE.stages].index("PhotonBudget")
+# (call, a number that it takes): the call gives that number back.
+OTHERS = {
+    "grid": (lambda n: confocal(n).sensor_shape[0], 3),
+    "grid of two": (lambda n: confocal((1, n)).sensor_shape[0], 3),
+    "laser": (spot, 3),
+    "passes": (passes, 2),
+    "threads": (counted, 2),
+    "phase steps": (lambda n: len(phase_steps(n)), 3),
+    "seed of a function": (seed_of_a_function, 3),
+    "bounces": (lambda n: bounces_of([2, n])[1], 3),
+    "samples of labels": (samples_of_labels, 4),
+    "sensor of a camera": (lambda n: camera_of(tt.TransientRenderer(room_of_four()), sensor=n) and int(n), 1),
+    "stage": (lambda n: (DEVICE.changed(n, cycles=7) == DEVICE.changed("PhotonBudget", cycles=7)) * int(n), STAGE),
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_whole_numbers_of_other_libraries_in_other_calls(name):
+    call, good = OTHERS[name]
+    for kind in (int, np.int64, np.uint8, np.array, torch.tensor):
+        assert call(kind(good)) == good
+    for bad in (True, 1.5, torch.tensor(1.5), "3", None, 1j, [[1]]):
+        if f"{name}: {bad}" in ("threads: None", "sensor of a camera: None"):
+            continue  # asks how many; the first
+        with pytest.raises(TorchTransientError, match="expected") as failure:
+            call(bad)
+        assert "\n" not in str(failure.value)
+
+
+def test_seeds_of_64_bits_and_without_an_order():
+    renderer = tt.TransientRenderer(make_room(), [COLOUR], spp=1)
+    x = torch.full((2, 3), 0.5)
+    large = torch.tensor([3, 2**63 + 3], dtype=torch.uint64)
+    with pytest.warns(TorchTransientWarning, match="counts as 3"):
+        assert renderer(seed=large[1]).stats.seeds == (3,)
+    with pytest.raises(UnitError, match="are one seed"):
+        renderer({COLOUR: x}, seed=large)
+    with pytest.warns(TorchTransientWarning, match="counts as 3"):
+        found = torch.func.vmap(lambda x, seed: renderer({COLOUR: x}, seed=seed).transient)(x, large)
+    assert torch.equal(found[0], found[1])
+    with pytest.raises(UnitError, match="or one for each batch entry"):
+        renderer({COLOUR: x}, seed={1, 2})

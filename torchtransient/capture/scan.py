@@ -16,7 +16,7 @@ from torchtransient.capture.distances import bounds_of, longest, shortest
 from torchtransient.capture.scan_checks import check_shapes, check_sides, float64_points, unit_normals
 from torchtransient.capture.wall import Wall, grid_size, triple
 from torchtransient.errors import ArgumentError, SceneError, ShapeError
-from torchtransient.quantities import Numbers, flag, positive, real_array, shown
+from torchtransient.quantities import Numbers, as_whole, flag, positive, real_array, shown
 from torchtransient.tensor_record import same
 
 KINDS = ("single", "confocal", "exhaustive")
@@ -327,11 +327,11 @@ def _check_kind(kind: Any) -> None:
 def laser_index(scan: Scan, laser: int | tuple[int, ...]) -> tuple[int, ...]:
     """`laser` as an index into the spots of a scan. Raises ShapeError where there is none."""
     index = laser if isinstance(laser, tuple) else (laser,)
-    whole = all(isinstance(i, int | np.integer) and not isinstance(i, bool) for i in index)
-    inside = len(index) == len(scan.laser_shape) and whole
-    if not inside or not all(-n <= i < n for i, n in zip(index, scan.laser_shape, strict=True)):
+    whole = [number for i in index if (number := as_whole(i)) is not None]
+    inside = len(index) == len(scan.laser_shape) == len(whole)
+    if not inside or not all(-n <= i < n for i, n in zip(whole, scan.laser_shape, strict=True)):
         raise ShapeError(f"laser: expected an index into spots {scan.laser_shape}, got {shown(laser)}.")
-    return tuple(int(i) for i in index)
+    return tuple(whole)
 
 
 def _spot(surface: Wall, laser: Any) -> tuple[Any, np.ndarray]:

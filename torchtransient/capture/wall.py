@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from torchtransient.capture.triangles import first_hits, triangle_normals
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
-from torchtransient.quantities import Numbers, flag, positive, real_array, shares, shown, transform
+from torchtransient.quantities import Numbers, as_whole, flag, positive, real_array, shares, shown, transform
 
 Array = NDArray[np.float64]
 
@@ -310,13 +310,15 @@ def checked_mesh(who: str, vertices: Any, faces: Any) -> tuple[Array, NDArray[np
 
 def grid_size(size: int | Sequence[int], who: str) -> tuple[int, int]:
     """(nx, ny) of one number or a pair. Raises ShapeError unless both are whole and at least 1."""
-    pair = tuple(size) if isinstance(size, Sequence | np.ndarray) else (size, size)
-    whole = [isinstance(n, int | np.integer) and not isinstance(n, bool) and n >= 1 for n in pair]
-    if len(pair) != 2 or not all(whole):
+    several = isinstance(size, Sequence) or getattr(size, "ndim", None) == 1
+    given: Any = size
+    pair = [as_whole(n) for n in (given if several else (given, given))]
+    nx, ny = pair if len(pair) == 2 else (None, None)
+    if nx is None or ny is None or nx < 1 or ny < 1:
         raise ShapeError(f"{who}: expected (nx, ny) or one whole number, at least 1, got {shown(size)}.")
-    if pair[0] * pair[1] > _MOST_POINTS:
+    if nx * ny > _MOST_POINTS:
         raise ShapeError(f"{who}: expected at most {_MOST_POINTS} points in all, got {shown(size)}.")
-    return int(pair[0]), int(pair[1])
+    return nx, ny
 
 
 def _detached(values: Any) -> Any:

@@ -15,7 +15,7 @@ from torchtransient.errors import SceneError, UnitError
 from torchtransient.nlos import defaults
 from torchtransient.nlos.arguments import check_is_scan
 from torchtransient.nlos.mesh_file import mesh_file
-from torchtransient.quantities import shown
+from torchtransient.quantities import as_number, as_whole, shown
 from torchtransient.rendering.build_options import BuildOptions
 from torchtransient.rendering.scene_handle import load
 from torchtransient.rendering.variant import active_variant
@@ -161,9 +161,10 @@ def _check_energy(energy: Any) -> None:
     """Raise UnitError for numbers that no laser brings, SceneError for what is no spectrum."""
     if isinstance(energy, Mapping):
         return
-    if isinstance(energy, bool) or not isinstance(energy, (int, float, np.number)):
+    joules = as_number(energy)
+    if joules is None:
         raise SceneError(f"energy: expected joules, or a spectrum as a Mitsuba dictionary, got {shown(energy)}.")
-    if not 0 <= energy < MOST_ENERGY:
+    if not 0 <= joules < MOST_ENERGY:
         raise UnitError(f"energy: expected joules of at least 0, got {shown(energy)} (of {MOST_ENERGY:g} at most).")
 
 
@@ -176,13 +177,14 @@ def _range(bounces: Sequence[int] | str) -> tuple[int, int]:
     """The first and the last number that counts; -1 for no limit."""
     if isinstance(bounces, str) and bounces == ALL_BOUNCES:
         return 0, -1
-    given: list[Any] = list(bounces) if isinstance(bounces, (tuple, list, range)) else [bounces]
-    whole = all(isinstance(n, int) and not isinstance(n, bool) and n >= 2 for n in given)
-    numbers = sorted(given) if whole else []
+    several = isinstance(bounces, (tuple, list, range)) or getattr(bounces, "ndim", None) == 1
+    given: list[Any] = list(bounces) if several else [bounces]
+    plain = [number for n in given if (number := as_whole(n)) is not None and number >= 2]
+    numbers = sorted(plain) if len(plain) == len(given) else []
     if not numbers or numbers != list(range(numbers[0], numbers[0] + len(numbers))):
         raise SceneError(
             "bounces: expected whole numbers of at least 2 without gaps, such as (3,) or (3, 4, 5), or 'all', "
-            f"got {bounces!r}. The laser's spot is the first bounce, so light around one corner has 3."
+            f"got {shown(bounces)}. The laser's spot is the first bounce, so light around one corner has 3."
         )
     return int(numbers[0]), int(numbers[-1])
 

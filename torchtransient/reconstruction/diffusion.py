@@ -18,7 +18,7 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import UnitError
-from torchtransient.quantities import finite, positive
+from torchtransient.quantities import as_whole, finite, positive, shown
 from torchtransient.reconstruction.capture_checks import SNR, within
 from torchtransient.reconstruction.confocal_operator import ConfocalOperator, InverseOperator
 from torchtransient.reconstruction.linear import each
@@ -104,9 +104,9 @@ class DiffusionDeconvolution(ConfocalOperator):
         who = type(self).__name__
         self.thickness = positive(f"{who}: thickness", thickness)
         self.properties = _slab_properties(properties, who)
-        if isinstance(passes, bool) or not isinstance(passes, int) or passes not in (1, 2):
-            raise UnitError(f"{who}: expected light that crosses the slab once or twice, got passes={passes!r}.")
-        self.passes, self.snr = passes, within(f"{who}: snr", snr, *SNR)
+        if (crossings := as_whole(passes)) not in (1, 2):
+            raise UnitError(f"{who}: expected light that crosses the slab once or twice, got passes={shown(passes)}.")
+        self.passes, self.snr = crossings, within(f"{who}: snr", snr, *SNR)
         self._set_tables()
 
     def tables(self) -> dict[str, Tensor]:

@@ -9,6 +9,7 @@ import torch
 
 from torchtransient.errors import DeviceError, UnitError, VariantError
 from torchtransient.plugins.drjit_pool import engine_lock, set_drjit_threads
+from torchtransient.quantities import as_whole, shown
 
 MOST_THREADS = 1024
 
@@ -58,7 +59,7 @@ def threads(n: int | None = None) -> Threads:
     threads (the counts stay what they were), ``VariantError`` in a process that was forked from one whose threads of
     Dr.Jit were at work.
     """
-    _check(n)
+    n = _checked(n)
     with engine_lock:
         before = _counts()
         if n is not None:
@@ -66,11 +67,13 @@ def threads(n: int | None = None) -> Threads:
         return Threads(*_counts(), before)
 
 
-def _check(n: int | None) -> None:
+def _checked(n: int | None) -> int | None:
     if n is None:
-        return
-    if isinstance(n, bool) or not isinstance(n, int) or not 1 <= n <= MOST_THREADS:
-        raise UnitError(f"threads: expected a whole number from 1 to {MOST_THREADS}, or None to ask, got {n!r}.")
+        return None
+    number = as_whole(n)
+    if number is None or not 1 <= number <= MOST_THREADS:
+        raise UnitError(f"threads: expected a whole number from 1 to {MOST_THREADS}, or None to ask, got {shown(n)}.")
+    return number
 
 
 def _counts() -> tuple[int, int]:

@@ -12,7 +12,7 @@ from torch.utils.data import IterableDataset, get_worker_info
 from torchtransient.data.reading.online_producers import WHAT, Producers
 from torchtransient.data.reading.online_schedule import Schedule
 from torchtransient.errors import ShapeError, TorchTransientError, UnitError
-from torchtransient.quantities import count, shown
+from torchtransient.quantities import as_number, count, shown
 
 
 class OnlineDataset(IterableDataset[dict[str, Any]]):
@@ -62,7 +62,8 @@ class OnlineDataset(IterableDataset[dict[str, Any]]):
         capacity, workers, warm = whole("capacity", capacity, 2), whole("workers", workers), whole("warm", warm)
         first, seed = whole("first", first, 0), whole("seed", seed, 0)
         for name, value in (("uses", uses), ("timeout_s", timeout_s)):
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not value > 0:
+            number = as_number(value)
+            if number is None or not number > 0:
                 raise UnitError(f"{WHAT}: expected {name} as a number above zero, got {shown(value)}.")
         self.transform = transform
         schedule = Schedule(capacity, workers, float(uses), min(warm, capacity), first, seed)

@@ -28,7 +28,7 @@ from torchtransient.data.storage.shard_writing import (
 )
 from torchtransient.data.storage.shard_writing import ShardWriter as ShardWriter
 from torchtransient.errors import StorageError
-from torchtransient.quantities import shown
+from torchtransient.quantities import as_whole, shown
 
 _TEXTS = ("format", "store", "compression")
 
@@ -210,7 +210,8 @@ class Shard:
         return array if as_stored else decoded(array, self.encoding(name))
 
     def _check_row(self, row: int) -> None:
-        if not (isinstance(row, int | np.integer) and 0 <= row < self.rows):
+        number = as_whole(row)
+        if number is None or not 0 <= number < self.rows:
             raise StorageError(f"{WHAT}: '{self.path}': expected a row from 0 to {self.rows - 1}, got {shown(row)}.")
         if not self._there[row]:
             reason = next((text for number, _, text in self._about["failed"] if number == row), "no reason")
