@@ -118,8 +118,9 @@ class TimeAxis:
         `opl` in metres, a number or a tensor on any device; compared in float64 with `edges_opl`, so that an edge
         belongs to the bin that starts there. Raises UnitError for NaN.
         """
-        known = isinstance(opl, Tensor) and not opl.is_complex()
-        lengths = (opl if known else torch.from_numpy(array("TimeAxis.bin_index: opl", opl))).detach().to(torch.float64)
+        if not isinstance(opl, Tensor) or opl.is_complex():
+            opl = torch.from_numpy(array("TimeAxis.bin_index: opl", opl))
+        lengths = opl.detach().to(torch.float64)
         if bool(torch.isnan(lengths).any()):
             raise UnitError("TimeAxis.bin_index: expected lengths in metres, got NaN.")
         edges = self.edges_opl.to(lengths.device)

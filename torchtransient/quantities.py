@@ -116,7 +116,7 @@ def real_array(values: Any) -> NDArray[np.float64] | None:
     of different lengths, entries behind a mask, and numbers that float64 cannot hold.
     """
     try:
-        if np.ma.is_masked(values):  # type: ignore[no-untyped-call]
+        if np.ma.is_masked(values):
             return None
         plain = np.asarray(values.detach().cpu() if hasattr(values, "detach") else values)
         if plain.dtype.kind in "iuf":
