@@ -179,7 +179,8 @@ def is_below(other, room):
         ("capture", "tensor_record"), ("capture", "quantities"), ("nlos", "files"), ("data", "files"), ("data", "nlos"),
         ("floating", "quantities"), ("metrics", "losses"), ("metrics", "reconstruction"), ("axes", "quantities"),
         ("gates", "quantities"), ("pulses", "quantities"), ("capture", "argument_names"),
-        ("units", "quantities"), ("stokes", "quantities"), ("array_files", "quantities"), ("array_files", "plain_texts"), ("array_files", "free_memory"),
+        ("units", "quantities"), ("stokes", "quantities"),
+        ("array_files", "quantities"), ("array_files", "plain_texts"), ("array_files", "free_memory"),
     }  # fmt: skip
     return other in {"errors", "units"} or (room, other) in within
 
