@@ -21,7 +21,6 @@ PYTHONS = {
 BARE = {
     "__init__.py": {"AttributeError"},  # the protocol of modules
     "argument_names.py": {"TypeError"},  # a wrong keyword argument, as Python says it
-    "axes.py": {"TypeError"},  # caught in the same function
     "capture/capture.py": {"TypeError"},  # caught where tensors are made, and told
     "capture/metadata.py": {"TypeError"},  # caught by its callers, who know the file
     "data/augmentation/augmented.py": {"AttributeError"},  # the protocol of objects

@@ -2,11 +2,12 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
 from torchtransient import stokes as st
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
 
 MEASURES = [
     st.degree_of_polarization,
@@ -194,3 +195,57 @@ def test_an_ideal_polarizer_lets_nothing_through_across():
         torch.testing.assert_close(st.linear_polarizer(angle), expected, rtol=0, atol=1e-6)
     half = st.linear_polarizer(math.pi / 4)
     torch.testing.assert_close(half[2], torch.tensor([0.5, 0.0, 0.5, 0.0]), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("measure", MEASURES)
+@pytest.mark.parametrize("floor", [0.0, 0.5])
+def test_light_that_is_no_number_has_no_measure(measure, floor):
+    given = light(1.0, 1.0, 0.75, 0.125).expand(5, 4).T.clone()
+    given.diagonal().fill_(math.nan)
+    found = measure(given, 0, floor).isnan()
+    found = found.any(0) if found.ndim == 2 else found
+    touched = {"angle": [0, 1, 1, 0, 0], "degree_of_circular": [1, 0, 0, 1, 0], "degree_of_linear": [1, 1, 1, 0, 0]}
+    expected = next((row for name, row in touched.items() if measure.__name__.startswith(name)), [1, 1, 1, 1, 0])
+    assert found.tolist() == [bool(entry) for entry in expected]
+    everything = torch.full((4,), math.nan, requires_grad=True)
+    assert torch.autograd.grad(measure(everything, 0).sum(), everything)[0].isnan().any()
+
+
+@pytest.mark.parametrize("measure", MEASURES)
+def test_what_is_no_light(measure):
+    ones = torch.ones(4, 2)
+    for given in (np.ones(4), [1, 0, 0, 0], None):
+        with pytest.raises(ShapeError, match="stokes: expected a tensor"):
+            measure(given, 0)
+    for floor in (None, "x", True, math.nan, -1.0, math.inf, 10**400, torch.ones(2), [1.0]):
+        with pytest.raises(UnitError, match="floor: expected a finite number of at least 0"):
+            measure(ones, 0, floor)
+    for dim in (None, 1.5, True, "x"):
+        with pytest.raises(ArgumentError, match="dim: expected a whole number"):
+            measure(ones, dim)
+
+
+def test_what_is_no_angle():
+    ones = torch.ones(4, 2)
+    calls = [
+        st.rotator, st.linear_polarizer, lambda x: st.linear_polarizer(0.0, x), lambda x: st.linear_retarder(x, 0.0),
+        lambda x: st.linear_retarder(0.0, x), lambda x: st.rotate_frame(ones, x, 0),
+        lambda x: st.apply_mueller(x, ones, 0),
+    ]  # fmt: skip
+    for call in calls:
+        for bad in (None, "x", True, 1j, torch.tensor(1j), torch.tensor(True)):
+            with pytest.raises(UnitError, match="expected"):
+                call(bad)
+    with pytest.raises(UnitError, match="extinction: expected finite numbers, got nan"):
+        st.linear_polarizer(0.0, math.nan)
+    with pytest.raises(UnitError, match=r"extinction: expected numbers in \[0, 1\], got tensor\(nan\)"):
+        st.linear_polarizer(0.0, torch.tensor(math.nan))
+
+
+def test_precision_of_angles_and_matrices():
+    assert st.rotator(0.1).dtype == st.rotator([1, 2]).dtype == torch.float32
+    assert st.rotator(np.float64(0.1)).dtype == torch.float64
+    horizontal = light(1.0, 1.0, 0.0, 0.0)
+    torch.testing.assert_close(st.rotate_frame(horizontal, 0.1, 0)[1], torch.tensor(math.cos(0.2), dtype=torch.float64))
+    matrix = [[0.1 if i == j else 0.0 for i in range(4)] for j in range(4)]
+    assert torch.equal(st.apply_mueller(matrix, horizontal, 0), 0.1 * horizontal)

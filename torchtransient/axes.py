@@ -12,13 +12,14 @@ from torch import Tensor
 
 from torchtransient import quantities
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.quantities import Numbers, shown
+from torchtransient.quantities import Numbers, as_number, as_whole, numbers, shown
 from torchtransient.units import LATEST_S, SHORTEST_OPL, SPEED_OF_LIGHT, near_seconds, opl_to_seconds, seconds_to_opl
 
 # What a number in another unit looks like. The bins of real records are 1 ps to 1 us wide: in nanoseconds, picoseconds
 # or femtoseconds that is 1e-3 to 1e9, and in seconds taken for metres at most 1e-6.
 WIDEST_BIN_S = 1e-6  # 300 m of path; a picosecond in microseconds is as much
 LOWEST_HERTZ = 1e3  # 1 GHz in megahertz
+MOST_BINS = 2**62  # beyond that an index of a bin has no 64 bits
 MOST_PER_METRE = 5e6  # a wavelength of 200 nm; 5 MHz taken for cycles per metre
 
 
@@ -42,11 +43,11 @@ class TimeAxis:
         width = _finite(self.bin_width_opl, "bin_width_opl")
         if width <= 0:
             raise UnitError(f"TimeAxis: expected bin_width_opl > 0 metres, got {width!r}.")
-        bins = quantities.as_whole(self.num_bins)
-        if bins is None or bins > quantities.MOST:
+        bins = as_whole(self.num_bins)
+        if bins is None:
             raise ShapeError(f"TimeAxis: expected num_bins to be a whole number, got {shown(self.num_bins)}.")
-        if bins < 1:
-            raise ShapeError(f"TimeAxis: expected num_bins >= 1, got {shown(bins)}.")
+        if not 1 <= bins <= MOST_BINS:
+            raise ShapeError(f"TimeAxis: expected num_bins >= 1 and at most 2^62, got {shown(bins)}.")
         end = start + bins * width
         if not math.isfinite(end) or width < 4 * max(math.ulp(start), math.ulp(end)):
             raise UnitError(
@@ -118,11 +119,9 @@ class TimeAxis:
         `opl` in metres, a number or a tensor on any device; compared in float64 with `edges_opl`, so that an edge
         belongs to the bin that starts there. Raises UnitError for NaN.
         """
-        array = None if isinstance(opl, Tensor) else quantities.real_array(opl)
-        given = opl if isinstance(opl, Tensor) else None if array is None else torch.from_numpy(array)
-        if given is None or given.is_complex() or given.dtype == torch.bool:
-            raise UnitError(f"TimeAxis.bin_index: expected lengths in metres, got {shown(opl)}.")
-        lengths = given.detach().to(torch.float64)
+        if not isinstance(opl, Tensor) or opl.is_complex() or opl.dtype == torch.bool:
+            opl = torch.from_numpy(numbers("TimeAxis.bin_index: opl", opl))
+        lengths = opl.detach().to(torch.float64)
         if bool(torch.isnan(lengths).any()):
             raise UnitError("TimeAxis.bin_index: expected lengths in metres, got NaN.")
         edges = self.edges_opl.to(lengths.device)
@@ -163,7 +162,7 @@ class FrequencyAxis:
     def uniform(cls, first: float, step: float, count: int, *, start_opl: float = 0.0) -> FrequencyAxis:
         """`count` frequencies `first + k step`, in cycles per metre. Equal steps render faster than arbitrary ones."""
         low, width = _finite(first, "first", "FrequencyAxis.uniform"), _finite(step, "step", "FrequencyAxis.uniform")
-        number = quantities.count("FrequencyAxis.uniform: count", count, 0, ShapeError)
+        number = quantities.count("FrequencyAxis.uniform: count", count, 1, ShapeError, quantities.MOST_MADE)
         return cls(tuple(low + k * width for k in range(number)), start_opl)
 
     @classmethod
@@ -208,13 +207,14 @@ class FrequencyAxis:
 
 def _row(given: Any, owner: str) -> tuple[float, ...]:
     """The numbers of one frequency or of several: any iterable, an array, a tensor."""
-    plain = given.tolist() if hasattr(given, "tolist") else given
-    values = tuple(plain) if isinstance(plain, Iterable) and not isinstance(plain, (str, bytes)) else (plain,)
+    plain = given.tolist() if isinstance(given, Tensor) else given
+    alone = isinstance(plain, (str, bytes)) or not isinstance(plain, Iterable) or getattr(plain, "ndim", None) == 0
+    values = (plain,) if alone else tuple(plain)
     return tuple(_finite(value, "a frequency", owner) for value in values)
 
 
 def _finite(value: float, name: str, owner: str = "TimeAxis") -> float:
-    number = quantities.as_number(value)
+    number = as_number(value)
     if number is None:
         raise UnitError(f"{owner}: expected {name} to be one number, got {shown(value)}.")
     if not math.isfinite(number):

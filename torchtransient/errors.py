@@ -1,9 +1,18 @@
-"""The errors and warnings of the library. Every message says what was expected, what came and what to do."""
+"""The errors and warnings of the library. A message says in one line what was expected, what came and what to do."""
 
 from __future__ import annotations
 
+from typing import Any
 
-class TorchTransientError(Exception):
+
+class _InOneLine(Exception):  # noqa: N818 - no error of its own
+    """What is shown in a message, an array of several rows for instance, does not break it into lines."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*(" ".join(a.split()) if isinstance(a, str) and "\n" in a else a for a in args), **kwargs)
+
+
+class TorchTransientError(_InOneLine):
     """Base of every error that torchtransient raises on purpose."""
 
 
@@ -57,7 +66,7 @@ class PluginRegistrationError(TorchTransientError, RuntimeError):
     """A Mitsuba plugin of this library could not be registered for the active variant."""
 
 
-class TorchTransientWarning(UserWarning):
+class TorchTransientWarning(_InOneLine, UserWarning):
     """Base of every warning that torchtransient gives on purpose."""
 
 

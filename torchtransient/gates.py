@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torchtransient import quantities
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.pulses import CUT_STDDEVS, FWHM_PER_STDDEV, Pulse
-from torchtransient.quantities import Numbers, finite, numbers
+from torchtransient.quantities import Numbers, finite, numbers, shown
 from torchtransient.units import SHORTEST_OPL, near_seconds, seconds_to_opl
 
 Array = NDArray[np.float64]
@@ -48,8 +48,8 @@ class Gate:
     values: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ArgumentError(f"Gate: expected one of {', '.join(KINDS)}, got {self.kind!r}.")
+        if not isinstance(self.kind, str) or self.kind not in KINDS:
+            raise ArgumentError(f"Gate: expected one of {', '.join(KINDS)}, got {shown(self.kind)}.")
         start, end = (finite(f"Gate: {name}", getattr(self, name)) for name in ("start_opl", "end_opl"))
         if not start < end:
             raise UnitError(f"Gate: expected a finite start before a finite end, got {start!r} m to {end!r} m.")
@@ -81,7 +81,8 @@ class Gate:
     @classmethod
     def tabulated(cls, opl: Numbers, values: Numbers) -> Gate:
         """A measured profile: linear between ``values`` at the lengths ``opl`` (rising), zero outside them."""
-        lengths, heights = numbers("Gate.tabulated: opl", opl), numbers("Gate.tabulated: values", values)
+        lengths = numbers("Gate.tabulated: opl", opl).ravel()
+        heights = numbers("Gate.tabulated: values", values).ravel()
         if lengths.size != heights.size or lengths.size < 2:
             raise ShapeError(
                 f"Gate.tabulated: expected two or more lengths and as many values, got {lengths.size} and "
@@ -120,22 +121,24 @@ class Gate:
     def sequence(self, step_opl: float, count: int) -> tuple[Gate, ...]:
         """``count`` gates of this shape, each ``step_opl`` metres after the one before."""
         step = finite("Gate.sequence: step_opl", step_opl)
-        number = quantities.count("Gate.sequence: count", count, 0, ShapeError)
+        number = quantities.count("Gate.sequence: count", count, 0, ShapeError, quantities.MOST_MADE)
         return tuple(self.shifted(k * step) for k in range(number))
 
     # ------------------------------------------------------------------------------------------------ the profile
 
     def value(self, opl: Any) -> Array:
-        """Sensitivity to light that arrives at ``opl``, in double precision."""
-        x = np.asarray(opl, dtype=np.float64)
+        """Sensitivity to light that arrives at ``opl``, in double precision; NaN where that is NaN."""
+        x = numbers("Gate.value: opl", opl)
         inside = (x >= self.start_opl) & (x < self.end_opl)
+        outside = np.where(np.isnan(x), np.nan, 0.0)
         if self.kind == "rectangular":
-            return np.asarray(inside, dtype=np.float64)
+            return np.where(inside, 1.0, outside)
         if self.kind == "tabulated":
-            return np.where(inside, np.interp(x, self.opl, self.values), 0.0)
-        u = (x - 0.5 * (self.start_opl + self.end_opl)) * (2 * CUT_STDDEVS / (self.end_opl - self.start_opl))
+            return np.where(inside, np.interp(x, self.opl, self.values), outside)
+        near = np.clip(x, self.start_opl, self.end_opl)
+        u = (near - 0.5 * (self.start_opl + self.end_opl)) * (2 * CUT_STDDEVS / (self.end_opl - self.start_opl))
         floor = math.exp(-0.5 * CUT_STDDEVS**2)
-        return np.where(inside, np.maximum((np.exp(-0.5 * u * u) - floor) / (1 - floor), 0.0), 0.0)
+        return np.where(inside, np.maximum((np.exp(-0.5 * u * u) - floor) / (1 - floor), 0.0), outside)
 
     @property
     def is_continuous(self) -> bool:

@@ -59,7 +59,8 @@ class Pulse:
         object.__setattr__(self, "width_opl", width)
 
     def _check_table(self) -> None:
-        opl, values = numbers("Pulse.tabulated: opl", self.opl), numbers("Pulse.tabulated: values", self.values)
+        opl = numbers("Pulse.tabulated: opl", self.opl).ravel()
+        values = numbers("Pulse.tabulated: values", self.values).ravel()
         if opl.size != values.size or opl.size < 2:
             raise ShapeError(
                 f"Pulse.tabulated: expected two or more lengths and as many values, got {opl.size} and {values.size}."
@@ -90,32 +91,32 @@ class Pulse:
     @classmethod
     def tabulated(cls, opl: Numbers, values: Numbers, center_opl: float = 0.0) -> Pulse:
         """A measured shape: linear between ``values`` at the lengths ``opl`` (metres, rising), zero outside them."""
-        lengths, heights = numbers("Pulse.tabulated: opl", opl), numbers("Pulse.tabulated: values", values)
+        lengths = numbers("Pulse.tabulated: opl", opl).ravel()
+        heights = numbers("Pulse.tabulated: values", values).ravel()
         return cls("tabulated", 0.0, center_opl, opl=tuple(lengths.tolist()), values=tuple(heights.tolist()))
 
     @classmethod
     def gaussian_s(cls, fwhm_s: float, center_s: float = 0.0) -> Pulse:
         """As :meth:`gaussian`, in seconds."""
-        width = near_seconds(_number(fwhm_s, "fwhm_s"), "fwhm_s", "Pulse.gaussian_s", limit_s=LONGEST_PULSE_S)
-        center = near_seconds(_number(center_s, "center_s"), "center_s", "Pulse.gaussian_s")
+        width = near_seconds(fwhm_s, "fwhm_s", "Pulse.gaussian_s", limit_s=LONGEST_PULSE_S)
+        center = near_seconds(center_s, "center_s", "Pulse.gaussian_s")
         return cls.gaussian(seconds_to_opl(width), seconds_to_opl(center))
 
     @classmethod
     def rectangular_s(cls, width_s: float, center_s: float = 0.0) -> Pulse:
         """As :meth:`rectangular`, in seconds."""
-        width = near_seconds(_number(width_s, "width_s"), "width_s", "Pulse.rectangular_s", limit_s=LONGEST_PULSE_S)
-        center = near_seconds(_number(center_s, "center_s"), "center_s", "Pulse.rectangular_s")
+        width = near_seconds(width_s, "width_s", "Pulse.rectangular_s", limit_s=LONGEST_PULSE_S)
+        center = near_seconds(center_s, "center_s", "Pulse.rectangular_s")
         return cls.rectangular(seconds_to_opl(width), seconds_to_opl(center))
 
     @classmethod
     def tabulated_s(cls, times_s: Numbers, values: Numbers, center_s: float = 0.0) -> Pulse:
         """As :meth:`tabulated`, with times in seconds."""
-        times = numbers("Pulse.tabulated_s: times_s", times_s)
+        times = numbers("Pulse.tabulated_s: times_s", times_s).ravel()
         for time in times.tolist():
             near_seconds(time, "times_s", "Pulse.tabulated_s")
-        lengths = seconds_to_opl(times)
-        center = near_seconds(_number(center_s, "center_s"), "center_s", "Pulse.tabulated_s")
-        return cls.tabulated(lengths.tolist(), values, seconds_to_opl(center))
+        center = near_seconds(center_s, "center_s", "Pulse.tabulated_s")
+        return cls.tabulated(seconds_to_opl(times), values, seconds_to_opl(center))
 
     def shifted(self, opl: float) -> Pulse:
         """The same shape, ``opl`` metres later."""
@@ -135,7 +136,7 @@ class Pulse:
 
     def cumulative(self, opl: Any) -> Array:
         """Share of the pulse up to the lengths ``opl``: 0 before the support and 1 after it, in double precision."""
-        x = np.asarray(opl, dtype=np.float64) - self.center_opl
+        x = numbers("Pulse.cumulative: opl", opl) - self.center_opl
         if self.kind == "rectangular":
             return np.asarray(np.clip(x / self.width_opl + 0.5, 0, 1), dtype=np.float64)
         if self.kind == "gaussian":
@@ -159,7 +160,9 @@ def transform(pulse: Pulse, frequencies: Any) -> NDArray[np.complex128]:
     measure under the pulse. One at frequency zero.
     """
     low, high = pulse.support_opl
-    wanted = np.atleast_1d(np.asarray(frequencies, dtype=np.float64)).ravel()
+    wanted = numbers("transform: frequencies", frequencies).ravel()
+    if not np.isfinite(wanted).all():
+        raise UnitError("transform: expected finite frequencies in cycles per metre, got NaN or infinity.")
     # Sixteen steps for every cycle of the highest frequency, and a factor for the width of a step.
     count = max(4096, math.ceil(16 * (high - low) * float(np.abs(wanted).max(initial=0.0))))
     edges = np.linspace(low, high, count + 1)

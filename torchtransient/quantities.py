@@ -1,7 +1,7 @@
 """Numbers as people give them, checked: finite, positive, shares, counts, arrays, transforms.
 
-What is none is a typed error that names it. A number is what Python, numpy or torch have for one; truth values and
-texts are none, although Python takes them.
+What is none is a typed error that names it. A number is what Python, numpy or torch have for one; truth values,
+texts, dates and entries that a mask hides are none, although Python or numpy take them.
 """
 
 from __future__ import annotations
@@ -38,6 +38,10 @@ _UNITS = {
 }
 # Files and tensors count in 64 bits.
 MOST = 2**63 - 1
+# So many objects are made of one call.
+MOST_MADE = 2**24
+# Certainly numbers.
+_PLAIN = {int, float}
 # So many numbers of an array are written in messages.
 _WRITTEN = 16
 
@@ -104,11 +108,20 @@ def index(name: str, value: Any, size: int, error: type[TorchTransientError] = A
 
 def as_whole(value: Any) -> int | None:
     """``value`` as an int, of any library that has whole numbers; None for what is none: 2.0, texts, truth values."""
-    if _is_truth(value) or getattr(value, "ndim", None):
+    if _is_no_number(value) or getattr(value, "ndim", None):
         return None
     try:
         return operator.index(value)
-    except (TypeError, RuntimeError):  # of torch: a number that is nowhere, as on "meta" or inside of vmap
+    except TypeError:
+        return None
+    except RuntimeError:  # of torch, for unsigned numbers of 64 bits
+        return _item(value)
+
+
+def _item(value: Any) -> int | None:
+    try:
+        return int(value.item())
+    except RuntimeError:  # a number that is nowhere, as on "meta" or inside of vmap
         return None
 
 
@@ -121,10 +134,10 @@ def flag(name: str, value: Any) -> bool:
 
 def real_array(values: Any) -> NDArray[np.float64] | None:
     """Real numbers of any library as a float64 array, detached; None for what is none: texts, None, truth values, rows
-    of different lengths, and numbers that float64 cannot hold.
+    of different lengths, entries behind a mask, and numbers that float64 cannot hold.
     """
     try:
-        if _has_truth(values):  # which numpy makes ones and zeros of, beside numbers
+        if _has_no_number(values):
             return None
         plain = np.asarray(values.detach().cpu() if hasattr(values, "detach") else values)
         if plain.dtype.kind in "iuf":
@@ -136,21 +149,22 @@ def real_array(values: Any) -> NDArray[np.float64] | None:
 
 
 def numbers(name: str, values: Any) -> NDArray[np.float64]:
-    """Real numbers of any library in a row, float64 (N,). Raises UnitError for what is none."""
+    """:func:`real_array` of numbers of any shape. Raises UnitError for what is none."""
     array = real_array(values)
     if array is None:
         raise UnitError(f"{name}: expected real numbers, got {shown(values)}.")
-    return array.ravel()
+    return array
 
 
-def _has_truth(values: Any) -> bool:
-    return isinstance(values, (list, tuple)) and any(
-        _has_truth(one) if isinstance(one, (list, tuple)) else _is_truth(one) for one in values
-    )
+def _has_no_number(values: Any) -> bool:
+    """Whether numpy makes numbers of what is none, truth values beside numbers for instance."""
+    if not isinstance(values, (list, tuple)):
+        return _is_no_number(values)
+    return any(type(one) not in _PLAIN and _has_no_number(one) for one in values)
 
 
 def _are_numbers(objects: NDArray[Any]) -> bool:
-    return all(hasattr(value, "__float__") for value in objects.reshape(-1))
+    return all(hasattr(value, "__float__") and not _is_no_number(value) for value in objects.reshape(-1))
 
 
 def transform(name: str, given: Any) -> NDArray[np.float64]:
@@ -174,6 +188,7 @@ def shown(value: Any) -> str:
         text = f"a {type(value).__name__} that is too long to be written"
     except RecursionError:
         text = f"a {type(value).__name__} that is nested too deeply to be written"
+    text = " ".join(text.split()) if "\n" in text else text
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
@@ -190,7 +205,7 @@ def with_article(word: str) -> str:
 
 def as_number(value: Any) -> float | None:
     """``value`` as a float, infinities and NaN too; None for what is no real number."""
-    if _is_truth(value) or isinstance(value, (str, bytes)) or getattr(value, "ndim", None) or _is_complex(value):
+    if _is_no_number(value) or getattr(value, "ndim", None):
         return None
     try:
         return float(value)
@@ -206,10 +221,13 @@ def _number(value: Any) -> float:
     return math.nan if number is None else number
 
 
+def _is_no_number(value: Any) -> bool:
+    """Whether Python or numpy makes a number of what is none."""
+    if isinstance(value, (str, bytes)) or np.ma.is_masked(value):
+        return True
+    dtype = getattr(value, "dtype", None)
+    return _is_truth(value) or "complex" in str(dtype) or getattr(dtype, "kind", None) in {"m", "M", "S", "U", "V"}
+
+
 def _is_truth(value: Any) -> bool:
     return isinstance(value, bool) or "bool" in str(getattr(value, "dtype", ""))
-
-
-def _is_complex(value: Any) -> bool:
-    """Numpy takes the real part of those, with a warning."""
-    return "complex" in str(getattr(value, "dtype", ""))

@@ -10,16 +10,20 @@ steady image ``(..., 4, C, H, W)`` (``STEADY_DIM``). Angles are radians. Any rea
 
 Nothing here divides zero by zero, forwards or backwards: dark entries and unpolarised ones have the value and the
 derivative zero, where the functions themselves have no derivative. Second derivatives exist away from these entries.
+NaN in the light is NaN in what is made of it.
 """
 
 from __future__ import annotations
+
+import math
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchtransient.errors import ShapeError, UnitError
-from torchtransient.quantities import as_whole, finite, index, real_array, shown
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
+from torchtransient.quantities import as_number, as_whole, index, numbers, shown
 
 TRANSIENT_DIM = -5
 STEADY_DIM = -4
@@ -63,7 +67,7 @@ def angle_of_linear_polarization(stokes: Tensor, dim: int, floor: float = 0.0) -
     largest = torch.maximum(s1.abs(), s2.abs()).detach()
     # The angle does not depend on the scale; at scale one the squares in its derivative cannot underflow.
     # The larger one alone may stay below the floor where both together do not.
-    there = (largest > torch.finfo(stokes.dtype).tiny) & (torch.hypot(s1, s2).detach() > floor)
+    there = ~((largest <= torch.finfo(stokes.dtype).tiny) | (torch.hypot(s1, s2).detach() <= floor))
     scale = torch.where(there, largest, 1.0)
     s1, s2 = torch.where(there, s1, 1.0) / scale, torch.where(there, s2, 0.0) / scale
     return 0.5 * torch.atan2(s2, s1)
@@ -85,7 +89,7 @@ def _degree(stokes: Tensor, dim: int, which: tuple[int, ...], floor: float) -> T
     lit, s0 = _intensity(part[0], floor)
     used = torch.stack([part[i] for i in which])
     largest = used.abs().amax(0).detach()
-    polarized = lit & (largest > torch.finfo(stokes.dtype).tiny)
+    polarized = lit & ~(largest <= torch.finfo(stokes.dtype).tiny)
     # At scale one no square underflows, and the root is taken of a number between one and three.
     scale = torch.where(polarized, largest, 1.0)
     unit = torch.where(polarized, used, 0.0) / scale
@@ -95,7 +99,7 @@ def _degree(stokes: Tensor, dim: int, which: tuple[int, ...], floor: float) -> T
 
 def _intensity(s0: Tensor, floor: float) -> tuple[Tensor, Tensor]:
     """Where there is light, and a divisor that is one elsewhere."""
-    lit = s0 > max(_checked_floor(floor), torch.finfo(s0.dtype).tiny)
+    lit = ~(s0 <= max(_checked_floor(floor), torch.finfo(s0.dtype).tiny))
     return lit, torch.where(lit, s0, 1.0)
 
 
@@ -109,7 +113,7 @@ def rotate_frame(stokes: Tensor, angle: Tensor | float, dim: int) -> Tensor:
     against ``stokes`` without ``dim``. Raises ``ShapeError``.
     """
     s0, s1, s2, s3 = _components(stokes, dim)
-    double = 2 * _floating("angle", angle).to(stokes.device, stokes.dtype)
+    double = 2 * _real("angle", angle).to(stokes)
     c, s = torch.cos(double), torch.sin(double)
     turned = c * s1 + s * s2, c * s2 - s * s1
     if turned[0].shape != s0.shape:
@@ -126,10 +130,10 @@ def apply_mueller(matrix: Tensor, stokes: Tensor, dim: int) -> Tensor:
     Several elements: multiply their matrices, the one that the light meets first on the right. Raises ``ShapeError``.
     """
     _components(stokes, dim)
-    dim = _axis(stokes, dim)
-    if matrix.shape != (4, 4):
-        raise ShapeError(f"matrix: expected a Mueller matrix of shape (4, 4), got {tuple(matrix.shape)}.")
-    return (matrix.to(stokes) @ stokes.movedim(dim, -1).unsqueeze(-1)).squeeze(-1).movedim(-1, dim)
+    dim, mueller = _axis(stokes, dim), _real("matrix", matrix)
+    if mueller.shape != (4, 4):
+        raise ShapeError(f"matrix: expected a Mueller matrix of shape (4, 4), got {tuple(mueller.shape)}.")
+    return (mueller.to(stokes) @ stokes.movedim(dim, -1).unsqueeze(-1)).squeeze(-1).movedim(-1, dim)
 
 
 # ------------------------------------------------------------------------------------------------ ideal elements
@@ -202,11 +206,12 @@ def depolarizer() -> Tensor:
 
 def _components(stokes: Tensor, dim: int) -> tuple[Tensor, ...]:
     if not isinstance(stokes, Tensor):
-        raise ShapeError(f"stokes: expected a tensor (..., 4, C, T, H, W), got {type(stokes).__name__}.")
+        raise ShapeError(f"stokes: expected a tensor (..., 4, C, T, H, W), got {shown(stokes)}.")
     if not stokes.dtype.is_floating_point:
         raise ShapeError(f"stokes: expected real floating point numbers, got {stokes.dtype}.")
-    place = as_whole(dim)
-    if place is None or not -stokes.ndim <= place < stokes.ndim or stokes.shape[place] != 4:
+    if (place := as_whole(dim)) is None:
+        raise ArgumentError(f"dim: expected a whole number, got {shown(dim)}.")
+    if not -stokes.ndim <= place < stokes.ndim or stokes.shape[place] != 4:
         raise ShapeError(
             f"stokes: expected four components along dim={shown(dim)}, got shape {tuple(stokes.shape)}. They are along "
             "-5 in a transient (..., 4, C, T, H, W) and along -4 in a steady image (..., 4, C, H, W); only polarized "
@@ -220,23 +225,29 @@ def _axis(stokes: Tensor, dim: int) -> int:
 
 
 def _checked_floor(floor: float) -> float:
-    number = finite("floor", floor)
-    if not number >= 0:
-        raise UnitError(f"floor: expected a number of at least 0, got {floor!r}.")
+    number = as_number(floor)
+    if number is None or not 0 <= number < math.inf:
+        raise UnitError(f"floor: expected a finite number of at least 0, got {shown(floor)}.")
     return number
 
 
-def _floating(name: str, value: Tensor | float) -> Tensor:
-    """A number or a tensor in floating point, with its gradient. Raises UnitError for what is no real number."""
+def _real(name: str, value: Any) -> Tensor:
+    """Numbers as a tensor, with its gradient. Raises UnitError for what is no real number."""
     if isinstance(value, Tensor):
         if value.is_complex() or value.dtype == torch.bool:
             raise UnitError(f"{name}: expected real numbers, got {value.dtype}.")
-        return value if value.dtype.is_floating_point else value.to(torch.get_default_dtype())
-    array = real_array(value)
-    if array is None or not np.isfinite(array).all():
+        return value
+    array = numbers(name, value)
+    if not np.isfinite(array).all():
         raise UnitError(f"{name}: expected finite numbers, got {shown(value)}.")
-    precise = getattr(value, "dtype", None) == np.float64
-    return torch.from_numpy(array.copy()).to(torch.float64 if precise else torch.get_default_dtype())
+    return torch.from_numpy(array)
+
+
+def _floating(name: str, value: Any) -> Tensor:
+    """As :func:`_real`, in floating point: numbers without a precision of their own have that of torch."""
+    tensor = _real(name, value)
+    own = tensor.is_floating_point() if isinstance(value, Tensor) else getattr(value, "dtype", None) == np.float64
+    return tensor if own else tensor.to(torch.get_default_dtype())
 
 
 def _together(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:

@@ -7,6 +7,7 @@ speed of light in vacuum gives the time of flight, in any medium.
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from torchtransient.errors import UnitError
@@ -46,11 +47,14 @@ def seconds_to_opl(time_s: Quantity) -> Quantity:
 
 
 def near_seconds(time_s: float, name: str, where: str, *, limit_s: float = LATEST_S) -> float:
-    """A time in seconds. UnitError from `limit_s` on, either side of zero: picoseconds, nanoseconds or metres."""
+    """A time in seconds. UnitError from `limit_s` on, either side of zero: picoseconds, nanoseconds or metres, and for
+    what is no number.
+    """
     number, limit = as_number(time_s), as_number(limit_s)
-    if number is None or number != number or limit is None or not limit > 0:
-        got = shown(time_s if limit is not None and limit > 0 else limit_s)
-        raise UnitError(f"{where}: expected {name} and its limit as numbers, seconds, got {got}.")
+    if limit is None or not limit > 0:
+        raise UnitError(f"{where}: expected the limit of {name} as seconds above 0, got {shown(limit_s)}.")
+    if number is None or math.isnan(number):
+        raise UnitError(f"{where}: expected {name} to be one finite number in seconds, got {shown(time_s)}.")
     if abs(number) >= limit:
         raise UnitError(
             f"{where}: expected {name} in seconds, below {limit_s:g} s, got {shown(time_s)} s, which is "

@@ -65,7 +65,7 @@ def test_a_context_puts_back_what_was():
     assert tt.threads() == module.Threads(torch=2, drjit=3)
 
 
-@pytest.mark.parametrize("n", [0, -1, True, False, 1.0, 1.5, "2", 1025, 2**40, torch.tensor(2)])
+@pytest.mark.parametrize("n", [0, -1, True, False, 1.0, 1.5, "2", 1025, 2**40, torch.tensor(2.0)])
 def test_what_is_no_number_of_threads(n):
     before = tt.threads()
     with pytest.raises(UnitError, match="whole number from 1 to 1024"):

@@ -15,7 +15,7 @@ from torchtransient.errors import SceneError, UnitError
 from torchtransient.nlos import defaults
 from torchtransient.nlos.arguments import check_is_scan
 from torchtransient.nlos.mesh_file import mesh_file
-from torchtransient.quantities import MOST, as_whole, shown
+from torchtransient.quantities import MOST, as_number, as_whole, shown
 from torchtransient.rendering.build_options import BuildOptions
 from torchtransient.rendering.scene_handle import load
 from torchtransient.rendering.variant import active_variant
@@ -161,9 +161,10 @@ def _check_energy(energy: Any) -> None:
     """Raise UnitError for numbers that no laser brings, SceneError for what is no spectrum."""
     if isinstance(energy, Mapping):
         return
-    if isinstance(energy, bool) or not isinstance(energy, (int, float, np.number)):
+    joules = as_number(energy)
+    if joules is None:
         raise SceneError(f"energy: expected joules, or a spectrum as a Mitsuba dictionary, got {shown(energy)}.")
-    if not 0 <= energy < MOST_ENERGY:
+    if not 0 <= joules < MOST_ENERGY:
         raise UnitError(f"energy: expected joules of at least 0, got {shown(energy)} (of {MOST_ENERGY:g} at most).")
 
 

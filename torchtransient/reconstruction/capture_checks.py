@@ -7,14 +7,13 @@ import os
 from collections.abc import Collection
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.quantities import positive, shown, with_article
+from torchtransient.quantities import as_whole, positive, shown, with_article
 from torchtransient.reconstruction.linear import PRECISIONS
 from torchtransient.reconstruction.planar_scan import PlanarScan, check_real
 
@@ -41,8 +40,9 @@ def within(name: str, value: Any, low: float, high: float) -> float:
 
 def one_of(name: str, value: Any, options: Collection[Any]) -> Any:
     """``value`` where it equals one of ``options``, texts or whole numbers. Raises ArgumentError for others."""
+    plain = value if isinstance(value, str) else as_whole(value)
     for option in options:
-        if isinstance(value, str | int | np.integer) and not isinstance(value, bool) and value == option:
+        if plain is not None and plain == option:
             return option
     raise ArgumentError(f"{name}: expected one of {', '.join(map(str, options))}, got {shown(value)}.")
 

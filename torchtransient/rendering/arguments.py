@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from torch import nn
 from torch.nn.utils import parametrize
 
 from torchtransient.errors import ArgumentError, DeviceError, ShapeError, UnitError, UnknownKeyError
-from torchtransient.quantities import as_whole, shown
+from torchtransient.quantities import as_whole, real_array, shown
 from torchtransient.rendering.films.choice import FilmChoice
 from torchtransient.rendering.films.choices import chosen
 
@@ -101,8 +100,9 @@ def as_float(key: str, value: Any, device: str) -> torch.Tensor:
         value = _tensor_of(key, value).to(device)
     if value.is_complex() or value.dtype == torch.bool:
         raise ShapeError(f"value of {key!r}: expected real numbers, got dtype {value.dtype}.")
-    if value.layout != torch.strided:
-        raise ShapeError(f"value of {key!r}: expected a dense tensor, got layout {value.layout}.")
+    if value.layout != torch.strided or value.is_nested or value.is_quantized:
+        kind = "a nested one" if value.is_nested else f"layout {value.layout} and dtype {value.dtype}"
+        raise ShapeError(f"value of {key!r}: expected a dense tensor, got {kind}.")
     if value.device.type != device:
         raise DeviceError(
             f"value of {key!r}: expected a tensor on {device!r}, where the scene's variant computes, got "
@@ -115,16 +115,23 @@ def as_float(key: str, value: Any, device: str) -> torch.Tensor:
 def _tensor_of(key: str, value: Any) -> torch.Tensor:
     """A tensor of a number, of lists of them, also with tensors inside, or of an array of any library."""
     try:
-        if isinstance(value, (list, tuple)) and any(isinstance(entry, torch.Tensor) for entry in value):
-            return torch.stack([entry if isinstance(entry, torch.Tensor) else torch.tensor(entry) for entry in value])
-        array = np.asarray(value)
-        # Numpy reads texts and objects too; arrays that may not be written to would be a warning of torch's.
-        return torch.from_numpy(array.copy() if array.dtype.kind in "biufc" else array.astype(np.float64, copy=True))
-    except (TypeError, ValueError, RuntimeError) as error:
+        if _holds_tensors(value):
+            return torch.stack([e if isinstance(e, torch.Tensor) else _tensor_of(key, e) for e in value])
+    except (TypeError, RuntimeError) as error:  # of different shapes or devices
+        raise ShapeError(f"value of {key!r}: expected tensors that can be stacked, got others: {error}.") from error
+    array = real_array(value)
+    if array is None:
         raise ShapeError(
-            f"value of {key!r}: expected a torch tensor, an array, a list of numbers or a number, got "
-            f"{type(value).__name__}: {error}."
-        ) from error
+            f"value of {key!r}: expected a torch tensor, an array, a list of numbers or a number, all of them real, "
+            f"got {shown(value)}."
+        )
+    return torch.from_numpy(array)
+
+
+def _holds_tensors(value: Any) -> bool:
+    """Whether there are tensors in a list, or in one of its lists."""
+    listed = isinstance(value, (list, tuple))
+    return listed and any(isinstance(entry, torch.Tensor) or _holds_tensors(entry) for entry in value)
 
 
 def fit_shape(key: str, value: torch.Tensor, shape: tuple[int, ...]) -> tuple[torch.Tensor, bool]:

@@ -11,6 +11,7 @@ import torch
 from torchtransient import geometry
 from torchtransient.errors import ArgumentError, SceneError
 from torchtransient.plugins.parameter_effect import class_of
+from torchtransient.quantities import as_whole, shown
 from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.renderer import TransientRenderer
 from torchtransient.rendering.variant import active_variant
@@ -53,9 +54,10 @@ def camera_of(
         import mitsuba as mi
 
         sensors = renderer.scene.built(renderer._options).scene.sensors()
-        if isinstance(index, bool) or not isinstance(index, int) or not 0 <= index < len(sensors):
-            raise ArgumentError(f"camera_of: expected a sensor from 0 to {len(sensors) - 1}, got {index!r}.")
-        found = sensors[index]
+        number = as_whole(index)
+        if number is None or not 0 <= number < len(sensors):
+            raise ArgumentError(f"camera_of: expected a sensor from 0 to {len(sensors) - 1}, got {shown(index)}.")
+        found = sensors[number]
         params = mi.traverse(found)
         if class_of(found) not in _OPTICS:
             raise SceneError(

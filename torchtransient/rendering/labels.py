@@ -14,6 +14,7 @@ import torch
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
+from torchtransient.quantities import as_whole, shown
 from torchtransient.rendering.carry_out import Numbered, check_whole, groups_of, refusal
 from torchtransient.rendering.engine import check_values
 from torchtransient.rendering.opaque import opaque
@@ -132,8 +133,10 @@ def _labels(
 ) -> tuple[dict[str, torch.Tensor], list[str]]:
     """(labels, what became of the recording of each item)."""
     wanted = _checked_names(names, average)
-    if isinstance(samples, bool) or not isinstance(samples, int) or not 1 <= samples <= 4096:
-        raise UnitError(f"samples: expected an integer from 1 to 4096, got {samples!r}.")
+    number = as_whole(samples)
+    if number is None or not 1 <= number <= 4096:
+        raise UnitError(f"samples: expected an integer from 1 to 4096, got {shown(samples)}.")
+    samples = number
     tensors, batched, batch = renderer._collect(values)
     tensors = [tensor.detach() for tensor in tensors]
     seeding = Seeding(renderer._sensors, 1 if batch is None else batch, None)

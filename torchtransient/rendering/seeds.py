@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import Any
 
@@ -106,7 +106,7 @@ def drawn(seed: int | Sequence[int] | torch.Tensor | None) -> tuple[Any, torch.T
     if not isinstance(seed, torch.Tensor) or seed.ndim != 0 or seed.is_floating_point() or seed.dtype == torch.bool:
         return seed, None
     try:
-        return int(seed), None
+        return int(seed.item()), None
     except RuntimeError:
         # Its number differs from entry to entry of a `vmap`: the autograd function takes it apart.
         return None, seed
@@ -118,7 +118,7 @@ def whole_number(seed: Any) -> int | None:
     if number is not None:
         return number
     try:
-        several = len(seed) >= 0 and not isinstance(seed, (str, bytes, Mapping))
+        several = len(seed) >= 0 and not isinstance(seed, (str, bytes, Mapping, Set))
     except TypeError:
         several = False
     if not several:

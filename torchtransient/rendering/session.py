@@ -75,7 +75,7 @@ class RenderJob:
 
     def seeded(self, seed: torch.Tensor | None) -> RenderJob:
         """The job with the items of a seed; with its own ones for None."""
-        return self if seed is None else replace(self, items=self.seeding.items(int(seed)))
+        return self if seed is None else replace(self, items=self.seeding.items(int(seed.item())))
 
 
 class Session:

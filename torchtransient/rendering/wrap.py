@@ -9,11 +9,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 
 from torchtransient.errors import ArgumentError, GradientError, ShapeError, UnitError
 from torchtransient.plugins.drjit_pool import engine_lock
+from torchtransient.quantities import as_whole, shown
 from torchtransient.rendering.arguments import as_float
 from torchtransient.rendering.arrays import computable, handle
 from torchtransient.rendering.derivatives import run
@@ -202,9 +202,10 @@ class _Wrapped:
         bound = signature.bind(*args, **kwargs)
         bound.apply_defaults()
         seed = bound.arguments[str(self.reseed)]
-        if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)):
-            raise UnitError(f"{self.name}: {self.reseed}: expected a whole number as a seed, got {seed!r}.")
-        bound.arguments[str(self.reseed)] = SeedLeaf(int(seed))
+        number = as_whole(seed)
+        if number is None:
+            raise UnitError(f"{self.name}: {self.reseed}: expected a whole number as a seed, got {shown(seed)}.")
+        bound.arguments[str(self.reseed)] = SeedLeaf(number)
         return bound.args, bound.kwargs
 
     def _given(self, leaves: Sequence[Any], values: Sequence[torch.Tensor]) -> _Given:

@@ -29,7 +29,7 @@ from torchtransient.array_files.part_files import write_text
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import MissingPackageError, StorageError, TorchTransientError
 from torchtransient.plain_texts import json_data, said_in_short, some_of, text_of_file, told_shortly, yaml_data
-from torchtransient.quantities import shown
+from torchtransient.quantities import as_whole, shown
 from torchtransient.sensing.base.layout import check_number
 from torchtransient.sensing.base.policies import GradPolicy
 from torchtransient.sensing.cameras.electronics import PixelElectronics
@@ -191,12 +191,13 @@ class Device:
                 raise StorageError(f"Device '{self.name}': expected one stage of kind '{stage}', got stages {kinds}.")
             parts[0].update(arguments)
         else:
-            if isinstance(stage, bool) or not isinstance(stage, int) or not -len(stages) <= stage < len(stages):
+            number = as_whole(stage)
+            if number is None or not -len(stages) <= number < len(stages):
                 raise StorageError(
                     f"Device '{self.name}': expected a stage by its kind or by a number from 0 to {len(stages) - 1}, "
                     f"got {shown(stage)}."
                 )
-            stages[stage].update(arguments)
+            stages[number].update(arguments)
         return Device(
             self.name,
             description=self.description,

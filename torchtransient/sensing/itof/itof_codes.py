@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.quantities import real_array, shown
+from torchtransient.quantities import as_whole, real_array, shown
 from torchtransient.sensing.base.given import no_arrays, refuse_cut_off
 from torchtransient.sensing.base.layout import check_number
 
@@ -288,14 +288,16 @@ def _pad_knots(knots: Tensor, values: Tensor, count: int) -> tuple[Tensor, Tenso
 
 def phase_steps(num_taps: int) -> Tensor:
     """(N,) float64 turns: n / N, and 0 and a quarter for two, which half a turn apart would see the same twice."""
-    steps = torch.arange(_check_taps(num_taps), dtype=torch.float64)
+    num_taps = _check_taps(num_taps)
+    steps = torch.arange(num_taps, dtype=torch.float64)
     return steps / (num_taps if num_taps > 2 else 4)
 
 
 def _check_taps(num_taps: int) -> int:
-    if isinstance(num_taps, bool) or not isinstance(num_taps, int) or num_taps < 2:
-        raise ShapeError(f"CorrelationCode: expected at least 2 taps, got {num_taps!r}.")
-    return num_taps
+    number = as_whole(num_taps)
+    if number is None or number < 2:
+        raise ShapeError(f"CorrelationCode: expected at least 2 taps, got {shown(num_taps)}.")
+    return number
 
 
 def _check_edges(edges_turns: Tensor) -> Tensor:
