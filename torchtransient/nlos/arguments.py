@@ -12,7 +12,7 @@ from torchtransient.capture import Scan
 from torchtransient.errors import ArgumentError, SceneError
 from torchtransient.quantities import as_whole, count, shown
 from torchtransient.rendering.arguments import samples
-from torchtransient.rendering.seeds import SEED_RANGE
+from torchtransient.rendering.seeds import SEED_RANGE, drawn
 from torchtransient.sensing import Device
 
 
@@ -47,11 +47,9 @@ def check_seeds(who: str, value: Any) -> None:
         for one in value:
             check_seeds(who, one)
         return
-    try:
+    _, of_each_entry = drawn(value)
+    if of_each_entry is None:
         checked_seed(who, value)
-    except RuntimeError as error:
-        if "vmap" not in str(error):
-            raise
 
 
 def check_is_scan(who: str, value: Any) -> None:

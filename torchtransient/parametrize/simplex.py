@@ -11,7 +11,7 @@ from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import floating, holds, without_autocast
 from torchtransient.parametrize.bounded import checked_margin
 from torchtransient.parametrize.settings import Settings
-from torchtransient.quantities import count
+from torchtransient.quantities import MOST, as_whole, shown
 
 # What single precision makes of a sum of some hundred weights.
 _SLACK = 1e-4
@@ -82,7 +82,10 @@ class Simplex(Settings):
 
 
 def _dim(dim: Any, where: str) -> int:
-    return count(f"{where}: dim", dim, None, ShapeError)
+    number = as_whole(dim)
+    if number is None or abs(number) > MOST:
+        raise ShapeError(f"{where}: expected dim as a whole number, got {shown(dim)}.")
+    return number
 
 
 def _checked(x: Tensor, dim: int, where: str) -> Tensor:

@@ -26,7 +26,6 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.quantities import count
 from torchtransient.reconstruction.capture_checks import one_of
 from torchtransient.reconstruction.capture_roots import checked_floor, stabilized_root
 from torchtransient.reconstruction.confocal_operator import ConfocalOperator, chunk_rows
@@ -76,7 +75,7 @@ class FK(ConfocalOperator):
     ) -> None:
         super().__init__(scan, time_axis=time_axis, dtype=dtype)
         self.target = one_of("FK: target", target, TARGETS)
-        self.taps = one_of("FK: taps", count("FK: taps", taps), TAPS)
+        self.taps = one_of("FK: taps", taps, TAPS)
         self.floor = checked_floor(floor, dtype)
         self._set_tables()
 

@@ -119,13 +119,13 @@ def test_lists_of_names_and_numbers():
     ):
         with pytest.raises(SceneError, match=f"recipe: labels: .*{words}"):
             _names("labels", wrong)
-    assert (_counts("sensors", "all"), _counts("sensors", 2, 0), _counts("sensors", [0, 2], 0)) == ("all", 2, (0, 2))
-    assert _counts("bounces", np.array([3, 4])) == (3, 4) and _counts("sensors", 0, 0) == 0
-    for wrong in (0, [3, 0], 1.5, [None]):
+    assert [_counts("sensors", given, 0, "all") for given in ("all", 2, [0, 2], 0)] == ["all", 2, (0, 2), 0]
+    assert _counts("bounces", np.array([3, 4]), 1, "all") == (3, 4)
+    for wrong in (0, [3, 0], 1.5, [None], [], "any"):
         with pytest.raises(SceneError, match="recipe: bounces"):
-            _counts("bounces", wrong)
+            _counts("bounces", wrong, 1, "all")
     assert samples_of([0, np.int64(3)]) == [0, 3]
-    with pytest.raises(ShapeError, match="at least 0, got -2"):
+    with pytest.raises(ShapeError, match="at least 0, got -1"):
         samples_of([0, -1, -2])
     with pytest.raises(ShapeError, match="whole numbers of samples"):
         samples_of([0.5])
