@@ -23,7 +23,7 @@ NONE = ["x", "3", b"3", True, np.bool_(True), torch.tensor(True), 1j, np.complex
         *DATES, object(), [1, [2]], np.array(["3"]), np.ma.masked, np.ma.array(1, mask=True)]  # fmt: skip
 NO_WHOLE = [*NONE, 0.5, 1.5, NAN, INF, 1e300, torch.tensor(1.5), np.float64(NAN), 10**30, -(10**30), 2**64, *MANY]
 # Whole numbers that may be negative, nothing, or larger than others, and real ones without an end, by their argument.
-BELOW = {"dim", "stokes_dim", "turns", "max_depth", "laser", "frame", "row", "number"}
+BELOW = {"dim", "stokes_dim", "turns", "max_depth", "laser", "frame", "row", "column", "number"}
 ZERO = BELOW | {
     "seed", "noise_seed", "epoch", "step", "rank", "first", "offset", "crop_offset", "gap", "subdivide", "level",
     "retries", "index", "sample", "workers", "sensors", "which", "pixels", "pixel", "bins", "count", "batches", "shard",

@@ -195,3 +195,10 @@ def test_median_of_batches():
         expected = (a - b).abs()[counts].median() if counts.any() else torch.tensor(torch.nan)
         torch.testing.assert_close(found, expected, equal_nan=True)
     assert torch.isnan(metrics.depth_median_error(x[:0], y[:0]))
+
+
+@pytest.mark.parametrize("metric, sign", [(metrics.phase_mae, 1), (metrics.phase_rmse, 1), (metrics.phase_bias, -1)])
+def test_phases_are_in_radians(metric, sign):
+    """3.5 is 2.783 the other way round, without a word of the period."""
+    found = metric(torch.full((1, 2), 3.5), torch.zeros(1, 2))
+    assert float(found) == pytest.approx(sign * (2 * math.pi - 3.5), rel=1e-5)

@@ -75,6 +75,9 @@ def test_overlap_by_hand():
     assert float(metrics.picture_iou(-x, y)) == 0.0
     with pytest.raises(UnitError, match="threshold"):
         metrics.picture_iou(x, y, threshold=1.5)
+    # zero and less is nothing, of the lowest threshold too
+    signed = torch.tensor([[-2.0, 0.0, 0.5, 3.0]])
+    assert float(metrics.picture_iou(signed, torch.tensor([[0.0, 4.0, 1.0, 2.0]]), threshold=0)) == pytest.approx(2 / 3)
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1.0, 1e30])

@@ -27,6 +27,7 @@ OPTIONS = {
     "value_range": 20.0,
     "timeout_s": 10.0,
     "shard": (0, 1),
+    "row": 3,
     "column": 1,
     "albedo": 0.5,
     "second_size": 0.3,

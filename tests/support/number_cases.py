@@ -302,7 +302,7 @@ def _pictures() -> dict[str, Case]:
         "vis.wall_video": Case(v.wall_video, capture("exhaustive"), video, laser=(1, 1), fps=10.0),
         "vis.frame_grid": Case(v.frame_grid, transient, bins=(1, 3), count=3, columns=3, exposure=1.0),
         "vis.histogram": Case(v.histogram, transient, pixels=[(1, 1)]),
-        "vis.streak": Case(v.streak, transient, exposure=1.0, row=3),
+        "vis.streak": Case(v.streak, transient, exposure=1.0),
         "vis.frames": Case(v.frames, transient, exposure=1.0, scale=1, every=3),
         "vis.side_by_side": Case(v.side_by_side, [frames, frames], gap=3),
         "vis.write_video": Case(v.write_video, video, list(frames), count=8, fps=10.0),
