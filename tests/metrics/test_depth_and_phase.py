@@ -202,3 +202,4 @@ def test_phases_are_in_radians(metric, sign):
     """3.5 is 2.783 the other way round, without a word of the period."""
     found = metric(torch.full((1, 2), 3.5), torch.zeros(1, 2))
     assert float(found) == pytest.approx(sign * (2 * math.pi - 3.5), rel=1e-5)
+    assert float(metrics.wrapped_difference(torch.tensor(3.5), torch.tensor(0.0))) == pytest.approx(3.5 - 2 * math.pi)

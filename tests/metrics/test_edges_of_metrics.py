@@ -74,13 +74,14 @@ def test_every_number_of_a_grid_says_where_voxels_are(change):
         metrics.volume_iou(here, there)
 
 
+@pytest.mark.parametrize("pitch", [(0.1, 0.1), (0.03, 0.1), (0.1, 0.03)])
 @pytest.mark.parametrize(("share", "one"), [(0.9, True), (1.1, False)])
-def test_grids_are_one_to_a_thousandth_of_a_voxel(share, one):
-    """By planes as by the corner: metres are metres along each direction."""
+def test_grids_are_one_to_a_thousandth_of_a_voxel(share, one, pitch):
+    """Of its shorter side, by planes as by the corner: metres are metres along each direction."""
     values = torch.rand(1, 12, 6, 8, generator=torch.Generator().manual_seed(0))
-    step = share * 1e-3 * min(GRID.pitch)
-    for change in ({"depths": GRID.depths + step}, {"first": GRID.first + step * GRID.along_x}):
-        here, there = (HiddenVolume(values, grid, "fk") for grid in (GRID, dataclasses.replace(GRID, **change)))
+    own, step = dataclasses.replace(GRID, pitch=pitch), share * 1e-3 * min(pitch)
+    for change in ({"depths": own.depths + step}, {"first": own.first + step * own.along_x}):
+        here, there = (HiddenVolume(values, grid, "fk") for grid in (own, dataclasses.replace(own, **change)))
         if one:
             assert metrics.volume_iou(here, there).item() == 1
             continue
