@@ -7,7 +7,7 @@ import mitsuba as mi
 import pytest
 
 from torchtransient.errors import SceneError
-from torchtransient.rendering.inventory import take_inventory
+from torchtransient.rendering.inventory import name_of, take_inventory
 from torchtransient.rendering.node_checks import check_nesting, check_nodes
 
 VARIANT = "llvm_ad_rgb"
@@ -54,6 +54,8 @@ def blend(a, b):
         (within("bumpmap", f'<texture type="checkerboard"/>{DIFFUSE}'), 0.3),
         (blend(DIFFUSE, BRIGHT), 0.7),
         (blend(BRIGHT, DIFFUSE), 0.7),
+        (DIFFUSE + BRIGHT, 0.7),
+        (BRIGHT + DIFFUSE, 0.7),
         (within("mask", DIFFUSE), 1.0),
         (GLASS, 1.0),
     ],
@@ -121,6 +123,11 @@ def test_the_film_of_the_sensor_counts():
     assert [inventory(both, n).film for n in (0, 1, 2)] == ["hdrfilm", "specfilm", "hdrfilm"]
     bands = inventory(both).bands
     assert [(band.what, band.where) for band in bands] == [("response curve 'red'", "specfilm")]
+    nested = '<texture name="green" type="checkerboard"/><rfilter type="box"/>'
+    bands = inventory(sensor("specfilm", nested)).bands
+    assert [(band.what, band.where) for band in bands] == [("response curve 'green'", "specfilm")]
+    # Curves of a film are no colours of the scene.
+    assert inventory(sensor("some_film", nested)).colours == [] == inventory(both).measured
     assert inventory(shape(DIFFUSE)).film is None
     pulses = [inventory(sensor("transient_hdr_film", inside)).pulsed for inside in (
         "", '<string name="pulse" value="gaussian"/>', '<string name="irf" value="gaussian"/>')]  # fmt: skip
@@ -136,6 +143,35 @@ def test_depths_of_nested_integrators_count():
     assert inventory(shape(DIFFUSE)).integrator is None
     named = '<integrator type="path"><string name="temporal_filter" value="{}"/></integrator>'
     assert [inventory(named.format(name)).temporal_filter for name in ("tent", "")] == ["tent", None]
+
+
+# -------------------------------------------------------------------------------------------------- colours and names
+
+
+def test_colours_of_nodes_and_of_their_properties_count():
+    curve = '<bsdf type="diffuse"><spectrum name="reflectance" value="400:0.1, 700:0.2"/></bsdf>'
+    flat = '<bsdf type="diffuse"><spectrum name="reflectance" value="0.25"/></bsdf>'
+    gold = '<bsdf type="conductor"><string name="material" value="Au"/></bsdf>'
+    found = inventory(shape(BRIGHT) + shape(curve, name="b") + shape(flat, name="c") + shape(gold, name="d"))
+    assert [finding.what for finding in found.colours] == ["coloured reflectance"]
+    assert [finding.what for finding in found.measured] == [
+        "reflectance given over wavelength", "indices of 'Au' over wavelength"]  # fmt: skip
+    assert found.plugins == {"rectangle", "diffuse", "conductor"}
+
+
+def test_nodes_are_called_by_plugin_name_and_place(tmp_path):
+    folder = tmp_path / "a"
+    folder.mkdir()
+    lines = ["<shape type='sphere'/>", "<shape type='cube' id='box'/>"]
+    (folder / "room.xml").write_text("<scene version='3.0.0'>\n" + "\n".join(lines) + "\n</scene>")
+    config = mi.parser.ParserConfig(mi.variant())
+    state = mi.parser.parse_file(config, str(folder / "room.xml"))
+    assert [name_of(state, index) for index in (1, 2)] == [
+        "sphere, room.xml (line 2, col 2)", "cube 'box', room.xml (line 3, col 2)"]  # fmt: skip
+    described = {"type": "scene", "box": {"type": "cube"}, "wall": {"type": "rectangle", "id": "front"}}
+    state = mi.parser.parse_dict(config, described)
+    names = {name_of(state, index) for index in (1, 2)}
+    assert names == {"cube 'box' at 'box'", "rectangle 'front' at 'wall'"}
 
 
 # ----------------------------------------------------------------------------------------------------- what is refused
