@@ -134,7 +134,8 @@ def test_large_pictures_are_taken_as_coloured(tmp_path):
         (tmp_path / "p.png").write_bytes(bytes(size))
         kind, said = verdict("bitmap", tmp_path.joinpath, filename="p.png")
         assert kind == "colour" and said.endswith(why)
-    assert verdict("bitmap", tmp_path.joinpath, filename="no.png") == ("colour", "picture 'no.png', which was not found")
+    found = verdict("bitmap", tmp_path.joinpath, filename="no.png")
+    assert found == ("colour", "picture 'no.png', which was not found")
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from torchtransient.rendering.node_checks import check_nesting, check_nodes
 VARIANT = "llvm_ad_rgb"
 DIFFUSE = '<bsdf type="diffuse"><float name="reflectance" value="0.3"/></bsdf>'
 BRIGHT = '<bsdf type="diffuse"><rgb name="reflectance" value="0.2, 0.7, 0.4"/></bsdf>'
+FOG = '<medium name="interior" type="homogeneous"><phase type="{}"/></medium>'
 GLASS = '<bsdf type="dielectric"/>'
 
 
@@ -93,8 +94,8 @@ def test_groups_have_no_surface_of_their_own():
         (shape(GLASS, "sphere"), True),
         (shape(GLASS) + shape(GLASS, name="other"), True),
         (shape(within("mask", GLASS)) + shape(GLASS, name="other"), True),
-        (shape('<medium name="interior" type="homogeneous"><phase type="rayleigh"/></medium>'), True),
-        (shape('<medium name="interior" type="homogeneous"><phase type="hg"/></medium>') + shape(GLASS, name="o"), False),
+        (shape(FOG.format("rayleigh")), True),
+        (shape(FOG.format("hg")) + shape(GLASS, name="other"), False),
     ],
 )
 def test_light_meets_polarizing_surfaces_in_a_row_unless_a_single_flat_one_is_there(content, in_a_row):

@@ -81,7 +81,8 @@ def test_points_of_a_scan_are_a_text(tmp_path, key):
     points = mi.TensorXf(np.array([[[0.5, -2.0, 3.0], [4.0, 5.0, 6.25]]], np.float32))
     found = said(tmp_path, "nlos_capture_meter", mi.ObjectType.Sensor, **{key: points})
     assert found == [("string", key, "0.5, -2, 3, 4, 5, 6.25")]
-    assert said(tmp_path, "nlos_capture_meter", mi.ObjectType.Sensor, **{key: "1, 2, 3"}) == [("string", key, "1, 2, 3")]
+    found = said(tmp_path, "nlos_capture_meter", mi.ObjectType.Sensor, **{key: "1, 2, 3"})
+    assert found == [("string", key, "1, 2, 3")]
 
 
 def test_pictures_keep_their_numbers(tmp_path):
@@ -198,12 +199,53 @@ def test_light_of_a_spectral_model_cannot_be_said(monkeypatch, spectrum):
         values.write_value(SimpleNamespace(state=None), built, {1: values.Place(0)}, slot, np.ones(3))
 
 
+def put_into(plugin, key, value, kind="number", held=(), keeps=False, **properties):
+    """The properties of a node after a value of one of its parameters was written."""
+    owner, name = SimpleNamespace(ptr=1, class_name=lambda: "Some"), f"x.{key}"
+    props = mi.Properties(plugin)
+    for each, given in properties.items():
+        props[each] = given
+    params = {f"x.{each}": np.array([given]) for each, given in dict(held).items()}
+    built = SimpleNamespace(params=type("Params", (dict,), {"properties": {name: (None, None, owner, None)}})(params))
+    state = SimpleNamespace(nodes=[None, SimpleNamespace(props=props)])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(values, "keeps_coefficients", lambda _: keeps)
+        slot = SimpleNamespace(key=name, targets=[name], kind=kind)
+        values.write_value(SimpleNamespace(state=state), built, {1: values.Place(1)}, slot, np.array(value))
+    return props
+
+
+def test_values_come_into_the_node_that_they_belong_to():
+    # What three numbers are in a spectral model is asked of values of spectra alone.
+    assert put_into("sphere", "radius", 2.5, keeps=True)["radius"] == 2.5
+    # The inner angle of a spot follows its outer one where it is not described, and keeps its value all the same.
+    spot = put_into("spot", "cutoff_angle", 30.0, held={"beam_width": 15.0})
+    assert (spot["cutoff_angle"], spot["beam_width"]) == (30.0, 15.0)
+    spot = put_into("spot", "cutoff_angle", 30.0, held={"beam_width": 15.0}, beam_width=12.0)
+    assert (spot["cutoff_angle"], spot["beam_width"]) == (30.0, 12.0)
+    matrix = np.diag([2.0, 3.0, 4.0, 1.0])
+    matrix[:3, 3] = 5, 6, 7
+    placed = put_into("sphere", "to_world", matrix, "transform", center=[0.0, 0.0, 0.0], radius=2.0, alpha=1.0)
+    np.testing.assert_array_equal(np.array(placed["to_world"].matrix), matrix)
+    assert [key for key, _ in placed.items()] == ["alpha", "to_world"]
+    np.testing.assert_array_equal(np.array(put_into("obj", "m", matrix, "mesh_transform")["to_world"].matrix), matrix)
+    flat = np.array([[2.0, 0.0, 5.0], [0.0, 3.0, 6.0], [0.0, 0.0, 1.0]])
+    turned = np.array(put_into("bitmap", "to_uv", flat, "transform")["to_uv"].matrix)
+    np.testing.assert_array_equal(turned[:2][:, [0, 1, 3]], flat[:2])
+    grid = np.arange(24.0).reshape(2, 3, 4)
+    held = put_into("gridvolume", "data", grid, "tensor", filename="a.vol", raw=True)
+    assert [key for key, _ in held.items()] == ["raw", "data"]
+    np.testing.assert_array_equal(np.array(held["data"]), grid)
+
+
 def test_numbers_that_went_through_a_file_are_the_same():
     one = np.array([1.0, 1000.0])
     assert _same(one, one * (1 + 9e-6)) and not _same(one, one * (1 + 2.2e-5))
     # What is small beside the largest may differ by the rounding of that.
-    assert _same(one, one + [9e-4, 0.0]) and not _same(one, one + [2e-3, 0.0])
-    assert _same(one / 2000, one / 2000 + [9e-7, 0.0]) and not _same(one / 2000, one / 2000 + [2e-6, 0.0])
+    small = np.array([1e-3, 0.0])
+    for sign in (1, -1):
+        assert _same(sign * one, sign * one + 0.9 * small) and not _same(sign * one, sign * one + 12 * small)
+    assert _same(one / 2000, one / 2000 + 0.9e-3 * small) and not _same(one / 2000, one / 2000 + 2e-3 * small)
     assert not _same(one, one[:1]) and not _same(one, one[None])
     assert _same(np.array(["a"]), np.array(["a"])) and not _same(np.array(["a"]), np.array(["b"]))
     assert _same(np.zeros((0, 3)), np.zeros((0, 3)))
