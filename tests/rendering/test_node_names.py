@@ -5,11 +5,14 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import mitsuba as mi
 import numpy as np
 import pytest
 import torch
 
 import torchtransient as tt
+from torchtransient.rendering.node_names import _free_name, name_nested, name_nodes, take_merged_apart
+from torchtransient.rendering.nodes import children
 from torchtransient.testing.small_room import VARIANT, make_room
 
 MERGED = """<scene version="3.0.0">
@@ -104,3 +107,55 @@ def test_shared_textures_that_become_other_objects(kind, named):
     apart = room(texture, texture)
     keys = [f"{name}.bsdf.reflectance.{key}" for name in ("wall", "box")]
     torch.testing.assert_close(slopes(shared, f"ours.{key}"), slopes(apart, *keys), rtol=1e-4, atol=1e-5)
+
+
+def parsed(content):
+    config = mi.parser.ParserConfig(VARIANT)
+    state = mi.parser.parse_string(config, f'<scene version="3.0.0">{content}</scene>')
+    mi.parser.transform_resolve(config, state)
+    return state
+
+
+def test_nameless_nodes_are_counted_by_kind_around_names_that_are_taken():
+    # Nothing is called after its place in the file: a parser that gives such names is made to forget them.
+    shapes = ["", "shape_0", "", "", "shape_3", ""]
+    state = parsed("".join('<shape type="cube"/>' for _ in shapes) + '<emitter type="point"/>')
+    direct = [state.nodes[index] for _, index in children(state, state.root)]
+    for node, name in zip(direct, [*shapes, ""], strict=True):
+        node.props.set_id(name)
+    name_nodes(state)
+    names = [node.props.id() for node in direct]
+    assert names == ["shape_1", "shape_0", "shape_2", "shape_4", "shape_3", "shape_5", "emitter"]
+    for node, name in zip(direct, ["emitter", *[""] * 6], strict=True):
+        node.props.set_id(name)
+    name_nodes(state)
+    assert [node.props.id() for node in direct] == ["emitter", *(f"shape_{n}" for n in range(5)), "emitter_1"]
+
+
+def test_merged_shapes_stand_where_the_merge_stood():
+    inner = '<shape type="cube" id="one"/><shape type="cube"/><shape type="cube" id="two"/>'
+    state = parsed(f'<shape type="merge" id="m">{inner}</shape><shape type="sphere" id="two_"/>')
+    for node in state.nodes:
+        if node.props.id().startswith("_"):
+            node.props.set_id("")
+    next(node for node in state.nodes if node.props.id() == "two_").props.set_id("two")
+    take_merged_apart(state)
+    direct = [state.nodes[index].props for _, index in children(state, state.root)]
+    # A name that another shape has, and no name, follow that of the merge.
+    assert sorted((props.plugin_name(), props.id()) for props in direct) == [
+        ("cube", "m_1"), ("cube", "m_two"), ("cube", "one"), ("sphere", "two")]  # fmt: skip
+    assert [_free_name("a", taken) for taken in ([], ["a"], ["a", "a_1", "a_3"])] == ["a", "a_1", "a_2"]
+
+
+def test_surfaces_inside_have_names_of_their_own():
+    inside = '<bsdf type="twosided"><bsdf type="diffuse"/></bsdf>'
+    shapes = f'<shape type="cube">{inside}</shape><shape type="cube"><ref id="top"/></shape>'
+    state = parsed(f'<bsdf type="diffuse" id="top"/>{shapes}')
+    for node in state.nodes[1:]:
+        node.props.set_id("top" if node.props.id() == "top" else "")
+    name_nested(state)
+    names = {index: node.props.id() for index, node in enumerate(state.nodes) if index}
+    kinds = {index: str(node.type).rsplit(".", 1)[-1] for index, node in enumerate(state.nodes) if index}
+    for index, name in names.items():
+        assert name == ("top" if name == "top" else f"_unnamed_{index}" if kinds[index] == "Shape" else f"#{index}")
+    assert sorted(names.values()).count("top") == 1 and len(set(names.values())) == len(names) == 5

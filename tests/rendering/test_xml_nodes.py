@@ -1,0 +1,251 @@
+"""What a node of a scene is as XML, and how values of parameters come into it, one by one."""
+
+import xml.etree.ElementTree as ElementTree
+from types import SimpleNamespace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from torchtransient.errors import SceneError
+from torchtransient.plugins.drjit_pool import threads_for_files
+from torchtransient.rendering.saving import values
+from torchtransient.rendering.saving.save import _same
+from torchtransient.rendering.saving.xml_nodes import XmlWriter
+
+VARIANT = "llvm_ad_rgb"
+
+
+def node(plugin, kind, **properties):
+    found = mi.parser.SceneNode()
+    found.type, found.props = kind, mi.Properties(plugin)
+    for key, value in properties.items():
+        found.props[key] = value
+    return found
+
+
+def written(folder, *nodes):
+    """The root of the XML of nodes that stand in a scene."""
+    scene = node("scene", mi.ObjectType.Scene)
+    for n in range(len(nodes)):
+        scene.props[f"object_{n}"] = mi.Properties.ResolvedReference(n + 1)
+    state = SimpleNamespace(nodes=[scene, *nodes], root=scene, id_to_index={})
+    return ElementTree.fromstring(XmlWriter(state, folder).text())
+
+
+def said(folder, plugin="sphere", kind=None, **properties):
+    """(tag, name, value) of what a node with these properties says."""
+    (element,) = written(folder, node(plugin, kind or mi.ObjectType.Shape, **properties))
+    return [(child.tag, child.get("name"), child.get("value")) for child in element]
+
+
+def test_numbers_and_words_as_xml(tmp_path):
+    folder = tmp_path / "files"
+    assert said(folder, on=True, off=False) == [("boolean", "on", "true"), ("boolean", "off", "false")]
+    assert said(folder, n=-3, x=0.1) == [("integer", "n", "-3"), ("float", "x", "0.1")]
+    assert said(folder, text="some text") == [("string", "text", "some text")]
+    assert said(folder, v=[0.25, -2.0, 3.0]) == [("vector", "v", "0.25, -2.0, 3.0")]
+    assert said(folder, c=mi.ScalarColor3f(0.25, 0.5, 0.75)) == [("rgb", "c", "0.25, 0.5, 0.75")]
+    with pytest.raises(SceneError, match=r"the text 'a\$b' at sphere\.text has a '\$'"):
+        said(folder, text="a$b")
+    with pytest.raises(SceneError, match=r"the TensorXf at sphere\.t cannot be said in XML"):
+        said(folder, t=mi.TensorXf(np.zeros((2, 3), np.float32)))
+    assert not folder.exists()
+
+
+def test_transforms_as_rows_of_numbers(tmp_path):
+    matrix = np.arange(1.0, 17.0).reshape(4, 4)
+    matrix[3] = 0, 0, 0, 1
+    (element,) = written(tmp_path, node("sphere", mi.ObjectType.Shape, to_world=mi.ScalarTransform4d(matrix)))
+    assert element.find("transform").get("name") == "to_world"
+    numbers = element.find("transform/matrix").get("value").split(", ")
+    np.testing.assert_array_equal(np.array(numbers, float).reshape(4, 4), matrix)
+
+
+def test_files_come_along_under_names_of_their_own(tmp_path):
+    folder, given = tmp_path / "files", tmp_path / "a b.ply"
+    given.write_bytes(b"ply")
+    first, second = written(folder, *(node("ply", mi.ObjectType.Shape, filename=str(given)) for _ in range(2)))
+    assert [element[0].get("value") for element in (first, second)] == ["files/a_b.ply", "files/a_b_1.ply"]
+    assert [path.read_bytes() for path in folder.iterdir()] == [b"ply"] * 2
+    # Texts that are no files stay as they are, and so do names of files under other keys.
+    assert said(folder, filename="nowhere.ply", note=str(given)) == [
+        ("string", "filename", "nowhere.ply"), ("string", "note", str(given))]  # fmt: skip
+    state = SimpleNamespace(nodes=[node("scene", mi.ObjectType.Scene)])
+    state.root = state.nodes[0]
+    assert XmlWriter(SimpleNamespace(**vars(state), id_to_index={}), folder).file("", ".x").name == "data.x"
+
+
+@pytest.mark.parametrize("key", ["points", "laser_points"])
+def test_points_of_a_scan_are_a_text(tmp_path, key):
+    points = mi.TensorXf(np.array([[[0.5, -2.0, 3.0], [4.0, 5.0, 6.25]]], np.float32))
+    found = said(tmp_path, "nlos_capture_meter", mi.ObjectType.Sensor, **{key: points})
+    assert found == [("string", key, "0.5, -2, 3, 4, 5, 6.25")]
+    found = said(tmp_path, "nlos_capture_meter", mi.ObjectType.Sensor, **{key: "1, 2, 3"})
+    assert found == [("string", key, "1, 2, 3")]
+
+
+def test_pictures_keep_their_numbers(tmp_path):
+    def read(name):
+        with threads_for_files():
+            return mi.Bitmap(str(tmp_path / name))
+
+    pixels = np.arange(18, dtype=np.float32).reshape(2, 3, 3) / 32
+    cases = {
+        "eight": (mi.Bitmap((pixels * 255).astype(np.uint8)), ".png"),
+        "float": (mi.Bitmap(pixels), ".exr"),
+        "half": (mi.Bitmap(pixels.astype(np.float16)), ".exr"),
+    }
+    for name, (bitmap, ending) in cases.items():
+        ((tag, key, value),) = said(tmp_path / name, "bitmap", mi.ObjectType.Texture, bitmap=bitmap)
+        again = read(value)
+        assert (tag, key, value) == ("string", "filename", f"{name}/bitmap_bitmap{ending}")
+        assert again.component_format() == bitmap.component_format()
+        np.testing.assert_array_equal(np.array(again), np.array(bitmap))
+    data = said(tmp_path / "data", "bitmap", mi.ObjectType.Texture, data=mi.TensorXf(pixels))[0][2]
+    np.testing.assert_array_equal(np.array(read(data)), pixels)
+    # Eight bits that are not to be decoded, and no raw picture, are decoded once and for all.
+    linear = mi.Bitmap((pixels * 255).astype(np.uint8))
+    linear.set_srgb_gamma(False)
+    assert said(tmp_path / "l", "bitmap", mi.ObjectType.Texture, bitmap=linear)[0][2].endswith(".exr")
+    assert any(entry[2].endswith(".png") for entry in said(
+        tmp_path / "r", "bitmap", mi.ObjectType.Texture, bitmap=linear, raw=True))  # fmt: skip
+
+
+def test_nodes_are_written_once_and_referred_to(tmp_path):
+    shared = node("diffuse", mi.ObjectType.BSDF)
+    shapes = [node("sphere", mi.ObjectType.Shape, bsdf=mi.Properties.ResolvedReference(3)) for _ in range(2)]
+    scene = node("scene", mi.ObjectType.Scene)
+    for n, shape in enumerate(shapes, 1):
+        shape.props.set_id(f"s{n}")
+        scene.props[f"object_{n}"] = mi.Properties.ResolvedReference(n)
+    state = SimpleNamespace(nodes=[scene, *shapes, shared], root=scene, id_to_index={})
+    first, second = ElementTree.fromstring(XmlWriter(state, tmp_path).text())
+    assert [first.get("id"), second.get("id")] == ["s1", "s2"]
+    assert (first[0].tag, first[0].get("type"), first[0].get("id")) == ("bsdf", "diffuse", "node_3")
+    assert (second[0].tag, second[0].get("name"), second[0].get("id")) == ("ref", "bsdf", "node_3")
+
+
+def test_plugins_of_no_kind_have_no_tag(tmp_path):
+    with pytest.raises(SceneError, match="the kind of plugin 'unheard_of' is not known"):
+        written(tmp_path, node("unheard_of", mi.ObjectType.Unknown))
+
+
+# ------------------------------------------------------------------------------------------------ values of parameters
+
+
+def put(name, value, /, **properties):
+    props = mi.Properties("some_plugin")
+    for key, each in properties.items():
+        props[key] = each
+    values._put_numbers(props, name, np.array(value), "some.key")
+    return props
+
+
+def test_numbers_as_the_property_that_is_there():
+    types = mi.Properties.Type
+    assert put("values", [0.5, 2.0], values="1, 2, 3")["values"] == "0.5, 2"
+    assert put("radius", [2.5])["radius"] == 2.5
+    assert list(put("v", [1.0, 2.0, 3.0], v=[0.0, 0.0, 0.0])["v"]) == [1, 2, 3]
+    for props in (put("c", [1.0, 2.0, 3.0]), put("c", [1.0, 2.0, 3.0], c=0.5),
+                  put("c", [1.0, 2.0, 3.0], c=mi.ScalarColor3f(0.0))):  # fmt: skip
+        assert props.type("c") == types.Color and [props["c"][n] for n in range(3)] == [1, 2, 3]
+    assert put("position", [1.0, 2.0, 3.0]).type("position") == types.Vector
+    points = np.arange(6.0).reshape(2, 3)
+    np.testing.assert_array_equal(np.array(put("points", points)["points"]), points[None])
+    with pytest.raises(SceneError, match=r"a value of shape \(2,\) for 'some.key' .* no property 'x' of that kind"):
+        put("x", [1.0, 2.0])
+    # A text that is no list of numbers is none that three numbers can replace.
+    with pytest.raises(SceneError, match="no property 'name'"):
+        put("name", [1.0, 2.0, 3.0], name="text")
+
+
+def test_what_says_the_same_otherwise_is_left_out():
+    assert "material" not in put("eta", [1.5], material="Au") and "material" not in put("k", [1.5], material="Au")
+    assert "focal_length" not in put("fov", [40.0], focal_length="50mm")
+    assert "material" in put("alpha", [0.5], material="Au")
+
+
+def test_properties_that_numbers_are_said_by():
+    def of(plugin, name):
+        props = mi.Properties(plugin)
+        return values._property_of(props, name, np.array(2.0))[0], {key: props[key] for key, _ in props.items()}
+
+    for plugin in ("dielectric", "plastic", "diff_dielectric"):
+        assert of(plugin, "eta") == ("int_ior", {"ext_ior": 1.0})
+    assert of("conductor", "eta") == ("eta", {})
+    assert of("dielectric", "k") == ("k", {})
+    assert of("perspective", "x_fov") == ("fov", {"fov_axis": "x"})
+    assert of("d65", "value") == ("scale", {}) and of("d65", "scale") == ("scale", {})
+    assert of("uniform", "value") == ("value", {})
+
+
+def test_maps_of_surroundings_lose_the_columns_that_are_there_twice():
+    value = np.arange(30.0).reshape(2, 5, 3)
+    owner = SimpleNamespace(class_name=lambda: "EnvironmentMapEmitter")
+    name, found = values._array_of(owner, "data", value)
+    assert name == "bitmap"
+    np.testing.assert_array_equal(found, value[:, 1:4])
+    assert values._array_of(SimpleNamespace(class_name=lambda: "BitmapTexture"), "data", value) == ("data", value)
+
+
+@pytest.mark.parametrize("spectrum", ["d65", "uniform"])
+def test_light_of_a_spectral_model_cannot_be_said(monkeypatch, spectrum):
+    owner = SimpleNamespace(ptr=1, class_name=lambda: spectrum)
+    monkeypatch.setattr(values, "keeps_coefficients", lambda given: given is owner)
+    built = SimpleNamespace(params=SimpleNamespace(properties={"a.value": (None, None, owner, None)}))
+    slot = SimpleNamespace(key="a.value", targets=["a.value"], kind="number")
+    with pytest.raises(SceneError, match=r"'a\.value' cannot be said in XML: .* a spectral model of light"):
+        values.write_value(SimpleNamespace(state=None), built, {1: values.Place(0)}, slot, np.ones(3))
+
+
+def put_into(plugin, key, value, kind="number", held=(), keeps=False, **properties):
+    """The properties of a node after a value of one of its parameters was written."""
+    owner, name = SimpleNamespace(ptr=1, class_name=lambda: "Some"), f"x.{key}"
+    props = mi.Properties(plugin)
+    for each, given in properties.items():
+        props[each] = given
+    params = {f"x.{each}": np.array([given]) for each, given in dict(held).items()}
+    built = SimpleNamespace(params=type("Params", (dict,), {"properties": {name: (None, None, owner, None)}})(params))
+    state = SimpleNamespace(nodes=[None, SimpleNamespace(props=props)])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(values, "keeps_coefficients", lambda _: keeps)
+        slot = SimpleNamespace(key=name, targets=[name], kind=kind)
+        values.write_value(SimpleNamespace(state=state), built, {1: values.Place(1)}, slot, np.array(value))
+    return props
+
+
+def test_values_come_into_the_node_that_they_belong_to():
+    # What three numbers are in a spectral model is asked of values of spectra alone.
+    assert put_into("sphere", "radius", 2.5, keeps=True)["radius"] == 2.5
+    # The inner angle of a spot follows its outer one where it is not described, and keeps its value all the same.
+    spot = put_into("spot", "cutoff_angle", 30.0, held={"beam_width": 15.0})
+    assert (spot["cutoff_angle"], spot["beam_width"]) == (30.0, 15.0)
+    spot = put_into("spot", "cutoff_angle", 30.0, held={"beam_width": 15.0}, beam_width=12.0)
+    assert (spot["cutoff_angle"], spot["beam_width"]) == (30.0, 12.0)
+    matrix = np.diag([2.0, 3.0, 4.0, 1.0])
+    matrix[:3, 3] = 5, 6, 7
+    placed = put_into("sphere", "to_world", matrix, "transform", center=[0.0, 0.0, 0.0], radius=2.0, alpha=1.0)
+    np.testing.assert_array_equal(np.array(placed["to_world"].matrix), matrix)
+    assert [key for key, _ in placed.items()] == ["alpha", "to_world"]
+    np.testing.assert_array_equal(np.array(put_into("obj", "m", matrix, "mesh_transform")["to_world"].matrix), matrix)
+    flat = np.array([[2.0, 0.0, 5.0], [0.0, 3.0, 6.0], [0.0, 0.0, 1.0]])
+    turned = np.array(put_into("bitmap", "to_uv", flat, "transform")["to_uv"].matrix)
+    np.testing.assert_array_equal(turned[:2][:, [0, 1, 3]], flat[:2])
+    grid = np.arange(24.0).reshape(2, 3, 4)
+    held = put_into("gridvolume", "data", grid, "tensor", filename="a.vol", raw=True)
+    assert [key for key, _ in held.items()] == ["raw", "data"]
+    np.testing.assert_array_equal(np.array(held["data"]), grid)
+
+
+def test_numbers_that_went_through_a_file_are_the_same():
+    one = np.array([1.0, 1000.0])
+    assert _same(one, one * (1 + 9e-6)) and not _same(one, one * (1 + 2.2e-5))
+    # What is small beside the largest may differ by the rounding of that.
+    small = np.array([1e-3, 0.0])
+    for sign in (1, -1):
+        assert _same(sign * one, sign * one + 0.9 * small) and not _same(sign * one, sign * one + 12 * small)
+    assert _same(one / 2000, one / 2000 + 0.9e-3 * small) and not _same(one / 2000, one / 2000 + 2e-3 * small)
+    assert not _same(one, one[:1]) and not _same(one, one[None])
+    assert _same(np.array(["a"]), np.array(["a"])) and not _same(np.array(["a"]), np.array(["b"]))
+    assert _same(np.zeros((0, 3)), np.zeros((0, 3)))
