@@ -223,7 +223,8 @@ def _number(value: Any) -> float:
 
 def _is_no_number(value: Any) -> bool:
     """Whether Python or numpy makes a number of what is none."""
-    if isinstance(value, (str, bytes)) or np.ma.is_masked(value):
+    # torch.compile does not follow `is_masked`.
+    if isinstance(value, (str, bytes)) or (isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value)):
         return True
     dtype = getattr(value, "dtype", None)
     return _is_truth(value) or "complex" in str(dtype) or getattr(dtype, "kind", None) in {"m", "M", "S", "U", "V"}
