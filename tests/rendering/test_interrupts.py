@@ -239,6 +239,15 @@ def test_an_interrupted_change_of_the_variant_leaves_all_plugins_whole(monkeypat
         assert mi.load_dict({"type": plugin}).variant_name() == "llvm_ad_mono"
 
 
+@pytest.fixture
+def _interrupts_raise():
+    """As from the keyboard: a process that a shell has started in the background ignores them."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("_interrupts_raise")
 def test_an_interrupt_waits_for_a_change_of_the_variant(monkeypatch):
     mi.set_variant(VARIANT)
     done, before, change = [], signal.getsignal(signal.SIGINT), mi.set_variant
