@@ -10,6 +10,7 @@ written since. Not a part of the tests: a room takes minutes to hours.
 from __future__ import annotations
 
 import argparse
+import ctypes
 import difflib
 import json
 import os
@@ -19,6 +20,7 @@ import signal
 import sys
 import tempfile
 import time
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -30,8 +32,12 @@ COPIED = ("torchtransient", "tests", "docs", "training_examples", "benchmarks", 
           "CHANGELOG.md", "LICENSE", "Makefile", "constraints.txt", "constraints-lowest.txt",
           "hatch_build.py")  # fmt: skip
 # A change that makes a loop endless is noticed, too: the tests would not end.
-PATIENCE, LEAST_SECONDS = 6.0, 240.0
+PATIENCE, LEAST_SECONDS = 8.0, 150.0
 FIRST = 4  # test files
+# Tests that do not execute a line notice its change by what others have left in a cache, or in another process. Files
+# of so many seconds are asked: what only longer ones would notice counts as not noticed.
+OTHERS_SECONDS = 90.0
+ADOPTS_ORPHANS = 36  # PR_SET_CHILD_SUBREAPER
 
 
 def copied(folder: Path) -> None:
@@ -55,19 +61,36 @@ def preload() -> None:
     scipy.signal.fftconvolve(scipy.stats.norm.pdf(np.zeros(1)), np.zeros(1))
 
 
-def run_tests(folder: Path, tests: list[str], seconds: float, data: Path | None = None) -> tuple[str, str]:
-    """('caught', what noticed) or ('survived', ''), from the room's tests in a copy; ``data``: what they execute."""
+def adopt_orphans() -> None:
+    """Processes whose parent has ended become children of this one, which ends them; on Linux alone."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(ADOPTS_ORPHANS, 1, 0, 0, 0)
+
+
+def end_children() -> None:
+    """Every process that runs of tests have left, those with a session of their own included."""
+    file = Path(f"/proc/self/task/{os.getpid()}/children")
+    while children := [int(word) for word in file.read_text().split()] if file.exists() else []:
+        for child in children:
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+
+
+def run_tests(folder: Path, tests: list[str], seconds: float, plugin: object = None) -> tuple[str, str]:
+    """('caught', what noticed) or ('survived', ''), from test files in a copy."""
     output = folder / "output.txt"
     process = os.fork()
     if process == 0:
-        _be_tested(folder, tests, output, data)
+        _be_tested(folder, tests, output, plugin)
     until = time.monotonic() + seconds
     while (ended := os.waitpid(process, os.WNOHANG)) == (0, 0):
         if time.monotonic() > until:
             os.killpg(process, signal.SIGKILL)
             os.waitpid(process, 0)
+            end_children()
             return "caught", f"not done after {seconds:.0f} s"
         time.sleep(0.02)
+    end_children()
     code = os.waitstatus_to_exitcode(ended[1])
     if code in (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED):
         return "survived", ""
@@ -75,7 +98,7 @@ def run_tests(folder: Path, tests: list[str], seconds: float, data: Path | None 
     return "caught", failed[0] if failed else f"exit code {code}"
 
 
-def _be_tested(folder: Path, tests: list[str], output: Path, data: Path | None) -> None:
+def _be_tested(folder: Path, tests: list[str], output: Path, plugin: object) -> None:
     code = 1
     try:
         os.setsid()
@@ -86,10 +109,12 @@ def _be_tested(folder: Path, tests: list[str], output: Path, data: Path | None) 
         os.environ["PYTHONPATH"] = sys.path[0] = str(folder)
         # One thread of Dr.Jit, as where tests run side by side: several runs share the cores.
         os.environ["PYTEST_XDIST_WORKER_COUNT"] = str(os.cpu_count() or 1)
-        recorders = [executed.Recorder(data, folder / "torchtransient")] if data else []
-        code = int(pytest.main(["-x", "-q", "--tb=no", "-p", "no:cacheprovider", *tests], plugins=recorders))
-        for recorder in recorders:
-            recorder.save()
+        if isinstance(plugin, Path):
+            plugin = executed.Recorder(plugin, folder, folder / "torchtransient")
+        plugins = [plugin] if plugin else []
+        code = int(pytest.main(["-x", "-q", "--tb=no", "-p", "no:cacheprovider", *tests], plugins=plugins))
+        if isinstance(plugin, executed.Recorder):
+            plugin.save()
         if Path(sys.modules["torchtransient"].__file__).parent != folder / "torchtransient":
             code = 99
     finally:
@@ -98,10 +123,10 @@ def _be_tested(folder: Path, tests: list[str], output: Path, data: Path | None) 
         os._exit(code)
 
 
-def ordered(folder: Path, tests: list[str], seconds: dict[str, float], change: changes.Change) -> list[str]:
+def ordered(folder: Path, known: executed.Executed, names: Iterable[str], change: changes.Change) -> list[str]:
     """Test files, those that speak of the changed module first, then those that are soon done."""
     module = (folder / change.path).read_text(encoding="utf-8")
-    names = set(re.findall(r"^(?:def|class) (\w{4,})", module, re.MULTILINE))
+    defined = set(re.findall(r"^(?:def|class) (\w{4,})", module, re.MULTILINE))
     around = re.findall(r"^(?:def|class) (\w+)", module.encode()[: change.start].decode(), re.MULTILINE)
     stem = Path(change.path).stem
 
@@ -109,11 +134,32 @@ def ordered(folder: Path, tests: list[str], seconds: dict[str, float], change: c
         path = folder / test
         text = path.read_text(encoding="utf-8")
         words = set(re.findall(r"\w+", text))
-        score = 4 * (stem in path.stem) + 3 * (stem in words) + len(names & words)
-        return -(score + 5 * bool(around and around[-1] in words)), seconds[test]
+        score = 4 * (stem in path.stem) + 3 * (stem in words) + len(defined & words)
+        return -(score + 5 * bool(around and around[-1] in words)), known.files[test].seconds
 
-    found = sorted(tests, key=related)
-    return found[:FIRST] + sorted(found[FIRST:], key=lambda test: seconds[test])
+    found = sorted(names, key=related)
+    return found[:FIRST] + sorted(found[FIRST:], key=lambda test: known.files[test].seconds)
+
+
+def rounds(
+    folder: Path, known: executed.Executed, change: changes.Change, source: bytes
+) -> Iterator[tuple[list[str], executed.Chosen, float]]:
+    """What is asked one after the other: test files, which tests of them, seconds that they take without the change."""
+    asked = known.tests(change.path, executed.range_of(source, change.line))
+    files = ordered(folder, known, asked, change)
+    for names in (files[:FIRST], files[FIRST:]):
+        tests = set().union(*(asked[name] for name in names))
+        yield names, executed.Chosen(only=tests), sum(known.files[n].tests[t] for n in names for t in asked[n])
+    # What executes lines of the module in vain, or in other processes.
+    near = {name for name, file in known.files.items() if change.path in file.lines}
+    others, left = [], OTHERS_SECONDS
+    for name in ordered(folder, known, near | known.elsewhere, change):
+        file = known.files[name]
+        rest = sum(seconds for test, seconds in file.tests.items() if test not in asked.get(name, ()))
+        if 0 < rest <= left:
+            others.append(name)
+            left -= rest
+    yield others, executed.Chosen(without=set().union(*asked.values())), OTHERS_SECONDS - left
 
 
 def difference(source: bytes, changed: bytes, path: str) -> str:
@@ -123,12 +169,12 @@ def difference(source: bytes, changed: bytes, path: str) -> str:
     return "\n".join(line for line in lines if not line.startswith("@@"))
 
 
-def try_change(folder: Path, known: executed.Executed, change: changes.Change, seconds: float) -> dict[str, object]:
+def try_change(folder: Path, known: executed.Executed, change: changes.Change) -> dict[str, object]:
     """The outcome of one change; the copy is as it was afterwards."""
     target = folder / change.path
     source = target.read_bytes()
     changed = change.apply(source)
-    tests = ordered(folder, known.files(change.path, *executed.statement(source, change.line)), known.seconds, change)
+    outcome, by, tests = "survived", "", 0
     begun = time.monotonic()
     # Compiled files are told apart by their second and size, which a change may leave as they were.
     compiled = [target.parent / "__pycache__" / f"{target.stem}.{sys.implementation.cache_tag}.pyc"]
@@ -137,16 +183,17 @@ def try_change(folder: Path, known: executed.Executed, change: changes.Change, s
         for path in compiled:
             path.unlink(missing_ok=True)
         # Most changes are noticed by the tests that speak of them: the others are not even collected.
-        outcome, by = run_tests(folder, tests[:FIRST], seconds)
-        if outcome == "survived" and tests[FIRST:]:
-            outcome, by = run_tests(folder, tests[FIRST:], seconds)
+        for names, chosen, expected in rounds(folder, known, change, source):
+            if names and outcome == "survived":
+                tests += len(names)
+                outcome, by = run_tests(folder, names, LEAST_SECONDS + PATIENCE * expected, chosen)
     finally:
         target.write_bytes(source)
         for path in compiled:
             path.unlink(missing_ok=True)
     return {
         "outcome": outcome, "by": by, "operator": change.operator, "path": change.path, "line": change.line,
-        "seconds": round(time.monotonic() - begun, 1), "files": len(tests),
+        "seconds": round(time.monotonic() - begun, 1), "files": tests,
         "diff": difference(source, changed, change.path),
     }  # fmt: skip
 
@@ -184,10 +231,10 @@ def main() -> None:
         folder = Path(name)
         copied(folder)
         preload()
+        adopt_orphans()
         tests = [path.relative_to(folder).as_posix() for path in room.test_files(folder)]
         known = executed.measured(folder, tests, record.with_name(f"{arguments.room}-executed.json"),
                                   lambda test, data: _seconds_unchanged(folder, test, data))  # fmt: skip
-        seconds = max(LEAST_SECONDS, PATIENCE * sum(known.seconds.values()))
         chosen = changes.drawn(folder, room.files(folder), arguments.seed)
         chosen = [change for change, _ in zip(chosen, range(arguments.count), strict=False)]
         if arguments.again:
@@ -196,7 +243,7 @@ def main() -> None:
                                                                                path.read_bytes())]  # fmt: skip
             chosen, results = [c for c in every if (c.path, _of(folder, c)) in left], []
         for number, change in enumerate(chosen[len(results) :], start=len(results) + 1):
-            result = try_change(folder, known, change, seconds)
+            result = try_change(folder, known, change)
             results.append(result)
             if not arguments.again:
                 with record.open("a", encoding="utf-8") as file:
