@@ -109,6 +109,22 @@ def test_nothing_counts(case):
     assert math.isnan(float(case(x, y, mask=torch.zeros(case.counts, dtype=torch.bool))))
 
 
+@pytest.mark.filterwarnings("ignore:Anomaly Detection")
+@every
+def test_an_item_of_which_nothing_counts_has_slope_zero(case):
+    x, y = case.pair()
+    mask = case.mask()
+    mask[1] = False
+    x.requires_grad_()
+    with torch.autograd.detect_anomaly(check_nan=True):
+        each = case(x, y, mask=mask, reduction="item")
+        assert bool(each[1].isnan().all()) and bool(each[0].isfinite().all())
+        if each.requires_grad:
+            each[~each.isnan()].sum().backward()
+    if each.requires_grad:
+        assert bool(x.grad.isfinite().all()) and not bool(x.grad[1].any())
+
+
 @every
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16], ids=str)
 def test_half_precision_is_measured_in_single(case, dtype):

@@ -92,6 +92,13 @@ def test_correlation_by_hand(scale):
     assert float(metrics.picture_correlation(x, y, mask=torch.tensor([[True, False, False, True]]))) == 1.0
 
 
+def test_rounding_makes_no_correlation_of_more_than_one():
+    pictures = torch.rand(400, 3, 5, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    for factor in (0.3, -0.7):
+        found = metrics.picture_correlation(factor * pictures, pictures, reduction="none")
+        assert float(found.abs().max()) == 1.0
+
+
 def test_flat_pictures():
     flat, slope = torch.full((3, 4), 0.1), torch.linspace(0, 1, 12).view(3, 4)
     assert float(metrics.picture_correlation(flat, slope)) == 0.0

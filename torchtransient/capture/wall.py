@@ -85,7 +85,7 @@ class Wall:
         """
         points, triangles = checked_mesh("Wall.mesh", vertices, faces)
         corners = points[triangles]
-        areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+        areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])  # twice
         mean = areas.sum(0)
         if not np.linalg.norm(mean) > 1e-3 * np.linalg.norm(areas, axis=1).sum():
             raise SceneError(
