@@ -61,8 +61,16 @@ def test_numbers_of_traced_calls(setting, tmp_path):
         assert outcome.launched, (key, outcome.said)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("setting", settings(bare=True), ids=lambda one: one.name)
+def marked(found):
+    """A plugin shows Dr.Jit the same arrays whatever its numbers are: its first setting is in the set of slow tests."""
+    seen = set()
+    for one in found:
+        what = one.name.split(" (")[0]
+        yield pytest.param(one, id=one.name, marks=pytest.mark.soak if what in seen else pytest.mark.slow)
+        seen.add(what)
+
+
+@pytest.mark.parametrize("setting", list(marked(settings(bare=True))))
 def test_numbers_of_traced_calls_for_every_plugin(setting, tmp_path):
     """Some plugins do not show Dr.Jit all of their arrays: their scenes are traced (docs/speed.md has a list)."""
     if setting.plugin == "timed_sunsky":

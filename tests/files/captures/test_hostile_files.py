@@ -63,7 +63,7 @@ def test_mutated_files(tmp_path):
     assert 0 < good < 150
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_ten_thousand_mutated_files(tmp_path):
     """In a process of its own, which also shows that it survives, and what memory it takes: all files are small, and
     the limit is what the libraries take beside them.
