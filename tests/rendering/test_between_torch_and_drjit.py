@@ -1,5 +1,6 @@
 """Numbers on their way between torch and Dr.Jit, memory that is asked for, and what is told on the way."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import drjit as dr
@@ -37,8 +38,10 @@ def test_copies_of_few_and_of_many_numbers(kind, rows):
         with torch.no_grad():
             given += 1
         assert torch.equal(back + 1, given)
-        flat = session.own_array(given)
-        assert type(flat) is mi.Float and np.array_equal(np.array(flat), given.detach().numpy().ravel())
+        flat, before = session.own_array(given), given.detach().numpy().ravel().copy()
+        with torch.no_grad():
+            given *= 3
+        assert type(flat) is mi.Float and np.array_equal(np.array(flat), before)
         assert session.own_array(torch.tensor(3.0, requires_grad=True))[0] == 3
 
 
@@ -118,6 +121,20 @@ def test_an_adjoint_is_read_where_it_is(axes):
     assert np.array_equal(np.array(engine._steady_adjoint(g)), g.detach().numpy())
 
 
+@pytest.mark.parametrize(("step", "whole"), [(2**32 - 2, False), (2**32 - 1, True)])
+def test_adjoints_beyond_32_bits_are_laid_as_the_film_is(step, whole):
+    two = torch.tensor([3.0, 5.0])
+    g = SimpleNamespace(shape=(2, 1), stride=lambda: (step, 7), is_cuda=False, storage_offset=lambda: 0)
+    g.detach = g.resolve_neg = lambda: g
+    g.contiguous = lambda: two
+    g.as_strided = lambda *given: two if given == ((step + 1,), (1,), 0) else None
+    found = engine._cube_adjoint(g)
+    if whole:
+        assert type(found) is mi.TensorXf and np.array_equal(np.array(found), [3, 5])
+    else:
+        assert np.array_equal(np.array(found[0]), [3, 5]) and found[1:] == (0, (step, 7))
+
+
 # ------------------------------------------------------------------------------------------------------------ memory
 
 
@@ -168,6 +185,12 @@ def test_cubes_that_fit(monkeypatch):
         memory.check_fits((2**9, 2**10, 2, 1), 2, VARIANT)
     monkeypatch.setattr(memory, "available_bytes", lambda variant: None)
     memory.check_fits((2**9, 2**30, 2, 1), 2, VARIANT)
+
+
+def test_memory_of_the_device(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda: (5, 9))
+    monkeypatch.setattr(memory, "available_memory", lambda: 7)
+    assert memory.available_bytes("cuda_ad_rgb") == 5 and memory.available_bytes("llvm_ad_rgb") == 7
 
 
 @pytest.mark.parametrize(
@@ -252,6 +275,9 @@ def test_statistics_of_a_batch():
     both = RenderStats.of_batch([one, two])
     assert (both.seconds, both.samples_per_second, both.seeds) == (8, 32.5, (1, 2, 3))
     assert (both.energy_before, both.energy_after) == ((0.5, 1.0, 2.0), (3.0, 4.0, 5.0))
+    for variant, polarized in ((VARIANT, False), ("llvm_ad_rgb_polarized", True)):
+        out = RenderOutput(None, torch.zeros(1, 2, 3), None, axis=None, stats=replace(one, variant=variant))
+        assert out.polarized is polarized
 
 
 def test_how_a_result_shows_its_statistics():

@@ -14,6 +14,7 @@ import torch
 import torchtransient as tt
 from torchtransient.errors import SceneError
 from torchtransient.plugins.dictionaries import Pixels
+from torchtransient.rendering import description
 from torchtransient.rendering.description import (
     DictDescription,
     _names_files,
@@ -191,6 +192,31 @@ def test_elements_as_deep_as_they_may_be(tmp_path):
     file.write_text("<a>" * most + "<c/>" + "</a>" * most, encoding="utf-8")
     with pytest.raises(SceneError, match=rf"at most {most} levels deep, got more at <c>"):
         describe_xml(file, {})
+
+
+def test_files_in_files_are_looked_at(tmp_path, monkeypatch):
+    """As many inside of each other as Mitsuba takes and one more; names have parameters, the longest ones first."""
+    looked = []
+    monkeypatch.setattr(description, "check_special", lambda path, *_: looked.append(path.name))
+    (tmp_path / "a.xml").write_text('<s><include filename="a.xml"/></s>', encoding="utf-8")
+    describe_xml(tmp_path / "a.xml", {})
+    assert looked == ["a.xml"] * 17
+    looked.clear()
+    (tmp_path / "b.xml").write_text(
+        '<s><default name="part" value="x"/><default name="partner" value="y"/>'
+        '<include filename="$partner-$part.xml"/><include filename="z.xml"/></s>', encoding="utf-8"
+    )  # fmt: skip
+    (tmp_path / "z.xml").write_text("<s><include filename='$part.xml'/></b>", encoding="utf-8")
+    describe_xml(tmp_path / "b.xml", {"part": 3})
+    assert looked == ["y-3.xml", "z.xml", "3.xml"]
+    # Levels count through files.
+    inside = "<b>" * 60 + "</b>" * 60
+    (tmp_path / "c.xml").write_text(f"<s>{'<b>' * 3}<include filename='d.xml'/>{'</b>' * 3}</s>", encoding="utf-8")
+    (tmp_path / "d.xml").write_text(inside, encoding="utf-8")
+    with pytest.raises(SceneError, match=r"d\.xml: expected elements at most 64 levels deep"):
+        describe_xml(tmp_path / "c.xml", {})
+    (tmp_path / "d.xml").write_text(inside[3:-4], encoding="utf-8")
+    describe_xml(tmp_path / "c.xml", {})
 
 
 # ------------------------------------------------------------------------------------------------- ready for pictures

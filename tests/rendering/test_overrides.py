@@ -244,6 +244,14 @@ def test_integrators_of_images_are_told_apart_when_they_are_built():
 # ----------------------------------------------------------------------------------------------------------- samplers
 
 
+@pytest.mark.parametrize("order", [1, -1])
+def test_every_sensor_gets_the_sampler(order):
+    content = [sensor(), shape(""), sensor('<film type="hdrfilm"/>')]
+    state = parsed("".join(content[::order]))
+    build._override_samplers(state, BuildOptions(sampler="multijitter"))
+    assert [one[0] for one in found(state, mi.ObjectType.Sampler)] == ["multijitter"] * 2
+
+
 def test_samplers_keep_their_number_and_seed():
     state = parsed(
         sensor('<sampler type="orthogonal" id="s"><integer name="sample_count" value="9"/>'
