@@ -38,7 +38,7 @@ MISSPELT = "Misspelt, of another plugin, or without effect beside the others"
         ("transient_path", [OTHER], [MISSPELT]),
         ("transient_path", [DEPTH], ["Leave 'nlos_hidden_geometry_sampling_max_depth' out: hidden geometry is"]),
         ("transient_path", [LASER], ["'nlos_laser_sampling': transient_nlos_path reads such."]),
-        ("transient_path", [DEPTH, LASER], ["Leave 'nlos_hid", "'nlos_laser_sampling': transient_nlos_path reads such."]),
+        ("transient_path", [DEPTH, LASER], ["Leave 'nlos_h", "'nlos_laser_sampling': transient_nlos_path reads such"]),
         ("transient_path", [DEPTH, OTHER], ["Leave 'nlos_hidden", MISSPELT]),
         ("transient_nlos_path", [LASER], [MISSPELT]),
         ("transient_nlos_path", [DEPTH], ["Leave 'nlos_hidden"]),
