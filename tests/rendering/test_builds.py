@@ -155,6 +155,20 @@ def test_values_are_the_same_memory_or_equal():
     assert same(pose, pose)
 
 
+def test_parameters_that_are_not_set_are_no_values():
+    """As the absorption of hair that has pigments: functions that reached it were a TypeError. Nor what is fixed."""
+    fixed = mi.ParamFlags.ReadOnly.value
+
+    def unset(*_):
+        raise RuntimeError("not set")
+
+    shown = {"a": (None, None, None, 0), "b": (2.5, None, None, 0), "c": (3.5, None, None, fixed),
+             "d": (4.5, None, None, 2), "e": (5.5, None, None, 2 + fixed), "f": (unset, unset, unset, 0)}  # fmt: skip
+    assert scene_state.values_of(SimpleNamespace(properties=shown)) == {"b": 2.5, "d": 4.5}
+    hair = mi.load_dict({"type": "hair", "eumelanin": 0.25, "pheomelanin": 0.5})
+    assert torch.equal(tt.wrap(lambda x: x * len((hair,)))(torch.ones(2)), torch.ones(2))
+
+
 def test_only_what_has_changed_is_put_back(params, monkeypatch):
     written = []
     monkeypatch.setattr(scene_state, "_follow", lambda params, keys: written.append(list(keys)))
