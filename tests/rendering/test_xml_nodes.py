@@ -126,6 +126,87 @@ def test_nodes_are_written_once_and_referred_to(tmp_path):
     assert (second[0].tag, second[0].get("name"), second[0].get("id")) == ("ref", "bsdf", "node_3")
 
 
+def parsed(content):
+    config = mi.parser.ParserConfig(VARIANT)
+    return mi.parser.parse_string(config, f'<scene version="3.0.0">{content}</scene>')
+
+
+def again(folder, content):
+    """The elements of a parsed scene as they are written."""
+    return list(ElementTree.fromstring(XmlWriter(parsed(content), folder).text()))
+
+
+def test_spectra_as_pairs_or_one_number(tmp_path):
+    (surface,) = again(tmp_path, '<bsdf type="a" id="a"><spectrum name="x" value="400:0.125, 500:0.5, 700:0.25"/>'
+                                 '<spectrum name="y" value="0.75"/></bsdf>')  # fmt: skip
+    assert [(one.tag, one.get("name")) for one in surface] == [("spectrum", "x"), (surface[1].tag, "y")]
+    pairs = [tuple(map(float, pair.split(":"))) for pair in surface[0].get("value").split(",")]
+    assert pairs == [(400, 0.125), (500, 0.5), (700, 0.25)] and float(surface[1].get("value")) == 0.75
+
+
+def test_names_that_parameters_are_called_by(tmp_path):
+    """Of what the scene holds, and of shapes in groups and sensors in batches, where no other has the same."""
+    group = '<shape type="shapegroup" id="g"><shape type="sphere" id="{}"/><shape type="cube" id="in"/></shape>'
+    ball = '<shape type="sphere" id="s"><bsdf type="diffuse" id="b"/></shape>'
+    (first, second) = again(tmp_path, group.format("free") + ball)
+    assert [first.get("id"), *(one.get("id") for one in first)] == ["g", "free", "in"]
+    assert second.get("id") == "s" and second[0].get("id") is None
+    state = parsed(group.format("free"))
+    next(one for one in state.nodes if one.props.id() == "free").props.set_id("in")
+    (first,) = ElementTree.fromstring(XmlWriter(state, tmp_path).text())
+    assert [one.get("id") for one in first] == [None, None]
+    batch = '<sensor type="batch" id="both"><sensor type="perspective" id="one"><film type="hdrfilm" id="f"/></sensor>'
+    (sensor,) = again(tmp_path, batch + "</sensor>")
+    assert [one.get("id") for one in (sensor, sensor[0], sensor[0][0])] == ["both", "one", None]
+
+
+def test_references_to_what_the_scene_holds(tmp_path):
+    """Before and after it; names that Mitsuba makes up for places are not said, others are."""
+    surface = '<bsdf type="diffuse" id="paint"/>'
+    uses = '<shape type="sphere" id="s"><ref id="paint"/></shape>'
+    uses += '<shape type="cube" id="c"><ref name="x" id="paint"/></shape>'
+    for content in (surface + uses, uses + surface):
+        state = parsed(content)
+        mi.parser.transform_resolve(mi.parser.ParserConfig(VARIANT), state)
+        by = {one.get("id"): one for one in ElementTree.fromstring(XmlWriter(state, tmp_path).text())}
+        assert set(by) == {"paint", "s", "c"} and by["paint"].tag == "bsdf" and by["paint"].get("name") is None
+        for shape, name in (("s", None), ("c", "x")):
+            assert [(one.tag, one.get("id"), one.get("name")) for one in by[shape]] == [("ref", "paint", name)]
+
+
+def test_tags_of_kinds(tmp_path):
+    kinds = mi.ObjectType
+    tags = {kinds.PhaseFunction: "phase", kinds.ReconstructionFilter: "rfilter", kinds.Medium: "medium",
+            kinds.Volume: "volume", kinds.Sampler: "sampler", kinds.BSDF: "bsdf"}  # fmt: skip
+    found = written(tmp_path, *(node("of_others", kind) for kind in tags))
+    assert [element.tag for element in found] == list(tags.values())
+    # The parser knows no kind of a plugin in Python: that of the object that was built of it.
+    scene, inner = node("scene", kinds.Scene), node("of_others", kinds.Unknown)
+    scene.props["a"] = mi.Properties.ResolvedReference(1)
+    state = SimpleNamespace(nodes=[scene, inner], root=scene, id_to_index={})
+    for built, tag in (({"type": "homogeneous"}, "medium"), ({"type": "diffuse"}, "bsdf"), ({"type": "hg"}, "phase")):
+        writer = XmlWriter(state, tmp_path)
+        writer.note_kind(1, mi.load_dict(built))
+        assert ElementTree.fromstring(writer.text())[0].tag == tag
+    writer = XmlWriter(state, tmp_path)
+    writer.note_kind(1, "text")
+    with pytest.raises(SceneError, match="the kind of plugin 'of_others' is not known"):
+        writer.text()
+
+
+def test_grids_keep_their_numbers(tmp_path):
+    grid = np.arange(24, dtype=np.float32).reshape(2, 3, 4, 1) / 32
+    cases = {"a": ("gridvolume", "grid", mi.VolumeGrid(grid)), "b": ("gridvolume", "data", mi.TensorXf(grid)),
+             "c": ("sdfgrid", "grid", mi.TensorXf(grid))}  # fmt: skip
+    for name, (plugin, key, value) in cases.items():
+        ((tag, said_key, file),) = said(tmp_path / name, plugin, mi.ObjectType.Volume, **{key: value})
+        assert (tag, said_key, file) == ("string", "filename", f"{name}/{plugin}_{key}.vol")
+        np.testing.assert_array_equal(np.array(mi.VolumeGrid(str(tmp_path / file))), grid[..., 0])
+    # Of others an array has no file.
+    with pytest.raises(SceneError, match=r"the TensorXf at sdfgrid\.data cannot be said in XML"):
+        said(tmp_path / "d", "sdfgrid", mi.ObjectType.Shape, data=mi.TensorXf(grid))
+
+
 def test_plugins_of_no_kind_have_no_tag(tmp_path):
     with pytest.raises(SceneError, match="the kind of plugin 'unheard_of' is not known"):
         written(tmp_path, node("unheard_of", mi.ObjectType.Unknown))
