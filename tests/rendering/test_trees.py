@@ -105,7 +105,7 @@ def test_entries_of_containers():
     assert entries_of(torch.nn.ParameterDict({"a": weights[1]}))[0] is weights[1]
 
 
-# ----------------------------------------------------------------------------------------------- results of several runs
+# ---------------------------------------------------------------------------------------------- results of several runs
 
 
 def result_of(*runs, tensors=("t0", "t1")):
@@ -139,7 +139,7 @@ def test_what_is_equal():
     assert not _equal(3, 4) and not _equal(odd, Odd()) and not _equal(several, several.copy()) and not _equal(None, 3)
 
 
-# ---------------------------------------------------------------------------------------------------- what was read back
+# --------------------------------------------------------------------------------------------------- what was read back
 
 
 def test_what_is_read_back_is_compared(monkeypatch):

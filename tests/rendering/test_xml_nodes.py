@@ -280,9 +280,9 @@ def test_light_of_a_spectral_model_cannot_be_said(monkeypatch, spectrum):
         values.write_value(SimpleNamespace(state=None), built, {1: values.Place(0)}, slot, np.ones(3))
 
 
-def put_into(plugin, key, value, kind="number", held=(), keeps=False, **properties):
+def put_into(plugin, key, value, kind="number", held=(), keeps=False, owner=None, **properties):
     """The properties of a node after a value of one of its parameters was written."""
-    owner, name = SimpleNamespace(ptr=1, class_name=lambda: "Some"), f"x.{key}"
+    owner, name = owner or SimpleNamespace(ptr=1, class_name=lambda: "Some"), f"x.{key}"
     props = mi.Properties(plugin)
     for each, given in properties.items():
         props[each] = given
@@ -292,7 +292,7 @@ def put_into(plugin, key, value, kind="number", held=(), keeps=False, **properti
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(values, "keeps_coefficients", lambda _: keeps)
         slot = SimpleNamespace(key=name, targets=[name], kind=kind)
-        values.write_value(SimpleNamespace(state=state), built, {1: values.Place(1)}, slot, np.array(value))
+        values.write_value(SimpleNamespace(state=state), built, {owner.ptr: values.Place(1)}, slot, np.array(value))
     return props
 
 
@@ -317,6 +317,60 @@ def test_values_come_into_the_node_that_they_belong_to():
     held = put_into("gridvolume", "data", grid, "tensor", filename="a.vol", raw=True)
     assert [key for key, _ in held.items()] == ["raw", "data"]
     np.testing.assert_array_equal(np.array(held["data"]), grid)
+
+
+def test_meshes_of_other_vertices_become_files(monkeypatch):
+    """Those whose node has no place for a transform, and those whose vertices are given."""
+    made = []
+    monkeypatch.setattr(values, "mesh_as_file", lambda writer, index, mesh: made.append((index, mesh)))
+    other = SimpleNamespace(ptr=1, class_name=lambda: "Some")
+    put_into("mesh_arrays", "m", np.eye(4), "mesh_transform", owner=other)
+    assert made == [(1, other)]
+    put_into("obj", "m", np.eye(4), "mesh_transform", owner=other)
+    mesh = mi.load_dict({"type": "cube"})
+    for count, name in enumerate(("vertex_positions", "vertex_normals", "vertex_texcoords"), 2):
+        put_into("cube", name, np.zeros((24, 3)), "vertices", owner=mesh)
+        assert made[count - 1 :] == [(1, mesh)]
+    assert put_into("cube", "radius", 2.5, owner=mesh)["radius"] == 2.5 and len(made) == 4
+    assert put_into("some", "vertex_positions", [1.0, 2, 3], owner=other).type("vertex_positions") == (
+        mi.Properties.Type.Color) and len(made) == 4  # fmt: skip
+
+
+def test_places_that_are_not_there():
+    owner = SimpleNamespace(ptr=1)
+    built = SimpleNamespace(params=SimpleNamespace(properties={"a.b": (None, None, owner, None)}))
+    slot = SimpleNamespace(key="a.b", targets=["a.b"], kind="number")
+    with pytest.raises(SceneError, match=r"'a\.b' has no place in the description, and cannot be said in XML"):
+        values.write_value(SimpleNamespace(state=None), built, {2: values.Place(0)}, slot, np.ones(3))
+
+
+def made_of(names, made, value, owner=None, plugin="diffuse", kind=mi.ObjectType.BSDF, **properties):
+    """The nodes after a value was put into what Mitsuba has made of a number, of a colour or of nothing."""
+    state = SimpleNamespace(nodes=[node(plugin, kind, **properties)], id_to_index={})
+    values._put_into_made(state, values.Place(0, names, made), owner, np.array(value), "some.key")
+    return [(one.props.plugin_name(), {key: one.props[key] for key, each in one.props.items()
+                                       if not isinstance(each, mi.Properties.ResolvedReference)})
+            for one in state.nodes]  # fmt: skip
+
+
+def test_values_of_what_mitsuba_has_made():
+    texture = mi.load_dict({"type": "uniform", "value": 0.5})
+    # A number of the node itself.
+    assert made_of(("eta",), texture, [1.5], texture) == [("diffuse", {"eta": 1.5})]
+    # A surface that nobody has described, and light that is daylight's.
+    surface = mi.load_dict({"type": "diffuse"})
+    assert made_of(("bsdf", "reflectance"), surface, [0.25], plugin="sphere", kind=mi.ObjectType.Shape) == [
+        ("sphere", {}), ("diffuse", {"reflectance": 0.25})]  # fmt: skip
+    light = {"plugin": "point", "kind": mi.ObjectType.Emitter}
+    assert made_of(("intensity",), texture, [2.5], texture, **light) == [("point", {}), ("d65", {"scale": 2.5})]
+    assert made_of(("intensity",), texture, [2.5], texture, intensity=1.0, **light) == [("point", {"intensity": 2.5})]
+    assert made_of(("intensity",), texture, [2.5], object(), **light) == [("point", {"intensity": 2.5})]
+    # A volume of one number.
+    volume = mi.load_dict({"type": "constvolume", "value": 0.5})
+    assert made_of(("albedo", "value"), volume, [0.75], plugin="homogeneous") == [("homogeneous", {"albedo": 0.75})]
+    for names, made in ((("a", "b"), texture), (("a", "b", "c"), volume), (("bsdf", "a", "b"), surface)):
+        with pytest.raises(SceneError, match=r"'some\.key' has no place in the description"):
+            made_of(names, made, [0.5])
 
 
 def test_numbers_that_went_through_a_file_are_the_same():
