@@ -14,7 +14,7 @@ import torch
 import torchtransient as tt
 from torchtransient.errors import SceneError
 from torchtransient.plugins.dictionaries import Pixels
-from torchtransient.rendering import description
+from torchtransient.rendering import description, ready_scenes
 from torchtransient.rendering.description import (
     DictDescription,
     _names_files,
@@ -263,6 +263,39 @@ def test_filters_of_ready_scenes(given, described):
     films = [entry["film"] for entry in tree.values() if isinstance(entry, dict) and "film" in entry]
     assert [film["rfilter"] for film in films] == [described]
     assert [entry["max_depth"] for entry in tree.values() if isinstance(entry, dict) and "max_depth" in entry] == [5]
+
+
+class Said:
+    """Stands in for an integrator that says other things of itself."""
+
+    hide_emitters = False
+
+    def __init__(self, *names, kind="PathIntegrator"):
+        self.names, self.class_name = names, lambda: kind
+
+    def __str__(self):
+        return "Path[\n" + "".join(f"  {name} = 3,\n" for name in self.names) + "]"
+
+
+def test_what_of_ready_scenes_is_not_described():
+    """Classes that are not known, what says nothing of its depths, films that are no pictures, and cameras in fog."""
+    both = ("max_depth", "rr_depth")
+    assert ready_scenes._integrator(Said(*both)) == {"type": "path", **dict.fromkeys(both, 3), "hide_emitters": False}
+    for other in (Said("max_depth"), Said("rr_depth"), Said(), Said(*both, kind="DirectIntegrator")):
+        assert ready_scenes._integrator(other) is None
+    assert ready_scenes._rfilter(mi.load_dict({"type": "mitchell"})) is None
+    film = {"type": "hdrfilm", "width": 4, "height": 3, "rfilter": {"type": "box"}}
+    assert ready_scenes._film(mi.load_dict(film))["width"] == 4
+    for other in (film | {"rfilter": {"type": "mitchell"}}, film | {"type": "transient_hdr_film"}):
+        assert ready_scenes._film(mi.load_dict(other)) is None
+    assert ready_scenes._sampler(SimpleNamespace(class_name=lambda: "SamplerOfOthers")) is None
+    camera = {"type": "perspective", "film": film}
+    found = ready_scenes._sensor(mi.load_dict(camera))
+    assert (found["type"], found["film"]["height"], found["sampler"]["type"]) == ("perspective", 3, "independent")
+    for other in (camera | {"type": "radiancemeter", "film": film | {"width": 1, "height": 1}},
+                  camera | {"film": film | {"type": "transient_hdr_film"}},
+                  camera | {"medium": {"type": "homogeneous"}}):  # fmt: skip
+        assert ready_scenes._sensor(mi.load_dict(other)) is None
 
 
 def test_ready_scenes_that_stay_as_they_are():
