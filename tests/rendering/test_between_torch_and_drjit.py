@@ -166,6 +166,35 @@ def test_places_of_a_batch():
         Batch(0, [], None).tensors()
 
 
+def test_results_that_are_in_their_place(monkeypatch):
+    """Of films that wrote to it only the image is taken; of others, and where none was lent, both, item by item."""
+    monkeypatch.setattr(batch, "_take_steady", lambda film: torch.full((2, 3, 1), film.light))
+    into = []
+
+    def take(film, place):
+        into.append(None if place is None else tuple(place.shape))
+        return torch.full((2, 3, 1), film.light), torch.full((2, 3, 5, 1), film.light)
+
+    monkeypatch.setattr(batch, "take", take)
+    memory = object()
+
+    def film(light, *bands):
+        return SimpleNamespace(light=light, bands=[(0, 2, band) for band in bands])
+
+    for lent, others in ((memory, [False, True, True]), (None, [True, True, True])):
+        whole, into[:] = Batch(3, [], None), []
+        whole._memory = lent
+        for n, one in enumerate((film(2.0, memory), film(3.0, object()), film(5.0))):
+            whole.take(one, n)
+        steady, response = whole.tensors()
+        assert steady.shape == (3, 2, 3, 1) and steady[:, 1, 2, 0].tolist() == [2, 3, 5]
+        assert response.shape == (3, 2, 3, 5, 1) and response[1:, 0, 0, 0, 0].tolist() == [3, 5]
+        assert into == [None, *[(2, 3, 5, 1)] * (sum(others) - 1)]
+    alone = Batch(1, [], None)
+    alone.take(film(7.0, object()), 0)
+    assert [tuple(one.shape) for one in alone.tensors()] == [(2, 3, 1), (2, 3, 5, 1)]
+
+
 def test_cubes_that_fit(monkeypatch):
     """Up to 4 MiB nobody asks; of several renders one film more than there are renders is held at a time."""
     monkeypatch.setattr(memory, "available_bytes", lambda variant: 10 * 2**20)
