@@ -1,5 +1,6 @@
 """Numbers on their way between torch and Dr.Jit, memory that is asked for, and what is told on the way."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import drjit as dr
@@ -37,8 +38,10 @@ def test_copies_of_few_and_of_many_numbers(kind, rows):
         with torch.no_grad():
             given += 1
         assert torch.equal(back + 1, given)
-        flat = session.own_array(given)
-        assert type(flat) is mi.Float and np.array_equal(np.array(flat), given.detach().numpy().ravel())
+        flat, before = session.own_array(given), given.detach().numpy().ravel().copy()
+        with torch.no_grad():
+            given *= 3
+        assert type(flat) is mi.Float and np.array_equal(np.array(flat), before)
         assert session.own_array(torch.tensor(3.0, requires_grad=True))[0] == 3
 
 
@@ -118,6 +121,20 @@ def test_an_adjoint_is_read_where_it_is(axes):
     assert np.array_equal(np.array(engine._steady_adjoint(g)), g.detach().numpy())
 
 
+@pytest.mark.parametrize(("step", "whole"), [(2**32 - 2, False), (2**32 - 1, True)])
+def test_adjoints_beyond_32_bits_are_laid_as_the_film_is(step, whole):
+    two = torch.tensor([3.0, 5.0])
+    g = SimpleNamespace(shape=(2, 1), stride=lambda: (step, 7), is_cuda=False, storage_offset=lambda: 0)
+    g.detach = g.resolve_neg = lambda: g
+    g.contiguous = lambda: two
+    g.as_strided = lambda *given: two if given == ((step + 1,), (1,), 0) else None
+    found = engine._cube_adjoint(g)
+    if whole:
+        assert type(found) is mi.TensorXf and np.array_equal(np.array(found), [3, 5])
+    else:
+        assert np.array_equal(np.array(found[0]), [3, 5]) and found[1:] == (0, (step, 7))
+
+
 # ------------------------------------------------------------------------------------------------------------ memory
 
 
@@ -149,6 +166,35 @@ def test_places_of_a_batch():
         Batch(0, [], None).tensors()
 
 
+def test_results_that_are_in_their_place(monkeypatch):
+    """Of films that wrote to it only the image is taken; of others, and where none was lent, both, item by item."""
+    monkeypatch.setattr(batch, "_take_steady", lambda film: torch.full((2, 3, 1), film.light))
+    into = []
+
+    def take(film, place):
+        into.append(None if place is None else tuple(place.shape))
+        return torch.full((2, 3, 1), film.light), torch.full((2, 3, 5, 1), film.light)
+
+    monkeypatch.setattr(batch, "take", take)
+    memory = object()
+
+    def film(light, *bands):
+        return SimpleNamespace(light=light, bands=[(0, 2, band) for band in bands])
+
+    for lent, others in ((memory, [False, True, True]), (None, [True, True, True])):
+        whole, into[:] = Batch(3, [], None), []
+        whole._memory = lent
+        for n, one in enumerate((film(2.0, memory), film(3.0, object()), film(5.0))):
+            whole.take(one, n)
+        steady, response = whole.tensors()
+        assert steady.shape == (3, 2, 3, 1) and steady[:, 1, 2, 0].tolist() == [2, 3, 5]
+        assert response.shape == (3, 2, 3, 5, 1) and response[1:, 0, 0, 0, 0].tolist() == [3, 5]
+        assert into == [None, *[(2, 3, 5, 1)] * (sum(others) - 1)]
+    alone = Batch(1, [], None)
+    alone.take(film(7.0, object()), 0)
+    assert [tuple(one.shape) for one in alone.tensors()] == [(2, 3, 1), (2, 3, 5, 1)]
+
+
 def test_cubes_that_fit(monkeypatch):
     """Up to 4 MiB nobody asks; of several renders one film more than there are renders is held at a time."""
     monkeypatch.setattr(memory, "available_bytes", lambda variant: 10 * 2**20)
@@ -168,6 +214,12 @@ def test_cubes_that_fit(monkeypatch):
         memory.check_fits((2**9, 2**10, 2, 1), 2, VARIANT)
     monkeypatch.setattr(memory, "available_bytes", lambda variant: None)
     memory.check_fits((2**9, 2**30, 2, 1), 2, VARIANT)
+
+
+def test_memory_of_the_device(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda: (5, 9))
+    monkeypatch.setattr(memory, "available_memory", lambda: 7)
+    assert memory.available_bytes("cuda_ad_rgb") == 5 and memory.available_bytes("llvm_ad_rgb") == 7
 
 
 @pytest.mark.parametrize(
@@ -252,6 +304,9 @@ def test_statistics_of_a_batch():
     both = RenderStats.of_batch([one, two])
     assert (both.seconds, both.samples_per_second, both.seeds) == (8, 32.5, (1, 2, 3))
     assert (both.energy_before, both.energy_after) == ((0.5, 1.0, 2.0), (3.0, 4.0, 5.0))
+    for variant, polarized in ((VARIANT, False), ("llvm_ad_rgb_polarized", True)):
+        out = RenderOutput(None, torch.zeros(1, 2, 3), None, axis=None, stats=replace(one, variant=variant))
+        assert out.polarized is polarized
 
 
 def test_how_a_result_shows_its_statistics():

@@ -14,6 +14,7 @@ import torch
 import torchtransient as tt
 from torchtransient.errors import SceneError
 from torchtransient.plugins.dictionaries import Pixels
+from torchtransient.rendering import description, ready_scenes
 from torchtransient.rendering.description import (
     DictDescription,
     _names_files,
@@ -193,6 +194,31 @@ def test_elements_as_deep_as_they_may_be(tmp_path):
         describe_xml(file, {})
 
 
+def test_files_in_files_are_looked_at(tmp_path, monkeypatch):
+    """As many inside of each other as Mitsuba takes and one more; names have parameters, the longest ones first."""
+    looked = []
+    monkeypatch.setattr(description, "check_special", lambda path, *_: looked.append(path.name))
+    (tmp_path / "a.xml").write_text('<s><include filename="a.xml"/></s>', encoding="utf-8")
+    describe_xml(tmp_path / "a.xml", {})
+    assert looked == ["a.xml"] * 17
+    looked.clear()
+    (tmp_path / "b.xml").write_text(
+        '<s><default name="part" value="x"/><default name="partner" value="y"/>'
+        '<include filename="$partner-$part.xml"/><include filename="z.xml"/></s>', encoding="utf-8"
+    )  # fmt: skip
+    (tmp_path / "z.xml").write_text("<s><include filename='$part.xml'/></b>", encoding="utf-8")
+    describe_xml(tmp_path / "b.xml", {"part": 3})
+    assert looked == ["y-3.xml", "z.xml", "3.xml"]
+    # Levels count through files.
+    inside = "<b>" * 60 + "</b>" * 60
+    (tmp_path / "c.xml").write_text(f"<s>{'<b>' * 3}<include filename='d.xml'/>{'</b>' * 3}</s>", encoding="utf-8")
+    (tmp_path / "d.xml").write_text(inside, encoding="utf-8")
+    with pytest.raises(SceneError, match=r"d\.xml: expected elements at most 64 levels deep"):
+        describe_xml(tmp_path / "c.xml", {})
+    (tmp_path / "d.xml").write_text(inside[3:-4], encoding="utf-8")
+    describe_xml(tmp_path / "c.xml", {})
+
+
 # ------------------------------------------------------------------------------------------------- ready for pictures
 
 
@@ -237,6 +263,39 @@ def test_filters_of_ready_scenes(given, described):
     films = [entry["film"] for entry in tree.values() if isinstance(entry, dict) and "film" in entry]
     assert [film["rfilter"] for film in films] == [described]
     assert [entry["max_depth"] for entry in tree.values() if isinstance(entry, dict) and "max_depth" in entry] == [5]
+
+
+class Said:
+    """Stands in for an integrator that says other things of itself."""
+
+    hide_emitters = False
+
+    def __init__(self, *names, kind="PathIntegrator"):
+        self.names, self.class_name = names, lambda: kind
+
+    def __str__(self):
+        return "Path[\n" + "".join(f"  {name} = 3,\n" for name in self.names) + "]"
+
+
+def test_what_of_ready_scenes_is_not_described():
+    """Classes that are not known, what says nothing of its depths, films that are no pictures, and cameras in fog."""
+    both = ("max_depth", "rr_depth")
+    assert ready_scenes._integrator(Said(*both)) == {"type": "path", **dict.fromkeys(both, 3), "hide_emitters": False}
+    for other in (Said("max_depth"), Said("rr_depth"), Said(), Said(*both, kind="DirectIntegrator")):
+        assert ready_scenes._integrator(other) is None
+    assert ready_scenes._rfilter(mi.load_dict({"type": "mitchell"})) is None
+    film = {"type": "hdrfilm", "width": 4, "height": 3, "rfilter": {"type": "box"}}
+    assert ready_scenes._film(mi.load_dict(film))["width"] == 4
+    for other in (film | {"rfilter": {"type": "mitchell"}}, film | {"type": "transient_hdr_film"}):
+        assert ready_scenes._film(mi.load_dict(other)) is None
+    assert ready_scenes._sampler(SimpleNamespace(class_name=lambda: "SamplerOfOthers")) is None
+    camera = {"type": "perspective", "film": film}
+    found = ready_scenes._sensor(mi.load_dict(camera))
+    assert (found["type"], found["film"]["height"], found["sampler"]["type"]) == ("perspective", 3, "independent")
+    for other in (camera | {"type": "radiancemeter", "film": film | {"width": 1, "height": 1}},
+                  camera | {"film": film | {"type": "transient_hdr_film"}},
+                  camera | {"medium": {"type": "homogeneous"}}):  # fmt: skip
+        assert ready_scenes._sensor(mi.load_dict(other)) is None
 
 
 def test_ready_scenes_that_stay_as_they_are():

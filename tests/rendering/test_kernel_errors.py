@@ -11,7 +11,7 @@ import torch
 import torchtransient as tt
 from support.gradient_cases.scenes import room
 from torchtransient.errors import GradientError, SceneError
-from torchtransient.rendering.kernel_errors import named_errors
+from torchtransient.rendering.kernel_errors import _reason, named_errors
 
 
 @pytest.fixture(autouse=True)
@@ -82,6 +82,15 @@ def traced(reason):
 def test_the_first_reason_is_named():
     with pytest.raises(SceneError, match=r"ValueError.*: no such lobe"):
         traced(ValueError("no such lobe"))
+
+
+def test_the_deepest_cause_that_says_more():
+    """Of those that only say that something happened above, the deepest."""
+    above = [RuntimeError(f"{n} (see above)") for n in range(3)]
+    assert _reason(above) is above[2]
+    said = RuntimeError("no such lobe")
+    for chain in ([above[0], said, above[1]], [said], [above[0], RuntimeError("less deep"), said]):
+        assert _reason(chain) is said
 
 
 def test_errors_of_this_library_are_raised_as_they_are():

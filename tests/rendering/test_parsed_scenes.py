@@ -167,6 +167,7 @@ def test_nodes_are_called_by_plugin_name_and_place(tmp_path):
     (folder / "room.xml").write_text("<scene version='3.0.0'>\n" + "\n".join(lines) + "\n</scene>")
     config = mi.parser.ParserConfig(mi.variant())
     state = mi.parser.parse_file(config, str(folder / "room.xml"))
+    assert name_of(state, 0) == "scene, room.xml (line 1, col 2)"
     assert [name_of(state, index) for index in (1, 2)] == [
         "sphere, room.xml (line 2, col 2)", "cube 'box', room.xml (line 3, col 2)"]  # fmt: skip
     described = {"type": "scene", "box": {"type": "cube"}, "wall": {"type": "rectangle", "id": "front"}}
@@ -183,6 +184,18 @@ def test_nodes_inside_of_nodes_as_deep_as_they_may_be():
     check_nesting(parsed(shape(within("mask", DIFFUSE, 29))))
     with pytest.raises(SceneError, match="at most 32 deep, got more"):
         check_nesting(parsed(shape(within("mask", DIFFUSE, 30))))
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_the_deepest_of_several_counts(order):
+    for levels, deep in ((29, False), (30, True)):
+        both = [DIFFUSE, within("mask", DIFFUSE, levels)][::order]
+        state = parsed(shape("".join(both)))
+        if deep:
+            with pytest.raises(SceneError, match="at most 32 deep, got more"):
+                check_nesting(state)
+        else:
+            check_nesting(state)
 
 
 def test_nodes_of_a_surface_as_many_as_there_may_be():

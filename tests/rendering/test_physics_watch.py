@@ -192,3 +192,18 @@ def test_what_a_built_scene_shows():
     silent.installed = each.installed
     assert messages(silent.placed, "scene", 5) == [] and len(asked) == 2
     assert each.looks and not silent.looks
+
+
+def test_warnings_point_at_the_line_outside():
+    """Of the library and of torch, however many calls of theirs are in between."""
+    calls = (
+        lambda: watch().tell("a", "b"),
+        lambda: watch().scene({"a": "b"}),
+        lambda: torch.func.vmap(lambda x: (watch().scene({"a": "b"}), x)[1])(torch.ones(2)),
+    )
+    for call in calls:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            call()
+        line = call.__code__.co_firstlineno
+        assert [(one.filename, one.lineno) for one in caught][:1] == [(__file__, line)]

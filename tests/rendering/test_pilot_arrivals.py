@@ -168,7 +168,7 @@ def test_nothing_is_left_out_where_all_counts():
     found = arrivals([4.0, 1.5, 9.0, 0.5, 20.0], [1, 1, 1, 0, 0], depth=[2, 1, 5, 1, 3])
     assert found.enough_depth(0.0) == 5
     # What brings no light is at neither end.
-    assert found.window(-1, 0.0) == (1.5, 9.0)
+    assert found.window(-1, 0.0) == found.window(0, 0.0) == (1.5, 9.0)
     assert found.window(4, 0.0) == (1.5, 4.0)
     assert arrivals([3.0, 2.0], [1, 1]).enough_depth(1e-3) == 1
 
@@ -193,6 +193,7 @@ def test_nothing_is_left_out_where_all_counts():
         ((5.0, 5.0, None, None), (4.9999967, 1.67e-5, 1)),
         ((5.0, 5.0, None, 10), (5.0, 0.0005, 10)),
         ((0.0, 0.0, None, None), (0.0, 1e-6, 1)),
+        ((-5.0, -5.0, None, 10), (-5.0, 0.0005, 10)),
         # A width of one's own: starts at its multiples, below the first arrival, and the last one is inside.
         ((2.0, 5.0, 0.5, None), (2.0, 0.5, 7)),
         ((2.1, 4.9, 0.5, None), (2.0, 0.5, 6)),
@@ -200,6 +201,7 @@ def test_nothing_is_left_out_where_all_counts():
         ((2.1, 2.2, 0.5, None), (2.0, 0.5, 1)),
         ((2.1, 4.9, 0.5, 3), (2.0, 0.5, 3)),
         ((2.1, 4.9, 0.5, 1), (2.0, 0.5, 1)),
+        ((2.5, 9.0, 2.0, None), (2.0, 2.0, 4)),
         # Multiples whose quotient is a little less than their number, and those that are a little too large.
         ((109 * 0.3, 33.0, 0.3, None), (32.7, 0.3, 2)),
         ((0.6, 1.0, 0.2, None), (0.4, 0.2, 4)),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,8 @@ import torch
 import torchtransient as tt
 from torchtransient.errors import GradientError, SceneError
 from torchtransient.gates import gates_to_text
+from torchtransient.rendering.plan import _check_known, _taken
+from torchtransient.rendering.plan_choices import Choice
 from torchtransient.testing.small_room import WALL_POSE, make_room
 
 VARIANT = "llvm_ad_rgb"
@@ -194,3 +197,22 @@ def test_a_plan_is_equal_to_its_copies():
     assert plan != tt.plan(scene, pilot=False, max_depth=3)
     assert plan != tt.plan(tt.scenes.cornell_box(9), pilot=False)
     assert plan != "plan"
+
+
+def test_plugins_that_a_plan_calls_for_are_there():
+    film = SimpleNamespace(kind=SimpleNamespace(plugin="transient_hdr_film"))
+    _check_known(SimpleNamespace(integrator="transient_path", film=film), [])
+    for integrator, plugin, words in (
+        ("unheard_of", "transient_hdr_film", "the integrator 'unheard_of'"),
+        ("transient_path", "transient_path", "the film 'transient_path'"),
+    ):
+        film.kind.plugin = plugin
+        with pytest.raises(tt.errors.SceneError, match=rf"calls for {words}, which is not registered here: one two$"):
+            _check_known(SimpleNamespace(integrator=integrator, film=film), ["one", "two"])
+
+
+def test_choices_that_are_taken_over_say_what_they_replace():
+    best = Choice("mono", "variant: mono; all is grey")
+    assert _taken("variant", None, best) == "variant: mono; all is grey"
+    assert _taken("variant", "rgb", best) == (
+        "variant: rgb, as asked for; the plan's own would have been mono; all is grey")  # fmt: skip

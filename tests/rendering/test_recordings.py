@@ -186,3 +186,23 @@ def test_errors_of_a_call_are_its_own():
         with pytest.raises(type(error)):
             one.run([job_of("a")], [])
         assert one._frozen is None and one.refusal is None and one._jobs == ()
+
+
+def test_an_error_that_is_behind_another_is_raised_in_its_place(monkeypatch):
+    one, behind, raised = Recording(), KeyboardInterrupt("behind"), RuntimeError("of C++")
+    one.refusal = None
+
+    def fail(scene, arrays):
+        raise raised
+
+    for reason in (behind, raised):
+        one._frozen = fail
+        monkeypatch.setattr(recordings, "not_recordable", lambda error, before, reason=reason: reason)
+        with pytest.raises(type(reason)) as caught:
+            one.run([job_of("a")], [])
+        assert caught.value is reason and one.refusal is None
+    one._frozen = fail
+    monkeypatch.setattr(recordings, "not_recordable", lambda error, before: "it changes its type")
+    with pytest.raises(NotRecordedError, match=r"traced: Dr\.Jit cannot record it: it changes its type") as caught:
+        one.run([job_of("a")], [])
+    assert caught.value.broken and one.refusal == str(caught.value)

@@ -221,6 +221,9 @@ def test_attached_parameters_are_constants():
     x = torch.ones(1, requires_grad=True)
     tt.wrap(lambda x: x * params["value"])(x).backward()
     assert x.grad == 2 and dr.grad_enabled(params["value"]) and dr.grad(params["value"]) == 0
+    # What depends on them alone depends on nothing that wants a gradient.
+    with pytest.raises(GradientError, match="nothing that the function returned depends on"):
+        tt.wrap(lambda x: params["value"] * 3)(x).backward()
 
 
 # ------------------------------------------------------------------------------------------------------------ seeds

@@ -126,6 +126,87 @@ def test_nodes_are_written_once_and_referred_to(tmp_path):
     assert (second[0].tag, second[0].get("name"), second[0].get("id")) == ("ref", "bsdf", "node_3")
 
 
+def parsed(content):
+    config = mi.parser.ParserConfig(VARIANT)
+    return mi.parser.parse_string(config, f'<scene version="3.0.0">{content}</scene>')
+
+
+def again(folder, content):
+    """The elements of a parsed scene as they are written."""
+    return list(ElementTree.fromstring(XmlWriter(parsed(content), folder).text()))
+
+
+def test_spectra_as_pairs_or_one_number(tmp_path):
+    (surface,) = again(tmp_path, '<bsdf type="a" id="a"><spectrum name="x" value="400:0.125, 500:0.5, 700:0.25"/>'
+                                 '<spectrum name="y" value="0.75"/></bsdf>')  # fmt: skip
+    assert [(one.tag, one.get("name")) for one in surface] == [("spectrum", "x"), (surface[1].tag, "y")]
+    pairs = [tuple(map(float, pair.split(":"))) for pair in surface[0].get("value").split(",")]
+    assert pairs == [(400, 0.125), (500, 0.5), (700, 0.25)] and float(surface[1].get("value")) == 0.75
+
+
+def test_names_that_parameters_are_called_by(tmp_path):
+    """Of what the scene holds, and of shapes in groups and sensors in batches, where no other has the same."""
+    group = '<shape type="shapegroup" id="g"><shape type="sphere" id="{}"/><shape type="cube" id="in"/></shape>'
+    ball = '<shape type="sphere" id="s"><bsdf type="diffuse" id="b"/></shape>'
+    (first, second) = again(tmp_path, group.format("free") + ball)
+    assert [first.get("id"), *(one.get("id") for one in first)] == ["g", "free", "in"]
+    assert second.get("id") == "s" and second[0].get("id") is None
+    state = parsed(group.format("free"))
+    next(one for one in state.nodes if one.props.id() == "free").props.set_id("in")
+    (first,) = ElementTree.fromstring(XmlWriter(state, tmp_path).text())
+    assert [one.get("id") for one in first] == [None, None]
+    batch = '<sensor type="batch" id="both"><sensor type="perspective" id="one"><film type="hdrfilm" id="f"/></sensor>'
+    (sensor,) = again(tmp_path, batch + "</sensor>")
+    assert [one.get("id") for one in (sensor, sensor[0], sensor[0][0])] == ["both", "one", None]
+
+
+def test_references_to_what_the_scene_holds(tmp_path):
+    """Before and after it; names that Mitsuba makes up for places are not said, others are."""
+    surface = '<bsdf type="diffuse" id="paint"/>'
+    uses = '<shape type="sphere" id="s"><ref id="paint"/></shape>'
+    uses += '<shape type="cube" id="c"><ref name="x" id="paint"/></shape>'
+    for content in (surface + uses, uses + surface):
+        state = parsed(content)
+        mi.parser.transform_resolve(mi.parser.ParserConfig(VARIANT), state)
+        by = {one.get("id"): one for one in ElementTree.fromstring(XmlWriter(state, tmp_path).text())}
+        assert set(by) == {"paint", "s", "c"} and by["paint"].tag == "bsdf" and by["paint"].get("name") is None
+        for shape, name in (("s", None), ("c", "x")):
+            assert [(one.tag, one.get("id"), one.get("name")) for one in by[shape]] == [("ref", "paint", name)]
+
+
+def test_tags_of_kinds(tmp_path):
+    kinds = mi.ObjectType
+    tags = {kinds.PhaseFunction: "phase", kinds.ReconstructionFilter: "rfilter", kinds.Medium: "medium",
+            kinds.Volume: "volume", kinds.Sampler: "sampler", kinds.BSDF: "bsdf"}  # fmt: skip
+    found = written(tmp_path, *(node("of_others", kind) for kind in tags))
+    assert [element.tag for element in found] == list(tags.values())
+    # The parser knows no kind of a plugin in Python: that of the object that was built of it.
+    scene, inner = node("scene", kinds.Scene), node("of_others", kinds.Unknown)
+    scene.props["a"] = mi.Properties.ResolvedReference(1)
+    state = SimpleNamespace(nodes=[scene, inner], root=scene, id_to_index={})
+    for built, tag in (({"type": "homogeneous"}, "medium"), ({"type": "diffuse"}, "bsdf"), ({"type": "hg"}, "phase")):
+        writer = XmlWriter(state, tmp_path)
+        writer.note_kind(1, mi.load_dict(built))
+        assert ElementTree.fromstring(writer.text())[0].tag == tag
+    writer = XmlWriter(state, tmp_path)
+    writer.note_kind(1, "text")
+    with pytest.raises(SceneError, match="the kind of plugin 'of_others' is not known"):
+        writer.text()
+
+
+def test_grids_keep_their_numbers(tmp_path):
+    grid = np.arange(24, dtype=np.float32).reshape(2, 3, 4, 1) / 32
+    cases = {"a": ("gridvolume", "grid", mi.VolumeGrid(grid)), "b": ("gridvolume", "data", mi.TensorXf(grid)),
+             "c": ("sdfgrid", "grid", mi.TensorXf(grid))}  # fmt: skip
+    for name, (plugin, key, value) in cases.items():
+        ((tag, said_key, file),) = said(tmp_path / name, plugin, mi.ObjectType.Volume, **{key: value})
+        assert (tag, said_key, file) == ("string", "filename", f"{name}/{plugin}_{key}.vol")
+        np.testing.assert_array_equal(np.array(mi.VolumeGrid(str(tmp_path / file))), grid[..., 0])
+    # Of others an array has no file.
+    with pytest.raises(SceneError, match=r"the TensorXf at sdfgrid\.data cannot be said in XML"):
+        said(tmp_path / "d", "sdfgrid", mi.ObjectType.Shape, data=mi.TensorXf(grid))
+
+
 def test_plugins_of_no_kind_have_no_tag(tmp_path):
     with pytest.raises(SceneError, match="the kind of plugin 'unheard_of' is not known"):
         written(tmp_path, node("unheard_of", mi.ObjectType.Unknown))
@@ -199,9 +280,9 @@ def test_light_of_a_spectral_model_cannot_be_said(monkeypatch, spectrum):
         values.write_value(SimpleNamespace(state=None), built, {1: values.Place(0)}, slot, np.ones(3))
 
 
-def put_into(plugin, key, value, kind="number", held=(), keeps=False, **properties):
+def put_into(plugin, key, value, kind="number", held=(), keeps=False, owner=None, **properties):
     """The properties of a node after a value of one of its parameters was written."""
-    owner, name = SimpleNamespace(ptr=1, class_name=lambda: "Some"), f"x.{key}"
+    owner, name = owner or SimpleNamespace(ptr=1, class_name=lambda: "Some"), f"x.{key}"
     props = mi.Properties(plugin)
     for each, given in properties.items():
         props[each] = given
@@ -211,7 +292,7 @@ def put_into(plugin, key, value, kind="number", held=(), keeps=False, **properti
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(values, "keeps_coefficients", lambda _: keeps)
         slot = SimpleNamespace(key=name, targets=[name], kind=kind)
-        values.write_value(SimpleNamespace(state=state), built, {1: values.Place(1)}, slot, np.array(value))
+        values.write_value(SimpleNamespace(state=state), built, {owner.ptr: values.Place(1)}, slot, np.array(value))
     return props
 
 
@@ -236,6 +317,60 @@ def test_values_come_into_the_node_that_they_belong_to():
     held = put_into("gridvolume", "data", grid, "tensor", filename="a.vol", raw=True)
     assert [key for key, _ in held.items()] == ["raw", "data"]
     np.testing.assert_array_equal(np.array(held["data"]), grid)
+
+
+def test_meshes_of_other_vertices_become_files(monkeypatch):
+    """Those whose node has no place for a transform, and those whose vertices are given."""
+    made = []
+    monkeypatch.setattr(values, "mesh_as_file", lambda writer, index, mesh: made.append((index, mesh)))
+    other = SimpleNamespace(ptr=1, class_name=lambda: "Some")
+    put_into("mesh_arrays", "m", np.eye(4), "mesh_transform", owner=other)
+    assert made == [(1, other)]
+    put_into("obj", "m", np.eye(4), "mesh_transform", owner=other)
+    mesh = mi.load_dict({"type": "cube"})
+    for count, name in enumerate(("vertex_positions", "vertex_normals", "vertex_texcoords"), 2):
+        put_into("cube", name, np.zeros((24, 3)), "vertices", owner=mesh)
+        assert made[count - 1 :] == [(1, mesh)]
+    assert put_into("cube", "radius", 2.5, owner=mesh)["radius"] == 2.5 and len(made) == 4
+    assert put_into("some", "vertex_positions", [1.0, 2, 3], owner=other).type("vertex_positions") == (
+        mi.Properties.Type.Color) and len(made) == 4  # fmt: skip
+
+
+def test_places_that_are_not_there():
+    owner = SimpleNamespace(ptr=1)
+    built = SimpleNamespace(params=SimpleNamespace(properties={"a.b": (None, None, owner, None)}))
+    slot = SimpleNamespace(key="a.b", targets=["a.b"], kind="number")
+    with pytest.raises(SceneError, match=r"'a\.b' has no place in the description, and cannot be said in XML"):
+        values.write_value(SimpleNamespace(state=None), built, {2: values.Place(0)}, slot, np.ones(3))
+
+
+def made_of(names, made, value, owner=None, plugin="diffuse", kind=mi.ObjectType.BSDF, **properties):
+    """The nodes after a value was put into what Mitsuba has made of a number, of a colour or of nothing."""
+    state = SimpleNamespace(nodes=[node(plugin, kind, **properties)], id_to_index={})
+    values._put_into_made(state, values.Place(0, names, made), owner, np.array(value), "some.key")
+    return [(one.props.plugin_name(), {key: one.props[key] for key, each in one.props.items()
+                                       if not isinstance(each, mi.Properties.ResolvedReference)})
+            for one in state.nodes]  # fmt: skip
+
+
+def test_values_of_what_mitsuba_has_made():
+    texture = mi.load_dict({"type": "uniform", "value": 0.5})
+    # A number of the node itself.
+    assert made_of(("eta",), texture, [1.5], texture) == [("diffuse", {"eta": 1.5})]
+    # A surface that nobody has described, and light that is daylight's.
+    surface = mi.load_dict({"type": "diffuse"})
+    assert made_of(("bsdf", "reflectance"), surface, [0.25], plugin="sphere", kind=mi.ObjectType.Shape) == [
+        ("sphere", {}), ("diffuse", {"reflectance": 0.25})]  # fmt: skip
+    light = {"plugin": "point", "kind": mi.ObjectType.Emitter}
+    assert made_of(("intensity",), texture, [2.5], texture, **light) == [("point", {}), ("d65", {"scale": 2.5})]
+    assert made_of(("intensity",), texture, [2.5], texture, intensity=1.0, **light) == [("point", {"intensity": 2.5})]
+    assert made_of(("intensity",), texture, [2.5], object(), **light) == [("point", {"intensity": 2.5})]
+    # A volume of one number.
+    volume = mi.load_dict({"type": "constvolume", "value": 0.5})
+    assert made_of(("albedo", "value"), volume, [0.75], plugin="homogeneous") == [("homogeneous", {"albedo": 0.75})]
+    for names, made in ((("a", "b"), texture), (("a", "b", "c"), volume), (("bsdf", "a", "b"), surface)):
+        with pytest.raises(SceneError, match=r"'some\.key' has no place in the description"):
+            made_of(names, made, [0.5])
 
 
 def test_numbers_that_went_through_a_file_are_the_same():

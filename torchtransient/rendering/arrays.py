@@ -62,7 +62,7 @@ def own(tensor: torch.Tensor) -> Any:
     kind = _type_of(tensor)
     shape = tuple(int(n) for n in tensor.shape)
     if tensor.numel() <= FEW:
-        few = dr.array_t(kind)(tensor.detach().reshape(-1).tolist())
+        few = dr.array_t(kind)(tensor.reshape(-1).tolist())
         # A single number would be a literal of the kernels, which every other number would have compiled anew.
         dr.make_opaque(few)
         return kind(few, shape)

@@ -35,6 +35,6 @@ def render(
         renderer = TransientRenderer(scene, parameters=list(given), spp=spp, **settings)
     for name, start in list(renderer.named_parameters()):
         # Not by `requires_grad_`, which torch.func forbids inside of its transforms.
-        setattr(renderer, name, nn.Parameter(start.detach(), requires_grad=False))
+        setattr(renderer, name, nn.Parameter(start, requires_grad=False))
     out: RenderOutput = renderer(values, seed=seed, progress=progress)
     return out

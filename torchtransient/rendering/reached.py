@@ -54,10 +54,13 @@ class Reached:
 
     def _look_at(self, value: Any, attributes: frozenset[str], depth: int = 0) -> None:
         """``attributes``: the names that the code which holds the value asks for."""
-        if isinstance(value, _LEAVES) or (id(value), attributes) in self._visits:
+        if isinstance(value, _LEAVES):
+            return
+        before = self._values.get(id(value), (_DEPTH + 1, None))[0]
+        # Nearer than before, more of what is below it is in reach, and a function is called for certain.
+        if (id(value), attributes) in self._visits and depth >= before:
             return
         self._visits.add((id(value), attributes))
-        before = self._values.get(id(value), (_DEPTH + 1, None))[0]
         is_new = id(value) not in self._values
         self._values[id(value)] = min(depth, before), value
         scene_parameters, mitsuba_object = self._kinds
@@ -140,12 +143,14 @@ def _parts_of(value: Any) -> tuple[Any, ...]:
         return (value(),)
     if isinstance(value, contextvars.ContextVar):
         return (value.get(None),)
-    if not isinstance(value, dict) and _is_container_of_python(value):
+    if _is_container_of_python(value):
         return tuple(value.values() if isinstance(value, Mapping) else value)
-    named = value if isinstance(value, dict) else _attributes_and_slots(value)
+    named = _attributes_and_slots(value)
     if isinstance(value, torch.nn.Module):
         named = {name: part for name, part in named.items() if name not in _of_every_module()}
-    return tuple(named.values() if named or not isinstance(value, _CONTAINERS) else value)
+    if isinstance(value, _CONTAINERS):
+        return (*named.values(), *(value.values() if isinstance(value, dict) else value))
+    return tuple(named.values())
 
 
 def _is_container_of_python(value: Any) -> bool:

@@ -223,7 +223,7 @@ class TransientRenderer(CopiesParametrized):
             if isinstance(given, Mapping) and given[slot.key] is not None:
                 own = given[slot.key]
                 own = as_float(slot.key, own.to(device) if isinstance(own, torch.Tensor) else own, device)
-                value, batched = fit_shape(slot.key, own.detach().clone(), slot.shape)
+                value, batched = fit_shape(slot.key, own.clone(), slot.shape)
                 if batched:
                     raise ShapeError(
                         f"start value of {slot.key!r}: expected shape {slot.shape}, got {tuple(value.shape)}."

@@ -335,7 +335,7 @@ def _derivative(tensor: Any) -> Any:
     """What has arrived at a tensor; where it has no entries Dr.Jit has a single zero for it."""
     import drjit as dr
 
-    return fresh(dr.grad(tensor)) if dr.width(tensor) else dr.detach(tensor)
+    return fresh(dr.grad(tensor)) if dr.width(tensor) else tensor
 
 
 def _has_gradient(leaf: Any) -> bool:

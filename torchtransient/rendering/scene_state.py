@@ -40,8 +40,9 @@ def values_of(params: Any) -> dict[str, Any]:
         try:
             value = ShownValue(key, handle, 0, cpptype).read(node)  # type: ignore[call-arg]
         except (RuntimeError, TypeError):
-            continue  # not set, as the absorption of hair
-        found[key] = _handle(value)
+            continue
+        if value is not None:  # not set, as the absorption of hair
+            found[key] = _handle(value)
     return found
 
 
