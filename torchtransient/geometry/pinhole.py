@@ -106,8 +106,7 @@ def pinhole_camera(camera_matrix: Tensor, to_world: Any, size: Sequence[int]) ->
     matrix = camera_matrices(camera_matrix, "pinhole_camera")
     outside = extrinsics(to_world).to(matrix.device, matrix.dtype)
     inside = torch.nn.functional.pad(matrix, (0, 1, 0, 1)) + torch.diag(matrix.new_tensor([0.0, 0.0, 0.0, 1.0]))
-    both = torch.zeros_like(inside) + torch.zeros_like(outside)
-    inside, outside = ((one + both).reshape(-1, 4, 4) for one in (inside, outside))
+    inside, outside = (one.reshape(-1, 4, 4) for one in torch.broadcast_tensors(inside, outside))
     full = matrix.new_ones(inside.shape[0])
     return PinholeCamera(inside, outside, full * height, full * width)
 
