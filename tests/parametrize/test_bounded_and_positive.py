@@ -35,6 +35,9 @@ def test_both_ends_are_as_precise():
     back = bounded(bounded_inverse(value))
     assert torch.allclose(back, value, rtol=1e-6)
     assert (1 - back[2]).item() == pytest.approx(2.0**-20, rel=0.1)
+    # Of a bound at zero all digits.
+    assert bounded(torch.tensor([23.0, -23.0]), -3.0, 0.0)[0].item() == pytest.approx(-3 / (1 + math.exp(23)), rel=1e-6)
+    assert bounded(torch.tensor([23.0, -23.0]), 0.0, 3.0)[1].item() == pytest.approx(3 / (1 + math.exp(23)), rel=1e-6)
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0, -1e-7, 1 + 1e-6])

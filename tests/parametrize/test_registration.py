@@ -181,6 +181,16 @@ def test_a_class_with_its_own_copies_keeps_them():
     assert copy.deepcopy(module) == "its own" and copy.copy(module) == "another"
 
 
+def test_what_a_class_keeps_beside_its_dictionary_is_copied():
+    class Slotted(Weights):
+        __slots__ = ("more",)
+
+    module = Slotted()
+    module.more = [3]
+    twin = copy.deepcopy(register(module, "w", Albedo()))
+    assert twin.more == [3] and twin.more is not module.more and torch.equal(twin.w, module.w)
+
+
 def its_own(*_):
     return str, ("its own",)
 

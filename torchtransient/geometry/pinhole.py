@@ -64,8 +64,9 @@ def intrinsics(
     focal = spans[fov_axis] / 2 / torch.tan(torch.deg2rad(fov) / 2)
     centre_u = width / 2 - 0.5 - crop[0] - offset[..., 0] * width
     centre_v = height / 2 - 0.5 - crop[1] - offset[..., 1] * height
-    none = 0 * (focal + centre_u)
-    rows = [focal + none, none, centre_u + none, none, focal + none, centre_v + none, none, none, none + 1]
+    focal, centre_u, centre_v = torch.broadcast_tensors(focal, centre_u, centre_v)
+    none, one = torch.zeros_like(focal), torch.ones_like(focal)
+    rows = [focal, none, centre_u, none, focal, centre_v, none, none, one]
     return torch.stack(rows, -1).reshape(*none.shape, 3, 3).to(given.dtype)
 
 
