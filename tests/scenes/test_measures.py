@@ -126,6 +126,17 @@ def test_an_icosahedron():
     assert volume(vertices, faces) == pytest.approx(5 / 12 * (3 + np.sqrt(5)) * edge**3)
 
 
+def test_arcs_are_halved():
+    """Of an edge that is cut in four, all parts fill the same angle."""
+    corners, faces = meshes.ellipsoid([0, 0, 0], 1.0, 0)
+    a, b = corners[faces[0, :2]]
+    fine = meshes.ellipsoid([0, 0, 0], 1.0, 2)[0]
+    n, middle = np.cross(a, b), (a + b) / np.linalg.norm(a + b)
+    on_the_arc = fine[(np.abs(fine @ n) < 1e-9) & (fine @ middle > a @ middle - 1e-9)]
+    angles = np.sort(np.arccos(np.clip(on_the_arc @ a, -1, 1)))
+    np.testing.assert_allclose(angles, np.linspace(0, np.arccos(a @ b), 5), atol=1e-7)
+
+
 def test_several_meshes_as_one():
     one, two = meshes.plate(1.0, 2.0), meshes.plate(3.0, 1.0, [0, 0, 1.0], cells=2)
     vertices, faces = meshes.joined(one, two, one)

@@ -9,6 +9,7 @@ import pytest
 from torchtransient import scenes
 from torchtransient.errors import SceneError, ShapeError, UnitError
 from torchtransient.scenes.bottle import PROFILE, lathe
+from torchtransient.scenes.nlos import mannequin
 from torchtransient.scenes.parts import diffuse, perspective, transient_film, transient_path
 
 VARIANT = "llvm_ad_rgb"
@@ -173,6 +174,13 @@ def test_outlines_that_make_no_body(outline, segments, words):
     with pytest.raises(SceneError, match=words):
         lathe(np.array(outline), segments)
     assert lathe(np.array(PROFILE), 3)[1].shape == (3 * 2 * (len(PROFILE) - 2), 3)
+
+
+def test_an_arm_that_touches_the_wall_is_too_long():
+    reach = float(-mannequin(1.45, 1)[0][:, 2].min())
+    with pytest.raises(SceneError, match=f"depth: expected more than {reach:.3g} m, the reach of the arm"):
+        scenes.nlos_mannequin(depth=reach, level=1)
+    assert scenes.nlos_mannequin(depth=reach + 1e-9, level=1)["body"]["vertices"][:, 2].min() > 0
 
 
 @pytest.mark.parametrize(("shape", "words"), [

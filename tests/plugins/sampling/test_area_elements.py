@@ -47,6 +47,9 @@ def test_weights_of_axes():
     np.testing.assert_allclose(found.T, expected, atol=1e-15)
     only = local_point(0, 0.25, 0.64, np, (TRIANGLE,))
     np.testing.assert_allclose(only, [0.6, 0.2, 0.0])
+    for one in (DISK, SPHERE, CYLINDER):
+        alone = local_point(np.array(one), np.float64(1 / 12), np.float64(1 / 4), np, (one,))
+        np.testing.assert_allclose(np.array(alone, dtype=float), expected[one], atol=1e-15)
 
 
 def test_rows_of_triangles():
@@ -99,6 +102,18 @@ def test_rows_of_round_shapes(flip, mirror):
     np.testing.assert_allclose(normals[1], np.tile(found.normal[0], (16, 1)))
     np.testing.assert_allclose(normals[2], mirror * (points[2] - found.axes[1, 0]) / 0.3, rtol=1e-6)
     np.testing.assert_allclose(points[2].mean(0), found.axes[1, 0], atol=1e-7)
+
+
+def test_points_of_elements_of_several_kinds():
+    """Of a triangle beside others sixteen places, too, with its own normal."""
+    elements = AreaElements.of([mesh("sheet", SHEET), analytic("sphere", 0.3, 0.3, 0.3)])
+    points, normals = elements.points(np.array([2, 1]))
+    np.testing.assert_allclose(normals[1], np.tile(elements.normal[1], (16, 1)))
+    away = points[1] - elements.axes[1, 0]
+    np.testing.assert_allclose(away @ elements.normal[1], 0, atol=1e-7)
+    place = np.linalg.lstsq(elements.axes[1, 1:3].T, away.T, rcond=None)[0]
+    assert place.min() > 0 and place.sum(0).max() < 1 and len(np.unique(place.round(6), axis=1).T) == 16
+    np.testing.assert_allclose(np.linalg.norm(points[0] - elements.axes[2, 0], axis=1), 0.3, rtol=1e-6)
 
 
 def test_spheres_that_are_turned_inside_out():
@@ -156,6 +171,8 @@ def test_sheared_shapes_are_left_out(kind, matrix, listed):
     found = AreaElements.of([shape, analytic("disk", 1, 1, 1)])
     assert len(found) == 1 + listed and found.left_out == ([] if listed else ["odd"])
     assert found.shape.tolist()[-1] == 1
+    unnamed = mi.load_dict({"type": kind, "to_world": mi.ScalarTransform4f(matrix)})
+    assert AreaElements.of([unnamed]).left_out == ([] if listed else [kind.capitalize()])
 
 
 def test_of_nothing():

@@ -130,13 +130,13 @@ def local_point(kind: Any, a: Any, y: Any, math_of: Any, kinds: tuple[int, ...] 
     """
     select = getattr(math_of, "select", None) if math_of is dr else math_of.where
     s = math_of.sqrt(y)
-    x = [s * (1 - a), s * a, a * 0]
+    x = [s * (1 - a), s * a, 0.0]
     if any(k != TRIANGLE for k in kinds):
         cos, sin = math_of.cos(2 * math.pi * a), math_of.sin(2 * math.pi * a)
         z = 1 - 2 * y
         # 1 - z^2 without a difference of nearly equal numbers.
         q = math_of.sqrt(4 * y * (1 - y))
-        others = {DISK: (s * cos, s * sin, a * 0), SPHERE: (q * cos, q * sin, z), CYLINDER: (cos, sin, y)}
+        others = {DISK: (s * cos, s * sin, 0.0), SPHERE: (q * cos, q * sin, z), CYLINDER: (cos, sin, y)}
         for k in kinds:
             if k in others:
                 x = [select(kind == k, new, old) for new, old in zip(others[k], x, strict=True)]
