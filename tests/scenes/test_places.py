@@ -8,6 +8,7 @@ import pytest
 
 from torchtransient import scenes
 from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.scenes import meshes
 from torchtransient.scenes.bottle import PROFILE, lathe
 from torchtransient.scenes.nlos import mannequin
 from torchtransient.scenes.parts import diffuse, perspective, transient_film, transient_path
@@ -174,6 +175,15 @@ def test_outlines_that_make_no_body(outline, segments, words):
     with pytest.raises(SceneError, match=words):
         lathe(np.array(outline), segments)
     assert lathe(np.array(PROFILE), 3)[1].shape == (3 * 2 * (len(PROFILE) - 2), 3)
+
+
+def test_what_no_shape_or_no_area_is_made_of():
+    almost_a_line = [[2.0, 0.6000000000000001], [-1.0, -0.2999999999999999], [-2.0, -0.5999999999999999], [2.0, 0.6]]
+    with pytest.raises(SceneError, match="corners that are not all in a row"):
+        meshes.sheet(almost_a_line)
+    for wrong in (3, "shapes", [{"type": "sphere"}]):
+        with pytest.raises(SceneError, match="bounds: expected a dictionary of shapes, got"):
+            scenes.bounds(wrong)
 
 
 def test_an_arm_that_touches_the_wall_is_too_long():
