@@ -11,7 +11,7 @@ import pytest
 
 from torchtransient import plugins
 from torchtransient.plugins import polarized
-from torchtransient.plugins.bsdfs.mueller import Interface, metal_reflection, two_by_two
+from torchtransient.plugins.bsdfs.mueller import Interface, across_plane, metal_reflection, two_by_two
 
 VARIANT = "llvm_ad_mono_polarized"
 COSINES = np.array([1.0, 0.93, 0.7, 0.5, 0.31, 0.12, 0.01])
@@ -46,7 +46,7 @@ def amplitudes(c, n):
     return s, p, 2 * c / (c + n * t), 2 * c / (n * c + t), n * t / c
 
 
-@pytest.mark.parametrize("index", [1.5, 2.4, 0.6, 1.0625])
+@pytest.mark.parametrize("index", [1.5, 4.0, 0.6, 1.0625])
 @pytest.mark.parametrize("side", [1, -1])
 def test_interfaces(index, side):
     """Total reflection included."""
@@ -95,6 +95,25 @@ def test_metals(eta, k):
 def test_the_places_of_the_entries():
     found = entries(two_by_two(mi.Float(2), mi.Float(3), mi.Float(5), mi.Float(7)))[..., 0]
     assert found.tolist() == [[2, 3, 0, 0], [3, 2, 0, 0], [0, 0, 5, -7], [0, 0, 7, 5]]
+
+
+def test_matrices_between_the_frames_of_directions():
+    """A plane of incidence that is turned about the normal by an angle turns both frames; along the normal none is."""
+    normal, m = mi.Vector3f(0, 0, 1), matrix(5)
+
+    def frame_turn(forward, horizontal):
+        implicit = np.array(mi.coordinate_system(mi.Vector3f(*forward.tolist()))[0]).ravel()
+        horizontal = horizontal / np.linalg.norm(horizontal)
+        return turn(math.atan2(forward @ np.cross(horizontal, implicit), horizontal @ implicit))
+
+    wi, wo = np.array([0.36, 0.48, 0.8]), np.array([-0.36, -0.48, 0.8])
+    up = np.array([0.0, 0, 1])
+    found = across_plane(as_spectrum(m), normal, *(mi.Vector3f(*d.tolist()) for d in (wi, wo)))
+    expected = frame_turn(wi, np.cross(up, wi)) @ m @ frame_turn(-wo, np.cross(up, -wo)).T
+    np.testing.assert_allclose(entries(found)[..., 0], expected, atol=1e-5)
+    found = across_plane(as_spectrum(m), normal, normal, normal)
+    x = np.array([1.0, 0, 0])
+    np.testing.assert_allclose(entries(found)[..., 0], frame_turn(up, x) @ m @ frame_turn(-up, x).T, atol=1e-5)
 
 
 # ------------------------------------------------------------------------------------------------------------- frames

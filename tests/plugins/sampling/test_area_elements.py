@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -173,6 +174,20 @@ def test_sheared_shapes_are_left_out(kind, matrix, listed):
     assert found.shape.tolist()[-1] == 1
     unnamed = mi.load_dict({"type": kind, "to_world": mi.ScalarTransform4f(matrix)})
     assert AreaElements.of([unnamed]).left_out == ([] if listed else [kind.capitalize()])
+
+
+def test_shapes_with_derivatives():
+    """Rows are numbers, whatever is attached."""
+    shapes = [analytic("disk", 0.5, 1.5, 2.0), mesh("ball", ball((0, 0, 1), 0.5, 0), vertex_normals=True)]
+    before = AreaElements.of(shapes)
+    for shape, keys in zip(shapes, (["to_world"], ["vertex_positions", "vertex_normals"]), strict=True):
+        params = mi.traverse(shape)
+        for key in keys:
+            dr.enable_grad(params[key])
+        params.update()
+    after = AreaElements.of(shapes)
+    for one, other in zip(before.columns(), after.columns(), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_of_nothing():

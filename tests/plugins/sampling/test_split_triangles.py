@@ -51,6 +51,14 @@ def test_parts_are_small_beside_their_distance():
     assert near[0] > 4 and touching[0] == 32
 
 
+def test_the_middle_may_be_nearest():
+    """Of a triangle with edges of 5, 3 and 4 m, 0.4 m below its middle and farther from all corners: 32 parts."""
+    sheet = "v 0 0 2\nv 3 0 2\nv 0 4 2\nf 1 2 3\n"
+    shape = mi.load_dict({"type": "obj", "filename": file_of("right sheet.obj", sheet), "face_normals": True})
+    found = AreaElements.of([shape])
+    assert [int(cuts_of(found, np.array([[1.0, 4 / 3, 2 - z]]))[0]) for z in (0.4, 0.63, 1.3, 5.0)] == [32, 16, 8, 2]
+
+
 def test_parts_cover_their_triangle_once():
     shapes, whole = elements()
     cuts = np.array([4, 2, 1, 1])
