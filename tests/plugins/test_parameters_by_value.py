@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from torchtransient import plugins
-from torchtransient.plugins.parameters import ParameterTracker
+from torchtransient.plugins.parameters import CORRECT, ParameterTracker, effect_of
 
 
 @pytest.fixture(autouse=True)
@@ -58,3 +58,10 @@ def test_an_index_of_one_needs_another_plugin(key, lost, kept):
         ball = {"type": "sphere", "bsdf": {"type": "principled", "spec_trans": 0.5, key: value}}
         effect = effect_in(ball, f"bsdf.{key}")
         assert effect.stand_in == "diff_principled" and effect.stand_in_needed == (value in lost), value
+
+
+def test_only_the_numbers_of_a_colour_are_coefficients():
+    mi.set_variant("llvm_ad_spectral")
+    texture = mi.load_dict({"type": "rgb", "value": [0.5, 0.4, 0.3]})
+    assert "coefficients" in effect_of(texture, "value").reason
+    assert effect_of(texture, "to_uv").reason == CORRECT
