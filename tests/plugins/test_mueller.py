@@ -167,6 +167,16 @@ def test_turns_of_a_frame(angle):
     np.testing.assert_allclose(numbers(found), turn(angle) @ matrix(3)[:, 0], atol=1e-6)
 
 
+def test_the_frame_of_a_segment():
+    """One fixed vector across the ray, whatever is attached."""
+    d = mi.Vector3f(0.48, 0.6, 0.64)
+    dr.enable_grad(d)
+    frame = polarized.stokes_frame_of(d)
+    assert not dr.grad_enabled(frame)
+    expected = mi.coordinate_system(-mi.Vector3f(0.48, 0.6, 0.64))[0]
+    np.testing.assert_array_equal(np.array(frame), np.array(expected))
+
+
 def test_no_turn_without_a_direction():
     rotation = polarized.rotation_along(mi.Float(0), mi.Float(0))
     assert (rotation.c[0], rotation.s[0]) == (1, 0)
