@@ -107,6 +107,17 @@ def test_what_a_point_below_and_above_is_sent(beam):
     assert light.bbox().max.z == pytest.approx(2.0)
 
 
+def test_the_slope_of_a_profile():
+    """By the cosine: that of the arc cosine over the width between both angles, and none beside it."""
+    scene = lamp_over_floor({"type": "angulararea", "radiance": 5.0, "cutoff_angle": 40.0, "beam_width": 10.0})
+    degrees = np.radians([0.0, 9.0, 25.0, 45.0])
+    cosine = mi.Float(np.cos(degrees))
+    dr.enable_grad(cosine)
+    dr.backward(scene.emitters()[0].falloff(cosine))
+    expected = [0, 0, 1 / (np.sin(np.radians(25.0)) * np.radians(30.0)), 0]
+    np.testing.assert_allclose(np.array(dr.grad(cosine)), expected, rtol=1e-4)
+
+
 def test_lights_that_stay_dark_to_paths():
     """All but the rays that leave them."""
     scene = lamp_over_floor({"type": "diff_directionalarea", "radiance": 5.0})

@@ -87,6 +87,21 @@ def test_masking_at_its_ends(ggx):
     assert smith_g1_over_cos(mi.Vector3f(0, 0, -1), normal, a, b, ggx)[0] == 1
 
 
+@pytest.mark.parametrize("ggx", [True, False])
+@pytest.mark.parametrize("v", [(0, 0, 1), (1, 0, 0), (0.6, 0, 0.8), (0, 1, 1e-6), (0, -0.6, -0.8)])
+def test_derivatives_are_finite_straight_down_and_along_the_surface(v, ggx):
+    """Along it nothing is seen of facets that face up."""
+    direction, facet = mi.Vector3f(*map(float, v)), mi.Vector3f(0, 0, 1)
+    a, b = mi.Float(0.25), mi.Float(0.5)
+    dr.enable_grad(direction, facet, a, b)
+    value = smith_g1_over_cos(direction, facet, a, b, ggx)
+    density = normal_density(direction, a, b, ggx)
+    assert (float(dr.detach(value)[0]) == 0) == (v[2] == 0)
+    dr.backward(value + density + normal_density(facet, a, b, ggx))
+    for leaf in (direction, facet, a, b):
+        assert np.isfinite(np.array(dr.grad(leaf))).all()
+
+
 def test_half_vectors():
     a, b = directions(4), directions(5)
     for weight in (1.0, 1.5):

@@ -92,6 +92,19 @@ def test_metals(eta, k):
         np.testing.assert_allclose(np.array(mean).ravel(), expected[0, 0], atol=5e-6)
 
 
+def test_a_metal_that_is_not_there():
+    """Along it the derivatives are numbers, too."""
+    for cosine in (0.0, 0.5):
+        c, eta, k = mi.Float(cosine), mi.UnpolarizedSpectrum(1.0), mi.UnpolarizedSpectrum(0.0)
+        dr.enable_grad(c, eta, k)
+        found = metal_reflection(c, eta, k)
+        total = sum(found[i, j][0] * (1 + i - 0.3 * j) for i in range(4) for j in range(4))
+        dr.backward(total, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+        for number in (total, *map(dr.grad, (c, eta, k))):
+            assert np.isfinite(np.array(number)).all()
+    assert abs(float(dr.detach(found)[0, 0][0][0])) < 1e-6
+
+
 def test_the_places_of_the_entries():
     found = entries(two_by_two(mi.Float(2), mi.Float(3), mi.Float(5), mi.Float(7)))[..., 0]
     assert found.tolist() == [[2, 3, 0, 0], [3, 2, 0, 0], [0, 0, 5, -7], [0, 0, 7, 5]]

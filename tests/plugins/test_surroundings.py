@@ -53,6 +53,22 @@ def test_nine_tenths_of_the_lines_enter_what_is_inside_out(kept):
     assert index == pytest.approx(1 / 1.5 if hit >= 29 else 1.0)
 
 
+def test_each_sensor_of_a_batch_has_its_own():
+    """One far from a ball that is inside out and looks away, one in it: entered by all lines and left by none."""
+    mi.set_variant(VARIANT)
+    plugins.sync()
+    from torchtransient.plugins.sensors.surroundings import Surroundings
+
+    film = {"type": "hdrfilm", "width": 1, "height": 1}
+    places = {f"at_{n}": mi.ScalarTransform4f().translate([0, 0, z]) for n, z in enumerate((9.0, 0.0))}
+    cameras = {n: {"type": "perspective", "fov": 0.01, "film": film, "to_world": pose} for n, pose in places.items()}
+    batch = {"type": "batch", "film": {**film, "width": 2}, **cameras}
+    inside_out = {"type": "sphere", "flip_normals": True, "bsdf": GLASS}
+    scene = mi.load_dict({"type": "scene", "batch": batch, "body": inside_out}, optimize=False)
+    found = Surroundings.of(scene, scene.sensors()[0], [shape.bsdf() for shape in scene.shapes()])
+    assert [float(index[0]) for index in found.indices(scene)] == pytest.approx([1.0, 1 / 1.5])
+
+
 @pytest.mark.parametrize(("levels", "index"), [(-1, 1 / 1.5), (1, 1.5), (2, 1.5**2), (4, 1.5**4), (5, 1.5**4)])
 def test_bodies_around_each_other(levels, index):
     mi.set_variant(VARIANT)

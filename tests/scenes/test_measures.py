@@ -304,6 +304,7 @@ def test_things_stand_on_each_other():
     around = [legs[:, 0].min(0), legs[:, 1].max(0)]
     np.testing.assert_allclose(np.subtract(around, found["desk_top"])[:, [0, 2]], [[0.015, 0.025], [-0.015, -0.025]])
     assert len({tuple(leg) for leg in np.round(legs[:, 0], 9).tolist()}) == 4
+    assert np.argsort(legs[:, 0] @ [2, 0, 1]).tolist() == [0, 1, 2, 3]
     assert found["desk_top"][0, 1] == pytest.approx(FLOOR + 0.71)
     assert found["chair_seat"][0, 1] == pytest.approx(found["chair_post"][1, 1]) == pytest.approx(FLOOR + 0.42)
     middle = LEFT + 0.75
