@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import itertools
 
@@ -185,6 +186,19 @@ def test_a_path_that_is_too_short():
     for opl in (2.9, 0.0, -5.0, torch.nan):
         assert geometry.distance_from_opl(torch.full((2, 2), opl), **setting).isnan().all()
     assert bool(geometry.distance_from_opl(torch.tensor([[-0.1, 0.0]])).isnan()[0, 0])
+    # As long as the way itself; and longer only because light is slow: 4 m of optical path are 2.5 m of glass.
+    assert geometry.distance_from_opl(torch.full((2, 2), 3.0), **setting).isnan().all()
+    assert geometry.distance_from_opl(torch.full((2, 2), 4.0), **setting, index=1.6).isnan().all()
+    assert not geometry.distance_from_opl(torch.full((2, 2), 5.0), **setting, index=1.6).isnan().any()
+
+
+@pytest.mark.parametrize("light", [(1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, 0.0)])
+def test_slopes_of_a_short_path_to_any_light(light):
+    """A metre across the ray, a metre ahead, at the pinhole."""
+    place = torch.tensor(light, requires_grad=True)
+    opl = torch.full((1, 1), -0.1, requires_grad=True)
+    geometry.distance_from_opl(opl, torch.eye(3), np.eye(4), light=place).nansum().backward()
+    assert place.grad.tolist() == [0, 0, 0] and opl.grad.item() == 0
 
 
 @pytest.mark.parametrize("light", [None, [0.0, 1.0, 0.0]])
@@ -342,3 +356,13 @@ def test_batches():
     assert torch.allclose(geometry.z_depth_from_distance(depth, matrices), torch.stack(list(many)), atol=1e-6)
     camera = geometry.pinhole_camera(matrices, poses[1], (4, 5))
     assert camera.batch_size == 2
+    assert camera.height.tolist() == [4, 4] and camera.width.tolist() == [5, 5]
+
+
+@pytest.mark.parametrize(("dtype", "near", "far"), [(torch.float64, 4e-5, 6e-5), (torch.bfloat16, 1 / 128, 3 / 128)])
+def test_motions_are_rigid_to_the_precision_they_have(dtype, near, far):
+    """Axes longer than one by 1e-4 of their square, or by four steps of the precision where that is more."""
+    for length in (near, far):
+        matrix = torch.diag(torch.tensor([1 + length, 1.0, 1.0, 1.0], dtype=torch.float64)).to(dtype)
+        with contextlib.nullcontext() if length == near else pytest.raises(UnitError, match="a rigid motion"):
+            geometry.extrinsics(matrix)

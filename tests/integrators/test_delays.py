@@ -256,6 +256,8 @@ def test_parameters_through_torch():
         ({"nested": DIFFUSE, "lifetime": 1.0, "elastic": DIFFUSE, "elastic_fraction": 0.5}, "got both"),
         ({"nested": DIFFUSE, "decay_opl": "0 1"}, "only decay_opl"),
         ({"nested": DIFFUSE, "decay_opl": "-1 1", "decay_values": "1 1"}, "negative"),
+        ({"nested": DIFFUSE, "decay_opl": "1 0", "decay_values": "1 1"}, "delayed: decay: "),
+        ({"nested": DIFFUSE, "lifetime": 1.0, "elastic_fraction": 1.01}, "elastic_fraction between 0 and 1, got 1.01"),
         ({"nested": DIFFUSE, "lifetime": 1.0, "emission": GREEN}, "only emission"),
         ({"nested": DIFFUSE, "lifetime": 1.0, "emission": GREEN, "excitation": BLUE}, "llvm_ad_spectral"),
     ],
@@ -263,6 +265,42 @@ def test_parameters_through_torch():
 def test_errors(node, message):
     with pytest.raises(SceneError, match=message), plugins.plugin_errors():
         mi.load_dict({"type": "delayed", **node})
+
+
+def test_numbers_at_the_ends_of_their_ranges():
+    for more in ({"elastic_fraction": 0.0}, {"elastic_fraction": 1.0}, {"quantum_yield": 0.0}, {"lifetime": 0.0}):
+        bsdf = mi.load_dict({"type": "delayed", "nested": DIFFUSE, "lifetime": 1.0, **more})
+        assert float(getattr(bsdf, next(iter(more)))[0]) == next(iter(more.values()))
+    assert mi.load_dict({"type": "delayed", "nested": DIFFUSE, "decay_opl": "0 1", "decay_values": "1 1"}).decay[0] == 0
+
+
+@pytest.mark.parametrize(("opl", "values", "mean", "at"), [
+    ("0 2", "3 3", 1.0, lambda p: 2 * p), ("0.5 2.5", "1 1", 1.5, lambda p: (0.5 + 2 * p) / 1.5),
+    ("0 3", "0 2", 2.0, lambda p: 1.5 * np.sqrt(p)), ("0 3", "2 0", 1.0, lambda p: 3 * (1 - np.sqrt(1 - p))),
+])  # fmt: skip
+def test_measured_decays_in_units_of_their_mean(opl, values, mean, at):
+    """At equal steps of probability; a lifetime stretches them."""
+    bsdf = mi.load_dict({"type": "delayed", "nested": DIFFUSE, "decay_opl": opl, "decay_values": values})
+    assert float(bsdf.lifetime[0]) == pytest.approx(mean, rel=1e-6)
+    np.testing.assert_allclose(bsdf.decay, at(np.linspace(0, 1, len(bsdf.decay))), atol=2e-4 * mean + 1e-6)
+    longer = mi.load_dict({"type": "delayed", "nested": DIFFUSE, "decay_opl": opl, "decay_values": values,
+                           "lifetime": 7.0})  # fmt: skip
+    assert float(longer.lifetime[0]) == 7.0 and np.array_equal(longer.decay, bsdf.decay)
+
+
+def test_spectra_that_are_none():
+    def shifted(**spectra):
+        return mi.load_dict({"type": "delayed", "lifetime": 1.0, "nested": DIFFUSE, "emission": GREEN,
+                             "excitation": BLUE, **spectra})  # fmt: skip
+
+    with mi.variant_context("llvm_ad_spectral"):
+        plugins.sync()
+        shifted()
+        for name, wrong in (("emission", -0.5), ("excitation", -0.5), ("emission", 0.0), ("excitation", 0.0)):
+            words = f"delayed: {name} must be finite, .* got values between {wrong:g} and {wrong:g}"
+            with pytest.raises(SceneError, match=words), plugins.plugin_errors():
+                shifted(**{name: {"type": "uniform", "value": wrong}})
+    plugins.sync()
 
 
 @pytest.mark.parametrize("outer", [{"type": "twosided"}, {"type": "delayed", "lifetime": 1.0}])

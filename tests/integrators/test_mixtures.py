@@ -26,6 +26,7 @@ from support.gradient_cases.cases_mixtures import (
     seen_through,
     two_sided,
 )
+from torchtransient.errors import SceneError
 from torchtransient.plugins.bsdfs.wrapper_copy import flags_of
 
 VARIANT = "llvm_ad_mono"
@@ -156,6 +157,31 @@ def test_hidden_flags_are_found(flags):
     mi.set_variant(VARIANT)
     for make in (lambda: around_metal(FLAT, 0.0, flags), lambda: bump(blend(DIFFUSE, MIRROR), 0.5, 0.5) | flags):
         assert flags_of(mi.load_dict(make())) == flags
+
+
+def test_what_samples_as_no_choice_of_flags():
+    mi.set_variant(VARIANT)
+    drawn = []
+
+    class Fickle(mi.BSDF):
+        """Other directions with every sample."""
+
+        def __init__(self, props):
+            mi.BSDF.__init__(self, props)
+            self.m_components = [mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide]
+            self.m_flags = self.m_components[0]
+
+        def sample(self, ctx, si, sample1, sample2, active):
+            drawn.append(len(drawn))
+            bs = dr.zeros(mi.BSDFSample3f)
+            bs.wo, bs.pdf = dr.normalize(mi.Vector3f(0.01 * len(drawn), 0, 1)), mi.Float(1)
+            return bs, mi.Spectrum(1)
+
+    mi.register_bsdf("fickle", Fickle)
+    described = {"type": "normalmap", "id": "rug", "normalmap": {"type": "uniform", "value": 0.5}}
+    with pytest.raises(SceneError, match=r"NormalMap 'rug': .* choice of flip_invalid_normals, use_shadowing_function"):
+        flags_of(mi.load_dict(described | {"nested": {"type": "fickle"}}))
+    assert len(drawn) == 5
 
 
 def test_looking_for_flags_leaves_values_and_their_derivatives():

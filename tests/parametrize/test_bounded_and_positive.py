@@ -35,6 +35,9 @@ def test_both_ends_are_as_precise():
     back = bounded(bounded_inverse(value))
     assert torch.allclose(back, value, rtol=1e-6)
     assert (1 - back[2]).item() == pytest.approx(2.0**-20, rel=0.1)
+    # Of a bound at zero all digits.
+    assert bounded(torch.tensor([23.0, -23.0]), -3.0, 0.0)[0].item() == pytest.approx(-3 / (1 + math.exp(23)), rel=1e-6)
+    assert bounded(torch.tensor([23.0, -23.0]), 0.0, 3.0)[1].item() == pytest.approx(3 / (1 + math.exp(23)), rel=1e-6)
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0, -1e-7, 1 + 1e-6])
@@ -67,11 +70,14 @@ def test_ranges_that_the_precision_has_not():
                  lambda: bounded(torch.zeros(2).half(), -6e4, 6e4)):  # fmt: skip
         with pytest.raises(UnitError, match="has not the range"):
             make()
-    for margin in (None, 0.1):
+    step = 2**-23
+    for margin, said in ((None, "no finite number stands"), (0.1, "torch.float32 has no number between 1.0 and 1")):
+        with pytest.raises(UnitError, match=said):
+            bounded_inverse(torch.ones(2), 1.0, 1.0 + step, margin=margin)
         with pytest.raises(UnitError):
             bounded_inverse(torch.ones(2), 1.0, 1.0 + 1e-9, margin=margin)
-        with pytest.raises(UnitError):
-            bounded_inverse(torch.ones(2), 1.0, 1.0 + 2**-23, margin=margin)
+        # One number in between is enough.
+        assert bounded_inverse(torch.full((2,), 1.0 + step), 1.0, 1.0 + 2 * step, margin=margin).tolist() == [0, 0]
 
 
 def test_bounds_of_nothing():
@@ -151,5 +157,8 @@ def test_simplex():
     weights = parametrize.Simplex(0, margin=0.01)
     found = weights(weights.right_inverse(torch.tensor([[0.0, 0.5], [1.0, 0.5]])))
     assert torch.allclose(found.sum(0), torch.ones(2)) and found[0, 0].item() == pytest.approx(0.005, rel=0.01)
+    # The numbers behind are the logarithms of the weights, zero on average.
+    x = simplex_inverse(torch.tensor([[0.125, 0.625, 0.25]], dtype=torch.float64))
+    assert x.mean().item() == pytest.approx(0, abs=1e-15) and (x[0, 1] - x[0, 0]).item() == pytest.approx(math.log(5))
     with pytest.raises(ShapeError, match="along dimension 2"):
         parametrize.simplex(torch.zeros(3), 2)

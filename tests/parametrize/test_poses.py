@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 
 import numpy as np
@@ -168,6 +169,27 @@ def test_a_scale_needs_its_base():
 def test_settings_that_are_none(settings, error, message):
     with pytest.raises(error, match=message):
         AxisAnglePose(**settings)
+
+
+INVERSES = [axis_angle_from_pose, twist_from_pose, AxisAnglePose().right_inverse, SE3Pose().right_inverse]
+
+
+@pytest.mark.parametrize("inverse", INVERSES)
+@pytest.mark.parametrize(("dtype", "near", "far"), [(torch.float64, 4e-5, 6e-5), (torch.bfloat16, 1 / 128, 3 / 128)])
+def test_motions_are_rigid_to_the_precision_they_have(inverse, dtype, near, far):
+    """Axes longer than one by 1e-4 of their square, or by four steps of the precision where that is more."""
+    scaled = [torch.diag(torch.tensor([1.0, 1 + length, 1.0, 1.0], dtype=torch.float64)) for length in (near, far)]
+    assert inverse(scaled[0].to(dtype)).abs().max() < 0.02
+    with pytest.raises(UnitError, match="expected a rigid motion"):
+        inverse(scaled[1].to(dtype))
+
+
+def test_the_last_row_of_a_base_is_exact_but_for_rounding():
+    for off in (0.5e-8, 2e-8):
+        base = np.eye(4)
+        base[3, 1] = off
+        with contextlib.nullcontext() if off < 1e-8 else pytest.raises(UnitError, match="last row 0, 0, 0, 1"):
+            AxisAnglePose(base)
 
 
 def test_wrong_shapes():

@@ -174,7 +174,44 @@ def test_a_class_with_its_own_copies_keeps_them():
         def __deepcopy__(self, memo):
             return "its own"
 
-    assert copy.deepcopy(register(Own(), "w", Albedo())) == "its own"
+        def __copy__(self):
+            return "another"
+
+    module = register(Own(), "w", Albedo())
+    assert copy.deepcopy(module) == "its own" and copy.copy(module) == "another"
+
+
+def test_what_a_class_keeps_beside_its_dictionary_is_copied():
+    class Slotted(Weights):
+        __slots__ = ("more",)
+
+    module = Slotted()
+    module.more = [3]
+    twin = copy.deepcopy(register(module, "w", Albedo()))
+    assert twin.more == [3] and twin.more is not module.more and torch.equal(twin.w, module.w)
+
+
+def its_own(*_):
+    return str, ("its own",)
+
+
+@pytest.mark.parametrize("method", ["__reduce__", "__reduce_ex__"])
+def test_a_class_with_its_own_pickles_keeps_them(method):
+    module = register(type("Own", (Weights,), {method: its_own})(), "w", Albedo())
+    assert pickle.loads(pickle.dumps(module)) == "its own"
+
+
+def test_keys_that_are_not_there_or_not_alone():
+    pair = nn.ModuleDict({"a": Weights(), "b": Weights()})
+    with pytest.raises(UnknownKeyError, match=r"ModuleDict has several modules with a parameter 'w'; there are a.w, b"):
+        register(pair, "w", Albedo())
+    with pytest.raises(UnknownKeyError, match=r"ModuleDict has no parameter 'v'; there are a.w, b.w\."):
+        register(pair, "v", Albedo())
+    with pytest.raises(UnknownKeyError, match=r"Tanh has no parameter 'w'; it has none\."):
+        register(nn.Tanh(), "w", Albedo())
+    many = nn.ModuleList(Weights() for _ in range(9))
+    with pytest.raises(UnknownKeyError, match=r"there are 0.w, .*, 7.w \.\.\.\.$"):
+        register(many, "v", Albedo())
 
 
 def test_under_autocast():

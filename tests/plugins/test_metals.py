@@ -218,3 +218,27 @@ def test_ranges_of_textures():
         _, _, node, flags = next(v for key, v in mi.traverse(scene).properties.items() if key.endswith("k.data"))
         assert tracker.effect_of(node, "data", flags).stand_in == "diff_rough_conductor"
         assert tracker.effect_of(node, "data", flags).stand_in_needed == needed
+
+
+@pytest.mark.parametrize(("slot", "eta", "k", "lost"), [
+    # Where the other number is zero, the slope truly is.
+    ("eta", (0.0, 0.0), (2.0, 2.0), True), ("eta", (0.5, 0.5), (0.0, 0.0), False), ("k", (0.0, 0.0), (2.0, 2.0), False),
+    ("k", (0.5, 0.5), (0.0, 0.0), True), ("k", (1.0, 1.0), (0.0, 0.0), False), ("k", (1.5, 1.5), (0.0, 0.0), False),
+    # eta k beside 0.8 % of 1 + k^2, for an index below one or a large absorption.
+    ("k", (1.5, 1.5), (180.0, 180.0), False), ("k", (1.5, 1.5), (200.0, 200.0), True),
+    ("k", (0.5, 0.5), (0.0159, 0.0159), True), ("k", (0.5, 0.5), (0.0161, 0.0161), False),
+    ("eta", (0.0199, 0.0199), (2.0, 2.0), True), ("eta", (0.0201, 0.0201), (2.0, 2.0), False),
+    # Of a range the smallest index, and either end of the absorption.
+    ("eta", (0.01, 3.0), (2.0, 2.0), True), ("k", (0.5, 3.0), (0.0, 2.0), True), ("k", (0.5, 3.0), (2.0, 80.0), True),
+    ("k", (0.5, 3.0), (2.0, 3.0), False), ("eta", (0.5, 3.0), (0.0, 2.0), True), ("k", (0.0, 3.0), (2.0, 2.0), True),
+])  # fmt: skip
+def test_which_metals_lose_their_slopes(slot, eta, k, lost):
+    activate(MONO)
+    assert loses_slope_of_metal(slot, eta, k) == lost
+
+
+def test_polarized_metals_lose_the_slope_of_no_absorption_alone():
+    activate(POLARIZED)
+    assert loses_slope_of_metal("k", (0.5, 2.0), (0.0, 1.0)) and not loses_slope_of_metal("eta", (0.5, 2.0), (0.0, 1.0))
+    for eta, k in (((0.0, 2.0), (0.0, 1.0)), ((1.0, 2.0), (0.0, 1.0)), ((0.5, 2.0), (1e-4, 1.0))):
+        assert not loses_slope_of_metal("k", eta, k)

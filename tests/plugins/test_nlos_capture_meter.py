@@ -12,6 +12,7 @@ import torch
 
 import torchtransient as tt
 from support.gradient_cases.cases_curves import file_of
+from torchtransient import plugins
 from torchtransient.errors import PhysicsWarning, SceneError, UnitError
 from torchtransient.plugins.sensors.places_on_mesh import PlacesOnMesh
 from torchtransient.rendering.build_options import BuildOptions
@@ -210,6 +211,100 @@ def test_energy_below_zero_as_a_value():
 
 
 SHEET = "v 0 0 1\nv 2 0 1\nv 2 3 1.5\nv 0 3 1\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nf 1/1 2/2 3/3\nf 1/1 3/3 4/4\n"
+
+
+@pytest.fixture
+def meter():
+    """A meter on a wall of 2 m by 4 m around (1, 2, 0), with nothing around it."""
+    mi.set_variant(VARIANT)
+    plugins.sync()
+    kept = []
+
+    def make(size=(3, 2), crop=None, **more):
+        film = {"type": "transient_hdr_film", "width": size[0], "height": size[1], "rfilter": {"type": "box"}}
+        if crop:
+            film |= dict(zip(("crop_offset_x", "crop_offset_y", "crop_width", "crop_height"), crop, strict=True))
+        node = {"type": "nlos_capture_meter", "film": film, "sampler": {"type": "independent"}, **more}
+        pose = mi.ScalarTransform4f().translate([1, 2, 0]).scale([1, 2, 1])
+        with plugins.plugin_errors():
+            wall = {"type": "rectangle", "to_world": pose, "sensor": node}
+            kept.append(mi.load_dict({"type": "scene", "wall": wall}))  # a sensor does not keep its wall
+        return kept[-1].sensors()[0]
+
+    return make
+
+
+def test_pixels_and_their_points(meter):
+    """Row by row, at the middles of as many parts of the wall; of a window those that it shows."""
+    sensor = meter(sensor_origin=[1.0, 2.0, 3.0])
+    x, y = np.meshgrid([1 / 3, 1, 5 / 3], [1.0, 3.0])
+    everything = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()])
+    np.testing.assert_allclose(np.array(sensor.scanned()), everything, atol=1e-6)
+    np.testing.assert_allclose(np.array(sensor.targets(mi.UInt32([4, 2]))), everything[:, [4, 2]], atol=1e-6)
+    part = meter((5, 4), (3, 1, 2, 3))
+    x, y = np.meshgrid([1.4, 1.8], [1.5, 2.5, 3.5])
+    window = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()])
+    np.testing.assert_allclose(np.array(part.scanned()), window, atol=1e-6)
+    # Every sample of a pixel looks along one ray, those at its edges as well.
+    for one, points, places in (
+        (sensor, everything, [(0.0, 0.0), (0.34, 0.1), (0.99, 0.0), (0.2, 0.5), (0.5, 0.9), (1.0, 1.0)]),
+        (part, window, [(0.1, 0.1), (0.5, 0.3), (0.49, 0.34), (0.9, 0.5), (0.2, 0.9), (1.0, 1.0)]),
+    ):  # fmt: skip
+        ray, weight = one.sample_ray(0.25, 0.5, mi.Point2f(np.array(places, dtype=np.float32).T), mi.Point2f(0.5))
+        origin = np.array([[1.0], [2.0], [3.0]]) if one is sensor else np.zeros((3, 1))
+        away = points - origin
+        np.testing.assert_allclose(np.array(ray.d), away / np.linalg.norm(away, axis=0), atol=1e-6)
+        np.testing.assert_allclose(np.array(ray.o).reshape(3, -1), origin)
+        assert dr.all(ray.time == 0.25) and dr.all(weight == 1, axis=None)
+    moved = np.array(sensor.world_transform().matrix).reshape(4, 4)
+    np.testing.assert_allclose(moved, np.array([[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]))
+
+
+def points_of(name, **given):
+    """Of the properties in a scene file, which are texts."""
+    from torchtransient.plugins.sensors.nlos_capture_meter import _points_of
+
+    return _points_of(given, name)
+
+
+def test_points_that_are_given(meter):
+    given = np.arange(18.0).reshape(6, 3)
+    sensor = meter(points=mi.TensorXf(given.astype(np.float32)), laser_points=mi.TensorXf(np.float32([[7, 8, 9]])))
+    np.testing.assert_allclose(np.array(sensor.scanned()), given.T)
+    np.testing.assert_allclose(np.array(sensor.spots()).ravel(), [7, 8, 9])
+    np.testing.assert_allclose(np.array(points_of("points", points="0 1 2, 3 4,5")), [[0, 3], [1, 4], [2, 5]])
+    assert points_of("points") is None and meter().spots() is None
+    for place, spot in (((3.0, 2.0, 0.0), (2, 4, 0)), ((0.0, 0.0, 0.0), (0, 0, 0)), ((1.5, 0.5, 0.0), (1, 1, 0))):
+        np.testing.assert_allclose(np.array(meter(laser_lookat_pixel=place).spots()).ravel(), spot, atol=1e-6)
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    ("0 1 2 3", r"finite points of shape \(N, 3\) or \(H, W, 3\) in metres, got shape \(4,\)"),
+    ("0 1", r"finite points of shape .* got shape \(2,\)"), ("", r"finite points of shape .* got shape \(0"),
+    ("0 1 nan", r"finite points of shape .* got shape \(1, 3\)"), ("0 one 2", "numbers with commas, .*'one'"),
+])  # fmt: skip
+def test_texts_that_are_no_points(meter, text, message):
+    with pytest.raises(SceneError, match=f"nlos_capture_meter: expected laser_points as {message}"):
+        points_of("laser_points", laser_points=text)
+
+
+TWO = np.zeros((2, 3), dtype=np.float32)
+
+
+@pytest.mark.parametrize(("more", "message"), [
+    ({"points": TWO}, "one of 'points' for each of the film's 3 x 2 pixels, got 2"),
+    ({"laser_points": TWO * NAN}, "expected laser_points as finite points of shape|expected finite"),
+    ({"sensor_origin": "0 1 2"}, "expected sensor_origin as a point of three finite numbers"),
+    ({"laser_origin": [0.0, 1.0, math.inf]}, "expected laser_origin as a point of three finite numbers"),
+    ({"laser_lookat_pixel": [3.25, 1.0, 0.0]}, "laser_lookat_pixel as a place of the film's 3 x 2 pixels, got .3.25"),
+    ({"laser_lookat_pixel": [1.0, 2.25, 0.0]}, "laser_lookat_pixel as a place of the film's 3 x 2 pixels"),
+    ({"laser_lookat_pixel": [-0.25, 1.0, 0.0]}, "laser_lookat_pixel as a place of the film's 3 x 2 pixels"),
+    ({"laser_lookat_pixel": [1.0, 1.0, 0.0], "laser_points": TWO}, "both say where the laser points; give one"),
+])  # fmt: skip
+def test_what_mitsuba_itself_is_refused(meter, more, message):
+    arrays = {name: mi.TensorXf(x) if isinstance(x, np.ndarray) else x for name, x in more.items()}
+    with pytest.raises(SceneError, match=message):
+        meter(**arrays)
 
 
 def test_places_of_a_texture_on_a_mesh():

@@ -134,7 +134,8 @@ def test_attributes_inside_groups():
             "copy": {"type": "instance", "shapegroup": {"type": "ref", "id": "group"}},
         }
     )
-    assert ParameterTracker(scene).effect_of(mesh, NAME).role == "normal"
+    for key in (NAME, f"group.thing.{NAME}"):
+        assert ParameterTracker(scene).effect_of(mesh, key).role == "normal"
 
 
 def test_attributes_that_nothing_reads_are_values():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from torchtransient import plugins
-from torchtransient.plugins.parameters import ParameterTracker
+from torchtransient.plugins.parameters import CORRECT, ParameterTracker, effect_of
 
 
 @pytest.fixture(autouse=True)
@@ -47,3 +47,21 @@ def test_a_lobe_of_weight_zero_needs_another_plugin(weight, lost):
         assert effect.stand_in == "diff_principled" and not effect.biased
         assert effect.stand_in_needed == needed
     assert effect_in(ball, "base_color.value").stand_in == ""
+
+
+@pytest.mark.parametrize(("key", "lost", "kept"), [
+    ("specular", (0.0, 1e-3), (5e-4, 1.5e-3, 0.5)), ("eta", (1.0, 1.001), (1.0005, 1.0015, 1.3)),
+])  # fmt: skip
+def test_an_index_of_one_needs_another_plugin(key, lost, kept):
+    """And what Mitsuba takes for one; beside it, its own has the derivative."""
+    for value in (*lost, *kept):
+        ball = {"type": "sphere", "bsdf": {"type": "principled", "spec_trans": 0.5, key: value}}
+        effect = effect_in(ball, f"bsdf.{key}")
+        assert effect.stand_in == "diff_principled" and effect.stand_in_needed == (value in lost), value
+
+
+def test_only_the_numbers_of_a_colour_are_coefficients():
+    mi.set_variant("llvm_ad_spectral")
+    texture = mi.load_dict({"type": "rgb", "value": [0.5, 0.4, 0.3]})
+    assert "coefficients" in effect_of(texture, "value").reason
+    assert effect_of(texture, "to_uv").reason == CORRECT

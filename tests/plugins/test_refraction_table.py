@@ -7,7 +7,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from torchtransient.plugins.bsdfs.refraction_table import RefractiveBSDFs
+from torchtransient.errors import SceneError
+from torchtransient.plugins.bsdfs.refraction_table import RefractiveBSDFs, boundaries_of, index_of
 
 VARIANT = "llvm_ad_mono"
 DIFFUSE = {"type": "diffuse"}
@@ -145,3 +146,25 @@ def test_derivative_inside_a_suspended_loop(glass):
         total = _sum_of_slopes(table, mi.BSDFPtr([scene.shapes()[0].bsdf()] * 5), si, wo)
     np.testing.assert_allclose(total.numpy(), [3, 4.5, 2, 3, 4.5], rtol=1e-6)
     assert dr.grad(params[key])[0] == pytest.approx(3 * (1 - 1 / 1.5**2 + 1), rel=1e-5)
+
+
+@pytest.mark.parametrize("specular", [0.25, 0.5, 0.98])
+def test_the_index_of_a_principled_surface_by_its_reflectance(specular):
+    """8 % of `specular` at normal incidence."""
+    bsdf = mi.load_dict({"type": "principled", "spec_trans": 0.5, "specular": specular})
+    n = float(index_of(bsdf)[0])
+    assert ((n - 1) / (n + 1)) ** 2 == pytest.approx(0.08 * specular, rel=1e-5)
+
+
+def test_what_refracts_by_an_index_that_it_does_not_show():
+    class Hidden(mi.BSDF):
+        def __init__(self, props):
+            mi.BSDF.__init__(self, props)
+            self.m_components = [mi.BSDFFlags.GlossyTransmission | mi.BSDFFlags.NonSymmetric | mi.BSDFFlags.FrontSide]
+            self.m_flags = self.m_components[0]
+
+    mi.register_bsdf("glass_without_index", Hidden)
+    bsdf = mi.load_dict({"type": "glass_without_index", "id": "pane"})
+    assert boundaries_of([bsdf])[0][1] is bsdf
+    with pytest.raises(SceneError, match=r"BSDF 'pane' \(.*\) has a refractive lobe but no parameter 'eta'"):
+        index_of(bsdf)

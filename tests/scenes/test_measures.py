@@ -126,6 +126,17 @@ def test_an_icosahedron():
     assert volume(vertices, faces) == pytest.approx(5 / 12 * (3 + np.sqrt(5)) * edge**3)
 
 
+def test_arcs_are_halved():
+    """Of an edge that is cut in four, all parts fill the same angle."""
+    corners, faces = meshes.ellipsoid([0, 0, 0], 1.0, 0)
+    a, b = corners[faces[0, :2]]
+    fine = meshes.ellipsoid([0, 0, 0], 1.0, 2)[0]
+    n, middle = np.cross(a, b), (a + b) / np.linalg.norm(a + b)
+    on_the_arc = fine[(np.abs(fine @ n) < 1e-9) & (fine @ middle > a @ middle - 1e-9)]
+    angles = np.sort(np.arccos(np.clip(on_the_arc @ a, -1, 1)))
+    np.testing.assert_allclose(angles, np.linspace(0, np.arccos(a @ b), 5), atol=1e-7)
+
+
 def test_several_meshes_as_one():
     one, two = meshes.plate(1.0, 2.0), meshes.plate(3.0, 1.0, [0, 0, 1.0], cells=2)
     vertices, faces = meshes.joined(one, two, one)
@@ -293,6 +304,7 @@ def test_things_stand_on_each_other():
     around = [legs[:, 0].min(0), legs[:, 1].max(0)]
     np.testing.assert_allclose(np.subtract(around, found["desk_top"])[:, [0, 2]], [[0.015, 0.025], [-0.015, -0.025]])
     assert len({tuple(leg) for leg in np.round(legs[:, 0], 9).tolist()}) == 4
+    assert np.argsort(legs[:, 0] @ [2, 0, 1]).tolist() == [0, 1, 2, 3]
     assert found["desk_top"][0, 1] == pytest.approx(FLOOR + 0.71)
     assert found["chair_seat"][0, 1] == pytest.approx(found["chair_post"][1, 1]) == pytest.approx(FLOOR + 0.42)
     middle = LEFT + 0.75

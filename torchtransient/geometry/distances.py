@@ -111,7 +111,7 @@ def distance_from_opl(
     length = path / given
     long = (length > 0) & (length * length > square)
     # Elsewhere some path that has a distance: the slope of what is not taken has to be finite, too.
-    length = torch.where(long, path, given * (1 + 2 * square.sqrt()).detach()) / given
+    length = torch.where(long, path, given * (1 + square.sqrt()).detach()) / given
     # |d ray - baseline| = length - d, squared.
     distance = (length * length - square) / (2 * (length - across))
     return torch.where(long, distance, torch.nan).to(opl.dtype)

@@ -64,8 +64,9 @@ def intrinsics(
     focal = spans[fov_axis] / 2 / torch.tan(torch.deg2rad(fov) / 2)
     centre_u = width / 2 - 0.5 - crop[0] - offset[..., 0] * width
     centre_v = height / 2 - 0.5 - crop[1] - offset[..., 1] * height
-    none = 0 * (focal + centre_u)
-    rows = [focal + none, none, centre_u + none, none, focal + none, centre_v + none, none, none, none + 1]
+    focal, centre_u, centre_v = torch.broadcast_tensors(focal, centre_u, centre_v)  # type: ignore[no-untyped-call]
+    none, one = torch.zeros_like(focal), torch.ones_like(focal)
+    rows = [focal, none, centre_u, none, focal, centre_v, none, none, one]
     return torch.stack(rows, -1).reshape(*none.shape, 3, 3).to(given.dtype)
 
 
@@ -106,8 +107,8 @@ def pinhole_camera(camera_matrix: Tensor, to_world: Any, size: Sequence[int]) ->
     matrix = camera_matrices(camera_matrix, "pinhole_camera")
     outside = extrinsics(to_world).to(matrix.device, matrix.dtype)
     inside = torch.nn.functional.pad(matrix, (0, 1, 0, 1)) + torch.diag(matrix.new_tensor([0.0, 0.0, 0.0, 1.0]))
-    both = torch.zeros_like(inside) + torch.zeros_like(outside)
-    inside, outside = ((one + both).reshape(-1, 4, 4) for one in (inside, outside))
+    both = torch.broadcast_tensors(inside, outside)  # type: ignore[no-untyped-call]
+    inside, outside = (one.reshape(-1, 4, 4) for one in both)
     full = matrix.new_ones(inside.shape[0])
     return PinholeCamera(inside, outside, full * height, full * width)
 

@@ -224,7 +224,5 @@ def _said(bound: Bound) -> str:
 
 
 def _span(value: Tensor) -> str:
-    if not value.numel():
-        return "none"
     least, most = value.min().item(), value.max().item()
     return f"{least:.8g}" if least == most else f"values from {least:.8g} to {most:.8g}"

@@ -17,7 +17,8 @@ class Settings(ScalarState):
     """
 
     def _keep(self, name: str, numbers: Tensor | float) -> None:
-        self.register_buffer(name, torch.as_tensor(numbers).detach().to(torch.float64, copy=True))
+        """``numbers``: without a derivative."""
+        self.register_buffer(name, torch.as_tensor(numbers).to(torch.float64, copy=True))
 
     def _apply(self, fn: Any, recurse: bool = True) -> Self:
         before = dict(self._buffers)

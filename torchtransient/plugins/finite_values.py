@@ -62,7 +62,7 @@ def numbers_of(value: Any) -> np.ndarray | None:
     if isinstance(value, (mi.Bitmap, mi.VolumeGrid, np.ndarray)):
         array = np.asarray(value)
     elif dr.is_array_v(value) and dr.is_float_v(value):
-        array = _components(dr.detach(value))
+        array = _components(value)
     else:
         return None
     return array if array.dtype.kind == "f" else None

@@ -92,7 +92,7 @@ class ParameterTracker:
         readers = []
         while waiting:
             node, inherited = waiting.pop()
-            if isinstance(node, mi.Texture) and attribute_name(node) is not None:
+            if attribute_name(node) is not None:
                 readers.append(node)
             values, objects = shown_by(node)
             is_scene = isinstance(node, mi.Scene)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import pytest
 
 from support.gradient_cases.cases_curves import file_of
 from torchtransient.plugins.sampling.area_elements import AreaElements
@@ -49,6 +50,46 @@ def test_parts_are_small_beside_their_distance():
     # Nearer points cut more, 32 times at most.
     near, touching = (cuts_of(found, WALL + np.array([0, 0, z])) for z in (1.9, 2.0))
     assert near[0] > 4 and touching[0] == 32
+
+
+def test_the_middle_may_be_nearest():
+    """Of a triangle with edges of 5, 3 and 4 m, 0.4 m below its middle and farther from all corners: 32 parts."""
+    sheet = "v 0 0 2\nv 3 0 2\nv 0 4 2\nf 1 2 3\n"
+    shape = mi.load_dict({"type": "obj", "filename": file_of("right sheet.obj", sheet), "face_normals": True})
+    found = AreaElements.of([shape])
+    assert [int(cuts_of(found, np.array([[1.0, 4 / 3, 2 - z]]))[0]) for z in (0.4, 0.63, 1.3, 5.0)] == [32, 16, 8, 2]
+
+
+def test_what_is_round_or_has_no_area_is_not_cut():
+    sliver = "v 0 0 0.1\nv 1 0 0.1\nv 2 0 0.1\nf 1 2 3\n"
+    flat = mi.load_dict({"type": "obj", "filename": file_of("sliver.obj", sliver), "face_normals": True})
+    around = AreaElements.of([flat, mi.load_dict({"type": "sphere"}), mi.load_dict({"type": "disk"})])
+    assert cuts_of(around, WALL).tolist() == [1, 1, 1]
+    assert around.area[0] == 0 and around.normal[0].tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize(("count", "cuts"), [(128, 32), (129, 16)])
+def test_many_large_triangles_are_cut_less(count, cuts):
+    """Into a thousand parts each, as long as there are no more than 2^17 in all."""
+    _, found = elements()
+    many = found.take(np.zeros(count, dtype=int))
+    assert cuts_of(many, WALL + np.array([0, 0, 2.0])).tolist() == [cuts] * count
+
+
+def test_points_beyond_a_rim_are_those_of_the_parts_at_it():
+    """By rounding; here by more, counted along both edges of a triangle that is cut in four by four."""
+    shapes, whole = elements()
+    cuts = np.array([4, 1, 1, 1])
+    _, number, cell = cut(whole, cuts)
+    density = np.arange(1.0, len(number) + 1, dtype=np.float32)[None]
+    table = PrimitiveDensity(shapes, whole, cuts, number, cell, density)
+    o, e1, e2 = whole.axes[0, :3]
+    for u, v, i, j, upper in ((3.2, 1.2, 3, 0, 0), (-0.3, 2.2, 0, 2, 0), (1.2, -0.1, 1, 0, 0), (0.6, 3.7, 0, 3, 0),
+                              (2.7, 1.6, 2, 1, 0), (1.7, 0.8, 1, 0, 1), (4.5, -0.2, 3, 0, 0)):  # fmt: skip
+        p = mi.Point3f(*(o + u / 4 * e1 + v / 4 * e2).tolist())
+        found = table.look_up(mi.ShapePtr(shapes[0]), mi.UInt32(0), p, mi.Bool(True), None)
+        own = (number == 0) & (cell == 2 * (4 * j + i) + upper)
+        assert float(found[0]) == density[0, own]
 
 
 def test_parts_cover_their_triangle_once():

@@ -1,12 +1,15 @@
 """Meshes that stand in a scene dictionary: the light of the same mesh in a file, and derivatives by vertices."""
 
+import math
 import pickle
 
+import mitsuba as mi
 import numpy as np
 import pytest
 import torch
 
 import torchtransient as tt
+from torchtransient import plugins
 from torchtransient.errors import SceneError
 from torchtransient.rendering.variant import active_variant
 from torchtransient.scenes.bottle import write_ply
@@ -144,6 +147,63 @@ def test_a_mesh_can_shine():
 def test_what_is_no_mesh(changes, message):
     with pytest.raises(SceneError, match=message), active_variant(VARIANT):
         tt.load(scene_with(diffuse(**changes)), variant=VARIANT).parameters()
+
+
+ARRAYS = {"vertices": OCTAHEDRON, "faces": FACES}
+NAN, INF = math.nan, math.inf
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"vertices": OCTAHEDRON * NAN}, "expected finite vertices"),
+        ({"vertices": np.where(OCTAHEDRON == 1, INF, 0)}, "expected finite vertices"),
+        ({"faces": FACES + 1}, "from 0 to 5, one less than the vertices, got numbers from 1 to 6"),
+        ({"faces": FACES - 1}, "from 0 to 5, one less than the vertices, got numbers from -1 to 4"),
+        ({"faces": FACES + 0.25 * (FACES == 2)}, "expected faces of whole numbers"),
+        ({"normals": OCTAHEDRON[:5]}, r"expected normals .* each of the 6 vertices, got 5 rows\.$"),
+        ({"normals": OCTAHEDRON * NAN}, "expected normals .* got 6 rows with NaN or infinity"),
+        ({"texcoords": OCTAHEDRON}, r"expected texcoords .* each of the 6 vertices, got 9 rows\."),
+        ({"texcoords": np.zeros((1, 3))}, "expected texcoords as rows of two numbers, got 3 numbers"),
+        ({"vertices": np.zeros((2, 2))}, "expected vertices as rows of three numbers, got 4 numbers"),
+        ({"vertices": np.zeros((0, 3))}, "expected vertices as rows of three numbers, got 0 numbers"),
+        ({"faces": None}, "expected faces .*, got nothing"),
+    ],
+)
+def test_mitsuba_itself_is_refused_what_is_no_mesh(changes, message):
+    with active_variant(VARIANT):
+        given = {"type": "mesh_arrays", **ARRAYS, **changes}
+        arrays = {key: mi.TensorXf(np.float32(x)) if isinstance(x, np.ndarray) else x for key, x in given.items()}
+        with pytest.raises(SceneError, match=message), plugins.plugin_errors():
+            mi.load_dict({key: x for key, x in arrays.items() if x is not None})
+
+
+def test_scene_files_name_a_mesh_file():
+    file = '<scene version="3.0.0"><shape type="mesh_arrays"><string name="vertices" value="0 1 2"/></shape></scene>'
+    words = r"vertices as an array \(N, 3\) in a scene dictionary, got str\. .*'ply'"
+    with active_variant(VARIANT), pytest.raises(SceneError, match=words), plugins.plugin_errors():
+        mi.load_string(file)
+
+
+def test_normals_and_vertices_under_a_transform():
+    """Normals stay across the surface where it is stretched, of length one."""
+    normals = np.array([[1.0, 2.0, -2.0], [0.0, 3.0, 4.0], [2.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0, 0, 5.0], [0, -1, 0]])
+    matrix = translate([1.0, -2.0, 0.5]) @ rotate([1, 2, 0], 20) @ scale([0.5, 2.0, 3.0])
+    with active_variant(VARIANT):
+        given = {"vertices": OCTAHEDRON, "faces": FACES, "normals": normals, "texcoords": OCTAHEDRON[:, :2] * [0.5, 2]}
+        arrays = {key: mi.TensorXf(np.float32(x)) for key, x in given.items()}
+        shape = mi.load_dict({"type": "mesh_arrays", **arrays, "to_world": mi.ScalarTransform4f(matrix)})
+        bare = mi.load_dict({"type": "mesh_arrays", **arrays})
+        params, unplaced = mi.traverse(shape), mi.traverse(bare)
+        found = {key: np.array(params[key], dtype=float) for key in params.keys() if key.startswith("vertex_")}  # noqa: SIM118
+        plain = np.array(unplaced["vertex_normals"]).reshape(-1, 3)
+    placed = OCTAHEDRON @ matrix[:3, :3].T + matrix[:3, 3]
+    np.testing.assert_allclose(found["vertex_positions"].reshape(-1, 3), placed, atol=1e-6)
+    expected = normals @ np.linalg.inv(matrix[:3, :3])
+    expected /= np.linalg.norm(expected, axis=1)[:, None]
+    np.testing.assert_allclose(found["vertex_normals"].reshape(-1, 3), expected, atol=1e-6)
+    np.testing.assert_allclose(found["vertex_texcoords"].reshape(-1, 2), OCTAHEDRON[:, :2] * [0.5, 2])
+    np.testing.assert_allclose(plain, normals)
 
 
 def test_missing_arrays_are_named():

@@ -34,13 +34,12 @@ def normal_density(m: Any, alpha_u: Any, alpha_v: Any, ggx: bool) -> Any:
     if ggx:
         total = slope2 + z2
         density = dr.rcp(dr.pi * alpha_u * alpha_v * total * total)
-        visible = m.z > 0
     else:
-        visible = (m.z > 0) & (slope2 < _BECKMANN_CUTOFF * z2)
+        visible = slope2 < _BECKMANN_CUTOFF * z2
         z2 = dr.select(visible, z2, 1.0)
         slope2 = dr.select(visible, slope2, 0.0)
-        density = dr.exp(-slope2 / z2) / (dr.pi * alpha_u * alpha_v * z2 * z2)
-    return dr.select(visible & (density * m.z > _DENSITY_FLOOR), density, 0.0)
+        density = dr.select(visible, dr.exp(-slope2 / z2) / (dr.pi * alpha_u * alpha_v * z2 * z2), 0.0)
+    return dr.select(density * m.z > _DENSITY_FLOOR, density, 0.0)
 
 
 def smith_g1_over_cos(v: Any, m: Any, alpha_u: Any, alpha_v: Any, ggx: bool) -> Any:

@@ -54,14 +54,13 @@ class Interface:
         r_p = self.d * (self.c * self.c * (self.m2 + 1) - 1) * self.over_p * self.over_p
         # Under total reflection both amplitudes have modulus one, and their phases differ by twice that of z.
         re, im = self.m2 * self.c * self.c + self.q * self.q, self.q * self.c * (1 - self.m2)
-        there = self.total & (re * re + im * im > 0)
+        there = self.total & (re > 0)
         scale = dr.rcp(dr.select(there, re * re + im * im, 1.0))
         cos_d, sin_d = dr.select(there, (re * re - im * im) * scale, 1.0), dr.select(there, 2 * re * im * scale, 0.0)
         a = dr.select(self.total, 1.0, 0.5 * (r_s * r_s + r_p * r_p))
         b = dr.select(self.total, 0.0, 0.5 * (r_s * r_s - r_p * r_p))
         c = dr.select(self.total, cos_d, r_s * r_p)
-        s = dr.select(self.total, sin_d, 0.0)
-        return two_by_two(a, b, c, s)
+        return two_by_two(a, b, c, sin_d)
 
     def transmission(self) -> Any:
         """Mueller matrix of refraction, as power through the interface; zero under total reflection."""

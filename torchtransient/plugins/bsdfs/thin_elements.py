@@ -39,9 +39,6 @@ class ThinElement(mi.BSDF):
         for name in (*self.angles, "transmittance"):
             cb.put(name, getattr(self, name), +mi.ParamFlags.Differentiable)
 
-    def matrix(self, si: Any, forward: Any, active: Any) -> Any:
-        raise NotImplementedError
-
     def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> Any:
         bs = dr.zeros(mi.BSDFSample3f)
         bs.wo = -si.wi

@@ -130,13 +130,13 @@ def local_point(kind: Any, a: Any, y: Any, math_of: Any, kinds: tuple[int, ...] 
     """
     select = getattr(math_of, "select", None) if math_of is dr else math_of.where
     s = math_of.sqrt(y)
-    x = [s * (1 - a), s * a, a * 0]
+    x = [s * (1 - a), s * a, 0.0]
     if any(k != TRIANGLE for k in kinds):
         cos, sin = math_of.cos(2 * math.pi * a), math_of.sin(2 * math.pi * a)
         z = 1 - 2 * y
         # 1 - z^2 without a difference of nearly equal numbers.
         q = math_of.sqrt(4 * y * (1 - y))
-        others = {DISK: (s * cos, s * sin, a * 0), SPHERE: (q * cos, q * sin, z), CYLINDER: (cos, sin, y)}
+        others = {DISK: (s * cos, s * sin, 0.0), SPHERE: (q * cos, q * sin, z), CYLINDER: (cos, sin, y)}
         for k in kinds:
             if k in others:
                 x = [select(kind == k, new, old) for new, old in zip(others[k], x, strict=True)]
@@ -154,7 +154,7 @@ def can_be_listed(shape: Any) -> bool:
 
 def _is_sheared(shape: Any) -> bool:
     """Whether the axes of an analytic shape have lost their right angles, or those of a round one their length."""
-    axes = _matrix(shape)[:3, :3].T
+    axes = _matrix(shape)[:3].T
     length = np.linalg.norm(axes, axis=1)
     same = {"Disk": [], "Sphere": [0, 1, 2], "Cylinder": [0, 1]}[shape.class_name()]
     # A disk has no thickness to be sheared.
@@ -171,7 +171,7 @@ def _rows_of(shape: Any) -> tuple[np.ndarray, int, np.ndarray, np.ndarray] | Non
 
 
 def _triangles(mesh: Any) -> tuple[np.ndarray, int, np.ndarray, np.ndarray]:
-    v = np.array(dr.detach(mesh.vertex_positions_buffer()), dtype=np.float64).reshape(-1, 3)
+    v = np.array(mesh.vertex_positions_buffer(), dtype=np.float64).reshape(-1, 3)
     f = np.array(mesh.faces_buffer(), dtype=np.int64).reshape(-1, 3)
     o, e1, e2 = v[f[:, 0]], v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]]
     n = np.cross(e1, e2)
@@ -191,7 +191,7 @@ def _corner_normals(mesh: Any, faces: np.ndarray) -> np.ndarray | None:
     """The normals at the corners of the triangles (F, 3, 3), None where there are none but those of their planes."""
     if mesh.has_face_normals() or not mesh.has_vertex_normals():
         return None
-    return np.array(dr.detach(mesh.vertex_normals_buffer()), dtype=np.float64).reshape(-1, 3)[faces]
+    return np.array(mesh.vertex_normals_buffer(), dtype=np.float64).reshape(-1, 3)[faces]
 
 
 def has_shading_normals(shape: Any) -> bool:
@@ -208,7 +208,7 @@ def has_shading_normals(shape: Any) -> bool:
 
 def _matrix(shape: Any) -> np.ndarray:
     shown = next(v for v in shown_by(shape)[0] if v.key == "to_world")
-    return np.array(dr.detach(shown.read(shape).matrix), dtype=np.float64).reshape(4, 4)
+    return np.array(shown.read(shape).matrix, dtype=np.float64).reshape(4, 4)
 
 
 def _analytic(shape: Any, kind: int) -> tuple[np.ndarray, int, np.ndarray, np.ndarray]:

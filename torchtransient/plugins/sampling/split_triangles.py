@@ -68,7 +68,7 @@ def cut(elements: AreaElements, cuts: np.ndarray) -> tuple[AreaElements, np.ndar
     axes[:, 0] += b1[:, None] * parts.axes[:, 1] + b2[:, None] * parts.axes[:, 2]
     axes[:, 1:3] *= scale[:, None, None]
     axes[triangle, 3] = np.stack([b1, b2, scale], 1)[triangle]
-    parts.axes, parts.area = np.where(triangle[:, None, None], axes, parts.axes), parts.area / n**2
+    parts.axes, parts.area = axes, parts.area / n**2
     return parts, number, cell
 
 
