@@ -30,7 +30,8 @@ KINDS = {"single": {}, "confocal": {}, "exhaustive": {"laser_grid": (2, 5)}}
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("bounces", "first", "last"), [
-    ((3,), 3, 3), (range(4, 9), 4, 8), ("all", 0, -1), (2, 2, 2), (np.array([4, 3]), 3, 4), (torch.tensor([6, 7]), 6, 7),
+    ((3,), 3, 3), (range(4, 9), 4, 8), ("all", 0, -1), (2, 2, 2), (np.array([4, 3]), 3, 4),
+    (torch.tensor([6, 7]), 6, 7),
 ])  # fmt: skip
 def test_scenes_say_what_a_scan_does(kind, bounces, first, last):
     scan = N.Scan.grid(WALL, (4, 3), kind=kind, first_and_last_leg=True, **KINDS[kind])
@@ -113,7 +114,7 @@ def test_things_have_names(hidden, names):
 def test_things_that_are_none(hidden):
     with pytest.raises(SceneError, match="hidden: expected a Mitsuba shape dictionary"):
         shapes_of(hidden)
-    with pytest.raises(SceneError, match="hidden: expected 'a' as a dictionary with a type, got {}"):
+    with pytest.raises(SceneError, match=r"hidden: expected 'a' as a dictionary with a type, got {}"):
         shapes_of({"a": {}})
 
 
@@ -218,7 +219,7 @@ def test_arguments_of_tals_scenes(tmp_path, entries, wanted):
 @pytest.mark.parametrize("entry", ["geometry: []", "relay_wall: wall"])
 def test_scenes_of_tal_are_told_by_their_entries(tmp_path, entry):
     (tmp_path / "a.yaml").write_text(entry + "\n")
-    with pytest.raises(SceneError, match="y-tal scene: .*geometry"):
+    with pytest.raises(SceneError, match=r"y-tal scene: .*geometry"):
         N.read_setup(tmp_path / "a.yaml")
 
 
@@ -301,7 +302,7 @@ num_bins: 16
 
 @pytest.mark.parametrize("value", ["3", "[]", "{a: 1}", "null"])
 def test_things_of_tal_are_a_list(value):
-    with pytest.raises(SceneError, match="y-tal scene: .*geometry"):
+    with pytest.raises(SceneError, match=r"y-tal scene: .*geometry"):
         read_tal_yaml(f"relay_wall: wall\ngeometry: {value}\n")
 
 

@@ -232,7 +232,7 @@ def test_names_of_descriptions(tmp_path):
     for source in (tmp_path / "office.yaml", str(tmp_path / "office.yaml")):
         assert read_description(source).name == "office"
     for name in ("3", "null", "1.5"):
-        with pytest.raises(SceneError, match="hidden: .*: expected a name without dots, and one of .*, got .'shape'"):
+        with pytest.raises(SceneError, match="expected a name without dots, and one of scene"):
             read_description(SHORT.replace("letter: {scene: nlos_letter}", f"{name}: {{shape: cube}}"))
 
 

@@ -193,10 +193,10 @@ def test_a_thousandth_of_a_scan_is_near_enough():
         scene_scan._check_same(ends, points + np.array([[0, 0, np.nextafter(1.0, 2)], [0, 0, 0]]), points, "sensor")
 
 
-def surface(flipped=False, twosided=False, **placed):
+def surface(flipped, twosided):
     bsdf = {"type": "diffuse"}
-    return {"type": "rectangle", "flip_normals": flipped, "bsdf": {"type": "twosided", "bsdf": bsdf} if twosided else bsdf,
-            "to_world": tt.scenes.transforms.translate([0, 0, 1.5]), **placed}  # fmt: skip
+    return {"type": "rectangle", "flip_normals": flipped, "to_world": tt.scenes.transforms.translate([0, 0, 1.5]),
+            "bsdf": {"type": "twosided", "bsdf": bsdf} if twosided else bsdf}  # fmt: skip
 
 
 @pytest.mark.parametrize("flipped", [False, True])

@@ -375,6 +375,6 @@ def test_light_without_a_slab_is_not_negative(dtype):
 @pytest.mark.parametrize("device", ["tpu", "cuda:99", ""])
 def test_devices_that_are_none(device):
     assert moved_to(captured(), "cpu").transient.device.type == "cpu"
-    with pytest.raises(DeviceError, match="reconstruct: expected a device that torch has, got .*: .") as caught:
+    with pytest.raises(DeviceError, match=r"reconstruct: expected a device that torch has, got .*: .") as caught:
         moved_to(captured(), device)
     assert "\n" not in str(caught.value)
