@@ -75,6 +75,7 @@ def test_a_parameter_that_changed_is_another_simulation(tmp_path):
 
 
 def test_scenes_that_cannot_be_read_have_no_files(tmp_path):
-    (tmp_path / "scene.xml").write_text(SCENE.format(named='<shape type="obj"><string name="a" value="$none"/></shape>'))
+    unfilled = SHAPE.format(name="$none")
+    (tmp_path / "scene.xml").write_text(SCENE.format(named=unfilled))
     with pytest.raises(SceneError, match=r"scene\.xml: .*none"):
         files_of(tt.load(tmp_path / "scene.xml", variant=VARIANT))
