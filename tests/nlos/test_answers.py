@@ -23,7 +23,7 @@ from torchtransient.errors import (
     TorchTransientError,
     UnitError,
 )
-from torchtransient.nlos import defaults, work
+from torchtransient.nlos import answers, defaults, work
 from torchtransient.nlos.renderer import LASER_ORIGIN, ORIGIN, POINTS, SPOTS
 from torchtransient.rendering.renderer import TransientRenderer
 
@@ -190,6 +190,40 @@ def test_sensors_without_a_generator(kind):
     torch.testing.assert_close(layer(seed=0, generator=generator).transient, doubled.transient, rtol=1e-5, atol=1e-9)
 
 
+class Open(torch.nn.Module):
+    """A module that takes any settings."""
+
+    def forward(self, transient, **settings):
+        self.settings = settings
+        return transient
+
+
+class Asked(sensing.Sensor):
+    """Remembers what it was given."""
+
+    def expected(self, x):
+        self.asked = tuple(x.shape), x.device.type
+        return x
+
+
+def test_generators_go_to_who_takes_them():
+    light, generator = torch.rand(1, 3, 4, 4, generator=torch.Generator().manual_seed(0)), torch.Generator()
+    sensor = Open()
+    assert torch.equal(answers.measured(light, scan(), sensor, generator), light)
+    assert sensor.settings == {"generator": generator}
+    assert torch.equal(answers.measured(light, scan(), Plain(), generator), 2 * light)
+
+
+def test_sensors_are_tried_where_they_are():
+    """On the device of their tensors, or on the processor where they have none."""
+    for buffers in ({}, {"weight": torch.ones(40, 1, 1, device="meta")}):
+        sensor = Asked()
+        for name, tensor in buffers.items():
+            sensor.register_buffer(name, tensor)
+        assert answers.checked_module(sensor, AXIS) is sensor
+        assert sensor.asked == ((1, 40, 1, 1), "meta" if buffers else "cpu")
+
+
 def response(axis):
     return sensing.ImpulseResponse(sensing.GaussianResponse(200e-12), axis)
 
@@ -206,6 +240,7 @@ def correlation(axis):
         (correlation(tt.TimeAxis(0.0, 0.05, 40)), UnitError, r"the axis of stage '0' \(ItofCorrelation"),
         (correlation(tt.TimeAxis(1.5, 0.05, 41)), UnitError, r"the axis of stage '0' \(ItofCorrelation"),
         (correlation(AXIS), SceneError, "expected an answer with the transient's 40 bins, got 8"),
+        (sensing.Compose([correlation(AXIS)]), SceneError, "expected an answer with the transient's 40 bins, got 8"),
     ],
 )  # fmt: skip
 def test_sensors_that_do_not_fit_are_said_before_the_render(monkeypatch, sensor, error, message):
@@ -257,6 +292,10 @@ def test_layers_without_light_say_it_once():
     found = physics_of(lambda: [layer(seed=seed) for seed in range(3)])
     assert len(found) == 1 and found[0].startswith("CaptureRenderer: no light comes back from the hidden things.")
     assert physics_of(lambda: renderer(hidden=TOWARDS)(seed=0)) == []
+    # What was said of something else does not explain it.
+    other = renderer(hidden=AWAY)
+    other.renderer.scene.told.add("window of a film")
+    assert len(physics_of(lambda: other(seed=0))) == 1
     assert physics_of(lambda: renderer(hidden=AWAY, physics="ignore")(seed=0)) == []
     strict = renderer(hidden=AWAY, physics="error")
     for _ in range(2):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -27,7 +29,10 @@ KINDS = {"single": {}, "confocal": {}, "exhaustive": {"laser_grid": (2, 5)}}
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize(("bounces", "first", "last"), [((3,), 3, 3), (range(4, 9), 4, 8), ("all", 0, -1), (2, 2, 2)])
+@pytest.mark.parametrize(("bounces", "first", "last"), [
+    ((3,), 3, 3), (range(4, 9), 4, 8), ("all", 0, -1), (2, 2, 2), (np.array([4, 3]), 3, 4),
+    (torch.tensor([6, 7]), 6, 7),
+])  # fmt: skip
 def test_scenes_say_what_a_scan_does(kind, bounces, first, last):
     scan = N.Scan.grid(WALL, (4, 3), kind=kind, first_and_last_leg=True, **KINDS[kind])
     scene = capture_scene(Z, scan, bounces=bounces, energy=2.5)
@@ -103,10 +108,21 @@ def test_things_have_names(hidden, names):
     assert sorted(shapes_of(hidden)) == names
 
 
-@pytest.mark.parametrize("hidden", [None, 3, (1, 2, 3), object()])
+@pytest.mark.parametrize(
+    "hidden", [None, 3, (1, 2, 3), object(), SimpleNamespace(vertices=np.eye(3)), SimpleNamespace(faces=[[0, 1, 2]])]
+)
 def test_things_that_are_none(hidden):
     with pytest.raises(SceneError, match="hidden: expected a Mitsuba shape dictionary"):
         shapes_of(hidden)
+    with pytest.raises(SceneError, match=r"hidden: expected 'a' as a dictionary with a type, got {}"):
+        shapes_of({"a": {}})
+
+
+def test_objects_with_vertices_and_faces_are_meshes():
+    found = shapes_of(SimpleNamespace(vertices=np.eye(3), faces=[[0, 1, 2]]))["hidden"]
+    assert found["type"] == "mesh_arrays"
+    np.testing.assert_array_equal(found["vertices"], np.eye(3))
+    np.testing.assert_array_equal(found["faces"], [[0, 1, 2]])
 
 
 @pytest.mark.parametrize("kind", ["area", "point", "spot", "projector", "constant", "envmap", "directional"])
@@ -176,6 +192,44 @@ def test_setups_are_files_of_three_kinds(tmp_path):
             N.read_setup(tmp_path / path, **given)
 
 
+@pytest.mark.parametrize(("entries", "wanted"), [
+    ("", {"time_axis": tt.TimeAxis(0.0, 0.003, 16), "frequencies": None, "energy": 1.0, "variant": None,
+          "bounces": "all", "spp": 1_000_000}),
+    ("mitsuba_variant: llvm_ad_mono\nlaser_emission: 1, 2, 3",
+     {"variant": "llvm_ad_mono", "energy": {"type": "rgb", "value": [1.0, 2.0, 3.0]}}),
+    ("laser_emission: 2.5, 2.5, 2.5\nintegrator_filter_bounces: 2\nsample_count: 7",
+     {"energy": 2.5, "bounces": (3,), "spp": 7}),
+    ("laser_emission_mode: mono\nlaser_emission: 4\nintegrator_max_depth: 5\nintegrator_discard_direct_paths: true",
+     {"energy": 4.0, "bounces": (3, 4, 5)}),
+    ("histogram_mode: frequency\nwl_mean: 0.02\nwl_sigma: 0.03", {"time_axis": None}),
+])  # fmt: skip
+def test_arguments_of_tals_scenes(tmp_path, entries, wanted):
+    (tmp_path / "a").mkdir()
+    path = tmp_path / "a" / "a.yaml"
+    path.write_text(TAL + entries + "\n")
+    said = read_tal_yaml(path)
+    for source in (path, tmp_path / "a"):
+        found = N.read_setup(source)
+        assert set(found) == {"hidden", "scan", "time_axis", "frequencies", "spp", "bounces", "energy", "variant"}
+        assert found["scan"] == said.scan and found["hidden"].keys() == {"ball"}
+        assert {name: found[name] for name in wanted} == wanted
+        assert (found["frequencies"] is None) == (found["time_axis"] is not None)
+
+
+@pytest.mark.parametrize("entry", ["geometry: []", "relay_wall: wall"])
+def test_scenes_of_tal_are_told_by_their_entries(tmp_path, entry):
+    (tmp_path / "a.yaml").write_text(entry + "\n")
+    with pytest.raises(SceneError, match=r"y-tal scene: .*geometry"):
+        N.read_setup(tmp_path / "a.yaml")
+
+
+def test_setups_of_all_bounces(tmp_path):
+    for bounces, found in (("all", "all"), ("[3, 4]", (3, 4))):
+        text = f"hidden: {{a: {{shape: cube}}}}\nscan: {{kind: confocal, size: 2}}\nbounces: {bounces}\n"
+        (tmp_path / "a.yml").write_text(text)
+        assert N.read_setup(tmp_path / "a.yml")["bounces"] == found
+
+
 def test_meshes_of_one_array(tmp_path):
     np.savez(tmp_path / "a.npz", vertices=np.eye(3))
     with pytest.raises(StorageError, match=r"hidden: expected 'vertices' and 'faces' in .*, got vertices alone"):
@@ -212,6 +266,7 @@ def test_parts_beyond_the_last_row(tmp_path, done):
     ({"id": "custom", "text": "<bsdf type='a'><float value='1'/></bsdf>"}, "<float> in a material is not supported"),
     ({"id": "custom", "text": "<bsdf type='a'><float name='b'/></bsdf>"}, "<float> in a material is not supported"),
     ({"id": "custom", "text": "<texture type='a'/>"}, "of one <bsdf>, got <texture>"),
+    ({"id": "custom", "text": "<bsdf type='a'><matrix name='b' value='1'/></bsdf>"}, "<matrix> in a material is not"),
 ])  # fmt: skip
 def test_materials_of_tal_that_are_none(data, words):
     with pytest.raises(SceneError, match=f"here: .*{words}"):
@@ -220,6 +275,9 @@ def test_materials_of_tal_that_are_none(data, words):
 
 def test_materials_and_spectra_of_tal():
     assert material({"id": "copper", "alpha": 0.25}, "here")["alpha"] == 0.25
+    numbers = "<bsdf type='a'><integer name='b' value='3'/><float name='c' value='3'/></bsdf>"
+    found = material({"id": "custom", "text": numbers}, "here")
+    assert found["b"] == found["c"] == 3 and type(found["b"]) is int and type(found["c"]) is float
     text = "<!-- a --><bsdf type='a'><rgb name='b' value='0.5'/><boolean name='c' value='false'/></bsdf>"
     assert material({"id": "custom", "text": text}, "here") == {
         "type": "a", "b": {"type": "rgb", "value": [0.5, 0.5, 0.5]}, "c": False
@@ -240,6 +298,12 @@ sensor_width: 8
 sensor_height: 4
 num_bins: 16
 """
+
+
+@pytest.mark.parametrize("value", ["3", "[]", "{a: 1}", "null"])
+def test_things_of_tal_are_a_list(value):
+    with pytest.raises(SceneError, match=r"y-tal scene: .*geometry"):
+        read_tal_yaml(f"relay_wall: wall\ngeometry: {value}\n")
 
 
 @pytest.mark.parametrize(("entries", "found"), [
@@ -297,6 +361,10 @@ def test_normals_of_points_that_move_are_those_of_a_flat_wall():
     assert _lasting(bent) == {"sensor_normals": None, "laser_normals": None}
     bare = N.Scan.points(flat.sensor_points, kind="confocal", sensor_origin=(0, 0, 1), laser_origin=(0, 0, 1))
     assert _lasting(bare) == {"sensor_normals": None, "laser_normals": None} and _lasting_normals(bare, ()) is None
+    one = N.Scan.grid(WALL, 1, kind="confocal")
+    assert _lasting(one)["sensor_normals"] is one.sensor_normals
+    carrying = replace(flat, sensor_normals=flat.sensor_normals.clone().requires_grad_())
+    np.testing.assert_array_equal(_lasting_normals(carrying, ()), flat.sensor_normals.reshape(-1, 3))
     # Known while nothing of the wall or its points moves; origins and hidden things may.
     found = _lasting_normals(flat, ["letter.vertex_positions", "wall.sensor.sensor_origin"])
     assert found.shape == (12, 3) and (found == [0, 0, 1]).all()

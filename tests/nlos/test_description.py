@@ -136,6 +136,7 @@ def test_axes_and_bounces():
     uniform = read(frequencies={"first": 1.0, "step": 0.5, "count": 4, "start_opl": 2.0})
     assert uniform.frequencies == FrequencyAxis.uniform(1.0, 0.5, 4, start_opl=2.0)
     assert read(bounces="all").bounces is None and read(bounces=4).bounces == (4,)
+    assert read(bounces=[2, 1]).bounces == (1, 2)
 
 
 def test_a_sensor_in_place():
@@ -209,6 +210,8 @@ MESH = {"vertices": [[0, 0, 1], [1, 0, 1], [0, 1, 1]], "faces": [[0, 2, 1]]}
         ({"frequencies": {"first": 1.0}}, SceneError, "an entry 'step'"),
         ({"spp": 0}, SceneError, "spp: expected a whole number of at least 1"),
         ({"bounces": [2.5]}, SceneError, "bounces: expected"),
+        ({"bounces": [0]}, SceneError, "bounces: expected"),
+        ({"time_axis": {"num_bins": 4}}, SceneError, "together, or neither"),
         ({"bounces": []}, SceneError, "bounces: expected"),
         ({"seed": -1}, SceneError, "at least 0"),
         ({"sensor": "none.yaml"}, SceneError, "^sensor: no file 'none.yaml'"),
@@ -222,6 +225,22 @@ MESH = {"vertices": [[0, 0, 1], [1, 0, 1], [0, 1, 1]], "faces": [[0, 2, 1]]}
 def test_what_is_refused(entries, error, message):
     with pytest.raises(error, match=message):
         read(**entries)
+
+
+def test_names_of_descriptions(tmp_path):
+    (tmp_path / "office.yaml").write_text(SHORT)
+    for source in (tmp_path / "office.yaml", str(tmp_path / "office.yaml")):
+        assert read_description(source).name == "office"
+    for name in ("3", "null", "1.5"):
+        with pytest.raises(SceneError, match="expected a name without dots, and one of scene"):
+            read_description(SHORT.replace("letter: {scene: nlos_letter}", f"{name}: {{shape: cube}}"))
+
+
+def test_walls_of_other_files(tmp_path):
+    (tmp_path / "wall.obj").write_text("v 0 0 1\nv 1 0 1\nv 0 1 1\nf 1 3 2\n")
+    (tmp_path / "a.yaml").write_text(SHORT + "wall: {file: wall.obj}\n")
+    with pytest.raises(SceneError, match=r"wall: expected an \.npz file with vertices and faces, got 'wall\.obj'"):
+        read_description(tmp_path / "a.yaml")
 
 
 def test_bins_of_a_mesh_file_have_to_be_given(tmp_path):

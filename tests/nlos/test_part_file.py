@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -104,7 +105,8 @@ def test_rows_that_were_changed(path):
         assert kept.has(1)
     whole[-50] ^= 1
     data.write_bytes(whole)
-    with pytest.raises(StorageError, match=r"rows 2 to 3 are not those.*Delete both"), PartFile(path, "key"):
+    words = r"^part file: '.*npy' is damaged .* rows 2 to 3 are not those.*Delete both"
+    with pytest.raises(StorageError, match=words), PartFile(path, "key"):
         pass
 
 
@@ -171,3 +173,49 @@ def test_one_process_at_a_time(path):
 def test_a_folder_that_is_missing(tmp_path):
     with pytest.raises(StorageError, match="does not exist"), PartFile(tmp_path / "no" / "a.part", "key"):
         pass
+
+
+def test_files_of_another_form(path):
+    """Whatever their simulation: they are neither read nor deleted."""
+    with PartFile(path, "key") as kept:
+        keep(kept, 0)
+    path.write_text(path.read_text().replace(part_file.FORMAT, "torchtransient part 1"))
+    for opened in (lambda: PartFile(path, "key").__enter__(), lambda: delete_part_file(path)):
+        with pytest.raises(StorageError, match="belongs to another simulation"):
+            opened()
+    assert path.exists()
+
+
+def test_parts_of_one_row_and_of_none(path):
+    with PartFile(path, "key") as kept:
+        kept.keep(0, 2, rows(0, count=1), total=3, seconds=0.0, about=ABOUT)
+    with PartFile(path, "key") as kept:
+        np.testing.assert_array_equal(kept.rows(2, 1), rows(0, count=1))
+    path.write_text(json.dumps({**json.loads(path.read_text()), "done": {"0": [0, 0, 0]}}))
+    with pytest.raises(StorageError, match="is not the part file of a simulation"), PartFile(path, "key"):
+        pass
+
+
+def test_a_lock_that_cannot_be_opened(path):
+    lock = path.with_name(path.name + ".lock")
+    lock.mkdir()
+    with pytest.raises(StorageError, match=rf"part file: '{lock}' could not be opened: "), PartFile(path, "key"):
+        pass
+
+
+@pytest.mark.skipif(os.name == "nt", reason="the system keeps files that are open")
+def test_a_lock_is_held_until_its_file_is_gone(path, monkeypatch):
+    """Who takes it in between has the lock of a file that is nobody's any more."""
+    real, asked = Path.unlink, []
+
+    def unlink(file, **settings):
+        if file.suffix == ".lock":
+            with file.open("a+") as other, pytest.raises(BlockingIOError):
+                part_file._hold(other)
+            asked.append(file.name)
+        real(file, **settings)
+
+    with PartFile(path, "key") as kept:
+        keep(kept, 0)
+        monkeypatch.setattr(Path, "unlink", unlink)
+    assert asked == [f"{path.name}.lock"]

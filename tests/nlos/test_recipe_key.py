@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 import torchtransient as tt
-from torchtransient.errors import StorageError
+from torchtransient.errors import SceneError, StorageError
+from torchtransient.nlos.scene_files import files_of
 
 VARIANT = "llvm_ad_mono"
 MESH = "v -0.4 -0.4 {z}\nv -0.4 0.4 {z}\nv 0.4 0.4 {z}\nf 1 2 3\n"
@@ -71,3 +72,10 @@ def test_a_parameter_that_changed_is_another_simulation(tmp_path):
     tt.nlos.simulate(tt.load(tmp_path / "scene.xml"), **settings)
     with pytest.raises(StorageError, match="belongs to another simulation"):
         tt.nlos.simulate(tt.load(tmp_path / "scene.xml", mesh="given.obj"), **settings)
+
+
+def test_scenes_that_cannot_be_read_have_no_files(tmp_path):
+    unfilled = SHAPE.format(name="$none")
+    (tmp_path / "scene.xml").write_text(SCENE.format(named=unfilled))
+    with pytest.raises(SceneError, match=r"scene\.xml: .*none"):
+        files_of(tt.load(tmp_path / "scene.xml", variant=VARIANT))

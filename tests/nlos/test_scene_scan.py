@@ -15,6 +15,7 @@ from torchtransient.errors import SceneError, TorchTransientWarning
 from torchtransient.nlos import scene_scan
 from torchtransient.nlos.scene_scan import Ends
 
+VARIANT = "llvm_ad_mono"
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -126,8 +127,9 @@ def boxed(low, high, area=1.0, name="thing"):
         return area
 
     return SimpleNamespace(
-        bbox=lambda: SimpleNamespace(min=low, max=high), id=lambda: name, surface_area=surface_area
-    )
+        bbox=lambda: SimpleNamespace(min=low, max=high), id=lambda: name, surface_area=surface_area,
+        class_name=lambda: "Thing",
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("low, high, before", [
@@ -167,3 +169,71 @@ def test_tolerances_of_a_scan():
     with no_gradient_is_lost():
         carrying = replace(near, sensor_points=points.clone().requires_grad_(), laser_points=points.clone())
         assert scene_scan.tolerance_of(carrying) == scene_scan.tolerance_of(near)
+
+
+# ---------------------------------------------------------------------------------------------------- numbers of bounds
+
+
+@pytest.mark.parametrize("origin, way", [
+    # Behind the plane and away from it, along it from behind, and on it.
+    ((0.5, 0.25, -1.0), (0.0, 0.6, -0.8)), ((0.5, 0.25, -1.0), (1.0, 0.0, 0.0)), ((0.5, 0.25, 0.0), (0.0, 0.0, -1.0)),
+])  # fmt: skip
+def test_rays_that_leave_the_wall_behind(origin, way):
+    ends = looking(GRID, met=[k != 3 for k in range(12)])
+    ends.origins[3], ends.directions[3] = origin, way
+    with pytest.raises(SceneError, match="1 of the sensor's 12 rays meet nothing in the scene, 1 of them not even"):
+        scene_scan._on_extended_wall(ends, (3, 4))
+
+
+def test_a_thousandth_of_a_scan_is_near_enough():
+    points = np.array([[0.0, 0, 0], [600.0, 800.0, 0]])
+    ends = looking(points, origin=(300.0, 400.0, 1.0))
+    scene_scan._check_same(ends, points + np.array([[0, 0, 1.0], [0, 0, 0]]), points, "sensor")
+    with pytest.raises(SceneError, match="1 of 2 sensor points"):
+        scene_scan._check_same(ends, points + np.array([[0, 0, np.nextafter(1.0, 2)], [0, 0, 0]]), points, "sensor")
+
+
+def surface(flipped, twosided):
+    bsdf = {"type": "diffuse"}
+    return {"type": "rectangle", "flip_normals": flipped, "to_world": tt.scenes.transforms.translate([0, 0, 1.5]),
+            "bsdf": {"type": "twosided", "bsdf": bsdf} if twosided else bsdf}  # fmt: skip
+
+
+@pytest.mark.parametrize("flipped", [False, True])
+@pytest.mark.parametrize("twosided", [False, True])
+def test_rays_end_on_the_side_that_they_come_from(flipped, twosided):
+    import mitsuba as mi
+
+    scene = mi.load_dict({"type": "scene", "plate": surface(flipped, twosided)})
+    # Upwards onto the plate, and past it on both sides.
+    ray = mi.Ray3f(mi.Point3f([0.5, 3.0, 0.25], 0.0, 0.0), mi.Vector3f(0.0, 0.0, [1.0, 1.0, 1.0]))
+    if not flipped and not twosided:
+        with pytest.raises(SceneError, match="2 of 3 rays end on the back of 'plate'"):
+            scene_scan._ends(scene, ray)
+        return
+    ends = scene_scan._ends(scene, ray)
+    assert ends.shapes == ["plate", "", "plate"] and ends.missed().tolist() == [1]
+    np.testing.assert_allclose(ends.points[[0, 2]], [[0.5, 0, 1.5], [0.25, 0, 1.5]])
+    np.testing.assert_allclose(ends.normals[[0, 2]], [[0, 0, -1], [0, 0, -1]], atol=1e-7)
+    np.testing.assert_allclose(ends.directions, [[0, 0, 1]] * 3)
+
+
+def test_things_without_a_name_have_that_of_their_class():
+    box = ((0, 0, 1), (1, 1, 2))
+    with pytest.raises(SceneError, match=r"an area that light falls on, got 'Thing' \(0 m\^2\)"):
+        scene_scan._check_areas([boxed(*box, area=0.0, name="")])
+    unnamed = SimpleNamespace(shapes=lambda: [boxed((0, 0, -1), (1, 1, 0), name="wall"), boxed(*box, name="")])
+    scene_scan._check_hidden(unnamed, looking(GRID))
+    met = looking(GRID)
+    met.shapes[5] = "Thing"
+    with pytest.raises(SceneError, match="at least one shape beside the wall, got none"):
+        scene_scan._check_hidden(unnamed, met)
+
+
+@pytest.mark.parametrize("moved", ["sensor_points", "laser_points"])
+def test_points_that_carry_gradients_are_looked_at(moved):
+    scan = tt.nlos.Scan.grid(tt.nlos.Wall.plane(), (3, 2), kind="single")
+    scan = replace(scan, **{moved: getattr(scan, moved).clone().requires_grad_()})
+    scene = tt.load(tt.nlos.capture_scene(tt.scenes.nlos_z(), scan), variant="llvm_ad_mono")
+    with no_gradient_is_lost():
+        tt.nlos.renderer.check_scan(scene, scan)

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 import torchtransient as tt
-from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
+from support.scalars import no_gradient_is_lost
+from torchtransient.errors import ArgumentError, DeviceError, SceneError, ShapeError, UnitError
 from torchtransient.nlos import volume_memory
 from torchtransient.nlos.methods import default_wavelength, pitch_of
+from torchtransient.nlos.preparation import moved_to
 from torchtransient.nlos.reconstruct import camera_of, checked_depths
 from torchtransient.nlos.volume_memory import least_bytes
 
@@ -84,6 +88,8 @@ def test_what_is_asked_of_memory(monkeypatch):
         volume_memory.check_volume_fits("fk", capture, None, {})
     assert set(asked) == {"llvm"}
     volume_memory.check_volume_fits("fk", capture.to("meta"), None, {})
+    monkeypatch.setattr(volume_memory, "available_bytes", lambda variant: None)
+    volume_memory.check_volume_fits("fk", capture, None, {})
 
 
 # -------------------------------------------------------------------------------------------------------- default grids
@@ -113,6 +119,32 @@ def test_legs_come_off_the_depths():
         early = N.Capture(torch.zeros(1, 10, *scan.shape), tt.TimeAxis(start, 0.04, 10), scan)
         with pytest.raises(UnitError, match=f"longer than its legs, {legs:.4g} m"):
             N.default_grid(early)
+    # Two metres of legs, and a record that ends there.
+    one = listed([[0.0, 0.0, 0.0]], first_and_last_leg=True)
+    with pytest.raises(UnitError, match="longer than its legs, 2 m, got 2 m"):
+        N.default_grid(N.Capture(torch.zeros(1, 8, 1), tt.TimeAxis(0.0, 0.25, 8), one))
+
+
+def test_scans_that_carry_gradients_have_plain_numbers():
+    scan = replace(SCANS["confocal"], first_and_last_leg=True)
+    axis = tt.TimeAxis(float(scan.legs.min()) + 0.4, 0.04, 10)
+    plain = N.Capture(torch.zeros(1, 10, *scan.shape), axis, scan)
+    points = scan.sensor_points.clone().requires_grad_()
+    carrying = replace(plain, scan=replace(scan, sensor_points=points, laser_points=points))
+    lists = [listed(scan.sensor_points.reshape(-1, 3)[:5].clone().requires_grad_(keep)) for keep in (True, False)]
+    with no_gradient_is_lost():
+        assert N.default_grid(carrying) == N.default_grid(plain)
+        assert pitch_of(lists[0]) == pitch_of(lists[1]) > 0
+
+
+def test_voxels_stand_before_the_points_of_a_flat_grid():
+    scan = SCANS["confocal"]
+    found = N.default_grid(captured(), depths=(0.25, 0.5), planes=2)
+    assert found == N.VoxelGrid.before(scan, [0.3125, 0.4375])
+    # As many on a wall that is not flat, rows first.
+    corners = [[-0.5, -0.3, 0.0], [0.5, -0.3, 0.0], [0.5, 0.3, 0.1], [-0.5, 0.3, 0.0]]
+    bent = N.Scan.grid((corners, [[0, 1, 2], [0, 2, 3]]), (5, 6), kind="confocal")
+    assert N.default_grid(N.Capture(torch.zeros(1, 64, 6, 5), AXIS, bent), depths=(0.2, 0.4)).size == (6, 5)
 
 
 def listed(points, **changes):
@@ -128,12 +160,16 @@ def test_lists_have_as_many_voxels_as_a_square_of_them(count, side):
     assert N.default_grid(capture, depths=(0.2, 0.4)).size == (side, side)
     assert N.default_grid(capture, depths=(0.2, 0.4), size=(7, 2)).size == (2, 7)
     assert N.default_grid(capture, depths=(0.2, 0.4), size=3, extent=(0.3, 0.6)).pitch == pytest.approx((0.2, 0.1))
+    wide = N.default_grid(capture, depths=(0.2, 0.4), extent=(0.25, 0.5))
+    assert wide.size == (side, side) and wide.pitch == pytest.approx((0.5 / side, 0.25 / side))
 
 
-@pytest.mark.parametrize(("off", "spans"), [(0.9e-6, False), (1.1e-6, True)])
-def test_points_on_one_line_to_a_millionth(off, spans):
-    # Two pairs of points: spreads of 2 along the line, and of twice the height across.
-    scan = listed([[-0.5, -0.5 * off, 0], [-0.5, 0.5 * off, 0], [0.5, -0.5 * off, 0], [0.5, 0.5 * off, 0]], wall=WALL)
+@pytest.mark.parametrize("long", [1.0, 0.125])
+@pytest.mark.parametrize(("off", "spans"), [(0.9e-6, False), (1.1e-6, True), (None, False)])
+def test_points_on_one_line_to_a_millionth(off, spans, long):
+    # Two pairs of points: spreads of 2 along the line, and of twice the height across; or one place four times.
+    corners = [[-1, -off, 0], [-1, off, 0], [1, -off, 0], [1, off, 0]] if off is not None else [[0.25, 0.25, 0]] * 4
+    scan = listed(0.5 * long * torch.tensor(corners, dtype=F64), wall=WALL)
     capture = N.Capture(torch.zeros(1, 64, 4), AXIS, scan)
     if spans:
         assert N.default_grid(capture, depths=(0.2, 0.4)).size == (2, 2)
@@ -198,6 +234,7 @@ def test_times_of_a_film():
         ("transient", None, ArgumentError, "got none"),
         ("film", None, ArgumentError, "a camera direct, confocal or transient, got 'film'"),
         (None, (0, 1, 2), ArgumentError, "a camera direct"), ("confocal", (0, 1), UnitError, "start, stop, count"),
+        (np.array(["direct", "film"]), None, ArgumentError, "a camera direct"),
     ):  # fmt: skip
         with pytest.raises(error, match=words):
             camera_of(name, times)
@@ -276,3 +313,68 @@ def test_options_that_are_names(value):
             N.reconstruct(captured(), "fbp", filter="laplacian", progress=False, **options)
     with pytest.raises(ArgumentError, match=r"expected grid as a tt\.nlos\.VoxelGrid, got 3"):
         N.reconstruct(captured(), "bp", grid=3, progress=False)
+
+
+@pytest.mark.parametrize(("name", "passes"), [("bp", [16, 4]), ("fbp", [16, 4]), ("phasor", [20])])
+def test_planes_of_a_volume_are_made_some_at_a_time(monkeypatch, name, passes):
+    """Those of backprojection sixteen at a time; phasor fields share their spectra over all of them."""
+    module, made = sys.modules["torchtransient.nlos.reconstruct"], []
+    kind = {"bp": "Backprojection", "fbp": "FilteredBackprojection", "phasor": "PhasorField"}[name]
+
+    class Counted(getattr(N, kind)):
+        def __init__(self, scan, voxels, **settings):
+            made.append(len(voxels.depths))
+            super().__init__(scan, voxels, **settings)
+
+    monkeypatch.setattr(module, kind, Counted)
+    scan = N.Scan.grid(WALL, (3, 2), kind="confocal")
+    light = torch.rand(1, 64, 2, 3, generator=torch.Generator().manual_seed(0))
+    voxels = N.VoxelGrid.before(scan, torch.linspace(0.1, 0.5, 20))
+    found = N.reconstruct(N.Capture(light, AXIS, scan), name, grid=voxels, wavelength=None if name == "bp" else 0.3,
+                          progress=False)  # fmt: skip
+    assert made == passes and found.grid == voxels
+    settings = {"bp": {}, "fbp": {"filter": N.PhasorFilter(0.3)}, "phasor": {"pulse": N.PhasorFilter(0.3)}}[name]
+    expected = getattr(N, kind)(scan, voxels, time_axis=AXIS, **settings).reconstruct(light)
+    torch.testing.assert_close(found.values, expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max()))
+
+
+def test_settings_that_were_given_are_told():
+    told = N.reconstruct(captured(), "lct", depths=(0.2, 0.4), v_bins=100, progress=False).metadata["settings"]
+    assert told["v_bins"] == 100 and told["target"] == N.reconstruct(
+        captured(), "lct", depths=(0.2, 0.4), progress=False).metadata["settings"]["target"]  # fmt: skip
+    camera = N.ConfocalCamera([0.1, 0.2])
+    told = N.reconstruct(captured(), "phasor", depths=(0.2, 0.25), camera=camera, progress=False).metadata["settings"]
+    assert told["camera"] == repr(camera) != repr(N.DirectLight())
+
+
+def test_methods_say_which_scans_they_take():
+    with pytest.raises(ArgumentError, match=r"'lct' takes confocal scans, and this one is single\. Take one of mid"):
+        N.reconstruct(captured("single"), "lct", progress=False)
+
+
+# ---------------------------------------------------------------------------------------------------------------- slabs
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_light_without_a_slab_is_not_negative(dtype):
+    scan, axis = N.Scan.grid(WALL, (3, 2), kind="confocal"), tt.TimeAxis(0.0, 0.02, 32)
+    light = torch.rand(2, 4, 1, 32, 2, 3, generator=torch.Generator().manual_seed(0), dtype=dtype)
+    steady = torch.ones(2, 4, 1, 2, 3)
+    stokes = N.Capture(light, axis, scan, polarized=True, steady=steady)
+    found = N.without_slab(stokes, 0.02, 10.0)
+    slab = N.DiffusionDeconvolution(scan, time_axis=axis, thickness=0.02, snr=10.0, dtype=F64)
+    clear = slab.reconstruct(light.double())
+    assert bool((clear[:, 0] < 0).any()) and bool((clear[:, 1:] < 0).any())
+    expected = torch.cat([clear[:, :1].clamp_min(0), clear[:, 1:]], 1).to(dtype)
+    assert found.polarized and found.steady is None and found.transient.dtype == dtype
+    torch.testing.assert_close(found.transient, expected)
+    plain = N.without_slab(N.Capture(light[:, 1], axis, scan), 0.02, 10.0)
+    torch.testing.assert_close(plain.transient, clear[:, 1].clamp_min(0).to(dtype))
+
+
+@pytest.mark.parametrize("device", ["tpu", "cuda:99", ""])
+def test_devices_that_are_none(device):
+    assert moved_to(captured(), "cpu").transient.device.type == "cpu"
+    with pytest.raises(DeviceError, match=r"reconstruct: expected a device that torch has, got .*: .") as caught:
+        moved_to(captured(), device)
+    assert "\n" not in str(caught.value)

@@ -38,7 +38,7 @@ def checked_module(sensor: nn.Module | Device, axis: TimeAxis, grad: GradPolicy 
 def is_readable(tensor: torch.Tensor) -> bool:
     """False under ``torch.vmap``, where Python cannot look at values (torch has no public question for that)."""
     try:
-        bool(tensor.detach().reshape(-1)[:1].any())
+        bool(tensor.any())
     except RuntimeError:
         return False
     return True

@@ -72,8 +72,6 @@ def _scene(name: str, entry: Mapping[str, Any], where: str) -> dict[str, Any]:
         made = function(**arguments)
     except TorchTransientError as error:
         raise type(error)(f"{where}: {error}") from error
-    except (TypeError, ValueError) as error:
-        raise SceneError(f"{where}: expected arguments of {chosen}, got {arguments}: {error}.") from error
     # A scene of one shape is called as it is here; parts of larger ones say which.
     return {name if len(made) == 1 else f"{name}_{part}": shape for part, shape in made.items()}
 

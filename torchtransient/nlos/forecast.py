@@ -74,7 +74,7 @@ def _shape(work: Work) -> tuple[int, ...]:
     times, channels = cube[-2:]
     channels = channels // 2 if renderer.frequencies is not None else channels
     # The components of polarization are channels of the film.
-    channels = channels // 4 if stokes and channels % 4 == 0 else channels
+    channels = channels // 4 if stokes else channels
     return (*stokes, channels, times, *work.scan.shape)
 
 

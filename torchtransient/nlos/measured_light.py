@@ -13,11 +13,13 @@ def checked_light(capture: Capture, who: str) -> Capture:
     volume: it says at how many points, and which is the first.
     """
     light = capture.transient
-    if light is None or not light.is_floating_point() or bool(torch.isfinite(light).all()):
+    assert light is not None  # a capture without one has been refused
+    finite = torch.isfinite(light)
+    if bool(finite.all()):
         return capture
     dims = len(capture.scan.shape)
     # All but the points: channels, batches and times.
-    dead = ~torch.isfinite(light.detach()).reshape(-1, *light.shape[light.ndim - dims :]).all(0)
+    dead = ~finite.reshape(-1, *light.shape[light.ndim - dims :]).all(0)
     places = dead.nonzero().tolist()
     first = ", ".join(map(str, places[0]))
     what = "pairs of laser and sensor points" if capture.scan.kind == "exhaustive" else "points"

@@ -69,7 +69,7 @@ class PartFile:
             form, key, about = said["format"], said["key"], dict(said["about"])
             rows, columns = (int(n) for n in said["shape"])
             seconds = float(said["seconds"])
-            if any(first < 0 or count < 0 or first + count > rows for first, count, _ in done.values()):
+            if any(first < 0 or count < 1 or first + count > rows for first, count, _ in done.values()):
                 raise ValueError("rows beyond the last one")
         except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
             raise StorageError(
@@ -245,8 +245,7 @@ class _Lock:
 
     def release(self) -> None:
         """Delete the file, and let go of it."""
-        if self._file is None:
-            return
+        assert self._file is not None  # it was taken
         if os.name == "nt":  # which keeps files that are open
             self._file.close()
         with contextlib.suppress(OSError):

@@ -101,7 +101,7 @@ def _measured(capture: Capture) -> torch.Tensor:
 
 def _points_first(tensor: torch.Tensor, rank: int) -> torch.Tensor:
     """(N, ...) of (..., *sensor): in memory as films are."""
-    flat = tensor.detach().cpu().flatten(tensor.ndim - rank)
+    flat = tensor.cpu().flatten(tensor.ndim - rank)
     return flat.movedim(-1, 0).contiguous()
 
 

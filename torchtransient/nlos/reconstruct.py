@@ -142,7 +142,7 @@ def default_grid(
             f"reconstruct: the sensor points of this scan lie on one line ({capture.scan!r}), which says not how wide "
             "and high a volume is. Give grid=default_grid(capture, extent=(width, height)) in metres, or another grid=."
         )
-    if size is None and extent is None and not is_planar(capture.scan):
+    if size is None and not is_planar(capture.scan):
         # As many as points: of a curved wall's grid, or of the square that a list of them would fill.
         shape = capture.scan.sensor_shape
         size = tuple(reversed(shape)) if len(shape) == 2 else math.ceil(math.sqrt(math.prod(shape)))
@@ -151,7 +151,7 @@ def default_grid(
 
 def _spans_area(scan: Scan) -> bool:
     """Whether sensor points are more than one, and not all on one line."""
-    points = scan.sensor_points.detach().cpu().reshape(-1, 3)
+    points = scan.sensor_points.cpu().reshape(-1, 3)
     spread = torch.linalg.svdvals(points - points.mean(0))
     return len(spread) > 1 and bool(spread[1] > _LINE * spread[0])
 
@@ -198,7 +198,7 @@ def _check_options(name: str, known: Iterable[str], options: dict[str, Any]) -> 
     for option in ("target", "filter"):
         if not isinstance(options.get(option, ""), str):
             raise ArgumentError(f"reconstruct: expected {option} as a name, got {shown(options[option])}.")
-    if options.get("filter", FILTERS[0]) not in FILTERS:
+    if "filter" in options and options["filter"] not in FILTERS:
         raise ArgumentError(
             f"reconstruct: expected filter to be one of {', '.join(FILTERS)}, got {options['filter']!r}."
         )
@@ -222,13 +222,11 @@ def _settings(entry: Method, used: dict[str, Any], axis: TimeAxis) -> dict[str, 
 
 
 def _intensities(capture: Capture) -> Capture:
-    transient, steady = capture.transient, capture.steady
+    transient = capture.transient
     assert transient is not None  # a capture without one has been refused
     if capture.polarized:
-        dims = len(capture.scan.shape)
-        transient = transient.select(transient.ndim - dims - 3, 0)
-        steady = None if steady is None else steady.select(steady.ndim - dims - 2, 0)
-    return replace(capture, transient=transient, steady=steady, polarized=False, phasor=None, frequencies=None)
+        transient = transient.select(-len(capture.scan.shape) - 3, 0)
+    return replace(capture, transient=transient, steady=None, polarized=False, phasor=None, frequencies=None)
 
 
 def _from_zero(capture: Capture) -> Capture:
@@ -236,7 +234,7 @@ def _from_zero(capture: Capture) -> Capture:
     axis = capture.axis
     assert axis is not None
     early = math.ceil(-axis.start_opl / axis.bin_width_opl - 1e-6)
-    if early <= 0:
+    if early < 1:
         return capture
     if early >= axis.num_bins:
         raise UnitError(f"reconstruct: expected light after time zero, got {axis}. Does the record begin too early?")
@@ -270,7 +268,7 @@ def _on_own_grid(
     operator = kinds[name](capture.scan, time_axis=axis, dtype=precision_of(transient), **options).to(transient.device)
     with _bar(transient.shape[dim], progress) as bar:
         for channel in range(transient.shape[dim]):
-            one = replace(capture, transient=transient.narrow(dim, channel, 1), steady=None, channels=())
+            one = replace(capture, transient=transient.narrow(dim, channel, 1), channels=())
             found.append(operator.reconstruct(one).index_select(-3, kept.to(transient.device)))
             bar.update()
     grid = operator.grid.at_depths(z[kept])

@@ -86,7 +86,7 @@ class CaptureRenderer(nn.Module):
         scene = load(capture_scene(hidden, scan, bounces=bounces, energy=energy), variant=variant)
         if not _WHAT_IS_MEASURED & {name for name, value in settings.items() if value is not None}:
             bounds = hidden_bounds(hidden, scene.variant)
-            settings["time_axis"] = scan.detach().default_axis(bounds, defaults.BIN_WIDTH_OPL)
+            settings["time_axis"] = scan.default_axis(bounds, defaults.BIN_WIDTH_OPL)
         self.scan, self.bounces = scan, bounces
         followed = _attached(scan)
         _check_once(wanted, followed)
@@ -94,10 +94,14 @@ class CaptureRenderer(nn.Module):
         self.renderer = TransientRenderer(scene, {**wanted, **dict.fromkeys(followed)}, **settings)
         for key in followed:
             self.renderer.values[key].requires_grad_(False)
-        if sensor is not None and self.renderer.axis is None:
-            raise ArgumentError("CaptureRenderer: a sensor takes transients; give time_axis= instead of another film.")
-        axis = self.renderer.axis
-        self.sensor = None if sensor is None or axis is None else checked_module(sensor, axis)
+        self.sensor: nn.Module | None = None
+        if sensor is not None:
+            axis = self.renderer.axis
+            if axis is None:
+                raise ArgumentError(
+                    "CaptureRenderer: a sensor takes transients; give time_axis= instead of another film."
+                )
+            self.sensor = checked_module(sensor, axis)
         self.says_black = True
         self._explained: str | None = None
         check_scan(self.renderer.scene, scan, self.renderer._options)
@@ -224,7 +228,7 @@ class _Sources:
 
 def _leaves(tensor: torch.Tensor) -> list[torch.Tensor]:
     """The leaves that a tensor was computed of; none for a leaf and its views, which see what becomes of it."""
-    if tensor.is_leaf or (tensor._is_view() and tensor._base is not None and tensor._base.is_leaf):
+    if tensor.is_leaf or (tensor._base is not None and tensor._base.is_leaf):
         return []
     found, seen, ahead = [], set(), [tensor.grad_fn]
     while ahead:
@@ -280,7 +284,8 @@ def as_capture(
             "tt.TransientRenderer(tt.nlos.capture_scene(...), gates=...)."
         )
     transient = out.transient
-    if transient is not None and sensor is not None:
+    if sensor is not None:
+        assert transient is not None  # sensors of phasors have been refused
         transient = measured(transient, scan, sensor, generator)
     # The steady image of an exhaustive scan sums over the laser's positions.
     steady = None if scan.kind == "exhaustive" else steady_in_scan_shape(out.steady, scan)

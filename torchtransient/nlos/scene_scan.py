@@ -133,8 +133,7 @@ def _laser_ends(scene: Any, sensor: Any, integrator: Any) -> tuple[NDArray[np.fl
     fov = None
     if integrator.capture is CaptureType.EXHAUSTIVE and not integrator.equal_grids:
         fov = integrator.laser_fov
-    origin = dr.detach(origin_of(scene, sensor))
-    aims = dr.detach(aims_of(scene, sensor, integrator.capture, fov))
+    origin, aims = origin_of(scene, sensor), aims_of(scene, sensor, integrator.capture, fov)
     check_count(aims, sensor, integrator.capture)
     return _array(origin).reshape(3), _ends(scene, mi.Ray3f(origin, dr.normalize(aims)))
 
@@ -208,7 +207,7 @@ def _on_extended_wall(ends: Ends, size: tuple[int, int]) -> tuple[Ends, NDArray[
     slope = (directions * normals[near]).sum(1)
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = ((points[near] - origins) * normals[near]).sum(1) / slope
-    lost = int((~((slope < 0) & np.isfinite(distance) & (distance > 0))).sum())
+    lost = int((~((slope < 0) & (distance > 0))).sum())
     if lost:
         raise SceneError(
             f"scan: {len(missed)} of the sensor's {len(ends.shapes)} rays meet nothing in the scene, {lost} of them "

@@ -91,11 +91,7 @@ def simulate(
     seed, path = checked_seed("simulate", seed), _part_path(part)
     check_sensor("simulate", sensor, generator)
     work = _work(hidden, scan, time_axis, frequencies, spp, (bounces, energy), variant, _parts(scan, path, tiles))
-    if sensor is not None and work.axes()[0] is None:
-        raise ArgumentError("simulate: a sensor takes transients, and phasors are asked for; leave out one of them.")
-    # Counts as they are drawn: nothing of a simulation has gradients.
-    axis = work.axes()[0]
-    chain = None if sensor is None or axis is None else checked_module(sensor, axis, "straight_through")
+    chain = None if sensor is None else _chain(sensor, work.axes()[0])
     with _part_file(path, work, seed) as kept, active_variant(work.variant.name), torch.no_grad():
         finished = kept is not None and all(_has(kept, work, number) for number in range(work.count))
         forecast = forecast_of(work, timed=progress and not finished)
@@ -161,11 +157,11 @@ def _work(
         "bounces": defaults.BOUNCES if bounces is None else bounces,
         "energy": defaults.ENERGY if energy is None else energy,
     }
-    chosen = choose_variant(load(capture_scene(hidden, scan.detach(), **settings)), variant)
+    chosen = choose_variant(load(capture_scene(hidden, scan, **settings)), variant)
     if time_axis is None and frequencies is None:
         with active_variant(chosen.name):
             bounds = hidden_bounds(hidden, chosen.name)
-        time_axis = scan.detach().default_axis(bounds, defaults.BIN_WIDTH_OPL)
+        time_axis = scan.default_axis(bounds, defaults.BIN_WIDTH_OPL)
     film = Film(time_axis, frequencies, defaults.SPP if spp is None else spp)
     return HiddenWork(hidden, scan, settings, film, chosen, parts)
 
@@ -246,7 +242,7 @@ def _in_parts(work: Work, seed: int, kept: PartFile | None, progress: bool) -> t
                 continue
             began = time.perf_counter()
             capture = work.render(number, seed_of(seed, number))
-            layout = layout or RowLayout.of(capture)
+            layout = RowLayout.of(capture)
             found = layout.rows(capture)
             seconds = time.perf_counter() - began
             done += seconds
@@ -293,6 +289,13 @@ def _everything(kept: PartFile, work: Work, points: int) -> Rows:
 
 
 # -------------------------------------------------------------------------------------------------------------- results
+
+
+def _chain(sensor: torch.nn.Module | Device, axis: TimeAxis | None) -> torch.nn.Module:
+    if axis is None:
+        raise ArgumentError("simulate: a sensor takes transients, and phasors are asked for; leave out one of them.")
+    # Counts as they are drawn: nothing of a simulation has gradients.
+    return checked_module(sensor, axis, "straight_through")
 
 
 def _through(transient: Any, scan: Scan, sensor: torch.nn.Module, generator: torch.Generator | None) -> torch.Tensor:

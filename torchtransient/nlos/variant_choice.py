@@ -29,7 +29,7 @@ def choose_variant(scene: Scene, requested: str | None) -> VariantChoice:
     if requested is not None:
         return VariantChoice(resolve_variant(requested), "as asked for")
     active, name = mi.variant(), resolve_variant(None)
-    if is_differentiable(active) and name.endswith("_polarized"):
+    if name.endswith("_polarized"):
         return VariantChoice(name, "the active one, which is polarized")
     # In the variant that is active, or becomes so: a switch takes time.
     found = inventory_of(load(scene, variant=name if is_differentiable(active) else f"{name.split('_')[0]}_ad_mono"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 
@@ -145,7 +145,7 @@ class SceneWork:
         return as_capture(out, self.scan)
 
 
-Work = HiddenWork | SceneWork
+Work: TypeAlias = "HiddenWork | SceneWork"
 
 
 def seed_of(seed: int, number: int) -> int:

@@ -1,0 +1,224 @@
+"""What a simulation renders in which order, what it keeps and tells of it; and which scenes and variants it takes."""
+
+from __future__ import annotations
+
+import importlib
+import time
+from dataclasses import replace
+from types import SimpleNamespace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+
+import torchtransient as tt
+from support.scalars import no_gradient_is_lost
+from torchtransient.errors import ArgumentError, SceneError, TorchTransientError
+from torchtransient.nlos import variant_choice, work
+from torchtransient.nlos.variant_choice import VariantChoice
+from torchtransient.nlos.work import Film, HiddenWork
+
+N = tt.nlos
+VARIANT = "llvm_ad_mono"
+AXIS = tt.TimeAxis(1.9, 0.05, 40)
+WALL = N.Wall.plane(2.0, 1.6, albedo=0.9)
+Z = tt.scenes.nlos_z()
+simulation = importlib.import_module("torchtransient.nlos.simulation")
+pytestmark = pytest.mark.usefixtures("no_leftovers")
+
+
+def scan(size=(3, 2), **settings):
+    return N.Scan.grid(WALL, size, kind="confocal", **settings)
+
+
+def simulated(of=None, **settings):
+    return N.simulate(Z, of or scan(), **{"time_axis": AXIS, "spp": 8, "progress": False} | settings)
+
+
+def complete(**changed):
+    description = N.capture_scene(Z, scan())
+    film = description["wall"]["sensor"]["film"]
+    film |= {"start_opl": AXIS.start_opl, "bin_width_opl": AXIS.bin_width_opl, "temporal_bins": AXIS.num_bins}
+    return description | changed
+
+
+# --------------------------------------------------------------------------------------------------------------- parts
+
+
+@pytest.mark.parametrize(("count", "tiles", "runs"), [
+    (7, 4, [(0, 2), (2, 4), (4, 6), (6, 7)]), (7, 3, [(0, 3), (3, 6), (6, 7)]), (7, 1, [(0, 7)]),
+    (2, 9, [(0, 1), (1, 2)]),
+])  # fmt: skip
+def test_parts_of_equal_sizes_share_a_scene(monkeypatch, count, tiles, runs):
+    made, checked = [], []
+
+    def renderer(hidden, of, parameters, **settings):
+        made.append((len(of.sensor_points.reshape(-1, 3)), parameters))
+        return SimpleNamespace(says_black=True)
+
+    monkeypatch.setattr(work, "CaptureRenderer", renderer)
+    monkeypatch.setattr(work, "load", lambda *_, **settings: settings["variant"])
+    monkeypatch.setattr(work, "check_scan", lambda *given: checked.append(given))
+    of = scan((count, 1))
+    film = Film(AXIS, None, 8)
+    found = HiddenWork(Z, of, {"bounces": (3,), "energy": 1.0}, film, VariantChoice(VARIANT, "asked for"), tiles)
+    assert [found.run(number) for number in range(found.count)] == runs
+    of_parts = [found._of(number) for number in range(found.count)]
+    sizes = sorted({last - first for first, last in runs}, reverse=True)
+    assert made == [(size, (work.POINTS,) if len(runs) > 1 else ()) for size in sizes]
+    assert [of_parts[0] is one for one in of_parts] == [last - first == sizes[0] for first, last in runs]
+    assert not any(one.says_black for one in of_parts)
+    # A scan in one part is looked at by what renders it.
+    assert len(checked) == (len(runs) > 1)
+
+
+def test_points_that_carry_gradients_are_simulated_without():
+    plain = scan()
+    points = plain.sensor_points.clone().requires_grad_()
+    carrying = replace(plain, sensor_points=points, laser_points=points)
+    for settings in ({"time_axis": None}, {"tiles": 2}):
+        with no_gradient_is_lost():
+            found = simulated(carrying, **settings)
+        expected = simulated(plain, **settings)
+        assert found.axis == expected.axis and found.scan == plain
+        assert not found.scan.sensor_points.requires_grad and not found.transient.requires_grad
+        torch.testing.assert_close(found.transient, expected.transient, rtol=1e-5, atol=1e-9)
+    assert points.grad is None
+
+
+@pytest.mark.parametrize("settings", [{}, {"tiles": 2}, {"tiles": 2, "part": True}])
+def test_seconds_are_those_of_rendering(tmp_path, settings):
+    settings = settings | ({"part": tmp_path / "a.part"} if "part" in settings else {})
+    began = time.perf_counter()
+    seconds = simulated(**settings).metadata["seconds"]
+    assert 0 < seconds < time.perf_counter() - began
+
+
+def test_a_part_file_of_one_part(tmp_path, monkeypatch, capsys):
+    """Kept as those of many are; what is finished is not timed again."""
+    path = tmp_path / "a.part"
+    first = simulated(part=path, tiles=1, keep_part=True, progress=True)
+    assert path.exists() and "about" in capsys.readouterr().err
+    monkeypatch.setattr(work.HiddenWork, "render", None)
+    again = simulated(part=path, tiles=1, keep_part=True, progress=True)
+    told = capsys.readouterr().err
+    assert torch.equal(first.transient, again.transient) and "samples a point" in told and "about" not in told
+
+
+def test_what_is_left_of_a_simulation_is_timed(tmp_path, monkeypatch, capsys):
+    real, numbers = work.HiddenWork.render, []
+
+    def render(self, number, seed, *, spp=None, progress=False):
+        if spp is None and number == 1 and not numbers:
+            numbers.append(number)
+            raise KeyboardInterrupt
+        return real(self, number, seed, spp=spp, progress=progress)
+
+    monkeypatch.setattr(work.HiddenWork, "render", render)
+    with pytest.raises(KeyboardInterrupt):
+        simulated(part=tmp_path / "a.part", tiles=2, progress=True)
+    capsys.readouterr()
+    simulated(part=tmp_path / "a.part", tiles=2, progress=True)
+    assert "about" in capsys.readouterr().err
+
+
+def test_sums_have_two_places_in_a_file(tmp_path):
+    path = tmp_path / "a.part"
+    N.simulate(complete(), spp=3, part=path, tiles=3, keep_part=True, progress=False)
+    assert np.load(path.with_name("a.part.npy")).shape[0] == 2 * 6
+
+
+def test_passes_are_no_more_than_samples():
+    made = simulation._scene_work(complete(), None, None, 2, (None, None), None, 4)
+    assert made.count == 2 and made.film.spp == 2
+    # Of other numbers of samples, as a forecast asks.
+    assert made.render(0, 0, spp=3).metadata["spp"] == 3 and made.render(0, 0).metadata["spp"] == 1
+
+
+# ------------------------------------------------------------------------------------------------- scenes and variants
+
+
+def test_variants_of_scenes_are_as_asked_for():
+    """In the call, or else when the scene was loaded."""
+    of_scene = tt.load(complete(), variant="llvm_ad_rgb")
+    chosen = [
+        simulation._scene_work(scene, None, None, 4, (None, None), variant, 1).variant
+        for scene, variant in ((of_scene, None), (of_scene, VARIANT), (tt.load(complete()), None), (complete(), None))
+    ]
+    assert [one.name for one in chosen] == ["llvm_ad_rgb", VARIANT, VARIANT, VARIANT]
+    assert ["as asked for" in one.why for one in chosen] == [True, True, False, False]
+
+
+@pytest.mark.parametrize(("active", "loaded"), [("llvm_ad_rgb", "llvm_ad_rgb"), ("scalar_rgb", "llvm_ad_mono")])
+def test_spectra_are_looked_at_in_the_active_variant(monkeypatch, active, loaded):
+    asked = []
+    grey = SimpleNamespace(colours=[], measured=[], bands=[])
+    monkeypatch.setattr(variant_choice, "load", lambda scene, variant: asked.append(variant))
+    monkeypatch.setattr(variant_choice, "inventory_of", lambda scene: grey)
+    with mi.variant_context(active):
+        found = variant_choice.choose_variant(None, None)
+    assert asked == [loaded] and found.name == "llvm_ad_mono"
+
+
+def test_an_active_polarized_variant_stays():
+    with mi.variant_context("llvm_ad_mono_polarized"):
+        found = variant_choice.choose_variant(None, None)
+    assert found.name == "llvm_ad_mono_polarized" and "active" in found.why
+
+
+@pytest.mark.parametrize(("scene", "is_one"), [
+    ({"integrator": {"type": "direct"}}, True), ({"mine": {"type": "transient_nlos_path"}}, True),
+    ({"type": "scene", "a": {"type": "sphere"}}, False), ({"a": {}}, False),
+])  # fmt: skip
+def test_scenes_have_an_integrator(scene, is_one):
+    assert simulation._is_complete(scene) is is_one
+
+
+def test_names_of_files_are_scenes(tmp_path):
+    for given in (str(tmp_path / "none.xml"), tmp_path / "none.xml"):
+        with pytest.raises(TorchTransientError, match=r"none\.xml") as caught:
+            N.simulate(given, progress=False)
+        assert "expected scan= beside" not in str(caught.value)
+
+
+def test_a_shape_that_shines_is_no_laser():
+    lamp = {"type": "rectangle", "to_world": tt.scenes.transforms.translate([0, 0, 4.0]),
+            "emitter": {"type": "area", "radiance": 1.0}}  # fmt: skip
+    scene = {name: node for name, node in complete(lamp=lamp).items() if name != "laser"}
+    for given, words in ((scene, "AreaLight"), (complete(laser={"type": "constant"}), "ConstantBackgroundEmitter")):
+        with pytest.raises(SceneError, match=f"expected a laser whose beam falls on a spot, got the emitter {words}"):
+            N.simulate(given, spp=4, progress=False)
+
+
+@pytest.mark.parametrize("kind", ["exhaustive", "confocal"])
+def test_spots_around_the_axis_of_a_laser(kind):
+    """A grid of 2 x 1 spots over an angle whose tangent is 1/4 on either side, on a wall half a metre away."""
+    of = N.Scan.grid(WALL, (3, 2), kind=kind, **({"laser_grid": (2, 1)} if kind == "exhaustive" else {}))
+    description = N.capture_scene(Z, of)
+    sensor = description["wall"]["sensor"]
+    sensor.pop("laser_points", None)
+    del sensor["laser_origin"]
+    description["integrator"] |= {"force_equal_illumination_scanning": False,
+                                  "illumination_scan_fov": 2 * float(np.degrees(np.arctan(0.25)))}  # fmt: skip
+    if kind == "confocal":
+        sensor["sensor_origin"] = [0.0, 0.0, 0.5]
+    look = mi.ScalarTransform4f().look_at([0, 0, 0.5], [0, 0, 0], [0, 1, 0])
+    description["laser"] |= {"to_world": look}
+    scene = tt.load(description, variant=VARIANT)
+    found = work.scan_of_scene(scene.built(tt.rendering.build_options.BuildOptions(transient=True)).scene)
+    assert found.kind == kind and found.laser_origin.tolist() == [0.0, 0.0, 0.5]
+    if kind == "confocal":  # whose laser goes along, whatever the integrator says
+        assert torch.equal(found.laser_points, found.sensor_points)
+        return
+    assert found.laser_points.shape == (1, 2, 3)
+    torch.testing.assert_close(found.laser_points[0, :, 0].sort().values, torch.tensor([-0.0625, 0.0625]).double(),
+                               rtol=0, atol=1e-6)  # fmt: skip
+
+
+def test_forecasts_know_of_the_light():
+    """Which bounces, and which energy."""
+    found = N.forecast(Z, scan(), time_axis=AXIS, spp=4, bounces=(3, 4), energy={"type": "rgb", "value": [1, 0.5, 0.2]})
+    assert "light of 4 bounces" in found.light and found.variant.startswith("llvm_ad_rgb, colour")
+    with pytest.raises(ArgumentError, match="bounces has no effect"):
+        N.forecast(complete(), bounces=(3,))
