@@ -10,7 +10,7 @@ import scipy.optimize
 
 from support.hidden_shapes import ball, join, mannequin, mesh, plate, wall_grid
 from torchtransient.plugins.around_corner import hiding
-from torchtransient.plugins.around_corner.edges import Edges, EdgeTable, Triangles
+from torchtransient.plugins.around_corner.edges import APART, Edges, EdgeTable, Triangles
 from torchtransient.plugins.around_corner.hiding import hiding_pairs, parts_of
 
 VARIANT = "llvm_ad_mono"
@@ -150,9 +150,24 @@ def test_rims_that_are_apart(apart, rims):
     assert edges.share.sum() == pytest.approx(rims)
 
 
+def test_rims_that_are_near_are_one_wherever_they_lie():
+    """Nearer than half of that along every axis."""
+    rng = np.random.default_rng(6)
+    place = rng.uniform(-0.4, 0.4, (60, 1, 3)) + np.linspace(0, 99, 60)[:, None, None] * [1, 0, 0]
+    rim, third = place + rng.normal(size=(60, 2, 3)) * 0.2, rng.normal(size=(60, 1, 3)) * 0.2
+    v = np.concatenate([rim, place + third], 1)
+    # Single precision rounds by a tenth of the step from rim to rim.
+    cell = APART * np.abs(v).max()
+    w = np.concatenate([rim + 0.38 * cell * rng.choice([-1, 1], (60, 1, 3)), place - third], 1)
+    faces = np.arange(180).reshape(60, 3)
+    _, edges = edges_of(mesh("one", (v.reshape(-1, 3), faces)), mesh("other", (w.reshape(-1, 3), faces)))
+    assert edges.share.sum() == pytest.approx(300)
+
+
 def test_faces_without_area_are_left_out():
-    v, f = page_at(0)
-    triangles, edges = edges_of(mesh("page", (v, np.concatenate([[[0, 1, 1]], f, [[2, 0, 2]]]))))
+    v, f = page_at(0.4, 0.5)
+    none = [[0, 1, 1], [1, 2, 2], [1, 1, 2], [2, 0, 2]]
+    triangles, edges = edges_of(mesh("page", (v, np.concatenate([none[:2], f, none[2:]]))))
     assert triangles.faces.tolist() == [[0, 1, 2]] and len(edges.ends) == 3 and triangles.mesh.tolist() == [0]
 
 
@@ -241,7 +256,8 @@ def test_planes_through_viewpoints_are_found_where_there_are_some():
         u = np.concatenate([a - q, q - b])
         u /= np.linalg.norm(u, axis=1, keepdims=True)
         # Largest t with n . u >= t in a box of normals.
-        plan = scipy.optimize.linprog([0, 0, 0, -1], np.c_[-u, np.ones(8)], np.zeros(8), bounds=[(-1, 1)] * 3 + [(0, 1)])
+        bounds = [(-1, 1)] * 3 + [(0, 1)]
+        plan = scipy.optimize.linprog([0, 0, 0, -1], np.c_[-u, np.ones(8)], np.zeros(8), bounds=bounds)
         apart = bool(hiding._cones_apart(a, b, q[None])[0])
         if -plan.fun > 0.1:
             seen[1] += 1

@@ -125,8 +125,8 @@ def test_a_flight_through_fog(floor):
     inside = np.array([True, True, True, True, False])
     media = settings(rate_floor=None if floor is None else mi.Float(floor))
     collides, real, t, factor = free_flight.tentative_flight(
-        media, mi.MediumPtr(kept("fog")), downwards([0.0] * 5), mi.Float(0.25), mi.Float(end), spectrum(carried), mi.Float(u),
-        numbers(pick), mi.Bool(inside),
+        media, mi.MediumPtr(kept("fog")), downwards([0.0] * 5), mi.Float(0.25), mi.Float(end), spectrum(carried),
+        mi.Float(u), numbers(pick), mi.Bool(inside),
     )  # fmt: skip
     rates = RATES if floor is None else np.maximum(RATES, floor)
     p = np.where(carried.sum(1)[:, None] > 0, carried / np.maximum(carried.sum(1), 1e-9)[:, None], 1 / 3)
@@ -166,8 +166,8 @@ def test_a_flight_through_a_cloud(floor):
     inside = np.array([True, True, True, False])
     media = settings(homogeneous=False, heterogeneous=True, rate_floor=None if floor is None else mi.Float(floor))
     collides, real, t, factor = free_flight.tentative_flight(
-        media, mi.MediumPtr(kept("cloud")), downwards([0.5] * 4), mi.Float(0), mi.Float(10), spectrum([[1, 1, 1.0]] * 4),
-        mi.Float(u), numbers([0.5] * 4, pick), mi.Bool(inside),
+        media, mi.MediumPtr(kept("cloud")), downwards([0.5] * 4), mi.Float(0), mi.Float(10),
+        spectrum([[1, 1, 1.0]] * 4), mi.Float(u), numbers([0.5] * 4, pick), mi.Bool(inside),
     )  # fmt: skip
     rate = 1.75 if floor is None else floor
     chance = 0.4 if floor is None else 0.25
@@ -185,8 +185,8 @@ def test_fog_and_clouds_in_one_scene():
     media = mi.MediumPtr([kept("fog", (0.7,) * 3), kept("cloud")])
     both = settings(heterogeneous=True)
     _, real, _, factor = free_flight.tentative_flight(
-        both, media, downwards([0.5, 0.5], z=0.9), mi.Float(0), mi.Float(1.5), spectrum([[1, 1, 1.0]] * 2), mi.Float(0.3),
-        numbers([0.5, 0.5], [0.9, 0.9]), mi.Bool(True),
+        both, media, downwards([0.5, 0.5], z=0.9), mi.Float(0), mi.Float(1.5), spectrum([[1, 1, 1.0]] * 2),
+        mi.Float(0.3), numbers([0.5, 0.5], [0.9, 0.9]), mi.Bool(True),
     )  # fmt: skip
     assert np.array(real).tolist() == [True, False]
     np.testing.assert_allclose(np.array(factor)[0], [1 / 0.7, 1], rtol=1e-4)
@@ -233,7 +233,8 @@ def test_a_leg_is_straight_between_its_ends():
     assert np.array(leg.length).tolist() == [2, 2, np.inf]
     np.testing.assert_allclose(np.array(leg.d).T, [DOWN, [1, 0, 0], DOWN], atol=1e-6)
     np.testing.assert_array_equal(np.array(leg.ray.d), np.array(leg.d))
-    np.testing.assert_allclose(np.array(leg.ray.maxt), np.array([2, 2, np.inf]) * (1 - mi.math.ShadowEpsilon), rtol=1e-6)
+    before = np.array([2, 2, np.inf]) * (1 - mi.math.ShadowEpsilon)
+    np.testing.assert_allclose(np.array(leg.ray.maxt), before, rtol=1e-6)
     assert np.array(leg.lanes).tolist() == [0, 1, 2]
 
 

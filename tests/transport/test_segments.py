@@ -105,7 +105,8 @@ def test_segments_between_points_of_shapes():
     dr.enable_grad(x)
     dr.set_grad(x, 1)
     a, p, n = np.array([0.1, 0.2, 0.3]), np.array([1.2, 2.4, -0.7]), unit(0.2, -0.5, 0.8)
-    da, dp, dn, area, darea = np.array([0.3, -0.2, 0.5]), np.array([-0.4, 0.7, 0.2]), np.array([0.6, 0.1, -0.3]), 1.7, 0.9
+    da, dp, dn = np.array([[0.3, -0.2, 0.5], [-0.4, 0.7, 0.2], [0.6, 0.1, -0.3]])
+    area, darea = 1.7, 0.9
 
     def vector(kind, v, dv):
         return kind(*v.tolist()) + mi.Vector3f(*dv.tolist()) * x
@@ -173,7 +174,8 @@ def followed(guides, depth, u, delta=False):
     vertex = Local(at=Local(p=p, spawn_ray_to=lambda q: Local(d=mi.Vector3f(q))))
     count = len(u)
     step = Step(out=mi.Vector3f(5, 6, 7), u_dir=mi.Point2f(0, 0.125), delta=mi.Bool([delta] * count),
-                unconnected=mi.Bool([True] * count), weight=mi.UnpolarizedSpectrum(mi.Float([0.5] * count)))  # fmt: skip
+                unconnected=mi.Bool([True] * count),
+                weight=mi.UnpolarizedSpectrum(mi.Float([0.5] * count)))  # fmt: skip
     surface._follow_guides(None, Local(depth=mi.UInt32(depth)), vertex, step, Local(next_1d=lambda: mi.Float(list(u))))
     return surface, step
 

@@ -45,6 +45,7 @@ def test_paths_go_on_by_chance():
     factor = np.where(np.isnan(chance), 1, 1 / chance)
     np.testing.assert_allclose(np.array(rr), factor, rtol=1e-6)
     np.testing.assert_allclose(np.array(β)[:, 2], np.array([0.05, 0.1, 0.075]) * factor[2], rtol=1e-5)
+    assert not np.array(played([0.0, 0.5, 0.0, 0.0, 0.0])[1])[1]  # a number of the chance itself ends a path
     bright = colour(*[[9.0, 1.0, 1.0]] * 5)
     _, goes_on, rr = played([0.949, 0.951, 0.949, 0.951, 0.949], β=bright)
     assert np.array(goes_on).tolist() == [True, False, True, True, True]
@@ -189,9 +190,10 @@ class Connected(Connection):
     name, finds_light = "connected", False
 
     def __init__(self, first=True):
-        self.first, self.dark_at_first = first, not first
+        self.first, self.dark_at_first, self.asked = first, not first, []
 
     def connect(self, world, path, vertex, proposal, answer, zeros):
+        self.asked.append("connection")
         active = vertex.goes_on & (mi.Bool(self.first) | (path.depth > 0))
         return Event(value=mi.Spectrum(3), opl=vertex.scattered_τ, active=active, depth=path.depth + 2)
 
@@ -199,8 +201,8 @@ class Connected(Connection):
 class Numbers(Sink):
     """Events by depth, four bits each, their light and lengths; with ``vertices`` what paths are there."""
 
-    def __init__(self, vertices):
-        self.keeps_vertices = vertices
+    def __init__(self, vertices, asked):
+        self.keeps_vertices, self.asked = vertices, asked
 
     def begin(self, world):
         kept = {"events": mi.UInt32(0), "light": mi.Spectrum(0), "opl": mi.Float64(0)}
@@ -212,6 +214,7 @@ class Numbers(Sink):
         kept["opl"] += dr.select(event.active, event.opl, 0)
 
     def vertex(self, kept, path, samples):
+        self.asked.append("vertex")
         walk = samples["walk"]
         seen = {"τ": walk.τ, "β": walk.β[0], "η": walk.η, "pdf": path.prev_pdf, "n": path.prev_n.z}
         seen |= {"off": dr.norm(path.prev_p), "goes_on": dr.select(walk.goes_on, 1.0, 0.0)}
@@ -223,15 +226,18 @@ class Numbers(Sink):
 def walked(connection, most, vertices=False, leg=None, window=lambda active, τ, p: active):
     """(number of vertices, what is kept) of four lanes."""
     world = Local(segment=Line(), scattering=Turning(), connections=[connection], max_depth=most, in_time=window,
-                  finds_light=connection.finds_light, dark_at_first=connection.dark_at_first, plays_roulette=False)  # fmt: skip
+                  finds_light=connection.finds_light, dark_at_first=connection.dark_at_first,
+                  plays_roulette=False)  # fmt: skip
     ray = mi.Ray3f(mi.Point3f(0, 0, mi.Float([0] * 4)), mi.Vector3f(0, 0, 1))
-    count, kept = walk(world, None, ray, mi.Float64(0.125), Numbers(vertices), 1.25, leg)
+    sink = Numbers(vertices, getattr(connection, "asked", []))
+    count, kept = walk(world, None, ray, mi.Float64(0.125), sink, 1.25, leg)
     dr.eval(count, kept)
-    return np.array(count), kept
+    return np.broadcast_to(np.array(count), 4), kept
 
 
 def depths(kept):
-    return [[d for d in range(8) for _ in range(int(word) >> 4 * d & 15)] for word in np.array(kept["events"])]
+    events = np.broadcast_to(np.array(kept["events"]), 4)
+    return [[d for d in range(8) for _ in range(int(word) >> 4 * d & 15)] for word in events]
 
 
 @pytest.mark.parametrize("vertices", [False, True])
@@ -252,6 +258,19 @@ def test_events_of_a_walk(most, vertices):
             assert list(count) == [min(end + 1, max(most - 1, min(most, 1))) for end in Line.ends]
         elif not first and most == 2:
             assert list(count) == [0] * 4  # nothing is to be found: no turn is taken
+
+
+def test_no_turn_is_traced_in_vain():
+    """Of a last vertex connections alone are asked, which is no turn where vertices are kept; of the second of three
+    where the first one is dark, there is no loop.
+    """
+    for vertices, last in ((False, "connection"), (True, "vertex")):
+        connection = Connected()
+        walked(connection, 4, vertices)
+        assert connection.asked[-1] == last
+    connection = Connected(first=False)
+    walked(connection, 3)
+    assert connection.asked == ["vertex", "connection"]
 
 
 def digits(values):

@@ -133,7 +133,7 @@ def _in_one_plane(shapes: list[Any]) -> bool:
 def _corners(shape: Any) -> np.ndarray | None:
     """Points that span a shape (N, 3), None for one that is curved."""
     if shape.is_mesh():
-        return np.array(dr.detach(shape.vertex_positions_buffer()), dtype=np.float64).reshape(-1, 3)
+        return np.array(shape.vertex_positions_buffer(), dtype=np.float64).reshape(-1, 3)
     if not is_flat_shape(shape):
         return None
     shown = next(v for v in shown_by(shape)[0] if v.key == "to_world")
