@@ -56,6 +56,12 @@ def test_lanes_that_add_up(monkeypatch, busy):
     assert (covered(found) == 1).all()
 
 
+def test_few_points_have_many_lanes():
+    """Some thousands in all, in one launch for a second's work."""
+    found = launches.launches_of(film_of(), WIDTH * 4, 2**16)
+    assert len(found) == 2 and all(2**11 < n.width * n.rows * n.spp <= 2**13 for n in found)
+
+
 @pytest.mark.parametrize(("most", "spp", "rows"), [
     (1, [1, 1, 1], [1] * 4), (10, [2, 1], [1] * 4), (15, [3], [1] * 4), (30, [3], [2, 1, 1]), (44, [3], [2, 1, 1]),
     (45, [3], [3, 1]), (1000, [3], [3, 1]),

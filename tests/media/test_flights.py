@@ -142,6 +142,17 @@ def test_a_flight_through_fog(floor):
     np.testing.assert_allclose(np.array(factor).T, expected, rtol=1e-4)
 
 
+def test_a_flight_of_no_length_ends_nowhere():
+    """Where there is no stretch to collide in, the number zero is no collision."""
+    media, end = settings(), mi.Float([0.25, 0.5])
+    collides, _, t, factor = free_flight.tentative_flight(
+        media, mi.MediumPtr(kept("fog")), downwards([0.0] * 2), mi.Float(0.25), end, spectrum([[1, 1, 1.0]] * 2),
+        mi.Float(0), numbers([0.5] * 2), mi.Bool(True),
+    )  # fmt: skip
+    assert np.array(collides).tolist() == [False, True] and t[1] == 0.25
+    np.testing.assert_allclose(np.array(factor).T, [[1] * 3, [3 / RATES.sum()] * 3], rtol=1e-6)
+
+
 def test_where_a_cloud_can_have_density():
     """In its grid, ahead of where the flight is and before its end."""
     x, t, end = [0.5, 0.5, 0.5, 0.5, 9.0, 0.5], [0, 2.5, 0, 5, 1, 0], [10, 10, 2.25, 10, 10, 1.0]

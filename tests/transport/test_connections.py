@@ -143,10 +143,66 @@ def test_spots_that_send_nothing():
     connection.start(world, Local(spot=mi.UInt32([0])))
     vertex, path = vertex_of(PLACES[:1], np.array([[0, 0.6, 0.8]])), Local(depth=mi.UInt32([0]))
     proposal = connection.propose(world, path, vertex, None)
+    missed = LaserSpot(Local(wall=None, spots=None, looks_at_points=True), False, True)
+    missed.points, missed.packed, missed.index = wall, PackedSpots(wall, mi.Bool([False])), connection.index
+    assert proposal.active[0] and not missed.propose(world, path, vertex, None).active[0]
     answer = Local(matrix=mi.Spectrum(0.125), eta=mi.Float(1.5))
     for zeros in (False, True):
         event = connection.connect(world, path, vertex, proposal, answer, zeros)
         assert event.active[0] == zeros and not np.array(event.value).any()
+
+
+@pytest.mark.parametrize("media", [None, "fog"])
+def test_a_spot_s_light_with_derivatives(media):
+    """Value and arrival follow the vertex; the arrival itself is a number. Idle lanes hold nothing."""
+    world, legs = Around(media), mi.Float64(0.75)
+    wall = WallPoints(mi.Point3f(*SPOT.tolist()), mi.Normal3f(0, 0, 1), spectrum([[2], [3], [5]]), legs)
+    connection = LaserSpot(Local(wall=None, spots=None, looks_at_points=True), False, True)
+    connection.points, connection.index = wall, mi.UInt32([0, 0])
+    lit, x = mi.Bool([True, False]), mi.Float(0)
+    dr.enable_grad(x, wall.leg)
+    dr.set_grad(x, 1)
+    place, move, turn = np.array([2.0, 3, 4]), np.array([0.3, -0.2, 0.5]), np.array([0.1, 0.7, -0.4])
+    p = mi.Point3f(*place.tolist()) + mi.Vector3f(*move.tolist()) * x
+    asked = []
+
+    def evaluate(world, vertex, d, active):
+        asked.append((d, active))
+        return Local(value=mi.Spectrum(0.25) * (1 + dr.dot(d, mi.Vector3f(*turn.tolist()))), wo=None, eta=mi.Float(1.5))
+
+    def transmittance(world, vertex, end, active):
+        asked.append(end)
+        return 1
+
+    world.scattering, world.segment = Local(evaluate=evaluate), Local(attached_transmittance=transmittance)
+    record = {"lit": lit} | ({"T": mi.Color3f(0.5, 0.25, 0.125)} if media else {})
+    v = Local(of=lambda name: record, η=mi.Float(1.25), arrival=lambda name: f"arrival of {name}")
+    vertex = Local(scattered_si=Local(p=mi.Point3f(p), wavelengths=[]), v=v, rotation=None,
+                   carry=Local(β=mi.Spectrum(0.5, 0.25, 2), η=mi.Float(1.25)), scattered_opl=mi.Float64(3),
+                   scattered_slope=7 * (x - dr.detach(x)))  # fmt: skip
+    for geometry in (False, True):
+        (term,) = connection.attached(world, vertex, None, Local(geometry=geometry))
+    value, slope = term.value * 1, term.slope * 1
+    dr.enqueue(dr.ADMode.Forward, x)
+    dr.traverse(dr.ADMode.Forward)
+
+    def at(h):
+        to = SPOT - place - h * move
+        r = np.linalg.norm(to)
+        T = np.array([0.5, 0.25, 0.125]) if media else 1
+        return np.array([0.5, 0.25, 2]) * [2, 3, 5] * T * 0.25 * (1 + turn @ to / r) * -to[2] / r**3, r
+
+    (one, r1), (other, r0) = at(1e-5), at(-1e-5)
+    np.testing.assert_allclose(np.array(value), np.outer(at(0)[0], [1, 0]), rtol=1e-5)
+    np.testing.assert_allclose(np.array(dr.grad(value)), np.outer((one - other) / 2e-5, [1, 0]), rtol=1e-3, atol=1e-6)
+    assert np.array(dr.grad(slope))[0] == pytest.approx(7 + 1.25 * 1.5 * (r1 - r0) / 2e-5, rel=1e-4)
+    assert term.opl[0] == pytest.approx(3 + at(0)[1] * 1.5 * 1.25 + 0.75, rel=1e-6)
+    assert not dr.grad_enabled(term.opl) and not np.array(slope).any()
+    assert (term.active is lit, term.arrival) == (True, "arrival of laser_spot")
+    (d, active), end = asked[-2:]
+    assert active is lit and dr.grad_enabled(d) and not dr.grad_enabled(end.d)
+    np.testing.assert_array_equal(np.array(end.d), np.array(d))
+    assert (end.ahead, bool(end.far[0])) == (False, False)
 
 
 # ---------------------------------------------------------------------------------------------------- points of lights
