@@ -253,6 +253,8 @@ def test_planes_through_viewpoints_are_found_where_there_are_some():
     for _ in range(60):
         a, b = (rng.normal(size=(4, 3)) * 0.8 + rng.normal(size=3) * 0.7 + [0, 0, 3] for _ in range(2))
         q = rng.normal(size=3) * 0.5
+        # A plane through a viewpoint parts near points from far ones as well.
+        a, b = (q + (each - q) * 10 ** rng.uniform(0, 3, (4, 1)) for each in (a, b))
         u = np.concatenate([a - q, q - b])
         u /= np.linalg.norm(u, axis=1, keepdims=True)
         # Largest t with n . u >= t in a box of normals.
@@ -275,6 +277,12 @@ def test_what_lies_beyond_hides_nothing():
     assert hiding._is_beyond(far, near, points) and not hiding._is_beyond(near, far, points)
     (left, right), _ = parts_of([mesh("left", plate(1, 1, (-1, 0, 1))), mesh("right", plate(1, 1, (1, 0, 1)))])
     assert hiding._is_beyond(left, right, points) and hiding._is_beyond(right, left, points)
+    # To rounding of their size, wherever they are.
+    for nearer, beyond in ((0.8, True), (1.3, False)):
+        z = 101 - nearer * hiding.ROUNDING * 5
+        left.corners[:, 2], right.corners[:, 2] = z, 101
+        far_off = wall_grid(3, 3.75)[0] + [0, 0, 100]
+        assert hiding._is_beyond(left, right, far_off) is beyond
 
 
 def test_shapes_without_triangles():
@@ -316,5 +324,6 @@ def test_bodies_of_many_corners_are_in_a_box(monkeypatch):
     for end in ("min", "max"):
         of_box, of_body = (getattr(each @ boxed.planes.T, end)(0) for each in (boxed.corners, triangles.vertices))
         np.testing.assert_allclose(of_box, of_body, atol=1e-6)
-    monkeypatch.setattr(hiding, "MOST_PRODUCTS", 1)
-    assert parts_of([body])[0][0].hides_itself and not every.hides_itself
+    for most, unknown in ((len(v) * len(f), False), (len(v) * len(f) - 1, True)):
+        monkeypatch.setattr(hiding, "MOST_PRODUCTS", most)
+        assert parts_of([body])[0][0].hides_itself is unknown
