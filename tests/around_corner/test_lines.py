@@ -7,14 +7,15 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from support.hidden_shapes import mesh, plate, scene_of, wall_grid
+from support.hidden_shapes import folded_plates, mesh, plate, scene_of, wall_grid
 from torchtransient.errors import ShapeError
 from torchtransient.plugins.around_corner import geometry, late_density
-from torchtransient.plugins.around_corner.attached import Ends, ends_of_points, leaves
+from torchtransient.plugins.around_corner.attached import Ends, ends_of_points, ends_of_samples, leaves
 from torchtransient.plugins.around_corner.sample_table import SampleTable
 from torchtransient.plugins.around_corner.wall_points import WallPoints, points_of
 from torchtransient.plugins.remembered import Remembered
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
+from torchtransient.plugins.sampling.shared_samples import draw_samples
 from torchtransient.plugins.transport.strategy import Local
 
 VARIANT = "llvm_ad_mono"
@@ -229,7 +230,53 @@ def test_scanned_points_with_their_laser():
     assert np.array(found.leg).tolist() == [13, 12]
 
 
+def test_samples_that_a_spot_lights():
+    """What arrives on the side that faces the spot, and what that side scatters of it; nothing where a sheet is in the
+    way, or a side scatters nothing.
+    """
+    v, f = plate(1.2, 1.2, (0, 0, 1), 3)
+    turned = v * [0.5, 0.5, 1] + [1.5, 0, 0.2], f[:, ::-1]
+    shapes = [mesh("both", (v, f), 0.7, two_sided=True), mesh("away", turned, 0.6), mesh("away, both", (
+        turned[0] - [3, 0, 0], turned[1]), 0.5, two_sided=True)]  # fmt: skip
+    sheet = mesh("sheet", plate(0.4, 2, (0.3, 0, 0.5)))
+    table = HiddenElements(shapes, *wall_grid(3))
+    samples = draw_samples(table, 256, 1)
+    laser = WallPoints(mi.Point3f(0.05, 0.02, 0), mi.Normal3f(0, 0, 1), 0.25)
+    ends = ends_of_samples(scene_of(*shapes, sheet), table, samples, None, laser)
+    found = ends.load(mi.UInt32(np.arange(256)))
+    p, n, weight = (np.array(each, dtype=float) for each in (samples.p, samples.n, samples.weight))
+    to = np.array([[0.05], [0.02], [0]]) - p
+    r = np.linalg.norm(to, axis=0)
+    cos = (n * to).sum(0) / r
+    scattered = np.where(cos > 0, np.array(samples.front)[0], np.array(samples.back)[0]) * weight
+    crossing = 0.05 + (p[0] - 0.05) * 0.5 / p[2]
+    expected = np.where((crossing > 0.1) & (crossing < 0.5), 0, scattered * np.abs(cos) * (p[2] / r) / r**2)
+    clear = np.abs(np.abs(crossing - 0.3) - 0.2) > 1e-3
+    assert 20 < (expected == 0).sum() < 200 and (cos[expected > 0] < 0).any() and (cos[expected > 0] > 0).any()
+    np.testing.assert_allclose(np.array(found.front)[0][clear], expected[clear], rtol=1e-4, atol=1e-9)
+    lit = (crossing < 0.1) | (crossing > 0.5)
+    np.testing.assert_allclose(np.array(found.delay)[clear], np.where(lit, r, 0)[clear], rtol=1e-5)
+    np.testing.assert_allclose(np.array(found.n), n * np.sign(cos), atol=1e-6)
+    plain = ends_of_samples(scene_of(*shapes, sheet), table, samples, None).load(mi.UInt32(np.arange(256)))
+    np.testing.assert_allclose(np.array(plain.front)[0], np.array(samples.front)[0] * weight, rtol=1e-5)
+    np.testing.assert_allclose(np.array(plain.back)[0], np.array(samples.back)[0] * weight, rtol=1e-5)
+
+
 # ----------------------------------------------------------------------------------------------- where chains begin
+
+
+def test_pilots_of_chains_see_what_is_scattered_twice(monkeypatch):
+    """In a V that opens towards the wall, and not beside each other in one plane, nor from black sides."""
+    squares = []
+    monkeypatch.setattr(late_density, "_smoothed", lambda elements, square, *others: squares.append(square) or (
+        elements.probabilities))  # fmt: skip
+    points, normals = wall_grid(2)
+    cases = [mesh("V", folded_plates()), mesh("V", folded_plates(), two_sided=True),
+             mesh("flat", plate(1, 1, (0, 0, 1))), mesh("black", folded_plates(), 0.0)]  # fmt: skip
+    for shape in cases:
+        late_density.late_density(scene_of(shape), HiddenElements([shape], points, normals), points, normals)
+    shares = [(square > 0).mean() for square in squares]
+    assert shares[0] > 0.1 and shares[1] > 0.1 and shares[2] == shares[3] == 0
 
 
 def test_weights_of_elements_from_samples_of_neighbours(monkeypatch):

@@ -1,4 +1,4 @@
-"""From where outlines are looked for, what of them is lacking in words, and when a scan's light is that of its points."""
+"""From where outlines are looked for, what of them is lacking, and when a scan's light is that of its points."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ def test_segments_whose_outlines_are_followed():
 def walls():
     """One that faces the viewer, and one that shows its back."""
     back = transform().translate([5, 0, 0]).rotate([0, 1, 0], 180)
-    return mi.load_dict({"type": "scene", "front": {"type": "rectangle"}, "back": {"type": "rectangle", "to_world": back}},
-                        optimize=False)  # fmt: skip
+    shapes = {"front": {"type": "rectangle"}, "back": {"type": "rectangle", "to_world": back}}
+    return mi.load_dict({"type": "scene", **shapes}, optimize=False)
 
 
 def seen(scene, *x):

@@ -258,7 +258,7 @@ def test_what_is_met_in_a_shaft():
                      .reshape(-1, 3)])  # fmt: skip
     out_ball = (np.einsum("epi,ki->epk", planes[..., :3], ball).min(2) >= planes[..., 3] - slack).any(1)
     expected = ~out.all(1) | ~out_ball
-    assert 20 < expected.sum() < 130 and 10 < (~out_ball).sum() and 10 < (~out.all(1) & out_ball).sum()
+    assert 20 < expected.sum() < 130 and (~out_ball).sum() > 10 and (~out.all(1) & out_ball).sum() > 10
     np.testing.assert_array_equal(shafts._met(tree, planes, elements), expected)
 
 

@@ -102,7 +102,7 @@ def test_numbers_of_a_line_are_its_own():
               drawn_from((0.25, 0.75), lanes, free_flight.SHADOW), np.roll(one, 1, 1), np.roll(one, 1, 0)]  # fmt: skip
     for other in others:
         assert abs(np.corrcoef(one.ravel(), other.ravel())[0, 1]) < 0.05  # 6 / 16000 ** 0.5
-    assert abs(one.mean() - 0.5) < 0.015 and 0 <= one.min() and one.max() < 1
+    assert abs(one.mean() - 0.5) < 0.015 and one.min() >= 0 and one.max() < 1
     np.testing.assert_array_equal(one[:2, [0, 7]], PINNED)
 
 
@@ -283,7 +283,7 @@ def test_derivatives_of_the_transmittance_of_a_leg(forward):
     """Minus its length by the rate, and minus the rate along it by its ends: in both modes, of active lanes."""
     medium = fog()
     params = mi.traverse(medium)
-    key = next(key for key in params.keys() if "sigma_t" in key)
+    key = next(key for key in params.properties if "sigma_t" in key)
     rate, x0, x1 = (type(x)(x) for x in (params[key], mi.Point3f(0, 0.1, 3), mi.Point3f([0, 0, 0], 0.1, [1, 0.5, 0])))
     dr.enable_grad(rate, x0, x1)
     params[key] = rate
