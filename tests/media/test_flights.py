@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 
 from support.media_scenes import rgb, volume
-from torchtransient.errors import GradientError
 from torchtransient.plugins.pointer_table import registry_number
 from torchtransient.plugins.transport import media_contents
-from torchtransient.plugins.transport.scattering import medium as scattering
 from torchtransient.plugins.transport.segment import free_flight, optical_depth
 from torchtransient.plugins.transport.strategy import Local
 
@@ -227,6 +225,42 @@ def test_a_step_of_a_shadow_ray():
         assert factor[0][0] == pytest.approx(0.6 if hits else 1, rel=1e-4)
 
 
+def shadow_rays(length):
+    ray = downwards([0.0] * len(length))
+    ray.maxt = mi.Float(length) * (1 - mi.math.ShadowEpsilon)
+    return ray, mi.Float(length), [mi.Float(0.25), mi.Float(0.5)], dr.arange(mi.UInt32, len(length))
+
+
+def test_shadow_rays_through_a_block_of_fog():
+    """Its length within counts; what lies behind their end does not hide it, nor do open boundaries."""
+    block = {"type": "cube", "bsdf": {"type": "null"}, "interior": kept("fog")}
+    wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -3]).scale(5)}
+    scene = mi.load_dict({"type": "scene", "block": block, "wall": wall})
+    media = media_contents.FlightSettings(media_contents.media_of(scene, None), None, False)
+    ray, length, drawn, lanes = shadow_rays([5, 7, 3, 5])
+    nowhere, active = dr.zeros(mi.MediumPtr, 4), mi.Bool([True] * 3 + [False])
+    T, visible = free_flight.transmittance(scene, media, ray, length, nowhere, drawn, lanes, active)
+    assert np.array(visible).tolist() == [True, False, True, False]
+    np.testing.assert_allclose(np.array(T).T[[0, 2]], [np.exp(-2 * RATES), np.exp(-RATES)], rtol=1e-4)
+    free = downwards([0.0])
+    assert free_flight.closed_surface(scene, media, free, mi.Bool(True)).t[0] == pytest.approx(6, rel=1e-5)
+    assert free_flight.closed_surface(scene, None, free, mi.Bool(True)).t[0] == pytest.approx(2, rel=1e-5)
+
+
+def test_shadow_rays_that_need_no_loop():
+    """In one medium, outside of it, and to what is hidden."""
+    wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -3]).scale(5)}
+    scene = mi.load_dict({"type": "scene", "wall": wall})
+    contents = media_contents.MediaContents([kept("fog")], None, False, False, 1.0)
+    ray, length, drawn, lanes = shadow_rays([2, 2, 7])
+    number = registry_number(kept("fog"))
+    medium = dr.reinterpret_array(mi.MediumPtr, mi.UInt32([number, 0, number]))
+    media = media_contents.FlightSettings(contents, None, False)
+    T, visible = free_flight.transmittance(scene, media, ray, length, medium, drawn, lanes, mi.Bool(True))
+    assert np.array(visible).tolist() == [True, True, False]
+    np.testing.assert_allclose(np.array(T).T[:2], [np.exp(-2 * RATES), [1] * 3], rtol=1e-5)
+
+
 # ---------------------------------------------------------------------------------------------------------------- legs
 
 
@@ -313,85 +347,3 @@ def test_derivatives_of_the_transmittance_of_a_leg(forward):
 
 def test_transmittances_that_nothing_changes():
     assert optical_depth.with_log_slope(None, settings(extinction_changes=False), None, None, None, None, None) == 1
-
-
-# ------------------------------------------------------------------------------------------------------------ contents
-
-
-def test_what_the_media_of_a_scene_are_like():
-    two = [fog(), cloud()]
-    both = media_contents.MediaContents(two, two[0], True, False, 2.5)
-    assert (both.homogeneous, both.heterogeneous, both.one_stretch, both.emitter_sampling) == (True, True, False, True)
-    assert (both.at_sensor, both.open_boundaries, both.shapes_in_groups, both.extent) == (two[0], True, False, 2.5)
-    alone = media_contents.MediaContents([fog()], None, False, False, 2.5)
-    assert (alone.homogeneous, alone.heterogeneous, alone.one_stretch) == (True, False, True)
-    assert not media_contents.MediaContents([cloud()], None, False, False, 1.0).one_stretch
-    assert not media_contents.MediaContents([fog()], None, True, False, 1.0).one_stretch
-    dark = mi.load_dict({"type": "homogeneous", "sample_emitters": False})
-    some = media_contents.MediaContents([fog(), dark], None, False, False, 1.0)
-    assert not some.emitter_sampling
-    some.check_spheres(False)
-    alone.check_spheres(True)
-    with pytest.raises(GradientError, match="sample_emitters = false"):
-        some.check_spheres(True)
-    some.check_sun(False)
-    with pytest.raises(GradientError, match="'sun_direction' has no derivative in a scene with media"):
-        some.check_sun(True)
-
-
-def test_what_a_job_asks_of_walks_through_media():
-    """Least rates where an extinction is differentiated, half of one over the scene's size; boundaries are kept where
-    path lengths change and lines pass them.
-    """
-    contents = media_contents.MediaContents([fog()], None, True, False, 2.5)
-    closed = media_contents.MediaContents([fog()], None, False, False, 2.5)
-    render = media_contents.FlightSettings(contents, None, True)
-    assert (render.recorded, render.geometry, render.extinction_changes, render.keeps_entry) == (False,) * 4
-    assert render.rate_floor is None and render.hide_emitters and render.open_boundaries
-    for geometry in (False, True):
-        for extinction in (False, True):
-            wanted = Local(geometry=geometry, extinction=extinction)
-            found = media_contents.FlightSettings(contents, wanted, False)
-            assert (found.geometry, found.extinction_changes) == (geometry, geometry or extinction)
-            assert found.keeps_entry == geometry and found.recorded and not found.hide_emitters
-            assert not media_contents.FlightSettings(closed, wanted, False).keeps_entry
-            assert (found.rate_floor is not None) == extinction
-            assert not extinction or found.rate_floor[0] == pytest.approx(0.2)
-
-
-def test_media_of_a_scene():
-    """Each once, those around the sensor and beyond shapes included; the size is the diagonal of all shapes."""
-    inside, outside = ({"type": "homogeneous", "sigma_t": x, "id": f"fog{x}"} for x in (1.0, 2.0))
-    sheet = {"type": "rectangle"}
-    dense = {"type": "rectangle", "interior": inside, "exterior": outside, "bsdf": {"type": "null"}}
-    scene = mi.load_dict({"type": "scene", "dense": dense, "sheet": sheet})
-    found = media_contents.media_of(scene, None)
-    assert {medium.id() for medium in found.media} == {"fog1.0", "fog2.0"} and found.at_sensor is None
-    assert found.extent == pytest.approx(8**0.5) and found.open_boundaries and not found.shapes_in_groups
-    assert media_contents.media_of(mi.load_dict({"type": "scene", "sheet": sheet}), None) is None
-    film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
-    sensor = mi.load_dict({"type": "radiancemeter", "medium": inside, "film": film})
-    alone = media_contents.media_of(mi.load_dict({"type": "scene", "sheet": sheet}), sensor)
-    assert len(alone.media) == 1 and alone.at_sensor.id() == "fog1.0" and not alone.open_boundaries
-    empty = media_contents.media_of(mi.load_dict({"type": "scene"}), sensor)
-    assert empty.extent == 1
-
-
-def test_boundaries_that_light_passes_unbent():
-    """A BSDF ``null`` that emits nothing, of one shape and of many."""
-    kinds = {"open": {"bsdf": {"type": "null"}}, "lamp": {"bsdf": {"type": "null"}, "emitter": {"type": "area"}},
-             "wall": {}, "veil": {"bsdf": {"type": "mask", "opacity": 0.5, "nested": {"type": "diffuse"}}}}  # fmt: skip
-    shapes = [mi.load_dict({"type": "rectangle"} | kind) for kind in kinds.values()]
-    assert [media_contents.is_open(shape) for shape in shapes] == [True, False, False, False]
-    assert np.array(media_contents.is_open(mi.ShapePtr(shapes))).tolist() == [True, False, False, False]
-
-
-def test_phase_functions_too_narrow_for_single_precision():
-    value = scattering.finite(mi.Float([2, np.inf, np.nan]), mi.Float(7))
-    assert np.array(value).tolist() == [2, 7, 7] and np.array(scattering.finite(mi.Float(np.inf)))[0] == 0
-    assert scattering.unpolarizing("as it is") == "as it is"
-    with mi.variant_context("llvm_ad_mono_polarized"):
-        matrix = np.array(scattering.unpolarizing(mi.UnpolarizedSpectrum(0.75)), dtype=float).reshape(4, 4)
-    expected = np.zeros((4, 4))
-    expected[0, 0] = 0.75
-    np.testing.assert_array_equal(matrix, expected)
