@@ -141,7 +141,7 @@ class ObstacleTree:
         triangles = triangles[~_harmless(triangles, region, hidden, slack)]
         low = np.concatenate([triangles.min(1), boxes[:, 0]])
         high = np.concatenate([triangles.max(1), boxes[:, 1]])
-        order = morton_order((low + high) / 2)
+        order = morton_order(low + high)
         depth = max(1, int(len(order) - 1).bit_length()) if len(order) else 1
         leaves = 2**depth
         # Nothing meets an empty box.
