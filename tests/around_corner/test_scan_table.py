@@ -116,6 +116,83 @@ def test_walls_that_lie_in_one_plane():
     assert not scan_table._in_one_plane([disk, mi.load_dict({"type": "sphere"})])
 
 
+def table_of(kind="single", **arguments):
+    scene = mi.load_dict(scan_scene({"a": plane()}, kind, **arguments))
+    integrator = scene.integrator()
+    return integrator.scan_table(scene, integrator.contents(scene, scene.sensors()[0]))
+
+
+def test_points_that_stand_for_a_scan():
+    """Five in a row at most, with the normals on the side that is looked at."""
+    turned = {"type": "rectangle", "to_world": transform().rotate([0, 1, 0], 180).scale([0.5, 0.5, 1]),
+              "bsdf": {"type": "twosided", "nested": {"type": "diffuse"}}}  # fmt: skip
+    for wall, flip in ((None, 1), (turned, -1)):
+        points, normals = table_of(film=film(bins=2) | {"width": 7, "height": 2}, wall=wall).reference_points()
+        columns, rows = (np.array([0, 2, 3, 4, 6]) + 0.5) / 7 - 0.5, (np.arange(2) + 0.5) / 2 - 0.5
+        expected = np.stack([np.tile(columns * flip, 2), np.repeat(rows, 5), np.zeros(10)], 1)
+        np.testing.assert_allclose(points, expected, atol=1e-6)
+        np.testing.assert_allclose(normals, np.tile([0, 0, 1], (10, 1)), atol=1e-6)
+
+
+def test_the_spot_of_a_beam():
+    """What the wall scatters of its energy, or of one joule; the way from the laser where it counts."""
+    table = table_of(laser={"type": "laser_beam", "energy": 2.5})
+    spots = table.spots
+    way = np.array([-0.2, 0.1, 0.0]) - [-0.5, 0.0, 0.25]
+    length = np.linalg.norm(way)
+    assert spots.length[0] == pytest.approx(length, rel=1e-5)
+    np.testing.assert_allclose(np.array(spots.origin).ravel(), [-0.5, 0, 0.25], atol=1e-6)
+    assert np.array(spots.lit().wi)[2, 0] == pytest.approx(0.25 / length, rel=1e-5)
+    for legs in (False, True):
+        for energy in (False, True):
+            points = spots.points(legs, energy=energy)
+            np.testing.assert_allclose(np.array(points.p).ravel(), [-0.2, 0.1, 0], atol=1e-6)
+            assert points.value[0][0] == pytest.approx(0.9 / np.pi * (2.5 if energy else 1), rel=1e-5)
+            assert points.leg[0] == pytest.approx(length if legs else 0, rel=1e-5)
+    assert spots.energy([], mi.UInt32(0), mi.Float([0.5, 0]), True)[0].numpy().tolist() == [5, 0]
+    assert len(spots.arrays()) == 10
+
+
+def test_spots_that_are_more_than_points():
+    """Of walls that are not diffuse, or not flat."""
+    assert table_of().lambertian_spots(True).leg[0] > 0 and table_of().lambertian_spots(False).leg[0] == 0
+    plate = {"type": "rectangle", "to_world": transform().scale([0.5, 0.5, 1])}
+    assert table_of(wall=plate | {"bsdf": {"type": "roughconductor"}}).lambertian_spots(True) is None
+    ball = {"type": "sphere", "center": [0, 0, 2.0], "radius": 2.05, "flip_normals": True}
+    points = mi.TensorXf(np.float32([[[0.1, 0.1, -0.045]]]))
+    scene = scan_scene({"a": plane()}, "single", film(1, bins=2), wall=ball)
+    scene["wall"]["sensor"]["points"] = points
+    scene = mi.load_dict(scene)
+    table = scene.integrator().scan_table(scene, scene.integrator().contents(scene, scene.sensors()[0]))
+    assert table.wall is None and table.lambertian_spots(True) is None
+
+
+def test_overlaps_are_looked_for_once(monkeypatch):
+    """As long as elements that are kept are the same; with the wall, which is another table, once more."""
+    calls = []
+    monkeypatch.setattr(scan_table, "overlaps", lambda *given: calls.append(given[1]) or ["a"])
+    scene = mi.load_dict(scan_scene({"a": plane()}))
+    integrator = scene.integrator()
+    first, second = (integrator.scan_table(scene, integrator.contents(scene, scene.sensors()[0])) for _ in range(2))
+    assert first.overlaps(False) == second.overlaps(False) == ["a"] and len(calls) == 1
+    assert {shape.id() for shape in calls[0].shapes} == {"a"}
+    second.overlaps(True)
+    first.overlaps(True)
+    assert len(calls) == 2 and {shape.id() for shape in calls[1].shapes} == {"a", "wall"}
+    first.elements(first.wall).key = b""
+    first.overlaps(False)
+    first.overlaps(False)
+    assert len(calls) == 4
+
+
+def test_planes_of_walls_are_those_to_rounding():
+    """A millionth of their extent and no more."""
+    for height, flat in ((0.0, True), (4e-7, True), (1e-5, False)):
+        sheets = [mi.load_dict({"type": "rectangle", "to_world": transform().translate([x, 0, z])})
+                  for x, z in ((-1, 0.0), (1, height))]  # fmt: skip
+        assert scan_table._in_one_plane(sheets) is flat
+
+
 THIRD, CHAINS = "three bounces from hidden samples", "4 to 7 bounces from chains"
 
 

@@ -8,6 +8,7 @@ import pytest
 
 from support.nlos_scenes import captures, film, plane, ratio, scan_scene, side, transform, worst_of_blocks
 from torchtransient.errors import SceneError
+from torchtransient.plugins.transport.strategy import Local
 
 VARIANT = "llvm_ad_mono"
 SIGMAS = 4.0
@@ -253,6 +254,51 @@ def test_polarized_light_of_a_glossy_surface():
     mi.set_variant("llvm_ad_mono_polarized")
     stokes = captures(scan_scene(plate, "single", film(2)), 2**13, 6)
     agree(stokes[..., :1], plain, 0.02)
+
+
+# ------------------------------------------------------------------------------------------------- what walks are of
+
+
+def test_segments_and_guides_of_a_walk():
+    """In vacuum vertices are points of their shapes, but where these are attached along rays alone; hidden area takes
+    nine tenths of the samples at the wall and a quarter beyond, or half of them everywhere.
+    """
+    plain = {"media": None, "instances": None, "detached_hits": None}
+
+    def integrator(laser=True, hidden=True, **settings):
+        settings |= {"nlos_laser_sampling": laser, "nlos_hidden_geometry_sampling": hidden}
+        return mi.load_dict({"type": "transient_nlos_path"} | settings)
+
+    def segment(laser=True, hidden=True, **changes):
+        return integrator(laser, hidden)._segment(Local(**plain | changes)).__name__
+
+    assert [segment(), segment(hidden=False), segment(laser=False)] == ["FoundVacuum", "MaterialVacuum", "Vacuum"]
+    assert [segment(instances=1), segment(detached_hits=1), segment(media=1)] == ["Vacuum", "Vacuum", "Media"]
+    asked, wall = [], object()
+    table = Local(elements=lambda without: asked.append(without))
+    contents = Local(media=None, sensor=Local(get_shape=lambda: wall))
+
+    def guide(contents=contents, **settings):
+        (found,) = integrator(**settings)._guides(contents, table)
+        return found.at_wall, found.share
+
+    assert guide() == (0.9, 0.25) and asked == [[wall]]
+    assert guide(nlos_hidden_geometry_sampling_do_rroulette=True) == (0.5, 0.5)
+    assert guide(Local(media="fog", sensor=Local(get_shape=lambda: None))) == (0.5, 0.5) and asked[-1] == []
+    assert guide(nlos_hidden_geometry_sampling_includes_relay_wall=True) == (0.9, 0.25) and asked[-1] == []
+    assert integrator(hidden=False)._guides(contents, table) == []
+
+
+@pytest.mark.parametrize(("given", "kind"), [
+    ("single", 1), ("Confocal", 2), ("EXHAUSTIVE", 3), ("1", 1), (" 2", 2), (3, 3), (2.0, 2),
+])  # fmt: skip
+def test_types_of_captures(given, kind):
+    from torchtransient.plugins.integrators.nlos_path import capture_type
+
+    assert capture_type(given).value == kind
+    for wrong in ("0", "-1", 4, "both", 1.5):
+        with pytest.raises(SceneError, match="capture_type: expected single, confocal or exhaustive"):
+            capture_type(wrong)
 
 
 # ---------------------------------------------------------------------------------------------------------- errors

@@ -279,6 +279,46 @@ def test_slopes_backwards_are_finite(kind):
     assert np.isfinite(slope).all() and slope.any()
 
 
+@pytest.mark.parametrize("kind", list(KEYS))
+def test_what_is_none_of_theirs_moves_as_it_did(kind):
+    """The lanes of other shapes, of nothing and of what is not asked for: no infinity reaches their rays and points."""
+    scene = mi.load_dict({"type": "scene", **two_of_each(kind)}, optimize=False)
+    ray = rays_to_targets(0.0)
+    pi, table = scene.ray_intersect_preliminary(ray), DetachedHits.of(scene).read()
+    plain, others = pi.compute_surface_interaction(ray), slice(6, 9)
+    si, p = mi.SurfaceInteraction3f(plain), mi.Point3f(plain.p)
+    dr.enable_grad(ray.o, ray.d, p)
+    si.p = p
+    found = table.attach(pi, pi.shape, ray, mi.Bool(ACTIVE))
+    table.put_right(si, found, mi.Bool(ACTIVE))
+    for name in ("n", "uv", "dp_du"):
+        np.testing.assert_array_equal(np.array(getattr(si, name)), np.array(getattr(plain, name)))
+    dr.backward(dr.sum(found.t + found.prim_uv.x + si.n.x + si.n.y + si.uv.y + si.dp_du.z + si.sh_frame.s.y + p.x))
+    slopes = [np.array(dr.grad(part)) for part in (ray.o, ray.d, p)]
+    assert not any(np.isnan(slope).any() for slope in slopes)
+    assert not slopes[0][:, others].any() and not slopes[1][:, others].any()
+    np.testing.assert_array_equal(slopes[2][:, others], [[1] * 3, [0] * 3, [0] * 3])
+    # Those of theirs follow the ray, or the point.
+    assert slopes[0 if kind != "bsplinecurve" else 2][:2, :6].any(0).all()
+
+
+def test_a_cone_as_steep_as_its_radius_has_no_slope_along_it():
+    """A segment whose radius grows as fast as it is long: nothing is divided by zero."""
+    scene = mi.load_dict(
+        {"type": "scene", "shape": curve_of("linearcurve", "steep.txt", np.array([[0, -1.0, 0, 1], [0, 1.0, 0, 3]]))}
+    )
+    params, pi = mi.traverse(scene), dr.zeros(mi.PreliminaryIntersection3f)
+    dr.enable_grad(params["shape.control_points"])
+    params.update()
+    pi.t, pi.prim_uv, pi.shape = mi.Float(2), mi.Point2f(0.5, 0), mi.ShapePtr(scene.shapes()[0])
+    ray = mi.Ray3f(mi.Point3f(0.3, 0.2, -4), mi.Vector3f(0, 0, 1))
+    found = DetachedHits.of(scene).read().attach(pi, pi.shape, ray, mi.Bool(True))
+    dr.backward(found.t + found.prim_uv.x)
+    slope = np.array(dr.grad(params["shape.control_points"])).reshape(2, 4)
+    # The distance alone: |off|^2 = r^2 at (0.3, 0.2, -2), in the middle between both ends.
+    np.testing.assert_allclose(slope, np.tile([0.3, 0.2, -2, 2], (2, 1)) * 0.5 / -2, rtol=1e-5)
+
+
 def test_a_spline_that_bends_as_its_surface_has_no_slope():
     """At the centre of its curvature every place along it is as near: nothing is divided by zero."""
     points = np.array([[-3, 0, 0, 1], [0, 1.5, 0, 1], [3, 0, 0, 1], [6, 0, 0, 1]])

@@ -162,6 +162,55 @@ def test_slopes_backwards_are_finite():
     assert np.isfinite(dr.grad(x)[0]) and dr.grad(x)[0] != 0
 
 
+def test_idle_lanes_reach_no_pose():
+    """What nothing was met by may hold what is no number, or lie at the ray's start: the poses, which all lanes share,
+    and its own ray hear nothing of it.
+    """
+    scene, x = scene_of("egg", "tube"), mi.Float(0)
+    params = mi.traverse(scene)
+    dr.enable_grad(x)
+    move(params, x, ("first",))
+    ray = rays(0.0)
+    pi = scene.ray_intersect_preliminary(ray)
+    missed = ~pi.is_valid()
+    lane = dr.arange(mi.UInt32, 10)
+    ray.o = dr.select(missed, dr.select(lane < 6, 0, mi.Float(np.nan)), ray.o)
+    ray.d = dr.select(missed & (lane >= 6), np.nan, ray.d)
+    dr.enable_grad(ray.o)
+    flags = mi.RayFlags.All | mi.RayFlags.FollowShape
+    si = module.surface_interaction(surfaces_of(scene), pi, ray, flags, mi.Bool(True))
+    dr.backward(dr.sum(dr.select(si.is_valid(), si.t + si.n.x + si.p.z, 0)))
+    slope = np.array(dr.grad(ray.o))
+    assert np.isfinite(dr.grad(x)[0]) and np.isfinite(slope).all() and slope.any()
+    assert np.array(missed).sum() == 4 and not slope[:, np.array(missed)].any()
+
+
+def test_poses_are_hidden_for_a_while():
+    """From Mitsuba, and attached again afterwards, whatever has happened: those that were."""
+    scene, x = scene_of("egg", "tube"), mi.Float(0)
+    params = mi.traverse(scene)
+    dr.enable_grad(x)
+    move(params, x, ("second",))
+    found = Instances.of(scene)
+
+    def attached():
+        return {node.id(): dr.grad_enabled(shown.read(node)) for node, shown in found._shown}
+
+    before = {"first": False, "second": True}
+    assert attached() == before
+
+    def fail():
+        with found.detached():
+            assert attached() == dict.fromkeys(before, False)
+            raise ValueError("what a derivative may raise")
+
+    with pytest.raises(ValueError, match="may raise"):
+        fail()
+    assert attached() == before
+    matrix = np.array(params["second.to_world"].matrix).reshape(4, 4)
+    np.testing.assert_allclose(matrix, POSES["second"], rtol=1e-6)
+
+
 def test_frames_of_normals_and_tangents():
     """Across the normal along the tangent; where there is none, as Mitsuba does it."""
     n = dr.normalize(mi.Normal3f([0.3, 0.2], [-0.2, 0.1], [0.9, -0.5]))

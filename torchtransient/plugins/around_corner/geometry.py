@@ -40,7 +40,7 @@ def front_normal(si: Any) -> Any:
     """The geometric normal (Normal3f) on the side that the shading normal points to, where a one-sided surface
     scatters: with mirrored transforms, and normals against the order of the corners, Mitsuba's own points behind.
     """
-    return dr.mulsign(mi.Normal3f(si.n), dr.detach(dr.dot(si.sh_frame.n, si.n)))
+    return dr.mulsign(mi.Normal3f(si.n), dr.dot(si.sh_frame.n, si.n))
 
 
 def sees(scene: Any, start: Any, end: Any, n: Any, active: Any) -> Any:

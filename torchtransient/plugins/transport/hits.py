@@ -117,11 +117,11 @@ class EllipsoidTable(_Kind):
         number = first - 1 + pi.prim_index
         n = [dr.gather(mi.Float, self._data, number * _ELLIPSOID + k, here) for k in range(_ELLIPSOID)]
         size = dr.gather(mi.Float, self._extents, number, here)
-        axes = dr.select(here, mi.Vector3f(n[3], n[4], n[5]) * size, 1)
+        axes = mi.Vector3f(n[3], n[4], n[5]) * size
         turn = dr.quat_to_matrix(mi.Matrix3f, mi.Quaternion4f(*n[6:])).T
         p = dr.select(here, ray.o + ray.d * pi.t, 0)
         local = mi.Vector3f(turn @ (p - mi.Point3f(*n[:3]))) / axes
-        towards = mi.Vector3f(turn @ dr.select(here, ray.d, 0)) / axes
+        towards = mi.Vector3f(turn @ ray.d) / axes
         # Along the ray, |local|^2 = 1.
         rate = 2 * dr.detach(dr.dot(local, towards))
         meets = here & (rate != 0)

@@ -87,7 +87,7 @@ class InstanceTable:
     def interaction(self, pi: Any, ray: Any, flags: int, active: Any, hits: HitTable | None) -> Any:
         """As :func:`surface_interaction`."""
         with dr.suspend_grad():
-            si = pi.compute_surface_interaction(dr.detach(ray), flags, active)
+            si = pi.compute_surface_interaction(ray, flags, active)
             valid = si.is_valid()
         M, inverse = self._matrices(si.instance)
         local_ray = mi.Ray3f(ray)
@@ -101,7 +101,7 @@ class InstanceTable:
             hits.put_right(local, pi, valid)
 
         # What Mitsuba found keeps its value to the bit.
-        si.p = dr.replace_grad(si.p, _point(M, dr.select(valid, local.p, 0)))
+        si.p = dr.replace_grad(si.p, _point(M, local.p))
         t = local.t
         if mi.has_flag(flags, mi.RayFlags.FollowShape):
             t = dr.norm(dr.select(valid, si.p - ray.o, mi.Vector3f(1))) * dr.rsqrt(dr.squared_norm(ray.d))

@@ -132,11 +132,13 @@ def walk(world, sampler, ray, first_opl, sink, η=1, leg=None):
     kept = sink.begin(world)
     # Of the last vertex nothing is asked but its connections where no light is found: it needs no turn of the loop.
     turns = world.max_depth if world.finds_light or sink.keeps_vertices else max(world.max_depth - 2, 0)
-    if dr.hint(world.dark_at_first and not sink.keeps_vertices and turns > 0, mode="scalar"):
+    dark = world.dark_at_first and not sink.keeps_vertices and turns > 0
+    if dr.hint(dark, mode="scalar"):
         bounce(world, path, kept, sampler, sink, dark=True)
-        turns = turns if turns > 1 else 0
-    while dr.hint(path.active & (path.depth < turns), max_iterations=turns, label="path"):
-        bounce(world, path, kept, sampler, sink)
+    # A loop of no turn would be compiled all the same.
+    if dr.hint(turns > dark or sink.keeps_vertices, mode="scalar"):
+        while dr.hint(path.active & (path.depth < turns), max_iterations=turns, label="path"):
+            bounce(world, path, kept, sampler, sink)
     if dr.hint(not (world.finds_light or sink.keeps_vertices), mode="scalar"):
         look_around(world, path, kept, sampler, sink)
     sink.end(kept)

@@ -127,7 +127,7 @@ class EmitterFound(Connection):
                 light.uv, light.sh_frame.n = light.uv + slide.uv, light.sh_frame.n + slide.sh_n
         light.wi = dr.select(lit, light.to_local(-out), fixed.wi)
         towards = world.scattering.evaluate(world, vertex, out, lit)
-        Le = mi.unpolarized_spectrum(dr.detach(light).emitter(world.scene).eval(light, lit))
+        Le = mi.unpolarized_spectrum(fixed.emitter(world.scene).eval(light, lit))
         value = scatter_unpolarized(towards.value, vertex.rotation) * (step.inv_pdf * J * mis) * Le
         end = Local(p=light.p, d=following.ray.d, far=mi.Bool(False), ahead=True)
         T = world.segment.weight(following) * world.segment.attached_transmittance(world, vertex, end, lit)

@@ -134,9 +134,9 @@ class EmitterSampled(Connection):
         alone = light.ds.delta | light.cone
         if self.sun is not None and not self.sun.rare:
             alone |= light.sun
-        pdf = dr.select(alone, 0, dr.detach(towards.pdf))
+        pdf = dr.select(alone, 0, towards.pdf)
         with dr.suspend_grad():
-            mis = self.weight(world, dr.detach(si), light.ds, light.ds.pdf, pdf, lit)
+            mis = self.weight(world, si, light.ds, light.ds.pdf, pdf, lit)
         value = scatter_unpolarized(towards.value, vertex.rotation) * Le * mis
         if "T" in r:
             value *= r["T"]
@@ -155,7 +155,7 @@ class EmitterSampled(Connection):
         """The sampled point of a light, attached: ``p, n``, its ``area`` element, and what kind it is of."""
         scene = world.scene
         with dr.suspend_grad():
-            ds, weight = self.sample(world, dr.detach(si), u, lit)
+            ds, weight = self.sample(world, si, u, lit)
             flags = ds.emitter.flags()
             far = lit & mi.has_flag(flags, mi.EmitterFlags.Infinite)
             surface = lit & mi.has_flag(flags, mi.EmitterFlags.Surface) & ~far
@@ -170,12 +170,12 @@ class EmitterSampled(Connection):
         if wanted.light:
             at_point = lit & mi.has_flag(flags, mi.EmitterFlags.DeltaPosition)
             moving, _ = scene.sample_emitter_direction(si, u, False, at_point)
-            light.p = dr.replace_grad(light.p, dr.select(at_point, moving.p, dr.detach(moving.p)))
+            light.p = dr.replace_grad(light.p, dr.select(at_point, moving.p, 0))
         if wanted.sphere_lights:
             light.cone = surface & self.claims(world, ds.emitter, ds.d, wanted)
             light.surface = surface & ~light.cone
             moving, light.cone_weight = self.sample(world, si, u, light.cone)
-            light.p = dr.replace_grad(light.p, dr.select(light.cone, moving.p, dr.detach(moving.p)))
+            light.p = dr.replace_grad(light.p, dr.select(light.cone, moving.p, 0))
         if wanted.geometry and world.contents.smooth_lights is not None:
             _, _, there, n = self._found(world, si, light)
             light.face_n = dr.select(there, n, light.face_n)
@@ -189,7 +189,7 @@ class EmitterSampled(Connection):
         what knows the shape.
         """
         with dr.suspend_grad():
-            ray = dr.detach(ref).spawn_ray(ds.d)
+            ray = ref.spawn_ray(ds.d)
             pi = world.segment.next_surface(world, ray, active)
             there = active & pi.is_valid()
             found = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, there)

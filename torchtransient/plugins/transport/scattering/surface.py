@@ -262,7 +262,7 @@ class Surface(Scattering):
         wo = si.to_local(out)
         value, pdf = self.eval_pdf(vertex, wo, out, active, sampled)
         if ds is not None:
-            pdf = self.mixture(world, vertex.v.k, dr.detach(si.p), ds, pdf, active)
+            pdf = self.mixture(world, vertex.v.k, si.p, ds, pdf, active)
         value = self.correct_two_sided(world, vertex.bsdf, si, wo, vertex.delay.scaled(value))
         return Local(value=value, pdf=pdf, wo=wo, eta=self.relative_index(vertex.bsdf, si, wo))
 
@@ -308,7 +308,7 @@ class Surface(Scattering):
             if world.contents.distant is not None:
                 far_away = slope_only(world.contents.distant.length(si.p, following.d))
                 longer = dr.select(smooth & ~ahead, far_away, longer)
-            slope = slope + dr.detach(η) * longer
+            slope = slope + η * longer
         p, n = (motion.p, motion.n) if "p" in world.carried else (mi.Point3f(0), mi.Normal3f(0))
         carry = Carry(
             β=product(vertex.carry.β, weight), slope=slope, η=η, o=o, d=d, x=dr.select(v.goes_on, si.p, 0), w=w, p=p,

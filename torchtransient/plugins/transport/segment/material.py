@@ -60,7 +60,7 @@ class MaterialVacuum(Vacuum):
         with dr.suspend_grad():
             si = v.pi.compute_surface_interaction(v.ray, flags, active)
         si.p, si.n = dr.replace_grad(si.p, carry.p), dr.replace_grad(si.n, carry.n)
-        si.sh_frame.n = dr.replace_grad(si.sh_frame.n, dr.mulsign(carry.n, dr.dot(si.sh_frame.n, dr.detach(si.n))))
+        si.sh_frame.n = dr.replace_grad(si.sh_frame.n, dr.mulsign(carry.n, dr.dot(si.sh_frame.n, si.n)))
         return si
 
     def _place(self, world, pi, ray, n, active):
@@ -74,7 +74,7 @@ class MaterialVacuum(Vacuum):
                 si, area = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active & ~listed), 1
         else:
             si, area = material_point(pi, ray, active & ~listed, world.contents.meshes)
-        across = dr.mulsign(point.across / twice, dr.dot(dr.detach(point.across), n))
+        across = dr.mulsign(point.across / twice, dr.dot(point.across, n))
         return dr.select(listed, point.p, si.p), dr.select(listed, across, si.n), dr.select(listed, twice, area)
 
     @staticmethod
@@ -88,7 +88,7 @@ class MaterialVacuum(Vacuum):
         to = dr.select(ahead, p - si.p, mi.Vector3f(following.d))
         r2 = dr.squared_norm(to)
         d = to * dr.rsqrt(r2)
-        cos = dr.abs_dot(dr.select(ahead, n, mi.Normal3f(dr.detach(d))), d)
+        cos = dr.abs_dot(dr.select(ahead, n, mi.Normal3f(d)), d)
         measure = dr.select(ahead & (cos > 0), area * cos / r2, 1)
         longer = slope_only(distance(si.p, p, ahead))
         return Local(

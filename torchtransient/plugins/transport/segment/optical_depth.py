@@ -64,8 +64,7 @@ def optical_depth(media, leg, part, x0, x1, active):
     bounded = inside & (end > begin) & dr.isfinite(end)
     length = dr.select(bounded, end - begin, 0)
     mei = medium_interaction(ray, part.medium, dr.fma(part.u, length, dr.select(bounded, begin, 0)))
-    σ_t = part.medium.get_scattering_coefficients(mei, bounded)[2]
-    return dr.select(bounded, σ_t * length, 0)
+    return part.medium.get_scattering_coefficients(mei, bounded)[2] * length
 
 
 def first_stretch(scene, media, leg, active):

@@ -34,7 +34,7 @@ class HiddenGeometry(Guide):
         if primitive is None:  # a light was asked for a point of its shape, and does not say of which triangle
             ray = mi.Ray3f(mi.Point3f(p), dr.normalize(v))
             with dr.suspend_grad():
-                primitive = shape_hit(world, dr.detach(ray), shape, active)
+                primitive = shape_hit(world, ray, shape, active)
         per_area = self.elements.per_area(shape, primitive, q, active)
         d2 = dr.squared_norm(v)
         cos = dr.abs_dot(n, v) * dr.rsqrt(d2)

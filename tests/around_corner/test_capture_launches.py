@@ -1,0 +1,125 @@
+"""How a capture is split into launches and lanes: every sample meets every point, once."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from torchtransient.plugins.around_corner import launches, third_bounce_gradients
+from torchtransient.plugins.around_corner.attached import Ends
+from torchtransient.plugins.around_corner.late_light import Tiles, divmod_by
+from torchtransient.plugins.around_corner.third_bounce_gradients import AdjointReader, Split
+from torchtransient.plugins.transport.strategy import Local
+
+VARIANT = "llvm_ad_mono"
+WIDTH, BANDS, SAMPLES = 5, [(0, 3), (3, 1)], 43
+
+
+def film_of(most=None, entry=None):
+    return Local(crop_size=lambda: (WIDTH, 4), lanes_at_most=lambda events: most, band_layout=lambda: BANDS,
+                 entries_per_pixel=lambda: 7, first_entry=lambda: entry)  # fmt: skip
+
+
+def covered(found):
+    """How often each pixel meets each sample."""
+    times = np.zeros((WIDTH * 4, SAMPLES), dtype=int)
+    for launch in found:
+        pixel, first, last = (np.array(each) for each in launch.lanes())
+        assert len(pixel) == launch.width * launch.rows * launch.spp and launch.chunks == launch.spp
+        first, last = np.broadcast_to(first, pixel.shape), np.broadcast_to(last, pixel.shape)
+        if launch.lists_events:
+            assert (np.diff(pixel) >= 0).all() and (last - first.astype(int)).max() <= launches.EVENTS
+        elif launch.spp > 1:
+            assert (np.diff(pixel)[: launch.width * launch.rows - 1] == 1).all()
+        for one, begin, end in zip(pixel, first, last, strict=True):
+            times[one, begin:end] += 1
+    return times
+
+
+@pytest.mark.parametrize("busy", [1, 15, 64, 10**6])
+def test_lanes_that_add_up(monkeypatch, busy):
+    """As many for a pixel as keep all cores busy, in launches of so many connections."""
+    monkeypatch.setattr(launches, "_BUSY", {dr.backend_v(mi.Float): busy})
+    found = launches.launches_of(film_of(), WIDTH * 4, SAMPLES)
+    lanes = [min(max(1, busy // (WIDTH * rows)), SAMPLES) for _, rows in BANDS]
+    expected = [(k, first, rows, first, lanes[k], 0, SAMPLES) for k, (first, rows) in enumerate(BANDS)]
+    told = [(n.band, n.first_row, n.rows, n.band_first_row, n.spp, n.first, n.last) for n in found]
+    assert told == expected and {(n.width, n.most_events, n.lists_events) for n in found} == {(WIDTH, 1, False)}
+    assert (covered(found) == 1).all()
+    monkeypatch.setattr(launches, "_CONNECTIONS", 15 * 7)
+    found = launches.launches_of(film_of(), WIDTH * 4, SAMPLES)
+    parts = [(n.band, n.first, n.last) for n in found]
+    ends = [[*range(0, SAMPLES, size), SAMPLES] for size in (7, 21)]
+    assert parts == [(k, *pair) for k in (0, 1) for pair in zip(ends[k], ends[k][1:], strict=False)]
+    assert (covered(found) == 1).all()
+
+
+def test_few_points_have_many_lanes():
+    """Some thousands in all, in one launch for a second's work."""
+    found = launches.launches_of(film_of(), WIDTH * 4, 2**16)
+    assert len(found) == 2 and all(2**11 < n.width * n.rows * n.spp <= 2**13 for n in found)
+
+
+@pytest.mark.parametrize(("most", "spp", "rows"), [
+    (1, [1, 1, 1], [1] * 4), (10, [2, 1], [1] * 4), (15, [3], [1] * 4), (30, [3], [2, 1, 1]), (44, [3], [2, 1, 1]),
+    (45, [3], [3, 1]), (1000, [3], [3, 1]),
+])  # fmt: skip
+def test_lanes_that_list_events(most, spp, rows):
+    """Of at most sixteen samples each: all lanes of a row at once where they fit, several rows where these do."""
+    found = launches.launches_of(film_of(most), WIDTH * 4, SAMPLES)
+    assert [(n.rows, n.spp) for n in found] == [(height, lanes) for height in rows for lanes in spp]
+    starts = np.cumsum([0, *rows])[:-1]
+    assert [n.first_row for n in found] == [row for row in starts for _ in spp]
+    assert [n.band_first_row for n in found] == [3 if row == 3 else 0 for row in starts for _ in spp]
+    assert {(n.most_events, n.lists_events, n.width) for n in found} == {(launches.EVENTS, True, WIDTH)}
+    assert (covered(found) == 1).all()
+
+
+@pytest.mark.parametrize("entry", [None, 3])
+def test_where_a_pixel_begins_in_its_band(entry):
+    launch = launches.Launch(1, 3, 1, 1, WIDTH, 3, 0, SAMPLES, 1, False)
+    base = np.array(launch.base(film_of(entry=entry), mi.UInt32([15, 17])))
+    assert base.tolist() == [0 + (entry or 0), 14 + (entry or 0)]
+
+
+@pytest.mark.parametrize("busy", [1, 3, 7, 100])
+def test_lanes_of_a_derivative(monkeypatch, busy):
+    """Several for each sample where there are few, each with a range of the points."""
+    monkeypatch.setattr(third_bounce_gradients, "BUSY", busy)
+    split = Split(Ends(3, {"leg": mi.Float([2, 3, 5])}), 11)
+    assert split.lanes == min(11, max(1, -(-busy // 3)))
+    times = np.zeros((3, 11), dtype=int)
+    for own, first, last in zip(*(np.array(each) for each in (split.own, split.first, split.last)), strict=True):
+        times[own, first:last] += 1
+    assert (times == 1).all()
+    np.testing.assert_array_equal(np.array(split.fields.leg), np.array([2, 3, 5])[np.array(split.own)])
+    value = np.arange(3.0 * split.lanes) ** 2
+    found = np.array(split.reduced(mi.Float(value)))
+    np.testing.assert_array_equal(found, value.reshape(split.lanes, 3).sum(0))
+
+
+def test_adjoints_of_scanned_points_are_those_of_their_pixels():
+    asked = []
+    incoming = Local(block=lambda place, pixel, match: asked.append((place, pixel, match)))
+    AdjointReader(film_of(), "match", incoming).block(mi.UInt32([0, 4, 5, 17]))
+    place, pixel, match = asked[0]
+    assert (np.array(place.row).tolist(), np.array(place.column).tolist()) == ([0, 0, 1, 3], [0, 4, 0, 2])
+    assert (np.array(pixel).tolist(), match, place.laser) == ([0, 4, 5, 17], "match", None)
+
+
+def test_points_of_a_tile_lie_as_far_apart_as_a_scan_is_wide():
+    """Neighbouring tiles stand next to each other along a curve."""
+    tiles = Tiles(5, 3, 2)
+    assert tiles.count == 6 and tiles.numbers.tolist() == [0, 1, 2, 0, 1, 3, 4, 5, 3, 4, 0, 1, 2, 0, 1]
+    assert np.array(tiles.of).tolist() == tiles.numbers.tolist()
+    assert np.array(tiles.rank).tolist() == [0, 1, 4, 2, 3, 5]
+    one = Tiles(3, 2, 4)
+    assert (one.count, one.numbers.tolist(), np.array(one.rank).tolist()) == (1, [0] * 6, [0])
+    assert Tiles(4, 1, 1).numbers.tolist() == [0, 1, 2, 3]
+
+
+def test_quotients_and_rests():
+    quotient, rest = divmod_by(mi.UInt32([0, 6, 7, 20]), 7)
+    assert (np.array(quotient).tolist(), np.array(rest).tolist()) == ([0, 0, 1, 2], [0, 6, 0, 6])
