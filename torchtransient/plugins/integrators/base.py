@@ -217,7 +217,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         """Optical path before the first ray starts, counted from ``start_opl``: doubles keep late times exact."""
         length = mi.Float(0)
         if not self.camera_unwarp:
-            length = rays.length()
+            length = dr.detach(rays.length())
         return mi.Float64(length) - film.start_opl
 
     def beside(self, world, sensor, film, seed, samples):
