@@ -146,7 +146,7 @@ def _scale(images: Sequence[NDArray[Any]]) -> dict[str, Any]:
 def _draw_curve(axes: Any, curve: NDArray[Any], times: NDArray[Any] | None) -> None:
     edges = np.arange(len(curve) + 1.0) if times is None else np.asarray(times)
     # The square root: what comes after the first reflection is weak.
-    axes.fill_between(edges[:-1], 0, np.sqrt(np.abs(curve)), step="post", color="#444444", linewidth=0)
+    axes.stairs(np.sqrt(np.abs(curve)), edges, fill=True, color="#444444", linewidth=0)
     axes.set_xlim(edges[0], edges[-1])
     axes.set_ylim(bottom=0)
     axes.set_xticks([])
