@@ -46,7 +46,7 @@ def oklch(lightness: Any, chroma: Any, hue_deg: Any) -> Array:
     lab = np.stack([light, chrom * np.cos(angle), chrom * np.sin(angle)], axis=-1)
     linear = (lab @ _LAB_TO_LMS.T) ** 3 @ _LMS_TO_RGB.T
     linear = np.clip(linear, 0, 1)
-    shown = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-12) ** (1 / 2.4) - 0.055)
+    shown = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
     return np.asarray(shown, dtype=np.float64)
 
 

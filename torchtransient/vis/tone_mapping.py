@@ -111,7 +111,7 @@ def tone_map(
 def _curve(linear: Tensor, curve: str, gamma: float, stops: float) -> Tensor:
     if curve == "srgb":
         x = linear.clamp(max=1)
-        return torch.where(x <= 0.0031308, 12.92 * x, 1.055 * x.clamp(min=1e-12) ** (1 / 2.4) - 0.055)
+        return torch.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
     if curve == "gamma":
         return linear.clamp(max=1) ** (1 / gamma)
     if curve == "linear":
