@@ -148,4 +148,4 @@ def test_a_misspelt_command(tmp_path):
     assert result.exit_code == 2 and "No such command or recipe 'inf'. Did you mean 'info'?" in result.output
     (tmp_path / "inf").write_text("scene: {}")  # a recipe by that name is a recipe
     assert "Missing option" in run(tmp_path, "inf").output
-    assert "does not exist" in run(tmp_path, "zzz", "--out", "set").output
+    assert "'zzz' cannot be read" in run(tmp_path, "zzz", "--out", "set").output

@@ -218,3 +218,91 @@ def test_strips():
     long = stamps.with_strip(np.zeros((40, 300, 3), np.uint8), "many words " * 4)[40:]
     written = np.nonzero((long != stamps.GROUND).any((0, 2)))[0]
     assert written.min() >= 5 and written.max() < 295
+
+
+def test_volumes():
+    values = torch.rand(2, 3, 4, generator=torch.Generator().manual_seed(5)) + 0.1
+    depth = torch.arange(12.0).reshape(3, 4)
+    figure = tt.vis.volume_views(values, depths=[0.5, 0.7], extent=(2.0, 1.5), depth=depth, title="hidden")
+    front, top, side, map_, bar = figure.axes
+    assert size(figure) == (3.4 * 4 + 0.6, 4.0) and figure.get_suptitle() == "hidden"
+    assert [words(panel) for panel in (front, top, side, map_)] == [
+        ("front", "x (m)", "y (m)"), ("top", "x (m)", "depth (m)"), ("side", "depth (m)", "y (m)"),
+        ("depth", "x (m)", "y (m)"),
+    ]  # fmt: skip
+    np.testing.assert_allclose(front.images[0].get_array(), values.amax(0) / values.max(), rtol=1e-6)
+    np.testing.assert_allclose(top.images[0].get_array(), values.amax(1) / values.max(), rtol=1e-6)
+    np.testing.assert_allclose(side.images[0].get_array(), values.amax(2).T / values.max(), rtol=1e-6)
+    assert front.get_aspect() == 1 and top.get_aspect() == side.get_aspect() == "auto"
+    assert map_.images[0].get_extent() == [-1, 1, -0.75, 0.75] and bar.get_ylabel() == "depth (m)"
+    bare = tt.vis.volume_views(values)
+    assert words(bare.axes[1]) == ("top", "x (voxels)", "depth (voxels)") and not bare.get_suptitle()
+    assert bare.axes[1].images[0].get_extent() == [-2, 2, -0.5, 1.5] and size(bare) == (3.4 * 3 + 0.6, 4.0)
+    # One plane is a metre thick.
+    assert tt.vis.volume_views(values[:1], depths=[3.0]).axes[1].images[0].get_extent() == [-2, 2, 2.5, 3.5]
+
+
+def test_maps_of_a_surface():
+    depth = torch.arange(12.0).reshape(3, 4)
+    seen = depth > 4
+    figure = tt.vis.depth_picture(depth, mask=seen, extent=(2.0, 1.5), title="z")
+    assert size(figure) == (4.6, 3.8) and words(figure.axes[0]) == ("z", "x (m)", "y (m)") and len(figure.axes) == 2
+    drawn = np.ma.filled(figure.axes[0].images[0].get_array(), np.nan)
+    np.testing.assert_array_equal(drawn, torch.where(seen, depth, torch.nan))
+    assert len(tt.vis.depth_picture(depth, mask=torch.zeros(3, 4)).axes) == 1  # nothing has no scale
+    normals = torch.stack([depth / 11, -depth / 11, torch.full((3, 4), 3.0)])
+    panel = tt.vis.normals_picture(normals, mask=seen).axes[0]
+    expected = ((normals + 1) / 2).clamp(0, 1).permute(1, 2, 0)
+    expected[~seen] = 0.85
+    np.testing.assert_allclose(panel.images[0].get_array(), expected, rtol=1e-6)
+    assert panel.images[0].get_extent() == [-2, 2, -1.5, 1.5] and words(panel) == ("", "x (voxels)", "y (voxels)")
+
+
+@pytest.mark.parametrize("off, even", [(0.9e-3, True), (1.1e-3, False)])
+def test_planes_are_even_to_a_thousandth(off, even):
+    from torchtransient.vis.volumes import _even
+
+    edges = torch.tensor([0.0, 1.0 + off, 2.0, 3.0], dtype=torch.float64)
+    assert _even(edges) == even and _even(5 * edges) == even
+    assert _even(torch.tensor([0.0, 1.0 - off, 2.0, 3.0], dtype=torch.float64)) == even
+
+
+def test_polarization():
+    vectors = torch.tensor([[4.0, 0.03, 8.0], [2.0, 0.0, 0.0], [0.0, 0.01, -6.0], [-1.0, 0.0, 2.0]]).reshape(4, 1, 1, 3)
+    figure = tt.vis.polarization_picture(vectors, quantities=("aolp", "docp", "s2"), title="light")
+    angle, circular, component, *bars = figure.axes
+    assert [panel.get_title() for panel in (angle, circular, component)] == [
+        "angle of linear polarization", "degree of circular polarization", "$S_2$"
+    ]  # fmt: skip
+    assert size(figure) == (3 * 3.4 * 1.15, 3.4 * (1 / 3) * 0.92 + 0.35) and figure.get_suptitle() == "light"
+    assert list(bars[0].get_yticks()) == [-90, -45, 0, 45, 90] and bars[0].get_ylim() == (-90, 90)
+    # A hundredth of the median of what is lit, 0.04, is dark: 0.03 is.
+    np.testing.assert_array_equal(np.ma.getmaskarray(circular.images[0].get_array()), [[False, True, False]])
+    np.testing.assert_allclose(np.ma.compressed(circular.images[0].get_array()), [-0.25, 0.25])
+    limit = np.percentile([0, 0.01, 6], 99)
+    assert component.images[0].get_clim() == pytest.approx((-limit, limit))
+    low = tt.vis.polarization_picture(vectors, quantities=("docp",), floor=0.02)
+    assert not np.ma.getmaskarray(low.axes[0].images[0].get_array()).any() and not low.get_suptitle()
+    at = tt.vis.polarization_picture(vectors, quantities=("dolp",), floor=4.0).axes[0].images[0].get_array()
+    np.testing.assert_array_equal(np.ma.getmaskarray(at), [[True, True, False]])
+
+
+def test_phasors():
+    phasor = torch.tensor([[[3.0 + 4.0j, 1e-5j, -2.0]], [[1.0, 2.0j, 0.0]]]).reshape(1, 2, 1, 3)
+    figure = tt.vis.phasor_picture(
+        phasor, show=("real", "imaginary", "amplitude", "phase"), which=(0, 1), percentile=100, title="wave"
+    )
+    panels = figure.axes[:8]
+    assert size(figure) == (4 * 3.6 * 1.15, 2 * (3.6 * (1 / 3) * 0.92 + 0.35)) and figure.get_suptitle() == "wave"
+    assert [panel.get_title() for panel in panels[::4]] == ["real, frequency 0", "real, frequency 1"]
+    drawn = [panel.images[0] for panel in panels]
+    for image, wanted, limits in (
+        (drawn[0], [3, 0, -2], (-3, 3)), (drawn[1], [4, 1e-5, 0], (-4, 4)), (drawn[2], [5, 1e-5, 2], (0, 5)),
+        (drawn[6], [1, 2, 0], (0, 2)),
+    ):  # fmt: skip
+        np.testing.assert_allclose(np.asarray(image.get_array()).ravel(), wanted, atol=1e-6)
+        assert image.get_clim() == pytest.approx(limits)
+    grey = np.ptp(np.asarray(drawn[3].get_array())[0], axis=-1) < 1e-9
+    assert grey.tolist() == [False, True, False]  # what is as good as dark has no phase
+    bar = figure.axes[-1]
+    assert list(bar.get_yticks()) == [-1, -0.5, 0, 0.5, 1] and bar.get_ylabel() == "phase"
