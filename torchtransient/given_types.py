@@ -60,7 +60,8 @@ def function(name: str, value: Any, what: str, error: type[TorchTransientError] 
     """``value``, which can be called. Raises ``error``, with ``what`` it is of: "images (N, 1, H, W)"."""
     if not callable(value):
         raise error(f"{name}: expected a function of {what}, got {shown(value)}.")
-    return value
+    called: Callable[..., Any] = value
+    return called
 
 
 def with_methods(name: str, value: Any, what: str, *methods: str) -> Any:

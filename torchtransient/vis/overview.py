@@ -177,8 +177,8 @@ def _draw_histogram(panel: Any, transient: Tensor, axis: TimeAxis, pixel: tuple[
     panel.margins(x=0)
 
 
-def _checked(transient: Any, who: str) -> Tensor:
-    transient = real_tensor(transient, who)
+def _checked(given: Any, who: str) -> Tensor:
+    transient = real_tensor(given, who)
     if transient.ndim != 4 or transient.shape[0] not in (1, 3) or transient.numel() == 0:
         raise ShapeError(
             f"{who}: expected a transient (C, T, H, W) with C = 1 or 3, got {tuple(transient.shape)}; of a batch, "
@@ -187,8 +187,8 @@ def _checked(transient: Any, who: str) -> Tensor:
     return transient
 
 
-def _on_axis(transient: Any, axis: Any, who: str) -> Tensor:
-    transient = _checked(transient, who)
+def _on_axis(given: Any, axis: Any, who: str) -> Tensor:
+    transient = _checked(given, who)
     if transient.shape[1] != of_class(f"{who}: axis", axis, TimeAxis).num_bins:
         raise ShapeError(
             f"{who}: expected a transient with T = {axis.num_bins} bins as its axis has, got {transient.shape[1]}."

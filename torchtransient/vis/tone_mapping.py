@@ -124,8 +124,8 @@ def _curve(linear: Tensor, curve: str, gamma: float, stops: float) -> Tensor:
     return level * _curve(ratio, "srgb", gamma, stops)
 
 
-def _checked(image: Any, who: str) -> Tensor:
-    image = real_tensor(image, who)
+def _checked(given: Any, who: str) -> Tensor:
+    image = real_tensor(given, who)
     if image.ndim != 3 or image.shape[0] not in (1, 3):
         raise ShapeError(f"{who}: expected an image (C, H, W) with C = 1 or 3, got {tuple(image.shape)}.")
     return image

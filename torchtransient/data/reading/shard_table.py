@@ -106,7 +106,7 @@ def shard_paths(where: Any) -> list[Path]:
                 "none."
             )
         return [path.absolute() for path in found]
-    places = several(WHAT, where, "folders, patterns or shards, or one", error=StorageError)
+    places: list[Any] = several(WHAT, where, "folders, patterns or shards, or one", error=StorageError)
     paths = [path for one in places for path in shard_paths(one)]
     if len(set(paths)) != len(paths):
         raise StorageError(f"{WHAT}: expected every shard once, got some of them twice.")
