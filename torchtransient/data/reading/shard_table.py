@@ -106,7 +106,10 @@ def shard_paths(where: Any) -> list[Path]:
                 "none."
             )
         return [path.absolute() for path in found]
-    places: list[Any] = several(WHAT, where, "folders, patterns or shards, or one", error=StorageError)
+    try:
+        places: list[Any] = several(WHAT, where, "folders", error=StorageError)
+    except StorageError:
+        places = []
     paths = [path for one in places for path in shard_paths(one)]
     if len(set(paths)) != len(paths):
         raise StorageError(f"{WHAT}: expected every shard once, got some of them twice.")
