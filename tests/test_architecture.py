@@ -23,7 +23,7 @@ LEVEL = {
     "errors": 0, "_llvm": 0, "_collection": 0, "units": 0, "axes": 0, "capture": 0, "interfaces": 0, "pulses": 0,
     "gates": 0, "stokes": 0, "tensor_record": 0, "quantities": 0, "volume_methods": 0,
     "transform_bins": 0, "plain_texts": 0, "file_places": 0, "free_memory": 0, "array_files": 0,
-    "floating": 0, "scalar_state": 0, "argument_names": 0,
+    "floating": 0, "scalar_state": 0, "given_types": 0, "argument_names": 0,
     "plugins": 1, "sensing": 1, "reconstruction": 1, "losses": 1, "metrics": 1, "vis": 1,
     "parametrize": 1, "geometry": 1,
     "scenes": 2,
@@ -40,6 +40,7 @@ FORBIDDEN = {
     "scenes": {"torch", "kornia", *MITSUBA},
     "errors": {"torch", *MITSUBA},
     "argument_names": {"torch", *MITSUBA},
+    "given_types": {"torch", *MITSUBA},
     "volume_methods": {"torch", *MITSUBA},
     "transform_bins": {"torch", *MITSUBA},
     "plain_texts": {"torch", *MITSUBA},
@@ -181,7 +182,7 @@ def is_below(other, room):
         ("floating", "quantities"), ("metrics", "losses"), ("metrics", "reconstruction"), ("axes", "quantities"),
         ("gates", "quantities"), ("pulses", "quantities"), ("capture", "argument_names"),
         ("array_files", "quantities"), ("array_files", "plain_texts"), ("array_files", "free_memory"),
-        ("units", "quantities"), ("stokes", "quantities"),
+        ("units", "quantities"), ("stokes", "quantities"), ("given_types", "quantities"), ("pulses", "given_types"),
         ("array_files", "file_places"), ("plain_texts", "file_places"), ("file_places", "quantities"),
     }  # fmt: skip
     return other in {"errors", "units"} or (room, other) in within

@@ -10,11 +10,9 @@ import pickle
 import numpy as np
 import pytest
 import torch
-from click.testing import CliRunner
 
 import torchtransient as tt
 from torchtransient.argument_names import arguments_of
-from torchtransient.cli.main import main
 from torchtransient.errors import (
     ArgumentError,
     SceneError,
@@ -202,14 +200,6 @@ def test_recipes_name_what_is_written_in_python(scene):
         tt.data.Recipe(box, {"white.reflectance.value": (0.2, 0.8)}, spp=1)
     with pytest.raises(ArgumentError, match=r"vary: expected a dictionary \{key: distribution\}, got \["):
         tt.data.Recipe(box, ["white.reflectance.value"], spp=1)
-
-
-def test_a_misspelt_command_of_data_sets(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    said = CliRunner().invoke(main, ["dataset", "inf", "rooms"])
-    assert said.exit_code == 2 and "Did you mean 'info'?" in said.output
-    (tmp_path / "inf").write_text("scene: {}")  # a recipe by that name is a recipe
-    assert "Missing option" in CliRunner().invoke(main, ["dataset", "inf"]).output
 
 
 ROOMS = (tt.sensing, tt.stokes, tt.units, tt.losses, tt.metrics, tt.geometry)

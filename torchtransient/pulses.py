@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
+from torchtransient.given_types import is_one_of, of_class, several
 from torchtransient.quantities import Numbers, as_number, finite, numbers, positive, shown
 from torchtransient.units import LONGEST_PULSE_S, SHORTEST_OPL, near_seconds, seconds_to_opl
 
@@ -46,8 +47,8 @@ class Pulse:
     values: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ArgumentError(f"Pulse: expected one of {', '.join(KINDS)}, got {self.kind!r}.")
+        if not is_one_of(self.kind, KINDS):
+            raise ArgumentError(f"Pulse: expected one of {', '.join(KINDS)}, got {shown(self.kind)}.")
         object.__setattr__(self, "center_opl", _number(self.center_opl, "center_opl"))
         if self.kind == "tabulated":
             self._check_table()
@@ -159,7 +160,7 @@ def transform(pulse: Pulse, frequencies: Any) -> NDArray[np.complex128]:
     A phasor film spreads no arrivals; ``out.phasor`` times this, one factor for each frequency, is what it would
     measure under the pulse. One at frequency zero.
     """
-    low, high = pulse.support_opl
+    low, high = of_class("transform: pulse", pulse, Pulse).support_opl
     wanted = numbers("transform: frequencies", frequencies).ravel()
     if not np.isfinite(wanted).all():
         raise UnitError("transform: expected finite frequencies in cycles per metre, got NaN or infinity.")
@@ -179,6 +180,7 @@ def cumulative_of_sum(pulses: Sequence[Pulse], step: float) -> tuple[int, Array]
     one 1. Exact at these lengths for one pulse, of second order in ``step`` for several. Raises UnitError without a
     pulse.
     """
+    pulses = several("cumulative_of_sum", pulses, "pulses", Pulse)
     if not pulses:
         raise UnitError("cumulative_of_sum: expected at least one pulse, got none.")
     first, masses, step = 0, np.ones(1), positive("cumulative_of_sum: step", step)

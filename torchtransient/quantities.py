@@ -180,7 +180,7 @@ def transform(name: str, given: Any) -> NDArray[np.float64]:
 def shown(value: Any) -> str:
     """A value in a message, not more of it than tells what it is: of arrays and tensors of many numbers the shape."""
     shape = getattr(value, "shape", None)
-    if isinstance(shape, tuple) and math.prod(shape) > _WRITTEN:
+    if isinstance(shape, tuple) and not isinstance(value, type) and math.prod(shape) > _WRITTEN:
         return f"{with_article(type(value).__name__)} {tuple(shape)}"
     try:
         text = repr(value)

@@ -141,3 +141,11 @@ def test_ctrl_c_and_on_again(made, tmp_path):
     assert events[0] == "begin" and events[-1] == "stopped"
     result = run(tmp_path, "verify", "set", "--quiet")
     assert result.exit_code == 1 and "missing" in result.stdout and "\nshard" not in result.stdout
+
+
+def test_a_misspelt_command(tmp_path):
+    result = run(tmp_path, "inf", "rooms")
+    assert result.exit_code == 2 and "No such command or recipe 'inf'. Did you mean 'info'?" in result.output
+    (tmp_path / "inf").write_text("scene: {}")  # a recipe by that name is a recipe
+    assert "Missing option" in run(tmp_path, "inf").output
+    assert "'zzz' cannot be read" in run(tmp_path, "zzz", "--out", "set").output

@@ -67,3 +67,35 @@ def test_a_missing_package(monkeypatch):
     found = {f.subject: f for f in doctor.versions()}
     assert (found["kornia"].state, found["h5py"].state, found["torch"].state) == ("problem", "note", "ok")
     assert "torchtransient[data]" in found["h5py"].text
+
+
+@pytest.mark.parametrize(
+    "driver, torch_sees, findings",
+    [
+        (False, False, [("note", "cuda_ad_rgb", "no NVIDIA driver")]),
+        (True, False, [("note", "cuda_ad_rgb", "Dr.Jit sees a GPU and torch")]),
+        (True, True, [("ok", "CUDA", "a card, torch built for CUDA"), ("ok", "cuda_ad_rgb", "as expected")]),
+    ],
+)
+def test_what_is_said_of_a_gpu(monkeypatch, driver, torch_sees, findings):
+    import drjit as dr
+    import torch
+
+    monkeypatch.setattr(dr, "has_backend", lambda backend: driver)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: torch_sees)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda number: "a card")
+    monkeypatch.setattr(doctor, "probe", lambda variant: doctor.Finding("ok", variant, "as expected"))
+    found = doctor.cuda()
+    assert [(one.state, one.subject) for one in found] == [one[:2] for one in findings]
+    assert all(one.text.startswith(start) for one, (_, _, start) in zip(found, findings, strict=True))
+
+
+def test_versions_of_what_is_not_installed(monkeypatch):
+    import torchtransient
+
+    def missing(name):
+        raise doctor.importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(doctor.importlib.metadata, "version", missing)
+    assert doctor._version("torchtransient") == torchtransient.__version__
+    assert doctor._version("drjit") is None

@@ -57,6 +57,16 @@ def test_errors_of_others(monkeypatch, error, status, words):
     assert type(CliRunner().invoke(main, ["--debug", "plan"]).exception) is type(error)
 
 
+def test_a_reader_that_has_left_is_no_error_of_ours(monkeypatch):
+    @click.command()
+    def broken():
+        raise BrokenPipeError(32, "Broken pipe")
+
+    monkeypatch.setattr(Commands, "get_command", lambda self, ctx, name: broken)
+    found = CliRunner().invoke(main, ["plan"])
+    assert found.exit_code == 1 and not found.stderr
+
+
 def test_a_folder_that_is_no_data_set(tmp_path):
     found = CliRunner().invoke(main, ["dataset", "verify", str(tmp_path)])
     assert found.exit_code == 2 and "holds no shard" in found.stderr

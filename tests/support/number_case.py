@@ -140,3 +140,13 @@ def entered(context: Callable[..., Any]) -> Callable[..., Any]:
             pass
 
     return through
+
+
+def listed(generator: Callable[..., Any]) -> Callable[..., Any]:
+    """A generator as a function that takes everything from it."""
+
+    @functools.wraps(generator)
+    def taken(*arguments: Any, **given: Any) -> list[Any]:
+        return list(generator(*arguments, **given))
+
+    return taken

@@ -31,6 +31,7 @@ def test_alone():
         assert (found.rank, found.size, found.local, found.local_size, found.is_first) == (0, 1, 0, 1, True)
         assert (found.device, found.variant_prefix) == (torch.device("cpu"), "llvm_ad_")
         assert found.mean(3.5) == 3.5
+        found.wait()  # for nobody
         assert not dist.is_initialized()
         assert (tt.threads().torch, tt.threads().drjit) == (3, 3)
     assert tt.threads() == before
@@ -63,9 +64,15 @@ def test_broken_settings(monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "two")
     with pytest.raises(UnitError, match="WORLD_SIZE: expected a whole number of at least 1, got 'two'"), ranks():
         pass
+    below = {"RANK": (-1, 0), "WORLD_SIZE": (0, 1), "LOCAL_RANK": (-1, 0), "LOCAL_WORLD_SIZE": (0, 1)}
+    for name, (value, least) in below.items():
+        torchrun(monkeypatch, 0, 1)
+        monkeypatch.setenv(name, str(value))
+        with pytest.raises(UnitError, match=f"^ranks: {name}: expected a whole number of at least {least}"), ranks():
+            pass
 
 
-@pytest.mark.parametrize("changed", [{"RANK": 3}, {"RANK": 1}, {"LOCAL_RANK": 5}])
+@pytest.mark.parametrize("changed", [{"RANK": 3}, {"RANK": 1}, {"LOCAL_RANK": 5}, {"LOCAL_RANK": 1}])
 def test_ranks_beyond_their_number(monkeypatch, changed):
     """Which would wait for others that never come, or leave nobody to write."""
     torchrun(monkeypatch, 0, 1)

@@ -100,3 +100,10 @@ def test_what_they_do_not_take(call, message):
 def test_a_purpose_is_a_text():
     with pytest.raises(ArgumentError, match="purpose as a text"):
         Seeds(0, 3)
+
+
+@pytest.mark.parametrize("samples", [torch.ones(2, 2, dtype=torch.int64), torch.ones(2), 1j * torch.ones(2),
+                                     torch.ones(2) > 0, torch.tensor(3)])  # fmt: skip
+def test_samples_are_a_row_of_whole_numbers(samples):
+    with pytest.raises(UnitError, match=r"samples as whole numbers of shape \(B,\), got torch\."):
+        Seeds(0)(1, samples)

@@ -6,6 +6,8 @@ import numpy as np
 import torch
 
 import torchtransient as tt
+from support.cubes import read_gif
+from torchtransient.vis import colour_maps
 from torchtransient.vis.arrival import _arrival_limits, _fused, _hue
 from torchtransient.vis.overview import light_curve, median_pixel, moments_of_arrival, peak_time
 from torchtransient.vis.shape_fit import _numbers
@@ -108,3 +110,30 @@ def test_numbers_of_what_is_drawn():
     found = _plain("x", leaf)
     assert found.tolist() == [1, 2] and not found.requires_grad
     assert _plain("x", torch.tensor([3.0 + 4.0j])).tolist() == [25]
+
+
+def test_hues_run_from_red_to_violet():
+    hues = np.array([0.0, 0.25, 1.0])
+    np.testing.assert_allclose(colour_maps.rainbow(hues), colour_maps.oklch(0.78, 0.16, [25.0, 95.0, 305.0]))
+    np.testing.assert_allclose(colour_maps.rainbow([-1.0, 2.0]), colour_maps.rainbow([0.0, 1.0]))
+    np.testing.assert_allclose(colour_maps.cyclic([0.0, 0.25]), colour_maps.oklch(0.75, 0.125, [25.0, 115.0]))
+    red, violet = colour_maps.rainbow([0.0, 1.0])
+    assert red.argmax() == 0 and violet.argmax() == 2 and violet.argmin() == 1
+
+
+def test_white_of_a_video_lies_within_nine_decades_of_the_brightest():
+    light = torch.full((1, 2, 3, 4), 1e-12, dtype=torch.float64)
+    light[0, 1, 2, 3] = 1.0
+    np.testing.assert_allclose(exposure_of_video(light, 0.5), 1e9, rtol=0.01)
+    light[light < 1] = 1e-7
+    np.testing.assert_allclose(exposure_of_video(light, 0.5), 1e7, rtol=0.01)
+    np.testing.assert_allclose(exposure_of_video(light, 1.0), 1.0)
+
+
+def test_the_palette_is_of_frames_out_of_all(tmp_path):
+    """Each second one of 30 is looked at: a colour that comes late is there."""
+    frames = [np.full((8, 6, 3), (200, 40, 12) if n < 15 else (12, 72, 220), np.uint8) for n in range(30)]
+    frames = [np.where(np.arange(6)[:, None] == n % 6, np.uint8(255), one) for n, one in enumerate(frames)]
+    found, _ = read_gif(tt.vis.write_video(tmp_path / "a.gif", frames, 30, fps=20))
+    for got, wanted in zip(found, frames, strict=True):
+        assert np.abs(got.astype(int) - wanted).max() < 8

@@ -15,6 +15,7 @@ from torchtransient import plugins
 from torchtransient._llvm import ensure_llvm
 from torchtransient.errors import VariantError
 from torchtransient.plugins.drjit_pool import check_process, engine_lock
+from torchtransient.quantities import shown
 from torchtransient.rendering.interrupts import interrupts_pass, interrupts_wait, put_back_log_level
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
@@ -61,9 +62,9 @@ def resolve_variant(requested: str | None) -> str:
     if requested is None:
         active = mi.variant()
         return active if is_differentiable(active) else DEFAULT_VARIANT
-    if requested not in mi.variants():
+    if not isinstance(requested, str) or requested not in mi.variants():
         raise VariantError(
-            f"variant {requested!r} is not part of this Mitsuba; expected one of "
+            f"variant {shown(requested)} is not part of this Mitsuba; expected one of "
             f"{', '.join(v for v in mi.variants() if is_differentiable(v))}."
         )
     if not is_differentiable(requested):

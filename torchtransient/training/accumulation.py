@@ -45,12 +45,14 @@ def accumulate(
     that are not finite, GradientError for a loss without a gradient. Nothing has been differentiated then, except by
     parts that came before the wrong loss.
     """
-    if not isinstance(parts, Iterable):
-        raise ArgumentError(f"accumulate: expected parts as a list or any iterable, got {shown(parts)}.")
-    listed = list(parts)
+    try:
+        each = iter(parts)
+    except TypeError:
+        raise ArgumentError(f"accumulate: expected parts as a list or any iterable, got {shown(parts)}.") from None
+    listed = list(each)
     if not listed:
         raise ShapeError("accumulate: expected at least one part, got none.")
-    if weights is not None and not isinstance(weights, Iterable):
+    if weights is not None and (not isinstance(weights, Iterable) or getattr(weights, "ndim", None) == 0):
         raise ShapeError(f"accumulate: expected a weight for each of {len(listed)} parts, got {shown(weights)}.")
     shares = [1.0 / len(listed)] * len(listed) if weights is None else [_weight(w) for w in weights]
     if len(shares) != len(listed):

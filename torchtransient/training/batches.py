@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Dataset, IterableDataset, Sampler
 
 from torchtransient.errors import StorageError, UnitError
+from torchtransient.given_types import by_number
 from torchtransient.quantities import count, flag, shown
 from torchtransient.training.processes import worker_init
 
@@ -37,7 +38,8 @@ class Batches(Sampler[list[int]]):
             ...
 
     ``size``: samples of the data set, which is map-style. ``shuffle=False``: in their order. ``step`` may be set at any
-    time before an iterator is made. Raises UnitError for numbers that cannot be used, StorageError for a state of
+    time before an iterator is made. Raises UnitError for numbers that cannot be used, ArgumentError for what is no data
+    set, StorageError for a state of
     another order and a position that was left behind.
     """
 
@@ -100,6 +102,8 @@ class Batches(Sampler[list[int]]):
                 f"{_WHAT}: expected a map-style data set, got {shown(data)}, which has an order of its own; use "
                 "DataLoader(stream, batch_size=..., generator=torch.Generator())."
             )
+        if not isinstance(data, Dataset):  # one of torch's need not know its length
+            by_number(_WHAT, data)
         said = [name for name in options if name in _OURS]
         if said:
             raise UnitError(f"{_WHAT}: {', '.join(said)} of a DataLoader are said by the batches; processes: workers=.")

@@ -13,6 +13,7 @@ import torch
 import torch.distributed as dist
 
 from torchtransient.errors import DeviceError, UnitError
+from torchtransient.given_types import is_one_of
 from torchtransient.quantities import as_number, count, positive, shown
 
 _TORCHRUN = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
@@ -82,8 +83,8 @@ def ranks(
     """
     from torchtransient.rendering.threads import threads as set_threads
 
-    if device not in ("cpu", "cuda"):
-        raise UnitError(f"ranks: expected device 'cpu' or 'cuda', got {device!r}.")
+    if not is_one_of(device, ("cpu", "cuda")):
+        raise UnitError(f"ranks: expected device 'cpu' or 'cuda', got {shown(device)}.")
     timeout_s = positive("ranks: timeout_s", timeout_s)
     found = _found(device)
     if device == "cuda":

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import torch
 
-from torchtransient.errors import ArgumentError, UnitError
-from torchtransient.quantities import count
+from torchtransient.errors import ArgumentError, DeviceError, UnitError
+from torchtransient.quantities import count, shown
 
 _BITS = 2**32
 
@@ -55,12 +55,17 @@ class Seeds:
         """A generator of torch for what else a step draws, sensor noise for instance.
 
         One generator for a whole batch makes noise that depends on who has which part of it. ``sample``: the number of
-        the one sample that it is for, where it shall not; or the rank, so that ranks draw different numbers.
+        the one sample that it is for, where it shall not; or the rank, so that ranks draw different numbers. Raises
+        UnitError, DeviceError.
         """
         number = count("Seeds: sample", sample, 0, UnitError)
         digest = self._digest(step, f"generator/{number}")
         # torch takes 64 bits; the sign stays clear for what stores seeds as int64.
-        return torch.Generator(device).manual_seed(int.from_bytes(digest[:8], "little") >> 1)
+        try:
+            generator = torch.Generator(device)
+        except (TypeError, RuntimeError):
+            raise DeviceError(f"Seeds: expected a device that torch has here, got {shown(device)}.") from None
+        return generator.manual_seed(int.from_bytes(digest[:8], "little") >> 1)
 
     def _keys(self, step: int) -> tuple[int, int, int]:
         digest = self._digest(step, "samples")

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.errors import UnitError
-from torchtransient.quantities import as_number, shown
+from torchtransient.errors import ArgumentError, UnitError
+from torchtransient.given_types import is_one_of
+from torchtransient.quantities import as_number, numbers, shown
 from torchtransient.vis.files import figure_type
 
 if TYPE_CHECKING:
@@ -34,6 +35,8 @@ _LMS_TO_RGB = np.array([
 
 # Hues that run from red over yellow and green to violet: those of a rainbow, without the purple that would close it.
 _FIRST_HUE, _LAST_HUE = 25.0, 305.0
+# Kinds of cyclic maps.
+CYCLES = ("even", "hsv")
 
 
 def oklch(lightness: Any, chroma: Any, hue_deg: Any) -> Array:
@@ -43,7 +46,7 @@ def oklch(lightness: Any, chroma: Any, hue_deg: Any) -> Array:
     lab = np.stack([light, chrom * np.cos(angle), chrom * np.sin(angle)], axis=-1)
     linear = (lab @ _LAB_TO_LMS.T) ** 3 @ _LMS_TO_RGB.T
     linear = np.clip(linear, 0, 1)
-    shown = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-12) ** (1 / 2.4) - 0.055)
+    shown = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
     return np.asarray(shown, dtype=np.float64)
 
 
@@ -65,8 +68,8 @@ def cyclic(turns: Any, value: Any = 1.0) -> Array:
 
     For phases and angles of polarization: no jump where the angle has none, and no angle brighter than another.
     """
-    turn = np.mod(np.nan_to_num(np.asarray(turns, dtype=np.float64)), 1.0)
-    level = np.clip(np.nan_to_num(np.asarray(value, dtype=np.float64)), 0, 1)
+    turn = np.mod(np.nan_to_num(numbers("cyclic: turns", turns)), 1.0)
+    level = np.clip(np.nan_to_num(numbers("cyclic: value", value)), 0, 1)
     return oklch(0.75 * level, 0.125 * level, _FIRST_HUE + 360.0 * turn)
 
 
@@ -74,8 +77,10 @@ def cyclic_map(kind: str = "even") -> ListedColormap:
     """A cyclic matplotlib colour map for bars that run over one period with angle 0 in the middle.
 
     "even" is `cyclic`; "hsv" is the hue circle of HSV, which papers on polarization often use: its yellow and cyan are
-    lighter than its blue.
+    lighter than its blue. Raises ArgumentError for another kind.
     """
+    if not is_one_of(kind, CYCLES):
+        raise ArgumentError(f"cyclic_map: expected a kind out of {', '.join(CYCLES)}, got {shown(kind)}.")
     figure_type()  # says so where matplotlib is missing
     import matplotlib
     from matplotlib.colors import ListedColormap

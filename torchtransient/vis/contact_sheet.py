@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.errors import ShapeError
-from torchtransient.quantities import count
+from torchtransient.given_types import mapping, of_class, several
+from torchtransient.quantities import count, numbers, shown
 from torchtransient.vis.files import figure_type, save_figure
 
 if TYPE_CHECKING:
@@ -35,6 +36,15 @@ class Cell:
     images: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     curve: NDArray[Any] | None = None
 
+    def __post_init__(self) -> None:
+        of_class("Cell: title", self.title, str)
+        for name, image in mapping("Cell: images", self.images, "{name: image}").items():
+            size = _plain_size(image)
+            if len(size) != 2 and (len(size) != 3 or size[2] != 3):
+                raise ShapeError(f"Cell: expected the image {name!r} as (H, W, 3) or (H, W), got {shown(image)}.")
+        if self.curve is not None and numbers("Cell: curve", self.curve).ndim != 1:
+            raise ShapeError(f"Cell: expected curve as (T,), got {shown(self.curve)}.")
+
 
 def contact_sheet(
     cells: Sequence[Cell],
@@ -48,9 +58,17 @@ def contact_sheet(
     Returns the matplotlib figure; written to ``path`` if given. Raises ShapeError for no cell, StorageError without
     matplotlib or where it cannot be written.
     """
+    cells = several("contact_sheet", cells, "samples, each a Cell", Cell)
     if not cells:
         raise ShapeError("contact_sheet: expected at least one sample, got none.")
     names = list(cells[0].images)
+    for cell_ in cells:
+        if set(cell_.images) != set(names):
+            raise ShapeError(
+                f"contact_sheet: expected the images {', '.join(names) or 'none'} of every sample, as the first has "
+                f"them, got {', '.join(cell_.images) or 'none'}."
+            )
+    times = _checked_times(times, cells)
     curves = any(cell.curve is not None for cell in cells)
     cell = (len(names) * _PICTURE + 0.15, _PICTURE + _TITLE + (_CURVE if curves else 0.0))
     # About as high as it is wide.
@@ -86,6 +104,23 @@ def contact_sheet(
     return save_figure(figure, path, "contact_sheet", dpi=160)
 
 
+def _checked_times(times: Any, cells: Sequence[Cell]) -> NDArray[np.float64] | None:
+    if times is None:
+        return None
+    edges = numbers("contact_sheet: times", times)
+    bins = {len(cell.curve) for cell in cells if cell.curve is not None}
+    if edges.ndim != 1 or len(edges) < 2 or any(len(edges) != count + 1 for count in bins):
+        wanted = " and ".join(str(count) for count in sorted(bins)) or "some"
+        raise ShapeError(f"contact_sheet: expected times as the edges of {wanted} bins, got {shown(times)}.")
+    return edges
+
+
+def _plain_size(image: Any) -> tuple[int, ...]:
+    """The shape of an image; of one dimension for what is no array of numbers."""
+    plain = np.asarray(image) if hasattr(image, "__array__") else np.asarray(None)
+    return plain.shape if plain.dtype.kind in "biuf" else (0,)
+
+
 def _cut(title: str, pictures: int) -> str:
     most = _LETTERS * pictures
     return title if len(title) <= most else title[: most - 3] + "..."
@@ -111,7 +146,7 @@ def _scale(images: Sequence[NDArray[Any]]) -> dict[str, Any]:
 def _draw_curve(axes: Any, curve: NDArray[Any], times: NDArray[Any] | None) -> None:
     edges = np.arange(len(curve) + 1.0) if times is None else np.asarray(times)
     # The square root: what comes after the first reflection is weak.
-    axes.fill_between(edges[:-1], 0, np.sqrt(np.abs(curve)), step="post", color="#444444", linewidth=0)
+    axes.stairs(np.sqrt(np.abs(curve)), edges, fill=True, color="#444444", linewidth=0)
     axes.set_xlim(edges[0], edges[-1])
     axes.set_ylim(bottom=0)
     axes.set_xticks([])

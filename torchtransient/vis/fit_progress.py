@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
-import torch
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from torchtransient.errors import ShapeError
-from torchtransient.quantities import Numbers
+from torchtransient.given_types import mapping
+from torchtransient.quantities import Numbers, finite, numbers, shown
 from torchtransient.vis.files import figure_type, save_figure
+from torchtransient.vis.sources import real_tensor
 from torchtransient.vis.tone_mapping import exposure_of, tone_map
 
 # A curve called by the name of a channel is drawn in its colour.
@@ -31,7 +35,13 @@ def plot_fit(
     a dashed line. Raises ShapeError without images or steps, or when the lists differ in length; StorageError when the
     file cannot be written. Needs matplotlib (extra `vis`).
     """
-    steps = len(loss)
+    given = mapping("plot_fit: images", images, "{title: image}")
+    images = {title: real_tensor(image, f"plot_fit: {title!r}") for title, image in given.items()}
+    curves = mapping("plot_fit: values", values, "{name: numbers}")
+    row, values = _row("loss", loss), {name: _row(f"values of {name!r}", curve) for name, curve in curves.items()}
+    aims = mapping("plot_fit: truth", truth, "{name: number}")
+    truth = {name: finite(f"plot_fit: truth of {name!r}", one) for name, one in aims.items()}
+    steps = len(row)
     if not images or steps == 0:
         raise ShapeError(f"plot_fit: expected at least one image and one step, got {len(images)} and {steps}.")
     for name, curve in values.items():
@@ -46,8 +56,8 @@ def plot_fit(
         panel.set_title(title, fontsize=10)
         panel.set_axis_off()
     left, right = lower.subplots(1, 2)
-    left.plot(loss, color="black", linewidth=1.2)
-    if bool((torch.tensor(loss) > 0).all()):
+    left.plot(row, color="black", linewidth=1.2)
+    if bool((row > 0).all()):
         left.set_yscale("log")
     left.set_ylabel("loss")
     for n, (name, curve) in enumerate(values.items()):
@@ -62,3 +72,10 @@ def plot_fit(
         panel.set_xlabel("step")
         panel.grid(True, color="0.9", linewidth=0.6)
     save_figure(figure, path, "plot_fit")
+
+
+def _row(what: str, given: Any) -> NDArray[np.float64]:
+    row = numbers(f"plot_fit: {what}", given)
+    if row.ndim != 1:
+        raise ShapeError(f"plot_fit: expected {what} as one number for each step, got {shown(given)}.")
+    return row

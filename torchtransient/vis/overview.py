@@ -13,8 +13,9 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, StorageError
 from torchtransient.file_places import check_folder
+from torchtransient.given_types import of_class
 from torchtransient.vis.files import figure_type, save_figure
-from torchtransient.vis.sources import pixel_of
+from torchtransient.vis.sources import pixel_of, real_tensor
 from torchtransient.vis.tone_mapping import tone_map
 
 _NANOSECONDS = 1e9
@@ -27,7 +28,7 @@ def light_curve(transient: Tensor) -> Tensor:
     Every pixel that sees light counts alike, whether it sees the lamp itself or a dark corner. `transient` is
     (C, T, H, W), else ShapeError.
     """
-    _check(transient)
+    transient = _checked(transient, "light_curve")
     total = torch.zeros(transient.shape[1], dtype=torch.float64, device=transient.device)
     lit = 0
     for part in _row_bands(transient):
@@ -44,7 +45,7 @@ def peak_time(transient: Tensor, axis: TimeAxis) -> Tensor:
 
     The first of equal bins counts. Raises ShapeError when the transient is not (C, T, H, W) with the axis' T.
     """
-    _check(transient, axis)
+    transient = _on_axis(transient, axis, "peak_time")
     centers = axis.centers_opl.to(transient.device)
     rows = []
     for part in _row_bands(transient):
@@ -75,6 +76,7 @@ def median_pixel(steady: Tensor) -> tuple[int, int]:
 
     Neither the lamp nor a corner in the dark. Raises ShapeError for another shape.
     """
+    steady = real_tensor(steady, "median_pixel")
     if steady.ndim != 3 or steady.numel() == 0:
         raise ShapeError(f"median_pixel: expected a steady image (C, H, W), got {tuple(steady.shape)}.")
     brightness = steady.detach().sum(0).flatten()
@@ -113,7 +115,7 @@ def plot_overview(
     `median_pixel`. Each image has its own exposure. Raises ShapeError for other shapes or a pixel outside, and
     StorageError when the file cannot be written. Needs matplotlib (extra `vis`).
     """
-    _check(transient, axis)
+    transient, steady = _on_axis(transient, axis, "plot_overview"), real_tensor(steady, "plot_overview: steady")
     height, width = transient.shape[-2:]
     if tuple(steady.shape) != (transient.shape[0], height, width):
         expected = (transient.shape[0], height, width)
@@ -175,12 +177,20 @@ def _draw_histogram(panel: Any, transient: Tensor, axis: TimeAxis, pixel: tuple[
     panel.margins(x=0)
 
 
-def _check(transient: Tensor, axis: TimeAxis | None = None) -> None:
+def _checked(given: Any, who: str) -> Tensor:
+    transient = real_tensor(given, who)
     if transient.ndim != 4 or transient.shape[0] not in (1, 3) or transient.numel() == 0:
         raise ShapeError(
-            f"expected a transient (C, T, H, W) with C = 1 or 3, got {tuple(transient.shape)}; of a batch, choose one."
+            f"{who}: expected a transient (C, T, H, W) with C = 1 or 3, got {tuple(transient.shape)}; of a batch, "
+            "choose one."
         )
-    if axis is not None and transient.shape[1] != axis.num_bins:
+    return transient
+
+
+def _on_axis(given: Any, axis: Any, who: str) -> Tensor:
+    transient = _checked(given, who)
+    if transient.shape[1] != of_class(f"{who}: axis", axis, TimeAxis).num_bins:
         raise ShapeError(
-            f"expected a transient with T = {axis.num_bins} bins as its axis has, got {transient.shape[1]}."
+            f"{who}: expected a transient with T = {axis.num_bins} bins as its axis has, got {transient.shape[1]}."
         )
+    return transient

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchtransient.axes import FrequencyAxis
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.given_types import several
 from torchtransient.quantities import Numbers, as_whole, count, shown
 from torchtransient.units import SPEED_OF_LIGHT
 from torchtransient.vis import colour_maps
@@ -49,6 +50,7 @@ def phasor_picture(
     `path` is given. Raises ShapeError for another shape or an index outside, UnitError for an unknown panel,
     StorageError.
     """
+    show = several("phasor_picture: show", show, "names of panels", str, UnitError)
     if not show or any(name not in SHOWS for name in show):
         raise UnitError(f"phasor_picture: expected panels out of {', '.join(SHOWS)}, got {tuple(show)}.")
     images, known = _images(source, "phasor_picture")
@@ -86,14 +88,14 @@ def phasor_video(
     check_video(path)
     images, known = _images(source, "phasor_video")
     frequencies = known if frequencies is None else frequencies_of(frequencies)
-    (which,) = _indices((which,), images, frequencies)
+    (chosen,) = _indices((which,), images, frequencies)
     steps = count("phasor_video: steps", steps, 1, ShapeError)
-    values = np.nan_to_num(images[which].numpy(), posinf=0.0, neginf=0.0)
+    values = np.nan_to_num(images[chosen].numpy(), posinf=0.0, neginf=0.0)
     limit = colour_maps.symmetric_limit(np.abs(values))
     colours = _colours("RdBu_r")
     factor = max(1, round(320 / max(values.shape))) if scale is None else scale
     factor = count("phasor_video: scale", factor, 1, ShapeError)
-    label = _label(which, frequencies, "real")
+    label = _label(chosen, frequencies, "real")
 
     def make(index: int) -> Any:
         turned = np.real(values * np.exp(2j * math.pi * index / steps))
@@ -109,6 +111,7 @@ def domain_colors(values: NDArray[Any], percentile: float = 99.0) -> NDArray[np.
     White-balanced hues of equal lightness; the given percentile of the amplitudes is fully bright. Values that are not
     finite are grey.
     """
+    values = _plain(values)
     finite = np.isfinite(values)
     safe = np.where(finite, values, 0)
     amplitude = np.abs(safe)
@@ -116,6 +119,17 @@ def domain_colors(values: NDArray[Any], percentile: float = 99.0) -> NDArray[np.
     image = colour_maps.cyclic(np.angle(safe) / (2 * math.pi), level)
     image[~finite] = 0.5
     return image
+
+
+def _plain(values: Any) -> NDArray[Any]:
+    """Real or complex numbers as an array."""
+    try:
+        plain = np.asarray(values.detach().cpu() if isinstance(values, Tensor) else values)
+    except ValueError:  # rows of different lengths
+        plain = np.asarray(None)
+    if plain.dtype.kind not in "biufc":
+        raise ShapeError(f"domain_colors: expected complex numbers, got {shown(values)}.")
+    return plain
 
 
 def _draw(figure: Any, panel: Any, name: str, values: NDArray[Any], percentile: float) -> None:
@@ -150,7 +164,7 @@ def _images(source: Source, who: str) -> tuple[Tensor, tuple[float, ...] | None]
 
 
 def _indices(which: Sequence[int], images: Tensor, frequencies: Sequence[float] | None) -> list[int]:
-    many = images.shape[0]
+    many, which = images.shape[0], several("phasor picture: which", which, "numbers of frequencies")
     found = [place for one in which if (place := as_whole(one)) is not None and 0 <= place < many]
     if not found or len(found) < len(which):
         raise ShapeError(f"phasor picture: expected indices out of {many} frequencies, got {shown(which)}.")

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from torchtransient import stokes as st
 from torchtransient.errors import ArgumentError, UnitError
-from torchtransient.quantities import finite
+from torchtransient.given_types import is_one_of, several
+from torchtransient.quantities import finite, shown
 from torchtransient.vis import colour_maps
 from torchtransient.vis.files import picture_figure, save_figure
 from torchtransient.vis.sources import Source, stokes_of
@@ -59,13 +60,14 @@ def polarization_picture(
     papers. Writes the figure when `path` is given. Raises ShapeError for unpolarized sources, ArgumentError for
     unknown names, UnitError for a negative `floor`, StorageError.
     """
+    quantities = several("polarization_picture: quantities", quantities, "names", str, ArgumentError)
     unknown = [q for q in quantities if q not in QUANTITIES]
     if unknown or not quantities:
         raise ArgumentError(
-            f"polarization_picture: expected quantities out of {', '.join(QUANTITIES)}, got {quantities}."
+            f"polarization_picture: expected quantities out of {', '.join(QUANTITIES)}, got {tuple(quantities)}."
         )
-    if angle_map not in ("even", "hsv"):
-        raise ArgumentError(f"polarization_picture: expected angle_map 'even' or 'hsv', got {angle_map!r}.")
+    if not is_one_of(angle_map, colour_maps.CYCLES):
+        raise ArgumentError(f"polarization_picture: expected angle_map 'even' or 'hsv', got {shown(angle_map)}.")
     vectors = stokes_of(source, frame, "polarization_picture").to(torch.float64)
     broken = ~torch.isfinite(vectors).all(0).all(0)
     vectors = torch.nan_to_num(vectors, posinf=0.0, neginf=0.0)
@@ -135,8 +137,8 @@ def _draw_scalar(figure: Any, panel: Any, name: str, total: Tensor, dark: NDArra
         high = colour_maps.symmetric_limit(values)
         low = -high
     colour_map = matplotlib.colormaps[colours].with_extremes(bad=(_NO_LIGHT,) * 3)
-    shown = np.where(dark, np.nan, values) if name in ("dop", "dolp", "docp") else values
-    image = panel.imshow(shown, cmap=colour_map, vmin=low, vmax=high, interpolation="nearest")
+    seen = np.where(dark, np.nan, values) if name in ("dop", "dolp", "docp") else values
+    image = panel.imshow(seen, cmap=colour_map, vmin=low, vmax=high, interpolation="nearest")
     figure.colorbar(image, ax=panel, shrink=0.8)
 
 

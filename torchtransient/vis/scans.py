@@ -17,6 +17,7 @@ from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
 from torchtransient.capture.arithmetic import computed
 from torchtransient.errors import ArgumentError, SceneError, ShapeError
+from torchtransient.given_types import is_one_of
 from torchtransient.quantities import shown
 from torchtransient.vis.arrival import checked_limits, peak_time_picture
 from torchtransient.vis.files import figure_type, save_figure
@@ -56,7 +57,7 @@ def transients_grid(
         part = Capture(cube, axis, scan).crop(*checked_limits(limits))
         cube, axis = _transient(part, "transients_grid")
     style = ("curves" if cube.ndim == 4 else "image") if style is None else style
-    if not isinstance(style, str) or style not in STYLES:
+    if not is_one_of(style, STYLES):
         raise ArgumentError(f"transients_grid: expected style 'curves' or 'image', got {shown(style)}.")
     if style == "curves" and cube.ndim != 4:
         raise ShapeError(

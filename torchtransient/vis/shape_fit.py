@@ -7,13 +7,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Scan, Wall
+from torchtransient.capture.wall import checked_mesh
 from torchtransient.errors import SceneError, ShapeError
-from torchtransient.quantities import Numbers
+from torchtransient.given_types import mapping, of_class
+from torchtransient.quantities import Numbers, numbers, shown
 from torchtransient.vis.files import figure_type, save_figure
+from torchtransient.vis.sources import real_tensor
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -44,31 +48,40 @@ def plot_shape_fit(
     colour. `losses`: one for each step; `errors`: name with unit -> numbers, drawn on logarithmic axes. Writes the
     figure when `path` is given. Raises ShapeError, SceneError for a scan without a wall, StorageError.
     """
+    of_class("plot_shape_fit: scan", scan, Scan, "; Scan.grid makes one")
+    of_class("plot_shape_fit: axis", axis, TimeAxis)
     if scan.wall is None or len(scan.sensor_shape) != 2:
         raise SceneError(
             "plot_shape_fit: expected a scan with a grid of sensor points and a wall. Scan.grid makes one."
         )
-    if not meshes or not losses:
-        raise ShapeError(f"plot_shape_fit: expected a mesh and a step, got {len(meshes)} and {len(losses)}.")
+    given = mapping("plot_shape_fit: meshes", meshes, "{name: vertices}")
+    loss, curves = _row("losses", losses), mapping("plot_shape_fit: errors", errors, "{name: numbers}")
+    if not given or not len(loss):
+        raise ShapeError(f"plot_shape_fit: expected a mesh and a step, got {len(given)} and {len(loss)}.")
+    shapes = {name: checked_mesh(f"plot_shape_fit: {name!r}", mesh, faces) for name, mesh in given.items()}
+    transients = {
+        name: real_tensor(cube, f"plot_shape_fit: {name!r}")
+        for name, cube in mapping("plot_shape_fit: transients", transients, "{name: transient}").items()
+    }
     for name, cube in transients.items():
         if tuple(cube.shape) != (axis.num_bins, *scan.sensor_shape):
             raise ShapeError(
                 f"plot_shape_fit: expected {name!r} as (T, H, W) = {(axis.num_bins, *scan.sensor_shape)}, got "
                 f"{tuple(cube.shape)}."
             )
-    colours = dict(zip(meshes, COLOURS, strict=False)) | {list(meshes)[-1]: LAST_COLOUR}
+    colours = dict(zip(shapes, COLOURS, strict=False)) | {list(shapes)[-1]: LAST_COLOUR}
     figure = figure_type()(figsize=(11.0, 7.4), layout="constrained")
     upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=(1.25, 1.0)).flat
     front, above = upper.subplots(1, 2)
-    _draw_views(front, above, scan, {name: _numbers(mesh) for name, mesh in meshes.items()}, _numbers(faces), colours)
+    _draw_views(front, above, scan, shapes, colours)
     panels = lower.subplots(1, 4, width_ratios=(1.0, 1.0, 1.0, 1.2))
     _draw_transients(panels[:3], transients, axis, colours)
-    _draw_curves(panels[3], losses, errors)
+    _draw_curves(panels[3], loss, {name: _row(f"errors of {name!r}", curve) for name, curve in curves.items()})
     return save_figure(figure, path, "plot_shape_fit")
 
 
 def _draw_views(
-    front: Any, above: Any, scan: Scan, meshes: Mapping[str, Any], faces: Any, colours: Mapping[str, str]
+    front: Any, above: Any, scan: Scan, meshes: Mapping[str, tuple[Any, Any]], colours: Mapping[str, str]
 ) -> None:
     """The wall's view, along its axes u and v, and that from above, along u and the wall's normal."""
     wall = Wall.of(scan.wall)
@@ -83,7 +96,8 @@ def _draw_views(
         panel.scatter(points[:, i], points[:, j], s=1.5, color="0.8", linewidths=0)
         # The truth first and broad, so that what was found shows on it.
         for n, name in enumerate(sorted(meshes, key=list(meshes)[-1].__ne__)):
-            _draw_mesh(panel, local(meshes[name])[:, [i, j]], faces, (colours[name], 1.3 if n else 3.5), name)
+            vertices, faces = meshes[name]
+            _draw_mesh(panel, local(vertices)[:, [i, j]], faces, (colours[name], 1.3 if n else 3.5), name)
         panel.set_aspect("equal")
         panel.set_xlabel("along the wall (m)")
     front.set_ylabel("up (m)")
@@ -137,6 +151,13 @@ def _draw_curves(panel: Any, losses: Numbers, errors: Mapping[str, Numbers]) -> 
     lines = [*panel.get_lines(), *twin.get_lines()]
     panel.legend(lines, [line.get_label() for line in lines], fontsize=7, frameon=False)
     panel.set_title("errors, and the loss (dashed)", fontsize=9)
+
+
+def _row(what: str, given: Any) -> NDArray[np.float64]:
+    row = numbers(f"plot_shape_fit: {what}", given)
+    if row.ndim != 1:
+        raise ShapeError(f"plot_shape_fit: expected {what} as a row of numbers, got {shown(given)}.")
+    return row
 
 
 def _numbers(values: Any) -> Any:

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchtransient import quantities
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ArgumentError, ShapeError
+from torchtransient.given_types import several
 from torchtransient.units import opl_to_seconds
 from torchtransient.vis.files import figure_type, picture_figure, save_figure
 from torchtransient.vis.overview import moments_of_arrival
@@ -96,7 +97,8 @@ def frame_grid(
     if bins is None:
         shares = tuple(float(s) for s in (np.arange(number) + 0.5) / number)
         bins = moments_of_arrival(cube.nan_to_num(posinf=0.0, neginf=0.0), shares)
-    if not len(bins):
+    bins = several("frame_grid: bins", bins, "numbers of bins")
+    if not bins:
         raise ShapeError("frame_grid: expected some bins, got none.")
     for index in bins:
         if (place := quantities.as_whole(index)) is None or not 0 <= place < total:
@@ -128,7 +130,8 @@ def histogram(
     """
     cube, axis, word = images_of(source, axis, "histogram", any_channels=True)
     height, width = cube.shape[2:]
-    if not len(pixels):
+    pixels = several("histogram", pixels, "pixels (row, column)")
+    if not pixels:
         raise ShapeError("histogram: expected at least one pixel (row, column), got none.")
     pixels = [pixel_of(pixel, (height, width), "histogram") for pixel in pixels]
     figure = figure_type()(figsize=(7.0, 0.5 + 2.1 * len(pixels)), layout="constrained")

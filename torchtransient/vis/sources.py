@@ -14,9 +14,10 @@ from torch import Tensor
 
 from torchtransient.array_files.array_file import damage_said, read_npy, read_some
 from torchtransient.axes import FrequencyAxis, TimeAxis
-from torchtransient.errors import ArgumentError, ShapeError, StorageError
+from torchtransient.errors import ArgumentError, ShapeError, StorageError, UnitError
+from torchtransient.given_types import of_class
 from torchtransient.plain_texts import json_data
-from torchtransient.quantities import as_whole, shown
+from torchtransient.quantities import as_whole, real_array, shown
 
 Source = Any  # Tensor | NDArray | RenderOutput | Result | str | Path, told apart by what they offer
 _HDF5 = (".h5", ".hdf5")
@@ -55,7 +56,7 @@ def transient_of(
             "gates, which are no bins. Draw them with frames, frame_grid or histogram, or render with time_axis=..."
         )
     cube = _only(loaded.transient, "transient", "(C, T, H, W)", who)
-    return _checked_cube(cube, axis or loaded.axis, who, any_channels)
+    return _checked_cube(cube, loaded.axis if axis is None else axis, who, any_channels)
 
 
 def images_of(
@@ -78,7 +79,7 @@ def _checked_cube(cube: Tensor, axis: TimeAxis | None, who: str, any_channels: b
             f"{who}: expected a transient (C, T, H, W) or (4, C, T, H, W) with C = 1 or 3, got {tuple(cube.shape)}; of "
             "a batch, choose one, and of many channels, choose one or three."
         )
-    if axis is not None and axis.num_bins != cube.shape[1]:
+    if axis is not None and of_class(f"{who}: axis", axis, TimeAxis).num_bins != cube.shape[1]:
         raise ShapeError(f"{who}: the axis has {axis.num_bins} bins, the transient {cube.shape[1]}.")
     return cube, axis
 
@@ -162,19 +163,31 @@ def phasor_of(source: Source, who: str = "picture") -> tuple[Tensor, tuple[float
     return phasor, loaded.frequencies
 
 
+def given_tensor(value: Any, who: str, expected: str = "a tensor or an array") -> Tensor:
+    """A tensor as it is, and one of the numbers of an array. Raises ArgumentError for anything else, ShapeError for
+    arrays of what is no number.
+    """
+    if isinstance(value, Tensor):
+        return value
+    if not isinstance(value, np.ndarray):
+        raise ArgumentError(f"{who}: expected {expected}, got {type(value).__name__}.")
+    try:
+        return torch.from_numpy(np.ascontiguousarray(value))
+    except TypeError:
+        raise ShapeError(f"{who}: expected numbers, got an array of {value.dtype}.") from None
+
+
+def real_tensor(value: Any, who: str) -> Tensor:
+    """As :func:`given_tensor`. Raises ShapeError for complex numbers, too."""
+    tensor = given_tensor(value, who)
+    if tensor.is_complex():
+        raise ShapeError(f"{who}: expected real numbers, got {tensor.dtype}.")
+    return tensor
+
+
 def as_tensor(value: Any, who: str) -> Tensor:
-    """A tensor or array on the CPU without gradients; ShapeError for anything else. 16 bit becomes float32."""
-    if isinstance(value, np.ndarray):
-        try:
-            tensor = torch.from_numpy(np.ascontiguousarray(value))
-        except TypeError:
-            raise ShapeError(f"{who}: expected numbers, got an array of {value.dtype}.") from None
-    elif isinstance(value, Tensor):
-        tensor = value.detach().cpu()
-    else:
-        raise ArgumentError(
-            f"{who}: expected a tensor, an array, a RenderOutput or the path of a result, got {type(value).__name__}."
-        )
+    """A tensor or array on the CPU without gradients; errors as :func:`given_tensor`. 16 bit becomes float32."""
+    tensor = given_tensor(value, who, "a tensor, an array, a RenderOutput or the path of a result").detach().cpu()
     if tensor.is_complex() or tensor.dtype in (torch.float32, torch.float64):
         return tensor
     return tensor.to(torch.float32)
@@ -204,7 +217,10 @@ def frequencies_of(given: Any) -> tuple[float, ...] | None:
         return None
     if isinstance(given, FrequencyAxis):
         return given.frequencies
-    return tuple(float(f) for f in np.ravel(given))
+    row = real_array(given)
+    if row is None:
+        raise UnitError(f"picture: expected frequencies in cycles per metre, got {shown(given)}.")
+    return tuple(row.ravel().tolist())
 
 
 def _only(value: Tensor | None, name: str, shape: str, who: str) -> Tensor:

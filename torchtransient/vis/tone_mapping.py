@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
+from torchtransient.given_types import is_one_of
 from torchtransient.quantities import as_number, shown
+from torchtransient.vis.sources import real_tensor
 
 BROKEN = (1.0, 0.0, 1.0)  # magenta: a pixel that is not finite must not pass for black or white
 CURVES = ("srgb", "gamma", "log", "linear")
@@ -21,7 +24,7 @@ def exposure_of(image: Tensor, quantile: float = 0.99) -> float:
 
     `image`: (C, H, W) linear radiance. Values that are not finite are left out. Raises ShapeError and UnitError.
     """
-    _check(image)
+    image = _checked(image, "exposure_of")
     quantile = _quantile(quantile, "exposure_of")
     brightest = image.amax(0).flatten().to(torch.float64)
     brightest = brightest[torch.isfinite(brightest)]
@@ -40,6 +43,7 @@ def exposure_of_video(transient: Tensor, quantile: float = 0.99) -> float:
     The quantile is found to 1 % of its value over nine decades below the maximum; nothing of the size of the cube is
     allocated. 1 for a black cube. Raises ShapeError and UnitError.
     """
+    transient = real_tensor(transient, "exposure_of_video")
     if transient.ndim != 4 or transient.shape[0] not in (1, 3):
         raise ShapeError(f"exposure_of_video: expected (C, T, H, W) with C = 1 or 3, got {tuple(transient.shape)}.")
     quantile = _quantile(quantile, "exposure_of_video")
@@ -88,10 +92,12 @@ def tone_map(
     (`x ** (1 / gamma)`), "linear", or "log", which spreads `stops` factors of two below white evenly over the scale,
     for direct and late light in one picture; there the brightest channel is mapped and the others keep their ratio
     to it. Negative values become black; pixels that are not finite magenta. Raises ShapeError for another shape,
-    UnitError for an unknown curve, or an exposure, gamma or number of stops that is not positive.
+    ArgumentError for an unknown curve, UnitError for an exposure, gamma or number of stops that is not positive.
     """
-    _check(image)
+    image = _checked(image, "tone_map")
     factor = checked_positive("exposure", exposure_of(image) if exposure is None else exposure)
+    if not is_one_of(curve, CURVES):
+        raise ArgumentError(f"tone_map: expected a curve out of {', '.join(CURVES)}, got {shown(curve)}.")
     gamma, stops = checked_positive("gamma", gamma), checked_positive("stops", stops)
     mapped = image.detach().to(torch.float64) * factor
     broken = ~torch.isfinite(mapped).all(0)
@@ -105,21 +111,21 @@ def tone_map(
 def _curve(linear: Tensor, curve: str, gamma: float, stops: float) -> Tensor:
     if curve == "srgb":
         x = linear.clamp(max=1)
-        return torch.where(x <= 0.0031308, 12.92 * x, 1.055 * x.clamp(min=1e-12) ** (1 / 2.4) - 0.055)
+        return torch.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
     if curve == "gamma":
         return linear.clamp(max=1) ** (1 / gamma)
     if curve == "linear":
         return linear
-    if curve == "log":
-        brightest = linear.amax(0)
-        tiny = torch.finfo(linear.dtype).tiny
-        level = (1 + brightest.clamp(min=tiny, max=1).log2() / stops).clamp(0, 1)
-        # The ratio of the channels is shown on the scale of the eye, else every colour would turn to its primary.
-        ratio = linear / torch.where(brightest > 0, brightest, 1.0)
-        return level * _curve(ratio, "srgb", gamma, stops)
-    raise ArgumentError(f"tone_map: expected a curve out of {', '.join(CURVES)}, got {curve!r}.")
+    brightest = linear.amax(0)
+    tiny = torch.finfo(linear.dtype).tiny
+    level = (1 + brightest.clamp(min=tiny, max=1).log2() / stops).clamp(0, 1)
+    # The ratio of the channels is shown on the scale of the eye, else every colour would turn to its primary.
+    ratio = linear / torch.where(brightest > 0, brightest, 1.0)
+    return level * _curve(ratio, "srgb", gamma, stops)
 
 
-def _check(image: Tensor) -> None:
+def _checked(given: Any, who: str) -> Tensor:
+    image = real_tensor(given, who)
     if image.ndim != 3 or image.shape[0] not in (1, 3):
-        raise ShapeError(f"tone mapping: expected an image (C, H, W) with C = 1 or 3, got {tuple(image.shape)}.")
+        raise ShapeError(f"{who}: expected an image (C, H, W) with C = 1 or 3, got {tuple(image.shape)}.")
+    return image

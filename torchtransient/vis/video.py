@@ -14,11 +14,12 @@ from torch import Tensor
 from torchtransient import quantities
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError
+from torchtransient.given_types import function, several
 from torchtransient.vis.files import Image, enlarge, to_bytes
 from torchtransient.vis.sources import Source, images_of
 from torchtransient.vis.stamps import moment, with_strip
 from torchtransient.vis.tone_mapping import checked_positive, exposure_of, exposure_of_video, tone_map
-from torchtransient.vis.video_file import check_video, write_video
+from torchtransient.vis.video_file import check_video, checked_frame, write_video
 
 _VISIBLE = 320  # pixels: smaller pictures are enlarged to about this, else a player shows a stamp
 
@@ -43,6 +44,7 @@ class Frames:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "count", quantities.count("Frames: count", self.count, 0, ShapeError))
+        function("Frames: make", self.make, "the number of a frame")
 
     def __len__(self) -> int:
         return self.count
@@ -123,12 +125,17 @@ def side_by_side(parts: Sequence[Frames], gap: int = 4) -> Frames:
 
     Raises ShapeError without any part. Write the result with `write_video(path, frames, len(frames))`.
     """
+    parts = several("side_by_side", parts, "sequences of frames")
+    for part in parts:
+        if not isinstance(part, (Frames, list, tuple)):
+            raise ShapeError(f"side_by_side: expected several sequences of frames, got {quantities.shown(part)} among "
+                             "them; tt.vis.frames makes one.")  # fmt: skip
     if not parts:
         raise ShapeError("side_by_side: expected at least one sequence of frames, got none.")
     between = quantities.count("side_by_side: gap", gap, 0, ShapeError)
 
     def make(index: int) -> Image:
-        images = [part[index] for part in parts]
+        images = [checked_frame(part[index], "side_by_side") for part in parts]
         height = max(image.shape[0] for image in images)
         row = []
         for image in images:

@@ -14,6 +14,7 @@ from torchtransient import quantities
 from torchtransient.array_files.part_files import replacing
 from torchtransient.errors import MissingPackageError, ShapeError, StorageError, UnitError
 from torchtransient.file_places import check_folder, path_of
+from torchtransient.given_types import one_by_one
 from torchtransient.plain_texts import said_in_short
 from torchtransient.quantities import positive, shown
 from torchtransient.vis.files import Image
@@ -58,6 +59,7 @@ def write_video(
         fps = positive("fps", fps)
     except UnitError:
         raise UnitError(f"video: expected fps > 0, got {shown(fps)}.") from None
+    one_by_one("video", frames, "frames (H, W, 3) of uint8")
     many = quantities.count("video: count", count, 0, ShapeError)
     if not many:
         raise ShapeError("video: expected at least one frame, got none.")
@@ -75,14 +77,22 @@ def write_video(
     return target
 
 
+def checked_frame(frame: Any, who: str) -> Image:
+    """An image (H, W, 3) of uint8. Raises ShapeError for what is none."""
+    if not isinstance(frame, np.ndarray):
+        raise ShapeError(f"{who}: expected frames (H, W, 3) of uint8, got {shown(frame)}.")
+    if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
+        raise ShapeError(f"{who}: expected frames (H, W, 3) of uint8, got {frame.dtype} {tuple(frame.shape)}.")
+    return frame
+
+
 def _followed(frames: Iterable[Image], count: int, progress: bool) -> Iterator[Image]:
     """The frames, checked, behind a progress bar."""
     from tqdm import tqdm
 
     size: tuple[int, ...] | None = None
-    for frame in tqdm(frames, total=count, desc="video", unit="frame", disable=not progress):
-        if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
-            raise ShapeError(f"video: expected frames (H, W, 3) of uint8, got {frame.dtype} {tuple(frame.shape)}.")
+    for given in tqdm(frames, total=count, desc="video", unit="frame", disable=not progress):
+        frame = checked_frame(given, "video")
         if size is not None and frame.shape != size:
             raise ShapeError(f"video: expected frames of equal size {size}, got {tuple(frame.shape)}.")
         size = frame.shape
@@ -135,7 +145,7 @@ def _palette(frames: Iterable[Image], count: int) -> Any:
     seen = []
     for number, frame in enumerate(frames):
         if number % step == 0:
-            pixels = frame.reshape(-1, 3)
+            pixels = checked_frame(frame, "video").reshape(-1, 3)
             seen.append(pixels[:: max(1, pixels.shape[0] * _PALETTE_FRAMES // _PALETTE_PIXELS)])
     if not seen:
         raise ShapeError("video: expected frames that can be iterated twice for a GIF, got none.")

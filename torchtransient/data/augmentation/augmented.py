@@ -14,6 +14,7 @@ from torchtransient.data.reading.sample_draws import Epochs, checked_seed, sampl
 from torchtransient.data.reading.stream import TransientStream
 from torchtransient.data.reading.transient_dataset import TransientDataset
 from torchtransient.errors import ArgumentError, SceneError
+from torchtransient.given_types import by_number
 from torchtransient.quantities import count, shown
 
 
@@ -29,9 +30,7 @@ class Augmented(Epochs, Dataset[Any]):
         super().__init__()
         if isinstance(dataset, IterableDataset):
             raise ArgumentError(f"Augmented: {shown(dataset)} is a stream; use AugmentedStream.")
-        if not hasattr(dataset, "__len__") or not hasattr(dataset, "__getitem__"):
-            raise ArgumentError(f"Augmented: expected a data set of samples by number, got {shown(dataset)}.")
-        self.dataset, self.augment = dataset, _checked(augment, "Augmented")
+        self.dataset, self.augment = by_number("Augmented", dataset), _checked(augment, "Augmented")
         self.seed = checked_seed("Augmented", seed)
 
     def __len__(self) -> int:

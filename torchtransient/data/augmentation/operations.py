@@ -12,6 +12,7 @@ import torch
 
 from torchtransient.data.augmentation.pixel_map import PixelMap
 from torchtransient.errors import ArgumentError, SceneError, ShapeError
+from torchtransient.given_types import is_one_of
 from torchtransient.quantities import count, share, shown
 
 Direction = Literal["horizontal", "vertical"]
@@ -35,7 +36,7 @@ class Flip(Operation):
     p: float = 0.5
 
     def __post_init__(self) -> None:
-        if self.direction not in get_args(Direction):
+        if not is_one_of(self.direction, get_args(Direction)):
             raise ArgumentError(f"Flip: expected 'horizontal' or 'vertical', got {shown(self.direction)}.")
         share("Flip: p", self.p)
 
@@ -85,7 +86,7 @@ class Crop(Operation):
     def __post_init__(self) -> None:
         for name, least in (("size", 1), ("offset", 0)):
             given = getattr(self, name)
-            if given is None:
+            if given is None and name == "offset":
                 continue
             if not isinstance(given, Sequence) or len(given) != 2:
                 raise ShapeError(f"Crop: expected {name} as two numbers of pixels, got {shown(given)}.")

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.geometry.pinhole import camera_matrices, transforms
+from torchtransient.given_types import of_class
 from torchtransient.quantities import as_number, count, real_array, shown
 
 Matrix = NDArray[np.float64]
@@ -108,12 +110,13 @@ class PixelMap:
 
     def intrinsics(self, camera_matrix: Tensor) -> Tensor:
         """Those of the camera that has taken the result."""
+        camera_matrix = camera_matrices(camera_matrix, "PixelMap.intrinsics")
         orthogonal = _like(self._orthogonal, camera_matrix)
         return torch.matmul(torch.matmul(_like(self.matrix, camera_matrix), camera_matrix), orthogonal.mT)
 
     def to_world(self, to_world: Tensor) -> Tensor:
         """That of the camera that has taken the result. Turns about the axis are the same in Mitsuba's frame."""
-        turn = np.eye(4)
+        to_world, turn = transforms(to_world, "PixelMap.to_world"), np.eye(4)
         turn[:3, :3] = self.rotation.T
         return torch.matmul(to_world, _like(turn, to_world))
 
@@ -121,7 +124,7 @@ class PixelMap:
         """(..., 4, 4) of the world: what the mirror of the camera's frame is there. The mirrors along x and y are the
         same in Mitsuba's frame.
         """
-        mirror = np.eye(4)
+        to_world, mirror = transforms(to_world, "PixelMap.mirrored_world"), np.eye(4)
         mirror[:3, :3] = np.eye(3) if self.mirror is None else self.mirror
         found: Tensor = torch.linalg.solve(to_world, torch.matmul(to_world, _like(mirror, to_world)), left=False)
         return found
@@ -152,6 +155,7 @@ class PixelMap:
         """
         if (number := as_number(fill)) is None:
             raise UnitError(f"PixelMap.nearest: expected fill as one number, got {shown(fill)}.")
+        self._check_image(image, name)
         fill = number
         rows, columns, inside = (one.to(image.device) for one in self._sources)
         # Bits are moved, no numbers: torch 2.6 has no index for these unsigned types.
@@ -175,6 +179,7 @@ class PixelMap:
         """
         if self.is_exact:
             return self.nearest(image, 0, name)
+        self._check_image(image, name)
         if image.is_complex():
             return torch.complex(self.smooth(image.real), self.smooth(image.imag))
         if not image.is_floating_point():
@@ -188,6 +193,12 @@ class PixelMap:
         matrix = _like(self.matrix[None, :2], whole)
         moved: Any = warp_affine(whole, matrix, self.new_size, mode="bilinear", align_corners=True)
         return torch.as_tensor(moved, dtype=image.dtype).reshape(*image.shape[:-2], *self.new_size)
+
+
+    def _check_image(self, image: Any, name: str) -> None:
+        size = tuple(of_class(f"PixelMap: {name}", image, Tensor).shape)
+        if size[-2:] != self.size:
+            raise ShapeError(f"PixelMap: expected {name!r} as (..., {self.size[0]}, {self.size[1]}), got {size}.")
 
 
 def _holds(dtype: torch.dtype, fill: float) -> bool:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.given_types import function as given_function
 from torchtransient.quantities import count
 
 
@@ -20,6 +21,7 @@ def spatial_filter(function: Callable[[Tensor], Tensor], light: Tensor, images_a
     the function takes. Differentiable as ``function`` is. Complex phasors raise UnitError: filter their real and
     imaginary parts. Raises ShapeError.
     """
+    given_function("spatial_filter", function, "images (N, 1, H, W)")
     if not isinstance(light, Tensor) or light.ndim < 2:
         got = tuple(light.shape) if isinstance(light, Tensor) else type(light).__name__
         raise ShapeError(f"spatial_filter: expected images (..., H, W), got {got}.")
@@ -44,7 +46,8 @@ class SpatialFilter(nn.Module):
 
     def __init__(self, function: Callable[[Tensor], Tensor], images_at_once: int = 4096) -> None:
         super().__init__()
-        self.function, self.images_at_once = function, count("SpatialFilter: images_at_once", images_at_once)
+        self.function = given_function("SpatialFilter", function, "images (N, 1, H, W)")
+        self.images_at_once = count("SpatialFilter: images_at_once", images_at_once)
 
     def forward(self, light: Tensor) -> Tensor:
         return spatial_filter(self.function, light, self.images_at_once)

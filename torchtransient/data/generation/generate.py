@@ -29,6 +29,7 @@ from torchtransient.data.generation.settings import (
 from torchtransient.data.recipes.plugin_modules import plugins_here
 from torchtransient.data.storage.file_names import RECIPE_FILE, SHARD_FILES, shard_file_name
 from torchtransient.errors import ArgumentError, SceneError, StorageError, TorchTransientError, UnitError
+from torchtransient.given_types import is_one_of, with_methods
 from torchtransient.quantities import as_number, count, shown
 
 ENGINES = ("local", "ray")
@@ -303,13 +304,11 @@ def _check_choices(store: Any, compression: Any, engine: Any, address: Any, reci
     hdf5_package(_WHAT)
     check_store(store, _WHAT)
     check_compression(compression, _WHAT)
-    if engine not in ENGINES:
+    if not is_one_of(engine, ENGINES):
         raise ArgumentError(f"{_WHAT}: expected engine to be one of {', '.join(ENGINES)}, got {shown(engine)}.")
     if address is not None and engine != "ray":
         raise UnitError(f"{_WHAT}: address={shown(address)} is for engine='ray', got engine={engine!r}.")
-    lacking = [name for name in ("maker", "key", "to_dict") if not callable(getattr(recipe, name, None))]
-    if lacking:
-        raise ArgumentError(f"{_WHAT}: expected a recipe, with {lacking[0]}(), got {shown(recipe)}.")
+    with_methods(_WHAT, recipe, "a recipe", "maker", "key", "to_dict")
     if store == "counts" and getattr(recipe, "device", ...) is None:
         raise SceneError(f"{_WHAT}: store='counts' stores the measurement of recipes with a device; give one.")
     try:

@@ -12,12 +12,14 @@ from torch.utils.data import Dataset
 from torchtransient.data.reading.sample_draws import (
     Epochs,
     checked_seed,
+    checked_transform,
     sample_generator,
     sample_number,
     takes_generator,
     transformed,
 )
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
+from torchtransient.given_types import with_methods
 from torchtransient.quantities import count, shown
 
 _WHAT = "RecipeDataset"
@@ -41,8 +43,8 @@ class RecipeDataset(Epochs, Dataset[dict[str, Any]]):
     :meth:`sample` tell epochs apart. None draws from torch's, anew each time.
 
     It pickles, without what it has built. ``close()`` lets go of that; it is built again when a sample is read. Raises
-    UnitError for sizes, seeds and epochs, ArgumentError for a seed that the transform cannot take, IndexError beyond
-    the sizes, and what the render of a sample raises.
+    UnitError for sizes, seeds and epochs, ArgumentError for what is no recipe, no function, and a seed that the
+    transform cannot take, IndexError beyond the sizes, and what the render of a sample raises.
     """
 
     def __init__(
@@ -55,7 +57,8 @@ class RecipeDataset(Epochs, Dataset[dict[str, Any]]):
         seed: int | None = None,
     ) -> None:
         super().__init__()
-        self.recipe, self.transform = recipe, transform
+        self.recipe = with_methods(_WHAT, recipe, "a recipe", "maker")
+        self.transform = checked_transform(_WHAT, transform)
         self.size = count(f"{_WHAT}: size", size, 1, UnitError)
         self.first = count(f"{_WHAT}: first", first, 0, UnitError)
         self.seed = checked_seed(_WHAT, seed)

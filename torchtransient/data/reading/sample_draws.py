@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import UnitError
+from torchtransient.given_types import function
 from torchtransient.quantities import count, shown
 
 
@@ -59,11 +60,16 @@ def sample_generator(what: str, seed: int | None, number: int, epoch: Any = None
     return torch.Generator().manual_seed(int(key.generate_state(1, np.uint64)[0] >> np.uint64(1)))
 
 
+def checked_transform(what: str, transform: Any) -> Callable[..., Any] | None:
+    """A function of transients, or None. Raises ArgumentError."""
+    return None if transform is None else function(f"{what}: transform", transform, "transients, as sensors are")
+
+
 def takes_generator(transform: Any) -> bool:
     """Whether a transform can draw from a generator that it is given."""
-    function = transform.forward if isinstance(transform, torch.nn.Module) else transform
+    called = transform.forward if isinstance(transform, torch.nn.Module) else transform
     try:
-        return "generator" in inspect.signature(function).parameters
+        return "generator" in inspect.signature(called).parameters
     except (TypeError, ValueError):
         return False
 

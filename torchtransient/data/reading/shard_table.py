@@ -5,7 +5,6 @@ from __future__ import annotations
 import glob
 import os
 from collections import OrderedDict
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from torchtransient.data.storage.manifest import shards_of
 from torchtransient.data.storage.shard_file import Shard
 from torchtransient.errors import StorageError
 from torchtransient.file_places import path_of
+from torchtransient.given_types import several
 from torchtransient.quantities import shown
 
 WHAT = "data set"
@@ -106,13 +106,16 @@ def shard_paths(where: Any) -> list[Path]:
                 "none."
             )
         return [path.absolute() for path in found]
-    if isinstance(where, Iterable):
-        paths = [path for one in where for path in shard_paths(one)]
-        if len(set(paths)) != len(paths):
-            raise StorageError(f"{WHAT}: expected every shard once, got some of them twice.")
-        if paths:
-            return paths
-    raise StorageError(f"{WHAT}: expected a folder, a pattern, or a list of them, got {shown(where)}.")
+    try:
+        places: list[Any] = several(WHAT, where, "folders", error=StorageError)
+    except StorageError:
+        places = []
+    paths = [path for one in places for path in shard_paths(one)]
+    if len(set(paths)) != len(paths):
+        raise StorageError(f"{WHAT}: expected every shard once, got some of them twice.")
+    if not paths:
+        raise StorageError(f"{WHAT}: expected a folder, a pattern, or a list of them, got {shown(where)}.")
+    return paths
 
 
 def _kind(shard: Shard) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from torchtransient.data.reading.parts import axis_of, bins_of, cut_axis, image_
 from torchtransient.data.reading.sample_draws import (
     Epochs,
     checked_seed,
+    checked_transform,
     sample_generator,
     sample_number,
     takes_generator,
@@ -24,6 +25,7 @@ from torchtransient.data.reading.shard_table import WHAT, ShardTable
 from torchtransient.data.storage.encodings import measured_names
 from torchtransient.data.storage.shard_file import Shard
 from torchtransient.errors import ArgumentError, StorageError, UnitError
+from torchtransient.given_types import several
 from torchtransient.quantities import count, shown
 
 _MEASURED = "measurement"
@@ -67,7 +69,8 @@ class TransientDataset(Epochs, Dataset[dict[str, Any]]):
         self._timed = measured_names(self.about)
         self._size = image_size(shapes, self._timed)
         self._pixels = pixels_of(pixels, self._size)
-        self.transform, self.as_stored, self.seed = transform, bool(as_stored), checked_seed(WHAT, seed)
+        self.transform, self.seed = checked_transform(WHAT, transform), checked_seed(WHAT, seed)
+        self.as_stored = bool(as_stored)
         self._fields = self._read_fields(fields, shapes)
         if seed is not None and not takes_generator(transform):
             raise StorageError(
@@ -137,7 +140,8 @@ class TransientDataset(Epochs, Dataset[dict[str, Any]]):
         if fields is None:
             names = known
         else:
-            names = tuple(fields) if not isinstance(fields, str) else (fields,)
+            listed = [fields] if isinstance(fields, str) else several(f"{WHAT}: fields", fields, "names", str)
+            names = tuple(listed)
             made = (_INDEX,) if self.transform is None else (_INDEX, _MEASURED)
             unknown = [name for name in names if name not in (*known, *made)]
             if unknown:

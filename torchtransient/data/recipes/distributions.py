@@ -224,7 +224,8 @@ class Choice(Distribution):
 
 def checked_choices(who: str, values: Any, weights: Any) -> tuple[list[Any], list[float] | None]:
     """Values and their weights as lists. Raises SceneError, UnitError."""
-    if isinstance(values, str | bytes | Mapping) or not isinstance(values, Sequence | np.ndarray | range):
+    is_row = isinstance(values, Sequence | np.ndarray | range) and getattr(values, "ndim", 1) > 0
+    if isinstance(values, str | bytes | Mapping) or not is_row:
         raise SceneError(f"{who}: expected a list of values, got {shown(values)}.")
     plain = [_plain(value) for value in values]
     if not plain:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from torchtransient.errors import PluginRegistrationError, SceneError
-from torchtransient.quantities import shown
+from torchtransient.given_types import several
 
 # A module's name, and the plugins that it said to have.
 PluginNames = tuple[tuple[str, tuple[tuple[str, str], ...]], ...]
@@ -36,9 +36,7 @@ def check_plugins(modules: Sequence[str]) -> tuple[str, ...]:
     """Names of modules, which are added in this process. Raises SceneError, PluginRegistrationError."""
     from torchtransient.plugins import register_module
 
-    found = () if isinstance(modules, str) else tuple(modules)
-    if isinstance(modules, str) or not all(isinstance(module, str) for module in found):
-        raise SceneError(f"recipe: plugins: expected a list of names of modules, got {shown(modules)}.")
+    found = tuple(several("recipe: plugins", modules, "names of modules in a list", str, SceneError))
     for module in found:
         register_module(module)
     return found

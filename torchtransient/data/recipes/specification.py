@@ -22,6 +22,7 @@ from torchtransient.data.recipes.written import read_distribution
 from torchtransient.errors import ArgumentError, SceneError, ShapeError
 from torchtransient.files.content_key import content_key
 from torchtransient.gates import Gate
+from torchtransient.given_types import is_one_of, mapping
 from torchtransient.pulses import Pulse
 from torchtransient.quantities import MOST, Numbers, as_whole, count, real_array, shown
 from torchtransient.rendering.variant import resolve_variant
@@ -87,8 +88,10 @@ class Specification:
         # Before the scene is looked at.
         self.plugins = check_plugins(plugins)
         labels, keep = _names("labels", labels), None if keep is None else _names("keep", keep)
-        if physics not in ("ignore", "error"):
-            raise ArgumentError(f"recipe: physics: expected 'ignore' or 'error', got {physics!r}.")
+        if not is_one_of(physics, ("ignore", "error")):
+            raise ArgumentError(f"recipe: physics: expected 'ignore' or 'error', got {shown(physics)}.")
+        if parameters is not None:
+            mapping("recipe: parameters", parameters, "{name: value}")
         if scan is not None and not isinstance(scan, Scan):
             raise ArgumentError(f"recipe: scan: expected a tt.nlos.Scan, got {shown(scan)}.")
         for name, given, kind in (
@@ -179,7 +182,8 @@ class Specification:
 
 def _listed(given: Any) -> list[Any]:
     """Of what is no list or row of things, itself."""
-    return list(given) if isinstance(given, Sequence | np.ndarray) and not isinstance(given, str) else [given]
+    is_row = isinstance(given, Sequence | np.ndarray) and not isinstance(given, str) and getattr(given, "ndim", 1) > 0
+    return list(given) if is_row else [given]
 
 
 def _names(what: str, given: Any) -> tuple[str, ...]:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from torchtransient.array_files.hdf5_writing import hdf5_package
 from torchtransient.errors import ArgumentError, MissingPackageError, StorageError
+from torchtransient.given_types import is_one_of
 from torchtransient.quantities import shown
 
 COMPRESSIONS = ("blosc2", "gzip", "none")
@@ -36,7 +37,7 @@ _BLOSC2 = 32026
 
 def check_compression(compression: Any, what: str) -> str:
     """`compression`, or StorageError for one that is unknown or lacks its package."""
-    if compression not in COMPRESSIONS:
+    if not is_one_of(compression, COMPRESSIONS):
         raise ArgumentError(
             f"{what}: expected compression as one of {', '.join(COMPRESSIONS)}, got {shown(compression)}."
         )

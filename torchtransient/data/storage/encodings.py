@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.errors import ArgumentError, StorageError
+from torchtransient.given_types import is_one_of
 from torchtransient.quantities import shown
 
 STORES = ("exact", "rounded", "counts")
@@ -35,7 +36,7 @@ def measured_names(about: Any) -> tuple[str, ...]:
 
 def check_store(store: Any, what: str) -> str:
     """`store`, or StorageError for one that is unknown."""
-    if store not in STORES:
+    if not is_one_of(store, STORES):
         raise ArgumentError(f"{what}: expected store as one of {', '.join(STORES)}, got {shown(store)}.")
     return str(store)
 

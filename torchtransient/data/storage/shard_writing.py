@@ -25,6 +25,7 @@ from torchtransient.array_files.part_files import whole_file, writing_said
 from torchtransient.data.storage.chunks import LIBVER, Compressor, check_compression
 from torchtransient.data.storage.encodings import check_store, encoded, encoding_of, measured_names
 from torchtransient.errors import StorageError
+from torchtransient.given_types import mapping
 from torchtransient.quantities import count, shown
 
 FORMAT = "torchtransient shard 1"
@@ -77,7 +78,8 @@ class ShardWriter:
         check_folder(self.path, WHAT)
         self.store, self.compression = check_store(store, WHAT), check_compression(compression, WHAT)
         self.rows = count(f"{WHAT}: rows", rows, 1, StorageError)
-        self._header = json.loads(_json(dict(header), "header"))
+        plain = dict(mapping(f"{WHAT}: header", header, "of plain data", StorageError))
+        self._header = json.loads(_json(plain, "header"))
         self._samples: dict[int, _Row] = {}
         self._failed: dict[int, tuple[int, str]] = {}
         self._arrays: dict[str, _Column] = {}

@@ -1,0 +1,99 @@
+"""Error against time and samples: points, the guide of slope -1, ticks and words."""
+
+from __future__ import annotations
+
+import numpy as np
+import PIL.Image
+import pytest
+from matplotlib.ticker import NullFormatter
+
+from torchtransient.errors import ShapeError
+from torchtransient.vis import accuracy_curve
+from torchtransient.vis.accuracy_curve import Curve, plot_accuracy
+
+CURVES = [
+    Curve("transient", "path", [4, 16, 64], [0.5, 0.0, 3.0], [0.2, 0.1, 0.025]),
+    Curve("transient", "guided", [4, 16], [0.7, 2.0], [-1.0, 0.3]),
+    Curve("gradient", "path", [8], [1.8], [0.4]),
+]
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """The panels of curves, row by row, and how they were written."""
+
+    def draw(curves):
+        kept = []
+        monkeypatch.setattr(accuracy_curve, "save_figure", lambda *given, **options: kept.append((given, options)))
+        plot_accuracy(curves, "out.png")
+        ((figure, path, who), options), = kept
+        assert (path, who, options) == ("out.png", "plot_accuracy", {"dpi": 100})
+        return figure, np.array(figure.axes).reshape(-1, 2)
+
+    return draw
+
+
+def lines(panel):
+    return {line.get_label(): (line.get_xdata().tolist(), line.get_ydata().tolist()) for line in panel.lines}
+
+
+def test_points_are_what_is_above_zero(drawn):
+    figure, panels = drawn(CURVES)
+    np.testing.assert_allclose(figure.get_size_inches(), [10, 7.6])
+    seconds, spp = lines(panels[0, 0]), lines(panels[0, 1])
+    assert seconds["path"] == ([0.5, 3.0], [0.2, 0.025]) and seconds["guided"] == ([2.0], [0.3])
+    assert spp["path"] == ([4, 16, 64], [0.2, 0.1, 0.025]) and spp["guided"] == ([16], [0.3])
+    assert set(lines(panels[1, 0])) == {"path", "slope -1"}
+    assert [line.get_marker() for line in panels[0, 0].lines] == ["o", "s", "None"]
+    for panel in panels.flat:
+        assert panel.get_xscale() == panel.get_yscale() == "log"
+
+
+def test_the_guide_falls_as_independent_samples_do(drawn):
+    _, panels = drawn(CURVES)
+    for panel, x, y in (
+        (panels[0, 0], [0.5, 3.0], [0.2, 0.1 / 3]),
+        (panels[0, 1], [4, 64], [0.2, 0.0125]),
+        # Of one point, to twice of what it took.
+        (panels[1, 0], [1.8, 3.6], [0.4, 0.2]),
+        (panels[1, 1], [8, 16], [0.4, 0.2]),
+    ):
+        np.testing.assert_allclose(lines(panel)["slope -1"], (x, y))
+
+
+def test_nothing_above_zero_is_nothing_drawn(drawn):
+    _, panels = drawn([Curve("transient", "path", [0], [0.0], [0.0])])
+    for panel in panels.flat:
+        assert lines(panel) == {"path": ([], [])}
+
+
+def test_words(drawn):
+    _, panels = drawn(CURVES)
+    assert [panel.get_title(loc="left") for panel in panels.flat] == ["transient", "", "gradient", ""]
+    assert [panel.get_ylabel() for panel in panels.flat] == ["squared relative error", ""] * 2
+    assert [panel.get_xlabel() for panel in panels.flat] == ["", "", "seconds per render", "samples per pixel"]
+    assert [panel.get_legend() is not None for panel in panels.flat] == [False, True] * 2
+    assert [text.get_text() for text in panels[0, 1].get_legend().texts] == ["path", "guided", "slope -1"]
+
+
+def test_ticks(drawn):
+    """Samples where there are some; seconds at 1, 2 and 5 of each decade, up to 30 % beyond what was measured."""
+    _, panels = drawn(CURVES)
+
+    def ticks(panel):
+        assert isinstance(panel.xaxis.get_minor_formatter(), NullFormatter)
+        return list(panel.get_xticks()), [label.get_text() for label in panel.get_xticklabels()]
+
+    assert ticks(panels[0, 1]) == ([4, 16, 64], ["4", "16", "64"])
+    assert ticks(panels[0, 0]) == ([0.5, 1, 2], ["0.5", "1", "2"])
+    assert ticks(panels[1, 0]) == ([2], ["2"])
+    _, wide = drawn([Curve("a", "b", [1, 2], [0.013, 19.0], [1.0, 1.0])])
+    assert ticks(wide[0, 0])[1] == ["0.01", "0.02", "0.05", "0.1", "0.2", "0.5", "1", "2", "5", "10", "20"]
+
+
+def test_the_file(tmp_path):
+    plot_accuracy(CURVES[2:], tmp_path / "a.png")
+    with PIL.Image.open(tmp_path / "a.png") as picture:
+        assert picture.size == (1000, 400)
+    with pytest.raises(ShapeError, match="at least one curve, got none"):
+        plot_accuracy([], tmp_path / "b.png")

@@ -1,0 +1,145 @@
+"""Samples beside each other: where each picture and curve stands, on which scale, and what is written."""
+
+from __future__ import annotations
+
+import numpy as np
+import PIL.Image
+import pytest
+
+import torchtransient as tt
+from torchtransient.errors import ShapeError, TorchTransientError
+
+RNG = np.random.default_rng(3)
+COLOURS, DEPTHS = RNG.random((5, 4, 6, 3)), RNG.random((5, 4, 6)) + 2.0
+CURVES = np.array([[4.0, 9.0, 16.0]]) * np.arange(1.0, 6.0)[:, None] ** 2
+TIMES = np.array([1.25, 2.0, 2.75, 3.5])
+
+
+def cells(count=5, curves=True, titles="abcde"):
+    return [
+        tt.vis.Cell(titles[n], {"light": COLOURS[n], "depth": DEPTHS[n]}, CURVES[n] if curves else None)
+        for n in range(count)
+    ]
+
+
+def boxes(figure):
+    """Left, bottom, width and height of all axes in inches."""
+    shares = np.array([axes.get_position(original=True).bounds for axes in figure.axes])
+    return shares * np.tile(figure.get_size_inches(), 2)
+
+
+def test_samples_stand_in_rows_from_the_upper_left():
+    figure = tt.vis.contact_sheet(cells(), columns=2, times=TIMES, title="a sheet")
+    # 2.85 x 2.0 inches each, two beside and three below each other, 0.25 for a line below and 0.2 for the title.
+    np.testing.assert_allclose(figure.get_size_inches(), [5.7, 6.5])
+    placed = boxes(figure).reshape(5, 3, 4)
+    for number, (light, depth, curve) in enumerate(placed):
+        left, low = 2.85 * (number % 2) + 0.05, 0.25 + 2.0 * (2 - number // 2)
+        np.testing.assert_allclose(light, [left, low + 0.45, 1.3095, 1.3095], atol=1e-9)
+        np.testing.assert_allclose(depth, [left + 1.35, low + 0.45, 1.3095, 1.3095], atol=1e-9)
+        np.testing.assert_allclose(curve, [left, low + 0.06, 2.65, 0.33], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "count, curves, across, down",
+    [(1, True, 1, 1), (2, False, 1, 2), (5, True, 2, 3), (4, False, 1, 4), (3, True, 1, 3)],
+)
+def test_a_sheet_is_about_as_high_as_it_is_wide(count, curves, across, down):
+    size = tt.vis.contact_sheet(cells(count, curves)).get_size_inches()
+    np.testing.assert_allclose(size, [2.85 * across, (2.0 if curves else 1.55) * down + 0.3])
+
+
+def test_pictures_are_what_is_given_and_numbers_share_a_scale():
+    figure = tt.vis.contact_sheet(cells(), columns=3)
+    for number in range(5):
+        light, depth = (figure.axes[3 * number + place].images[0] for place in (0, 1))
+        np.testing.assert_array_equal(light.get_array(), COLOURS[number])
+        np.testing.assert_array_equal(depth.get_array(), DEPTHS[number])
+        assert depth.get_clim() == (DEPTHS.min(), DEPTHS.max())
+        assert light.get_interpolation() == depth.get_interpolation() == "nearest"
+        assert depth.get_cmap()(np.nan)[:3] == (0.15, 0.15, 0.15) and depth.get_cmap().name == "viridis"
+        assert not figure.axes[3 * number].axison
+
+
+def test_scales_of_what_is_finite():
+    def limits(*images):
+        figure = tt.vis.contact_sheet([tt.vis.Cell("", {"depth": np.array(image)}) for image in images])
+        return figure.axes[0].images[0].get_clim()
+
+    assert limits([[np.inf, 3.0]], [[np.nan, 7.0]]) == (3.0, 7.0)
+    assert limits([[np.nan, np.inf]]) == (0.0, 1.0)
+    assert limits([[5.0, 5.0]]) == (5.0, 5.0 + 1e-12)
+
+
+def test_light_over_time_is_drawn_as_its_root():
+    figure = tt.vis.contact_sheet(cells(2), times=TIMES)
+    for number in (0, 1):
+        axes = figure.axes[3 * number + 2]
+        steps = axes.patches[0].get_data()
+        np.testing.assert_allclose(steps.values, (number + 1) * np.array([2.0, 3.0, 4.0]))
+        np.testing.assert_array_equal(steps.edges, TIMES)
+        assert axes.get_xlim() == (1.25, 3.5) and axes.get_ylim()[0] == 0 and axes.patches[0].get_fill()
+        assert not len(axes.get_xticks()) and not len(axes.get_yticks())
+        assert [name for name, spine in axes.spines.items() if spine.get_visible()] == ["bottom"]
+    assert [text.get_text() for text in figure.texts] == [
+        "square root of the light over time, 1.25 m to 3.5 m of optical path"
+    ]
+    below = tt.vis.Cell("", {"light": COLOURS[0]}, np.array([-4.0, 1.0]))
+    figure = tt.vis.contact_sheet([below])
+    steps = figure.axes[1].patches[0].get_data()
+    assert steps.values.tolist() == [2, 1] and steps.edges.tolist() == [0, 1, 2] and not figure.texts
+
+
+def test_a_sample_without_light_among_others():
+    figure = tt.vis.contact_sheet([*cells(1), *cells(1, curves=False)], columns=2, times=TIMES)
+    assert len(figure.axes) == 5 and figure.get_size_inches()[1] == pytest.approx(2.3)
+    assert not tt.vis.contact_sheet(cells(2, curves=False), times=TIMES).texts
+
+
+def test_what_is_written_beside_pictures():
+    titles = ["x" * 60, "y" * 61, "c"]
+    figure = tt.vis.contact_sheet(cells(3, titles=titles), columns=2, title="a sheet")
+    assert [axes.get_title(loc="left") for axes in figure.axes] == [
+        "x" * 60, "", "", "y" * 57 + "...", "", "", "c", "", "",
+    ]  # fmt: skip
+    # The first row says which picture is what.
+    assert [[text.get_text() for text in axes.texts] for axes in figure.axes] == [
+        ["light"], ["depth"], [], ["light"], ["depth"], [], [], [], [],
+    ]  # fmt: skip
+    (title,) = figure.texts
+    assert title.get_text() == "a sheet" and title.get_position() == pytest.approx((0.01, 1 - 0.05 / 4.5))
+    alone = tt.vis.contact_sheet([tt.vis.Cell("z" * 31, {"light": COLOURS[0]})])
+    assert alone.axes[0].get_title(loc="left") == "z" * 27 + "..." and not alone.axes[0].texts
+
+
+def test_the_file_has_160_dots_an_inch(tmp_path):
+    tt.vis.contact_sheet(cells(1, curves=False), tmp_path / "sheet.png")
+    with PIL.Image.open(tmp_path / "sheet.png") as picture:
+        assert picture.size == (456, 296)  # 2.85 x 1.85
+
+
+@pytest.mark.parametrize(
+    "make, said",
+    [
+        (lambda: tt.vis.contact_sheet([]), "expected at least one sample, got none"),
+        (lambda: tt.vis.contact_sheet(cells(1), columns=0), "columns: expected a whole number of at least 1, got 0"),
+        (lambda: tt.vis.contact_sheet([*cells(1), tt.vis.Cell("b", {"light": COLOURS[0]})]),
+         "expected the images light, depth of every sample, as the first has them, got light"),
+        (lambda: tt.vis.contact_sheet(cells(1), times=TIMES[1:]), "times as the edges of 3 bins"),
+        (lambda: tt.vis.contact_sheet(cells(1, False), times=[1.0]), "times as the edges of some bins"),
+        (lambda: tt.vis.contact_sheet(cells(1), times=5), "times as the edges of 3 bins"),
+        (lambda: tt.vis.Cell("a", {"light": np.zeros((2, 3, 4))}), "image 'light' as"),
+        (lambda: tt.vis.Cell("a", {"light": np.zeros(3)}), "image 'light' as"),
+        (lambda: tt.vis.Cell("a", {"light": [["x"]]}), "image 'light' as"),
+        (lambda: tt.vis.Cell("a", curve=np.zeros((2, 2))), r"curve as \(T,\)"),
+    ],
+)  # fmt: skip
+def test_what_is_no_sheet(make, said):
+    with pytest.raises(ShapeError, match=said):
+        make()
+
+
+def test_what_is_no_cell():
+    for wrong in ({"title": 5}, {"title": "a", "images": 5}, {"title": "a", "curve": "x"}):
+        with pytest.raises(TorchTransientError, match=r"^Cell: "):
+            tt.vis.Cell(**wrong)
