@@ -144,12 +144,21 @@ def test_rows_that_do_not_converge_are_solved_directly(monkeypatch):
     def stuck(operator, right, start, *others):
         found, residual = converging(operator, right, start, *others)
         found, residual = found.clone(), residual.clone()
-        found[1], residual[1] = math.nan, 1e-3
+        found[1:], residual[1:] = math.nan, 1e-3
         return found, residual
 
+    def spied(chain, right, pinned, *, transposed):
+        pins.append(pinned.tolist())
+        return solve_banded(chain, right, pinned, transposed=transposed)
+
+    pins = []
     monkeypatch.setattr(phases, "gmres", stuck)
+    monkeypatch.setattr(phases, "solve_banded", spied)
     for found, exact in zip(solved(rate, part, 3), wanted, strict=True):
         torch.testing.assert_close(found, exact, rtol=1e-7, atol=1e-9)
+    # each row is held where its own detections are: lines twice, both derivatives, and the change
+    largest = wanted[0][1:, :6].argmax(-1).tolist()
+    assert largest[0] != largest[1] and pins == [largest] * 5
     monkeypatch.setattr(phases, "solve_banded", lambda chain, right, *_, **__: right + 0.1)
     with pytest.raises(TorchTransientError, match="stationary_phases: expected a relative residual"):
         phases.stationary_phases(rate, part, 3)
