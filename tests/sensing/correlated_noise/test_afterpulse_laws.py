@@ -85,17 +85,6 @@ def test_shares_are_those_of_drawn_delays(name):
     assert float(seen[~use].sum()) == pytest.approx(float(mean[~use].sum()), abs=5 * float(mean[~use].sum()) ** 0.5 + 5)
 
 
-@pytest.mark.parametrize("random", [0.0, 1 - 2.0**-53])
-def test_the_last_random_numbers_are_delays_of_the_histogram(random, monkeypatch):
-    """Shares whose sum rounds down to less than one: the last delay is that of its last bin."""
-    law = MeasuredDelays(torch.ones(10), 2.0, start_s=3.0)
-    assert float(law.share_of_bins.double().cumsum(0)[-1]) < 1
-    monkeypatch.setattr(torch, "rand", lambda *shape, **_: torch.full(shape, random, dtype=torch.float64))
-    for dead_time_s in (0.0, 7.0, 22.0):
-        found = law.draw(2, dead_time_s, None)
-        assert found.tolist() == pytest.approx([max(3.0, dead_time_s) if random == 0 else 23.0] * 2, rel=1e-12)
-
-
 @each_law
 def test_constant_counts_stay_constant_and_grow_by_all_generations(name):
     x = torch.full((1, BINS, 2, 2), 3.0, dtype=torch.float64)
