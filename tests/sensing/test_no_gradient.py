@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
@@ -19,6 +21,7 @@ from torchtransient.sensing.estimation.depth import background_per_bin
 from torchtransient.sensing.numerics.draws import check_rates, sample_first_photons, sample_multinomial
 from torchtransient.sensing.numerics.thinning import halve, thin
 from torchtransient.sensing.numerics.time_convolution import convolve_time
+from torchtransient.sensing.pixels.coincidence import _mean_survival
 from torchtransient.sensing.spad.spad import sample_detections
 
 PS = 1e-12
@@ -283,3 +286,62 @@ def test_codes_hold_no_gradient():
         code = sensing.PiecewiseLinearCode(torch.nn.Parameter(knots), torch.nn.Parameter(values), shifts)
     assert not code.shifts.requires_grad
     assert not code.evaluate(torch.tensor([0.2, 0.9])).requires_grad
+
+
+WIDE = {"bin_width_s": 1e-9}
+DARK = torch.tensor(
+    [[0.0, 0.0, 0.0, 0.0, 0.0], [3.0, 0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0, 2.0], [2.0, 2.0, 2.0, 2.0, 2.0],
+     [0.0, 1.0, 5.0, 1.0, 0.0], [0.0, -1.0, 1.0, 0.0, 0.0]], dtype=torch.float64).T.reshape(1, 5, 1, 6)  # fmt: skip
+LIT = DARK.clamp_min(0) * torch.tensor([1.0, 1e-7, 1.0, 1e-3, 10.0, 1.0], dtype=torch.float64)
+BACKWARDS = {
+    "peak": lambda x: sensing.peak_position(x),
+    "mean": lambda x: sensing.center_of_mass(x),
+    "mean around the peak": lambda x: sensing.center_of_mass(x, half_width_bins=1, background=0.5),
+    "first": lambda x: sensing.first_return(x, 1.0).position,
+    "first of a share": lambda x: sensing.first_return(x, 0.5 * x.amax(1)).position,
+    "several": lambda x: sensing.multi_return(x, 2, threshold=0.5).position,
+    "soft": lambda x: sensing.soft_argmax(x),
+    "equal shares": lambda x: sensing.equi_depth_edges(x.clamp_min(0), 3),
+}
+DETECTED = {
+    "one a cycle": lambda: sensing.SynchronousSPAD(9),
+    "several a cycle": lambda: sensing.SynchronousSPAD(9, dead_time_s=1.4e-9, **WIDE),
+    "running free": lambda: sensing.FreeRunningSPAD(9, 1.4e-9, **WIDE),
+    "frames": lambda: sensing.BinaryFrames(9),
+    "shot noise": lambda: sensing.ShotNoise(),
+}
+
+
+@pytest.mark.parametrize("name", BACKWARDS)
+def test_positions_of_dark_and_of_flat_pixels_have_derivatives(name):
+    """No step on the way back gives NaN that another one hides."""
+    x = DARK.clone().requires_grad_()
+    with torch.autograd.set_detect_anomaly(True):
+        (slope,) = torch.autograd.grad(BACKWARDS[name](x).sum(), x)
+    assert bool(slope.isfinite().all())
+
+
+@pytest.mark.parametrize("name", DETECTED)
+def test_detections_in_the_dark_have_derivatives(name):
+    """Means, variances and logarithms of chances: of no light at all, of hardly any, and of bright bins."""
+    sensor, x = DETECTED[name](), LIT.clone().requires_grad_()
+    seen = torch.where(LIT > 0.5, 1.0, 0.0).double()
+    with torch.autograd.set_detect_anomaly(True):
+        values = [sensor.expected(x), sensor.variance(x)]
+        if name != "running free":
+            values.append(sensor.log_prob(seen, x))
+        for value in values:
+            assert bool(value.isfinite().all())
+            (slope,) = torch.autograd.grad(value.sum(), x, retain_graph=True)
+            assert bool(slope.isfinite().all())
+
+
+def test_the_share_of_a_bin_that_a_detector_is_armed():
+    """(1 - exp(-x)) / x, in the dark a straight line."""
+    x = torch.tensor([0.0, 0.9e-5, 1.1e-5, 0.3, 40.0], dtype=torch.float64, requires_grad=True)
+    with torch.autograd.set_detect_anomaly(True):
+        value = _mean_survival(x)
+        (slope,) = torch.autograd.grad(value.sum(), x)
+    exact = torch.tensor([1.0, 1 - 0.45e-5, 1 - 0.55e-5, -math.expm1(-0.3) / 0.3, 1 / 40], dtype=torch.float64)
+    torch.testing.assert_close(value.detach(), exact, rtol=3e-11, atol=0)  # the next term is x^2 / 6
+    assert slope.tolist()[:3] == pytest.approx([-0.5] * 3, rel=1e-5)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -17,9 +18,11 @@ from torchtransient.sensing.correlated_noise.afterpulse_delays import Afterpulse
 from torchtransient.sensing.correlated_noise.trapped_ring import _Chain
 from torchtransient.sensing.counts.added_counts import AddedCounts
 from torchtransient.sensing.counts.moved_counts import MovedCounts, Moves
+from torchtransient.sensing.dead_time.free_running_ring import _closing
 from torchtransient.sensing.dead_time.stationary_phases import _check
 from torchtransient.sensing.devices.devices import Device
 from torchtransient.sensing.numerics.draws import sample_multinomial
+from torchtransient.sensing.optics.polarization import demosaic, mosaic_rows
 from torchtransient.sensing.response.responses import Response
 
 PS = 1e-12
@@ -181,6 +184,26 @@ REFUSED = {
     "no codes": (lambda: sensing.TDC(torch.ones(0)), ShapeError, r"TDC: expected code_widths \(T,\)"),
     "half a sphere and more": (lambda: sensing.Optics(solid_angle_sr=6.3), UnitError,
                                r"solid_angle_sr in \(0, 6\.28319\]"),
+    "one angle": (lambda: sensing.linear_analyzers(30.0), ShapeError,
+                  "linear_analyzers: expected a list of angles, got 30"),
+    "one angle as a tensor": (lambda: sensing.linear_analyzers(torch.tensor(30.0)), ShapeError, "a list of angles"),
+    "block of one angle": (lambda: mosaic_rows(30.0), ShapeError, "mosaic_rows: expected rows of angles, got 30"),
+    "block of one row": (lambda: mosaic_rows([30.0, 60.0]), ShapeError, "mosaic_rows: expected rows of angles"),
+    "raw light as a list": (lambda: demosaic([1.0]), ShapeError, r"demosaic: expected raw as a tensor, got .*1\.0"),
+    "time constant as a text": (lambda: sensing.afterpulse_kernel("3", 1e-9, 1e-9, period_bins=4), UnitError,
+                                "afterpulse_kernel: expected tau_s as one number of seconds, got '3'"),
+    "two time constants": (lambda: sensing.afterpulse_kernel(torch.ones(2), 1e-9, 1e-9, period_bins=4), UnitError,
+                           "tau_s as one number of seconds"),
+    "transpose of no sensor": (lambda: sensing.adjoint(torch.nn.Identity(), LIGHT, LIGHT.shape), ArgumentError,
+                               r"adjoint: expected a sensor of tt\.sensing, got .*Identity"),
+    "samples of two lengths": (lambda: sensing.measured_code([[0.0, 1.0, 2.0], [1.0, 2.0]]), ShapeError,
+                               "measured_code: expected samples as rows of numbers of one length"),
+    "ends of a train that has no state": (
+        lambda: _closing(None, None, SimpleNamespace(begin=None), SimpleNamespace(begin=LIGHT), 3, None),
+        AssertionError, "begins in its stationary state"),
+    "trains that have no state": (
+        lambda: _closing(None, None, SimpleNamespace(begin=LIGHT), SimpleNamespace(begin=None), 3, None),
+        AssertionError, "begins in its stationary state"),
     "no solid angle": (lambda: sensing.Optics(solid_angle_sr=0.0), UnitError, "solid_angle_sr in"),
 }  # fmt: skip
 

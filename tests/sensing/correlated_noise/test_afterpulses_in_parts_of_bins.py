@@ -6,6 +6,11 @@ import pytest
 import torch
 
 from torchtransient import TimeAxis, sensing
+from torchtransient.sensing.correlated_noise import trapped_carriers as carriers
+from torchtransient.sensing.correlated_noise.trapped_ring import _Chain
+from torchtransient.sensing.dead_time import stationary_phases as phases
+from torchtransient.sensing.dead_time.renewal_chain import RenewalChain, bin_response
+from torchtransient.sensing.dead_time.stationary_phases import stationary_phases
 from torchtransient.sensing.spad.spad import exposed_cycles
 
 BINS, WIDTH = 5, 100e-12
@@ -106,3 +111,72 @@ def test_light_without_pixels():
 def test_cycles_that_could_fire_once():
     counts = torch.tensor([3.0, 0.0, 2.0, 1.0]).reshape(1, 4, 1, 1)
     assert exposed_cycles(counts, 9, None).flatten().tolist() == [9.0, 6.0, 6.0, 4.0]
+
+
+# ------------------------------------------------------------------------------------------- what carriers are made of
+
+
+def number(values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def test_hazards_of_parts_of_bins():
+    """Sums while armed over armed time: parts that are armed longer count for more; nothing where none is."""
+    hazard, waited = number([[1.0, 3.0, 2.0, 5.0, 7.0, 9.0]]), number([[0.5, 1.0, 0.0, 0.25, 0.0, 0.0]])
+    found = carriers._coarser(hazard, waited, 2)
+    assert found.tolist() == [[pytest.approx(2 * 3.5 / 1.5), 10.0, 0.0]]
+    assert carriers._finer(number([[6.0, 9.0]]), 3).tolist() == [[2.0, 2.0, 2.0, 3.0, 3.0, 3.0]]
+    part, whole = number([3.0, -1.0, 2.0]), number([2.0, 2.0, 0.0]).requires_grad_()
+    with torch.autograd.set_detect_anomaly(True):
+        ratio = carriers._ratio(part, whole)
+        (slope,) = torch.autograd.grad(ratio.sum(), whole)
+    assert ratio.tolist() == [1.5, 0.0, 0.0] and slope.tolist() == [-0.75, 0.0, 0.0]
+    assert carriers._ratio(number([1.0, 4.0]), number([1e-201, 1e-199])).tolist() == pytest.approx([0.0, 4e199])
+
+
+def test_generations_of_carriers():
+    """Until 1e-5 of them are left, two at least; one where there are hardly any."""
+    for seen, rounds in (([1e-6], 1), ([0.9e-5], 1), ([1.1e-5], 2), ([0.003], 2), ([0.004], 3), ([0.1, 0.1], 8),
+                         ([0.5], 17)):  # fmt: skip
+        assert carriers._rounds(number(seen)) == rounds
+
+
+@pytest.mark.parametrize("largest", [0.3, 1.9, 2.1, 40.0])
+@pytest.mark.parametrize("part", [0.0, 0.35])
+def test_a_bin_by_powers_and_by_moments(part, largest):
+    """Up to 2 photons powers of them; what a bin does is the same."""
+    loss = largest * number([[0.0, 0.01, 0.4], [1.0, 0.7, 0.2]])
+    found = carriers._response(loss, number(part), largest)
+    wanted = bin_response(loss, number(part))
+    for name in ("kept", "waited", "hit_slope", "slope", "wait", "decay"):
+        torch.testing.assert_close(getattr(found, name), getattr(wanted, name), rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("whole", [0, 3, 8])
+def test_carriers_on_a_ring_start_from_constant_light(whole):
+    """Rows that are constant are undone at once, by the losses and shares of their own."""
+    loss, kept = number([[0.03], [0.9], [7.0]]).expand(3, 5), number([[0.999], [0.3], [0.8]]).expand(3, 5)
+    chain = _Chain(loss.contiguous(), kept.contiguous(), number(0.4), whole)
+    x = torch.randn(3, 10, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    torch.testing.assert_close(chain.constant.solve(x - chain.step(x)), x, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(chain.solve(x - chain.step(x)), x, rtol=1e-8, atol=1e-8)
+    # all of a share and none of one, too: a number that is near enough
+    for share in (0.0, 1.0):
+        edge = _Chain(loss[:1].contiguous(), share + 0 * kept[:1], number(0.4), whole)
+        found = edge.constant.solve(x[:1] - edge.step(x[:1]))
+        if share == 0:
+            torch.testing.assert_close(found, x[:1], rtol=1e-5, atol=1e-5)
+        assert bool(found.isfinite().all())
+
+
+@pytest.mark.parametrize("whole", [0, 3, 8])
+def test_detections_on_a_ring_start_from_constant_light(whole):
+    """The mean wait of each row is that of its own light."""
+    rate = number([[0.03], [0.9], [7.0]]).expand(3, 5).contiguous()
+    chain = RenewalChain(rate, whole, number(0.4))
+    pi = stationary_phases(rate, number(0.4), whole)
+    torch.testing.assert_close(pi[:, :5], torch.full((3, 5), 0.2, dtype=torch.float64))
+    x = torch.randn(3, 10, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    ones = torch.cat([torch.ones(5), torch.zeros(5)]).double()
+    right = x - chain.step(x) + x[:, :5].mean(-1, keepdim=True) * ones
+    torch.testing.assert_close(phases._constant(chain, 4 * pi).solve(right), x, rtol=1e-8, atol=1e-8)

@@ -12,6 +12,7 @@ from torchtransient.errors import UnitError
 from torchtransient.sensing import (
     Afterpulsing,
     Crosstalk,
+    MeasuredDelays,
     ScoreFunction,
     add_afterpulses,
     add_crosstalk,
@@ -224,3 +225,14 @@ def test_half_precision_images_whose_sum_overflows(make, level):
     assert y.dtype == torch.float32
     added, mean = float((y.float() - x.float()).mean()), float(make().extra(x.float()).mean())
     assert added == pytest.approx(mean, abs=0.02)
+
+
+@pytest.mark.parametrize("random", [0.0, 1 - 2.0**-53])
+def test_the_last_random_numbers_are_delays_of_the_histogram(random, monkeypatch):
+    """Shares whose sum rounds down to less than one: the last delay is that of its last bin."""
+    law = MeasuredDelays(torch.ones(10), 2e-9, start_s=3e-9)
+    assert float(law.share_of_bins.double().cumsum(0)[-1]) < 1
+    monkeypatch.setattr(torch, "rand", lambda *shape, **_: torch.full(shape, random, dtype=torch.float64))
+    for dead_time_s in (0.0, 7e-9, 22e-9):
+        found = law.draw(2, dead_time_s, None)
+        assert found.tolist() == pytest.approx([max(3e-9, dead_time_s) if random == 0 else 23e-9] * 2, rel=1e-12)

@@ -46,6 +46,23 @@ def test_first_photons_of_few_and_of_many_counts(monkeypatch, few, kind):
     assert abs(covariance - expected) < 5 * float(pair.var(0).prod().sqrt()) / repeats**0.5
 
 
+@pytest.mark.parametrize("block", [1, 9, 10, 12])
+@pytest.mark.parametrize("bins", [13, 16])
+def test_counts_are_parted_block_by_block(monkeypatch, block, bins):
+    """As many pairs of bins at a time as fit into a block, one at least, and the last few; odd ones stay."""
+    monkeypatch.setattr(draws, "_FEW_COUNTS", 0)
+    monkeypatch.setattr(draws, "_BLOCK", block)
+    shares = 1 + torch.rand(bins, 1, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    shares[5, :, 1], shares[-1, :, 2] = 0.0, 0.0
+    shares = shares / shares.sum(0)
+    trials = 1_000_000
+    counts = draws.sample_multinomial(trials, shares * (1 - 1e-12), torch.Generator().manual_seed(0))
+    assert counts.sum(0).flatten().tolist() == [float(trials)] * 3  # all but one of 1e6
+    spread = (trials * shares * (1 - shares)).sqrt()
+    assert bool(((counts - trials * shares).abs() <= 5 * spread).all())
+    assert bool((counts != (trials * shares).round()).any())
+
+
 @pytest.mark.parametrize("boundary", ["periodic", "zero"])
 @pytest.mark.parametrize("lost", [0.0, 0.3])
 @pytest.mark.parametrize("first", [-2, 0, 9])

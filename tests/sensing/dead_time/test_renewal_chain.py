@@ -11,6 +11,7 @@ from torch.autograd import forward_ad
 
 from torchtransient.errors import TorchTransientError
 from torchtransient.sensing.correlated_noise.trapped_ring import trapped_lines
+from torchtransient.sensing.dead_time import free_running_ring
 from torchtransient.sensing.dead_time import stationary_phases as phases
 from torchtransient.sensing.dead_time.banded_solve import solve_banded
 from torchtransient.sensing.dead_time.dead_time_cycle import Cycle, cycle_of_rows
@@ -144,12 +145,21 @@ def test_rows_that_do_not_converge_are_solved_directly(monkeypatch):
     def stuck(operator, right, start, *others):
         found, residual = converging(operator, right, start, *others)
         found, residual = found.clone(), residual.clone()
-        found[1], residual[1] = math.nan, 1e-3
+        found[1:], residual[1:] = math.nan, 1e-3
         return found, residual
 
+    def spied(chain, right, pinned, *, transposed):
+        pins.append(pinned.tolist())
+        return solve_banded(chain, right, pinned, transposed=transposed)
+
+    pins = []
     monkeypatch.setattr(phases, "gmres", stuck)
+    monkeypatch.setattr(phases, "solve_banded", spied)
     for found, exact in zip(solved(rate, part, 3), wanted, strict=True):
         torch.testing.assert_close(found, exact, rtol=1e-7, atol=1e-9)
+    # each row is held where its own detections are: lines twice, both derivatives, and the change
+    largest = wanted[0][1:, :6].argmax(-1).tolist()
+    assert largest[0] != largest[1] and pins == [largest] * 5
     monkeypatch.setattr(phases, "solve_banded", lambda chain, right, *_, **__: right + 0.1)
     with pytest.raises(TorchTransientError, match="stationary_phases: expected a relative residual"):
         phases.stationary_phases(rate, part, 3)
@@ -178,8 +188,44 @@ def test_carriers_on_a_ring_are_those_of_the_matrix(whole, part):
             lambda *v: trapped_lines(*v, whole), leaves, atol=1e-6, fast_mode=True, check_forward_ad=True
         )
     one = [v.detach() for v in leaves]
+    with forward_ad.dual_level():  # what is given beside it is left as it is
+        trapped_lines(forward_ad.make_dual(one[0], one[0]), *one[1:], whole)
+        phases.stationary_phases(one[0], forward_ad.make_dual(dead, one[3]), whole)
+        phases.stationary_phases(forward_ad.make_dual(one[0], one[0]), dead, whole)
+    assert not any(v.requires_grad for v in (*one, dead))
     found = torch.autograd.grad(trapped_lines(*one[:1], leaves[1], *one[2:], whole).sum(), leaves[1])[0]
     assert bool(found.isfinite().all()) and not any(v.requires_grad for v in one)
+
+
+def test_which_trains_are_drawn_with_their_memory(monkeypatch):
+    """A wait below half a period, and bins that three of the larger deviations would leave with too little."""
+    waits = [1.99, 0.5, 2.0, 1.0, 3.0]
+    per_bin = torch.tensor([[0.1, 0.2, 0.3, 0.4]], dtype=torch.float64).expand(5, -1)
+    per_bin = per_bin * 4 / (torch.tensor(waits).double() + 1.5).unsqueeze(1) / per_bin.sum(-1, keepdim=True)
+    asked, mean = [], 10 * per_bin
+    # by how much the first bin would fall short, as a share of all counts
+    short = torch.tensor([0.0101, 0.0099, 9.0, 0.02, 9.0], dtype=torch.float64)
+
+    class State:
+        def __init__(self):
+            self.per_bin = per_bin
+
+        def of(self, rows):
+            asked.append(rows.tolist())
+            return rows
+
+    def periods(rows, number, generator, *, normal):
+        assert number == 10 and normal
+        more = 0.1 * mean[rows]
+        half = rows.numel() // 2
+        more[half:, 0] = -(mean[:, 0] + short * mean.sum(-1))[rows[half:]] / 3
+        return None, more
+
+    monkeypatch.setattr(free_running_ring, "_periods", periods)
+    dead = torch.tensor(1.5, dtype=torch.float64)
+    wide = free_running_ring._remembered(State(), per_bin, dead, 10)
+    assert wide.tolist() == [True, False, False, True, False] and asked == [[0, 1, 3, 0, 1, 3]]
+    assert not bool(free_running_ring._remembered(State(), per_bin, dead, 1).any()) and len(asked) == 1
 
 
 # ------------------------------------------------------------------------- who is armed again one piece later

@@ -10,9 +10,10 @@ import torch
 
 import torchtransient as tt
 from torchtransient import sensing
-from torchtransient.errors import ArgumentError, GradientError, ShapeError, UnitError
+from torchtransient.errors import ArgumentError, DeviceError, GradientError, ShapeError, UnitError
 from torchtransient.losses import first_photon_nll, poisson_nll
 from torchtransient.sensing import covariance_bound, crlb, return_rates
+from torchtransient.sensing.estimation.cramer_rao import shares_between
 from torchtransient.units import SPEED_OF_LIGHT
 
 PS = 1e-12
@@ -183,6 +184,33 @@ def test_rates_are_those_of_the_sensor_model(response):
     assert float(arrival[1] - arrival[0]) == pytest.approx(11.25, abs=0.02)
 
 
+class KernelOnly(sensing.Response):
+    """A normal response of which a kernel is known and no distribution function."""
+
+    def __init__(self):
+        super().__init__(0.0, False)
+
+    def kernel(self, bin_width_s, within_bin="uniform"):
+        return sensing.GaussianResponse(400 * PS, delay_s=37 * PS).kernel(bin_width_s, within_bin)
+
+
+def test_a_response_with_a_kernel_alone():
+    """The shares between any edges: those of the distribution, to the square of 1/32 of a bin over the width."""
+    exact = sensing.GaussianResponse(400 * PS, delay_s=37 * PS)
+    edges = 100 * PS * (torch.arange(-9.0, 11.0, dtype=torch.float64) + torch.tensor([[0.0], [0.3], [-7.8]]))
+    found = shares_between(KernelOnly(), edges, 100 * PS)
+    wanted = shares_between(exact, edges, 100 * PS)
+    # twice the variance of a part of a bin, by the second derivative of a normal distribution
+    bound = (100 / 32) ** 2 / 12 * 2 / (400 / 2.3548) ** 2
+    assert found.shape == (3, 19) and float((found - wanted).abs().max()) < bound < 1e-4
+    assert float(wanted.max()) > 0.2 and bool((found >= 0).all())
+    inside = shares_between(KernelOnly(), edges[:1, 8:11], 100 * PS)  # what lies before the first edge is not in it
+    torch.testing.assert_close(inside, wanted[:1, 8:10], rtol=0, atol=bound)
+    given = {"distance_m": place(20.3), "signal": 40.0, "background": 0.3}
+    torch.testing.assert_close(crlb(KernelOnly(), AXIS, **given).distance_m, crlb(exact, AXIS, **given).distance_m,
+                               rtol=1e-3, atol=0)  # fmt: skip
+
+
 # ------------------------------------------------------------------------------------------------------------- chains
 
 
@@ -248,6 +276,8 @@ def test_errors():
         (lambda: return_rates(NORMAL, AXIS, distance_m=0.6, signal=-1.0), UnitError),
         (lambda: covariance_bound(light, []), ShapeError),
         (lambda: covariance_bound(light, [1.0, 2.0]), ShapeError),
+        (lambda: covariance_bound(light(*maps(0.6, 3.0, 0.1)), maps(0.6, 3.0, 0.1)), ArgumentError),
+        (lambda: crlb(NORMAL, AXIS, distance_m=0.6, signal=torch.ones(2, device="meta")), DeviceError),
         (lambda: covariance_bound(lambda *p: light(*p)[0], maps(0.6, 3.0, 0.1)), ShapeError),
         (lambda: covariance_bound(lambda *p: -light(*p), maps(0.6, 3.0, 0.1)), UnitError),
         (lambda: covariance_bound(light, maps(0.6, 3.0, 0.1), cycles=2), UnitError),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
@@ -9,6 +11,7 @@ from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing import (
     BinaryFrames,
     CodedHistogram,
+    EquiDepthHistogram,
     equi_depth_edges,
     fourier_codes,
     frames_to_rate,
@@ -45,6 +48,53 @@ def test_equi_depth_edges_cut_equal_shares():
     torch.testing.assert_close(empty.flatten(), torch.tensor([2.0, 4.0, 6.0]))
     with pytest.raises(UnitError, match="counts >= 0"):
         equi_depth_edges(-torch.ones(1, 8, 1, 1), 4)
+
+
+def test_equi_depth_edges_by_hand():
+    """Counts are even over their bins; a share that ends with a bin, empty bins, and each pixel by itself."""
+    counts = torch.tensor([[2.0, 0.0, 6.0, 4.0, 0.0], [0.0, 3.0, 1.0, 0.0, 8.0]]).T.reshape(1, 5, 1, 2)
+    found = equi_depth_edges(counts, 3)
+    assert found.shape == (1, 2, 1, 2) and found.dtype == torch.float32
+    assert found[0, :, 0, 0].tolist() == pytest.approx([2 + 2 / 6, 3.0])
+    assert found[0, :, 0, 1].tolist() == pytest.approx([3.0, 4.5])
+    assert torch.equal(EquiDepthHistogram(3)(counts), found)
+    # two pixels, of which one has no counts
+    half = torch.cat([counts[..., :1], counts[..., :1] * 0], -1)
+    assert equi_depth_edges(half, 2)[0, 0, 0].tolist() == pytest.approx([2 + 4 / 6, 2.5])
+    for make in (lambda: equi_depth_edges(counts, 1), lambda: EquiDepthHistogram(1)):
+        with pytest.raises(UnitError, match="depth"):
+            make()
+
+
+@pytest.mark.parametrize("frames", [1, 7])
+def test_pixels_that_fired_in_every_frame(frames):
+    """The rate of a share of 1 - 1 / 2N; counts of normal surrogates, to 3 sqrt(N) + 1 beyond, are taken as all."""
+    most = frames + 1 + 3 * frames**0.5
+    for counts in (float(frames), most):
+        found = frames_to_rate(torch.tensor([counts, -0.4, 0.0], dtype=torch.float64), frames)
+        assert found.tolist() == pytest.approx([math.log(2 * frames), 0.0, 0.0], rel=1e-12)
+    with pytest.raises(UnitError, match=f"at most as many counts as the {frames} frames"):
+        frames_to_rate(torch.tensor([0.0, most * (1 + 1e-12)], dtype=torch.float64), frames)
+
+
+def test_probabilities_of_binary_frames():
+    """Binomials of independent bins: mean, variance, and logarithms that add up to one over all counts."""
+    rate = torch.tensor([[0.0, 2.5], [0.4, 1e-3]], dtype=torch.float64).reshape(1, 2, 1, 2)
+    sensor, p = BinaryFrames(5), 1 - torch.exp(-rate)
+    torch.testing.assert_close(sensor.expected(rate), 5 * p)
+    torch.testing.assert_close(sensor.variance(rate), 5 * p * (1 - p))
+    k = torch.arange(6, dtype=torch.float64).reshape(6, 1, 1, 1, 1).expand(6, 1, 1, 1, 2)
+    for one in rate.split(1, 1):
+        logs = sensor.log_prob(k, one.expand(6, 1, 1, 1, 2))
+        assert logs.shape == (6, 1, 1, 2)
+        torch.testing.assert_close(logs.exp().sum(0), torch.ones(1, 1, 2, dtype=torch.float64))
+        exact = torch.distributions.Binomial(5, (1 - torch.exp(-one)).clamp_min(1e-300)).log_prob(k).squeeze(2)
+        torch.testing.assert_close(logs.exp(), exact.exp(), rtol=1e-12, atol=2e-15)  # torch takes no p below 2e-16
+    both = sensor.log_prob(torch.tensor([[0.0, 4.0], [1.0, 0.0]]).reshape(1, 2, 1, 2).double(), rate)
+    wanted = torch.distributions.Binomial(5, p[0, :, 0, 1]).log_prob(torch.tensor([4.0, 0.0]).double()).sum()
+    torch.testing.assert_close(both[0, 0, 1], wanted)
+    # a bin without light that has counts is impossible
+    assert float(sensor.log_prob(torch.ones(1, 1, 1, 1).double(), rate[:, :1, :, :1])) < -1e2
 
 
 def test_coded_histograms():

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from support.sensing.event_driven import Events, compare, detect
-from torchtransient.errors import GradientError
+from torchtransient.errors import GradientError, ShapeError, UnitError
 from torchtransient.sensing import (
     Afterpulsing,
     AfterpulsingSPAD,
@@ -230,6 +230,79 @@ def test_coincidences_everywhere(mode, dead, total, kind, k):
         sensor = CoincidencePixel(detector(mode, dead), 16, coincidence=k, window_s=3.4 * WIDTH, bin_width_s=WIDTH)
         found.append(compare(seen, sensor.expected(image(rate)).numpy()))
     assert sum(a.total_variation for a in found) < 1.5 * sum(a.noise for a in found)
+
+
+@pytest.mark.parametrize("mode, window", [("first", 1.6), ("first", 0.7), ("first", 5.0), ("free", 1.6), ("free", 4.3)])
+@pytest.mark.parametrize("k", [1, 2, 3])
+def test_coincidences_of_three_spads_by_quadrature(mode, window, k):
+    """One of them detects while k - 1 of the others have within the window: products, at each moment of each bin."""
+    bins, weights, points = 5, [1.0, 2.0, 4.0], 1000
+    rate = torch.tensor([[0.3, 2.5, 0.0, 1.2, 0.7], [1.1, 0.2, 0.9, 3.0, 0.1]], dtype=torch.float64)
+    x = rate.T.reshape(1, bins, 1, 2)
+    spad = detector(mode, 4.6, cycles=7)
+    t = (np.arange(bins * points) + 0.5) / points
+    for pixel in range(2):
+        densities, fired = [], []
+        for weight in weights:
+            own = rate[pixel].numpy() * weight / 7
+            if mode == "first":
+                flux = np.interp(t, np.arange(bins + 1.0), np.append(0, own.cumsum()))
+                before = np.interp(np.maximum(t - window, 0), np.arange(bins + 1.0), np.append(0, own.cumsum()))
+                densities.append(np.repeat(own, points) * np.exp(-flux))
+                fired.append(np.exp(-before) - np.exp(-flux))
+            else:
+                one = spad.probabilities(x * (weight / 7))[0, :, 0, pixel].numpy()
+                edges = np.append(0, np.tile(one, 2).cumsum())
+                densities.append(np.repeat(one, points))
+                fired.append(np.interp(t + bins, np.arange(2 * bins + 1.0), edges)
+                             - np.interp(t + bins - window, np.arange(2 * bins + 1.0), edges))  # fmt: skip
+        wanted = np.zeros(bins * points)
+        for i, density in enumerate(densities):
+            a, b = (q for j, q in enumerate(fired) if j != i)
+            chance = {1: (1 - a) * (1 - b), 2: a * (1 - b) + b * (1 - a), 3: a * b}[k]
+            wanted += density * chance
+        wanted = wanted.reshape(bins, points).mean(1)
+        sensor = CoincidencePixel(
+            spad, 3, coincidence=k, window_s=window * WIDTH, weights=weights, bin_width_s=WIDTH
+        )  # fmt: skip
+        p = sensor.probabilities(x)
+        np.testing.assert_allclose(p[0, :, 0, pixel].numpy(), wanted, rtol=2e-6, atol=1e-12)
+    torch.testing.assert_close(sensor.variance(x), 7 * p * (1 - p))
+    torch.testing.assert_close(sensor.expected(x), 7 * p)
+    n = torch.tensor([[0.0, 3, 1, 7, 2], [1, 0, 2, 5, 4]]).double().T.reshape(1, bins, 1, 2)
+    seen = torch.where(rate.T.reshape(x.shape) > 0, n, 0.0)
+    ways = torch.tensor([math.comb(7, int(v)) for v in seen.flatten()], dtype=torch.float64).view_as(p)
+    logs = ways.log() + torch.xlogy(seen, p) + torch.xlogy(7 - seen, 1 - p)
+    torch.testing.assert_close(sensor.log_prob(seen, x), logs.sum(-3), rtol=1e-9, atol=1e-9)
+
+
+def test_windows_of_coincidences():
+    """At most the dead time, to 1e-9 of it, and at most the bins of the light; as many SPADs as there are."""
+
+    def pixel(window, k=2, spads=3, weights=None):
+        return CoincidencePixel(
+            detector("free", 4.0), spads, coincidence=k, window_s=window * WIDTH, weights=weights, bin_width_s=WIDTH
+        )
+
+    x = torch.full((1, 4, 1, 1), 0.3, dtype=torch.float64)
+    assert bool((pixel(4.0, k=3)(x) > 0).all()) and bool((pixel(4.0 * (1 + 0.9e-9)).detector(x) > 0).all())
+    with pytest.raises(UnitError, match="window_s of at most the dead time"):
+        pixel(4.0 * (1 + 1.1e-9))
+    with pytest.raises(UnitError, match="window_s within the 3 bins of the light, got 4 bins"):
+        pixel(4.0)(x[:, :3])
+    for spads, weights in ((3, None), (4, [1, 0, 2, 1])):
+        assert pixel(1.0, 3, spads, weights).coincidence == 3
+        with pytest.raises(UnitError, match=f"a coincidence of at most {spads} SPADs with light, got 4"):
+            pixel(1.0, 4, spads, weights)
+    for wrong, words in (([1, 2], "weights of 3 SPADs, got 2"), ([0, 0, 0], "weights with a sum above 0")):
+        with pytest.raises((ShapeError, UnitError), match=words):
+            pixel(1.0, weights=wrong)
+    with pytest.raises(UnitError, match="CoincidencePixel: expected detector to be a SynchronousSPAD"):
+        CoincidencePixel(ZoneSum(1, 1), 3, coincidence=2, window_s=WIDTH, bin_width_s=WIDTH)
+    # several coincidences of a cycle in a bin are no probability
+    crowd = CoincidencePixel(detector("free", 1.0), 90, coincidence=1, window_s=0.02 * WIDTH, bin_width_s=WIDTH)
+    with pytest.raises(UnitError, match="at most one coincidence per cycle in a bin, got"):
+        crowd.sample(100 * x)
 
 
 @pytest.mark.parametrize("k", [1, 2, 3, 5])

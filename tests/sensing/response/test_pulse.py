@@ -89,6 +89,26 @@ def test_keep_is_part_of_a_larger_axis():
     torch.testing.assert_close(apply_pulse(longer, more, *pulses, keep=AXIS), kept)
 
 
+@pytest.mark.parametrize(
+    ("first", "width", "fits"),
+    [(0.9e-6, 1, True), (1.1e-6, 1, False), (-0.9e-6, 1, True), (-1.1e-6, 1, False), (40 + 0.9 * 40e-6, 1, True),
+     (40 + 1.1 * 40e-6, 1, False), (40 - 1.1 * 40e-6, 1, False), (145, 1, True), (146, 1, False), (-1, 1, False),
+     (3, 1 + 0.9e-9, True), (3, 1 + 1.1e-9, False)],
+)  # fmt: skip
+def test_what_counts_as_bins_of_an_axis(first, width, fits):
+    """Starts to 1e-6 of a bin, or of their distance in bins, and widths to 1e-9; the whole of `keep` inside."""
+    axis = tt.TimeAxis(0.0, 1.0, 150)
+    x, keep = torch.arange(150.0).double().reshape(1, 150, 1, 1), tt.TimeAxis(first, width, 5)
+    if fits:
+        kept = apply_pulse(x, axis, tt.Pulse.rectangular(0.5, center_opl=0.0), keep=keep)
+        assert kept.shape == (1, 5, 1, 1)
+        whole = apply_pulse(x, axis, tt.Pulse.rectangular(0.5, center_opl=0.0))
+        assert torch.equal(kept, whole[:, round(first) : round(first) + 5])
+    else:
+        with pytest.raises(ShapeError, match="expected `keep` to consist of bins of"):
+            apply_pulse(x, axis, tt.Pulse.gaussian(1.0), keep=keep)
+
+
 def test_gradients():
     x = torch.rand(1, 9, 1, 1, dtype=torch.float64, requires_grad=True)
     axis = tt.TimeAxis(0.0, 0.1, 9)

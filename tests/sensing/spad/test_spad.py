@@ -311,3 +311,25 @@ def test_counts_behind_a_shut_gate_say_nothing():
     wanted = [-math.log(1 - 2 / 10), 0.0, -2 * math.log(1 - 1 / 5)]
     assert found.rate.flatten().tolist() == pytest.approx(wanted)
     assert found.valid.flatten().tolist() == [True, False, True]
+
+
+@pytest.mark.parametrize("dead", [None, 2.0, 2.5])
+def test_where_counts_tell_the_rate(dead):
+    """Up to a share of 1 - 1/2N of what is armed, half a cycle is none; those that come back are armed anew."""
+    pixels = [[9.0, 0.0, 0.0, 0.0], [9.5, 0.0, 0.0, 0.0], [9.75, 0.25, 0.0, 0.0], [10.0, 0.0, 0.0, 0.0],
+              [4.0, 5.0, 0.95, 0.0], [4.0, 5.0, 0.96, 0.0]]  # fmt: skip
+    found = coates(torch.tensor(pixels, dtype=torch.float64).T.reshape(1, 4, 1, 6), 10, dead)
+    first = [[True, True], [True, False], [False, False], [False, False], [True, True], [True, True]]
+    late = [[True, True], [False, False], [False, False], [False, False], [True, False], [False, False]]
+    if dead is not None:
+        late = [[True, True]] * 6
+    assert found.valid[0, :, 0].T.tolist() == [a + b for a, b in zip(first, late, strict=True)]
+    most, rates = math.log(20), found.rate[0, :, 0].T
+    wanted = [[math.log(10), 0.0], [most, 0.0], [most, 0.0], [most, 0.0], [-math.log(0.6), math.log(6)]]
+    assert rates[:5, :2].flatten().tolist() == pytest.approx([r for row in wanted for r in row])
+    assert rates[:4, 2:].tolist() == [[0.0, 0.0]] * 4
+    if dead is None:
+        assert rates[4:, 2].tolist() == pytest.approx([most, most])
+    else:  # more than 500 photons in a bin are not told from one another
+        flood = coates(torch.tensor([1000.0, 0.0, 900.0, 0.0]).double().reshape(1, 4, 1, 1), 1000, 2.0)
+        assert float(flood.rate.flatten()[2]) == 500.0 and flood.valid.flatten().tolist() == [False, False, False, True]

@@ -32,8 +32,7 @@ from torchtransient.units import SPEED_OF_LIGHT
 UNKNOWNS = ("distance", "signal", "background")
 _DARK = 1e-100  # a rate of that much is none, and its square still a number
 _SAME = 1e-13  # of a variance, what is left when the others are known: two parameters that do the same but for rounding
-_FINE = 32  # parts of a bin, of responses that know their kernel only,
-_PARTS = 500  # and of such a response
+_FINE = 32  # parts of a bin, of responses that know their kernel only
 
 
 @dataclass(frozen=True, eq=False, repr=False)

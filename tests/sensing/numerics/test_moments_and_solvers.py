@@ -1,0 +1,171 @@
+"""Moments of exponentials to the last digits, rows of equations by GMRES, constant light with losses, sums."""
+
+from __future__ import annotations
+
+import math
+
+import mpmath
+import pytest
+import torch
+
+from torchtransient.sensing.dead_time.constant_light import ConstantLight
+from torchtransient.sensing.dead_time.renewal_chain import RenewalChain
+from torchtransient.sensing.numerics.exponential_moments import _weights, moments, second_moment
+from torchtransient.sensing.numerics.krylov import gmres
+from torchtransient.sensing.numerics.running_sums import sum_before
+
+BELOW = math.nextafter(1.0, 0.0)
+SMALL = [0.0, 1e-12, 1e-3, 0.4, BELOW, 1.0]
+LARGE = [math.nextafter(1.0, 2.0), 1.5, 7.0, 60.0, 900.0]
+
+
+def decayed(power, x):
+    """Integral over z from 0 to 1 of z^power exp(-x z), in 50 digits."""
+    with mpmath.workdps(50):
+        x = mpmath.mpf(x)
+        return mpmath.gammainc(power + 1, 0, x) / x ** (power + 1) if x else mpmath.mpf(1) / (power + 1)
+
+
+def caught(power, x):
+    """... of z^power (1 - exp(-x z)) / x."""
+    with mpmath.workdps(50):
+        return (mpmath.mpf(1) / (power + 1) - decayed(power, x)) / mpmath.mpf(x) if x else mpmath.mpf(1) / (power + 2)
+
+
+def slope_of_caught(power, x):
+    with mpmath.workdps(50):
+        if x == 0:
+            return -mpmath.mpf(1) / (2 * (power + 3))
+        return (decayed(power + 1, x) - caught(power, x)) / mpmath.mpf(x)
+
+
+def close(found, wanted, rtol):
+    wanted = torch.tensor([float(w) for w in wanted], dtype=torch.float64)
+    torch.testing.assert_close(found, wanted, rtol=rtol, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("values", "largest"),
+    [(SMALL, None), (SMALL, 1.0), (SMALL[:4], 0.4), (SMALL[:3], 1e-3), (LARGE, None), (SMALL + LARGE, None),
+     (SMALL + LARGE, 900.0), ([0.0, 0.0], None)],
+)  # fmt: skip
+def test_moments_and_their_slopes(values, largest):
+    """Of all rates, with and without a bound that is known: few roundings of the number itself."""
+    x = torch.tensor(values, dtype=torch.float64, requires_grad=True)
+    found = moments(x, largest)
+    for power in (0, 1):
+        close(found.decay[power].detach(), [decayed(power, v) for v in values], 4e-15)
+        close(found.hit[power].detach(), [caught(power, v) for v in values], 4e-15)
+        (slope,) = torch.autograd.grad(found.decay[power].sum(), x, create_graph=True)
+        close(slope.detach(), [-decayed(power + 1, v) for v in values], 2e-13)
+        (slope,) = torch.autograd.grad(slope.sum(), x, retain_graph=True)
+        close(slope.detach(), [decayed(power + 2, v) for v in values], 2e-11)
+        (slope,) = torch.autograd.grad(found.hit[power].sum(), x, retain_graph=True)
+        close(slope, [slope_of_caught(power, v) for v in values], 2e-12)
+    close(second_moment(x).detach(), [decayed(2, v) for v in values], 1e-14)
+    (slope,) = torch.autograd.grad(second_moment(x).sum(), x)
+    close(slope, [-decayed(3, v) for v in values], 2e-12)
+
+
+def test_series_are_as_long_as_their_rates_need():
+    """In the dark three derivatives; terms below 1e-19 are left out; nothing at all has no moments."""
+    assert _weights(0.0) == pytest.approx([1 / 3, 1 / 8, 1 / 30, 1 / 144], rel=1e-15)
+    assert [len(_weights(x)) for x in (1e-3, 0.1, 1.0)] == [8, 13, 20]
+    assert all(v.shape == (0,) for v in moments(torch.zeros(0, dtype=torch.float64)).hit)
+
+
+# ------------------------------------------------------------------------------------------------------------ solvers
+
+
+def counted(matrix):
+    calls = []
+
+    def operator(v):
+        calls.append(1)
+        return torch.einsum("pij,pj->pi", matrix, v)
+
+    return operator, calls
+
+
+def random(*shape, seed=0):
+    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize("different", [1, 3, 4, 5, 9])
+def test_as_many_steps_as_a_matrix_has_different_values(different):
+    """Four at a time, whatever the start; one is taken for the residual of the start and one for that of the end."""
+    turned = torch.linalg.qr(random(2, 15, 15)).Q
+    values = 1 + torch.arange(15.0).double() % different
+    matrix = turned @ torch.diag_embed(values).expand(2, -1, -1) @ turned.mT
+    right, start = random(2, 15, seed=1), random(2, 15, seed=2)
+    operator, calls = counted(matrix)
+    found, residual = gmres(operator, right, start, 1e-10)
+    torch.testing.assert_close(found, torch.linalg.solve(matrix, right), rtol=1e-9, atol=1e-9)
+    assert len(calls) == 2 + 4 * math.ceil(different / 4) and float(residual.max()) < 1e-10
+    # what is solved is left alone, and a right side of zero as well
+    operator, calls = counted(matrix)
+    again, residual = gmres(operator, right, found, 1e-9)
+    assert torch.equal(again, found) and len(calls) == 1
+    nothing, residual = gmres(operator, 0 * right, 0 * right, 1e-10)
+    assert not bool(nothing.any()) and residual.tolist() == [0.0, 0.0]
+    # the inverse takes one, of which four are asked; one solved row beside one that is not
+    operator, calls = counted(matrix)
+    begin = start.clone()
+    begin[1] = torch.linalg.solve(matrix, right)[1]
+    found, residual = gmres(operator, right, begin, 1e-10, lambda v: torch.linalg.solve(matrix, v))
+    torch.testing.assert_close(found, torch.linalg.solve(matrix, right), rtol=1e-10, atol=1e-10)
+    assert len(calls) == 6 and float(residual.max()) < 1e-10
+
+
+def test_two_restarts_and_no_more():
+    """A ring that is turned by one: no step helps before the last; the residual says so."""
+    ring = torch.eye(90, dtype=torch.float64).roll(1, 0).unsqueeze(0)
+    right = torch.zeros(1, 90, dtype=torch.float64)
+    right[0, 0] = 3.0
+    operator, calls = counted(ring)
+    found, residual = gmres(operator, right, 0 * right, 1e-10)
+    assert len(calls) == 1 + 2 * 41 and residual.tolist() == pytest.approx([1.0], rel=1e-12)
+    assert float(found.abs().max()) < 1e-12
+    # 70 values in two restarts: some digits
+    spread = torch.linalg.qr(random(1, 70, 70)).Q
+    matrix = spread @ torch.diag(torch.linspace(1, 30, 70).double()) @ spread.mT
+    operator, calls = counted(matrix)
+    wanted = random(1, 70, seed=3)
+    found, residual = gmres(operator, (matrix @ wanted.unsqueeze(-1)).squeeze(-1), 0 * wanted, 1e-14)
+    assert float((found - wanted).norm() / wanted.norm()) < 1e-11 and 42 < len(calls) <= 83
+
+
+@pytest.mark.parametrize(("bins", "whole"), [(6, 2), (7, 17)])
+def test_constant_light_with_losses_is_inverted(bins, whole):
+    """1 - kept F, and its transpose: nothing is left to a rank-one term."""
+    rate = torch.tensor([[0.05], [0.8], [6.0]], dtype=torch.float64)
+    kept, part = torch.tensor([[0.9], [0.4], [0.97]], dtype=torch.float64), torch.tensor(0.35, dtype=torch.float64)
+    chain = RenewalChain(rate.expand(3, bins).contiguous(), whole, part)
+    inverse = ConstantLight(1 / rate, bins, whole, part, kept)
+    x = random(3, 2 * bins)
+    torch.testing.assert_close(inverse.solve(x - kept * chain.step(x)), x, rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(inverse.solve_transposed(x - kept * chain.transposed(x)), x, rtol=1e-10, atol=1e-10)
+
+
+# --------------------------------------------------------------------------------------------------------------- sums
+
+
+@pytest.mark.parametrize("image", [(2, 3), (7, 9), (8, 8), (5, 13)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_sums_before_of_small_and_large_images(image, dtype):
+    """One by one, in float64; gradients are sums behind, in the dtype of what is summed."""
+    x = torch.rand(2, 5, *image, generator=torch.Generator().manual_seed(0)).to(dtype).requires_grad_()
+    found = sum_before(x)
+    assert found.dtype == torch.float64
+    wanted = torch.stack([x.detach().double()[:, :k].sum(1) for k in range(5)], 1)
+    torch.testing.assert_close(found.detach(), wanted, rtol=1e-14, atol=1e-15)
+    weights = torch.rand(found.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    (slope,) = torch.autograd.grad((found * weights).sum(), x)
+    behind = torch.stack([weights[:, k + 1 :].sum(1) for k in range(5)], 1)
+    assert slope.dtype == dtype
+    torch.testing.assert_close(slope, behind.to(dtype))
+    tangent = torch.func.jvp(sum_before, (x.detach(),), (2 * x.detach(),))[1]
+    torch.testing.assert_close(tangent, 2 * wanted, rtol=1e-6, atol=0)
+    for dim in (0, 2, 3):
+        many = torch.func.vmap(sum_before, in_dims=dim)(torch.stack([x.detach(), 3 * x.detach()], dim))
+        torch.testing.assert_close(many, torch.stack([wanted, 3 * wanted]), rtol=1e-6, atol=0)
