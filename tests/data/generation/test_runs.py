@@ -16,6 +16,7 @@ from support.fake_recipe import FakeRecipe
 from support.generation_runs import data_files, leftovers
 from torchtransient.data.generation import generate as runs
 from torchtransient.data.generation import ray_engine, settings, supervisor
+from torchtransient.data.generation import summary as summaries
 from torchtransient.data.generation.generate import generate
 from torchtransient.data.generation.run_log import RunLog, SampleBar
 from torchtransient.data.generation.settings import check_same, plain, read_description
@@ -327,6 +328,47 @@ def test_where_recipes_differ(tmp_path, there, here, words):
     with pytest.raises(StorageError, match=words):
         check_same({"key": 1, "recipe": there}, {"key": 2, "recipe": here}, tmp_path)
     check_same({"key": 1, "n": 2}, {"key": 1, "store": "exact"}, tmp_path)
+
+
+def test_what_a_summary_says(whole, tmp_path):
+    """Of all shards, line by line; where the folder has no description, the shards have."""
+    size = sum(path.stat().st_size for path in whole.glob("*.h5")) / 1e6
+    lines = summary(whole).splitlines()
+    assert lines == [
+        f"{whole}: 7 of 7 samples in 4 shards, 0 failed, {size:.4g} MB", "  depth: 2 x 3 float32",
+        "  transient: 1 x 4 x 2 x 3 float32", "  values: albedo, name", "  stored: exact, none",
+        "  1 samples per pixel, standard error 0.25", "  fake", "  made with fake 1",
+    ]  # fmt: skip
+    alone = copied(whole, tmp_path / "set", 3)
+    assert summary(alone).splitlines()[1:] == lines[1:] and "1 of 7 samples in 1 shards" in summary(alone)
+    described = json.loads((whole / "recipe.json").read_text())
+    about = described["about"] | {
+        "plan": {"a": ["one"], "b": ["two", "three"]}, "spp": 8, "versions": {"x": "1", "y": "2"},
+        "axis": {"start_opl": 1.5, "bin_width_opl": 0.25, "num_bins": 6}, "frequencies": {"per_metre": [2.0, 0.5, 3]},
+    }  # fmt: skip
+    (alone / "recipe.json").write_text(json.dumps(described | {"about": about, "standard_error": None}))
+    assert summary(alone).splitlines()[5:] == [
+        "  6 bins of 0.25 m of optical path, from 1.5 to 3 m", "  3 frequencies, 0.5 to 3 cycles per metre",
+        "  8 samples per pixel", "  a: one", "  b: two", "  b: three", "  made with x 1, y 2",
+    ]  # fmt: skip
+
+
+def test_samples_that_are_drawn_for_a_sheet(whole, tmp_path, monkeypatch):
+    """Each once, in order, with all that is stored of them."""
+    sheets = []
+    monkeypatch.setattr(summaries, "sheet_of", lambda samples, *given: sheets.append((list(samples), *given)))
+    chosen = drawn_sheet(whole, "sheet.png", 4, 2)
+    assert len(set(chosen)) == 4 and chosen == sorted(chosen) and chosen == drawn_sheet(whole, "sheet.png", 4, 2)
+    assert drawn_sheet(whole, "sheet.png", 99, 0) == list(range(7))
+    samples, path, axis, title, behind = sheets[0]
+    assert (path, axis, title, behind) == ("sheet.png", None, str(whole), 2)
+    maker = RECIPE.maker()
+    for index, one in zip(chosen, samples, strict=True):
+        made = maker.sample(index)
+        assert (one.index, one.seed, one.outside) == (index, made.seed, made.outside)
+        assert np.array_equal(one.arrays["transient"], made.arrays["transient"]) and one.values["name"] == (
+            made.values["name"]
+        )
 
 
 def test_folders_without_samples(tmp_path):
