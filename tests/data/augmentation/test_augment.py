@@ -232,6 +232,12 @@ def test_maps_of_pixels():
     assert torch.equal(Augment(Flip(p=1.0))({"phasor": complex_cube})["phasor"], complex_cube.flip(-1))
 
 
+def test_what_is_no_fill():
+    for wrong in ("a", None, [1, 2]):
+        with pytest.raises(UnitError, match="expected fill as one number, got"):
+            PixelMap(np.eye(3), (2, 3), (2, 3)).nearest(torch.ones(2, 3), wrong)
+
+
 def test_decomposition_of_maps():
     rng = np.random.default_rng(0)
     for _ in range(20):

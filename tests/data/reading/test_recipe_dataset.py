@@ -82,6 +82,18 @@ def test_noise_belongs_to_seed_number_and_epoch():
     assert torch.equal(torch.get_rng_state(), state)
 
 
+def test_what_it_builds_is_let_go_of():
+    """Once, and built again when a sample is read."""
+    alike, closed = Stored({"transient": np.zeros((1, 4, 2, 2), np.float32)}), []
+    alike.close = lambda: closed.append("closed")
+    data = tt.data.RecipeDataset(alike, 3)
+    data.close()
+    assert closed == [] and data[0]["index"] == 0 and closed == []
+    data.close()
+    data.close()
+    assert closed == ["closed"] and data[2]["index"] == 2
+
+
 @pytest.mark.slow
 def test_rendered_by_spawned_workers_in_the_order_of_steps(recipe):
     def read(workers, first, last):

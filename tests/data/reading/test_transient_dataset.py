@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -123,7 +124,7 @@ def test_fields(data):
         TransientDataset(data, fields=["albedo"])
 
 
-def test_transforms(data):
+def test_transforms(data, tmp_path):
     found = TransientDataset(data, fields=["depth"], window=slice(0, 64), transform=doubled)
     assert set(found[2]) == {"depth", "measurement", "index"} == {*found.fields, "index"}
     assert np.array_equal(found[2]["measurement"].numpy(), 2 * cube(2)[:, :64])
@@ -143,6 +144,9 @@ def test_transforms(data):
             TransientDataset(data, transform=chain, seed=seed)
     with pytest.raises(UnitError, match="epoch"):
         one.sample(4, -1)
+    write(tmp_path / "shard-000000.h5", [replace(sample(0), arrays={"steady": np.ones((2, 3, 5))})])
+    with pytest.raises(StorageError, match="transform= is for transients, and the samples have steady"):
+        TransientDataset(tmp_path, transform=doubled)
 
 
 def test_counts(tmp_path):

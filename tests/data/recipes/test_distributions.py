@@ -111,6 +111,8 @@ def test_normal_distributions_end_where_floats_do():
     most = NormalDist().inv_cdf(1 - 2.0**-53)
     ends = [float(D.Normal(1, 2).draw(Extreme(upper), NUMBER)) for upper in (False, True)]
     assert ends == pytest.approx([1 - 2 * most, 1 + 2 * most], rel=1e-6)
+    # Where 2^-54 of it lies below the lower end, the last of its draws is rounded up to all of it.
+    assert float(D.Normal(1, 2, low=1 - 2 * 8.37).draw(Extreme(True), NUMBER)) == pytest.approx(ends[1])
     assert D.Normal(0, 1, low=-np.inf, high=np.inf) == D.Normal(0, 1)
     # Nor does a logarithm bring numbers beyond their ends: that of 10 gives 10.000000000000002 back.
     assert all(float(D.LogUniform(10, 10).draw(Fixed(u), NUMBER)) == 10 for u in (0.0, 0.25, 0.5, 0.75))
@@ -248,8 +250,11 @@ PLACES = {
     "shape": (D.Uniform([0, 0], [1, 1]), COLOUR, ShapeError, r"shape \(2,\)"),
     "choice of shape": (D.Choice([[1, 2]]), COLOUR, ShapeError, "choices of shape"),
     "number for a pose": (D.Choice([1.0]), AT, ShapeError, "choices of shape"),
+    "composed entry": (
+        D.Compose([D.Offset(0, 1)]), Place("box.bsdf", ANYTHING), SceneError, "Compose is for parameters; use Choice"
+    ),
     "nothing described": (D.Scale(1, 2), Place("box.bsdf", ANYTHING), SceneError, "no parameter"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("wrong", PLACES)

@@ -13,6 +13,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
+import zstandard
 
 import torchtransient as tt
 from support.capture_files import grids, made
@@ -94,6 +95,13 @@ def test_what_cannot_be_exported(data, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_names_with_points(tmp_path):
+    """Members of a sample end in their names."""
+    write(tmp_path / "shard-000000.h5", [replace(sample(0), arrays={"a.b": np.ones((2, 3))})])
+    with pytest.raises(StorageError, match=r"expected 'a\.b' as a tensor, under a name without points"):
+        export(tmp_path, tmp_path / "out")
+
+
 def test_bars(data, tmp_path, capsys):
     export_web_dataset(data, tmp_path)
     assert "export: 100%" in capsys.readouterr().err
@@ -123,13 +131,16 @@ def npy(array):
         ("0.depth.npy", b"x"),
         ("0.depth.npy", npy(np.zeros(3)).replace(b"(3,)", b"(9,)")),
         ("0.depth.npy", npy(np.array(["a"]))),
+        ("0.depth.npy", npy(np.zeros(3)).replace(b"NUMPY\x01\x00", b"NUMPY\x03\x00")),
+        ("0.depth.npy", npy(np.zeros((2, 3), order="F"))),
+        ("0.depth.npy.zst", zstandard.ZstdCompressor(write_content_size=False).compress(npy(np.zeros(3)))),
         ("0.sample.json", b"{"),
         ("0.sample.json", b'{"index": 0, "values": {"a": 1}, "dtypes": {"a": "O"}}'),
         ("0.code.pickle", b"cos\nsystem\n(S'true'\ntR."),
     ],
 )
 def test_damaged_tars(tmp_path, name, content):
-    with pytest.raises(StorageError):
+    with pytest.raises(StorageError, match="WebDataset"):
         list(read_web_dataset(tar_of(tmp_path / "a.tar", {name: content})))
 
 

@@ -174,6 +174,23 @@ def test_folders(tmp_path, capsys):
     assert "verify" in capsys.readouterr().err
 
 
+def test_numbers_of_samples_that_are_none(tmp_path):
+    """A hundred million that are missing are no data set; a manifest that is no text is none."""
+    place = folder(tmp_path / "set", 2)
+    for n, words in ((10**8 + 3, "recipe.json' counts 100000003 samples, and 2 are there"), (10**12, "counts")):
+        (place / "recipe.json").write_text(json.dumps({"key": "abc123", "n": n}))
+        with pytest.raises(StorageError, match=words):
+            verify(place)
+    (place / "recipe.json").unlink()
+    write(place / "shard-000009.h5", [sample(10**8 + 4)], shard=9)
+    with pytest.raises(StorageError, match="the numbers of its samples ask for 100000005 samples, and 3 are there"):
+        verify(place)
+    (place / "shard-000009.h5").unlink()
+    (place / "manifest.json").write_bytes(b"\xff\xfe\xff")
+    with pytest.raises(StorageError, match=r"manifest\.json' cannot be read"):
+        verify(place)
+
+
 def test_ranges():
     assert ranges([3, 1, 2, 7]) == [[1, 3], [7, 7]] and ranges_text([3, 1, 2, 7]) == "1 to 3, 7"
     assert ranges_text(range(0, 40, 2), 2) == "0, 2 and 18 more ranges"

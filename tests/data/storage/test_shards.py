@@ -106,12 +106,30 @@ def test_a_shard_of_failures(tmp_path):
         (lambda s: replace(s, values={**s.values, "count": "many"}), "expected values"),
         (lambda s: replace(s, arrays={**s.arrays, "depth": np.array(["a"])}), "array of numbers"),
         (lambda s: replace(s, arrays={**s.arrays, "depth": np.zeros((0, 3))}), "array of numbers"),
+        (lambda s: replace(s, arrays={**s.arrays, "depth": np.zeros(3, np.clongdouble)}), "array of numbers"),
     ],
 )
 def test_samples_of_a_recipe_are_alike(tmp_path, change, message):
     with pytest.raises(StorageError, match=message):
         write(tmp_path / "a.h5", [sample(0), change(sample(1))])
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_shards_are_made_of(tmp_path):
+    with pytest.raises(StorageError, match="expected a sample with arrays, got none"):
+        write(tmp_path / "a.h5", [replace(sample(0), arrays={})])
+    with pytest.raises(StorageError, match="is for the measurement of a sensor, and the samples have depth, normals"):
+        write(tmp_path / "a.h5", [sample(0)], "counts")
+    path = write(tmp_path / "a.h5", [replace(sample(0), arrays={"line": np.arange(3.0)}, values={})])
+    with Shard(path) as shard:
+        assert shard.read("line", 0).tolist() == [0, 1, 2] and shard.values(0) == {}
+        with pytest.raises(StorageError, match=r"'line' \(3,\) has no rows and columns; read all of it"):
+            shard.read("line", 0, pixels=(slice(0, 1), slice(0, 1)))
+        with pytest.raises(StorageError, match=r"'line' \(3,\) has no time axis; read all of it"):
+            shard.read("line", 0, window=slice(0, 1))
+        for row in (1, -1, 0.5):
+            with pytest.raises(StorageError, match="expected a row from 0 to 0, got"):
+                shard.read("line", row)
 
 
 def test_rows_come_once(tmp_path):

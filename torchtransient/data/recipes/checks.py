@@ -111,7 +111,8 @@ def _check_ranges(built: Any, kept: Kept, where: str, drawn: Mapping[str, Any]) 
     from torchtransient.plugins.physical_ranges import physical_range
 
     for key, place in kept.places.items():
-        value = np.asarray(drawn[key], dtype=np.float32)
+        with np.errstate(over="ignore"):
+            value = np.asarray(drawn[key], dtype=np.float32)
         if not np.isfinite(value).all():
             raise UnitError(f"recipe: vary: {key!r} {where}: expected finite numbers, got {value.tolist()}.")
         limits = physical_range(built.params, key)

@@ -264,9 +264,7 @@ class Kept:
             for key in self.device_keys:
                 device = changed(device, key, drawn[key])
             chain = self._chain_of(device)
-        transient = tensors.get("transient")
-        if transient is None:
-            raise SceneError("recipe: device: a device measures transients; give time_axis= instead of another film.")
+        transient = tensors["transient"]
         if stokes_components(self.recipe.variant) > 1 and not _is_polarized(chain):
             # A detector that takes no notice of polarization counts all light.
             transient = transient.select(-5, 0)
@@ -280,11 +278,11 @@ class Kept:
             rows, columns, bins = renderer._cube_shape[0], renderer._cube_shape[1], renderer.film.count
             stokes = (4,) if stokes_components(self.recipe.variant) > 1 else ()
             dark = torch.zeros(*stokes, len(renderer._channels), bins, rows, columns)
-            self._measured(0, drawn, {"transient": dark} if renderer.axis is not None else {})
+            self._measured(0, drawn, {"transient": dark})
 
     def _chain_of(self, device: Device) -> Compose:
         axis = self.renderer.axis
-        if axis is None:
+        if axis is None or self.renderer.film.measures != "transient":
             raise SceneError("recipe: device: a device measures transients; give time_axis= instead of another film.")
         return device.sensor(axis)
 

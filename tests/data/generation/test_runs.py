@@ -1,0 +1,378 @@
+"""Runs of `generate` whose workers live in this process: what is made, kept and made again, and what is said of it."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import torchtransient as tt
+from support.crew_here import CrewHere
+from support.fake_recipe import FakeRecipe
+from support.generation_runs import data_files, leftovers
+from torchtransient.data.generation import generate as runs
+from torchtransient.data.generation import ray_engine, settings, supervisor
+from torchtransient.data.generation import summary as summaries
+from torchtransient.data.generation.generate import generate
+from torchtransient.data.generation.run_log import RunLog, SampleBar
+from torchtransient.data.generation.settings import check_same, plain, read_description
+from torchtransient.data.generation.summary import drawn_sheet, summary
+from torchtransient.data.storage import manifest
+from torchtransient.data.storage.manifest import verify
+from torchtransient.data.storage.shard_file import Shard
+from torchtransient.errors import SceneError, StorageError, TorchTransientError
+
+SMALL = {"n": 7, "per_shard": 2, "progress": False, "compression": "none", "workers": 1}
+RECIPE = FakeRecipe(shape=(1, 4, 2, 3))
+
+
+@dataclass(frozen=True)
+class Counted(FakeRecipe):
+    n: int = 5
+
+
+@pytest.fixture(autouse=True)
+def here(monkeypatch):
+    monkeypatch.setattr(supervisor, "Supervisor", CrewHere)
+    with tt.threads(1):
+        yield
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "set"
+    with pytest.MonkeyPatch.context() as patch, tt.threads(1):
+        patch.setattr(supervisor, "Supervisor", CrewHere)
+        done = generate(RECIPE, folder, **SMALL)
+    assert (done.samples, done.failed, done.kept, done.restarts, done.shards) == (7, 0, 0, 0, 4)
+    assert done.bytes == sum(path.stat().st_size for path in folder.glob("*.h5")) and done.folder == folder
+    return folder
+
+
+def events(folder, *names):
+    found = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+    return [event for event in found if not names or event["event"] in names]
+
+
+def copied(whole, folder, *numbers):
+    folder.mkdir()
+    for number in numbers:
+        name = f"shard-{number:06d}.h5"
+        (folder / name).write_bytes((whole / name).read_bytes())
+    return folder
+
+
+# -------------------------------------------------------------------------------------------------- what is made
+
+
+def test_a_run_and_its_log(whole):
+    assert verify(whole).complete and verify(whole).samples == 7 and leftovers(whole) == []
+    first, *shards, last = events(whole)
+    assert (first["event"], first["n"], first["workers"], first["engine"], first["shard"]) == (
+        "begin", 7, 1, "local", None,
+    )  # fmt: skip
+    assert [one["shard"] for one in shards] == [0, 1, 2, 3] and {one["event"] for one in shards} == {"shard"}
+    assert (last["event"], last["samples"], last["shards"], last["failed"]) == ("end", 7, 4, 0)
+    assert json.loads((whole / "recipe.json").read_text())["about"]["plan"] == ["fake"]
+
+
+def test_two_shares_are_the_whole(whole, tmp_path):
+    first = generate(RECIPE, tmp_path, shard=(1, 2), **SMALL | {"workers": 3})
+    assert (first.samples, first.shards, first.kept) == (3, 2, 0)
+    assert sorted(path.name for path in tmp_path.glob("*.h5")) == ["shard-000001.h5", "shard-000003.h5"]
+    second = generate(RECIPE, tmp_path, shard=(0, 2), **SMALL)
+    assert (second.samples, second.kept) == (4, 0) and data_files(tmp_path) == data_files(whole)
+    assert events(tmp_path, "begin")[0]["shard"] == [1, 2]
+
+
+def test_going_on(whole, tmp_path):
+    """What is missing or damaged is made, everything else stays; also without what the first call said."""
+    folder = tmp_path / "set"
+    generate(RECIPE, folder, **SMALL)
+    stamp = (folder / "shard-000003.h5").stat().st_mtime_ns
+    (folder / "shard-000001.h5").unlink()
+    os.truncate(folder / "shard-000002.h5", 3000)
+    (folder / ".shard-000004.h5.12345678.part").write_bytes(b"half")
+    with (folder / "log.jsonl").open("a") as log:
+        log.write('{"half')
+    done = generate(RECIPE, folder, **SMALL | {"per_shard": None})
+    assert (done.samples, done.kept, done.shards) == (4, 3, 2)
+    assert data_files(folder) == data_files(whole) and leftovers(folder) == []
+    assert (folder / "shard-000003.h5").stat().st_mtime_ns == stamp
+    lines = (folder / "log.jsonl").read_text().splitlines()
+    assert [line for line in lines if not line.endswith("}")] == ['{"half']
+    assert [json.loads(line)["shard"] for line in lines if '"damaged"' in line] == [2]
+    again = generate(RECIPE, folder, **SMALL)
+    assert (again.samples, again.kept, again.shards) == (0, 7, 0)
+
+
+def test_how_many_samples_a_recipe_says(tmp_path):
+    done = generate(Counted(shape=(1, 4, 2, 3)), tmp_path, per_shard=4, compression="none", progress=False)
+    assert (done.samples, done.shards) == (5, 2)
+
+
+@pytest.mark.parametrize(("n", "per_shard", "shards"), [(130, 2, 65), (64, 1, 64)])
+def test_samples_of_a_file_unless_they_are_told(tmp_path, monkeypatch, n, per_shard, shards):
+    made = []
+    monkeypatch.setattr(CrewHere, "make", lambda self, left, found: made.append((left, found["per_shard"])))
+    monkeypatch.setattr(runs, "_check_made", lambda *given: None)
+    generate(RECIPE, tmp_path, n, compression="none", progress=False)
+    assert made == [(list(range(shards)), per_shard)]
+
+
+def test_a_bar_over_the_samples(whole, tmp_path, monkeypatch):
+    """Those that are there count from the beginning."""
+    shown = []
+
+    def bar(**given):
+        shown.append([given["total"], given["initial"], 0])
+        return SimpleNamespace(
+            update=lambda more: shown[-1].__setitem__(2, shown[-1][2] + more),
+            set_postfix=lambda told, refresh: shown[-1].append(told), close=lambda: shown[-1].append("closed"),
+        )  # fmt: skip
+
+    monkeypatch.setattr("tqdm.auto.tqdm", bar)
+    folder = copied(whole, tmp_path / "set", 1, 3)
+    generate(RECIPE, folder, **SMALL | {"progress": True})
+    assert shown == [[7, 3, 4, "closed"]]
+    generate(FakeRecipe(raising=(1, 3)), tmp_path / "other", retries=0, **SMALL | {"progress": True})
+    assert shown[1] == [7, 0, 7, *({"failed": k, "restarts": 0} for k in (1, 2)), "closed"]
+
+
+def test_what_a_bar_tells():
+    bar = SampleBar(5, 0, shown=False)
+    bar(2, failed=1)
+    bar(-1, failed=-1, restarts=1)
+    assert (bar.failed, bar.restarts) == (0, 1)
+    told = []
+    bar._bar = SimpleNamespace(set_postfix=lambda one, refresh: told.append(one), update=told.append)
+    bar(3)
+    bar(1, restarts=2)
+    bar(1, failed=4)
+    assert told == [3, {"failed": 0, "restarts": 3}, 1, {"failed": 4, "restarts": 3}, 1]
+    # A terminal that is gone.
+    bar._bar = SimpleNamespace(update=lambda more: (_ for _ in ()).throw(OSError))
+    bar(1)
+    assert bar._bar is None
+
+
+def test_a_log_that_cannot_be_written(tmp_path):
+    log = RunLog(tmp_path / "nowhere")
+    log("event")
+    log.close()
+    log = RunLog(tmp_path)
+    log("event", number=np.int64(3), path=tmp_path)
+    log.close()
+    log.close()
+    log("not any more")
+    (line,) = events(tmp_path)
+    assert (line["event"], line["run"], line["path"]) == ("event", os.getpid(), str(tmp_path))
+
+
+# ---------------------------------------------------------------------------------------------- what does not fit
+
+
+def test_shards_without_their_recipe(whole, tmp_path):
+    """What the shards say counts where recipe.json was lost; what does not open says nothing."""
+    folder = copied(whole, tmp_path / "set", 1)
+    with pytest.raises(StorageError, match=r"shard-000001\.h5' belongs to another data set: its recipe is another"):
+        generate(replace(RECIPE, seed=1), folder, **SMALL)
+    with pytest.raises(StorageError, match="has a data set, and resume=False"):
+        generate(RECIPE, folder, resume=False, **SMALL)
+    assert generate(RECIPE, folder, **SMALL).kept == 2 and data_files(folder) == data_files(whole)
+    name = "shard-000001.h5"
+    (folder / name).write_bytes((whole / "shard-000002.h5").read_bytes())
+    with pytest.raises(StorageError, match=rf"{name}' is of this recipe and differs in 'samples', as when"):
+        generate(RECIPE, folder, **SMALL)
+    broken = tmp_path / "broken"
+    broken.mkdir()
+    (broken / "shard-000000.h5").write_bytes(b"no shard")
+    assert generate(RECIPE, broken, **SMALL).samples == 7
+
+
+def test_shards_of_other_versions(whole, tmp_path):
+    folder = copied(whole, tmp_path / "set", 0, 2, 3)
+    (folder / "recipe.json").write_bytes((whole / "recipe.json").read_bytes())
+    with pytest.raises(StorageError, match=r"versions is .'fake': '1'. there and .'fake': '2'. here"):
+        generate(replace(RECIPE, versions={"fake": "2"}), folder, **SMALL)
+    assert not (folder / "shard-000001.h5").exists()
+
+
+def test_two_runs_that_begin_at_once(tmp_path, monkeypatch):
+    """The one that comes second makes what the first one began."""
+
+    def first(folder, described):
+        return described | {"per_shard": 3}
+
+    monkeypatch.setattr(runs, "write_description", first)
+    assert generate(RECIPE, tmp_path / "a", **SMALL | {"per_shard": None}).shards == 3
+    with pytest.raises(StorageError, match="per_shard is 3 there and 2 here"):
+        generate(RECIPE, tmp_path / "b", **SMALL)
+
+
+def test_a_manifest_of_all_that_is_there_at_the_end(whole, tmp_path, monkeypatch):
+    """Also of what another run finishes meanwhile; of nothing there is none."""
+    folder, built, build = copied(whole, tmp_path / "set", 0), [], manifest.build_manifest
+
+    def watched(place):
+        built.append(len(list(place.glob("*.h5"))))
+        if len(built) == 1:
+            (place / "shard-000001.h5").write_bytes((whole / "shard-000001.h5").read_bytes())
+        return build(place)
+
+    monkeypatch.setattr(manifest, "build_manifest", watched)
+    runs._write_manifest(folder)
+    assert built == [1, 2]
+    (tmp_path / "empty").mkdir()
+    runs._write_manifest(tmp_path / "empty")
+    assert built == [1, 2]
+
+
+@pytest.mark.parametrize(("engine", "more"), [("local", ""), ("ray", " All machines of the cluster have to see this")])
+def test_shards_that_are_somewhere_else(tmp_path, monkeypatch, engine, more):
+    """A worker says that it has written one, and this machine does not see it."""
+    monkeypatch.setattr(ray_engine, "RayCrew", lambda settings, workers, ledger, timeout_s, address: (
+        seen.append(address), CrewHere(settings, workers, ledger, timeout_s))[1])  # fmt: skip
+    seen = []
+    monkeypatch.setattr(CrewHere, "make", lambda self, left, found: None)
+    with pytest.raises(StorageError, match=rf"shard 0 was written, and '.*shard-000000\.h5' is not there\.{more}"):
+        generate(RECIPE, tmp_path, engine=engine, address="auto" if engine == "ray" else None, **SMALL)
+    assert seen == (["auto"] if engine == "ray" else [])
+    (stopped,) = events(tmp_path, "stopped")
+    assert stopped["error"].startswith("StorageError: generate: shard 0") and not events(tmp_path, "end")
+
+
+def test_a_run_that_is_stopped(whole, tmp_path, monkeypatch):
+    """In the middle of a shard: finished ones stay, nothing is half-written; the same call goes on."""
+    sample = RECIPE.maker().__class__.sample
+
+    def interrupted(self, index):
+        if index == 3:
+            raise KeyboardInterrupt
+        return sample(self, index)
+
+    monkeypatch.setattr("support.fake_recipe.FakeMaker.sample", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        generate(RECIPE, tmp_path, **SMALL)
+    assert [path.name for path in tmp_path.glob("*.h5")] == ["shard-000000.h5"] and leftovers(tmp_path) == []
+    assert events(tmp_path)[-1]["event"] == "stopped" and not (tmp_path / "manifest.json").exists()
+    monkeypatch.setattr("support.fake_recipe.FakeMaker.sample", sample)
+    assert generate(RECIPE, tmp_path, **SMALL).kept == 2 and data_files(tmp_path) == data_files(whole)
+
+
+def test_samples_that_fail(whole, tmp_path):
+    recipe = replace(RECIPE, raising=(0, 3), late=(5,))
+    done = generate(recipe, tmp_path, retries=1, **SMALL)
+    assert (done.samples, done.failed, done.kept) == (4, 3, 0)
+    failed = {}
+    for path in tmp_path.glob("*.h5"):
+        with Shard(path) as shard:
+            failed |= shard.failed
+    reason = "SceneError: sample {} cannot be made by <object at 0x...>"
+    assert failed == {0: reason.format(0), 3: reason.format(3), 5: failed[5]}
+    assert failed[5] == "0 of its light lies before the window and 0.5 after it, more than max_outside=0.01"
+    assert [one["sample"] for one in events(tmp_path, "failed")] == [0, 3, 5]
+    # Sample 0 is tried first where it is measured, too.
+    assert [one["sample"] for one in events(tmp_path, "retry")] == [0, 0, 3]
+    again = generate(recipe, tmp_path, retries=1, **SMALL)
+    assert (again.kept, again.samples, again.failed) == (4, 0, 0)
+    with pytest.raises(SceneError, match=r"none of the samples 0 to 6 .* The last one: SceneError: sample 6 cannot"):
+        generate(replace(RECIPE, raising=tuple(range(7))), tmp_path / "none", **SMALL)
+    with pytest.raises(SceneError, match=r"none of the samples 0 to 15 "):
+        generate(replace(RECIPE, raising=tuple(range(40))), tmp_path / "none", **SMALL | {"n": 40})
+
+
+def test_calls_out_of_place(tmp_path, monkeypatch):
+    monkeypatch.setattr(runs.os, "access", lambda place, mode: mode != os.W_OK | os.X_OK)
+    with pytest.raises(StorageError, match="no permission to write into"):
+        generate(RECIPE, tmp_path, **SMALL)
+    monkeypatch.setattr(runs.multiprocessing, "current_process", lambda: SimpleNamespace(_inheriting=True))
+    with pytest.raises(TorchTransientError, match="called while a worker imports this script"):
+        generate(RECIPE, tmp_path, **SMALL)
+
+
+# ------------------------------------------------------------------------------------------- recipe.json, and words
+
+
+def test_recipe_json_that_is_none(tmp_path):
+    assert read_description(tmp_path) is None
+    place = tmp_path / "recipe.json"
+    for content, words in ((b"[1]", "lacks 'key'"), (b'{"key": 1, "n": 2}', "lacks 'per_shard'"), (b"\xff", "damaged")):
+        place.write_bytes(content)
+        with pytest.raises(StorageError, match=words):
+            read_description(tmp_path)
+    names = (*settings.DECIDING, "about")
+    place.write_text(json.dumps(dict.fromkeys(names, 1)))
+    assert read_description(tmp_path) == dict.fromkeys(names, 1)
+    for wrong in ({"a": object()}, {"a": {1: {2}}}):
+        with pytest.raises(StorageError, match="recipe of plain data, which JSON can hold"):
+            plain(wrong)
+    assert plain({"b": (1, 2), "a": None}) == {"a": None, "b": [1, 2]}
+
+
+@pytest.mark.parametrize(
+    ("there", "here", "words"),
+    [
+        ({"seed": 1}, {"seed": 2}, r"another one \(seed is 1 there and 2 here\)"),
+        ({"a": {"b": [1], "c": 2}}, {"a": {"b": [1], "c": 3}}, r"\(a\.c is 2 there and 3 here\)"),
+        ({"n": 3, "a": 1}, {"n": 4, "a": 1}, "a file that it names has changed"),
+        ([1], [2], r"\(it is \[1\] there and \[2\] here\)"),
+        ({"a": "x" * 58}, {"a": "x" * 59}, f"a is '{'x' * 58}' there and '{'x' * 56}... here"),
+    ],
+)
+def test_where_recipes_differ(tmp_path, there, here, words):
+    with pytest.raises(StorageError, match=words):
+        check_same({"key": 1, "recipe": there}, {"key": 2, "recipe": here}, tmp_path)
+    check_same({"key": 1, "n": 2}, {"key": 1, "store": "exact"}, tmp_path)
+
+
+def test_what_a_summary_says(whole, tmp_path):
+    """Of all shards, line by line; where the folder has no description, the shards have."""
+    size = sum(path.stat().st_size for path in whole.glob("*.h5")) / 1e6
+    lines = summary(whole).splitlines()
+    assert lines == [
+        f"{whole}: 7 of 7 samples in 4 shards, 0 failed, {size:.4g} MB", "  depth: 2 x 3 float32",
+        "  transient: 1 x 4 x 2 x 3 float32", "  values: albedo, name", "  stored: exact, none",
+        "  1 samples per pixel, standard error 0.25", "  fake", "  made with fake 1",
+    ]  # fmt: skip
+    alone = copied(whole, tmp_path / "set", 3)
+    assert summary(alone).splitlines()[1:] == lines[1:] and "1 of 7 samples in 1 shards" in summary(alone)
+    described = json.loads((whole / "recipe.json").read_text())
+    about = described["about"] | {
+        "plan": {"a": ["one"], "b": ["two", "three"]}, "spp": 8, "versions": {"x": "1", "y": "2"},
+        "axis": {"start_opl": 1.5, "bin_width_opl": 0.25, "num_bins": 6}, "frequencies": {"per_metre": [2.0, 0.5, 3]},
+    }  # fmt: skip
+    (alone / "recipe.json").write_text(json.dumps(described | {"about": about, "standard_error": None}))
+    assert summary(alone).splitlines()[5:] == [
+        "  6 bins of 0.25 m of optical path, from 1.5 to 3 m", "  3 frequencies, 0.5 to 3 cycles per metre",
+        "  8 samples per pixel", "  a: one", "  b: two", "  b: three", "  made with x 1, y 2",
+    ]  # fmt: skip
+
+
+def test_samples_that_are_drawn_for_a_sheet(whole, tmp_path, monkeypatch):
+    """Each once, in order, with all that is stored of them."""
+    sheets = []
+    monkeypatch.setattr(summaries, "sheet_of", lambda samples, *given: sheets.append((list(samples), *given)))
+    chosen = drawn_sheet(whole, "sheet.png", 4, 2)
+    assert len(set(chosen)) == 4 and chosen == sorted(chosen) and chosen == drawn_sheet(whole, "sheet.png", 4, 2)
+    assert drawn_sheet(whole, "sheet.png", 99, 0) == list(range(7))
+    samples, path, axis, title, behind = sheets[0]
+    assert (path, axis, title, behind) == ("sheet.png", None, str(whole), 2)
+    maker = RECIPE.maker()
+    for index, one in zip(chosen, samples, strict=True):
+        made = maker.sample(index)
+        assert (one.index, one.seed, one.outside) == (index, made.seed, made.outside)
+        assert np.array_equal(one.arrays["transient"], made.arrays["transient"]) and one.values["name"] == (
+            made.values["name"]
+        )
+
+
+def test_folders_without_samples(tmp_path):
+    with pytest.raises(StorageError, match="holds no shard"):
+        summary(tmp_path)
+    with pytest.raises(StorageError, match="holds no samples"):
+        drawn_sheet(tmp_path, tmp_path / "sheet.png", 3, 0)
