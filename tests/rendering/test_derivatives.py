@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import pytest
 import torch
 from torch.autograd import forward_ad
@@ -163,6 +165,46 @@ def test_entries_of_a_batch_are_calls_of_their_own(given):
         torch.func.vmap(lambda x: run(job, x, y, n))(xs[:, :0].T)
 
 
+class Silent(torch.autograd.Function):
+    """A function that has no gradient to give."""
+
+    @staticmethod
+    def forward(ctx, x):
+        return x.clone()
+
+    @staticmethod
+    def backward(ctx, _):
+        return None
+
+
+def test_gradients_that_nobody_gives(given):
+    x, y, n = given
+    job = Job()
+    first, second, _ = run(job, x, y, n)
+    (Silent.apply(first).sum() + Silent.apply(second).sum()).backward()
+    assert x.grad is None and y.grad is None and job.asked == ["primal"]
+
+
+@pytest.mark.filterwarnings("ignore:Please use `torch.vmap`")
+def test_batches_of_batches_as_torch_maps_its_own_backward(given):
+    """Some of whose cotangents belong to the outer batch alone, which is of another size than the inner one."""
+    from torch._vmap_internals import _vmap
+
+    x, y, n = given
+    job = Job()
+    first, second, _ = run(job, x, y, n)
+    inner = torch.arange(6.0, dtype=torch.float64).view(3, 2) - 1.5
+    outer = torch.arange(15.0, dtype=torch.float64).view(5, 3) ** 2
+
+    def pulled(both, a):
+        return torch.autograd.grad((first, second), x, (a, both), retain_graph=True)[0]
+
+    found = _vmap(lambda both: _vmap(lambda a: pulled(both, a))(inner))(outer)
+    wanted = torch.stack([torch.stack([pulled(b, a) for a in inner]) for b in outer])
+    assert found.shape == (5, 3, 3)
+    torch.testing.assert_close(found, wanted)
+
+
 def test_nothing_is_run_where_nothing_is_asked_for(given):
     x, y, n = given
     job = Job()
@@ -185,3 +227,9 @@ def test_what_cannot_be_traced(given):
         with pytest.raises(GradientError, match="the function cannot be traced: in the graphs of torch"):
             way()
     assert job.asked == []
+
+
+def test_tensors_without_memory_are_looked_for_where_torch_has_loaded_them(given, monkeypatch):
+    x, y, n = given
+    monkeypatch.delitem(sys.modules, "torch._subclasses.fake_tensor", raising=False)
+    assert run(Job(), x, y, n)[0].requires_grad

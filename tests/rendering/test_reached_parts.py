@@ -5,6 +5,7 @@ from __future__ import annotations
 import collections
 import contextlib
 import functools
+import importlib.machinery
 import sys
 import types
 import weakref
@@ -184,7 +185,10 @@ def test_what_belongs_to_libraries(tmp_path):
     written.__file__ = str(tmp_path / "written.py")
     for library in (np, torch, mi, functools, sys, torch.nn.functional.relu, torch.nn.Module, dict, tt.load, Reached):
         assert _is_of_library(library), library
-    for own in (by_hand, written, sys.modules[__name__], held, _Own, held.__get__(1)):
+    # as `python -m` has it
+    started = types.ModuleType("__main__")
+    started.__spec__ = importlib.machinery.ModuleSpec("started", None)
+    for own in (by_hand, written, started, sys.modules[__name__], held, _Own, held.__get__(1)):
         assert not _is_of_library(own), own
     assert not _is_of_library(3) and not _is_of_library(type("Nowhere", (), {"__module__": "nowhere"}))
 

@@ -253,7 +253,7 @@ def _check_slope(session: Session) -> None:
 def _steady_adjoint(g: torch.Tensor) -> Any:
     import mitsuba as mi
 
-    g = g.detach().resolve_neg().contiguous()
+    g = g.resolve_neg().contiguous()
     wait_for_torch(g)
     return mi.TensorXf(g)
 

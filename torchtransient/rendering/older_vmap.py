@@ -17,17 +17,29 @@ import torch
 def each_of_older_vmap(function: Callable[..., tuple[torch.Tensor, ...]], *tensors: Any) -> tuple[torch.Tensor, ...]:
     """``function`` of tensors or None, called once for every entry of such a batch; once where there is none."""
     private: Any = torch
+    level = private._C._vmapmode_increment_nesting() - 1
+    private._C._vmapmode_decrement_nesting()
+    return _each(function, level, tensors)
+
+
+def _each(function: Callable[..., tuple[torch.Tensor, ...]], level: int, tensors: Any) -> tuple[torch.Tensor, ...]:
+    """For the entries of the batches of a level and of those around it."""
+    private: Any = torch
     batched = [t is not None and torch._C._functorch.is_legacy_batchedtensor(t) for t in tensors]
     if not any(batched):
         return function(*tensors)
-    level = private._C._vmapmode_increment_nesting() - 1
-    private._C._vmapmode_decrement_nesting()
     pairs = list(zip(tensors, batched, strict=True))
     # A tensor that is no batch of this level, but of one around it, is repeated as often as it is told.
-    size = max(private._remove_batch_dim(t, level, 1, 0).shape[0] for t, is_batch in pairs if is_batch)
-    opened = [private._remove_batch_dim(t, level, size, 0) if is_batch else None for t, is_batch in pairs]
+    sizes = [
+        {private._remove_batch_dim(t, level, told, 0).shape[0] for told in (1, 2)} for t, is_one in pairs if is_one
+    ]
+    of_level = [size for size in sizes if len(size) == 1]
+    if not of_level:
+        return _each(function, level - 1, tensors)
+    (size,) = of_level[0]
+    opened = [private._remove_batch_dim(t, level, size, 0) if is_one else None for t, is_one in pairs]
     columns = [
-        each_of_older_vmap(function, *(t if new is None else new[i] for t, new in zip(tensors, opened, strict=True)))
+        _each(function, level - 1, [t if new is None else new[i] for t, new in zip(tensors, opened, strict=True)])
         for i in range(size)
     ]
     return tuple(private._add_batch_dim(torch.stack(column), 0, level) for column in zip(*columns, strict=True))

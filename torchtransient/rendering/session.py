@@ -133,7 +133,7 @@ def own_array(tensor: torch.Tensor) -> Any:
     import drjit as dr
     import mitsuba as mi
 
-    flat = tensor.detach().resolve_neg().reshape(-1)
+    flat = tensor.resolve_neg().reshape(-1)
     if flat.numel() <= FEW:
         few = mi.Float(flat.tolist())
         # A single number would be a literal of the kernels, and that of the first call for ever where a plugin does not
