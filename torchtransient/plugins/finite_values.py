@@ -62,7 +62,8 @@ def numbers_of(value: Any) -> np.ndarray | None:
     if isinstance(value, (mi.Bitmap, mi.VolumeGrid, np.ndarray)):
         array = np.asarray(value)
     elif dr.is_array_v(value) and dr.is_float_v(value):
-        array = _components(value)
+        # of a copy: to read a literal evaluates it, and shows the scene another array
+        array = _components(dr.detach(value))
     else:
         return None
     return array if array.dtype.kind == "f" else None

@@ -189,7 +189,7 @@ def _attenuates(medium: Any, name: str) -> bool:
 
 def _is_an_index_of_one(site: Site) -> bool:
     """Whether the index of a principled surface is (what Mitsuba takes for) one."""
-    now = mi.traverse(site.node)[site.key]
+    now = dr.detach(mi.traverse(site.node)[site.key])
     taken_for = (0, 1e-3) if site.key == "specular" else (1, 1.001)
     return any(bool(dr.any(dr.abs(now - value) < 1e-7)) for value in taken_for)
 
@@ -231,7 +231,7 @@ def _range_of(texture: Any) -> tuple[float, float] | None:
             continue
         numbers = [shown.read(node) for shown in shown_by(node)[0] if shown.key in NUMBERS]
         for value in numbers:
-            value = mi.Float(value) if isinstance(value, float) else value
+            value = mi.Float(value) if isinstance(value, float) else dr.detach(value)
             value = value.array if dr.is_tensor_v(value) else dr.ravel(value)
             found += [float(dr.slice(least_or_most(value), 0)) for least_or_most in (dr.min, dr.max)]
     return (min(found), max(found)) if found else None

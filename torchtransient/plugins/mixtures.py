@@ -166,7 +166,7 @@ class Seal:
         for mixture in self._mixtures:
             texture = dict(objects_of(mixture))[weight_slot(mixture)]
             values = numbers_below(texture, self._shapes)
-            weights = (np.array(value) for value in values if dr.grad_enabled(value))
+            weights = (np.array(dr.detach(value)) for value in values if dr.grad_enabled(value))
             if any(((weight <= 0) | (weight >= 1)).any() for weight in weights):
                 raise GradientError(
                     f"{self._names(mixture)}, whose weight is exactly 0 or 1, where the derivative by it is lost. "

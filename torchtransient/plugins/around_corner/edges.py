@@ -43,7 +43,7 @@ class Triangles:
     @staticmethod
     def of(meshes: list[Any]) -> Triangles:
         """Those of Mitsuba meshes, as they are now."""
-        v = [np.array(m.vertex_positions_buffer(), dtype=np.float32).reshape(-1, 3) for m in meshes]
+        v = [np.array(dr.detach(m.vertex_positions_buffer()), dtype=np.float32).reshape(-1, 3) for m in meshes]
         f = [np.array(m.faces_buffer(), dtype=np.int64).reshape(-1, 3) for m in meshes]
         first = np.cumsum([0, *(len(one) for one in v)])
         mesh = np.repeat(np.arange(len(f)), [len(one) for one in f])

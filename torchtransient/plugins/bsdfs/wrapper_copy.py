@@ -76,7 +76,7 @@ def _telling_values(wrapper: Any) -> Iterator[None]:
 
 def _random(value: Any, rng: np.random.Generator) -> Any:
     """Numbers between 0.6 and 1 (of the range of whole ones) of the shape of a parameter."""
-    numbers = np.array(value)
+    numbers = np.array(dr.detach(value))
     drawn = rng.uniform(0.6, 1.0, numbers.shape)
     if np.issubdtype(numbers.dtype, np.integer):
         drawn = drawn * np.iinfo(numbers.dtype).max

@@ -347,7 +347,7 @@ class TransientNLOSPath(base.TransientIntegrator):
         if not self.laser_sampling:
             return []
         shared = [self._shared(world, film, seed, samples)] if world.division.third_bounce else []
-        edges = mutual_occlusion(self, world, sensor, film, seed, samples, self._table(world).seen())
+        edges = mutual_occlusion(self, world, sensor, film, seed, samples, dr.detach(self._table(world).seen()))
         return shared if edges is None else [*shared, edges]
 
     @staticmethod
@@ -378,7 +378,7 @@ def _choice(props: Any, name: str, shared: str) -> str:
 
 def _scanned(scene: Any, sensor: Any) -> Any:
     """What the rays of a scan meet, one for each pixel: all samples of a pixel look at one point."""
-    found = scene.ray_intersect_preliminary(scan_rays(sensor), coherent=True)
+    found = scene.ray_intersect_preliminary(dr.detach(scan_rays(sensor)), coherent=True)
     dr.eval(found)
     return found
 

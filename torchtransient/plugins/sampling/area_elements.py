@@ -171,7 +171,7 @@ def _rows_of(shape: Any) -> tuple[np.ndarray, int, np.ndarray, np.ndarray] | Non
 
 
 def _triangles(mesh: Any) -> tuple[np.ndarray, int, np.ndarray, np.ndarray]:
-    v = np.array(mesh.vertex_positions_buffer(), dtype=np.float64).reshape(-1, 3)
+    v = np.array(dr.detach(mesh.vertex_positions_buffer()), dtype=np.float64).reshape(-1, 3)
     f = np.array(mesh.faces_buffer(), dtype=np.int64).reshape(-1, 3)
     o, e1, e2 = v[f[:, 0]], v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]]
     n = np.cross(e1, e2)
@@ -191,7 +191,7 @@ def _corner_normals(mesh: Any, faces: np.ndarray) -> np.ndarray | None:
     """The normals at the corners of the triangles (F, 3, 3), None where there are none but those of their planes."""
     if mesh.has_face_normals() or not mesh.has_vertex_normals():
         return None
-    return np.array(mesh.vertex_normals_buffer(), dtype=np.float64).reshape(-1, 3)[faces]
+    return np.array(dr.detach(mesh.vertex_normals_buffer()), dtype=np.float64).reshape(-1, 3)[faces]
 
 
 def has_shading_normals(shape: Any) -> bool:
@@ -208,7 +208,7 @@ def has_shading_normals(shape: Any) -> bool:
 
 def _matrix(shape: Any) -> np.ndarray:
     shown = next(v for v in shown_by(shape)[0] if v.key == "to_world")
-    return np.array(shown.read(shape).matrix, dtype=np.float64).reshape(4, 4)
+    return np.array(dr.detach(shown.read(shape).matrix), dtype=np.float64).reshape(4, 4)
 
 
 def _analytic(shape: Any, kind: int) -> tuple[np.ndarray, int, np.ndarray, np.ndarray]:

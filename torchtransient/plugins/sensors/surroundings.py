@@ -119,7 +119,7 @@ class Surroundings:
     def _lines(self, sensor: Any) -> Any:
         """From where the sensor's rays start, half of them along the rays."""
         ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, self._film, self._aperture)
-        return mi.Ray3f(dr.detach(ray.o), dr.select(_all_directions(), self._around, ray.d))
+        return mi.Ray3f(dr.detach(ray.o), dr.select(_all_directions(), self._around, dr.detach(ray.d)))
 
 
 def _bodies(shapes: list[Any], bsdfs: list[Any]) -> list[Any]:
