@@ -25,7 +25,7 @@ def candidates(table, opl):
 
 
 def test_every_open_gate_is_a_candidate():
-    """Of many gates, at their edges and next to them; and the first and the last of them are not a cell away from the arrival."""
+    """Of many gates, at their edges and next to them; and the first and last of them are within a cell."""
     rng = np.random.default_rng(8)
     starts, lengths = rng.uniform(3, 90, 40), rng.uniform(1e-4, 5, 40)
     gates = [Gate.rectangular(a, a + w) for a, w in zip(starts, lengths, strict=True)]
