@@ -317,6 +317,11 @@ def test_filters_that_are_not_zero_at_their_ends():
     film.tabulate_filter()
     assert film._offset_distribution[1] == 6
     np.testing.assert_allclose(np.array(film._offset_distribution[0].pdf), np.linspace(2, 4, 513), rtol=1e-6)
+    # of one that changes its sign, the height without it
+    film._offset_distribution, film.rfilter = None, lambda: filter_of(lambda x: x - 0.25)
+    film.tabulate_filter()
+    density = np.maximum(np.abs(np.linspace(-1.25, 0.75, 513)), 1.25e-4)
+    np.testing.assert_allclose(np.array(film._offset_distribution[0].pdf), density, rtol=1e-5)
 
 
 def test_what_is_no_filter_of_an_image():
