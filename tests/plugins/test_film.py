@@ -308,7 +308,7 @@ def test_factory_names():
 def test_the_adjoint_of_the_sum_over_the_bins(settings):
     """Weighs what is in the window alone, at its rims too, whether bins have an adjoint of their own or not."""
     film = make_film(steady=False, **settings)
-    x = np.array([-22.3, -1.2, -0.3, 0.2, 17.4, BINS - 0.7, BINS + 0.3, BINS + 5.0])
+    x = np.array([-22.3, -1.2, -0.3, 0.2, 17.4, BINS - 0.7, BINS + 0.3, BINS + 5.0, 11.3])
     n, size = len(x), film.entries_per_pixel()
     steady, opl = [mi.Float(v) for v in (2, 3, 5)], mi.Float64(x * WIDTH)
     base, active = dr.arange(mi.UInt32, n) * size, mi.Bool([True] * (n - 1) + [False])

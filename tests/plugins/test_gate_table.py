@@ -62,10 +62,13 @@ def test_cells_of_gates_are_those_that_they_reach_into():
 
 
 class Between:
-    """Three gates that are open to everything, of which an arrival is said to meet the second alone."""
+    """Three gates that are open to everything, of which an arrival is said to meet the second alone, or none."""
+
+    def __init__(self, end=2):
+        self.end = end
 
     def candidates(self, opl, active):
-        return mi.UInt32(1), mi.UInt32(2)
+        return mi.UInt32(1), mi.UInt32(self.end)
 
     def value(self, gate, opl, active):
         return mi.Float(gate + 2) * mi.Float(opl), mi.Float(5)
@@ -90,6 +93,10 @@ def test_candidates_alone_are_asked():
         for c in range(2):
             value = numbers[2 + c] + more * (c + 1)
             assert list(A[c]) == [value * 1.5, 0] and list(slope[c]) == [value * 5, 0]
+    layout = layout_of(np.zeros(12))
+    put_gates(layout, Between(1), opl, [mi.Float(3)] * 2, [mi.Float(3)] * 2, active)
+    A, slope = read_gates(layout_of(numbers), Between(1), opl, None, active)
+    assert not np.array(layout.flat).any() and not np.any([np.array(part) for part in A + slope])
 
 
 def test_a_gate_that_begins_to_open_has_a_slope_and_no_weight():

@@ -281,9 +281,13 @@ def test_sizes_of_what_paths_keep():
         for tangents, numbers in ((False, 3), (True, 6)):
             film.start_render()
             block = film.create_event_block(Job(1, 2, 5), mi.UInt32(0), Copies(), most, tangents)
-            assert (block.slots, block.overflows, block.paths) == (slots, overflows, 30)
+            assert (block.slots, block.overflows, block.width, block.paths) == (slots, overflows, 3, 30)
             assert dr.width(block.count) == 30 and dr.width(block.opl) == slots * 30
             assert [dr.width(array) for array in block.values] == [slots * 30] * numbers
+    pairs = make_film(3, 4, **LIST, exhaustive_scan=True, laser_scan_width=5, laser_scan_height=7)
+    pairs.start_render()
+    block = pairs.create_event_block(Job(1, 2, 4), mi.UInt32(0), Copies(), 1)
+    assert (block.width, block.paths) == (3 * 5 * 7, 3 * 5 * 7 * 2 * 4)
 
 
 def test_events_of_any_channel_and_sign_take_room():

@@ -320,6 +320,9 @@ def test_curves_count_alike_where_wavelengths_are_drawn():
         found = np.interp(np.array(wavelengths[k], dtype=float), at, density)
         np.testing.assert_allclose(1 / np.array(weight[k], dtype=float), found, rtol=1e-3)
     assert len(set(np.array(wavelengths).ravel().round(3))) == 8
+    # the floor is a share of the highest density, of whatever sum
+    low["values"] = "0, 4, 0"
+    assert np.array(curves_of(a=low, b=low)._density.pdf).min() == pytest.approx(0.02)
 
 
 def test_even_curves_have_the_fewest_nodes():

@@ -289,6 +289,7 @@ def test_outputs_and_files_without_the_film(argument):
     assert kind.from_output(output) == choice
     without = replace(output, **{kind.measures: None})
     assert kind.from_output(without) is None and choices.of_output(without) is None
+    assert kind.from_output(replace(output, **dict.fromkeys(choice.attributes()))) is None
     for other in GIVEN:
         if other != argument:
             assert type(choice_for(other)).from_output(output) is None
