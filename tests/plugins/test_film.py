@@ -247,10 +247,10 @@ def test_lengths_from_an_origin_are_lengths(name, stddev):
     of the whole length do: bins and what is lost.
     """
     film = make_film(temporal_filter=name, gaussian_stddev=stddev)
-    n, per_pixel = 9, film.entries_per_pixel()
-    origin = np.array([-3.3, -0.1, 0.0, 0.7, 4.9, 9.7, 9.99, 10.6, -2e12])
-    opl = np.array([1.9, 0.45, 0.3, 5.2, 3.1, 0.2, 0.3, 0.7, 5.0])
-    value, active = [mi.Float(np.arange(2.0, 11.0) * k) for k in (1, 2, 3)], mi.Bool([True] * 8 + [False])
+    n, per_pixel = 10, film.entries_per_pixel()
+    origin = np.array([-3.3, -0.1, 0.0, 0.7, 4.9, 9.7, 9.99, 10.6, 4.775, -2e12])
+    opl = np.array([1.9, 0.45, 0.3, 5.2, 3.1, 0.2, 0.3, 0.7, 0.05, 5.0])
+    value, active = [mi.Float(np.arange(2.0, 12.0) * k) for k in (1, 2, 3)], mi.Bool([True] * 9 + [False])
     job, base = Local(band=0), dr.arange(mi.UInt32, n) * per_pixel
     found = []
     for start, lengths in ((mi.Float64(origin), opl), (None, origin + opl)):
