@@ -44,9 +44,9 @@ ROOMS = {
     "films": Room(
         ("plugins/films", "rendering/films"),
         ("plugins/test_film.py", "plugins/test_film_interface.py", "plugins/test_film_parts.py",
-         "plugins/test_film_renders.py", "plugins/test_gated_film.py", "plugins/test_phasor_adjoint.py",
-         "plugins/test_phasor_film.py", "plugins/test_pulsed_filter.py", "plugins/test_response.py",
-         "plugins/test_wrong_options.py", "rendering/films", "integrators/test_phasors.py",
+         "plugins/test_film_renders.py", "plugins/test_gate_table.py", "plugins/test_gated_film.py",
+         "plugins/test_phasor_adjoint.py", "plugins/test_phasor_film.py", "plugins/test_pulsed_filter.py",
+         "plugins/test_response.py", "plugins/test_wrong_options.py", "rendering/films", "integrators/test_phasors.py",
          "integrators/test_phasor_gradients.py", "integrators/test_large_films.py"),
     ),
     "integrators": Room(

@@ -12,6 +12,7 @@ from scipy.special import erf
 
 from torchtransient import plugins
 from torchtransient.errors import SceneError, StorageError
+from torchtransient.plugins.films.long_kernel import BinLayout, reduce_mode
 from torchtransient.plugins.films.temporal_filter import make_temporal_filter
 from torchtransient.plugins.transport.strategy import Local
 from torchtransient.testing.film_storage import storage
@@ -246,10 +247,10 @@ def test_lengths_from_an_origin_are_lengths(name, stddev):
     of the whole length do: bins and what is lost.
     """
     film = make_film(temporal_filter=name, gaussian_stddev=stddev)
-    n, per_pixel = 9, film.entries_per_pixel()
-    origin = np.array([-3.3, -0.1, 0.0, 0.7, 4.9, 9.7, 9.99, 10.6, -2e12])
-    opl = np.array([1.9, 0.45, 0.3, 5.2, 3.1, 0.2, 0.3, 0.7, 5.0])
-    value, active = [mi.Float(np.arange(2.0, 11.0) * k) for k in (1, 2, 3)], mi.Bool([True] * 8 + [False])
+    n, per_pixel = 10, film.entries_per_pixel()
+    origin = np.array([-3.3, -0.1, 0.0, 0.7, 4.9, 9.7, 9.99, 10.6, 4.775, -2e12])
+    opl = np.array([1.9, 0.45, 0.3, 5.2, 3.1, 0.2, 0.3, 0.7, 0.05, 5.0])
+    value, active = [mi.Float(np.arange(2.0, 12.0) * k) for k in (1, 2, 3)], mi.Bool([True] * 9 + [False])
     job, base = Local(band=0), dr.arange(mi.UInt32, n) * per_pixel
     found = []
     for start, lengths in ((mi.Float64(origin), opl), (None, origin + opl)):
@@ -295,3 +296,97 @@ def test_how_far_filters_reach():
 def test_factory_names():
     with pytest.raises(SceneError, match="lanczos"):
         make_temporal_filter("lanczos")
+
+
+# ----------------------------------------------------------------------------------------- pieces of the histogram
+
+
+@pytest.mark.parametrize("settings", [
+    {"temporal_filter": "tent"}, {"temporal_filter": "gaussian", "gaussian_stddev": 0.7},
+    {"pulse": "tabulated", "pulse_opl": "0 1 5", "pulse_values": "1 3 0"},
+])  # fmt: skip
+def test_the_adjoint_of_the_sum_over_the_bins(settings):
+    """Weighs what is in the window alone, at its rims too, whether bins have an adjoint of their own or not."""
+    film = make_film(steady=False, **settings)
+    x = np.array([-22.3, -1.2, -0.3, 0.2, 17.4, BINS - 0.7, BINS + 0.3, BINS + 5.0, 11.3])
+    n, size = len(x), film.entries_per_pixel()
+    steady, opl = [mi.Float(v) for v in (2, 3, 5)], mi.Float64(x * WIDTH)
+    base, active = dr.arange(mi.UInt32, n) * size, mi.Bool([True] * (n - 1) + [False])
+    weights, slopes = storage(film, n * size), None
+    film.put(0, base, opl, [mi.Float(1)] * 3, active)
+    slopes = storage(film, n * size)
+    film.put_slope(0, base, opl, [mi.Float(0)] * 3, [mi.Float(1)] * 3, active)
+    weights, slopes = (np.array(part, dtype=float).reshape(n, BINS, 3)[..., 0] for part in (weights, slopes))
+    assert (weights.sum(1) > 0.99).sum() < (weights.sum(1) > 0.01).sum() < n - 1
+    rows = np.random.default_rng(1).normal(size=(BINS, 3))
+    for adjoint, own in ((None, 0), ((mi.Float(rows.ravel()), 3, 1), rows)):
+        A, slope = film.read(adjoint, mi.UInt32(0), opl, active, steady)
+        for found, shares in ((A, weights), (slope, slopes)):
+            expected = shares @ (own + np.broadcast_to([2.0, 3.0, 5.0], (BINS, 3)))
+            np.testing.assert_allclose(np.array(found).T, expected, atol=2e-5 * np.abs(shares).sum(1).max() * 8)
+
+
+def test_bins_far_behind_the_first_are_told_apart():
+    """An event a short way behind its origin, in the middle of a million bins."""
+    film = make_film(temporal_bins=2**20, bin_width_opl=1.0)
+    cube = storage(film, film.entries_per_pixel())
+    match = Local(to_channels=lambda spectrum: spectrum)
+    origin = mi.Float64([1000000.998, 700000.5])
+    block = film.create_event_block(Local(band=0), mi.UInt32(0), match, 1, origin=origin)
+    lost = block.put({}, mi.Float64([0.001, 0.499]), [mi.Float(1)] * 3, mi.Bool(True))
+    assert np.flatnonzero(np.array(cube)).tolist() == [2100000, 2100001, 2100002, 3000000, 3000001, 3000002]
+    assert not np.any(np.array(lost))
+
+
+def test_how_lanes_add_to_a_histogram():
+    """Each by itself where most of them add to many bins of a large array, on a processor."""
+    large, modes = dr.zeros(mi.Float, dr.expand_threshold() + 1), dr.ReduceMode
+    many, few = make_film(temporal_bins=64), make_film(temporal_bins=63)
+    assert many.reduce_mode(large, False, True) == modes.Direct and few.reduce_mode(large, False, True) == modes.Auto
+    assert many.reduce_mode(large, False, False) == modes.Auto
+    assert many.reduce_mode(dr.zeros(mi.Float, 64), False, True) == modes.Auto
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dr, "backend_v", lambda array: dr.JitBackend.CUDA)
+        assert many.reduce_mode(large, False, True) == modes.Auto
+    given = [(False, False), (False, True), (True, False), (True, True)]
+    assert [reduce_mode(*one) for one in given] == [modes.Auto, modes.Direct, modes.NoConflicts, modes.NoConflicts]
+    assert BinLayout(large, 0, 1, 1, 1, 1).mode == modes.Auto
+    assert BinLayout(large, 0, 1, 1, 1, 1, exclusive=True).mode == modes.NoConflicts
+
+
+@pytest.mark.parametrize(("bins", "name"), [(8, "HistogramBlock"), (9, "FilmBlock")])
+def test_kernels_of_nine_bins_are_written_out(bins, name):
+    """Those of a pulse of eight whole bins; longer ones are looped over, wherever lengths are counted from."""
+    film = make_film(pulse="rectangular", pulse_width_opl=bins * WIDTH, pulse_center_opl=bins * WIDTH / 2)
+    assert film.filter.count == bins + 1
+    block = film.create_event_block(Local(band=0), mi.UInt32(0), None, 1, origin=mi.Float64(1))
+    assert type(block).__name__ == name
+
+
+@pytest.mark.parametrize(("settings", "first", "last"), [
+    ({}, 0, BINS), ({"temporal_filter": "tent"}, -0.5, BINS + 0.5),
+    ({"temporal_filter": "gaussian", "gaussian_stddev": 0.5}, -2, BINS + 2),
+    ({"pulse": "rectangular", "pulse_width_opl": 3 * WIDTH, "pulse_center_opl": 5.5 * WIDTH}, -8, BINS - 4),
+])  # fmt: skip
+def test_arrivals_that_can_reach_the_window(settings, first, last):
+    """Of a film without a steady image: a late pulse is met by arrivals before the window."""
+    assert make_film(**settings).arrivals() is None
+    window = make_film(steady=False, **settings).arrivals()
+    assert (window.first, window.last) == (first * WIDTH, last * WIDTH)
+
+
+def test_eight_filters_are_kept():
+    film = make_film(temporal_filter="gaussian", pulse="rectangular", pulse_width_opl=0.5)
+    made = [film.filter]
+    for stddev in (0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2):
+        film.gaussian_stddev = stddev
+        made.append(film.filter)
+    film.gaussian_stddev = 0.5
+    assert film.filter is made[0] and len(film._filters) == 8
+    film.gaussian_stddev = 1.3  # takes the place of that of 0.6, used longest ago
+    assert len(film._filters) == 8
+    for stddev, kept in ((0.7, made[2]), (0.5, made[0])):
+        film.gaussian_stddev = stddev
+        assert film.filter is kept
+    film.gaussian_stddev = 0.6
+    assert film.filter is not made[1]

@@ -10,6 +10,8 @@ import pytest
 from support.marks import long_pairs
 from torchtransient import plugins
 from torchtransient.errors import SceneError
+from torchtransient.plugins.films.pulsed_filter import PulsedFilter
+from torchtransient.plugins.films.temporal_filter import BoxFilter
 from torchtransient.pulses import Pulse
 from torchtransient.testing.film_storage import storage
 
@@ -192,3 +194,58 @@ def test_errors(arguments, message):
 def test_a_width_without_a_pulse_is_reported():
     with pytest.raises(RuntimeError, match="pulse_fwhm_opl"):
         make_film(pulse_fwhm_opl=0.3)
+
+
+# -------------------------------------------------------------------------------------------- the table of a kernel
+
+
+def box_of(bins, **settings):
+    return PulsedFilter(BoxFilter(), [Pulse.rectangular(bins * 0.5, **settings)], 0.5)
+
+
+@pytest.mark.parametrize(("bins", "nodes"), [(3, 1024), (4, 512), (4000, 8), (300, 8), (0.01, 16384), (0.125, 16384)])
+def test_nodes_of_a_bin(bins, nodes):
+    """2048 or more over the kernel, a power of two; 8 at least and 16384 at most."""
+    assert box_of(bins).nodes_per_bin == nodes
+
+
+def test_the_longest_kernel():
+    assert box_of(4096).reach == (-2048, 2049)
+    with pytest.raises(SceneError, match=r"together cover 4097 bins of 0\.5 m; at most 4096"):
+        box_of(4097)
+
+
+@pytest.mark.parametrize("bins", [2, 30])
+def test_arrivals_at_the_start_of_a_bin(bins):
+    """Have weights that add up to one, and the slopes of arrivals right after it: of a kernel that is written out, and
+    of one that is looped over.
+    """
+    film = make_film(pulse="tabulated", pulse_opl=f"0 {bins * WIDTH}", pulse_values="1 3")
+    at = np.array([0.0, 1.0, 20.0, 29.0])
+    cube, before, after = put_each(film, at)
+    np.testing.assert_allclose(cube[..., 0].sum(1) + before + after, 1, atol=1e-6)
+    edges = (np.arange(BINS + 1) - at[:, None]).clip(0, bins) / bins
+    np.testing.assert_allclose(cube[..., 0], np.diff((edges + edges**2) / 2), atol=1e-5)
+    adjoint = (mi.Float(np.random.default_rng(6).normal(size=BINS * 3)), 3, 1)
+    slopes = [
+        np.array(film.read(adjoint, mi.UInt32(0), mi.Float64((at + late) * WIDTH), mi.Bool(True))[1], dtype=float)
+        for late in (0, 1e-5)
+    ]
+    np.testing.assert_allclose(slopes[0], slopes[1], atol=1e-3 * np.abs(slopes[1]).max())
+    _, taps = film.filter.weights(mi.Float64(20.0))
+    assert len(taps) == bins + 1
+    density = (1 + 2 * np.arange(bins + 1) / bins) / (2 * bins)
+    # what leaves at the lower edge comes in at the upper one; nothing comes in before the first, nor leaves the last
+    expected = np.r_[-density[1], density[1:-1] - density[2:], density[-1]]
+    np.testing.assert_allclose([float(slope[0]) for _, _, slope in taps], expected, atol=2e-3 / bins)
+
+
+def test_how_far_an_asymmetric_kernel_reaches():
+    """From the first bin that a pulse before its arrival meets to the last that one in the same bin does."""
+    spread = box_of(2.5, center_opl=0.5 * 7.25)
+    # from 6 to 8.5 bins behind an arrival
+    assert (spread.first, spread.count, spread.reach) == (6, 4, (6, 10))
+    base, node, share = spread.begin(mi.Float64([3.0, 3.25, 3.96875]))
+    assert list(base) == [9, 9, 9]
+    edges = (np.array(node) + np.array(share)) / spread.nodes_per_bin
+    np.testing.assert_allclose(edges, [1, 0.75, 0.03125], atol=1e-6)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -276,3 +279,77 @@ def test_how_finely_curves_are_tabulated():
     assert found[0].tabulate(np.array([399.0, 425.0, 450.0])).tolist() == [[0, 0.5, 1]]
     pdf = np.array(found[0]._density.pdf)
     np.testing.assert_allclose(pdf, np.maximum(1 - np.abs(np.linspace(-1, 1, 65)), 0.01), rtol=1e-4)
+
+
+def test_ends_of_the_observer_s_table():
+    """Both belong to it, and nothing is read behind its last node."""
+    mi.set_variant("llvm_ad_spectral")
+    observer = StandardObserver()
+    numbers = np.arange(1.0, 96.0) ** 2
+    observer._tables = [mi.Float(np.r_[numbers * scale, np.full(4, np.nan)]) for scale in (1, 2, 3)]
+    at = np.array([360.0, 362.5, 365.0, 827.5, 830.0, 359.99, 830.01])
+    rows = observer.matrix(mi.UnpolarizedSpectrum(*(mi.Float(at) for _ in range(4))))
+    expected = np.interp(at, np.linspace(360, 830, 95), numbers, left=0, right=0)
+    assert len(rows) == 4
+    for row in rows:
+        np.testing.assert_allclose(np.array(row), expected * np.array([[1], [2], [3]]), rtol=1e-4)
+
+
+def curves_of(**nodes):
+    mi.set_variant("llvm_ad_spectral")
+    return SensorResponse({name: mi.load_dict(node) for name, node in nodes.items()})
+
+
+def test_curves_count_alike_where_wavelengths_are_drawn():
+    """Each is scaled to one; what the channels see are the curves as they are, over the number of wavelengths."""
+    high = {"type": "regular", "wavelength_min": 400, "wavelength_max": 600, "values": "1, 8, 2"}
+    low = {"type": "regular", "wavelength_min": 400, "wavelength_max": 600, "values": "0.5, 0, 0.25"}
+    response = curves_of(high=high, low=low)
+    at = np.linspace(400, 600, 65)
+    curves = [np.interp(at, [400, 500, 600], values) for values in ([1, 8, 2], [0.5, 0, 0.25])]
+    np.testing.assert_allclose(np.array(response._density.pdf), curves[0] / 8 + curves[1] / 0.5, rtol=1e-5)
+    places = np.array([425.0, 450.0, 580.0])
+    rows = response.matrix(mi.UnpolarizedSpectrum(*(mi.Float(np.roll(places, k)) for k in range(4))))
+    for k, row in enumerate(rows):
+        expected = [np.interp(np.roll(places, k), at, curve) / 4 for curve in curves]
+        np.testing.assert_allclose(np.array(row), expected, rtol=1e-5)
+    assert len(rows) == 4
+    wavelengths, weight = response.sample(mi.Float([0.1, 0.27]))
+    density = (curves[0] / 8 + curves[1] / 0.5) / np.trapezoid(curves[0] / 8 + curves[1] / 0.5, at)
+    for k in range(4):
+        found = np.interp(np.array(wavelengths[k], dtype=float), at, density)
+        np.testing.assert_allclose(1 / np.array(weight[k], dtype=float), found, rtol=1e-3)
+    assert len(set(np.array(wavelengths).ravel().round(3))) == 8
+    # the floor is a share of the highest density, of whatever sum
+    low["values"] = "0, 4, 0"
+    assert np.array(curves_of(a=low, b=low)._density.pdf).min() == pytest.approx(0.02)
+
+
+def test_even_curves_have_the_fewest_nodes():
+    """Also beside others that say how fine they are; one of a single step is as fine as another."""
+    even = {"type": "uniform", "value": 2.0, "wavelength_min": 400, "wavelength_max": 500}
+    fine = {"type": "regular", "wavelength_min": 400, "wavelength_max": 500, "values": ", ".join("12" * 100)}
+    counts = [
+        np.array(curves_of(**nodes)._density.pdf).size
+        for nodes in ({"a": even}, {"a": even, "b": fine}, {"a": fine, "b": even})
+    ]
+    assert counts == [65, 200, 200]
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_curve_that_is_no_number_is_refused(value):
+    mi.set_variant(VARIANT)
+    curve = SimpleNamespace(
+        wavelength_range=lambda: (400, 500),
+        spectral_resolution=lambda: 0.0,
+        eval=lambda si: dr.select(si.wavelengths > 450, mi.UnpolarizedSpectrum(value), 1),
+    )
+    with pytest.raises(SceneError, match=r"'bad' must be finite"):
+        SensorResponse({"bad": curve})
+
+
+def test_curves_are_seen_beside_the_film_s_settings():
+    mi.set_variant(VARIANT)
+    plugins.sync()
+    seen = mi.traverse(mi.load_dict(film()))
+    assert all(any(key.startswith(f"{name}.") for key in seen.keys()) for name in BANDS)  # noqa: SIM118

@@ -6,6 +6,7 @@ import copy
 import json
 import pickle
 from dataclasses import replace
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -18,7 +19,7 @@ from torchtransient.errors import ArgumentError, SceneError, ShapeError, Storage
 from torchtransient.files.result_file import read_result, write_result
 from torchtransient.rendering import films
 from torchtransient.rendering.films import choices, layout
-from torchtransient.rendering.films.choice import FilmChoice
+from torchtransient.rendering.films.choice import FilmChoice, measured
 from torchtransient.rendering.films.gates import Gates
 from torchtransient.rendering.films.histogram import Histogram
 from torchtransient.rendering.films.phasors import Phasors
@@ -288,6 +289,7 @@ def test_outputs_and_files_without_the_film(argument):
     assert kind.from_output(output) == choice
     without = replace(output, **{kind.measures: None})
     assert kind.from_output(without) is None and choices.of_output(without) is None
+    assert kind.from_output(replace(output, **dict.fromkeys(choice.attributes()))) is None
     for other in GIVEN:
         if other != argument:
             assert type(choice_for(other)).from_output(output) is None
@@ -338,3 +340,49 @@ def test_what_is_planned_for_outputs():
     ):
         found = Histogram.planned(outputs)
         assert (found.name, found.all_times) == (name, all_times) and words in found.reason
+    asked = {"peak_time": Histogram, "phasor": Phasors, "gates": Gates, "transient": Histogram}
+    assert [choices.planned(["steady", name]).kind for name in asked] == list(asked.values())
+    assert choices.planned(["phasor"]).reason == "film: phasor, since phasors are asked for; no time axis is stored"
+
+
+@pytest.mark.parametrize("given", [{"start_opl": 0.0}, {"bin_width_opl": 1.0}, {"num_bins": 5}])
+def test_no_part_of_an_axis_is_given_alone(given):
+    with pytest.raises(ArgumentError, match="replace the scene's axis together: give all"):
+        Histogram.from_options(given)
+    assert Histogram.from_options({"start_opl": None, "frequencies": "1"}) is None
+
+
+def test_options_of_two_films_are_named_by_their_first():
+    axis = {"start_opl": 3.5, "bin_width_opl": 0.25, "num_bins": 5}
+    with pytest.raises(ArgumentError, match=r"^--start-opl and --gates ask for different films"):
+        choices.from_options({**axis, "gates": "rectangular 1 2"})
+
+
+def test_histograms_of_files_have_an_axis_and_an_array():
+    axis = {"start_opl": 3.5, "bin_width_opl": 0.25, "num_bins": 5}
+    assert Histogram.from_entries({**axis, "transient": 0}) == choice_for("time_axis")
+    assert Histogram.from_entries(axis) is None
+    assert Histogram.from_entries({"start_opl": 3.5, "bin_width_opl": 0.25, "transient": 0}) is None
+    assert Gates.tensor_in({"transient": 3}) == 3 and Gates.tensor_in({"transient": 3, "gated": 4}) == 4
+
+
+def test_what_an_object_holds_under_a_name():
+    held = SimpleNamespace(phasor=None, transient=3, others={"phasor": 5, "transient": 7})
+    assert [measured(held, name) for name in ("transient", "phasor", "gated")] == [3, 5, None]
+    assert measured(SimpleNamespace(transient=None), "transient") is None
+
+
+def test_plugins_in_words():
+    assert choices.plugins_in_words() == "transient_hdr_film, phasor_hdr_film, gated_hdr_film"
+    assert choices.plugins_in_words([Gates, Histogram]) == "gated_hdr_film, transient_hdr_film"
+    assert choices.of_plugin("hdrfilm") is None
+    assert Histogram.fits("streak_hdr_film") and not Gates.fits("transient_hdr_film") and Gates.fits("gated_hdr_film")
+
+
+def test_explicit_frequencies_replace_those_that_a_film_had():
+    peers = {"wl_mean": 0.5, "wl_sigma": 0.1, "temporal_bins": 7, "bin_width_opl": 0.5, "frequency_first": 1.0,
+             "frequency_step": 2.0, "frequency_count": 3}  # fmt: skip
+    for given in (peers, dict.fromkeys(["wl_sigma"], 1.0)):
+        props = dict(given) | {"width": 4}
+        choice_for("frequencies").write(props)
+        assert props == {"frequencies": "0.0, 0.5, -2.0", "start_opl": 1.5, "width": 4}

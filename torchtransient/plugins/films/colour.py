@@ -38,7 +38,7 @@ class StandardObserver:
         i = dr.clip(mi.UInt32(x), 0, _NODES - 2)
         b = x - mi.Float(i)
         ends = [[dr.gather(mi.Float, table, i + k, inside) for k in (0, 1)] for table in self._tables]
-        return [dr.select(inside, dr.fma(1 - b, low, b * high), 0) for low, high in ends]
+        return [dr.fma(1 - b, low, b * high) for low, high in ends]
 
 
 class ChannelMatch:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -35,10 +33,10 @@ class GateTable:
         self._cell_scale = CELLS / (self.last - self.first)
         low, high = np.full(CELLS, self.count), np.zeros(CELLS, dtype=int)
         for g in range(self.count):
-            a = max(math.floor((starts[g] - self.first) * self._cell_scale) - 1, 0)
-            b = min(math.ceil((ends[g] - self.first) * self._cell_scale) + 1, CELLS)
-            low[a:b] = np.minimum(low[a:b], g)
-            high[a:b] = np.maximum(high[a:b], g + 1)
+            # From the cell of the start to that of the end, as those of arrivals are rounded.
+            a, b = (int((opl[g] - self.first) * self._cell_scale) for opl in (starts, ends))
+            low[a : b + 1] = np.minimum(low[a : b + 1], g)
+            high[a : b + 1] = np.maximum(high[a : b + 1], g + 1)
         self.open_cells = (high > low).astype(np.uint32)
         self._low, self._high = mi.UInt32(np.minimum(low, high)), mi.UInt32(high)
         dr.make_opaque(
@@ -61,7 +59,7 @@ class GateTable:
         i = dr.minimum(mi.UInt32(x), dr.gather(mi.UInt32, self._last_interval, gate, inside))
         at = dr.gather(mi.UInt32, self._offset, gate, inside) + i
         a, b = dr.gather(mi.Float, self._values, at, inside), dr.gather(mi.Float, self._values, at + 1, inside)
-        return dr.select(inside, dr.fma(b - a, x - mi.Float(i), a), 0), dr.select(inside, (b - a) * scale, 0)
+        return dr.select(inside, dr.fma(b - a, x - mi.Float(i), a), 0), (b - a) * scale
 
 
 @dr.syntax
@@ -73,7 +71,7 @@ def put_gates(layout, table, opl, value, slope_value, active):
         weight, slope = table.value(g, opl, going)
         _scatter(layout, g, weight, slope, value, slope_value, going & ((weight != 0) | (slope != 0)))
         g += 1
-        going = going & (g < end)
+        going = g < end
 
 
 def _scatter(layout, gate, weight, slope, value, slope_value, active):
@@ -95,7 +93,7 @@ def read_gates(layout, table, opl, steady, active):
         weight, dweight = table.value(g, opl, going)
         A, slope = _gathered(layout, g, weight, dweight, steady, A, slope, going)
         g += 1
-        going = going & (g < end)
+        going = g < end
     return A, slope
 
 

@@ -32,7 +32,7 @@ def reduce_mode(exclusive, direct=False):
 @dr.syntax
 def put(layout, kernel, x, value, slope_value, active):
     """Add ``value`` times the weight and ``slope_value`` times its slope per bin; returns the shares of the weight
-    before and after the window. Either list may be None.
+    before and after the window. ``slope_value`` may be None.
     """
     k, node, share = kernel.begin(x)
     end = k + kernel.count
@@ -49,7 +49,7 @@ def put(layout, kernel, x, value, slope_value, active):
         scatter(layout, inside, k, weight, dweight, value, slope_value)
         low, low_pdf = mi.Float(high), mi.Float(high_pdf)
         k += 1
-        going = going & (k < end)
+        going = k < end
     return before, after
 
 
@@ -57,7 +57,7 @@ def scatter(layout, inside, k, weight, dweight, value, slope_value):
     """Add to one bin."""
     index = dr.fma(mi.UInt32(k), layout.bin_stride, layout.base)
     for c in range(layout.channels):
-        v = 0 if value is None else value[c] * weight
+        v = value[c] * weight
         if slope_value is not None:
             v += slope_value[c] * dweight
         index_c = index + c * layout.channel_stride
@@ -80,7 +80,7 @@ def read(layout, kernel, x, active, steady=None):
         A, slope = gathered(layout, going, k, high - low, low_pdf - high_pdf, steady, A, slope)
         low, low_pdf = mi.Float(high), mi.Float(high_pdf)
         k += 1
-        going = going & (k < end)
+        going = k < end
     return A, slope
 
 

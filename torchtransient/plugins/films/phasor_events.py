@@ -163,11 +163,10 @@ class FrequencyBlock:
             return [rotation(ν * opl) for ν in self.values]
         z = rotation(self.frequency(0) * opl)
         result = [z]
-        if self.size > 1:
-            w = rotation(self.step * opl)
-            for _ in range(1, self.size):
-                z = dr.fma(z[0], w[0], -z[1] * w[1]), dr.fma(z[0], w[1], z[1] * w[0])
-                result.append(z)
+        w = rotation(self.step * opl)
+        for _ in range(1, self.size):
+            z = dr.fma(z[0], w[0], -z[1] * w[1]), dr.fma(z[0], w[1], z[1] * w[0])
+            result.append(z)
         return result
 
 

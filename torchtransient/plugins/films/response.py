@@ -52,9 +52,7 @@ class SensorResponse:
             step = float(curve.spectral_resolution())
             resolution = min(resolution, step) if step > 0 else resolution
         self.range = (low, high)
-        count = MIN_NODES
-        if math.isfinite(resolution):
-            count = min(max(count, math.ceil((high - low) / resolution) + 1), MAX_NODES)
+        count = min(max(MIN_NODES, math.ceil((high - low) / resolution) + 1), MAX_NODES)
         self._density = mi.ContinuousDistribution(mi.ScalarVector2f(low, high), mi.Float(self._node_density(count)))
         self.sensors = []
 

@@ -37,4 +37,4 @@ class GappedWindow(ArrivalWindow):
         inside = super().counts(opl)
         cell = mi.UInt32(dr.select(inside, (opl - self.first) * self._scale, 0))
         cell = dr.minimum(cell, dr.width(self._cells) - 1)
-        return inside & (dr.gather(mi.UInt32, self._cells, cell, inside) == 1)
+        return dr.gather(mi.UInt32, self._cells, cell, inside) == 1
