@@ -6,6 +6,7 @@ numbers.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any, TypeVar
 
@@ -41,12 +42,10 @@ def one_by_one(
     name: str, values: Any, what: str, error: type[TorchTransientError] = ShapeError
 ) -> Iterator[Any]:
     """As :func:`several`, of which nothing is taken yet."""
-    try:
-        if isinstance(values, (str, bytes, Mapping)):
-            raise TypeError
-        return iter(values)
-    except TypeError:
-        raise error(f"{name}: expected several {what}, got {shown(values)}.") from None
+    with contextlib.suppress(TypeError):
+        if not isinstance(values, (str, bytes, Mapping)):
+            return iter(values)
+    raise error(f"{name}: expected several {what}, got {shown(values)}.")
 
 
 def mapping(name: str, value: Any, what: str, error: type[TorchTransientError] = ArgumentError) -> Mapping[Any, Any]:

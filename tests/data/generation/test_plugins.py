@@ -115,7 +115,7 @@ def test_recipes_name_their_modules(theirs):
     assert before.startswith("sha256 ")
     theirs.write_text(PAINT.replace("self.gain)", "self.gain * 2)"))
     assert recipe.maker().about()["versions"]["their_paint_module"] != before
-    with pytest.raises(SceneError, match="plugins: expected a list"):
+    with pytest.raises(SceneError, match="plugins: expected several names of modules in a list"):
         painted(plugins="their_paint_module")
     with pytest.raises(PluginRegistrationError, match="no module named"):
         painted(plugins=["their_absent_module"])

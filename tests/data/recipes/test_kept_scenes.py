@@ -240,8 +240,8 @@ def test_other_errors_of_a_renderer_are_raised():
         ({"pulse": 3}, ArgumentError, "pulse: expected a Pulse"),
         ({"frequencies": [[1.0]]}, ArgumentError, "frequencies: expected cycles per metre in a list"),
         ({"gates": [3]}, ArgumentError, "gates: expected a list"),
-        ({"plugins": "a.b"}, SceneError, "plugins: expected a list of names"),
-        ({"plugins": [3]}, SceneError, "plugins: expected a list of names"),
+        ({"plugins": "a.b"}, SceneError, "plugins: expected several names of modules in a list"),
+        ({"plugins": [3]}, SceneError, "plugins: expected several names of modules in a list"),
     ],
 )
 def test_what_is_no_argument(settings, error, words):
