@@ -69,6 +69,15 @@ def test_a_missing_package(monkeypatch):
     assert "torchtransient[data]" in found["h5py"].text
 
 
+@pytest.mark.parametrize("version", [(3, 10, 9), (3, 11, 0)])
+def test_a_python_that_is_too_old(monkeypatch, version):
+    monkeypatch.setattr(doctor.sys, "version_info", version)
+    monkeypatch.setattr(doctor.platform, "python_version", lambda: "3.x")
+    old = version < (3, 11)
+    text = "3.x; 3.11 or newer is needed" if old else "3.x"
+    assert doctor.versions()[0] == doctor.Finding("problem" if old else "ok", "python", text)
+
+
 @pytest.mark.parametrize(
     "driver, torch_sees, findings",
     [

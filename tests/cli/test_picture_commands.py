@@ -111,6 +111,10 @@ def test_phasors_become_a_wave(folder):
     assert Image.open("wave.gif").n_frames == 48
     done = run("render", "box.xml", "--frequencies", "0.5,1", "--rainbow", "r.png", "--quiet")
     assert done.exit_code == 2 and "--rainbow shows a histogram over time" in done.stderr
+    assert run("render", "box.xml", "-o", "wave.h5", "--frequencies", "0.5,1", "--quiet").exit_code == 0
+    done = run("picture", "wave.h5", "none.png", "--kind", "overview")
+    assert done.exit_code == 2
+    assert "--kind overview shows a histogram over time, and this file holds phasors" in done.stderr
 
 
 def test_gates_become_frames(folder):

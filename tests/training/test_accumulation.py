@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from torch import nn
+from torch.nn.parallel import DistributedDataParallel
 
 import torchtransient as tt
 from torchtransient.errors import ArgumentError, GradientError, ShapeError, UnitError
@@ -62,6 +63,26 @@ def test_parts_have_the_gradient_of_the_batch(model):
             # 6 samples and 2 weights are at most 8 roundings of a sum.
             assert ((value - expected[name]).abs() <= 8 * EPS * magnitude[name]).all(), name
     assert expected["network.weight"].abs().max() > 0
+
+
+def test_ranks_exchange_gradients_at_the_last_part_alone(tmp_path, monkeypatch):
+    torch.distributed.init_process_group("gloo", init_method=f"file://{tmp_path}/store", rank=0, world_size=1)
+    try:
+        waiting = []
+        plain = DistributedDataParallel.no_sync
+        monkeypatch.setattr(DistributedDataParallel, "no_sync", lambda self: waiting.append(parts[-1]) or plain(self))
+        model, parts = DistributedDataParallel(nn.Linear(2, 1, bias=False)), [-1]
+
+        def loss_of(part):
+            parts.append(part)
+            return model(torch.tensor([[part + 1.0, 2.0]])).sum()
+
+        accumulate(loss_of, range(3), model=model)
+        # before the first, and before the second
+        assert waiting == [-1, 0] and parts == [-1, 0, 1, 2]
+        torch.testing.assert_close(model.module.weight.grad, torch.tensor([[2.0, 2.0]]))
+    finally:
+        torch.distributed.destroy_process_group()
 
 
 def test_memory_is_that_of_a_part():

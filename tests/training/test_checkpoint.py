@@ -399,3 +399,24 @@ def test_what_cannot_be_written_or_read(tmp_path):
     save_checkpoint(path, {"m": tiny(1.0).double()}, step=0)
     with pytest.raises(ShapeError, match=r"expected torch\.float32, the file has torch\.float64"):
         load_checkpoint(path, {"m": tiny()})
+
+
+class Remembers(nn.Module):
+    """A module with a state beside its tensors."""
+
+    def __init__(self, said):
+        super().__init__()
+        self.weight, self.said = nn.Parameter(torch.ones(2)), said
+
+    def get_extra_state(self):
+        return {"said": self.said}
+
+    def set_extra_state(self, state):
+        self.said = state["said"]
+
+
+def test_states_beside_tensors(tmp_path):
+    save_checkpoint(tmp_path / "a.pt", {"model": Remembers("before")})
+    other = Remembers("after")
+    load_checkpoint(tmp_path / "a.pt", {"model": other})
+    assert other.said == "before"

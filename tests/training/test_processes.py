@@ -11,6 +11,7 @@ import torch.distributed as dist
 import torchtransient as tt
 from torchtransient.errors import DeviceError, UnitError
 from torchtransient.training import ranks, worker_init
+from torchtransient.training.processes import Ranks
 
 
 @pytest.fixture(autouse=True)
@@ -91,6 +92,22 @@ def test_groups_that_cannot_be_joined(monkeypatch):
     monkeypatch.setattr(dist, "is_initialized", lambda: True)
     with pytest.raises(DeviceError, match="in a group already"), ranks():
         pass
+
+
+def test_means_over_ranks(monkeypatch):
+    """Of three that have the same number."""
+    monkeypatch.setattr(dist, "all_reduce", lambda total: total.mul_(3))
+    assert Ranks(2, 3).mean(2.5) == 2.5
+
+
+def test_a_group_of_others_is_left_alone(tmp_path):
+    dist.init_process_group("gloo", init_method=f"file://{tmp_path}/store", rank=0, world_size=1)
+    try:
+        with ranks() as found:
+            assert found.size == 1
+        assert dist.is_initialized()
+    finally:
+        dist.destroy_process_group()
 
 
 @pytest.mark.parametrize("value", [torch.ones(2), "1", None, [1.0]])

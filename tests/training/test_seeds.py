@@ -102,6 +102,12 @@ def test_a_purpose_is_a_text():
         Seeds(0, 3)
 
 
+@pytest.mark.parametrize("samples", [[0, 2**32], [2**32, 0], torch.tensor([3, 2**32])], ids=str)
+def test_samples_are_below_the_number_of_seeds(samples):
+    with pytest.raises(UnitError, match=r"expected samples below 2\^32, got 4294967296"):
+        Seeds(1)(0, samples)
+
+
 @pytest.mark.parametrize("samples", [torch.ones(2, 2, dtype=torch.int64), torch.ones(2), 1j * torch.ones(2),
                                      torch.ones(2) > 0, torch.tensor(3)])  # fmt: skip
 def test_samples_are_a_row_of_whole_numbers(samples):

@@ -47,13 +47,13 @@ def fit_colour(renderer: Any, target: torch.Tensor, steps: int, learning_rate: f
             loss = (weight * (_averages(renderer(seed=step).transient) - wanted).square()).mean()
             loss.backward()  # type: ignore[no-untyped-call]
             fit.losses.append(loss.item())
-            fit.colours.append(colour.detach().tolist())
+            fit.colours.append(colour.tolist())
             optimizer.step()
             schedule.step()
             with torch.no_grad():
                 colour.clamp_(0.0, 1.0)
             bar.set_postfix(loss=f"{fit.losses[-1]:.2e}")
-    fit.found = colour.detach().tolist()
+    fit.found = colour.tolist()
     return fit
 
 

@@ -95,7 +95,7 @@ def _report_energy(output: Any) -> None:
     before, after = sum(output.stats.energy_before), sum(output.stats.energy_after)
     inside = _mean_over_channels(_power(output)[0])
     total = before + after + inside
-    if total > 0 and before + after > 0.001 * total:
+    if before + after > 0.001 * total:
         axis = output.axis
         click.echo(
             f"note: the axis from {axis.start_opl:g} m to {axis.end_opl:g} m misses light: "
