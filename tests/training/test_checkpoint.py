@@ -416,7 +416,7 @@ class Remembers(nn.Module):
 
 
 def test_states_beside_tensors(tmp_path):
-    save_checkpoint(tmp_path / "a.pt", {"model": Remembers("before")})
+    save_checkpoint(tmp_path / "a.pt", {"model": Remembers("before")}, step=1)
     other = Remembers("after")
     load_checkpoint(tmp_path / "a.pt", {"model": other})
     assert other.said == "before"
