@@ -81,7 +81,7 @@ FRAME = np.zeros((4, 6, 3), np.uint8)
         (lambda: tt.vis.write_video("a.gif", [], 1), ShapeError, "iterated twice for a GIF, got none.$"),
         (lambda: tt.vis.write_video("a.gif", iter([FRAME]), 1), ShapeError, "got none the second time"),
         (lambda: tt.vis.write_video("a.gif", [FRAME, FRAME[1:]], 2), ShapeError, r"equal size \(4, 6, 3\), got"),
-        (lambda: tt.vis.write_video("a.gif", [[5]], 1), ShapeError, r"video: expected frames \(H, W, 3\) of uint8, got"),
+        (lambda: tt.vis.write_video("a.gif", [[5]], 1), ShapeError, r"video: expected frames .* of uint8, got"),
         (lambda: tt.vis.write_video("a.gif", [FRAME[0]], 1), ShapeError, r"got uint8 \(6, 3\)"),
         (lambda: tt.vis.write_video("a.gif", [FRAME[..., :2]], 1), ShapeError, r"got uint8 \(4, 6, 2\)"),
         (lambda: tt.vis.write_video("a.gif", [FRAME + 0.5], 1), ShapeError, r"got float64 \(4, 6, 3\)"),
