@@ -87,6 +87,18 @@ def test_broken_pixels_have_no_degree():
     tt.vis.polarization_picture(torch.zeros(4, 1, 3, 3))  # no light at all
 
 
+def test_more_than_polarized_is_polarized():
+    """Noise may say so; a floor of zero keeps all that is lit."""
+    vectors = torch.tensor([[1.0, 1.0], [3.0, 0.0], [0.0, 0.25], [0.0, 0.0]])[:, None].double()
+    image = angle_image(vectors, np.zeros((1, 2), bool))[0]
+    grey = colour_maps.oklch(0.75, 0.0, 0.0)
+    np.testing.assert_allclose(image[0], colour_maps.cyclic(0.0), atol=1e-9)
+    np.testing.assert_allclose(image[1], grey + 0.5 * (colour_maps.cyclic(0.25) - grey), atol=1e-9)
+    weak = torch.tensor([1e-9, 0.0, 1.0, 4.0]).reshape(1, 1, 1, 4) * torch.tensor([1.0, 0.5, 0, 0]).reshape(4, 1, 1, 1)
+    drawn = tt.vis.polarization_picture(weak, quantities=("dolp",), floor=0.0).axes[0].images[0].get_array()
+    np.testing.assert_array_equal(np.ma.getmaskarray(drawn), [[False, True, False, False]])
+
+
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import sys
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from torchtransient.errors import ArgumentError, MissingPackageError, ShapeError
 from torchtransient.vis import video_file
 from torchtransient.vis.files import to_bytes
 from torchtransient.vis.stamps import moment, with_strip
+from torchtransient.vis.video import _Running
 
 
 def test_frame_shows_its_bin_alone():
@@ -259,3 +261,35 @@ def box(kind, size, long=False):
 def test_what_is_a_whole_mp4(tmp_path, content, whole):
     (tmp_path / "a.mp4").write_bytes(content)
     assert video_file._is_whole(tmp_path / "a.mp4") == whole
+
+
+def test_what_was_added_is_not_added_again():
+    cube = torch.rand(2, 7, 3, 4, generator=torch.Generator().manual_seed(3))
+    running = _Running(cube)
+    np.testing.assert_allclose(running.until(5), cube[:, :5].sum(1), rtol=1e-6)
+    running.cube = torch.zeros_like(cube)
+    np.testing.assert_allclose(running.until(5), cube[:, :5].sum(1), rtol=1e-6)
+    np.testing.assert_allclose(running.until(6), cube[:, :5].sum(1), rtol=1e-6)
+    assert not running.until(4).any()
+
+
+def test_colours_of_a_palette():
+    """Those of the strip first; then what is seen in some pixels of large frames, to a sixty-fourth."""
+    frame = np.full((200, 200, 3), (203, 43, 15), np.uint8)
+    flat = frame.reshape(-1, 3)
+    flat[1::3] = (15, 203, 43)  # of 40000, each third one is looked at
+    flat[3] = (43, 15, 203)
+    found = [tuple(colour) for colour in np.reshape(video_file._palette([frame], 1).getpalette(), (-1, 3)).tolist()]
+    greys = [(level,) * 3 for level in range(44, 235, 24)]
+    assert found[: 5 + len(greys)] == [(20,) * 3, (95,) * 3, (235,) * 3, (0,) * 3, (255,) * 3, *greys]
+    assert {(200, 40, 12), (40, 12, 200)} <= set(found[5 + len(greys) :]) and (12, 200, 40) not in found
+
+
+def test_an_mp4_may_be_fast(tmp_path, monkeypatch):
+    told = []
+    monkeypatch.setattr(video_file, "_write_mp4", lambda target, frames, fps: told.append((list(frames), fps)))
+    monkeypatch.setattr(video_file, "replacing", lambda target, who: nullcontext(target))
+    frame = np.zeros((4, 6, 3), np.uint8)
+    assert tt.vis.write_video(tmp_path / "a.MP4", [frame, frame + 1], 2, fps=120) == tmp_path / "a.MP4"
+    ((frames, fps),) = told
+    assert fps == 120 and [int(one.max()) for one in frames] == [0, 1]
