@@ -274,7 +274,7 @@ def test_volumes():
     assert tt.vis.volume_views(values[:1], depths=[3.0]).axes[1].images[0].get_extent() == [-2, 2, 2.5, 3.5]
 
 
-def test_maps_of_a_surface():
+def test_maps_of_a_surface(caplog):
     depth = torch.arange(12.0).reshape(3, 4)
     seen = depth > 4
     figure = tt.vis.depth_picture(depth, mask=seen, extent=(2.0, 1.5), title="z")
@@ -287,6 +287,7 @@ def test_maps_of_a_surface():
     expected = ((normals + 1) / 2).clamp(0, 1).permute(1, 2, 0)
     expected[~seen] = 0.85
     np.testing.assert_allclose(panel.images[0].get_array(), expected, rtol=1e-6)
+    assert not caplog.records  # of matplotlib, which says so where colours lie outside
     assert panel.images[0].get_extent() == [-2, 2, -1.5, 1.5] and words(panel) == ("", "x (voxels)", "y (voxels)")
 
 

@@ -59,7 +59,7 @@ def test_moments_by_which_shares_have_arrived():
     """Of one pixel with shares 0.1, 0.2, 0.4, 0.2 and 0.1; they differ where they can."""
     one = tracked(np.array([1.0, 2, 4, 2, 1], np.float32).reshape(1, 5, 1, 1))
     assert moments_of_arrival(one) == [0, 2, 3] and moments_of_arrival(one, (0.11, 0.12, 0.13)) == [1, 2, 3]
-    assert moments_of_arrival(one, (0.99, 0.999, 1.0)) == [4, 4, 4]
+    assert moments_of_arrival(one, (0.99, 0.999, 1.0)) == [4, 4, 4] and moments_of_arrival(one, (1.5,)) == [4]
     assert moments_of_arrival(torch.zeros(1, 9, 1, 1), (0.0, 0.5, 1.0)) == [0, 4, 8]
     # Between the first and the last hundredth of the light, whole bins.
     assert _arrival_limits(one.detach(), AXIS) == (1.0, 3.5)
@@ -152,6 +152,8 @@ def test_white_of_a_video_is_found_to_half_a_hundredth():
         light[0, 0, 0, 0], light[0, 2, 0, 1:3] = highest, 0.0
         found = 1 / exposure_of_video(light, 0.5)
         assert highest * 3.3e-4 * (1 - 1e-9) <= found <= highest * 3.3e-4 * np.exp(step) * (1 + 1e-9)
+    for one in np.random.default_rng(1).random(40) + 0.1:  # alone, it is the white
+        np.testing.assert_allclose(1 / exposure_of_video(torch.full((1, 1, 1, 1), one, dtype=torch.float64)), one)
     # Half of what is lit, of all pieces of sixteen frames.
     light = torch.zeros(1, 40, 1, 2, dtype=torch.float64)
     light[0, :, 0, 0] = torch.arange(1.0, 41.0)
