@@ -88,6 +88,9 @@ def test_ticks(drawn):
     assert ticks(panels[0, 0]) == ([0.5, 1, 2], ["0.5", "1", "2"])
     assert ticks(panels[1, 0]) == ([2], ["2"])
     _, wide = drawn([Curve("a", "b", [1, 2], [0.013, 19.0], [1.0, 1.0])])
+    for seconds, wanted in (([0.3, 3.5], [0.5, 1, 2]), ([0.6, 9.0], [0.5, 1, 2, 5, 10]),
+                            ([2.7, 40.0], [5, 10, 20, 50])):
+        assert ticks(drawn([Curve("a", "b", [1, 2], seconds, [1.0, 1.0])])[1][0, 0])[0] == wanted
     assert ticks(wide[0, 0])[1] == ["0.01", "0.02", "0.05", "0.1", "0.2", "0.5", "1", "2", "5", "10", "20"]
 
 

@@ -84,6 +84,9 @@ def test_light_over_time_is_drawn_as_its_root():
     assert [text.get_text() for text in figure.texts] == [
         "square root of the light over time, 1.25 m to 3.5 m of optical path"
     ]
+    for title, top in (("", 0.0), ("a sheet", 0.2)):
+        text = tt.vis.contact_sheet(cells(2), columns=1, times=TIMES, title=title).texts[0]
+        assert text.get_position() == pytest.approx((0.01, 0.03 / (4.0 + top)))
     below = tt.vis.Cell("", {"light": COLOURS[0]}, np.array([-4.0, 1.0]))
     figure = tt.vis.contact_sheet([below])
     steps = figure.axes[1].patches[0].get_data()
@@ -127,6 +130,9 @@ def test_the_file_has_160_dots_an_inch(tmp_path):
          "expected the images light, depth of every sample, as the first has them, got light"),
         (lambda: tt.vis.contact_sheet(cells(1), times=TIMES[1:]), "times as the edges of 3 bins"),
         (lambda: tt.vis.contact_sheet(cells(1, False), times=[1.0]), "times as the edges of some bins"),
+        (lambda: tt.vis.contact_sheet(cells(1), times=np.ones((4, 2))), "times as the edges of 3 bins"),
+        (lambda: tt.vis.Cell("a", {"light": np.zeros((1, 2, 3, 3))}), "image 'light' as"),
+        (lambda: tt.vis.Cell("a", {"light": 1j * np.zeros((2, 3))}), "image 'light' as"),
         (lambda: tt.vis.contact_sheet(cells(1), times=5), "times as the edges of 3 bins"),
         (lambda: tt.vis.Cell("a", {"light": np.zeros((2, 3, 4))}), "image 'light' as"),
         (lambda: tt.vis.Cell("a", {"light": np.zeros(3)}), "image 'light' as"),

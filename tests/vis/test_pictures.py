@@ -11,6 +11,7 @@ import torchtransient as tt
 from support.cubes import AXIS, read_png, sweep
 from torchtransient.errors import ArgumentError, ShapeError, StorageError, UnitError
 from torchtransient.vis import colour_maps
+from torchtransient.vis.arrival import _arrival_limits
 from torchtransient.vis.files import save_image, to_palette
 
 NAN, INF = float("nan"), float("inf")
@@ -135,6 +136,23 @@ def test_rainbow_repeats_with_its_period():
     image = tt.vis.rainbow(sweep(), axis=AXIS, period_opl=1.0, limits=(2.0, 7.0))
     np.testing.assert_array_equal(image[0, 0:8], image[0, 2:10])
     assert (image[0, 0] != image[0, 1]).any()
+
+
+def test_rainbow_as_it_is_without_options():
+    """Bins are the lengths, 5 % of the pixels are white, and light below zero is none."""
+    cube = torch.rand(1, 7, 4, 6, generator=torch.Generator().manual_seed(9)) - 0.1
+    cube[0, 2, 0, 0] = -3.0
+    given = {"axis": tt.TimeAxis(0.0, 1.0, 7), "exposure": tt.vis.exposure_of(cube.sum(1), 0.95)}
+    for style in ("peak", "fusion"):
+        limits = _arrival_limits(cube, given["axis"])
+        np.testing.assert_array_equal(
+            tt.vis.rainbow(cube, style=style), tt.vis.rainbow(cube, style=style, limits=limits, **given)
+        )
+    cube = torch.tensor([2.0, -5.0, 6.0]).reshape(1, 3, 1, 1)
+    mixed = tt.vis.rainbow(cube, style="fusion", limits=(0, 3), exposure=1.0)
+    np.testing.assert_array_equal(
+        mixed, tt.vis.rainbow(cube.clamp(min=0), style="fusion", limits=(0, 3), exposure=1.0)
+    )
 
 
 @pytest.mark.parametrize("style", ["peak", "fusion"])

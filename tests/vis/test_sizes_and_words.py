@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from PIL import Image, ImageDraw, ImageFont
 
 import torchtransient as tt
 from support.number_case import capture
@@ -214,10 +215,41 @@ def test_strips():
         assert (found[height : height + bar][~lit] == stamps.DIM).all()
         assert (found[height + bar :] == stamps.GROUND).all()
         assert (stamps.with_strip(image, "")[height:] == stamps.GROUND).all()
-        assert not (stamps.with_strip(image, "", 0.5 / width) == stamps.INK).all(-1).any()
+        for share, columns in ((0.5 / width, 0), (0.6 / width, 1), (1 / width, 1), (1.0, width)):
+            drawn = (stamps.with_strip(image, "", share) == stamps.INK).all(-1)
+            assert drawn[height : height + bar, :columns].all() and drawn.sum() == bar * columns
     long = stamps.with_strip(np.zeros((40, 300, 3), np.uint8), "many words " * 4)[40:]
     written = np.nonzero((long != stamps.GROUND).any((0, 2)))[0]
     assert written.min() >= 5 and written.max() < 295
+
+
+def test_letters_of_a_strip():
+    """As high as the strip has room for, in its middle, from a quarter of its height; not below six pixels."""
+    found = stamps.with_strip(np.zeros((100, 400, 3), np.uint8), "H", None)[100:]
+    rows, columns = np.nonzero((found != stamps.GROUND).any(-1))
+    assert 11 <= np.ptp(rows) + 1 <= 14 and abs((rows.min() + rows.max()) / 2 - 16.5) <= 1.5
+    assert 7 <= columns.min() <= 10
+    draw = ImageDraw.Draw(Image.new("RGB", (9, 9)))
+    text = "some words"
+    length = draw.textlength(text, ImageFont.load_default(20.0))
+    for room, size_ in ((length, 20.0), (length - 0.5, 18.0), (1.0, 20 * 0.9**12)):
+        assert stamps._font(draw, text, 20.0, room).size == pytest.approx(size_)
+    assert stamps._font(draw, text, 6.0, 1.0).size == 6
+
+
+def test_endings_and_scales(tmp_path):
+    """A figure without an ending is a PNG; images are what their endings say, in capitals, too."""
+    figure = tt.vis.streak(CUBE, tmp_path / "streak")
+    assert size(figure) == (6.2, 5.2) and (tmp_path / "streak.png").read_bytes()[:4] == b"\x89PNG"
+    assert [path.name for path in tmp_path.iterdir()] == ["streak.png"]
+    image = np.arange(18, dtype=np.uint8).reshape(2, 3, 3)
+    for name, kind in (("a.PNG", "PNG"), ("b.jpg", "JPEG"), ("c.jpeg", "JPEG")):
+        assert files.save_image(image, tmp_path / name, "x") is image
+        assert Image.open(tmp_path / name).format == kind
+    large = files.enlarge(image, 4)
+    assert large.shape == (8, 12, 3) and (files.enlarge(image, 1) == image).all()
+    for row, column in ((0, 0), (3, 4), (7, 11), (4, 3)):
+        assert large[row, column].tolist() == image[row // 4, column // 4].tolist()
 
 
 def test_volumes():
@@ -242,7 +274,7 @@ def test_volumes():
     assert tt.vis.volume_views(values[:1], depths=[3.0]).axes[1].images[0].get_extent() == [-2, 2, 2.5, 3.5]
 
 
-def test_maps_of_a_surface():
+def test_maps_of_a_surface(caplog):
     depth = torch.arange(12.0).reshape(3, 4)
     seen = depth > 4
     figure = tt.vis.depth_picture(depth, mask=seen, extent=(2.0, 1.5), title="z")
@@ -255,6 +287,7 @@ def test_maps_of_a_surface():
     expected = ((normals + 1) / 2).clamp(0, 1).permute(1, 2, 0)
     expected[~seen] = 0.85
     np.testing.assert_allclose(panel.images[0].get_array(), expected, rtol=1e-6)
+    assert not caplog.records  # of matplotlib, which says so where colours lie outside
     assert panel.images[0].get_extent() == [-2, 2, -1.5, 1.5] and words(panel) == ("", "x (voxels)", "y (voxels)")
 
 

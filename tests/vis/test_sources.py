@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ import torchtransient as tt
 from support.cubes import AXIS, sweep
 from torchtransient.errors import ShapeError, StorageError
 from torchtransient.files.result_file import read_result, write_result
-from torchtransient.vis.sources import phasor_of, steady_of, stokes_of, transient_of
+from torchtransient.vis.sources import as_tensor, images_of, phasor_of, steady_of, stokes_of, transient_of
 
 
 @dataclass
@@ -26,6 +27,7 @@ class Output:
     axis: Any = None
     frequencies: Any = None
     polarized: bool = False
+    gated: Any = None
 
 
 @pytest.fixture(scope="module")
@@ -109,3 +111,77 @@ def test_broken_files(tmp_path, stored):
     np.save(tmp_path / "d.npy", np.array(["text"]))
     with pytest.raises(ShapeError, match="expected numbers"):
         transient_of(tmp_path / "d.npy")
+
+
+def test_which_shapes_are_what():
+    four = torch.rand(4, 5, 2, 3)
+    with pytest.raises(ShapeError, match=r"got \(4, 5, 2, 3\)"):
+        transient_of(four)
+    assert torch.equal(transient_of(four, any_channels=True)[0], four)
+    for steady in (torch.ones(2, 1, 4, 5), torch.ones(4, 4, 5)):
+        with pytest.raises(ShapeError, match="expected an image"):
+            steady_of(Output(steady=steady))
+    assert torch.equal(steady_of(four[:, :3]), four[0, :3]) and torch.equal(steady_of(four[:3]), four[:3].sum(1))
+    turned = torch.complex(torch.rand(4, 3, 2, 5, 6), torch.rand(4, 3, 2, 5, 6))
+    assert torch.equal(phasor_of(turned)[0], turned[0])
+    with pytest.raises(ShapeError, match="expected complex"):
+        phasor_of(turned[:3])
+    back = np.arange(30.0).reshape(1, 5, 2, 3)[..., ::-1]
+    assert transient_of(back)[0].tolist() == back.tolist()
+
+
+def test_which_numbers_are_kept():
+    for dtype, kept in (
+        (torch.float16, torch.float32), (torch.int64, torch.float32), (torch.float32, torch.float32),
+        (torch.float64, torch.float64), (torch.complex128, torch.complex128), (torch.complex64, torch.complex64),
+    ):  # fmt: skip
+        assert as_tensor(torch.ones(2, dtype=dtype), "x").dtype == kept
+
+
+def test_bins_of_stokes_vectors():
+    stokes = torch.rand(4, 3, 5, 2, 6)
+    for frame in (0, 4, -1, -5):
+        assert torch.equal(stokes_of(stokes, frame), stokes[:, :, frame])
+    for frame in (5, -6, 0.5, "x"):
+        with pytest.raises(ShapeError, match="of 5 does not exist"):
+            stokes_of(stokes, frame)
+    assert torch.equal(stokes_of(Output(gated=stokes, polarized=True), 1), stokes[:, :, 1])
+    # A steady image alone has no bins to choose of.
+    assert torch.equal(stokes_of(Output(steady=stokes[:, :, 0], polarized=True), 2), stokes[:, :, 0])
+    # One of all times that is not polarized says less than the transient.
+    assert torch.equal(stokes_of(Output(stokes, stokes[0, :, 0], polarized=True)), stokes.sum(2))
+    for wrong, said in ((Output(stokes[:3], polarized=True), r"got \(3, 3, 5, 2, 6\)"), (Output(), "got neither"),
+                        (Output(steady=stokes[:3, :, 0]), r"got \(3, 3, 2, 6\)")):  # fmt: skip
+        with pytest.raises(ShapeError, match=said):
+            stokes_of(wrong)
+
+
+def test_batches_of_gated_images():
+    with pytest.raises(ShapeError, match="got a batch or several sensors"):
+        images_of(Output(gated=torch.rand(4, 3, 5, 2, 6)))
+    known = SimpleNamespace(transient=torch.rand(4, 1, 5, 2, 3), metadata={"stats": {"variant": "llvm_ad_rgb"}})
+    with pytest.raises(ShapeError, match="got a batch or several sensors"):
+        transient_of(known)
+    for metadata in ({"stats": {"variant": "llvm_mono_polarized"}}, {"stats": None}, {}, None):
+        known.metadata = metadata
+        assert torch.equal(transient_of(known)[0], known.transient[0])
+
+
+def test_names_in_files(tmp_path):
+    cube = np.random.default_rng(0).random((1, 5, 2, 3)).astype(np.float32)
+    frequencies = np.array([1.5, 2.5])
+    np.savez(tmp_path / "a.npz", transient=cube, start_opl=1.0, bin_width_opl=0.25, num_bins=5)
+    np.savez(tmp_path / "b.npz", transient=cube, gates=np.zeros((5, 2)))
+    np.savez(tmp_path / "c.npz", phasor=cube[:, :2] * 1j, frequencies_per_metre=frequencies)
+    np.savez(tmp_path / "d.npz", gated=cube, steady=cube[:, 0], gates=np.zeros((5, 2)))
+    found, axis, word = images_of(tmp_path / "a.npz")
+    assert found.tolist() == cube.tolist() and axis == tt.TimeAxis(1.0, 0.25, 5) and word == "bin"
+    for name in "bd":
+        found, axis, word = images_of(tmp_path / f"{name}.npz")
+        assert found.tolist() == cube.tolist() and axis is None and word == "gate"
+    found, known = phasor_of(tmp_path / "c.npz")
+    assert found.tolist() == (cube[:, :2] * 1j).tolist() and known == (1.5, 2.5)
+    assert steady_of(tmp_path / "d.npz").tolist() == cube[:, 0].tolist()
+    for name in ("a.NPY", "a.txt", "a"):
+        with pytest.raises(StorageError):
+            transient_of(tmp_path / name)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import struct
 import sys
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -11,7 +13,10 @@ import torch
 import torchtransient as tt
 from support.cubes import AXIS, read_gif, read_mp4, sweep
 from torchtransient.errors import ArgumentError, MissingPackageError, ShapeError, StorageError, UnitError
+from torchtransient.vis import video_file
+from torchtransient.vis.files import to_bytes
 from torchtransient.vis.stamps import moment, with_strip
+from torchtransient.vis.video import _Running
 
 
 def test_frame_shows_its_bin_alone():
@@ -182,3 +187,109 @@ def test_refused(tmp_path, arguments, error, message):
 def test_black_video(tmp_path):
     frames, _ = read_gif(tt.vis.video(torch.zeros(1, 2, 8, 8), tmp_path / "dark.gif", stamp=False))
     assert max(frame.max() for frame in frames) == 0
+
+
+def test_moments_and_shares_of_stamps(monkeypatch):
+    """The middle bin of those that are added up, the last one of those that are accumulated."""
+    told = []
+    module = sys.modules["torchtransient.vis.video"]  # of the package, the name is that of a function
+    monkeypatch.setattr(module, "with_strip", lambda image, text, share: told.append((text, share)) or image)
+    axis, cube = tt.TimeAxis(1.0, 0.5, 7), torch.rand(1, 7, 2, 3, generator=torch.Generator().manual_seed(6))
+    for accumulate, bins in ((False, (1, 4, 6)), (True, (2, 5, 6))):
+        told.clear()
+        assert len(list(tt.vis.frames(cube, axis=axis, every=3, accumulate=accumulate, scale=1))) == 3
+        assert told == [(moment(axis, k, 7), share) for k, share in zip(bins, (3 / 7, 6 / 7, 1), strict=True)]
+    told.clear()
+    assert tt.vis.frames(cube)[3].shape == (2 * 107, 3 * 107, 3) and told == [("bin 3 of 7", 4 / 7)]
+    assert tt.vis.frames(torch.ones(1, 2, 700, 3))[0].shape == (700, 3, 3)
+
+
+def test_exposure_of_what_a_frame_adds_up():
+    """White is that of the frames as they are shown; that of all the light where it is accumulated."""
+    cube = torch.zeros(1, 5, 1, 2)
+    cube[0, :, 0, 0], cube[0, :, 0, 1] = torch.tensor([1.0, 2.0, 3.0, 4.0, 5.0]), 0.5
+    added = torch.stack([cube[:, :2].sum(1), cube[:, 2:4].sum(1), cube[:, 4]], 1)
+    for every, accumulate, exposure in (
+        (1, False, tt.vis.exposure_of_video(cube)), (2, False, tt.vis.exposure_of_video(added)),
+        (2, True, tt.vis.exposure_of(cube.sum(1))),
+    ):  # fmt: skip
+        shown = tt.vis.frames(cube, every=every, accumulate=accumulate, stamp=False, scale=1)
+        told = tt.vis.frames(cube, every=every, accumulate=accumulate, stamp=False, scale=1, exposure=exposure)
+        for one, other in zip(shown, told, strict=True):
+            np.testing.assert_array_equal(one, other)
+        weak = cube[:, :every].sum(1)
+        np.testing.assert_array_equal(told[0], to_bytes(tt.vis.tone_map(weak, exposure)))
+
+
+def test_parts_of_several_heights():
+    low, high = np.full((2, 3, 3), 40, np.uint8), np.full((5, 1, 3), 90, np.uint8)
+    both = tt.vis.side_by_side([[low, low], [high]])
+    assert len(both) == 1 and both[0].shape == (5, 3 + 4 + 1, 3)
+    assert (both[0][:2, :3] == 40).all() and not both[0][2:, :3].any() and (both[0][:, 7:] == 90).all()
+    np.testing.assert_array_equal(tt.vis.side_by_side([[high], [low]], gap=0)[0][:, 0], high[:, 0])
+
+
+def test_bytes_are_the_nearest():
+    assert to_bytes([-1.0, 0.0, 0.0999, 0.1, 0.5, 1.0, 2.0]).tolist() == [0, 0, 25, 26, 128, 255, 255]
+
+
+@pytest.mark.parametrize("fps, duration", [(50, 20), (30, 30), (24, 40), (7, 140)])
+def test_hundredths_of_a_second(tmp_path, fps, duration):
+    frames = [np.full((4, 6, 3), 80 * k, np.uint8) for k in range(3)]
+    assert read_gif(tt.vis.write_video(tmp_path / "a.gif", frames, 3, fps=fps))[1]["duration"] == duration
+
+
+def box(kind, size, long=False):
+    """A box of an MP4, of zeros."""
+    head = struct.pack(">I4s", 1 if long else size, kind) + (struct.pack(">Q", size) if long else b"")
+    return head + bytes(size - len(head))
+
+
+@pytest.mark.parametrize(
+    "content, whole",
+    [
+        (box(b"ftyp", 20) + box(b"moov", 30) + box(b"mdat", 50), True),
+        (box(b"moov", 30) + box(b"mdat", 50, long=True) + box(b"free", 8), True),
+        (box(b"moov", 30) + box(b"mdat", 50)[:-1], False),
+        (box(b"moov", 30) + box(b"mdat", 50) + bytes(3), False),
+        (box(b"ftyp", 20) + box(b"mdat", 50), False),
+        (box(b"ftyp", 20) + box(b"moov", 50), False),
+        (box(b"moov", 30) + struct.pack(">I4s", 7, b"mdat") + box(b"mdat", 50), False),
+        (b"", False),
+    ],
+)
+def test_what_is_a_whole_mp4(tmp_path, content, whole):
+    (tmp_path / "a.mp4").write_bytes(content)
+    assert video_file._is_whole(tmp_path / "a.mp4") == whole
+
+
+def test_what_was_added_is_not_added_again():
+    cube = torch.rand(2, 7, 3, 4, generator=torch.Generator().manual_seed(3))
+    running = _Running(cube)
+    np.testing.assert_allclose(running.until(5), cube[:, :5].sum(1), rtol=1e-6)
+    running.cube = torch.zeros_like(cube)
+    np.testing.assert_allclose(running.until(5), cube[:, :5].sum(1), rtol=1e-6)
+    np.testing.assert_allclose(running.until(6), cube[:, :5].sum(1), rtol=1e-6)
+    assert not running.until(4).any()
+
+
+def test_colours_of_a_palette():
+    """Those of the strip first; then what is seen in some pixels of large frames, to a sixty-fourth."""
+    frame = np.full((200, 200, 3), (203, 43, 15), np.uint8)
+    flat = frame.reshape(-1, 3)
+    flat[1::3] = (15, 203, 43)  # of 40000, each third one is looked at
+    flat[3] = (43, 15, 203)
+    found = [tuple(colour) for colour in np.reshape(video_file._palette([frame], 1).getpalette(), (-1, 3)).tolist()]
+    greys = [(level,) * 3 for level in range(44, 235, 24)]
+    assert found[: 5 + len(greys)] == [(20,) * 3, (95,) * 3, (235,) * 3, (0,) * 3, (255,) * 3, *greys]
+    assert {(200, 40, 12), (40, 12, 200)} <= set(found[5 + len(greys) :]) and (12, 200, 40) not in found
+
+
+def test_an_mp4_may_be_fast(tmp_path, monkeypatch):
+    told = []
+    monkeypatch.setattr(video_file, "_write_mp4", lambda target, frames, fps: told.append((list(frames), fps)))
+    monkeypatch.setattr(video_file, "replacing", lambda target, who: nullcontext(target))
+    frame = np.zeros((4, 6, 3), np.uint8)
+    assert tt.vis.write_video(tmp_path / "a.MP4", [frame, frame + 1], 2, fps=120) == tmp_path / "a.MP4"
+    ((frames, fps),) = told
+    assert fps == 120 and [int(one.max()) for one in frames] == [0, 1]

@@ -95,6 +95,21 @@ def test_what_cannot_be_drawn(tmp_path):
         vis.volume_views(volume(), extent=(1.0, 0.0))
     with pytest.raises(UnitError, match="extent"):
         vis.volume_views(volume(), extent=(1.0, float("inf")))
+    for wrong in ((-1.0, 1.0), (0.0, 1.0), (float("nan"), 1.0), (1.0,), (1.0, 2.0, 3.0), "x"):
+        with pytest.raises(UnitError, match="extent: expected"):
+            vis.depth_picture(torch.ones(2, 3), extent=wrong)
+    with pytest.raises(ShapeError, match=r"volume: expected \(Z, Y, X\), got \(0, 2, 3\)"):
+        vis.volume_views(torch.zeros(0, 2, 3))
+    for wrong in (torch.zeros(2), torch.zeros(0, 3), torch.zeros(1, 2, 3)):
+        with pytest.raises(ShapeError, match=r"depth: expected \(Y, X\)"):
+            vis.depth_picture(wrong)
+    for wrong in (torch.zeros(2, 3), torch.zeros(2, 4, 5), torch.zeros(3, 2, 4, 5)):
+        with pytest.raises(ShapeError, match=r"normals: expected \(3, Y, X\)"):
+            vis.normals_picture(wrong)
+    with pytest.raises(ShapeError, match=r"normals: expected \(3, 5, 6\)"):
+        vis.volume_views(volume(), normals=torch.zeros(3, 6, 5))
+    with pytest.raises(ShapeError, match=r"mask: expected \(2, 3\)"):
+        vis.depth_picture(torch.ones(2, 3), mask=torch.ones(3, 2))
     with pytest.raises(UnitError, match="gamma"):
         vis.volume_views(volume(), gamma=0.0)
     with pytest.raises(ShapeError, match="depth"):

@@ -106,7 +106,7 @@ def picture_figure(height: int, width: int, panels: int = 1, side: float = 4.2, 
 def enlarge(image: Image, factor: int) -> Image:
     """Every pixel as a square of `factor` pixels. Raises ShapeError when `factor` is not a whole number >= 1."""
     factor = count("picture: scale", factor, 1, ShapeError)
-    return image.repeat(factor, axis=0).repeat(factor, axis=1) if factor > 1 else image
+    return image.repeat(factor, axis=0).repeat(factor, axis=1)
 
 
 def missing(package: str) -> MissingPackageError:

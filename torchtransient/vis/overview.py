@@ -79,7 +79,7 @@ def median_pixel(steady: Tensor) -> tuple[int, int]:
     steady = real_tensor(steady, "median_pixel")
     if steady.ndim != 3 or steady.numel() == 0:
         raise ShapeError(f"median_pixel: expected a steady image (C, H, W), got {tuple(steady.shape)}.")
-    brightness = steady.detach().sum(0).flatten()
+    brightness = steady.sum(0).flatten()
     order = brightness.argsort(stable=True)
     order = order[brightness[order] > 0] if bool((brightness > 0).any()) else order
     flat = int(order[(order.numel() - 1) // 2])

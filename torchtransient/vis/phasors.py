@@ -115,7 +115,7 @@ def domain_colors(values: NDArray[Any], percentile: float = 99.0) -> NDArray[np.
     finite = np.isfinite(values)
     safe = np.where(finite, values, 0)
     amplitude = np.abs(safe)
-    level = np.sqrt(np.clip(amplitude / colour_maps.symmetric_limit(amplitude, percentile), 0, 1))
+    level = np.sqrt(amplitude / colour_maps.symmetric_limit(amplitude, percentile))
     image = colour_maps.cyclic(np.angle(safe) / (2 * math.pi), level)
     image[~finite] = 0.5
     return image

@@ -115,8 +115,6 @@ def peak_time_map(
     `laser` as in `transients_grid`; `limits` in metres as in `peak_time_picture`. Errors as both.
     """
     cube, axis = _grid(capture, laser, "peak_time_map")
-    if cube.shape[0] not in (1, 3):
-        raise ShapeError(f"peak_time_map: expected one channel or three, got {cube.shape[0]}.")
     return peak_time_picture(cube, path, axis=axis, limits=limits, title=title or _title(capture, laser))
 
 

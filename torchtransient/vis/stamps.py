@@ -54,7 +54,9 @@ def with_strip(image: Image, text: str, share: float | None = None) -> Image:
     draw.text((rows // 4, (rows - bar) / 2 + bar), text, fill=INK, font=font, anchor="lm")
     if share is not None:
         draw.rectangle((0, 0, width, bar - 1), fill=DIM)
-        draw.rectangle((0, 0, round(share * width) - 1, bar - 1), fill=INK) if share * width >= 1 else None
+        filled = round(share * width)
+        if filled:
+            draw.rectangle((0, 0, filled - 1, bar - 1), fill=INK)
     return np.concatenate([image, np.asarray(strip)])
 
 

@@ -57,9 +57,10 @@ def exposure_of_video(transient: Tensor, quantile: float = 0.99) -> float:
     counts = torch.zeros(_LOG_STEPS, dtype=torch.float64)
     for start in parts:
         values = _lit(transient, start).to(torch.float64).log()
-        counts += torch.histc(values.clamp(min=low), _LOG_STEPS, low, high)
+        # Two libraries' logarithms of the highest may differ in their last digit.
+        counts += torch.histc(values.clamp(low, high), _LOG_STEPS, low, high)
     reached = counts.cumsum(0) / counts.sum()
-    step = min(int(torch.searchsorted(reached, torch.tensor(quantile, dtype=torch.float64))), _LOG_STEPS - 1)
+    step = int(torch.searchsorted(reached, torch.tensor(quantile, dtype=torch.float64)))
     return 1.0 / math.exp(low + (step + 1) * (high - low) / _LOG_STEPS)
 
 
@@ -110,15 +111,13 @@ def tone_map(
 
 def _curve(linear: Tensor, curve: str, gamma: float, stops: float) -> Tensor:
     if curve == "srgb":
-        x = linear.clamp(max=1)
-        return torch.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
+        return torch.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
     if curve == "gamma":
-        return linear.clamp(max=1) ** (1 / gamma)
+        return linear ** (1 / gamma)
     if curve == "linear":
         return linear
     brightest = linear.amax(0)
-    tiny = torch.finfo(linear.dtype).tiny
-    level = (1 + brightest.clamp(min=tiny, max=1).log2() / stops).clamp(0, 1)
+    level = (1 + brightest.log2() / stops).clamp(0, 1)
     # The ratio of the channels is shown on the scale of the eye, else every colour would turn to its primary.
     ratio = linear / torch.where(brightest > 0, brightest, 1.0)
     return level * _curve(ratio, "srgb", gamma, stops)
