@@ -41,6 +41,12 @@ LEFT = {
 }  # fmt: skip
 
 
+@pytest.fixture(autouse=True)
+def _beside_the_library(tmp_path, monkeypatch):
+    """Names of files are texts, too."""
+    monkeypatch.chdir(tmp_path)
+
+
 def required(call):
     """The arguments that a function or class cannot do without."""
     either = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
