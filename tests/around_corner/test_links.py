@@ -7,11 +7,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from support.hidden_shapes import mesh, plate, scene_of
+from support.hidden_shapes import mesh, plate, scene_of, wall_grid
 from torchtransient.errors import SceneError
 from torchtransient.interfaces import CaptureType
 from torchtransient.plugins.around_corner import chains, late_light
 from torchtransient.plugins.around_corner.late_light import LateLanes, LateLaunch, LateLight, Tiles
+from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 from torchtransient.plugins.transport.strategy import Local
 
 VARIANT = "llvm_ad_mono"
@@ -102,6 +103,36 @@ def test_sides_of_surfaces_that_are_drawn():
     found = chains._probability_of_front(plan, p, n, mi.Bool([True] * 4))
     np.testing.assert_allclose(np.array(found), [0.9, 0.9, 0.1, 0.1], rtol=1e-6)
     assert np.array(chains._probability_of_front(plan, p, n, mi.Bool([False] * 4))).tolist() == [1] * 4
+
+
+@pytest.mark.parametrize("name", ["wall", "floor"])
+def test_steps_to_what_is_hidden_weigh_its_form_factor(name):
+    """From a wall, which most go to the hidden area from, and from what belongs to it."""
+    wall, floor, roof = (mesh(one, (v, f[:, ::-1] if one != "roof" else f)) for one, (v, f) in (
+        ("wall", plate(1, 1, (5, 0, 0))), ("floor", plate(1, 1, (0, 0, 0))), ("roof", plate(1, 0.6, (0, 0, 0.8)))
+    ))  # fmt: skip
+    plan = Local(elements=HiddenElements([floor, roof], *wall_grid(2)), center=mi.Point3f(0, 0, 0))
+    shape = {"wall": wall, "floor": floor}[name]
+    side = 64
+    strata = np.stack(np.meshgrid(np.arange(side), np.arange(side)), -1).reshape(-1, 2)
+    places = (strata + np.random.default_rng(7).random((side**2, 2))) / side
+    numbers = [mi.UInt32((places[:, i] * 2.0**32).astype(np.uint32)) for i in range(2)]
+    up = mi.Vector3f(0, 0, 1)
+    start = chains.Vertices(p=mi.Point3f(0, 0, 0), n=up, geometric_n=up, shape=dr.gather(
+        mi.ShapePtr, mi.ShapePtr(shape), dr.zeros(mi.UInt32, side**2)
+    ), primitive=dr.zeros(mi.UInt32, side**2), alive=dr.full(mi.Bool, True, side**2))  # fmt: skip
+    vertex, weight = chains._guided_step(scene_of(floor, roof, wall), plan, start, numbers, (0, 1))
+    alive, p = np.array(vertex.alive), np.array(vertex.p)
+    # A quarter of a rectangle, of sides a and b in parts of its height, straight above.
+    a, b = 0.5 / 0.8, 0.3 / 0.8
+    quarter = sum(s / np.hypot(1, s) * np.arctan(t / np.hypot(1, s)) for s, t in ((a, b), (b, a))) / (2 * np.pi)
+    assert np.array(weight).mean() == pytest.approx(4 * quarter, rel=0.02)
+    np.testing.assert_allclose(p[2, alive], 0.8, rtol=1e-5)
+    assert not np.array(weight)[~alive].any()
+    # Most of the steps from the wall, a quarter of the others go to the hidden area, to the roof by its share.
+    roofs = plan.elements.probabilities[0][plan.elements.elements.centers()[:, 2] > 0.5].sum()
+    share = {"wall": 0.9, "floor": 0.25}[name]
+    assert alive.mean() == pytest.approx(share * roofs + (1 - share) * 4 * quarter, abs=0.01)
 
 
 # ------------------------------------------------------------------------------------------------- tiles and lanes
