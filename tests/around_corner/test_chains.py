@@ -245,6 +245,28 @@ def test_progress_goes_up_to_one():
 # ------------------------------------------------------------------------------------------------ colours
 
 
+@pytest.mark.parametrize("kind", ["confocal", "single"])
+def test_chains_are_the_same_in_every_colour(corner, kind):
+    """Light of two hidden bounces goes by the square of their albedo, also where another colour is not scattered."""
+    given = corner[2:]
+    grey = by_chains(mesh("a", folded_plates(), 0.5, two_sided=True), *given, kind)
+    albedos = [0.0, 0.8, 0.3]
+    shape = {"type": "rgb", "value": albedos}
+    with mi.variant_context("llvm_ad_rgb"):
+        colours = by_chains(mesh("a", folded_plates(), shape, two_sided=True), *given, kind)
+    assert not colours[..., 0].any()
+    for channel in (1, 2):
+        expected = grey[..., 0] * (albedos[channel] / 0.5) ** 2
+        np.testing.assert_allclose(colours[..., channel], expected, rtol=1e-3, atol=1e-4 * grey.max())
+
+
+def by_chains(shape, points, normals, kind):
+    scene, sensors = scene_of(shape), wall_of(points, normals)
+    elements = density_of(scene, table_of([shape]), points, normals)
+    lasers = sensors if kind == "confocal" else wall_of(points[:1], normals[:1])
+    return chains(scene, elements, histogram(2), sensors, lasers, kind, 64, bounces=(4, 4))[1]
+
+
 @pytest.mark.slow
 def test_colours():
     """Of red, green and blue albedos, each channel is that of paths."""

@@ -9,6 +9,7 @@ import pytest
 import scipy.optimize
 
 from support.hidden_shapes import ball, join, mannequin, mesh, plate, wall_grid
+from torchtransient.plugins.around_corner import edges as edges_module
 from torchtransient.plugins.around_corner import hiding
 from torchtransient.plugins.around_corner.edges import APART, Edges, EdgeTable, Triangles
 from torchtransient.plugins.around_corner.hiding import hiding_pairs, parts_of
@@ -225,6 +226,18 @@ def test_edges_are_drawn_by_what_is_seen_of_them():
     assert set(np.round(inverse * 1000)) == set(np.round(edges.share[order] * length.sum() / length * 1000))
 
 
+def test_faces_seen_edge_on_have_no_outline():
+    """From the very plane of a face: a viewpoint at one side of it sees one."""
+    edge = np.array([[[0, -1, 3], [0, 1, 3], [0, 0, 5], [0, 0, 5.0]]])
+    up = np.array([[0, 0, 1.0]])
+    assert edges_module._weights_of_some(edge, np.zeros((1, 3)), up).tolist() == [0]
+    beside = np.array([[4.0, 0, 0]])
+    assert edges_module._weights_of_some(edge, beside, up)[0] == pytest.approx(2 / 25 * 0.6)
+    # One face on each side of the line of sight: a crease that is crossed.
+    edge[0, 3] = [-9, 0, 3]
+    assert edges_module._weights_of_some(edge, beside, up).tolist() == [0]
+
+
 def test_edges_follow_the_vertices_of_their_meshes():
     meshes = hinged()
     params = [mi.traverse(one) for one in meshes]
@@ -268,6 +281,17 @@ def test_planes_through_viewpoints_are_found_where_there_are_some():
             seen[0] += 1
             assert not apart
     assert min(seen) > 10
+
+
+def test_planes_through_very_many_viewpoints():
+    """Each has its own answer, in whichever block it is."""
+    a, b = np.array([[1.0, 0, 2], [1, 1, 3]]), np.array([[-1.0, 0, 2], [-2, 1, 4]])
+    # Between the two there is a plane; from beside them one lies behind the other.
+    beside = a[0] + 2 * (a[0] - b[0])
+    viewpoints = np.tile([0.1, 0.2, -1.0], (8200, 1))
+    hidden = [0, 4095, 4097, 8193, 8199]
+    viewpoints[hidden] = beside
+    assert np.flatnonzero(~hiding._cones_apart(a, b, viewpoints)).tolist() == hidden
 
 
 def test_what_lies_beyond_hides_nothing():

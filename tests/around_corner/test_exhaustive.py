@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import torchtransient.plugins.around_corner.exhaustive as exhaustive
-from support.hidden_shapes import ball, folded_plates, mannequin, mesh, scene_of, wall_grid
+from support.hidden_shapes import ball, folded_plates, mannequin, mesh, plate, scene_of, wall_grid
 from support.third_bounce_runs import captured, film_of, table_of, wall_of
 from torchtransient.errors import SceneError, ShapeError
 from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
@@ -90,8 +90,51 @@ def test_blocks_of_samples_add_up(monkeypatch):
     runs = Runs(SCENES["body"]())
     _, cube = runs.exhaustive()
     monkeypatch.setattr(exhaustive, "MOST_BYTES", 8 * GRID**2 * 50)
+    made, block = [], exhaustive.SampleBlock
+    monkeypatch.setattr(exhaustive, "SampleBlock", lambda *a: made.append(a[2:]) or block(*a))
     _, parts = runs.exhaustive()
     assert parts == pytest.approx(cube, rel=1e-5, abs=1e-7 * cube.max())
+    # Eight bytes for each sample and point, in whole turns of four; spots of their own are points, too.
+    assert made == [(0, 48), (48, 96), (96, 130)]
+    runs.exhaustive(runs.spots)
+    assert made[3:] == [(k, min(k + 24, 130)) for k in range(0, 130, 24)]
+
+
+@pytest.mark.parametrize("name", ["smooth", "V and plate"])
+def test_how_points_see_samples(name):
+    """Cosines over the squared distance, that of the shading normal towards a spot and that of the surface towards a
+    scanned point, negative at backs, times the root of what one colour scatters; zero where something is in between.
+    """
+    runs = Runs(SCENES[name]())
+    if name != "smooth":
+        v, f = plate(0.3, 0.8, (0.1, 0, 0.4))
+        runs.scene = scene_of(*SCENES[name](), mesh("sheet", (v, f)))
+    runs.pairs.start_render(1)
+    block = exhaustive.SampleBlock(runs.job(runs.pairs), runs.spots, 7, 25)
+    s, some = runs.samples, slice(7, 25)
+    p, n = np.array(s.p)[:, some].T, np.array(s.n)[:, some].T
+    surface = np.array(s.geometric_n)[:, some].T if s.smooth else n
+    to = wall_grid(GRID, 0.4)[0][None] - p[:, None]
+    r = np.linalg.norm(to, axis=2)
+    cos, across = ((to * each[:, None]).sum(2) / r for each in (n, surface))
+    front, back, weight = (np.array(each).reshape(-1)[some, None] for each in (s.front, s.back, s.weight))
+    side = np.where(cos > 0, front, back)
+    sees = side > 0
+    if name != "smooth":
+        at = wall_grid(GRID, 0.4)[0] + (p[:, None] - wall_grid(GRID, 0.4)[0]) * (0.4 / p[:, 2])[:, None, None]
+        sees &= ~((np.abs(at[..., 0] - 0.1) < 0.15) & (np.abs(at[..., 1]) < 0.4) & (p[:, 2] > 0.4)[:, None])
+    assert block.rows == 20 and block.count == 18 and block.values is None
+    for table, one in ((block.seen, across), (block.lit, cos)):
+        found = np.array(table).reshape(20, GRID**2, 2)
+        assert not found[18:].any()
+        expected = np.abs(one) * p[:, None, 2] / r**3 * np.sqrt(side * weight) * np.sign(cos)
+        np.testing.assert_allclose(found[:18, :, 1], r, rtol=1e-5)
+        if name == "smooth":  # a convex body hides what its surface turns away
+            sees = (side > 0) & (across > 0)
+        there = found[:18, :, 0] != 0
+        np.testing.assert_allclose(found[:18, :, 0][there], expected[there], rtol=2e-4)
+        assert not (there & ~sees).any() and (there == sees).mean() > (0.99 if name == "smooth" else 0.8)
+        assert 10 < there.sum() < there.size
 
 
 @pytest.mark.parametrize("window", [(1.0, 60), (1.9, 6)])
@@ -119,15 +162,17 @@ def test_gates_are_sums_of_bins_and_phasors_are_refused():
 
 
 def test_colours():
-    """Each channel is a capture in its own albedo and energy."""
+    """Each channel is a capture in its own albedo and energy; where one is black the others are seen."""
     with mi.variant_context("llvm_ad_rgb"):
-        shapes = [mesh("a", folded_plates(), {"type": "rgb", "value": [0.2, 0.5, 0.8]}, two_sided=True)]
+        shapes = [mesh("a", folded_plates(), {"type": "rgb", "value": [0.0, 0.5, 0.8]}, two_sided=True)]
         runs = Runs(shapes)
         job = lambda film: ThirdBounce(runs.scene, film, runs.samples, runs.sensors, mi.Color3f(1, 2, 3))  # noqa: E731
         steady, cube = captured(runs.pairs, lambda: exhaustive.add_exhaustive(job(runs.pairs), runs.sensors))
         _, confocal = captured(runs.one, lambda: job(runs.one).add_confocal())
-    ratio = np.array([0.2, 1.0, 2.4])
-    for array in (steady, cube, confocal):
+        spot = wall_of([[0.1, 0.2, 0]], [[0, 0, 1]])
+        _, single = captured(runs.one, lambda: job(runs.one).add_single(spot))
+    ratio = np.array([0.0, 1.0, 2.4])
+    for array in (steady, cube, confocal, single):
         total = array.reshape(-1, 3).sum(0)
         assert total / total[1] == pytest.approx(ratio, rel=1e-5)
     mono = Runs([mesh("a", folded_plates(), 0.5, two_sided=True)])

@@ -97,6 +97,11 @@ def test_spots_that_are_the_scanned_points(walls):
     assert not shared_light._same(seen(walls, 0.25), points)
     missed = seen(walls, 0.25, 20, -0.5)
     assert not shared_light._same(missed, missed)
+    # A millionth of their coordinates, and of a metre.
+    for z, off, same in ((0, 1e-6, True), (0, 1.2e-6, False), (3, 3.5e-6, True), (3, 4.6e-6, False)):
+        at, beside = (Local(p=mi.Point3f(0, 0, [5, z]), wi=mi.Vector3f(0, 0, 1), is_valid=lambda: mi.Bool([True] * 2))
+                      for z in (z, z + off))  # fmt: skip
+        assert shared_light._same(beside, at) is same
     turned = seen(walls, 0.25, 5.5, -0.5)
     turned.wi = -turned.wi
     assert not shared_light._same(turned, points)

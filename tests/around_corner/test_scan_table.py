@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -230,3 +231,17 @@ def test_what_is_left_for_paths(shared, first, last, lights_itself, longest):
     division = Division.of(shared, first, last, lights_itself)
     assert (division.longest, division.walks, division.third_bounce) == (longest, longest > 0, 3 in shared)
     assert division.chained == range(max(shared.start, 4), max(shared.stop, 4))
+
+
+@pytest.mark.parametrize("key", ["laser.to_world", "wall.to_world"])
+def test_what_of_spots_is_attached(key):
+    """What the table says, and no other field of the interaction: lanes tell those."""
+    scene = mi.load_dict(scan_scene({"a": plane()}, "single"))
+    params = mi.traverse(scene)
+    dr.enable_grad(params[key])
+    params.update()
+    integrator = scene.integrator()
+    spots = integrator.scan_table(scene, integrator.contents(scene, scene.sensors()[0])).spots
+    assert dr.grad_enabled(spots.si.p) and dr.grad_enabled(spots.length)
+    assert not any(dr.grad_enabled(getattr(spots.si, name)) for name in ("t", "wi", "dn_du", "dn_dv"))
+    assert [dr.grad_enabled(each) for each in (spots.ray.d, spots.si.n)] == [key[0] == "l", key[0] == "w"]

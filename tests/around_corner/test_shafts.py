@@ -192,6 +192,31 @@ def test_the_box_of_a_scan():
             middle[axis] = end[axis] + sign * 1.1 * slack
             assert not region.holds(np.stack([middle @ region.frame, points[0]]))
     np.testing.assert_allclose(ScanRegion(points, np.tile([[0, 0, 1.0], [0, 0, -1.0]], (6, 1))).frame[2], [0, 0, 1])
+    # A mean of normals that differ is shorter than they are.
+    curved = ScanRegion(points, np.tile([[0.96, 0.0, 0.28], [-0.96, 0.28, 0.0]], (6, 1)))
+    np.testing.assert_allclose(curved.frame @ curved.frame.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(curved.frame[2], [0, 0.5**0.5, 0.5**0.5], atol=1e-12)
+
+
+@pytest.mark.parametrize(("obstacles", "leaves"), [(0, 2), (1, 2), (2, 2), (3, 4), (4, 4), (5, 8), (8, 8), (9, 16)])
+def test_trees_have_no_more_leaves_than_they_need(obstacles, leaves):
+    """The next power of two, and both ends of the root."""
+    region, _, _ = random_region()
+    balls = [mi.load_dict({"type": "sphere", "center": [0, 0, k]}) for k in range(obstacles)]
+    tree = shafts.ObstacleTree(balls, region, np.ones((1, 3, 3)), 1e-9)
+    assert (tree.leaves[0], dr.width(tree.low), dr.width(tree.corners[0])) == (leaves, 2 * leaves, leaves)
+
+
+@pytest.mark.parametrize(("scanned", "hidden"), [
+    ([0.3, 0.2], [1000, -1000]), ([0.3, 0.2], [-1000, 1000]), ([0.3, -1000], [0.4, 0.3]), ([1000, 0.2], [0.4, 0.3]),
+])  # fmt: skip
+def test_elements_beside_a_scan_are_in_doubt(scanned, hidden):
+    """By the rounding of the largest coordinate of the scan and of what is hidden, whatever its sign."""
+    region = ScanRegion([[0, 0, 0], [*scanned, 0]], [[0, 0, 1.0]] * 2)
+    rounding = 1000 * shafts.ROUNDING
+    for height, clear in ((0.8 * rounding, False), (1.3 * rounding, True)):
+        elements = table_of([mesh("a", plate(0.1, 0.1, (*hidden, height)))]).elements
+        assert set(clear_elements([], elements, region).tolist()) == {clear}
 
 
 def test_shafts_touch_what_they_hold():

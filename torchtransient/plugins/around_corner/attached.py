@@ -96,15 +96,14 @@ def ends_of_samples(scene: Any, elements: Any, samples: Any, meshes: Any, laser:
     if laser is None:
         fields["back"] = found.back
     else:
-        line = span(_line_start(found, samples.smooth), laser.p, mi.Vector3f(laser.n))
+        start, n = _line_start(found, samples.smooth), mi.Vector3f(laser.n)
+        line = span(start, laser.p, n)
         arrives = dr.abs(line.cos) * line.wall_cos * line.inverse_square
         reflected = dr.select(line.cos > 0, found.front, found.back)
         with dr.suspend_grad():
-            plain = _line_start(Local(**{k: dr.detach(v) for k, v in vars(found).items()}), samples.smooth)
-            to = span(plain, dr.detach(laser.p), mi.Vector3f(dr.detach(laser.n)))
-            lit = dr.detach(arrives) > 0
-            lit &= ~occluded(scene, plain, to, dr.detach(laser.p), mi.Vector3f(dr.detach(laser.n)), lit)
-        fields["n"] = dr.select(to.cos > 0, found.n, -found.n)
+            lit = arrives > 0
+            lit &= ~occluded(scene, start, line, laser.p, n, lit)
+        fields["n"] = dr.select(line.cos > 0, found.n, -found.n)
         fields["front"] = dr.select(lit, reflected * arrives, 0)
         fields["delay"] = dr.select(lit, line.r, 0)
     if samples.smooth:

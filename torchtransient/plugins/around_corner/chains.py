@@ -119,7 +119,9 @@ def _cosine_direction(n: Any, numbers: list[Any], which: tuple[int, int]) -> Any
 
 
 def _step(scene: Any, plan: ChainPlan, start: Vertices, d: Any, active: Any) -> Vertices:
-    """What a ray meets. Offsets as in :func:`.geometry.occluded`, by the size of the hidden scene."""
+    """What a ray meets, its ``value`` still to be said. Offsets as in :func:`.geometry.occluded`, by the size of the
+    hidden scene.
+    """
     reach = dr.max(dr.abs(start.p)) + dr.norm(plan.center - start.p)
     offset = dr.mulsign(OFFSET * reach, dr.dot(start.geometric_n, d))
     ray = mi.Ray3f(mi.Point3f(start.p + start.geometric_n * offset), d)
@@ -135,7 +137,7 @@ def _step(scene: Any, plan: ChainPlan, start: Vertices, d: Any, active: Any) -> 
     geometric_n = mi.Vector3f(front_normal(si)) if plan.elements.smooth else n
     alive = lit & (dr.max(albedo) > 0)
     return Vertices(
-        p=si.p, n=n * turn, geometric_n=geometric_n * turn, albedo=albedo, value=albedo * dr.inv_pi, alive=alive,
+        p=si.p, n=n * turn, geometric_n=geometric_n * turn, albedo=albedo, value=albedo, alive=alive,
         shape=pi.shape, primitive=pi.prim_index, uv=pi.prim_uv,
     )  # fmt: skip
 

@@ -64,7 +64,7 @@ class Tiles:
         self.numbers = (y % down) * across + x % across
         self.count = across * down
         ty, tx = np.divmod(np.arange(self.count), across)
-        places = np.stack([tx, ty, 0 * tx], 1)
+        places = np.stack([tx, ty, np.zeros_like(tx)], 1)
         rank = np.empty(self.count, dtype=np.uint32)
         rank[morton_order(places, bits=max(1, int(max(across, down) - 1).bit_length()))] = np.arange(self.count)
         self.of, self.rank = mi.UInt32(self.numbers.astype(np.uint32)), mi.UInt32(rank)

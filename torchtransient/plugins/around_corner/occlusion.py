@@ -116,21 +116,21 @@ class MutualOcclusion:
 
     def _terms(self, rays: Any, pixel: Any, job: Pass) -> list[Local]:
         """One term for each viewpoint: ``value`` (detached), ``outwards`` (attached), ``opl``, ``active``."""
-        world = self.world
-        ray = dr.detach(rays.ray)
+        world, ray = self.world, rays.ray
         leg = rays.leg if rays.leg is not None else world.scene.ray_intersect_preliminary(ray, coherent=True)
-        seen = leg.compute_surface_interaction(rays.ray, mi.RayFlags.All)
+        seen = leg.compute_surface_interaction(ray, mi.RayFlags.All)
         found = seen.is_valid()
         spot = self.spots.general_spot(ray.wavelengths, found)
         found &= spot.valid
+        # Attached where the scene is; all but seen_at and lit_at is read where derivatives are suspended.
         place = Local(
-            seen=dr.detach(seen), lit=dr.detach(spot.si), spot=spot, seen_at=seen.p, lit_at=spot.p, ray=ray, found=found
+            seen=seen, lit=spot.si, spot=spot, seen_at=seen.p, lit_at=spot.p, ray=ray, found=found, η=rays.η
         )  # fmt: skip
-        place.before = self.integrator.first_opl(self.film, rays)
-        if not world.camera_unwarp:
-            place.before += mi.Float64(dr.norm(place.seen.p - ray.o) * dr.detach(rays.η))
-        place.before += mi.Float64(dr.detach(spot.leg))
-        place.η = dr.detach(rays.η)
+        with dr.suspend_grad():
+            place.before = self.integrator.first_opl(self.film, rays)
+            if not world.camera_unwarp:
+                place.before += mi.Float64(dr.norm(seen.p - ray.o) * rays.η)
+            place.before += mi.Float64(spot.leg)
         edge = self._edge_point(pixel, job)
         views = [self._term(place, edge, from_spot=False)]
         if not self.spots.confocal:
@@ -148,17 +148,18 @@ class MutualOcclusion:
         x, u = plane_point(number, job.spp, seed)
         index, per_edge = self.edges.sample(x)
         a, b = self.edges.end_points(index)
-        along = dr.detach(b) - dr.detach(a)
-        length = dr.norm(along)
+        with dr.suspend_grad():
+            along = b - a
+            length = dr.norm(along)
         p, sides = dr.lerp(a, b, u), self.edges.third_corners(index)
-        return Local(p=p, at=dr.detach(p), t=along / length, sides=sides, weight=length * per_edge)
+        return Local(p=p, t=along / length, sides=sides, weight=length * per_edge)
 
     def _term(self, place: Local, edge: Local, from_spot: bool) -> Local:
         """The boundary term of one viewpoint."""
         scene = self.world.scene
         viewer, Q = (place.lit, place.lit_at) if from_spot else (place.seen, place.seen_at)
         with dr.suspend_grad():
-            d = edge.at - viewer.p
+            d = edge.p - viewer.p
             distance = dr.norm(d)
             distance = dr.select(distance > 0, distance, 1)
             d /= distance
@@ -166,7 +167,7 @@ class MutualOcclusion:
             spans = dr.norm(across)
             # Lanes without a term must not multiply zero by what is not a number.
             n = dr.select(spans > 0, across / spans, 0)
-            here, there = (dr.dot(n, side - edge.at) for side in edge.sides)
+            here, there = (dr.dot(n, side - edge.p) for side in edge.sides)
             active = place.found & (here * there > 0)
             n = dr.select(here > 0, -n, n)
             past = viewer.spawn_ray(dr.normalize(d + n * BESIDE))
@@ -197,8 +198,7 @@ class MutualOcclusion:
         active &= (r_seen > 0) & (r_spot > 0) & (cos_seen > EDGE_ON) & (cos_spot > EDGE_ON)
         at_wall = self._scattered(seen, place.ray.d, d_seen, active)
         hidden = self._scattered(si, d_seen, d_spot, active)
-        light = dr.detach(place.spot.light(d_spot, active))
-        value = product(at_wall, product(hidden, light))
+        value = product(at_wall, product(hidden, place.spot.light(d_spot, active)))
         # The cosine towards the spot is in the BSDF's value.
         measure = dr.rcp(dr.square(r_spot)) if not from_spot else cos_seen / (cos_spot * dr.square(r_seen))
         opl = place.before + mi.Float64((r_seen + r_spot) * place.η)

@@ -41,7 +41,7 @@ class ScanTable:
         self.scene, self.sensor, self.memory = scene, sensor, contents.memory
         self.rays, self.spots = scan_rays(sensor), None
         with dr.suspend_grad():
-            self.found = scene.ray_intersect_preliminary(dr.detach(self.rays), coherent=True)
+            self.found = scene.ray_intersect_preliminary(self.rays, coherent=True)
             dr.eval(self.found)
         if laser:
             aims = aims_of(scene, sensor, capture, fov)
@@ -97,7 +97,7 @@ class ScanTable:
         index = mi.UInt32((rows[:, None] * int(size[0]) + columns).ravel().astype(np.uint32))
         with dr.suspend_grad():
             found = dr.gather(mi.PreliminaryIntersection3f, self.found, index)
-            si = found.compute_surface_interaction(dr.gather(mi.Ray3f, dr.detach(self.rays), index), mi.RayFlags.All)
+            si = found.compute_surface_interaction(dr.gather(mi.Ray3f, self.rays, index), mi.RayFlags.All)
             n = front_normal(si)
             n = dr.select(si.wi.z < 0, -n, n)
             dr.eval(si.p, n, si.t)
@@ -151,10 +151,10 @@ class LaserSpots:
     def __init__(self, scene: Any, laser: Any, aims: Any, origin: Any) -> None:
         self.emitter, self.origin = laser, origin
         there = dr.norm(aims)
-        _check_not_at(dr.detach(there), "laser", "emitter's to_world or laser_origin")
+        _check_not_at(there, "laser", "emitter's to_world or laser_origin")
         self.ray = mi.Ray3f(self.origin, aims / there)
         with dr.suspend_grad():
-            pi = scene.ray_intersect_preliminary(dr.detach(self.ray), coherent=True)
+            pi = scene.ray_intersect_preliminary(self.ray, coherent=True)
             dr.eval(pi)
         si = pi.compute_surface_interaction(self.ray, mi.RayFlags.All)
         self.shape = pi.shape
@@ -285,7 +285,7 @@ def scanned_points(scene: Any, sensor: Any) -> Any:
         return sensor.scanned()
     ray = scan_rays(sensor)
     with dr.suspend_grad():
-        pi = scene.ray_intersect_preliminary(dr.detach(ray), coherent=True)
+        pi = scene.ray_intersect_preliminary(ray, coherent=True)
         dr.eval(pi)
     si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal)
     return dr.select(si.is_valid(), si.p, ray.o + ray.d)

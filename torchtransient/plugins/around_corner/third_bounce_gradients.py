@@ -45,7 +45,8 @@ class ThirdBounceGradients:
     def connection(self, sample: Any, point: Any, k: Any) -> tuple[Any, Any, Any, Any]:
         """(value, length and arrival minus the film's start of sample ``k`` at a point, whether it arrives)."""
         geometric_n = sample.geometric_n if self.smooth else sample.n
-        line = span(Local(p=sample.p, n=sample.n, geometric_n=geometric_n), point.p, point.n)
+        start = Local(p=sample.p, n=sample.n, geometric_n=geometric_n)
+        line = span(start, point.p, point.n)
         if self.lit:
             side, reflected, length = line.cos > 0, sample.front, line.r + sample.delay
             g = dr.abs(line.geometric_cos) * line.wall_cos * line.inverse_square
@@ -54,15 +55,13 @@ class ThirdBounceGradients:
             reflected = dr.select(line.cos > 0, sample.front, sample.back)
             g = dr.abs(line.cos * line.geometric_cos) * dr.square(line.wall_cos * line.inverse_square)
         length = length + point.leg
-        active = dr.detach(side & (g > 0))
-        opl = mi.Float64(dr.detach(length)) - self.film.start_opl
-        if self.window is not None:
-            active &= self.window.counts(opl)
+        active = side & (g > 0)
         with dr.suspend_grad():
-            plain, line = (Local(**{n: dr.detach(v) for n, v in vars(x).items()}) for x in (sample, line))
-            plain.geometric_n = plain.geometric_n if self.smooth else plain.n
+            opl = mi.Float64(length) - self.film.start_opl
+            if self.window is not None:
+                active &= self.window.counts(opl)
             in_doubt = active & (k >= self.clear)
-            active &= ~occluded(self.scene, plain, line, dr.detach(point.p), dr.detach(point.n), in_doubt)
+            active &= ~occluded(self.scene, start, line, point.p, point.n, in_doubt)
         return reflected * g * point.value, length, opl, active
 
     # ------------------------------------------------------------------------------------------------- reverse
@@ -127,7 +126,7 @@ class ThirdBounceGradients:
             value, length, opl, arrives = self.connection(sample, point, k)
             d_value, d_opl = tangents_of([value, slope_only(length)])
         kept["dL"] = kept["dL"] + dr.select(arrives, d_value, 0)
-        block.put_slope(kept["block"], opl, d_value, dr.detach(value) * d_opl, arrives)
+        block.put_slope(kept["block"], opl, d_value, value * d_opl, arrives)
 
 
 def dr_copy(local: Local) -> Local:

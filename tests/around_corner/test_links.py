@@ -1,0 +1,239 @@
+"""Groups of chains by themselves: their links, their numbers, and which lanes take them, against numpy."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from support.hidden_shapes import mesh, plate, scene_of, wall_grid
+from torchtransient.errors import SceneError
+from torchtransient.interfaces import CaptureType
+from torchtransient.plugins.around_corner import chains, late_light
+from torchtransient.plugins.around_corner.late_light import LateLanes, LateLaunch, LateLight, Tiles
+from torchtransient.plugins.sampling.hidden_elements import HiddenElements
+from torchtransient.plugins.transport.strategy import Local
+
+VARIANT = "llvm_ad_mono"
+
+
+def vertices(rng, count, low, high, up):
+    """Points in a box whose normals point up or down, by and large; every fifth one is dead."""
+    n, g = (rng.normal(size=(count, 3)) * 0.5 + [0, 0, up] for _ in range(2))
+    found = Local(p=rng.uniform(low, high, (count, 3)), n=n, geometric_n=g, value=rng.uniform(0.2, 2, count),
+                  alive=np.arange(count) % 5 != 4, length=rng.uniform(1, 2, count))  # fmt: skip
+    types = {"p": mi.Point3f, "n": mi.Vector3f, "geometric_n": mi.Vector3f, "value": mi.UnpolarizedSpectrum,
+             "alive": mi.Bool, "length": mi.Float}  # fmt: skip
+    given = {name: kind(np.transpose(getattr(found, name))) for name, kind in types.items() if name != "value"}
+    given["value"] = mi.UnpolarizedSpectrum(mi.Float(found.value.astype(np.float32)))
+    return found, Local(**given)
+
+
+@pytest.mark.parametrize("smooth", [True, False])
+def test_links_of_heads_and_tails(smooth):
+    """Every tail with the heads of its group, weighed by what all of them send there: cosines over the squared
+    distance, none where one turns its back or a sheet is in between.
+    """
+    rng, size, groups = np.random.default_rng(4), 4, 3
+    count = size * groups
+    heads, heads_in = vertices(rng, count, [-1, -1, 0], [1, 1, 0.4], 0.6)
+    tails, tails_in = vertices(rng, count, [-1, -1, 1], [1, 1, 1.5], -0.6)
+    density = rng.uniform(0.02, 0.3, count)
+    scene = scene_of(mesh("sheet", plate(0.9, 0.7, (0.3, -0.2, 0.7))))
+    table = [chains.VertexTable(each, smooth) for each in (heads_in, tails_in)]
+    links = chains.Links(scene, Local(size=size), *table, mi.Float(density.astype(np.float32)))
+    surface = [each.geometric_n if smooth else each.n for each in (heads, tails)]
+    expected, counts = {}, [0] * groups
+    for t in range(count):
+        group, q, r = t // size, np.zeros(size), np.zeros(size)
+        for i in range(size):
+            h = group * size + i
+            d = tails.p[t] - heads.p[h]
+            r[i] = np.linalg.norm(d)
+            at = heads.p[h] + d * (0.7 - heads.p[h, 2]) / d[2]
+            hidden = abs(at[0] - 0.3) < 0.45 and abs(at[1] + 0.2) < 0.35
+            if heads.alive[h] and tails.alive[t] and tails.n[t] @ d < 0 and not hidden:
+                q[i] = max(heads.n[h] @ d, 0) * abs(surface[1][t] @ d) / r[i] ** 4 / np.pi
+        drawn = 0.75 * q.sum() + size * 0.25 * density[t]
+        for i in np.flatnonzero(q):
+            expected[group * size + i, t] = q[i] * np.pi / drawn * heads.value[group * size + i], r[i]
+            counts[group] += 1
+    assert len(set(counts)) > 1 and 8 < len(expected) < 30
+    assert np.array(links.count).tolist() == counts and links.most == max(counts)
+    assert np.array(links.first).tolist() == [0, counts[0], counts[0] + counts[1]]
+    rows = np.array(links.flat).reshape(-1, 4)
+    assert len(rows) == len(expected) + 1 and not rows[-1].any()
+    # Group by group, tail by tail.
+    assert [(int(h), int(t)) for *_, h, t in rows[:-1]] == sorted(expected, key=lambda pair: pair[::-1])
+    found = {(int(h), int(t)): (weight, r) for weight, r, h, t in rows[:-1]}
+    for pair, numbers in expected.items():
+        assert found[pair] == pytest.approx(numbers, rel=1e-4)
+
+
+def test_more_chains_than_single_precision_counts():
+    heads = Local(p=mi.Point3f(dr.zeros(mi.Float, 2**24 + 1), 0, 0))
+    with pytest.raises(SceneError, match=r"at most 2\^24 chains at a time, got 16777217"):
+        chains.Links(None, Local(size=4), heads, None, None)
+
+
+def test_vertices_in_memory_are_taken_by_number():
+    """One that stands for all is each of them."""
+    rng = np.random.default_rng(5)
+    given, vertex = vertices(rng, 6, 0, 1, 1)
+    vertex.length = mi.Float(0.5)
+    for smooth in (True, False):
+        taken = chains.VertexTable(vertex, smooth).take(mi.UInt32([4, 1]))
+        for name in ("p", "n"):
+            np.testing.assert_allclose(np.array(getattr(taken, name)).T, getattr(given, name)[[4, 1]], rtol=1e-6)
+        surface = given.geometric_n if smooth else given.n
+        np.testing.assert_allclose(np.array(taken.geometric_n).T, surface[[4, 1]], rtol=1e-6)
+        assert np.array(taken.alive).tolist() == [False, True] and np.array(taken.length).tolist() == [0.5]
+
+
+@pytest.mark.parametrize(("size", "groups", "stride"), [(1, 1, 1), (4, 3, 16), (4, 4, 16), (8, 5, 64), (1, 2, 2)])
+def test_numbers_that_a_tile_has_for_itself(size, groups, stride):
+    assert chains.ChainPlan(None, None, size, groups, 1, None).stride == stride
+
+
+def test_sides_of_surfaces_that_are_drawn():
+    """Nine times in ten that towards the scan where both scatter; always the front where it is the only one."""
+    plan = Local(center=mi.Point3f(0.5, 0, -1))
+    p, n = mi.Point3f([0, 2, 0, 0.5], 0, [1, 1, 1, 0]), mi.Vector3f([0, -1, 0, 1], 0, [-1, 0, 1, 0])
+    found = chains._probability_of_front(plan, p, n, mi.Bool([True] * 4))
+    np.testing.assert_allclose(np.array(found), [0.9, 0.9, 0.1, 0.1], rtol=1e-6)
+    assert np.array(chains._probability_of_front(plan, p, n, mi.Bool([False] * 4))).tolist() == [1] * 4
+
+
+@pytest.mark.parametrize("name", ["wall", "floor"])
+def test_steps_to_what_is_hidden_weigh_its_form_factor(name):
+    """From a wall, which most go to the hidden area from, and from what belongs to it."""
+    wall, floor, roof = (mesh(one, (v, f[:, ::-1] if one != "roof" else f)) for one, (v, f) in (
+        ("wall", plate(1, 1, (5, 0, 0))), ("floor", plate(1, 1, (0, 0, 0))), ("roof", plate(1, 0.6, (0, 0, 0.8)))
+    ))  # fmt: skip
+    plan = Local(elements=HiddenElements([floor, roof], *wall_grid(2)), center=mi.Point3f(0, 0, 0))
+    shape = {"wall": wall, "floor": floor}[name]
+    side = 64
+    strata = np.stack(np.meshgrid(np.arange(side), np.arange(side)), -1).reshape(-1, 2)
+    places = (strata + np.random.default_rng(7).random((side**2, 2))) / side
+    numbers = [mi.UInt32((places[:, i] * 2.0**32).astype(np.uint32)) for i in range(2)]
+    up = mi.Vector3f(0, 0, 1)
+    start = chains.Vertices(p=mi.Point3f(0, 0, 0), n=up, geometric_n=up, shape=dr.gather(
+        mi.ShapePtr, mi.ShapePtr(shape), dr.zeros(mi.UInt32, side**2)
+    ), primitive=dr.zeros(mi.UInt32, side**2), alive=dr.full(mi.Bool, True, side**2))  # fmt: skip
+    vertex, weight = chains._guided_step(scene_of(floor, roof, wall), plan, start, numbers, (0, 1))
+    alive, p = np.array(vertex.alive), np.array(vertex.p)
+    # A quarter of a rectangle, of sides a and b in parts of its height, straight above.
+    a, b = 0.5 / 0.8, 0.3 / 0.8
+    quarter = sum(s / np.hypot(1, s) * np.arctan(t / np.hypot(1, s)) for s, t in ((a, b), (b, a))) / (2 * np.pi)
+    assert np.array(weight).mean() == pytest.approx(4 * quarter, rel=0.02)
+    np.testing.assert_allclose(p[2, alive], 0.8, rtol=1e-5)
+    assert not np.array(weight)[~alive].any()
+    # Most of the steps from the wall, a quarter of the others go to the hidden area, to the roof by its share.
+    roofs = plan.elements.probabilities[0][plan.elements.elements.centers()[:, 2] > 0.5].sum()
+    share = {"wall": 0.9, "floor": 0.25}[name]
+    assert alive.mean() == pytest.approx(share * roofs + (1 - share) * 4 * quarter, abs=0.01)
+
+
+# ------------------------------------------------------------------------------------------------- tiles and lanes
+
+
+@pytest.mark.parametrize(("width", "height", "side", "tiles"), [(7, 5, 2, (4, 3)), (5, 7, 4, (2, 2)), (3, 2, 1, (3, 2)),
+                                                                (4, 4, 4, (1, 1))])  # fmt: skip
+def test_points_of_a_tile_lie_far_apart(width, height, side, tiles):
+    """As many tiles as points of a patch; neighbours have different ones, and their ranks are near."""
+    found = Tiles(width, height, side)
+    across, down = tiles
+    assert found.count == across * down
+    of = found.numbers.reshape(height, width)
+    for y in range(height):
+        for x in range(width):
+            assert of[y, x] == (y % down) * across + x % across
+    assert np.array(found.of).tolist() == found.numbers.tolist()
+    rank = np.array(found.rank)
+    assert sorted(rank) == list(range(across * down))
+    if (across, down) == (4, 3):  # quarters of the scan come one after the other, within them row by row
+        assert rank.reshape(3, 4).tolist() == [[0, 1, 4, 5], [2, 3, 6, 7], [8, 9, 10, 11]]
+
+
+def test_regions_that_heads_of_a_group_come_from():
+    """The lowest two bits are one for each group, and all numbers are taken once; where groups fill no four regions
+    evenly numbers stay.
+    """
+    plan = Local(size=2, groups=8)
+    row = dr.arange(mi.UInt32, 16)
+    found = np.array(late_light._in_regions(row, plan)).reshape(8, 2)
+    assert (found % 4).tolist() == [[k % 4] * 2 for k in range(8)]
+    assert sorted(found.ravel()) == list(range(16))
+    assert (found // 4).tolist() == [[0, 1]] * 4 + [[2, 3]] * 4
+    assert np.array(late_light._in_regions(row, Local(size=2, groups=6))).tolist() == list(range(16))
+
+
+def light_of(kind, size=(5, 3), lasers=6, bounces=(4, 6), most=None, **choices):
+    film = Local(crop_size=lambda: size, lanes_at_most=lambda events: most)
+    job = Local(film=film, sensors=Local(width=size[0] * size[1]))
+    return LateLight(job, None, Local(width=lasers), kind, bounces, **choices)
+
+
+def test_tables_of_a_group(monkeypatch):
+    """Links of a group, and in exhaustive captures what every spot sees of the tails; tiles there hold more points
+    until tables fit.
+    """
+    assert light_of(CaptureType.SINGLE, lasers=1)._entries(5) == 5 * 32 * 32
+    assert light_of(CaptureType.EXHAUSTIVE)._entries(5) == 5 * 32 * 32
+    many = light_of(CaptureType.EXHAUSTIVE, lasers=15)
+    assert many._entries(5) == 5 * 32 * 45 and many.tiles.count == 2
+    for most, tiles in ((15 * 32 * 45, 15), (15 * 32 * 45 - 1, 6), (6 * 32 * 45 - 1, 2), (2 * 32 * 45 - 1, 1), (1, 1)):
+        monkeypatch.setattr(late_light, "_MOST_ENTRIES", most)
+        assert light_of(CaptureType.EXHAUSTIVE, lasers=15, side=1).tiles.count == tiles
+        assert light_of(CaptureType.CONFOCAL, lasers=15, side=1).tiles.count == 15
+
+
+def test_groups_at_a_time(monkeypatch):
+    """Lanes for all cores, no more than there are, and no larger tables than may be."""
+    backend = dr.backend_v(mi.Float)
+    monkeypatch.setitem(late_light._BUSY, backend, 100)
+
+    def at_once(kind, groups, lasers=3):
+        light = light_of(kind, lasers=lasers, size=(5, 3))
+        light.plan = Local(groups=groups)
+        return light._groups_at_once()
+
+    assert at_once(CaptureType.CONFOCAL, 50) == 6 and at_once(CaptureType.CONFOCAL, 4) == 4
+    assert at_once(CaptureType.EXHAUSTIVE, 50) == 2 and at_once(CaptureType.EXHAUSTIVE, 50, 30) == 1
+    monkeypatch.setattr(late_light, "_MOST_ENTRIES", 2 * 32 * 32 * 3)
+    assert at_once(CaptureType.CONFOCAL, 50) == 3
+    monkeypatch.setattr(late_light, "_MOST_ENTRIES", 1)
+    assert at_once(CaptureType.CONFOCAL, 50) == 1
+
+
+def test_launches_of_films_that_list_events():
+    """As many rows at a time as lanes fit, each lane with as many links as it has room for; one for all other films."""
+    part = Local(groups=2, links=Local(most=23), lit=[None, None])
+    (whole,) = light_of(CaptureType.SINGLE)._launches(part, 1, 4, 7)
+    assert whole == LateLaunch(1, 4, 7, 2, 1, 23, False)
+    links = late_light.EVENTS // 2
+    pieces = -(-23 // links)
+    rows = light_of(CaptureType.SINGLE, most=5 * 2 * pieces * 3 + 1)._launches(part, 1, 4, 7)
+    assert rows == [LateLaunch(1, row, n, 2 * pieces, pieces, links, True) for row, n in ((4, 3), (7, 3), (10, 1))]
+    part = Local(groups=2, links=Local(most=0), lit=[None] * (late_light.EVENTS + 1))
+    rows = light_of(CaptureType.SINGLE, most=1)._launches(part, 0, 0, 2)
+    assert rows == [LateLaunch(0, row, 1, 2, 1, 1, True) for row in range(2)]
+
+
+@pytest.mark.parametrize("kind", [CaptureType.SINGLE, CaptureType.EXHAUSTIVE])
+@pytest.mark.parametrize("listed", [True, False])
+def test_numbers_of_lanes(kind, listed):
+    """Every pixel with every piece of every group, and every spot in exhaustive captures: lanes of a pixel together
+    where events are listed, else points of a tile.
+    """
+    light, launch = light_of(kind, side=2), LateLaunch(0, 1, 2, 6, 3, 9, listed)
+    pixel, group, piece, laser = (np.array(each) for each in LateLanes._numbers(light, None, launch))
+    spots = range(6) if kind is CaptureType.EXHAUSTIVE else range(1)
+    tile = light.tiles.numbers
+    rest = [(g, k) for g in range(2) for k in range(3)]
+    if listed:
+        expected = [(p, g, k, s) for p in range(5, 15) for g, k in rest for s in spots]
+    else:
+        expected = [(p, g, k, s) for g, k in rest for p in sorted(range(5, 15), key=lambda p: tile[p]) for s in spots]
+    assert [tuple(row) for row in np.stack([pixel, group, piece, laser], 1).tolist()] == expected
