@@ -144,7 +144,6 @@ def test_two_runs_at_once(tmp_path, calm):
     assert data_files(tmp_path) == calm and verify(tmp_path).complete and leftovers(tmp_path) == []
 
 
-@pytest.mark.slow
 @pytest.mark.soak
 def test_a_hundred_kills(tmp_path, calm):
     """Of workers and of supervisors, starting, rendering and between the first and the last byte of a shard."""
