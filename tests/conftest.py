@@ -8,6 +8,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import torchtransient as torchtransient  # isort: skip
 
 import gc
+import signal
+import threading
 import types
 
 import drjit as dr
@@ -16,6 +18,10 @@ import pytest
 import torch
 
 from torchtransient import plugins
+
+# A shell lets what it starts in the background ignore interrupts: tests send some to themselves and to their children.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN and threading.current_thread() is threading.main_thread():
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Tensors of tests are small: a second thread is no faster, and where the cores are busy all wait for it (five-fold).
 torch.set_num_threads(1)
