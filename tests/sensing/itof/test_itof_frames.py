@@ -61,6 +61,14 @@ def test_a_converter_that_clips_differences_is_refused(how):
         sensing.Compose([two_tap(None, sensing.PixelElectronics(), sensing.TapDifference()), converter(**how)])
 
 
+def test_a_quarter_of_the_range_is_room_enough():
+    """4096 codes, of which 1024 are below the level."""
+    stages = sensing.PixelElectronics(), sensing.TapDifference()
+    two_tap(None, *stages, converter(black_level_dn=0.25 * 4095))
+    with pytest.raises(UnitError, match="room below zero"):
+        two_tap(None, *stages, converter(black_level_dn=0.25 * 4095 - 1))
+
+
 def test_no_shot_noise_of_a_difference():
     with pytest.raises(UnitError, match="no shot noise behind a TapDifference"):
         two_tap(None, sensing.TapDifference(), sensing.PixelElectronics())

@@ -118,3 +118,9 @@ def test_errors():
         SpatialPSF(torch.ones(4, 4))
     with pytest.raises(ShapeError, match="larger"):
         blur_image(torch.ones(1, 1, 3, 3), torch.ones(9, 9))
+
+
+@pytest.mark.parametrize("shape", [(3,), (3, 3, 3), (2, 3), (3, 4)])
+def test_sizes_of_a_psf(shape):
+    with pytest.raises(ShapeError, match=r"SpatialPSF: expected a PSF \(h, w\) of odd sizes"):
+        SpatialPSF(torch.ones(shape))
