@@ -156,7 +156,7 @@ def stocked(monkeypatch):
 
 
 def test_a_transform_of_what_is_drawn(stocked):
-    with OnlineDataset(None, 8, transform=lambda light: 2 * light, first=5) as data:
+    with OnlineDataset(OnlineRecipe(), 8, transform=lambda light: 2 * light, first=5) as data:
         drawn = next(iter(data))
         assert drawn["measurement"].tolist() == [[2.0] * 3] * 2 and not drawn["measurement"].requires_grad
         assert (data.failed, data.waited_s, data.made, data.drawn, data.next_index) == (3, 1.5, 0, 0, 5)
@@ -167,11 +167,11 @@ def test_a_transform_of_what_is_drawn(stocked):
             pickle.dumps(data)
         assert stocked.closed == []
     assert stocked.closed == [1]
-    assert "measurement" not in OnlineDataset(None, 8).draw()
+    assert "measurement" not in OnlineDataset(OnlineRecipe(), 8).draw()
 
 
 def test_a_loader_with_workers_is_told(stocked, monkeypatch):
-    data = OnlineDataset(None, 8)
+    data = OnlineDataset(OnlineRecipe(), 8)
     monkeypatch.setattr(online, "get_worker_info", lambda: SimpleNamespace(id=0))
     with pytest.raises(TorchTransientError, match=r"use DataLoader\(\.\.\., num_workers=0\) and OnlineDataset"):
         next(iter(data))
@@ -183,13 +183,13 @@ def test_what_does_not_start_is_closed(stocked):
 
     stocked.stock.start = start
     with pytest.raises(KeyboardInterrupt):
-        OnlineDataset(None, 8)
+        OnlineDataset(OnlineRecipe(), 8)
     assert stocked.closed == [1]
 
 
 def test_numbers_of_a_data_set(stocked):
     """The smallest of each; no more samples are waited for than there is room."""
-    least = OnlineDataset(None, 2, workers=1, warm=1, first=0, seed=0, uses=1e-9, timeout_s=1e-9)
+    least = OnlineDataset(OnlineRecipe(), 2, workers=1, warm=1, first=0, seed=0, uses=1e-9, timeout_s=1e-9)
     assert least._producers.schedule.warm == 1 and tt.data.OnlineDataset is OnlineDataset
-    assert OnlineDataset(None, 8, warm=9)._producers.schedule.warm == 8
-    assert OnlineDataset(None, 8, warm=7, seed=2**70)._producers.schedule.warm == 7
+    assert OnlineDataset(OnlineRecipe(), 8, warm=9)._producers.schedule.warm == 8
+    assert OnlineDataset(OnlineRecipe(), 8, warm=7, seed=2**70)._producers.schedule.warm == 7
