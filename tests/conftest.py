@@ -107,9 +107,3 @@ def _activate(module):
         if mi.variant() != wanted:
             mi.set_variant(wanted)
         plugins.sync()
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _scenes_of_other_files_are_gone():
-    """What waits for the collector is alive for Dr.Jit: its plugins are in every kernel that asks one of their kind."""
-    gc.collect()

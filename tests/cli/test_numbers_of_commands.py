@@ -22,6 +22,7 @@ from torchtransient.cli.options import assignments, scene_values
 from torchtransient.cli.pictures import write_pictures
 from torchtransient.cli.reconstruct import Numbers, _as_words, _check_together, _draw, _grid, _wall_size
 from torchtransient.quantities import positive
+from torchtransient.rendering.variant import active_variant
 
 # ----------------------------------------------------------------------------------------------------------- options
 
@@ -313,7 +314,8 @@ def test_samples_of_the_demo(monkeypatch, tmp_path):
     monkeypatch.setattr("torchtransient.vis.fit_progress.plot_fit", lambda *_, **__: None)
     monkeypatch.setattr("torchtransient.vis.overview.plot_overview", lambda *_, **__: None)
     arguments = ["demo", "-o", str(tmp_path / "demo"), "--resolution", "8", "--spp", "3", "--steps", "2"]
-    result = CliRunner().invoke(main, arguments)
+    with active_variant("llvm_ad_mono"):  # in which the box has no colours
+        result = CliRunner().invoke(main, arguments)
     assert result.exit_code == 0, result.output
     assert asked[0] == ("truth", 48)
     assert [spp for spp in asked[1:] if spp != 1] == [12, 3, 3, 12]

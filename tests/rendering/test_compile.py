@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import inspect
 import subprocess
 import sys
+import weakref
 
 import pytest
 import torch
@@ -13,6 +15,7 @@ from torch import nn
 import torchtransient as tt
 from support.marks import long
 from support.sensing.all_entries import ENTRIES
+from torchtransient.rendering.opaque import opaque
 from torchtransient.testing.small_room import COLOUR
 from torchtransient.testing.small_room import VARIANT as VARIANT
 
@@ -122,3 +125,28 @@ def test_a_render_does_not_import_the_compiler():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split()[-2:] == ["False", "False"]
+
+
+def test_what_an_opaque_function_holds_goes_with_it():
+    """Beside the compiler, which everything that makes an optimizer imports."""
+    assert "torch._dynamo" in sys.modules
+
+    class Held:
+        pass
+
+    def made():
+        held = Held()
+        function = opaque(lambda x: x + bool(held))
+        return function, weakref.ref(held)
+
+    function, held = made()
+    assert function(1) == function(1) == 2 and held() is not None
+    del function
+    gc.collect()
+    assert held() is None
+    wrapped = tt.wrap(lambda x: x * 2)
+    inner = weakref.ref(wrapped.__wrapped__)
+    torch.testing.assert_close(wrapped(torch.ones(2)), torch.full((2,), 2.0))
+    del wrapped
+    gc.collect()
+    assert inner() is None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -150,3 +151,50 @@ def test_what_cannot_be_compared_is_refused(value):
         return
     with pytest.raises(NotComparableError):
         structure(value)
+
+
+LOOSE = {
+    "diffuse": {},
+    "dielectric": {},
+    "mask": {"opacity": {"type": "uniform", "value": 0.3}, "inner": {"type": "diffuse"}},
+    "principled": {},
+    "retroreflector": {},
+    "uniform": {"value": 0.3},
+    "bitmap": {"data": np.full((4, 4, 1), 0.5, np.float32), "raw": True},
+    "constant": {},
+    "area": {},
+    "homogeneous": {},
+    "hg": {},
+    "perspective": {},
+    "sphere": {"bsdf": {"type": "diffuse"}},
+    "constvolume": {"value": 0.5},
+    "transient_hdr_film": {},
+}
+
+
+@pytest.mark.parametrize("kind", LOOSE)
+def test_plugins_of_no_scene(kind):
+    """A method call is compiled for every plugin of a kind that is alive, of a scene or not."""
+    import mitsuba as mi
+
+    before = mi.load_dict({"type": kind, **LOOSE[kind]})
+    traced, recorded = (
+        tt.TransientRenderer(tt.load(make_room(), variant=VARIANT), parameters=[GREY], spp=2, freeze=freeze)
+        for freeze in (False, True)
+    )
+    after = mi.load_dict({"type": kind, **LOOSE[kind]})
+    for seed in range(6):
+        out, expected = recorded(seed=seed), traced(seed=seed)
+        torch.testing.assert_close(out.transient, expected.transient, rtol=1e-5, atol=0)
+        (found,) = torch.autograd.grad(out.transient.sum(), recorded.values[GREY])
+        (wanted,) = torch.autograd.grad(expected.transient.sum(), traced.values[GREY])
+        torch.testing.assert_close(found, wanted, rtol=1e-4, atol=0)
+    assert out.stats.recorded == (LAUNCHED,)
+    # They may go, and others come, between two calls.
+    del before
+    again = [mi.load_dict({"type": kind, **LOOSE[kind]}) for _ in range(2)]
+    del after
+    for seed in range(6):
+        out = recorded(seed=seed)
+        torch.testing.assert_close(out.transient, traced(seed=seed).transient, rtol=1e-5, atol=0)
+    assert out.stats.recorded == (LAUNCHED,) and again

@@ -75,6 +75,7 @@ def command(output: Path, resolution: int, spp: int, steps: int) -> None:
     import torchtransient as tt
     from torchtransient.errors import StorageError
     from torchtransient.files.result_file import write_result
+    from torchtransient.rendering.variant import DEFAULT_VARIANT
     from torchtransient.vis.fit_progress import plot_fit
     from torchtransient.vis.overview import plot_overview
 
@@ -83,10 +84,8 @@ def command(output: Path, resolution: int, spp: int, steps: int) -> None:
     except OSError as error:
         raise StorageError(f"demo: the folder '{output}' cannot be made: {error}. Choose another with -o.") from error
     bins = 100
-    box = tt.scenes.cornell_box(
-        resolution=resolution, max_depth=6, num_bins=bins, start_opl=3.5, bin_width_opl=0.06
-    )
-    scene = tt.load(box)
+    box = tt.scenes.cornell_box(resolution=resolution, max_depth=6, num_bins=bins, start_opl=3.5, bin_width_opl=0.06)
+    scene = tt.load(box, variant=DEFAULT_VARIANT)  # it is about colours
     click.echo(f"Rendering the Cornell box: {resolution} x {resolution} pixels, {bins} bins.")
     with torch.no_grad():
         truth = tt.render(scene, spp=16 * spp, seed=10_000, progress=True)

@@ -23,6 +23,8 @@ _POINTERS = {
     "Sensor": "SensorPtr",
     "Shape": "ShapePtr",
 }
+# Kinds that kernels ask as well, and that nobody has a table of.
+_MORE_POINTERS = ("MeshPtr", "TexturePtr")
 
 
 def registry_number(plugin: Any) -> int:
@@ -33,6 +35,11 @@ def registry_number(plugin: Any) -> int:
         if isinstance(plugin, getattr(mi, kind)):
             return int(dr.reinterpret_array(mi.UInt32, getattr(mi, pointer)(plugin))[0])
     raise SceneError(f"registry_number: expected one of {', '.join(_POINTERS)}, got {type(plugin).__name__}.")
+
+
+def null_pointers() -> list[Any]:
+    """A pointer to nothing of each kind."""
+    return [dr.zeros(getattr(mi, name)) for name in (*_POINTERS.values(), *_MORE_POINTERS)]
 
 
 class PointerTable:

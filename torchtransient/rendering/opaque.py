@@ -28,11 +28,14 @@ def opaque(function: Callable[_P, _R]) -> Callable[_P, _R]:
     longer than everything else that is imported here.
     """
 
+    # Here, and in no table of all functions: with it goes what a function holds, scenes for instance.
+    disabled: list[Callable[..., Any]] = []
+
     @functools.wraps(function)
     def call(*args: _P.args, **kwargs: _P.kwargs) -> _R:
         if "torch._dynamo" not in sys.modules:
             return function(*args, **kwargs)
-        return _untraced(function, args, kwargs)
+        return _untraced(function, disabled, args, kwargs)
 
     return _stopping(call)
 
@@ -44,15 +47,13 @@ def _stopping(function: Callable[_P, _R]) -> Callable[_P, _R]:
     return function
 
 
-_disabled: dict[Any, Any] = {}
-
-
 @_stopping
-def _untraced(function: Callable[..., _R], args: tuple[Any, ...], kwargs: dict[str, Any]) -> _R:
-    disabled = _disabled.get(function)
-    if disabled is None:
+def _untraced(
+    function: Callable[..., _R], disabled: list[Callable[..., Any]], args: tuple[Any, ...], kwargs: dict[str, Any]
+) -> _R:
+    if not disabled:
         # what is disabled says why from torch 2.7 on
         why = {"reason": _REASON} if "reason" in inspect.signature(torch.compiler.disable).parameters else {}
-        disabled = _disabled[function] = torch.compiler.disable(function, **why)  # type: ignore[no-untyped-call]
-    result: _R = disabled(*args, **kwargs)
+        disabled.append(torch.compiler.disable(function, **why))  # type: ignore[no-untyped-call]
+    result: _R = disabled[0](*args, **kwargs)
     return result

@@ -61,6 +61,8 @@ class Recordings:
         """
         import drjit as dr
 
+        from torchtransient.plugins.pointer_table import null_pointers
+
         for job in jobs:
             if job.refusal is not None or len(job.launches) > 1:
                 raise NotRecordedError(SEVERAL if job.refusal is None else f"traced: {job.refusal}")
@@ -69,6 +71,9 @@ class Recordings:
             structure, arrays = jobs[0].integrator.state_of(jobs)
         except NotComparableError as error:
             raise NotRecordedError(f"traced: whether a call is like the last one cannot be told of {error}") from None
+        # By a pointer of each kind Dr.Jit finds all plugins of that kind, which it has in every kernel, and with them
+        # the arrays of those that are of no scene.
+        arrays = [*arrays, *null_pointers()]
         # A recording holds memory for each thread's share of a sum.
         structure = (("threads", dr.thread_count()), *structure)
         found = self._found.get(structure)
