@@ -6,6 +6,7 @@ import math
 import re
 import warnings
 from fractions import Fraction
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ import torch
 
 from support.number_case import is_number
 from support.number_cases import CASES, LEFT, SLOW
+from support.refused import complaint
 from support.sweeps import together
 from test_public_names import found, members_of, public_names, signature_of
 
@@ -83,15 +85,8 @@ def refusals(entry, values):
     for value in values:
         if value is None and "None" in said:
             continue
-        try:
-            case(**{argument: case.in_place(argument, value)})
-        except case.errors as error:
-            if "\n" in str(error):
-                wrong.append(f"{value!r}: {error}")
-        except Exception as error:  # noqa: BLE001 - what is looked for
-            wrong.append(f"{value!r}: {type(error).__name__}: {error}"[:160])
-        else:
-            wrong.append(f"{value!r} is taken"[:80])
+        taken, said_wrong = complaint(partial(case, **{argument: case.in_place(argument, value)}), case.errors, value)
+        wrong += [f"{value!r} is taken"[:80]] if taken else [said_wrong] if said_wrong else []
     return wrong
 
 

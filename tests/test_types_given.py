@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import warnings
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import torch
 import torchtransient as tt
 from support.fake_recipe import FakeRecipe
 from support.number_case import Table, recipe
+from support.refused import complaint
 from support.sweeps import together
 from support.type_cases import TYPE_CASES
 from test_public_names import found, members_of, public_names, signature_of
@@ -87,16 +89,10 @@ def test_what_is_of_a_wrong_type(entry):
     for value in [] if place in HANDED_ON else WRONG:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            try:
-                case.call(**{**base, argument: value})
-            except case.errors as error:
-                if "\n" in str(error):
-                    wrong.append(f"{value!r}: {error}")
-            except Exception as error:  # noqa: BLE001 - what is looked for
-                wrong.append(f"{value!r}: {type(error).__name__}: {error}"[:160])
-            else:
-                if value is NOTHING and place not in ANYTHING:
-                    wrong.append("object() is taken")
+            taken, said_wrong = complaint(partial(case.call, **{**base, argument: value}), case.errors, value)
+        if taken and value is NOTHING and place not in ANYTHING:
+            wrong.append("object() is taken")
+        wrong += [said_wrong] if said_wrong else []
     assert not wrong, "; ".join(wrong)
 
 

@@ -101,3 +101,12 @@ def leftovers(folder):
     """Files that no data set has."""
     known = {"manifest.json", "recipe.json", "log.jsonl", "latest.png"}
     return sorted(p.name for p in Path(folder).iterdir() if p.name not in known and not p.name.startswith("shard-"))
+
+
+def damage(folder):
+    """A file of samples is missing, the next one is cut, one that was being written is left over, as is half a line."""
+    (folder / "shard-000001.h5").unlink()
+    os.truncate(folder / "shard-000002.h5", 3000)
+    (folder / ".shard-000004.h5.12345678.part").write_bytes(b"half")
+    with (folder / "log.jsonl").open("a") as log:
+        log.write('{"half')

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import resource
 import subprocess
 import sys
@@ -14,7 +13,7 @@ import pytest
 
 import torchtransient as tt
 from support.fake_recipe import FakeRecipe
-from support.generation_runs import data_files, environment, finish, leftovers, start
+from support.generation_runs import damage, data_files, environment, finish, leftovers, start
 from torchtransient.data.generation.generate import generate
 from torchtransient.data.generation.latest_picture import LatestPicture
 from torchtransient.data.generation.ledger import DIED
@@ -89,11 +88,7 @@ def test_going_on(calm, tmp_path):
     generate(RECIPE, folder, workers=1, **QUICK)
     before = data_files(folder)
     stamp = (folder / "shard-000003.h5").stat().st_mtime_ns
-    (folder / "shard-000001.h5").unlink()
-    os.truncate(folder / "shard-000002.h5", 3000)
-    (folder / ".shard-000004.h5.12345678.part").write_bytes(b"half")
-    with (folder / "log.jsonl").open("a") as log:
-        log.write('{"half')
+    damage(folder)
     done = generate(RECIPE, folder, workers=1, n=23, progress=False)
     assert (done.samples, done.kept) == (8, 15)
     assert data_files(folder) == before == data_files(calm)

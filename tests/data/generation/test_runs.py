@@ -13,7 +13,7 @@ import pytest
 import torchtransient as tt
 from support.crew_here import CrewHere
 from support.fake_recipe import FakeRecipe
-from support.generation_runs import data_files, leftovers
+from support.generation_runs import damage, data_files, leftovers
 from torchtransient.data.generation import generate as runs
 from torchtransient.data.generation import ray_engine, settings, supervisor
 from torchtransient.data.generation import summary as summaries
@@ -94,11 +94,7 @@ def test_going_on(whole, tmp_path):
     folder = tmp_path / "set"
     generate(RECIPE, folder, **SMALL)
     stamp = (folder / "shard-000003.h5").stat().st_mtime_ns
-    (folder / "shard-000001.h5").unlink()
-    os.truncate(folder / "shard-000002.h5", 3000)
-    (folder / ".shard-000004.h5.12345678.part").write_bytes(b"half")
-    with (folder / "log.jsonl").open("a") as log:
-        log.write('{"half')
+    damage(folder)
     done = generate(RECIPE, folder, **SMALL | {"per_shard": None})
     assert (done.samples, done.kept, done.shards) == (4, 3, 2)
     assert data_files(folder) == data_files(whole) and leftovers(folder) == []
