@@ -81,6 +81,13 @@ def by_number(name: str, value: Any) -> Any:
     return value
 
 
+def text(name: str, value: Any, what: str, error: type[TorchTransientError] = ArgumentError) -> str:
+    """``value``, which is a text. Raises ``error``, with ``what`` it is: "the name of a sampler"."""
+    if not isinstance(value, str):
+        raise error(f"{name}: expected {what}, got {shown(value)}.")
+    return value
+
+
 def is_one_of(value: Any, names: Collection[str]) -> bool:
     """Whether a value is one of these texts; an array is none, whatever is in it."""
     return isinstance(value, str) and value in names

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -10,9 +11,11 @@ from torch import nn
 from torch.nn.utils import parametrize
 
 from torchtransient.errors import ArgumentError, DeviceError, ShapeError, UnitError, UnknownKeyError
+from torchtransient.given_types import is_one_of, text
 from torchtransient.quantities import as_whole, real_array, shown
 from torchtransient.rendering.films.choice import FilmChoice
 from torchtransient.rendering.films.choices import chosen
+from torchtransient.rendering.parameters import unknown_key
 
 # What samplers count with has 32 bits, and a depth of all ones stands for no limit.
 MOST_SAMPLES, MOST_DEPTH = 2**32 - 1, 2**32 - 2
@@ -48,9 +51,29 @@ def checked_depth(value: Any) -> int | None:
 
 def checked_filter(name: str) -> str:
     """The name of a temporal filter, or "auto". Raises ``ArgumentError``."""
-    if name not in TEMPORAL_FILTERS:
-        raise ArgumentError(f"temporal_filter: expected one of {', '.join(TEMPORAL_FILTERS)}, got {name!r}.")
+    if not is_one_of(name, TEMPORAL_FILTERS):
+        raise ArgumentError(f"temporal_filter: expected one of {', '.join(TEMPORAL_FILTERS)}, got {shown(name)}.")
     return name
+
+
+def checked_sampler(name: Any) -> str | None:
+    """The plugin name of a sampler, or None. Raises ``ArgumentError``."""
+    return None if name is None else text("sampler", name, "the plugin name of a sampler of Mitsuba, or None")
+
+
+def checked_keys(keys: Any, known: Sequence[str] | None = None) -> tuple[str, ...]:
+    """Keys of parameters, also those of a mapping. Raises ``ArgumentError``, and ``UnknownKeyError`` for those that a
+    renderer with ``known`` ones does not have.
+    """
+    with contextlib.suppress(TypeError):
+        if not isinstance(keys, (str, bytes)):
+            found = tuple(keys)
+            unknown = [key for key in found if known is not None and not is_one_of(key, known)]
+            if unknown:
+                raise UnknownKeyError(unknown_key(str(unknown[0]), list(known or ()), "the renderer"))
+            return found
+    got = f"a string; write [{keys!r}]" if isinstance(keys, str) else shown(keys)
+    raise ArgumentError(f"parameters: expected a list of keys, got {got}.")
 
 
 def checked_grad_seed(value: int | str | None) -> int | str | None:

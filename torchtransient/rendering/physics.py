@@ -18,7 +18,9 @@ import numpy as np
 import torch
 
 from torchtransient.errors import ArgumentError, PhysicsError, PhysicsWarning
+from torchtransient.given_types import is_one_of
 from torchtransient.plugins.physical_ranges import SHARE, PhysicalRange
+from torchtransient.quantities import shown
 
 MODES = ("warn", "error", "ignore")
 # Light outside of the window, as a share of all light, from which on it is said.
@@ -40,8 +42,8 @@ class PhysicsWatch:
     """
 
     def __init__(self, mode: str, told: set[str]):
-        if mode not in MODES:
-            raise ArgumentError(f"physics: expected one of {', '.join(map(repr, MODES))}, got {mode!r}.")
+        if not is_one_of(mode, MODES):
+            raise ArgumentError(f"physics: expected one of {', '.join(map(repr, MODES))}, got {shown(mode)}.")
         self.mode = mode
         self.window_name = ""
         self.ranges: dict[str, PhysicalRange] = {}

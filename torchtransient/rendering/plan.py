@@ -15,10 +15,11 @@ from torchtransient.argument_names import arguments_of
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import ArgumentError, SceneError, TorchTransientError, UnitError
 from torchtransient.gates import Gate
+from torchtransient.given_types import text
 from torchtransient.pulses import Pulse
 from torchtransient.quantities import Numbers, as_whole, count, shown
 from torchtransient.rendering import plan_choices as choices
-from torchtransient.rendering.arguments import checked_depth, film_asked_for
+from torchtransient.rendering.arguments import checked_depth, checked_filter, checked_keys, film_asked_for
 from torchtransient.rendering.effects import Effects
 from torchtransient.rendering.films.choice import FilmChoice
 from torchtransient.rendering.films.choices import all_films, planned
@@ -32,7 +33,7 @@ from torchtransient.rendering.pulse_properties import checked_pulse
 from torchtransient.rendering.renderer import TransientRenderer
 from torchtransient.rendering.scene_handle import Scene, load
 from torchtransient.rendering.taken import ReadyScene
-from torchtransient.rendering.variant import active_variant
+from torchtransient.rendering.variant import active_variant, resolve_variant
 
 # Decisions of a draft that a plan takes over as they are.
 _OF_THE_DRAFT = ("scene", "variant", "integrator", "pulse", "irf", "parameters", "sensor")
@@ -172,6 +173,12 @@ def plan(
     if (index := as_whole(sensor)) is None:
         raise ArgumentError(f"tt.plan: sensor: expected the index of a sensor, got {shown(sensor)}.")
     sensor = index
+    if variant is not None:
+        resolve_variant(variant)
+    if integrator is not None:
+        text("tt.plan: integrator", integrator, "the plugin name of an integrator")
+    if temporal_filter is not None:
+        checked_filter(temporal_filter)
     loaded = load(scene)
     asked = choices.checked_outputs(outputs)
     inventory = inventory_of(loaded, sensor)
@@ -186,14 +193,14 @@ def plan(
     tracer, more = choices.choose_integrator(inventory)
     reasons = (_taken("variant", variant, best), *notes, _taken("integrator", integrator, tracer), *more, kind.reason)
     draft = Draft(
-        scene=load(loaded, variant=variant or best.value),
-        variant=variant or best.value,
-        integrator=integrator or tracer.value,
+        scene=load(loaded, variant=best.value if variant is None else variant),
+        variant=best.value if variant is None else variant,
+        integrator=tracer.value if integrator is None else integrator,
         film=kind,
         film_choice=choices.film_settings(kind, given, inventory.film, asked),
         pulse=checked_pulse("pulse", pulse),
         irf=checked_pulse("irf", irf),
-        parameters=tuple(parameters),
+        parameters=checked_keys(parameters),
         sensor=sensor,
     )
     _check_known(draft, reasons)

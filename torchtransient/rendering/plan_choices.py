@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from torchtransient.errors import ArgumentError, SceneError
+from torchtransient.given_types import is_one_of, several
+from torchtransient.quantities import shown
 from torchtransient.rendering.films.choice import FilmChoice, PlannedFilm
 from torchtransient.rendering.films.choices import all_films
 from torchtransient.rendering.inventory import Finding, SceneInventory
@@ -41,10 +43,10 @@ def known_outputs() -> tuple[str, ...]:
 
 def checked_outputs(outputs: Sequence[str] | str) -> tuple[str, ...]:
     """The outputs as a tuple. Raises ``ArgumentError`` for unknown ones, and for two that need different films."""
-    asked = (outputs,) if isinstance(outputs, str) else tuple(outputs)
+    asked = (outputs,) if isinstance(outputs, str) else tuple(several("tt.plan: outputs", outputs, "names"))
     of_films, known = tuple(kind.output for kind in all_films()), known_outputs()
-    if not asked or any(name not in known for name in asked):
-        raise ArgumentError(f"tt.plan: outputs are some of {', '.join(known)}; got {list(asked)}.")
+    if not asked or not all(is_one_of(name, known) for name in asked):
+        raise ArgumentError(f"tt.plan: outputs are some of {', '.join(known)}; got {shown(list(asked))}.")
     films = [name for name in asked if name in of_films]
     if len(set(films)) > 1:
         raise ArgumentError(

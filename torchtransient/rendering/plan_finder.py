@@ -7,8 +7,10 @@ from dataclasses import dataclass, replace
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ArgumentError, SceneError
+from torchtransient.given_types import is_one_of
 from torchtransient.plugins.parameters import check_slope
 from torchtransient.pulses import Pulse
+from torchtransient.quantities import shown
 from torchtransient.rendering import plan_choices as choices
 from torchtransient.rendering.build_options import BuildOptions
 from torchtransient.rendering.films.choice import FilmChoice, PlannedFilm
@@ -225,8 +227,8 @@ class Finder:
         if isinstance(given, TimeAxis):
             self.reasons.append(f"time axis: {given}, as asked for")
             return given
-        if given is not None and given != "scene":
-            raise ArgumentError(f"time_axis: expected a tt.TimeAxis, 'scene' or None, got {given!r}.")
+        if given is not None and not is_one_of(given, ("scene",)):
+            raise ArgumentError(f"time_axis: expected a tt.TimeAxis, 'scene' or None, got {shown(given)}.")
         if self.draft.film.all_times:
             last = _ALL_TIMES if self.arrivals is None or self.arrivals.dark else 4 * float(self.arrivals.opl.max())
             return TimeAxis(0.0, last, 1)

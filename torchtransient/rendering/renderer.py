@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,6 +13,7 @@ from torch import nn
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import ArgumentError, SceneError, ShapeError
 from torchtransient.gates import Gate
+from torchtransient.given_types import is_one_of
 from torchtransient.parametrize.copies import CopiesParametrized
 from torchtransient.plugins.parameters import check_slope
 from torchtransient.plugins.physical_ranges import physical_range
@@ -25,6 +26,8 @@ from torchtransient.rendering.arguments import (
     checked_depth,
     checked_filter,
     checked_grad_seed,
+    checked_keys,
+    checked_sampler,
     film_asked_for,
     fit_shape,
     given_values,
@@ -132,18 +135,15 @@ class TransientRenderer(CopiesParametrized):
             max_depth = effects.max_depth if max_depth is None else max_depth
             pulse, irf = pulse or effects.pulse, irf or effects.irf
             sensors = effects.sensor if sensors is None else sensors
-        elif effects != "auto":
-            raise ArgumentError(f"effects: expected 'auto' or a plan of tt.plan(...), got {effects!r}.")
-        if isinstance(parameters, str) or not isinstance(parameters, Iterable):
-            got = f"a string; write [{parameters!r}]" if isinstance(parameters, str) else shown(parameters)
-            raise ArgumentError(f"parameters: expected a list of keys, got {got}.")
+        elif not is_one_of(effects, ("auto",)):
+            raise ArgumentError(f"effects: expected 'auto' or a plan of tt.plan(...), got {shown(effects)}.")
+        self._keys = checked_keys(parameters)
         self.scene: Scene = load(scene)
         self.spp, self.spp_grad = samples("spp", spp), samples("spp_grad", spp_grad)
         self.temporal_filter = checked_filter(temporal_filter)
         self.grad_seed = checked_grad_seed(grad_seed)
         self.freeze = bool(freeze)
         self._watch = PhysicsWatch(physics, self.scene.told)
-        self._keys = tuple(parameters)
         changes: dict[str, Any] = {"pulse": checked_pulse("pulse", pulse), "irf": checked_pulse("irf", irf)}
         changes |= {"film": film, "steady": bool(steady)}
         changes["integrator"] = effects.integrator if isinstance(effects, Effects) else None
@@ -162,7 +162,8 @@ class TransientRenderer(CopiesParametrized):
     # --------------------------------------------------------------------------------------------------- set-up
 
     def _build_options(self, max_depth: int | None, sampler: str | None, changes: dict[str, Any]) -> BuildOptions:
-        options = BuildOptions(max_depth=checked_depth(max_depth), transient=True, sampler=sampler, **changes)
+        changes |= {"max_depth": checked_depth(max_depth), "sampler": checked_sampler(sampler)}
+        options = BuildOptions(transient=True, **changes)
         return self.scene.options_for(self._keys, options)
 
     def _parameter_infos(self) -> dict[str, ParameterInfo]:
@@ -262,30 +263,28 @@ class TransientRenderer(CopiesParametrized):
 
     @opaque
     def variation(self, *, sampler: str | None = None, temporal_filter: str | None = None) -> TransientRenderer:
-        """A copy with the same parameter values and another sampler or temporal filter; None keeps what this one
-        has.
-        """
+        """A copy with the same values and another sampler or temporal filter; None keeps what this one has."""
         if temporal_filter is not None:
             checked_filter(temporal_filter)
         if not self.film.has_filter and temporal_filter not in (None, "auto"):
             raise ArgumentError(f"temporal_filter: the film has none, expected 'auto', got {temporal_filter!r}.")
         twin = copy.deepcopy(self)
         if sampler is not None:
-            twin._options = replace(self._options, sampler=sampler)
+            twin._options = replace(self._options, sampler=checked_sampler(sampler))
         if temporal_filter is not None:
             twin.temporal_filter = temporal_filter
         return twin
 
     def has_slope_for(self, keys: Sequence[str]) -> bool:
-        """Whether gradients for ``keys`` exist with the filter or gates in use: a box has none of path lengths."""
-        there = has_slope(self.effective_filter, self._pulsed) and self._response[0]
-        return there or not needing_slope(self._infos, keys)
+        """Whether gradients for ``keys`` exist with the filter or gates in use: a box has none of path lengths. Raises
+        ``UnknownKeyError`` for keys that the renderer does not have.
+        """
+        moving = needing_slope(self._infos, checked_keys(keys, self._keys))
+        return not moving or (has_slope(self.effective_filter, self._pulsed) and self._response[0])
 
     @opaque
     def samples_drawn(self, spp: int) -> int:
-        """Samples per pixel that a render with ``spp`` really draws: stratified samplers round up to counts that
-        they can lay out.
-        """
+        """Samples per pixel that a render with ``spp`` really draws: stratified samplers round up."""
         with active_variant(self.scene.variant):
             sampler = self.scene.built(self._options).scene.sensors()[self._sensors[0]].sampler().clone()
             sampler.set_sample_count(samples("spp", spp) or sampler.sample_count())

@@ -12,6 +12,7 @@ from typing import Any
 import torch
 
 from torchtransient.errors import ArgumentError, GradientError, ShapeError, UnitError
+from torchtransient.given_types import is_one_of
 from torchtransient.plugins.drjit_pool import engine_lock
 from torchtransient.quantities import as_whole, shown
 from torchtransient.rendering.arguments import as_float
@@ -92,10 +93,10 @@ def wrap(
 
 def _check_direction(source: Any, target: Any) -> None:
     names = tuple(given.__name__ if isinstance(given, types.ModuleType) else given for given in (source, target))
-    if names != ("torch", "drjit"):
+    if not (is_one_of(names[0], ("torch",)) and is_one_of(names[1], ("drjit",))):
         raise ArgumentError(
-            f"tt.wrap: expected source='torch' and target='drjit', got {names[0]!r} and {names[1]!r}. Other directions "
-            "are those of drjit.wrap."
+            f"tt.wrap: expected source='torch' and target='drjit', got {shown(names[0])} and {shown(names[1])}. Other "
+            "directions are those of drjit.wrap."
         )
 
 
@@ -129,9 +130,9 @@ class _Wrapped:
 
     def _checked_signature(self) -> inspect.Signature:
         signature = inspect.signature(self.function)
-        if self.reseed not in signature.parameters:
+        if not is_one_of(self.reseed, signature.parameters):
             raise ArgumentError(
-                f"tt.wrap: reseed={self.reseed!r} is no argument of {self.name}, which has "
+                f"tt.wrap: reseed={shown(self.reseed)} is no argument of {self.name}, which has "
                 f"{', '.join(signature.parameters) or 'none'}."
             )
         return signature

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from torchtransient.errors import ArgumentError, SceneError
+from torchtransient.given_types import text
 from torchtransient.quantities import Numbers, count, finite, positive, shares, shown
 from torchtransient.scenes.transforms import Matrix
 
@@ -51,7 +52,10 @@ def perspective(
         "near_clip": positive("near_clip", near_clip),
         "far_clip": 100.0,
         "to_world": to_world,
-        "sampler": {"type": sampler, "sample_count": count("spp", spp)},
+        "sampler": {
+            "type": text("sampler", sampler, "the plugin name of a sampler"),
+            "sample_count": count("spp", spp),
+        },
         "film": film,
     }
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from torchtransient.errors import ArgumentError
-from torchtransient.quantities import count, finite, positive
+from torchtransient.given_types import is_one_of
+from torchtransient.quantities import count, finite, positive, shown
 from torchtransient.scenes.parts import SceneDict, diffuse, perspective, transient_film, transient_path
 from torchtransient.scenes.transforms import look_at, rotate, scale, translate
 
@@ -111,12 +112,12 @@ def etalon_slab(
     reflected orders, after 3 m of air. Closed form: `closed_forms.etalon_slab`.
     """
     d = positive("thickness", thickness)
+    if not is_one_of(light, ("behind", "front")):
+        raise ArgumentError(f"etalon_slab: expected light='behind' or light='front', got {shown(light)}")
     if light == "behind":
         emitter_to_world = translate([0.0, 0.0, -1.0])
-    elif light == "front":
-        emitter_to_world = translate([0.0, 0.0, d + 2.0]) @ rotate([0, 1, 0], 180)
     else:
-        raise ArgumentError(f"etalon_slab: expected light='behind' or light='front', got {light!r}")
+        emitter_to_world = translate([0.0, 0.0, d + 2.0]) @ rotate([0, 1, 0], 180)
     film = transient_film(resolution, num_bins, start_opl, bin_width_opl)
     # The cube's faces are pairs of triangles; one ray in 1e4 would slip through the diagonal if the camera looked along
     # it.

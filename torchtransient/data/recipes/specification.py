@@ -25,6 +25,7 @@ from torchtransient.gates import Gate
 from torchtransient.given_types import is_one_of, mapping
 from torchtransient.pulses import Pulse
 from torchtransient.quantities import MOST, Numbers, as_whole, count, real_array, shown
+from torchtransient.rendering.arguments import checked_filter
 from torchtransient.rendering.variant import resolve_variant
 from torchtransient.sensing import DEVICES, Device
 from torchtransient.sensing import device as device_by_name
@@ -114,7 +115,7 @@ class Specification:
         self.variant = resolve_variant(variant)
         self.settings = Settings(
             labels=labels, keep=keep, time_axis=time_axis, frequencies=frequencies,
-            gates=None if gates is None else tuple(gates), temporal_filter=temporal_filter,
+            gates=None if gates is None else tuple(gates), temporal_filter=checked_filter(temporal_filter),
             spp=None if spp is None else count("recipe: spp", spp),
             max_depth=None if max_depth is None else count("recipe: max_depth", max_depth, -1),
             sensors=_counts("sensors", sensors, 0, "all"), bounces=_counts("bounces", bounces, 1, "all"),

@@ -20,6 +20,7 @@ from torchtransient.files import capture_file
 from torchtransient.files.captures import cdt, dirac, keyhole, phasor_field, rect_data, tal, zaragoza
 from torchtransient.files.captures.contents import WHAT, Contents, opened
 from torchtransient.files.captures.gaps import Gaps
+from torchtransient.given_types import is_one_of
 from torchtransient.plain_texts import some_of
 from torchtransient.quantities import shown
 
@@ -126,7 +127,7 @@ def write_capture(path: str | Path, capture: Capture, metadata: Any = None, *, f
 
 
 def _check_name(name: Any, names: tuple[str, ...]) -> None:
-    if name is not None and name not in names:
+    if name is not None and not is_one_of(name, names):
         raise ArgumentError(f"{WHAT}: expected format to be one of {', '.join(names)}, got {shown(name)}.")
 
 
