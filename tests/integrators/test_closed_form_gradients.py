@@ -144,6 +144,22 @@ def test_light_beyond_a_wall_by_its_reflectance(weight, reflectance):
     check_mean(rows, 3.0, 0.02)
 
 
+@pytest.mark.parametrize("weight", [0.0, 1.0])
+def test_mirrors_and_roulette(weight):
+    """A beam between two mirrors comes to the shell after five bounces, with L r^5; few of its samples live so long."""
+    mirror = {"type": "conductor", "material": "none", "specular_reflectance": 0.7}
+    low, high = ({"type": "rectangle", "to_world": pose, "bsdf": mirror} for pose in (
+        T().translate([0, 0, -0.5]), T().translate([0, 0, 0.5]).rotate([1, 0, 0], 180)))  # fmt: skip
+    lit = scene_of(
+        beam((-0.9, 0, 0), (0.2, 0, -0.5)), 8, low=low, high=high, **shell(weight), properties={"rr_depth": 1}
+    )
+    unknown = set_color("low.bsdf.specular_reflectance.value"), 0.7
+    rows = np.array([forward(lit, unknown, 4096, seed)[0] for seed in range(8)])
+    back = np.array([reverse(lit, unknown, spp=4096, seed=seed)[0] for seed in range(8)])
+    np.testing.assert_allclose(back, rows, rtol=2e-3)
+    check_mean(rows, 3 * 3.0 * 0.7**4, 0.02)
+
+
 @pytest.mark.parametrize("black", ["first", "second"])
 @pytest.mark.parametrize("weight", [0.0, 1.0])
 def test_light_beyond_one_black_wall_of_two(black, weight):

@@ -245,3 +245,14 @@ def test_a_lent_array_is_added_to_from_its_first_entry_on():
     assert expected.sum() > 0
     np.testing.assert_allclose(found[7:-4], expected, rtol=1e-5)
     assert not found[:7].any() and not found[-4:].any()
+
+
+def test_what_samples_count_for_in_channels_is_no_function_of_the_scene():
+    """Derivatives by the rays are taken where light arrives, not again where it is counted."""
+    weight = mi.UnpolarizedSpectrum(0.5)
+    dr.enable_grad(weight)
+    rays = Local(ray=dr.zeros(mi.Ray3f), weight=weight, scale=mi.Float(3.0), seen=None)
+    integrator = load(camera(1, 1), {}).integrator()
+    match = integrator.channel_match(Local(observer=None), Local(curves=None), rays)
+    (channel,) = match.to_channels(mi.UnpolarizedSpectrum(2.0))
+    assert float(channel[0]) == 3.0 and not dr.grad_enabled(channel)

@@ -71,6 +71,19 @@ def test_a_pilot_of_a_scene_whose_sensor_is_attached():
     np.testing.assert_allclose(found.energy, expected.energy, rtol=1e-5)
 
 
+def test_a_pilot_from_within_glass_that_is_attached():
+    """Lengths there are times its index, of which nobody asks for a derivative."""
+    ball = {"type": "sphere", "center": [0, 0, 4.0], "radius": 0.5, "bsdf": {"type": "dielectric", "int_ior": 1.5}}
+    lamp = {"type": "point", "intensity": 3.0, "position": [0, 0, 2.0]}
+    scenes = [load(camera(6, 4, bins=3, fov=10.0), {"wall": WALL, "lamp": lamp, "ball": ball}) for _ in range(2)]
+    params = mi.traverse(scenes[1])
+    dr.enable_grad(params["ball.bsdf.eta"])
+    params.update()
+    expected, found = map(events_of, scenes)
+    assert len(found.opl) and found.opl.tolist() == expected.opl.tolist()
+    assert found.energy.tolist() == expected.energy.tolist()
+
+
 def test_at_least_one_sample_a_pixel():
     events = events_of(lit_wall(), paths=1, pixels=1000)
     assert (events.size, events.paths) == ((6, 4), 24)

@@ -151,6 +151,38 @@ def test_points_of_a_sheet_are_carried_along():
     assert not moved[:, 4:].any() and not longer[4:].any()
 
 
+@pytest.mark.parametrize("name", ["first", "rays"])
+def test_distance_to_where_a_ray_leaves(name):
+    """A ball in an instance, seen from outside: not the distance to where the ray enters."""
+    scene = scene_of("sheet", "egg", "tube")
+    params = mi.traverse(scene)
+
+    def distance(x):
+        move(params, x, (name,))
+        ray = rays(x if name == "rays" else 0.0)
+        before = dr.detach(ray)
+        entry = scene.ray_intersect_preliminary(before)
+        pi = scene.ray_intersect_preliminary(mi.Ray3f(before(entry.t + 0.01), before.d))
+        pi.t += entry.t + 0.01
+        met = pi.is_valid()
+        return dr.select(met, module.distance_to(surfaces_of(scene), pi, ray, met), 0)
+
+    above, below = (np.array(distance(mi.Float(x))) for x in (5 * STEP, -5 * STEP))
+    x = unknown()
+    (found,) = derivative(x, [distance(x)])
+    # The first of the four rays to each instance meets its ball.
+    assert np.abs(found[:4]).max() > 0.05
+    np.testing.assert_allclose(found, (above - below) / (10 * STEP), rtol=0.02, atol=0.01)
+
+
+@pytest.mark.parametrize("follows", [False, True])
+def test_rays_that_meet_nothing_have_no_slope(follows):
+    scene, x = scene_of(), unknown()
+    si = interaction(scene, rays(x), mi.RayFlags.All | (mi.RayFlags.FollowShape if follows else mi.RayFlags.Empty))
+    (longer,) = derivative(x, [si.t * 1])
+    assert not np.array(si.is_valid())[9] and longer[9] == 0 and np.abs(longer[:9]).min() > 1e-4
+
+
 def test_slopes_backwards_are_finite():
     """What no ray meets leaves no NaN at the poses, which all lanes share."""
     scene, x = scene_of("egg", "tube"), mi.Float(0)

@@ -11,6 +11,7 @@ from torchtransient.plugins.sampling.distant import DistantReference
 from torchtransient.plugins.transport.scattering.surface import Surface, is_black, strayed
 from torchtransient.plugins.transport.segment import vacuum
 from torchtransient.plugins.transport.segment.material import MaterialVacuum
+from torchtransient.plugins.transport.segment.media import reference
 from torchtransient.plugins.transport.strategy import Guide, Local, Step
 
 VARIANT = "llvm_ad_mono"
@@ -138,6 +139,17 @@ def test_segments_between_points_of_shapes():
     np.testing.assert_allclose(np.array(motion.d)[:, 0], direction, rtol=1e-6)
 
 
+def test_points_of_reference():
+    """That of the medium where light scatters there, without a normal; that of the surface elsewhere."""
+    si, mei = dr.zeros(mi.SurfaceInteraction3f, 2), dr.zeros(mi.MediumInteraction3f, 2)
+    for found, number in ((si, 3.0), (mei, 5.0)):
+        found.t = found.time = mi.Float(number)
+        found.p, found.n = mi.Point3f(number), mi.Normal3f(0, 0, 1)
+    at = reference(si, mei, mi.Bool([True, False]))
+    assert np.array(at.t).tolist() == [5, 3] and np.array(at.p).tolist() == [[5, 3]] * 3
+    assert np.array(at.n).tolist() == [[0, 0], [0, 0], [0, 1]] and np.unique(np.array(at.time)).tolist() == [3]
+
+
 # ----------------------------------------------------------------------------------------------------------- scattering
 
 
@@ -159,7 +171,7 @@ class Points(Guide):
         self.share, self.number, self.given, self.normal, self.primitive = share, number, density, normal, primitive
 
     def draw(self, world, vertex, x, y):
-        p = mi.Point3f(mi.Float(x), mi.Float(y), self.number)
+        p, self.x = mi.Point3f(mi.Float(x), mi.Float(y), self.number), np.array(x)
         return Local(p=p, shape=dr.zeros(mi.ShapePtr), primitive=self.primitive, n=self.normal, uv=None)
 
     def density(self, world, p, q, n, shape, active, primitive=None):
@@ -199,6 +211,8 @@ def test_who_draws_the_next_vertex():
         assert np.array(step.delta).tolist() == np.array(step.unconnected).tolist() == (~guided).tolist()
         np.testing.assert_allclose(np.array(step.weight).ravel(), np.where(guided, 0.5, 2.0))
         assert step.target is None
+        # Those who are not chosen are asked, too, and look things up.
+        assert all(np.all((guide.x >= 0) & (guide.x < 1)) for guide in guides)
     known = Points(0.5, 2, normal=mi.Normal3f(0, 0, 1))
     assert followed([known], 1, u)[1].target is not None and followed([Points(0.5, 2)], 1, u)[1].target is None
     np.testing.assert_allclose(np.array(followed([known], 1, u)[1].weight).ravel(), 0.5)

@@ -378,7 +378,7 @@ def _choice(props: Any, name: str, shared: str) -> str:
 
 def _scanned(scene: Any, sensor: Any) -> Any:
     """What the rays of a scan meet, one for each pixel: all samples of a pixel look at one point."""
-    found = scene.ray_intersect_preliminary(dr.detach(scan_rays(sensor)), coherent=True)
+    found = scene.ray_intersect_preliminary(scan_rays(sensor), coherent=True)
     dr.eval(found)
     return found
 

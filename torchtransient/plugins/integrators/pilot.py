@@ -126,7 +126,7 @@ def _trace(scene, integrator, sensor, film, size, spp, seed, slots) -> tuple[Eve
         settings = replace(settings, max_depth=deepest, rr_depth=min(settings.rr_depth, PILOT_RR_DEPTH))
         world = integrator.world(scene, contents, settings=settings)
         world.start(rays)
-        walk(world, rays.sampler, ray, integrator.first_opl(film, rays), sink, dr.detach(rays.η), rays.leg)
+        walk(world, rays.sampler, ray, integrator.first_opl(film, rays), sink, rays.η, rays.leg)
         most = dr.max(sink.used)
         dr.eval(most, sink.opl, sink.energy, sink.depth)
         dr.sync_thread()
