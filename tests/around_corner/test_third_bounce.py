@@ -6,7 +6,9 @@ import pytest
 
 from support.hidden_shapes import ball, folded_plates, join, mannequin, mesh, plate, scene_of, wall_grid
 from support.third_bounce_runs import WALL_ALBEDO, BruteForce, confocal, film_of, single, table_of
+from torchtransient.plugins.around_corner.third_bounce import _clear
 from torchtransient.plugins.sampling.shared_samples import draw_samples
+from torchtransient.plugins.transport.strategy import Local
 
 VARIANT = "llvm_ad_mono"
 UP = (0.0, 0.0, 1.0)
@@ -177,3 +179,10 @@ def unoccluded(shape, points, normals):
         g = np.maximum((n * d).sum(1), 0) * np.maximum(-d @ m, 0) / r**4
         total.append((f * g * g).sum() * (WALL_ALBEDO / np.pi) ** 2)
     return np.array(total)
+
+
+def test_samples_that_need_no_rays():
+    """The first ones of each tile, as many as it says."""
+    samples = Local(count=4, tiles=3, clear=mi.UInt32([0, 3, 4]))
+    assert np.array(_clear(samples)).reshape(3, 4).sum(1).tolist() == [0, 3, 4]
+    assert np.array(_clear(samples)).tolist() == [False] * 4 + [True] * 3 + [False] + [True] * 4

@@ -24,7 +24,7 @@ class Ends:
         self.count, self.fields = count, fields
         self.size = dr.opaque(mi.UInt32, count)
         with dr.suspend_grad():
-            columns = [column for value in fields.values() for column in _columns(dr.detach(value))]
+            columns = [column for value in fields.values() for column in _columns(value)]
             self.rows = -(-len(columns) // 4)
             columns += [mi.Float(0)] * (4 * self.rows - len(columns))
             rows = [columns[4 * i : 4 * i + 4] for i in range(self.rows)]
