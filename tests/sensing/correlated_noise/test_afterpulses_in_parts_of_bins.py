@@ -83,6 +83,32 @@ def test_pixels_of_several_levels_are_those_of_each():
     torch.testing.assert_close(mapped.squeeze(-1).movedim(0, -1), together, rtol=1e-9, atol=1e-10)
 
 
+def test_counts_beyond_the_window_reach_mapped_pixels_of_several_levels_once():
+    """What the background outside of the window sends is that of each pixel, however many levels there are."""
+    afterpulsing = sensing.Afterpulsing(0.2, 400e-12, 150e-12, axis=AXIS, period_s=1.2e-9, background=7.0)
+    module = sensing.AfterpulsingSPAD(spad(), afterpulsing)
+    x = torch.cat([light(0.1, 1), light(6.0, 1), light(0.3, 1)], -1)
+    mapped = torch.func.vmap(module.expected)(x.movedim(-1, 0).unsqueeze(-1))
+    torch.testing.assert_close(mapped.squeeze(-1).movedim(0, -1), module.expected(x), rtol=1e-9, atol=1e-10)
+
+
+def test_what_does_not_reach_the_window_leaves_nothing_below_zero():
+    """Afterpulses that all come at once: of counts outside of the window, and of other cycles."""
+    window = TimeAxis.from_seconds(0.0, WIDTH, 50)
+    for dead in (0.0, 150e-12):
+        stage = sensing.Afterpulsing(0.2, 10e-12, dead, axis=window, period_s=60 * WIDTH, background=5.0)
+        dark = torch.zeros(1, 50, 1, 1, dtype=torch.float64)
+        assert float(stage.extra(dark).min()) >= 0
+        assert bool((stage.sample(dark, torch.Generator().manual_seed(0)) >= 0).all())
+        one = sensing.AfterpulsingSPAD(sensing.SynchronousSPAD(100, axis=window), stage)
+        several = [sensing.SynchronousSPAD(100, dead_time_s=dead, axis=window)] if dead else []
+        for module in (one, *(sensing.AfterpulsingSPAD(s, stage) for s in several)):
+            flash = dark.clone()
+            flash[:, 25] = 5.0
+            for x in (dark, flash):
+                assert float(module.released(x).min()) >= 0
+
+
 def test_transforms_of_detectors_with_dead_time():
     """Gradients mapped over pixels, of one level and of several: those of autograd."""
     detector = spad()

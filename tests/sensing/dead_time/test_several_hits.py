@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from torch.autograd import forward_ad
 
 from support.sensing.event_driven import compare, detect
 from torchtransient.errors import TorchTransientError, UnitError
@@ -136,6 +137,8 @@ def test_pixels_of_all_levels():
     stacked = torch.stack([x, x.flip(-1)])
     mapped = torch.func.vmap(lambda v: detections_with_dead_time(v, 1.3))(stacked)
     torch.testing.assert_close(mapped, detections_with_dead_time(stacked, 1.3), rtol=1e-12, atol=1e-14)
+    with torch.no_grad():
+        assert torch.equal(torch.func.vmap(lambda v: detections_with_dead_time(v, 1.3))(stacked), mapped)
     by_func = torch.func.grad(lambda v: detections_with_dead_time(v, 1.3).square().sum())(x)
     leaf = mixed(True)
     detections_with_dead_time(leaf, 1.3).square().sum().backward()
@@ -175,6 +178,19 @@ def test_batches_of_autograd_and_of_func():
     bend = torch.func.hessian(lambda v: f(v).square().sum())(x)
     numeric = torch.autograd.functional.hessian(lambda v: f(v).square().sum(), x)
     torch.testing.assert_close(bend, numeric, rtol=1e-11, atol=1e-13)
+
+
+def test_forward_derivatives_where_no_graph_is_built():
+    """`no_grad` is about graphs: tangents of the light and of the dead time go on."""
+    x, d = mixed()[..., :2] + 0.01, torch.tensor(1.3, dtype=torch.float64)
+    for of in (lambda t: (x + t * x, d), lambda t: (x, d + t)):
+        found = []
+        for grad in (True, False):
+            with forward_ad.dual_level(), torch.set_grad_enabled(grad):
+                t = forward_ad.make_dual(torch.zeros_like(d), torch.ones_like(d))
+                found.append(forward_ad.unpack_dual(detections_with_dead_time(*of(t))).tangent.clone())
+        assert float(found[0].abs().max()) > 0.1
+        torch.testing.assert_close(found[1], found[0], rtol=1e-12, atol=1e-14)
 
 
 @pytest.mark.parametrize("dead", [slow(0.7), 1.3])

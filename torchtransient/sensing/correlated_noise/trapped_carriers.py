@@ -282,7 +282,7 @@ def of_cycles(
 def of_free_running(rate: Tensor, dead_bins: Tensor, seen: Tensor, tau: Tensor, steps: int = 1) -> Tensor:
     """The same of a detector that runs free, for rates (P, T) per period; 0 in the dark."""
     dark = rate.sum(-1, keepdim=True) < DARK
-    safe = torch.where(dark, torch.full_like(rate, 1.0 / rate.shape[-1]), rate)
+    safe = torch.where(dark, 0.1, rate)
     found = rate.new_zeros(rate.shape[0], steps * rate.shape[-1])
     for rows, cut in rows_by_contrast(safe):
         pieces = max(cut, steps)

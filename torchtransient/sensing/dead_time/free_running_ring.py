@@ -103,7 +103,7 @@ def train_counts(
     """
     counts = torch.zeros_like(rate)
     dark = rate.sum(-1, keepdim=True) < DARK
-    safe = torch.where(dark, torch.full_like(rate, 1.0 / rate.shape[-1]), rate)
+    safe = torch.where(dark, 0.1, rate)
     for rows, pieces in rows_by_level(safe.clamp_max(_FLOOD), float(dead_bins), PHOTONS):
         own = safe if rows is None else safe[rows]
         state = _stationary(own, dead_bins, pieces)

@@ -44,7 +44,7 @@ def stationary_state(rate: Tensor, dead_bins: Tensor) -> FreeRunningState:
     """
     # a dark pixel has no phases; its limit is one photon, at most, per many periods
     dark = rate.sum(-1, keepdim=True) < DARK
-    safe = torch.where(dark, torch.full_like(rate, 1.0 / rate.shape[-1]), rate)
+    safe = torch.where(dark, 0.1, rate)
     state = _settled(safe, dead_bins, 1)
     inside = _armed_in_the_light(safe, state).nonzero().flatten()
     for rows, pieces in rows_by_contrast(safe[inside]):
