@@ -132,6 +132,18 @@ def test_samples_add_whole_counts():
     assert float(y.mean() / 200) == pytest.approx(1 / 0.95, rel=2e-3)
 
 
+def test_counts_below_zero_trigger_nothing():
+    """As differences have them, whole or not; and a measurement of less than was given has nothing added."""
+    x = torch.full((1, BINS, 3, 2), -2.5, dtype=torch.float64)
+    for stage in (Crosstalk(0.02), Afterpulsing(0.05, 4e-10, 1e-10, bin_width_s=1e-10)):
+        for counts in (x, 2 * x):
+            assert torch.equal(stage.sample(counts, torch.Generator().manual_seed(0)), counts)
+        lit = x.abs()
+        alike = stage.log_prob(lit, lit)
+        torch.testing.assert_close(alike, -stage.extra(lit).sum(1), rtol=1e-12, atol=0)
+        torch.testing.assert_close(stage.log_prob(lit - 1, lit), alike, rtol=1e-12, atol=0)
+
+
 def test_hot_pixels():
     rates = hot_pixel_rates(200, 200, median_hz=50.0, hot_fraction=0.02, generator=torch.Generator().manual_seed(0))
     assert float(rates.median()) == pytest.approx(50.0, rel=0.03)

@@ -62,7 +62,7 @@ def bin_chances(rate: Tensor, state: FreeRunningState) -> BinChances:
     # detections of before the period
     dead = back_soon * (index < whole) + back_late * (index < whole + 1)
     begin = torch.cat([state.armed.narrow(TIME, 0, 1), dead], TIME)
-    begin = begin / begin.sum(TIME, keepdim=True).clamp_min(1)  # rounding
+    begin = begin / begin.sum(TIME, keepdim=True)  # rounding
     return step_chances(rate, state.detected, state.armed, state.late, back, begin, whole)
 
 

@@ -30,7 +30,13 @@ from torchtransient.sensing.dead_time.free_running_draws import (
     normal_share,
 )
 from torchtransient.sensing.dead_time.free_running_events import begin_places, event_counts
-from torchtransient.sensing.dead_time.free_running_state import DARK, FreeRunningState, late_lines, per_period
+from torchtransient.sensing.dead_time.free_running_state import (
+    DARK,
+    FreeRunningState,
+    late_lines,
+    per_period,
+    within_limits,
+)
 from torchtransient.sensing.dead_time.renewal_chain import RenewalChain
 from torchtransient.sensing.dead_time.stationary_phases import stationary_phases, tangent_phases
 from torchtransient.sensing.numerics.draws import sample_multinomial
@@ -58,22 +64,23 @@ class _Stationary:
     chain: RenewalChain
     pieces: int
     phases: Tensor  # lines whose counts sum to 1,
-    lines: Tensor  # per period
+    state: FreeRunningState  # per period
     chances: BinChances
 
     @property
     def per_bin(self) -> Tensor:
         """Detections (P, T) per period."""
-        return _whole_bins(self.lines[:, : self.chain.bins].clamp_min(0), self.pieces)
+        return _whole_bins(self.state.detected, self.pieces)
 
     def of(self, rows: Tensor) -> _Stationary:
         if torch.equal(rows, torch.arange(self.chain.rate.shape[0], device=rows.device)):
             return self
-        c = self.chances
+        c, s = self.chances, self.state
         begin = None if c.begin is None else c.begin[:, rows]
         chances = BinChances(begin, c.fire[:, rows], c.soon[:, rows], c.late[:, rows], c.whole)
         chain = RenewalChain(self.chain.rate[rows], self.chain.whole, self.chain.part)
-        return _Stationary(chain, self.pieces, self.phases[rows], self.lines[rows], chances)
+        state = FreeRunningState(s.detected[rows], s.armed[rows], s.late[rows], s.whole)
+        return _Stationary(chain, self.pieces, self.phases[rows], state, chances)
 
 
 def _whole_bins(fine: Tensor, pieces: int) -> Tensor:
@@ -85,12 +92,9 @@ def _stationary(rate: Tensor, dead_bins: Tensor, pieces: int) -> _Stationary:
     whole, part = whole_and_part(dead_bins.to(rate.device) * pieces)
     chain = RenewalChain(fine, whole, part)
     phases = stationary_phases(fine, part, whole)
-    lines = per_period(chain, phases)
-    count = lines[:, : chain.bins].clamp_min(0)
-    late = torch.minimum(late_lines(lines, part).clamp_min(0), count)
-    armed = chain.at_start(chain.inflow(lines)).clamp(0, 1)
-    state = FreeRunningState(_columns(count), _columns(armed), _columns(late), whole)
-    return _Stationary(chain, pieces, phases, lines, bin_chances(_columns(fine), state))
+    state = within_limits(chain, per_period(chain, phases))
+    columns = FreeRunningState(_columns(state.detected), _columns(state.armed), _columns(state.late), whole)
+    return _Stationary(chain, pieces, phases, state, bin_chances(_columns(fine), columns))
 
 
 def train_counts(
@@ -144,7 +148,7 @@ def _whole_counts(
                 f"part of the period, got {float(number[rows].max()):g}. The phase is remembered over so many of them "
                 "that they are drawn one by one. Use fewer cycles, or grad='gaussian'."
             )
-        start = begin_places(chosen.chain, chosen.lines, generator) / state.pieces
+        start = begin_places(chosen.state, chosen.chain.part, generator) / state.pieces
         counts = counts.index_copy(0, rows, event_counts(rate[rows], dead_bins, start, periods, generator))
     return counts
 
@@ -226,5 +230,4 @@ def _added(counts: Tensor, more: Tensor, generator: torch.Generator | None) -> T
     start = torch.rand(counts[:, :1].shape, dtype=counts.dtype, device=counts.device, generator=generator)
     upto = counts.cumsum(-1) + torch.floor(more.cumsum(-1) + start)
     # a bin with too few to take away from leaves it to the next one, the last one to the first: the total is kept
-    total = upto[:, -1:].clamp_min(0)
-    return torch.cat([upto - total, upto], -1).cummax(-1).values[:, -counts.shape[-1] - 1 :].diff(dim=-1)
+    return torch.cat([upto - upto[:, -1:], upto], -1).cummax(-1).values[:, -counts.shape[-1] - 1 :].diff(dim=-1)

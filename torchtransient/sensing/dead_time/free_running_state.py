@@ -123,6 +123,14 @@ def late_lines(lines: Tensor, part: Tensor) -> Tensor:
     return part * lines[:, :bins] + math.sqrt(3.0) * (1 - part) * part * lines[:, bins:]
 
 
+def within_limits(chain: RenewalChain, lines: Tensor) -> FreeRunningState:
+    """Of lines (P, 2 N), which may dip below zero where detections crowd at an edge: what can be drawn from."""
+    count = lines[:, : chain.bins].clamp_min(0)
+    late = torch.minimum(late_lines(lines, chain.part).clamp_min(0), count)
+    armed = chain.at_start(chain.inflow(lines)).clamp(0, 1)
+    return FreeRunningState(count, armed, late, chain.whole)
+
+
 def _solved(rate: Tensor, dead_bins: Tensor, pieces: int) -> FreeRunningState:
     """With every bin cut in `pieces` of equal rate, and put together again."""
     pixels, bins = rate.shape
