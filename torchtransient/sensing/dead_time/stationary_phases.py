@@ -100,7 +100,7 @@ def _tangent(chain: RenewalChain, pi: Tensor, right: Tensor) -> Tensor:
         hard, p, r = RenewalChain(chain.rate[rows], chain.whole, chain.part), pi[rows], right[rows]
         direct = solve_banded(hard, r, p[:, : chain.bins].argmax(-1), transposed=False)
         direct = direct - p * _counts(hard, direct)
-        _check((direct - hard.step(direct) - r).norm(dim=-1) / direct.norm(dim=-1).clamp_min(1e-300))
+        _check((direct - hard.step(direct) - r).norm(dim=-1) / direct.norm(dim=-1))
         found = found.index_copy(0, rows, direct)
     return found
 
