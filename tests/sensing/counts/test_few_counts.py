@@ -106,7 +106,8 @@ def test_bins_whose_counts_go_by_lags_of_their_own(tally):
     shares[0, 2], shares[3, 3] = 1.0, 1.0
     for level in (3.0, 1000.0):
         counts = torch.full((1, 4, 2, 3), level, dtype=torch.float64)
-        moved, tallies = move_counts(counts, Moves(0, shares, "periodic"), torch.Generator().manual_seed(0), tally=tally)
+        g = torch.Generator().manual_seed(0)
+        moved, tallies = move_counts(counts, Moves(0, shares, "periodic"), g, tally=tally)
         # bin 0 goes to 0 and 1, bin 1 to 3 and 0, bin 2 to itself, bin 3 to 2
         assert bool((moved.sum(1) == 4 * level).all())
         assert bool((moved[:, 0] + moved[:, 1] + moved[:, 3] == 2 * level).all())

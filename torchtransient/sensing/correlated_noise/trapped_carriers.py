@@ -241,7 +241,7 @@ def of_cycles(
     `earlier(detections, rows)`: carriers of other cycles. `tau` (K,) in bins.
     """
     size = rate.shape[-1]
-    least = max(steps, 1 if float(dead_bins.detach()) >= 1 - 1e-9 else 2)
+    least = max(steps, 1 if float(dead_bins) >= 1 - 1e-9 else 2)
     level, present, hidden = row_levels(rate + (seen / tau).sum(), least)
 
     def solved(rows: Tensor, at: Tensor | slice, pieces: int) -> Tensor:
