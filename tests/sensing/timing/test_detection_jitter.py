@@ -277,6 +277,16 @@ def test_log_probability_of_multinomial_counts():
     assert float(multinomial_log_prob(n + 1, p, 12)) == -float("inf")
 
 
+@pytest.mark.parametrize("level", [0.01, 3.0, 1e5])
+def test_counts_beside_items_below_zero_are_moved(level):
+    """Differences have a mean, and no counts that could be drawn."""
+    whole = torch.poisson(torch.full((1, 1, 40, 3, 4), level), generator=generator())
+    x = torch.cat([whole, torch.full_like(whole, -2.5)])
+    moved = jitter(boundary="periodic").sample(x, generator())
+    torch.testing.assert_close(moved[1], jitter(boundary="periodic").expected(x[1]))
+    assert torch.equal(moved[0].sum(1), whole[0].sum(1)) and torch.equal(moved[0], moved[0].round())
+
+
 def test_log_probability_of_chances_that_round_to_more_than_one():
     """Cycles without a detection are all but impossible then, and no NaN."""
     p = torch.full((10, 1, 1), 0.1, dtype=torch.float32)

@@ -132,8 +132,7 @@ def draw_path(
 
 def log_likelihood(count: Tensor, chance: Tensor) -> Tensor:
     """count log(chance), 0 for no count whatever the chance."""
-    some = count != 0
-    return torch.where(some, count * torch.log(torch.where(some, chance, torch.ones_like(chance))), 0.0)
+    return count * torch.log(torch.where(count != 0, chance, 1.0))
 
 
 def path_log_prob(path: Path, chances: BinChances, periods: int) -> Tensor:
