@@ -249,6 +249,31 @@ def test_more_detections_than_cycles_leave_none_armed():
         assert 0 <= float(here.part) < 1e-12
 
 
+def test_estimates_have_gradients_where_no_cycle_is_armed():
+    """All ten are dead for three bins: nothing is known of these, and nothing is infinite."""
+    counts = image([10.0, 0.4, 0.0, 6.0, 1.0]).requires_grad_()
+    rate, valid = coates(counts, 10, 3.0)
+    assert valid.flatten().tolist() == [False, False, False, True, True] and rate.flatten()[1:3].tolist() == [0.0, 0.0]
+    assert bool(rate.isfinite().all())
+    (slope,) = torch.autograd.grad(rate.sum(), counts)
+    assert bool(slope.isfinite().all()) and bool((slope[:, 3:] != 0).all())
+
+
+@pytest.mark.parametrize("dead", [1.0, 1.4, 2.3])
+def test_slopes_of_estimates_where_nothing_was_detected(dead):
+    """A detection more in a bin without one: the rate rises by the time that cycles are armed in it, as it does."""
+    counts = image([60.0, 0.0, 20.0, 0.0, 5.0])
+    rate = coates(leaf := counts.clone().requires_grad_(), 100, dead).rate.flatten()
+    assert rate[1::2].tolist() == [0.0, 0.0]
+    for k in (1, 3):
+        (slope,) = torch.autograd.grad(rate[k], leaf, retain_graph=True)
+        more = counts.clone()
+        more[:, k] = 1e-4
+        risen = float(coates(more, 100, dead).rate.flatten()[k]) / 1e-4
+        # what uncut bins miss has no derivative
+        assert float(slope.flatten()[k]) == pytest.approx(risen, rel=5e-3)
+
+
 def test_in_a_flood_coates_looks_no_closer(monkeypatch):
     """What uncut bins miss is asked for rates of 30 a bin at most, and is a tenth of the counts at most."""
     asked, given = [], []

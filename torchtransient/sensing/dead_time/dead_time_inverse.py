@@ -108,7 +108,7 @@ def _explained(here: ArmedCounts, share: Tensor, cycles: float) -> Tensor:
     trials = here.cycles
     usable = ~(trials <= 0.5)  # NaN stays NaN
     trials = torch.where(usable, trials, torch.ones_like(trials))
-    share = torch.where(usable, share, torch.zeros_like(share)).clamp(0, 1 - 1 / (2 * cycles))
+    share = share.clamp(0, 1 - 1 / (2 * cycles))
     armed = torch.where(usable, here.armed, trials)
     back = None if here.back is None else here.back * usable.unsqueeze(1)
     here, target = ArmedCounts(armed, back, here.part), trials.log() + torch.log1p(-share)
@@ -125,7 +125,8 @@ def _explained(here: ArmedCounts, share: Tensor, cycles: float) -> Tensor:
             if not bool(((rate - last).abs() > _SETTLED * (1 + rate)).any()):
                 break
     found = torch.where(rate < _BRIGHTEST, better(rate), rate)
-    return torch.where(share > 0, found, share)
+    # none fired: no rate but rounding, which falls away with its derivative left
+    return torch.where(share > 0, found, found - found.detach())
 
 
 def rates_of_counts(counts: Tensor, cycles: float, dead_bins: float) -> tuple[Tensor, Tensor]:

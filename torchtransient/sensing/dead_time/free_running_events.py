@@ -34,7 +34,7 @@ def begin_places(state: FreeRunningState, part: Tensor, generator: torch.Generat
     armed = state.armed[:, :1]
     start = torch.zeros_like(armed)
     left = (uniform() >= armed) & (weights[:, -1:] > 0)
-    share = torch.where(count > 0, state.late / count, 0.0)
+    share = state.late / count  # NaN of pieces that nothing is drawn from
     for _ in range(_TRIES):
         if not bool(left.any()):
             break

@@ -117,12 +117,13 @@ def train_counts(
         else:
             found = _whole_counts(state, own, dead_bins, periods, generator)
         counts = found if rows is None else counts.index_copy(0, rows, found)
-    if bool(dark.any()):
-        many = torch.full_like(rate, float(periods))
-        # without light there is nothing to be dead after
-        alone = (normal_share if normal else binomial_share)(many, torch.where(dark, rate, 0.0), generator)
-        counts = torch.where(dark, alone, counts)
-    return counts
+    rows = dark.squeeze(-1).nonzero().squeeze(-1)
+    if not rows.numel():
+        return counts
+    # without light there is nothing to be dead after
+    many = torch.full_like(rate[rows], float(periods))
+    alone = (normal_share if normal else binomial_share)(many, rate[rows], generator)
+    return counts.index_copy(0, rows, alone)
 
 
 def _whole_counts(
@@ -201,8 +202,7 @@ def _closing(
     begin = _rows(path.begin)
     # the train itself begins and ends somewhere
     first, last = (_rows(sample_multinomial(1, chances.begin, generator)) for _ in range(2))
-    known = (first.sum(-1, keepdim=True) > 0) & (last.sum(-1, keepdim=True) > 0)
-    ends = torch.where(known, first - last, 0.0)
+    ends = first - last
     armed = path.end - begin[:, :1] + ends[:, :1]
     back = _rows(path.wrapped) - begin[:, 1:] + ends[:, 1:]
     soon = _rows(chances.soon)

@@ -65,7 +65,7 @@ class BinaryFrames(RandomSensor):
         n, r = measurement.double(), check_rates(x, "BinaryFrames").double()
         hit = n > 0
         fire = log_of_firing(torch.where(hit, r, 0.5))
-        value = n * fire - r * (self.frames - n)
+        value = torch.where(hit, n * fire, torch.zeros_like(r)) - r * (self.frames - n)
         total = torch.lgamma(torch.tensor(self.frames + 1.0, dtype=torch.float64))
         value = value + (total - torch.lgamma(n + 1) - torch.lgamma(self.frames - n + 1))
         return value.sum(TIME).to(x.dtype)

@@ -346,7 +346,7 @@ def first_photon_log_prob(
     hit = n != 0
     # where on the input: the logarithm of 0 has no finite gradient
     fire = log_of_firing(torch.where(hit, r, 0.5))
-    value = n * fire - r * quiet - sooner
+    value = torch.where(hit, n * fire, torch.zeros_like(r)) - r * quiet - sooner
     if constant:
         value = value + (torch.lgamma(n + quiet + 1) - torch.lgamma(n + 1) - torch.lgamma(quiet + 1))
     return value.to(rate.dtype)
