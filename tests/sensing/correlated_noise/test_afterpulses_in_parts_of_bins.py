@@ -160,6 +160,24 @@ def test_hazards_of_parts_of_bins():
     assert carriers._ratio(number([1.0, 4.0]), number([1e-201, 1e-199])).tolist() == pytest.approx([0.0, 4e199])
 
 
+class Watched(carriers.RingTrain):
+    """Remembers the lowest rate that it was asked for."""
+
+    least = 1.0
+
+    def trapped(self, rate, lost, back, source):
+        Watched.least = min(Watched.least, float(rate.min()))
+        return super().trapped(rate, lost, back, source)
+
+
+def test_no_rate_of_other_carriers_is_below_zero():
+    """Of pairs in the dark before a flash, where each of them makes others less likely."""
+    first = number([[1e-6, 1e-6, 1.0, 1e-6, 1e-6, 1e-6]])
+    train = Watched(1, number(0.3))
+    hazard, _ = carriers.armed_hazard(train, None, first, None, number([0.5]), number([2.0]), number(1.3))
+    assert 0 < Watched.least <= 1e-6 * (1 + 1e-9) and bool((hazard > 0).all())
+
+
 def test_generations_of_carriers():
     """Until 1e-5 of them are left, two at least; one where there are hardly any."""
     for seen, rounds in (([1e-6], 1), ([0.9e-5], 1), ([1.1e-5], 2), ([0.003], 2), ([0.004], 3), ([0.1, 0.1], 8),

@@ -16,6 +16,7 @@ from torchtransient.sensing.dead_time.dead_time_inverse import armed_time, check
 from torchtransient.sensing.dead_time.free_running_events import begin_places
 from torchtransient.sensing.dead_time.free_running_state import (
     FreeRunningState,
+    _armed_in_the_light,
     _settled,
     _solved,
     per_period,
@@ -204,6 +205,35 @@ def test_stationary_states_in_bright_light_are_within_limits(dead):
     assert float(bare.armed.min()) < 0
     assert bool((state.detected >= 0).all() & (state.late >= 0).all() & (state.late <= state.detected).all())
     assert bool((state.armed >= 0).all() & (state.armed <= 1).all())
+
+
+@pytest.mark.parametrize("dead", [1.3, 4.0])
+def test_stationary_states_by_hand(dead):
+    """Constant light n: n / (1 + n d) detected, the rest armed; of a flash all come back late but those of its first
+    1 - part. In the dark all are armed, and what is detected are the photons."""
+    rate = number([[0.4] * 6, [0.0] * 6, [1e-13, 0, 0, 0, 0, 0], [0, 0, 0.3, 0, 0, 0]])
+    state, part = stationary_state(rate, number(dead)), dead % 1
+    n = 0.4 / (1 + 0.4 * dead)
+    assert state.detected[0].tolist() == pytest.approx([n] * 6)
+    assert state.late[0].tolist() == pytest.approx([part * n] * 6)
+    assert state.armed[0].tolist() == pytest.approx([1 - n * dead] * 6)
+    assert torch.equal(state.detected[1:3], rate[1:3]) and state.late[1:3].abs().sum() == 0
+    assert bool((state.armed[1:3] == 1).all())
+    once = -math.expm1(-0.3)  # in a period
+    assert float(state.detected[3, 2]) == pytest.approx(once, rel=1e-3)
+    assert float(state.late[3, 2]) == pytest.approx(once - -math.expm1(-0.3 * (1 - part)), rel=2e-2, abs=1e-12)
+    assert state.armed[3, 2:4].tolist() == pytest.approx([1.0, 1 - once], rel=1e-3)
+
+
+def test_detections_that_end_being_dead_in_the_light():
+    """All of bin 0 are armed again in bin 3, or those that are late in bin 4: whether it is bright there."""
+    for late, place in ((0.0, 3), (0.9, 4)):
+        detected = number([[0.9, 0, 0, 0, 0, 0]])
+        state = FreeRunningState(detected, torch.ones_like(detected), detected * (late > 0), 3)
+        for lit in range(6):
+            rate = number([[0.1] * 6])
+            rate[0, lit] = 20.0
+            assert bool(_armed_in_the_light(rate, state)) == (lit == place)
 
 
 def test_detectors_that_nothing_of_the_period_before_keeps_dead_begin_armed():

@@ -129,6 +129,14 @@ def test_amplitudes_at_the_edge_of_what_light_can_have(readout, read, known):
         assert flat(found.depth_std_m.isnan()) == [not taken], factor
 
 
+def test_all_of_the_light_in_one_tap_is_light():
+    """a = 2 offset, but for rounding of 1e-5 of the largest tap; without noise a ten thousandth more is none."""
+    assert flat(sensing.read_itof(frames(8, 0, 0, 0), F, 4).depth_std_m) == pytest.approx([0.0], abs=1e-12)
+    with pytest.warns(PhysicsWarning, match="more amplitude than their light"):
+        found = sensing.read_itof(frames(8, -4e-4, 0, -4e-4), F, 4)
+    assert flat(found.depth_std_m.isnan()) == [True]
+
+
 def test_noise_of_a_phase():
     a, b = torch.tensor([5.0, 20.0]).double(), torch.tensor([18.0, 50.0]).double()
     single = itof_reading.phase_noise_rad(a, b, 3, read_noise_e=2.0)
