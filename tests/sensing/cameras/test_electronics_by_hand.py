@@ -86,6 +86,26 @@ def test_normal_numbers_that_are_clipped():
     assert float(clipped_normal_variance(at, -wide, 80.0)) == 0.0
 
 
+def test_no_variance_is_below_zero():
+    """A charge below zero has no noise of its own, and that of normal numbers without variance is none."""
+    at = torch.tensor([70.0, 90.0]).double()
+    assert flat(clipped_normal_mean(at, torch.full_like(at, -9.0), high=80.0)) == pytest.approx([70.0, 80.0], abs=1e-9)
+    x = light(-20.0, 10.0)
+    drawn = sensing.PixelElectronics(shot_noise=False, excess_noise=1.5, read_noise_e=2.0)
+    assert flat(drawn.variance(x)) == [4.0, 0.5 * 10 + 4.0]
+    spread = drawn.sample(light(-20.0).expand(1, 1, 1, 40_000), torch.Generator().manual_seed(0)).var()
+    assert float(spread) == pytest.approx(4.0, rel=0.05)
+
+
+def test_a_full_well_far_away_takes_nothing():
+    """However far: squares of standard deviations are not subtracted from one another."""
+    mean, variance = torch.tensor(5.0).double(), torch.tensor(4.0).double()
+    for high in (1e3, 1e6, 1e12):
+        assert float(clipped_normal_variance(mean, variance, high)) == pytest.approx(4.0, rel=1e-12)
+        assert float(clipped_normal_variance(mean.float(), variance.float(), high)) == pytest.approx(4.0, rel=1e-4)
+        assert 0 <= float(clipped_normal_variance(mean + 2 * high, variance, high)) < 1e-30
+
+
 def test_reset_noise():
     """sqrt(k T C) / q, of up to a nanofarad."""
     assert ktc_noise(4e-15, 250.0) == pytest.approx(math.sqrt(1.380649e-23 * 250 * 4e-15) / 1.602176634e-19)

@@ -237,6 +237,10 @@ REFUSED = {
         lambda: [halves(lambda: sensing.MacroPixel(pulsing(), 2)), sensing.Afterpulsing(0.05, 1e-9, 3e-10, axis=AXIS)],
         "afterpulses of its own",
     ),
+    "afterpulses twice, with jitter between": (
+        lambda: [pulsing(), jitter(), sensing.Afterpulsing(0.05, 1e-9, 3e-10, axis=AXIS)],
+        "afterpulses of its own",
+    ),
     "codes of another number": (lambda: [budget(), spad(), sensing.TDC(torch.ones(64))], "16 bins .*64 bins"),
     "codes behind codes of another number": (
         lambda: [sensing.TDC(torch.ones(64)), sensing.TDC(torch.ones(32))],

@@ -172,6 +172,7 @@ def test_adjoint(length):
     assert linearity_error(sensor, x) < 1e-12
     saturating = Compose([PixelElectronics(full_well_e=0.5)])
     assert linearity_error(saturating, light()) > 0.1
+    assert linearity_error(sensor, 0 * light()) == 0.0
 
 
 @pytest.mark.parametrize(

@@ -83,6 +83,32 @@ def test_pixels_of_several_levels_are_those_of_each():
     torch.testing.assert_close(mapped.squeeze(-1).movedim(0, -1), together, rtol=1e-9, atol=1e-10)
 
 
+def test_counts_beyond_the_window_reach_mapped_pixels_of_several_levels_once():
+    """What the background outside of the window sends is that of each pixel, however many levels there are."""
+    afterpulsing = sensing.Afterpulsing(0.2, 400e-12, 150e-12, axis=AXIS, period_s=1.2e-9, background=7.0)
+    module = sensing.AfterpulsingSPAD(spad(), afterpulsing)
+    x = torch.cat([light(0.1, 1), light(6.0, 1), light(0.3, 1)], -1)
+    mapped = torch.func.vmap(module.expected)(x.movedim(-1, 0).unsqueeze(-1))
+    torch.testing.assert_close(mapped.squeeze(-1).movedim(0, -1), module.expected(x), rtol=1e-9, atol=1e-10)
+
+
+def test_what_does_not_reach_the_window_leaves_nothing_below_zero():
+    """Afterpulses that all come at once: of counts outside of the window, and of other cycles."""
+    window = TimeAxis.from_seconds(0.0, WIDTH, 50)
+    for dead in (0.0, 150e-12):
+        stage = sensing.Afterpulsing(0.2, 10e-12, dead, axis=window, period_s=60 * WIDTH, background=5.0)
+        dark = torch.zeros(1, 50, 1, 1, dtype=torch.float64)
+        assert float(stage.extra(dark).min()) >= 0
+        assert bool((stage.sample(dark, torch.Generator().manual_seed(0)) >= 0).all())
+        one = sensing.AfterpulsingSPAD(sensing.SynchronousSPAD(100, axis=window), stage)
+        several = [sensing.SynchronousSPAD(100, dead_time_s=dead, axis=window)] if dead else []
+        for module in (one, *(sensing.AfterpulsingSPAD(s, stage) for s in several)):
+            flash = dark.clone()
+            flash[:, 25] = 5.0
+            for x in (dark, flash):
+                assert float(module.released(x).min()) >= 0
+
+
 def test_transforms_of_detectors_with_dead_time():
     """Gradients mapped over pixels, of one level and of several: those of autograd."""
     detector = spad()
@@ -132,6 +158,24 @@ def test_hazards_of_parts_of_bins():
         (slope,) = torch.autograd.grad(ratio.sum(), whole)
     assert ratio.tolist() == [1.5, 0.0, 0.0] and slope.tolist() == [-0.75, 0.0, 0.0]
     assert carriers._ratio(number([1.0, 4.0]), number([1e-201, 1e-199])).tolist() == pytest.approx([0.0, 4e199])
+
+
+class Watched(carriers.RingTrain):
+    """Remembers the lowest rate that it was asked for."""
+
+    least = 1.0
+
+    def trapped(self, rate, lost, back, source):
+        Watched.least = min(Watched.least, float(rate.min()))
+        return super().trapped(rate, lost, back, source)
+
+
+def test_no_rate_of_other_carriers_is_below_zero():
+    """Of pairs in the dark before a flash, where each of them makes others less likely."""
+    first = number([[1e-6, 1e-6, 1.0, 1e-6, 1e-6, 1e-6]])
+    train = Watched(1, number(0.3))
+    hazard, _ = carriers.armed_hazard(train, None, first, None, number([0.5]), number([2.0]), number(1.3))
+    assert 0 < Watched.least <= 1e-6 * (1 + 1e-9) and bool((hazard > 0).all())
 
 
 def test_generations_of_carriers():

@@ -19,6 +19,7 @@ from torchtransient.sensing import (
     afterpulse_kernel,
     hot_pixel_rates,
 )
+from torchtransient.sensing.correlated_noise import crosstalk
 
 BINS = 40
 
@@ -130,6 +131,29 @@ def test_samples_add_whole_counts():
     assert torch.equal(y, y.round())
     assert bool((y >= x).all())
     assert float(y.mean() / 200) == pytest.approx(1 / 0.95, rel=2e-3)
+
+
+def test_counts_below_zero_trigger_nothing():
+    """As differences have them, whole or not; and a measurement of less than was given has nothing added."""
+    x = torch.full((1, BINS, 3, 2), -2.5, dtype=torch.float64)
+    for stage in (Crosstalk(0.02), Afterpulsing(0.05, 4e-10, 1e-10, bin_width_s=1e-10)):
+        for counts in (x, 2 * x):
+            assert torch.equal(stage.sample(counts, torch.Generator().manual_seed(0)), counts)
+        lit = x.abs()
+        alike = stage.log_prob(lit, lit)
+        torch.testing.assert_close(alike, -stage.extra(lit).sum(1), rtol=1e-12, atol=0)
+        torch.testing.assert_close(stage.log_prob(lit - 1, lit), alike, rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize("together", [1, 3, 7, 20])
+def test_frames_that_are_followed_some_at_a_time(together, monkeypatch):
+    """Each has crosstalk of its own detections, and all of it, however many fit into a block."""
+    monkeypatch.setattr(crosstalk, "_BLOCK", together * 2 * 3 + 1)
+    x = torch.full((100, 2, 3), 20.0)
+    stage = Crosstalk(0.1, diagonal_ratio=0.5)
+    found = stage.sample(x.unsqueeze(0), torch.Generator().manual_seed(0))[0] - x
+    mean = stage.extra(x.unsqueeze(0).double())[0]
+    assert bool(((found - mean).sum((1, 2)).abs() < 5 * mean.sum((1, 2)).sqrt()).all())
 
 
 def test_hot_pixels():

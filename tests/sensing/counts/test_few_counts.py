@@ -96,3 +96,35 @@ def test_the_largest_random_number_stays_in_its_column(pixels, monkeypatch):
     chances = torch.tensor([[0.25], [0.5], [0.5]], dtype=torch.float64).expand(-1, pixels)
     counts = draws._one_by_one(torch.ones(pixels, dtype=torch.float64), chances, None)
     assert torch.equal(counts, torch.tensor([[0.0], [1.0], [0.0]], dtype=torch.float64).expand(-1, pixels))
+
+
+@pytest.mark.parametrize("tally", [False, True])
+def test_bins_whose_counts_go_by_lags_of_their_own(tally):
+    """Lags that a bin does not use get none of its counts, whichever are looked at together."""
+    shares = torch.zeros(4, 4, dtype=torch.float64)
+    shares[:2, 0], shares[2:, 1] = 0.5, 0.5
+    shares[0, 2], shares[3, 3] = 1.0, 1.0
+    for level in (3.0, 1000.0):
+        counts = torch.full((1, 4, 2, 3), level, dtype=torch.float64)
+        g = torch.Generator().manual_seed(0)
+        moved, tallies = move_counts(counts, Moves(0, shares, "periodic"), g, tally=tally)
+        # bin 0 goes to 0 and 1, bin 1 to 3 and 0, bin 2 to itself, bin 3 to 2
+        assert bool((moved.sum(1) == 4 * level).all())
+        assert bool((moved[:, 0] + moved[:, 1] + moved[:, 3] == 2 * level).all())
+        assert bool((moved[:, 2] == 2 * level).all()) and 0 < float(moved[:, 1].mean()) < level
+        if tallies is not None:
+            assert bool((tallies[:2].sum(0) == 2 * level).all()) and bool((tallies[3] >= level).all())
+
+
+def test_shares_that_rounding_puts_below_none_or_above_all():
+    """Draws, tallies and noise are those of none and of all."""
+    x = torch.full((1, 3, 40, 50), 7.0, dtype=torch.float64)
+    below = Moves(-1, torch.tensor([-1e-17, 0.6, 0.4], dtype=torch.float64), "periodic")
+    above = Moves(0, torch.tensor([[0.5, 0.3, 0.2], [0.1, 0.7 + 3e-16, 0.8 + 3e-16]], dtype=torch.float64), "periodic")
+    assert float(above.shares.sum(0).max()) > 1 and float(above.shares.sum(0).min()) < 1
+    for moves in (below, above):
+        assert bool(torch.isfinite(moves.noise(x, torch.Generator().manual_seed(0))).all())
+        moved, tallies = move_counts(x, moves, torch.Generator().manual_seed(0), tally=True)
+        assert bool((moved >= 0).all()) and tallies is not None and bool((tallies >= 0).all())
+        assert moved.mean((0, 2, 3)).tolist() == pytest.approx(moves.mean(x).mean((0, 2, 3)).tolist(), abs=0.3)
+    assert float(move_counts(x, below, torch.Generator().manual_seed(0), tally=True)[1][0].sum()) == 0

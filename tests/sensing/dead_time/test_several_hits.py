@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from torch.autograd import forward_ad
 
 from support.sensing.event_driven import compare, detect
 from torchtransient.errors import TorchTransientError, UnitError
 from torchtransient.sensing import ScoreFunction, SynchronousSPAD, coates, first_photon_log_prob, sample_detections
+from torchtransient.sensing.dead_time import dead_time_inverse
 from torchtransient.sensing.dead_time.dead_time_cycle import detected_rows
 from torchtransient.sensing.dead_time.dead_time_means import detected_columns
 from torchtransient.sensing.spad.spad import detections_with_dead_time
@@ -136,6 +138,8 @@ def test_pixels_of_all_levels():
     stacked = torch.stack([x, x.flip(-1)])
     mapped = torch.func.vmap(lambda v: detections_with_dead_time(v, 1.3))(stacked)
     torch.testing.assert_close(mapped, detections_with_dead_time(stacked, 1.3), rtol=1e-12, atol=1e-14)
+    with torch.no_grad():
+        assert torch.equal(torch.func.vmap(lambda v: detections_with_dead_time(v, 1.3))(stacked), mapped)
     by_func = torch.func.grad(lambda v: detections_with_dead_time(v, 1.3).square().sum())(x)
     leaf = mixed(True)
     detections_with_dead_time(leaf, 1.3).square().sum().backward()
@@ -175,6 +179,19 @@ def test_batches_of_autograd_and_of_func():
     bend = torch.func.hessian(lambda v: f(v).square().sum())(x)
     numeric = torch.autograd.functional.hessian(lambda v: f(v).square().sum(), x)
     torch.testing.assert_close(bend, numeric, rtol=1e-11, atol=1e-13)
+
+
+def test_forward_derivatives_where_no_graph_is_built():
+    """`no_grad` is about graphs: tangents of the light and of the dead time go on."""
+    x, d = mixed()[..., :2] + 0.01, torch.tensor(1.3, dtype=torch.float64)
+    for of in (lambda t: (x + t * x, d), lambda t: (x, d + t)):
+        found = []
+        for grad in (True, False):
+            with forward_ad.dual_level(), torch.set_grad_enabled(grad):
+                t = forward_ad.make_dual(torch.zeros_like(d), torch.ones_like(d))
+                found.append(forward_ad.unpack_dual(detections_with_dead_time(*of(t))).tangent.clone())
+        assert float(found[0].abs().max()) > 0.1
+        torch.testing.assert_close(found[1], found[0], rtol=1e-12, atol=1e-14)
 
 
 @pytest.mark.parametrize("dead", [slow(0.7), 1.3])
@@ -220,6 +237,54 @@ def test_coates_undoes_the_mean(total, dead):
     if total == 1.0:  # nothing to put right: the gradient is that of the estimate
         counts = sensor(rate).requires_grad_()
         assert torch.autograd.gradcheck(lambda c: coates(c, cycles, dead).rate, (counts,), eps=1e-3, fast_mode=True)
+
+
+def test_more_detections_than_cycles_leave_none_armed():
+    """As noise has them: in the next bin those can fire that come back."""
+    counts = torch.tensor([[13.0, 5.0, 1.0]], dtype=torch.float64)
+    for dead, back in ((1.0, 13.0), (1.0 - 1e-10, 13.0), (2.0, 0.0)):
+        here = dead_time_inverse._walked(counts, 10, dead)[0]
+        assert float(here.armed[0, 1]) == 0.0
+        assert float(here.cycles[0, 1]) == pytest.approx(back, abs=1e-8)
+        assert 0 <= float(here.part) < 1e-12
+
+
+def test_estimates_have_gradients_where_no_cycle_is_armed():
+    """All ten are dead for three bins: nothing is known of these, and nothing is infinite."""
+    counts = image([10.0, 0.4, 0.0, 6.0, 1.0]).requires_grad_()
+    rate, valid = coates(counts, 10, 3.0)
+    assert valid.flatten().tolist() == [False, False, False, True, True] and rate.flatten()[1:3].tolist() == [0.0, 0.0]
+    assert bool(rate.isfinite().all())
+    (slope,) = torch.autograd.grad(rate.sum(), counts)
+    assert bool(slope.isfinite().all()) and bool((slope[:, 3:] != 0).all())
+
+
+@pytest.mark.parametrize("dead", [1.0, 1.4, 2.3])
+def test_slopes_of_estimates_where_nothing_was_detected(dead):
+    """A detection more in a bin without one: the rate rises by the time that cycles are armed in it, as it does."""
+    counts = image([60.0, 0.0, 20.0, 0.0, 5.0])
+    rate = coates(leaf := counts.clone().requires_grad_(), 100, dead).rate.flatten()
+    assert rate[1::2].tolist() == [0.0, 0.0]
+    for k in (1, 3):
+        (slope,) = torch.autograd.grad(rate[k], leaf, retain_graph=True)
+        more = counts.clone()
+        more[:, k] = 1e-4
+        risen = float(coates(more, 100, dead).rate.flatten()[k]) / 1e-4
+        # what uncut bins miss has no derivative
+        assert float(slope.flatten()[k]) == pytest.approx(risen, rel=5e-3)
+
+
+def test_in_a_flood_coates_looks_no_closer(monkeypatch):
+    """What uncut bins miss is asked for rates of 30 a bin at most, and is a tenth of the counts at most."""
+    asked, given = [], []
+    means, walked = dead_time_inverse.detected_columns, dead_time_inverse._walked
+    monkeypatch.setattr(dead_time_inverse, "detected_columns", lambda r, d: asked.append(r) or means(r, d))
+    monkeypatch.setattr(dead_time_inverse, "_walked", lambda c, *rest: given.append(c) or walked(c, *rest))
+    counts = spad(1.3, 1000)(image([0.5, 70.0, 90.0, 40.0, 3.0]))
+    rate = coates(counts, 1000, 1.3).rate.flatten()
+    assert float(rate.max()) > 30 and max(float(r.max()) for r in asked) == 30.0
+    wrong = max(float(((c - given[0]).abs() / given[0]).max()) for c in given[1:])
+    assert wrong == pytest.approx(0.1, rel=1e-9)
 
 
 def test_coates_of_draws_is_unbiased():

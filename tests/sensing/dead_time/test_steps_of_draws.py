@@ -14,7 +14,15 @@ from torchtransient.sensing.dead_time import free_running_draws as draws
 from torchtransient.sensing.dead_time.dead_time_draws import _steps, draw_cycles, score_of_cycles
 from torchtransient.sensing.dead_time.dead_time_inverse import armed_time, check_cycles
 from torchtransient.sensing.dead_time.free_running_events import begin_places
-from torchtransient.sensing.dead_time.free_running_state import _solved, per_period, stationary_state
+from torchtransient.sensing.dead_time.free_running_state import (
+    FreeRunningState,
+    _armed_in_the_light,
+    _settled,
+    _solved,
+    per_period,
+    stationary_state,
+    within_limits,
+)
 from torchtransient.sensing.dead_time.renewal_chain import RenewalChain
 from torchtransient.sensing.dead_time.stationary_phases import stationary_phases
 
@@ -156,7 +164,8 @@ def test_places_where_detectors_begin(whole, part):
     chain = RenewalChain(rate, whole, number(part))
     lines = per_period(chain, stationary_phases(rate, number(part), whole))
     several = RenewalChain(rate.expand(many, -1), whole, number(part))
-    start = begin_places(several, lines.expand(many, -1), generator()).flatten().numpy()
+    state = within_limits(several, lines.expand(many, -1))
+    start = begin_places(state, number(part), generator()).flatten().numpy()
     armed = float(chain.at_start(chain.inflow(lines))[0, 0])
     assert np.mean(start == 0) == pytest.approx(armed, abs=5 * math.sqrt(armed * (1 - armed) / many))
     # a detection at time t < 0 arms again at t + dead: light of the last dead time, seen backwards
@@ -171,6 +180,70 @@ def test_places_where_detectors_begin(whole, part):
     assert later.max() <= dead
     # inside of a stretch the place is even: of second order in the slope of the light
     assert later.mean() == pytest.approx(mean, abs=5 * spread / math.sqrt(len(later)) + 0.01)
+
+
+def test_lines_that_dip_below_zero_are_drawn_from_within_limits():
+    """No detections below none, of which none to all are late; a chance to be armed from 0 to 1."""
+    chain = RenewalChain(rates(2, 1.2, 4), 1, number(0.6))
+    count = number([[0.5, -0.2, 0.3, 0.4], [9.0, 8.0, -30.0, 7.0]])
+    slope = number([[2.0, 0.1, -2.0, 0.0], [0.0, 0.0, 0.0, 0.0]])
+    lines = torch.cat([count, slope], -1)
+    late = 0.6 * count + math.sqrt(3) * 0.4 * 0.6 * slope
+    armed = chain.at_start(chain.inflow(lines))
+    assert float(armed.min()) < 0 and float(armed.max()) > 1 and float(late[0, 0]) > 0.5 and float(late[0, 2]) < 0
+    state = within_limits(chain, lines)
+    assert state.detected.tolist() == [[0.5, 0.0, 0.3, 0.4], [9.0, 8.0, 0.0, 7.0]] and state.whole == 1
+    assert state.late.flatten().tolist() == pytest.approx([0.5, 0.0, 0.0, 0.24, 5.4, 4.8, 0.0, 4.2])
+    assert torch.equal(state.armed, armed.clamp(0, 1))
+
+
+@pytest.mark.parametrize("dead", [1.3, 2.0, 11.7])
+def test_stationary_states_in_bright_light_are_within_limits(dead):
+    """Straight lines miss the edges of bins by up to a third of what is in them; no number of a state does."""
+    rate = 10 ** (4 * torch.rand(40, 6, generator=generator(), dtype=torch.float64) - 2)
+    bare, state = _settled(rate, number(dead), 1), stationary_state(rate, number(dead))
+    assert float(bare.armed.min()) < 0
+    assert bool((state.detected >= 0).all() & (state.late >= 0).all() & (state.late <= state.detected).all())
+    assert bool((state.armed >= 0).all() & (state.armed <= 1).all())
+
+
+@pytest.mark.parametrize("dead", [1.3, 4.0])
+def test_stationary_states_by_hand(dead):
+    """Constant light n: n / (1 + n d) detected, the rest armed; of a flash all come back late but those of its first
+    1 - part. In the dark all are armed, and what is detected are the photons."""
+    rate = number([[0.4] * 6, [0.0] * 6, [1e-13, 0, 0, 0, 0, 0], [0, 0, 0.3, 0, 0, 0]])
+    state, part = stationary_state(rate, number(dead)), dead % 1
+    n = 0.4 / (1 + 0.4 * dead)
+    assert state.detected[0].tolist() == pytest.approx([n] * 6)
+    assert state.late[0].tolist() == pytest.approx([part * n] * 6)
+    assert state.armed[0].tolist() == pytest.approx([1 - n * dead] * 6)
+    assert torch.equal(state.detected[1:3], rate[1:3]) and state.late[1:3].abs().sum() == 0
+    assert bool((state.armed[1:3] == 1).all())
+    once = -math.expm1(-0.3)  # in a period
+    assert float(state.detected[3, 2]) == pytest.approx(once, rel=1e-3)
+    assert float(state.late[3, 2]) == pytest.approx(once - -math.expm1(-0.3 * (1 - part)), rel=2e-2, abs=1e-12)
+    assert state.armed[3, 2:4].tolist() == pytest.approx([1.0, 1 - once], rel=1e-3)
+
+
+def test_detections_that_end_being_dead_in_the_light():
+    """All of bin 0 are armed again in bin 3, or those that are late in bin 4: whether it is bright there."""
+    for late, place in ((0.0, 3), (0.9, 4)):
+        detected = number([[0.9, 0, 0, 0, 0, 0]])
+        state = FreeRunningState(detected, torch.ones_like(detected), detected * (late > 0), 3)
+        for lit in range(6):
+            rate = number([[0.1] * 6])
+            rate[0, lit] = 20.0
+            assert bool(_armed_in_the_light(rate, state)) == (lit == place)
+
+
+def test_detectors_that_nothing_of_the_period_before_keeps_dead_begin_armed():
+    """Light that is over one dead time before the end, beside light that is not."""
+    count = number([[0.6, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.9]])
+    state = FreeRunningState(count, number([[0.0, 1, 1, 1], [0.0, 0.5, 1, 1]]), 0 * count, 1)
+    for seed in range(5):
+        start = begin_places(state, number(0.4), generator(seed)).flatten()
+        # the detection of the last piece lay in its first 0.6, and is felt for 1.4 pieces
+        assert float(start[0]) == 0.0 and 0 < float(start[1]) <= 1.0
 
 
 # ------------------------------------------------------------------------------------------ what a histogram tells

@@ -251,6 +251,24 @@ def test_of_chains():
         torch.testing.assert_close(slope, wanted, rtol=1e-6, atol=0)
 
 
+def test_of_chains_without_light_or_without_a_cycle_left():
+    """Bins that stay dark tell nothing; a detector that fires in every cycle tells no brightness, and is no NaN."""
+    given = maps(float(place(20.3)), 100.0)
+    even = sensing.UniformResponse(630 * PS)
+
+    def dark(d, s):
+        return return_rates(even, AXIS, distance_m=d, signal=s).movedim(-1, -3)
+
+    wanted = crlb(even, AXIS, distance_m=given[0], signal=given[1], unknown=("distance", "signal")).covariance
+    assert int((dark(*given) == 0).sum()) > 50
+    torch.testing.assert_close(covariance_bound(dark, given), wanted, rtol=1e-9, atol=0)
+    halves = maps(0.5)
+    full = covariance_bound(lambda p: torch.stack([4 * p, 4 * (1 - p)], -3), halves, cycles=4)
+    # a coin tossed four times: p (1 - p) / 4
+    p = halves[0].flatten()
+    torch.testing.assert_close(full.flatten(), p * (1 - p) / 4, rtol=1e-6, atol=0)
+
+
 class _Backward(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x):

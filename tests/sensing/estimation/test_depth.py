@@ -201,6 +201,17 @@ def test_positions_stay_in_the_window(estimate, dtype):
         assert bool((found >= 0).all()) and bool((found <= WINDOW).all()), (float(found.min()), float(found.max()))
 
 
+def test_a_mass_stays_inside_of_the_window():
+    """Excess [6, 0, 0, -3] around its largest bin has its mass at 1/2 - 9 3 / 45 = -1/10: before the first bin."""
+    x = torch.tensor([10.0, 4.0, 4.0, 1.0], dtype=torch.float64).view(1, 4, 1, 1)
+    given = {"background": 4.0, "half_width_bins": 3}
+    assert float(depth.center_of_mass(x, **given)) == 0.0
+    assert float(depth.center_of_mass(x.flip(1), **given)) == 4.0
+    # the bins that count end sooner: -3 at a distance of 1
+    near = torch.tensor([4.0, 4.0, 10.0, 1.0], dtype=torch.float64).view(1, 4, 1, 1)
+    assert float(depth.center_of_mass(near, background=4.0, half_width_bins=1)) == pytest.approx(2.5 - 9 / 45)
+
+
 @pytest.mark.parametrize("half_width", [None, 6])
 def test_the_slope_of_a_mass_of_weak_light_is_bounded(half_width):
     """(reach + 2 reach) over the noise of what counts, N >= the largest entry: none larger, of any total.

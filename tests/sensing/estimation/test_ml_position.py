@@ -9,6 +9,7 @@ import torch
 
 from torchtransient import TimeAxis, sensing
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
+from torchtransient.sensing.estimation.position_likelihood import _top
 
 PS = 1e-12
 AXIS = TimeAxis.from_seconds(0.0, 100 * PS, 64)
@@ -128,6 +129,14 @@ def test_flat_tops_and_ends_of_the_window():
         assert bool(slope.isfinite().all()) and float(slope.abs().max()) == 0
         for response in SHAPES.values():
             assert 0 <= float(sensing.ml_position(counts.detach(), response, AXIS)) <= 64
+
+
+def test_tops_of_rows():
+    """Between entries by a parabola, in the middle of what is flat, at an end or beside what cannot be as they are."""
+    low = -math.inf
+    rows = [[1, 2, 4, 3], [1, 2, 3, 4], [4, 3, 2, 1], [0, 3, 3, 1], [5, 5, 5, 5], [1, 3, low, 2], [low, 2, 1, 1]]
+    found = _top(torch.tensor(rows, dtype=torch.float64))
+    assert found.tolist() == pytest.approx([2 + 0.5 / 3, 3, 0, 1.5, 1.5, 1, 1])
 
 
 def test_mistakes():

@@ -78,6 +78,23 @@ def test_phase_amplitude_and_deviation_of_four_taps():
     assert flat(two.offset) == [31 / 4]
 
 
+def test_numbers_below_zero_have_read_noise_alone():
+    """Taps and sums of taps that noise has put below zero: no shot noise, and none taken off."""
+    metres = SPEED_OF_LIGHT / (4 * math.pi * F)
+    noise = sensing.ItofNoise(read_noise_e=10.0)
+
+    def std(steps, variances):
+        z = complex(steps[0] - steps[2], steps[1] - steps[3]) / 2
+        slopes = [2 * math.sin(n * TURN / 4 - math.atan2(z.imag, z.real)) / (4 * abs(z)) for n in range(4)]
+        return metres * math.sqrt(sum(g**2 * v for g, v in zip(slopes, variances, strict=True)))
+
+    single = sensing.read_itof(frames(60, 55, -4, -3), F, 4, noise=noise)
+    assert flat(single.depth_std_m) == pytest.approx([std((60, 55, -4, -3), (160, 155, 100, 100))])
+    taps = frames(80, 20, 90, 60, -7, -5, 30, 50)
+    two = sensing.read_itof(taps, F, 4, readout="two_tap", noise=noise)
+    assert flat(two.depth_std_m) == pytest.approx([std((60, 30, -2, -20), (300, 350, 200, 280))])
+
+
 def test_deviations_of_two_frequencies_add_by_their_shares():
     """w f^2 / sum: 1 / 10 and 9 / 10 of 20 and 60 MHz; one that is dark makes the depth unknown."""
     x = torch.cat([frames(9, 6, 1, 4), frames(20, 11, 2, 5)], 1)
@@ -110,6 +127,14 @@ def test_amplitudes_at_the_edge_of_what_light_can_have(readout, read, known):
             with pytest.warns(PhysicsWarning, match="more amplitude than their light"):
                 found = sensing.read_itof(steps, F, 4, readout=readout, noise=noise)
         assert flat(found.depth_std_m.isnan()) == [not taken], factor
+
+
+def test_all_of_the_light_in_one_tap_is_light():
+    """a = 2 offset, but for rounding of 1e-5 of the largest tap; without noise a ten thousandth more is none."""
+    assert flat(sensing.read_itof(frames(8, 0, 0, 0), F, 4).depth_std_m) == pytest.approx([0.0], abs=1e-12)
+    with pytest.warns(PhysicsWarning, match="more amplitude than their light"):
+        found = sensing.read_itof(frames(8, -4e-4, 0, -4e-4), F, 4)
+    assert flat(found.depth_std_m.isnan()) == [True]
 
 
 def test_noise_of_a_phase():
@@ -255,6 +280,14 @@ def test_gates_against_light():
     top = itof_codes.square_code(3, 0.2, 0.5).evaluate(torch.tensor([0.0, 1 / 3 + 0.14, 0.34], dtype=torch.float64))
     # tap 0 sees all of the light from -0.15 to 0.15 around phase zero
     assert top[0].tolist() == pytest.approx([1.0, -1.0, -0.9])
+
+
+def test_corners_of_gates_are_within_all_of_the_light():
+    """Whatever rounding makes of openings and pulses."""
+    for duty, a, b in ((0.29, 0.76, 1.37), (0.65, 0.28, 1.06), (0.46, 0.63, 1.44), (0.07, 0.43, 0.57)):
+        code = itof_codes.binary_code(duty, [[(a, b)], [(a, b)]])
+        top = code.evaluate(torch.linspace(0, 1, 101, dtype=torch.float64))
+        assert float(top.max()) <= 1.0 and float(top.min()) >= -1.0
 
 
 def test_measured_codes():

@@ -13,6 +13,7 @@ import torch
 from torchtransient import sensing
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import PhysicsWarning, UnitError
+from torchtransient.sensing.itof.itof_pixels import _DEEPEST_M
 from torchtransient.units import SPEED_OF_LIGHT
 
 AXIS = TimeAxis.from_seconds(0.0, 100e-12, 500)
@@ -192,6 +193,18 @@ def test_the_exposures_of_the_numbers():
 def test_calibrations_in_other_units_are_refused(wrong, word):
     with pytest.raises(UnitError, match=word):
         sensing.ItofCalibration(**wrong)
+
+
+def test_how_far_calibrations_reach():
+    """Two turns of phase, of all pixels or of each, and as many metres as told."""
+    turns = 4 * np.pi
+    for name, most in (("phase_offset_rad", turns), ("phase_map_rad", turns), ("depth_map_m", _DEEPEST_M)):
+        for sign in (1.0, -1.0):
+            given = [np.full((2, 3), sign * part * most) for part in (0.999, 1.001)]
+            given = [float(g[0, 0]) for g in given] if name == "phase_offset_rad" else given
+            sensing.ItofCalibration(**{name: given[0]})
+            with pytest.raises(UnitError, match=f"expected {name} between -{most:.4g} and {most:.4g}"):
+                sensing.ItofCalibration(**{name: given[1]})
 
 
 def test_frames_of_other_machines():

@@ -113,6 +113,15 @@ def test_learnable_width():
     assert float(layer.log_fwhm_px.grad) < 0
 
 
+def test_pixels_without_light_can_be_learnt():
+    """They start at e^-30 of all, from where a gradient leads on."""
+    module = SpatialPSF(torch.tensor([[0.0, 3.0, 1.0]]), learnable=True)
+    assert module.psf_logits.flatten().tolist() == pytest.approx([math.log(1e-13), math.log(0.75), math.log(0.25)])
+    x = torch.rand(1, 2, 1, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    (slope,) = torch.autograd.grad(module(x)[..., 2].sum(), module.psf_logits)
+    assert bool((slope != 0).all())
+
+
 def test_errors():
     with pytest.raises(ShapeError, match="odd"):
         SpatialPSF(torch.ones(4, 4))

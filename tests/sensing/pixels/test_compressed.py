@@ -66,6 +66,12 @@ def test_equi_depth_edges_by_hand():
             make()
 
 
+def test_a_pixel_with_nan_has_no_edges():
+    counts = torch.tensor([[1.0, 2.0, math.nan, 1.0], [3.0, 1.0, 1.0, 3.0]], dtype=torch.float64).T.reshape(1, 4, 1, 2)
+    found = equi_depth_edges(counts, 4).squeeze()
+    assert bool(found[:, 0].isnan().all()) and found[:, 1].tolist() == pytest.approx([2 / 3, 2.0, 10 / 3])
+
+
 @pytest.mark.parametrize("frames", [1, 7])
 def test_pixels_that_fired_in_every_frame(frames):
     """The rate of a share of 1 - 1 / 2N; counts of normal surrogates, to 3 sqrt(N) + 1 beyond, are taken as all."""

@@ -349,7 +349,7 @@ def test_no_image_at_all(make):
         assert measure(torch.ones(0, 1, BINS, 2, 2)).shape == (0, 1, BINS, 2, 2)
 
 
-@pytest.mark.parametrize("photons", [1e-3, 40.0, 400.0, pytest.param(1e15, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("photons", [1e-3, 40.0, 400.0, 1e12, pytest.param(1e15, marks=pytest.mark.slow)])
 def test_coincidences_of_a_bin_with_any_number_of_photons(photons):
     """All light in bin 0, first photons, a window of a bin: one as soon as k of n SPADs have fired, none after that.
 
@@ -366,3 +366,13 @@ def test_coincidences_of_a_bin_with_any_number_of_photons(photons):
         if spads == 1:  # probabilities of one
             assert float(pixel.sample(x, torch.Generator().manual_seed(0)).max()) <= 3
             assert bool(pixel.log_prob(torch.round(3 * found), x).isfinite().all())
+
+
+def test_coincidences_that_round_to_more_than_one_per_cycle(monkeypatch):
+    """One in every cycle: no other number of them is possible, and none is NaN."""
+    pixel = CoincidencePixel(SynchronousSPAD(3), 2, coincidence=1, window_s=WIDTH, bin_width_s=WIDTH)
+    monkeypatch.setattr(CoincidencePixel, "probabilities", lambda self, x: torch.full_like(x, 1 + 1e-7).double())
+    x = torch.ones(1, 1, 1, 2, dtype=torch.float64)
+    assert pixel.sample(x).flatten().tolist() == [3.0, 3.0] and pixel.variance(x).flatten().tolist() == [0.0, 0.0]
+    found = pixel.log_prob(torch.tensor([3.0, 2.0], dtype=torch.float64).view(1, 1, 1, 2), x)
+    assert found.flatten().tolist() == [pytest.approx(0.0, abs=1e-12), -math.inf]

@@ -13,11 +13,48 @@ from torchtransient import sensing
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.correlated_noise.afterpulse_delays import exponential_kernel, exponential_shares
 from torchtransient.sensing.counts.moved_counts import Moves, move_counts, shifted
+from torchtransient.sensing.estimation.cramer_rao import shares_between
 from torchtransient.sensing.response import response_shapes as shapes
 from torchtransient.sensing.response.composed_responses import _full_convolution, _gathered
 from torchtransient.sensing.response.responses import _between
 
 NS = 1e-9
+
+
+class Rippled(sensing.GaussianResponse):
+    """A distribution that rounding makes fall here and there."""
+
+    def cdf(self, time_s):
+        return super().cdf(time_s) + 1e-8 * torch.cos(1e13 * time_s)
+
+    def integrals(self, time_s):
+        below, above = super().integrals(time_s)
+        return below + 1e-20 * torch.cos(1e13 * time_s), above
+
+
+@pytest.mark.parametrize("within_bin", ["uniform", "center"])
+@pytest.mark.parametrize("closed", [True, False])
+def test_no_share_of_a_kernel_is_below_zero(within_bin, closed, monkeypatch):
+    if not closed:
+        monkeypatch.setattr(Rippled, "integrals", sensing.Response.integrals)
+    plain = sensing.GaussianResponse(0.4 * NS).kernel(0.002 * NS, within_bin)[1]
+    found = Rippled(0.4 * NS).kernel(0.002 * NS, within_bin)[1]
+    assert float(found.min()) == 0.0
+    torch.testing.assert_close(found, plain, rtol=0, atol=1e-7)
+
+
+def test_no_share_between_edges_is_below_zero():
+    edges = 0.005 * NS * torch.arange(-400.0, 401.0, dtype=torch.float64)
+    found = shares_between(Rippled(0.4 * NS), edges, 0.005 * NS)
+    assert float(found.min()) == 0.0 and float(found.sum()) == pytest.approx(1, abs=1e-4)
+
+
+def test_parts_that_are_convolved_leave_nothing_below_zero():
+    both = sensing.ComposedResponse([sensing.UniformResponse(0.3 * NS), sensing.UniformResponse(0.5 * NS)])
+    assert float(both.kernel(0.01 * NS)[1].min()) >= 0
+    a = number(0, 0, 1, 3, 0, 0, 0, 0, 0, 0, 0)
+    full = _full_convolution(a, a.roll(1))
+    assert float(full.min()) == 0.0 and flat(full)[5:8] == pytest.approx([1.0, 6.0, 9.0])
 
 
 def number(*values):

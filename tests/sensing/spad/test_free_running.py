@@ -157,6 +157,17 @@ def test_dark_and_saturated_pixels():
     torch.testing.assert_close(x.grad[..., 0], torch.ones(1, 32, 1, dtype=torch.float64))
 
 
+@pytest.mark.parametrize("chance", [0.25, 1 + 1e-6])
+def test_detections_that_round_to_more_than_one_per_period(chance, monkeypatch):
+    """Variance of none to one in each of 1000 periods, and a surrogate that is a number."""
+    spad = FreeRunningSPAD(1000, 2e-10, bin_width_s=1e-10, grad="gaussian")
+    monkeypatch.setattr(FreeRunningSPAD, "probabilities", lambda self, x: chance * x / x.detach())
+    x = torch.full((1, 5, 1, 2), 0.3, dtype=torch.float64, requires_grad=True)
+    assert spad.variance(x).flatten().tolist() == pytest.approx([1000 * chance * max(1 - chance, 0)] * 10)
+    y = spad(x, generator=torch.Generator().manual_seed(0))
+    assert bool(torch.isfinite(y).all()) and bool(torch.isfinite(torch.autograd.grad(y.sum(), x)[0]).all())
+
+
 def test_errors():
     with pytest.raises(UnitError, match="half a bin"):
         nonparalyzable_histogram(torch.ones(1, 4, 1, 1), 0.01)

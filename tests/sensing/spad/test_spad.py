@@ -17,9 +17,11 @@ from torchtransient.sensing import (
     ScoreFunction,
     SynchronousSPAD,
     coates,
+    first_photon_log_prob,
     first_photon_probabilities,
     sample_detections,
 )
+from torchtransient.sensing.dead_time.dead_time_inverse import armed_time
 from torchtransient.sensing.numerics.draws import fast_poisson, sample_first_photons, sample_multinomial
 from torchtransient.sensing.numerics.running_sums import sum_before
 
@@ -333,3 +335,24 @@ def test_where_counts_tell_the_rate(dead):
     else:  # more than 500 photons in a bin are not told from one another
         flood = coates(torch.tensor([1000.0, 0.0, 900.0, 0.0]).double().reshape(1, 4, 1, 1), 1000, 2.0)
         assert float(flood.rate.flatten()[2]) == 500.0 and flood.valid.flatten().tolist() == [False, False, False, True]
+
+
+def test_estimates_behind_a_gate_have_gradients():
+    """A bin that is shut has no rate, half a gate twice that of the estimate."""
+    gate = torch.tensor([1.0, 0.0, 0.5])
+    counts = as_image(torch.tensor([20.0, 0.0, 10.0], dtype=torch.float64)).requires_grad_()
+    rate = SynchronousSPAD(100, gate=gate).inverse(counts).rate
+    assert rate.flatten().tolist() == pytest.approx([-math.log(0.8), 0.0, -2 * math.log(7 / 8)])
+    (slope,) = torch.autograd.grad(rate.sum(), counts)
+    # -log(1 - a / 100) - 2 log(1 - c / (100 - a))
+    assert slope.flatten().tolist() == pytest.approx([1 / 80 + 2 / 70 - 2 / 80, 2 / 70 - 2 / 80, 2 / 70])
+
+
+def test_probability_of_more_counts_than_were_armed_on_average():
+    """Every one that could fire has: the rest is none, and there is one way to choose them."""
+    counts, rate = (as_image(torch.tensor(v, dtype=torch.float64)) for v in ([60.0, 50.0, 3.0], [0.9, 0.8, 0.1]))
+    both = [first_photon_log_prob(counts, rate, 100, dead_bins=1.5, constant=c).flatten() for c in (True, False)]
+    # 40 are armed, and of the 60 a quarter comes back for a quarter of the bin
+    sooner = float(armed_time(counts, 100, 1.5).sooner(rate).flatten()[1])
+    assert float(both[0][1]) == pytest.approx(50 * math.log(-math.expm1(-0.8)) - sooner)
+    assert float(both[0][1]) == float(both[1][1]) and float(both[0][0]) != float(both[1][0])

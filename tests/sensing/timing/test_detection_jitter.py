@@ -277,6 +277,34 @@ def test_log_probability_of_multinomial_counts():
     assert float(multinomial_log_prob(n + 1, p, 12)) == -float("inf")
 
 
+@pytest.mark.parametrize("level", [0.01, 3.0, 1e5])
+def test_counts_beside_items_below_zero_are_moved(level):
+    """Differences have a mean, and no counts that could be drawn."""
+    whole = torch.poisson(torch.full((1, 1, 40, 3, 4), level), generator=generator())
+    x = torch.cat([whole, torch.full_like(whole, -2.5)])
+    moved = jitter(boundary="periodic").sample(x, generator())
+    torch.testing.assert_close(moved[1], jitter(boundary="periodic").expected(x[1]))
+    assert torch.equal(moved[0].sum(1), whole[0].sum(1)) and torch.equal(moved[0], moved[0].round())
+
+
+def test_log_probability_of_chances_that_round_to_more_than_one():
+    """Cycles without a detection are all but impossible then, and no NaN."""
+    p = torch.full((10, 1, 1), 0.1, dtype=torch.float32)
+    assert float(p.double().sum()) > 1
+    value = multinomial_log_prob(torch.full((10, 1, 1), 2.0), p, 21)
+    assert -100 < float(value) < -20
+
+
+def test_noise_of_moves_that_lose_nothing_is_one_draw_for_each_lag():
+    x = column([7.0, 2.0, 5.0, 0.0])
+    for shares, draws in (([0.2, 0.5, 0.3], 3), ([0.2, 0.5, 0.29], 4)):
+        own, counted = generator(3), generator(3)
+        Moves(-1, torch.tensor(shares, dtype=torch.float64), "zero").noise(x, own)
+        for _ in range(draws):
+            torch.randn(x.shape, dtype=x.dtype, generator=counted)
+        assert torch.equal(own.get_state(), counted.get_state())
+
+
 def test_likelihood_of_a_chain():
     """That of its last stages, and highest in expectation where the light is right."""
     x = bright(total=2.0)

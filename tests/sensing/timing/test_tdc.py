@@ -104,6 +104,19 @@ def test_what_falls_inside_is_conserved():
     torch.testing.assert_close(TDC(widths())(x).sum(-3), x.sum(-3))
 
 
+def test_random_widths_are_above_zero():
+    """A twentieth of a bin at least, before their mean is made one."""
+    found = random_code_widths(400, 1.0, torch.Generator().manual_seed(0))
+    assert float(found.mean()) == pytest.approx(1.0)
+    g = torch.Generator().manual_seed(0)
+    normal = 1 + torch.randn(400, dtype=torch.float64, generator=g)
+    assert float(normal.min()) < 0
+    kept = normal > 0.05
+    assert float(found[~kept].min()) == float(found[~kept].max()) > 0
+    ratio = found[kept] / normal[kept]
+    assert float(found[~kept][0] / ratio[0]) == pytest.approx(0.05) and float(ratio.max() / ratio.min()) < 1 + 1e-9
+
+
 def test_errors():
     with pytest.raises(UnitError, match="code_widths > 0"):
         TDC(torch.tensor([1.0, -1.0]))

@@ -53,7 +53,7 @@ def keep_map(module: nn.Module, name: str, value: float | Tensor) -> None:
     if isinstance(value, nn.Parameter):
         module.register_parameter(name, value)
     elif isinstance(value, Tensor):
-        module.register_buffer(name, value.detach().double())
+        module.register_buffer(name, value.double())
     else:
         setattr(module, name, value)
 

@@ -67,7 +67,7 @@ def clipped_normal_variance(mean: Tensor, variance: Tensor, high: float) -> Tens
     t = ((high - mean) / (variance + VARIANCE_FLOOR).sqrt()).clamp(-12, 12)
     density, below = _density(t), 0.5 * torch.erfc(-t / math.sqrt(2))
     first, second = density + t * below, (1 + t * t) * below + t * density
-    return variance * (second - first * first).clamp(0, 1)
+    return variance * (second - first * first)
 
 
 def fixed_pattern(
@@ -208,7 +208,8 @@ class PixelElectronics(RandomSensor):
     def _moments(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and variance of the charge that reaches the converter."""
         mean = self.collected(x)
-        variance = mean * (self.excess_noise if self.shot_noise else self.excess_noise - 1)
+        # a charge below zero, as a difference of taps has them, has no noise of its own
+        variance = mean.clamp_min(0) * (self.excess_noise if self.shot_noise else self.excess_noise - 1)
         if self.full_well_e is not None:
             clipped = clipped_normal_mean(mean, variance, high=self.full_well_e)
             mean, variance = clipped, clipped_normal_variance(mean, variance, self.full_well_e)

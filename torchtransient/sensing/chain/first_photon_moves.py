@@ -79,9 +79,8 @@ def multinomial_log_prob(counts: Tensor, probabilities: Tensor, trials: int) -> 
     """
     n, p = counts.detach().double(), probabilities.double()
     none, rest = trials - n.sum(TIME), 1 - p.sum(TIME)
-    hit, quiet = n > 0, none > 0
-    value = torch.where(hit, n * torch.where(hit, p, torch.ones_like(p)).log(), torch.zeros_like(p)).sum(TIME)
+    value = (n * torch.where(n > 0, p, 1.0).log()).sum(TIME)
     # probabilities that add up to one leave rounding of either sign
-    rest = torch.where(quiet, rest.clamp_min(1e-18), torch.ones_like(rest))
+    rest = rest.clamp_min(1e-18)
     counted = torch.lgamma(none + 1) + torch.lgamma(n + 1).sum(TIME)
     return value + none * rest.log() - counted + torch.lgamma(n.new_tensor(trials + 1.0))

@@ -70,7 +70,7 @@ class PixelGroups(RandomSensor):
         """
         if not isinstance(values, Tensor) or values.ndim != 2:
             raise ShapeError("PixelGroups.by_value: expected a map (H, W), got something else.")
-        different, which = torch.unique(values.detach().double(), return_inverse=True)
+        different, which = torch.unique(values.double(), return_inverse=True)
         if different.numel() > _MOST_GROUPS:
             raise UnitError(
                 f"PixelGroups.by_value: expected at most {_MOST_GROUPS} different values, got {different.numel()}. "

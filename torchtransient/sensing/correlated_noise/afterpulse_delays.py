@@ -225,13 +225,14 @@ class MeasuredDelays(AfterpulseDelays):
         return begin - k + (integral(k + 1) - integral(begin)) / left
 
     def draw(self, number: int, dead_time_s: float, generator: torch.Generator | None) -> Tensor:
-        shares = self.share_of_bins.double()
-        u = torch.rand(number, dtype=torch.float64, device=shares.device, generator=generator)
-        u = 1 - self.seen(dead_time_s) * (1 - u)
+        # from the end on: what is yet to come is above 0 and at most all, which ends in a bin that holds something
+        shares = self.share_of_bins.double().flip(0)
         sums = shares.cumsum(0)
-        whole = torch.searchsorted(sums, u, right=True).clamp_max(shares.numel() - 1)
-        part = ((u - sums[whole]) / shares[whole].clamp_min(torch.finfo(torch.float64).tiny) + 1).clamp(0, 1)
-        return (self.start_s + (whole + part) * self.own_width_s).clamp_min(dead_time_s)
+        u = torch.rand(number, dtype=torch.float64, device=shares.device, generator=generator)
+        yet = self.seen(dead_time_s) * (1 - u) * sums[-1]
+        later = torch.searchsorted(sums, yet)
+        place = shares.numel() - 1 - later + (sums[later] - yet) / shares[later]
+        return (self.start_s + place * self.own_width_s).clamp_min(dead_time_s)
 
     def extra_repr(self) -> str:
         return f"bins={self.share_of_bins.numel()}, bin_width_s={self.own_width_s:g}, start_s={self.start_s:g}"

@@ -280,7 +280,7 @@ class Afterpulsing(AddedCounts):
         delay = torch.rand(like.shape, dtype=like.dtype, device=like.device, generator=generator).neg_().log1p_()
         if tau.numel() == 1:
             return delay.mul_(-float(tau)).add_(dead)
-        parts = self.seen().detach()
+        parts = self.seen()
         edges = (parts / parts.sum()).cumsum(0)[:-1].to(like)
         u = torch.rand(like.shape, dtype=like.dtype, device=like.device, generator=generator)
         which = torch.bucketize(u, edges, right=True)
@@ -321,7 +321,7 @@ class Afterpulsing(AddedCounts):
     def _lags(self, period: int, counts: Tensor) -> Callable[[Tensor, torch.Generator | None], Tensor]:
         """Draws of the bins from a detection to its afterpulse, folded into one period: int64 as large as a tensor."""
         if counts.device.type == "cpu" and counts.numel() >= _WORTH_TABLE and period <= _MOST_LAGS:
-            kernel = self._kernel(period).detach().cpu()
+            kernel = self._kernel(period).cpu()
             return LagTable(kernel / kernel.sum()).draw
         if self.delays is None:
             longest = self.dead_time_s + 20 * float(self.tau_s.detach().max())

@@ -78,7 +78,7 @@ class Crosstalk(AddedCounts):
     def _probabilities(self) -> tuple[Tensor, Tensor | float]:
         """Of an edge and of a corner."""
         p = self.probability
-        if not bool(p.detach() <= _MOST * (1 + 1e-9)):
+        if not bool(p <= _MOST * (1 + 1e-9)):
             raise UnitError(
                 f"Crosstalk: expected probability in (0, {_MOST:g}], got {float(p.detach()):g}. If it is learnt, lower "
                 "the learning rate."

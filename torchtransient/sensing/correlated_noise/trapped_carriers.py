@@ -241,7 +241,7 @@ def of_cycles(
     `earlier(detections, rows)`: carriers of other cycles. `tau` (K,) in bins.
     """
     size = rate.shape[-1]
-    least = max(steps, 1 if float(dead_bins.detach()) >= 1 - 1e-9 else 2)
+    least = max(steps, 1 if float(dead_bins) >= 1 - 1e-9 else 2)
     level, present, hidden = row_levels(rate + (seen / tau).sum(), least)
 
     def solved(rows: Tensor, at: Tensor | slice, pieces: int) -> Tensor:
@@ -282,7 +282,7 @@ def of_cycles(
 def of_free_running(rate: Tensor, dead_bins: Tensor, seen: Tensor, tau: Tensor, steps: int = 1) -> Tensor:
     """The same of a detector that runs free, for rates (P, T) per period; 0 in the dark."""
     dark = rate.sum(-1, keepdim=True) < DARK
-    safe = torch.where(dark, torch.full_like(rate, 1.0 / rate.shape[-1]), rate)
+    safe = torch.where(dark, 0.1, rate)
     found = rate.new_zeros(rate.shape[0], steps * rate.shape[-1])
     for rows, cut in rows_by_contrast(safe):
         pieces = max(cut, steps)

@@ -27,8 +27,7 @@ class _Chain:
 
     def __init__(self, loss: Tensor, kept: Tensor, part: Tensor, whole: int) -> None:
         self.chain, self.kept = RenewalChain(loss, whole, part), kept
-        share = (kept.mean(-1, keepdim=True)).clamp(1e-6, 1 - 1e-9)
-        wait = (1 / loss.mean(-1, keepdim=True)).clamp_min(1e-9)
+        wait, share = 1 / loss.mean(-1, keepdim=True), kept.mean(-1, keepdim=True)
         self.constant = ConstantLight(wait, self.chain.bins, whole, part, share)
 
     def step(self, x: Tensor) -> Tensor:

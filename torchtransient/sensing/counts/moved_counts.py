@@ -189,7 +189,7 @@ class _Tree:
     def __init__(self, moves: Moves, data: Tensor, tallies: Tensor | None) -> None:
         self.moves, self.data, self.tallies = moves, data.contiguous(), tallies
         self.shares = moves.shares.detach().double().to(data.device)
-        rest = (1 - self.shares.sum(0, keepdim=True)).clamp_min(0)
+        rest = 1 - self.shares.sum(0, keepdim=True)
         if float(rest.max()) > _NOTHING_LOST:
             self.shares = torch.cat([self.shares, rest])  # those that are lost
         self.weights = (self.shares if self.shares.ndim == 1 else self.shares.mean(1)).tolist()
@@ -207,7 +207,7 @@ class _Tree:
         level = float(counts.sum(dtype=torch.float64)) / counts.numel()
         small, large = self._split(lags, level)
         few, whole = (self.shares[list(part)].sum(0) for part in (small, lags))
-        share = (few / whole.clamp_min(1e-300)).clamp(0, 1)
+        share = few / whole.clamp_min(1e-300)
         highest = float(share.max())
         if highest * level < _RARE:
             events = thin(counts, self._of_entries(share, place, counts), generator)

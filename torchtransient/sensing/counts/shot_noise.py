@@ -41,7 +41,7 @@ def poisson_log_prob(counts: Tensor, mean: Tensor) -> Tensor:
     empty = counts == 0
     # where on the input: xlogy(0, 0) has a NaN gradient
     log_mean = torch.where(empty, torch.ones_like(mean), mean).log()
-    return torch.where(empty, torch.zeros_like(mean), counts * log_mean) - mean - torch.lgamma(counts + 1)
+    return counts * log_mean - mean - torch.lgamma(counts + 1)
 
 
 class ShotNoise(RandomSensor):

@@ -215,8 +215,8 @@ def detected_rows(rate: Tensor, dead_bins: Tensor) -> Tensor:
     for k in present:
         if hidden:
             here = (level == k).unsqueeze(-1)
-            # rows of other levels are dark here: no number of theirs can spoil a gradient
-            detected = detected + torch.where(here, solved(torch.where(here, rate, 0.0), k), 0.0)
+            # rows of other levels are dark here, and add nothing: no number of theirs can spoil a gradient
+            detected = detected + solved(torch.where(here, rate, 0.0), k)
         else:
             rows = (level == k).nonzero().squeeze(-1)
             detected = detected.index_copy(0, rows, solved(rate[rows], k))

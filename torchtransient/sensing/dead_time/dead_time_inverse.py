@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchtransient.errors import UnitError
 from torchtransient.sensing.base.layout import TIME
-from torchtransient.sensing.dead_time.dead_time_cycle import BlockWalk, check_dead_bins, cycle_of_rows
+from torchtransient.sensing.dead_time.dead_time_cycle import BlockWalk, check_dead_bins, cycle_of_rows, whole_and_part
 from torchtransient.sensing.dead_time.dead_time_means import detected_columns
 from torchtransient.sensing.dead_time.renewal_chain import bin_response
 from torchtransient.sensing.numerics.exponential_moments import moments, second_moment
@@ -79,8 +79,7 @@ def _check_uncut(dead_bins: float, where: str) -> None:
 def _walked(counts: Tensor, cycles: float, dead_bins: float) -> tuple[ArmedCounts, Tensor, Tensor]:
     """(armed cycles, share of them that fired, rate that explains it) for rows (P, T)."""
     dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=counts.device)
-    whole = math.floor(float(dead) + 1e-9)
-    part = (dead - whole).clamp_min(0)
+    whole, part = whole_and_part(dead)
     walk = BlockWalk(counts.shape[-1], whole, 1)
     left = torch.full_like(counts[:, :1], float(cycles))
     columns: list[tuple[Tensor, ...]] = []
@@ -109,7 +108,7 @@ def _explained(here: ArmedCounts, share: Tensor, cycles: float) -> Tensor:
     trials = here.cycles
     usable = ~(trials <= 0.5)  # NaN stays NaN
     trials = torch.where(usable, trials, torch.ones_like(trials))
-    share = torch.where(usable, share, torch.zeros_like(share)).clamp(0, 1 - 1 / (2 * cycles))
+    share = share.clamp(0, 1 - 1 / (2 * cycles))
     armed = torch.where(usable, here.armed, trials)
     back = None if here.back is None else here.back * usable.unsqueeze(1)
     here, target = ArmedCounts(armed, back, here.part), trials.log() + torch.log1p(-share)
@@ -117,7 +116,7 @@ def _explained(here: ArmedCounts, share: Tensor, cycles: float) -> Tensor:
     def better(rate: Tensor) -> Tensor:
         value, fall = here.survivors(rate)
         # the slope belongs to a rate that is a number here
-        return rate + (value.clamp_min(1e-300).log() - target) * (value / fall.clamp_min(1e-300)).detach()
+        return rate + (value.clamp_min(1e-300).log() - target) * (value / fall).detach()
 
     rate = -torch.log1p(-share.detach())
     with torch.no_grad():
@@ -125,8 +124,9 @@ def _explained(here: ArmedCounts, share: Tensor, cycles: float) -> Tensor:
             last, rate = rate, better(rate).clamp(0, _BRIGHTEST)
             if not bool(((rate - last).abs() > _SETTLED * (1 + rate)).any()):
                 break
-    found = torch.where(rate < _BRIGHTEST, better(rate).clamp_max(_BRIGHTEST), rate)
-    return torch.where(share > 0, found, share)
+    found = torch.where(rate < _BRIGHTEST, better(rate), rate)
+    # none fired: no rate but rounding, which falls away with its derivative left
+    return torch.where(share > 0, found, found - found.detach())
 
 
 def rates_of_counts(counts: Tensor, cycles: float, dead_bins: float) -> tuple[Tensor, Tensor]:
@@ -184,8 +184,8 @@ class ArmedTime:
 def armed_time(counts: Tensor, cycles: int, dead_bins: float) -> ArmedTime:
     """From the histogram (..., T, H, W) alone, linear in it; detections are taken to be even inside a bin."""
     check_dead_bins(dead_bins)
-    whole = math.floor(dead_bins + 1e-9)
-    part = max(0.0, dead_bins - whole)
+    whole, rest = whole_and_part(torch.tensor(dead_bins, dtype=torch.float64))
+    part = float(rest)
     first, bins = 1 - part, counts.shape[TIME]
     n = counts.to(torch.float64)
     upto = n.cumsum(TIME)

@@ -62,7 +62,7 @@ def bin_chances(rate: Tensor, state: FreeRunningState) -> BinChances:
     # detections of before the period
     dead = back_soon * (index < whole) + back_late * (index < whole + 1)
     begin = torch.cat([state.armed.narrow(TIME, 0, 1), dead], TIME)
-    begin = begin / begin.sum(TIME, keepdim=True).clamp_min(1)  # rounding
+    begin = begin / begin.sum(TIME, keepdim=True)  # rounding
     return step_chances(rate, state.detected, state.armed, state.late, back, begin, whole)
 
 
@@ -132,8 +132,7 @@ def draw_path(
 
 def log_likelihood(count: Tensor, chance: Tensor) -> Tensor:
     """count log(chance), 0 for no count whatever the chance."""
-    some = count != 0
-    return torch.where(some, count * torch.log(torch.where(some, chance, torch.ones_like(chance))), 0.0)
+    return count * torch.log(torch.where(count != 0, chance, 1.0))
 
 
 def path_log_prob(path: Path, chances: BinChances, periods: int) -> Tensor:

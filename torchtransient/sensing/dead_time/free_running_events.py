@@ -9,41 +9,39 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchtransient.sensing.dead_time.free_running_state import late_lines
-from torchtransient.sensing.dead_time.renewal_chain import RenewalChain
+from torchtransient.sensing.dead_time.free_running_state import FreeRunningState
 
 _TRIES = 64  # for a place in the piece that holds the detection just one dead time ago
 _LATER = 32  # detections between looks at which pixels are done
 
 
-def begin_places(chain: RenewalChain, lines: Tensor, generator: torch.Generator | None) -> Tensor:
+def begin_places(state: FreeRunningState, part: Tensor, generator: torch.Generator | None) -> Tensor:
     """When each detector (P,) is armed for the first time, in pieces after the start: 0, or up to a dead time later.
 
-    `lines`: stationary lines (P, 2 N) of the chain, detections per period.
+    `state`: the stationary one of pieces (P, N), whose dead time is `state.whole` of them and a `part` of one.
     """
-    pixels, size = chain.rate.shape
-    dead = chain.whole + chain.part
-    count = lines[:, :size].clamp_min(0)
-    late = torch.minimum(late_lines(lines, chain.part).clamp_min(0), count)
-    index = torch.arange(size, dtype=torch.float64, device=lines.device)
+    count = state.detected
+    pixels, size = count.shape
+    dead = state.whole + part
+    index = torch.arange(size, dtype=torch.float64, device=count.device)
     # earlier periods in which a detection of this piece would still be felt, the piece where it only may be included
     rounds = torch.ceil((index + 1 + dead) / size - 1e-12) - 1
     weights = (count * rounds).cumsum(-1)
 
     def uniform() -> Tensor:
-        return torch.rand(pixels, 1, dtype=torch.float64, device=lines.device, generator=generator)
+        return torch.rand(pixels, 1, dtype=torch.float64, device=count.device, generator=generator)
 
-    armed = chain.at_start(chain.inflow(lines))[:, :1].clamp(0, 1)
+    armed = state.armed[:, :1]
     start = torch.zeros_like(armed)
     left = (uniform() >= armed) & (weights[:, -1:] > 0)
-    share = torch.where(count > 0, late / count.clamp_min(1e-300), 0.0)
+    share = state.late / count  # NaN of pieces that nothing is drawn from
     for _ in range(_TRIES):
         if not bool(left.any()):
             break
         piece = torch.searchsorted(weights, uniform() * weights[:, -1:], right=True).clamp_max(size - 1)
         # in the last `part` of the piece with the chance of the line, evenly inside either stretch
         at_end = uniform() < share.gather(1, piece)
-        inside = torch.where(at_end, 1 - chain.part * uniform(), (1 - chain.part) * uniform())
+        inside = torch.where(at_end, 1 - part * uniform(), (1 - part) * uniform())
         before = torch.floor(uniform() * rounds[piece]) + 1
         free = piece + inside - before * size + dead
         start = torch.where(left & (free > 0), free, start)

@@ -30,7 +30,13 @@ from torchtransient.sensing.dead_time.free_running_draws import (
     normal_share,
 )
 from torchtransient.sensing.dead_time.free_running_events import begin_places, event_counts
-from torchtransient.sensing.dead_time.free_running_state import DARK, FreeRunningState, late_lines, per_period
+from torchtransient.sensing.dead_time.free_running_state import (
+    DARK,
+    FreeRunningState,
+    late_lines,
+    per_period,
+    within_limits,
+)
 from torchtransient.sensing.dead_time.renewal_chain import RenewalChain
 from torchtransient.sensing.dead_time.stationary_phases import stationary_phases, tangent_phases
 from torchtransient.sensing.numerics.draws import sample_multinomial
@@ -58,22 +64,23 @@ class _Stationary:
     chain: RenewalChain
     pieces: int
     phases: Tensor  # lines whose counts sum to 1,
-    lines: Tensor  # per period
+    state: FreeRunningState  # per period
     chances: BinChances
 
     @property
     def per_bin(self) -> Tensor:
         """Detections (P, T) per period."""
-        return _whole_bins(self.lines[:, : self.chain.bins].clamp_min(0), self.pieces)
+        return _whole_bins(self.state.detected, self.pieces)
 
     def of(self, rows: Tensor) -> _Stationary:
         if torch.equal(rows, torch.arange(self.chain.rate.shape[0], device=rows.device)):
             return self
-        c = self.chances
+        c, s = self.chances, self.state
         begin = None if c.begin is None else c.begin[:, rows]
         chances = BinChances(begin, c.fire[:, rows], c.soon[:, rows], c.late[:, rows], c.whole)
         chain = RenewalChain(self.chain.rate[rows], self.chain.whole, self.chain.part)
-        return _Stationary(chain, self.pieces, self.phases[rows], self.lines[rows], chances)
+        state = FreeRunningState(s.detected[rows], s.armed[rows], s.late[rows], s.whole)
+        return _Stationary(chain, self.pieces, self.phases[rows], state, chances)
 
 
 def _whole_bins(fine: Tensor, pieces: int) -> Tensor:
@@ -85,12 +92,9 @@ def _stationary(rate: Tensor, dead_bins: Tensor, pieces: int) -> _Stationary:
     whole, part = whole_and_part(dead_bins.to(rate.device) * pieces)
     chain = RenewalChain(fine, whole, part)
     phases = stationary_phases(fine, part, whole)
-    lines = per_period(chain, phases)
-    count = lines[:, : chain.bins].clamp_min(0)
-    late = torch.minimum(late_lines(lines, part).clamp_min(0), count)
-    armed = chain.at_start(chain.inflow(lines)).clamp(0, 1)
-    state = FreeRunningState(_columns(count), _columns(armed), _columns(late), whole)
-    return _Stationary(chain, pieces, phases, lines, bin_chances(_columns(fine), state))
+    state = within_limits(chain, per_period(chain, phases))
+    columns = FreeRunningState(_columns(state.detected), _columns(state.armed), _columns(state.late), whole)
+    return _Stationary(chain, pieces, phases, state, bin_chances(_columns(fine), columns))
 
 
 def train_counts(
@@ -103,7 +107,7 @@ def train_counts(
     """
     counts = torch.zeros_like(rate)
     dark = rate.sum(-1, keepdim=True) < DARK
-    safe = torch.where(dark, torch.full_like(rate, 1.0 / rate.shape[-1]), rate)
+    safe = torch.where(dark, 0.1, rate)
     for rows, pieces in rows_by_level(safe.clamp_max(_FLOOD), float(dead_bins), PHOTONS):
         own = safe if rows is None else safe[rows]
         state = _stationary(own, dead_bins, pieces)
@@ -113,12 +117,13 @@ def train_counts(
         else:
             found = _whole_counts(state, own, dead_bins, periods, generator)
         counts = found if rows is None else counts.index_copy(0, rows, found)
-    if bool(dark.any()):
-        many = torch.full_like(rate, float(periods))
-        # without light there is nothing to be dead after
-        alone = (normal_share if normal else binomial_share)(many, torch.where(dark, rate, 0.0), generator)
-        counts = torch.where(dark, alone, counts)
-    return counts
+    rows = dark.squeeze(-1).nonzero().squeeze(-1)
+    if not rows.numel():
+        return counts
+    # without light there is nothing to be dead after
+    many = torch.full_like(rate[rows], float(periods))
+    alone = (normal_share if normal else binomial_share)(many, rate[rows], generator)
+    return counts.index_copy(0, rows, alone)
 
 
 def _whole_counts(
@@ -144,7 +149,7 @@ def _whole_counts(
                 f"part of the period, got {float(number[rows].max()):g}. The phase is remembered over so many of them "
                 "that they are drawn one by one. Use fewer cycles, or grad='gaussian'."
             )
-        start = begin_places(chosen.chain, chosen.lines, generator) / state.pieces
+        start = begin_places(chosen.state, chosen.chain.part, generator) / state.pieces
         counts = counts.index_copy(0, rows, event_counts(rate[rows], dead_bins, start, periods, generator))
     return counts
 
@@ -197,8 +202,7 @@ def _closing(
     begin = _rows(path.begin)
     # the train itself begins and ends somewhere
     first, last = (_rows(sample_multinomial(1, chances.begin, generator)) for _ in range(2))
-    known = (first.sum(-1, keepdim=True) > 0) & (last.sum(-1, keepdim=True) > 0)
-    ends = torch.where(known, first - last, 0.0)
+    ends = first - last
     armed = path.end - begin[:, :1] + ends[:, :1]
     back = _rows(path.wrapped) - begin[:, 1:] + ends[:, 1:]
     soon = _rows(chances.soon)
@@ -226,5 +230,4 @@ def _added(counts: Tensor, more: Tensor, generator: torch.Generator | None) -> T
     start = torch.rand(counts[:, :1].shape, dtype=counts.dtype, device=counts.device, generator=generator)
     upto = counts.cumsum(-1) + torch.floor(more.cumsum(-1) + start)
     # a bin with too few to take away from leaves it to the next one, the last one to the first: the total is kept
-    total = upto[:, -1:].clamp_min(0)
-    return torch.cat([upto - total, upto], -1).cummax(-1).values[:, -counts.shape[-1] - 1 :].diff(dim=-1)
+    return torch.cat([upto - upto[:, -1:], upto], -1).cummax(-1).values[:, -counts.shape[-1] - 1 :].diff(dim=-1)

@@ -44,7 +44,7 @@ def stationary_state(rate: Tensor, dead_bins: Tensor) -> FreeRunningState:
     """
     # a dark pixel has no phases; its limit is one photon, at most, per many periods
     dark = rate.sum(-1, keepdim=True) < DARK
-    safe = torch.where(dark, torch.full_like(rate, 1.0 / rate.shape[-1]), rate)
+    safe = torch.where(dark, 0.1, rate)
     state = _settled(safe, dead_bins, 1)
     inside = _armed_in_the_light(safe, state).nonzero().flatten()
     for rows, pieces in rows_by_contrast(safe[inside]):
@@ -121,6 +121,14 @@ def late_lines(lines: Tensor, part: Tensor) -> Tensor:
     """Of detections on lines (P, 2 T): those that are armed again after one bin more than the whole dead time."""
     bins = lines.shape[-1] // 2
     return part * lines[:, :bins] + math.sqrt(3.0) * (1 - part) * part * lines[:, bins:]
+
+
+def within_limits(chain: RenewalChain, lines: Tensor) -> FreeRunningState:
+    """Of lines (P, 2 N), which may dip below zero where detections crowd at an edge: what can be drawn from."""
+    count = lines[:, : chain.bins].clamp_min(0)
+    late = torch.minimum(late_lines(lines, chain.part).clamp_min(0), count)
+    armed = chain.at_start(chain.inflow(lines)).clamp(0, 1)
+    return FreeRunningState(count, armed, late, chain.whole)
 
 
 def _solved(rate: Tensor, dead_bins: Tensor, pieces: int) -> FreeRunningState:

@@ -100,7 +100,7 @@ def _tangent(chain: RenewalChain, pi: Tensor, right: Tensor) -> Tensor:
         hard, p, r = RenewalChain(chain.rate[rows], chain.whole, chain.part), pi[rows], right[rows]
         direct = solve_banded(hard, r, p[:, : chain.bins].argmax(-1), transposed=False)
         direct = direct - p * _counts(hard, direct)
-        _check((direct - hard.step(direct) - r).norm(dim=-1) / direct.norm(dim=-1).clamp_min(1e-300))
+        _check((direct - hard.step(direct) - r).norm(dim=-1) / direct.norm(dim=-1))
         found = found.index_copy(0, rows, direct)
     return found
 
@@ -114,9 +114,7 @@ def tangent_phases(chain: RenewalChain, pi: Tensor, right: Tensor) -> Tensor:
     for r, p, d in zip(*(torch.split(rows, _PIXELS_AT_ONCE) for rows in (chain.rate, pi, right)), strict=True):
         # rounding is no excess
         d = d - p * _counts(chain, d)
-        some = d.norm(dim=-1, keepdim=True) > 0
-        one = torch.where(some, d, torch.zeros_like(d))
-        found.append(torch.where(some, _tangent(RenewalChain(r, chain.whole, chain.part), p, one), 0.0))
+        found.append(_tangent(RenewalChain(r, chain.whole, chain.part), p, d))
     return torch.cat(found)
 
 

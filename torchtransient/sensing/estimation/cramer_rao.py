@@ -191,11 +191,13 @@ def _shares(response: Response, axis: TimeAxis, distance: Tensor) -> Tensor:
 def shares_between(response: Response, edges_s: Tensor, bin_width_s: float) -> Tensor:
     """(..., K): the share of a response, of light at one known time, between edges (..., K + 1) in seconds."""
     if type(response).cdf is Response.cdf:
-        return _by_kernel(response, bin_width_s / _FINE, edges_s)
-    below, above = response.cdf(edges_s), response.survival(edges_s)
-    # differences of what is small: tails keep their relative precision
-    late = (below > 0.5)[..., :-1]
-    return torch.where(late, above[..., :-1] - above[..., 1:], below.diff(dim=-1)).clamp_min(0)
+        found = _by_kernel(response, bin_width_s / _FINE, edges_s)
+    else:
+        below, above = response.cdf(edges_s), response.survival(edges_s)
+        # differences of what is small: tails keep their relative precision
+        late = (below > 0.5)[..., :-1]
+        found = torch.where(late, above[..., :-1] - above[..., 1:], below.diff(dim=-1))
+    return found.clamp_min(0)  # rounding
 
 
 def _by_kernel(response: Response, width_s: float, edges_s: Tensor) -> Tensor:
@@ -204,7 +206,7 @@ def _by_kernel(response: Response, width_s: float, edges_s: Tensor) -> Tensor:
     start = (first - 0.5) * width_s
     flat = torch.cat([edges_s.new_full((1,), start - width_s), edges_s.reshape(-1)])
     below = resample_counts(kernel, width_s, flat, start_s=start).cumsum(0).reshape(edges_s.shape)
-    return below.diff(dim=-1).clamp_min(0)
+    return below.diff(dim=-1)
 
 
 def _inverse(information: Tensor) -> Tensor:

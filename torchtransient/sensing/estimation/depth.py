@@ -109,8 +109,6 @@ def center_of_mass(
     window (or the bins that count). Half precision is summed in float32.
     """
     check_transient(histogram, "center_of_mass")
-    dtype = histogram.dtype
-    histogram = histogram if dtype.itemsize > 2 else histogram.float()
     excess = histogram - _per_pixel(background, histogram, "center_of_mass", "background")
     bins = _positions(histogram)
     if half_width_bins is None:
@@ -135,7 +133,7 @@ def center_of_mass(
     position = reference + torch.where(there, moment, 0.0) / over
     reach = 0.5 * bins.numel() if half_width_bins is None else half_width_bins + 0.5
     first, last = (reference - reach).clamp(min=0.0), (reference + reach).clamp(max=float(bins.numel()))
-    return torch.minimum(torch.maximum(position, first), last).squeeze(TIME).to(dtype)
+    return torch.minimum(torch.maximum(position, first), last).squeeze(TIME)
 
 
 @in_single

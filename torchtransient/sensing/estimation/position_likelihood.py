@@ -92,7 +92,8 @@ def _top(values: Tensor) -> Tensor:
     left, right = values.gather(1, (begin - 1).clamp(min=0)), values.gather(1, (begin + 1).clamp(max=last))
     usable = ~flat & (begin > 0) & (begin < last) & left.isfinite() & right.isfinite()
     one = torch.ones_like(here)
+    # both neighbours are lower, so that it lies within half a step
     bend = torch.where(usable, 2 * here - left - right, one)
-    offset = torch.where(usable, 0.5 * (right - left) / torch.where(bend > 0, bend, one), torch.zeros_like(here))
+    offset = torch.where(usable, 0.5 * (right - left) / bend, torch.zeros_like(here))
     middle = 0.5 * (begin + ends).to(values.dtype)
-    return (middle + offset.clamp(-0.5, 0.5)).squeeze(1)
+    return (middle + offset).squeeze(1)

@@ -139,9 +139,12 @@ def phase_of(phasor: Tensor) -> Tensor:
     scale = torch.where(there, largest, 1.0)
     angle = torch.atan2(torch.where(there, imag, 0.0) / scale, torch.where(there, real, 1.0) / scale)
     # Not where(..., turn, 0.0): two plain numbers make a float32 of the turn.
-    wrapped = angle + _TURN * (angle < 0).to(angle)
-    # The sum of a tiny negative angle and a turn rounds to the turn itself.
-    return torch.where(wrapped >= _TURN, wrapped - _TURN, wrapped)
+    return below_a_turn(angle + _TURN * (angle < 0).to(angle))
+
+
+def below_a_turn(phase: Tensor) -> Tensor:
+    """Phases of up to a turn in [0, 2 pi): the sum of a tiny negative angle and a turn rounds to the turn itself."""
+    return torch.where(phase >= _TURN, phase - _TURN, phase)
 
 
 def amplitude_of(phasor: Tensor) -> Tensor:

@@ -37,6 +37,7 @@ from torchtransient.sensing.itof.itof_depth import (
     Readout,
     amplitude_of,
     as_frames,
+    below_a_turn,
     check_readout,
     depth_of_phase,
     offset_of,
@@ -144,7 +145,7 @@ def phase_noise_rad(
 
 
 def decode_code(taps: Frames, code: CorrelationCode, *, num_phases: int = 1024, readout: Readout = "single") -> Tensor:
-    """Phase (..., C, F, H, W) in radians of frames of *any* code, by the closest shape of the N steps.
+    """Phase (..., C, F, H, W) in [0, 2 pi) of frames of *any* code, by the closest shape of the N steps.
 
     The steps at length one, single taps without their mean, are compared with the code at ``num_phases`` phases
     (normalised cross-correlation, Gupta et al. 2018); the best of them, detached, is refined by one Gauss-Newton step
@@ -165,7 +166,7 @@ def _by_shape(steps: Tensor, code: CorrelationCode, num_phases: int, readout: st
     centred = split - split.mean(-1, keepdim=True) if single else split
     length = torch.linalg.vector_norm(centred, dim=-1, keepdim=True)
     faint = (1e-6 if single else 0.0) * split.abs().amax(-1, keepdim=True)
-    there = ~(length <= faint.clamp_min(torch.finfo(split.dtype).tiny))
+    there = ~(length <= faint)
     unit = torch.where(there, centred, 0.0) / torch.where(there, length, 1.0)
     x = torch.arange(num_phases, dtype=torch.float64) / num_phases
     table = _unit_shapes(code, x, single).to(unit)
@@ -177,7 +178,7 @@ def _by_shape(steps: Tensor, code: CorrelationCode, num_phases: int, readout: st
     speed = direction.square().sum(-1).clamp_min(1e-12)
     shift = ((unit - here) * direction).sum(-1) / speed
     turns = x.to(unit)[best] + shift.clamp(-2 / num_phases, 2 / num_phases)
-    phase = (turns - torch.floor(turns)) * _TURN
+    phase = below_a_turn((turns - torch.floor(turns)) * _TURN)
     slopes = _TURN * direction / (torch.where(there, length, 1.0) * speed.unsqueeze(-1))
     slopes = torch.where(there, slopes, math.inf)
     return torch.where(there.squeeze(-1), phase, 0.0), slopes.movedim(-1, -3)
@@ -272,8 +273,7 @@ def _without_offsets(phase: Tensor, calibration: ItofCalibration, frequencies: t
         )
     # In [0, 2 pi) before the dtype of the frames rounds it.
     phase = phase - (added % _TURN).to(phase)
-    phase = phase - _TURN * torch.floor(phase / _TURN)
-    return torch.where(phase >= _TURN, phase - _TURN, phase)
+    return below_a_turn(phase - _TURN * torch.floor(phase / _TURN))
 
 
 def _slopes(phasor: Tensor, num_taps: int) -> Tensor:
@@ -299,14 +299,12 @@ def _at_corners(
     number = steps.shape[-3]
     # sqrt has no slope at 0
     far = torch.where(variance > 0, (number * torch.where(variance > 0, variance, 1.0)).sqrt(), 0.0)
-    total, squares = torch.zeros_like(first), torch.zeros_like(first)
+    found = []
     for row in torch.eye(number, dtype=steps.dtype, device=steps.device):
         away = far * row.view(-1, 1, 1)
         for moved in (steps + away, steps - away):
-            difference = wrapped_difference(_by_shape(moved, code, 1024, readout)[0], phase)
-            total, squares = total + difference, squares + difference.square()
-    around = squares / (2 * number) - (total / (2 * number)).square()
-    return torch.where(first < _SMALL_PHASE**2, around.clamp_min(0), first)
+            found.append(wrapped_difference(_by_shape(moved, code, 1024, readout)[0], phase))
+    return torch.where(first < _SMALL_PHASE**2, torch.stack(found).var(0, correction=0), first)
 
 
 def _depth_std(
@@ -384,7 +382,7 @@ def _can_be(steps: Tensor, offset: Tensor, from_picture: bool, read: float) -> T
     size = (2 / number) * torch.hypot((steps * angles.cos()).sum(-3), (steps * angles.sin()).sum(-3))
     mean = offset.mean(-3)
     # read noise of both sides, and the shot noise of differences beside a mean that does not know it
-    spread = (6 / number * (read + (mean.clamp_min(0) if from_picture else 0.0))) ** 0.5
+    spread = (6 / number * (read + (mean if from_picture else 0.0))) ** 0.5
     largest = steps.abs().amax(-3)
     return ~(size > 2 * mean + 6 * spread + 1e-5 * largest)
 

@@ -131,10 +131,10 @@ def _distribution(probabilities: Tensor, most: int) -> Tensor:
     results = min(most, math.ceil(mean + 10 * math.sqrt(mean) + 25))
     n = torch.arange(most + 1, dtype=torch.float64, device="cpu").unsqueeze(1)
     k = torch.arange(results + 1, dtype=torch.float64, device="cpu")
-    ways = torch.lgamma(n + 1) - torch.lgamma(k + 1) - torch.lgamma((n - k).clamp_min(0) + 1)
+    ways = torch.lgamma(n + 1) - torch.lgamma(k + 1) - torch.lgamma(n - k + 1)  # none of k > n
     p = probabilities.view(-1, 1, 1)
     chance = torch.exp(ways + torch.xlogy(k, p) + (n - k) * torch.log1p(-p))
-    return torch.where(k <= n, chance, 0.0).cumsum_(-1).clamp_(max=1.0).view(-1, results + 1)
+    return chance.cumsum_(-1).clamp_(max=1.0).view(-1, results + 1)
 
 
 @functools.lru_cache(maxsize=32)

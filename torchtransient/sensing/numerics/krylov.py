@@ -57,7 +57,7 @@ def _cycle(operator: Operator, precondition: Operator, residual: Tensor, length:
             table[:, : k + 1, k] += overlap.squeeze(-1)
         norm = v.norm(dim=-1)
         table[:, k + 1, k] = norm
-        basis[:, k + 1] = torch.where((norm > 1e-14).unsqueeze(-1), v / norm.clamp_min(1e-300).unsqueeze(-1), 0.0)
+        basis[:, k + 1] = torch.where((norm > 1e-14).unsqueeze(-1), v / norm.unsqueeze(-1), 0.0)
         used = k + 1
         if used % 4 == 0 and bool((_solve(table, used, length)[1] <= goal).all()):
             break

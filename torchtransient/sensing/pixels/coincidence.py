@@ -226,7 +226,7 @@ class CoincidencePixel(RandomSensor):
 
     def variance(self, x: Tensor) -> Tensor:
         p = self.probabilities(x)
-        variance: Tensor = self.cycles * p * (1 - p)
+        variance: Tensor = self.cycles * p * (1 - p).clamp_min(0)  # rounding
         return variance
 
     def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
@@ -242,7 +242,7 @@ class CoincidencePixel(RandomSensor):
                 f"CoincidencePixel: expected at most one coincidence per cycle in a bin, got {float(p.max()):g}. Use "
                 "narrower bins to draw."
             )
-        return p.clamp_max(1)
+        return p
 
     def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
         """Of the draws as described: independent binomials."""

@@ -116,6 +116,7 @@ class Response(PhysicalModule):
         else:
             edges = torch.arange(first, last + 2, dtype=torch.float64, device=self.delay_ps.device) - 0.5
             weights = self.mass(edges * bin_width_s)
+        weights = weights.clamp_min(0)  # rounding
         return first, weights / weights.sum()
 
     def _lags(self, bin_width_s: float) -> tuple[int, int]:
@@ -142,7 +143,7 @@ class Response(PhysicalModule):
             return self._spread_by_nodes(first, last, bin_width_s)
         below, above = closed
         early, late = below.diff().diff(), above.diff().diff()
-        return torch.where((below > above)[1:-1], late, early).clamp_min(0) / bin_width_s
+        return torch.where((below > above)[1:-1], late, early) / bin_width_s
 
     def _spread_by_nodes(self, first: int, last: int, bin_width_s: float) -> Tensor:
         """The mean of `mass` over places in the bin, by Gauss-Legendre rules on panels of an eighth of the response."""

@@ -219,7 +219,7 @@ class FreeRunningSPAD(RandomSensor):
 
     def variance(self, x: Tensor) -> Tensor:
         p = self.probabilities(x)
-        variance: Tensor = self.cycles * p * (1 - p)
+        variance: Tensor = self.cycles * p * (1 - p).clamp_min(0)  # rounding
         return variance
 
     def _check_dead_time(self, dead_time_s: float) -> None:
@@ -256,7 +256,7 @@ class FreeRunningSPAD(RandomSensor):
         if self.kind == "paralyzable":
             return super().gaussian(x, generator)
         drawn, mean = self._train(x, generator, normal=True), self.expected(x)
-        width = (self.variance(x).clamp_min(0) + VARIANCE_FLOOR).sqrt()
+        width = (self.variance(x) + VARIANCE_FLOOR).sqrt()
         return mean + (drawn - mean.detach()) * (width / width.detach())
 
     def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:

@@ -61,9 +61,11 @@ class SweepJitter(RandomSensor):
             return x
         reach = math.ceil(6 * self.sigma_bins) + 1
         lags = torch.arange(-reach, reach + 1, dtype=torch.float64, device=x.device)
-        # Mean of the tent max(0, 1 - |shift - lag|): second difference of the integral of the normal cumulative.
-        ramp = self.sigma_bins * normal_integral(torch.stack([lags - 1, lags, lags + 1]) / self.sigma_bins)
-        kernel = (ramp[0] - 2 * ramp[1] + ramp[2]).clamp_min(0)
+        # Mean of the tent max(0, 1 - |shift - lag|): second difference of the integral of the normal cumulative, on
+        # the side where that keeps its digits.
+        low = -lags.abs()
+        ramp = self.sigma_bins * normal_integral(torch.stack([low - 1, low, low + 1]) / self.sigma_bins)
+        kernel = ramp[0] - 2 * ramp[1] + ramp[2]
         return convolve_time(x, kernel / kernel.sum(), -reach, boundary=self.boundary)
 
     def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:

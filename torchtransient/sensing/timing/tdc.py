@@ -46,7 +46,7 @@ def code_bands(
     before = _triangle if dither else _box
     share = before(upper.unsqueeze(1) - true) - before(lower.unsqueeze(1) - true)
     inside = 1.0 if periodic else (true >= 0) & (true < num_bins)
-    return first, share.clamp_min(0) * inside
+    return first, share * inside
 
 
 def _box(z: Tensor) -> Tensor:
