@@ -22,11 +22,11 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from torchtransient.errors import GradientError, SceneError
 from torchtransient.plugins.bsdfs.inherited import hides_lobe_probability
 from torchtransient.plugins.bsdfs.wrapper_copy import can_be_rebuilt, flags_of, rebuild_wrapper
+from torchtransient.plugins.host_numbers import host_numbers
 from torchtransient.plugins.mitsuba_compat import adds_up_wrongly, weight_slot
 from torchtransient.plugins.node_walk import bsdfs_below, objects_below, objects_of, shown_by
 from torchtransient.plugins.parameter_effect import class_of
@@ -166,7 +166,7 @@ class Seal:
         for mixture in self._mixtures:
             texture = dict(objects_of(mixture))[weight_slot(mixture)]
             values = numbers_below(texture, self._shapes)
-            weights = (np.array(dr.detach(value)) for value in values if dr.grad_enabled(value))
+            weights = (host_numbers(value, None) for value in values if dr.grad_enabled(value))
             if any(((weight <= 0) | (weight >= 1)).any() for weight in weights):
                 raise GradientError(
                     f"{self._names(mixture)}, whose weight is exactly 0 or 1, where the derivative by it is lost. "

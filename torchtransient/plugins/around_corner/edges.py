@@ -14,6 +14,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from torchtransient.plugins.host_numbers import host_numbers
+
 # Creases flatter than this are no outline: 1 minus the cosine of 1.4e-3 radians.
 FLAT = 1e-6
 # Rims that are nearer than this to each other, in parts of the largest coordinate, are one.
@@ -43,7 +45,7 @@ class Triangles:
     @staticmethod
     def of(meshes: list[Any]) -> Triangles:
         """Those of Mitsuba meshes, as they are now."""
-        v = [np.array(dr.detach(m.vertex_positions_buffer()), dtype=np.float32).reshape(-1, 3) for m in meshes]
+        v = [host_numbers(m.vertex_positions_buffer(), np.float32).reshape(-1, 3) for m in meshes]
         f = [np.array(m.faces_buffer(), dtype=np.int64).reshape(-1, 3) for m in meshes]
         first = np.cumsum([0, *(len(one) for one in v)])
         mesh = np.repeat(np.arange(len(f)), [len(one) for one in f])

@@ -15,6 +15,7 @@ from torchtransient.plugins.around_corner.geometry import front_normal
 from torchtransient.plugins.around_corner.overlaps import overlaps
 from torchtransient.plugins.around_corner.wall_points import WallPoints, points_of
 from torchtransient.plugins.bsdfs.lambertian import is_lambertian
+from torchtransient.plugins.host_numbers import host_numbers
 from torchtransient.plugins.mitsuba_compat import is_flat_shape
 from torchtransient.plugins.node_walk import shown_by
 from torchtransient.plugins.pointer_table import registry_number
@@ -133,11 +134,11 @@ def _in_one_plane(shapes: list[Any]) -> bool:
 def _corners(shape: Any) -> np.ndarray | None:
     """Points that span a shape (N, 3), None for one that is curved."""
     if shape.is_mesh():
-        return np.array(dr.detach(shape.vertex_positions_buffer()), dtype=np.float64).reshape(-1, 3)
+        return host_numbers(shape.vertex_positions_buffer()).reshape(-1, 3)
     if not is_flat_shape(shape):
         return None
     shown = next(v for v in shown_by(shape)[0] if v.key == "to_world")
-    m = np.array(dr.detach(shown.read(shape).matrix), dtype=np.float64).reshape(4, 4)
+    m = host_numbers(shown.read(shape).matrix).reshape(4, 4)
     return m[:3, 3] + np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]) @ m[:3, :3].T
 
 

@@ -18,6 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from torchtransient.plugins.host_numbers import host_numbers
 from torchtransient.plugins.sampling.area_elements import TRIANGLE, AreaElements, morton_order
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 
@@ -164,7 +165,7 @@ def _obstacles(shapes: list[Any], frame: np.ndarray) -> tuple[np.ndarray, np.nda
     triangles, boxes = [np.zeros((0, 3, 3))], [np.zeros((0, 2, 3))]
     for shape in shapes:
         if shape.is_mesh() and not shape.is_ellipsoids():
-            v = np.array(dr.detach(shape.vertex_positions_buffer()), dtype=np.float64).reshape(-1, 3) @ frame.T
+            v = host_numbers(shape.vertex_positions_buffer()).reshape(-1, 3) @ frame.T
             triangles.append(v[np.array(shape.faces_buffer(), dtype=np.int64).reshape(-1, 3)])
         elif shape.bbox().valid():
             ends = [np.array(end, dtype=np.float64) for end in (shape.bbox().min, shape.bbox().max)]

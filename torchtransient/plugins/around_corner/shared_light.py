@@ -22,6 +22,7 @@ from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
 from torchtransient.plugins.around_corner.third_bounce_gradients import ThirdBounceGradients
 from torchtransient.plugins.around_corner.wall_points import WallPoints, points_of
 from torchtransient.plugins.bsdfs.lambertian import is_lambertian
+from torchtransient.plugins.host_numbers import host_numbers
 from torchtransient.plugins.node_walk import objects_below
 from torchtransient.plugins.parameter_effect import class_of
 from torchtransient.plugins.sampling.area_elements import can_be_listed, has_shading_normals
@@ -106,7 +107,7 @@ def moves_scan(world: Any, hidden: list[Any]) -> bool:
 
 def _rows(vectors: Any, width: int) -> np.ndarray:
     """(width, 3), detached."""
-    return np.broadcast_to(np.array(dr.detach(vectors), dtype=np.float64).T, (width, 3))
+    return np.broadcast_to(host_numbers(vectors).T, (width, 3))
 
 
 def add_late_light(table: ScanTable, film: Any, job: Any, bounces: range, run: Any) -> None:

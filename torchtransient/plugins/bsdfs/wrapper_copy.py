@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient.errors import SceneError
+from torchtransient.plugins.host_numbers import host_numbers
 from torchtransient.plugins.mitsuba_compat import HIDDEN_FLAGS, is_two_sided_itself, normal_texture
 from torchtransient.plugins.node_walk import objects_below, objects_of, shown_by
 
@@ -76,7 +77,7 @@ def _telling_values(wrapper: Any) -> Iterator[None]:
 
 def _random(value: Any, rng: np.random.Generator) -> Any:
     """Numbers between 0.6 and 1 (of the range of whole ones) of the shape of a parameter."""
-    numbers = np.array(dr.detach(value))
+    numbers = host_numbers(value, None)
     drawn = rng.uniform(0.6, 1.0, numbers.shape)
     if np.issubdtype(numbers.dtype, np.integer):
         drawn = drawn * np.iinfo(numbers.dtype).max

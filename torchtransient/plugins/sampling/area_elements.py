@@ -27,6 +27,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from torchtransient.plugins.host_numbers import host_numbers
 from torchtransient.plugins.mitsuba_compat import has_surface
 from torchtransient.plugins.node_walk import shown_by
 from torchtransient.plugins.parameter_effect import class_of
@@ -171,7 +172,7 @@ def _rows_of(shape: Any) -> tuple[np.ndarray, int, np.ndarray, np.ndarray] | Non
 
 
 def _triangles(mesh: Any) -> tuple[np.ndarray, int, np.ndarray, np.ndarray]:
-    v = np.array(dr.detach(mesh.vertex_positions_buffer()), dtype=np.float64).reshape(-1, 3)
+    v = host_numbers(mesh.vertex_positions_buffer()).reshape(-1, 3)
     f = np.array(mesh.faces_buffer(), dtype=np.int64).reshape(-1, 3)
     o, e1, e2 = v[f[:, 0]], v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]]
     n = np.cross(e1, e2)
@@ -191,7 +192,7 @@ def _corner_normals(mesh: Any, faces: np.ndarray) -> np.ndarray | None:
     """The normals at the corners of the triangles (F, 3, 3), None where there are none but those of their planes."""
     if mesh.has_face_normals() or not mesh.has_vertex_normals():
         return None
-    return np.array(dr.detach(mesh.vertex_normals_buffer()), dtype=np.float64).reshape(-1, 3)[faces]
+    return host_numbers(mesh.vertex_normals_buffer()).reshape(-1, 3)[faces]
 
 
 def has_shading_normals(shape: Any) -> bool:
@@ -208,7 +209,7 @@ def has_shading_normals(shape: Any) -> bool:
 
 def _matrix(shape: Any) -> np.ndarray:
     shown = next(v for v in shown_by(shape)[0] if v.key == "to_world")
-    return np.array(dr.detach(shown.read(shape).matrix), dtype=np.float64).reshape(4, 4)
+    return host_numbers(shown.read(shape).matrix).reshape(4, 4)
 
 
 def _analytic(shape: Any, kind: int) -> tuple[np.ndarray, int, np.ndarray, np.ndarray]:

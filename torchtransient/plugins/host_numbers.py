@@ -1,0 +1,18 @@
+"""Numbers of Dr.Jit in memory of numpy's."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from numpy.typing import DTypeLike
+
+
+def host_numbers(value: Any, dtype: DTypeLike = np.float64) -> np.ndarray:
+    """A copy of an array's numbers.
+
+    Of a detached handle: Dr.Jit evaluates what it reads in place, and a literal that a scene shows to recordings would
+    be another array afterwards.
+    """
+    return np.array(dr.detach(value), dtype=dtype)
