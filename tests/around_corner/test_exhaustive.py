@@ -180,6 +180,23 @@ def test_colours():
     assert cube[..., 1].sum() == pytest.approx(one.sum() * 2 / 2.5, rel=1e-5)
 
 
+def test_colours_of_the_other_side():
+    """A sheet has the colour of the side that it turns towards the wall."""
+    colours = [0.1, 0.5, 0.8], [0.9, 0.3, 0.2]
+    v, f = plate(0.5, 0.4, (0.1, 0, 0.9))
+    found = []
+    with mi.variant_context("llvm_ad_rgb"):
+        front, back = ({"type": "rgb", "value": list(colour)} for colour in colours)
+        for faces in (f, f[:, ::-1]):
+            runs = Runs([mesh("a", (v, faces), front, two_sided=True, back=back)])
+            job = lambda film, runs=runs: ThirdBounce(runs.scene, film, runs.samples, runs.sensors, 1.0)  # noqa: E731
+            add = lambda runs=runs, job=job: exhaustive.add_exhaustive(job(runs.pairs), runs.sensors)  # noqa: E731
+            found.append(captured(runs.pairs, add)[1].reshape(-1, 3).sum(0))
+    away = np.cross(*(v[f[0][1:]] - v[f[0][0]]))[2] > 0
+    expected = colours[::-1] if away else colours
+    np.testing.assert_allclose([c / c[1] for c in found], [np.divide(c, c[1]) for c in expected], rtol=1e-4)
+
+
 def test_films_and_spots_are_checked():
     runs = Runs(SCENES["body"]())
     with pytest.raises(SceneError, match="exhaustive_scan"):

@@ -39,14 +39,15 @@ def folded_plates(z=1.0):
     return join((left, f), (right, f), plate(0.25, 0.25, (0.3, 0.2, z - 0.1)))
 
 
-def mesh(name, arrays, albedo=0.7, two_sided=False, vertex_normals=False):
-    """A Mitsuba mesh of (vertices, faces)."""
+def mesh(name, arrays, albedo=0.7, two_sided=False, vertex_normals=False, back=None):
+    """A Mitsuba mesh of (vertices, faces). ``back``: the albedo of its other side, where that is another one."""
     v, f = arrays
     if not isinstance(albedo, dict):
         albedo = float(albedo)
     bsdf = {"type": "diffuse", "reflectance": albedo}
     properties = mi.Properties()
-    properties["mesh_bsdf"] = mi.load_dict({"type": "twosided", "nested": bsdf} if two_sided else bsdf)
+    sides = {} if back is None else {"back": {"type": "diffuse", "reflectance": back}}
+    properties["mesh_bsdf"] = mi.load_dict({"type": "twosided", "front": bsdf, **sides} if two_sided else bsdf)
     made = mi.Mesh(name, len(v), len(f), has_vertex_normals=vertex_normals, props=properties)
     parameters = mi.traverse(made)
     parameters["vertex_positions"] = mi.Float(np.ravel(v).astype(np.float32))
