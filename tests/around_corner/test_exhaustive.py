@@ -93,7 +93,7 @@ def test_blocks_of_samples_add_up(monkeypatch):
     made, block = [], exhaustive.SampleBlock
     monkeypatch.setattr(exhaustive, "SampleBlock", lambda *a: made.append(a[2:]) or block(*a))
     told = []
-    steady, parts = captured(
+    _, parts = captured(
         runs.pairs,
         lambda: exhaustive.add_exhaustive(
             ThirdBounce(runs.scene, runs.pairs, runs.samples, runs.sensors, 2.5, progress=told.append), runs.sensors
