@@ -13,7 +13,7 @@ from support.gradient_cases.scenes import camera, film, room
 from torchtransient import plugins
 from torchtransient._collection import no_collection
 from torchtransient.errors import SceneError
-from torchtransient.plugins.bsdfs.delay_table import DECAY_NODES
+from torchtransient.plugins.bsdfs.delay_table import DECAY_NODES, _distribution
 from torchtransient.pulses import Pulse
 from torchtransient.sensing.response.pulse import pulse_kernel
 from torchtransient.testing.statistics import two_sample_z_test, z_test
@@ -308,3 +308,25 @@ def test_a_delay_inside_another_bsdf_is_refused(outer):
     target = scene({**outer, "nested": LATE})
     with pytest.raises(SceneError, match="outermost"):
         target.integrator().render(target, spp=1)
+
+
+@pytest.mark.parametrize(
+    ("resolution", "count"), [(0.0, 471), (-1.0, 471), (1e-4, 4096), (2.0, 151), (7.0, 65), (300.0, 65)]
+)
+def test_nodes_of_spectra(resolution, count):
+    """As many as the spectrum has, within bounds, between its ends."""
+    mi.set_variant("llvm_ad_spectral")
+
+    class Ramp:
+        def wavelength_range(self):
+            return 400.0, 700.0
+
+        def spectral_resolution(self):
+            return resolution
+
+        def eval(self, si):
+            return si.wavelengths - 399
+
+    found = _distribution(Ramp(), "emission")
+    np.testing.assert_allclose(np.array(found.pdf), np.linspace(1, 301, count), rtol=1e-5, atol=1e-4)
+    assert float(found.integral()[0]) == pytest.approx(300 * 151, rel=1e-4)

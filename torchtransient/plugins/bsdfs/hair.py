@@ -284,7 +284,7 @@ def _longitudinal(sin_i: Any, cos_i: Any, sin_o: Any, cos_o: Any, concentration:
 def _azimuthal(angle: Any, scale: Any) -> Any:
     """``N_p`` at an angle from the perfect path, which integrates to one over a turn."""
     turn = 2 * pi
-    angle = dr.abs(angle - turn * dr.round(dr.detach(angle) / turn))
+    angle = dr.abs(angle - turn * dr.round(angle / turn))
     fading = dr.exp(-angle / scale)
     return fading / (scale * dr.square(1 + fading) * dr.tanh(0.5 * pi / scale))
 
