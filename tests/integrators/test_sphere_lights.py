@@ -300,3 +300,17 @@ def test_numbers_of_lights():
     eps = float(mi.math.RayEpsilon)
     outer = [0, 0, 2, 0.5, 0.25, (0.5 * (1 - eps)) ** 2, 1, 0.25]
     np.testing.assert_allclose(rows, [[0.5, -1, 7, 3, 9, (3 * (1 + eps)) ** 2, -1, 0.75], outer], rtol=3e-6)
+
+
+@pytest.mark.parametrize("inside", [False, True])
+def test_no_density_along_the_surface(inside):
+    """Neither towards a point that is seen from the side or from behind, nor where there is no way to it."""
+    scene = over_a_plane(lamp(0.1, flip_normals=inside))
+    table = SphereLights.of(scene).read(scene)
+    ds = dr.zeros(mi.DirectionSample3f, 4)
+    ds.d, ds.n = mi.Vector3f(0, 0, 1), mi.Normal3f([1, 0, 0, 0], 0, [0, 1, -1, -1])
+    ds.dist, ds.emitter = mi.Float(2.0, 2.0, 0.0, 2.0), scene.emitters_dr()[0]
+    ref = dr.zeros(mi.Interaction3f, 4)
+    ref.p = mi.Point3f(0, 0, DISTANCE if inside else 0)
+    pdf = np.array(table.pdf(scene, ref, ds, mi.Bool(True)))
+    assert (pdf[:3] == 0).all() and 0 < pdf[3] < 1e3

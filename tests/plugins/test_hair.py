@@ -338,3 +338,13 @@ def test_a_roughness_below_the_least_one_keeps_its_slope():
         assert used[0] == pytest.approx(value, rel=1e-6)
         dr.backward(used)
         assert dr.grad(roughness)[0] == 1
+
+
+@pytest.mark.parametrize(("wi", "eta", "sigma"), [((0, 1, 0), 1.0, 0.3), ((0.6, 0.8, 0), 1.5, 0.0), ((0, 1, 0), 0.7, 0.0)])
+def test_shares_where_nothing_enters(wi, eta, sigma):
+    """Along the fibre, and along its surface where nothing is absorbed: no number is divided by zero."""
+    hair = mi.load_dict(described((0.3, 0.4), 2.0, eta, sigma))
+    si = interaction(np.float32(wi)[:, None])
+    fibre = hair._fibre(si, True)
+    shares = np.array([np.array(share[0])[0] for share in fibre.shares])
+    assert np.isfinite(shares).all() and shares.sum() == pytest.approx(1, abs=1e-4)
