@@ -114,7 +114,8 @@ def test_roulette_does_not_change_the_mean():
 def test_roulette_does_not_change_derivatives_through_mirrors():
     """Between two mirrors under a uniform sky: by the reflectance of one of them, of two bounces off it and more."""
     metal = {"type": "conductor", "material": "none", "specular_reflectance": {"type": "uniform", "value": 0.4}}
-    mirror = {"type": "rectangle", "to_world": T().translate([0, 0, 4.5]).rotate([0, 1, 0], 180).scale(3), "bsdf": metal}
+    facing = T().translate([0, 0, 4.5]).rotate([0, 1, 0], 180).scale(3)
+    mirror = {"type": "rectangle", "to_world": facing, "bsdf": metal}
     wall = {"type": "rectangle", "bsdf": metal}
     objects = {"wall": wall, "mirror": mirror, "sky": {"type": "constant", "radiance": 1.0}}
 

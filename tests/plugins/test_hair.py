@@ -340,7 +340,9 @@ def test_a_roughness_below_the_least_one_keeps_its_slope():
         assert dr.grad(roughness)[0] == 1
 
 
-@pytest.mark.parametrize(("wi", "eta", "sigma"), [((0, 1, 0), 1.0, 0.3), ((0.6, 0.8, 0), 1.5, 0.0), ((0, 1, 0), 0.7, 0.0)])
+@pytest.mark.parametrize(
+    ("wi", "eta", "sigma"), [((0, 1, 0), 1.0, 0.3), ((0.6, 0.8, 0), 1.5, 0.0), ((0, 1, 0), 0.7, 0.0)]
+)
 def test_shares_where_nothing_enters(wi, eta, sigma):
     """Along the fibre, and along its surface where nothing is absorbed: no number is divided by zero."""
     hair = mi.load_dict(described((0.3, 0.4), 2.0, eta, sigma))
