@@ -15,7 +15,7 @@ from support.hair_model import scattered
 from support.surface_samples import activate
 from torchtransient import plugins
 from torchtransient.errors import GradientError, SceneError
-from torchtransient.plugins.bsdfs.bessel import scaled_i0
+from torchtransient.plugins.bsdfs.bessel import _asymptotic_coefficients, _power_coefficients, scaled_i0
 
 RGB = "llvm_ad_rgb"
 INDEX = {"int_ior": 1.55, "ext_ior": 1.0}
@@ -66,6 +66,14 @@ def sampled(bsdf, si, seed=1):
 def towards(theta, phi):
     """One direction, by the angle to the plane across the fibre and that around it."""
     return np.array([np.cos(theta) * np.cos(phi), np.sin(theta), np.cos(theta) * np.sin(phi)])[:, None]
+
+
+def test_coefficients_of_bessel_functions():
+    """Abramowitz and Stegun 9.6.10 and 9.7.1, of the orders 0 and 1."""
+    np.testing.assert_allclose(_power_coefficients(0)[:4], [1, 1, 1 / 4, 1 / 36])
+    np.testing.assert_allclose(_power_coefficients(1)[:4], [1, 1 / 2, 1 / 12, 1 / 144])
+    np.testing.assert_allclose(_asymptotic_coefficients(0)[:3], [1, 1 / 8, 9 / 128])
+    np.testing.assert_allclose(_asymptotic_coefficients(1)[:3], [1, -3 / 8, -15 / 128])
 
 
 def test_bessel_function_and_its_slope():
