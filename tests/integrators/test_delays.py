@@ -13,7 +13,7 @@ from support.gradient_cases.scenes import camera, film, room
 from torchtransient import plugins
 from torchtransient._collection import no_collection
 from torchtransient.errors import SceneError
-from torchtransient.plugins.bsdfs.delay_table import DECAY_NODES
+from torchtransient.plugins.bsdfs.delay_table import DECAY_NODES, DelayedBSDFs, _distribution
 from torchtransient.pulses import Pulse
 from torchtransient.sensing.response.pulse import pulse_kernel
 from torchtransient.testing.statistics import two_sample_z_test, z_test
@@ -308,3 +308,41 @@ def test_a_delay_inside_another_bsdf_is_refused(outer):
     target = scene({**outer, "nested": LATE})
     with pytest.raises(SceneError, match="outermost"):
         target.integrator().render(target, spp=1)
+
+
+@pytest.mark.parametrize(
+    ("resolution", "count"), [(0.0, 471), (-1.0, 471), (1e-4, 4096), (2.0, 151), (7.0, 65), (300.0, 65)]
+)
+def test_nodes_of_spectra(resolution, count):
+    """As many as the spectrum has, within bounds, between its ends."""
+    mi.set_variant("llvm_ad_spectral")
+
+    class Ramp:
+        def wavelength_range(self):
+            return 400.0, 700.0
+
+        def spectral_resolution(self):
+            return resolution
+
+        def eval(self, si):
+            return si.wavelengths - 399
+
+    found = _distribution(Ramp(), "emission")
+    np.testing.assert_allclose(np.array(found.pdf), np.linspace(1, 301, count), rtol=1e-5, atol=1e-4)
+    assert float(found.integral()[0]) == pytest.approx(300 * 151, rel=1e-4)
+
+
+def test_delays_are_read_between_the_nodes_of_their_own_table():
+    """Two measured decays and an exponential one between them, in units of the lifetime."""
+    mi.set_variant(VARIANT)
+    plugins.sync()
+    other = {"decay_opl": "0, 0.5, 3.0", "decay_values": "0.2 1 0"}
+    bsdfs = [mi.load_dict({"type": "delayed", "nested": DIFFUSE, **how}) for how in (DECAY, {"lifetime": 0.9}, other)]
+    table = DelayedBSDFs(bsdfs).read()
+    v = np.random.default_rng(4).random(400).astype(np.float32)
+    v[:3] = 0, 0.5 / (DECAY_NODES - 1), 1
+    for row, bsdf in enumerate(bsdfs):
+        found = np.array(table._delay(mi.Float(v), mi.UInt32(row), mi.Bool(True)))
+        x = np.minimum(v, np.float32(1 - 2.0**-24)).astype(float)
+        expected = -np.log1p(-x) if row == 1 else np.interp(x * (DECAY_NODES - 1), np.arange(DECAY_NODES), bsdf.decay)
+        np.testing.assert_allclose(found, expected, rtol=2e-4, atol=2e-5)

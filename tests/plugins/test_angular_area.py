@@ -130,3 +130,24 @@ def test_lights_that_stay_dark_to_paths():
     ps, position_weight = light.sample_position(0.0, mi.Point2f(0.25, 0.5))
     assert float(position_weight[0]) == pytest.approx(0.04) and float(ps.p.z[0]) == pytest.approx(2.0)
     assert float(light.sample_position(0.0, mi.Point2f(0.5, 0.5), False)[1][0]) == 0
+
+
+def test_light_with_a_texture_varies_in_space():
+    bitmap = {"type": "bitmap", "raw": True, "data": mi.TensorXf(np.ones((2, 2, 1)))}
+    for radiance, varies in ((2.0, False), (bitmap, True)):
+        lamp = mi.load_dict({"type": "rectangle", "emitter": {"type": "angulararea", "radiance": radiance}}).emitter()
+        assert mi.has_flag(lamp.flags(), mi.EmitterFlags.SpatiallyVarying) == varies
+        assert mi.has_flag(lamp.flags(), mi.EmitterFlags.Surface)
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral"])
+def test_wavelengths_are_those_of_area_lights(variant):
+    mi.set_variant(variant)
+    plugins.sync()
+    ours, theirs = (
+        mi.load_dict({"type": "rectangle", "emitter": {"type": kind, "radiance": {"type": "d65"}}}).emitter()
+        for kind in ("angulararea", "area")
+    )
+    si, u = dr.zeros(mi.SurfaceInteraction3f, 5), mi.Float([0.1, 0.3, 0.5, 0.7, 0.9])
+    for one, other in zip(ours.sample_wavelengths(si, u), theirs.sample_wavelengths(si, u), strict=True):
+        np.testing.assert_allclose(np.array(one), np.array(other), rtol=1e-6)

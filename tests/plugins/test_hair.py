@@ -15,7 +15,7 @@ from support.hair_model import scattered
 from support.surface_samples import activate
 from torchtransient import plugins
 from torchtransient.errors import GradientError, SceneError
-from torchtransient.plugins.bsdfs.bessel import scaled_i0
+from torchtransient.plugins.bsdfs.bessel import _asymptotic_coefficients, _power_coefficients, scaled_i0
 
 RGB = "llvm_ad_rgb"
 INDEX = {"int_ior": 1.55, "ext_ior": 1.0}
@@ -66,6 +66,14 @@ def sampled(bsdf, si, seed=1):
 def towards(theta, phi):
     """One direction, by the angle to the plane across the fibre and that around it."""
     return np.array([np.cos(theta) * np.cos(phi), np.sin(theta), np.cos(theta) * np.sin(phi)])[:, None]
+
+
+def test_coefficients_of_bessel_functions():
+    """Abramowitz and Stegun 9.6.10 and 9.7.1, of the orders 0 and 1."""
+    np.testing.assert_allclose(_power_coefficients(0)[:4], [1, 1, 1 / 4, 1 / 36])
+    np.testing.assert_allclose(_power_coefficients(1)[:4], [1, 1 / 2, 1 / 12, 1 / 144])
+    np.testing.assert_allclose(_asymptotic_coefficients(0)[:3], [1, 1 / 8, 9 / 128])
+    np.testing.assert_allclose(_asymptotic_coefficients(1)[:3], [1, -3 / 8, -15 / 128])
 
 
 def test_bessel_function_and_its_slope():
@@ -326,3 +334,27 @@ def test_derivatives_of_mitsubas_own_are_refused(key, description):
 def test_what_is_refused(settings, words):
     with pytest.raises(SceneError, match=words), plugins.plugin_errors():
         mi.load_dict({"type": "diff_hair", **settings})
+
+
+def test_a_roughness_below_the_least_one_keeps_its_slope():
+    from torchtransient.plugins.bsdfs.hair import LEAST_ROUGHNESS, _at_least  # of a variant
+
+    for given, value in ((0.0, LEAST_ROUGHNESS), (0.5 * LEAST_ROUGHNESS, LEAST_ROUGHNESS), (0.4, 0.4)):
+        roughness = mi.Float(given)
+        dr.enable_grad(roughness)
+        used = _at_least(roughness)
+        assert used[0] == pytest.approx(value, rel=1e-6)
+        dr.backward(used)
+        assert dr.grad(roughness)[0] == 1
+
+
+@pytest.mark.parametrize(
+    ("wi", "eta", "sigma"), [((0, 1, 0), 1.0, 0.3), ((0.6, 0.8, 0), 1.5, 0.0), ((0, 1, 0), 0.7, 0.0)]
+)
+def test_shares_where_nothing_enters(wi, eta, sigma):
+    """Along the fibre, and along its surface where nothing is absorbed: no number is divided by zero."""
+    hair = mi.load_dict(described((0.3, 0.4), 2.0, eta, sigma))
+    si = interaction(np.float32(wi)[:, None])
+    fibre = hair._fibre(si, True)
+    shares = np.array([np.array(share[0])[0] for share in fibre.shares])
+    assert np.isfinite(shares).all() and shares.sum() == pytest.approx(1, abs=1e-4)

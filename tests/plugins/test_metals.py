@@ -230,6 +230,8 @@ def test_ranges_of_textures():
     ("eta", (0.0199, 0.0199), (2.0, 2.0), True), ("eta", (0.0201, 0.0201), (2.0, 2.0), False),
     # Of a range the smallest index, and either end of the absorption.
     ("eta", (0.01, 3.0), (2.0, 2.0), True), ("k", (0.5, 3.0), (0.0, 2.0), True), ("k", (0.5, 3.0), (2.0, 80.0), True),
+    # At these bounds nothing is lost: 2 * 0.008, and an index of one over a smaller absorption.
+    ("k", (0.016, 0.016), (1.0, 1.0), False), ("k", (1.0, 1.0), (1e-3, 1e-3), False),
     ("k", (0.5, 3.0), (2.0, 3.0), False), ("eta", (0.5, 3.0), (0.0, 2.0), True), ("k", (0.0, 3.0), (2.0, 2.0), True),
 ])  # fmt: skip
 def test_which_metals_lose_their_slopes(slot, eta, k, lost):

@@ -244,3 +244,10 @@ def test_without_polarization_all_of_it_is_plain_numbers():
         si = dr.zeros(mi.SurfaceInteraction3f)
         assert polarized.rotation_to_sensor(si, si.wi) is polarized.rotation_from_light(si, si.wi) is None
     assert polarized.light_type() is mi.SpectrumEntry
+
+
+def test_grazing_incidence_on_an_interface_that_is_not_there():
+    """All is reflected as it is, and nothing passes."""
+    surface = Interface(mi.Float(0.0), mi.Float(1.0))
+    np.testing.assert_array_equal(entries(surface.reflection())[..., 0], np.eye(4))
+    np.testing.assert_array_equal(entries(surface.transmission()), 0)

@@ -54,6 +54,14 @@ def test_values_densities_and_samples_are_those_of_mitsuba(settings):
         assert np.mean(np.array(a.sampled_component) != np.array(b.sampled_component)) < 1e-3
 
 
+def test_names_of_distributions():
+    for wrong in ("phong", "as"):
+        with pytest.raises(RuntimeError, match=f"'distribution' must be 'beckmann' or 'ggx', got '{wrong}'"):
+            mi.load_dict({"type": "diff_rough_plastic", "distribution": wrong})
+    for right, ggx in (("ggx", True), ("Beckmann", False)):
+        assert mi.load_dict({"type": "diff_rough_plastic", "distribution": right}).ggx == ggx
+
+
 QUICK = [
     (external_transmittance, False, 0.1), (external_transmittance, True, 0.6), (internal_reflectance, True, 0.6)
 ]  # fmt: skip

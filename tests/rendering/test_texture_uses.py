@@ -9,7 +9,7 @@ import pytest
 import torchtransient as tt
 from support.gradient_cases.scenes import area_light, room
 from torchtransient.errors import SceneError
-from torchtransient.plugins.texture_uses import check_textures
+from torchtransient.plugins.texture_uses import check_textures, numbers_below
 
 VARIANT = "llvm_ad_rgb"
 HEIGHTS = {"type": "constvolume", "value": 0.5}
@@ -185,3 +185,20 @@ def test_attributes_of_lights_are_named(kind):
 
 def test_lights_that_stay_dark_may_have_them():
     assert tt.load(glowing("directionalarea"), variant=VARIANT).parameters()
+
+
+def test_numbers_of_attributes_belong_to_their_shapes():
+    """Those that a texture reads, of the shapes that are named, and no others."""
+    ply = mi.Mesh("shape", 3, 1)
+    ply.add_attribute("vertex_color", 3, np.arange(9, dtype=np.float32))
+    ply.add_attribute("vertex_other", 1, np.float32([20, 21, 22]))
+    disk = mi.load_dict({"type": "disk", "face_paint": {"type": "uniform", "value": 0.25}})
+
+    def found(name, shapes):
+        reader = mi.load_dict({"type": "mesh_attribute", "name": name, "scale": 0.5})
+        return sorted(np.concatenate([np.ravel(np.array(value)) for value in numbers_below(reader, shapes)]).tolist())
+
+    assert found("vertex_color", ()) == [0.5]
+    assert found("vertex_color", (ply, disk)) == [0.0, 0.5, *map(float, range(1, 9))]
+    assert found("vertex_other", (ply,)) == [0.5, 20, 21, 22]
+    assert found("face_paint", (ply, disk)) == [0.25, 0.5]

@@ -11,7 +11,7 @@ import scipy.spatial.transform
 
 from support.gradient_cases.cases_curves import DIFFUSE, ellipsoid, file_of, seen_wall
 from torchtransient.plugins.transport.hits import DetachedHits, _spline, _starts
-from torchtransient.plugins.transport.instances import AttachedSurfaces, Instances, surface_interaction
+from torchtransient.plugins.transport.instances import AttachedSurfaces, Instances, distance_to, surface_interaction
 from torchtransient.plugins.transport.strategy import Local
 
 VARIANT = "llvm_ad_mono"
@@ -367,3 +367,20 @@ def test_the_place_on_a_spline():
 def test_where_shapes_begin_in_a_table_of_all():
     arrays = [dr.zeros(mi.Float, width) for width in (8, 12, 4, 0)]
     assert _starts(arrays, 4) == [0, 2, 5, 6]
+
+
+def test_distance_of_where_a_ray_leaves():
+    """Of the far side of a sphere, for a ray that starts before the near one: sqrt(r^2 - x^2) + 3, by x and by r."""
+    mi.set_variant("llvm_ad_mono")
+    scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere", "radius": 1.5}})
+    x, scale = mi.Float(0.9), mi.Float(1.0)
+    pi = scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(x, 0, 0), mi.Vector3f(0, 0, 1)))
+    pi.t += 3
+    dr.enable_grad(x, scale)
+    params = mi.traverse(scene)
+    params["ball.to_world"] = mi.Transform4f(params["ball.to_world"]) @ mi.Transform4f().scale(mi.Vector3f(scale))
+    params.update()
+    t = distance_to(None, pi, mi.Ray3f(mi.Point3f(x, 0, -3), mi.Vector3f(0, 0, 1)), mi.Bool(True))
+    dr.backward(t)
+    assert dr.grad(x)[0] == pytest.approx(-0.9 / 1.2, rel=1e-5)
+    assert dr.grad(scale)[0] == pytest.approx(1.5 * 1.5 / 1.2, rel=1e-5)

@@ -306,7 +306,7 @@ def attached_distance(pi: Any, si: Any, ray: Any, active: Any) -> Any:
     """
     n = dr.detach(si.n)
     cosine = dr.dot(n, ray.d)
-    meets = active & (dr.detach(cosine) != 0)
+    meets = active & (cosine != 0)
     distance = dr.dot(si.p - ray.o, n) / dr.select(meets, cosine, 1)
     return dr.replace_grad(pi.t, dr.select(meets, distance, 0))
 

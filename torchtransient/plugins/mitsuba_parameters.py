@@ -189,7 +189,7 @@ def _attenuates(medium: Any, name: str) -> bool:
 
 def _is_an_index_of_one(site: Site) -> bool:
     """Whether the index of a principled surface is (what Mitsuba takes for) one."""
-    now = dr.detach(mi.traverse(site.node)[site.key])
+    now = mi.traverse(site.node)[site.key]
     taken_for = (0, 1e-3) if site.key == "specular" else (1, 1.001)
     return any(bool(dr.any(dr.abs(now - value) < 1e-7)) for value in taken_for)
 

@@ -61,6 +61,7 @@ def test_draws_lie_on_the_shape_with_its_normals(name):
     assert np.abs(np.array(si.t)[hit] - length).max() < 2e-6
     # Of the side that scatters, which is not Mitsuba's geometric one under mirrored transforms.
     assert np.abs(np.array(dr.dot(si.sh_frame.n, n))[hit] - 1).max() < 1e-5
+    assert np.abs(np.array(dr.norm(n)) - 1).max() < 1e-5
     density = table.per_area(si.shape, si.prim_index, si.p)
     # The mean of one over the density is the area, without noise where there is one element.
     inverse = 1 / np.array(density, dtype=float)[hit]

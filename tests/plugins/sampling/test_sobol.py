@@ -5,7 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from torchtransient.plugins.sampling.sobol import DIMENSIONS, sobol, unit_double, unit_float
+from torchtransient.plugins.sampling.sobol import DIMENSIONS, _directions, sobol, unit_double, unit_float
 
 VARIANT = "llvm_ad_mono"
 
@@ -23,6 +23,11 @@ def test_blocks_have_a_point_in_every_interval(dimension):
         assert sorted(np.floor(x * count).astype(int)) == list(range(count))
     x = np.concatenate([coordinates(256 * k, 256, dimension) for k in range(4)])
     assert sorted(np.floor(x * 1024).astype(int)) == list(range(1024))
+
+
+def test_the_first_dimension_reverses_bits():
+    assert _directions(0) == [2**31 >> i for i in range(32)]
+    assert _directions(1)[:3] == [1 << 31, 3 << 30, 5 << 29]
 
 
 def test_the_first_two_dimensions_are_a_net():

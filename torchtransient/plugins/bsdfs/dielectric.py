@@ -62,7 +62,7 @@ class DiffDielectric(mi.BSDF):
         terms = fresnel(cos_i, self.eta)
         if has_r and has_t:
             # The second condition keeps a lobe of zero probability from being drawn when the first one rounds.
-            selected_r = (sample1 < dr.detach(terms.reflectance)) | (dr.detach(terms.transmittance) <= 0)
+            selected_r = (sample1 < terms.reflectance) | (terms.transmittance <= 0)
             probability = dr.select(selected_r, terms.reflectance, terms.transmittance)
             bs.pdf = dr.detach(probability)
             # The value over its detached probability: one, with the derivative of Fresnel's term.

@@ -125,8 +125,8 @@ class DiffHair(mi.BSDF):
         """``A_p``. ``inside``: the index times the cosine of the refracted ray; ``beyond``: that of its projection on
         the plane along the fibre, squared.
         """
-        enters = beyond > 0
-        length = dr.select(enters, 2 * self.eta * inside / dr.select(enters, beyond, 1), 0)
+        # Where nothing enters, nothing is inside.
+        length = 2 * self.eta * inside / dr.select(beyond > 0, beyond, 1)
         transmittance = dr.exp(-self._absorption(si, active) * length)
         interface = fresnel(dr.abs(si.wi.z), self.eta)
         f, t = interface.reflectance, interface.transmittance
@@ -135,7 +135,7 @@ class DiffHair(mi.BSDF):
         shares += [shares[-1] * bounce]
         # 1 - T f, without the difference of numbers near one where little enters.
         lost = t + f * (1 - transmittance)
-        often = t * dr.select(lost > 0, t / dr.select(lost > 0, lost, 1), 0)
+        often = t * (t / dr.select(lost > 0, lost, 1))
         return [*shares, often * transmittance * bounce * bounce]
 
     def _fibre(self, si: Any, active: Any) -> Fibre:
@@ -284,7 +284,7 @@ def _longitudinal(sin_i: Any, cos_i: Any, sin_o: Any, cos_o: Any, concentration:
 def _azimuthal(angle: Any, scale: Any) -> Any:
     """``N_p`` at an angle from the perfect path, which integrates to one over a turn."""
     turn = 2 * pi
-    angle = dr.abs(angle - turn * dr.round(dr.detach(angle) / turn))
+    angle = dr.abs(angle - turn * dr.round(angle / turn))
     fading = dr.exp(-angle / scale)
     return fading / (scale * dr.square(1 + fading) * dr.tanh(0.5 * pi / scale))
 

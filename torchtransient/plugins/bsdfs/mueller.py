@@ -56,7 +56,7 @@ class Interface:
         re, im = self.m2 * self.c * self.c + self.q * self.q, self.q * self.c * (1 - self.m2)
         there = self.total & (re > 0)
         scale = dr.rcp(dr.select(there, re * re + im * im, 1.0))
-        cos_d, sin_d = dr.select(there, (re * re - im * im) * scale, 1.0), dr.select(there, 2 * re * im * scale, 0.0)
+        cos_d, sin_d = dr.select(there, (re * re - im * im) * scale, 1.0), 2 * re * im * scale
         a = dr.select(self.total, 1.0, 0.5 * (r_s * r_s + r_p * r_p))
         b = dr.select(self.total, 0.0, 0.5 * (r_s * r_s - r_p * r_p))
         c = dr.select(self.total, cos_d, r_s * r_p)

@@ -80,7 +80,7 @@ class Retroreflector(mi.BSDF):
         back, diffuse = self._lobes(ctx)
         if back != diffuse:
             return mi.Float(1 if back else 0)
-        return dr.clip(dr.detach(self.share), _LEAST_DRAWN, 1 - _LEAST_DRAWN)
+        return dr.clip(self.share, _LEAST_DRAWN, 1 - _LEAST_DRAWN)
 
     def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
         has_back, has_diffuse = self._lobes(ctx)
@@ -115,7 +115,7 @@ class Retroreflector(mi.BSDF):
             return bs, mi.Spectrum(0)
         active = mi.Mask(active) & (si.wi.z > 0)
         with dr.suspend_grad():
-            wi = dr.detach(si.wi)
+            wi = si.wi
             back = sample1 < self._drawn(ctx)
             alpha = dr.maximum(self.alpha, ALPHA_MIN)
             b, _ = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, True).sample(wi, sample2)

@@ -53,14 +53,14 @@ def internal_reflectance(alpha: Any, eta: Any, ggx: bool) -> Any:
 def look_up(table: Any, cos_theta: Any, active: Any) -> Any:
     """Linear interpolation in one of the tables."""
     x = cos_theta * (ENTRIES - 1)
-    index = dr.minimum(mi.UInt32(dr.detach(x)), ENTRIES - 2)
+    index = dr.minimum(mi.UInt32(x), ENTRIES - 2)
     below, above = dr.gather(mi.Float, table, index, active), dr.gather(mi.Float, table, index + 1, active)
     return dr.lerp(below, above, x - mi.Float(index))
 
 
 def _refracts_all(eta: Any) -> bool:
     """Whether light refracts at every angle on its way to the side whose relative index is ``eta``."""
-    return bool(dr.all(dr.detach(eta) > 1))
+    return bool(dr.all(eta > 1))
 
 
 def _with_slopes(f: Callable[[Any, Any], Any], alpha: Any, eta: Any, smooth: bool) -> Any:
@@ -124,6 +124,6 @@ def _facet_mean(alpha: Any, eta: Any, ggx: bool, transmitted: bool) -> Any:
         return dr.block_sum(seen * weight, count * count)
     # Of the density of visible facets only that of all facets depends on the facet; the rest goes with the norm.
     density = normal_density(m, alpha, alpha, ggx)
-    drawn = dr.detach(density) > 0
+    drawn = density > 0
     weight *= dr.select(drawn, dr.relative_grad(dr.select(drawn, density, 1)), 1)
     return dr.block_sum(seen * weight, count * count) / dr.block_sum(weight, count * count)

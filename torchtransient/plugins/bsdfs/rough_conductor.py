@@ -57,7 +57,7 @@ class DiffRoughConductor(mi.BSDF):
     def _coated(self, ctx: Any, si: Any, wo: Any, mirrored: Any, active: Any) -> Any:
         """``mirrored`` by facets of metal instead of perfect mirrors."""
         share = mi.unpolarized_spectrum(mirrored)
-        lit = mi.Mask(active) & (dr.max(dr.detach(share)) > 0)
+        lit = mi.Mask(active) & (dr.max(share) > 0)
         metal = self._reflection(ctx, si, wo, lit)
         return (mi.mueller.absorber(share) @ metal if mi.is_polarized else share * metal) & lit
 

@@ -96,7 +96,7 @@ class DiffRoughDielectric(mi.BSDF):
             for key in ("value", "data"):
                 if self.warned_of_clamp or key not in params:
                     continue
-                lowest = dr.min(dr.detach(params[key]), axis=None)
+                lowest = dr.min(params[key], axis=None)
                 if dr.any(lowest < ALPHA_MIN):
                     self.warned_of_clamp = True
                     mi.Log(
@@ -180,10 +180,10 @@ class DiffRoughDielectric(mi.BSDF):
         colour = self._colour(si, reflect, active) * value
         if not mi.is_polarized:
             return mi.Spectrum(colour) & active
-        # The facet is a smooth interface. The power of its matrix is in the value already.
+        # The facet is a smooth interface. The power of its matrix is in the value already, the same for all colours.
         interface = Interface(dr.dot(si.wi, m), self.eta)
         matrix = dr.select(reflect, interface.reflection(), interface.transmission())
-        power = matrix[0, 0][0]
+        power = dr.max(mi.unpolarized_spectrum(matrix))
         there = active & (power > 0)
         radiance = ctx.mode == mi.TransportMode.Radiance
         towards_sensor, towards_light = (si.wi, wo) if radiance else (wo, si.wi)
@@ -214,9 +214,9 @@ class DiffRoughDielectric(mi.BSDF):
 
         active = mi.Mask(active) & (si.wi.z != 0)
         with dr.suspend_grad():
-            wi = dr.detach(si.wi)
+            wi = si.wi
             m = self._draw_normal(si, wi, sample2, active)
-            terms = fresnel(dr.dot(wi, m), dr.detach(self.eta))
+            terms = fresnel(dr.dot(wi, m), self.eta)
             if has_r and has_t:
                 selected_r = (sample1 < terms.reflectance) | (terms.transmittance <= 0)
             else:

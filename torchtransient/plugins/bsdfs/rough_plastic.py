@@ -147,7 +147,7 @@ class DiffRoughPlastic(mi.BSDF):
             return bs, mi.Spectrum(0)
         active = mi.Mask(active) & (si.wi.z > 0)
         with dr.suspend_grad():
-            wi = dr.detach(si.wi)
+            wi = si.wi
             specular = sample1 < self._specular_probability(ctx, look_up(self.transmittance, wi.z, active))
             kind = mi.MicrofacetType.GGX if self.ggx else mi.MicrofacetType.Beckmann
             m, _ = mi.MicrofacetDistribution(kind, self._alpha(), self.sample_visible).sample(wi, sample2)

@@ -199,7 +199,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         """The map from samples of the primary rays to the film's channels, detached."""
         ray = dr.detach(rays.ray)
         rotation = sensor_rotation(rays.seen, ray) if mi.is_polarized else None
-        weight = dr.detach(rays.weight) * rays.scale
+        weight = rays.weight * rays.scale
         return ChannelMatch(ray.wavelengths, weight, film.curves or contents.observer, rotation)
 
     def pixel_indices(self, film, job, rays):
@@ -217,7 +217,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         """Optical path before the first ray starts, counted from ``start_opl``: doubles keep late times exact."""
         length = mi.Float(0)
         if not self.camera_unwarp:
-            length = dr.detach(rays.length())
+            length = rays.length()
         return mi.Float64(length) - film.start_opl
 
     def beside(self, world, sensor, film, seed, samples):

@@ -117,7 +117,7 @@ def _trace(scene, integrator, sensor, film, size, spp, seed, slots) -> tuple[Eve
         contents = integrator.contents(scene, sensor)
         rays = integrator.start(scene, contents, sensor, film, job)
         ray = dr.detach(rays.ray)
-        match = ChannelMatch(ray.wavelengths, dr.detach(rays.weight) * rays.scale, film.curves)
+        match = ChannelMatch(ray.wavelengths, rays.weight * rays.scale, film.curves)
         sink = EventListSink(size[0] * size[1] * spp, slots, lambda value: _energy(match, value, film.curves))
         # Without a window: what the sensor's film would not count is asked for, too.
         settings = integrator.settings()

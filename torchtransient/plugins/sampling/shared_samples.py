@@ -111,7 +111,7 @@ def material_samples(elements: HiddenElements, samples: SharedSamples, meshes: A
     pi, ray = _preliminary(elements, samples.element, samples.p, samples.geometric_n, a, y)
     si, area = material_point(pi, ray, mi.Mask(True), meshes)
     weight = samples.weight * dr.relative_grad(area)
-    geometric_n = dr.mulsign(mi.Vector3f(si.n), dr.dot(mi.Vector3f(samples.geometric_n), dr.detach(si.n)))
+    geometric_n = dr.mulsign(mi.Vector3f(si.n), dr.dot(mi.Vector3f(samples.geometric_n), si.n))
     n = mi.Vector3f(si.sh_frame.n) if samples.smooth else geometric_n
     front, back = (_scattered(si, side) * weight for side in (1.0, -1.0))
     return Local(p=mi.Point3f(si.p), n=n, geometric_n=geometric_n, front=front, back=back)

@@ -129,7 +129,7 @@ class SphereLightTable:
     def draws(self, emitter: Any) -> Any:
         """Which of an array of emitter pointers are spherical lights that :meth:`sample` chooses often enough."""
         listed = self.lists(emitter)
-        return listed & (dr.detach(self.numbers(emitter, listed)[7]) >= self._least_pmf)
+        return listed & (self.numbers(emitter, listed)[7] >= self._least_pmf)
 
     def sample(self, scene: Any, ref: Any, u: Any, active: Any) -> tuple[Any, Any]:
         """(direction sample, emission over density) towards an emitter of the scene, as
@@ -180,7 +180,7 @@ class _Sphere:
         self.square = dr.select(active, r2, 1)
         self.to_center = dr.select(active, self.center - p, mi.Vector3f(0, 0, 2))
         d2 = dr.squared_norm(self.to_center)
-        self.outside = dr.detach(d2) > dr.select(active, edge2, 1)
+        self.outside = d2 > dr.select(active, edge2, 1)
         self.distance2 = dr.select(self.outside, d2, 4 * self.square)
         self.sin2_max = dr.minimum(self.square / self.distance2, 1)
         # (1 - cos_max) / sin_max^2

@@ -43,7 +43,7 @@ class MovingSun:
 
     def contains(self, d: Any) -> Any:
         """Whether the unit direction ``d`` points into the disk."""
-        return dr.dot(dr.detach(self.direction), d) >= self._cosine
+        return dr.dot(self.direction, d) >= self._cosine
 
     def shines(self, emitter: Any, d: Any) -> Any:
         """Whether light of ``emitter`` from the direction ``d`` is the sun's: of the light without a place that comes
