@@ -199,7 +199,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         """The map from samples of the primary rays to the film's channels, detached."""
         ray = dr.detach(rays.ray)
         rotation = sensor_rotation(rays.seen, ray) if mi.is_polarized else None
-        weight = rays.weight * rays.scale
+        weight = dr.detach(rays.weight) * rays.scale
         return ChannelMatch(ray.wavelengths, weight, film.curves or contents.observer, rotation)
 
     def pixel_indices(self, film, job, rays):

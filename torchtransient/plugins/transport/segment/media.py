@@ -212,6 +212,7 @@ def lane_numbers(sampler):
 def reference(si, mei, scatter):
     """The vertex as a point of reference: that of the surface, or of the medium where ``scatter``."""
     at = dr.zeros(mi.Interaction3f)
+    at.t = dr.select(scatter, mei.t, si.t)
     at.time = si.time
     at.wavelengths = si.wavelengths
     at.p = dr.select(scatter, mei.p, si.p)
