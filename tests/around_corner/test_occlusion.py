@@ -179,6 +179,22 @@ def test_a_box_of_six_plates_is_a_cube(kind):
     agree(cube, 2**13, most_error=0.03)
 
 
+@pytest.mark.parametrize("kind", ["confocal", "single"])
+def test_what_hides_may_show_its_back(kind):
+    """The way around an outline is the other one then: a plate that is turned away hides as a black one does."""
+    black = plane(0.9, 0.3, 0.22, 0.1)
+    black["bsdf"] = {"type": "diffuse", "reflectance": 0.0}
+    turned = plane(0.9, 0.3, 0.22, 0.1)
+    turned["to_world"] = turned["to_world"] @ transform().rotate([1, 0, 0], 180)
+    found = []
+    for front in (black, turned):
+        capture = capture_of(plates() | {"front": front}, "front.to_world", move(1, 0, 0), kind)
+        found.append(np.array([capture.reverse(seed, 2**10) for seed in range(6)]))
+    error = np.hypot(*(x.std(ddof=1) / len(x) ** 0.5 for x in found))
+    assert abs(found[0].mean() - found[1].mean()) < SIGMAS * error < 0.2 * abs(found[0].mean())
+
+
+
 @pytest.mark.slow
 def test_viewpoints_with_the_same_outline():
     """The spot is a scanned point and lies in line with others; outlines along the lines are those of both."""
