@@ -224,7 +224,7 @@ def transmittance(scene, media, ray, length, medium, numbers, lanes, active):
         visible = active & ~scene.ray_test(ray, active)
         inside = visible & (medium != None)  # noqa: E711
         σ_t = medium.get_majorant(medium_interaction(ray, medium, mi.Float(0)), inside)
-        T = mi.UnpolarizedSpectrum(attenuation(dr.select(inside, σ_t, 0), length))
+        T = mi.UnpolarizedSpectrum(attenuation(σ_t, length))
     else:
         rng = generator(numbers, lanes, SHADOW)
         t = mi.Float(0)
@@ -264,5 +264,5 @@ def ratio_tracking_step(media, medium, ray, t, t_end, rng, inside):
         σ_t = medium.get_scattering_coefficients(medium_interaction(ray, medium, t_new), collides)[2]
         factor = dr.select(collides, dr.maximum(1 - σ_t / rate, 0), 1)
     if media.homogeneous:
-        factor = dr.select(inside & analytic, attenuation(majorant, t_end - t), factor)
+        factor = dr.select(analytic, attenuation(majorant, t_end - t), factor)
     return collides, t_new, mi.UnpolarizedSpectrum(factor)
