@@ -150,7 +150,7 @@ class Media(Vacuum):
         leg = Leg(v, v.ray.o, vertex.sid.p, v.ray.d, far, v.begin, ARRIVING)
         T = v.weight * with_log_slope(world.scene, self.settings, leg, carry.x, si.p, carry.β[0], v.active)
         if wanted.geometry:
-            T *= dr.relative_grad(dr.select(v.scatter, stretch, 1))
+            T *= dr.relative_grad(stretch)
         vertex.carry = replace(carry, β=attenuated(carry.β, T))
         return vertex
 
