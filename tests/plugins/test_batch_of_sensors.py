@@ -27,7 +27,7 @@ def test_children_of_an_attached_batch_start_the_rays_of_the_batch():
     given |= {"position": mi.Point2f(x, y), "aperture": mi.Point2f(u, v)}
     plain, weight = sample_rays(batch, views(batch, given["position"], None), **given)
     params = mi.traverse(batch)
-    key = next(key for key in params.keys() if key.endswith("second.to_world"))
+    key = next(key for key in dict(params) if key.endswith("second.to_world"))
     shift = mi.Float(0.0)
     dr.enable_grad(shift)
     params[key] = mi.Transform4f(params[key]) @ mi.Transform4f().translate(mi.Vector3f(shift, 0, 0))

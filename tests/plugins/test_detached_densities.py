@@ -141,7 +141,7 @@ def test_values_and_densities_alone_are_those_of_both(kind):
 @pytest.mark.parametrize("given", [{}, {"specular_reflectance": 0.4}])
 def test_twins_show_the_parameters_of_mitsubas(kind, given):
     ours, theirs = (
-        {key.removesuffix(".value") for key in mi.traverse(mi.load_dict({"type": name, **given})).keys()}
+        {key.removesuffix(".value") for key in dict(mi.traverse(mi.load_dict({"type": name, **given})))}
         for name in (DIFFERENTIABLE_PLUGINS[kind], kind)
     )
     assert ("specular_reflectance" in ours) == bool(given)
