@@ -136,3 +136,14 @@ def test_affine_maps_of_kornia_with_a_derivative_of_their_own():
     assert len({drawn.matrix.tobytes() for drawn in eight}) == 8
     with pytest.raises(SceneError, match="RandomPerspective is no affine map"):
         Affine(RandomPerspective(0.5, p=1.0)).draw((5, 5), torch.Generator().manual_seed(0))
+
+
+def test_half_of_a_pixel_is_rounded_up():
+    """Also where the inverse of a map is a little less than that."""
+    image = torch.arange(1.0, 5.0).reshape(1, 4)
+    third = PixelMap([[3.0, 0.0, -1.5], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], (1, 4), (1, 9))
+    for found, moved in (
+        (PixelMap([[1.0, 0.0, -0.5], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], (1, 4), (1, 3)), [2, 3, 4]),
+        (third, [2, 2, 2, 3, 3, 3, 4, 4, 4]),
+    ):
+        assert found.nearest(image, 0.0).tolist() == [moved]

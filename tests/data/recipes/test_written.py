@@ -181,6 +181,11 @@ def test_files_that_an_xml_scene_names(tmp_path):
     assert set(found) == {
         "pot.ply", "own.ply", "cup.ply", "parts/more.xml", "beside.ply", "deep.ply", "broken.xml",
     }  # fmt: skip
+    # One that includes itself comes to the last level.
+    (tmp_path / "round.xml").write_text('<scene><include filename="round.xml"/><a filename="cup.ply"/></scene>')
+    assert set(places._of_xml('<scene><include filename="round.xml"/></scene>', tmp_path, {}, 3)) == {
+        "round.xml", "cup.ply",
+    }  # fmt: skip
     # At the last level includes are named and not opened.
     assert set(places._of_xml(text, tmp_path, {}, 0)) == {"pot.ply", "cup.ply", "parts/more.xml", "broken.xml"}
     assert places._of_xml("<scene>", tmp_path, {}, 3) == {}

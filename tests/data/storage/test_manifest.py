@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from support.stored_samples import folder, header, sample, write
-from torchtransient.data.storage.manifest import build_manifest, ranges, ranges_text, verify
+from torchtransient.data.storage.manifest import _difference, build_manifest, ranges, ranges_text, verify
 from torchtransient.data.storage.shard_file import Shard
 from torchtransient.errors import StorageError
 
@@ -206,3 +206,12 @@ def test_reading_damage_says_so(data):
     path.write_bytes(raw)
     with Shard(path) as shard, pytest.raises(StorageError, match="damaged"):
         shard.read("transient", 0)
+
+
+def test_differences_are_named_as_deep_as_both_go():
+    for expected, found, said in (
+        ({"a": {"b": 1, "c": 2}}, {"a": {"b": 1, "c": 3}}, "about: a: c: 3, expected 2"),
+        ({"a": 5}, {"a": {"b": 1}}, "about: a: {'b': 1}, expected 5"),
+        ({"a": {"b": 1}}, {"a": 5}, "about: a: 5, expected {'b': 1}"),
+    ):
+        assert _difference("about", expected, found) == f"differs from the data set in {said}"
