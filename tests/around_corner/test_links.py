@@ -105,11 +105,84 @@ def test_sides_of_surfaces_that_are_drawn():
     assert np.array(chains._probability_of_front(plan, p, n, mi.Bool([False] * 4))).tolist() == [1] * 4
 
 
+@pytest.mark.parametrize("two_sided", [True, False])
+def test_points_that_are_drawn_on_a_sheet_of_two_colours(two_sided):
+    """Each side with its normals, its colour and its probability: light off both adds up to that of the two."""
+    v, f = plate(0.5, 0.4, (0.1, 0.2, 1.1))
+    sheet = mesh("a", (v, f), 0.3, two_sided=two_sided, back=0.8 if two_sided else None)
+    plan = chains.ChainPlan(HiddenElements([sheet], *wall_grid(2)), mi.Point3f(0, 0, 0), 4, 16, 1, None)
+    places = np.random.default_rng(8).random((3, 64))
+    places[2] = (np.arange(64) + 0.5) / 64
+    numbers = [mi.UInt32((row * 2.0**32).astype(np.uint32)) for row in places]
+    drawn = chains._drawn(plan, numbers, (0, 1), 2)
+    n, value, albedo = (np.array(each, dtype=float) for each in (drawn.n, drawn.value[0], drawn.albedo[0]))
+    to_wall = n[2] < 0
+    faces = np.cross(v[f[0][1]] - v[f[0][0]], v[f[0][2]] - v[f[0][0]])[2] < 0
+    assert faces and np.array(drawn.alive).all()
+    np.testing.assert_array_equal(to_wall, places[2] < 0.9 if two_sided else True)
+    np.testing.assert_allclose(n, np.array(drawn.geometric_n))
+    np.testing.assert_allclose(np.abs(n[2]), 1, rtol=1e-6)
+    colour = np.where(to_wall, 0.3, 0.8)
+    np.testing.assert_allclose(albedo, colour, rtol=1e-5)
+    density = np.array(plan.elements.density_of(plan.elements.select_element(chains.unit_double(numbers[0]))[0]))
+    chance = np.where(to_wall, 0.9, 0.1) if two_sided else 1
+    np.testing.assert_allclose(value, colour / np.pi / (64 * density * chance), rtol=1e-4)
+    black = mesh("b", (v, f), 0.0, two_sided=two_sided, back=0.8 if two_sided else None)
+    plan.elements = HiddenElements([black, sheet], *wall_grid(2))
+    drawn = chains._drawn(plan, numbers, (0, 1), 2)
+    np.testing.assert_array_equal(np.array(drawn.alive), np.array(drawn.albedo[0]) > 0)
+
+
+def test_where_rays_of_chains_start():
+    """Off their surfaces, towards the side that they go to, by 2^-20 of the largest coordinate and of the distance to
+    the scan.
+    """
+    plan = Local(center=mi.Point3f(1, -6, 3))
+    p = np.array([[0, 2, -5], [0, 2, 5], [0, -0.5, 0.25]]).T
+    start = Local(p=mi.Point3f(p), geometric_n=mi.Vector3f(-1, 0, 0))
+    found = np.array(chains._origin(plan, start, mi.Float([0.3, -0.3, 0.0])), dtype=float)
+    reach = np.abs(p).max(0) + np.linalg.norm(p - [[1], [-6], [3]], axis=0)
+    np.testing.assert_allclose(found[0], -reach * 2.0**-20 * [1, -1, 1], rtol=1e-5)
+    np.testing.assert_array_equal(found[1:], p[1:])
+
+
+def test_every_vertex_has_numbers_of_its_own(monkeypatch):
+    """Five of the head and the step to the tail, two sides, and two for each further vertex; lengths and values add up
+    along the tail.
+    """
+    used, plan = [], Local(tail=4, seed=dr.opaque(mi.UInt32, 3), size=8, groups=1)
+
+    def vertex(x, value, alive=True):
+        return chains.Vertices(p=mi.Point3f(x, 0, 0), n=mi.Vector3f(0, 0, 1), value=mi.UnpolarizedSpectrum(value),
+                               albedo=mi.UnpolarizedSpectrum(value), alive=mi.Bool(alive))  # fmt: skip
+
+    def drawn(plan, numbers, place, side):
+        used.append((place, side))
+        return vertex(5, 0.5)
+
+    def step(scene, plan, last, numbers, which):
+        used.append((which, len(numbers)))
+        return vertex(last.p.x + len(used), 0.5, len(used) < 5), mi.Float(0.25)
+
+    monkeypatch.setattr(chains, "_drawn", drawn)
+    monkeypatch.setattr(chains, "_step", lambda *given: vertex(7, 0.25))
+    monkeypatch.setattr(chains, "_guided_step", step)
+    head, tail = chains.trace_chains(None, plan, dr.arange(mi.UInt32, 8))
+    assert used == [((0, 1), 5), ((2, 3), 6), ((7, 8), 13), ((9, 10), 13), ((11, 12), 13)]
+    first = np.array(tail[0].p.x)
+    assert set(first) == {5, 7} and (first == 5).sum() == 2  # of eight chains in a row two begin over the area
+    np.testing.assert_allclose(np.array(tail[0].value[0]), np.where(first == 5, 0.5, 0.25) / np.pi, rtol=1e-6)
+    for j, (length, alive) in enumerate(((0, True), (3, True), (7, True), (12, False))):
+        assert np.array(tail[j].length).max() == length and np.array(tail[j].alive).all() == alive
+        np.testing.assert_allclose(np.array(tail[j].value[0]), np.array(tail[0].value[0]) * 0.125**j, rtol=1e-6)
+    assert head.length[0] == 0
+
+
 @pytest.mark.parametrize("name", ["wall", "floor"])
 def test_steps_to_what_is_hidden_weigh_its_form_factor(name):
     """From a wall, which most go to the hidden area from, and from what belongs to it."""
     wall, floor, roof = (mesh(one, (v, f[:, ::-1] if one != "roof" else f)) for one, (v, f) in (
-        ("wall", plate(1, 1, (5, 0, 0))), ("floor", plate(1, 1, (0, 0, 0))), ("roof", plate(1, 0.6, (0, 0, 0.8)))
+        ("wall", plate(1, 1, (5, 0, 0.5))), ("floor", plate(1, 1, (0, 0, 0.5))), ("roof", plate(1, 0.6, (0, 0, 1.3)))
     ))  # fmt: skip
     plan = Local(elements=HiddenElements([floor, roof], *wall_grid(2)), center=mi.Point3f(0, 0, 0))
     shape = {"wall": wall, "floor": floor}[name]
@@ -118,7 +191,7 @@ def test_steps_to_what_is_hidden_weigh_its_form_factor(name):
     places = (strata + np.random.default_rng(7).random((side**2, 2))) / side
     numbers = [mi.UInt32((places[:, i] * 2.0**32).astype(np.uint32)) for i in range(2)]
     up = mi.Vector3f(0, 0, 1)
-    start = chains.Vertices(p=mi.Point3f(0, 0, 0), n=up, geometric_n=up, shape=dr.gather(
+    start = chains.Vertices(p=mi.Point3f(0, 0, 0.5), n=up, geometric_n=up, shape=dr.gather(
         mi.ShapePtr, mi.ShapePtr(shape), dr.zeros(mi.UInt32, side**2)
     ), primitive=dr.zeros(mi.UInt32, side**2), alive=dr.full(mi.Bool, True, side**2))  # fmt: skip
     vertex, weight = chains._guided_step(scene_of(floor, roof, wall), plan, start, numbers, (0, 1))
@@ -127,10 +200,10 @@ def test_steps_to_what_is_hidden_weigh_its_form_factor(name):
     a, b = 0.5 / 0.8, 0.3 / 0.8
     quarter = sum(s / np.hypot(1, s) * np.arctan(t / np.hypot(1, s)) for s, t in ((a, b), (b, a))) / (2 * np.pi)
     assert np.array(weight).mean() == pytest.approx(4 * quarter, rel=0.02)
-    np.testing.assert_allclose(p[2, alive], 0.8, rtol=1e-5)
+    np.testing.assert_allclose(p[2, alive], 1.3, rtol=1e-5)
     assert not np.array(weight)[~alive].any()
     # Most of the steps from the wall, a quarter of the others go to the hidden area, to the roof by its share.
-    roofs = plan.elements.probabilities[0][plan.elements.elements.centers()[:, 2] > 0.5].sum()
+    roofs = plan.elements.probabilities[0][plan.elements.elements.centers()[:, 2] > 1].sum()
     share = {"wall": 0.9, "floor": 0.25}[name]
     assert alive.mean() == pytest.approx(share * roofs + (1 - share) * 4 * quarter, abs=0.01)
 

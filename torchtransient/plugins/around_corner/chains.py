@@ -68,7 +68,7 @@ class Vertices(Local):
 
 def trace_chains(scene: Any, plan: ChainPlan, index: Any) -> tuple[Vertices, list[Vertices]]:
     """(heads, vertices of tails) of the chains of numbers ``index`` (UInt32) of Sobol's points. Not evaluated."""
-    numbers = [sobol(index, d, plan.seed) for d in range(min(DIMENSIONS, _FURTHER + 2 * (plan.tail - 1)))]
+    numbers = [sobol(index, d, plan.seed) for d in range(_FURTHER + 2 * (plan.tail - 1))]
     head = _drawn(plan, numbers, _HEAD, _SIDES[0])
     guided = unit_float(numbers[_CHOICE]) < AREA_SHARE
     direction = _cosine_direction(head.n, numbers, _STEP)
@@ -82,7 +82,7 @@ def trace_chains(scene: Any, plan: ChainPlan, index: Any) -> tuple[Vertices, lis
     for j in range(1, plan.tail):
         last = tail[-1]
         vertex, weight = _guided_step(scene, plan, last, numbers, (_FURTHER + 2 * j - 2, _FURTHER + 2 * j - 1))
-        vertex.value = dr.select(vertex.alive, last.value * vertex.albedo * weight, 0)
+        vertex.value = last.value * vertex.albedo * weight
         vertex.alive &= dr.max(vertex.value) > 0
         vertex.length = last.length + dr.norm(vertex.p - last.p)
         tail.append(vertex)
@@ -118,13 +118,17 @@ def _cosine_direction(n: Any, numbers: list[Any], which: tuple[int, int]) -> Any
     return mi.Frame3f(mi.Normal3f(n)).to_world(mi.warp.square_to_cosine_hemisphere(u))
 
 
-def _step(scene: Any, plan: ChainPlan, start: Vertices, d: Any, active: Any) -> Vertices:
-    """What a ray meets, its ``value`` still to be said. Offsets as in :func:`.geometry.occluded`, by the size of the
-    hidden scene.
+def _origin(plan: ChainPlan, start: Vertices, side: Any) -> Any:
+    """Where rays to the ``side`` of a surface start. Offsets as in :func:`.geometry.occluded`, by the size of the hidden
+    scene.
     """
     reach = dr.max(dr.abs(start.p)) + dr.norm(plan.center - start.p)
-    offset = dr.mulsign(OFFSET * reach, dr.dot(start.geometric_n, d))
-    ray = mi.Ray3f(mi.Point3f(start.p + start.geometric_n * offset), d)
+    return mi.Point3f(start.p + start.geometric_n * dr.mulsign(OFFSET * reach, side))
+
+
+def _step(scene: Any, plan: ChainPlan, start: Vertices, d: Any, active: Any) -> Vertices:
+    """What a ray meets, its ``value`` still to be said."""
+    ray = mi.Ray3f(_origin(plan, start, dr.dot(start.geometric_n, d)), d)
     pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
     si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
     valid = active & si.is_valid()
@@ -132,7 +136,7 @@ def _step(scene: Any, plan: ChainPlan, start: Vertices, d: Any, active: Any) -> 
     two_sided = scatters_behind(bsdf)
     lit = valid & ((si.wi.z > 0) | (two_sided & (si.wi.z < 0)))
     turn = dr.select(si.wi.z < 0, mi.Float(-1), 1)
-    albedo = dr.select(lit, mi.unpolarized_spectrum(bsdf.eval_diffuse_reflectance(si, lit)), 0)
+    albedo = mi.unpolarized_spectrum(bsdf.eval_diffuse_reflectance(si, lit))
     n = mi.Vector3f(si.sh_frame.n)
     geometric_n = mi.Vector3f(front_normal(si)) if plan.elements.smooth else n
     alive = lit & (dr.max(albedo) > 0)
@@ -154,9 +158,7 @@ def _guided_step(scene: Any, plan: ChainPlan, start: Vertices, numbers: list[Any
     element, a = plan.elements.select_element(x, start.alive & guided)
     point, _ = plan.elements.point(element, a, unit_float(v), start.alive & guided)
     cosine = mi.warp.square_to_cosine_hemisphere(mi.Point2f(mi.Float(x), unit_float(v)))
-    reach = dr.max(dr.abs(start.p)) + dr.norm(plan.center - start.p)
-    side = dr.select(guided, dr.dot(start.geometric_n, point - start.p), 1)
-    origin = mi.Point3f(start.p + start.geometric_n * dr.mulsign(OFFSET * reach, side))
+    origin = _origin(plan, start, dr.select(guided, dr.dot(start.geometric_n, point - start.p), 1))
     to = mi.Vector3f(point - origin)
     d = dr.select(guided, dr.normalize(to), mi.Frame3f(mi.Normal3f(start.n)).to_world(cosine))
     cos = dr.dot(start.n, d)
