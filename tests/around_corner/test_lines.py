@@ -273,10 +273,14 @@ def test_pilots_of_chains_see_what_is_scattered_twice(monkeypatch):
     points, normals = wall_grid(2)
     cases = [mesh("V", folded_plates()), mesh("V", folded_plates(), two_sided=True),
              mesh("flat", plate(1, 1, (0, 0, 1))), mesh("black", folded_plates(), 0.0)]  # fmt: skip
+    v, f = folded_plates()
+    cases += [mesh("away", (v, f[:, ::-1])), mesh("away, both", (v, f[:, ::-1]), two_sided=True),
+              mesh("black there", (v, f), 0.0, two_sided=True, back=0.5)]  # fmt: skip
     for shape in cases:
         late_density.late_density(scene_of(shape), HiddenElements([shape], points, normals), points, normals)
     shares = [(square > 0).mean() for square in squares]
-    assert shares[0] > 0.1 and shares[1] > 0.1 and shares[2] == shares[3] == 0
+    assert shares[0] > 0.1 and shares[1] > 0.1 and shares[2] == shares[3] == shares[4] == shares[6] == 0
+    np.testing.assert_allclose([shares[5], squares[5].sum()], [shares[1], squares[1].sum()], rtol=0.05)
 
 
 def test_weights_of_elements_from_samples_of_neighbours(monkeypatch):
