@@ -140,7 +140,7 @@ def test_where_rays_of_chains_start():
     plan = Local(center=mi.Point3f(1, -6, 3))
     p = np.array([[0, 2, -5], [0, 2, 5], [0, -0.5, 0.25]]).T
     start = Local(p=mi.Point3f(p), geometric_n=mi.Vector3f(-1, 0, 0))
-    found = np.array(chains._origin(plan, start, mi.Float([0.3, -0.3, 0.0])), dtype=float)
+    found = np.array(chains._origin(plan, start, mi.Vector3f([-0.3, 0.3, 0], 4, -5)), dtype=float)
     reach = np.abs(p).max(0) + np.linalg.norm(p - [[1], [-6], [3]], axis=0)
     np.testing.assert_allclose(found[0], -reach * 2.0**-20 * [1, -1, 1], rtol=1e-5)
     np.testing.assert_array_equal(found[1:], p[1:])
@@ -150,11 +150,12 @@ def test_every_vertex_has_numbers_of_its_own(monkeypatch):
     """Five of the head and the step to the tail, two sides, and two for each further vertex; lengths and values add up
     along the tail.
     """
-    used, plan = [], Local(tail=4, seed=dr.opaque(mi.UInt32, 3), size=8, groups=1)
+    used, plan = [], Local(tail=4, seed=dr.opaque(mi.UInt32, 3), size=8, groups=1, center=mi.Point3f(0, 0, 0))
 
     def vertex(x, value, alive=True):
         return chains.Vertices(p=mi.Point3f(x, 0, 0), n=mi.Vector3f(0, 0, 1), value=mi.UnpolarizedSpectrum(value),
-                               albedo=mi.UnpolarizedSpectrum(value), alive=mi.Bool(alive))  # fmt: skip
+                               geometric_n=mi.Vector3f(0, 0, 1), albedo=mi.UnpolarizedSpectrum(value),
+                               alive=mi.Bool(alive))  # fmt: skip
 
     def drawn(plan, numbers, place, side):
         used.append((place, side))

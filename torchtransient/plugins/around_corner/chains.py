@@ -72,7 +72,8 @@ def trace_chains(scene: Any, plan: ChainPlan, index: Any) -> tuple[Vertices, lis
     head = _drawn(plan, numbers, _HEAD, _SIDES[0])
     guided = unit_float(numbers[_CHOICE]) < AREA_SHARE
     direction = _cosine_direction(head.n, numbers, _STEP)
-    vertex = _step(scene, plan, head, direction, head.alive & ~guided)
+    origin = _origin(plan, head, direction)
+    vertex = _step(scene, plan, origin, direction, head.alive & ~guided)
     drawn = _drawn(plan, numbers, _STEP, _SIDES[1])
     vertex = _select(guided, drawn, vertex)
     # The area it stands for belongs to the density of the step.
@@ -118,17 +119,18 @@ def _cosine_direction(n: Any, numbers: list[Any], which: tuple[int, int]) -> Any
     return mi.Frame3f(mi.Normal3f(n)).to_world(mi.warp.square_to_cosine_hemisphere(u))
 
 
-def _origin(plan: ChainPlan, start: Vertices, side: Any) -> Any:
-    """Where rays to the ``side`` of a surface start. Offsets as in :func:`.geometry.occluded`, by the size of the hidden
+def _origin(plan: ChainPlan, start: Vertices, towards: Any) -> Any:
+    """Where rays that go off a surface start. Offsets as in :func:`.geometry.occluded`, by the size of the hidden
     scene.
     """
     reach = dr.max(dr.abs(start.p)) + dr.norm(plan.center - start.p)
-    return mi.Point3f(start.p + start.geometric_n * dr.mulsign(OFFSET * reach, side))
+    offset = dr.mulsign(OFFSET * reach, dr.dot(start.geometric_n, towards))
+    return mi.Point3f(start.p + start.geometric_n * offset)
 
 
-def _step(scene: Any, plan: ChainPlan, start: Vertices, d: Any, active: Any) -> Vertices:
+def _step(scene: Any, plan: ChainPlan, origin: Any, d: Any, active: Any) -> Vertices:
     """What a ray meets, its ``value`` still to be said."""
-    ray = mi.Ray3f(_origin(plan, start, dr.dot(start.geometric_n, d)), d)
+    ray = mi.Ray3f(origin, d)
     pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
     si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
     valid = active & si.is_valid()
@@ -158,11 +160,12 @@ def _guided_step(scene: Any, plan: ChainPlan, start: Vertices, numbers: list[Any
     element, a = plan.elements.select_element(x, start.alive & guided)
     point, _ = plan.elements.point(element, a, unit_float(v), start.alive & guided)
     cosine = mi.warp.square_to_cosine_hemisphere(mi.Point2f(mi.Float(x), unit_float(v)))
-    origin = _origin(plan, start, dr.select(guided, dr.dot(start.geometric_n, point - start.p), 1))
+    cosine = mi.Frame3f(mi.Normal3f(start.n)).to_world(cosine)
+    origin = _origin(plan, start, dr.select(guided, mi.Vector3f(point - start.p), cosine))
     to = mi.Vector3f(point - origin)
-    d = dr.select(guided, dr.normalize(to), mi.Frame3f(mi.Normal3f(start.n)).to_world(cosine))
+    d = dr.select(guided, dr.normalize(to), cosine)
     cos = dr.dot(start.n, d)
-    vertex = _step(scene, plan, start, d, start.alive & (cos > 0))
+    vertex = _step(scene, plan, origin, d, start.alive & (cos > 0))
     way = mi.Vector3f(vertex.p - origin)
     shape, primitive = plan.elements.surface(element, start.alive & guided)
     arrived = (vertex.shape == shape) & (vertex.primitive == primitive)
