@@ -31,10 +31,12 @@ def vertices(rng, count, low, high, up):
 
 
 @pytest.mark.parametrize("smooth", [True, False])
-def test_links_of_heads_and_tails(smooth):
+def test_links_of_heads_and_tails(monkeypatch, smooth):
     """Every tail with the heads of its group, weighed by what all of them send there: cosines over the squared
-    distance, none where one turns its back or a sheet is in between.
+    distance, none where one turns its back or a sheet is in between, which is asked of the others alone.
     """
+    asked, occluded = [], chains.occluded
+    monkeypatch.setattr(chains, "occluded", lambda *given: asked.append(np.array(given[-1])) or occluded(*given))
     rng, size, groups = np.random.default_rng(4), 4, 3
     count = size * groups
     heads, heads_in = vertices(rng, count, [-1, -1, 0], [1, 1, 0.4], 0.6)
@@ -44,7 +46,7 @@ def test_links_of_heads_and_tails(smooth):
     table = [chains.VertexTable(each, smooth) for each in (heads_in, tails_in)]
     links = chains.Links(scene, Local(size=size), *table, mi.Float(density.astype(np.float32)))
     surface = [each.geometric_n if smooth else each.n for each in (heads, tails)]
-    expected, counts = {}, [0] * groups
+    expected, counts, faces = {}, [0] * groups, []
     for t in range(count):
         group, q, r = t // size, np.zeros(size), np.zeros(size)
         for i in range(size):
@@ -53,13 +55,15 @@ def test_links_of_heads_and_tails(smooth):
             r[i] = np.linalg.norm(d)
             at = heads.p[h] + d * (0.7 - heads.p[h, 2]) / d[2]
             hidden = abs(at[0] - 0.3) < 0.45 and abs(at[1] + 0.2) < 0.35
-            if heads.alive[h] and tails.alive[t] and tails.n[t] @ d < 0 and not hidden:
+            faces.append(heads.alive[h] and tails.alive[t] and tails.n[t] @ d < 0 < heads.n[h] @ d)
+            if faces[-1] and not hidden:
                 q[i] = max(heads.n[h] @ d, 0) * abs(surface[1][t] @ d) / r[i] ** 4 / np.pi
         drawn = 0.75 * q.sum() + size * 0.25 * density[t]
         for i in np.flatnonzero(q):
             expected[group * size + i, t] = q[i] * np.pi / drawn * heads.value[group * size + i], r[i]
             counts[group] += 1
     assert len(set(counts)) > 1 and 8 < len(expected) < 30
+    assert asked[0].tolist() == faces and sum(faces) < 40
     assert np.array(links.count).tolist() == counts and links.most == max(counts)
     assert np.array(links.first).tolist() == [0, counts[0], counts[0] + counts[1]]
     rows = np.array(links.flat).reshape(-1, 4)
@@ -127,10 +131,30 @@ def test_points_that_are_drawn_on_a_sheet_of_two_colours(two_sided):
     density = np.array(plan.elements.density_of(plan.elements.select_element(chains.unit_double(numbers[0]))[0]))
     chance = np.where(to_wall, 0.9, 0.1) if two_sided else 1
     np.testing.assert_allclose(value, colour / np.pi / (64 * density * chance), rtol=1e-4)
+    np.testing.assert_allclose(np.array(chains.area_density(plan, drawn)), density * chance, rtol=1e-4)
     black = mesh("b", (v, f), 0.0, two_sided=two_sided, back=0.8 if two_sided else None)
     plan.elements = HiddenElements([black, sheet], *wall_grid(2))
     drawn = chains._drawn(plan, numbers, (0, 1), 2)
     np.testing.assert_array_equal(np.array(drawn.alive), np.array(drawn.albedo[0]) > 0)
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_what_a_ray_of_a_chain_meets(smooth):
+    """A side that scatters, with normals on it; not the back of a sheet of one side, nor a black one, nor nothing."""
+    v, f = plate(0.6, 0.6, (0, 0, 1))
+    sheets = [mesh(f"s{k}", (v + np.array([k, 0, 0]), f[:, ::-1] if k % 2 else f), (0.3, 0.4, 0.5, 0.6, 0)[k], two_sided=k > 1)
+              for k in range(5)]  # fmt: skip
+    origin = mi.Point3f([0.1, 1.1, 2.1, 3.1, 4.1, 9, 0.1, 2.1], 0.2, [0, 0, 0, 0, 0, 0, 2, 2])
+    d = mi.Vector3f(0, 0, [1, 1, 1, 1, 1, 1, -1, -1])
+    active = np.array([True] * 7 + [False])
+    met = chains._step(scene_of(*sheets), Local(elements=Local(smooth=smooth)), origin, d, mi.Bool(active))
+    assert np.array(met.alive).tolist() == [True, False, True, True, False, False, False, False]
+    alive = np.array(met.alive)
+    for name in ("n", "geometric_n"):
+        np.testing.assert_allclose(np.array(getattr(met, name)).T[alive], [[0, 0, -1]] * 3, atol=1e-6)
+    np.testing.assert_allclose(np.array(met.albedo[0])[alive], [0.3, 0.5, 0.6], rtol=1e-5)
+    np.testing.assert_array_equal(np.array(met.value[0]), np.array(met.albedo[0]))
+    np.testing.assert_allclose(np.array(met.p).T[alive], [[x, 0.2, 1] for x in (0.1, 2.1, 3.1)], atol=1e-5)
 
 
 def test_where_rays_of_chains_start():
@@ -163,7 +187,7 @@ def test_every_vertex_has_numbers_of_its_own(monkeypatch):
 
     def step(scene, plan, last, numbers, which):
         used.append((which, len(numbers)))
-        return vertex(last.p.x + len(used), 0.5, len(used) < 5), mi.Float(0.25)
+        return vertex(last.p.x + len(used), 0.5), mi.Float(0.25 if len(used) < 5 else 0)
 
     monkeypatch.setattr(chains, "_drawn", drawn)
     monkeypatch.setattr(chains, "_step", lambda *given: vertex(7, 0.25))
@@ -175,7 +199,7 @@ def test_every_vertex_has_numbers_of_its_own(monkeypatch):
     np.testing.assert_allclose(np.array(tail[0].value[0]), np.where(first == 5, 0.5, 0.25) / np.pi, rtol=1e-6)
     for j, (length, alive) in enumerate(((0, True), (3, True), (7, True), (12, False))):
         assert np.array(tail[j].length).max() == length and np.array(tail[j].alive).all() == alive
-        np.testing.assert_allclose(np.array(tail[j].value[0]), np.array(tail[0].value[0]) * 0.125**j, rtol=1e-6)
+        np.testing.assert_allclose(np.array(tail[j].value[0]), np.array(tail[0].value[0]) * 0.125**j * alive, rtol=1e-6)
     assert head.length[0] == 0
 
 
@@ -261,6 +285,31 @@ def test_tables_of_a_group(monkeypatch):
         monkeypatch.setattr(late_light, "_MOST_ENTRIES", most)
         assert light_of(CaptureType.EXHAUSTIVE, lasers=15, side=1).tiles.count == tiles
         assert light_of(CaptureType.CONFOCAL, lasers=15, side=1).tiles.count == 15
+
+
+@pytest.mark.parametrize(("count", "size", "groups"), [(1, 1, 1), (3, 4, 1), (32, 32, 1), (33, 32, 2), (97, 32, 4)])
+def test_chains_of_a_job_in_groups(monkeypatch, count, size, groups):
+    """As many as fill a power of two, then groups that are filled up; some groups at a time, and told of."""
+    blocks, launched, told = [], [], []
+    light = light_of(CaptureType.SINGLE, size=(2, 3), lasers=1)
+    monkeypatch.setattr(light, "_groups_at_once", lambda: 2)
+    monkeypatch.setattr(light, "_launches", lambda part, band, row, rows: [(part, band, row, rows)])
+    monkeypatch.setattr(light, "_launch", lambda part, launch: launched.append((part, *launch)))
+    monkeypatch.setattr(late_light, "GroupBlock", lambda light, first, n: blocks.append((first, n)) or len(blocks))
+    light.job.film.band_layout = lambda: [(0, 2), (2, 1)]
+    light.job.done = lambda *given: told.append(given)
+    light.job.sensors.p = mi.Point3f([1, 2, 6], [0, 1, -4], 2)
+    light.add(count, 5)
+    assert (light.plan.size, light.plan.groups, light.plan.tail) == (size, groups, 3)
+    assert blocks == [(first, min(2, groups - first)) for first in range(0, groups, 2)]
+    assert launched == [(k + 1, k + 1, *band) for k in range(len(blocks)) for band in ((0, 0, 2), (1, 2, 1))]
+    assert told == [((first + n) / groups, band) for first, n in blocks for band in (0, 1)]
+    np.testing.assert_allclose(np.array(light.plan.center).ravel(), [3, -1, 2], rtol=1e-6)
+    seeds = []
+    for seed in (5, 5 + 2**32, mi.UInt32(5), 6):
+        light.add(count, seed)
+        seeds.append(light.plan.seed[0])
+    assert len(set(seeds[:3])) == 1 and len(set(seeds)) == 2 and seeds[0] != 5
 
 
 def test_groups_at_a_time(monkeypatch):

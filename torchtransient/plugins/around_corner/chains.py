@@ -232,7 +232,7 @@ class Links:
         r = square * inverse
         cos = dr.maximum(dr.dot(x.n, d) * inverse, 0)
         q = cos * dr.abs(dr.dot(v.geometric_n, d)) * dr.square(inverse) * inverse * dr.inv_pi
-        active = x.alive & v.alive & (dr.dot(v.n, d) < 0) & (square > 0) & (q > 0)
+        active = x.alive & v.alive & (dr.dot(v.n, d) < 0) & (q > 0)
         line = Local(r=r, geometric_cos=dr.dot(x.geometric_n, d))
         facing = mi.Vector3f(dr.mulsign(v.geometric_n, -dr.dot(v.geometric_n, d)))
         q = dr.select(active & ~occluded(scene, x, line, v.p, facing, active), q, 0)
