@@ -284,6 +284,28 @@ def test_pilots_of_chains_see_what_is_scattered_twice(monkeypatch):
     np.testing.assert_allclose([shares[5], squares[5].sum()], [shares[1], squares[1].sum()], rtol=0.05)
 
 
+def test_where_pilots_of_chains_start():
+    """Off the side that faces the scan, by the size of the hidden scene, into its half space."""
+    v, f = plate(0.6, 0.4, (0, 0, 0))
+    upright = mesh("a", (np.stack([0 * v[:, 0], v[:, 1] - 0.7, v[:, 0] + 1.5], 1), f), two_sided=True)
+    points, normals = wall_grid(3)
+    elements = HiddenElements([upright], points, normals)
+    rays = []
+
+    def met(ray, coherent, active):
+        rays.append((np.array(ray.o, dtype=float), np.array(ray.d)))
+        raise StopIteration
+
+    scene = Local(ray_intersect_preliminary=met)
+    for side in (1, -1):
+        with pytest.raises(StopIteration):
+            late_density.late_density(scene, elements, points + np.array([4 * side, 1, 0]), normals)
+        o, d = rays[-1]
+        reach = np.abs(o[1:]).max(0) + np.linalg.norm(o - [[4 * side], [1], [0]], axis=0)
+        np.testing.assert_allclose(o[0], side * mi.math.RayEpsilon * reach, rtol=1e-4)
+        assert (d[0] * side > 0).all() and abs(np.abs(d[0]).mean() - 2 / 3) < 0.01
+
+
 def test_weights_of_elements_from_samples_of_neighbours(monkeypatch):
     """Root mean squares by area over some samples in a row, times the area; the rest goes as before."""
     monkeypatch.setattr(late_density, "_BUCKET", 4)

@@ -142,8 +142,8 @@ def test_points_that_are_drawn_on_a_sheet_of_two_colours(two_sided):
 def test_what_a_ray_of_a_chain_meets(smooth):
     """A side that scatters, with normals on it; not the back of a sheet of one side, nor a black one, nor nothing."""
     v, f = plate(0.6, 0.6, (0, 0, 1))
-    sheets = [mesh(f"s{k}", (v + np.array([k, 0, 0]), f[:, ::-1] if k % 2 else f), (0.3, 0.4, 0.5, 0.6, 0)[k], two_sided=k > 1)
-              for k in range(5)]  # fmt: skip
+    arrays = [(v + np.array([k, 0, 0]), f[:, ::-1] if k % 2 else f) for k in range(5)]
+    sheets = [mesh(f"s{k}", arrays[k], (0.3, 0.4, 0.5, 0.6, 0)[k], two_sided=k > 1) for k in range(5)]
     origin = mi.Point3f([0.1, 1.1, 2.1, 3.1, 4.1, 9, 0.1, 2.1], 0.2, [0, 0, 0, 0, 0, 0, 2, 2])
     d = mi.Vector3f(0, 0, [1, 1, 1, 1, 1, 1, -1, -1])
     active = np.array([True] * 7 + [False])

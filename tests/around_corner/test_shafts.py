@@ -257,7 +257,8 @@ def obstacles(rng):
     return [mesh("some", (v.reshape(-1, 3), np.arange(72).reshape(24, 3))), ball], v.astype(np.float32).astype(float)
 
 
-def test_what_is_met_in_a_shaft():
+@pytest.mark.parametrize("slack", [1e-9, 0.05])
+def test_what_is_met_in_a_shaft(slack):
     """By the tree as one by one: a triangle is outside beyond a plane of the shaft, or where its own plane has region
     and element on one side; a ball is, with its box, beyond a plane.
     """
@@ -267,7 +268,6 @@ def test_what_is_met_in_a_shaft():
     elements = rng.uniform(-2.5, 2.5, (150, 1, 3)) + rng.normal(size=(150, 3, 3)) * 0.1
     elements[:, :, 2] = region.high[2] + rng.uniform(0.3, 1.2, (150, 3))
     planes = shafts._shafts(elements, np.zeros((150, 3)), np.zeros(150, dtype=bool), region)
-    slack = 1e-9
     tree = shafts.ObstacleTree(shapes, region, elements, slack)
     n = np.cross(v[:, 1] - v[:, 0], v[:, 2] - v[:, 0])
     n /= np.linalg.norm(n, axis=1, keepdims=True)
@@ -300,6 +300,17 @@ def test_triangles_that_hide_nothing_from_a_scan():
     expected = (height >= 0).all(0) | (height <= 0).all(0)
     assert 10 < expected.sum() < 190
     np.testing.assert_array_equal(shafts._harmless(v, region, hidden, 1e-12), expected)
+
+
+@pytest.mark.parametrize("turn", [1, -1])
+def test_triangles_in_the_plane_of_a_scan_or_of_what_is_hidden(turn):
+    """To rounding they have both on one side, whichever way round their corners are."""
+    region = ScanRegion([[0, 0, 0], [0.3, 0.2, 0]], [[0, 0, 1.0]] * 2)
+    hidden = np.array([[[0.1, 0.2, 1], [0.4, 0.2, 1], [0.1, 0.5, 2.0]]]) @ region.frame.T
+    heights = np.array([-0.5, 0, 0.9, 1.1, 5, 1e3 - 5, 1e3 - 1.1, 1e3 - 0.9, 1e3, 2e3]) * 2e-3
+    v = np.array([[-3, -3, 0], [3, -3, 0], [0, 4, 0.0]])[::turn] + heights[:, None, None] * [0, 0, 1]
+    found = shafts._harmless(v @ region.frame.T, region, hidden, 2e-3)
+    assert found.tolist() == [True, True, True, False, False, False, False, True, True, True]
 
 
 @pytest.mark.parametrize(("rays", "worth"), [(2000, False), (2001, True)])
