@@ -25,13 +25,15 @@ class Ends:
         rng = np.random.default_rng(seed)
         self.p, self.n, self.g = rng.uniform([-1, -1, 0.5], [1, 1, 1.5], (COUNT, 3)), *rng.normal(size=(2, COUNT, 3))
         self.n[COUNT - 1] = [0, 0, 1]  # seen edge-on
-        self.g[COUNT - 1], self.p[COUNT - 1] = self.n[COUNT - 1], [0.5, 0.5, 0]
+        self.g[COUNT - 1], self.p[COUNT - 1] = [1, 0, 0], [0.5, 0.5, 0]
         self.front, self.back = rng.uniform(0.2, 1, (2, colours, COUNT))
         self.front[:, ::5], self.back[:, 1::3] = 0, 0
         self.weight, self.delay, self.leg = rng.uniform(0.5, 2, (3, COUNT))
         self.q, self.m = rng.uniform(-1, 1, (COUNT, 3)) * [1, 1, 0], np.tile([0, 0, 1.0], (COUNT, 1))
         self.m[::4] *= -1
-        self.m[COUNT - 1] = [0.6, 0, 0.8]
+        self.m[[2, COUNT - 1]], self.q[[2, COUNT - 1]] = [0.6, 0, 0.8], [[-0.5, 0.25, 0], [-0.25, 0.75, 0]]
+        if colours > 1:
+            self.front[0, 3::7] = 0  # seen in the others
         self.value = rng.uniform(0.5, 2, (colours, COUNT))
         for name, array in vars(self).items():
             setattr(self, name, array.astype(np.float32).astype(np.float64))
@@ -198,24 +200,25 @@ def test_how_points_see_a_block_of_samples(monkeypatch, colours):
         ends, asked = Ends(4, colours), asked_of(monkeypatch, exhaustive)
         walls = points_of(ends, slice(0, 6)), points_of(ends, slice(6, 11))
         job = Local(scene=None, energy=mi.UnpolarizedSpectrum(1), samples=ends.samples(), sensors=walls[0])
-        block = exhaustive.SampleBlock(job, walls[1], 3, 25)
+        job.samples.clear = mi.UInt32(22)
+        block = exhaustive.SampleBlock(job, walls[1], 18, 40)
         tables = [np.array(each, dtype=float).reshape(24, -1, 2) for each in (block.seen, block.lit)]
         values = None if colours == 1 else np.array(block.values, dtype=float).reshape(24, 2, 4)
-    k = np.arange(3, 25)[:, None]
+    k = np.arange(18, 40)[:, None]
     for table, number, j in zip(tables, (0, 1), (np.arange(6), np.arange(6, 11)), strict=True):
         cos, across, wall, r = ends.line(k, j[None])
-        side = np.where(cos > 0, ends.front[:, 3:25, None], ends.back[:, 3:25, None])
+        side = np.where(cos > 0, ends.front[:, 18:, None], ends.back[:, 18:, None])
         g = np.abs(across if number == 0 else cos) * wall / r**2
         if colours == 1:
-            g = g * np.sqrt(side[0] * ends.weight[3:25, None])
+            g = g * np.sqrt(side[0] * ends.weight[18:, None])
         active = (g > 0) & (side.max(0) > 0)
-        np.testing.assert_array_equal(asked[number].reshape(22, -1), active & (k >= 7))
-        g = np.where(active & seen_of(asked[number]).reshape(22, -1), g * np.sign(cos), 0)
+        np.testing.assert_array_equal(asked[number].reshape(22, -1), active & (k >= 22))
+        g = np.where(active & seen_of(asked[number]).reshape(22, -1), g * np.where(cos < 0, -1, 1), 0)
         np.testing.assert_allclose(table[:22, :, 0], g, rtol=1e-4, atol=1e-8)
         np.testing.assert_allclose(table[:22, :, 1], r, rtol=1e-5)
         assert not table[22:].any()
     if colours == 3:
-        expected = np.stack([ends.front[:, 3:25], ends.back[:, 3:25]], 2) * ends.weight[3:25, None]
+        expected = np.stack([ends.front[:, 18:], ends.back[:, 18:]], 2) * ends.weight[18:, None]
         np.testing.assert_allclose(values[:22, :, :3], expected.transpose(1, 2, 0), rtol=1e-5)
         assert not values[22:].any() and not values[..., 3].any()
 
