@@ -79,6 +79,9 @@ def test_more_chains_than_single_precision_counts():
     heads = Local(p=mi.Point3f(dr.zeros(mi.Float, 2**24 + 1), 0, 0))
     with pytest.raises(SceneError, match=r"at most 2\^24 chains at a time, got 16777217"):
         chains.Links(None, Local(size=4), heads, None, None)
+    heads = Local(p=mi.Point3f(dr.zeros(mi.Float, 2**24), 0, 0))
+    with pytest.raises(AttributeError, match="take"):
+        chains.Links(None, Local(size=1), heads, None, None)
 
 
 def test_vertices_in_memory_are_taken_by_number():
@@ -117,6 +120,7 @@ def test_points_that_are_drawn_on_a_sheet_of_two_colours(two_sided):
     plan = chains.ChainPlan(HiddenElements([sheet], *wall_grid(2)), mi.Point3f(0, 0, 0), 4, 16, 1, None)
     places = np.random.default_rng(8).random((3, 64))
     places[2] = (np.arange(64) + 0.5) / 64
+    places[2, 7] = 0.9  # which belongs to the back
     numbers = [mi.UInt32((row * 2.0**32).astype(np.uint32)) for row in places]
     drawn = chains._drawn(plan, numbers, (0, 1), 2)
     n, value, albedo = (np.array(each, dtype=float) for each in (drawn.n, drawn.value[0], drawn.albedo[0]))

@@ -192,6 +192,11 @@ def test_planes_of_walls_are_those_to_rounding():
         sheets = [mi.load_dict({"type": "rectangle", "to_world": transform().translate([x, 0, z])})
                   for x, z in ((-1, 0.0), (1, height))]  # fmt: skip
         assert scan_table._in_one_plane(sheets) is flat
+    # Of their largest coordinate, where that is larger.
+    for x, flat in ((1000, True), (-1000, True), (0, False)):
+        sheets = [mi.load_dict({"type": "rectangle", "to_world": transform().translate([x + dx, 0, z])})
+                  for dx, z in ((-1, 0.0), (1, 3e-4))]  # fmt: skip
+        assert scan_table._in_one_plane(sheets) is flat
 
 
 THIRD, CHAINS = "three bounces from hidden samples", "4 to 7 bounces from chains"

@@ -109,9 +109,11 @@ def test_rays_that_would_be_traced(monkeypatch):
         np.testing.assert_allclose(n, np.tile([0, 0, 1], (count, 1)))
 
 
-def test_scans_of_what_is_near_have_tiles():
+def test_scans_of_what_is_near_have_tiles(monkeypatch):
     """Nearer than half their width, to some of the points; a density of their own then, and a table for this job."""
     points, normals = wall_grid(8)
+    looked, found_distance = [], shared_light.distance_to
+    monkeypatch.setattr(shared_light, "distance_to", lambda v, p: looked.append(p) or found_distance(v, p))
     for z, tiled in ((0.2, True), (0.9, False)):
         job = Local(light=Local(sensors=wall_of(points, normals)), tile=None,
                     world=Local(contents=Local(memory=Remembered())))  # fmt: skip
@@ -121,6 +123,7 @@ def test_scans_of_what_is_near_have_tiles():
         if tiled:
             centers = elements.elements.centers()
             some = np.linspace(0, 63, 25).round().astype(int)
+            np.testing.assert_allclose(looked[0], points[some], atol=1e-6)
             distance = np.linalg.norm(centers[:, None] - points[some], axis=2).min()
             tiles = ScanTiles(points, normals, distance)
             assert np.array(job.tile).tolist() == tiles.tile.tolist() and found.tile_count == tiles.count > 1
