@@ -163,6 +163,7 @@ class MutualOcclusion:
         with dr.suspend_grad():
             d = edge.p - viewer.p
             distance = dr.norm(d)
+            distance = dr.select(distance > 0, distance, 1)
             d /= distance
             across = dr.cross(edge.t, d)
             spans = dr.norm(across)
