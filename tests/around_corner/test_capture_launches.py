@@ -7,8 +7,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from torchtransient.plugins.around_corner import launches, third_bounce_gradients
+from torchtransient.plugins.around_corner import late_light, launches, third_bounce_gradients
 from torchtransient.plugins.around_corner.attached import Ends
+from torchtransient.plugins.around_corner.chains import ChainPlan
 from torchtransient.plugins.around_corner.late_light import Tiles, divmod_by
 from torchtransient.plugins.around_corner.occlusion import MutualOcclusion
 from torchtransient.plugins.around_corner.third_bounce_gradients import AdjointReader, Split
@@ -147,6 +148,27 @@ def test_points_of_a_tile_lie_as_far_apart_as_a_scan_is_wide():
     one = Tiles(3, 2, 4)
     assert (one.count, one.numbers.tolist(), np.array(one.rank).tolist()) == (1, [0] * 6, [0])
     assert Tiles(4, 1, 1).numbers.tolist() == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize(("first", "groups"), [(0, 2), (2, 3), (4, 4)])
+def test_chains_of_all_tiles_are_points_of_one_set(monkeypatch, first, groups):
+    """Each tile has a block of numbers of its own, by its rank, and goes on where the groups before have ended."""
+    asked = []
+
+    def traced(scene, plan, index):
+        asked.append(np.array(index))
+        raise StopIteration
+
+    monkeypatch.setattr(late_light, "trace_chains", traced)
+    monkeypatch.setattr(late_light, "_in_regions", lambda row, plan: row * 2)
+    tiles = Tiles(7, 5, 2)
+    plan = ChainPlan(None, None, 4, 9, 2, None)
+    with pytest.raises(StopIteration):
+        late_light.GroupBlock(Local(plan=plan, job=Local(scene=None), tiles=tiles), first, groups)
+    rows = np.arange(4 * first, 4 * (first + groups))
+    expected = 64 * np.array(tiles.rank)[:, None] + 2 * rows
+    assert plan.stride == 64 and tiles.count == 12
+    np.testing.assert_array_equal(asked[0].reshape(12, -1), expected)
 
 
 def test_quotients_and_rests():

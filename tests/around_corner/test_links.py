@@ -161,6 +161,33 @@ def test_what_a_ray_of_a_chain_meets(smooth):
     np.testing.assert_allclose(np.array(met.p).T[alive], [[x, 0.2, 1] for x in (0.1, 2.1, 3.1)], atol=1e-5)
 
 
+def test_steps_that_arrive_at_a_point_that_was_chosen(monkeypatch):
+    """At its triangle, and within a thousandth of the way; a ray in any other direction arrives wherever it does."""
+    sheets = [mesh(name, plate(1, 1, (0, 0, z))) for name, z in (("a", 4), ("b", 5))]
+    off = np.array([0.9e-3, -0.9e-3, 1.1e-3, -1.1e-3, 0, 0, 0.5])
+    shape = dr.gather(mi.ShapePtr, mi.ShapePtr(*sheets), mi.UInt32([0, 0, 0, 0, 1, 0, 0]))
+    primitive = mi.UInt32([3, 3, 3, 3, 3, 2, 3])
+    elements = Local(
+        per_area=lambda *given: mi.Float(0), select_element=lambda x, active: (mi.UInt32(1), mi.Float(0.5)),
+        point=lambda element, a, y, active: (mi.Point3f(0, 3, 4), None),
+        surface=lambda element, active: (mi.ShapePtr(sheets[0]), mi.UInt32(3)),
+    )  # fmt: skip
+    up = mi.Vector3f(0, 0, 1)
+    start = chains.Vertices(p=mi.Point3f(0, 0, 0), n=up, geometric_n=up, shape=shape, primitive=primitive,
+                            alive=mi.Bool([True] * 7))  # fmt: skip
+
+    def step(scene, plan, origin, d, active):
+        p = origin + d * (5 * (1 + mi.Float(off.astype(np.float32))))
+        return chains.Vertices(p=p, geometric_n=-up, shape=shape, primitive=primitive, alive=active)
+
+    numbers = [mi.UInt32([2**31] * 6 + [4080218931]), mi.UInt32(2**31)]
+    monkeypatch.setattr(chains, "_step", step)
+    plan = Local(elements=elements, center=mi.Point3f(0, 0, 0))
+    vertex, weight = chains._guided_step(None, plan, start, numbers, (0, 1))
+    assert np.array(vertex.alive).tolist() == [True, True, False, False, False, False, True]
+    assert (np.array(weight) > 0).tolist() == np.array(vertex.alive).tolist()
+
+
 def test_where_rays_of_chains_start():
     """Off their surfaces, towards the side that they go to, by 2^-20 of the largest coordinate and of the distance to
     the scan.

@@ -191,7 +191,12 @@ def test_the_box_of_a_scan():
             assert region.holds(middle @ region.frame)
             middle[axis] = end[axis] + sign * 1.1 * slack
             assert not region.holds(np.stack([middle @ region.frame, points[0]]))
-    np.testing.assert_allclose(ScanRegion(points, np.tile([[0, 0, 1.0], [0, 0, -1.0]], (6, 1))).frame[2], [0, 0, 1])
+    upright = ScanRegion(points, np.tile([[0, 0, 1.0], [0, 0, -1.0]], (6, 1)))
+    np.testing.assert_array_equal(upright.frame[2], [0, 0, 1])
+    # What is just as far off still belongs to it.
+    slack = shafts.ROUNDING * upright.scale
+    ends = np.stack([upright.low - slack, upright.high + slack])
+    assert upright.holds(ends @ upright.frame) and not upright.holds(ends * (1 + 1e-12) @ upright.frame)
     # A mean of normals that differ is shorter than they are.
     curved = ScanRegion(points, np.tile([[0.96, 0.0, 0.28], [-0.96, 0.28, 0.0]], (6, 1)))
     np.testing.assert_allclose(curved.frame @ curved.frame.T, np.eye(3), atol=1e-12)
