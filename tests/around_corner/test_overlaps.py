@@ -50,6 +50,13 @@ def test_points_of_one_plane_do_not_see_each_other():
             start = Local(p=mi.Point3f(0.25, 0, 0), geometric_n=mi.Vector3f(*n.tolist()))
             found = geometry.sees(scene, start, mi.Point3f(*end.tolist()), mi.Vector3f(*m.tolist()), mi.Bool(True))
             assert bool(found[0]) is seen, (height, n, m)
+    # What is exactly so near is not seen, either.
+    tie = 9 * 2.0**-22
+    for n, m in (((0, 0, tie), (0, -1, 0)), ((0, 1, 0), (0, 0, -tie))):
+        for factor in (1, 1.25):
+            start = Local(p=mi.Point3f(0, 0, 0), geometric_n=mi.Vector3f(*n) * factor)
+            found = geometry.sees(scene, start, mi.Point3f(0, 3, 4), mi.Vector3f(*m) * factor, mi.Bool(True))
+            assert bool(found[0]) is (factor > 1)
 
 
 @pytest.mark.parametrize("side", [1, -1])
