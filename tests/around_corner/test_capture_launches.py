@@ -7,9 +7,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from torchtransient.plugins.around_corner import launches, third_bounce_gradients
+from torchtransient.plugins.around_corner import late_light, launches, third_bounce_gradients
 from torchtransient.plugins.around_corner.attached import Ends
+from torchtransient.plugins.around_corner.chains import ChainPlan
 from torchtransient.plugins.around_corner.late_light import Tiles, divmod_by
+from torchtransient.plugins.around_corner.occlusion import MutualOcclusion
 from torchtransient.plugins.around_corner.third_bounce_gradients import AdjointReader, Split
 from torchtransient.plugins.transport.strategy import Local
 
@@ -109,6 +111,34 @@ def test_adjoints_of_scanned_points_are_those_of_their_pixels():
     assert (np.array(pixel).tolist(), match, place.laser) == ([0, 4, 5, 17], "match", None)
 
 
+def test_points_of_edges_for_each_pixel():
+    """Evenly spread over all edges, every pixel's by themselves, and along each edge; as many as a launch says."""
+    ends = mi.Point3f([0, 2], [0, 0], [1, 1]), mi.Point3f([0, 5], [3, 0], [1, 5])
+    asked = []
+
+    def sample(x):
+        asked.append(np.array(x))
+        index = mi.UInt32(dr.select(x < 0.25, mi.UInt32(0), 1))
+        return index, dr.select(index == 0, mi.Float(4), 4 / 3)
+
+    edges = Local(sample=sample, end_points=lambda index: [dr.gather(mi.Point3f, end, index) for end in ends],
+                  third_corners=lambda index: ("corners", index))  # fmt: skip
+    pixel = mi.UInt32(np.repeat(np.arange(3, dtype=np.uint32), 8))
+    found = MutualOcclusion(None, None, None, None, edges, None, [])._edge_point(pixel, Local(spp=8, seed=mi.UInt32(4)))
+    x = asked[0].reshape(3, 8)
+    np.testing.assert_array_equal(np.floor(x * 8), [np.arange(8)] * 3)
+    assert len({tuple(np.round(row * 8 % 1, 6)) for row in x}) == 3
+    second = x.ravel() >= 0.25
+    p, t, weight = np.array(found.p, dtype=float).T, np.array(found.t).T, np.array(found.weight)
+    np.testing.assert_allclose(t, np.where(second[:, None], [0.6, 0, 0.8], [0, 1, 0]), atol=1e-6)
+    np.testing.assert_allclose(weight, np.where(second, 5 * 4 / 3, 3 * 4), rtol=1e-5)
+    u = np.where(second, (p[:, 0] - 2) / 3, p[:, 1] / 3)
+    along = t * (u * np.where(second, 5, 3))[:, None]
+    np.testing.assert_allclose(p, np.where(second[:, None], [2, 0, 1], [0, 0, 1]) + along, atol=1e-5)
+    assert ((u > 0) & (u < 1)).all() and (np.sort(np.floor(u.reshape(3, 8) * 8), 1) == np.arange(8)).all()
+    assert found.sides[0] == "corners"
+
+
 def test_points_of_a_tile_lie_as_far_apart_as_a_scan_is_wide():
     """Neighbouring tiles stand next to each other along a curve."""
     tiles = Tiles(5, 3, 2)
@@ -118,6 +148,27 @@ def test_points_of_a_tile_lie_as_far_apart_as_a_scan_is_wide():
     one = Tiles(3, 2, 4)
     assert (one.count, one.numbers.tolist(), np.array(one.rank).tolist()) == (1, [0] * 6, [0])
     assert Tiles(4, 1, 1).numbers.tolist() == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize(("first", "groups"), [(0, 2), (2, 3), (4, 4)])
+def test_chains_of_all_tiles_are_points_of_one_set(monkeypatch, first, groups):
+    """Each tile has a block of numbers of its own, by its rank, and goes on where the groups before have ended."""
+    asked = []
+
+    def traced(scene, plan, index):
+        asked.append(np.array(index))
+        raise StopIteration
+
+    monkeypatch.setattr(late_light, "trace_chains", traced)
+    monkeypatch.setattr(late_light, "_in_regions", lambda row, plan: row * 2)
+    tiles = Tiles(7, 5, 2)
+    plan = ChainPlan(None, None, 4, 9, 2, None)
+    with pytest.raises(StopIteration):
+        late_light.GroupBlock(Local(plan=plan, job=Local(scene=None), tiles=tiles), first, groups)
+    rows = np.arange(4 * first, 4 * (first + groups))
+    expected = 64 * np.array(tiles.rank)[:, None] + 2 * rows
+    assert plan.stride == 64 and tiles.count == 12
+    np.testing.assert_array_equal(asked[0].reshape(12, -1), expected)
 
 
 def test_quotients_and_rests():

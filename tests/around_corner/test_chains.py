@@ -150,6 +150,15 @@ def test_bins_and_what_is_outside_are_the_steady_image(corner):
     assert min(film.energy_before, film.energy_after) > 0.05 * steady.sum()
 
 
+def test_a_film_without_a_steady_image_leaves_out_what_it_cannot_see(corner):
+    scene, elements, points, normals = corner
+    sensors = wall_of(points, normals)
+    runs = [chains(scene, elements, film_of(2, 2, 3.2, 9, 0.1, **more), sensors, sensors, "confocal", 100)
+            for more in ({}, {"steady": False})]  # fmt: skip
+    assert runs[1][1] == pytest.approx(runs[0][1], rel=1e-6)
+    assert runs[1][0].sum() == pytest.approx(runs[0][1].sum(), rel=1e-6) and runs[0][0].sum() > 1.1 * runs[0][1].sum()
+
+
 @pytest.mark.parametrize("busy", [1, 64])
 def test_groups_at_a_time_do_not_matter(corner, monkeypatch, busy):
     scene, elements, points, normals = corner

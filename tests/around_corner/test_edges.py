@@ -283,6 +283,15 @@ def test_planes_through_viewpoints_are_found_where_there_are_some():
     assert min(seen) > 10
 
 
+def test_planes_that_were_found_stay():
+    """While others are still looked for: three directions around an axis, which a step to one of them would leave."""
+    angle = np.arange(3) * 2 * np.pi / 3
+    u = np.stack([np.cos(angle), np.sin(angle), [0.05] * 3], 1)
+    a, b = u[:2], -u[2:]
+    behind = b[0] + 2 * (b[0] - a[0])
+    assert hiding._cones_apart(a, b, np.array([[0, 0, 0], behind])).tolist() == [True, False]
+
+
 def test_planes_through_very_many_viewpoints():
     """Each has its own answer, in whichever block it is."""
     a, b = np.array([[1.0, 0, 2], [1, 1, 3]]), np.array([[-1.0, 0, 2], [-2, 1, 4]])

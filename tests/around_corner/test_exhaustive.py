@@ -1,5 +1,6 @@
 """Exhaustive captures: diagonal, rows, reciprocity, colours, blocks, and what the film counts."""
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -8,8 +9,12 @@ import torchtransient.plugins.around_corner.exhaustive as exhaustive
 from support.hidden_shapes import ball, folded_plates, mannequin, mesh, plate, scene_of, wall_grid
 from support.third_bounce_runs import captured, film_of, table_of, wall_of
 from torchtransient.errors import SceneError, ShapeError
+from torchtransient.interfaces import CaptureType
+from torchtransient.plugins.around_corner.late_light import LateLight
+from torchtransient.plugins.around_corner.scan_job import ScanJob
 from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
 from torchtransient.plugins.sampling.shared_samples import draw_samples
+from torchtransient.plugins.transport.strategy import Local
 
 VARIANT = "llvm_ad_mono"
 SCENES = {
@@ -68,14 +73,70 @@ def differences(a, b):
     return len(wrong) // 2
 
 
-@pytest.mark.parametrize("name", ["body", "V and plate"])
-def test_reciprocity_is_exact(name):
+@pytest.mark.parametrize(("name", "bins", "samples"), [("body", 60, 1), ("V and plate", 30, 1), ("body", 60, 2**40)])
+def test_reciprocity_is_exact(monkeypatch, name, bins, samples):
+    """In numbers of four or one, of single or double precision, and so many scan points at a time."""
     runs = Runs(SCENES[name]())
+    runs.pairs = films(bins)[1]
+    start = type(runs.pairs).start_render
+    monkeypatch.setattr(type(runs.pairs), "start_render", lambda film, count: start(film, samples))
+    monkeypatch.setattr(exhaustive, "MOST_MIRRORED", 2 * GRID**2 * bins)
+    assert [exhaustive._rows_at_once(*pair) for pair in ((9, bins), (9, 2 * bins), (18, 2 * bins))] == [2, 1, 1]
     steady, cube = runs.exhaustive()
     assert np.array_equal(cube, cube.transpose(1, 0, 2, 3))
     whole_steady, whole = runs.exhaustive(reciprocal=False)
     assert np.array_equal(cube, whole)
     assert steady == pytest.approx(whole_steady, rel=1e-6)
+
+
+@pytest.mark.parametrize("rows", [1, 2])
+def test_bands_of_a_film_hold_what_it_holds(monkeypatch, rows):
+    """Of scans that are not square, whoever finds the light."""
+    shapes = [mesh("a", folded_plates(), two_sided=True)]
+    scene, samples, elements = scene_of(*shapes), draw_samples(table_of(shapes), 40, 2), table_of(shapes)
+    points, normals = (each[:6] for each in wall_grid(3, 0.4))
+    sensors, spots = wall_of(points, normals), wall_of(points[:4], normals[:4])
+    pairs = film_of(2, 3, 1.0, 30, 0.1, exhaustive_scan=True, laser_scan_width=4, laser_scan_height=1)
+    one = film_of(2, 3, 1.0, 30, 0.1)
+
+    def runs():
+        for film, kind, lasers in ((pairs, "EXHAUSTIVE", spots), (one, "CONFOCAL", sensors)):
+            film.start_render(1)
+            third = ThirdBounce(scene, film, samples, sensors)
+            third.add_confocal() if film is one else exhaustive.add_exhaustive(third, spots)
+            yield held_by(film)
+            film.start_render(1)
+            with dr.suspend_grad():
+                LateLight(ScanJob(scene, film, sensors), elements, lasers, CaptureType[kind], (4, 5)).add(32, 0)
+            yield held_by(film)
+
+    whole = list(runs())
+    monkeypatch.setattr(type(one), "band_rows", lambda film: rows)
+    assert len(one.band_layout()) == len(pairs.band_layout()) == -(-3 // rows)
+    for found, expected in zip(runs(), whole, strict=True):
+        for a, b in zip(found, expected, strict=True):
+            assert b.max() > 0
+            np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6 * b.max())
+
+
+def held_by(film):
+    return np.array(film.steady), np.concatenate([np.array(values) for _, _, values in film.bands])
+
+
+def test_turns_of_the_loop_end_with_a_block():
+    """What stands behind it in memory is not looked at, nor what pairs that are not wanted would see."""
+    rng = np.random.default_rng(9)
+    seen, lit = rng.uniform(0.1, 1, (12, 3, 2)), rng.uniform(0.1, 1, (12, 2, 2))
+    tables = [mi.Float(each.ravel().astype(np.float32)) for each in (seen, lit)]
+    block = Local(seen=tables[0], lit=tables[1], values=None, size=mi.UInt32(8))
+    pairs = Local(pixel=mi.UInt32([0, 1, 2, 2]), laser=mi.UInt32([1, 0, 1, 0]), sensor_count=mi.UInt32(3),
+                  laser_count=mi.UInt32(2), factor=mi.UnpolarizedSpectrum(mi.Float(2)))  # fmt: skip
+    target = Local(put=lambda state, opl, value, active: (mi.Float(0), mi.Float(0)))
+    kept = {"L": mi.UnpolarizedSpectrum(0), "before": mi.Float(0), "after": mi.Float(0)}
+    wanted = mi.Bool([True, True, True, False])
+    kept = exhaustive.sum_over_block(Local(window=None), block, pairs, target, kept, wanted)
+    expected = 2 * (seen[:8, [0, 1, 2, 2], 0] * lit[:8, [1, 0, 1, 0], 0]).sum(0) * [1, 1, 1, 0]
+    np.testing.assert_allclose(np.array(kept["L"][0]), expected, rtol=1e-5)
 
 
 def test_interpolated_normals_are_not_reciprocal():
@@ -111,12 +172,19 @@ def test_blocks_of_samples_add_up(monkeypatch):
 @pytest.mark.parametrize("name", ["smooth", "V and plate"])
 def test_how_points_see_samples(name):
     """Cosines over the squared distance, that of the shading normal towards a spot and that of the surface towards a
-    scanned point, negative at backs, times the root of what one colour scatters; zero where something is in between.
+    scanned point, negative at backs, times the root of what one colour scatters; zero where something is in between,
+    but for the first samples, which nothing is said to hide.
     """
-    runs = Runs(SCENES[name]())
+    shapes = SCENES["smooth"]()
+    if name != "smooth":
+        v, f = folded_plates()
+        f[::2] = f[::2, ::-1]  # every other face shows its back
+        shapes = [mesh("a", (v, f), two_sided=True, back=0.3)]
+    runs = Runs(shapes)
     if name != "smooth":
         v, f = plate(0.3, 0.8, (0.1, 0, 0.4))
-        runs.scene = scene_of(*SCENES[name](), mesh("sheet", (v, f)))
+        runs.scene = scene_of(*shapes, mesh("sheet", (v, f)))
+        runs.samples.clear = mi.UInt32(13)
     runs.pairs.start_render(1)
     block = exhaustive.SampleBlock(runs.job(runs.pairs), runs.spots, 7, 25)
     s, some = runs.samples, slice(7, 25)
@@ -130,7 +198,10 @@ def test_how_points_see_samples(name):
     sees = side > 0
     if name != "smooth":
         at = wall_grid(GRID, 0.4)[0] + (p[:, None] - wall_grid(GRID, 0.4)[0]) * (0.4 / p[:, 2])[:, None, None]
-        sees &= ~((np.abs(at[..., 0] - 0.1) < 0.15) & (np.abs(at[..., 1]) < 0.4) & (p[:, 2] > 0.4)[:, None])
+        behind = (np.abs(at[..., 0] - 0.1) < 0.15) & (np.abs(at[..., 1]) < 0.4) & (p[:, 2] > 0.4)[:, None]
+        behind[:6] = False
+        sees &= ~behind
+        assert behind[6].any() and (cos[sees] < 0).any() and (cos[sees] > 0).any()
     assert block.rows == 20 and block.count == 18 and block.values is None
     for table, one in ((block.seen, across), (block.lit, cos)):
         found = np.array(table).reshape(20, GRID**2, 2)
@@ -145,9 +216,12 @@ def test_how_points_see_samples(name):
         assert 10 < there.sum() < there.size
 
 
-@pytest.mark.parametrize("window", [(1.0, 60), (2.2, 3)])
-def test_bins_and_what_is_outside_are_the_steady_image(window):
-    runs = Runs(SCENES["body"]())
+@pytest.mark.parametrize(("name", "window"), [("body", (1.0, 60)), ("body", (2.2, 3)), ("sheet across", (1.0, 60))])
+def test_bins_and_what_is_outside_are_the_steady_image(name, window):
+    """Also of a sheet that some pairs see from either side, which brings no light of these."""
+    v, f = plate(0.8, 0.8, (0, 0, 0))
+    across = mesh("a", (np.stack([0 * v[:, 0], v[:, 1], 1 + v[:, 0]], 1), f), two_sided=True)
+    runs = Runs([across] if name == "sheet across" else SCENES[name]())
     runs.pairs = films(window[1], window[0])[1]
     steady, cube = runs.exhaustive()
     outside = runs.pairs.energy_before, runs.pairs.energy_after

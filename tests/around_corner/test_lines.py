@@ -116,6 +116,9 @@ def test_what_a_wall_makes_of_light_from_either_side():
     before = np.array([1, -1, 1, -1, 1])
     o = mi.Point3f([0.5, 0.5, 5.5, 5.5, 20], 0.25, mi.Float(2.0 * before))
     si = scene.ray_intersect(mi.Ray3f(o, mi.Vector3f(0, 0, mi.Float(-1.0 * before))))
+    along = dr.copy(si)
+    along.wi = mi.Vector3f(1, 0, 0)
+    assert not np.array(points_of(along, mi.UnpolarizedSpectrum(0.5), mi.Float(1)).value).any()
     wall = points_of(si, mi.UnpolarizedSpectrum(0.5), mi.Float([2, 3, 5, 7, 11]))
     np.testing.assert_allclose(np.array(wall.value).ravel(), [0.15, 0, 0.3, 0.3, 0], rtol=1e-6)
     np.testing.assert_allclose(np.array(wall.n), [[0] * 5, [0] * 5, [1, 1, 1, -1, 1]], atol=1e-6)
@@ -270,13 +273,40 @@ def test_pilots_of_chains_see_what_is_scattered_twice(monkeypatch):
     squares = []
     monkeypatch.setattr(late_density, "_smoothed", lambda elements, square, *others: squares.append(square) or (
         elements.probabilities))  # fmt: skip
-    points, normals = wall_grid(2)
+    points, normals = wall_grid(3)  # the middle one in the origin, where rays that meet nothing seem to end
     cases = [mesh("V", folded_plates()), mesh("V", folded_plates(), two_sided=True),
              mesh("flat", plate(1, 1, (0, 0, 1))), mesh("black", folded_plates(), 0.0)]  # fmt: skip
+    v, f = folded_plates()
+    cases += [mesh("away", (v, f[:, ::-1])), mesh("away, both", (v, f[:, ::-1]), two_sided=True),
+              mesh("black there", (v, f), 0.0, two_sided=True, back=0.5)]  # fmt: skip
     for shape in cases:
         late_density.late_density(scene_of(shape), HiddenElements([shape], points, normals), points, normals)
     shares = [(square > 0).mean() for square in squares]
-    assert shares[0] > 0.1 and shares[1] > 0.1 and shares[2] == shares[3] == 0
+    assert np.isfinite(squares).all()
+    assert shares[0] > 0.1 and shares[1] > 0.1 and shares[2] == shares[3] == shares[4] == shares[6] == 0
+    np.testing.assert_allclose([shares[5], squares[5].sum()], [shares[1], squares[1].sum()], rtol=0.05)
+
+
+def test_where_pilots_of_chains_start():
+    """Off the side that faces the scan, by the size of the hidden scene, into its half space."""
+    v, f = plate(0.6, 0.4, (0, 0, 0))
+    upright = mesh("a", (np.stack([0 * v[:, 0], v[:, 1] - 0.7, v[:, 0] + 1.5], 1), f), two_sided=True)
+    points, normals = wall_grid(3)
+    elements = HiddenElements([upright], points, normals)
+    rays = []
+
+    def met(ray, coherent, active):
+        rays.append((np.array(ray.o, dtype=float), np.array(ray.d)))
+        raise StopIteration
+
+    scene = Local(ray_intersect_preliminary=met)
+    for side in (1, -1):
+        with pytest.raises(StopIteration):
+            late_density.late_density(scene, elements, points + np.array([4 * side, 1, 0]), normals)
+        o, d = rays[-1]
+        reach = np.abs(o[1:]).max(0) + np.linalg.norm(o - [[4 * side], [1], [0]], axis=0)
+        np.testing.assert_allclose(o[0], side * mi.math.RayEpsilon * reach, rtol=1e-4)
+        assert (d[0] * side > 0).all() and abs(np.abs(d[0]).mean() - 2 / 3) < 0.01
 
 
 def test_weights_of_elements_from_samples_of_neighbours(monkeypatch):

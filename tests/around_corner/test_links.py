@@ -31,10 +31,12 @@ def vertices(rng, count, low, high, up):
 
 
 @pytest.mark.parametrize("smooth", [True, False])
-def test_links_of_heads_and_tails(smooth):
+def test_links_of_heads_and_tails(monkeypatch, smooth):
     """Every tail with the heads of its group, weighed by what all of them send there: cosines over the squared
-    distance, none where one turns its back or a sheet is in between.
+    distance, none where one turns its back or a sheet is in between, which is asked of the others alone.
     """
+    asked, occluded = [], chains.occluded
+    monkeypatch.setattr(chains, "occluded", lambda *given: asked.append(np.array(given[-1])) or occluded(*given))
     rng, size, groups = np.random.default_rng(4), 4, 3
     count = size * groups
     heads, heads_in = vertices(rng, count, [-1, -1, 0], [1, 1, 0.4], 0.6)
@@ -44,7 +46,7 @@ def test_links_of_heads_and_tails(smooth):
     table = [chains.VertexTable(each, smooth) for each in (heads_in, tails_in)]
     links = chains.Links(scene, Local(size=size), *table, mi.Float(density.astype(np.float32)))
     surface = [each.geometric_n if smooth else each.n for each in (heads, tails)]
-    expected, counts = {}, [0] * groups
+    expected, counts, faces = {}, [0] * groups, []
     for t in range(count):
         group, q, r = t // size, np.zeros(size), np.zeros(size)
         for i in range(size):
@@ -53,13 +55,15 @@ def test_links_of_heads_and_tails(smooth):
             r[i] = np.linalg.norm(d)
             at = heads.p[h] + d * (0.7 - heads.p[h, 2]) / d[2]
             hidden = abs(at[0] - 0.3) < 0.45 and abs(at[1] + 0.2) < 0.35
-            if heads.alive[h] and tails.alive[t] and tails.n[t] @ d < 0 and not hidden:
+            faces.append(heads.alive[h] and tails.alive[t] and tails.n[t] @ d < 0 < heads.n[h] @ d)
+            if faces[-1] and not hidden:
                 q[i] = max(heads.n[h] @ d, 0) * abs(surface[1][t] @ d) / r[i] ** 4 / np.pi
         drawn = 0.75 * q.sum() + size * 0.25 * density[t]
         for i in np.flatnonzero(q):
             expected[group * size + i, t] = q[i] * np.pi / drawn * heads.value[group * size + i], r[i]
             counts[group] += 1
     assert len(set(counts)) > 1 and 8 < len(expected) < 30
+    assert asked[0].tolist() == faces and sum(faces) < 40
     assert np.array(links.count).tolist() == counts and links.most == max(counts)
     assert np.array(links.first).tolist() == [0, counts[0], counts[0] + counts[1]]
     rows = np.array(links.flat).reshape(-1, 4)
@@ -75,6 +79,9 @@ def test_more_chains_than_single_precision_counts():
     heads = Local(p=mi.Point3f(dr.zeros(mi.Float, 2**24 + 1), 0, 0))
     with pytest.raises(SceneError, match=r"at most 2\^24 chains at a time, got 16777217"):
         chains.Links(None, Local(size=4), heads, None, None)
+    heads = Local(p=mi.Point3f(dr.zeros(mi.Float, 2**24), 0, 0))
+    with pytest.raises(AttributeError, match="take"):
+        chains.Links(None, Local(size=1), heads, None, None)
 
 
 def test_vertices_in_memory_are_taken_by_number():
@@ -105,11 +112,133 @@ def test_sides_of_surfaces_that_are_drawn():
     assert np.array(chains._probability_of_front(plan, p, n, mi.Bool([False] * 4))).tolist() == [1] * 4
 
 
+@pytest.mark.parametrize("two_sided", [True, False])
+def test_points_that_are_drawn_on_a_sheet_of_two_colours(two_sided):
+    """Each side with its normals, its colour and its probability: light off both adds up to that of the two."""
+    v, f = plate(0.5, 0.4, (0.1, 0.2, 1.1))
+    sheet = mesh("a", (v, f), 0.3, two_sided=two_sided, back=0.8 if two_sided else None)
+    plan = chains.ChainPlan(HiddenElements([sheet], *wall_grid(2)), mi.Point3f(0, 0, 0), 4, 16, 1, None)
+    places = np.random.default_rng(8).random((3, 64))
+    places[2] = (np.arange(64) + 0.5) / 64
+    places[2, 7] = 0.9  # which belongs to the back
+    numbers = [mi.UInt32((row * 2.0**32).astype(np.uint32)) for row in places]
+    drawn = chains._drawn(plan, numbers, (0, 1), 2)
+    n, value, albedo = (np.array(each, dtype=float) for each in (drawn.n, drawn.value[0], drawn.albedo[0]))
+    to_wall = n[2] < 0
+    faces = np.cross(v[f[0][1]] - v[f[0][0]], v[f[0][2]] - v[f[0][0]])[2] < 0
+    assert faces and np.array(drawn.alive).all()
+    np.testing.assert_array_equal(to_wall, places[2] < 0.9 if two_sided else True)
+    np.testing.assert_allclose(n, np.array(drawn.geometric_n))
+    np.testing.assert_allclose(np.abs(n[2]), 1, rtol=1e-6)
+    colour = np.where(to_wall, 0.3, 0.8)
+    np.testing.assert_allclose(albedo, colour, rtol=1e-5)
+    density = np.array(plan.elements.density_of(plan.elements.select_element(chains.unit_double(numbers[0]))[0]))
+    chance = np.where(to_wall, 0.9, 0.1) if two_sided else 1
+    np.testing.assert_allclose(value, colour / np.pi / (64 * density * chance), rtol=1e-4)
+    np.testing.assert_allclose(np.array(chains.area_density(plan, drawn)), density * chance, rtol=1e-4)
+    black = mesh("b", (v, f), 0.0, two_sided=two_sided, back=0.8 if two_sided else None)
+    plan.elements = HiddenElements([black, sheet], *wall_grid(2))
+    drawn = chains._drawn(plan, numbers, (0, 1), 2)
+    np.testing.assert_array_equal(np.array(drawn.alive), np.array(drawn.albedo[0]) > 0)
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_what_a_ray_of_a_chain_meets(smooth):
+    """A side that scatters, with normals on it; not the back of a sheet of one side, nor a black one, nor nothing."""
+    v, f = plate(0.6, 0.6, (0, 0, 1))
+    arrays = [(v + np.array([k, 0, 0]), f[:, ::-1] if k % 2 else f) for k in range(5)]
+    sheets = [mesh(f"s{k}", arrays[k], (0.3, 0.4, 0.5, 0.6, 0)[k], two_sided=k > 1) for k in range(5)]
+    origin = mi.Point3f([0.1, 1.1, 2.1, 3.1, 4.1, 9, 0.1, 2.1], 0.2, [0, 0, 0, 0, 0, 0, 2, 2])
+    d = mi.Vector3f(0, 0, [1, 1, 1, 1, 1, 1, -1, -1])
+    active = np.array([True] * 7 + [False])
+    met = chains._step(scene_of(*sheets), Local(elements=Local(smooth=smooth)), origin, d, mi.Bool(active))
+    assert np.array(met.alive).tolist() == [True, False, True, True, False, False, False, False]
+    alive = np.array(met.alive)
+    for name in ("n", "geometric_n"):
+        np.testing.assert_allclose(np.array(getattr(met, name)).T[alive], [[0, 0, -1]] * 3, atol=1e-6)
+    np.testing.assert_allclose(np.array(met.albedo[0])[alive], [0.3, 0.5, 0.6], rtol=1e-5)
+    np.testing.assert_array_equal(np.array(met.value[0]), np.array(met.albedo[0]))
+    np.testing.assert_allclose(np.array(met.p).T[alive], [[x, 0.2, 1] for x in (0.1, 2.1, 3.1)], atol=1e-5)
+
+
+def test_steps_that_arrive_at_a_point_that_was_chosen(monkeypatch):
+    """At its triangle, and within a thousandth of the way; a ray in any other direction arrives wherever it does."""
+    sheets = [mesh(name, plate(1, 1, (0, 0, z))) for name, z in (("a", 4), ("b", 5))]
+    off = np.array([0.9e-3, -0.9e-3, 1.1e-3, -1.1e-3, 0, 0, 0.5])
+    shape = dr.gather(mi.ShapePtr, mi.ShapePtr(*sheets), mi.UInt32([0, 0, 0, 0, 1, 0, 0]))
+    primitive = mi.UInt32([3, 3, 3, 3, 3, 2, 3])
+    elements = Local(
+        per_area=lambda *given: mi.Float(0), select_element=lambda x, active: (mi.UInt32(1), mi.Float(0.5)),
+        point=lambda element, a, y, active: (mi.Point3f(0, 3, 4), None),
+        surface=lambda element, active: (mi.ShapePtr(sheets[0]), mi.UInt32(3)),
+    )  # fmt: skip
+    up = mi.Vector3f(0, 0, 1)
+    start = chains.Vertices(p=mi.Point3f(0, 0, 0), n=up, geometric_n=up, shape=shape, primitive=primitive,
+                            alive=mi.Bool([True] * 7))  # fmt: skip
+
+    def step(scene, plan, origin, d, active):
+        p = origin + d * (5 * (1 + mi.Float(off.astype(np.float32))))
+        return chains.Vertices(p=p, geometric_n=-up, shape=shape, primitive=primitive, alive=active)
+
+    numbers = [mi.UInt32([2**31] * 6 + [4080218931]), mi.UInt32(2**31)]
+    monkeypatch.setattr(chains, "_step", step)
+    plan = Local(elements=elements, center=mi.Point3f(0, 0, 0))
+    vertex, weight = chains._guided_step(None, plan, start, numbers, (0, 1))
+    assert np.array(vertex.alive).tolist() == [True, True, False, False, False, False, True]
+    assert (np.array(weight) > 0).tolist() == np.array(vertex.alive).tolist()
+
+
+def test_where_rays_of_chains_start():
+    """Off their surfaces, towards the side that they go to, by 2^-20 of the largest coordinate and of the distance to
+    the scan.
+    """
+    plan = Local(center=mi.Point3f(1, -6, 3))
+    p = np.array([[0, 2, -5], [0, 2, 5], [0, -0.5, 0.25]]).T
+    start = Local(p=mi.Point3f(p), geometric_n=mi.Vector3f(-1, 0, 0))
+    found = np.array(chains._origin(plan, start, mi.Vector3f([-0.3, 0.3, 0], 4, -5)), dtype=float)
+    reach = np.abs(p).max(0) + np.linalg.norm(p - [[1], [-6], [3]], axis=0)
+    np.testing.assert_allclose(found[0], -reach * 2.0**-20 * [1, -1, 1], rtol=1e-5)
+    np.testing.assert_array_equal(found[1:], p[1:])
+
+
+def test_every_vertex_has_numbers_of_its_own(monkeypatch):
+    """Five of the head and the step to the tail, two sides, and two for each further vertex; lengths and values add up
+    along the tail.
+    """
+    used, plan = [], Local(tail=4, seed=dr.opaque(mi.UInt32, 3), size=8, groups=1, center=mi.Point3f(0, 0, 0))
+
+    def vertex(x, value, alive=True):
+        return chains.Vertices(p=mi.Point3f(x, 0, 0), n=mi.Vector3f(0, 0, 1), value=mi.UnpolarizedSpectrum(value),
+                               geometric_n=mi.Vector3f(0, 0, 1), albedo=mi.UnpolarizedSpectrum(value),
+                               alive=mi.Bool(alive))  # fmt: skip
+
+    def drawn(plan, numbers, place, side):
+        used.append((place, side))
+        return vertex(5, 0.5)
+
+    def step(scene, plan, last, numbers, which):
+        used.append((which, len(numbers)))
+        return vertex(last.p.x + len(used), 0.5), mi.Float(0.25 if len(used) < 5 else 0)
+
+    monkeypatch.setattr(chains, "_drawn", drawn)
+    monkeypatch.setattr(chains, "_step", lambda *given: vertex(7, 0.25))
+    monkeypatch.setattr(chains, "_guided_step", step)
+    head, tail = chains.trace_chains(None, plan, dr.arange(mi.UInt32, 8))
+    assert used == [((0, 1), 5), ((2, 3), 6), ((7, 8), 13), ((9, 10), 13), ((11, 12), 13)]
+    first = np.array(tail[0].p.x)
+    assert set(first) == {5, 7} and (first == 5).sum() == 2  # of eight chains in a row two begin over the area
+    np.testing.assert_allclose(np.array(tail[0].value[0]), np.where(first == 5, 0.5, 0.25) / np.pi, rtol=1e-6)
+    for j, (length, alive) in enumerate(((0, True), (3, True), (7, True), (12, False))):
+        assert np.array(tail[j].length).max() == length and np.array(tail[j].alive).all() == alive
+        np.testing.assert_allclose(np.array(tail[j].value[0]), np.array(tail[0].value[0]) * 0.125**j * alive, rtol=1e-6)
+    assert head.length[0] == 0
+
+
 @pytest.mark.parametrize("name", ["wall", "floor"])
 def test_steps_to_what_is_hidden_weigh_its_form_factor(name):
     """From a wall, which most go to the hidden area from, and from what belongs to it."""
     wall, floor, roof = (mesh(one, (v, f[:, ::-1] if one != "roof" else f)) for one, (v, f) in (
-        ("wall", plate(1, 1, (5, 0, 0))), ("floor", plate(1, 1, (0, 0, 0))), ("roof", plate(1, 0.6, (0, 0, 0.8)))
+        ("wall", plate(1, 1, (5, 0, 0.5))), ("floor", plate(1, 1, (0, 0, 0.5))), ("roof", plate(1, 0.6, (0, 0, 1.3)))
     ))  # fmt: skip
     plan = Local(elements=HiddenElements([floor, roof], *wall_grid(2)), center=mi.Point3f(0, 0, 0))
     shape = {"wall": wall, "floor": floor}[name]
@@ -118,7 +247,7 @@ def test_steps_to_what_is_hidden_weigh_its_form_factor(name):
     places = (strata + np.random.default_rng(7).random((side**2, 2))) / side
     numbers = [mi.UInt32((places[:, i] * 2.0**32).astype(np.uint32)) for i in range(2)]
     up = mi.Vector3f(0, 0, 1)
-    start = chains.Vertices(p=mi.Point3f(0, 0, 0), n=up, geometric_n=up, shape=dr.gather(
+    start = chains.Vertices(p=mi.Point3f(0, 0, 0.5), n=up, geometric_n=up, shape=dr.gather(
         mi.ShapePtr, mi.ShapePtr(shape), dr.zeros(mi.UInt32, side**2)
     ), primitive=dr.zeros(mi.UInt32, side**2), alive=dr.full(mi.Bool, True, side**2))  # fmt: skip
     vertex, weight = chains._guided_step(scene_of(floor, roof, wall), plan, start, numbers, (0, 1))
@@ -127,10 +256,10 @@ def test_steps_to_what_is_hidden_weigh_its_form_factor(name):
     a, b = 0.5 / 0.8, 0.3 / 0.8
     quarter = sum(s / np.hypot(1, s) * np.arctan(t / np.hypot(1, s)) for s, t in ((a, b), (b, a))) / (2 * np.pi)
     assert np.array(weight).mean() == pytest.approx(4 * quarter, rel=0.02)
-    np.testing.assert_allclose(p[2, alive], 0.8, rtol=1e-5)
+    np.testing.assert_allclose(p[2, alive], 1.3, rtol=1e-5)
     assert not np.array(weight)[~alive].any()
     # Most of the steps from the wall, a quarter of the others go to the hidden area, to the roof by its share.
-    roofs = plan.elements.probabilities[0][plan.elements.elements.centers()[:, 2] > 0.5].sum()
+    roofs = plan.elements.probabilities[0][plan.elements.elements.centers()[:, 2] > 1].sum()
     share = {"wall": 0.9, "floor": 0.25}[name]
     assert alive.mean() == pytest.approx(share * roofs + (1 - share) * 4 * quarter, abs=0.01)
 
@@ -187,6 +316,31 @@ def test_tables_of_a_group(monkeypatch):
         monkeypatch.setattr(late_light, "_MOST_ENTRIES", most)
         assert light_of(CaptureType.EXHAUSTIVE, lasers=15, side=1).tiles.count == tiles
         assert light_of(CaptureType.CONFOCAL, lasers=15, side=1).tiles.count == 15
+
+
+@pytest.mark.parametrize(("count", "size", "groups"), [(1, 1, 1), (3, 4, 1), (32, 32, 1), (33, 32, 2), (97, 32, 4)])
+def test_chains_of_a_job_in_groups(monkeypatch, count, size, groups):
+    """As many as fill a power of two, then groups that are filled up; some groups at a time, and told of."""
+    blocks, launched, told = [], [], []
+    light = light_of(CaptureType.SINGLE, size=(2, 3), lasers=1)
+    monkeypatch.setattr(light, "_groups_at_once", lambda: 2)
+    monkeypatch.setattr(light, "_launches", lambda part, band, row, rows: [(part, band, row, rows)])
+    monkeypatch.setattr(light, "_launch", lambda part, launch: launched.append((part, *launch)))
+    monkeypatch.setattr(late_light, "GroupBlock", lambda light, first, n: blocks.append((first, n)) or len(blocks))
+    light.job.film.band_layout = lambda: [(0, 2), (2, 1)]
+    light.job.done = lambda *given: told.append(given)
+    light.job.sensors.p = mi.Point3f([1, 2, 6], [0, 1, -4], 2)
+    light.add(count, 5)
+    assert (light.plan.size, light.plan.groups, light.plan.tail) == (size, groups, 3)
+    assert blocks == [(first, min(2, groups - first)) for first in range(0, groups, 2)]
+    assert launched == [(k + 1, k + 1, *band) for k in range(len(blocks)) for band in ((0, 0, 2), (1, 2, 1))]
+    assert told == [((first + n) / groups, band) for first, n in blocks for band in (0, 1)]
+    np.testing.assert_allclose(np.array(light.plan.center).ravel(), [3, -1, 2], rtol=1e-6)
+    seeds = []
+    for seed in (5, 5 + 2**32, mi.UInt32(5), 6):
+        light.add(count, seed)
+        seeds.append(light.plan.seed[0])
+    assert len(set(seeds[:3])) == 1 and len(set(seeds)) == 2 and seeds[0] != 5
 
 
 def test_groups_at_a_time(monkeypatch):

@@ -194,7 +194,6 @@ def test_what_hides_may_show_its_back(kind):
     assert abs(found[0].mean() - found[1].mean()) < SIGMAS * error < 0.2 * abs(found[0].mean())
 
 
-
 @pytest.mark.slow
 def test_viewpoints_with_the_same_outline():
     """The spot is a scanned point and lies in line with others; outlines along the lines are those of both."""
@@ -208,7 +207,10 @@ def test_what_hides_may_stand_still():
     derivatives of others do not.
     """
     far = plates() | {"far": plane(1.0, 0.1, 1.7)}
-    assert capture_of(plates(), "back.to_world", move(1, 0, 0)).boundary() is not None
+    # A point of an edge for four paths, and at least one.
+    capture = capture_of(plates(), "back.to_world", move(1, 0, 0))
+    for spp, of_edges in ((64, 16), (7, 1), (2, 1)):
+        assert {job.spp for job in capture.boundary(spp).jobs} == {of_edges}
     assert capture_of(far, "far.to_world", move(1, 0, 0)).boundary() is None
     assert capture_of(far, "wall.to_world", move(1, 0, 0)).boundary() is not None
     assert capture_of(plates(), "back.bsdf.reflectance.value", lambda start, θ: start + θ).boundary() is None

@@ -105,6 +105,8 @@ def test_spots_that_are_the_scanned_points(walls):
     turned = seen(walls, 0.25, 5.5, -0.5)
     turned.wi = -turned.wi
     assert not shared_light._same(turned, points)
+    turned.wi.z = 0
+    assert not shared_light._same(turned, points)
     np.testing.assert_array_equal(shared_light._rows(mi.Vector3f(1, 2, 3), 2), [[1, 2, 3]] * 2)
 
 

@@ -73,6 +73,14 @@ def test_as_many_aims_as_a_capture_asks_for():
         scan_table.check_count(seven, sensor, CaptureType.EXHAUSTIVE)
 
 
+def test_a_scan_has_one_laser():
+    lasers = [Local(id=lambda name=name: name) for name in ("a", "b")]
+    assert scan_table.laser_of(Local(emitters=lambda: lasers[:1])) is lasers[0]
+    for emitters, told in ((lasers, r"got 2 \('a', 'b'\)"), ([], r"got 0 \(none\)")):
+        with pytest.raises(SceneError, match=told):
+            scan_table.laser_of(Local(emitters=lambda emitters=emitters: emitters))
+
+
 def test_rays_that_meet_nothing():
     scan_table._check_hit(np.array([1.0, 2.0]), "laser")
     with pytest.warns(TorchTransientWarning, match="2 of the laser's 3 rays meet nothing"):
@@ -191,6 +199,11 @@ def test_planes_of_walls_are_those_to_rounding():
     for height, flat in ((0.0, True), (4e-7, True), (1e-5, False)):
         sheets = [mi.load_dict({"type": "rectangle", "to_world": transform().translate([x, 0, z])})
                   for x, z in ((-1, 0.0), (1, height))]  # fmt: skip
+        assert scan_table._in_one_plane(sheets) is flat
+    # Of their largest coordinate, where that is larger.
+    for x, flat in ((1000, True), (-1000, True), (0, False)):
+        sheets = [mi.load_dict({"type": "rectangle", "to_world": transform().translate([x + dx, 0, z])})
+                  for dx, z in ((-1, 0.0), (1, 3e-4))]  # fmt: skip
         assert scan_table._in_one_plane(sheets) is flat
 
 

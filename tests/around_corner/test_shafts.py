@@ -191,7 +191,12 @@ def test_the_box_of_a_scan():
             assert region.holds(middle @ region.frame)
             middle[axis] = end[axis] + sign * 1.1 * slack
             assert not region.holds(np.stack([middle @ region.frame, points[0]]))
-    np.testing.assert_allclose(ScanRegion(points, np.tile([[0, 0, 1.0], [0, 0, -1.0]], (6, 1))).frame[2], [0, 0, 1])
+    upright = ScanRegion(points, np.tile([[0, 0, 1.0], [0, 0, -1.0]], (6, 1)))
+    np.testing.assert_array_equal(upright.frame[2], [0, 0, 1])
+    # What is just as far off still belongs to it.
+    slack = shafts.ROUNDING * upright.scale
+    ends = np.stack([upright.low - slack, upright.high + slack])
+    assert upright.holds(ends @ upright.frame) and not upright.holds(ends * (1 + 1e-12) @ upright.frame)
     # A mean of normals that differ is shorter than they are.
     curved = ScanRegion(points, np.tile([[0.96, 0.0, 0.28], [-0.96, 0.28, 0.0]], (6, 1)))
     np.testing.assert_allclose(curved.frame @ curved.frame.T, np.eye(3), atol=1e-12)
@@ -205,6 +210,21 @@ def test_trees_have_no_more_leaves_than_they_need(obstacles, leaves):
     balls = [mi.load_dict({"type": "sphere", "center": [0, 0, k]}) for k in range(obstacles)]
     tree = shafts.ObstacleTree(balls, region, np.ones((1, 3, 3)), 1e-9)
     assert (tree.leaves[0], dr.width(tree.low), dr.width(tree.corners[0])) == (leaves, 2 * leaves, leaves)
+
+
+def test_leaves_next_to_each_other_are_neighbours_by_their_middles():
+    """Whatever their sizes; a box holds both below it."""
+    region = ScanRegion([[0, 0, 0], [0.3, 0.2, 0]], [[0, 0, 1.0]] * 2)
+    place, radius = np.array([5, 2, 7, 0, 3, 6, 1]), np.array([0.1, 3, 0.2, 0.1, 2.5, 0.3, 0.2])
+    centers = (place[:, None] * region.frame[0] + 9 * region.frame[2]).tolist()
+    balls = [mi.load_dict({"type": "sphere", "center": c, "radius": r}) for c, r in zip(centers, radius, strict=True)]
+    tree = shafts.ObstacleTree(balls, region, np.ones((1, 3, 3)), 1e-9)
+    low, high = np.array(tree.low).T, np.array(tree.high).T
+    np.testing.assert_allclose((low[8:15, 0] + high[8:15, 0]) / 2, np.sort(place), atol=1e-5)
+    np.testing.assert_allclose((high[8:15, 0] - low[8:15, 0]) / 2, radius[np.argsort(place)], rtol=1e-5)
+    for node in range(1, 8):
+        np.testing.assert_array_equal(low[node], low[2 * node : 2 * node + 2].min(0))
+        np.testing.assert_array_equal(high[node], high[2 * node : 2 * node + 2].max(0))
 
 
 @pytest.mark.parametrize(("scanned", "hidden"), [
@@ -257,7 +277,8 @@ def obstacles(rng):
     return [mesh("some", (v.reshape(-1, 3), np.arange(72).reshape(24, 3))), ball], v.astype(np.float32).astype(float)
 
 
-def test_what_is_met_in_a_shaft():
+@pytest.mark.parametrize("slack", [1e-9, 0.05])
+def test_what_is_met_in_a_shaft(slack):
     """By the tree as one by one: a triangle is outside beyond a plane of the shaft, or where its own plane has region
     and element on one side; a ball is, with its box, beyond a plane.
     """
@@ -267,7 +288,6 @@ def test_what_is_met_in_a_shaft():
     elements = rng.uniform(-2.5, 2.5, (150, 1, 3)) + rng.normal(size=(150, 3, 3)) * 0.1
     elements[:, :, 2] = region.high[2] + rng.uniform(0.3, 1.2, (150, 3))
     planes = shafts._shafts(elements, np.zeros((150, 3)), np.zeros(150, dtype=bool), region)
-    slack = 1e-9
     tree = shafts.ObstacleTree(shapes, region, elements, slack)
     n = np.cross(v[:, 1] - v[:, 0], v[:, 2] - v[:, 0])
     n /= np.linalg.norm(n, axis=1, keepdims=True)
@@ -300,6 +320,17 @@ def test_triangles_that_hide_nothing_from_a_scan():
     expected = (height >= 0).all(0) | (height <= 0).all(0)
     assert 10 < expected.sum() < 190
     np.testing.assert_array_equal(shafts._harmless(v, region, hidden, 1e-12), expected)
+
+
+@pytest.mark.parametrize("turn", [1, -1])
+def test_triangles_in_the_plane_of_a_scan_or_of_what_is_hidden(turn):
+    """To rounding they have both on one side, whichever way round their corners are."""
+    region = ScanRegion([[0, 0, 0], [0.3, 0.2, 0]], [[0, 0, 1.0]] * 2)
+    hidden = np.array([[[0.1, 0.2, 1], [0.4, 0.2, 1], [0.1, 0.5, 2.0]]]) @ region.frame.T
+    heights = np.array([-0.5, 0, 0.9, 1.1, 5, 1e3 - 5, 1e3 - 1.1, 1e3 - 0.9, 1e3, 2e3]) * 2e-3
+    v = np.array([[-3, -3, 0], [3, -3, 0], [0, 4, 0.0]])[::turn] + heights[:, None, None] * [0, 0, 1]
+    found = shafts._harmless(v @ region.frame.T, region, hidden, 2e-3)
+    assert found.tolist() == [True, True, True, False, False, False, False, True, True, True]
 
 
 @pytest.mark.parametrize(("rays", "worth"), [(2000, False), (2001, True)])

@@ -1,10 +1,18 @@
 """Shafts in the integrator: rays are left out where that pays, and the light is the same."""
 
+import mitsuba as mi
+import numpy as np
 import pytest
 
 import torchtransient.plugins.around_corner.shared_light as shared_light
+from support.hidden_shapes import ball, mesh, wall_grid
 from support.marks import long
 from support.nlos_scenes import captures, film, plane, ratio, scan_scene, side
+from support.third_bounce_runs import table_of, wall_of
+from torchtransient.plugins.around_corner.shared_light import SharedThirdBounce
+from torchtransient.plugins.remembered import Remembered
+from torchtransient.plugins.sampling.scan_tiles import ScanTiles
+from torchtransient.plugins.transport.strategy import Local
 
 VARIANT = "llvm_ad_mono"
 pytestmark = pytest.mark.usefixtures("no_leftovers")
@@ -30,3 +38,94 @@ def test_rays_that_are_left_out_change_nothing(monkeypatch, kind):
 def test_small_jobs_look_for_no_shafts(monkeypatch):
     monkeypatch.setattr(shared_light, "spare_rays", lambda *a: pytest.fail("not worth its time"))
     captures(scan_scene({"a": plane()}, max_depth=3, third_bounce="shared"), 16, 1)
+
+
+def named(name, **facts):
+    return Local(id=lambda: name, class_name=lambda: "Kind", **facts)
+
+
+AGAINST = {
+    "nothing": ({}, {}, None),
+    "a film that lists": ({"exhaustive_scan": True, "most": 5}, {}, "an exhaustive capture is a phasors, which lists"),
+    "a list of one capture": ({"most": 5}, {}, None),
+    "sums of an exhaustive one": ({"exhaustive_scan": True}, {}, None),
+    "a camera": ({"looks_at_points": False}, {}, "the sensor (Class) is no nlos_capture_meter"),
+    "fog": ({}, {"media": "fog"}, "participating media"),
+    "late surfaces": ({}, {"delays": "some"}, "scatter late, or are mixtures"),
+    "mixtures": ({}, {"mixtures": "some"}, "scatter late, or are mixtures"),
+    "metal": ({}, {"bsdfs": [named("a", diffuse=True), named("b", diffuse=False), named("", diffuse=False)]},
+              "not all surfaces are diffuse (b, Kind)"),
+    "four of them": ({}, {"bsdfs": [named(name, diffuse=False) for name in "abcd"]}, "diffuse (a, b, c)"),
+    "a smooth wall": ({"wall": named("w", smooth=True)}, {}, "interpolated on the relay wall (w)"),
+    "one without a name": ({"wall": named("", smooth=True)}, {}, "interpolated on the relay wall (Class)"),
+    "a wall": ({"wall": named("w", smooth=False)}, {}, None),
+    "curves": ({"shapes": [named("c", listed=True), named("d", listed=False), named("", listed=False)]}, {},
+               "points cannot be drawn on d, Kind"),
+    "four curves": ({"shapes": [named(name, listed=False) for name in "abcd"]}, {}, "drawn on a, b, c"),
+    "overlaps": ({"overlapping": list("abcd")}, {}, "areas would count twice (a, b, c)"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", AGAINST)
+def test_what_stands_against_shared_samples(monkeypatch, case):
+    facts, more, expected = AGAINST[case]
+    facts = {"exhaustive_scan": False, "most": None, "looks_at_points": True, "wall": None, "shapes": [],
+             "overlapping": []} | facts  # fmt: skip
+    response = Local(exhaustive_scan=facts["exhaustive_scan"], lanes_at_most=lambda events: facts["most"],
+                     plugin="phasors")  # fmt: skip
+    sensor, asked = Local(film=lambda: response, get_shape=lambda: facts["wall"]), []
+    table = Local(scene=Local(shapes=lambda: facts["shapes"]), sensor=sensor, looks_at_points=facts["looks_at_points"],
+                  overlaps=lambda with_wall: asked.append(with_wall) or facts["overlapping"])  # fmt: skip
+    contents = Local(**{"media": None, "delays": None, "mixtures": None, "bsdfs": []} | more)
+    monkeypatch.setattr(shared_light, "class_of", lambda node: "Class")
+    for name, fact in (("is_lambertian", "diffuse"), ("has_shading_normals", "smooth"), ("can_be_listed", "listed")):
+        monkeypatch.setattr(shared_light, name, lambda node, fact=fact: getattr(node, fact))
+    found = shared_light.why_not(table, contents, "asked")
+    assert (expected is None) == (found is None) and (expected is None or expected in found)
+    assert not found or found.endswith(")") == expected.endswith(")")
+    assert set(asked) <= {"asked"}
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral", "llvm_ad_mono_polarized"])
+def test_variants_whose_paths_are_not_alike(variant):
+    with mi.variant_context(variant):
+        assert f"the variant {variant} gives" in shared_light.why_not(Local(scene=None, sensor=None), None, False)
+
+
+def test_rays_that_would_be_traced(monkeypatch):
+    """To every scanned point and every spot, but once where these are the same."""
+    asked, spared = [], []
+    monkeypatch.setattr(shared_light, "pays", lambda scene, rays: asked.append(rays) or len(asked) != 2)
+    monkeypatch.setattr(shared_light, "spare_rays", lambda *given: spared.append(given))
+    points, normals = wall_grid(3)
+    sensors, spot = wall_of(points, normals), wall_of(points[:1] + 0.25, normals[:1])
+    for spots in (spot, sensors, sensors):
+        job = Local(light=Local(sensors=sensors, spots=spots), world=Local(scene="scene"))
+        SharedThirdBounce._spare_rays(job, "elements", 7)
+    assert asked == [70, 63, 63] and len(spared) == 2
+    for (scene, elements, p, n), count in zip(spared, (10, 9), strict=True):
+        assert (scene, elements) == ("scene", "elements")
+        np.testing.assert_allclose(p, np.concatenate([points, points[:1] + 0.25])[:count], atol=1e-6)
+        np.testing.assert_allclose(n, np.tile([0, 0, 1], (count, 1)))
+
+
+def test_scans_of_what_is_near_have_tiles(monkeypatch):
+    """Nearer than half their width, to some of the points; a density of their own then, and a table for this job."""
+    points, normals = wall_grid(8)
+    looked, found_distance = [], shared_light.distance_to
+    monkeypatch.setattr(shared_light, "distance_to", lambda v, p: looked.append(p) or found_distance(v, p))
+    for z, tiled in ((0.2, True), (0.9, False)):
+        job = Local(light=Local(sensors=wall_of(points, normals)), tile=None,
+                    world=Local(contents=Local(memory=Remembered())))  # fmt: skip
+        elements = table_of([mesh("a", ball((0.1, 0, z), 0.05, 1))])
+        found = SharedThirdBounce._near(job, elements)
+        assert (found is not elements) == tiled == (job.tile is not None)
+        if tiled:
+            centers = elements.elements.centers()
+            some = np.linspace(0, 63, 25).round().astype(int)
+            np.testing.assert_allclose(looked[0], points[some], atol=1e-6)
+            distance = np.linalg.norm(centers[:, None] - points[some], axis=2).min()
+            tiles = ScanTiles(points, normals, distance)
+            assert np.array(job.tile).tolist() == tiles.tile.tolist() and found.tile_count == tiles.count > 1
+            again = SharedThirdBounce._near(job, elements)
+            assert again is not found and again.key == found.key

@@ -25,10 +25,9 @@ class Ends:
         self.size = dr.opaque(mi.UInt32, count)
         with dr.suspend_grad():
             columns = [column for value in fields.values() for column in _columns(value)]
-            self.rows = -(-len(columns) // 4)
-            columns += [mi.Float(0)] * (4 * self.rows - len(columns))
-            rows = [columns[4 * i : 4 * i + 4] for i in range(self.rows)]
-            self.flat = packed_columns(rows, count) if rows else None
+            columns += [mi.Float(0)] * (-len(columns) % 4)
+            rows = [columns[i : i + 4] for i in range(0, len(columns), 4)]
+            self.rows, self.flat = len(rows), packed_columns(rows, count) if rows else None
 
     @property
     def attached(self) -> list[str]:

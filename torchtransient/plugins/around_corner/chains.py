@@ -68,11 +68,12 @@ class Vertices(Local):
 
 def trace_chains(scene: Any, plan: ChainPlan, index: Any) -> tuple[Vertices, list[Vertices]]:
     """(heads, vertices of tails) of the chains of numbers ``index`` (UInt32) of Sobol's points. Not evaluated."""
-    numbers = [sobol(index, d, plan.seed) for d in range(min(DIMENSIONS, _FURTHER + 2 * (plan.tail - 1)))]
+    numbers = [sobol(index, d, plan.seed) for d in range(_FURTHER + 2 * (plan.tail - 1))]
     head = _drawn(plan, numbers, _HEAD, _SIDES[0])
     guided = unit_float(numbers[_CHOICE]) < AREA_SHARE
     direction = _cosine_direction(head.n, numbers, _STEP)
-    vertex = _step(scene, plan, head, direction, head.alive & ~guided)
+    origin = _origin(plan, head, direction)
+    vertex = _step(scene, plan, origin, direction, head.alive & ~guided)
     drawn = _drawn(plan, numbers, _STEP, _SIDES[1])
     vertex = _select(guided, drawn, vertex)
     # The area it stands for belongs to the density of the step.
@@ -82,7 +83,7 @@ def trace_chains(scene: Any, plan: ChainPlan, index: Any) -> tuple[Vertices, lis
     for j in range(1, plan.tail):
         last = tail[-1]
         vertex, weight = _guided_step(scene, plan, last, numbers, (_FURTHER + 2 * j - 2, _FURTHER + 2 * j - 1))
-        vertex.value = dr.select(vertex.alive, last.value * vertex.albedo * weight, 0)
+        vertex.value = last.value * vertex.albedo * weight
         vertex.alive &= dr.max(vertex.value) > 0
         vertex.length = last.length + dr.norm(vertex.p - last.p)
         tail.append(vertex)
@@ -118,13 +119,18 @@ def _cosine_direction(n: Any, numbers: list[Any], which: tuple[int, int]) -> Any
     return mi.Frame3f(mi.Normal3f(n)).to_world(mi.warp.square_to_cosine_hemisphere(u))
 
 
-def _step(scene: Any, plan: ChainPlan, start: Vertices, d: Any, active: Any) -> Vertices:
-    """What a ray meets, its ``value`` still to be said. Offsets as in :func:`.geometry.occluded`, by the size of the
-    hidden scene.
+def _origin(plan: ChainPlan, start: Vertices, towards: Any) -> Any:
+    """Where rays that go off a surface start. Offsets as in :func:`.geometry.occluded`, by the size of the hidden
+    scene.
     """
     reach = dr.max(dr.abs(start.p)) + dr.norm(plan.center - start.p)
-    offset = dr.mulsign(OFFSET * reach, dr.dot(start.geometric_n, d))
-    ray = mi.Ray3f(mi.Point3f(start.p + start.geometric_n * offset), d)
+    offset = dr.mulsign(OFFSET * reach, dr.dot(start.geometric_n, towards))
+    return mi.Point3f(start.p + start.geometric_n * offset)
+
+
+def _step(scene: Any, plan: ChainPlan, origin: Any, d: Any, active: Any) -> Vertices:
+    """What a ray meets, its ``value`` still to be said."""
+    ray = mi.Ray3f(origin, d)
     pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
     si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
     valid = active & si.is_valid()
@@ -132,7 +138,7 @@ def _step(scene: Any, plan: ChainPlan, start: Vertices, d: Any, active: Any) -> 
     two_sided = scatters_behind(bsdf)
     lit = valid & ((si.wi.z > 0) | (two_sided & (si.wi.z < 0)))
     turn = dr.select(si.wi.z < 0, mi.Float(-1), 1)
-    albedo = dr.select(lit, mi.unpolarized_spectrum(bsdf.eval_diffuse_reflectance(si, lit)), 0)
+    albedo = mi.unpolarized_spectrum(bsdf.eval_diffuse_reflectance(si, lit))
     n = mi.Vector3f(si.sh_frame.n)
     geometric_n = mi.Vector3f(front_normal(si)) if plan.elements.smooth else n
     alive = lit & (dr.max(albedo) > 0)
@@ -154,13 +160,12 @@ def _guided_step(scene: Any, plan: ChainPlan, start: Vertices, numbers: list[Any
     element, a = plan.elements.select_element(x, start.alive & guided)
     point, _ = plan.elements.point(element, a, unit_float(v), start.alive & guided)
     cosine = mi.warp.square_to_cosine_hemisphere(mi.Point2f(mi.Float(x), unit_float(v)))
-    reach = dr.max(dr.abs(start.p)) + dr.norm(plan.center - start.p)
-    side = dr.select(guided, dr.dot(start.geometric_n, point - start.p), 1)
-    origin = mi.Point3f(start.p + start.geometric_n * dr.mulsign(OFFSET * reach, side))
+    cosine = mi.Frame3f(mi.Normal3f(start.n)).to_world(cosine)
+    origin = _origin(plan, start, dr.select(guided, mi.Vector3f(point - start.p), cosine))
     to = mi.Vector3f(point - origin)
-    d = dr.select(guided, dr.normalize(to), mi.Frame3f(mi.Normal3f(start.n)).to_world(cosine))
+    d = dr.select(guided, dr.normalize(to), cosine)
     cos = dr.dot(start.n, d)
-    vertex = _step(scene, plan, start, d, start.alive & (cos > 0))
+    vertex = _step(scene, plan, origin, d, start.alive & (cos > 0))
     way = mi.Vector3f(vertex.p - origin)
     shape, primitive = plan.elements.surface(element, start.alive & guided)
     arrived = (vertex.shape == shape) & (vertex.primitive == primitive)
@@ -227,7 +232,7 @@ class Links:
         r = square * inverse
         cos = dr.maximum(dr.dot(x.n, d) * inverse, 0)
         q = cos * dr.abs(dr.dot(v.geometric_n, d)) * dr.square(inverse) * inverse * dr.inv_pi
-        active = x.alive & v.alive & (dr.dot(v.n, d) < 0) & (square > 0) & (q > 0)
+        active = x.alive & v.alive & (dr.dot(v.n, d) < 0) & (q > 0)
         line = Local(r=r, geometric_cos=dr.dot(x.geometric_n, d))
         facing = mi.Vector3f(dr.mulsign(v.geometric_n, -dr.dot(v.geometric_n, d)))
         q = dr.select(active & ~occluded(scene, x, line, v.p, facing, active), q, 0)

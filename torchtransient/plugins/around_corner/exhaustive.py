@@ -22,6 +22,8 @@ from torchtransient.plugins.transport.strategy import Local
 
 # Bytes of the pairs of numbers that are kept at a time, for scan points and laser spots together.
 MOST_BYTES = 2**28
+# Numbers that are mirrored at a time.
+MOST_MIRRORED = 2**24
 # Samples that one turn of the loop takes; blocks are filled up with samples that nothing reaches.
 UNROLLED = 4
 
@@ -202,6 +204,11 @@ def deposit(job, block, pairs, target, kept, k):
     kept["after"] = kept["after"] + after
 
 
+def _rows_at_once(points: int, size: int) -> int:
+    """How many scan points' rows of histograms are mirrored together: what is in flight stays small."""
+    return max(1, MOST_MIRRORED // (points * size))
+
+
 def _mirror(film: Any) -> None:
     """Histograms of (scan point, laser spot) with the numbers in descending order, from those in ascending order."""
     cube = film.band_array(0)
@@ -210,8 +217,7 @@ def _mirror(film: Any) -> None:
     packet = 4 if size % 4 == 0 else 1
     kind = type(cube) if packet == 1 else (mi.Vector4f if type(cube) is mi.Float else mi.Vector4d)
     parts = size // packet
-    # Row by row of scan points: what is in flight stays small.
-    at_once = max(1, 2**24 // (points * size))
+    at_once = _rows_at_once(points, size)
     for first in range(0, points, at_once):
         rows = min(at_once, points - first)
         i = dr.arange(mi.UInt32, rows * points * parts)

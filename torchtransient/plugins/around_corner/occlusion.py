@@ -80,7 +80,7 @@ class MutualOcclusion:
                 objective = mi.Float(0)
                 for term in self._terms(rays, pixel, job):
                     A, _ = block.read(term.opl, term.active)
-                    objective += dr.select(term.active, total_of(A, term.value) * term.outwards, 0)
+                    objective += total_of(A, term.value) * term.outwards
                 if dr.grad_enabled(objective):
                     dr.backward_from(objective)
             dr.eval()
@@ -98,7 +98,7 @@ class MutualOcclusion:
                 tangents = tangents_of([term.outwards for term in terms])
             events, total = block.begin(), light_type()(0)
             for term, outwards in zip(terms, tangents, strict=True):
-                value = dr.select(term.active, term.value * outwards, 0)
+                value = term.value * outwards
                 block.put_slope(events, term.opl, value, light_type()(0), term.active)
                 total += value
             block.end(events)
@@ -115,7 +115,9 @@ class MutualOcclusion:
     # --------------------------------------------------------------------------------------------- the terms
 
     def _terms(self, rays: Any, pixel: Any, job: Pass) -> list[Local]:
-        """One term for each viewpoint: ``value`` (detached), ``outwards`` (attached), ``opl``, ``active``."""
+        """One term for each viewpoint: ``value`` (detached), ``outwards`` (attached), both zero where none is
+        ``active``, and ``opl``.
+        """
         world, ray = self.world, rays.ray
         leg = rays.leg if rays.leg is not None else world.scene.ray_intersect_preliminary(ray, coherent=True)
         seen = leg.compute_surface_interaction(ray, mi.RayFlags.All)
@@ -184,7 +186,7 @@ class MutualOcclusion:
                 weight *= self._seen_otherwise(
                     place.seen if from_spot else place.lit, viewer, si, d - n * BESIDE, active
                 )
-            value *= dr.select(active, weight, 0)
+            value = dr.select(active, value * weight, 0)
         outwards = dr.dot(n, (edge.p - Q) / distance - (y.p - Q) / beyond)
         return Local(value=value, outwards=dr.select(active, outwards, 0), opl=opl, active=active)
 
@@ -203,7 +205,7 @@ class MutualOcclusion:
         measure = dr.rcp(dr.square(r_spot)) if not from_spot else cos_seen / (cos_spot * dr.square(r_seen))
         opl = place.before + mi.Float64((r_seen + r_spot) * place.η)
         active = world.counted(active, opl)
-        return dr.select(active, value * measure, 0), opl, active
+        return value * measure, opl, active
 
     def _seen_otherwise(self, other: Any, viewer: Any, si: Any, d: Any, active: Any) -> Any:
         """How much of the hidden point ``si`` is seen from the ``other`` viewpoint (Float).

@@ -89,7 +89,7 @@ class ThirdBounceGradients:
         """
         with dr.resume_grad():
             sample, point = dr_copy(pair.sample), dr_copy(pair.point)
-            found = leaves(sample if of_sample else point, list(kept), max(dr.width(pair.k), dr.width(pair.s)))
+            found = leaves(sample if of_sample else point, list(kept), dr.width(pair.k))
             value, length, opl, arrives = self.connection(sample, point, pair.k)
             A, slope = read.block(pair.s).read(opl, arrives)
             objective = total_of(A, value) + total_of(slope, dr.detach(value)) * slope_only(length)
