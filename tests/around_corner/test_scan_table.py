@@ -39,7 +39,7 @@ def test_a_grid_around_the_laser_s_axis():
             scan_table.aims_of(scene, sensor, CaptureType.EXHAUSTIVE, fov)
 
 
-def test_one_direction_or_those_of_scanned_points():
+def test_one_direction_or_those_of_scanned_points(monkeypatch):
     scene = mi.load_dict(scan_scene({"a": plane()}, "confocal"))
     sensor = scene.sensors()[0]
     single = np.array(scan_table.aims_of(scene, sensor, CaptureType.SINGLE, None)).ravel()
@@ -47,6 +47,12 @@ def test_one_direction_or_those_of_scanned_points():
     aims = np.array(scan_table.aims_of(scene, sensor, CaptureType.CONFOCAL, None))
     points = np.array(scan_table.scanned_points(scene, sensor))
     np.testing.assert_allclose(aims, points - np.array([[-0.5], [0.0], [0.25]]), rtol=1e-5, atol=1e-6)
+    # A pixel that the laser is said to look at is for captures that do not light the scanned points.
+    monkeypatch.setattr(type(sensor), "spots", lambda self: mi.Point3f(9, 8, 7))
+    again = np.array(scan_table.aims_of(scene, sensor, CaptureType.CONFOCAL, None))
+    np.testing.assert_array_equal(again, aims)
+    single = np.array(scan_table.aims_of(scene, sensor, CaptureType.SINGLE, None)).ravel()
+    np.testing.assert_allclose(single, [9.5, 8, 6.75], rtol=1e-5)
 
 
 def test_laser_positions_are_said_once():
