@@ -160,7 +160,9 @@ def test_the_area_of_a_triangle_is_that_of_its_vertices():
     np.testing.assert_allclose(np.array(dr.grad(si.p))[:, 0], moved, rtol=1e-4, atol=1e-5)
 
 
-def test_what_changes_where_a_point_slides_on_a_sphere():
+@pytest.mark.parametrize("own", [0.0, 0.6])
+def test_what_changes_where_a_point_slides_on_a_sphere(own):
+    """Of the drag alone, though the ray may have a motion of its ``own``."""
     scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere", "center": [0.2, -0.1, 0.3], "radius": 1.5}})
     d = dr.normalize(mi.Vector3f([0.1, -0.2, 0.05], [0.2, 0.1, -0.1], -1))
     start, drag = mi.Point3f([0.3, 0.1, 0.2], [0.2, 0.4, -0.5], 5), mi.Vector3f([0.3, 0.5, 0.2], [0.7, -0.2, 0.3], 0.1)
@@ -171,10 +173,11 @@ def test_what_changes_where_a_point_slides_on_a_sphere():
         return [np.array(v) for v in (si.uv, si.n, si.sh_frame.n)]
 
     expected = [(a - b) / (2 * step) * [1, 1, 0] for a, b in zip(hit(step), hit(-step), strict=True)]
-    x, ray = mi.Float(0), mi.Ray3f(start, d)
+    x = mi.Float(0)
     dr.enable_grad(x)
     dr.set_grad(x, 1)
-    moved = terms.slide_on_shape(scene.ray_intersect_preliminary(ray), ray, drag * x, active)
+    ray = mi.Ray3f(start + mi.Vector3f(own, -own, 0) * x, d)
+    moved = terms.slide_on_shape(scene.ray_intersect_preliminary(dr.detach(ray)), ray, drag * x, active)
     dr.enqueue(dr.ADMode.Forward, x)
     dr.traverse(dr.ADMode.Forward)
     for one, other in zip((moved.uv, moved.n, moved.sh_n), expected, strict=True):
