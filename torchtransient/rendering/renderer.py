@@ -279,7 +279,7 @@ class TransientRenderer(CopiesParametrized):
         """Whether gradients for ``keys`` exist with the filter or gates in use: a box has none of path lengths. Raises
         ``UnknownKeyError`` for keys that the renderer does not have.
         """
-        moving = needing_slope(self._infos, checked_keys(keys, self._keys))
+        moving = needing_slope(self._infos, checked_keys(keys, tuple(self._infos)))
         return not moving or (has_slope(self.effective_filter, self._pulsed) and self._response[0])
 
     @opaque
