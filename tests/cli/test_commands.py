@@ -212,6 +212,7 @@ def test_cost(folder):
     assert (folder / "cost.png").read_bytes()[:4] == b"\x89PNG"
 
 
+@pytest.mark.slow
 def test_demo_finds_the_colour(folder):
     result = run("demo", "--resolution", 32, "--spp", 16, "--steps", 25)
     assert result.exit_code == 0, result.output

@@ -185,6 +185,7 @@ def test_drjit_computes_with_as_many_threads():
     assert run(script) == ["1", "3", "1", "2", "1", "3", "1", "2"]
 
 
+@pytest.mark.slow
 def test_pictures_of_scenes_are_read_by_one_thread(tmp_path):
     """Mitsuba alone waits for ever: it leaves an OpenEXR file to other threads of the pool, and there is none."""
     script = f"""
@@ -207,6 +208,7 @@ def test_pictures_of_scenes_are_read_by_one_thread(tmp_path):
     assert run(script) == ["0.25", "1", "llvm_ad_mono", "1"]
 
 
+@pytest.mark.slow
 def test_films_write_pictures_by_one_thread(tmp_path):
     script = f"""
         import torchtransient as tt

@@ -47,6 +47,7 @@ def test_a_tenth_of_the_variance_at_a_millimetre(name, monkeypatch):
     assert 10 * damped < gradients(name, 1e-3).var(ddof=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", long(["plates", "corner"], ["corner"]))
 def test_mean_at_a_millimetre(name):
     """Guards against distances measured from the surface where the ray starts 2e-4 m off it, a fifth of the gap."""

@@ -20,6 +20,7 @@ def example():
     return runpy.run_path(str(SCRIPT))
 
 
+@pytest.mark.slow
 def test_a_few_steps_halve_the_errors_of_a_pose(example, tmp_path):
     found = example["main"](["--smoke", "--fit", "pose", "--kind", "confocal", "--output", str(tmp_path)])
     errors = found["pose, confocal"]["fits"]["pose, confocal, seed 0"]

@@ -44,6 +44,7 @@ def test_the_transient_tells_what_the_steady_image_does_not(example, tmp_path, c
     assert (tmp_path / "scattering_material.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_the_formula_is_right_late_and_in_the_dark(example):
     scene = example("turbid_block")
     coefficients = (200.0, 6.0)

@@ -50,6 +50,7 @@ def failures(folder):
     return found
 
 
+@pytest.mark.slow
 def test_what_is_there(calm):
     assert leftovers(calm) == []
     assert verify(calm).complete and verify(calm).samples == 23

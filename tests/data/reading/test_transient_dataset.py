@@ -198,7 +198,7 @@ def test_shards_that_do_not_belong_together(data, tmp_path):
         TransientDataset([data, tmp_path / "a.h5"])
 
 
-@pytest.mark.parametrize("workers", [0, ("fork", 2), ("spawn", 2)])
+@pytest.mark.parametrize("workers", [0, ("fork", 2), pytest.param(("spawn", 2), marks=pytest.mark.slow)])
 def test_loaders(data, workers):
     found = TransientDataset(data, window=slice(0, 64), transform=doubled)
     assert found[7]["index"] == 7  # files are open here

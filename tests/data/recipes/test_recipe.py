@@ -92,6 +92,7 @@ def test_what_is_kept_of_a_sample():
     kept.preview(1)
 
 
+@pytest.mark.slow
 def test_another_process_makes_the_same_bytes(tmp_path):
     recipe = small()
     recipe.to_yaml(tmp_path / "recipe.yaml")
