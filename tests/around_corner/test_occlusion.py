@@ -300,9 +300,14 @@ BODIES = {
 }
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["confocal", "single"])
-@pytest.mark.parametrize("case", BODIES)
+def bodies():
+    """Each with one kind of capture in the set of slow tests, in turns; the other is for the soak."""
+    for n, case in enumerate(BODIES):
+        for m, kind in enumerate(["confocal", "single"]):
+            yield pytest.param(case, kind, marks=pytest.mark.slow if (n + m) % 2 == 0 else pytest.mark.soak)
+
+
+@pytest.mark.parametrize(("case", "kind"), bodies())
 def test_bodies_of_many_parts(case, kind):
     hidden, change = BODIES[case]
     capture = capture_of(hidden(), "body.vertex_positions", change, kind)

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-pytestmark = pytest.mark.slow
 
 
 def run(script, tmp_path, *arguments):
@@ -22,6 +21,7 @@ def run(script, tmp_path, *arguments):
     return json.loads(report.read_text(encoding="utf-8")), done.stdout
 
 
+@pytest.mark.soak
 def test_steps_and_their_parts(tmp_path):
     report, printed = run("step_cost.py", tmp_path, "--threads", "1")
     rows = {row["kind"]: row for row in report["rows"]}
@@ -34,6 +34,7 @@ def test_steps_and_their_parts(tmp_path):
     assert "within" not in json.dumps(report["ratios"]) and "phasor film" in printed
 
 
+@pytest.mark.slow
 def test_batches_and_cameras(tmp_path):
     report, _ = run("batch_cost.py", tmp_path, "--only", "cameras, render and", "--threads", "1")
     assert list(report["peak_bytes"]) == ["cameras, render and sum", "cameras, render and squares"]
@@ -41,6 +42,7 @@ def test_batches_and_cameras(tmp_path):
     assert [ratio["to"] for ratio in report["ratios"]] == [f"{name}: loop" for name in report["peak_bytes"]]
 
 
+@pytest.mark.slow
 def test_recordings_stay_what_they_are(tmp_path):
     report, printed = run("frozen_memory.py", tmp_path)
     assert report["recordings_added"] == report["calls_traced_when_settled"] == 0
@@ -48,17 +50,20 @@ def test_recordings_stay_what_they_are(tmp_path):
     assert report["every"][-1]["step"] == 60 and "60 steps, 3 parameters" in printed
 
 
+@pytest.mark.slow
 def test_threads_and_processes(tmp_path):
     report, _ = run("thread_cost.py", tmp_path)
     assert len(report["cases"]) == 6 and len(report["ratios"]) == 4
 
 
+@pytest.mark.slow
 def test_functions_across(tmp_path):
     report, _ = run("wrap_cost.py", tmp_path)
     assert len(report["cases"]) == 20 and all(case["min"] > 0 for case in report["cases"].values())
     assert len(report["ratios"]) == 12
 
 
+@pytest.mark.slow
 def test_ways_to_store(tmp_path):
     report, printed = run("dataset_storage.py", tmp_path)
     assert list(report["data"]) == ["16 spp", "1024 spp"] and "| exact, gzip |" in printed
@@ -68,6 +73,7 @@ def test_ways_to_store(tmp_path):
         assert rows["counts"]["smaller"] > rows["rounded"]["smaller"] > rows["exact"]["smaller"] > 1
 
 
+@pytest.mark.slow
 def test_data_sets(tmp_path):
     report, printed = run("dataset.py", tmp_path, "--only", "samples", "views", "captures", "reading", "loader", "new")
     rows = {row["name"]: row for row in report["rows"]}
@@ -81,11 +87,13 @@ def test_data_sets(tmp_path):
     assert "within" not in json.dumps(report["rows"]) and "bar:" not in printed
 
 
+@pytest.mark.soak
 def test_data_sets_by_two_workers(tmp_path):
     report, _ = run("dataset.py", tmp_path, "--only", "workers")
     assert [row["unit"] for row in report["rows"]] == ["x", "x"] and report["rows"][0]["load"] >= 0
 
 
+@pytest.mark.soak
 def test_bias_of_noisy_renders(tmp_path):
     """At toy size already the likelihood is farther off than squares, whose bias is none."""
     report, printed = run("noisy_renders.py", tmp_path)
@@ -98,6 +106,7 @@ def test_bias_of_noisy_renders(tmp_path):
     assert "the start" in report["priors"] and "`expected_root_loss`" in printed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("script", ["accuracy_curve.py", "nlos_accuracy.py"])
 def test_quick_runs_leave_the_kept_numbers(script, tmp_path):
     """Their kept files have paths below the folder that they are started in: none of these comes into being."""

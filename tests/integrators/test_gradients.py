@@ -19,8 +19,9 @@ SIGMAS = 3.0
 # Forward and reverse mode add the same float32 terms in another order; a sum of n terms of mixed signs is good to about
 # sqrt(n) ulp.
 ROUNDING = 2e-3
-# So many cases of each row of the support table are in the default set; the set of slow tests runs the others.
-FIRST = 1
+# So many cases of each row of the support table are in the default set, and so many in the set of slow tests; the soak
+# runs the others.
+FIRST, SECOND = 1, 8
 # So does it run cases of more than a second that need many samples.
 LONG = {
     "pattern_grows", "plastic_alpha", "hair_coloured_absorption", "plastic_index", "pattern_shifts", "medium_albedo",
@@ -36,11 +37,13 @@ LONG = {
 
 def marked(cases):
     """Parameters of a test, with the marker that a case's cost asks for."""
-    found, seen = [], Counter()
+    found, seen, later = [], Counter(), Counter()
     for case in cases:
         slow = "slow" in case.tags or case.name in LONG or seen[case.row] >= FIRST
         seen[case.row] += not slow
-        found.append(pytest.param(case, id=case.name, marks=[pytest.mark.slow] if slow else []))
+        later[case.row] += slow
+        kind = pytest.mark.soak if later[case.row] > SECOND else pytest.mark.slow
+        found.append(pytest.param(case, id=case.name, marks=[kind] if slow else []))
     return found
 
 

@@ -23,8 +23,14 @@ def foam():
     return module
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("inches, paths", [(2, 200_000), (4, 400_000), (8, 800_000)])
+@pytest.mark.parametrize(
+    ("inches", "paths"),
+    [
+        pytest.param(2, 200_000, marks=pytest.mark.slow),
+        pytest.param(4, 400_000, marks=pytest.mark.slow),
+        pytest.param(8, 800_000, marks=pytest.mark.soak),
+    ],
+)
 def test_transmittance_is_the_measured_one(foam, inches, paths):
     # Published coefficients, only time and height are fitted. Noise and misfit add up in squares; the standard error is
     # known from eight batches, to about a quarter of itself.

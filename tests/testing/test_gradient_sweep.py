@@ -323,13 +323,13 @@ def sample():
     return [*bare, *random.Random(3).sample(nested, 6)]
 
 
-@pytest.mark.slow
-def test_against_finite_differences(tmp_path):
+@pytest.mark.parametrize("half", [pytest.param(0, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.soak)])
+def test_against_finite_differences(tmp_path, half):
     """Few samples: what they cannot decide, the whole sweep does."""
-    file = ResultFile(tmp_path / "results.jsonl")
-    runner.sweep(sample(), file, quick=True)
+    file, settings = ResultFile(tmp_path / "results.jsonl"), sample()[half::2]
+    runner.sweep(settings, file, quick=True)
     results = file.results()
-    assert {line["setting"] for line in results} >= {setting.name for setting in sample() if setting.kind == "bsdf"}
+    assert {line["setting"] for line in results} >= {setting.name for setting in settings if setting.kind == "bsdf"}
     assert [line for line in results if line["verdict"] in WRONG and not line["biased"]] == []
     compared = [line["verdict"] for line in results if line["verdict"] != "refused"]
     assert compared.count("agree") > 0.8 * len(compared)

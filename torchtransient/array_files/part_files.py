@@ -11,7 +11,7 @@ import re
 import secrets
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,8 @@ _SUFFIX = ".part"
 _OURS = re.compile(r"\..{1,40}\.[0-9a-f]{8}\.part", re.DOTALL)
 # What file systems without locks answer.
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
+# What this process is writing.
+_unfinished: set[Path] = set()
 
 
 def check_system(what: str) -> None:
@@ -44,6 +46,7 @@ def whole_file(target: Path, what: str, *, over: bool = True, synchronized: bool
     with writing_said(target, what):
         unfinished, lock = _locked(target)
     try:
+        _unfinished.add(unfinished)
         yield unfinished
         with writing_said(target, what):
             if synchronized:
@@ -53,6 +56,7 @@ def whole_file(target: Path, what: str, *, over: bool = True, synchronized: bool
                 _sync_folder(target.parent)
     finally:
         unfinished.unlink(missing_ok=True)
+        _unfinished.discard(unfinished)
         os.close(lock)
 
 
@@ -108,6 +112,13 @@ def sweep_parts(folder: str | Path) -> list[Path]:
         finally:
             os.close(descriptor)
     return removed
+
+
+def remove_unfinished() -> None:
+    """Remove what this process is writing: for one that ends at once, without its ``finally``."""
+    for path in tuple(_unfinished):
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
 
 
 def _put(unfinished: Path, target: Path, over: bool) -> None:

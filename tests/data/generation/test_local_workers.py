@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pickle
 import signal
+import subprocess
+import sys
 from multiprocessing import Pipe
 from types import SimpleNamespace
 
@@ -11,6 +13,8 @@ import pytest
 
 import torchtransient as tt
 from support.fake_recipe import FakeRecipe
+from support.generation_runs import environment
+from torchtransient.array_files.part_files import whole_file
 from torchtransient.data.generation import supervisor, worker
 from torchtransient.data.generation.crew import Member
 from torchtransient.data.generation.ledger import Ledger
@@ -101,9 +105,50 @@ def test_what_ends_a_worker(working, tmp_path):
         said, status = working(("measure", range(3), {}), **arguments)
         assert said[-1][:2] == ("fatal", "SceneError") and words in said[-1][2] and status == 1
         assert "Error" in said[-1][3]
-    with pytest.raises(SystemExit) as ended:
+
+
+def test_a_worker_that_is_told_to_end_leaves_nothing_unfinished(tmp_path, monkeypatch):
+    statuses = []
+    monkeypatch.setattr(worker.os, "_exit", statuses.append)
+    with whole_file(tmp_path / "whole", "test") as part:
+        part.write_text("whole")
+    with pytest.raises(InterruptedError), whole_file(tmp_path / "a", "test"), whole_file(tmp_path / "b", "test"):
+        assert len(list(tmp_path.iterdir())) == 3
         worker._end(signal.SIGTERM, None)
-    assert ended.value.code == 3
+        assert [path.name for path in tmp_path.iterdir()] == ["whole"] and statuses == [3]
+        raise InterruptedError
+
+
+IN_A_CALLBACK = """
+import signal, sys, time, weakref
+from pathlib import Path
+from torchtransient.array_files.part_files import whole_file
+from torchtransient.data.generation import worker
+
+class Thing:
+    pass
+
+def called_back(_):
+    print("here", flush=True)
+    time.sleep(60)
+
+signal.signal(signal.SIGTERM, worker._end)
+with whole_file(Path(sys.argv[1]) / "a", "test"):
+    thing = Thing()
+    kept = weakref.ref(thing, called_back)
+    del thing
+"""
+
+
+@pytest.mark.slow
+def test_a_worker_is_told_to_end_in_a_callback(tmp_path):
+    """Of a weak reference, for instance: Python forgets what is raised there."""
+    command = [sys.executable, "-c", IN_A_CALLBACK, str(tmp_path)]
+    child = subprocess.Popen(command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert child.stdout.readline() == "here\n"
+    child.terminate()
+    _, said = child.communicate(timeout=20)
+    assert (child.returncode, said, list(tmp_path.iterdir())) == (3, "", [])
 
 
 def test_a_worker_ends_with_its_supervisor(monkeypatch):

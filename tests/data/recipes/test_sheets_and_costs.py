@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
+from torchtransient.array_files.part_files import sweep_parts
 from torchtransient.data.generation import latest_picture
 from torchtransient.data.generation.latest_picture import LatestPicture, picture_of
 from torchtransient.data.recipes import contact_sheet as contact_sheets
@@ -179,6 +181,23 @@ def test_the_last_picture_is_written_every_ten_seconds(tmp_path, monkeypatch):
     monkeypatch.setattr(latest_picture.time, "time", lambda: latest_time(tmp_path) + 10)
     picture("f")
     assert (tmp_path / "latest.png").read_text() == "f"
+
+
+def test_a_last_picture_whose_writer_was_killed_is_swept(tmp_path, monkeypatch):
+    """And not while its writer lives."""
+    (tmp_path / "killed").mkdir()
+    swept = []
+
+    def save(_, path):
+        path.write_text("half")
+        shutil.copy(path, tmp_path / "killed")
+        swept.extend([sweep_parts(tmp_path), [found.name for found in sweep_parts(tmp_path / "killed")], [path.name]])
+
+    monkeypatch.setattr(latest_picture, "picture_of", lambda one: one)
+    monkeypatch.setattr(latest_picture, "_save", save)
+    LatestPicture(tmp_path)("a")
+    assert swept[0] == [] and swept[1] == swept[2]
+    assert (tmp_path / "latest.png").read_text() == "half"
 
 
 def latest_time(folder):

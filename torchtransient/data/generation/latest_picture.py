@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from torchtransient.array_files.part_files import whole_file
 
 NAME = "latest.png"
 EVERY_S = 10.0
@@ -30,17 +31,15 @@ class LatestPicture:
         if now < self._next:
             return
         self._next = now + EVERY_S
-        part = self._path.with_name(f".{NAME}.{os.getpid()}.part")
         try:
             with contextlib.suppress(FileNotFoundError):
                 if abs(time.time() - self._path.stat().st_mtime) < EVERY_S:
                     return
-            _save(picture_of(sample), part)
-            part.replace(self._path)
+            pixels = picture_of(sample)
+            with whole_file(self._path, "generate", synchronized=False) as part:
+                _save(pixels, part)
         except Exception:  # noqa: BLE001  a picture is never a reason to fail
             self._next = now + 60 * EVERY_S
-            with contextlib.suppress(OSError):
-                part.unlink(missing_ok=True)
 
 
 def picture_of(sample: Any) -> NDArray[np.uint8]:

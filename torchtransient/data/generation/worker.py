@@ -11,6 +11,7 @@ import time
 from multiprocessing.connection import Connection
 from typing import Any, NoReturn
 
+from torchtransient.array_files.part_files import remove_unfinished
 from torchtransient.data.generation.shard_making import ShardMaker, fatal
 from torchtransient.data.generation.telling import Telling
 from torchtransient.data.generation.told_errors import unpacked
@@ -59,8 +60,10 @@ def _carry_out(task: tuple[Any, ...], maker: ShardMaker, telling: Telling) -> No
 
 
 def _end(*_: Any) -> NoReturn:
-    # An exception, so that the shard that is being written leaves nothing behind.
-    sys.exit(_GONE)
+    # No exception: where Python calls back (of weak references, from plugins) it would be printed and forgotten, or
+    # become an error of the scene.
+    remove_unfinished()
+    os._exit(_GONE)
 
 
 def _end_with_supervisor() -> None:
