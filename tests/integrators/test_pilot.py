@@ -39,6 +39,14 @@ def test_sizes_of_films_for_a_pilot():
     assert [size(100, 1, 4), size(2, 300, 6)] == [(20, 1), (1, 30)]
 
 
+def test_energy_of_an_arrival():
+    """The mean of what a spectrum weighs; of the channels where a film has curves."""
+    mi.set_variant(VARIANT)
+    match = Local(weight=mi.Color3f(1, 2, 4), to_channels=lambda value: [10 * value[2], mi.Float(0)])
+    assert pilot._energy(match, mi.Color3f(1, 2, 3), None)[0] == pytest.approx((1 + 4 + 12) / 3)
+    assert pilot._energy(match, mi.Color3f(1, 2, 3), "curves")[0] == pytest.approx(15)
+
+
 def test_arrivals_of_a_lit_wall():
     scene = lit_wall()
     events = events_of(scene)
