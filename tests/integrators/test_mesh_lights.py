@@ -10,6 +10,7 @@ import torchtransient as tt
 from support.gradient_cases.cases_curves import file_of
 from support.gradient_cases.scenes import camera, room, transform
 from support.marks import long
+from torchtransient.plugins.mitsuba_compat import has_smooth_shape
 
 VARIANT = "llvm_ad_mono"
 # Normals that stand 45 degrees off those of the faces.
@@ -59,3 +60,12 @@ def test_mitsuba_takes_the_interpolated_normal():
         scene["sensor"] = scene["sensor"] | {"film": {"type": "hdrfilm", "width": 8, "height": 8}}
         sums.append(float(np.sum(np.array(mi.render(mi.load_dict(scene), spp=1024, seed=1)))))
     assert abs(sums[0] - sums[1]) > 0.05 * sums[0]
+
+
+def test_which_lights_have_normals_at_their_vertices():
+    mi.set_variant(VARIANT)
+    meshes = [{"type": "obj", "filename": file_of("tilted.obj", TILTED), "face_normals": flat} for flat in (True, False)]
+    lights = [shape | {"emitter": {"type": "area"}} for shape in (*meshes, {"type": "rectangle"}, {"type": "sphere"})]
+    shapes = [mi.load_dict(light) for light in lights]
+    assert [has_smooth_shape(shape.emitter()) for shape in shapes] == [False, True, False, False]
+    assert not has_smooth_shape(mi.load_dict({"type": "point"}))

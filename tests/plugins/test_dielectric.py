@@ -135,6 +135,31 @@ def test_rough_equals_mitsuba(variant):
         compare(ours, mi.load_dict({"type": "roughdielectric", **both}), ctx, power_alone=mi.is_polarized)
 
 
+@pytest.mark.parametrize("roughness", ROUGHNESSES)
+def test_density_of_all_normals_is_mitsubas(roughness):
+    """Where not only visible ones are drawn; they are drawn from a wider distribution along both axes."""
+    activate("llvm_ad_mono")
+    both = {**MATERIALS[0], **roughness, "sample_visible": False}
+    theirs, ours = (mi.load_dict({"type": name, **both}) for name in ("roughdielectric", "diff_rough_dielectric"))
+    wi, wo, *_ = inputs(LANES)
+    si, wo = interaction(mi.Vector3f(wi.T)), mi.Vector3f(wo.T)
+    expected, found = (bsdf.pdf(mi.BSDFContext(), si, wo).numpy() for bsdf in (theirs, ours))
+    assert (expected > 1e-3).sum() > 200
+    assert np.max(np.abs(found - expected) / (expected + 2e-3)) < 1e-3
+
+
+@pytest.mark.parametrize("number", [0.0, 0.5, 1 - 2.0**-24])
+def test_what_does_not_reflect_transmits_whatever_is_drawn(number):
+    """Between equal indices; and where all light is reflected, nothing is transmitted."""
+    activate("llvm_ad_mono")
+    ctx, glass = mi.BSDFContext(), mi.load_dict({"type": "diff_dielectric", "int_ior": 1.5, "ext_ior": 1.0})
+    nothing = mi.load_dict({"type": "diff_dielectric", "int_ior": 1.25, "ext_ior": 1.25})
+    for bsdf, wi, component in ((nothing, [0, 0.6, 0.8], 1), (glass, [0, 0.8, -0.6], 0)):
+        bs, weight = bsdf.sample(ctx, interaction(mi.Vector3f(wi)), mi.Float(number), mi.Point2f(0.5))
+        found = [*bs.sampled_component, *bs.pdf, *weight[0]]
+        assert found == pytest.approx([component, 1, 1])
+
+
 def test_grazing_mueller_matrix():
     activate("llvm_ad_mono_polarized")
     bsdf = mi.load_dict({"type": "diff_dielectric", "int_ior": 1.5, "ext_ior": 1.0})

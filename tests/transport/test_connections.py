@@ -319,3 +319,32 @@ def test_light_that_a_path_runs_into(lit_sheet, hide, discard, seen):
     assert np.array(event.depth).tolist() == [1, 1, 2, 2, 5, 2] and np.array(event.opl).tolist() == [3]
     assert np.array(other.asked).tolist() == [bool(one) and k > 1 for k, one in enumerate(seen)]
     assert connection.record(Local(event=event))["mis"] is event.mis
+
+
+def test_lights_that_derivatives_reach_elsewhere():
+    """What any other strategy claims; nobody is asked twice."""
+    connection, world = EmitterFound(), Around()
+    claims = [None, mi.Bool([True, False, False]), mi.Bool([False, False, True])]
+    world.connections = [connection, *(Local(claims=lambda *_, own=own: own) for own in claims)]
+    assert np.array(connection._claimed(world, None, None, None)).tolist() == [True, False, True]
+    world.connections = world.connections[:3]
+    assert np.array(connection._claimed(world, None, None, None)).tolist() == [True, False, False]
+    world.connections = world.connections[:2]
+    assert connection._claimed(world, None, None, None) is None
+
+
+def test_lights_that_may_change():
+    """Only where a derivative is asked for, and one of them is attached."""
+    world, connection = Around(), EmitterSampled()
+    world.contents.sphere_lights = None
+    lamps = [mi.load_dict({"type": "point", "intensity": power}) for power in (1.0, 2.0)]
+    world.scene = Local(emitters=lambda: lamps)
+    for attached in (False, True):
+        if attached:
+            parameters = mi.traverse(lamps[1])
+            dr.enable_grad(parameters["intensity.value"])
+            parameters.update()
+        for wanted in (None, Local(sky=None)):
+            world.wanted = wanted
+            connection.prepare(world)
+            assert connection.lights_change is (attached and wanted is not None)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins.sampling.ray_offsets import past
+
 
 @dr.syntax
 def behind_area_lights(scene, ray, pi):
@@ -17,7 +19,7 @@ def behind_area_lights(scene, ray, pi):
     lit = pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711 (a Dr.Jit comparison)
     while dr.hint(lit, label="hide_emitters"):
         p = ray(pi.t)
-        t = pi.t + (1 + dr.max(dr.abs(p))) * mi.math.RayEpsilon
+        t = pi.t + past(p)
         onward = mi.Ray3f(ray)
         onward.o = ray(t)
         onward.maxt = ray.maxt - t

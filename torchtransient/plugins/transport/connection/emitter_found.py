@@ -9,6 +9,9 @@ shape, from infinitely far away, but for a sun that moves and is hardly ever dra
 
 from __future__ import annotations
 
+from functools import reduce
+from operator import or_
+
 import drjit as dr
 import mitsuba as mi
 
@@ -104,7 +107,7 @@ class EmitterFound(Connection):
         """
         claims = [c.claims(world, emitter, d, wanted) for c in world.connections if c is not self]
         claims = [c for c in claims if c is not None]
-        return None if not claims else claims[0] if len(claims) == 1 else dr.any(claims)
+        return reduce(or_, claims) if claims else None
 
     def _ahead(self, world, vertex, step, wanted):
         si, following = vertex.scattered_si, vertex.v.after()

@@ -14,6 +14,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins.sampling.ray_offsets import past
 from torchtransient.plugins.transport.media_contents import is_open
 
 # Streams of random numbers that start from the same number must differ.
@@ -142,7 +143,7 @@ def cross_boundary(scene, ray, pi, medium, passes):
     changes = passes & si.is_medium_transition()
     medium = dr.select(changes, si.target_medium(ray.d), medium)
     # The search goes on along the line itself: an origin lifted off along the normal would land beside it.
-    start = pi.t + (1 + dr.max(dr.abs(si.p))) * mi.math.RayEpsilon
+    start = pi.t + past(si.p)
     onward = mi.Ray3f(ray)
     onward.o = ray(start)
     onward.maxt = ray.maxt - start

@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.polarized import attenuated
+from torchtransient.plugins.sampling.ray_offsets import shortest
 from torchtransient.plugins.transport.derivative.vertex import VertexEnd
 from torchtransient.plugins.transport.instances import distance_to, surface_interaction
 from torchtransient.plugins.transport.media_contents import FlightSettings
@@ -69,7 +70,7 @@ class Media(Vacuum):
         t = end.t
         if self.settings.geometry:
             # A collision on top of the vertex before has no direction to it: as far as single precision can tell apart.
-            t = dr.maximum(t, 1e-6 * (1 + dr.max(dr.abs(ray.o))))
+            t = dr.maximum(t, shortest(ray.o))
         leg = {"pi": end.pi, "scatter": end.scatter, "t": t, "medium": end.medium, "weight": end.weight}
         if self.settings.recorded:
             leg["begin"] = medium
