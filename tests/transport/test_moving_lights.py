@@ -7,46 +7,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from torchtransient.plugins.sampling.distant import DistantReference
-from torchtransient.plugins.transport.connection.emitter_found import EmitterFound
+from support.moving_points import MOVE, PLACE, attached_zero, difference, painted_lamp, slopes, unit, vector
 from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
 from torchtransient.plugins.transport.strategy import Local
 
 VARIANT = "llvm_ad_rgb"
-H = 1e-6
-
-
-def unit(v):
-    return v / np.linalg.norm(v)
-
-
-def vector(kind, value, slope, x):
-    """``value + slope x``"""
-    return kind(*np.asarray(value).tolist()) + mi.Vector3f(*np.asarray(slope).tolist()) * x
-
-
-def slopes(x, *values):
-    """The derivatives of ``values`` by ``x``."""
-    values = [value * 1 for value in values]  # inner nodes keep no derivative
-    dr.set_grad(x, 1)
-    dr.enqueue(dr.ADMode.Forward, x)
-    dr.traverse(dr.ADMode.Forward)
-    return [np.array(dr.grad(value), dtype=np.float64).ravel() for value in values]
-
-
-def attached_zero():
-    x = mi.Float(0)
-    dr.enable_grad(x)
-    return x
-
-
-def difference(f):
-    return (np.array(f(H)) - np.array(f(-H))) / (2 * H)
-
-
-# ------------------------------------------------------------------------------------------------------ sampled points
-
-PLACE, MOVE = np.array([0.3, -0.2, 0.5]), np.array([0.4, -0.3, 0.6])
 LAMP, DRIFT = np.array([1.2, 0.7, 2.1]), np.array([-0.5, 0.2, 0.3])
 NORMAL, TURN = unit(np.array([0.2, -0.3, -1.0])), np.array([0.5, -0.7, 0.4])
 AREA = 0.9
@@ -93,7 +58,7 @@ def test_points_of_lights_as_their_vertex_moves(kind, moves):
     np.testing.assert_allclose(turned, difference(lambda h: unit(to(h))), rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(went, drift, rtol=1e-5, atol=1e-6)
     assert longer == pytest.approx(difference(lambda h: np.linalg.norm(to(h))), rel=1e-4)
-    assert J == pytest.approx(difference(angle) / angle(0) if kind == "surface" else 0, rel=1e-4)
+    assert J[0] == pytest.approx(difference(angle) / angle(0) if kind == "surface" else 0, rel=1e-4)
 
 
 @pytest.mark.parametrize("moves", [True, False])
@@ -136,7 +101,7 @@ def test_lights_that_keep_their_shape():
     def angle(h):
         return abs(NORMAL @ (to - h * MOVE)) / np.linalg.norm(to - h * MOVE) ** 3
 
-    assert J == pytest.approx(difference(angle) / angle(0), rel=1e-4)
+    assert J[0] == pytest.approx(difference(angle) / angle(0), rel=1e-4)
     x = attached_zero()
     world, wanted = Local(contents=Local(patterned_lights=False)), Local(emitter_shape=False)
     light = light_of(x, "surface")
@@ -148,13 +113,7 @@ def test_lights_that_keep_their_shape():
 
 @pytest.fixture(scope="module")
 def painted():
-    """A lamp of two by three metres, two metres above, that shines by place: ``7 u`` and ``7 v``; and its pose."""
-    x = (np.arange(64) + 0.5) / 64
-    image = np.stack([*np.meshgrid(x, x), np.ones((64, 64))], 2)
-    radiance = {"type": "bitmap", "data": mi.TensorXf(7 * image.astype(np.float32)), "raw": True}
-    pose = mi.ScalarTransform4f().translate([0, 0, 2]).rotate([0, 1, 0], 180).scale([1, 1.5, 1])
-    lamp = {"type": "rectangle", "to_world": pose, "emitter": {"type": "area", "radiance": radiance}}
-    return mi.load_dict({"type": "scene", "lamp": lamp})
+    return painted_lamp()
 
 
 def test_points_of_near_patterned_lights_slide_over_the_pattern(painted):
@@ -177,6 +136,74 @@ def test_points_of_near_patterned_lights_slide_over_the_pattern(painted):
     np.testing.assert_allclose(np.array(light.uv), np.array(found.uv))
 
 
+def test_points_of_near_round_lights_turn_their_normal():
+    """By where they slide to, over the radius: only a pattern asks for it."""
+    scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere", "center": [0, 0, 2], "radius": 0.8}})
+    ray = mi.Ray3f(mi.Point3f(0.2, -0.1, 0.5), mi.Vector3f(*unit(np.array([0.02, 0.1, 1.0])).tolist()))
+    pi = scene.ray_intersect_preliminary(ray)
+    found = pi.compute_surface_interaction(ray)
+    for patterned in (False, True):
+        x = attached_zero()
+        light = Local(ds=Local(d=ray.d, dist=found.t), near=mi.Bool(True), surface=mi.Bool(True), p=mi.Point3f(found.p),
+                      face_n=mi.Normal3f(found.n), n=mi.Normal3f(found.sh_frame.n), uv=mi.Point2f(found.uv),
+                      area=mi.Float(1), found=(ray, pi, mi.Bool(True), found.n))  # fmt: skip
+        si = Local(p=mi.Point3f(vector(mi.Point3f, np.array([0.2, -0.1, 0.5]), MOVE, x)))
+        world = Local(contents=Local(patterned_lights=patterned))
+        vertex = Local(scattered_si=si, damping_radius=mi.Float(3))
+        EmitterSampled()._move(world, vertex, light, Local(emitter_shape=False))
+        went, turned = slopes(x, light.p, light.n)
+        np.testing.assert_allclose(turned, went / 0.8 * patterned, rtol=1e-3, atol=1e-5)
+        assert np.linalg.norm(went) > 0.05
+        np.testing.assert_allclose(np.array(light.n), np.array(found.n), atol=1e-6)
+
+
+def test_points_follow_the_shape_of_their_light():
+    """Place, normal, texture coordinates and area are those of the triangle as it moves, where it was found."""
+    lamp = mi.Mesh("lamp", 3, 1, has_vertex_texcoords=True)
+    params = mi.traverse(lamp)
+    corners = np.array([[-2, -1.5, 2], [2, -1, 2], [0.5, 3, 2]])
+    uv = np.array([[0.1, 0.2], [0.9, 0.3], [0.4, 0.8]])
+    params["vertex_positions"], params["vertex_texcoords"] = mi.Float(corners.ravel()), mi.Float(uv.ravel())
+    params["faces"] = mi.UInt32([0, 2, 1])
+    params.update()
+    scene = mi.load_dict({"type": "scene", "lamp": lamp})
+    params, x = mi.traverse(scene), attached_zero()
+    turn, drift = np.random.default_rng(4).normal(size=(2, 3, 3))
+    drift = drift[:, :2]
+    params["lamp.vertex_positions"] = mi.Float(corners.ravel()) + mi.Float(turn.ravel()) * x
+    params["lamp.vertex_texcoords"] = mi.Float(uv.ravel()) + mi.Float(drift.ravel()) * x
+    params.update()
+    ray = mi.Ray3f(mi.Point3f(0.2, -0.1, 0.5), mi.Vector3f(*unit(np.array([0.02, 0.1, 1.0])).tolist()))
+    with dr.suspend_grad():
+        pi = scene.ray_intersect_preliminary(ray)
+        found = pi.compute_surface_interaction(ray)
+    assert bool(pi.is_valid()[0])
+    there = mi.Bool([True, False])
+    light = Local(p=mi.Point3f(1, 2, 3), n=mi.Normal3f(4, 5, 6), face_n=mi.Normal3f(7, 8, 9), uv=mi.Point2f(3, 4),
+                  found=(ray, pi, there, found.n))  # fmt: skip
+    meshes = Local(lists=lambda shape: mi.Bool(True))
+    world = Local(contents=Local(emitting_meshes=meshes))
+    EmitterSampled()._follow_shape(world, None, light)
+    given = [light.p, light.n, light.face_n, light.uv, light.area]
+    for value, number in zip(given, ([1, 2, 3], [4, 5, 6], [7, 8, 9], [3, 4], [1]), strict=True):
+        np.testing.assert_array_equal(np.array(value).reshape(len(number), -1)[:, 0], number)
+    went, turned, face, over, area = (v.reshape(-1, 2) for v in slopes(x, *given))
+    b1, b2 = np.array(pi.prim_uv).ravel()
+    share = np.array([1 - b1 - b2, b1, b2])[[0, 2, 1]]
+
+    def normal(h):
+        a, b, c = corners + h * turn
+        return np.cross(c - a, b - a)
+
+    np.testing.assert_allclose(went, np.outer(share @ turn, [1, 0]), rtol=1e-4, atol=1e-5)
+    rotated = difference(lambda h: unit(normal(h)))
+    np.testing.assert_allclose(turned, np.outer(rotated, [1, 0]), rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(face, turned, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(over, np.outer(share @ drift, [1, 0]), rtol=1e-4, atol=1e-5)
+    grown = difference(lambda h: np.linalg.norm(normal(h))) / np.linalg.norm(normal(0))
+    np.testing.assert_allclose(area, [[grown, 0]], rtol=1e-3)
+
+
 def test_light_of_a_point_that_slides_over_a_pattern(painted):
     """Emission over density, as the pattern says where the point has gone, and the measure of solid angles."""
     x, wanted = attached_zero(), Local(geometry=True, emitter_shape=False, light=False, sphere_lights=False)
@@ -195,12 +222,12 @@ def test_light_of_a_point_that_slides_over_a_pattern(painted):
     np.testing.assert_allclose(slope, 0.3 * plain + 7 * np.array([0.2, -0.4, 0]) / float(ds.pdf[0]), rtol=2e-3)
 
 
-@pytest.mark.parametrize("geometry", [False, True])
-def test_emission_that_changes(geometry):
+@pytest.mark.parametrize("moves", [None, "nothing", "emitter_shape", "light", "sphere_lights", "pattern"])
+def test_emission_that_changes(moves):
     """Over the density of the sample; none where that is zero. What a light that fills a cone sends is known whole, and
-    has its own measure.
+    has its own measure. Where its place, or a pattern, says what a light sends, it is that of the attached point.
     """
-    x, asked = attached_zero(), []
+    x, asked, geometry = attached_zero(), [], moves is not None
 
     def emission(si, ds, active):
         asked.append(ds)
@@ -211,16 +238,18 @@ def test_emission_that_changes(geometry):
     cone = mi.Bool([False, False, True])
     light = Local(ds=ds, weight=mi.Color3f(0.5, 0.75, 1.25), J=1 + 0.3 * x, longer=0.9 * x, cone=cone, uv=mi.Point2f(7),
                   cone_weight=mi.Color3f(1.1, 1.2, 1.3) * (1 + 0.2 * x), p=mi.Point3f(1), n=mi.Normal3f(3))  # fmt: skip
-    world, d = Local(scene=Local(eval_emitter_direction=emission), contents=Local(patterned_lights=False)), (0.6, 0, 0.8)
-    wanted = Local(geometry=geometry, emitter_shape=False, light=False, sphere_lights=geometry)
+    world = Local(scene=Local(eval_emitter_direction=emission), contents=Local(patterned_lights=moves == "pattern"))
+    d, kinds = (0.6, 0, 0.8), ("emitter_shape", "light", "sphere_lights")
+    wanted = Local(geometry=geometry, **{kind: moves == kind for kind in kinds})
     value = EmitterSampled._emission(world, None, light, mi.Vector3f(*d), mi.Bool(True), wanted)
     np.testing.assert_array_equal(np.array(value)[:, 0], [0.5, 0.75, 1.25])
     found, longer = slopes(x, value, asked[0].dist)
     slope = np.array([0.5, 0.75, 1.25]) * (0.7 + 0.3 * geometry)
-    last = np.array([1.1, 1.2, 1.3]) * 0.2 if geometry else slope
+    last = np.array([1.1, 1.2, 1.3]) * 0.2 if moves == "sphere_lights" else slope
     np.testing.assert_allclose(found.reshape(3, 3).T, [slope, [0] * 3, last], rtol=1e-5)
     assert longer[0] == pytest.approx(0.9 * geometry)
-    place = [1, 3, 7] if geometry else [0, 0, 0]
+    np.testing.assert_array_equal(np.array(asked[0].dist), 2)
+    place = [0, 0, 0] if moves in (None, "nothing") else [1, 3, 7]
     assert [float(each.x[0]) for each in (asked[0].p, asked[0].n, asked[0].uv)] == place
     np.testing.assert_allclose(np.array(asked[0].d)[:, 0], d if geometry else 0, rtol=1e-6)
     assert not np.array(ds.uv).any(), "the sample itself stays as it was"
@@ -242,7 +271,7 @@ def test_smooth_lights_are_sampled_by_their_faces():
     ray finds another surface, and of other lights, the sample stays as it is.
     """
     shaded = np.array([[0, 0, 0, 0, 1.0], [0.6] * 4 + [0], [-0.8] * 4 + [0]])
-    normal = np.array([[0.6, 1, 0.6, 0.6, 0.6], [0, 0, 0, 0, 0], [-0.8, 0, -0.8, -0.8, -0.8]])
+    normal = np.array([[0.6, 1, 0.8, 0.2, 0.6], [0, 0, 0, 0, 0], [-0.8, 0, -0.6, -0.4, -0.8]])
     normal[2, 0], normal[0, 0] = -0.28, 0.96
     connection = Faces([True, True, False, True, True], normal)
     ds = Local(n=mi.Normal3f(shaded), d=mi.Vector3f(0, 0, 1), pdf=mi.Float([3.0] * 5), emitter="lamp")
