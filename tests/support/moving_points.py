@@ -39,11 +39,11 @@ def difference(f):
     return (np.array(f(H)) - np.array(f(-H))) / (2 * H)
 
 
-def painted_lamp():
+def painted_lamp(**kind):
     """A lamp of two by three metres, two metres above, that shines by place: ``7 u`` and ``7 v``; and its pose."""
     x = (np.arange(64) + 0.5) / 64
     image = np.stack([*np.meshgrid(x, x), np.ones((64, 64))], 2)
     radiance = {"type": "bitmap", "data": mi.TensorXf(7 * image.astype(np.float32)), "raw": True}
     pose = mi.ScalarTransform4f().translate([0, 0, 2]).rotate([0, 1, 0], 180).scale([1, 1.5, 1])
-    lamp = {"type": "rectangle", "to_world": pose, "emitter": {"type": "area", "radiance": radiance}}
+    lamp = {"type": "rectangle", "to_world": pose, "emitter": {"type": "area", "radiance": radiance} | kind}
     return mi.load_dict({"type": "scene", "lamp": lamp})
