@@ -26,7 +26,9 @@ def slopes(x, *values):
     dr.set_grad(x, 1)
     dr.enqueue(dr.ADMode.Forward, x)
     dr.traverse(dr.ADMode.Forward)
-    return [np.array(dr.grad(value), dtype=np.float64).ravel() for value in values]
+    found = [dr.grad(value) for value in values]
+    dr.eval(found)
+    return [np.array(value, dtype=np.float64).ravel() for value in found]
 
 
 def attached_zero():
