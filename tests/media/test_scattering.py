@@ -52,7 +52,7 @@ def in_medium(medium, lanes=3):
 
 def asked(lanes=3):
     """(proposals, answers, step) as the surface leaves them."""
-    proposal = Local(d=mi.Vector3f(OUT[:, :lanes]), active=mi.Bool([True] * lanes))
+    proposal = Local(d=mi.Vector3f(OUT[:, np.arange(lanes) % 3]), active=mi.Bool([True] * lanes))
     answer = Local(value=mi.Color3f(7, 11, 13), pdf=mi.Float(17))
     step = Local(weight=mi.Color3f(0.2, 0.3, 0.4), out=mi.Vector3f(1, 2, 3), pdf=mi.Float(5), eta=mi.Float(1.5),
                  u_lobe=mi.Float(0.4), u_dir=mi.Point2f(0.3, 0.6),
@@ -126,10 +126,20 @@ class Given(scattering.SurfaceOrMedium):
 
     def __init__(self, value, pdf):
         super().__init__()
-        value, pdf = mi.Color3f(mi.Float(value)), mi.Float(pdf)
-        self.phase = Local(eval_pdf=lambda *a: (value, pdf), sample=lambda *a: (mi.Vector3f(0, 0, 1), value, pdf))
+        value, pdf, self.asked = mi.Color3f(mi.Float(value)), mi.Float(pdf), []
+
+        def eval_pdf(ctx, mei, d, active):
+            self.asked.append(np.array(active).tolist())
+            return value, pdf
+
+        def sample(ctx, mei, u, v, active):
+            self.asked.append(np.array(active).tolist())
+            return mi.Vector3f(0, 0, 1), value, pdf
+
+        self.phase = Local(eval_pdf=eval_pdf, sample=sample)
 
     def _phase_and_scattering(self, mei, u, active):
+        self.asked.append(np.array(active).tolist())
         return self.phase, mi.Color3f(*RATES.tolist())
 
 
@@ -159,6 +169,35 @@ def test_phase_functions_without_a_value(monkeypatch):
         value, pdf = one.eval_pdf(vertex, None, None, mi.Bool(True), sampled)
         np.testing.assert_allclose(np.array(value), np.outer(RATES, [0.5, *[1.0 * sampled] * 3]))
         assert np.array(pdf).tolist() == [2, *[1.0 * sampled] * 3]
+
+
+def test_phase_functions_are_asked_where_light_scatters():
+    """Of lanes in a medium that go on, and whose connection does."""
+    one = Given([0.5], [2])
+    world = Local(contents=Local(media=Local(emitter_sampling=True)))
+    vertex = Local(mei=None, scatter=mi.Bool([True, True, False, True]), goes_on=mi.Bool([True, True, True, False]),
+                   u_phase="number")  # fmt: skip
+    step = asked(4)[2]
+    answers = [Local(value=mi.Color3f(7), pdf=mi.Float(7))]
+    proposals = [Local(d=mi.Vector3f(0, 0, 1), active=mi.Bool([True, False, True, False]))]
+    one.elsewhere(world, vertex, proposals, answers, step)
+    assert one.asked == [[True, True, False, False], [True, False, False, False], [True, True, False, False]]
+    assert step.u_phase == "number"
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_blends_draw_a_number(there, monkeypatch):
+    """At each vertex, and keep it; where there are no blends nothing is drawn."""
+    for name in ("prepare", "arrive"):
+        monkeypatch.setattr(Surface, name, lambda *a: None)
+    monkeypatch.setattr(Surface, "fields", lambda *a: {"own": mi.Float})
+    one, vertex = scattering.SurfaceOrMedium(), Local()
+    blends = Local(read=lambda wanted: f"blends for {wanted}") if there else None
+    one.prepare(Local(contents=Local(media=Local(phase_mixtures=blends)), wanted="slopes"))
+    assert one.blends == ("blends for slopes" if there else None)
+    one.arrive(None, None, vertex, Local(next_1d=lambda: 0.25))
+    assert vertex.u_phase == (0.25 if there else None)
+    assert set(one.fields(None)) == ({"own", "u_phase"} if there else {"own"})
 
 
 COUNT = 800

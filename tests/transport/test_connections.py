@@ -98,7 +98,8 @@ def vertex_of(places, n):
 
 @pytest.mark.parametrize("media", [None, "fog"])
 @pytest.mark.parametrize("confocal", [False, True])
-def test_connections_to_a_laser_s_spot(confocal, media):
+@pytest.mark.parametrize("before", [0, 1])
+def test_connections_to_a_laser_s_spot(before, confocal, media):
     """Its light over the squared distance, later by the way times the index, and by the laser's own way. In vacuum the
     second vertex of a confocal path has seen the spot before.
     """
@@ -110,7 +111,7 @@ def test_connections_to_a_laser_s_spot(confocal, media):
     connection.start(world, Local(spot=mi.UInt32([0] * 6)))
     n = np.tile(unit(np.array([1.0, 2, 2])), (6, 1))
     n[2] = 1, 0, 0
-    vertex, path = vertex_of(PLACES, n), Local(depth=mi.UInt32(DEPTHS) + (1 if confocal else 0))
+    vertex, path = vertex_of(PLACES, n), Local(depth=mi.UInt32(DEPTHS) + before)
     sampler = Local(next_2d=lambda: mi.Point2f(0.25, 0.75))
     proposal = connection.propose(world, path, vertex, sampler)
     to = SPOT - PLACES
@@ -125,10 +126,11 @@ def test_connections_to_a_laser_s_spot(confocal, media):
     cos = -to[0, 2] / r[0]
     expected = np.array([0.5, 0.25, 2]) * 0.125 * np.array([2, 3, 5]) * cos / r[0] ** 2 * 0.5
     np.testing.assert_allclose(np.array(event.value)[:, 0], expected, rtol=1e-5)
+    assert not np.array(event.value)[:, 1:5].any()
     assert event.opl[0] == pytest.approx(3 + r[0] * 1.25 * 1.5 + 0.75, rel=1e-6)
     assert np.array(event.active).tolist() == [True] + [False] * 5
-    assert np.array(event.depth).tolist() == [d + 2 + confocal for d in DEPTHS]
-    assert np.array(world.tested).any() == (media is not None or not confocal)
+    assert np.array(event.depth).tolist() == [d + 2 + before for d in DEPTHS]
+    assert np.array(world.tested).any() == (media is not None or not confocal or before == 0)
     assert connection.record(Local(event=event))["lit"] is event.active
     assert ("T" in connection.fields(world)) == (media is not None)
 
@@ -150,6 +152,10 @@ def test_spots_that_send_nothing():
     for zeros in (False, True):
         event = connection.connect(world, path, vertex, proposal, answer, zeros)
         assert event.active[0] == zeros and not np.array(event.value).any()
+    green = WallPoints(mi.Point3f(*SPOT.tolist()), mi.Normal3f(0, 0, 1), spectrum([[0], [3], [0]]))
+    connection.points, connection.packed = green, PackedSpots(green, mi.Bool([True]))
+    proposal = connection.propose(world, path, vertex, None)
+    assert connection.connect(world, path, vertex, proposal, answer, False).active[0]
 
 
 @pytest.mark.parametrize("media", [None, "fog"])
