@@ -76,7 +76,7 @@ class Around:
     def __init__(self, media=None, distant=None):
         self.contents = Local(media=media, distant=distant, smooth_lights=None)
         self.segment, self.scattering = Local(transmittance=self.transmittance), Local(samples_all=False)
-        self.tested = None
+        self.tested, self.clear = None, True
 
     def deep_enough(self, active, depth):
         return active & (depth <= self.max_depth)
@@ -86,7 +86,7 @@ class Around:
 
     def transmittance(self, world, vertex, ds, u, sampler, active):
         self.tested = active
-        return active, 0.5
+        return active & self.clear, 0.5
 
 
 def vertex_of(places, n):
@@ -133,6 +133,9 @@ def test_connections_to_a_laser_s_spot(before, confocal, media):
     assert np.array(world.tested).any() == (media is not None or not confocal or before == 0)
     assert connection.record(Local(event=event))["lit"] is event.active
     assert ("T" in connection.fields(world)) == (media is not None)
+    world.clear = False
+    hidden = connection.connect(world, path, vertex, proposal, answer, False)
+    assert np.array(hidden.active).tolist() == [confocal and before == 1 and media is None] + [False] * 5
 
 
 def test_spots_that_send_nothing():
