@@ -126,7 +126,7 @@ class Given(scattering.SurfaceOrMedium):
 
     def __init__(self, value, pdf):
         super().__init__()
-        value, pdf, self.asked = mi.Color3f(mi.Float(value)), mi.Float(pdf), []
+        value, pdf, self.asked, self.numbers = mi.Color3f(mi.Float(value)), mi.Float(pdf), [], []
 
         def eval_pdf(ctx, mei, d, active):
             self.asked.append(np.array(active).tolist())
@@ -140,6 +140,7 @@ class Given(scattering.SurfaceOrMedium):
 
     def _phase_and_scattering(self, mei, u, active):
         self.asked.append(np.array(active).tolist())
+        self.numbers.append(u)
         return self.phase, mi.Color3f(*RATES.tolist())
 
 
@@ -171,7 +172,7 @@ def test_phase_functions_without_a_value(monkeypatch):
         assert np.array(pdf).tolist() == [2, *[1.0 * sampled] * 3]
 
 
-def test_phase_functions_are_asked_where_light_scatters():
+def test_phase_functions_are_asked_where_light_scatters(monkeypatch):
     """Of lanes in a medium that go on, and whose connection does."""
     one = Given([0.5], [2])
     world = Local(contents=Local(media=Local(emitter_sampling=True)))
@@ -183,6 +184,17 @@ def test_phase_functions_are_asked_where_light_scatters():
     one.elsewhere(world, vertex, proposals, answers, step)
     assert one.asked == [[True, True, False, False], [True, False, False, False], [True, True, False, False]]
     assert step.u_phase == "number"
+    monkeypatch.setattr(Surface, "value_towards", lambda *a: (mi.Color3f(7), mi.Float(7)))
+    monkeypatch.setattr(Surface, "eval_pdf", lambda *a: (mi.Color3f(7), mi.Float(7)))
+    monkeypatch.setattr(Surface, "look_up_attached", lambda *a: None)
+    active, both = mi.Bool([True, False, True, False]), [True, False, False, False]
+    one.asked.clear()
+    one.value_towards(world, None, vertex, mi.Vector3f(0, 0, 1), active)
+    assert one.asked == [both, both]
+    vertex.v = Local(of=lambda name: {"u_phase": "number"}, active=active)
+    one.look_up_attached(world, vertex, None)
+    one.eval_pdf(vertex, None, mi.Vector3f(0, 0, 1), active, False)
+    assert one.asked[2:] == [both, both] and one.numbers == ["number"] * 3
 
 
 @pytest.mark.parametrize("there", [False, True])

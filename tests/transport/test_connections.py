@@ -172,7 +172,8 @@ def test_a_spot_s_light_with_derivatives(media):
     dr.enable_grad(x, wall.leg)
     dr.set_grad(x, 1)
     place, move, turn = np.array([2.0, 3, 4]), np.array([0.3, -0.2, 0.5]), np.array([0.1, 0.7, -0.4])
-    p = mi.Point3f(*place.tolist()) + mi.Vector3f(*move.tolist()) * x
+    # The idle lane lies at the spot itself.
+    p = dr.select(lit, mi.Point3f(*place.tolist()), mi.Point3f(*SPOT.tolist())) + mi.Vector3f(*move.tolist()) * x
     asked = []
 
     def evaluate(world, vertex, d, active):
