@@ -171,6 +171,7 @@ def test_a_spot_s_light_with_derivatives(media):
     lit, x = mi.Bool([True, False]), mi.Float(0)
     dr.enable_grad(x, wall.leg)
     dr.set_grad(x, 1)
+    dr.set_grad(wall.leg, 11)
     place, move, turn = np.array([2.0, 3, 4]), np.array([0.3, -0.2, 0.5]), np.array([0.1, 0.7, -0.4])
     # The idle lane lies at the spot itself.
     p = dr.select(lit, mi.Point3f(*place.tolist()), mi.Point3f(*SPOT.tolist())) + mi.Vector3f(*move.tolist()) * x
@@ -193,7 +194,7 @@ def test_a_spot_s_light_with_derivatives(media):
     for geometry in (False, True):
         (term,) = connection.attached(world, vertex, None, Local(geometry=geometry))
     value, slope = term.value * 1, term.slope * 1
-    dr.enqueue(dr.ADMode.Forward, x)
+    dr.enqueue(dr.ADMode.Forward, x, wall.leg)
     dr.traverse(dr.ADMode.Forward)
 
     def at(h):
@@ -206,7 +207,7 @@ def test_a_spot_s_light_with_derivatives(media):
     np.testing.assert_allclose(np.array(value), np.outer(at(0)[0], [1, 0]), rtol=1e-5)
     np.testing.assert_allclose(np.array(dr.grad(value)), np.outer((one - other) / 2e-5, [1, 0]), rtol=1e-3, atol=1e-6)
     longer = 1.25 * 1.5 * (r1 - r0) / 2e-5
-    np.testing.assert_allclose(np.array(dr.grad(slope)), [7 + longer, 7], rtol=1e-4)
+    np.testing.assert_allclose(np.array(dr.grad(slope)), [18 + longer, 7], rtol=1e-4)
     assert term.opl[0] == pytest.approx(3 + at(0)[1] * 1.5 * 1.25 + 0.75, rel=1e-6)
     assert not dr.grad_enabled(term.opl) and not np.array(slope).any()
     assert (term.active is lit, term.arrival) == (True, "arrival of laser_spot")
