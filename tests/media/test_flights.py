@@ -347,3 +347,47 @@ def test_derivatives_of_the_transmittance_of_a_leg(forward):
 
 def test_transmittances_that_nothing_changes():
     assert optical_depth.with_log_slope(None, settings(extinction_changes=False), None, None, None, None, None) == 1
+
+
+@pytest.mark.parametrize("forward", [False, True])
+@pytest.mark.parametrize("geometry", [False, True])
+def test_derivatives_of_a_leg_through_two_blocks(geometry, forward):
+    """Minus the length within each by its own rate, whatever lies between; of its ends, the one in a medium counts."""
+    blocks = {}
+    for name, z, rates in (("a", 0, (0.5, 1.25, 2.0)), ("b", -3, (0.7, 0.3, 1.1))):
+        medium = {"type": "homogeneous", "sigma_t": rgb(*(x / 4 for x in rates)), "scale": 4.0}
+        pose = mi.ScalarTransform4f().translate([0, 0, z])
+        blocks[name] = {"type": "cube", "bsdf": {"type": "null"}, "interior": medium, "to_world": pose}
+    scene = mi.load_dict({"type": "scene", **blocks}, optimize=False)
+    params = mi.traverse(scene)
+    keys = [next(key for key in params.properties if key.startswith(name) and "sigma_t" in key) for name in "ab"]
+    x0, x1 = mi.Point3f(0, 0.1, 3), mi.Point3f(0, 0.1, mi.Float([-2.5, -2.25, 0.5, -2.5]))
+    rates = [type(params[key])(params[key]) for key in keys]
+    dr.enable_grad(x0, x1, *rates)
+    for key, rate in zip(keys, rates, strict=True):
+        params[key] = rate
+    params.update()
+    contents = media_contents.media_of(scene, None)
+    media = media_contents.FlightSettings(contents, Local(geometry=geometry, extinction=True), False)
+    ends = np.array(dr.detach(x1)).T
+    leg = leg_of(dr.zeros(mi.MediumPtr, 4), ends, [False] * 4)
+    active = mi.Bool([True] * 3 + [False])
+    one = optical_depth.with_log_slope(scene, media, leg, x0, x1, rates[0], active)
+    np.testing.assert_array_equal(np.array(one), 1)
+    lengths = np.array([[2, 2, 0.5, 0], [0.5, 0.25, 0, 0]])
+    last = np.array([[0.7, 0.3, 1.1]] * 2 + [[0.5, 1.25, 2.0], [0, 0, 0]]) * geometry
+    if forward:
+        moves = mi.Color3f(1, 2, 3) / 16, mi.Color3f(3, 5, 7) / 4, mi.Vector3f(0, 0, 11), mi.Vector3f(5, 7, 0.25)
+        for value, tangent in zip((*rates, x0, x1), moves, strict=True):
+            dr.set_grad(value, tangent)
+        dr.enqueue(dr.ADMode.Forward, *rates, x0, x1)
+        dr.traverse(dr.ADMode.Forward)
+        expected = -np.outer(lengths[0], [0.25, 0.5, 0.75]) - np.outer(lengths[1], [3, 5, 7]) + 0.25 * last
+        np.testing.assert_allclose(np.array(dr.grad(one)).T, expected, rtol=1e-3, atol=1e-4)
+        return
+    g = np.array([[1, 2, 3], [5, 7, 11], [13, 17, 19], [23, 29, 31.0]])
+    dr.backward(dr.sum(dr.sum(one * spectrum(g))))
+    for rate, length in zip(rates, lengths, strict=True):
+        np.testing.assert_allclose(np.array(dr.grad(rate)).ravel(), -4 * length @ g, rtol=1e-3)
+    np.testing.assert_allclose(np.array(dr.grad(x1))[2], (g * last).sum(1), rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(np.array(dr.grad(x0))[2], 0, atol=1e-2)

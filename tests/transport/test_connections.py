@@ -76,7 +76,7 @@ class Around:
     def __init__(self, media=None, distant=None):
         self.contents = Local(media=media, distant=distant, smooth_lights=None)
         self.segment, self.scattering = Local(transmittance=self.transmittance), Local(samples_all=False)
-        self.tested = None
+        self.tested, self.clear = None, True
 
     def deep_enough(self, active, depth):
         return active & (depth <= self.max_depth)
@@ -86,7 +86,7 @@ class Around:
 
     def transmittance(self, world, vertex, ds, u, sampler, active):
         self.tested = active
-        return active, 0.5
+        return active & self.clear, 0.5
 
 
 def vertex_of(places, n):
@@ -98,7 +98,8 @@ def vertex_of(places, n):
 
 @pytest.mark.parametrize("media", [None, "fog"])
 @pytest.mark.parametrize("confocal", [False, True])
-def test_connections_to_a_laser_s_spot(confocal, media):
+@pytest.mark.parametrize("before", [0, 1])
+def test_connections_to_a_laser_s_spot(before, confocal, media):
     """Its light over the squared distance, later by the way times the index, and by the laser's own way. In vacuum the
     second vertex of a confocal path has seen the spot before.
     """
@@ -110,7 +111,7 @@ def test_connections_to_a_laser_s_spot(confocal, media):
     connection.start(world, Local(spot=mi.UInt32([0] * 6)))
     n = np.tile(unit(np.array([1.0, 2, 2])), (6, 1))
     n[2] = 1, 0, 0
-    vertex, path = vertex_of(PLACES, n), Local(depth=mi.UInt32(DEPTHS) + (1 if confocal else 0))
+    vertex, path = vertex_of(PLACES, n), Local(depth=mi.UInt32(DEPTHS) + before)
     sampler = Local(next_2d=lambda: mi.Point2f(0.25, 0.75))
     proposal = connection.propose(world, path, vertex, sampler)
     to = SPOT - PLACES
@@ -125,12 +126,16 @@ def test_connections_to_a_laser_s_spot(confocal, media):
     cos = -to[0, 2] / r[0]
     expected = np.array([0.5, 0.25, 2]) * 0.125 * np.array([2, 3, 5]) * cos / r[0] ** 2 * 0.5
     np.testing.assert_allclose(np.array(event.value)[:, 0], expected, rtol=1e-5)
+    assert not np.array(event.value)[:, 1:5].any()
     assert event.opl[0] == pytest.approx(3 + r[0] * 1.25 * 1.5 + 0.75, rel=1e-6)
     assert np.array(event.active).tolist() == [True] + [False] * 5
-    assert np.array(event.depth).tolist() == [d + 2 + confocal for d in DEPTHS]
-    assert np.array(world.tested).any() == (media is not None or not confocal)
+    assert np.array(event.depth).tolist() == [d + 2 + before for d in DEPTHS]
+    assert np.array(world.tested).any() == (media is not None or not confocal or before == 0)
     assert connection.record(Local(event=event))["lit"] is event.active
     assert ("T" in connection.fields(world)) == (media is not None)
+    world.clear = False
+    hidden = connection.connect(world, path, vertex, proposal, answer, False)
+    assert np.array(hidden.active).tolist() == [confocal and before == 1 and media is None] + [False] * 5
 
 
 def test_spots_that_send_nothing():
@@ -150,6 +155,10 @@ def test_spots_that_send_nothing():
     for zeros in (False, True):
         event = connection.connect(world, path, vertex, proposal, answer, zeros)
         assert event.active[0] == zeros and not np.array(event.value).any()
+    green = WallPoints(mi.Point3f(*SPOT.tolist()), mi.Normal3f(0, 0, 1), spectrum([[0], [3], [0]]))
+    connection.points, connection.packed = green, PackedSpots(green, mi.Bool([True]))
+    proposal = connection.propose(world, path, vertex, None)
+    assert connection.connect(world, path, vertex, proposal, answer, False).active[0]
 
 
 @pytest.mark.parametrize("media", [None, "fog"])
@@ -162,8 +171,10 @@ def test_a_spot_s_light_with_derivatives(media):
     lit, x = mi.Bool([True, False]), mi.Float(0)
     dr.enable_grad(x, wall.leg)
     dr.set_grad(x, 1)
+    dr.set_grad(wall.leg, 11)
     place, move, turn = np.array([2.0, 3, 4]), np.array([0.3, -0.2, 0.5]), np.array([0.1, 0.7, -0.4])
-    p = mi.Point3f(*place.tolist()) + mi.Vector3f(*move.tolist()) * x
+    # The idle lane lies at the spot itself.
+    p = dr.select(lit, mi.Point3f(*place.tolist()), mi.Point3f(*SPOT.tolist())) + mi.Vector3f(*move.tolist()) * x
     asked = []
 
     def evaluate(world, vertex, d, active):
@@ -183,7 +194,7 @@ def test_a_spot_s_light_with_derivatives(media):
     for geometry in (False, True):
         (term,) = connection.attached(world, vertex, None, Local(geometry=geometry))
     value, slope = term.value * 1, term.slope * 1
-    dr.enqueue(dr.ADMode.Forward, x)
+    dr.enqueue(dr.ADMode.Forward, x, wall.leg)
     dr.traverse(dr.ADMode.Forward)
 
     def at(h):
@@ -195,7 +206,8 @@ def test_a_spot_s_light_with_derivatives(media):
     (one, r1), (other, r0) = at(1e-5), at(-1e-5)
     np.testing.assert_allclose(np.array(value), np.outer(at(0)[0], [1, 0]), rtol=1e-5)
     np.testing.assert_allclose(np.array(dr.grad(value)), np.outer((one - other) / 2e-5, [1, 0]), rtol=1e-3, atol=1e-6)
-    assert np.array(dr.grad(slope))[0] == pytest.approx(7 + 1.25 * 1.5 * (r1 - r0) / 2e-5, rel=1e-4)
+    longer = 1.25 * 1.5 * (r1 - r0) / 2e-5
+    np.testing.assert_allclose(np.array(dr.grad(slope)), [18 + longer, 7], rtol=1e-4)
     assert term.opl[0] == pytest.approx(3 + at(0)[1] * 1.5 * 1.25 + 0.75, rel=1e-6)
     assert not dr.grad_enabled(term.opl) and not np.array(slope).any()
     assert (term.active is lit, term.arrival) == (True, "arrival of laser_spot")

@@ -123,7 +123,7 @@ class EmitterFound(Connection):
         if wanted.geometry:
             δ, r = displacement(si.p, lit) - displacement(light.p, lit), dr.norm(fixed.p - following.ray.o)
             motion = damped_motion(δ, out, r, fixed.n, lit, vertex.damping_radius)
-            out, J = motion.d, motion.J * motion.of_material(light.n, dr.relative_grad(dr.select(lit, area, 1)))
+            out, J = motion.d, motion.J * motion.of_material(light.n, dr.relative_grad(area))
             light.p = light.p + motion.slide(fixed.n)
             if world.contents.patterned_lights:
                 slide = slide_on_shape(following.pi, following.ray, motion.drag, lit)

@@ -209,7 +209,7 @@ class EmitterSampled(Connection):
         light.n = dr.select(there, dr.replace_grad(light.n, found.sh_frame.n), light.n)
         light.face_n = dr.select(there, dr.replace_grad(light.face_n, found.n), light.face_n)
         light.uv = dr.select(there, dr.replace_grad(light.uv, found.uv), light.uv)
-        light.area = dr.relative_grad(dr.select(there, area, 1))
+        light.area = dr.relative_grad(area)
 
     def _move(self, world, vertex, light, wanted):
         """The attached direction towards the point of a light, which slides like any other one that is near: points

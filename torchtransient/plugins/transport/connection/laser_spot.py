@@ -120,7 +120,7 @@ class LaserSpot(Connection):
         length = dr.norm(to)
         d = to / length
         towards = world.scattering.evaluate(world, vertex, d, lit)
-        matrix = rotate_mueller(towards.value, vertex.rotation, rotation_from_light(si, towards.wo, d, dr.detach(d)))
+        matrix = rotate_mueller(towards.value, vertex.rotation, rotation_from_light(si, towards.wo, d))
         light = spot.light(d, lit) * dr.rcp(dr.square(length)) * r.get("T", 1)
         end = Local(p=spot.p, d=dr.detach(d), far=mi.Bool(False), ahead=False)
         light *= world.segment.attached_transmittance(world, vertex, end, lit)
