@@ -69,6 +69,14 @@ def test_points_that_hidden_things_are_seen_from(walls):
     assert outlines.Viewpoints(seen(walls, 20.0), seen(walls, 20.0), False).references.tolist() == []
 
 
+def test_normals_of_points_that_are_seen_edge_on(walls):
+    """Those of the front, by shading normals that rays do not know of."""
+    si = seen(walls, -0.5, 0.5)
+    for z, up in ((0, 1), (-0.8, -1)):
+        si.wi = mi.Vector3f(0.6, 0, z)
+        np.testing.assert_allclose(outlines._visible(si)[1], [[0, 0, up]] * 2, atol=1e-6)
+
+
 def test_names_of_what_hides_what():
     """Each pair of names once, three of them, and how many more; shapes without a name by their class."""
     shapes = [Local(id=lambda name=name: name, class_name=lambda: "Mesh") for name in ("a", "b", "c", "")]
@@ -102,6 +110,10 @@ def test_spots_that_are_the_scanned_points(walls):
         at, beside = (Local(p=mi.Point3f(0, 0, [5, z]), wi=mi.Vector3f(0, 0, 1), is_valid=lambda: mi.Bool([True] * 2))
                       for z in (z, z + off))  # fmt: skip
         assert shared_light._same(beside, at) is same
+    # That much itself is near enough.
+    origin, tie = (Local(p=mi.Point3f(x, 0, 0), wi=mi.Vector3f(0, 0, 1), is_valid=lambda: mi.Bool(True))
+                   for x in (0, float(np.float32(1e-6))))  # fmt: skip
+    assert shared_light._same(tie, origin)
     turned = seen(walls, 0.25, 5.5, -0.5)
     turned.wi = -turned.wi
     assert not shared_light._same(turned, points)

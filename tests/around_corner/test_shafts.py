@@ -15,6 +15,7 @@ from torchtransient.plugins.around_corner import shafts
 from torchtransient.plugins.around_corner.shafts import ScanRegion, clear_elements, spare_rays
 from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
 from torchtransient.plugins.sampling.shared_samples import draw_samples
+from torchtransient.plugins.transport.strategy import Local
 
 VARIANT = "llvm_ad_mono"
 
@@ -250,6 +251,10 @@ def test_shafts_touch_what_they_hold():
     beyond = (np.einsum("epi,eki->epk", planes[:, :, :3], held) - planes[:, :, 3:]).max(2)
     assert planes.shape == (40, 11, 4)
     np.testing.assert_allclose(beyond[:, :10], 0, atol=1e-9)
+    # Those across touch both, those before and behind one of them.
+    for some in (slice(0, 3), slice(3, 11)):
+        touched = (np.einsum("epi,eki->epk", planes[:, :8, :3], held[:, some]) - planes[:, :8, 3:]).max(2)
+        np.testing.assert_allclose(touched, 0, atol=1e-9)
     assert len({tuple(np.sign(p[:2])) for p in planes[0, :8]}) == 8
     assert (planes[~front, 10] == [0, 0, 0, np.inf]).all()
     np.testing.assert_allclose(planes[front, 10, :3], -normal[front])
@@ -331,6 +336,44 @@ def test_triangles_in_the_plane_of_a_scan_or_of_what_is_hidden(turn):
     v = np.array([[-3, -3, 0], [3, -3, 0], [0, 4, 0.0]])[::turn] + heights[:, None, None] * [0, 0, 1]
     found = shafts._harmless(v @ region.frame.T, region, hidden, 2e-3)
     assert found.tolist() == [True, True, True, False, False, False, False, True, True, True]
+
+
+def test_shafts_at_a_bound(monkeypatch):
+    """Planes that touch the region have it before them or behind; what touches a shaft is outside of it; sheets across
+    the axes of the region are no empty boxes.
+    """
+    region = ScanRegion([[0, 0, 0], [0.5, 0.25, 0]], [[0, 0, 1.0]] * 2)
+    x, _, z = region.high
+    up = np.array([[0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0.0]])
+    p = np.abs(up) * [x, 0, z]
+    turned, before = shafts._turned_to(region, p, up, np.array([True, False, True, False]))
+    assert turned[:2].tolist() == [[0, 0, -1], [0, 0, -1]] and turned[2:, 0].tolist() == [-1, -1]
+    assert before.all()
+    flat = np.array([[-3, -3, 0], [3, -3, 0], [0, 4, 0.0]])
+    hidden = np.array([[[0.1, 0.2, 1], [0.4, 0.2, 1], [0.1, 0.5, 2.0]]])
+    for sign in (1, -1):
+        both = np.stack([flat, flat[::-1]]) * [1, 1, sign]
+        assert shafts._harmless(both, region, hidden * [1, 1, sign], 0.0).all()
+    plane, level = mi.Vector4d(1, 0, 0, 0.5), mi.Float64(0)
+    for least, outside in ((0.5, True), (0.4375, False)):
+        tree = Local(low=mi.Point3d(least, 0, 0), high=mi.Point3d(least, 1, 1), slack=level)
+        assert bool(shafts._box_outside(tree, [plane], mi.UInt32(0))[0]) is outside
+        # Its own plane has the element on both sides.
+        tree.corners = [mi.Point3d(least, *rest) for rest in ((0, 0), (0, 1), (1, 0))]
+        tree.region, own = (mi.Vector3d(-1, -1, -1), mi.Vector3d(1, 1, 1)), [mi.Vector3d(k, 0, 0) for k in (-1, 0, 1)]
+        assert bool(shafts._triangle_outside(tree, [plane], own, mi.UInt32(0), mi.Bool(True))[0]) is outside
+    for top, outside in ((0.5, True), (0.5625, False)):
+        for side in (1, -1):
+            tree.corners = [mi.Point3d(0.5 * side, *rest) for rest in ((0, 0), (0, 1), (1, 0))]
+            ends = sorted((-side, top * side))
+            tree.region = mi.Vector3d(ends[0], 0, 0), mi.Vector3d(ends[1], 1, 1)
+            own = [mi.Vector3d(0.25 * side, 0, k) for k in range(3)]
+            assert bool(shafts._triangle_outside(tree, [], own, mi.UInt32(0), mi.Bool(True))[0]) is outside
+    monkeypatch.setattr(shafts, "ROUNDING", 0.0)
+    elements = table_of([mesh("a", plate(0.25, 0.25, (0.25, 0.125, 0)))]).elements
+    assert not clear_elements([], elements, region).any()
+    tie = ScanRegion([[0, 0, 0], [0.5, 0.25, 0]], [[1e-6, 0, 0]] * 2)
+    np.testing.assert_array_equal(tie.frame[2], [0, 0, 1])
 
 
 @pytest.mark.parametrize(("rays", "worth"), [(2000, False), (2001, True)])
