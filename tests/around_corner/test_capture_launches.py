@@ -176,6 +176,7 @@ def test_numbers_of_narrow_scans():
     squares = np.arange(4)[None] * 4 + np.array([[0, 1], [2, 3]])[..., None]
     wide = squares.transpose(0, 2, 1).reshape(2, 8)
     assert np.array(Tiles(8, 2, 1).rank).tolist() == wide.ravel().tolist()
+    assert np.array(Tiles(7, 2, 1).rank).tolist() == [*wide[0, :6], 12, *wide[1, :6], 13]
     assert np.array(Tiles(2, 8, 1).rank).tolist() == squares.transpose(2, 0, 1).ravel().tolist()
 
 

@@ -60,7 +60,10 @@ def test_terms_of_single_points_of_edges(from_spot, x):
                   spot=Local(light=lambda d, active: mi.UnpolarizedSpectrum(0.3)))  # fmt: skip
     viewer = place.lit_at if from_spot else place.seen_at
     dr.enable_grad(edge.p, viewer)
-    term = term_of(scene)._term(place, edge, from_spot)
+    job, looked = term_of(scene), []
+    half = job._seen_otherwise
+    job._seen_otherwise = lambda *given: looked.append(given) or half(*given)
+    term = job._term(place, edge, from_spot)
     active = np.array([row[3] for row in EDGES.values()])
     assert np.array(term.active).tolist() == active.tolist()
     value, outwards, opl = (np.array(each, dtype=float) for each in (term.value[0], term.outwards, term.opl))
@@ -86,6 +89,8 @@ def test_terms_of_single_points_of_edges(from_spot, x):
         light *= i != list(EDGES).index("unseen by the other")
         assert value[i] == pytest.approx(-(2 + i) * spans / distance * light * measure, rel=1e-3)
         assert opl[i] == pytest.approx(0.25 + 1.5 * sum(r), rel=1e-4)
+        # Of the other side of the outline half of it is seen, or not.
+        np.testing.assert_allclose(np.array(looked[0][3], dtype=float)[:, i], d - n * 1e-4, atol=1e-6)
         # Rays start a ten thousandth before the wall.
         assert outwards[i] == pytest.approx(n @ (d - (y - q) / beyond), abs=3e-5)
         np.testing.assert_allclose(slopes[0][i], n / distance, atol=1e-5)
@@ -135,11 +140,11 @@ def test_half_of_a_point_is_seen_where_outlines_coincide():
     screen = SHEET | {"to_world": transform().translate([0.5, 0, 1]).scale(0.5)}
     scene = mi.load_dict({"type": "scene", "back": back, "screen": screen}, optimize=False)
     viewer = dr.zeros(mi.SurfaceInteraction3f, 3)
-    viewer.p = mi.Point3f(0, 0.1, 0)
+    viewer.p = mi.Point3f(0, 0.1, -0.5)
     # Past the rim x = 0 of the screen, on its free side, and on either side all of the way.
     x, d = np.array([-1e-3, -0.5, 0.5]), np.array([[1e-3, 0, 1], [-0.2, 0, 1], [0.2, 0, 1.0]])
     si = dr.zeros(mi.SurfaceInteraction3f, 3)
     si.p, si.n = mi.Point3f(mi.Float(x.astype(np.float32)), 0.1, 2), mi.Normal3f(0, 0, -1)
-    other = Local(p=mi.Point3f(0, -0.2, 0))
+    other = Local(p=mi.Point3f(0, -0.2, -0.5))
     found = term_of(scene)._seen_otherwise(other, viewer, si, mi.Vector3f(d.T), mi.Bool([True] * 3))
     assert np.array(found).tolist() == [0.5, 1, 0]

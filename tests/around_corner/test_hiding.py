@@ -107,3 +107,18 @@ def test_creases_exactly_as_flat_as_is_allowed_are_none(monkeypatch):
     monkeypatch.setattr(edges_module, "FLAT", 0.0)
     assert len(edges_of(page(1, 0), page(0, 1), page(-1, 0)).ends) == 6
     assert len(edges_of(page(1, 0), page(0, 1), page(-1, 0.001)).ends) == 7
+
+
+@pytest.mark.parametrize(("angle", "edges"), [(1.2e-3, 6), (1.7e-3, 7)])
+def test_gaps_that_are_almost_half_a_turn_are_none(angle, edges):
+    """Between three faces, wider than it by less than 1.4e-3 radians."""
+    assert len(edges_of(page(1, 0), page(0, 1), page(-np.cos(angle), np.sin(angle))).ends) == edges
+
+
+def test_the_two_zeros_are_one_place():
+    """Closed bodies that touch in it alone are one part."""
+    v, f = octahedron(8)
+    aside = np.array([1, 0, 0])
+    one, other = v + aside, v - aside
+    other[0] = [-0.0, -0.0, 0.0]
+    assert len(parts_of([mesh("both", join((one, f), (other, f)))])[0]) == 1

@@ -15,7 +15,6 @@ from torchtransient.plugins.around_corner import shafts
 from torchtransient.plugins.around_corner.shafts import ScanRegion, clear_elements, spare_rays
 from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
 from torchtransient.plugins.sampling.shared_samples import draw_samples
-from torchtransient.plugins.transport.strategy import Local
 
 VARIANT = "llvm_ad_mono"
 
@@ -204,30 +203,6 @@ def test_the_box_of_a_scan():
     np.testing.assert_allclose(curved.frame[2], [0, 0.5**0.5, 0.5**0.5], atol=1e-12)
 
 
-@pytest.mark.parametrize(("obstacles", "leaves"), [(0, 2), (1, 2), (2, 2), (3, 4), (4, 4), (5, 8), (8, 8), (9, 16)])
-def test_trees_have_no_more_leaves_than_they_need(obstacles, leaves):
-    """The next power of two, and both ends of the root."""
-    region, _, _ = random_region()
-    balls = [mi.load_dict({"type": "sphere", "center": [0, 0, k]}) for k in range(obstacles)]
-    tree = shafts.ObstacleTree(balls, region, np.ones((1, 3, 3)), 1e-9)
-    assert (tree.leaves[0], dr.width(tree.low), dr.width(tree.corners[0])) == (leaves, 2 * leaves, leaves)
-
-
-def test_leaves_next_to_each_other_are_neighbours_by_their_middles():
-    """Whatever their sizes; a box holds both below it."""
-    region = ScanRegion([[0, 0, 0], [0.3, 0.2, 0]], [[0, 0, 1.0]] * 2)
-    place, radius = np.array([5, 2, 7, 0, 3, 6, 1]), np.array([0.1, 3, 0.2, 0.1, 2.5, 0.3, 0.2])
-    centers = (place[:, None] * region.frame[0] + 9 * region.frame[2]).tolist()
-    balls = [mi.load_dict({"type": "sphere", "center": c, "radius": r}) for c, r in zip(centers, radius, strict=True)]
-    tree = shafts.ObstacleTree(balls, region, np.ones((1, 3, 3)), 1e-9)
-    low, high = np.array(tree.low).T, np.array(tree.high).T
-    np.testing.assert_allclose((low[8:15, 0] + high[8:15, 0]) / 2, np.sort(place), atol=1e-5)
-    np.testing.assert_allclose((high[8:15, 0] - low[8:15, 0]) / 2, radius[np.argsort(place)], rtol=1e-5)
-    for node in range(1, 8):
-        np.testing.assert_array_equal(low[node], low[2 * node : 2 * node + 2].min(0))
-        np.testing.assert_array_equal(high[node], high[2 * node : 2 * node + 2].max(0))
-
-
 @pytest.mark.parametrize(("scanned", "hidden"), [
     ([0.3, 0.2], [1000, -1000]), ([0.3, 0.2], [-1000, 1000]), ([0.3, -1000], [0.4, 0.3]), ([1000, 0.2], [0.4, 0.3]),
 ])  # fmt: skip
@@ -336,44 +311,6 @@ def test_triangles_in_the_plane_of_a_scan_or_of_what_is_hidden(turn):
     v = np.array([[-3, -3, 0], [3, -3, 0], [0, 4, 0.0]])[::turn] + heights[:, None, None] * [0, 0, 1]
     found = shafts._harmless(v @ region.frame.T, region, hidden, 2e-3)
     assert found.tolist() == [True, True, True, False, False, False, False, True, True, True]
-
-
-def test_shafts_at_a_bound(monkeypatch):
-    """Planes that touch the region have it before them or behind; what touches a shaft is outside of it; sheets across
-    the axes of the region are no empty boxes.
-    """
-    region = ScanRegion([[0, 0, 0], [0.5, 0.25, 0]], [[0, 0, 1.0]] * 2)
-    x, _, z = region.high
-    up = np.array([[0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0.0]])
-    p = np.abs(up) * [x, 0, z]
-    turned, before = shafts._turned_to(region, p, up, np.array([True, False, True, False]))
-    assert turned[:2].tolist() == [[0, 0, -1], [0, 0, -1]] and turned[2:, 0].tolist() == [-1, -1]
-    assert before.all()
-    flat = np.array([[-3, -3, 0], [3, -3, 0], [0, 4, 0.0]])
-    hidden = np.array([[[0.1, 0.2, 1], [0.4, 0.2, 1], [0.1, 0.5, 2.0]]])
-    for sign in (1, -1):
-        both = np.stack([flat, flat[::-1]]) * [1, 1, sign]
-        assert shafts._harmless(both, region, hidden * [1, 1, sign], 0.0).all()
-    plane, level = mi.Vector4d(1, 0, 0, 0.5), mi.Float64(0)
-    for least, outside in ((0.5, True), (0.4375, False)):
-        tree = Local(low=mi.Point3d(least, 0, 0), high=mi.Point3d(least, 1, 1), slack=level)
-        assert bool(shafts._box_outside(tree, [plane], mi.UInt32(0))[0]) is outside
-        # Its own plane has the element on both sides.
-        tree.corners = [mi.Point3d(least, *rest) for rest in ((0, 0), (0, 1), (1, 0))]
-        tree.region, own = (mi.Vector3d(-1, -1, -1), mi.Vector3d(1, 1, 1)), [mi.Vector3d(k, 0, 0) for k in (-1, 0, 1)]
-        assert bool(shafts._triangle_outside(tree, [plane], own, mi.UInt32(0), mi.Bool(True))[0]) is outside
-    for top, outside in ((0.5, True), (0.5625, False)):
-        for side in (1, -1):
-            tree.corners = [mi.Point3d(0.5 * side, *rest) for rest in ((0, 0), (0, 1), (1, 0))]
-            ends = sorted((-side, top * side))
-            tree.region = mi.Vector3d(ends[0], 0, 0), mi.Vector3d(ends[1], 1, 1)
-            own = [mi.Vector3d(0.25 * side, 0, k) for k in range(3)]
-            assert bool(shafts._triangle_outside(tree, [], own, mi.UInt32(0), mi.Bool(True))[0]) is outside
-    monkeypatch.setattr(shafts, "ROUNDING", 0.0)
-    elements = table_of([mesh("a", plate(0.25, 0.25, (0.25, 0.125, 0)))]).elements
-    assert not clear_elements([], elements, region).any()
-    tie = ScanRegion([[0, 0, 0], [0.5, 0.25, 0]], [[1e-6, 0, 0]] * 2)
-    np.testing.assert_array_equal(tie.frame[2], [0, 0, 1])
 
 
 @pytest.mark.parametrize(("rays", "worth"), [(2000, False), (2001, True)])
