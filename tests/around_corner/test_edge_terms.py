@@ -104,6 +104,31 @@ def term_of(scene, **world):
     return MutualOcclusion(None, Local(scene=scene, **given | world), None, None, None, Local(confocal=False), [])
 
 
+@pytest.mark.parametrize("confocal", [True, False])
+@pytest.mark.parametrize("unwarp", [True, False])
+def test_where_terms_of_a_launch_begin(confocal, unwarp):
+    """With the ways from the sensor, where it counts, and to the spot; from the scanned point, and but for confocal
+    captures from the spot; where both are found.
+    """
+    scene = mi.load_dict({"type": "scene", "wall": SHEET})
+    ray = mi.Ray3f(mi.Point3f(mi.Float([0.5, 0.5, 9]), 0.25, 3), mi.Vector3f(0, 0, -1))
+    spot = Local(valid=mi.Bool([True, False, True]), si="lit", p="lit at", leg=mi.Float(0.125))
+    spots = Local(confocal=confocal, general_spot=lambda wavelengths, found: spot)
+    integrator = Local(first_opl=lambda film, rays: mi.Float64(10))
+    job = MutualOcclusion(integrator, Local(scene=scene, camera_unwarp=unwarp), None, None, None, spots, [])
+    job._edge_point, asked = lambda pixel, job: "edge", []
+    job._term = lambda place, edge, from_spot: asked.append((place, edge, from_spot)) or len(asked)
+    for leg in (None, scene.ray_intersect_preliminary(ray)):
+        asked.clear()
+        views = job._terms(Local(ray=ray, leg=leg, η=1.5), "pixel", "job")
+        assert views == ([1] if confocal else [1, 2])
+        assert [(edge, from_spot) for _, edge, from_spot in asked] == [("edge", k == 1) for k in range(len(views))]
+        place = asked[0][0]
+        assert np.array(place.found).tolist() == [True, False, False] and (place.lit, place.lit_at) == ("lit", "lit at")
+        assert np.array(place.before)[0] == pytest.approx(10.125 + (0 if unwarp else 4.5), rel=1e-6)
+        np.testing.assert_allclose(np.array(place.seen_at)[:, 0], [0.5, 0.25, 0], atol=1e-6)
+
+
 def test_points_that_are_seen_edge_on_send_nothing():
     """From either end, nor those at an end itself, nor those that the film does not count."""
     scene = mi.load_dict({"type": "scene", "wall": SHEET}, optimize=False)
