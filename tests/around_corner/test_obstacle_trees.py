@@ -88,3 +88,14 @@ def test_shafts_at_a_bound(monkeypatch):
     assert not clear_elements([], elements, region).any()
     tie = ScanRegion([[0, 0, 0], [0.5, 0.25, 0]], [[1e-6, 0, 0]] * 2)
     np.testing.assert_array_equal(tie.frame[2], [0, 0, 1])
+
+
+def test_planes_that_cross_a_scan_are_in_doubt_where_normals_are_interpolated():
+    """Points there are seen from behind, too."""
+    region = ScanRegion([[0, 0, 0], [0.5, 0.25, 0]], [[0, 0, 1.0]] * 2)
+    v, f = plate(0.25, 0.25, (0, 0, 0))
+    upright = np.stack([0 * v[:, 0] + 0.25, v[:, 1], v[:, 0] + 1], 1), f
+    for arrays, across in ((upright, True), ((v + np.array([0, 0, 1]), f), False)):
+        elements = table_of([mesh("a", arrays)]).elements
+        assert clear_elements([], elements, region).all()
+        assert set(clear_elements([], elements, region, smooth=True).tolist()) == {not across}
