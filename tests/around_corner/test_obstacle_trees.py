@@ -53,8 +53,8 @@ def test_leaves_that_are_empty_are_met_by_no_shaft():
 
 
 def test_shafts_at_a_bound(monkeypatch):
-    """Planes that touch the region have it before them or behind; what touches a shaft is outside of it; sheets across
-    the axes of the region are no empty boxes.
+    """Planes that touch the region have it before them or behind, those of triangles have it on one side; elements
+    that touch it are in doubt.
     """
     region = ScanRegion([[0, 0, 0], [0.5, 0.25, 0]], [[0, 0, 1.0]] * 2)
     x, _, z = region.high
@@ -68,21 +68,6 @@ def test_shafts_at_a_bound(monkeypatch):
     for sign in (1, -1):
         both = np.stack([flat, flat[::-1]]) * [1, 1, sign]
         assert shafts._harmless(both, region, hidden * [1, 1, sign], 0.0).all()
-    plane, level = mi.Vector4d(1, 0, 0, 0.5), mi.Float64(0)
-    for least, outside in ((0.5, True), (0.4375, False)):
-        tree = Local(low=mi.Point3d(least, 0, 0), high=mi.Point3d(least, 1, 1), slack=level)
-        assert bool(shafts._box_outside(tree, [plane], mi.UInt32(0))[0]) is outside
-        # Its own plane has the element on both sides.
-        tree.corners = [mi.Point3d(least, *rest) for rest in ((0, 0), (0, 1), (1, 0))]
-        tree.region, own = (mi.Vector3d(-1, -1, -1), mi.Vector3d(1, 1, 1)), [mi.Vector3d(k, 0, 0) for k in (-1, 0, 1)]
-        assert bool(shafts._triangle_outside(tree, [plane], own, mi.UInt32(0), mi.Bool(True))[0]) is outside
-    for top, outside in ((0.5, True), (0.5625, False)):
-        for side in (1, -1):
-            tree.corners = [mi.Point3d(0.5 * side, *rest) for rest in ((0, 0), (0, 1), (1, 0))]
-            ends = sorted((-side, top * side))
-            tree.region = mi.Vector3d(ends[0], 0, 0), mi.Vector3d(ends[1], 1, 1)
-            own = [mi.Vector3d(0.25 * side, 0, k) for k in range(3)]
-            assert bool(shafts._triangle_outside(tree, [], own, mi.UInt32(0), mi.Bool(True))[0]) is outside
     monkeypatch.setattr(shafts, "ROUNDING", 0.0)
     elements = table_of([mesh("a", plate(0.25, 0.25, (0.25, 0.125, 0)))]).elements
     assert not clear_elements([], elements, region).any()
@@ -99,3 +84,41 @@ def test_planes_that_cross_a_scan_are_in_doubt_where_normals_are_interpolated():
         elements = table_of([mesh("a", arrays)]).elements
         assert clear_elements([], elements, region).all()
         assert set(clear_elements([], elements, region, smooth=True).tolist()) == {not across}
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_what_touches_a_shaft_is_outside_of_it(axis):
+    """Beyond a plane, or where its own plane has region and element on one side; along each axis."""
+
+    def at(*place):
+        return mi.Vector3d(*np.roll(place, axis).tolist())
+
+    plane, level = mi.Vector4d(*np.roll([1, 0, 0], axis).tolist(), 0.5), mi.Float64(0)
+    for least, outside in ((0.5, True), (0.4375, False)):
+        tree = Local(low=mi.Point3d(at(least, 0, 0)), high=mi.Point3d(at(least, 1, 1)), slack=level)
+        assert bool(shafts._box_outside(tree, [plane], mi.UInt32(0))[0]) is outside
+        # Its own plane has the element on both sides.
+        tree.corners = [mi.Point3d(at(least, *rest)) for rest in ((0, 0), (0, 1), (1, 0))]
+        tree.region, own = (at(-1, -1, -1), at(1, 1, 1)), [at(k, 0, 0) for k in (-1, 0, 1)]
+        assert bool(shafts._triangle_outside(tree, [plane], own, mi.UInt32(0), mi.Bool(True))[0]) is outside
+    for top, outside in ((0.5, True), (0.5625, False)):
+        for side in (1, -1):
+            tree.corners = [mi.Point3d(at(0.5 * side, *rest)) for rest in ((0, 0), (0, 1), (1, 0))]
+            ends = sorted((-side, top * side))
+            tree.region = at(ends[0], 0, 0), at(ends[1], 1, 1)
+            own = [at(0.25 * side, 0, k) for k in range(3)]
+            assert bool(shafts._triangle_outside(tree, [], own, mi.UInt32(0), mi.Bool(True))[0]) is outside
+
+
+def test_elements_that_are_seen_from_one_side_alone(monkeypatch):
+    """Those that scatter on one, and those of two that have all of the scan before or behind them."""
+    asked = []
+    monkeypatch.setattr(shafts, "_shafts", lambda corners, normal, front, region: asked.append(front) or np.zeros((
+        len(front), 1, 4)))  # fmt: skip
+    region = ScanRegion([[0, 0, 0], [0.5, 0.25, 0]], [[0, 0, 1.0]] * 2)
+    v, f = plate(0.25, 0.25, (0, 0, 0))
+    upright, level = np.stack([0 * v[:, 0] + 0.25, v[:, 1], v[:, 0] + 1], 1), v + np.array([0, 0, 1])
+    for place, faces, two_sided, one in ((upright, f, False, True), (upright, f, True, False), (level, f, True, True),
+                                         (level, f[:, ::-1], True, True)):  # fmt: skip
+        clear_elements([], table_of([mesh("a", (place, faces), two_sided=two_sided)]).elements, region)
+        assert set(asked[-1].tolist()) == {one}
