@@ -171,6 +171,45 @@ def test_chains_of_all_tiles_are_points_of_one_set(monkeypatch, first, groups):
     np.testing.assert_array_equal(asked[0].reshape(12, -1), expected)
 
 
+def test_numbers_of_narrow_scans():
+    """Squares of four tiles one after the other, also where only two rows of them are, or two columns."""
+    squares = np.arange(4)[None] * 4 + np.array([[0, 1], [2, 3]])[..., None]
+    wide = squares.transpose(0, 2, 1).reshape(2, 8)
+    assert np.array(Tiles(8, 2, 1).rank).tolist() == wide.ravel().tolist()
+    assert np.array(Tiles(7, 2, 1).rank).tolist() == [*wide[0, :6], 12, *wide[1, :6], 13]
+    assert np.array(Tiles(2, 8, 1).rank).tolist() == squares.transpose(2, 0, 1).ravel().tolist()
+
+
+@pytest.mark.parametrize(("exhaustive", "spp"), [(True, 1), (False, 3)])
+def test_a_launch_of_late_light_in_a_band(monkeypatch, exhaustive, spp):
+    """Its pixels count from the band's first row on, five a row, with the entries of their spots; all of the light, and
+    what is outside, goes to their places on the film.
+    """
+    done, pixel, spot = [], mi.UInt32([15, 17, 19]), mi.UInt32([1, 2, 0])
+    film = film_of()
+    film.pixel_base = lambda base, laser: base + 100 * laser
+    film.add_steady = lambda place, channels: done.append(("steady", place, channels))
+    film.add_outside = lambda place, before, after: done.append(("outside", place, before, after))
+    target = Local(begin=lambda: "begun", end=lambda block: done.append(block), finish=lambda: done.append("finished"))
+    film.create_event_block = lambda *given, **named: done.append((*given, named)) or target
+    monkeypatch.setattr(late_light, "LateLanes", lambda *given: Local(pixel=pixel, laser=spot))
+
+    def summed(light, part, lanes, block, kept):
+        assert block is target and kept["block"] == "begun"
+        assert [np.array(kept[name]).ravel().tolist() for name in ("L", "before", "after")] == [[0]] * 3
+        return {"L": "light", "before": "before", "after": "after", "block": "ended"}
+
+    monkeypatch.setattr(late_light, "sum_over_links", summed)
+    light = Local(job=Local(film=film, match=Local(to_channels=lambda value: [value])), exhaustive=exhaustive)
+    launch = late_light.LateLaunch(1, 3, 1, spp, 1, 5, False)
+    late_light.LateLight._launch(light, "part", launch)
+    (asked, base, match, events, named), ended, steady, outside, finished = done
+    assert asked is launch and match is light.job.match and events == late_light.EVENTS
+    assert named == {"exclusive": spp == 1} and (ended, finished) == ("ended", "finished")
+    assert np.array(base).tolist() == [0 + 100 * exhaustive, 14 + 200 * exhaustive, 28]
+    assert (steady, outside) == (("steady", pixel, ["light"]), ("outside", pixel, "before", "after"))
+
+
 def test_quotients_and_rests():
     quotient, rest = divmod_by(mi.UInt32([0, 6, 7, 20]), 7)
     assert (np.array(quotient).tolist(), np.array(rest).tolist()) == ([0, 0, 1, 2], [0, 6, 0, 6])

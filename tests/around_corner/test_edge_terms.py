@@ -60,7 +60,10 @@ def test_terms_of_single_points_of_edges(from_spot, x):
                   spot=Local(light=lambda d, active: mi.UnpolarizedSpectrum(0.3)))  # fmt: skip
     viewer = place.lit_at if from_spot else place.seen_at
     dr.enable_grad(edge.p, viewer)
-    term = term_of(scene)._term(place, edge, from_spot)
+    job, looked = term_of(scene), []
+    half = job._seen_otherwise
+    job._seen_otherwise = lambda *given: looked.append(given) or half(*given)
+    term = job._term(place, edge, from_spot)
     active = np.array([row[3] for row in EDGES.values()])
     assert np.array(term.active).tolist() == active.tolist()
     value, outwards, opl = (np.array(each, dtype=float) for each in (term.value[0], term.outwards, term.opl))
@@ -86,6 +89,8 @@ def test_terms_of_single_points_of_edges(from_spot, x):
         light *= i != list(EDGES).index("unseen by the other")
         assert value[i] == pytest.approx(-(2 + i) * spans / distance * light * measure, rel=1e-3)
         assert opl[i] == pytest.approx(0.25 + 1.5 * sum(r), rel=1e-4)
+        # Of the other side of the outline half of it is seen, or not.
+        np.testing.assert_allclose(np.array(looked[0][3], dtype=float)[:, i], d - n * 1e-4, atol=1e-6)
         # Rays start a ten thousandth before the wall.
         assert outwards[i] == pytest.approx(n @ (d - (y - q) / beyond), abs=3e-5)
         np.testing.assert_allclose(slopes[0][i], n / distance, atol=1e-5)
@@ -97,6 +102,31 @@ def term_of(scene, **world):
     given = {"counted": lambda active, opl: active,
              "scattering": Local(correct_two_sided=lambda world, bsdf, si, wo, value: value)}  # fmt: skip
     return MutualOcclusion(None, Local(scene=scene, **given | world), None, None, None, Local(confocal=False), [])
+
+
+@pytest.mark.parametrize("confocal", [True, False])
+@pytest.mark.parametrize("unwarp", [True, False])
+def test_where_terms_of_a_launch_begin(confocal, unwarp):
+    """With the ways from the sensor, where it counts, and to the spot; from the scanned point, and but for confocal
+    captures from the spot; where both are found.
+    """
+    scene = mi.load_dict({"type": "scene", "wall": SHEET})
+    ray = mi.Ray3f(mi.Point3f(mi.Float([0.5, 0.5, 9]), 0.25, 3), mi.Vector3f(0, 0, -1))
+    spot = Local(valid=mi.Bool([True, False, True]), si="lit", p="lit at", leg=mi.Float(0.125))
+    spots = Local(confocal=confocal, general_spot=lambda wavelengths, found: spot)
+    integrator = Local(first_opl=lambda film, rays: mi.Float64(10))
+    job = MutualOcclusion(integrator, Local(scene=scene, camera_unwarp=unwarp), None, None, None, spots, [])
+    job._edge_point, asked = lambda pixel, job: "edge", []
+    job._term = lambda place, edge, from_spot: asked.append((place, edge, from_spot)) or len(asked)
+    for leg in (None, scene.ray_intersect_preliminary(ray)):
+        asked.clear()
+        views = job._terms(Local(ray=ray, leg=leg, η=1.5), "pixel", "job")
+        assert views == ([1] if confocal else [1, 2])
+        assert [(edge, from_spot) for _, edge, from_spot in asked] == [("edge", k == 1) for k in range(len(views))]
+        place = asked[0][0]
+        assert np.array(place.found).tolist() == [True, False, False] and (place.lit, place.lit_at) == ("lit", "lit at")
+        assert np.array(place.before)[0] == pytest.approx(10.125 + (0 if unwarp else 4.5), rel=1e-6)
+        np.testing.assert_allclose(np.array(place.seen_at)[:, 0], [0.5, 0.25, 0], atol=1e-6)
 
 
 def test_points_that_are_seen_edge_on_send_nothing():
@@ -135,11 +165,11 @@ def test_half_of_a_point_is_seen_where_outlines_coincide():
     screen = SHEET | {"to_world": transform().translate([0.5, 0, 1]).scale(0.5)}
     scene = mi.load_dict({"type": "scene", "back": back, "screen": screen}, optimize=False)
     viewer = dr.zeros(mi.SurfaceInteraction3f, 3)
-    viewer.p = mi.Point3f(0, 0.1, 0)
+    viewer.p = mi.Point3f(0, 0.1, -0.5)
     # Past the rim x = 0 of the screen, on its free side, and on either side all of the way.
     x, d = np.array([-1e-3, -0.5, 0.5]), np.array([[1e-3, 0, 1], [-0.2, 0, 1], [0.2, 0, 1.0]])
     si = dr.zeros(mi.SurfaceInteraction3f, 3)
     si.p, si.n = mi.Point3f(mi.Float(x.astype(np.float32)), 0.1, 2), mi.Normal3f(0, 0, -1)
-    other = Local(p=mi.Point3f(0, -0.2, 0))
+    other = Local(p=mi.Point3f(0, -0.2, -0.5))
     found = term_of(scene)._seen_otherwise(other, viewer, si, mi.Vector3f(d.T), mi.Bool([True] * 3))
     assert np.array(found).tolist() == [0.5, 1, 0]

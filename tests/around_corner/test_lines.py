@@ -116,6 +116,7 @@ def test_what_a_wall_makes_of_light_from_either_side():
     before = np.array([1, -1, 1, -1, 1])
     o = mi.Point3f([0.5, 0.5, 5.5, 5.5, 20], 0.25, mi.Float(2.0 * before))
     si = scene.ray_intersect(mi.Ray3f(o, mi.Vector3f(0, 0, mi.Float(-1.0 * before))))
+    si.p = dr.select(si.is_valid(), si.p, 7)
     along = dr.copy(si)
     along.wi = mi.Vector3f(1, 0, 0)
     assert not np.array(points_of(along, mi.UnpolarizedSpectrum(0.5), mi.Float(1)).value).any()
@@ -329,6 +330,10 @@ def test_weights_of_elements_from_samples_of_neighbours(monkeypatch):
     learned = np.array([mean[k] for k in (0, 0, 0, 1, 2, 2)]) * Sizes.area
     assert found.shape == (1, 6)
     np.testing.assert_allclose(found[0], 0.6 * learned / learned.sum() + 0.4 * before / before.sum(), rtol=1e-12)
+    # Nothing is drawn of the last ones, behind a row that is full.
+    none = late_density._smoothed(elements, square[:4], area[:4], np.zeros(4, dtype=int))
+    learned = np.array([1, 0, 0, 0, 0, 0]) * Sizes.area
+    np.testing.assert_allclose(none[0], 0.6 * learned + 0.4 * before / before.sum(), rtol=1e-12)
     dark = late_density._smoothed(elements, 0 * square, area, element)
     np.testing.assert_allclose(dark[0], 0.4 * before / before.sum(), rtol=1e-12)
 

@@ -340,7 +340,9 @@ def test_chains_of_a_job_in_groups(monkeypatch, count, size, groups):
     for seed in (5, 5 + 2**32, mi.UInt32(5), 6):
         light.add(count, seed)
         seeds.append(light.plan.seed[0])
-    assert len(set(seeds[:3])) == 1 and len(set(seeds)) == 2 and seeds[0] != 5
+    assert len(set(seeds[:3])) == 1 and len(set(seeds)) == 2
+    # From version to version a seed is the same chains.
+    assert seeds[0] == 1455807922
 
 
 def test_groups_at_a_time(monkeypatch):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from support.nlos_scenes import transform
-from torchtransient.errors import TorchTransientWarning
+from torchtransient.errors import GradientError, TorchTransientWarning
 from torchtransient.plugins.around_corner import outlines, shared_light
 from torchtransient.plugins.parameter_effect import CORRECT
 from torchtransient.plugins.pointer_table import registry_number
@@ -69,6 +69,14 @@ def test_points_that_hidden_things_are_seen_from(walls):
     assert outlines.Viewpoints(seen(walls, 20.0), seen(walls, 20.0), False).references.tolist() == []
 
 
+def test_normals_of_points_that_are_seen_edge_on(walls):
+    """Those of the front, by shading normals that rays do not know of."""
+    si = seen(walls, -0.5, 0.5)
+    for z, up in ((0, 1), (-0.8, -1)):
+        si.wi = mi.Vector3f(0.6, 0, z)
+        np.testing.assert_allclose(outlines._visible(si)[1], [[0, 0, up]] * 2, atol=1e-6)
+
+
 def test_names_of_what_hides_what():
     """Each pair of names once, three of them, and how many more; shapes without a name by their class."""
     shapes = [Local(id=lambda name=name: name, class_name=lambda: "Mesh") for name in ("a", "b", "c", "")]
@@ -84,6 +92,76 @@ def test_names_of_what_hides_what():
         outlines._warn_of_limbs(shapes, parts, [(0, 1), (2, 0)])
     assert outlines._warn_of_limbs(shapes, parts, [(0, 1)]) is None
     assert "('a' hides 'Mesh')" in outlines._refusal(shapes, parts, [(0, 2)])
+
+
+RIM, NONE = Local(ends=[1]), Local(ends=[])
+PARTS = [(0, RIM), (1, RIM), (2, NONE), (3, None)]
+
+
+def term_of(monkeypatch, pairs, moving=(), spp=10, **facts):
+    """(the job's boundary term, which pairs were asked for) of four parts, each a shape; scanned points lie on 3."""
+    facts = {"geometry": True, "sensor": False, "light": False, "followed": True, "depths": (0, 7),
+             "exhaustive": False} | facts  # fmt: skip
+    points = Local(p=np.arange(12.0).reshape(4, 3), n=-np.arange(12.0).reshape(4, 3), references=[2, 0], shapes={13})
+    shapes = [Local(ptr=100 + k, number=10 + k, id=lambda k=k: f"s{k}") for k in range(4)]
+    parts, asked = [Local(shapes=frozenset([k]), edges=edges) for k, edges in PARTS], []
+
+    def hiding_pairs(given, viewpoints, of_interest):
+        assert given is parts and viewpoints is points.p
+        asked.append([[of_interest(i, j) for j in range(4)] for i in range(4)])
+        return pairs
+
+    monkeypatch.setattr(outlines, "follows_outlines", lambda segment, contents: facts["followed"])
+    monkeypatch.setattr(outlines, "Viewpoints", lambda scanned, spots, confocal: points)
+    monkeypatch.setattr(outlines, "registry_number", lambda shape: shape.number)
+    monkeypatch.setattr(outlines, "parts_of", lambda given: (parts, "triangles"))
+    monkeypatch.setattr(outlines, "hiding_pairs", hiding_pairs)
+    monkeypatch.setattr(outlines, "EdgeTable", lambda *given: given)
+    monkeypatch.setattr(outlines, "passes_of", lambda *given: (given, None))
+    spots = Local(spots=Local(si=mi.Float(0)), confocal=False)
+    world = Local(wanted=Local(geometry=facts["geometry"], sensor=facts["sensor"], light=facts["light"],
+                               shapes={100 + k for k in moving}), segment=None, contents=None, connections=[spots],
+                  min_depth=facts["depths"][0], max_depth=facts["depths"][1],
+                  scene=Local(shapes=lambda: shapes))  # fmt: skip
+    sampler = Local(clone=lambda: Local(sample_count=lambda: 27))
+    found = outlines.mutual_occlusion("integrator", world, Local(sampler=lambda: sampler),
+                                      Local(exhaustive_scan=facts["exhaustive"]), 5, spp, "scanned")  # fmt: skip
+    return found, asked
+
+
+@pytest.mark.parametrize("facts", [
+    {"geometry": False, "moving": [0]}, {"followed": False, "moving": [0]}, {}, {"moving": [0], "depths": (4, 7)},
+    {"moving": [0], "depths": (0, 2)}, {"moving": [0], "pairs": []}, {"moving": [0], "pairs": [(2, 0)]},
+])  # fmt: skip
+def test_jobs_without_outlines_to_follow(monkeypatch, facts):
+    """Nothing moves, no light of three bounces, nothing hides anything, or what does has no edges."""
+    assert term_of(monkeypatch, **{"pairs": [(0, 1)], **facts})[0] is None
+
+
+@pytest.mark.parametrize("depths", [(3, 3), (0, 7)])
+def test_jobs_with_outlines(monkeypatch, depths):
+    """The edges of all that hides something, seen from the points that stand for all; a quarter of the samples."""
+    pairs = [(1, 0), (2, 0), (0, 1), (1, 3)]
+    for spp, count in ((10, 2), (3, 1), (0, 6)):
+        found, _ = term_of(monkeypatch, pairs, moving=[0], spp=spp, depths=depths)
+        triangles, edges, p, n = found.edges
+        assert triangles == "triangles" and edges == [RIM, RIM]
+        assert (p[:, 0].tolist(), n[:, 0].tolist()) == ([6, 0], [-6, 0])
+        _, film, seed, samples, _ = found.jobs
+        assert film is found.film and samples == count and seed[0] not in (5, 0)
+    with pytest.raises(GradientError, match="'s1' hides 's0', 's2' hides 's0', 's0' hides 's1', and 1 more"):
+        term_of(monkeypatch, pairs, moving=[0], exhaustive=True)
+    with pytest.warns(TorchTransientWarning, match=r"\('s3' hides 's0'\)"):
+        assert term_of(monkeypatch, [(0, 1), (3, 0)], moving=[0])[0].edges[1] == [RIM]
+
+
+def test_pairs_that_may_change(monkeypatch):
+    """Those of which one moves; all of them where points do that are looked from, or the shape that they lie on."""
+    for facts in ({"sensor": True}, {"light": True}, {"moving": [3]}):
+        assert np.all(term_of(monkeypatch, [], **facts)[1][0])
+    expected = np.zeros((4, 4), dtype=bool)
+    expected[1], expected[:, 1] = True, True
+    np.testing.assert_array_equal(term_of(monkeypatch, [], moving=[1])[1][0], expected)
 
 
 # ---------------------------------------------------------------------------------------------------------- the light
@@ -102,6 +180,10 @@ def test_spots_that_are_the_scanned_points(walls):
         at, beside = (Local(p=mi.Point3f(0, 0, [5, z]), wi=mi.Vector3f(0, 0, 1), is_valid=lambda: mi.Bool([True] * 2))
                       for z in (z, z + off))  # fmt: skip
         assert shared_light._same(beside, at) is same
+    # That much itself is near enough.
+    origin, tie = (Local(p=mi.Point3f(x, 0, 0), wi=mi.Vector3f(0, 0, 1), is_valid=lambda: mi.Bool(True))
+                   for x in (0, float(np.float32(1e-6))))  # fmt: skip
+    assert shared_light._same(tie, origin)
     turned = seen(walls, 0.25, 5.5, -0.5)
     turned.wi = -turned.wi
     assert not shared_light._same(turned, points)

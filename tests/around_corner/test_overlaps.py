@@ -104,10 +104,10 @@ def test_drawn_points_that_lie_in_something_else(monkeypatch, side):
 
 def test_points_at_edges_of_triangles():
     """Nearer than a hundredth in barycentric coordinates; other shapes have none."""
-    uv = mi.Point2f([0.3, 0.005, 0.3, 0.495, 0.005], [0.4, 0.5, 0.005, 0.5, 0.5])
-    kind = mi.UInt32([TRIANGLE] * 4 + [TRIANGLE + 1])
+    uv = mi.Point2f([0.3, 0.005, 0.3, 0.495, 0.01, 0.005], [0.4, 0.5, 0.005, 0.5, 0.5, 0.5])
+    kind = mi.UInt32([TRIANGLE] * 5 + [TRIANGLE + 1])
     elements = Local(coordinates=lambda element, a, y: uv, kind=lambda element: kind)
-    assert np.array(overlaps._is_inside(elements, None, None, None)).tolist() == [True, False, False, False, True]
+    assert np.array(overlaps._is_inside(elements, None, None, None)).tolist() == [True] + [False] * 4 + [True]
 
 
 @pytest.mark.parametrize("places", [[2, 0], [2, 1], [0, 3]])

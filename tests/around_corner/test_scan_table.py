@@ -149,6 +149,19 @@ def test_points_that_stand_for_a_scan():
         np.testing.assert_allclose(normals, np.tile([0, 0, 1], (10, 1)), atol=1e-6)
 
 
+def test_scans_that_meet_nothing(monkeypatch):
+    """Have no points that stand for them, and say so; where some meet something these do, and nothing is said."""
+    told = []
+    monkeypatch.setattr(scan_table, "_check_hit", lambda t, what: told.append((len(t), what)))
+    table = table_of(film=film(bins=2) | {"width": 7, "height": 2})
+    assert len(table.reference_points()[0]) == 10 and told == [(1, "laser")]
+    told.clear()
+    table.found.t = mi.Float([1.0] * 2 + [dr.inf] * 12)
+    assert len(table.reference_points()[0]) == 1 and told == []
+    table.found.t = dr.full(mi.Float, dr.inf, 14)
+    assert len(table.reference_points()[0]) == 0 and told == [(10, "sensor")]
+
+
 def test_the_spot_of_a_beam():
     """What the wall scatters of its energy, or of one joule; the way from the laser where it counts."""
     table = table_of(laser={"type": "laser_beam", "energy": 2.5})
@@ -200,12 +213,16 @@ def test_overlaps_are_looked_for_once(monkeypatch):
     assert len(calls) == 4
 
 
-def test_planes_of_walls_are_those_to_rounding():
+def test_planes_of_walls_are_those_to_rounding(monkeypatch):
     """A millionth of their extent and no more."""
     for height, flat in ((0.0, True), (4e-7, True), (1e-5, False)):
         sheets = [mi.load_dict({"type": "rectangle", "to_world": transform().translate([x, 0, z])})
                   for x, z in ((-1, 0.0), (1, height))]  # fmt: skip
         assert scan_table._in_one_plane(sheets) is flat
+    # So much itself is flat.
+    monkeypatch.setattr(scan_table, "FLAT", 0.0)
+    assert scan_table._in_one_plane([mi.load_dict({"type": "rectangle"})])
+    monkeypatch.undo()
     # Of their largest coordinate, where that is larger.
     for x, flat in ((1000, True), (-1000, True), (0, False)):
         sheets = [mi.load_dict({"type": "rectangle", "to_world": transform().translate([x + dx, 0, z])})

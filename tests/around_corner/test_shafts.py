@@ -203,30 +203,6 @@ def test_the_box_of_a_scan():
     np.testing.assert_allclose(curved.frame[2], [0, 0.5**0.5, 0.5**0.5], atol=1e-12)
 
 
-@pytest.mark.parametrize(("obstacles", "leaves"), [(0, 2), (1, 2), (2, 2), (3, 4), (4, 4), (5, 8), (8, 8), (9, 16)])
-def test_trees_have_no_more_leaves_than_they_need(obstacles, leaves):
-    """The next power of two, and both ends of the root."""
-    region, _, _ = random_region()
-    balls = [mi.load_dict({"type": "sphere", "center": [0, 0, k]}) for k in range(obstacles)]
-    tree = shafts.ObstacleTree(balls, region, np.ones((1, 3, 3)), 1e-9)
-    assert (tree.leaves[0], dr.width(tree.low), dr.width(tree.corners[0])) == (leaves, 2 * leaves, leaves)
-
-
-def test_leaves_next_to_each_other_are_neighbours_by_their_middles():
-    """Whatever their sizes; a box holds both below it."""
-    region = ScanRegion([[0, 0, 0], [0.3, 0.2, 0]], [[0, 0, 1.0]] * 2)
-    place, radius = np.array([5, 2, 7, 0, 3, 6, 1]), np.array([0.1, 3, 0.2, 0.1, 2.5, 0.3, 0.2])
-    centers = (place[:, None] * region.frame[0] + 9 * region.frame[2]).tolist()
-    balls = [mi.load_dict({"type": "sphere", "center": c, "radius": r}) for c, r in zip(centers, radius, strict=True)]
-    tree = shafts.ObstacleTree(balls, region, np.ones((1, 3, 3)), 1e-9)
-    low, high = np.array(tree.low).T, np.array(tree.high).T
-    np.testing.assert_allclose((low[8:15, 0] + high[8:15, 0]) / 2, np.sort(place), atol=1e-5)
-    np.testing.assert_allclose((high[8:15, 0] - low[8:15, 0]) / 2, radius[np.argsort(place)], rtol=1e-5)
-    for node in range(1, 8):
-        np.testing.assert_array_equal(low[node], low[2 * node : 2 * node + 2].min(0))
-        np.testing.assert_array_equal(high[node], high[2 * node : 2 * node + 2].max(0))
-
-
 @pytest.mark.parametrize(("scanned", "hidden"), [
     ([0.3, 0.2], [1000, -1000]), ([0.3, 0.2], [-1000, 1000]), ([0.3, -1000], [0.4, 0.3]), ([1000, 0.2], [0.4, 0.3]),
 ])  # fmt: skip
@@ -250,6 +226,10 @@ def test_shafts_touch_what_they_hold():
     beyond = (np.einsum("epi,eki->epk", planes[:, :, :3], held) - planes[:, :, 3:]).max(2)
     assert planes.shape == (40, 11, 4)
     np.testing.assert_allclose(beyond[:, :10], 0, atol=1e-9)
+    # Those across touch both, those before and behind one of them.
+    for some in (slice(0, 3), slice(3, 11)):
+        touched = (np.einsum("epi,eki->epk", planes[:, :8, :3], held[:, some]) - planes[:, :8, 3:]).max(2)
+        np.testing.assert_allclose(touched, 0, atol=1e-9)
     assert len({tuple(np.sign(p[:2])) for p in planes[0, :8]}) == 8
     assert (planes[~front, 10] == [0, 0, 0, np.inf]).all()
     np.testing.assert_allclose(planes[front, 10, :3], -normal[front])

@@ -129,3 +129,78 @@ def test_scans_of_what_is_near_have_tiles(monkeypatch):
             assert np.array(job.tile).tolist() == tiles.tile.tolist() and found.tile_count == tiles.count > 1
             again = SharedThirdBounce._near(job, elements)
             assert again is not found and again.key == found.key
+
+
+@pytest.mark.parametrize("of_hidden", [True, False])
+@pytest.mark.parametrize("of_scan", [True, False])
+@pytest.mark.parametrize("capture", ["CONFOCAL", "SINGLE"])
+def test_what_derivatives_of_a_job_are_attached(monkeypatch, capture, of_hidden, of_scan):
+    """Points where the scan moves, samples where what is hidden does, or the spot that lights them."""
+
+    class Kept(Local):
+        def detached(self):
+            return "detached"
+
+    monkeypatch.setattr(shared_light, "draw_samples", lambda elements, count, seed: Local(clear=(count, seed)))
+    monkeypatch.setattr(shared_light, "ends_of_samples", lambda scene, elements, samples, meshes, laser: Kept(
+        fields={"p": "samples"}, laser=laser))  # fmt: skip
+    monkeypatch.setattr(shared_light, "ends_of_points", lambda *given: Kept(fields={"p": "points"}, given=given))
+    monkeypatch.setattr(shared_light, "ThirdBounceGradients", lambda *given: given)
+    monkeypatch.setattr(shared_light, "moves", lambda world, shapes: of_hidden)
+    monkeypatch.setattr(shared_light, "moves_scan", lambda world, shapes: of_scan)
+    spared = []
+    monkeypatch.setattr(SharedThirdBounce, "_spare_rays", lambda job, *given: spared.append(given))
+    monkeypatch.setattr(SharedThirdBounce, "_near", lambda *given: pytest.fail("tiles are for renders"))
+    world = Local(wanted=Local(), scene="scene", contents=Local(meshes="meshes"))
+    light = Local(sensors=Local(p="p"), spots=Local(q="q"), energy="energy")
+    elements = Local(tile_count=3, shapes=["shape"])
+    kind = shared_light.CaptureType[capture]
+    job = SharedThirdBounce(world, "film", light, elements, kind, ("seed", 7))
+    scene, film, samples, points, clear = job.gradients
+    assert (scene, film, clear, spared) == ("scene", "film", (7, "seed"), [(elements, 21)])
+    assert (points == "detached") == (not of_scan)
+    assert (samples == "detached") == (not of_hidden and not (of_scan and capture == "SINGLE"))
+    assert job._tables == ["samples", "points", "p", "q", "energy"] and job.tile is None
+    if of_hidden and of_scan:
+        assert samples.laser is (None if capture == "CONFOCAL" else light.spots)
+        assert points.given == (light.sensors, light.spots, "energy")
+
+
+@pytest.mark.parametrize(("capture", "near"), [("CONFOCAL", True), ("SINGLE", True), ("EXHAUSTIVE", False)])
+def test_renders_of_what_is_near(monkeypatch, capture, near):
+    """Tiles are asked for but in exhaustive captures; nothing is attached."""
+    monkeypatch.setattr(shared_light, "draw_samples", lambda elements, count, seed: (elements, count, seed))
+    monkeypatch.setattr(SharedThirdBounce, "_spare_rays", lambda job, *given: None)
+    monkeypatch.setattr(SharedThirdBounce, "_near", lambda job, elements: Local(tile_count=2, name="near"))
+    elements = Local(tile_count=1, name="all")
+    job = SharedThirdBounce(Local(wanted=None), "film", None, elements, shared_light.CaptureType[capture], ("seed", 7))
+    assert job.samples[0].name == ("near" if near else "all") and job.samples[1:] == (7, "seed")
+    assert job.gradients is None
+
+
+@pytest.mark.parametrize("legs", [True, False])
+@pytest.mark.parametrize("kind", ["a beam", "a beam from the sensor", "an emitter"])
+def test_light_of_a_scan(monkeypatch, kind, legs):
+    """Spots that are the scanned points are one object with them, where the ways to both are; a beam's energy is told
+    beside them, and that of an emitter is in the spots.
+    """
+    monkeypatch.setattr(shared_light, "points_of", lambda si, factor, length: (si, factor, length))
+    origin = mi.Point3f(0.5, 0, 1)
+    seen = Local(p=mi.Point3f([0.5, 3.5], 0, [-2, 5]))
+    beam = Local(energy_at=lambda wavelengths, active: mi.UnpolarizedSpectrum(3))
+    emitter = Local() if kind == "an emitter" else beam
+    spots = Local(emitter=emitter, origin=mi.Point3f(0.5, 0, 1 + (kind == "a beam")), lit=lambda: "lit",
+                  points=lambda legs, energy=True: ("spots", legs, energy))  # fmt: skip
+    table = Local(sensor=Local(origin=origin), spots=spots, seen=lambda: seen)
+    for same in (True, False):
+        monkeypatch.setattr(shared_light, "_same", lambda lit, points, same=same: same)
+        for capture in shared_light.CaptureType:
+            light = shared_light.scan_light(table, capture, legs)
+            si, factor, length = light.sensors
+            assert si is seen and factor == pytest.approx(1 / np.pi)
+            assert np.array(length).tolist() == ([3, 5] if legs else [0])
+            one = same and capture.name == "EXHAUSTIVE" and (kind.endswith("sensor") or (kind == "a beam" and not legs))
+            assert (light.spots is light.sensors) == one
+            if not one:
+                assert light.spots == ("spots", legs, kind == "an emitter")
+            assert light.energy[0] == (1 if kind == "an emitter" else 3)

@@ -86,6 +86,6 @@ def _smoothed(elements: HiddenElements, square: np.ndarray, area: np.ndarray, el
     bucket = (np.cumsum(drawn) - drawn) // _BUCKET
     total, covered = (np.bincount(bucket, np.bincount(element, w, size)) for w in (square * area, area))
     rms = np.sqrt(total / np.where(covered > 0, covered, 1))
-    learned = (rms / max(rms.max(), 1e-300))[bucket] * elements.elements.area
+    learned = rms[bucket] * elements.elements.area
     before = elements.probabilities[0]
     return (learned * ((1 - _BEFORE) / max(learned.sum(), 1e-300)) + _BEFORE * before / before.sum())[None]

@@ -197,7 +197,8 @@ class MutualOcclusion:
         r_seen, r_spot = dr.norm(to_hidden), dr.norm(to_spot)
         d_seen, d_spot = to_hidden / r_seen, to_spot / r_spot
         cos_seen, cos_spot = dr.abs_dot(si.n, d_seen), dr.abs_dot(si.n, d_spot)
-        active &= (r_seen > 0) & (r_spot > 0) & (cos_seen > EDGE_ON) & (cos_spot > EDGE_ON)
+        # Of points at an end itself no cosine is a number.
+        active &= (cos_seen > EDGE_ON) & (cos_spot > EDGE_ON)
         at_wall = self._scattered(seen, place.ray.d, d_seen, active)
         hidden = self._scattered(si, d_seen, d_spot, active)
         value = product(at_wall, product(hidden, place.spot.light(d_spot, active)))

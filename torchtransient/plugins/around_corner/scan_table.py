@@ -128,7 +128,7 @@ def _in_one_plane(shapes: list[Any]) -> bool:
         return False
     v = np.concatenate(corners)
     spread = np.linalg.svd(v - v.mean(0), compute_uv=False)
-    return len(spread) < 3 or bool(spread[2] <= FLAT * max(spread[0], np.abs(v).max()))
+    return bool(spread[2] <= FLAT * max(spread[0], np.abs(v).max()))
 
 
 def _corners(shape: Any) -> np.ndarray | None:
