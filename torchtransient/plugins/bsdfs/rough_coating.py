@@ -26,6 +26,8 @@ _NODES, _NODES_TOTAL_REFLECTION, _NODES_OF_SLOPES = 32, 128, 96
 # reflection sets in: the slope of Fresnel's equations is infinite there, which no quadrature survives, while the
 # integral is smooth. They are good to 0.5 % from alpha 0.02 to 1 and index 1.1 to 2, most of them to 0.1 %.
 _STEP = 0.2
+# From an index of one to where the limits of slopes from above are taken.
+_ABOVE = 1e-5
 
 
 def external_transmittance(alpha: Any, eta: Any, ggx: bool) -> Any:
@@ -38,7 +40,7 @@ def external_transmittance(alpha: Any, eta: Any, ggx: bool) -> Any:
     def table(alpha: Any, eta: Any) -> Any:
         return _facet_mean(alpha, eta, ggx, transmitted=True)
 
-    return _with_slopes(table, alpha, eta, smooth=_refracts_all(eta))
+    return _with_slopes(table, alpha, eta, smooth=_refracts_all(_beside_one(eta)))
 
 
 def internal_reflectance(alpha: Any, eta: Any, ggx: bool) -> Any:
@@ -47,7 +49,7 @@ def internal_reflectance(alpha: Any, eta: Any, ggx: bool) -> Any:
     def number(alpha: Any, eta: Any) -> Any:
         return dr.mean(_facet_mean(alpha, dr.rcp(eta), ggx, transmitted=False) * _cosines()) * 2
 
-    return _with_slopes(number, alpha, eta, smooth=not _refracts_all(eta))
+    return _with_slopes(number, alpha, eta, smooth=not _refracts_all(_beside_one(eta)))
 
 
 def look_up(table: Any, cos_theta: Any, active: Any) -> Any:
@@ -63,6 +65,13 @@ def _refracts_all(eta: Any) -> bool:
     return bool(dr.all(eta > 1))
 
 
+def _beside_one(eta: Any) -> Any:
+    """Where the slope by an index is taken: at exactly one there is no difference to divide by, and the limit from
+    above is taken.
+    """
+    return dr.select(dr.detach(eta) == 1, 1 + _ABOVE, eta)
+
+
 def _with_slopes(f: Callable[[Any, Any], Any], alpha: Any, eta: Any, smooth: bool) -> Any:
     """``f(alpha, eta)`` with its derivatives by what is attached, taken in forward mode: the graph that stays behind
     has the size of the result instead of that of the quadrature. ``smooth``: by ``eta`` no difference is needed.
@@ -76,6 +85,7 @@ def _with_slopes(f: Callable[[Any, Any], Any], alpha: Any, eta: Any, smooth: boo
         dr.set_grad(moving, 1)
         result = result + dr.forward_to(f(moving, e)) * (alpha - a)
     if dr.grad_enabled(eta):
+        e = _beside_one(e)
         if smooth:
             moving = type(e)(e)
             dr.enable_grad(moving)
@@ -85,7 +95,7 @@ def _with_slopes(f: Callable[[Any, Any], Any], alpha: Any, eta: Any, smooth: boo
             h = _STEP * (e - 1)
             near, far = f(a, e + h) - f(a, e - h), f(a, e + 2 * h) - f(a, e - 2 * h)
             slope = (8 * near - far) / (12 * h)
-        result = result + slope * (eta - e)
+        result = result + slope * (eta - dr.detach(eta))
     return dr.replace_grad(value, result)
 
 
