@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -261,3 +263,6 @@ def test_tangents_that_a_traversal_has_cleared_are_said():
     capture.install(θ)
     with pytest.warns(TorchTransientWarning, match="no tangent has come"):
         capture.scene.integrator().render_forward(capture.scene, capture.parameters, spp=16)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", TorchTransientWarning)
+        assert capture.forward(0, 16) != 0

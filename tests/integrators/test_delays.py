@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -134,6 +135,23 @@ def test_the_sum_is_what_steady_integrators_see(extra):
     result = two_sample_z_test(ours[:, None], theirs[:, None])
     assert result.passed, str(result)
     assert not two_sample_z_test(ours[:, None], 1.05 * theirs[:, None]).passed
+
+
+@pytest.mark.parametrize(("number", "chosen"), [(0.25, "mirror"), (0.75, "matte")])
+def test_a_mirror_beside_what_is_delayed(number, chosen):
+    """Half of the samples each: what a mirror sends back has no density per solid angle to share."""
+    mi.set_variant(VARIANT)
+    both = mi.load_dict(LATE | {"elastic": {"type": "conductor"}})
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.wi = mi.Vector3f(0.28, 0, 0.96)
+    bs, weight = both.sample(mi.BSDFContext(), si, mi.Float(number), mi.Point2f(0.3, 0.6))
+    mirrored = dr.norm(bs.wo - mi.Vector3f(-0.28, 0, 0.96))[0] < 1e-6
+    assert mirrored == (chosen == "mirror")
+    if mirrored:
+        assert (weight[0][0], bs.pdf[0]) == pytest.approx((2, 0.5))
+    else:
+        cos = bs.wo.z[0]
+        assert (weight[0][0], bs.pdf[0]) == pytest.approx((2 * YIELD * 0.5, 0.5 * cos / np.pi), rel=1e-5)
 
 
 def test_seconds():

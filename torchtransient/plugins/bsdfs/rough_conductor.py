@@ -43,8 +43,7 @@ class DiffRoughConductor(mi.BSDF):
 
     def _reflection(self, ctx: Any, si: Any, wo: Any, active: Any) -> Any:
         """What the facets that mirror one direction into the other leave of the light: a share or a Mueller matrix."""
-        normal, defined = half_vector(si.wi, wo, 1.0)
-        normal = dr.select(defined, normal, mi.Vector3f(0, 0, 1))
+        normal, _ = half_vector(si.wi, wo, 1.0)
         cosine = dr.dot(si.wi, normal)
         cosine = dr.select(cosine > 0, cosine, 1)
         matrix = metal_reflection(cosine, self.eta.eval(si, active), self.k.eval(si, active))
