@@ -272,3 +272,11 @@ def test_stokes_vectors_count_by_their_first_component(room):
 def test_other_words_are_refused(room):
     with pytest.raises(tt.errors.ArgumentError, match="physics: expected one of 'warn', 'error', 'ignore', got 'loud'"):
         tt.TransientRenderer(loaded(room), physics="loud")
+
+
+def test_a_sun_without_a_direction(room):
+    room["sky"] = {"type": "sunsky", "sun_direction": [0.0, 0.6, 0.8]}
+    renderer = tt.TransientRenderer(loaded(room), parameters=["sky.sun_direction"], spp=1, temporal_filter="tent")
+    assert said(renderer, {"sky.sun_direction": torch.tensor([0.0, 0.0, 1.0])}, seed=0)[1] == []
+    found = said(renderer, {"sky.sun_direction": torch.zeros(3)}, seed=0)[1]
+    assert len(found) == 1 and "has no length" in found[0]

@@ -94,6 +94,18 @@ def test_flat_transforms_of_a_batch_that_has_a_gradient():
     assert messages(each.value, "other", flat, 0.0, 1.0) == []
 
 
+def test_directions_without_a_length():
+    """One of a batch, too."""
+    each = watch()
+    each.directions = frozenset(["sky.sun_direction"])
+    assert messages(each.value, "sky.sun_direction", torch.tensor([[0.0, 0.0, -2.0], [1.0, 0.0, 0.0]]), -2.0, 1.0) == []
+    given = torch.tensor([[0.0, 0.0, -2.0], [0.0, 0.0, 0.0]])
+    assert "'sky.sun_direction' is a direction and has no length" in messages(
+        each.value, "sky.sun_direction", given, -2.0, 0.0
+    )[0]
+    assert messages(each.value, "other", given, -2.0, 0.0) == []
+
+
 def test_flat_transforms_are_errors_each_time():
     each = watch("error")
     each.transforms = frozenset(["pose"])

@@ -210,6 +210,7 @@ class TransientRenderer(CopiesParametrized):
             ranges = {key: physical_range(built.params, key) for key in self._keys}
             self._watch.ranges = {key: limits for key, limits in ranges.items() if limits is not None}
             self._watch.transforms = frozenset(slot.key for slot in slots if slot.kind.endswith("transform"))
+            self._watch.directions = frozenset(slot.key for slot in slots if slot.key.endswith(".sun_direction"))
             # What is given replaces what is described.
             findings = self.scene.findings(self._options)
             self._watch.scene({key: text for key, text in findings.items() if key not in self._keys})
