@@ -35,6 +35,7 @@ _TREATED: dict[type, str] = {**dict.fromkeys(_PLAIN, "plain"), float: "float", l
 _NOT_RECORDABLE = (
     "recording a frozen function",
     "record(): ",
+    "collect(): ",
     "replay(): ",
     "validate(): ",
     "within frozen functions",
@@ -43,11 +44,14 @@ _NOT_RECORDABLE = (
 )
 
 
+# Why a call cannot be recorded now, and can be another time.
+WAITS = "an array of a plugin waits for what another call writes to it"
 # Without numbers and addresses, which differ from run to run.
 _REASONS = {
     "was created before recording": "a plugin of the scene does not show Dr.Jit all of its arrays",
     "validate(): ": "a plugin of the scene does not show Dr.Jit all of its arrays",
     "not supplied as an input": "a plugin of the scene does not show Dr.Jit all of its arrays",
+    "in unsupported state": WAITS,
     "reading from evaluated variables": "numbers of arrays are read while it is traced",
     "FlatVariables": "an attribute of a plugin changes its type while it is recorded",
 }

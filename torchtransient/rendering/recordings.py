@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from torchtransient.interfaces import BACKWARD
-from torchtransient.plugins.frozen_state import NotComparableError, not_recordable
+from torchtransient.plugins.frozen_state import WAITS, NotComparableError, not_recordable
 from torchtransient.rendering.physics import level_of_user
 
 # Structures of one built scene and set of keys, and recordings of each of them for other sizes and flags of arrays.
@@ -155,13 +155,18 @@ class Recording:
             return results, not self._traced
         except BaseException as error:
             self._frozen = None
+            # What was to be written to its arrays is forgotten: they would wait for ever, and with them the calls of
+            # every scene, since Dr.Jit finds all sensors.
+            for job in jobs:
+                job.film.clear()
             reason = not_recordable(error, before)
             if isinstance(reason, BaseException):
                 if reason is error:
                     raise
                 raise reason from None
-            self.refusal = f"traced: Dr.Jit cannot record it: {reason}"
-            refused = NotRecordedError(self.refusal)
+            refusal = f"traced: Dr.Jit cannot record it: {reason}"
+            self.refusal = None if reason == WAITS else refusal
+            refused = NotRecordedError(refusal)
             refused.broken = "changes its type" in reason
             raise refused from error
         finally:
