@@ -34,6 +34,17 @@ def test_a_reason_inside_a_kernel(unreadable):
         tt.render(unreadable, spp=1, seed=0)
 
 
+def test_a_reason_inside_a_kernel_that_is_recorded(unreadable):
+    """From the second call on."""
+    renderer = tt.TransientRenderer(tt.load(unreadable, variant="llvm_ad_rgb"), spp=1)
+    said = []
+    for seed in range(3):
+        with pytest.raises(SceneError, match=r"cannot be rendered.*channels") as caught:
+            renderer(seed=seed)
+        said.append(str(caught.value))
+    assert len(set(said)) == 1
+
+
 def test_forward_mode_after_an_error(unreadable):
     """What is attached does not live on in the frames of an exception that somebody holds."""
     key, right = "wall.bsdf.reflectance.value", tt.load(room(), variant="llvm_ad_rgb")

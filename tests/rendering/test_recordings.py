@@ -188,19 +188,26 @@ def test_errors_of_a_call_are_its_own():
         assert one._frozen is None and one.refusal is None and one._jobs == ()
 
 
-def test_an_error_that_is_behind_another_is_raised_in_its_place(monkeypatch):
-    one, behind, raised = Recording(), KeyboardInterrupt("behind"), RuntimeError("of C++")
+@pytest.mark.parametrize("word", ["__cause__", "__context__"])
+def test_what_failed_is_raised_as_a_traced_call_raises_it(monkeypatch, word):
+    """Without the recorder's own error, and with all that it came of."""
+    one, first = Recording(), ValueError("first")
+    inside, raised = RuntimeError("inside of a loop"), RuntimeError("while it was recorded")
     one.refusal = None
 
     def fail(scene, arrays):
         raise raised
 
-    for reason in (behind, raised):
+    for reason, below, expected in ((first, inside, inside), (raised, inside, raised), (first, None, raised)):
+        setattr(inside, word, first)
+        setattr(raised, word, below)
         one._frozen = fail
         monkeypatch.setattr(recordings, "not_recordable", lambda error, before, reason=reason: reason)
-        with pytest.raises(type(reason)) as caught:
+        with pytest.raises(RuntimeError) as caught:
             one.run([job_of("a")], [])
-        assert caught.value is reason and one.refusal is None
+        assert caught.value is expected and one.refusal is None
+        if expected is inside:
+            assert caught.value.__cause__ is first
     one._frozen = fail
     monkeypatch.setattr(recordings, "not_recordable", lambda error, before: "it changes its type")
     with pytest.raises(NotRecordedError, match=r"traced: Dr\.Jit cannot record it: it changes its type") as caught:

@@ -161,9 +161,11 @@ class Recording:
                 job.film.clear()
             reason = not_recordable(error, before)
             if isinstance(reason, BaseException):
-                if reason is error:
+                below = error.__cause__ or error.__context__
+                if reason is error or below is None:
                     raise
-                raise reason from None
+                # As a call that is traced raises it, with all that it came of.
+                raise below from (below.__cause__ or below.__context__)
             refusal = f"traced: Dr.Jit cannot record it: {reason}"
             self.refusal = None if reason == WAITS else refusal
             refused = NotRecordedError(refusal)
