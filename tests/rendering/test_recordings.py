@@ -22,6 +22,8 @@ from torchtransient.rendering.recordings import (
     _short,
 )
 
+VARIANT = "llvm_ad_rgb"
+
 
 def job_of(structure, *, refusal=None, launches=(1,), kind="render"):
     cleared = []
