@@ -22,7 +22,7 @@ ROUNDING = 2e-3
 # So many cases of each row of the support table are in the default set, and so many in the set of slow tests; the soak
 # runs the others.
 FIRST, SECOND = 1, 8
-# So does it run cases of more than a second that need many samples.
+# Neither are cases of more than a second that need many samples in the default set.
 LONG = {
     "pattern_grows", "plastic_alpha", "hair_coloured_absorption", "plastic_index", "pattern_shifts", "medium_albedo",
     "rough_mirror_moves", "thin_glass_tilts", "rough_glass_index", "glass_in_a_group", "phasor_fog_density",

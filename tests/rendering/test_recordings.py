@@ -209,7 +209,8 @@ def test_what_failed_is_raised_as_a_traced_call_raises_it(monkeypatch, word):
             one.run([job_of("a")], [])
         assert caught.value is expected and one.refusal is None
         if expected is inside:
-            assert caught.value.__cause__ is first
+            assert getattr(caught.value, word) is first
+            assert caught.value.__suppress_context__ is (word == "__cause__")
     one._frozen = fail
     monkeypatch.setattr(recordings, "not_recordable", lambda error, before: "it changes its type")
     with pytest.raises(NotRecordedError, match=r"traced: Dr\.Jit cannot record it: it changes its type") as caught:

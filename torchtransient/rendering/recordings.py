@@ -105,9 +105,9 @@ class Recordings:
         self._before[kind] = structure
 
     def _reason(self, kind: str, structure: tuple[Any, ...]) -> str:
-        refusal = self._found[structure].refusal
-        if refusal not in (None, FIRST):
-            return str(refusal)
+        found = self._found[structure]
+        if found.waits or found.refusal not in (None, FIRST):
+            return found.waits or str(found.refusal)
         difference = _difference(self._before.get(kind, ()), structure)
         if len(self._found) < MAX_STRUCTURES:
             return difference
@@ -137,6 +137,8 @@ class Recording:
         self._frozen: Any = None
         self._traced = False
         self.refusal: str | None = FIRST
+        # Why the last call was traced that may be recorded another time.
+        self.waits = ""
         self.calls = 0
 
     def run(self, jobs: Sequence[Any], arrays: list[Any]) -> tuple[list[list[Any]], bool]:
@@ -152,6 +154,7 @@ class Recording:
         before, self._jobs, self._traced = sys.exc_info()[1], jobs, False
         try:
             results = self._frozen(jobs[0].scene, arrays)
+            self.waits = ""
             return results, not self._traced
         except BaseException as error:
             self._frozen = None
@@ -164,15 +167,20 @@ class Recording:
                 below = error.__cause__ or error.__context__
                 if reason is error or below is None:
                     raise
-                # As a call that is traced raises it, with all that it came of.
-                raise below from (below.__cause__ or below.__context__)
-            refusal = f"traced: Dr.Jit cannot record it: {reason}"
-            self.refusal = None if reason == WAITS else refusal
-            refused = NotRecordedError(refusal)
-            refused.broken = "changes its type" in reason
-            raise refused from error
+            else:
+                refusal = f"traced: Dr.Jit cannot record it: {reason}"
+                self.refusal, self.waits = (None, refusal) if reason == WAITS else (refusal, "")
+                refused = NotRecordedError(refusal)
+                refused.broken = "changes its type" in reason
+                raise refused from error
         finally:
             self._jobs = ()
+        # As a call that is traced raises it: without the recorder's own error, and with its causes as they are, which
+        # raising it while that one is handled would change.
+        try:
+            raise below
+        finally:
+            del below
 
     def _made(self) -> Any:
         import drjit as dr

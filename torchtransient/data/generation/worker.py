@@ -78,6 +78,6 @@ def _end_with_supervisor() -> None:
         connection.wait([parent.sentinel])
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(LAST_SECONDS)
-        os._exit(_GONE)
+        _end()
 
     threading.Thread(target=wait, daemon=True).start()

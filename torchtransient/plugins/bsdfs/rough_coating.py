@@ -26,7 +26,7 @@ _NODES, _NODES_TOTAL_REFLECTION, _NODES_OF_SLOPES = 32, 128, 96
 # reflection sets in: the slope of Fresnel's equations is infinite there, which no quadrature survives, while the
 # integral is smooth. They are good to 0.5 % from alpha 0.02 to 1 and index 1.1 to 2, most of them to 0.1 %.
 _STEP = 0.2
-# From an index of one to where the limits of slopes from above are taken.
+# From an index of one to where its slopes are taken.
 _ABOVE = 1e-5
 
 
@@ -66,8 +66,8 @@ def _refracts_all(eta: Any) -> bool:
 
 
 def _beside_one(eta: Any) -> Any:
-    """Where the slope by an index is taken: at exactly one there is no difference to divide by, and the limit from
-    above is taken.
+    """Where the slope by an index is taken: at exactly one there is no difference to divide by, and that beside it
+    stands in, which has no limit for smooth coatings.
     """
     return dr.select(dr.detach(eta) == 1, 1 + _ABOVE, eta)
 

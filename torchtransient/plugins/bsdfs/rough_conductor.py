@@ -56,9 +56,9 @@ class DiffRoughConductor(mi.BSDF):
     def _coated(self, ctx: Any, si: Any, wo: Any, mirrored: Any, active: Any) -> Any:
         """``mirrored`` by facets of metal instead of perfect mirrors."""
         share = mi.unpolarized_spectrum(mirrored)
-        lit = mi.Mask(active) & (dr.max(share) > 0)
-        metal = self._reflection(ctx, si, wo, lit)
-        return (mi.mueller.absorber(share) @ metal if mi.is_polarized else share * metal) & lit
+        metal = self._reflection(ctx, si, wo, active)
+        # Where nothing is mirrored, too: a colour of zero has a derivative.
+        return (mi.mueller.absorber(share) @ metal if mi.is_polarized else share * metal) & mi.Mask(active)
 
     def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> Any:
         bs, weight = self.facets.sample(ctx, si, sample1, sample2, active)

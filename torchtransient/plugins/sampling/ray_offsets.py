@@ -1,4 +1,4 @@
-"""How far from a point single precision can tell another one apart."""
+"""Distances along rays that single precision can tell from none."""
 
 from __future__ import annotations
 
