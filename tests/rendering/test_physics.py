@@ -278,5 +278,11 @@ def test_a_sun_without_a_direction(room):
     room["sky"] = {"type": "sunsky", "sun_direction": [0.0, 0.6, 0.8]}
     renderer = tt.TransientRenderer(loaded(room), parameters=["sky.sun_direction"], spp=1, temporal_filter="tent")
     assert said(renderer, {"sky.sun_direction": torch.tensor([0.0, 0.0, 1.0])}, seed=0)[1] == []
+    up, tilted = (torch.tensor([x, 0.0, 1.0], requires_grad=True) for x in (0.0, 1e-3))
+    out, found = said(renderer, {"sky.sun_direction": up}, seed=0)
+    assert len(found) == 1 and "points along the axis of its sky" in found[0]
+    out, found = said(renderer, {"sky.sun_direction": tilted}, seed=0)
+    out.steady.sum().backward()
+    assert found == [] and torch.isfinite(tilted.grad).all()
     found = said(renderer, {"sky.sun_direction": torch.zeros(3)}, seed=0)[1]
     assert len(found) == 1 and "has no length" in found[0]

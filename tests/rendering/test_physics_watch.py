@@ -97,13 +97,17 @@ def test_flat_transforms_of_a_batch_that_has_a_gradient():
 def test_directions_without_a_length():
     """One of a batch, too."""
     each = watch()
-    each.directions = frozenset(["sky.sun_direction"])
+    each.directions = {"sky.sun_direction": np.array([0.0, 1.0, 0.0])}
     assert messages(each.value, "sky.sun_direction", torch.tensor([[0.0, 0.0, -2.0], [1.0, 0.0, 0.0]]), -2.0, 1.0) == []
     given = torch.tensor([[0.0, 0.0, -2.0], [0.0, 0.0, 0.0]])
     assert "'sky.sun_direction' is a direction and has no length" in messages(
         each.value, "sky.sun_direction", given, -2.0, 0.0
     )[0]
     assert messages(each.value, "other", given, -2.0, 0.0) == []
+    along = torch.tensor([0.0, -3.0, 0.0])
+    assert messages(each.value, "sky.sun_direction", along, -3.0, 0.0) == []
+    (said,) = messages(each.value, "sky.sun_direction", along.requires_grad_(), -3.0, 0.0)
+    assert "points along the axis of its sky" in said
 
 
 def test_flat_transforms_are_errors_each_time():

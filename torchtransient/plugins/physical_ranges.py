@@ -110,3 +110,8 @@ def described_ranges(params: Any) -> Iterator[tuple[str, PhysicalRange, float, f
             numbers = np.array(unshared(params[key]))
             if numbers.size:
                 yield key, found, float(numbers.min()), float(numbers.max())
+
+
+def axis_of(params: Any, key: str) -> np.ndarray:
+    """Where a transform brings the third axis to."""
+    return np.array(unshared(params[key].matrix), dtype=float).reshape(4, 4)[:3, 2]

@@ -37,9 +37,9 @@ class PhysicsWatch:
 
     ``told``: what was said before, of the same scene: ``tt.render`` in a loop makes a renderer each time.
     ``window_name``: what tells its window from others, empty where none is looked at. ``ranges``: those that the
-    renderer's keys have; ``transforms``: which are transforms; ``directions``: which are directions. ``installed``:
-    looks at a built scene that holds the values of a call, for the sensor of a number, and returns what it finds by
-    what it is about; None looks at nothing.
+    renderer's keys have; ``transforms``: which are transforms; ``directions``: which are those of a sun, with the axis
+    of its sky. ``installed``: looks at a built scene that holds the values of a call, for the sensor of a number, and
+    returns what it finds by what it is about; None looks at nothing.
     """
 
     def __init__(self, mode: str, told: set[str]):
@@ -49,7 +49,7 @@ class PhysicsWatch:
         self.window_name = ""
         self.ranges: dict[str, PhysicalRange] = {}
         self.transforms: frozenset[str] = frozenset()
-        self.directions: frozenset[str] = frozenset()
+        self.directions: dict[str, np.ndarray] = {}
         self.installed: Callable[[Any, int], Mapping[str, str]] | None = None
         self._told = told
 
@@ -82,8 +82,15 @@ class PhysicsWatch:
             elif limits.below(low):
                 self.tell(f"{key} too small", outside_message(key, limits, low, high))
         elif key in self.directions:
-            if bool((value.detach() == 0).all(-1).any()):
-                self.tell(key, f"{key!r} is a direction and has no length: its derivative is NaN. Give it one.")
+            given = value.detach().cpu().double().numpy()
+            if (given == 0).all(-1).any():
+                self.tell(key, f"{key!r} is a direction and has no length. Give it one.")
+            elif value.requires_grad and (np.cross(given, self.directions[key]) == 0).all(-1).any():
+                self.tell(
+                    f"{key} at the pole",
+                    f"{key!r} points along the axis of its sky, where Mitsuba's derivative by it is NaN. Tilt it by a "
+                    "thousandth.",
+                )
         elif key in self.transforms and (self.mode == "error" or key not in self._told):
             matrices = value.detach().cpu().numpy().reshape(-1, *value.shape[-2:])
             if any(is_singular(matrix) for matrix in matrices):

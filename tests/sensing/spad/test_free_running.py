@@ -181,3 +181,21 @@ def test_errors():
         spad(x)
     with pytest.raises(GradientError, match="were dead"):
         spad.log_prob(torch.zeros(1, 4, 1, 1), x)
+
+
+@pytest.mark.parametrize("dead", [0.5, 1.0, 2.5, 7.9])
+def test_gradients_in_constant_light(dead):
+    """Where neighbouring bins are equal, as under ambient light alone and in the dark."""
+    for level in (0.3, 0.0):
+        rate = torch.full((1, 5, 1, 1), level, dtype=torch.float64)
+        rate[0, 3] += 0.2
+        found = torch.autograd.functional.jacobian(lambda x: paralyzable_histogram(x, dead), rate)
+        step, expected = 1e-5, []
+        for k in range(5):
+            change = torch.zeros_like(rate)
+            change[0, k] = step
+            # To one side alone: rates are not negative.
+            one, two = (paralyzable_histogram(rate + n * change, dead) for n in (1, 2))
+            here = paralyzable_histogram(rate, dead)
+            expected.append((4 * one - two - 3 * here).flatten() / (2 * step))
+        torch.testing.assert_close(found.view(5, 5), torch.stack(expected, 1), rtol=1e-6, atol=1e-8)

@@ -97,8 +97,10 @@ def _mean_of_exponentials(start: Tensor, step: Tensor) -> Tensor:
 
     Counted from the smaller end, so that no factor overflows where the other one is 0.
     """
-    low = torch.where(step < 0, start + step, start)
-    width = step.abs()
+    back = step < 0
+    low = torch.where(back, start + step, start)
+    # Not its magnitude, whose slope is 0 for a step of 0, as in constant light.
+    width = torch.where(back, -step, step)
     small = width < 1e-4
     safe = torch.where(small, torch.ones_like(width), width)
     return torch.exp(-low) * torch.where(small, 1 - width / 2 + width**2 / 6, -torch.expm1(-safe) / safe)
