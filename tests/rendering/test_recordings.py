@@ -140,6 +140,25 @@ def test_why_calls_are_in_vain(kept):
     refusing._in_vain = 100
     (text,) = said(refusing, "a")
     assert "could use a recording: traced: too wide. Tracing" in text
+    found = next(iter(refusing._found.values()))
+    found.refusal, found.waits = None, "traced: an array waits"
+    assert refusing._reason("render", next(iter(refusing._found))) == "traced: an array waits"
+
+
+def test_what_waits_is_recorded_another_time(monkeypatch):
+    one = Recording()
+    one.refusal = None
+
+    def fail(scene, arrays):
+        raise RuntimeError("collect()")
+
+    monkeypatch.setattr(recordings, "not_recordable", lambda error, before: recordings.WAITS)
+    one._frozen = fail
+    with pytest.raises(NotRecordedError, match=recordings.WAITS):
+        one.run([job_of("a")], [])
+    assert one.refusal is None and one.waits == f"traced: Dr.Jit cannot record it: {recordings.WAITS}"
+    one._frozen = lambda scene, arrays: []
+    assert one.run([job_of("a")], []) == ([], True) and one.waits == ""
 
 
 def test_differences_of_structures():
