@@ -114,8 +114,8 @@ class TensorRecord:
         for k, record in enumerate(records):
             if not isinstance(record, cls):
                 kind = type(record).__name__
-                other = f" {kind}.stack is for those of its class." if isinstance(record, TensorRecord) else ""
-                raise ArgumentError(f"a batch of {cls.__name__}: expected these alone, got {kind} as entry {k}.{other}")
+                hint = f" {kind}.stack is for those of its class." if isinstance(record, TensorRecord) else ""
+                raise ArgumentError(f"a batch of {cls.__name__}: expected these alone, got {kind} as entry {k}.{hint}")
         if len(records) == 0:
             raise ShapeError(f"a batch of {cls.__name__}: expected at least one, got none.")
         first = records[0]
