@@ -7,6 +7,7 @@ numbers.
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any, TypeVar
 
@@ -71,6 +72,19 @@ def with_methods(name: str, value: Any, what: str, *methods: str) -> Any:
     if lacking:
         raise ArgumentError(f"{name}: expected {what}, with {lacking[0]}(), got {shown(value)}.")
     return value
+
+
+def a_recipe(name: str, value: Any, *methods: str) -> Any:
+    """As :func:`with_methods`, for what makes samples. Raises ArgumentError, which says what reads files of recipes."""
+    hint = ""
+    if isinstance(value, (str, os.PathLike)):
+        hint = " tt.data.Recipe.read reads files."
+    elif isinstance(value, Mapping):
+        hint = " tt.data.Recipe.from_dict reads dictionaries."
+    try:
+        return with_methods(name, value, "a recipe", *methods)
+    except ArgumentError as error:
+        raise ArgumentError(f"{error}{hint}") from None
 
 
 def by_number(name: str, value: Any) -> Any:

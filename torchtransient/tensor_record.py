@@ -109,8 +109,13 @@ class TensorRecord:
 
     @classmethod
     def _joined(cls, records: Sequence[Self], join: Callable[[Sequence[torch.Tensor]], torch.Tensor]) -> Self:
-        if not isinstance(records, Sequence) or not all(isinstance(record, cls) for record in records):
+        if not isinstance(records, Sequence) or isinstance(records, (str, bytes)):
             raise ArgumentError(f"a batch of {cls.__name__}: expected a list of them, got {type(records).__name__}.")
+        for k, record in enumerate(records):
+            if not isinstance(record, cls):
+                kind = type(record).__name__
+                hint = f" {kind}.stack is for those of its class." if isinstance(record, TensorRecord) else ""
+                raise ArgumentError(f"a batch of {cls.__name__}: expected these alone, got {kind} as entry {k}.{hint}")
         if len(records) == 0:
             raise ShapeError(f"a batch of {cls.__name__}: expected at least one, got none.")
         first = records[0]

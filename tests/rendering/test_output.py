@@ -66,6 +66,27 @@ def test_what_is_no_batch(outputs):
         tt.RenderOutput.stack([])
     with pytest.raises(tt.errors.ShapeError, match="the same tensors"):
         default_collate([first, replace(second, transient=None)])
+    for odd, words in ((3, "got int as entry 1"), (None, "got NoneType as entry 1")):
+        with pytest.raises(tt.errors.ArgumentError, match=rf"of RenderOutput: expected these alone, {words}\.$"):
+            tt.RenderOutput.stack([first, odd, second])
+    for none in (3, "outputs", b"outputs", {first}):
+        with pytest.raises(tt.errors.ArgumentError, match=f"expected a list of them, got {type(none).__name__}"):
+            tt.RenderOutput.cat(none)
+
+
+def test_a_render_and_the_result_of_its_file_are_two_classes(outputs, tmp_path):
+    out, again = outputs
+    read = [read_result(write_result(tmp_path / f"{k}.npz", one)) for k, one in enumerate(outputs)]
+    assert torch.equal(read[0].transient, out.transient) and read[0] != out
+    assert read[0] == read_result(tmp_path / "0.npz") and read[0] != read[1]
+    with pytest.raises(tt.errors.ArgumentError, match=r"got Result as entry 1\. Result\.stack is for those of its c"):
+        tt.RenderOutput.stack([out, read[0]])
+    with pytest.raises(tt.errors.ArgumentError, match=r"a batch of Result: .* got RenderOutput as entry 1"):
+        default_collate([read[0], again])
+    batch = type(read[0]).stack(read)
+    assert torch.equal(batch.steady, torch.stack([out.steady, again.steady]))
+    assert read[0].metadata["stats"]["spp"] == out.stats.spp
+    assert [one["stats"]["seeds"] for one in batch.metadata["batch"]] == [[*one.stats.seeds] for one in outputs]
 
 
 class Renders(Dataset):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 
 import mitsuba as mi
 import numpy as np
@@ -249,6 +250,11 @@ def test_what_cannot_be_said_is_refused_and_nothing_is_written(tmp_path):
         scene.save(tmp_path / "found.xml", {"wall.colour": 1.0})
     with pytest.raises(tt.errors.ShapeError, match=r"light.position"):
         scene.save(tmp_path / "found.xml", {"light.position": torch.zeros(2, 3)})
+    odd = {COLOUR: float("nan")}, {COLOUR: torch.tensor([0.1, -torch.inf, torch.nan])}
+    for given, got in zip(odd, ("nan.", "-inf (2 of 3)."), strict=True):
+        words = re.escape(f"scene.save: value of {COLOUR!r}: expected finite numbers, got {got}")
+        with pytest.raises(tt.errors.UnitError, match=f"^{words}$"):
+            scene.save(tmp_path / "found.xml", given)
     room = make_room()
     room["box"] = mi.load_dict({"type": "sphere"})
     with pytest.raises(tt.errors.SceneError, match="was taken as it is"):

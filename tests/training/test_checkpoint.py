@@ -117,8 +117,12 @@ def test_written_whole_or_not_at_all(tmp_path, monkeypatch):
         assert model.weight[0, 0] == 1.0
     save_checkpoint(path, {"model": tiny(2.0)}, step=2)
     assert load_checkpoint(path, {"model": tiny()}).step == 2
-    with pytest.raises(StorageError, match="cannot be written"):
+    with pytest.raises(StorageError, match=r"cannot be written: the folder '.*nowhere' does not exist") as told:
         save_checkpoint(tmp_path / "nowhere" / "run.pt", {}, step=0)
+    assert str(told.value).count("save_checkpoint") == 1
+    monkeypatch.setattr(os, "access", lambda *arguments: False)
+    with pytest.raises(StorageError, match=r"^save_checkpoint: [^:]*run.pt cannot be written: no permission for "):
+        save_checkpoint(path, {}, step=0)
 
 
 def test_torn_and_damaged_files(tmp_path):

@@ -92,7 +92,9 @@ def save_checkpoint(
     own = _written(place, content) if _rank() == 0 else None
     failure = _told_by_first(None if own is None else str(own))
     if failure is not None:
-        raise StorageError(f"save_checkpoint: {place} cannot be written: {failure}") from own
+        # What check_folder says begins with the same words.
+        reason = failure.removeprefix("save_checkpoint: ").removeprefix(f"'{place}' cannot be written: ")
+        raise StorageError(f"save_checkpoint: {place} cannot be written: {reason}") from own
 
 
 def load_checkpoint(path: str | os.PathLike[str], parts: Mapping[str, Any], *, random: bool = True) -> Checkpoint:

@@ -7,6 +7,7 @@ import resource
 import subprocess
 import sys
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -272,6 +273,24 @@ def test_arguments(tmp_path, changes, error, words):
     with pytest.raises(error, match=words):
         generate(given.pop("recipe"), given.pop("folder"), **given)
     assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (("folder", RECIPE), "a recipe and then a folder, got the recipe behind 'folder'"),
+        ((Path("folder"), RECIPE, 4), "a recipe and then a folder, got the recipe behind PosixPath"),
+        (({}, "folder"), r"expected a recipe, with maker\(\), got {}\. tt.data.Recipe.from_dict reads"),
+        (("rec.yaml", "folder"), r"got 'rec.yaml'\. tt.data.Recipe.read reads files\.$"),
+        ((Path("rec.yaml"), "folder"), r"\. tt.data.Recipe.read reads files\.$"),
+        ((None, "folder"), r"got None\.$"),
+    ],
+)
+def test_what_is_no_recipe_is_said_before_a_number_is_asked_for(given, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ArgumentError, match=words):
+        generate(*given)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_folder_that_is_a_file(tmp_path):

@@ -29,7 +29,7 @@ from torchtransient.data.generation.settings import (
 from torchtransient.data.recipes.plugin_modules import plugins_here
 from torchtransient.data.storage.file_names import RECIPE_FILE, SHARD_FILES, shard_file_name
 from torchtransient.errors import ArgumentError, SceneError, StorageError, TorchTransientError, UnitError
-from torchtransient.given_types import is_one_of, with_methods
+from torchtransient.given_types import a_recipe, is_one_of
 from torchtransient.quantities import as_number, count, shown
 
 ENGINES = ("local", "ray")
@@ -115,6 +115,7 @@ def generate(
     start = time.monotonic()
     check_system(_WHAT)
     _check_process()
+    _check_recipe(recipe, folder)
     n = getattr(recipe, "n", None) if n is None else n
     if n is None:
         raise ArgumentError(f"{_WHAT}: neither the call nor the recipe says how many samples. Give n=.")
@@ -296,6 +297,12 @@ def _check_limits(timeout_s: Any, max_outside: Any) -> None:
             raise UnitError(f"{_WHAT}: expected {name} to be a number {wanted}, or None, got {shown(value)}.")
 
 
+def _check_recipe(recipe: Any, folder: Any) -> None:
+    if callable(getattr(folder, "maker", None)) and not callable(getattr(recipe, "maker", None)):
+        raise ArgumentError(f"{_WHAT}: expected a recipe and then a folder, got the recipe behind {shown(recipe)}.")
+    a_recipe(_WHAT, recipe, "maker", "key", "to_dict")
+
+
 def _check_choices(store: Any, compression: Any, engine: Any, address: Any, recipe: Any) -> None:
     from torchtransient.array_files.hdf5_writing import hdf5_package
     from torchtransient.data.storage.chunks import check_compression
@@ -308,7 +315,6 @@ def _check_choices(store: Any, compression: Any, engine: Any, address: Any, reci
         raise ArgumentError(f"{_WHAT}: expected engine to be one of {', '.join(ENGINES)}, got {shown(engine)}.")
     if address is not None and engine != "ray":
         raise UnitError(f"{_WHAT}: address={shown(address)} is for engine='ray', got engine={engine!r}.")
-    with_methods(_WHAT, recipe, "a recipe", "maker", "key", "to_dict")
     if store == "counts" and getattr(recipe, "device", ...) is None:
         raise SceneError(f"{_WHAT}: store='counts' stores the measurement of recipes with a device; give one.")
     try:

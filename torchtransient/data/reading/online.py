@@ -13,7 +13,7 @@ from torchtransient.data.reading.online_producers import WHAT, Producers
 from torchtransient.data.reading.online_schedule import Schedule
 from torchtransient.data.reading.sample_draws import checked_transform
 from torchtransient.errors import ShapeError, TorchTransientError, UnitError
-from torchtransient.given_types import with_methods
+from torchtransient.given_types import a_recipe
 from torchtransient.quantities import MOST, as_number, count, shown
 
 
@@ -66,7 +66,7 @@ class OnlineDataset(IterableDataset[dict[str, Any]]):
         for name, value in (("uses", uses), ("timeout_s", timeout_s)):
             if (number := as_number(value)) is None or not number > 0:
                 raise UnitError(f"{WHAT}: expected {name} as a number above zero, got {shown(value)}.")
-        with_methods(WHAT, recipe, "a recipe", "maker")
+        a_recipe(WHAT, recipe, "maker")
         self.transform = checked_transform(WHAT, transform)
         schedule = Schedule(capacity, workers, float(uses), min(warm, capacity), first, seed)
         self._producers = Producers(recipe, schedule, capacity, workers, float(timeout_s))

@@ -19,7 +19,7 @@ from torchtransient.data.reading.sample_draws import (
     transformed,
 )
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.given_types import with_methods
+from torchtransient.given_types import a_recipe
 from torchtransient.quantities import count, shown
 
 _WHAT = "RecipeDataset"
@@ -57,7 +57,7 @@ class RecipeDataset(Epochs, Dataset[dict[str, Any]]):
         seed: int | None = None,
     ) -> None:
         super().__init__()
-        self.recipe = with_methods(_WHAT, recipe, "a recipe", "maker")
+        self.recipe = a_recipe(_WHAT, recipe, "maker")
         self.transform = checked_transform(_WHAT, transform)
         self.size = count(f"{_WHAT}: size", size, 1, UnitError)
         self.first = count(f"{_WHAT}: first", first, 0, UnitError)

@@ -14,7 +14,7 @@ import torch
 
 from torchtransient import plugins
 from torchtransient.array_files.part_files import writing_said
-from torchtransient.errors import SceneError, ShapeError, TorchTransientError
+from torchtransient.errors import SceneError, ShapeError, TorchTransientError, UnitError
 from torchtransient.file_places import check_folder, path_of
 from torchtransient.plugins.mitsuba_compat import keeps_coefficients
 from torchtransient.plugins.node_walk import ShownValue, objects_below
@@ -110,7 +110,12 @@ def _options(scene: Scene, keys: tuple[str, ...]) -> BuildOptions:
 
 
 def _leaf(slot: Any, value: Any, variant: str) -> Any:
-    tensor, batched = fit_shape(slot.key, as_float(slot.key, value, device_type(variant)), slot.shape)
+    numbers = as_float(slot.key, value, device_type(variant))
+    odd = numbers[~numbers.isfinite()]
+    if odd.numel():
+        share = f" ({odd.numel()} of {numbers.numel()})" if numbers.numel() > 1 else ""
+        raise UnitError(f"scene.save: value of {slot.key!r}: expected finite numbers, got {odd[0].item()}{share}.")
+    tensor, batched = fit_shape(slot.key, numbers, slot.shape)
     if batched:
         raise ShapeError(f"scene.save: expected shape {slot.shape} for {slot.key!r}, got {tuple(tensor.shape)}.")
     slot.check(tensor)
