@@ -114,8 +114,14 @@ def test_rows_that_are_gone(path):
     with PartFile(path, "key") as kept:
         keep(kept, 1)
     path.with_name(path.name + ".npy").unlink()
-    with pytest.raises(StorageError, match=r"a\.h5\.part.*could not be read"), PartFile(path, "key"):
+    words = r"part\.npy', which holds the rows .* is gone\. Put it back, or delete '.*a\.h5\.part' to start anew\.$"
+    with pytest.raises(StorageError, match=words), PartFile(path, "key"):
         pass
+    # As it says.
+    path.unlink()
+    with PartFile(path, "key") as kept:
+        keep(kept, 1)
+        assert kept.has(1)
 
 
 def test_a_full_disk_loses_nothing(path, monkeypatch):

@@ -42,6 +42,67 @@ def test_what_is_no_state_of_an_optimizer(tmp_path, state):
         load_checkpoint(path, {"adam": optimizer})
 
 
+class Adam(torch.optim.Adam):
+    """Another one of the same name."""
+
+
+@pytest.mark.parametrize(
+    ("there", "here"),
+    [("Adam", "Adamax"), ("Adam", "RAdam"), ("Adam", "AdamW"), ("AdamW", "Adam"), ("NAdam", "RAdam"), ("Adam", None)],
+)
+def test_states_of_other_kinds_of_optimizers(tmp_path, there, here):
+    """Some have the same settings as the one here, and would go on with its moments as their own."""
+    path, model = tmp_path / "run.pt", nn.Linear(2, 3)
+    save_checkpoint(path, {"model": model, "one": getattr(torch.optim, there)(model.parameters())}, step=1)
+    other = nn.Linear(2, 3)
+    optimizer = (Adam if here is None else getattr(torch.optim, here))(other.parameters(), lr=0.5)
+    before, weight = optimizer.state_dict(), other.weight.detach().clone()
+    words = rf"the state of 'one' is of another kind of optimiser, 'torch\.optim\..*\.{there}'; here is '.*"
+    with pytest.raises(StorageError, match=words):
+        load_checkpoint(path, {"model": other, "one": optimizer})
+    assert optimizer.state_dict() == before and torch.equal(other.weight, weight)
+
+
+def test_kinds_of_optimizers_move_within_a_package(tmp_path):
+    path, optimizer = tmp_path / "run.pt", torch.optim.Adam(nn.Linear(2, 3).parameters())
+    save_checkpoint(path, {"one": optimizer}, step=1)
+    content = torch.load(path, weights_only=True)
+    for kind in ("torch.optim.moved.adam.Adam", "__main__.Adam", None):
+        torch.save({**content, "optimizers": {"one": kind}}, path)
+        assert load_checkpoint(path, {"one": optimizer}).step == 1
+    for kind in ("others.Adam", "torch.optim.sgd.SGD", 5):
+        torch.save({**content, "optimizers": {"one": kind}}, path)
+        with pytest.raises(StorageError, match="another kind of optimiser"):
+            load_checkpoint(path, {"one": optimizer})
+
+
+def test_kinds_of_optimizers_in_older_files(tmp_path):
+    """Which do not tell them: what they lack is told."""
+    path, model = tmp_path / "run.pt", nn.Linear(2, 3)
+    save_checkpoint(path, {"one": torch.optim.Adam(model.parameters())}, step=1)
+    content = torch.load(path, weights_only=True)
+    del content["optimizers"]
+    torch.save(content, path)
+    assert load_checkpoint(path, {"one": torch.optim.Adam(model.parameters())}).step == 1
+    with pytest.raises(StorageError, match=r"another kind of optimiser, it lacks .*momentum.*; here is SGD"):
+        load_checkpoint(path, {"one": torch.optim.SGD(model.parameters())})
+
+
+@pytest.mark.parametrize("scheduled", ["LambdaLR", "OneCycleLR"])
+def test_states_from_before_there_was_a_schedule(tmp_path, scheduled):
+    """What a schedule keeps in the optimiser is its own: it stays, and the schedule goes on."""
+    path, model = tmp_path / "run.pt", nn.Linear(2, 3)
+    save_checkpoint(path, {"one": torch.optim.Adam(model.parameters(), lr=0.25)}, step=1)
+    optimizer = torch.optim.Adam(model.parameters(), lr=0.5)
+    settings = {"lr_lambda": lambda step: 1.0} if scheduled == "LambdaLR" else {"max_lr": 1.0, "total_steps": 9}
+    schedule = getattr(torch.optim.lr_scheduler, scheduled)(optimizer, **settings)
+    before = optimizer.param_groups[0]["initial_lr"]
+    load_checkpoint(path, {"one": optimizer})
+    assert optimizer.param_groups[0]["lr"] == 0.25 and optimizer.param_groups[0]["initial_lr"] == before
+    optimizer.step()
+    schedule.step()
+
+
 def test_random_numbers_are_all_there_or_none_is_put_back():
     random.seed(3)
     np.random.seed(4)  # noqa: NPY002

@@ -85,7 +85,13 @@ class PartFile:
             )
         self._done, self._shape, self.about, self.seconds = done, (rows, columns), about, seconds
         with self._errors_said():
-            self._file = self._data.open("r+b")
+            try:
+                self._file = self._data.open("r+b")
+            except FileNotFoundError as error:
+                raise StorageError(
+                    f"part file: '{self._data}', which holds the rows that '{self.path}' tells of, is gone. Put it "
+                    f"back, or delete '{self.path}' to start anew."
+                ) from error
             self._check()
 
     def _check(self) -> None:

@@ -29,7 +29,7 @@ from torchtransient.errors import (
 )
 from torchtransient.file_places import check_folder, check_special, path_of
 from torchtransient.quantities import count, shown
-from torchtransient.training.optimizer_states import check_optimizer
+from torchtransient.training.optimizer_states import check_optimizer, kind_of, put_back_optimizer
 from torchtransient.training.plain_state import plain
 from torchtransient.training.random_states import check_random_state, random_state, set_random_state
 
@@ -109,10 +109,10 @@ def load_checkpoint(path: str | os.PathLike[str], parts: Mapping[str, Any], *, r
     ``tt.threads(1)``. Other libraries are warned of (TorchTransientWarning).
 
     Nothing in the file is executed (``weights_only``), and nothing is changed before the whole file has been checked:
-    its sums, format, names of parts, names and shapes of the tensors of modules, groups, settings and moments of
-    optimisers, order of :class:`Batches` (of other parts: what their ``check_state_dict(state)`` raises, if they have
-    one). What a part still refuses afterwards is an error that says so. Every rank reads it. Raises
-    StorageError for a file that is not there, torn, or something else; ShapeError for tensors of other shapes.
+    its sums, format, names of parts, names and shapes of the tensors of modules, kind, groups, settings and moments
+    of optimisers, order of :class:`Batches` (of other parts: what their ``check_state_dict(state)`` raises, if they
+    have one). What a part still refuses afterwards is an error that says so. Every rank reads it. Raises StorageError
+    for a file that is not there, torn, or something else; ShapeError for tensors of other shapes.
     """
     source = path_of(path, "load_checkpoint")
     given, where = _named(parts, "load_checkpoint"), str(source)
@@ -122,8 +122,14 @@ def load_checkpoint(path: str | os.PathLike[str], parts: Mapping[str, Any], *, r
         raise StorageError(
             f"load_checkpoint: {where} has the parts {', '.join(states) or '(none)'}, expected {', '.join(given)}."
         )
+    kinds = content.get("optimizers")
+    kinds = kinds if isinstance(kinds, dict) else {}  # older files have none
     for name, part in given.items():
-        _check(name, part, states[name], content["libraries"].get("torch") == torch.__version__)
+        if isinstance(part, torch.optim.Optimizer):
+            is_same_torch = content["libraries"].get("torch") == torch.__version__
+            check_optimizer(name, part, states[name], kinds.get(name), is_same_torch)
+        else:
+            _check(name, part, states[name])
     if random and ranks != _size():
         raise StorageError(
             f"load_checkpoint: {where} has the random numbers of {ranks} ranks, expected those of {_size()}. Start as "
@@ -150,6 +156,7 @@ def _content(parts: Any, step: Any, values: Mapping[str, Any] | None) -> dict[st
         "version": _VERSION,
         "step": count("save_checkpoint: step", step, 0, UnitError),
         "parts": {name: _state_of(name, part) for name, part in _named(parts, "save_checkpoint").items()},
+        "optimizers": {name: kind_of(one) for name, one in parts.items() if isinstance(one, torch.optim.Optimizer)},
         "values": _plain_values(values),
         "libraries": _libraries(),
     }
@@ -198,7 +205,7 @@ def _state_of(name: str, part: Any) -> Any:
     return plain(part.state_dict(), name)
 
 
-def _check(name: str, part: Any, state: Any, is_same_torch: bool) -> None:
+def _check(name: str, part: Any, state: Any) -> None:
     """What can be told before anything is changed."""
     part = _inner(part)
     if isinstance(part, torch.Generator):
@@ -209,8 +216,6 @@ def _check(name: str, part: Any, state: Any, is_same_torch: bool) -> None:
                 f"load_checkpoint: the part {name!r} is a generator of each of {len(state['generators'])} ranks, "
                 f"expected {_size()}. Start as many, or draw by Seeds.generator, which needs no state."
             )
-    elif isinstance(part, torch.optim.Optimizer):
-        check_optimizer(name, part, state, is_same_torch)
     elif hasattr(part, "check_state_dict"):
         part.check_state_dict(state)
     elif isinstance(part, nn.Module):
@@ -242,6 +247,8 @@ def _put_back(name: str, part: Any, state: Any) -> None:
     try:
         if isinstance(part, torch.Generator):
             part.set_state(state["generators"][_rank()])
+        elif isinstance(part, torch.optim.Optimizer):
+            put_back_optimizer(part, state)
         else:
             part.load_state_dict(state)
     except TorchTransientError:

@@ -27,7 +27,7 @@ from torchtransient.data.generation.settings import (
     write_description,
 )
 from torchtransient.data.recipes.plugin_modules import plugins_here
-from torchtransient.data.storage.file_names import RECIPE_FILE, SHARD_FILES, shard_file_name
+from torchtransient.data.storage.file_names import MANIFEST_FILE, RECIPE_FILE, SHARD_FILES, shard_file_name
 from torchtransient.errors import ArgumentError, SceneError, StorageError, TorchTransientError, UnitError
 from torchtransient.given_types import a_recipe, is_one_of
 from torchtransient.quantities import as_number, count, shown
@@ -88,7 +88,8 @@ def generate(
     address: str | None = None,
 ) -> Generated:
     """Render samples 0 to ``n`` - 1 of a recipe into shard files in ``folder``; None takes the recipe's own ``n``. Call
-    it again to go on after whatever ended it: finished shards are kept.
+    it again to go on after whatever ended it: finished shards are kept, damaged ones made again (bytes are compared
+    with checksums where the manifest does not name the shard, as after ``verify``).
 
     Files of a recipe have the same bytes in whatever order, by however many workers and on whichever engine they are
     made, on one kind of processor with the same packages; every worker computes with one thread. A sample that raises
@@ -196,35 +197,50 @@ def _there(place: Path, wanted: dict[str, Any], resume: bool) -> dict[str, Any] 
 def _survey(
     place: Path, settings: Settings, described: dict[str, Any], share: range, log: RunLog
 ) -> tuple[list[int], int]:
-    """Shards that are missing, and how many samples stand in the others. Raises StorageError for those of another data
-    set.
+    """Shards that are missing or damaged, and how many samples stand in the others. Raises StorageError for those of
+    another data set.
     """
+    from torchtransient.data.storage.manifest import fault_of, named_shards
     from torchtransient.data.storage.shard_file import Shard
 
-    left, kept = [], 0
+    left, kept, named = [], 0, named_shards(place)
     for number in share:
         path = place / shard_file_name(number)
         if not path.exists():
             left.append(number)
             continue
-        try:
-            with Shard(path) as there:
-                header, samples = there.header, len(there.index)
-        except StorageError as error:
-            # A disk that lost what it had promised to keep.
-            log("damaged", shard=number, error=str(error))
+        # A disk that lost what it had promised to keep. What verify has found damaged, the manifest does not name.
+        fault = fault_of(path, named)
+        header: dict[str, Any] = {}
+        if fault is None:
+            try:
+                with Shard(path) as there:
+                    header, samples = there.header, len(there.index)
+            except StorageError as error:
+                fault = str(error)
+        expected = plain(shard_header(settings, described, number))
+        if fault is None:
+            fault = _fault_of_header(header, expected, path)
+        if fault is not None:
+            log("damaged", shard=number, error=fault)
             left.append(number)
             continue
-        expected = plain(shard_header(settings, described, number))
-        check_same(header, expected, path)
-        if header != expected:
-            name = next(k for k in sorted({*header, *expected}) if header.get(k) != expected.get(k))
-            raise StorageError(
-                f"{_WHAT}: '{path}' is of this recipe and differs in {name!r}, as when other versions of packages made "
-                "it. Choose another folder."
-            )
         kept += samples
     return left, kept
+
+
+def _fault_of_header(header: dict[str, Any], expected: dict[str, Any], path: Path) -> str | None:
+    """Whether a shard stands in the place of another one. Raises StorageError where it is of another data set."""
+    check_same(header, expected, path)
+    other = [k for k in sorted({*header, *expected}) if header.get(k) != expected.get(k)]
+    if other and set(other) <= {"shard", "samples"}:
+        return f"'{path}' is shard {shown(header.get('shard'))} under another name."
+    if other:
+        raise StorageError(
+            f"{_WHAT}: '{path}' is of this recipe and differs in {other[0]!r}, as when other versions of packages made "
+            "it. Choose another folder."
+        )
+    return None
 
 
 def _check_made(place: Path, made: list[int], engine: str) -> None:
@@ -236,13 +252,23 @@ def _check_made(place: Path, made: list[int], engine: str) -> None:
 
 
 def _write_manifest(place: Path) -> None:
-    """Again where another run on this folder has finished shards meanwhile: the last one to look has seen all."""
-    from torchtransient.data.storage.manifest import build_manifest
+    """Again where another run on this folder has finished shards meanwhile: the last one to look has seen all. Of
+    shards of other runs those that are damaged are left out where ``verify`` did.
+    """
+    from torchtransient.data.storage.manifest import build_manifest, fault_of, manifest_of, named_shards, shards_of
 
+    named, damaged = named_shards(place), set[str]()
+    if (place / MANIFEST_FILE).exists():
+        written = (place / MANIFEST_FILE).stat().st_mtime_ns
+        # Younger ones were finished after it. Reading all would be done by each of many machines.
+        older = [path for path in shards_of(place) if path.stat().st_mtime_ns <= written]
+        damaged = {path.name for path in older if path.name not in named and fault_of(path, named)}
     seen: set[str] | None = None
     while (now := {path.name for path in place.glob(SHARD_FILES)}) != seen:
         seen = now
-        if now:
+        if now & damaged:
+            manifest_of(place, [path for path in shards_of(place) if path.name in now - damaged])
+        elif now:
             build_manifest(place)
 
 

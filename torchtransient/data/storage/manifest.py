@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -76,7 +77,11 @@ def build_manifest(folder: str | Path) -> dict[str, Any]:
     Checksums are those that the shards carry, not compared with their bytes: :func:`verify` does. Raises StorageError
     for damaged shards, doubled samples, shards of several recipes, and for no shard at all.
     """
-    paths = shards_of(folder)
+    return manifest_of(folder, shards_of(folder))
+
+
+def manifest_of(folder: str | Path, paths: Sequence[Path]) -> dict[str, Any]:
+    """As :func:`build_manifest`, of some of the shards."""
     if not paths:
         raise StorageError(f"{_WHAT}: '{folder}' holds no shard ({SHARD_FILES}).")
     entries = [_Entry.read(path) for path in paths]
@@ -85,6 +90,26 @@ def build_manifest(folder: str | Path) -> dict[str, Any]:
         name, said = next(iter(faults.items()))
         raise StorageError(f"{_WHAT}: '{folder}': {name}: {said[0]}. Use verify, which tells of every shard.")
     return _write(Path(folder), entries)
+
+
+def named_shards(folder: Path) -> dict[str, tuple[str, int]]:
+    """Checksums and sizes of the shards that ``manifest.json`` names, by name; nothing where it is missing or none."""
+    with suppress(StorageError, KeyError, TypeError, AttributeError):
+        text = _text_of(folder / MANIFEST_FILE)
+        found = {} if text is None else json_data(text, f"{_WHAT}: '{folder / MANIFEST_FILE}'")["shards"]
+        return {name: (entry["sha256"], entry["bytes"]) for name, entry in found.items()}
+    return {}
+
+
+def fault_of(path: Path, named: Mapping[str, tuple[str, int]]) -> str | None:
+    """What is wrong with the bytes of a shard. They are read unless it is one that was ``named``."""
+    try:
+        if named.get(path.name) == (stored_checksum(path), path.stat().st_size):
+            return None
+        with Shard(path) as shard:
+            return shard.verify()
+    except StorageError as error:
+        return str(error)
 
 
 def verify(folder: str | Path, progress: bool = False) -> Verified:
@@ -110,7 +135,7 @@ def verify(folder: str | Path, progress: bool = False) -> Verified:
     sound = [entry for entry in entries if entry.name not in between]
     faults |= between
     before = _text_of(Path(folder) / MANIFEST_FILE)
-    if sound:
+    if sound or (paths and before is not None):
         _write(Path(folder), sound)
         if before is not None and before != _text_of(Path(folder) / MANIFEST_FILE):
             faults[MANIFEST_FILE] = ["did not tell what the shards hold; it was made again"]
@@ -238,6 +263,8 @@ def _write(folder: Path, entries: Sequence[_Entry]) -> dict[str, Any]:
 
 
 def _manifest(entries: Sequence[_Entry]) -> dict[str, Any]:
+    if not entries:  # of shards none of which is sound
+        return {"format": FORMAT, "samples": 0, "failed": {}, "shards": {}}
     first = next((entry for entry in entries if entry.index), entries[0])
     errors = sorted(e.header["standard_error"] for e in entries if _is_number(e.header.get("standard_error")))
     return {

@@ -223,7 +223,7 @@ def stored_checksum(path: Path) -> str:
         file.seek(-SEAL_BYTES, 2)
         found = file.read(SEAL_BYTES)
     if found[: len(SEAL)] != SEAL or len(found) != len(SEAL) + hashlib.sha256().digest_size:
-        raise StorageError(f"{WHAT}: '{path}' has no checksum at its end: it was cut or changed.")
+        raise StorageError(f"{WHAT}: '{path}' has no checksum at its end: it was cut or changed. Make it again.")
     return found[len(SEAL) :].hex()
 
 
