@@ -35,7 +35,7 @@ from torch import Tensor
 
 from torchtransient.errors import ArgumentError, GradientError, ShapeError
 from torchtransient.floating import in_single
-from torchtransient.sensing.base.layout import check_tensors
+from torchtransient.sensing.base.layout import check_broadcast, real_tensors
 
 GradPolicy = Literal["expected", "gaussian", "straight_through", "score"]
 GRAD_POLICIES: tuple[GradPolicy, ...] = get_args(GradPolicy)
@@ -65,7 +65,7 @@ def gaussian_noise(variance: Tensor, generator: torch.Generator | None = None) -
     The scale is sqrt(v + e) - sqrt(e) with e = VARIANCE_FLOOR: an empty bin stays empty, its gradient is finite (at
     most 50 |eps|), and at v = 1 the variance is 2 % short. Negative variances (rounding) count as 0.
     """
-    check_tensors("gaussian_noise", variance=variance)
+    (variance,) = real_tensors("gaussian_noise", variance=variance)
     v = variance.clamp_min(0)
     scale: Tensor = (v + VARIANCE_FLOOR).sqrt() - math.sqrt(VARIANCE_FLOOR)
     return scale * standard_normal(v, generator)
@@ -73,7 +73,8 @@ def gaussian_noise(variance: Tensor, generator: torch.Generator | None = None) -
 
 def straight_through(sample: Tensor, mean: Tensor) -> Tensor:
     """The values of `sample` with the gradient of `mean`. Exact for losses that are linear in the sample."""
-    check_tensors("straight_through", sample=sample, mean=mean)
+    sample, mean = real_tensors("straight_through", sample=sample, mean=mean)
+    check_broadcast("straight_through", sample=sample, mean=mean)
     return sample.detach() + (mean - mean.detach())
 
 

@@ -27,9 +27,16 @@ from torch import Tensor
 
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.floating import in_single
-from torchtransient.quantities import Numbers, real_array, shown
+from torchtransient.quantities import Numbers, as_number, real_array, shown
 from torchtransient.sensing.base.given import refuse_cut_off, tensor_of
-from torchtransient.sensing.base.layout import check_count, check_tensors, product
+from torchtransient.sensing.base.layout import (
+    check_broadcast,
+    check_count,
+    complex_tensor,
+    number_or_tensor,
+    product,
+    real_tensors,
+)
 from torchtransient.sensing.itof.itof import Frequencies, check_frequencies
 from torchtransient.sensing.itof.itof_codes import phase_steps
 from torchtransient.units import SPEED_OF_LIGHT
@@ -131,7 +138,7 @@ def _precise(frames: Tensor, where: str) -> Tensor:
 
 def phase_of(phasor: Tensor) -> Tensor:
     """Angle of a complex tensor in [0, 2 pi), in its shape; zero, with derivative zero, where it is zero."""
-    check_tensors("phase_of", phasor=phasor)
+    phasor = complex_tensor("phase_of", phasor=phasor)
     real, imag = phasor.real, phasor.imag
     # At scale one the squares in the derivative of atan2 cannot underflow; the angle does not depend on it.
     largest = torch.maximum(real.abs(), imag.abs()).detach()
@@ -149,7 +156,7 @@ def below_a_turn(phase: Tensor) -> Tensor:
 
 def amplitude_of(phasor: Tensor) -> Tensor:
     """Modulus of a complex tensor, in its shape; derivative zero where it is zero."""
-    check_tensors("amplitude_of", phasor=phasor)
+    phasor = complex_tensor("amplitude_of", phasor=phasor)
     real, imag = phasor.real, phasor.imag
     largest = torch.maximum(real.abs(), imag.abs()).detach()
     there = ~(largest <= torch.finfo(real.dtype).tiny)  # NaN is not darkness
@@ -161,7 +168,10 @@ def amplitude_of(phasor: Tensor) -> Tensor:
 @in_single
 def depth_of_phase(phase: Tensor, frequency_hz: float) -> Tensor:
     """``c phase / (4 pi f)`` in metres, in the shape of ``phase``."""
-    (f,) = check_frequencies(frequency_hz, "depth_of_phase")
+    (phase,) = real_tensors("depth_of_phase", phase=phase)
+    if len(values := check_frequencies(frequency_hz, "depth_of_phase")) != 1:
+        raise UnitError(f"depth_of_phase: expected frequency_hz as one number, got {shown(frequency_hz)}.")
+    (f,) = values
     return phase * (SPEED_OF_LIGHT / (2 * _TURN * f))
 
 
@@ -179,7 +189,8 @@ def unambiguous_range_m(frequencies_hz: Frequencies) -> float:
 @in_single
 def wrapped_difference(a: Tensor, b: Tensor) -> Tensor:
     """``a - b`` in radians, the short way round: in [-pi, pi), derivative one everywhere. Shapes broadcast."""
-    check_tensors("wrapped_difference", a=a, b=b)
+    a, b = real_tensors("wrapped_difference", a=a, b=b)
+    check_broadcast("wrapped_difference", a=a, b=b)
     difference = a - b
     turns = torch.floor((difference + math.pi) / _TURN)
     return difference - _TURN * turns
@@ -190,10 +201,16 @@ def phasor_loss(phasor: Tensor, target: Tensor, weight: Tensor | None = None) ->
 
     Scale both to amplitude one (``z / amplitude``) for a loss on the phase alone, ``2 (1 - cos(difference))``.
     """
-    check_tensors("phasor_loss", phasor=phasor, target=target)
+    phasor, target = complex_tensor("phasor_loss", phasor=phasor), complex_tensor("phasor_loss", target=target)
+    check_broadcast("phasor_loss", phasor=phasor, target=target)
     difference = phasor - target
     loss = difference.real.square() + difference.imag.square()
-    return loss if weight is None else loss * weight
+    if weight is None:
+        return loss
+    weight = number_or_tensor(weight, "weight", "phasor_loss")
+    if isinstance(weight, Tensor):
+        check_broadcast("phasor_loss", phasor=phasor, weight=weight)
+    return loss * weight
 
 
 def shares_of_depth(frequencies_hz: Sequence[float], weights: Sequence[float] | None = None) -> list[float]:
@@ -226,9 +243,14 @@ def unwrap_depth(
     """
     me = "unwrap_depth"
     values = check_frequencies(frequencies_hz, me)
+    (phase,) = real_tensors(me, phase=phase)
     if phase.ndim < 4 or phase.shape[-3] != len(values):
         raise ShapeError(f"{me}: expected phases (..., C, {len(values)}, H, W), got {tuple(phase.shape)}.")
-    longest = float(min_depth_m + unambiguous_range_m(values) if max_depth_m is None else max_depth_m)
+    least, most = as_number(min_depth_m), None if max_depth_m is None else as_number(max_depth_m)
+    if least is None or (most is None and max_depth_m is not None):
+        raise UnitError(f"{me}: expected min_depth_m and max_depth_m as numbers of metres, got {shown(min_depth_m)} and "
+                        f"{shown(max_depth_m)}.")  # fmt: skip
+    min_depth_m, longest = least, least + unambiguous_range_m(values) if most is None else most
     if not (math.isfinite(longest) and longest > min_depth_m):
         raise UnitError(f"{me}: expected min_depth_m < max_depth_m in metres, got {min_depth_m!r} and {longest!r}.")
     # a tenth more leaves room for noise at both ends
@@ -238,9 +260,10 @@ def unwrap_depth(
             f"phases of {values} Hz repeat, got {longest - min_depth_m:.4g} m. Metres? Or add a frequency."
         )
     refuse_cut_off(weights, "weights", me)
-    weight = [1.0] * len(values) if weights is None else [float(w) for w in weights]
-    if len(weight) != len(values) or not all(w > 0 for w in weight):
-        raise UnitError(f"{me}: expected {len(values)} positive weights, got {weights!r}.")
+    given = np.ones(len(values)) if weights is None else real_array(weights)
+    if given is None or given.shape != (len(values),) or not (given > 0).all():
+        raise UnitError(f"{me}: expected {len(values)} positive weights, got {shown(weights)}.")
+    weight = given.tolist()
 
     turns = phase / _TURN
     periods = [SPEED_OF_LIGHT / (2 * f) for f in values]  # metres per turn

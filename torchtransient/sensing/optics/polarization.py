@@ -22,9 +22,17 @@ from torch.nn import functional
 
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
+from torchtransient.given_types import several
 from torchtransient.quantities import Numbers, as_number, shown
 from torchtransient.sensing.base.given import refuse_cut_off
-from torchtransient.sensing.base.layout import check_number, check_tensor, check_tensors, product, without_autocast
+from torchtransient.sensing.base.layout import (
+    check_count,
+    check_number,
+    check_tensor,
+    product,
+    real_tensors,
+    without_autocast,
+)
 from torchtransient.sensing.base.sensor import Sensor
 from torchtransient.stokes import TRANSIENT_DIM, circular_polarizer, linear_polarizer
 
@@ -67,6 +75,7 @@ def circular_analyzers(extinction_ratio: float = math.inf, transmission: float =
 def analyze(stokes: Tensor, rows: Tensor) -> Tensor:
     """Light behind every analyser, (..., A, C, T, H, W), of Stokes vectors (..., 4, C, T, H, W). ShapeError."""
     _check_stokes(stokes, "analyze")
+    (rows,) = real_tensors("analyze", rows=rows)
     if rows.ndim != 2 or rows.shape[1] != 4:
         raise ShapeError(f"analyze: expected rows (A, 4), got {tuple(rows.shape)}.")
     return _by_rows(rows.to(stokes), stokes)
@@ -81,7 +90,7 @@ def stokes_from(measurements: Tensor, rows: Tensor) -> Tensor:
     ``S0 = sum / 2, S1 = I0 - I90, S2 = I45 - I135``. Not constrained: noise can make S0 < |S123|, see
     `project_physical`. Raises ShapeError.
     """
-    check_tensors("stokes_from", measurements=measurements, rows=rows)
+    measurements, rows = real_tensors("stokes_from", measurements=measurements, rows=rows)
     if rows.ndim != 2 or rows.shape[1] != 4 or measurements.ndim < 5 or measurements.shape[-5] != rows.shape[0]:
         raise ShapeError(
             f"stokes_from: expected measurements (..., A, C, T, H, W) and rows (A, 4), got "
@@ -103,7 +112,7 @@ def _by_rows(matrix: Tensor, x: Tensor) -> Tensor:
 @in_single
 def unphysical_part(stokes: Tensor, dim: int = TRANSIENT_DIM) -> Tensor:
     """``max(|S123| - S0, 0)``, without ``dim``: zero for every Stokes vector that light can have. ShapeError."""
-    check_tensors("unphysical_part", stokes=stokes)
+    (stokes,) = real_tensors("unphysical_part", stokes=stokes)
     s0, length = _parts(stokes, dim)
     return (length - s0).clamp_min(0)
 
@@ -115,7 +124,7 @@ def project_physical(stokes: Tensor, dim: int = TRANSIENT_DIM) -> Tensor:
     Euclidean projection onto the cone: with excess ``|S123| > S0`` both become ``(S0 + |S123|) / 2``, and zero where
     that is negative. Continuous, with gradients that are finite everywhere (zero in dark). ShapeError.
     """
-    check_tensors("project_physical", stokes=stokes)
+    (stokes,) = real_tensors("project_physical", stokes=stokes)
     s0, length = _parts(stokes, dim)
     inside = length <= s0
     nearest = ((s0 + length) / 2).clamp_min(0)
@@ -155,6 +164,7 @@ class PolarizationMosaic(Sensor):
 
     def __init__(self, rows: Tensor) -> None:
         super().__init__()
+        (rows,) = real_tensors("PolarizationMosaic", rows=rows)
         if rows.ndim != 3 or rows.shape[-1] != 4:
             raise ShapeError(f"PolarizationMosaic: expected rows (P, Q, 4), got {tuple(rows.shape)}.")
         self.register_buffer("rows", rows.detach().double())
@@ -216,8 +226,11 @@ def demosaic(raw: Tensor, block: tuple[int, int] = (2, 2)) -> Tensor:
     same. A constant picture stays constant, and the pixels themselves keep their values for 2 x 2. Order: row by row
     within the block. Linear in the light. Raises ShapeError for less than one block.
     """
-    check_tensors("demosaic", raw=raw)
-    p, q = block
+    (raw,) = real_tensors("demosaic", raw=raw)
+    sizes = several("demosaic: block", block, "numbers of pixels")
+    if len(sizes) != 2:
+        raise ShapeError(f"demosaic: expected block as two numbers of pixels, got {shown(block)}.")
+    p, q = (check_count(size, "block", "demosaic") for size in sizes)  # type: ignore[arg-type]
     if raw.ndim < 4 or raw.shape[-2] < p or raw.shape[-1] < q:
         raise ShapeError(f"demosaic: expected raw light (..., C, T, H >= {p}, W >= {q}), got {tuple(raw.shape)}.")
     h, w = raw.shape[-2:]
@@ -248,6 +261,7 @@ class Analyzers(Sensor):
 
     def __init__(self, rows: Tensor) -> None:
         super().__init__()
+        (rows,) = real_tensors("Analyzers", rows=rows)
         if rows.ndim != 2 or rows.shape[-1] != 4:
             raise ShapeError(f"Analyzers: expected rows (A, 4), got {tuple(rows.shape)}.")
         self.register_buffer("rows", rows.detach().double())
