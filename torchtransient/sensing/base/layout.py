@@ -38,9 +38,9 @@ def check_tensors(where: str, **given: object) -> None:
         check_dense(value, where, name)
 
 
-def real_tensors(where: str, **given: object) -> tuple[Tensor, ...]:
-    """Tensors of real numbers; whole numbers and truth values, which counts may be, in the default dtype. ShapeError for
-    no tensors, UnitError for complex numbers.
+def real_tensors(where: str, whole: torch.dtype | None = None, **given: object) -> tuple[Tensor, ...]:
+    """Tensors of real numbers; whole numbers and truth values, which counts may be, in the default dtype
+    or `whole`, which holds all their digits. ShapeError for no tensors, UnitError for complex numbers.
     """
     check_tensors(where, **given)
     found = []
@@ -48,7 +48,7 @@ def real_tensors(where: str, **given: object) -> tuple[Tensor, ...]:
         assert isinstance(value, Tensor)  # as was checked
         if value.is_complex():
             raise UnitError(f"{where}: expected {name} as real numbers, got {value.dtype}.")
-        found.append(value if value.is_floating_point() else value.to(torch.get_default_dtype()))
+        found.append(value if value.is_floating_point() else value.to(whole or torch.get_default_dtype()))
     return tuple(found)
 
 
@@ -58,7 +58,7 @@ def complex_tensor(where: str, **given: object) -> Tensor:
     ((name, value),) = given.items()
     if not isinstance(value, Tensor) or not value.is_complex():
         kind = getattr(value, "dtype", None)
-        raise UnitError(f"{where}: expected {name} as complex numbers, got {kind}. torch.complex(real, imag) makes some.")
+        raise UnitError(f"{where}: expected {name} as complex numbers, got {kind}. torch.complex makes some.")
     return value
 
 
@@ -69,6 +69,13 @@ def check_broadcast(where: str, **given: Tensor) -> None:
     if any(len(sizes) > 1 for sizes in ends):
         got = " and ".join(map(str, shapes))
         raise ShapeError(f"{where}: expected {' and '.join(given)} of shapes that broadcast, got {got}.")
+
+
+def going_together(where: str, **given: object) -> tuple[Tensor, ...]:
+    """`real_tensors` whose shapes broadcast. ShapeError for others."""
+    found = real_tensors(where, **given)
+    check_broadcast(where, **dict(zip(given, found, strict=True)))
+    return found
 
 
 def number_or_tensor(value: Any, name: str, where: str) -> Any:
@@ -123,6 +130,8 @@ def check_number(
     GradientError for a tensor that requires a gradient, which a float cannot carry.
     """
     refuse_cut_off(value, name, where)
+    if isinstance(value, Tensor):
+        check_dense(value, where, name)
     number = as_number(value)
     if number is None:
         raise UnitError(f"{where}: expected {name} to be one number, got {shown(value)}.")
@@ -135,9 +144,10 @@ def check_number(
 
 def one_number(value: Any, name: str, where: str) -> Any:
     """One real number as a float, or a tensor of one as it is, with its gradient. UnitError."""
-    if isinstance(value, Tensor) and value.numel() == 1 and value.layout == torch.strided and not value.is_complex():
+    plain = isinstance(value, Tensor) and value.numel() == 1 and value.layout == torch.strided
+    if plain and not value.is_complex() and value.dtype != torch.bool:
         return value
-    number = as_number(value)
+    number = None if plain or getattr(value, "layout", torch.strided) != torch.strided else as_number(value)
     if number is None:
         raise UnitError(f"{where}: expected {name} to be one number, got {shown(value)}.")
     return number

@@ -35,7 +35,9 @@ from torch import Tensor
 
 from torchtransient.errors import ArgumentError, GradientError, ShapeError
 from torchtransient.floating import in_single
-from torchtransient.sensing.base.layout import check_broadcast, real_tensors
+from torchtransient.given_types import is_one_of
+from torchtransient.quantities import shown
+from torchtransient.sensing.base.layout import going_together, real_tensors
 
 GradPolicy = Literal["expected", "gaussian", "straight_through", "score"]
 GRAD_POLICIES: tuple[GradPolicy, ...] = get_args(GradPolicy)
@@ -48,8 +50,8 @@ _ACTIVE: ContextVar[tuple[ScoreFunction, ...]] = ContextVar("active_score_functi
 
 def check_policy(grad: str, where: str) -> GradPolicy:
     """`grad` when it is one of GRAD_POLICIES, else GradientError."""
-    if grad not in GRAD_POLICIES:
-        raise ArgumentError(f"{where}: expected grad to be one of {', '.join(GRAD_POLICIES)}, got {grad!r}.")
+    if not is_one_of(grad, GRAD_POLICIES):
+        raise ArgumentError(f"{where}: expected grad to be one of {', '.join(GRAD_POLICIES)}, got {shown(grad)}.")
     return grad
 
 
@@ -73,8 +75,7 @@ def gaussian_noise(variance: Tensor, generator: torch.Generator | None = None) -
 
 def straight_through(sample: Tensor, mean: Tensor) -> Tensor:
     """The values of `sample` with the gradient of `mean`. Exact for losses that are linear in the sample."""
-    sample, mean = real_tensors("straight_through", sample=sample, mean=mean)
-    check_broadcast("straight_through", sample=sample, mean=mean)
+    sample, mean = going_together("straight_through", sample=sample, mean=mean)
     return sample.detach() + (mean - mean.detach())
 
 

@@ -14,7 +14,15 @@ from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
 from torchtransient.quantities import Numbers, as_number, shown
 from torchtransient.sensing.base.given import numbers_of
-from torchtransient.sensing.base.layout import TIME, bin_width_of, check_number, check_seconds, check_transient
+from torchtransient.sensing.base.layout import (
+    TIME,
+    bin_width_of,
+    check_number,
+    check_seconds,
+    check_transient,
+    one_number,
+    real_tensors,
+)
 from torchtransient.sensing.base.pixel_maps import check_map, keep_map, kept_map, over_time
 from torchtransient.sensing.base.policies import GradPolicy
 from torchtransient.sensing.base.remembered import remembered
@@ -48,6 +56,9 @@ def afterpulse_kernel(tau_s: Tensor | float, dead_time_s: float, bin_width_s: fl
     """
     if as_number(tau_s) is None:
         raise UnitError(f"afterpulse_kernel: expected tau_s as one number of seconds, got {shown(tau_s)}.")
+    for name, value in (("dead_time_s", dead_time_s), ("bin_width_s", bin_width_s)):
+        check_seconds(value, name, "afterpulse_kernel", open_low=name == "bin_width_s", high=1.0)
+    tau_s = one_number(tau_s, "tau_s", "afterpulse_kernel")
     tau = torch.as_tensor(tau_s, dtype=torch.float64) / bin_width_s
     return exponential_kernel(tau.reshape(1), dead_time_s / bin_width_s, period_bins)[0]
 
@@ -68,6 +79,10 @@ def add_afterpulses(
     Differentiable in all three. Computed in float64 by FFT round the period; dtype and device of `counts` are kept.
     """
     check_transient(counts, "add_afterpulses")
+    (kernel,) = real_tensors("add_afterpulses", kernel=kernel)
+    if kernel.ndim != 1:
+        raise ShapeError(f"add_afterpulses: expected a kernel (P,), got {tuple(kernel.shape)}.")
+    probability = one_number(probability, "probability", "add_afterpulses")
     bins, period = counts.shape[TIME], kernel.shape[0]
     _check_period(period, bins)
     p = torch.as_tensor(probability, dtype=torch.float64, device=counts.device)

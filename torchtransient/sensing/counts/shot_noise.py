@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchtransient.errors import UnitError
 from torchtransient.floating import in_single
-from torchtransient.sensing.base.layout import check_broadcast, check_transient, real_tensors
+from torchtransient.sensing.base.layout import check_transient, going_together, real_tensors
 from torchtransient.sensing.base.sensor import RandomSensor
 
 # float32 counts whole numbers up to here; torch.poisson beyond it draws even numbers only.
@@ -37,8 +37,7 @@ def poisson_log_prob(counts: Tensor, mean: Tensor) -> Tensor:
 
     A count above 0 where the mean is 0 has log-probability -inf. Shapes broadcast.
     """
-    counts, mean = real_tensors("poisson_log_prob", counts=counts, mean=mean)
-    check_broadcast("poisson_log_prob", counts=counts, mean=mean)
+    counts, mean = going_together("poisson_log_prob", counts=counts, mean=mean)
     empty = counts == 0
     # where on the input: xlogy(0, 0) has a NaN gradient
     log_mean = torch.where(empty, torch.ones_like(mean), mean).log()

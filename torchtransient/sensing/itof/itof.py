@@ -28,10 +28,16 @@ from torch import Tensor, nn
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import GradientError, ShapeError, UnitError
-from torchtransient.floating import in_single
+from torchtransient.floating import in_single, product
 from torchtransient.quantities import real_array, shown
 from torchtransient.sensing.base.given import refuse_cut_off
-from torchtransient.sensing.base.layout import check_number, check_tensors, check_time_axis, check_transient, product
+from torchtransient.sensing.base.layout import (
+    check_number,
+    check_tensors,
+    check_time_axis,
+    check_transient,
+    real_tensors,
+)
 from torchtransient.sensing.base.sensor import Sensor
 from torchtransient.sensing.itof.itof_codes import CorrelationCode
 from torchtransient.sensing.itof.itof_pixels import ItofCalibration, in_direction
@@ -134,6 +140,7 @@ def correlate(transient: Tensor, weights: Tensor) -> Tensor:
     Raises ShapeError when the numbers of bins differ.
     """
     check_transient(transient, "correlate")
+    (weights,) = real_tensors("correlate", weights=weights)
     if weights.ndim != 2 or weights.shape[1] != transient.shape[-3]:
         raise ShapeError(
             f"correlate: expected weights (M, {transient.shape[-3]}) for the transient {tuple(transient.shape)}, got "
@@ -171,7 +178,9 @@ def taps_from_phasor(
             f"{me}: expected a complex phasor (..., C, {phasor_axis.num_frequencies}, H, W), got {phasor.dtype} "
             f"{tuple(phasor.shape)}."
         )
-    check_number(contrast, "contrast", me, high=1.0)
+    contrast = check_number(contrast, "contrast", me, high=1.0)
+    if steady is not None:
+        (steady,) = real_tensors(me, steady=steady)
     known = calibration or ItofCalibration()
     code, values = in_direction(check_code(code, me), known.direction), check_frequencies(frequencies_hz, me)
     phases = _fitting(known.phases_rad(values), phasor, me)

@@ -27,12 +27,14 @@ from torch import Tensor
 
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.floating import in_single
+from torchtransient.given_types import is_one_of
 from torchtransient.quantities import Numbers, as_number, real_array, shown
-from torchtransient.sensing.base.given import refuse_cut_off, tensor_of
+from torchtransient.sensing.base.given import check_dense, refuse_cut_off, tensor_of
 from torchtransient.sensing.base.layout import (
     check_broadcast,
     check_count,
     complex_tensor,
+    going_together,
     number_or_tensor,
     product,
     real_tensors,
@@ -98,8 +100,9 @@ def sums_of(taps: Frames, num_taps: int, where: str) -> Tensor:
 
 def check_readout(readout: str, where: str) -> None:
     """UnitError for what is no way of reading pixels out."""
-    if readout not in get_args(Readout):
-        raise ArgumentError(f"{where}: expected readout to be one of {', '.join(get_args(Readout))}, got {readout!r}.")
+    if not is_one_of(readout, get_args(Readout)):
+        known = ", ".join(get_args(Readout))
+        raise ArgumentError(f"{where}: expected readout to be one of {known}, got {shown(readout)}.")
 
 
 def _split(taps: Frames, num_taps: int, readout: str, where: str) -> Tensor:
@@ -128,6 +131,7 @@ def as_frames(taps: Frames, where: str) -> Tensor:
 
 def _precise(frames: Tensor, where: str) -> Tensor:
     """Frames in float32 or better, in which differences of 16-bit numbers cannot wrap."""
+    check_dense(frames, where)
     if frames.is_complex() or frames.dtype == torch.bool:
         raise UnitError(f"{where}: expected frames of real numbers, got {frames.dtype}.")
     if not frames.is_floating_point():
@@ -189,8 +193,7 @@ def unambiguous_range_m(frequencies_hz: Frequencies) -> float:
 @in_single
 def wrapped_difference(a: Tensor, b: Tensor) -> Tensor:
     """``a - b`` in radians, the short way round: in [-pi, pi), derivative one everywhere. Shapes broadcast."""
-    a, b = real_tensors("wrapped_difference", a=a, b=b)
-    check_broadcast("wrapped_difference", a=a, b=b)
+    a, b = going_together("wrapped_difference", a=a, b=b)
     difference = a - b
     turns = torch.floor((difference + math.pi) / _TURN)
     return difference - _TURN * turns
@@ -246,10 +249,7 @@ def unwrap_depth(
     (phase,) = real_tensors(me, phase=phase)
     if phase.ndim < 4 or phase.shape[-3] != len(values):
         raise ShapeError(f"{me}: expected phases (..., C, {len(values)}, H, W), got {tuple(phase.shape)}.")
-    least, most = as_number(min_depth_m), None if max_depth_m is None else as_number(max_depth_m)
-    if least is None or (most is None and max_depth_m is not None):
-        raise UnitError(f"{me}: expected min_depth_m and max_depth_m as numbers of metres, got {shown(min_depth_m)} and "
-                        f"{shown(max_depth_m)}.")  # fmt: skip
+    least, most = check_depths(min_depth_m, max_depth_m, me)
     min_depth_m, longest = least, least + unambiguous_range_m(values) if most is None else most
     if not (math.isfinite(longest) and longest > min_depth_m):
         raise UnitError(f"{me}: expected min_depth_m < max_depth_m in metres, got {min_depth_m!r} and {longest!r}.")
@@ -274,6 +274,15 @@ def unwrap_depth(
     metres = turns.new_tensor([s * p for s, p in zip(share, periods, strict=True)]).reshape(-1, 1, 1)
     depth: Tensor = ((turns + whole) * metres).sum(-3)
     return depth
+
+
+def check_depths(min_depth_m: Any, max_depth_m: Any, where: str) -> tuple[float, float | None]:
+    """The ends of a range of depths, the far one of which may be None. UnitError for no numbers."""
+    least, most = as_number(min_depth_m), None if max_depth_m is None else as_number(max_depth_m)
+    if least is None or (most is None and max_depth_m is not None):
+        got = f"{shown(min_depth_m)} and {shown(max_depth_m)}"
+        raise UnitError(f"{where}: expected min_depth_m and max_depth_m as numbers of metres, got {got}.")
+    return least, most
 
 
 def _search(

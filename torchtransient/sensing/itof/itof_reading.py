@@ -26,10 +26,10 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import ArgumentError, PhysicsWarning, ShapeError, UnitError
-from torchtransient.floating import holds, in_single
+from torchtransient.floating import holds, in_single, without_autocast
 from torchtransient.quantities import shown
 from torchtransient.sensing.base.given import no_arrays
-from torchtransient.sensing.base.layout import check_count, check_number, without_autocast
+from torchtransient.sensing.base.layout import check_count, check_number, going_together, real_tensors
 from torchtransient.sensing.itof.itof import Frequencies, check_frequencies
 from torchtransient.sensing.itof.itof_codes import CorrelationCode, phase_steps
 from torchtransient.sensing.itof.itof_depth import (
@@ -38,6 +38,7 @@ from torchtransient.sensing.itof.itof_depth import (
     amplitude_of,
     as_frames,
     below_a_turn,
+    check_depths,
     check_readout,
     depth_of_phase,
     offset_of,
@@ -121,7 +122,7 @@ class ItofNoise:
             if given is not None and not isinstance(given, Tensor):
                 # no light at all has no phase, and no noise no deviation
                 given = check_number(given, name, me, open_low=True)
-            elif given is not None and not holds(given >= 0):
+            elif given is not None and not holds(real_tensors(me, **{name: given})[0] >= 0):
                 raise UnitError(f"{me}: expected every {name} to be a number >= 0, got {shown(given)}.")
             object.__setattr__(self, name, given)
 
@@ -137,7 +138,8 @@ def phase_noise_rad(
     deviations below about 0.2 rad. Dark electrons are part of the offset. Infinite at amplitude zero. With three
     single taps the variance also swings with the phase, ``(2 B - A cos 3 phi) / A^2``; this is its root mean square.
     """
-    check_number(read_noise_e, "read_noise_e", "phase_noise_rad")
+    read_noise_e = check_number(read_noise_e, "read_noise_e", "phase_noise_rad")
+    amplitude, offset = going_together("phase_noise_rad", amplitude=amplitude, offset=offset)
     check_readout(readout, "phase_noise_rad")
     num_taps = check_count(num_taps, "num_taps", "phase_noise_rad")
     each = 1 if readout == "single" else 2
@@ -257,6 +259,7 @@ def read_itof(
     phase = _without_offsets(phase, known, values)
     std = _depth_std(taps, steps, slopes, values, readout, noise, at_corners)
     if len(values) == 1:
+        check_depths(min_depth_m, max_depth_m, me)
         depth = depth_of_phase(phase, values[0]).squeeze(-3)
     else:
         depth = unwrap_depth(phase, values, max_depth_m=max_depth_m, min_depth_m=min_depth_m)

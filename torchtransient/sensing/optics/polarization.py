@@ -24,7 +24,7 @@ from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
 from torchtransient.given_types import several
 from torchtransient.quantities import Numbers, as_number, shown
-from torchtransient.sensing.base.given import refuse_cut_off
+from torchtransient.sensing.base.given import check_dense, refuse_cut_off
 from torchtransient.sensing.base.layout import (
     check_count,
     check_number,
@@ -56,6 +56,8 @@ def linear_analyzers(
     factor = check_number(transmission, "transmission", me, high=1.0)
     if not isinstance(angles_deg, Iterable) or getattr(angles_deg, "ndim", 1) == 0:
         raise ShapeError(f"{me}: expected a list of angles, got {shown(angles_deg)}.")
+    if isinstance(angles_deg, Tensor):
+        check_dense(angles_deg, me, "angles_deg")
     angles = [math.radians(check_number(a, "angles_deg", me, low=-360.0, high=360.0)) for a in angles_deg]
     if not angles:
         raise ShapeError(f"{me}: expected at least one angle, got none.")
@@ -164,7 +166,7 @@ class PolarizationMosaic(Sensor):
 
     def __init__(self, rows: Tensor) -> None:
         super().__init__()
-        (rows,) = real_tensors("PolarizationMosaic", rows=rows)
+        (rows,) = real_tensors("PolarizationMosaic", torch.float64, rows=rows)
         if rows.ndim != 3 or rows.shape[-1] != 4:
             raise ShapeError(f"PolarizationMosaic: expected rows (P, Q, 4), got {tuple(rows.shape)}.")
         self.register_buffer("rows", rows.detach().double())
@@ -208,6 +210,8 @@ def mosaic_rows(
     angles_deg: Sequence[Sequence[float]], extinction_ratio: float = math.inf, transmission: float = 1.0
 ) -> Tensor:
     """(P, Q, 4): rows of linear analysers at the angles of a block of pixels; arguments as `linear_analyzers`."""
+    if isinstance(angles_deg, Tensor):
+        check_dense(angles_deg, "mosaic_rows", "angles_deg")
     rows = angles_deg.tolist() if hasattr(angles_deg, "tolist") else angles_deg
     if not isinstance(rows, Sequence) or not all(isinstance(line, Sequence) for line in rows):
         raise ShapeError(f"mosaic_rows: expected rows of angles, got {shown(angles_deg)}.")
@@ -261,7 +265,7 @@ class Analyzers(Sensor):
 
     def __init__(self, rows: Tensor) -> None:
         super().__init__()
-        (rows,) = real_tensors("Analyzers", rows=rows)
+        (rows,) = real_tensors("Analyzers", torch.float64, rows=rows)
         if rows.ndim != 2 or rows.shape[-1] != 4:
             raise ShapeError(f"Analyzers: expected rows (A, 4), got {tuple(rows.shape)}.")
         self.register_buffer("rows", rows.detach().double())

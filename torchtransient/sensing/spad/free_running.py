@@ -117,7 +117,7 @@ def paralyzable_histogram(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
     check_rates(check_bins(rate, "paralyzable_histogram"), "paralyzable_histogram")
     dead_bins = one_number(dead_bins, "dead_bins", "paralyzable_histogram")
     dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=rate.device)
-    if not float(dead.detach()) >= 0 or not math.isfinite(float(dead.detach())):
+    if not 0 <= float(dead.detach()) < math.inf:
         raise UnitError(f"paralyzable_histogram: expected dead_bins >= 0, got {float(dead.detach()):g}.")
     wide = rate.to(torch.float64)
     bins = wide.shape[TIME]
@@ -130,7 +130,7 @@ def paralyzable_histogram(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
     before = edges.narrow(TIME, 0, bins)
     earlier = before.roll(rest, TIME)
     index = torch.arange(bins, device=rate.device).view(-1, 1, 1)
-    wrapped = torch.where(index < rest, before - earlier + total, before - earlier) + cycles * total
+    wrapped = torch.where(index < rest, before - earlier + total, before - earlier) + float(cycles) * total
     # the bin in which the dead time before the start of this bin begins, and the one after it
     first, second = wide.roll(rest + 1, TIME), wide.roll(rest, TIME)
     exponent = wrapped + part * first
