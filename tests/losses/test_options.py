@@ -147,3 +147,9 @@ def test_a_wrong_call_of_a_module_names_it(name):
     for arguments, keywords in (((), {}), (results(9), {}), (results(1), {"redution": "sum"})):
         with pytest.raises(TypeError, match=rf"^{name}\b"):
             module(*arguments, **keywords)
+
+
+def test_reductions_that_are_no_text():
+    for wrong in (np.array([1, 2], dtype=object), [1], None, torch.ones(2)):
+        with pytest.raises(ArgumentError, match="expected reduction 'none', 'sum' or 'mean', got"):
+            losses.total_variation(torch.ones(1, 2, 2, 2), reduction=wrong)

@@ -38,7 +38,7 @@ def check_tensors(where: str, **given: object) -> None:
         check_dense(value, where, name)
 
 
-def real_tensors(where: str, whole: torch.dtype | None = None, **given: object) -> tuple[Tensor, ...]:
+def reals(where: str, whole: torch.dtype | None = None, **given: object) -> tuple[Tensor, ...]:
     """Tensors of real numbers; whole numbers and truth values, which counts may be, in the default dtype
     or `whole`, which holds all their digits. ShapeError for no tensors, UnitError for complex numbers.
     """
@@ -72,16 +72,16 @@ def check_broadcast(where: str, **given: Tensor) -> None:
 
 
 def going_together(where: str, **given: object) -> tuple[Tensor, ...]:
-    """`real_tensors` whose shapes broadcast. ShapeError for others."""
-    found = real_tensors(where, **given)
+    """`reals` whose shapes broadcast. ShapeError for others."""
+    found = reals(where, **given)
     check_broadcast(where, **dict(zip(given, found, strict=True)))
     return found
 
 
 def number_or_tensor(value: Any, name: str, where: str) -> Any:
-    """A finite number as a float, or a tensor as `real_tensors` takes it, with its gradient. UnitError, ShapeError."""
+    """A finite number as a float, or a tensor as `reals` takes it, with its gradient. UnitError, ShapeError."""
     if isinstance(value, Tensor):
-        return real_tensors(where, **{name: value})[0]
+        return reals(where, **{name: value})[0]
     return check_number(value, name, where, low=-math.inf)
 
 

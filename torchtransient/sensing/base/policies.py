@@ -37,7 +37,7 @@ from torchtransient.errors import ArgumentError, GradientError, ShapeError
 from torchtransient.floating import in_single
 from torchtransient.given_types import is_one_of
 from torchtransient.quantities import shown
-from torchtransient.sensing.base.layout import going_together, real_tensors
+from torchtransient.sensing.base.layout import check_generator, going_together, reals
 
 GradPolicy = Literal["expected", "gaussian", "straight_through", "score"]
 GRAD_POLICIES: tuple[GradPolicy, ...] = get_args(GradPolicy)
@@ -67,7 +67,8 @@ def gaussian_noise(variance: Tensor, generator: torch.Generator | None = None) -
     The scale is sqrt(v + e) - sqrt(e) with e = VARIANCE_FLOOR: an empty bin stays empty, its gradient is finite (at
     most 50 |eps|), and at v = 1 the variance is 2 % short. Negative variances (rounding) count as 0.
     """
-    (variance,) = real_tensors("gaussian_noise", variance=variance)
+    (variance,) = reals("gaussian_noise", variance=variance)
+    check_generator(generator, "gaussian_noise")
     v = variance.clamp_min(0)
     scale: Tensor = (v + VARIANCE_FLOOR).sqrt() - math.sqrt(VARIANCE_FLOOR)
     return scale * standard_normal(v, generator)

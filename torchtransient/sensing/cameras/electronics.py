@@ -22,7 +22,7 @@ from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
 from torchtransient.given_types import several
 from torchtransient.quantities import MOST, as_whole, shown
-from torchtransient.sensing.base.layout import check_count, check_number, check_transient, real_tensors
+from torchtransient.sensing.base.layout import check_count, check_generator, check_number, check_transient, reals
 from torchtransient.sensing.base.policies import (
     VARIANCE_FLOOR,
     GradPolicy,
@@ -83,6 +83,7 @@ def fixed_pattern(
     spread, center = check_number(spread, "spread", me), check_number(center, "center", me, low=-math.inf)
     sizes = [shape] if as_whole(shape) is not None else several(f"{me}: shape", shape, "numbers of pixels")
     shape = tuple(check_count(size, "shape", me, low=0) for size in sizes)  # type: ignore[arg-type]
+    check_generator(generator, me)
     if math.prod(shape) > MOST:
         raise UnitError(f"{me}: expected shape of at most 2^63 - 1 numbers, got {shown(shape)}.")
     return center + spread * torch.randn(shape, generator=generator)
@@ -152,7 +153,7 @@ class PixelElectronics(RandomSensor):
         self.black_level_dn = check_number(black_level_dn, "black_level_dn", me, low=lowest, high=highest)
         for name, values in (("gain_map", gain_map), ("offset_map_e", offset_map_e)):
             if values is not None:
-                values = values if isinstance(values, nn.Parameter) else real_tensors(me, **{name: values})[0]
+                values = values if isinstance(values, nn.Parameter) else reals(me, **{name: values})[0]
             if isinstance(values, nn.Parameter):
                 self.register_parameter(name, values)
             else:

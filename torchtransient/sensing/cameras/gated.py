@@ -20,7 +20,7 @@ from torchtransient.errors import ShapeError, UnitError
 from torchtransient.given_types import several
 from torchtransient.quantities import Numbers
 from torchtransient.sensing.base.given import numbers_of
-from torchtransient.sensing.base.layout import check_number, check_seconds, check_time_axis, real_tensors
+from torchtransient.sensing.base.layout import check_number, check_seconds, check_time_axis, reals
 from torchtransient.sensing.base.sensor import Sensor
 from torchtransient.sensing.itof.itof import correlate
 from torchtransient.sensing.response.response_shapes import normal_integral
@@ -43,7 +43,7 @@ def gate_profiles(
     rise = check_seconds(rise_s, "rise_s", me, open_low=True) / RISE_PER_SIGMA
     fall = check_seconds(fall_s, "fall_s", me, open_low=True) / RISE_PER_SIGMA
     leakage = check_number(leakage, "leakage", me, high=1.0)
-    delays_s, widths_s = real_tensors(me, delays_s=delays_s, widths_s=widths_s)
+    delays_s, widths_s = reals(me, delays_s=delays_s, widths_s=widths_s)
     if delays_s.ndim != 1 or delays_s.shape != widths_s.shape:
         raise ShapeError(
             f"{me}: expected delays and widths (G,), got {tuple(delays_s.shape)}, {tuple(widths_s.shape)}."

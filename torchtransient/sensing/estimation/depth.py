@@ -19,6 +19,7 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
+from torchtransient.quantities import count
 from torchtransient.sensing.base.layout import (
     TIME,
     check_bins,
@@ -28,7 +29,7 @@ from torchtransient.sensing.base.layout import (
     check_transient,
     number_or_tensor,
     one_number,
-    real_tensors,
+    reals,
 )
 from torchtransient.sensing.numerics.time_convolution import Boundary, convolve_time
 from torchtransient.tensor_record import TensorRecord
@@ -60,7 +61,8 @@ def log_matched_filter(
             f"{me}: expected a kernel (K,) with K >= 1, got {shape}. first, kernel = response.kernel(bin_width_s)."
         )
     check_transient(histogram, me)
-    (kernel,) = real_tensors(me, kernel=kernel)
+    (kernel,) = reals(me, kernel=kernel)
+    first = count(f"{me}: first", first, None, UnitError)
     if bool((kernel < 0).any()):
         raise UnitError(f"{me}: expected shares >= 0 in the kernel, got {float(kernel.min()):g}.")
     weights = torch.log1p(ratio * kernel.to(histogram.device))
@@ -243,7 +245,7 @@ def distance_of_position(position: Tensor, axis: TimeAxis) -> Tensor:
     returned in the dtype given: float32 resolves 4e-6 m at 100 m.
     """
     check_time_axis(axis, "distance_of_position")
-    (position,) = real_tensors("distance_of_position", position=position)
+    (position,) = reals("distance_of_position", position=position)
     return (0.5 * (axis.start_opl + position.to(torch.float64) * axis.bin_width_opl)).to(position.dtype)
 
 
@@ -255,7 +257,7 @@ def distance_to_points(distance_m: Tensor, intrinsics: Tensor) -> Tensor:
     centres at *integer* coordinates, so that the middle of a picture is ``((W - 1) / 2, (H - 1) / 2)``. Distances are
     Euclidean, as times of flight are; not depths along z. Differentiable in both. Raises ShapeError.
     """
-    distance_m, intrinsics = real_tensors("distance_to_points", distance_m=distance_m, intrinsics=intrinsics)
+    distance_m, intrinsics = reals("distance_to_points", distance_m=distance_m, intrinsics=intrinsics)
     if intrinsics.shape[-2:] != (3, 3) or intrinsics.ndim not in (2, 3):
         raise ShapeError(f"distance_to_points: expected intrinsics (3, 3) or (B, 3, 3), got {tuple(intrinsics.shape)}.")
     batched = intrinsics.ndim == 3
@@ -284,7 +286,7 @@ def range_deviation_m(response_fwhm_s: float, detections: Tensor) -> Tensor:
     from torchtransient.units import SPEED_OF_LIGHT
 
     if isinstance(detections, Tensor):
-        (detections,) = real_tensors("range_deviation_m", detections=detections)
+        (detections,) = reals("range_deviation_m", detections=detections)
     if not isinstance(detections, Tensor) or bool((detections < 0).any()):
         got = "negative ones" if isinstance(detections, Tensor) else type(detections).__name__
         raise UnitError(f"range_deviation_m: expected a tensor of detections >= 0, got {got}. Give expected numbers.")

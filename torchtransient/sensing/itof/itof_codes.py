@@ -22,7 +22,7 @@ from torchtransient.errors import ShapeError, UnitError
 from torchtransient.given_types import mapping, several
 from torchtransient.quantities import MOST_MADE, as_whole, count, real_array, shown
 from torchtransient.sensing.base.given import refuse_cut_off
-from torchtransient.sensing.base.layout import check_number, real_tensors
+from torchtransient.sensing.base.layout import check_number, reals
 
 _FULL = 2 * math.pi
 
@@ -111,7 +111,10 @@ def _harmonic(h: object, pair: object) -> tuple[int, tuple[float, float]]:
     if len(parts) != 2:
         raise ShapeError(f"{me}: expected {name} as (amplitude, phase in radians), got {shown(pair)}.")
     amplitude, phase = (check_number(part, name, me, low=-math.inf) for part in parts)  # type: ignore[arg-type]
-    return count(f"{me}: {name}", h, error=UnitError, most=MOST_MADE), (amplitude, phase)
+    number = count(f"{me}: {name}", h, None, UnitError, MOST_MADE)
+    if number < 1:
+        raise UnitError(f"{me}: expected harmonics 1, 2, ..., got {shown(h)}.")
+    return number, (amplitude, phase)
 
 
 class PiecewiseLinearCode(CorrelationCode):
@@ -213,13 +216,14 @@ def hamiltonian_code(num_taps: int = 3) -> PiecewiseLinearCode:
     3 taps: light on for 1/6 turn, gates half a turn, a third apart. 4 taps: light on for 1/12 turn; two gates are
     open for half a turn, two of them twice within a turn. Raises ShapeError for another number of taps.
     """
-    if num_taps == 3:
+    taps = as_whole(num_taps)
+    if taps == 3:
         shifts = torch.arange(3, dtype=torch.float64) / 3
         return binary_code(1 / 6, [[(float(s), float(s) + 0.5)] for s in shifts], shifts)
-    if num_taps == 4:
+    if taps == 4:
         twelfths = [[(5, 11)], [(2, 8)], [(0, 3), (7, 10)], [(4, 6), (9, 13)]]
         return binary_code(1 / 12, [[(a / 12, b / 12) for a, b in gate] for gate in twelfths])
-    raise ShapeError(f"hamiltonian_code: expected 3 or 4 taps, got {num_taps!r}; use binary_code for other gates.")
+    raise ShapeError(f"hamiltonian_code: expected 3 or 4 taps, got {shown(num_taps)}; use binary_code for other gates.")
 
 
 def binary_code(
@@ -271,7 +275,7 @@ def _plain(given: object, name: str, where: str) -> Tensor:
     array = None if isinstance(given, Tensor) else real_array(given)
     if not isinstance(given, Tensor) and array is None:
         raise ShapeError(f"{where}: expected {name} as rows of numbers of one length, got {shown(given)}.")
-    (table,) = real_tensors(where, torch.float64, **{name: given if array is None else torch.tensor(array)})
+    (table,) = reals(where, torch.float64, **{name: given if array is None else torch.tensor(array)})
     return table.detach().to("cpu", torch.float64)
 
 

@@ -37,7 +37,7 @@ from torchtransient.sensing.base.layout import (
     going_together,
     number_or_tensor,
     product,
-    real_tensors,
+    reals,
 )
 from torchtransient.sensing.itof.itof import Frequencies, check_frequencies
 from torchtransient.sensing.itof.itof_codes import phase_steps
@@ -72,6 +72,7 @@ def offset_of(taps: Frames, num_taps: int, readout: Readout = "single") -> Tenso
 
     Half precision becomes float32. Errors as `steps_of`, and UnitError for differences, in which it has cancelled.
     """
+    check_readout(readout, "offset_of")
     if readout == "differential":
         raise UnitError("offset_of: expected frames of taps, got differences, in which the offset has cancelled.")
     if readout == "two_tap":
@@ -172,7 +173,7 @@ def amplitude_of(phasor: Tensor) -> Tensor:
 @in_single
 def depth_of_phase(phase: Tensor, frequency_hz: float) -> Tensor:
     """``c phase / (4 pi f)`` in metres, in the shape of ``phase``."""
-    (phase,) = real_tensors("depth_of_phase", phase=phase)
+    (phase,) = reals("depth_of_phase", phase=phase)
     if len(values := check_frequencies(frequency_hz, "depth_of_phase")) != 1:
         raise UnitError(f"depth_of_phase: expected frequency_hz as one number, got {shown(frequency_hz)}.")
     (f,) = values
@@ -246,7 +247,7 @@ def unwrap_depth(
     """
     me = "unwrap_depth"
     values = check_frequencies(frequencies_hz, me)
-    (phase,) = real_tensors(me, phase=phase)
+    (phase,) = reals(me, phase=phase)
     if phase.ndim < 4 or phase.shape[-3] != len(values):
         raise ShapeError(f"{me}: expected phases (..., C, {len(values)}, H, W), got {tuple(phase.shape)}.")
     least, most = check_depths(min_depth_m, max_depth_m, me)

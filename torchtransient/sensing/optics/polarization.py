@@ -23,14 +23,14 @@ from torch.nn import functional
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
 from torchtransient.given_types import several
-from torchtransient.quantities import Numbers, as_number, shown
+from torchtransient.quantities import Numbers, as_number, count, shown
 from torchtransient.sensing.base.given import check_dense, refuse_cut_off
 from torchtransient.sensing.base.layout import (
     check_count,
     check_number,
     check_tensor,
     product,
-    real_tensors,
+    reals,
     without_autocast,
 )
 from torchtransient.sensing.base.sensor import Sensor
@@ -77,7 +77,7 @@ def circular_analyzers(extinction_ratio: float = math.inf, transmission: float =
 def analyze(stokes: Tensor, rows: Tensor) -> Tensor:
     """Light behind every analyser, (..., A, C, T, H, W), of Stokes vectors (..., 4, C, T, H, W). ShapeError."""
     _check_stokes(stokes, "analyze")
-    (rows,) = real_tensors("analyze", rows=rows)
+    (rows,) = reals("analyze", rows=rows)
     if rows.ndim != 2 or rows.shape[1] != 4:
         raise ShapeError(f"analyze: expected rows (A, 4), got {tuple(rows.shape)}.")
     return _by_rows(rows.to(stokes), stokes)
@@ -92,7 +92,7 @@ def stokes_from(measurements: Tensor, rows: Tensor) -> Tensor:
     ``S0 = sum / 2, S1 = I0 - I90, S2 = I45 - I135``. Not constrained: noise can make S0 < |S123|, see
     `project_physical`. Raises ShapeError.
     """
-    measurements, rows = real_tensors("stokes_from", measurements=measurements, rows=rows)
+    measurements, rows = reals("stokes_from", measurements=measurements, rows=rows)
     if rows.ndim != 2 or rows.shape[1] != 4 or measurements.ndim < 5 or measurements.shape[-5] != rows.shape[0]:
         raise ShapeError(
             f"stokes_from: expected measurements (..., A, C, T, H, W) and rows (A, 4), got "
@@ -114,7 +114,7 @@ def _by_rows(matrix: Tensor, x: Tensor) -> Tensor:
 @in_single
 def unphysical_part(stokes: Tensor, dim: int = TRANSIENT_DIM) -> Tensor:
     """``max(|S123| - S0, 0)``, without ``dim``: zero for every Stokes vector that light can have. ShapeError."""
-    (stokes,) = real_tensors("unphysical_part", stokes=stokes)
+    (stokes,) = reals("unphysical_part", stokes=stokes)
     s0, length = _parts(stokes, dim)
     return (length - s0).clamp_min(0)
 
@@ -126,7 +126,7 @@ def project_physical(stokes: Tensor, dim: int = TRANSIENT_DIM) -> Tensor:
     Euclidean projection onto the cone: with excess ``|S123| > S0`` both become ``(S0 + |S123|) / 2``, and zero where
     that is negative. Continuous, with gradients that are finite everywhere (zero in dark). ShapeError.
     """
-    (stokes,) = real_tensors("project_physical", stokes=stokes)
+    (stokes,) = reals("project_physical", stokes=stokes)
     s0, length = _parts(stokes, dim)
     inside = length <= s0
     nearest = ((s0 + length) / 2).clamp_min(0)
@@ -138,6 +138,7 @@ def project_physical(stokes: Tensor, dim: int = TRANSIENT_DIM) -> Tensor:
 
 def _parts(stokes: Tensor, dim: int) -> tuple[Tensor, Tensor]:
     """S0 and |S123|, the latter with derivative zero where it is zero."""
+    dim = count("stokes: dim", dim, None, ShapeError)
     if not -stokes.ndim <= dim < stokes.ndim or stokes.shape[dim] != 4:
         raise ShapeError(f"stokes: expected four components along dim={dim}, got shape {tuple(stokes.shape)}.")
     part = stokes.narrow(dim, 1, 3)
@@ -166,7 +167,7 @@ class PolarizationMosaic(Sensor):
 
     def __init__(self, rows: Tensor) -> None:
         super().__init__()
-        (rows,) = real_tensors("PolarizationMosaic", torch.float64, rows=rows)
+        (rows,) = reals("PolarizationMosaic", torch.float64, rows=rows)
         if rows.ndim != 3 or rows.shape[-1] != 4:
             raise ShapeError(f"PolarizationMosaic: expected rows (P, Q, 4), got {tuple(rows.shape)}.")
         self.register_buffer("rows", rows.detach().double())
@@ -230,7 +231,7 @@ def demosaic(raw: Tensor, block: tuple[int, int] = (2, 2)) -> Tensor:
     same. A constant picture stays constant, and the pixels themselves keep their values for 2 x 2. Order: row by row
     within the block. Linear in the light. Raises ShapeError for less than one block.
     """
-    (raw,) = real_tensors("demosaic", raw=raw)
+    (raw,) = reals("demosaic", raw=raw)
     sizes = several("demosaic: block", block, "numbers of pixels")
     if len(sizes) != 2:
         raise ShapeError(f"demosaic: expected block as two numbers of pixels, got {shown(block)}.")
@@ -265,7 +266,7 @@ class Analyzers(Sensor):
 
     def __init__(self, rows: Tensor) -> None:
         super().__init__()
-        (rows,) = real_tensors("Analyzers", torch.float64, rows=rows)
+        (rows,) = reals("Analyzers", torch.float64, rows=rows)
         if rows.ndim != 2 or rows.shape[-1] != 4:
             raise ShapeError(f"Analyzers: expected rows (A, 4), got {tuple(rows.shape)}.")
         self.register_buffer("rows", rows.detach().double())

@@ -14,7 +14,7 @@ from torchtransient.sensing.base.layout import (
     check_count,
     check_number,
     check_transient,
-    real_tensors,
+    reals,
     without_autocast,
 )
 from torchtransient.sensing.base.sensor import Sensor
@@ -35,7 +35,7 @@ def blur_image(x: Tensor, psf: Tensor, border: Border = "reflect") -> Tensor:
     """
     check_transient(x, "blur_image")
     check_choice(border, Border, "border", "blur_image")
-    (psf,) = real_tensors("blur_image", psf=psf)
+    (psf,) = reals("blur_image", psf=psf)
     if psf.ndim != 2 or psf.shape[0] % 2 == 0 or psf.shape[1] % 2 == 0:
         raise ShapeError(f"blur_image: expected a PSF (h, w) of odd sizes, got {tuple(psf.shape)}.")
     height, width = x.shape[-2:]
@@ -56,7 +56,7 @@ def blur_image(x: Tensor, psf: Tensor, border: Border = "reflect") -> Tensor:
 
 def gaussian_psf(fwhm_px: Tensor, size: int) -> Tensor:
     """(size, size) float64 normal spot of `fwhm_px` pixels, integrated over pixels, sum 1; differentiable in fwhm."""
-    (fwhm_px,) = real_tensors("gaussian_psf", fwhm_px=fwhm_px)
+    (fwhm_px,) = reals("gaussian_psf", fwhm_px=fwhm_px)
     size = check_count(size, "size", "gaussian_psf", most=_LARGEST)
     sigma = fwhm_px.double() / FWHM_PER_SIGMA
     edges = torch.arange(size + 1, dtype=torch.float64, device=fwhm_px.device) - size / 2
@@ -97,7 +97,7 @@ class SpatialPSF(Sensor):
     def __init__(self, psf: Tensor, border: Border = "reflect", *, learnable: bool = False) -> None:
         super().__init__()
         check_choice(border, Border, "border", "SpatialPSF")
-        (psf,) = real_tensors("SpatialPSF", torch.float64, psf=psf)
+        (psf,) = reals("SpatialPSF", torch.float64, psf=psf)
         if psf.ndim != 2 or psf.shape[0] % 2 == 0 or psf.shape[1] % 2 == 0:
             raise ShapeError(f"SpatialPSF: expected a PSF (h, w) of odd sizes, got {tuple(psf.shape)}.")
         values = psf.detach().double()

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
 from torchtransient.quantities import MOST_MADE
-from torchtransient.sensing.base.layout import TIME, check_bins, check_count, check_transient, product, real_tensors
+from torchtransient.sensing.base.layout import TIME, check_bins, check_count, check_transient, product, reals
 from torchtransient.sensing.base.sensor import Sensor
 
 
@@ -92,7 +92,7 @@ class CodedHistogram(Sensor):
         if not isinstance(codes, Tensor) or codes.ndim != 2:
             shape = tuple(codes.shape) if isinstance(codes, Tensor) else type(codes).__name__
             raise ShapeError(f"CodedHistogram: expected codes (K, T), got {shape}.")
-        values = real_tensors("CodedHistogram", torch.float64, codes=codes)[0].detach().double().clone()
+        values = reals("CodedHistogram", torch.float64, codes=codes)[0].detach().double().clone()
         if not bool(torch.isfinite(values).all()):
             raise UnitError("CodedHistogram: expected finite codes.")
         if learnable:

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchtransient.errors import GradientError, ShapeError, UnitError
 from torchtransient.given_types import several
 from torchtransient.quantities import Numbers
-from torchtransient.sensing.base.layout import check_count, check_number, check_transient, real_tensors
+from torchtransient.sensing.base.layout import check_count, check_number, check_transient, reals
 from torchtransient.sensing.base.policies import GradPolicy
 from torchtransient.sensing.base.sensor import RandomSensor, Sensor
 from torchtransient.sensing.base.wrapped_detector import WrappedDetector, added, cycles_of, several_of
@@ -27,7 +27,7 @@ def groups_of(spads: int, weights: Numbers | None, where: str) -> Groups:
     if weights is None:
         return [(1.0 / number, number)]
     if isinstance(weights, Tensor):
-        weights = real_tensors(where, torch.float64, weights=weights)[0].double().tolist()
+        weights = reals(where, torch.float64, weights=weights)[0].double().tolist()
     given = several(f"{where}: weights", weights, "numbers")
     values = [check_number(w, "weights", where) for w in given]
     if len(values) != number:

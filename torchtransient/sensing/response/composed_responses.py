@@ -9,9 +9,9 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.given_types import several
+from torchtransient.given_types import is_one_of, several
 from torchtransient.quantities import MOST_MADE, as_whole, shown
-from torchtransient.sensing.base.layout import check_seconds, real_tensors
+from torchtransient.sensing.base.layout import check_seconds, reals
 from torchtransient.sensing.numerics.time_convolution import check_choice
 from torchtransient.sensing.response.response_shapes import (
     above_floor,
@@ -59,10 +59,10 @@ class MeasuredResponse(Response):
         if not isinstance(counts, Tensor) or counts.ndim != 1 or counts.numel() < 2:
             shape = tuple(counts.shape) if isinstance(counts, Tensor) else type(counts).__name__
             raise ShapeError(f"MeasuredResponse: expected counts (T,) with T >= 2, got {shape}.")
-        if align not in ("center_of_mass", "start"):
-            raise ShapeError(f"MeasuredResponse: expected align 'center_of_mass' or 'start', got {align!r}.")
+        if not is_one_of(align, ("center_of_mass", "start")):
+            raise ShapeError(f"MeasuredResponse: expected align 'center_of_mass' or 'start', got {shown(align)}.")
         self.bin_width_s = check_seconds(bin_width_s, "bin_width_s", "MeasuredResponse", open_low=True)
-        values = real_tensors("MeasuredResponse", torch.float64, counts=counts)[0].detach().double()
+        values = reals("MeasuredResponse", torch.float64, counts=counts)[0].detach().double()
         if not bool(torch.isfinite(values).all()) or not bool((values.amax() > values.median()) & (values >= 0).all()):
             raise UnitError("MeasuredResponse: expected finite counts >= 0 with a peak above their median.")
         shares = above_floor(values, floor, "MeasuredResponse")

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.base.layout import check_number, going_together, one_number, real_tensors
+from torchtransient.sensing.base.layout import check_number, going_together, one_number, reals
 
 FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))  # 2.3548
 
@@ -47,20 +47,23 @@ def emg_density(time_s: Tensor, mean_s: Tensor, sigma_s: Tensor, tau_s: Tensor) 
     `mean_s`, `sigma_s`: of the normal part; `tau_s`: mean of the exponential part. Stable for every ratio of the two.
     Source: Grushka, Anal. Chem. 44 (1972); erfcx form as in Kalambet et al., J. Chemometrics 25 (2011).
     """
-    time_s, mean_s, sigma_s, tau_s = going_together("emg_density", time_s=time_s, mean_s=mean_s, sigma_s=sigma_s, tau_s=tau_s)
+    given = going_together("emg_density", time_s=time_s, mean_s=mean_s, sigma_s=sigma_s, tau_s=tau_s)
+    time_s, mean_s, sigma_s, tau_s = given
     return _tail_term((time_s - mean_s) / sigma_s, sigma_s / tau_s) / tau_s
 
 
 def emg_cdf(time_s: Tensor, mean_s: Tensor, sigma_s: Tensor, tau_s: Tensor) -> Tensor:
     """Share of `emg_density` before `time_s`."""
-    time_s, mean_s, sigma_s, tau_s = going_together("emg_cdf", time_s=time_s, mean_s=mean_s, sigma_s=sigma_s, tau_s=tau_s)
+    given = going_together("emg_cdf", time_s=time_s, mean_s=mean_s, sigma_s=sigma_s, tau_s=tau_s)
+    time_s, mean_s, sigma_s, tau_s = given
     u = (time_s - mean_s) / sigma_s
     return normal_cdf(u) - _tail_term(u, sigma_s / tau_s)
 
 
 def emg_survival(time_s: Tensor, mean_s: Tensor, sigma_s: Tensor, tau_s: Tensor) -> Tensor:
     """Share of `emg_density` after `time_s`, with relative precision far out in the tail."""
-    time_s, mean_s, sigma_s, tau_s = going_together("emg_survival", time_s=time_s, mean_s=mean_s, sigma_s=sigma_s, tau_s=tau_s)
+    given = going_together("emg_survival", time_s=time_s, mean_s=mean_s, sigma_s=sigma_s, tau_s=tau_s)
+    time_s, mean_s, sigma_s, tau_s = given
     u = (time_s - mean_s) / sigma_s
     return normal_cdf(-u) + _tail_term(u, sigma_s / tau_s)
 
@@ -106,7 +109,7 @@ def resample_counts(counts: Tensor, width_s: float, edges_s: Tensor, *, start_s:
     lies outside the new edges is left out. Differentiable in the counts, the edges and the start.
     """
     me = "resample_counts"
-    counts, edges_s = real_tensors(me, torch.float64, counts=counts, edges_s=edges_s)
+    counts, edges_s = reals(me, torch.float64, counts=counts, edges_s=edges_s)
     if counts.ndim != 1 or edges_s.ndim != 1 or not counts.numel():
         raise ShapeError(f"{me}: expected counts (T,) of one bin or more and edges_s (K + 1,), got "
                          f"{tuple(counts.shape)} and {tuple(edges_s.shape)}.")  # fmt: skip

@@ -28,7 +28,7 @@ from torchtransient.sensing.base.layout import (
     check_seconds,
     check_tensor,
     one_number,
-    real_tensors,
+    reals,
 )
 from torchtransient.sensing.base.policies import VARIANCE_FLOOR, GradPolicy, record_score
 from torchtransient.sensing.base.sensor import RandomSensor
@@ -54,7 +54,7 @@ def free_running_rate(rate_hz: Tensor, dead_time_s: float, kind: DeadTime = "non
     """Detections per second at a constant photon rate n: n/(1 + n td), or n exp(-n td) for "paralyzable"."""
     dead = check_seconds(dead_time_s, "dead_time_s", "free_running_rate")
     check_choice(kind, DeadTime, "kind", "free_running_rate")
-    (rate_hz,) = real_tensors("free_running_rate", rate_hz=rate_hz)
+    (rate_hz,) = reals("free_running_rate", rate_hz=rate_hz)
     check_rates(rate_hz, "free_running_rate")
     if kind == "paralyzable":
         return rate_hz * torch.exp(-rate_hz * dead)
@@ -122,7 +122,7 @@ def paralyzable_histogram(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
     wide = rate.to(torch.float64)
     bins = wide.shape[TIME]
     whole = math.floor(float(dead.detach()))
-    part = dead - whole
+    part = dead - float(whole)
     # flux between the start of the bin minus the dead time and the start of the bin
     total = wide.sum(TIME, keepdim=True)
     cycles, rest = divmod(whole, bins)

@@ -27,7 +27,7 @@ from torchtransient.sensing.base.layout import (
     check_seconds,
     check_transient,
     one_number,
-    real_tensors,
+    reals,
 )
 from torchtransient.sensing.base.policies import GradPolicy, gaussian_noise, record_score
 from torchtransient.sensing.base.sensor import RandomSensor
@@ -336,7 +336,7 @@ def first_photon_log_prob(
     `cycles` cycles.
     """
     number = check_count(cycles, "cycles", where)
-    (counts,), (rate,) = real_tensors(where, torch.float64, counts=counts), real_tensors(where, rate=rate)
+    (counts,), (rate,) = reals(where, torch.float64, counts=counts), reals(where, rate=rate)
     check_broadcast(where, counts=counts, rate=rate)
     if min(counts.ndim, rate.ndim) < 3:
         raise ShapeError(f"{where}: expected counts and rate (..., T, H, W), got {tuple(counts.shape)} and "
