@@ -6,12 +6,13 @@ import functools
 import inspect
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
 from support.loss_cases import CASES
 from torchtransient import losses
-from torchtransient.errors import TorchTransientError
+from torchtransient.errors import ArgumentError, TorchTransientError
 
 # Options that are numbers, by one that fits.
 NUMBERS = {

@@ -300,9 +300,9 @@ def _at_corners(
     slope is averaged over the noise. sqrt(N) deviations in each step have the covariance of all of them together.
     """
     # sqrt has no slope at 0
-    far = torch.where(variance > 0, ((number := steps.shape[-3]) * torch.where(variance > 0, variance, 1.0)).sqrt(), 0.0)
+    far = torch.where(variance > 0, (steps.shape[-3] * torch.where(variance > 0, variance, 1.0)).sqrt(), 0.0)
     found = []
-    for row in torch.eye(number, dtype=steps.dtype, device=steps.device):
+    for row in torch.eye(steps.shape[-3], dtype=steps.dtype, device=steps.device):
         away = far * row.view(-1, 1, 1)
         for moved in (steps + away, steps - away):
             found.append(wrapped_difference(_by_shape(moved, code, 1024, readout)[0], phase))
