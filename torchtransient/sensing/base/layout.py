@@ -73,7 +73,7 @@ def check_broadcast(where: str, **given: Tensor) -> None:
 
 def going_together(where: str, **given: object) -> tuple[Tensor, ...]:
     """`reals` whose shapes broadcast. ShapeError for others."""
-    found = reals(where, **given)
+    found = reals(where, None, **given)
     check_broadcast(where, **dict(zip(given, found, strict=True)))
     return found
 
@@ -81,7 +81,7 @@ def going_together(where: str, **given: object) -> tuple[Tensor, ...]:
 def number_or_tensor(value: Any, name: str, where: str) -> Any:
     """A finite number as a float, or a tensor as `reals` takes it, with its gradient. UnitError, ShapeError."""
     if isinstance(value, Tensor):
-        return reals(where, **{name: value})[0]
+        return reals(where, None, **{name: value})[0]
     return check_number(value, name, where, low=-math.inf)
 
 

@@ -28,7 +28,7 @@ import math
 from collections.abc import Callable
 from contextvars import ContextVar, Token
 from types import TracebackType
-from typing import Literal, get_args
+from typing import Literal, cast, get_args
 
 import torch
 from torch import Tensor
@@ -52,7 +52,7 @@ def check_policy(grad: str, where: str) -> GradPolicy:
     """`grad` when it is one of GRAD_POLICIES, else GradientError."""
     if not is_one_of(grad, GRAD_POLICIES):
         raise ArgumentError(f"{where}: expected grad to be one of {', '.join(GRAD_POLICIES)}, got {shown(grad)}.")
-    return grad
+    return cast("GradPolicy", grad)
 
 
 def standard_normal(like: Tensor, generator: torch.Generator | None = None) -> Tensor:

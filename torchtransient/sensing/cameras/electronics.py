@@ -153,7 +153,7 @@ class PixelElectronics(RandomSensor):
         self.black_level_dn = check_number(black_level_dn, "black_level_dn", me, low=lowest, high=highest)
         for name, values in (("gain_map", gain_map), ("offset_map_e", offset_map_e)):
             if values is not None:
-                values = values if isinstance(values, nn.Parameter) else reals(me, **{name: values})[0]
+                values = values if isinstance(values, nn.Parameter) else reals(me, None, **{name: values})[0]
             if isinstance(values, nn.Parameter):
                 self.register_parameter(name, values)
             else:

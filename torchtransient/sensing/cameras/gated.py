@@ -11,6 +11,7 @@ Laurenzis et al., "Time-of-flight range gating" (2007).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -92,8 +93,8 @@ class GatedIntegration(Sensor):
     ) -> None:
         super().__init__()
         me = type(self).__name__
-        given_s = several(f"{me}: delays_s", numbers_of(delays_s, "delays_s", me), "numbers of seconds")
-        delays = [check_seconds(d, "delays_s", me, signed=True) for d in given_s]  # type: ignore[arg-type]
+        given_s: list[Any] = several(f"{me}: delays_s", numbers_of(delays_s, "delays_s", me), "numbers of seconds")
+        delays = [check_seconds(d, "delays_s", me, signed=True) for d in given_s]
         width = numbers_of(widths_s, "widths_s", me)
         given = list(width) if isinstance(width, Sequence) else [width] * len(delays)
         widths = [check_seconds(w, "widths_s", me, open_low=True) for w in given]

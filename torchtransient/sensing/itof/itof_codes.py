@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -107,10 +108,10 @@ class FourierCode(CorrelationCode):
 
 def _harmonic(h: object, pair: object) -> tuple[int, tuple[float, float]]:
     name, me = "harmonics_of_one_tap", "FourierCode"
-    parts = several(f"{me}: {name}", pair, "numbers, amplitude and phase,")
+    parts: list[Any] = several(f"{me}: {name}", pair, "numbers, amplitude and phase,")
     if len(parts) != 2:
         raise ShapeError(f"{me}: expected {name} as (amplitude, phase in radians), got {shown(pair)}.")
-    amplitude, phase = (check_number(part, name, me, low=-math.inf) for part in parts)  # type: ignore[arg-type]
+    amplitude, phase = (check_number(part, name, me, low=-math.inf) for part in parts)
     number = count(f"{me}: {name}", h, None, UnitError, MOST_MADE)
     if number < 1:
         raise UnitError(f"{me}: expected harmonics 1, 2, ..., got {shown(h)}.")

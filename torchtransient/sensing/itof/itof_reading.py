@@ -122,7 +122,7 @@ class ItofNoise:
             if given is not None and not isinstance(given, Tensor):
                 # no light at all has no phase, and no noise no deviation
                 given = check_number(given, name, me, open_low=True)
-            elif given is not None and not holds(reals(me, **{name: given})[0] >= 0):
+            elif given is not None and not holds(reals(me, None, **{name: given})[0] >= 0):
                 raise UnitError(f"{me}: expected every {name} to be a number >= 0, got {shown(given)}.")
             object.__setattr__(self, name, given)
 

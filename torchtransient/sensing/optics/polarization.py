@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -232,10 +233,10 @@ def demosaic(raw: Tensor, block: tuple[int, int] = (2, 2)) -> Tensor:
     within the block. Linear in the light. Raises ShapeError for less than one block.
     """
     (raw,) = reals("demosaic", raw=raw)
-    sizes = several("demosaic: block", block, "numbers of pixels")
+    sizes: list[Any] = several("demosaic: block", block, "numbers of pixels")
     if len(sizes) != 2:
         raise ShapeError(f"demosaic: expected block as two numbers of pixels, got {shown(block)}.")
-    p, q = (check_count(size, "block", "demosaic") for size in sizes)  # type: ignore[arg-type]
+    p, q = (check_count(size, "block", "demosaic") for size in sizes)
     if raw.ndim < 4 or raw.shape[-2] < p or raw.shape[-1] < q:
         raise ShapeError(f"demosaic: expected raw light (..., C, T, H >= {p}, W >= {q}), got {tuple(raw.shape)}.")
     h, w = raw.shape[-2:]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -28,7 +29,7 @@ def groups_of(spads: int, weights: Numbers | None, where: str) -> Groups:
         return [(1.0 / number, number)]
     if isinstance(weights, Tensor):
         weights = reals(where, torch.float64, weights=weights)[0].double().tolist()
-    given = several(f"{where}: weights", weights, "numbers")
+    given: list[Any] = several(f"{where}: weights", weights, "numbers")
     values = [check_number(w, "weights", where) for w in given]
     if len(values) != number:
         raise ShapeError(f"{where}: expected weights of {number} SPADs, got {len(values)}.")
