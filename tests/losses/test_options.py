@@ -6,12 +6,13 @@ import functools
 import inspect
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
 from support.loss_cases import CASES
 from torchtransient import losses
-from torchtransient.errors import TorchTransientError
+from torchtransient.errors import ArgumentError, TorchTransientError
 
 # Options that are numbers, by one that fits.
 NUMBERS = {
@@ -147,3 +148,9 @@ def test_a_wrong_call_of_a_module_names_it(name):
     for arguments, keywords in (((), {}), (results(9), {}), (results(1), {"redution": "sum"})):
         with pytest.raises(TypeError, match=rf"^{name}\b"):
             module(*arguments, **keywords)
+
+
+def test_reductions_that_are_no_text():
+    for wrong in (np.array([1, 2], dtype=object), [1], None, torch.ones(2)):
+        with pytest.raises(ArgumentError, match="expected reduction 'none', 'sum' or 'mean', got"):
+            losses.total_variation(torch.ones(1, 2, 2, 2), reduction=wrong)

@@ -83,3 +83,18 @@ def test_thin_volumes_and_errors():
         losses.total_variation(picture, spacing=(1.0, 0.0, 1.0))
     with pytest.raises(UnitError, match="smoothing"):
         losses.total_variation(picture, smoothing=-1.0)
+
+
+@pytest.mark.parametrize("isotropic", [True, False])
+@pytest.mark.parametrize("size", [1e-30, 1e-23, 1e25])
+def test_squares_of_differences_neither_vanish_nor_overflow(isotropic, size):
+    """Of numbers whose squares single precision does not hold; so do gradients."""
+    noise = torch.rand(2, 1, 6, 6, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    for options in ({}, {"smoothing": 0.0}):
+        single, double = ((size * noise).to(d).requires_grad_() for d in (torch.float32, torch.float64))
+        found, wanted = (losses.total_variation(x, isotropic=isotropic, **options) for x in (single, double))
+        # a few thousand roundings of 6e-8, of differences of numbers ten times larger
+        assert float(found) == pytest.approx(float(wanted), rel=1e-5)
+        found.backward()
+        wanted.backward()
+        torch.testing.assert_close(single.grad.double(), double.grad, rtol=1e-3, atol=1e-6)

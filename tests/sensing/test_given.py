@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import inspect
+import warnings
+from functools import partial
 
 import pytest
 import torch
 from torch import nn
 
-from support.sensing.arguments import CALLS, DECIDE, OTHERS
+from support.refused import complaint
+from support.sensing.arguments import CALLS, COUNTS, DECIDE, LIGHT, OTHERS, PHASOR, RESPONSE, STOKES
 from support.sweeps import together
 from torchtransient import sensing
 from torchtransient.axes import TimeAxis
-from torchtransient.errors import GradientError
+from torchtransient.errors import GradientError, ShapeError, TorchTransientError, UnitError
 
 every_call = pytest.mark.parametrize("name", sorted(CALLS))
 
@@ -229,3 +232,76 @@ def test_calibrations_are_learnt(name):
     known = sensing.ItofCalibration(**{name: learnt})
     with pytest.raises(GradientError, match="sine code"):
         sensing.ItofCorrelation(sensing.square_code(4), 20e6, axis, calibration=known)
+
+
+def wrong_for(value):
+    """What may stand in the place of a tensor, or of a number, by mistake."""
+    whole = value.real.round().long() if value.is_complex() else value.round().long()
+    yield from (None, object(), ["a"], "x", 2**70, whole, whole > 0, value.to_sparse())
+    yield value.real if value.is_complex() else value + 1j
+    if value.ndim:
+        yield value[..., :0, :, :] if value.ndim >= 4 else value[:0]
+
+
+@together("name", sorted(CALLS))
+def test_what_is_no_tensor_of_numbers_is_said_in_one_sentence(name):
+    call, (numbers, rest) = getattr(sensing, name), CALLS[name]
+    wrong = []
+    for argument, value in numbers.items():
+        for given in wrong_for(value):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                attempt = partial(call, **{**numbers, argument: given}, **rest)
+                taken, said = complaint(attempt, TorchTransientError, given)
+            if taken and (isinstance(given, (str, list)) or type(given) is object):
+                said = f"{given!r} is taken"
+            wrong += [f"{argument}: {said}"] if said else []
+    assert not wrong, "; ".join(wrong)
+
+
+@together(
+    "make, error, said",
+    [
+        (lambda: sensing.Compose(0), TorchTransientError, "Compose: expected several sensors, got 0"),
+        (lambda: sensing.ComposedResponse(0), ShapeError, "ComposedResponse: expected several responses"),
+        (lambda: sensing.ComposedResponse([RESPONSE], oversampling=2**70), ShapeError, "oversampling to be odd"),
+        (lambda: sensing.PixelGroups(0, 0), TorchTransientError, "PixelGroups: expected several sensors, got 0"),
+        (lambda: sensing.fixed_pattern(-1, 2), UnitError, r"fixed_pattern: expected shape in \[0, inf\]"),
+        (lambda: sensing.fixed_pattern((2**40, 2**40), 2), UnitError, "at most 2\\^63 - 1 numbers"),
+        (lambda: sensing.sine_code(2**70), ShapeError, "expected at most 16777216 taps"),
+        (lambda: sensing.square_code(2**70), ShapeError, "expected at most 16777216 taps"),
+        (lambda: sensing.fourier_codes(2**70, 2), UnitError, "num_bins to be a whole number of at most 16777216"),
+        (lambda: sensing.FourierCode(4, {2**70: (0.5, 0.1)}), UnitError, "whole number of at most 16777216"),
+        (lambda: sensing.FourierCode(4, 5), TorchTransientError, "FourierCode: expected a dictionary"),
+        (lambda: sensing.FourierCode(4, {1: (0.5,)}), ShapeError, r"as \(amplitude, phase in radians\)"),
+        (lambda: sensing.defocus_psf(2**70), UnitError, "defocus_psf: expected a disc of at most 32768 points"),
+        (lambda: sensing.hamiltonian_code(torch.ones(3)), ShapeError, "expected 3 or 4 taps"),
+        (lambda: sensing.demosaic(torch.ones(1, 1, 4, 4), 2), ShapeError, "demosaic: block"),
+        (lambda: sensing.project_physical(STOKES, None), ShapeError, "stokes: dim: expected a whole number"),
+        (lambda: sensing.poisson(LIGHT, 5), TorchTransientError, "poisson: expected generator to be a torch.Generator"),
+        (lambda: sensing.poisson(1j * LIGHT), UnitError, "poisson: expected mean as real numbers, got torch"),
+        (lambda: sensing.phase_of(LIGHT), UnitError, "phase_of: expected phasor as complex numbers, got torch.float64"),
+        (lambda: sensing.background_per_bin(LIGHT[:, :0]), ShapeError, "one bin or more along time"),
+        (lambda: sensing.offset_of(LIGHT, 4, readout=torch.ones(2)), TorchTransientError, "expected readout to be one"),
+    ],
+)
+def test_what_sensors_do_not_take(make, error, said):
+    with pytest.raises(error, match=said):
+        make()
+
+
+def test_whole_numbers_and_truth_values_are_numbers():
+    """Of the default dtype; histograms that are measured with all their digits."""
+    whole, some = COUNTS.long(), COUNTS > 5
+    for function in (sensing.poisson_log_prob, sensing.wrapped_difference):
+        for given in (whole, some):
+            torch.testing.assert_close(function(given, given), function(given.float(), given.float()), rtol=0, atol=0)
+    exact = sensing.frames_to_rate(whole.float(), 100)
+    torch.testing.assert_close(sensing.frames_to_rate(whole, 100), exact, rtol=0, atol=0)
+    stokes = torch.tensor([3, 2, 2, 2]).reshape(4, 1, 1, 1, 1)
+    torch.testing.assert_close(sensing.project_physical(stokes), sensing.project_physical(stokes.float()))
+    assert sensing.poisson(some, torch.Generator().manual_seed(0)).dtype == torch.float32
+    many = torch.tensor([2**24 + 1, 2**25 + 1])
+    found = sensing.resample_counts(many, 1.0, torch.tensor([0.0, 1.0, 2.0]).double())
+    assert found.tolist() == many.tolist()
+    assert sensing.amplitude_of(PHASOR).dtype == torch.float64

@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from torchtransient.errors import ArgumentError, DeviceError, ShapeError, TorchTransientError, UnitError
+from torchtransient.given_types import is_one_of
 from torchtransient.quantities import MOST, finite, flag, shown
 from torchtransient.units import SHORTEST_OPL
 
@@ -23,8 +24,8 @@ Reduction = Literal["none", "sum", "mean"]
 
 
 def check_reduction(reduction: Reduction, where: str) -> None:
-    if reduction not in get_args(Reduction):
-        raise ArgumentError(f"{where}: expected reduction 'none', 'sum' or 'mean', got {reduction!r}.")
+    if not is_one_of(reduction, get_args(Reduction)):
+        raise ArgumentError(f"{where}: expected reduction 'none', 'sum' or 'mean', got {shown(reduction)}.")
 
 
 def check_pair(

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.errors import ShapeError
+from torchtransient.given_types import is_one_of
 from torchtransient.losses.comparison import (
     Reduction,
     check_dense,
@@ -92,7 +93,7 @@ def mesh_normal_consistency(
 
 
 def _check_weights(weights: Weights, where: str) -> None:
-    if weights not in get_args(Weights):
+    if not is_one_of(weights, get_args(Weights)):
         raise ShapeError(f"{where}: expected weights 'uniform' or 'cotangent', got {shown(weights)}.")
 
 

@@ -66,10 +66,12 @@ def total_variation(
         smooth = _SMOOTHING / min(steps) * item_scale(seen, seen, _DIMS, mask)
     else:
         smooth = check_level("smoothing", smoothing, seen, where, zero=True, square=True)
-    squares = [_squared_difference(seen, mask, dim, step) for dim, step in zip(_DIMS, steps, strict=True)]
+    differences = [_difference(seen, mask, dim, step) for dim, step in zip(_DIMS, steps, strict=True)]
+    scale = _scale(differences, smooth)
+    squares = [squared_modulus(difference / scale) for difference in differences]
     if isotropic:
         squares = [torch.stack(squares).sum(0)]
-    value = torch.stack([_smooth_root(square, smooth) for square in squares]).sum(0)
+    value = torch.stack([_smooth_root(square, smooth / scale) for square in squares]).sum(0) * scale
     return reduce(value, reduction, where, mask)
 
 
@@ -87,14 +89,25 @@ def _check_spacing(spacing: Numbers | None, like: Tensor, where: str) -> tuple[f
     return z, y, x
 
 
-def _squared_difference(x: Tensor, mask: Tensor | None, dim: int, step: float) -> Tensor:
+def _difference(x: Tensor, mask: Tensor | None, dim: int, step: float) -> Tensor:
     size = x.shape[dim]
     difference = x.diff(dim=dim) / step
     if mask is not None:
         both = mask.narrow(dim, 1, size - 1) & mask.narrow(dim, 0, size - 1)
         difference = counted(difference, both)
-    square = squared_modulus(difference)
-    return torch.cat([square, torch.zeros_like(square.sum(dim, keepdim=True))], dim)
+    return torch.cat([difference, torch.zeros_like(x.narrow(dim, 0, 1))], dim)
+
+
+def _scale(differences: list[Tensor], smooth: Tensor) -> Tensor:
+    """The largest difference of each item (..., 1, 1, 1), or the smoothing where that is larger, without gradient: the
+    squares of its shares neither overflow nor vanish.
+    """
+    parts = [(d.real.abs() + d.imag.abs() if d.is_complex() else d.abs()).detach().amax(_DIMS, True)
+             for d in differences]  # fmt: skip
+    largest = torch.stack(parts).amax(0)
+    level = smooth.detach().amax(_DIMS, True) if smooth.ndim >= len(_DIMS) else smooth.detach().amax()
+    largest = torch.maximum(largest, level)
+    return torch.where((largest > 0) & largest.isfinite(), largest, torch.ones_like(largest))
 
 
 def _smooth_root(square: Tensor, smooth: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd import forward_ad
 
-from torchtransient.errors import GradientError, UnitError
+from torchtransient.errors import GradientError, ShapeError, UnitError
 from torchtransient.quantities import shown
 
 
@@ -23,6 +23,14 @@ def tensor_of(array: np.ndarray[Any, Any], where: str) -> Tensor:
         return torch.from_numpy(native if native.flags.writeable else native.copy())
     except TypeError as error:
         raise UnitError(f"{where}: expected numbers as a tensor or an array, got {shown(array)}.") from error
+
+
+def check_dense(x: Tensor, where: str, name: str = "") -> Tensor:
+    """The tensor. ShapeError for a sparse one."""
+    if x.layout != torch.strided:
+        said = f"{name} as a dense tensor" if name else "a dense tensor"
+        raise ShapeError(f"{where}: expected {said}, got {x.layout}. x.to_dense() makes one.")
+    return x
 
 
 def no_arrays(value: Any, where: str) -> Any:
@@ -69,6 +77,9 @@ def careful_init(init: Callable[..., None]) -> Callable[..., None]:
         where = type(self).__name__
         given = [no_arrays(value, where) for value in args]
         named = {name: no_arrays(value, where) for name, value in keywords.items()}
+        for value in (*given, *named.values()):
+            if isinstance(value, Tensor):
+                check_dense(value, where)
         try:
             init(self, *given, **named)
         except TypeError as error:  # of arguments that a class inherits: said of the class, not of its base

@@ -13,8 +13,8 @@ from torchtransient.axes import WIDEST_BIN_S, TimeAxis
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.floating import product as product
 from torchtransient.floating import without_autocast as without_autocast
-from torchtransient.quantities import as_number, shown, unit_of
-from torchtransient.sensing.base.given import refuse_cut_off
+from torchtransient.quantities import MOST, as_number, as_whole, shown, unit_of
+from torchtransient.sensing.base.given import check_dense, refuse_cut_off
 
 TIME = -3  # the time dimension of (..., C, T, H, W)
 _OTHER_FILMS = (
@@ -27,7 +27,7 @@ def check_tensor(x: object, where: str) -> Tensor:
     """`x` when it is a tensor, else ShapeError: a renderer's output, or the transient that a film does not measure."""
     if not isinstance(x, Tensor):
         raise ShapeError(f"{where}: expected a tensor (..., C, T, H, W), got {not_a_transient(x)}")
-    return x
+    return check_dense(x, where)
 
 
 def check_tensors(where: str, **given: object) -> None:
@@ -35,6 +35,54 @@ def check_tensors(where: str, **given: object) -> None:
     for name, value in given.items():
         if not isinstance(value, Tensor):
             raise ShapeError(f"{where}: expected {name} as a tensor, got {shown(value)}. torch.as_tensor makes one.")
+        check_dense(value, where, name)
+
+
+def reals(where: str, whole: torch.dtype | None = None, **given: object) -> tuple[Tensor, ...]:
+    """Tensors of real numbers; whole numbers and truth values, which counts may be, in the default dtype
+    or `whole`, which holds all their digits. ShapeError for no tensors, UnitError for complex numbers.
+    """
+    check_tensors(where, **given)
+    found = []
+    for name, value in given.items():
+        assert isinstance(value, Tensor)  # as was checked
+        if value.is_complex():
+            raise UnitError(f"{where}: expected {name} as real numbers, got {value.dtype}.")
+        found.append(value if value.is_floating_point() else value.to(whole or torch.get_default_dtype()))
+    return tuple(found)
+
+
+def complex_tensor(where: str, **given: object) -> Tensor:
+    """The one tensor given, of complex numbers. ShapeError for no tensor, UnitError for real numbers."""
+    check_tensors(where, **given)
+    ((name, value),) = given.items()
+    if not isinstance(value, Tensor) or not value.is_complex():
+        kind = getattr(value, "dtype", None)
+        raise UnitError(f"{where}: expected {name} as complex numbers, got {kind}. torch.complex makes some.")
+    return value
+
+
+def check_broadcast(where: str, **given: Tensor) -> None:
+    """ShapeError for tensors whose shapes do not go together."""
+    shapes = [tuple(x.shape) for x in given.values()]
+    ends = [{shape[-k] for shape in shapes if len(shape) >= k} - {1} for k in range(1, max(map(len, shapes)) + 1)]
+    if any(len(sizes) > 1 for sizes in ends):
+        got = " and ".join(map(str, shapes))
+        raise ShapeError(f"{where}: expected {' and '.join(given)} of shapes that broadcast, got {got}.")
+
+
+def going_together(where: str, **given: object) -> tuple[Tensor, ...]:
+    """`reals` whose shapes broadcast. ShapeError for others."""
+    found = reals(where, None, **given)
+    check_broadcast(where, **dict(zip(given, found, strict=True)))
+    return found
+
+
+def number_or_tensor(value: Any, name: str, where: str) -> Any:
+    """A finite number as a float, or a tensor as `reals` takes it, with its gradient. UnitError, ShapeError."""
+    if isinstance(value, Tensor):
+        return reals(where, None, **{name: value})[0]
+    return check_number(value, name, where, low=-math.inf)
 
 
 def check_transient(x: Tensor, where: str) -> Tensor:
@@ -50,6 +98,13 @@ def check_transient(x: Tensor, where: str) -> Tensor:
         )
     if not x.is_floating_point():
         raise UnitError(f"{where}: expected a floating dtype, got {x.dtype}. Convert with .float().")
+    return x
+
+
+def check_bins(x: Tensor, where: str) -> Tensor:
+    """As `check_transient`, of one bin at least: nothing is the largest of none. ShapeError."""
+    if not check_transient(x, where).shape[TIME]:
+        raise ShapeError(f"{where}: expected one bin or more along time, got {tuple(x.shape)}.")
     return x
 
 
@@ -75,6 +130,8 @@ def check_number(
     GradientError for a tensor that requires a gradient, which a float cannot carry.
     """
     refuse_cut_off(value, name, where)
+    if isinstance(value, Tensor):
+        check_dense(value, where, name)
     number = as_number(value)
     if number is None:
         raise UnitError(f"{where}: expected {name} to be one number, got {shown(value)}.")
@@ -85,12 +142,28 @@ def check_number(
     return number
 
 
-def check_count(value: float, name: str, where: str, *, low: int = 1) -> int:
-    """`value` as an int when it is a whole number >= low, else UnitError."""
+def one_number(value: Any, name: str, where: str) -> Any:
+    """One real number as a float, or a tensor of one as it is, with its gradient. UnitError."""
+    plain = isinstance(value, Tensor) and value.numel() == 1 and value.layout == torch.strided
+    if plain and not value.is_complex() and value.dtype != torch.bool:
+        return value
+    number = None if plain or getattr(value, "layout", torch.strided) != torch.strided else as_number(value)
+    if number is None:
+        raise UnitError(f"{where}: expected {name} to be one number, got {shown(value)}.")
+    return number
+
+
+def check_count(value: float, name: str, where: str, *, low: int = 1, most: int = MOST) -> int:
+    """`value` as an int when it is a whole number from low to most, else UnitError."""
     number = check_number(value, name, where, low=low)
     if number != int(number):
-        raise UnitError(f"{where}: expected {name} to be a whole number, got {value!r}.")
-    return int(number)
+        raise UnitError(f"{where}: expected {name} to be a whole number, got {shown(value)}.")
+    whole = as_whole(value)  # all its digits
+    whole = int(number) if whole is None else whole
+    if whole > most:
+        limit = "2^63 - 1" if most == MOST else most
+        raise UnitError(f"{where}: expected {name} to be a whole number of at most {limit}, got {shown(value)}.")
+    return whole
 
 
 def check_one_of(where: str, given: Mapping[str, Any]) -> None:

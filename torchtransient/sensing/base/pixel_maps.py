@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import holds
 from torchtransient.quantities import unit_of
-from torchtransient.sensing.base.given import no_arrays
+from torchtransient.sensing.base.given import check_dense, no_arrays
 from torchtransient.sensing.base.layout import check_number
 
 
@@ -26,6 +26,7 @@ def check_map(
     value = no_arrays(value, where)
     if not isinstance(value, Tensor):
         return check_number(value, name, where, low=low, high=high, open_low=open_low)  # type: ignore[arg-type]
+    check_dense(value, where, name)
     if value.is_complex() or value.dtype == torch.bool:
         raise UnitError(f"{where}: expected {name} as real numbers, got {value.dtype}.")
     if value.ndim == 1:

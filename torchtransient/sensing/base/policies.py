@@ -28,14 +28,16 @@ import math
 from collections.abc import Callable
 from contextvars import ContextVar, Token
 from types import TracebackType
-from typing import Literal, get_args
+from typing import Literal, cast, get_args
 
 import torch
 from torch import Tensor
 
 from torchtransient.errors import ArgumentError, GradientError, ShapeError
 from torchtransient.floating import in_single
-from torchtransient.sensing.base.layout import check_tensors
+from torchtransient.given_types import is_one_of
+from torchtransient.quantities import shown
+from torchtransient.sensing.base.layout import check_generator, going_together, reals
 
 GradPolicy = Literal["expected", "gaussian", "straight_through", "score"]
 GRAD_POLICIES: tuple[GradPolicy, ...] = get_args(GradPolicy)
@@ -48,9 +50,9 @@ _ACTIVE: ContextVar[tuple[ScoreFunction, ...]] = ContextVar("active_score_functi
 
 def check_policy(grad: str, where: str) -> GradPolicy:
     """`grad` when it is one of GRAD_POLICIES, else GradientError."""
-    if grad not in GRAD_POLICIES:
-        raise ArgumentError(f"{where}: expected grad to be one of {', '.join(GRAD_POLICIES)}, got {grad!r}.")
-    return grad
+    if not is_one_of(grad, GRAD_POLICIES):
+        raise ArgumentError(f"{where}: expected grad to be one of {', '.join(GRAD_POLICIES)}, got {shown(grad)}.")
+    return cast("GradPolicy", grad)
 
 
 def standard_normal(like: Tensor, generator: torch.Generator | None = None) -> Tensor:
@@ -65,7 +67,8 @@ def gaussian_noise(variance: Tensor, generator: torch.Generator | None = None) -
     The scale is sqrt(v + e) - sqrt(e) with e = VARIANCE_FLOOR: an empty bin stays empty, its gradient is finite (at
     most 50 |eps|), and at v = 1 the variance is 2 % short. Negative variances (rounding) count as 0.
     """
-    check_tensors("gaussian_noise", variance=variance)
+    (variance,) = reals("gaussian_noise", variance=variance)
+    check_generator(generator, "gaussian_noise")
     v = variance.clamp_min(0)
     scale: Tensor = (v + VARIANCE_FLOOR).sqrt() - math.sqrt(VARIANCE_FLOOR)
     return scale * standard_normal(v, generator)
@@ -73,7 +76,7 @@ def gaussian_noise(variance: Tensor, generator: torch.Generator | None = None) -
 
 def straight_through(sample: Tensor, mean: Tensor) -> Tensor:
     """The values of `sample` with the gradient of `mean`. Exact for losses that are linear in the sample."""
-    check_tensors("straight_through", sample=sample, mean=mean)
+    sample, mean = going_together("straight_through", sample=sample, mean=mean)
     return sample.detach() + (mean - mean.detach())
 
 

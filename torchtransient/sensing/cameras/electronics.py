@@ -20,7 +20,9 @@ from torch import Tensor, nn
 
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
-from torchtransient.sensing.base.layout import check_count, check_number, check_transient
+from torchtransient.given_types import several
+from torchtransient.quantities import MOST, as_whole, shown
+from torchtransient.sensing.base.layout import check_count, check_generator, check_number, check_transient, reals
 from torchtransient.sensing.base.policies import (
     VARIANCE_FLOOR,
     GradPolicy,
@@ -77,7 +79,13 @@ def fixed_pattern(
 
     For ``gain_map`` (center 1, spread 0.5 to 2 %) and ``offset_map_e`` of `PixelElectronics`. UnitError below zero.
     """
-    check_number(spread, "spread", "fixed_pattern")
+    me = "fixed_pattern"
+    spread, center = check_number(spread, "spread", me), check_number(center, "center", me, low=-math.inf)
+    sizes = [shape] if as_whole(shape) is not None else several(f"{me}: shape", shape, "numbers of pixels")
+    shape = tuple(check_count(size, "shape", me, low=0) for size in sizes)  # type: ignore[arg-type]
+    check_generator(generator, me)
+    if math.prod(shape) > MOST:
+        raise UnitError(f"{me}: expected shape of at most 2^63 - 1 numbers, got {shown(shape)}.")
     return center + spread * torch.randn(shape, generator=generator)
 
 
@@ -144,6 +152,8 @@ class PixelElectronics(RandomSensor):
         lowest, highest = self.range_dn
         self.black_level_dn = check_number(black_level_dn, "black_level_dn", me, low=lowest, high=highest)
         for name, values in (("gain_map", gain_map), ("offset_map_e", offset_map_e)):
+            if values is not None:
+                values = values if isinstance(values, nn.Parameter) else reals(me, None, **{name: values})[0]
             if isinstance(values, nn.Parameter):
                 self.register_parameter(name, values)
             else:

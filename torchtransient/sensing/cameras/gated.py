@@ -11,15 +11,17 @@ Laurenzis et al., "Time-of-flight range gating" (2007).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.given_types import several
 from torchtransient.quantities import Numbers
 from torchtransient.sensing.base.given import numbers_of
-from torchtransient.sensing.base.layout import check_number, check_seconds, check_time_axis
+from torchtransient.sensing.base.layout import check_number, check_seconds, check_time_axis, reals
 from torchtransient.sensing.base.sensor import Sensor
 from torchtransient.sensing.itof.itof import correlate
 from torchtransient.sensing.response.response_shapes import normal_integral
@@ -41,7 +43,8 @@ def gate_profiles(
     me = "gate_profiles"
     rise = check_seconds(rise_s, "rise_s", me, open_low=True) / RISE_PER_SIGMA
     fall = check_seconds(fall_s, "fall_s", me, open_low=True) / RISE_PER_SIGMA
-    check_number(leakage, "leakage", me, high=1.0)
+    leakage = check_number(leakage, "leakage", me, high=1.0)
+    delays_s, widths_s = reals(me, delays_s=delays_s, widths_s=widths_s)
     if delays_s.ndim != 1 or delays_s.shape != widths_s.shape:
         raise ShapeError(
             f"{me}: expected delays and widths (G,), got {tuple(delays_s.shape)}, {tuple(widths_s.shape)}."
@@ -90,7 +93,8 @@ class GatedIntegration(Sensor):
     ) -> None:
         super().__init__()
         me = type(self).__name__
-        delays = [check_seconds(d, "delays_s", me, signed=True) for d in numbers_of(delays_s, "delays_s", me)]
+        given_s: list[Any] = several(f"{me}: delays_s", numbers_of(delays_s, "delays_s", me), "numbers of seconds")
+        delays = [check_seconds(d, "delays_s", me, signed=True) for d in given_s]
         width = numbers_of(widths_s, "widths_s", me)
         given = list(width) if isinstance(width, Sequence) else [width] * len(delays)
         widths = [check_seconds(w, "widths_s", me, open_low=True) for w in given]

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import ArgumentError, GradientError, ShapeError, UnitError
+from torchtransient.given_types import several
 from torchtransient.sensing.base.layout import TIME, not_a_transient
 from torchtransient.sensing.base.policies import GradPolicy, check_policy
 from torchtransient.sensing.base.sensor import RandomSensor, Sensor
@@ -61,6 +62,7 @@ class Compose(Sensor):
             raise ArgumentError(
                 f"Compose: expected a list of sensors, got one {type(stages).__name__}. Put it into []."
             )
+        stages = several("Compose", stages, "sensors", error=ArgumentError)
         wrong = [type(s).__name__ for s in stages if not isinstance(s, nn.Module)]
         if not len(stages) or wrong:
             raise ArgumentError(f"Compose: expected a list of sensors, got {wrong or 'an empty one'}.")

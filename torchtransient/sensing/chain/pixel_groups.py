@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.errors import ArgumentError, GradientError, ShapeError, UnitError
+from torchtransient.given_types import several
 from torchtransient.sensing.base.layout import check_transient
 from torchtransient.sensing.base.own_bins import common_bins
 from torchtransient.sensing.base.policies import GradPolicy, ScoreFunction, check_policy, record_score
@@ -40,6 +41,7 @@ class PixelGroups(RandomSensor):
 
     def __init__(self, sensors: Sequence[Sensor], which: Tensor, *, grad: GradPolicy | None = None) -> None:
         super(RandomSensor, self).__init__()
+        sensors = several("PixelGroups", sensors, "sensors", error=ArgumentError)
         wrong = [type(s).__name__ for s in sensors if not isinstance(s, Sensor)]
         if not len(sensors) or wrong:
             raise ArgumentError(f"PixelGroups: expected a list of sensors, got {wrong or 'an empty one'}.")

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ArgumentError
+from torchtransient.sensing.base.layout import check_number
 from torchtransient.sensing.base.policies import GradPolicy
 from torchtransient.sensing.cameras.electronics import PixelElectronics
 from torchtransient.sensing.chain.compose import Compose
@@ -56,6 +57,9 @@ class StreakCamera(Compose):
     ) -> None:
         if not isinstance(axis, TimeAxis):
             raise ArgumentError(f"StreakCamera: expected a TimeAxis, got {type(axis).__name__}.")
+        time_fwhm_s = check_number(time_fwhm_s, "time_fwhm_s", "StreakCamera")
+        spatial_fwhm_px = check_number(spatial_fwhm_px, "spatial_fwhm_px", "StreakCamera")
+        phosphor_fwhm_px = check_number(phosphor_fwhm_px, "phosphor_fwhm_px", "StreakCamera")
         camera = PixelElectronics(
             shot_noise=False,
             read_noise_e=read_noise_e,

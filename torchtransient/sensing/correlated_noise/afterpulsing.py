@@ -12,9 +12,18 @@ from torch import Tensor, nn
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
-from torchtransient.quantities import Numbers, as_number, shown
+from torchtransient.quantities import MOST_MADE, Numbers, as_number, shown
 from torchtransient.sensing.base.given import numbers_of
-from torchtransient.sensing.base.layout import TIME, bin_width_of, check_number, check_seconds, check_transient
+from torchtransient.sensing.base.layout import (
+    TIME,
+    bin_width_of,
+    check_count,
+    check_number,
+    check_seconds,
+    check_transient,
+    one_number,
+    reals,
+)
 from torchtransient.sensing.base.pixel_maps import check_map, keep_map, kept_map, over_time
 from torchtransient.sensing.base.policies import GradPolicy
 from torchtransient.sensing.base.remembered import remembered
@@ -48,7 +57,10 @@ def afterpulse_kernel(tau_s: Tensor | float, dead_time_s: float, bin_width_s: fl
     """
     if as_number(tau_s) is None:
         raise UnitError(f"afterpulse_kernel: expected tau_s as one number of seconds, got {shown(tau_s)}.")
-    tau = torch.as_tensor(tau_s, dtype=torch.float64) / bin_width_s
+    dead_time_s = check_seconds(dead_time_s, "dead_time_s", "afterpulse_kernel", high=1.0)
+    bin_width_s = check_seconds(bin_width_s, "bin_width_s", "afterpulse_kernel", open_low=True, high=1.0)
+    period_bins = check_count(period_bins, "period_bins", "afterpulse_kernel", most=MOST_MADE)
+    tau = torch.as_tensor(one_number(tau_s, "tau_s", "afterpulse_kernel"), dtype=torch.float64) / bin_width_s
     return exponential_kernel(tau.reshape(1), dead_time_s / bin_width_s, period_bins)[0]
 
 
@@ -68,9 +80,12 @@ def add_afterpulses(
     Differentiable in all three. Computed in float64 by FFT round the period; dtype and device of `counts` are kept.
     """
     check_transient(counts, "add_afterpulses")
-    bins, period = counts.shape[TIME], kernel.shape[0]
-    _check_period(period, bins)
-    p = torch.as_tensor(probability, dtype=torch.float64, device=counts.device)
+    (kernel,) = reals("add_afterpulses", kernel=kernel)
+    if kernel.ndim != 1:
+        raise ShapeError(f"add_afterpulses: expected a kernel (P,), got {tuple(kernel.shape)}.")
+    _check_period(kernel.shape[0], bins := counts.shape[TIME])
+    p = one_number(probability, "probability", "add_afterpulses")
+    p = torch.as_tensor(p, dtype=torch.float64, device=counts.device)
     added = _filtered(counts, *_gain(p, kernel.to(counts.device, torch.float64), bins))
     return added if only_added else counts + added
 
@@ -375,11 +390,11 @@ def hot_pixel_rates(
 
     `log_std`: standard deviation of the natural logarithm. For `PhotonBudget(dark_count_rate_hz=...)`.
     """
-    where = "hot_pixel_rates"
-    median = check_number(median_hz, "median_hz", where)
+    median = check_number(median_hz, "median_hz", where := "hot_pixel_rates")
     spread = check_number(log_std, "log_std", where)
     fraction = check_number(hot_fraction, "hot_fraction", where, high=1.0)
     factor = check_number(hot_factor, "hot_factor", where, low=1.0)
-    rates = median * torch.exp(spread * torch.randn(height, width, dtype=torch.float64, generator=generator))
-    hot = torch.rand(height, width, dtype=torch.float64, generator=generator) < fraction
+    size = [check_count(side, "height and width", where, low=0, most=MOST_MADE) for side in (height, width)]
+    rates = median * torch.exp(spread * torch.randn(size, dtype=torch.float64, generator=generator))
+    hot = torch.rand(size, dtype=torch.float64, generator=generator) < fraction
     return torch.where(hot, rates * factor, rates)

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from torchtransient.errors import UnitError
 from torchtransient.floating import in_single
-from torchtransient.sensing.base.layout import check_number, check_transient
+from torchtransient.sensing.base.layout import check_number, check_transient, one_number
 from torchtransient.sensing.base.policies import GradPolicy
 from torchtransient.sensing.counts.added_counts import AddedCounts
 from torchtransient.sensing.numerics.draws import by_pieces
@@ -31,6 +31,8 @@ def add_crosstalk(
     the rim of the sensor is lost. First order: crosstalk of crosstalk is left out. (..., C, T, H, W), dtype kept.
     """
     check_transient(counts, "add_crosstalk")
+    probability = one_number(probability, "probability", "add_crosstalk")
+    diagonal = one_number(diagonal, "diagonal", "add_crosstalk")
     near = torch.as_tensor(probability, device=counts.device).to(counts.dtype)
     far = torch.as_tensor(diagonal, device=counts.device).to(counts.dtype)
     padded = torch.nn.functional.pad(counts, (1, 1, 1, 1))

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchtransient.errors import UnitError
 from torchtransient.floating import in_single
-from torchtransient.sensing.base.layout import check_tensors, check_transient
+from torchtransient.sensing.base.layout import check_generator, check_transient, going_together, reals
 from torchtransient.sensing.base.sensor import RandomSensor
 
 # float32 counts whole numbers up to here; torch.poisson beyond it draws even numbers only.
@@ -21,7 +21,8 @@ def poisson(mean: Tensor, generator: torch.Generator | None = None) -> Tensor:
     Half precision gives float32. Float32 above 2^24 is drawn in float64, then rounded to the dtype of `mean`. Raises
     UnitError for negative or non-finite means: negative lobes of a filter have to be dealt with where they arise.
     """
-    check_tensors("poisson", mean=mean)
+    (mean,) = reals("poisson", mean=mean)
+    check_generator(generator, "poisson")
     mean = mean.detach()
     low, high = torch.aminmax(mean) if mean.numel() else (mean.new_zeros(()), mean.new_zeros(()))
     if not bool(low >= 0) or not bool(torch.isfinite(high)):
@@ -37,7 +38,7 @@ def poisson_log_prob(counts: Tensor, mean: Tensor) -> Tensor:
 
     A count above 0 where the mean is 0 has log-probability -inf. Shapes broadcast.
     """
-    check_tensors("poisson_log_prob", counts=counts, mean=mean)
+    counts, mean = going_together("poisson_log_prob", counts=counts, mean=mean)
     empty = counts == 0
     # where on the input: xlogy(0, 0) has a NaN gradient
     log_mean = torch.where(empty, torch.ones_like(mean), mean).log()

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import TorchTransientError, UnitError
+from torchtransient.sensing.base.layout import one_number
 from torchtransient.sensing.dead_time.renewal_chain import BinResponse, bin_response
 
 PHOTONS = 0.25  # of the brightest piece, at most: the total variation of means is then below 1e-5
@@ -45,9 +46,10 @@ class Cycle:
         return torch.minimum((self.count - soon).clamp_min(0), self.count)
 
 
-def check_dead_bins(dead_bins: Tensor | float) -> float:
+def check_dead_bins(dead_bins: Tensor | float, where: str = "dead time") -> float:
     """A dead time in bins as a number. Raises UnitError below half a bin, or where it is not finite."""
-    value = float(dead_bins.detach()) if isinstance(dead_bins, Tensor) else float(dead_bins)
+    given = one_number(dead_bins, "dead_bins", where)
+    value = float(given.detach()) if isinstance(given, Tensor) else given
     if not 0.5 - 1e-9 <= value < 1e9:
         raise UnitError(
             f"dead time: expected at least half a bin, got {value:g} bins. Use narrower bins, or no dead time "

@@ -22,7 +22,7 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ArgumentError, DeviceError, GradientError, ShapeError, UnitError
 from torchtransient.quantities import shown
-from torchtransient.sensing.base.given import no_arrays
+from torchtransient.sensing.base.given import check_dense, no_arrays
 from torchtransient.sensing.base.layout import TIME, check_count, check_time_axis
 from torchtransient.sensing.response.impulse_response import Response
 from torchtransient.sensing.response.response_shapes import resample_counts
@@ -240,6 +240,7 @@ def _pixels(values: tuple[Tensor | float, ...], response: Response, where: str) 
         value = no_arrays(given, where)
         if isinstance(value, bool) or not isinstance(value, (Tensor, int, float)):
             raise UnitError(f"{where}: expected {name} to be a number or a tensor, got {type(value).__name__}.")
+        value = check_dense(value, where, name) if isinstance(value, Tensor) else float(value)
         device = response.delay_ps.device
         tensor = torch.as_tensor(value, device=None if isinstance(value, Tensor) and value.ndim else device)
         if tensor.device != device:

@@ -19,13 +19,17 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
+from torchtransient.quantities import count
 from torchtransient.sensing.base.layout import (
     TIME,
+    check_bins,
     check_count,
     check_number,
-    check_tensors,
     check_time_axis,
     check_transient,
+    number_or_tensor,
+    one_number,
+    reals,
 )
 from torchtransient.sensing.numerics.time_convolution import Boundary, convolve_time
 from torchtransient.tensor_record import TensorRecord
@@ -56,6 +60,9 @@ def log_matched_filter(
         raise ShapeError(
             f"{me}: expected a kernel (K,) with K >= 1, got {shape}. first, kernel = response.kernel(bin_width_s)."
         )
+    check_transient(histogram, me)
+    (kernel,) = reals(me, kernel=kernel)
+    first = count(f"{me}: first", first, None, UnitError)
     if bool((kernel < 0).any()):
         raise UnitError(f"{me}: expected shares >= 0 in the kernel, got {float(kernel.min()):g}.")
     weights = torch.log1p(ratio * kernel.to(histogram.device))
@@ -71,7 +78,7 @@ def peak_position(scores: Tensor, refine: bool = True) -> Tensor:
     pulled towards the middle of the bin. Differentiable through the parabola only. Without refinement, in the first
     or last bin and where the three entries are equal, it is the middle of the bin with derivative zero.
     """
-    check_transient(scores, "peak_position")
+    check_bins(scores, "peak_position")
     index = scores.argmax(TIME, keepdim=True)
     middle = index.squeeze(TIME).to(scores.dtype) + 0.5
     position = middle + _parabola(scores, index).squeeze(TIME) if refine else middle
@@ -108,7 +115,7 @@ def center_of_mass(
     light is: the result goes to the middle as ``S^2 / N^2``, its derivative stays bounded, and it never leaves the
     window (or the bins that count). Half precision is summed in float32.
     """
-    check_transient(histogram, "center_of_mass")
+    check_bins(histogram, "center_of_mass")
     excess = histogram - _per_pixel(background, histogram, "center_of_mass", "background")
     bins = _positions(histogram)
     if half_width_bins is None:
@@ -144,7 +151,7 @@ def soft_argmax(scores: Tensor, temperature: float = 1.0) -> Tensor:
     temperatures and background pull it to the middle of the window; with so many counts (or so small a temperature)
     that the posterior is narrower than half a bin, it snaps to the middle of a bin. Differentiable everywhere.
     """
-    check_transient(scores, "soft_argmax")
+    check_bins(scores, "soft_argmax")
     dtype = scores.dtype
     scores = scores if dtype.itemsize > 2 else scores.float()
     scale = check_number(temperature, "temperature", "soft_argmax", open_low=True)
@@ -172,7 +179,7 @@ def first_return(histogram: Tensor, threshold: Tensor | float) -> Returns:
     middle. Earlier than the peak by a share of the pulse: a leading-edge discriminator has the same walk error.
     An entry of zero or less is no return, whatever the threshold: a share of the largest entry is 0 in an empty pixel.
     """
-    check_transient(histogram, "first_return")
+    check_bins(histogram, "first_return")
     level = _per_pixel(threshold, histogram, "first_return", "threshold")
     # NaN counts as reached, and is then what is found
     reached = ~((histogram < level) | (histogram <= 0))
@@ -197,7 +204,8 @@ def multi_return(scores: Tensor, max_returns: int, *, threshold: float, min_sepa
     Memory and time grow as R.
     """
     me = "multi_return"
-    check_transient(scores, me)
+    check_bins(scores, me)
+    threshold = one_number(threshold, "threshold", me)
     check_count(max_returns, "max_returns", me)
     separation = check_count(min_separation_bins, "min_separation_bins", me)
     # NaN is no maximum anywhere: a histogram with one has no returns that could be told
@@ -226,7 +234,7 @@ def multi_return(scores: Tensor, max_returns: int, *, threshold: float, min_sepa
 
 def background_per_bin(histogram: Tensor) -> Tensor:
     """Median over the bins, (..., C, H, W), without gradient: the level where most bins hold background only."""
-    return check_transient(histogram, "background_per_bin").detach().median(TIME).values
+    return check_bins(histogram, "background_per_bin").detach().median(TIME).values
 
 
 @in_single
@@ -237,6 +245,7 @@ def distance_of_position(position: Tensor, axis: TimeAxis) -> Tensor:
     returned in the dtype given: float32 resolves 4e-6 m at 100 m.
     """
     check_time_axis(axis, "distance_of_position")
+    (position,) = reals("distance_of_position", position=position)
     return (0.5 * (axis.start_opl + position.to(torch.float64) * axis.bin_width_opl)).to(position.dtype)
 
 
@@ -248,7 +257,7 @@ def distance_to_points(distance_m: Tensor, intrinsics: Tensor) -> Tensor:
     centres at *integer* coordinates, so that the middle of a picture is ``((W - 1) / 2, (H - 1) / 2)``. Distances are
     Euclidean, as times of flight are; not depths along z. Differentiable in both. Raises ShapeError.
     """
-    check_tensors("distance_to_points", distance_m=distance_m, intrinsics=intrinsics)
+    distance_m, intrinsics = reals("distance_to_points", distance_m=distance_m, intrinsics=intrinsics)
     if intrinsics.shape[-2:] != (3, 3) or intrinsics.ndim not in (2, 3):
         raise ShapeError(f"distance_to_points: expected intrinsics (3, 3) or (B, 3, 3), got {tuple(intrinsics.shape)}.")
     batched = intrinsics.ndim == 3
@@ -276,6 +285,8 @@ def range_deviation_m(response_fwhm_s: float, detections: Tensor) -> Tensor:
     from torchtransient.sensing.response.response_shapes import FWHM_PER_SIGMA
     from torchtransient.units import SPEED_OF_LIGHT
 
+    if isinstance(detections, Tensor):
+        (detections,) = reals("range_deviation_m", detections=detections)
     if not isinstance(detections, Tensor) or bool((detections < 0).any()):
         got = "negative ones" if isinstance(detections, Tensor) else type(detections).__name__
         raise UnitError(f"range_deviation_m: expected a tensor of detections >= 0, got {got}. Give expected numbers.")
@@ -285,6 +296,7 @@ def range_deviation_m(response_fwhm_s: float, detections: Tensor) -> Tensor:
 
 def _per_pixel(value: Tensor | float, histogram: Tensor, where: str, name: str) -> Tensor:
     """A number, or one for each pixel (..., C, H, W), ready to meet a histogram."""
+    value = number_or_tensor(value, name, where)
     if not isinstance(value, Tensor) or value.ndim == 0:
         return torch.as_tensor(value, dtype=histogram.dtype, device=histogram.device)
     wanted = (*histogram.shape[:TIME], *histogram.shape[TIME + 1 :])

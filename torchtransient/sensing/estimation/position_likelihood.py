@@ -15,7 +15,7 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError
 from torchtransient.floating import in_single
-from torchtransient.sensing.base.layout import TIME, bin_width_of, check_number, check_transient
+from torchtransient.sensing.base.layout import TIME, bin_width_of, check_bins, check_number
 from torchtransient.sensing.estimation.cramer_rao import shares_between
 from torchtransient.sensing.estimation.depth import log_matched_filter
 from torchtransient.sensing.response.impulse_response import check_response
@@ -49,7 +49,7 @@ def ml_position(
     float64. Raises ShapeError, UnitError.
     """
     where = "ml_position"
-    check_transient(histogram, where)
+    check_bins(histogram, where)
     check_response(response, where)
     width = bin_width_of(axis, bin_width_s, where)
     bins = histogram.shape[TIME]

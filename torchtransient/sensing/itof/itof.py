@@ -28,10 +28,10 @@ from torch import Tensor, nn
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import GradientError, ShapeError, UnitError
-from torchtransient.floating import in_single
+from torchtransient.floating import in_single, product
 from torchtransient.quantities import real_array, shown
 from torchtransient.sensing.base.given import refuse_cut_off
-from torchtransient.sensing.base.layout import check_number, check_tensors, check_time_axis, check_transient, product
+from torchtransient.sensing.base.layout import check_number, check_tensors, check_time_axis, check_transient, reals
 from torchtransient.sensing.base.sensor import Sensor
 from torchtransient.sensing.itof.itof_codes import CorrelationCode
 from torchtransient.sensing.itof.itof_pixels import ItofCalibration, in_direction
@@ -106,8 +106,8 @@ def _checked(
     """The code in the direction of its steps, and the phases (F, 1, 1) or (F, H, W) of offsets and maps."""
     check_number(contrast, "contrast", me, high=1.0)
     check_time_axis(axis, me)
-    if within_bin not in ("uniform", "center"):
-        raise UnitError(f"{me}: expected within_bin 'uniform' or 'center', got {within_bin!r}.")
+    if not isinstance(within_bin, str) or within_bin not in ("uniform", "center"):
+        raise UnitError(f"{me}: expected within_bin 'uniform' or 'center', got {shown(within_bin)}.")
     if calibration is not None and not isinstance(calibration, ItofCalibration):
         raise UnitError(f"{me}: expected calibration to be an ItofCalibration, got {calibration!r}.")
     known = calibration or ItofCalibration()
@@ -134,6 +134,7 @@ def correlate(transient: Tensor, weights: Tensor) -> Tensor:
     Raises ShapeError when the numbers of bins differ.
     """
     check_transient(transient, "correlate")
+    (weights,) = reals("correlate", weights=weights)
     if weights.ndim != 2 or weights.shape[1] != transient.shape[-3]:
         raise ShapeError(
             f"correlate: expected weights (M, {transient.shape[-3]}) for the transient {tuple(transient.shape)}, got "
@@ -171,7 +172,8 @@ def taps_from_phasor(
             f"{me}: expected a complex phasor (..., C, {phasor_axis.num_frequencies}, H, W), got {phasor.dtype} "
             f"{tuple(phasor.shape)}."
         )
-    check_number(contrast, "contrast", me, high=1.0)
+    contrast = check_number(contrast, "contrast", me, high=1.0)
+    steady = None if steady is None else reals(me, steady=steady)[0]
     known = calibration or ItofCalibration()
     code, values = in_direction(check_code(code, me), known.direction), check_frequencies(frequencies_hz, me)
     phases = _fitting(known.phases_rad(values), phasor, me)

@@ -14,14 +14,16 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.quantities import as_whole, real_array, shown
-from torchtransient.sensing.base.given import no_arrays, refuse_cut_off
-from torchtransient.sensing.base.layout import check_number
+from torchtransient.given_types import mapping, several
+from torchtransient.quantities import MOST_MADE, as_whole, count, real_array, shown
+from torchtransient.sensing.base.given import refuse_cut_off
+from torchtransient.sensing.base.layout import check_number, reals
 
 _FULL = 2 * math.pi
 
@@ -65,11 +67,10 @@ class FourierCode(CorrelationCode):
 
     def __init__(self, num_taps: int, harmonics_of_one_tap: Mapping[int, tuple[float, float]]) -> None:
         self.num_taps = _check_taps(num_taps)
-        for number in (part for pair in harmonics_of_one_tap.values() for part in pair):
-            refuse_cut_off(number, "harmonics_of_one_tap", "FourierCode")
-        self.parts = {int(h): (float(a), float(p)) for h, (a, p) in sorted(harmonics_of_one_tap.items())}
-        if not self.parts or any(h < 1 for h in self.parts):
-            raise UnitError(f"FourierCode: expected harmonics 1, 2, ..., got {sorted(self.parts)}.")
+        given = mapping("FourierCode", harmonics_of_one_tap, "{harmonic: (amplitude, phase in radians)}")
+        self.parts = dict(sorted(_harmonic(h, pair) for h, pair in given.items()))
+        if not self.parts:
+            raise UnitError("FourierCode: expected harmonics 1, 2, ..., got none.")
         total = sum(abs(a) for a, _ in self.parts.values())
         if not total <= 1 + 1e-9:
             raise UnitError(f"FourierCode: expected amplitudes that sum to at most 1, got {total}. Divide them by it.")
@@ -103,6 +104,18 @@ class FourierCode(CorrelationCode):
     @property
     def harmonics(self) -> tuple[int, ...]:
         return tuple(self.parts)
+
+
+def _harmonic(h: object, pair: object) -> tuple[int, tuple[float, float]]:
+    name, me = "harmonics_of_one_tap", "FourierCode"
+    parts: list[Any] = several(f"{me}: {name}", pair, "numbers, amplitude and phase,")
+    if len(parts) != 2:
+        raise ShapeError(f"{me}: expected {name} as (amplitude, phase in radians), got {shown(pair)}.")
+    amplitude, phase = (check_number(part, name, me, low=-math.inf) for part in parts)
+    number = count(f"{me}: {name}", h, None, UnitError, MOST_MADE)
+    if number < 1:
+        raise UnitError(f"{me}: expected harmonics 1, 2, ..., got {shown(h)}.")
+    return number, (amplitude, phase)
 
 
 class PiecewiseLinearCode(CorrelationCode):
@@ -204,13 +217,14 @@ def hamiltonian_code(num_taps: int = 3) -> PiecewiseLinearCode:
     3 taps: light on for 1/6 turn, gates half a turn, a third apart. 4 taps: light on for 1/12 turn; two gates are
     open for half a turn, two of them twice within a turn. Raises ShapeError for another number of taps.
     """
-    if num_taps == 3:
+    taps = as_whole(num_taps)
+    if taps == 3:
         shifts = torch.arange(3, dtype=torch.float64) / 3
         return binary_code(1 / 6, [[(float(s), float(s) + 0.5)] for s in shifts], shifts)
-    if num_taps == 4:
+    if taps == 4:
         twelfths = [[(5, 11)], [(2, 8)], [(0, 3), (7, 10)], [(4, 6), (9, 13)]]
         return binary_code(1 / 12, [[(a / 12, b / 12) for a, b in gate] for gate in twelfths])
-    raise ShapeError(f"hamiltonian_code: expected 3 or 4 taps, got {num_taps!r}; use binary_code for other gates.")
+    raise ShapeError(f"hamiltonian_code: expected 3 or 4 taps, got {shown(num_taps)}; use binary_code for other gates.")
 
 
 def binary_code(
@@ -259,9 +273,11 @@ def measured_code(samples: Tensor, closed: bool = False) -> PiecewiseLinearCode:
 def _plain(given: object, name: str, where: str) -> Tensor:
     """float64 on the CPU, of a tensor, an array or rows of numbers. GradientError: codes are not learnt."""
     refuse_cut_off(given, name, where)
-    if not isinstance(given, Tensor) and real_array(given) is None:
+    array = None if isinstance(given, Tensor) else real_array(given)
+    if not isinstance(given, Tensor) and array is None:
         raise ShapeError(f"{where}: expected {name} as rows of numbers of one length, got {shown(given)}.")
-    return torch.as_tensor(no_arrays(given, where)).detach().to("cpu", torch.float64)
+    (table,) = reals(where, torch.float64, **{name: given if array is None else torch.tensor(array)})
+    return table.detach().to("cpu", torch.float64)
 
 
 def _overlap(x: Tensor, light: float, a: float, b: float) -> Tensor:
@@ -297,6 +313,8 @@ def _check_taps(num_taps: int) -> int:
     number = as_whole(num_taps)
     if number is None or number < 2:
         raise ShapeError(f"CorrelationCode: expected at least 2 taps, got {shown(num_taps)}.")
+    if number > MOST_MADE:
+        raise ShapeError(f"CorrelationCode: expected at most {MOST_MADE} taps, got {shown(num_taps)}.")
     return number
 
 

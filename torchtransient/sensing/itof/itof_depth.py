@@ -27,9 +27,18 @@ from torch import Tensor
 
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.floating import in_single
-from torchtransient.quantities import Numbers, real_array, shown
-from torchtransient.sensing.base.given import refuse_cut_off, tensor_of
-from torchtransient.sensing.base.layout import check_count, check_tensors, product
+from torchtransient.given_types import is_one_of
+from torchtransient.quantities import Numbers, as_number, real_array, shown
+from torchtransient.sensing.base.given import check_dense, refuse_cut_off, tensor_of
+from torchtransient.sensing.base.layout import (
+    check_broadcast,
+    check_count,
+    complex_tensor,
+    going_together,
+    number_or_tensor,
+    product,
+    reals,
+)
 from torchtransient.sensing.itof.itof import Frequencies, check_frequencies
 from torchtransient.sensing.itof.itof_codes import phase_steps
 from torchtransient.units import SPEED_OF_LIGHT
@@ -63,6 +72,7 @@ def offset_of(taps: Frames, num_taps: int, readout: Readout = "single") -> Tenso
 
     Half precision becomes float32. Errors as `steps_of`, and UnitError for differences, in which it has cancelled.
     """
+    check_readout(readout, "offset_of")
     if readout == "differential":
         raise UnitError("offset_of: expected frames of taps, got differences, in which the offset has cancelled.")
     if readout == "two_tap":
@@ -91,8 +101,9 @@ def sums_of(taps: Frames, num_taps: int, where: str) -> Tensor:
 
 def check_readout(readout: str, where: str) -> None:
     """UnitError for what is no way of reading pixels out."""
-    if readout not in get_args(Readout):
-        raise ArgumentError(f"{where}: expected readout to be one of {', '.join(get_args(Readout))}, got {readout!r}.")
+    if not is_one_of(readout, get_args(Readout)):
+        known = ", ".join(get_args(Readout))
+        raise ArgumentError(f"{where}: expected readout to be one of {known}, got {shown(readout)}.")
 
 
 def _split(taps: Frames, num_taps: int, readout: str, where: str) -> Tensor:
@@ -121,6 +132,7 @@ def as_frames(taps: Frames, where: str) -> Tensor:
 
 def _precise(frames: Tensor, where: str) -> Tensor:
     """Frames in float32 or better, in which differences of 16-bit numbers cannot wrap."""
+    check_dense(frames, where)
     if frames.is_complex() or frames.dtype == torch.bool:
         raise UnitError(f"{where}: expected frames of real numbers, got {frames.dtype}.")
     if not frames.is_floating_point():
@@ -131,7 +143,7 @@ def _precise(frames: Tensor, where: str) -> Tensor:
 
 def phase_of(phasor: Tensor) -> Tensor:
     """Angle of a complex tensor in [0, 2 pi), in its shape; zero, with derivative zero, where it is zero."""
-    check_tensors("phase_of", phasor=phasor)
+    phasor = complex_tensor("phase_of", phasor=phasor)
     real, imag = phasor.real, phasor.imag
     # At scale one the squares in the derivative of atan2 cannot underflow; the angle does not depend on it.
     largest = torch.maximum(real.abs(), imag.abs()).detach()
@@ -149,7 +161,7 @@ def below_a_turn(phase: Tensor) -> Tensor:
 
 def amplitude_of(phasor: Tensor) -> Tensor:
     """Modulus of a complex tensor, in its shape; derivative zero where it is zero."""
-    check_tensors("amplitude_of", phasor=phasor)
+    phasor = complex_tensor("amplitude_of", phasor=phasor)
     real, imag = phasor.real, phasor.imag
     largest = torch.maximum(real.abs(), imag.abs()).detach()
     there = ~(largest <= torch.finfo(real.dtype).tiny)  # NaN is not darkness
@@ -161,7 +173,10 @@ def amplitude_of(phasor: Tensor) -> Tensor:
 @in_single
 def depth_of_phase(phase: Tensor, frequency_hz: float) -> Tensor:
     """``c phase / (4 pi f)`` in metres, in the shape of ``phase``."""
-    (f,) = check_frequencies(frequency_hz, "depth_of_phase")
+    (phase,) = reals("depth_of_phase", phase=phase)
+    if len(values := check_frequencies(frequency_hz, "depth_of_phase")) != 1:
+        raise UnitError(f"depth_of_phase: expected frequency_hz as one number, got {shown(frequency_hz)}.")
+    (f,) = values
     return phase * (SPEED_OF_LIGHT / (2 * _TURN * f))
 
 
@@ -179,7 +194,7 @@ def unambiguous_range_m(frequencies_hz: Frequencies) -> float:
 @in_single
 def wrapped_difference(a: Tensor, b: Tensor) -> Tensor:
     """``a - b`` in radians, the short way round: in [-pi, pi), derivative one everywhere. Shapes broadcast."""
-    check_tensors("wrapped_difference", a=a, b=b)
+    a, b = going_together("wrapped_difference", a=a, b=b)
     difference = a - b
     turns = torch.floor((difference + math.pi) / _TURN)
     return difference - _TURN * turns
@@ -190,10 +205,16 @@ def phasor_loss(phasor: Tensor, target: Tensor, weight: Tensor | None = None) ->
 
     Scale both to amplitude one (``z / amplitude``) for a loss on the phase alone, ``2 (1 - cos(difference))``.
     """
-    check_tensors("phasor_loss", phasor=phasor, target=target)
+    phasor, target = complex_tensor("phasor_loss", phasor=phasor), complex_tensor("phasor_loss", target=target)
+    check_broadcast("phasor_loss", phasor=phasor, target=target)
     difference = phasor - target
     loss = difference.real.square() + difference.imag.square()
-    return loss if weight is None else loss * weight
+    if weight is None:
+        return loss
+    weight = number_or_tensor(weight, "weight", "phasor_loss")
+    if isinstance(weight, Tensor):
+        check_broadcast("phasor_loss", phasor=phasor, weight=weight)
+    return loss * weight
 
 
 def shares_of_depth(frequencies_hz: Sequence[float], weights: Sequence[float] | None = None) -> list[float]:
@@ -226,9 +247,11 @@ def unwrap_depth(
     """
     me = "unwrap_depth"
     values = check_frequencies(frequencies_hz, me)
+    (phase,) = reals(me, phase=phase)
     if phase.ndim < 4 or phase.shape[-3] != len(values):
         raise ShapeError(f"{me}: expected phases (..., C, {len(values)}, H, W), got {tuple(phase.shape)}.")
-    longest = float(min_depth_m + unambiguous_range_m(values) if max_depth_m is None else max_depth_m)
+    least, most = check_depths(min_depth_m, max_depth_m, me)
+    min_depth_m, longest = least, least + unambiguous_range_m(values) if most is None else most
     if not (math.isfinite(longest) and longest > min_depth_m):
         raise UnitError(f"{me}: expected min_depth_m < max_depth_m in metres, got {min_depth_m!r} and {longest!r}.")
     # a tenth more leaves room for noise at both ends
@@ -238,9 +261,10 @@ def unwrap_depth(
             f"phases of {values} Hz repeat, got {longest - min_depth_m:.4g} m. Metres? Or add a frequency."
         )
     refuse_cut_off(weights, "weights", me)
-    weight = [1.0] * len(values) if weights is None else [float(w) for w in weights]
-    if len(weight) != len(values) or not all(w > 0 for w in weight):
-        raise UnitError(f"{me}: expected {len(values)} positive weights, got {weights!r}.")
+    given = np.ones(len(values)) if weights is None else real_array(weights)
+    if given is None or given.shape != (len(values),) or not (given > 0).all():
+        raise UnitError(f"{me}: expected {len(values)} positive weights, got {shown(weights)}.")
+    weight = given.tolist()
 
     turns = phase / _TURN
     periods = [SPEED_OF_LIGHT / (2 * f) for f in values]  # metres per turn
@@ -251,6 +275,15 @@ def unwrap_depth(
     metres = turns.new_tensor([s * p for s, p in zip(share, periods, strict=True)]).reshape(-1, 1, 1)
     depth: Tensor = ((turns + whole) * metres).sum(-3)
     return depth
+
+
+def check_depths(min_depth_m: Any, max_depth_m: Any, where: str) -> tuple[float, float | None]:
+    """The ends of a range of depths, the far one of which may be None. UnitError for no numbers."""
+    least, most = as_number(min_depth_m), None if max_depth_m is None else as_number(max_depth_m)
+    if least is None or (most is None and max_depth_m is not None):
+        got = f"{shown(min_depth_m)} and {shown(max_depth_m)}"
+        raise UnitError(f"{where}: expected min_depth_m and max_depth_m as numbers of metres, got {got}.")
+    return least, most
 
 
 def _search(

@@ -26,7 +26,7 @@ from torch import Tensor
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import holds
 from torchtransient.quantities import Numbers, real_array, shown
-from torchtransient.sensing.base.given import no_arrays
+from torchtransient.sensing.base.given import check_dense, no_arrays
 from torchtransient.sensing.base.layout import check_transient
 from torchtransient.sensing.base.sensor import Sensor
 from torchtransient.sensing.itof.itof_codes import CorrelationCode
@@ -210,7 +210,7 @@ def _numbers(given: object, name: str, dims: tuple[int, ...], most: float = math
     if given is None:
         return torch.zeros((), dtype=torch.float64)
     if isinstance(given, Tensor) and given.is_floating_point():
-        numbers = given.to("cpu", torch.float64)
+        numbers = check_dense(given, "ItofCalibration", name).to("cpu", torch.float64)
     else:
         array = real_array(given)
         if array is None:

@@ -26,10 +26,10 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import ArgumentError, PhysicsWarning, ShapeError, UnitError
-from torchtransient.floating import holds, in_single
-from torchtransient.quantities import shown
+from torchtransient.floating import holds, in_single, without_autocast
+from torchtransient.quantities import MOST_MADE, shown
 from torchtransient.sensing.base.given import no_arrays
-from torchtransient.sensing.base.layout import check_count, check_number, without_autocast
+from torchtransient.sensing.base.layout import check_count, check_number, going_together, reals
 from torchtransient.sensing.itof.itof import Frequencies, check_frequencies
 from torchtransient.sensing.itof.itof_codes import CorrelationCode, phase_steps
 from torchtransient.sensing.itof.itof_depth import (
@@ -38,6 +38,7 @@ from torchtransient.sensing.itof.itof_depth import (
     amplitude_of,
     as_frames,
     below_a_turn,
+    check_depths,
     check_readout,
     depth_of_phase,
     offset_of,
@@ -77,8 +78,8 @@ class ItofReading(TensorRecord):
     depth_m: Tensor
 
     def __getattr__(self, name: str) -> Any:
-        stood_for = " What it stood for: depth_std_m (metres), amplitude, or contrast (amplitude / offset)."
-        hint = stood_for if name == "confidence" else ""
+        instead = " What it stood for: depth_std_m (metres), amplitude, or contrast (amplitude / offset)."
+        hint = instead * (name == "confidence")
         raise AttributeError(f"'{type(self).__name__}' object has no attribute '{name}'.{hint}")
 
     @property
@@ -121,7 +122,7 @@ class ItofNoise:
             if given is not None and not isinstance(given, Tensor):
                 # no light at all has no phase, and no noise no deviation
                 given = check_number(given, name, me, open_low=True)
-            elif given is not None and not holds(given >= 0):
+            elif given is not None and not holds(reals(me, None, **{name: given})[0] >= 0):
                 raise UnitError(f"{me}: expected every {name} to be a number >= 0, got {shown(given)}.")
             object.__setattr__(self, name, given)
 
@@ -137,11 +138,11 @@ def phase_noise_rad(
     deviations below about 0.2 rad. Dark electrons are part of the offset. Infinite at amplitude zero. With three
     single taps the variance also swings with the phase, ``(2 B - A cos 3 phi) / A^2``; this is its root mean square.
     """
-    check_number(read_noise_e, "read_noise_e", "phase_noise_rad")
+    read = check_number(read_noise_e, "read_noise_e", "phase_noise_rad")
+    amplitude, offset = going_together("phase_noise_rad", amplitude=amplitude, offset=offset)
     check_readout(readout, "phase_noise_rad")
-    num_taps = check_count(num_taps, "num_taps", "phase_noise_rad")
-    each = 1 if readout == "single" else 2
-    return (2 * (offset + each * read_noise_e**2) / num_taps).sqrt() / amplitude
+    power = 2 * (offset + (1 if readout == "single" else 2) * read**2)
+    return (power / check_count(num_taps, "num_taps", "phase_noise_rad")).sqrt() / amplitude
 
 
 def decode_code(taps: Frames, code: CorrelationCode, *, num_phases: int = 1024, readout: Readout = "single") -> Tensor:
@@ -153,8 +154,9 @@ def decode_code(taps: Frames, code: CorrelationCode, *, num_phases: int = 1024, 
     has phase zero. ``code``: that of one tap, or its `TwoTapCode`. Errors as `itof_depth.steps_of`; UnitError for a
     `TwoTapCode` of single taps.
     """
-    code = one_tap(code, readout, "decode_code")
-    return _by_shape(steps_of(taps, code.num_taps, readout, "decode_code"), code, num_phases, readout)[0]
+    code = one_tap(code, readout, me := "decode_code")
+    phases = check_count(num_phases, "num_phases", me, most=MOST_MADE)
+    return _by_shape(steps_of(taps, code.num_taps, readout, me), code, phases, readout)[0]
 
 
 @without_autocast
@@ -257,6 +259,7 @@ def read_itof(
     phase = _without_offsets(phase, known, values)
     std = _depth_std(taps, steps, slopes, values, readout, noise, at_corners)
     if len(values) == 1:
+        check_depths(min_depth_m, max_depth_m, me)
         depth = depth_of_phase(phase, values[0]).squeeze(-3)
     else:
         depth = unwrap_depth(phase, values, max_depth_m=max_depth_m, min_depth_m=min_depth_m)
@@ -296,11 +299,10 @@ def _at_corners(
     At a corner of a code the slope has two values, and frames on its inner side jump from one side to the other: the
     slope is averaged over the noise. sqrt(N) deviations in each step have the covariance of all of them together.
     """
-    number = steps.shape[-3]
     # sqrt has no slope at 0
-    far = torch.where(variance > 0, (number * torch.where(variance > 0, variance, 1.0)).sqrt(), 0.0)
+    far = torch.where(variance > 0, (steps.shape[-3] * torch.where(variance > 0, variance, 1.0)).sqrt(), 0.0)
     found = []
-    for row in torch.eye(number, dtype=steps.dtype, device=steps.device):
+    for row in torch.eye(steps.shape[-3], dtype=steps.dtype, device=steps.device):
         away = far * row.view(-1, 1, 1)
         for moved in (steps + away, steps - away):
             found.append(wrapped_difference(_by_shape(moved, code, 1024, readout)[0], phase))

@@ -9,8 +9,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from torchtransient.errors import ArgumentError, ShapeError
-from torchtransient.sensing.base.layout import TIME, check_transient, without_autocast
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
+from torchtransient.given_types import is_one_of
+from torchtransient.quantities import count, shown
+from torchtransient.sensing.base.layout import TIME, check_transient, reals, without_autocast
 from torchtransient.transform_bins import fast_length
 
 Boundary = Literal["zero", "periodic"]
@@ -28,8 +30,8 @@ _SHIFTED_PIXELS = 64
 def check_choice(value: str, choices: object, name: str, where: str) -> None:
     """ShapeError unless `value` is one of the strings of a Literal type."""
     allowed = get_args(choices)
-    if value not in allowed:
-        raise ArgumentError(f"{where}: expected {name} to be one of {', '.join(allowed)}, got {value!r}.")
+    if not is_one_of(value, allowed):
+        raise ArgumentError(f"{where}: expected {name} to be one of {', '.join(allowed)}, got {shown(value)}.")
 
 
 @without_autocast
@@ -49,6 +51,8 @@ def convolve_time(
     check_transient(x, "convolve_time")
     check_choice(boundary, Boundary, "boundary", "convolve_time")
     check_choice(method, Method, "method", "convolve_time")
+    (kernel,) = reals("convolve_time", kernel=kernel)
+    first = count("convolve_time: first", first, None, UnitError)
     if kernel.ndim != 1 or kernel.numel() == 0:
         raise ShapeError(f"convolve_time: expected a kernel (K,) with K >= 1, got {tuple(kernel.shape)}.")
     bins, kernel = x.shape[TIME], kernel.to(x.device)

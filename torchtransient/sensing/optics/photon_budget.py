@@ -14,6 +14,7 @@ from torchtransient.floating import in_single
 from torchtransient.sensing.base.layout import (
     TIME,
     bin_width_of,
+    check_broadcast,
     check_count,
     check_number,
     check_one_of,
@@ -133,6 +134,8 @@ def ambient_photon_rate(
         raise UnitError(f"{where}: expected filter_bandwidth_m in metres, got {bandwidth!r}. 10 nm is 10e-9.")
     reflected = check_map(albedo, "albedo", where, high=1.0)
     lit = check_map(illumination, "illumination", where, high=1.0)
+    if isinstance(reflected, Tensor) and isinstance(lit, Tensor):
+        check_broadcast(where, albedo=reflected, illumination=lit)
     return irradiance * bandwidth * 1e9 / math.pi * optics.etendue_m2_sr / energy * reflected * lit
 
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,9 +23,17 @@ from torch.nn import functional
 
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
-from torchtransient.quantities import Numbers, as_number, shown
-from torchtransient.sensing.base.given import refuse_cut_off
-from torchtransient.sensing.base.layout import check_number, check_tensor, check_tensors, product, without_autocast
+from torchtransient.given_types import several
+from torchtransient.quantities import Numbers, as_number, count, shown
+from torchtransient.sensing.base.given import check_dense, refuse_cut_off
+from torchtransient.sensing.base.layout import (
+    check_count,
+    check_number,
+    check_tensor,
+    product,
+    reals,
+    without_autocast,
+)
 from torchtransient.sensing.base.sensor import Sensor
 from torchtransient.stokes import TRANSIENT_DIM, circular_polarizer, linear_polarizer
 
@@ -48,6 +57,8 @@ def linear_analyzers(
     factor = check_number(transmission, "transmission", me, high=1.0)
     if not isinstance(angles_deg, Iterable) or getattr(angles_deg, "ndim", 1) == 0:
         raise ShapeError(f"{me}: expected a list of angles, got {shown(angles_deg)}.")
+    if isinstance(angles_deg, Tensor):
+        check_dense(angles_deg, me, "angles_deg")
     angles = [math.radians(check_number(a, "angles_deg", me, low=-360.0, high=360.0)) for a in angles_deg]
     if not angles:
         raise ShapeError(f"{me}: expected at least one angle, got none.")
@@ -67,6 +78,7 @@ def circular_analyzers(extinction_ratio: float = math.inf, transmission: float =
 def analyze(stokes: Tensor, rows: Tensor) -> Tensor:
     """Light behind every analyser, (..., A, C, T, H, W), of Stokes vectors (..., 4, C, T, H, W). ShapeError."""
     _check_stokes(stokes, "analyze")
+    (rows,) = reals("analyze", rows=rows)
     if rows.ndim != 2 or rows.shape[1] != 4:
         raise ShapeError(f"analyze: expected rows (A, 4), got {tuple(rows.shape)}.")
     return _by_rows(rows.to(stokes), stokes)
@@ -81,7 +93,7 @@ def stokes_from(measurements: Tensor, rows: Tensor) -> Tensor:
     ``S0 = sum / 2, S1 = I0 - I90, S2 = I45 - I135``. Not constrained: noise can make S0 < |S123|, see
     `project_physical`. Raises ShapeError.
     """
-    check_tensors("stokes_from", measurements=measurements, rows=rows)
+    measurements, rows = reals("stokes_from", measurements=measurements, rows=rows)
     if rows.ndim != 2 or rows.shape[1] != 4 or measurements.ndim < 5 or measurements.shape[-5] != rows.shape[0]:
         raise ShapeError(
             f"stokes_from: expected measurements (..., A, C, T, H, W) and rows (A, 4), got "
@@ -103,7 +115,7 @@ def _by_rows(matrix: Tensor, x: Tensor) -> Tensor:
 @in_single
 def unphysical_part(stokes: Tensor, dim: int = TRANSIENT_DIM) -> Tensor:
     """``max(|S123| - S0, 0)``, without ``dim``: zero for every Stokes vector that light can have. ShapeError."""
-    check_tensors("unphysical_part", stokes=stokes)
+    (stokes,) = reals("unphysical_part", stokes=stokes)
     s0, length = _parts(stokes, dim)
     return (length - s0).clamp_min(0)
 
@@ -115,7 +127,7 @@ def project_physical(stokes: Tensor, dim: int = TRANSIENT_DIM) -> Tensor:
     Euclidean projection onto the cone: with excess ``|S123| > S0`` both become ``(S0 + |S123|) / 2``, and zero where
     that is negative. Continuous, with gradients that are finite everywhere (zero in dark). ShapeError.
     """
-    check_tensors("project_physical", stokes=stokes)
+    (stokes,) = reals("project_physical", stokes=stokes)
     s0, length = _parts(stokes, dim)
     inside = length <= s0
     nearest = ((s0 + length) / 2).clamp_min(0)
@@ -127,6 +139,7 @@ def project_physical(stokes: Tensor, dim: int = TRANSIENT_DIM) -> Tensor:
 
 def _parts(stokes: Tensor, dim: int) -> tuple[Tensor, Tensor]:
     """S0 and |S123|, the latter with derivative zero where it is zero."""
+    dim = count("stokes: dim", dim, None, ShapeError)
     if not -stokes.ndim <= dim < stokes.ndim or stokes.shape[dim] != 4:
         raise ShapeError(f"stokes: expected four components along dim={dim}, got shape {tuple(stokes.shape)}.")
     part = stokes.narrow(dim, 1, 3)
@@ -155,6 +168,7 @@ class PolarizationMosaic(Sensor):
 
     def __init__(self, rows: Tensor) -> None:
         super().__init__()
+        (rows,) = reals("PolarizationMosaic", torch.float64, rows=rows)
         if rows.ndim != 3 or rows.shape[-1] != 4:
             raise ShapeError(f"PolarizationMosaic: expected rows (P, Q, 4), got {tuple(rows.shape)}.")
         self.register_buffer("rows", rows.detach().double())
@@ -198,6 +212,8 @@ def mosaic_rows(
     angles_deg: Sequence[Sequence[float]], extinction_ratio: float = math.inf, transmission: float = 1.0
 ) -> Tensor:
     """(P, Q, 4): rows of linear analysers at the angles of a block of pixels; arguments as `linear_analyzers`."""
+    if isinstance(angles_deg, Tensor):
+        check_dense(angles_deg, "mosaic_rows", "angles_deg")
     rows = angles_deg.tolist() if hasattr(angles_deg, "tolist") else angles_deg
     if not isinstance(rows, Sequence) or not all(isinstance(line, Sequence) for line in rows):
         raise ShapeError(f"mosaic_rows: expected rows of angles, got {shown(angles_deg)}.")
@@ -216,8 +232,11 @@ def demosaic(raw: Tensor, block: tuple[int, int] = (2, 2)) -> Tensor:
     same. A constant picture stays constant, and the pixels themselves keep their values for 2 x 2. Order: row by row
     within the block. Linear in the light. Raises ShapeError for less than one block.
     """
-    check_tensors("demosaic", raw=raw)
-    p, q = block
+    (raw,) = reals("demosaic", raw=raw)
+    sizes: list[Any] = several("demosaic: block", block, "numbers of pixels")
+    if len(sizes) != 2:
+        raise ShapeError(f"demosaic: expected block as two numbers of pixels, got {shown(block)}.")
+    p, q = (check_count(size, "block", "demosaic") for size in sizes)
     if raw.ndim < 4 or raw.shape[-2] < p or raw.shape[-1] < q:
         raise ShapeError(f"demosaic: expected raw light (..., C, T, H >= {p}, W >= {q}), got {tuple(raw.shape)}.")
     h, w = raw.shape[-2:]
@@ -248,6 +267,7 @@ class Analyzers(Sensor):
 
     def __init__(self, rows: Tensor) -> None:
         super().__init__()
+        (rows,) = reals("Analyzers", torch.float64, rows=rows)
         if rows.ndim != 2 or rows.shape[-1] != 4:
             raise ShapeError(f"Analyzers: expected rows (A, 4), got {tuple(rows.shape)}.")
         self.register_buffer("rows", rows.detach().double())

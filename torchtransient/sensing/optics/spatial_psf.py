@@ -9,11 +9,19 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.base.layout import check_number, check_tensors, check_transient, without_autocast
+from torchtransient.quantities import shown
+from torchtransient.sensing.base.layout import (
+    check_count,
+    check_number,
+    check_transient,
+    reals,
+    without_autocast,
+)
 from torchtransient.sensing.base.sensor import Sensor
 from torchtransient.sensing.numerics.time_convolution import check_choice
 from torchtransient.sensing.response.response_shapes import FWHM_PER_SIGMA
 
+_LARGEST = 1 << 15  # points across a PSF, whose square still fits into memory
 Border = Literal["constant", "reflect", "replicate", "circular"]
 
 
@@ -27,6 +35,7 @@ def blur_image(x: Tensor, psf: Tensor, border: Border = "reflect") -> Tensor:
     """
     check_transient(x, "blur_image")
     check_choice(border, Border, "border", "blur_image")
+    (psf,) = reals("blur_image", psf=psf)
     if psf.ndim != 2 or psf.shape[0] % 2 == 0 or psf.shape[1] % 2 == 0:
         raise ShapeError(f"blur_image: expected a PSF (h, w) of odd sizes, got {tuple(psf.shape)}.")
     height, width = x.shape[-2:]
@@ -47,7 +56,8 @@ def blur_image(x: Tensor, psf: Tensor, border: Border = "reflect") -> Tensor:
 
 def gaussian_psf(fwhm_px: Tensor, size: int) -> Tensor:
     """(size, size) float64 normal spot of `fwhm_px` pixels, integrated over pixels, sum 1; differentiable in fwhm."""
-    check_tensors("gaussian_psf", fwhm_px=fwhm_px)
+    (fwhm_px,) = reals("gaussian_psf", fwhm_px=fwhm_px)
+    size = check_count(size, "size", "gaussian_psf", most=_LARGEST)
     sigma = fwhm_px.double() / FWHM_PER_SIGMA
     edges = torch.arange(size + 1, dtype=torch.float64, device=fwhm_px.device) - size / 2
     line = 0.5 * torch.special.erf(edges / (sigma * math.sqrt(2))).diff()
@@ -61,8 +71,14 @@ def defocus_psf(radius_px: float, oversampling: int = 15) -> Tensor:
     Not differentiable in the radius.
     """
     radius = check_number(radius_px, "radius_px", "defocus_psf", open_low=True)
+    oversampling = check_count(oversampling, "oversampling", "defocus_psf")
     half = math.ceil(radius - 0.5) if radius > 0.5 else 0
     size = 2 * half + 1
+    if size * oversampling > _LARGEST:
+        raise UnitError(
+            f"defocus_psf: expected a disc of at most {_LARGEST} points across, got a radius of {shown(radius_px)} "
+            f"pixels times oversampling {oversampling}."
+        )
     fine = (torch.arange(size * oversampling, dtype=torch.float64) + 0.5) / oversampling - size / 2
     inside = (fine[:, None] ** 2 + fine[None, :] ** 2 <= radius**2).double()
     area = inside.view(size, oversampling, size, oversampling).mean((1, 3))
@@ -81,6 +97,7 @@ class SpatialPSF(Sensor):
     def __init__(self, psf: Tensor, border: Border = "reflect", *, learnable: bool = False) -> None:
         super().__init__()
         check_choice(border, Border, "border", "SpatialPSF")
+        (psf,) = reals("SpatialPSF", torch.float64, psf=psf)
         if psf.ndim != 2 or psf.shape[0] % 2 == 0 or psf.shape[1] % 2 == 0:
             raise ShapeError(f"SpatialPSF: expected a PSF (h, w) of odd sizes, got {tuple(psf.shape)}.")
         values = psf.detach().double()
@@ -117,7 +134,8 @@ class LensBlur(Sensor):
         check_choice(border, Border, "border", "LensBlur")
         fwhm = check_number(fwhm_px, "fwhm_px", "LensBlur", open_low=True)
         self.border: Border = border
-        self.size = 2 * max(1, math.ceil(2 * fwhm)) + 1 if size is None else int(size)
+        own = 2 * max(1, math.ceil(2 * fwhm)) + 1
+        self.size = own if size is None else check_count(size, "size", "LensBlur", most=_LARGEST)
         if self.size < 1 or self.size % 2 == 0:
             raise ShapeError(f"LensBlur: expected an odd size, got {size!r}.")
         value = torch.tensor(math.log(fwhm), dtype=torch.float64)

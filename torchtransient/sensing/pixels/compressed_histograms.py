@@ -9,7 +9,8 @@ from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
-from torchtransient.sensing.base.layout import TIME, check_count, check_transient, product
+from torchtransient.quantities import MOST_MADE
+from torchtransient.sensing.base.layout import TIME, check_bins, check_count, check_transient, product, reals
 from torchtransient.sensing.base.sensor import Sensor
 
 
@@ -21,7 +22,7 @@ def equi_depth_edges(counts: Tensor, depth: int) -> Tensor:
     in `counts` where the bin of a quantile has any. A pixel without counts gets the quantiles of even light. Source:
     Ingle and Maier, Count-free single-photon 3D imaging with race logic, TPAMI 2023 (their circuits track these edges).
     """
-    check_transient(counts, "equi_depth_edges")
+    check_bins(counts, "equi_depth_edges")
     parts = check_count(depth, "depth", "equi_depth_edges", low=2)
     if bool((counts < 0).any()):
         raise UnitError("equi_depth_edges: expected counts >= 0, got negative ones.")
@@ -58,7 +59,7 @@ def fourier_codes(num_bins: int, num_codes: int) -> Tensor:
     Rows 0, 1 are one turn, 2, 3 two turns, and so on (truncated Fourier of Gutierrez-Barragan et al., Compressive
     single-photon 3D cameras, CVPR 2022). The constant is left out: it does not see time.
     """
-    bins = check_count(num_bins, "num_bins", "fourier_codes")
+    bins = check_count(num_bins, "num_bins", "fourier_codes", most=MOST_MADE)
     codes = check_count(num_codes, "num_codes", "fourier_codes")
     if codes > bins - 1:
         raise ShapeError(f"fourier_codes: expected at most {bins - 1} codes for {bins} bins, got {codes}.")
@@ -91,7 +92,7 @@ class CodedHistogram(Sensor):
         if not isinstance(codes, Tensor) or codes.ndim != 2:
             shape = tuple(codes.shape) if isinstance(codes, Tensor) else type(codes).__name__
             raise ShapeError(f"CodedHistogram: expected codes (K, T), got {shape}.")
-        values = codes.detach().double().clone()
+        values = reals("CodedHistogram", torch.float64, codes=codes)[0].detach().double().clone()
         if not bool(torch.isfinite(values).all()):
             raise UnitError("CodedHistogram: expected finite codes.")
         if learnable:

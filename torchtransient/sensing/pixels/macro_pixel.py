@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchtransient.errors import GradientError, ShapeError, UnitError
+from torchtransient.given_types import several
 from torchtransient.quantities import Numbers
-from torchtransient.sensing.base.layout import check_count, check_number, check_transient
+from torchtransient.sensing.base.layout import check_count, check_number, check_transient, reals
 from torchtransient.sensing.base.policies import GradPolicy
 from torchtransient.sensing.base.sensor import RandomSensor, Sensor
 from torchtransient.sensing.base.wrapped_detector import WrappedDetector, added, cycles_of, several_of
@@ -25,7 +27,9 @@ def groups_of(spads: int, weights: Numbers | None, where: str) -> Groups:
     number = check_count(spads, "spads", where)
     if weights is None:
         return [(1.0 / number, number)]
-    given = weights.double().tolist() if isinstance(weights, Tensor) else list(weights)
+    if isinstance(weights, Tensor):
+        weights = reals(where, torch.float64, weights=weights)[0].double().tolist()
+    given: list[Any] = several(f"{where}: weights", weights, "numbers")
     values = [check_number(w, "weights", where) for w in given]
     if len(values) != number:
         raise ShapeError(f"{where}: expected weights of {number} SPADs, got {len(values)}.")

@@ -9,7 +9,9 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.base.layout import check_seconds
+from torchtransient.given_types import is_one_of, several
+from torchtransient.quantities import MOST_MADE, as_whole, shown
+from torchtransient.sensing.base.layout import check_seconds, reals
 from torchtransient.sensing.numerics.time_convolution import check_choice
 from torchtransient.sensing.response.response_shapes import (
     above_floor,
@@ -57,10 +59,10 @@ class MeasuredResponse(Response):
         if not isinstance(counts, Tensor) or counts.ndim != 1 or counts.numel() < 2:
             shape = tuple(counts.shape) if isinstance(counts, Tensor) else type(counts).__name__
             raise ShapeError(f"MeasuredResponse: expected counts (T,) with T >= 2, got {shape}.")
-        if align not in ("center_of_mass", "start"):
-            raise ShapeError(f"MeasuredResponse: expected align 'center_of_mass' or 'start', got {align!r}.")
+        if not is_one_of(align, ("center_of_mass", "start")):
+            raise ShapeError(f"MeasuredResponse: expected align 'center_of_mass' or 'start', got {shown(align)}.")
         self.bin_width_s = check_seconds(bin_width_s, "bin_width_s", "MeasuredResponse", open_low=True)
-        values = counts.detach().double()
+        values = reals("MeasuredResponse", torch.float64, counts=counts)[0].detach().double()
         if not bool(torch.isfinite(values).all()) or not bool((values.amax() > values.median()) & (values >= 0).all()):
             raise UnitError("MeasuredResponse: expected finite counts >= 0 with a peak above their median.")
         shares = above_floor(values, floor, "MeasuredResponse")
@@ -117,15 +119,17 @@ class ComposedResponse(Response):
 
     def __init__(self, responses: Sequence[Response], *, oversampling: int = 9) -> None:
         super().__init__(0.0, learnable=False)
+        responses = several("ComposedResponse", responses, "responses such as GaussianResponse")
         if len(responses) == 0:
             raise ShapeError("ComposedResponse: expected at least one response, got none.")
         wrong = [type(r).__name__ for r in responses if not isinstance(r, Response)]
         if wrong:
             raise ShapeError(f"ComposedResponse: expected responses such as GaussianResponse, got {wrong}.")
-        if oversampling < 1 or oversampling % 2 == 0:
-            raise ShapeError(f"ComposedResponse: expected oversampling to be odd and >= 1, got {oversampling}.")
+        odd = as_whole(oversampling)
+        if odd is None or odd < 1 or odd % 2 == 0 or odd > MOST_MADE:
+            raise ShapeError(f"ComposedResponse: expected oversampling to be odd and >= 1, got {shown(oversampling)}.")
         self.responses = nn.ModuleList(responses)
-        self.oversampling = int(oversampling)
+        self.oversampling = odd
 
     def _normal_part(self) -> tuple[TailedResponse | None, Tensor, Tensor] | None:
         """The one tailed response, delay and standard deviation of all cores; None where that is not all there is."""

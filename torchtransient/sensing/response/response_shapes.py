@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchtransient.errors import UnitError
-from torchtransient.sensing.base.layout import check_number, check_tensors
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.sensing.base.layout import check_number, going_together, one_number, reals
 
 FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))  # 2.3548
 
@@ -47,20 +47,23 @@ def emg_density(time_s: Tensor, mean_s: Tensor, sigma_s: Tensor, tau_s: Tensor) 
     `mean_s`, `sigma_s`: of the normal part; `tau_s`: mean of the exponential part. Stable for every ratio of the two.
     Source: Grushka, Anal. Chem. 44 (1972); erfcx form as in Kalambet et al., J. Chemometrics 25 (2011).
     """
-    check_tensors("emg_density", time_s=time_s, mean_s=mean_s, sigma_s=sigma_s, tau_s=tau_s)
+    given = going_together("emg_density", time_s=time_s, mean_s=mean_s, sigma_s=sigma_s, tau_s=tau_s)
+    time_s, mean_s, sigma_s, tau_s = given
     return _tail_term((time_s - mean_s) / sigma_s, sigma_s / tau_s) / tau_s
 
 
 def emg_cdf(time_s: Tensor, mean_s: Tensor, sigma_s: Tensor, tau_s: Tensor) -> Tensor:
     """Share of `emg_density` before `time_s`."""
-    check_tensors("emg_cdf", time_s=time_s, mean_s=mean_s, sigma_s=sigma_s, tau_s=tau_s)
+    given = going_together("emg_cdf", time_s=time_s, mean_s=mean_s, sigma_s=sigma_s, tau_s=tau_s)
+    time_s, mean_s, sigma_s, tau_s = given
     u = (time_s - mean_s) / sigma_s
     return normal_cdf(u) - _tail_term(u, sigma_s / tau_s)
 
 
 def emg_survival(time_s: Tensor, mean_s: Tensor, sigma_s: Tensor, tau_s: Tensor) -> Tensor:
     """Share of `emg_density` after `time_s`, with relative precision far out in the tail."""
-    check_tensors("emg_survival", time_s=time_s, mean_s=mean_s, sigma_s=sigma_s, tau_s=tau_s)
+    given = going_together("emg_survival", time_s=time_s, mean_s=mean_s, sigma_s=sigma_s, tau_s=tau_s)
+    time_s, mean_s, sigma_s, tau_s = given
     u = (time_s - mean_s) / sigma_s
     return normal_cdf(-u) + _tail_term(u, sigma_s / tau_s)
 
@@ -105,7 +108,12 @@ def resample_counts(counts: Tensor, width_s: float, edges_s: Tensor, *, start_s:
     `counts`: (T,) in bins of `width_s` from `start_s` on; `edges_s`: (K + 1,) increasing; returns (K,) float64. What
     lies outside the new edges is left out. Differentiable in the counts, the edges and the start.
     """
-    check_tensors("resample_counts", counts=counts, edges_s=edges_s)
+    me = "resample_counts"
+    counts, edges_s = reals(me, torch.float64, counts=counts, edges_s=edges_s)
+    if counts.ndim != 1 or edges_s.ndim != 1 or not counts.numel():
+        raise ShapeError(f"{me}: expected counts (T,) of one bin or more and edges_s (K + 1,), got "
+                         f"{tuple(counts.shape)} and {tuple(edges_s.shape)}.")  # fmt: skip
+    width_s, start_s = one_number(width_s, "width_s", me), one_number(start_s, "start_s", me)
     cumulative = torch.nn.functional.pad(counts.to(torch.float64).cumsum(0), (1, 0))
     bins = counts.shape[0]
     position = ((edges_s.to(torch.float64) - start_s) / width_s).clamp(0, bins)

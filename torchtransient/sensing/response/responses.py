@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.given_types import several
 from torchtransient.quantities import Numbers
 from torchtransient.sensing.base.layout import check_number, check_seconds
 from torchtransient.sensing.base.remembered import remembered
@@ -259,6 +260,8 @@ class TailedResponse(Response):
     ) -> None:
         super().__init__(delay_s, learnable)
         self._hold_log("fwhm_s", fwhm_s)
+        tails_s = several("TailedResponse: tails_s", tails_s, "numbers of seconds")
+        fractions = several("TailedResponse: fractions", fractions, "shares of light")
         if len(tails_s) != len(fractions) or len(tails_s) == 0:
             raise ShapeError(
                 f"TailedResponse: expected as many fractions as tails_s, got {len(fractions)} and {len(tails_s)}."

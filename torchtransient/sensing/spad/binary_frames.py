@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchtransient.errors import UnitError
 from torchtransient.floating import holds, in_single
-from torchtransient.sensing.base.layout import TIME, check_count, check_transient
+from torchtransient.sensing.base.layout import TIME, check_count, check_transient, reals
 from torchtransient.sensing.base.policies import GradPolicy
 from torchtransient.sensing.base.sensor import RandomSensor
 from torchtransient.sensing.numerics.draws import WHOLE_FLOAT32, check_rates
@@ -22,6 +22,7 @@ def frames_to_rate(counts: Tensor, frames: int) -> Tensor:
     for more counts than frames.
     """
     number = check_count(frames, "frames", "frames_to_rate")
+    (counts,) = reals("frames_to_rate", counts=counts)
     # a normal surrogate goes beyond all frames by some standard deviations, of which half the root is the largest
     if not holds(~(counts > number + 1 + 3 * number**0.5)):
         raise UnitError(

@@ -23,10 +23,12 @@ from torchtransient.sensing.base.layout import (
     TIME,
     bin_width_of,
     bins_of_period,
+    check_bins,
     check_count,
     check_seconds,
     check_tensor,
-    check_transient,
+    one_number,
+    reals,
 )
 from torchtransient.sensing.base.policies import VARIANCE_FLOOR, GradPolicy, record_score
 from torchtransient.sensing.base.sensor import RandomSensor
@@ -52,6 +54,7 @@ def free_running_rate(rate_hz: Tensor, dead_time_s: float, kind: DeadTime = "non
     """Detections per second at a constant photon rate n: n/(1 + n td), or n exp(-n td) for "paralyzable"."""
     dead = check_seconds(dead_time_s, "dead_time_s", "free_running_rate")
     check_choice(kind, DeadTime, "kind", "free_running_rate")
+    (rate_hz,) = reals("free_running_rate", rate_hz=rate_hz)
     check_rates(rate_hz, "free_running_rate")
     if kind == "paralyzable":
         return rate_hz * torch.exp(-rate_hz * dead)
@@ -86,8 +89,7 @@ def nonparalyzable_histogram(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
     otherwise right to third order in the rate of a bin (see docs/photon_counting.md for errors). Raises
     TorchTransientError for a phase locked so narrowly that bins cut in 32 do not show it.
     """
-    check_transient(rate, "nonparalyzable_histogram")
-    check_rates(rate, "nonparalyzable_histogram")
+    check_rates(check_bins(rate, "nonparalyzable_histogram"), "nonparalyzable_histogram")
     check_dead_bins(dead_bins)
     return state_image(rate, dead_bins).detected.to(rate.dtype)
 
@@ -114,15 +116,15 @@ def paralyzable_histogram(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
     `rate`: (..., C, T, H, W) per period and bin, the T bins being one period; `dead_bins`: dead time in bins, >= 0,
     also longer than a period; differentiable in both. dtype and device are kept; computed in float64.
     """
-    check_transient(rate, "paralyzable_histogram")
-    check_rates(rate, "paralyzable_histogram")
+    check_rates(check_bins(rate, "paralyzable_histogram"), "paralyzable_histogram")
+    dead_bins = one_number(dead_bins, "dead_bins", "paralyzable_histogram")
     dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=rate.device)
-    if not float(dead.detach()) >= 0 or not math.isfinite(float(dead.detach())):
+    if not 0 <= float(dead.detach()) < math.inf:
         raise UnitError(f"paralyzable_histogram: expected dead_bins >= 0, got {float(dead.detach()):g}.")
     wide = rate.to(torch.float64)
     bins = wide.shape[TIME]
     whole = math.floor(float(dead.detach()))
-    part = dead - whole
+    part = dead - float(whole)
     # flux between the start of the bin minus the dead time and the start of the bin
     total = wide.sum(TIME, keepdim=True)
     cycles, rest = divmod(whole, bins)
@@ -130,7 +132,7 @@ def paralyzable_histogram(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
     before = edges.narrow(TIME, 0, bins)
     earlier = before.roll(rest, TIME)
     index = torch.arange(bins, device=rate.device).view(-1, 1, 1)
-    wrapped = torch.where(index < rest, before - earlier + total, before - earlier) + cycles * total
+    wrapped = torch.where(index < rest, before - earlier + total, before - earlier) + float(cycles) * total
     # the bin in which the dead time before the start of this bin begins, and the one after it
     first, second = wide.roll(rest + 1, TIME), wide.roll(rest, TIME)
     exponent = wrapped + part * first

@@ -20,10 +20,14 @@ from torchtransient.sensing.base.given import refuse_cut_off
 from torchtransient.sensing.base.layout import (
     TIME,
     bin_width_of,
+    check_bins,
+    check_broadcast,
     check_count,
     check_generator,
     check_seconds,
     check_transient,
+    one_number,
+    reals,
 )
 from torchtransient.sensing.base.policies import GradPolicy, gaussian_noise, record_score
 from torchtransient.sensing.base.sensor import RandomSensor
@@ -49,8 +53,7 @@ def first_photon_probabilities(rate: Tensor) -> tuple[Tensor, Tensor]:
     1e4 bins lose no digits; in a saturated pixel the late bins get probability and gradient 0, as they should. Raises
     UnitError for rates that are negative, infinite or NaN.
     """
-    check_transient(rate, "first_photon_probabilities")
-    check_rates(rate, "first_photon_probabilities")
+    check_rates(check_bins(rate, "first_photon_probabilities"), "first_photon_probabilities")
     before = sum_before(rate)
     p = -torch.expm1(-rate) * torch.exp(-before.to(rate.dtype))
     none = torch.exp(-(before.select(TIME, -1) + rate.select(TIME, -1).double()))
@@ -115,7 +118,8 @@ def coates(counts: Tensor, cycles: int, dead_bins: float | None = None) -> Coate
     number = check_count(cycles, "cycles", "coates")
     if dead_bins is not None and counts.numel():
         refuse_cut_off(dead_bins, "dead_bins", "coates")
-        rate, valid = rates_of_counts(_rows(counts), number, float(dead_bins))
+        dead = float(one_number(dead_bins, "dead_bins", "coates"))
+        rate, valid = rates_of_counts(_rows(counts), number, dead)
         return CoatesEstimate(_image(rate, counts).to(counts.dtype), _image(valid, counts))
     armed = number - sum_before(counts)
     usable = ~(armed <= 0.5)  # NaN stays NaN
@@ -211,7 +215,7 @@ class SynchronousSPAD(RandomSensor):
             self.dead_bins = self.dead_time_s / bin_width_of(axis, bin_width_s, "SynchronousSPAD")
             check_dead_bins(self.dead_bins)
         if gate is not None:
-            if not isinstance(gate, Tensor) or gate.ndim != 1:
+            if not isinstance(gate, Tensor) or gate.ndim != 1 or gate.is_complex():
                 shape = tuple(gate.shape) if isinstance(gate, Tensor) else type(gate).__name__
                 raise ShapeError(f"SynchronousSPAD: expected gate to be a tensor (T,), got {shape}.")
             if not bool(((gate >= 0) & (gate <= 1)).all()):
@@ -332,6 +336,12 @@ def first_photon_log_prob(
     `cycles` cycles.
     """
     number = check_count(cycles, "cycles", where)
+    (counts,), (rate,) = reals(where, torch.float64, counts=counts), reals(where, rate=rate)
+    check_broadcast(where, counts=counts, rate=rate)
+    if min(counts.ndim, rate.ndim) < 3:
+        raise ShapeError(f"{where}: expected counts and rate (..., T, H, W), got {tuple(counts.shape)} and "
+                         f"{tuple(rate.shape)}.")  # fmt: skip
+    dead_bins = None if dead_bins is None else one_number(dead_bins, "dead_bins", where)
     n, r = counts.to(torch.float64), rate.to(torch.float64)
     if dead_bins is None:
         sooner, exposed = torch.zeros_like(r), number - sum_before(n.detach())

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from torchtransient.axes import TimeAxis
 from torchtransient.floating import in_single
-from torchtransient.sensing.base.layout import TIME, bin_width_of, check_seconds, check_transient
+from torchtransient.sensing.base.layout import TIME, bin_width_of, check_seconds, check_transient, number_or_tensor
 from torchtransient.sensing.base.pixel_maps import check_map, pixels_of
 from torchtransient.sensing.base.policies import GradPolicy, gaussian_noise
 from torchtransient.sensing.base.sensor import PhysicalModule, Sensor
@@ -51,6 +51,7 @@ def shift_time(x: Tensor, delay_bins: Tensor | float, *, boundary: Boundary = "p
     """
     check_transient(x, "shift_time")
     check_choice(boundary, Boundary, "boundary", "shift_time")
+    delay_bins = number_or_tensor(delay_bins, "delay_bins", "shift_time")
     pixels_of(delay_bins, x, "delay_bins", "shift_time")
     if x.numel() == 0:
         return x

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.base.layout import TIME, check_count, check_number, check_transient
+from torchtransient.sensing.base.layout import TIME, check_count, check_number, check_transient, reals
 from torchtransient.sensing.base.policies import GradPolicy
 from torchtransient.sensing.counts.moved_counts import MovedCounts, Moves
 from torchtransient.sensing.numerics.time_convolution import Boundary, check_choice
@@ -104,7 +104,7 @@ class TDC(MovedCounts):
         super().__init__(grad)
         if not isinstance(code_widths, Tensor) or code_widths.ndim != 1 or code_widths.numel() == 0:
             raise ShapeError("TDC: expected code_widths (T,), got something else.")
-        widths = code_widths.detach().double()
+        widths = reals("TDC", torch.float64, code_widths=code_widths)[0].detach().double()
         if not bool((widths > 0).all()) or not bool(torch.isfinite(widths).all()):
             raise UnitError("TDC: expected code_widths > 0, finite, relative to the bin (mean about 1).")
         if not 0.1 <= float(widths.mean()) <= 10:
@@ -121,7 +121,7 @@ class TDC(MovedCounts):
             self.takes, self.gives = ("radiance", "rate", "electrons"), "the same"
         self.boundary: Boundary = boundary
         self.sliding_scale = check_count(sliding_scale, "sliding_scale", "TDC")
-        self.offset_bins = check_number(offset_bins, "offset_bins", "TDC", low=-1e6)
+        self.offset_bins = check_number(offset_bins, "offset_bins", "TDC", low=-1e6, high=1e6)
         self.dither = bool(dither)
         self.num_bins = widths.shape[0]
         self.register_buffer("code_widths", widths)
