@@ -90,7 +90,7 @@ def test_responses_of_all_counters_sum_to_one(example):
         assert (parameter.grad is not None and bool(parameter.grad.ne(0).any())) == moved, name
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_errors_are_as_low_as_said(example, tmp_path):
     """One seed of three; the docs have the means of three."""
     amortised = example("amortised")
@@ -99,7 +99,7 @@ def test_errors_are_as_low_as_said(example, tmp_path):
     assert table.percent(amortised.HYBRID) < 0.25 * table.percent(amortised.BEST)
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_an_unknown_counter_costs_little(example, tmp_path):
     """One seed of three."""
     script = example("self_calibration")
