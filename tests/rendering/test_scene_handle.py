@@ -299,9 +299,9 @@ def test_xml_parameters_need_xml():
     with pytest.raises(tt.errors.ArgumentError, match=r"XML files \(spp\) are for these alone, got dict"):
         tt.load(make_room(), spp=4)
     for given, words in (
-        ({"max_depth": 3}, r" max_depth is an option of .* tt\.render, max_depth of the scene's integrator too\.$"),
-        ({"spp": 4, "a": 1, "freeze": True}, r"\(a, freeze, spp\) .* freeze, spp are options of TransientRenderer and"),
-        ({"a": 1}, r"for these alone, got dict\.$"),
+        ({"max_depth": 3}, r" Options of a render belong to .* tt\.render, max_depth to the scene's integrator too\.$"),
+        ({"spp": 4, "a": 1, "freeze": True}, r"\(a, freeze, spp\) .* belong to TransientRenderer and"),
+        ({"a": 1}, r"for these alone, got dict\. Options"),
     ):
         with pytest.raises(tt.errors.ArgumentError, match=words):
             tt.load(make_room(), **given)

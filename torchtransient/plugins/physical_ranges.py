@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -112,6 +112,8 @@ def described_ranges(params: Any) -> Iterator[tuple[str, PhysicalRange, float, f
                 yield key, found, float(numbers.min()), float(numbers.max())
 
 
-def axis_of(params: Any, key: str) -> np.ndarray:
-    """Where a transform brings the third axis to."""
-    return np.array(unshared(params[key].matrix), dtype=float).reshape(4, 4)[:3, 2]
+def sun_axes(params: Any, keys: Iterable[str]) -> dict[str, np.ndarray]:
+    """Of the keys that are directions of a sun, where its sky's third axis points."""
+    suns = [key for key in keys if key.endswith(".sun_direction")]
+    matrices = {key: params[f"{key.removesuffix('sun_direction')}to_world"].matrix for key in suns}
+    return {key: np.array(unshared(matrix), dtype=float).reshape(4, 4)[:3, 2] for key, matrix in matrices.items()}

@@ -16,7 +16,7 @@ from torchtransient.gates import Gate
 from torchtransient.given_types import is_one_of
 from torchtransient.parametrize.copies import CopiesParametrized
 from torchtransient.plugins.parameters import check_slope
-from torchtransient.plugins.physical_ranges import axis_of, physical_range
+from torchtransient.plugins.physical_ranges import physical_range, sun_axes
 from torchtransient.pulses import Pulse
 from torchtransient.quantities import Numbers, shown
 from torchtransient.rendering import engine
@@ -210,11 +210,7 @@ class TransientRenderer(CopiesParametrized):
             ranges = {key: physical_range(built.params, key) for key in self._keys}
             self._watch.ranges = {key: limits for key, limits in ranges.items() if limits is not None}
             self._watch.transforms = frozenset(slot.key for slot in slots if slot.kind.endswith("transform"))
-            self._watch.directions = {
-                slot.key: axis_of(built.params, slot.key.removesuffix("sun_direction") + "to_world")
-                for slot in slots
-                if slot.key.endswith(".sun_direction")
-            }
+            self._watch.directions = sun_axes(built.params, self._keys)
             # What is given replaces what is described.
             findings = self.scene.findings(self._options)
             self._watch.scene({key: text for key, text in findings.items() if key not in self._keys})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import os
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping
@@ -268,7 +267,7 @@ def _described(scene: Any, variant: str | None, xml_parameters: Mapping[str, Any
         names = ", ".join(sorted(xml_parameters))
         raise ArgumentError(
             f"tt.load: $parameters of XML files ({names}) are for these alone, got {type(scene).__name__}."
-            f"{_whose(xml_parameters)}"
+            " Options of a render belong to TransientRenderer and tt.render, max_depth to the scene's integrator too."
         )
     if isinstance(scene, Scene):
         return scene if variant is None or variant == scene.variant else Scene(scene._description, variant)
@@ -285,16 +284,3 @@ def _described(scene: Any, variant: str | None, xml_parameters: Mapping[str, Any
         f"tt.load: expected a path, a dictionary, a tt.Scene or a mi.Scene, got {type(scene).__name__}. Other objects "
         "of Mitsuba are taken inside a dictionary: {'type': 'scene', 'shape': mesh, ...}."
     )
-
-
-def _whose(names: Iterable[str]) -> str:
-    """Behind a message: which of these are options of a renderer."""
-    from torchtransient.rendering.renderer import TransientRenderer
-
-    options = inspect.signature(TransientRenderer.__init__).parameters.keys() - {"self", "scene"}
-    found = sorted(options & set(names))
-    if not found:
-        return ""
-    scene = ", max_depth of the scene's integrator too" if "max_depth" in found else ""
-    verb = "is an option" if len(found) == 1 else "are options"
-    return f" {', '.join(found)} {verb} of TransientRenderer and tt.render{scene}."

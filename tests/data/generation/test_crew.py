@@ -9,7 +9,14 @@ import pytest
 
 from torchtransient.data.generation import crew as crews
 from torchtransient.data.generation.crew import Crew, Member
-from torchtransient.data.generation.generate import Generated, _check_choices, _check_limits, _size, _whole_pair
+from torchtransient.data.generation.generate import (
+    Generated,
+    _check_choices,
+    _check_limits,
+    _check_recipe,
+    _size,
+    _whole_pair,
+)
 from torchtransient.data.generation.ledger import MEASURING, Ledger
 from torchtransient.data.generation.ray_engine import RayCrew
 from torchtransient.data.generation.run_log import RunLog, SampleBar
@@ -275,7 +282,6 @@ def test_choices_that_do_not_go_together():
             r"address='host:1' is for engine='ray', got engine='lo",
         ),
         (("exact", "none", "remote", None, recipe), ArgumentError, "expected engine to be one of"),
-        (("exact", "none", "local", None, object()), ArgumentError, r"expected a recipe, with maker\(\), got"),
         (("counts", "none", "local", None, recipe), SceneError, "of recipes with a device; give one"),
         (
             ("exact", "none", "local", None, SimpleNamespace(maker=len, key=len, to_dict=lambda: 1)),
@@ -285,6 +291,15 @@ def test_choices_that_do_not_go_together():
     ):
         with pytest.raises(error, match=words):
             _check_choices(*arguments)
+
+
+def test_a_recipe_is_expected():
+    with pytest.raises(ArgumentError, match=r"expected a recipe, with maker\(\), got"):
+        _check_recipe(object(), "folder")
+    recipe = SimpleNamespace(maker=len, key=len, to_dict=len)
+    with pytest.raises(ArgumentError, match="expected a recipe and then a folder, got the recipe behind 'folder'"):
+        _check_recipe("folder", recipe)
+    _check_recipe(recipe, "folder")
 
 
 def test_shares_and_limits():

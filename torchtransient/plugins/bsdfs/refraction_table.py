@@ -62,7 +62,7 @@ class RefractiveBSDFs:
 
     def _check(self) -> None:
         for bsdf, parts in self._entries:
-            indices = {_number(part) for part in parts}
+            indices = {_number(part) for part in parts} if len(parts) > 1 else set()
             if len(indices) > 1:
                 raise SceneError(
                     f"BSDF '{bsdf.id()}': one relative index of refraction per surface is expected, its parts have "
