@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
+
+import pytest
+
+import torchtransient as tt
+from torchtransient.data.generation import supervisor
 from torchtransient.data.generation.crew import Crew, Member
 from torchtransient.data.generation.shard_making import ShardMaker
 from torchtransient.data.generation.telling import Telling
@@ -41,3 +47,11 @@ class CrewHere(Crew):
         for worker in self.workers:
             worker.end()
         self.workers.clear()
+
+
+@contextmanager
+def workers_here():
+    """`generate` with such a crew, of one thread."""
+    with pytest.MonkeyPatch.context() as patch, tt.threads(1):
+        patch.setattr(supervisor, "Supervisor", CrewHere)
+        yield

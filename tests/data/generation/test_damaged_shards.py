@@ -8,12 +8,10 @@ import shutil
 
 import pytest
 
-import torchtransient as tt
-from support.crew_here import CrewHere
+from support.crew_here import workers_here
 from support.fake_recipe import FakeRecipe
 from support.generation_runs import data_files
 from support.stored_samples import sample
-from torchtransient.data.generation import supervisor
 from torchtransient.data.generation.generate import generate
 from torchtransient.data.storage.manifest import build_manifest, verify
 from torchtransient.data.storage.shard_file import Shard, ShardWriter
@@ -25,17 +23,15 @@ NAMES = [f"shard-{number:06d}.h5" for number in range(4)]
 
 
 @pytest.fixture(autouse=True)
-def here(monkeypatch):
-    monkeypatch.setattr(supervisor, "Supervisor", CrewHere)
-    with tt.threads(1):
+def here():
+    with workers_here():
         yield
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     folder = tmp_path_factory.mktemp("damaged") / "set"
-    with pytest.MonkeyPatch.context() as patch, tt.threads(1):
-        patch.setattr(supervisor, "Supervisor", CrewHere)
+    with workers_here():
         generate(RECIPE, folder, **SMALL)
     return folder
 

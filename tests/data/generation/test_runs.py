@@ -10,12 +10,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-import torchtransient as tt
-from support.crew_here import CrewHere
+from support.crew_here import CrewHere, workers_here
 from support.fake_recipe import FakeRecipe
 from support.generation_runs import damage, data_files, leftovers
 from torchtransient.data.generation import generate as runs
-from torchtransient.data.generation import ray_engine, settings, supervisor
+from torchtransient.data.generation import ray_engine, settings
 from torchtransient.data.generation import summary as summaries
 from torchtransient.data.generation.generate import generate
 from torchtransient.data.generation.run_log import RunLog, SampleBar
@@ -36,17 +35,15 @@ class Counted(FakeRecipe):
 
 
 @pytest.fixture(autouse=True)
-def here(monkeypatch):
-    monkeypatch.setattr(supervisor, "Supervisor", CrewHere)
-    with tt.threads(1):
+def here():
+    with workers_here():
         yield
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "set"
-    with pytest.MonkeyPatch.context() as patch, tt.threads(1):
-        patch.setattr(supervisor, "Supervisor", CrewHere)
+    with workers_here():
         done = generate(RECIPE, folder, **SMALL)
     assert (done.samples, done.failed, done.kept, done.restarts, done.shards) == (7, 0, 0, 0, 4)
     assert done.bytes == sum(path.stat().st_size for path in folder.glob("*.h5")) and done.folder == folder
