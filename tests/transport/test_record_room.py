@@ -105,6 +105,21 @@ def test_stacks_of_python_threads_are_asked_for():
     assert 2**10 < found[0] <= 2**19 < 16 * record_room.room_of_path()
 
 
+def test_the_first_thread_is_asked_once_for_each_limit(monkeypatch):
+    resource = pytest.importorskip("resource")
+    limits, asked = [(2**20, -1), (2**20, -1), (2**21, -1)], []
+    monkeypatch.setattr(resource, "getrlimit", lambda kind: limits[0])
+    monkeypatch.setattr(record_room, "_stack_of_this_thread", lambda: asked.append(limits[0][0]) or 1000)
+    record_room._stack_of_first_thread.cache_clear()
+    try:
+        while limits:
+            assert record_room._smallest_stack() == 1000
+            limits.pop(0)
+    finally:
+        record_room._stack_of_first_thread.cache_clear()
+    assert asked == [2**20, 2**21]
+
+
 @pytest.mark.parametrize("variant", [VARIANT, pytest.param("llvm_ad_mono", marks=pytest.mark.slow)])
 def test_paths_of_twenty_thousand_bounces(variant):
     """Of reflectance 0.999 and emission 1 the radiance is 1 / (1 - 0.999), its derivative the square. In a process of

@@ -9,7 +9,10 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import os
 import sys
+import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -74,22 +77,42 @@ def _smallest_stack() -> int:
     """Bytes of the smaller stack of those that kernels run on: that of the calling thread, and those of Dr.Jit's."""
     if not sys.platform.startswith("linux"):
         return _STACKS.get(sys.platform, _STACK_UNKNOWN)
-    library, found = ctypes.CDLL(None), []
+    import resource  # Windows has none
+
+    if threading.get_native_id() == os.getpid():
+        own = _stack_of_first_thread(os.getpid(), resource.getrlimit(resource.RLIMIT_STACK)[0])
+    else:
+        own = _stack_of_this_thread()
+    # Dr.Jit's threads are made with the default.
+    return min(own, _stack_said(lambda library, attributes: library.pthread_getattr_default_np(attributes)))
+
+
+@functools.lru_cache(maxsize=1)
+def _stack_of_first_thread(process: int, limit: int) -> int:
+    """Asked once for each limit: the C library reads the list of all that is mapped into the process, which takes a
+    millisecond, and ten where many kernels are.
+    """
+    return _stack_of_this_thread()
+
+
+def _stack_of_this_thread() -> int:
+    return _stack_said(
+        lambda library, attributes: library.pthread_getattr_np(ctypes.c_void_p(library.pthread_self()), attributes)
+    )
+
+
+def _stack_said(ask: Callable[[Any, Any], int]) -> int:
+    """Bytes of the stack in the attributes that ``ask`` fills."""
+    library = ctypes.CDLL(None)
     library.pthread_self.restype = ctypes.c_void_p
     attributes, size = ctypes.create_string_buffer(256), ctypes.c_size_t()
-    # Dr.Jit's threads are made with the default.
-    for ask in (
-        lambda: library.pthread_getattr_default_np(attributes),
-        lambda: library.pthread_getattr_np(ctypes.c_void_p(library.pthread_self()), attributes),
-    ):
-        try:
-            said = ask() == 0 and library.pthread_attr_getstacksize(attributes, ctypes.byref(size)) == 0
-        except AttributeError:  # another C library
-            said = False
-        else:
-            library.pthread_attr_destroy(attributes)
-        found.append(size.value if said else _STACK_UNKNOWN)
-    return min(found)
+    try:
+        said = ask(library, attributes) == 0
+        said = said and library.pthread_attr_getstacksize(attributes, ctypes.byref(size)) == 0
+    except AttributeError:  # another C library
+        return _STACK_UNKNOWN
+    library.pthread_attr_destroy(attributes)
+    return size.value if said else _STACK_UNKNOWN
 
 
 def _lanes_of_vector() -> int:
