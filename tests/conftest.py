@@ -7,15 +7,19 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import torchtransient as torchtransient  # isort: skip
 
+import faulthandler
 import gc
 import signal
+import sys
 import threading
+import time
 import types
 
 import drjit as dr
 import mitsuba as mi
 import pytest
 import torch
+from _pytest.faulthandler import fault_handler_stderr_fd_key
 
 from torchtransient import plugins
 
@@ -51,6 +55,26 @@ dr.syntax = _syntax_once
 # read): tests that call Mitsuba for such a file do it in `with tt.threads(2):`, as users have to.
 if (_workers := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))) > 1:
     dr.set_thread_count(max(1, (os.cpu_count() or 1) // _workers))
+
+
+# Seconds after which a test waits for ever.
+_FOR_EVER = 1200
+_watched_since = -float(_FOR_EVER)
+
+
+def pytest_runtest_setup(item):
+    """A test that waits for ever ends its process, which pytest-xdist reports by the test's name. The clock is set once
+    a minute and not for each test, as pytest's own is: a thread starts and ends each time, a fifth of a small test.
+    """
+    global _watched_since
+    if time.monotonic() - _watched_since > 60:
+        stderr = item.config.stash.get(fault_handler_stderr_fd_key, sys.__stderr__)
+        faulthandler.dump_traceback_later(_FOR_EVER, exit=True, file=stderr)
+        _watched_since = time.monotonic()
+
+
+def pytest_sessionfinish():
+    faulthandler.cancel_dump_traceback_later()
 
 
 def pytest_collectstart():

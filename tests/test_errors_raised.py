@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import torchtransient
+from support.sweeps import together
 from torchtransient import errors
 
 PACKAGE = Path(torchtransient.__file__).parent
@@ -78,7 +79,7 @@ def test_a_new_bare_error_is_found(tmp_path, line):
     assert [number for number, _ in bare(path, tmp_path)] == [2]
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: path.relative_to(PACKAGE).as_posix())
+@together("path", FILES, lambda path: path.relative_to(PACKAGE).as_posix())
 def test_missing_packages_have_their_error(path):
     """What is made of an ImportError says which package to install, in its own type."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.sweeps import together
 from torchtransient.argument_names import arguments_of
 from torchtransient.errors import (
     ArgumentError,
@@ -45,11 +46,11 @@ def public_classes():
         for name, value in vars(getattr(tt, room)).items():
             own = inspect.isclass(value) and value.__module__.startswith("torchtransient.")
             if own and not inspect.isabstract(value) and not getattr(value, "_is_protocol", False):
-                yield pytest.param(value, id=f"{room}.{name}")
+                yield f"{room}.{name}", value
 
 
-@pytest.mark.parametrize("kind", list(public_classes()))
-def test_an_unknown_argument_is_said_of_the_class_that_was_called(kind):
+@together("name, kind", public_classes(), lambda row: row[0])
+def test_an_unknown_argument_is_said_of_the_class_that_was_called(name, kind):
     with pytest.raises(TypeError, match=rf"^{kind.__name__}\."):
         kind(no_such_argument=1)
 
@@ -211,11 +212,11 @@ def _functions():
         for name, value in vars(room).items():
             ours = inspect.isfunction(value) and value.__module__.startswith(room.__name__)
             if ours and not name.startswith("_"):
-                yield pytest.param(value, id=f"{room.__name__.rpartition('.')[2]}.{name}")
+                yield f"{room.__name__.rpartition('.')[2]}.{name}", value
 
 
-@pytest.mark.parametrize("function", list(_functions()))
-def test_what_is_no_number_is_a_typed_error_of_every_function(function):
+@together("name, function", _functions(), lambda row: row[0])
+def test_what_is_no_number_is_a_typed_error_of_every_function(name, function):
     every = inspect.signature(function).parameters.values()
     needed = [p for p in every if p.default is p.empty and p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
     for given in NOT_NUMBERS:

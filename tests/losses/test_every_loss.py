@@ -12,15 +12,16 @@ import pytest
 import torch
 
 from support.loss_cases import CASES, CYCLES, MESHES, OTHERS
+from support.sweeps import together
 from torchtransient import FrequencyAxis, losses
 from torchtransient.errors import ArgumentError, DeviceError, ShapeError, TorchTransientError, UnitError
 
-every = pytest.mark.parametrize("case", CASES, ids=str)
+every = together("case", CASES)
 HALVES = (torch.float16, torch.bfloat16)
 
 
 def over(condition):
-    return pytest.mark.parametrize("case", [case for case in CASES if condition(case)], ids=str)
+    return together("case", [case for case in CASES if condition(case)])
 
 
 def real(x):
@@ -147,7 +148,7 @@ def test_what_does_not_count_may_be_anything(case):
 
 
 @every
-@pytest.mark.parametrize("reduction", ["mean", "sum", "none"])
+@together("reduction", ["mean", "sum", "none"])
 def test_nothing_counts(case, reduction):
     x, y = case.tensors()
     mask = torch.zeros_like(y, dtype=torch.bool)
@@ -243,7 +244,7 @@ def test_precision(case):
 
 
 @over(lambda case: real(case.tensors()[0]))
-@pytest.mark.parametrize("dtype", HALVES, ids=str)
+@together("dtype", HALVES)
 def test_half_precision_under_autocast(case, dtype):
     x, y = (t.to(dtype) for t in case.tensors())
     wanted = case(x.float(), y.float())

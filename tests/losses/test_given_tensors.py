@@ -23,11 +23,11 @@ NLLS = {
     "read_noise_nll": lambda x, y, **k: losses.read_noise_nll(x, y, 2.0, **k),
 }
 nlls = pytest.mark.parametrize("loss", NLLS.values(), ids=NLLS.keys())
-every = pytest.mark.parametrize("case", CASES, ids=str)
+every = together("case", CASES)
 
 
 def over(condition):
-    return pytest.mark.parametrize("case", [case for case in CASES if condition(case)], ids=str)
+    return together("case", [case for case in CASES if condition(case)])
 
 
 def of_time(case):
@@ -54,7 +54,7 @@ LAYOUTS = {
 
 
 @over(of_time)
-@pytest.mark.parametrize("dim, laid_out", LAYOUTS.values(), ids=LAYOUTS.keys())
+@together("dim, laid_out", LAYOUTS.values())
 def test_every_layout_has_the_numbers_of_images(case, dim, laid_out):
     x, y = pair_of(case)
     if dim == -1:

@@ -34,9 +34,9 @@ from torchtransient.reconstruction import (
 
 ON_GRIDS, ANYWHERE = grid_operators.operators(), scan_operators.operators()
 OPERATORS = ON_GRIDS | ANYWHERE
-every = pytest.mark.parametrize("name", OPERATORS)
-on_grids = pytest.mark.parametrize("name", ON_GRIDS)
-with_pictures = pytest.mark.parametrize("name", [name for name in OPERATORS if hasattr(OPERATORS[name], "reconstruct")])
+every = together("name", OPERATORS)
+on_grids = together("name", ON_GRIDS)
+with_pictures = together("name", [name for name in OPERATORS if hasattr(OPERATORS[name], "reconstruct")])
 CLASSES = [
     kind for kind in vars(room).values()
     if inspect.isclass(kind) and issubclass(kind, LinearOperator) and kind is not LinearOperator
@@ -89,7 +89,7 @@ def test_adjoint_is_exact(name):
 
 
 @every
-@pytest.mark.parametrize("way", ["forward", "adjoint"])
+@together("way", ["forward", "adjoint"])
 def test_derivatives_of_first_and_second_order_in_both_modes(name, way):
     operator = OPERATORS[name]
     function = getattr(operator, way)
@@ -213,7 +213,7 @@ def test_works_where_its_tables_are(name):
 
 
 @every
-@pytest.mark.parametrize("half", [torch.bfloat16, torch.float16])
+@together("half", [torch.bfloat16, torch.float16])
 def test_autocast_does_not_reach_in(name, half):
     operator = copy.deepcopy(OPERATORS[name]).float()
     for function, make in ((operator, volume_of), (operator.adjoint, data_of)):

@@ -10,13 +10,16 @@ import torch
 
 from support.sensing.all_entries import ENTRIES, each
 from support.sensing.contract import HALVES, LOOSE, expected, parts, pickled, through_state_dict
+from support.sweeps import together
 from torchtransient import sensing
 from torchtransient.errors import ShapeError
 from torchtransient.sensing import ScoreFunction
 
-each_random = pytest.mark.parametrize("entry", [e for e in ENTRIES if e.random], ids=lambda e: e.name)
-each_policy = pytest.mark.parametrize(
-    "entry, policy", [(e, p) for e in ENTRIES if e.random for p in e.policies], ids=lambda v: getattr(v, "name", v)
+each_random = together("entry", [e for e in ENTRIES if e.random], lambda entry: entry.name)
+each_policy = together(
+    "entry, policy",
+    [(e, p) for e in ENTRIES if e.random for p in e.policies],
+    lambda pair: f"{pair[0].name}, {pair[1]}",
 )
 
 
@@ -30,12 +33,12 @@ def test_batch_invariance(entry):
     module, x = entry.module(), entry.x()
     whole = parts(expected(module, x))
     for i in range(x.shape[0]):
-        for together, alone in zip(whole, parts(expected(module, x[i])), strict=True):
-            torch.testing.assert_close(together[i], alone, rtol=1e-10, atol=1e-12)
+        for of_all, alone in zip(whole, parts(expected(module, x[i])), strict=True):
+            torch.testing.assert_close(of_all[i], alone, rtol=1e-10, atol=1e-12)
 
 
 @each
-@pytest.mark.parametrize("what", ["no transient", "output"])
+@together("what", ["no transient", "output"])
 def test_what_a_film_does_not_measure_is_refused(entry, what):
     """`out.transient` of a gated film is None; the output itself is for chains."""
     module = entry.module()
@@ -86,7 +89,7 @@ def test_half_precision_is_measured_in_single(entry):
 
 @pytest.mark.slow
 @each
-@pytest.mark.parametrize("dtype", HALVES, ids=str)
+@together("dtype", HALVES)
 def test_half_precision_under_every_policy(entry, dtype):
     same_as_in_single(entry, dtype, entry.policies if entry.random else [None])
 
@@ -191,10 +194,12 @@ def test_conservation(entry):
     )
 
 
-@pytest.mark.parametrize(
-    "call, error", [pytest.param(*pair, id=f"{e.name}-{i}") for e in ENTRIES for i, pair in enumerate(e.errors)]
+@together(
+    "name, call, error",
+    [(f"{e.name} {i}", *pair) for e in ENTRIES for i, pair in enumerate(e.errors)],
+    lambda row: row[0],
 )
-def test_errors(call, error):
+def test_errors(name, call, error):
     with pytest.raises(error, match=r"\w+: .*(expected|needs|not supported).*"):
         call()
 

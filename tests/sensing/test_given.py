@@ -17,7 +17,7 @@ from torchtransient import sensing
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import GradientError, ShapeError, TorchTransientError, UnitError
 
-every_call = pytest.mark.parametrize("name", sorted(CALLS))
+every_call = together("name", sorted(CALLS))
 
 
 def tensors_of(value):

@@ -3,8 +3,8 @@
 import importlib
 from pathlib import Path
 
-import pytest
+from support.sweeps import together
 
 _MODULES = sorted(path.stem for path in Path(__file__).parent.glob("entries_*.py"))
 ENTRIES = [entry for name in _MODULES for entry in importlib.import_module(f"support.sensing.{name}").ENTRIES]
-each = pytest.mark.parametrize("entry", ENTRIES, ids=lambda e: e.name)
+each = together("entry", ENTRIES, lambda entry: entry.name)
