@@ -194,7 +194,10 @@ OVERLAPS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", OVERLAPS)
+ALIKE = ("other diagonal", "tile in a plate", "a millionth behind", "disk in a disk", "spheres", "balls that cross")
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in ALIKE)) for n in OVERLAPS])
 def test_surfaces_in_surfaces_count_once(name):
     hidden, alone, overlap = OVERLAPS[name]
     found = division(scan_scene(hidden(), third_bounce="auto"))

@@ -9,7 +9,7 @@ from support.mutated_files import run
 from support.read_files import READERS
 
 _TEXTS = ("WebDataset", "device", "setup", "scene", "capture of cdt", "capture of keyhole", "result")
-QUICK = {name: 100 if name in _TEXTS else 20 for name in READERS if name not in ("built scene", "data set")}
+QUICK = {name: 60 if name in _TEXTS else 12 for name in READERS if name not in ("built scene", "data set")}
 
 
 def test_mutants(tmp_path):

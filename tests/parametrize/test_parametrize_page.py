@@ -69,6 +69,7 @@ def test_the_free_fit_leaves_the_range(names):
     assert errors(names, history[-1])["rigid"] > 0.1
 
 
+@pytest.mark.slow
 def test_other_blocks(names):
     assert torch.allclose(names["back"], names["depth"], atol=1e-4)
     assert names["pose"].shape == (4, 4, 4) and names["normals"].shape == (3, 6, 8)

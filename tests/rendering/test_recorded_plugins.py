@@ -172,17 +172,23 @@ LOOSE = {
 }
 
 
-@pytest.mark.parametrize("kind", LOOSE)
-def test_plugins_of_no_scene(kind):
+ALONE = [pytest.param([kind], id=kind, marks=pytest.mark.slow) for kind in LOOSE]
+
+
+@pytest.mark.parametrize("kinds", [pytest.param(list(LOOSE), id="all"), *ALONE])
+def test_plugins_of_no_scene(kinds):
     """A method call is compiled for every plugin of a kind that is alive, of a scene or not."""
     import mitsuba as mi
 
-    before = mi.load_dict({"type": kind, **LOOSE[kind]})
+    def made():
+        return [mi.load_dict({"type": kind, **LOOSE[kind]}) for kind in kinds]
+
+    before = made()
     traced, recorded = (
         tt.TransientRenderer(tt.load(make_room(), variant=VARIANT), parameters=[GREY], spp=2, freeze=freeze)
         for freeze in (False, True)
     )
-    after = mi.load_dict({"type": kind, **LOOSE[kind]})
+    after = made()
     for seed in range(6):
         out, expected = recorded(seed=seed), traced(seed=seed)
         torch.testing.assert_close(out.transient, expected.transient, rtol=1e-5, atol=0)
@@ -192,7 +198,7 @@ def test_plugins_of_no_scene(kind):
     assert out.stats.recorded == (LAUNCHED,)
     # They may go, and others come, between two calls.
     del before
-    again = [mi.load_dict({"type": kind, **LOOSE[kind]}) for _ in range(2)]
+    again = made() + made()
     del after
     for seed in range(6):
         out = recorded(seed=seed)

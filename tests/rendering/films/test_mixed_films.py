@@ -57,9 +57,12 @@ def grad_and_values(renderer):
     return tensor.detach(), renderer.values[WALL_POSE].grad, out.stats.temporal_filter
 
 
-# With a filter of the integrator's, every film once on either side.
-QUICK = {(pair, "") for pair in PAIRS} | {
-    (pair, "gaussian") for pair in PAIRS if pair[0] == "histogram" or pair[1] == "smooth histogram"
+# Every pair once; with a filter of the integrator's, every film once on either side.
+QUICK = {
+    (pair, filtered)
+    for pair in PAIRS
+    for filtered in ("", "gaussian")
+    if (pair[0] == "histogram" or pair[1] == "smooth histogram") == bool(filtered)
 }
 
 

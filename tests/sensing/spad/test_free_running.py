@@ -112,7 +112,7 @@ def test_gmres_solves_rows_of_different_difficulty():
 
 
 @pytest.mark.parametrize("solve", [nonparalyzable_histogram, paralyzable_histogram])
-@pytest.mark.parametrize("dead", [5.3, 20.7])
+@pytest.mark.parametrize("dead", [5.3, pytest.param(20.7, marks=pytest.mark.slow)])
 def test_gradients(solve, dead):
     x = as_image(pulse(2.0, 12)).clone().requires_grad_()
     d = torch.tensor(dead, dtype=torch.float64, requires_grad=True)
