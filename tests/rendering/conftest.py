@@ -15,9 +15,11 @@ def room() -> dict:
     return make_room()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def room_scene() -> tt.Scene:
-    """The room loaded once; scenes are immutable."""
+    """The room loaded once; scenes are immutable. A scene keeps what was built of it for each kind of film, and a kernel
+    has every plugin that is alive: those of other modules are not carried along.
+    """
     return tt.load(make_room(), variant=VARIANT)
 
 
