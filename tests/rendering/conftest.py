@@ -17,8 +17,8 @@ def room() -> dict:
 
 @pytest.fixture(scope="module")
 def room_scene() -> tt.Scene:
-    """The room loaded once; scenes are immutable. A scene keeps what was built of it for each kind of film, and a kernel
-    has every plugin that is alive: those of other modules are not carried along.
+    """The room loaded once; scenes are immutable. A scene keeps what was built of it for each kind of film, and every
+    kernel has all plugins that are alive: those of other modules are not carried along.
     """
     return tt.load(make_room(), variant=VARIANT)
 

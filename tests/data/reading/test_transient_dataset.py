@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import pickle
+import shutil
+import warnings
 from dataclasses import replace
 
 import h5py
@@ -14,7 +16,8 @@ from torch.utils.data import DataLoader
 import torchtransient as tt
 from support.stored_samples import AXIS, cube, folder, header, sample, write
 from torchtransient.data.reading.transient_dataset import TransientDataset
-from torchtransient.errors import ArgumentError, StorageError, UnitError
+from torchtransient.data.storage.manifest import build_manifest
+from torchtransient.errors import ArgumentError, StorageError, TorchTransientWarning, UnitError
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +56,23 @@ def test_where(data, tmp_path):
     ):  # fmt: skip
         with pytest.raises(StorageError, match=message):
             TransientDataset(where)
+
+
+def test_shards_that_are_gone_are_said(data, tmp_path):
+    place = shutil.copytree(data, tmp_path / "set")
+    build_manifest(place)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(TransientDataset(place)) == 10
+        TransientDataset(place / "shard-000000.h5")
+    (place / "shard-000001.h5").unlink()
+    for where in (place, [place], str(tmp_path / "s*")):
+        with pytest.warns(TorchTransientWarning, match=r"'.*set': .* names 1 shards .*: \['shard-000001.h5'\]") as said:
+            assert len(TransientDataset(where)) < 10
+        assert said[0].filename == __file__
+    with warnings.catch_warnings():  # asked for by name
+        warnings.simplefilter("error")
+        TransientDataset(sorted(map(str, place.glob("shard*"))))
 
 
 def test_failed_samples_are_left_out(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import os
+import warnings
 from collections import OrderedDict
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.data.storage.manifest import shards_of
+from torchtransient.data.storage.manifest import named_shards, shards_of
 from torchtransient.data.storage.shard_file import Shard
-from torchtransient.errors import StorageError
+from torchtransient.errors import StorageError, TorchTransientWarning
 from torchtransient.file_places import path_of
 from torchtransient.given_types import several
 from torchtransient.quantities import shown
+from torchtransient.rendering.physics import level_of_user
 
 WHAT = "data set"
 _OPEN = 32
@@ -88,18 +90,20 @@ class ShardTable:
 
 
 def shard_paths(where: Any) -> list[Path]:
-    """The shards that a folder, a pattern, a file, or a list of them means. Raises StorageError for none."""
+    """The shards that a folder, a pattern, a file, or a list of them means. Raises StorageError for none. Warns where a
+    folder lacks some of its own.
+    """
     if isinstance(where, str | os.PathLike):
         text = os.fspath(where)
         path = path_of(text, WHAT)
         if path.is_dir():
-            found = shards_of(path)
+            found = _of_folder(path)
         elif path.is_file():
             found = [path]
         else:
             found = sorted(Path(name) for name in glob.glob(str(text), recursive=True))
             if any(place.is_dir() for place in found):
-                found = [shard for place in found for shard in (shards_of(place) if place.is_dir() else [place])]
+                found = [shard for place in found for shard in (_of_folder(place) if place.is_dir() else [place])]
         if not found:
             raise StorageError(
                 f"{WHAT}: expected a folder with shards, or a pattern of their names, got '{text}', where there is "
@@ -116,6 +120,20 @@ def shard_paths(where: Any) -> list[Path]:
     if not paths:
         raise StorageError(f"{WHAT}: expected a folder, a pattern, or a list of them, got {shown(where)}.")
     return paths
+
+
+def _of_folder(folder: Path) -> list[Path]:
+    """Its shards; those that its manifest names and that are not there are said."""
+    found = shards_of(folder)
+    gone = sorted(set(named_shards(folder)) - {path.name for path in found})
+    if found and gone:
+        warnings.warn(
+            f"{WHAT}: '{folder}': manifest.json names {len(gone)} shards that are not there: {shown(gone)}. Their "
+            "samples are left out; `torchtransient dataset verify` says which, and generate makes them again.",
+            TorchTransientWarning,
+            level_of_user(),
+        )
+    return found
 
 
 def _kind(shard: Shard) -> dict[str, Any]:

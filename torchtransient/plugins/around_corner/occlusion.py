@@ -226,4 +226,4 @@ class MutualOcclusion:
         bsdf = si.bsdf()
         value = bsdf.eval(mi.BSDFContext(), si, wo, active)
         value = self.world.scattering.correct_two_sided(self.world, bsdf, si, wo, value)
-        return rotate_mueller(value, rotation_to_sensor(si, into), rotation_from_light(si, wo, out, out))
+        return rotate_mueller(value, rotation_to_sensor(si, into), rotation_from_light(si, wo, out))
