@@ -14,6 +14,7 @@ import torch
 
 import torchtransient as tt
 from torchtransient.errors import DeviceError, UnitError
+from torchtransient.plugins import drjit_pool
 from torchtransient.plugins.drjit_pool import engine_lock
 from torchtransient.rendering import threads as module
 
@@ -92,6 +93,54 @@ def test_what_the_system_refuses_is_taken_back(monkeypatch):
         with pytest.raises(DeviceError, match=r"asked for 5 of torch and 5 of Dr\.Jit, which took 2 and 5"):
             tt.threads(5)
     assert tt.threads() == before
+
+
+class Asleep:
+    """A nanothread whose thread falls asleep while it is told to end: it ends when a task wakes it."""
+
+    def __init__(self, takes):
+        self.woken, self.takes, self.released = threading.Event(), takes, []
+
+    def pool_set_size(self, pool, size, start_parked):
+        assert self.woken.wait(20), "nobody wakes the thread that is waited for"
+        if self.takes:
+            dr.set_thread_count(size)
+
+    def task_submit_dep(self, *arguments):
+        self.woken.set()
+        return 5
+
+    def task_release(self, task):
+        self.released.append(task)
+
+
+@pytest.mark.parametrize("takes", [True, False])
+def test_a_thread_that_falls_asleep_while_it_is_told_to_end_is_woken(monkeypatch, takes):
+    """Dr.Jit waited for it for ever, once in a hundred thousand times."""
+    before, asleep = tt.threads(3), Asleep(takes)
+    with before, monkeypatch.context() as patch:
+        patch.setattr(drjit_pool, "_nanothread", lambda: asleep)
+        patch.setattr(drjit_pool, "WAKE_S", 0.01)
+        assert tt.threads(2).drjit == 2 and asleep.released
+        assert not [t for t in threading.enumerate() if "wakes" in t.name]
+
+
+def test_threads_are_woken_by_a_task():
+    """Of the pool itself: tasks that do nothing, submitted all the time, leave it as it is."""
+    assert drjit_pool._nanothread() is not None
+    ended = threading.Event()
+    helper = threading.Thread(target=drjit_pool._wake, args=(drjit_pool._nanothread(), ended))
+    with tt.threads(2), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(drjit_pool, "WAKE_S", 1e-4)
+        helper.start()
+        try:
+            for count in (1, 3, 2) * 20:
+                assert tt.threads(count).drjit == count
+                x = dr.arange(dr.llvm.Float, 200_000) + count
+                assert dr.sum(x)[0] == pytest.approx(200_000 * (199_999 / 2 + count), rel=1e-5)
+        finally:
+            ended.set()
+            helper.join()
 
 
 def test_renders_of_other_threads_end_first():

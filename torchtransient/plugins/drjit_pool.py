@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import ctypes
+import functools
 import os
 import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
 
 import drjit as dr
 
@@ -19,6 +23,9 @@ _process = {"parent_was_rendering": False}
 
 # The process that has changed Dr.Jit's pool: its threads do not come along in a fork, and waiting for them never ends.
 _pool = {"of": 0}
+
+# Seconds that threads may take to end before they are woken, and how often they are.
+WAKE_S, MOST_WAKES = 0.1, 600
 
 
 def _mark_fork() -> None:
@@ -53,7 +60,63 @@ def set_drjit_threads(count: int) -> None:
         )
     _pool["of"] = os.getpid()
     dr.sync_thread()
-    dr.set_thread_count(count)
+    resize_pool(count)
+
+
+def resize_pool(count: int) -> None:
+    """``dr.set_thread_count``, which waits for ever for a thread that falls asleep while it is told to end.
+
+    Once in a hundred thousand times nanothread (of Dr.Jit 1.5) neither sees that the thread sleeps nor lets it see that
+    it is to end. A task that is submitted meanwhile wakes it: so another Python thread has to run, which
+    ``dr.set_thread_count`` would keep waiting with the interpreter's lock.
+    """
+    library = _nanothread()
+    if library is None or count >= dr.thread_count():
+        dr.set_thread_count(count)
+        return
+    ended = threading.Event()
+    helper = threading.Thread(target=_wake, args=(library, ended), name="torchtransient wakes Dr.Jit", daemon=True)
+    try:
+        helper.start()
+        library.pool_set_size(None, count, 1)
+    finally:
+        ended.set()
+        if helper.ident is not None:
+            helper.join()
+    if dr.thread_count() != count:  # a nanothread that counts otherwise
+        dr.set_thread_count(count)
+
+
+def _wake(library: Any, ended: threading.Event) -> None:
+    """Submit a task that does nothing, again and again until the pool has its size; not for ever, should an interrupt
+    come in before that is told.
+    """
+    for _ in range(MOST_WAKES):
+        if ended.wait(WAKE_S):
+            return
+        task = library.task_submit_dep(None, None, 0, 1, None, None, 0, None, 1, 0)
+        library.task_release(task)
+
+
+@functools.cache
+def _nanothread() -> Any:
+    """Dr.Jit's pool of threads, which Python does not offer whole; None where it is not found."""
+    path = next(Path(dr.__file__).parent.glob("*nanothread*"), None)
+    try:
+        library = None if path is None else ctypes.CDLL(str(path))
+        if library is not None:
+            pointer, number, flag = ctypes.c_void_p, ctypes.c_uint32, ctypes.c_int
+            library.pool_set_size.argtypes = [pointer, number, flag]
+            library.pool_set_size.restype = None
+            library.task_submit_dep.argtypes = [
+                pointer, pointer, number, number, pointer, pointer, number, pointer, flag, flag
+            ]  # fmt: skip
+            library.task_submit_dep.restype = pointer
+            library.task_release.argtypes = [pointer]
+            library.task_release.restype = None
+    except (OSError, AttributeError):
+        return None
+    return library
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from types import TracebackType
 import torch
 
 from torchtransient.errors import DeviceError, UnitError, VariantError
-from torchtransient.plugins.drjit_pool import engine_lock, set_drjit_threads
+from torchtransient.plugins.drjit_pool import engine_lock, resize_pool, set_drjit_threads
 from torchtransient.quantities import as_whole, shown
 
 MOST_THREADS = 1024
@@ -105,7 +105,5 @@ def _set(for_torch: int, for_drjit: int) -> None:
 
 
 def _put_back(before: tuple[int, int]) -> None:
-    import drjit as dr
-
-    dr.set_thread_count(before[1])
+    resize_pool(before[1])
     torch.set_num_threads(before[0])
