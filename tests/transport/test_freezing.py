@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from support.marks import long_pairs
 from support.plain_scenes import as_mitsuba
 from torchtransient._collection import no_collection
 from torchtransient.scenes import cornell_box
@@ -88,8 +89,12 @@ def arrays(value):
     return [np.array(v) for v in (value if isinstance(value, tuple) else (value,))]
 
 
-@pytest.mark.parametrize("run", [render, backward, forward], ids=lambda f: f.__name__)
-@pytest.mark.parametrize("kind", KINDS)
+RUNS = (render, backward, forward)
+# Every kind of scene in one of the three modes, by turns.
+QUICK = {(kind, RUNS[number % 3]) for number, kind in enumerate(KINDS)}
+
+
+@pytest.mark.parametrize(("kind", "run"), long_pairs(KINDS, RUNS, QUICK))
 def test_one_recording_for_all_seeds(kind, run):
     scene = mi.load_dict(scene_of(kind), optimize=False)
     params, shape = mi.traverse(scene), scene.sensors()[0].film().cube_shape()
