@@ -128,8 +128,8 @@ def _of_folder(folder: Path) -> list[Path]:
     gone = sorted(set(named_shards(folder)) - {path.name for path in found})
     if found and gone:
         warnings.warn(
-            f"{WHAT}: '{folder}': manifest.json names shards that are not there, {len(gone)} of them: {shown(gone)}. Their "
-            "samples are left out; `torchtransient dataset verify` says which, and generate makes them again.",
+            f"{WHAT}: '{folder}': manifest.json names shards that are not there, {len(gone)} of them: {shown(gone)}. "
+            "Their samples are left out; `torchtransient dataset verify` says which, and generate makes them again.",
             TorchTransientWarning,
             level_of_user(),
         )
