@@ -16,9 +16,9 @@ from typing import Any
 
 # Reentrant: freeing objects runs finalizers that free others.
 _lock = threading.RLock()
-# One entry for each block that is inside, and whether it was we who have stopped the collector. An interrupt may come
-# between any two lines: what it leaves undone here is done by the next block that ends.
-_traces: list[object] = []
+# One entry for each block that is inside, with its thread, and whether it was we who have stopped the collector. An
+# interrupt may come between any two lines: what it leaves undone here is done by the next block that ends.
+_traces: list[tuple[int, object]] = []
 _stopped = False
 _kept: list[Any] = []
 
@@ -27,7 +27,7 @@ _kept: list[Any] = []
 def no_collection() -> Iterator[None]:
     """No garbage collection and no :func:`let_go` inside, in any thread. May be nested; also a decorator."""
     global _stopped
-    trace = object()
+    trace = threading.get_ident(), object()
     try:
         with _lock:
             _traces.append(trace)
@@ -44,6 +44,14 @@ def no_collection() -> Iterator[None]:
                 if _stopped:
                     gc.enable()
                     _stopped = False
+
+
+def forget_traces() -> None:
+    """At the beginning of a call: no block of this thread is inside. One that an interrupt has cut off at its end would
+    keep the collector from going on until its traceback is let go of.
+    """
+    with _lock:
+        _traces[:] = [trace for trace in _traces if trace[0] != threading.get_ident()]
 
 
 def let_go(contents: list[Any]) -> None:

@@ -71,9 +71,13 @@ def test_described_values_are_put_back_for_others(empty, monkeypatch):
     empty.leave(options, one, attached=False)
     assert one.restored == 3
     monkeypatch.setattr(empty, "is_shared", False)
-    for other in (Table("built", originals=()), Table("another")):
-        empty.leave(options, other, attached=True)
-        assert other.restored == 0
+    nothing, dropped = Table("built", originals=()), Table("another")
+    empty.leave(options, nothing, attached=True)
+    empty.leave(options, dropped, attached=False)
+    assert nothing.restored == dropped.restored == 0
+    # Dropped in the middle of being put back, it may be alive and attached.
+    empty.leave(options, dropped, attached=True)
+    assert dropped.restored == 1 and empty._builds[options] == "built" and options not in empty._unsettled
     # A scene that cannot be put back is built anew.
     torn = Table("built", fails=True)
     with pytest.raises(RuntimeError, match="torn"):

@@ -15,6 +15,7 @@ import torch
 import torchtransient as tt
 from torchtransient._collection import no_collection
 from torchtransient.plugins import _registry
+from torchtransient.rendering import interrupts
 from torchtransient.rendering.interrupts import quiet
 from torchtransient.rendering.variant import active_variant
 from torchtransient.testing.small_room import COLOUR, VARIANT, WALL_POSE, make_room
@@ -119,10 +120,10 @@ def test_level_of_messages_is_put_back_when_an_interrupt_cuts_its_end_off(level,
         with active_variant(VARIANT), quiet():
             assert mi.logger().log_level() == mi.LogLevel.Error
 
-    with monkeypatch.context() as patched:
-        patched.setattr("torchtransient.rendering.interrupts.put_back_log_level", interrupt)
-        with pytest.raises(KeyboardInterrupt):
-            cut_off()
+    once, put_back = [interrupt], interrupts.put_back_log_level
+    monkeypatch.setattr(interrupts, "put_back_log_level", lambda: (once.pop() if once else put_back)())
+    with pytest.raises(KeyboardInterrupt):
+        cut_off()
 
 
 def test_errors_that_are_no_interrupts_stay_what_they_are(renderer, monkeypatch):

@@ -7,6 +7,7 @@ pickled. Mitsuba's own ``mi.load_dict`` refuses arrays, so :func:`take_arrays` l
 from __future__ import annotations
 
 import functools
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -185,10 +186,11 @@ def _taking_arrays(load_dict: Callable[..., Any]) -> Callable[..., Any]:
             args = (for_mitsuba(args[0]), *args[1:])
         elif isinstance(options.get("dict"), dict):
             options["dict"] = for_mitsuba(options["dict"])
+        handled = sys.exc_info()[1]
         try:
             return load_dict(*args, **options)
         except RuntimeError as error:
-            interrupt = interrupt_behind(error)
+            interrupt = interrupt_behind(error, handled)
             if interrupt is None:
                 raise
             raise interrupt from None

@@ -15,6 +15,7 @@ from typing import Any
 import drjit as dr
 
 from torchtransient.errors import VariantError
+from torchtransient.plugins.unfinished import afterwards
 
 # One lock for everything that touches Mitsuba: the variant, the scenes' parameters and Dr.Jit's graph are shared state.
 engine_lock = threading.RLock()
@@ -131,8 +132,6 @@ def threads_for_files() -> Iterator[None]:
         if before > 1:
             yield
             return
-        try:
+        with afterwards(lambda: set_drjit_threads(before)):
             set_drjit_threads(2)
             yield
-        finally:
-            set_drjit_threads(before)

@@ -11,6 +11,7 @@ import torch
 
 from torchtransient.errors import ShapeError
 from torchtransient.plugins.frozen_state import says_it_can_be_recorded
+from torchtransient.plugins.unfinished import afterwards
 from torchtransient.rendering.carry_out import LARGE_FILM
 
 
@@ -37,11 +38,9 @@ class Batch:
         if not able or not all(other.can_borrow(spp) for other in self.films):
             yield False
             return
-        try:
+        with afterwards(lambda: film.lend(None)):
             self._lend(film, n, entries)
             yield True
-        finally:
-            film.lend(None)
 
     def _lend(self, film: Any, n: int, entries: int) -> None:
         import mitsuba as mi

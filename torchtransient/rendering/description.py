@@ -21,6 +21,7 @@ from torchtransient import plugins
 from torchtransient.errors import SceneError, StorageError
 from torchtransient.file_places import check_special, path_of
 from torchtransient.plugins.dictionaries import NUMBERS_IN_TEXT, Pixels, Voxels, for_mitsuba, is_ours, numbers_in_text
+from torchtransient.plugins.unfinished import afterwards
 from torchtransient.quantities import shown
 from torchtransient.rendering.node_checks import MOST_LEVELS
 from torchtransient.rendering.taken import ReadyScene, Taken, check_variant, describe_object, refuse, taken_below
@@ -159,11 +160,9 @@ def _search_path(folder: str) -> Iterator[None]:
     before = mi.file_resolver()
     resolver = mi.FileResolver(before)
     resolver.prepend(folder)
-    try:
+    with afterwards(lambda: mi.set_file_resolver(before)):
         mi.set_file_resolver(resolver)
         yield
-    finally:
-        mi.set_file_resolver(before)
 
 
 def describe_xml(path: str | os.PathLike[str], parameters: Mapping[str, Any]) -> XmlDescription:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
 from torchtransient.interfaces import is_time_resolved
+from torchtransient.plugins.unfinished import afterwards
 
 
 @contextmanager
@@ -28,5 +30,5 @@ def temporal_filter(name: str | None, integrator: Any, films: Iterable[Any]) -> 
 
 
 def _set(restore: ExitStack, target: Any, name: str) -> None:
-    restore.callback(setattr, target, "temporal_filter", target.temporal_filter)
+    restore.enter_context(afterwards(functools.partial(setattr, target, "temporal_filter", target.temporal_filter)))
     target.temporal_filter = name

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -20,21 +21,22 @@ _EVALUATED = ": not permitted. "
 def named_errors() -> Iterator[None]:
     """For the time of a render: raise the error of this library that ended it, or one that names the reason."""
     raised: BaseException | None = None
+    handled = sys.exc_info()[1]
     try:
         yield
     except RuntimeError as error:
-        raised = _instead_of(error)
+        raised = _instead_of(error, handled)
         if raised is error:
             raise
-        clear_frames(error)
-        raise raised from (None if raised in chain_of(error) else error)
+        clear_frames(error, handled)
+        raise raised from (None if raised in chain_of(error, handled) else error)
     finally:
         # A frame must not hold what it raises: both would stay until they are collected, and the scene with them.
-        del raised
+        del raised, handled
 
 
-def _instead_of(error: RuntimeError) -> BaseException:
-    chain = chain_of(error)
+def _instead_of(error: RuntimeError, handled: BaseException | None) -> BaseException:
+    chain = chain_of(error, handled)
     own = next((cause for cause in chain if isinstance(cause, TorchTransientError)), None)
     if own is None and any(words in str(error) for words in (_INSIDE, _ACROSS)):
         return _named(_reason(chain))
@@ -43,7 +45,7 @@ def _instead_of(error: RuntimeError) -> BaseException:
 
 def _reason(chain: list[BaseException]) -> BaseException:
     """The first cause that says more than that something happened inside."""
-    return next((cause for cause in reversed(chain) if "(see above)" not in str(cause)), chain[-1])
+    return next((one for one in reversed(chain) if str(one) and "(see above)" not in str(one)), chain[-1])
 
 
 def _named(reason: BaseException) -> TorchTransientError:

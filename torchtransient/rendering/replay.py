@@ -17,6 +17,7 @@ import torch
 
 from torchtransient._collection import no_collection
 from torchtransient.errors import GradientError, ShapeError, UnitError, VariantError
+from torchtransient.plugins.unfinished import afterwards
 from torchtransient.rendering.arrays import as_tensor, as_torch, fresh, handle, own
 from torchtransient.rendering.broken_numbers import carried_on
 from torchtransient.rendering.derivatives import Asked
@@ -292,14 +293,19 @@ class Call:
 
     @contextmanager
     def _scenes_as_at_call(self) -> Iterator[None]:
+        import drjit as dr
+
         before = [values_of(params) for params in self.scenes.params]
-        try:
+
+        def as_before() -> None:
+            with dr.resume_grad():
+                for params, values in zip(self.scenes.params, before, strict=True):
+                    put_back(params, values)
+
+        with afterwards(as_before):
             for params, values, now in zip(self.scenes.params, self.scenes.values, before, strict=True):
                 put_back(params, values, now)
             yield
-        finally:
-            for params, values in zip(self.scenes.params, before, strict=True):
-                put_back(params, values)
 
     def result(self, tensors: Tensors) -> Any:
         """What the function returned, with tensors for its arrays. Raises ``ShapeError`` where the entries of a

@@ -159,10 +159,15 @@ class Scene:
         """End of a run: the described values are put back when the built scene is asked for by anyone but a run with
         the same keys, and at once where values are ``attached``, so that no graph outlives a run.
         """
-        if slots.originals and self._builds.get(options) is slots.built:
-            self._unsettled[options] = slots
-            if attached or self.is_shared:
-                self._settle(options)
+        if not slots.originals:
+            return
+        if self._builds.get(options) is not slots.built:
+            if attached:  # dropped where an interrupt came into its putting back, and perhaps still alive
+                slots.restore()
+            return
+        self._unsettled[options] = slots
+        if attached or self.is_shared:
+            self._settle(options)
 
     def _settle(self, options: BuildOptions) -> None:
         slots = self._unsettled.pop(options, None)

@@ -15,6 +15,7 @@ import torch
 from torchtransient._collection import no_collection
 from torchtransient.errors import SceneError, TorchTransientError, VariantError
 from torchtransient.plugins.black_textures import lifted
+from torchtransient.plugins.unfinished import afterwards
 from torchtransient.rendering.build_options import BuildOptions
 from torchtransient.rendering.filter_override import temporal_filter
 from torchtransient.rendering.interrupts import quiet
@@ -172,13 +173,11 @@ def session_of(job: RenderJob) -> Iterator[Session]:
             slots = job.scene.slots(job.keys, job.options)
             session = Session(job, slots)
             films = [sensor.film() for sensor in session.sensors]
-            try:
+            attached = True  # where something is raised, whatever it was may hold values
+            with afterwards(lambda: job.scene.leave(job.options, slots, attached)):
                 with named_errors(), temporal_filter(job.temporal_filter, session.integrator, films):
                     yield session
-            except BaseException:
-                job.scene.leave(job.options, slots, attached=True)
-                raise
-            job.scene.leave(job.options, slots, attached=any(job.needs))
+                attached = any(job.needs)
 
 
 @contextmanager
@@ -192,12 +191,14 @@ def _as_at_call(job: RenderJob) -> Iterator[None]:
     params = job.scene.built(job.options).params
     with dr.resume_grad():
         now = values_of(params)
-    try:
+
+    def as_before() -> None:
+        with dr.resume_grad():
+            put_back(params, now)
+
+    with afterwards(as_before):
         with dr.resume_grad():
             if not job.at_call:
                 job.at_call.append(detached(now))
             put_back(params, job.at_call[0], now)
         yield
-    finally:
-        with dr.resume_grad():
-            put_back(params, now)

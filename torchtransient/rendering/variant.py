@@ -12,16 +12,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from torchtransient import plugins
+from torchtransient._collection import forget_traces
 from torchtransient._llvm import ensure_llvm
 from torchtransient.errors import VariantError
 from torchtransient.plugins.drjit_pool import check_process, engine_lock
+from torchtransient.plugins.unfinished import make_good
 from torchtransient.quantities import shown
-from torchtransient.rendering.interrupts import interrupts_pass, interrupts_wait, put_back_log_level
+from torchtransient.rendering.interrupts import interrupts_pass, interrupts_wait
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
-
-# The calls, one inside the other, that hold the lock.
-_holders: list[object] = []
 
 # A switch takes some 0.1 s and makes Dr.Jit translate every loop anew; once or twice is fine, at every step it is not.
 MANY_SWITCHES = 20
@@ -30,21 +29,20 @@ _switches = {"count": 0}
 
 @contextmanager
 def at_work() -> Iterator[None]:
-    """Hold the engine lock. Interrupts pass, and what they have left changed is put back when nobody is at work any
-    more. Raises ``VariantError`` as :func:`check_process`.
+    """Hold the engine lock. Interrupts pass, and what they have left changed is put back at the end, or first thing in
+    the next call. Raises ``VariantError`` as :func:`check_process`.
     """
+    outermost = not engine_lock._is_owned()  # type: ignore[attr-defined]
     with engine_lock, interrupts_pass():
         check_process()
-        holder = object()
         try:
-            _holders.append(holder)
+            if outermost:
+                forget_traces()
+                make_good()
             yield
         finally:
-            # With those above it, if an interrupt has kept them from it.
-            if holder in _holders:
-                del _holders[_holders.index(holder) :]
-            if not _holders:
-                put_back_log_level()
+            if outermost:
+                make_good()
 
 
 def is_differentiable(variant: str | None) -> bool:

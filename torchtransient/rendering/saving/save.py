@@ -19,6 +19,7 @@ from torchtransient.file_places import check_folder, path_of
 from torchtransient.plugins.mitsuba_compat import keeps_coefficients
 from torchtransient.plugins.node_walk import ShownValue, objects_below
 from torchtransient.plugins.spectral_colours import same_spectra
+from torchtransient.plugins.unfinished import afterwards
 from torchtransient.rendering.arguments import as_float, fit_shape
 from torchtransient.rendering.build_options import BuildOptions
 from torchtransient.rendering.node_names import name_nodes, take_merged_apart
@@ -77,31 +78,30 @@ def _write(scene: Scene, draft: Path, folder: Path, values: Mapping[str, Any]) -
     slots = scene.slots(keys, options)
     built = slots.built
     try:
-        slots.install([_leaf(slot, values[slot.key], scene.variant) for slot in slots.slots])
-        with description.resolved_files(), plugins.plugin_errors():
-            state = _parsed(description, scene.variant)
-            writer = XmlWriter(state, folder)
-            places = places_of(built.scene, state)
-            for slot in slots.slots:
-                shape = slot.shape if slot.kind != "mesh_transform" else (4, 4)
-                given = values[slot.key]
-                array = np.asarray(given.detach().cpu() if isinstance(given, torch.Tensor) else given, dtype=np.float64)
-                write_value(writer, built, places, slot, array.reshape(shape))
-            for value in objects_below(built.scene, mi.Object):
-                place = places.get(value.ptr)
-                if place is None or place.names:
-                    continue
-                writer.note_kind(place.node, value)
-                if isinstance(value, mi.Mesh) and state.nodes[place.node].props.plugin_name() == "mesh_arrays":
-                    mesh_as_file(writer, place.node, value)
-            draft.write_text(writer.text(), encoding="utf-8")
-        return _numbers(built)
+        with afterwards(lambda: scene.leave(options, slots, attached=True)):
+            slots.install([_leaf(slot, values[slot.key], scene.variant) for slot in slots.slots])
+            with description.resolved_files(), plugins.plugin_errors():
+                state = _parsed(description, scene.variant)
+                writer = XmlWriter(state, folder)
+                places = places_of(built.scene, state)
+                for slot in slots.slots:
+                    shape = slot.shape if slot.kind != "mesh_transform" else (4, 4)
+                    given = values[slot.key]
+                    given = given.detach().cpu() if isinstance(given, torch.Tensor) else given
+                    write_value(writer, built, places, slot, np.asarray(given, dtype=np.float64).reshape(shape))
+                for value in objects_below(built.scene, mi.Object):
+                    place = places.get(value.ptr)
+                    if place is None or place.names:
+                        continue
+                    writer.note_kind(place.node, value)
+                    if isinstance(value, mi.Mesh) and state.nodes[place.node].props.plugin_name() == "mesh_arrays":
+                        mesh_as_file(writer, place.node, value)
+                draft.write_text(writer.text(), encoding="utf-8")
+            return _numbers(built)
     except (RuntimeError, ValueError, TypeError) as error:
         if isinstance(error, TorchTransientError):
             raise
         raise SceneError(f"scene.save: {description.name} cannot be written: {error}") from error
-    finally:
-        scene.leave(options, slots, attached=True)
 
 
 def _options(scene: Scene, keys: tuple[str, ...]) -> BuildOptions:

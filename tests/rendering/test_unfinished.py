@@ -1,0 +1,212 @@
+"""What an interrupt cuts off in the middle of being put back is put back by the next call, of whatever scene."""
+
+from __future__ import annotations
+
+import functools
+import gc
+import random
+import warnings
+
+import mitsuba as mi
+import pytest
+import torch
+
+import torchtransient as tt
+from support.interrupts import moments_of
+from torchtransient import _collection
+from torchtransient.errors import SceneError, ShapeError
+from torchtransient.plugins import unfinished
+from torchtransient.plugins.unfinished import afterwards, make_good
+from torchtransient.rendering.variant import active_variant
+from torchtransient.testing.small_room import COLOUR, VARIANT, WALL_POSE, make_room
+
+# What ends calls: the moments in these functions are the ones that leave something behind.
+ENDS = {
+    "__exit__", "_exit_wrapper", "_carry_out", "afterwards", "leave", "_settle", "restore", "_update", "put_back",
+    "_follow", "as_before", "values_of", "_same", "no_collection", "session_of", "active_variant", "at_work",
+    "take_filter", "quiet", "put_back_log_level", "interrupts_wait", "named_errors", "<lambda>", "_as_at_call",
+    "_scenes_as_at_call", "lent_to",
+}  # fmt: skip
+
+
+def ready():
+    """Two scenes, of a renderer and of Mitsuba, and the calls that are interrupted."""
+    mi.set_variant(VARIANT)
+    renderer = tt.TransientRenderer(make_room(), [COLOUR, WALL_POSE], spp=2, temporal_filter="tent", freeze=False)
+    scene = mi.load_dict(make_room())
+    seen = tt.wrap(lambda params: mi.render(scene, params, spp=2, seed=0)[0], mi.traverse(scene))
+    shared = tt.TransientRenderer(tt.load(scene), [COLOUR], spp=2, freeze=False)
+
+    def backward(of=renderer):
+        of(seed=0).transient.mean().backward()
+
+    def of_a_twin():
+        backward(tt.TransientRenderer(make_room(), [COLOUR, WALL_POSE], spp=2, freeze=False))
+
+    def wrapped():
+        seen({COLOUR: torch.full((3,), 0.5, requires_grad=True)}).mean().backward()
+
+    jobs = {"backward": backward, "twin": of_a_twin, "wrapped": wrapped, "shared": functools.partial(backward, shared)}
+    return jobs, tt.TransientRenderer(make_room(), [COLOUR], spp=2, freeze=False)
+
+
+def pushed(renderer):
+    """A forward derivative: Dr.Jit builds it into every object alive, and refuses where one of them is attached."""
+    x = torch.full((3,), 0.5)
+    return torch.func.jvp(lambda x: renderer({COLOUR: x}, seed=0).transient, (x,), (x,))
+
+
+def check_moments(chosen, names):
+    """Interrupts at ``chosen(moments)`` of each job leave all other calls as they were."""
+    jobs, renderer = ready()
+    level, expected = mi.logger().log_level(), pushed(renderer)
+    for name in names:
+        jobs[name]()
+        moments = moments_of(jobs[name])
+        ends = [n for n, (_, function) in enumerate(moments) if function in ENDS]
+        interrupted = 0
+        for n in chosen(ends):
+            where = f"{name}, interrupted at {n} of {len(moments)}, {moments[n]}"
+            try:
+                moments_of(jobs[name], n)
+            except KeyboardInterrupt:
+                interrupted += 1
+            found = pushed(renderer)
+            for one, other in zip(found, expected, strict=True):
+                torch.testing.assert_close(one, other, msg=where)
+            assert mi.variant() == VARIANT and mi.logger().log_level() == level, where
+            assert gc.isenabled() and not _collection._traces and not unfinished._owed, where
+        assert interrupted > len(ends) / 20 or interrupted > 3
+
+
+def test_interrupts_where_scenes_are_put_back():
+    def chosen(ends):
+        last = ends[-120:]  # of the backward pass
+        return random.Random(0).sample(last, 8)
+
+    check_moments(chosen, ("backward", "wrapped"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["backward", "twin", "wrapped", "shared"])
+def test_interrupts_wherever_something_is_put_back(name):
+    check_moments(lambda ends: sorted(random.Random(1).sample(ends, min(150, len(ends)))), (name,))
+
+
+def test_another_scene_after_an_interrupt(monkeypatch):
+    """Forward mode refuses where any object alive is attached: the interrupted scene is none any more."""
+    jobs, renderer = ready()
+    expected = pushed(renderer)
+    for name in ("backward", "wrapped"):
+        with monkeypatch.context() as patched:
+            for place in ("scene_handle.Scene._settle", "replay.put_back"):
+                patched.setattr(f"torchtransient.rendering.{place}", interrupt_at_the_end(place))
+            with pytest.raises(KeyboardInterrupt):
+                jobs[name]()
+        for one, other in zip(pushed(renderer), expected, strict=True):
+            torch.testing.assert_close(one, other)
+
+
+def interrupt_at_the_end(place):
+    """In place of what puts back: an interrupt, once there is something attached."""
+    from torchtransient.rendering import replay, scene_handle
+
+    own = scene_handle.Scene._settle if place.startswith("scene") else replay.put_back
+
+    def cut_off(*args):
+        is_end = bool(args[0]._unsettled) if place.startswith("scene") else len(args) == 2
+        if is_end:
+            raise KeyboardInterrupt
+        return own(*args)
+
+    return cut_off
+
+
+# ------------------------------------------------------------------------------------------------------- the ledger
+
+
+def test_what_was_put_back_is_not_put_back_again():
+    done = []
+    with afterwards(lambda: done.append(1)):
+        assert not done
+    make_good()
+    assert done == [1]
+
+
+def test_the_last_change_is_put_back_first_and_before_the_next_call():
+    done, broken = [], [True]
+
+    def put_back(name):
+        if broken[0]:
+            raise KeyboardInterrupt
+        done.append(name)
+
+    first, second = afterwards(lambda: put_back("first")), afterwards(lambda: put_back("second"))
+    with pytest.raises(KeyboardInterrupt), first, second:
+        pass
+    assert not done
+    with pytest.raises(KeyboardInterrupt), active_variant(VARIANT):
+        raise AssertionError("never reached")
+    broken[0] = False
+    with active_variant(VARIANT):
+        assert done == ["second", "first"]
+        with active_variant(VARIANT), afterwards(lambda: put_back("third")), active_variant(VARIANT):
+            assert len(done) == 2  # calls inside of the call
+    assert done == ["second", "first", "third"]
+
+
+def test_what_cannot_be_put_back_is_said_once():
+    def never():
+        raise ValueError("gone")
+
+    with pytest.raises(ValueError, match="gone"), afterwards(never):
+        pass
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        make_good()
+    unfinished._owed["left"] = never
+    with pytest.warns(RuntimeWarning, match="interrupted.*ValueError: gone.*Load its scene again"):
+        make_good()
+    assert not unfinished._owed
+
+
+def test_a_frame_that_ends_late_changes_nothing():
+    """A traceback that is kept keeps the frames that have something to put back: that has been done by then."""
+    done = []
+    block = afterwards(lambda: done.append(1))
+    block.__enter__()
+    make_good()  # as the next call
+    block.__exit__(None, None, None)
+    assert done == [1]
+
+
+# ---------------------------------------------------------------------------------- calls in somebody's except block
+
+
+@pytest.mark.parametrize(
+    "handled", [KeyboardInterrupt(), ShapeError("of another call"), ValueError("of another call")]
+)
+def test_calls_in_an_except_block_raise_their_own_errors(room_scene, monkeypatch, handled):
+    def broken(*args, **kwargs):
+        raise RuntimeError("a plain mistake")
+
+    renderer = tt.TransientRenderer(room_scene, [COLOUR], spp=2, freeze=False)
+    monkeypatch.setattr("torchtransient.plugins.transport.walk.bounce", broken)
+    try:
+        raise handled
+    except (KeyboardInterrupt, ValueError):
+        with pytest.raises(SceneError, match="a plain mistake"):
+            renderer(seed=0)
+
+
+@pytest.mark.parametrize("handled", [KeyboardInterrupt(), ShapeError("of another call")])
+def test_scenes_that_are_loaded_in_an_except_block(handled):
+    try:
+        raise handled
+    except (KeyboardInterrupt, ValueError):
+        room = make_room()
+        room["wall"] = {"type": "no_such_plugin"}
+        with pytest.raises(RuntimeError, match="no_such_plugin"):
+            mi.load_dict(room)
+        with pytest.raises(SceneError, match="no_such_plugin"):
+            tt.render(room, spp=1)
