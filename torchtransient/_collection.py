@@ -16,8 +16,9 @@ from typing import Any
 
 # Reentrant: freeing objects runs finalizers that free others.
 _lock = threading.RLock()
-# One entry for each block that is inside, with its thread, and whether it was we who have stopped the collector. An
-# interrupt may come between any two lines: what it leaves undone here is done by the next block that ends.
+# The blocks under way: (thread, token); whether the collector was running when the first of them stopped it; what
+# `let_go` was given meanwhile. An interrupt may come between any two lines: what it leaves undone here is done by the
+# next block that ends.
 _traces: list[tuple[int, object]] = []
 _stopped = False
 _kept: list[Any] = []
@@ -39,19 +40,27 @@ def no_collection() -> Iterator[None]:
         with _lock:
             if trace in _traces:
                 _traces.remove(trace)
-            if not _traces:
-                _kept.clear()
-                if _stopped:
-                    gc.enable()
-                    _stopped = False
+            _go_on()
 
 
 def forget_traces() -> None:
-    """At the beginning of a call: no block of this thread is inside. One that an interrupt has cut off at its end would
-    keep the collector from going on until its traceback is let go of.
+    """To be called where this thread is in no :func:`no_collection` block. Forgets those that an interrupt has cut off
+    at their end: each would keep the collector stopped until its traceback is let go of.
     """
     with _lock:
         _traces[:] = [trace for trace in _traces if trace[0] != threading.get_ident()]
+        _go_on()
+
+
+def _go_on() -> None:
+    """Where no thread traces any more: free what was kept, and let the collector work."""
+    global _stopped
+    if _traces:
+        return
+    _kept.clear()
+    if _stopped:
+        gc.enable()
+        _stopped = False
 
 
 def let_go(contents: list[Any]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import gc
 import random
-import warnings
+import signal
 
 import mitsuba as mi
 import pytest
@@ -14,9 +14,12 @@ import torch
 import torchtransient as tt
 from support.interrupts import moments_of
 from torchtransient import _collection
-from torchtransient.errors import SceneError, ShapeError
+from torchtransient.errors import SceneError, ShapeError, TorchTransientWarning
 from torchtransient.plugins import unfinished
 from torchtransient.plugins.unfinished import afterwards, make_good
+from torchtransient.rendering.description import _search_path
+from torchtransient.rendering.interrupts import interrupts_wait, quiet
+from torchtransient.rendering.scene_handle import Scene
 from torchtransient.rendering.variant import active_variant
 from torchtransient.testing.small_room import COLOUR, VARIANT, WALL_POSE, make_room
 
@@ -155,18 +158,35 @@ def test_the_last_change_is_put_back_first_and_before_the_next_call():
     assert done == ["second", "first", "third"]
 
 
-def test_what_cannot_be_put_back_is_said_once():
-    def never():
-        raise ValueError("gone")
+def never():
+    raise ValueError("gone")
 
+
+@pytest.mark.parametrize("handled", [None, KeyboardInterrupt()])
+def test_what_cannot_be_put_back_is_said_once(handled):
+    """Also by a call in the except block of an interrupt, where people write checkpoints."""
     with pytest.raises(ValueError, match="gone"), afterwards(never):
         pass
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        make_good()
+    assert not unfinished._owed
     unfinished._owed["left"] = never
-    with pytest.warns(RuntimeWarning, match="interrupted.*ValueError: gone.*Load its scene again"):
-        make_good()
+    try:
+        if handled is not None:
+            raise handled
+        put_back_what_is_left_and_say("ValueError: gone.*load that scene again")
+    except KeyboardInterrupt:
+        put_back_what_is_left_and_say("ValueError: gone.*load that scene again")
+    assert not unfinished._owed
+
+
+def put_back_what_is_left_and_say(words):
+    with pytest.warns(TorchTransientWarning, match=words) as said, active_variant(VARIANT):
+        pass
+    assert said[0].filename == __file__
+
+
+def test_an_error_beside_an_interrupt_is_no_interrupt():
+    with pytest.raises(ValueError, match="gone"), afterwards(never):
+        raise KeyboardInterrupt
     assert not unfinished._owed
 
 
@@ -178,6 +198,74 @@ def test_a_frame_that_ends_late_changes_nothing():
     make_good()  # as the next call
     block.__exit__(None, None, None)
     assert done == [1]
+
+
+def test_what_is_done_meanwhile_is_left_out():
+    """One thing that is put back may let go of the frame that was to put back another."""
+    done, late = [], afterwards(lambda: done.append("late"))
+    late.__enter__()
+    early = afterwards(lambda: late.__exit__(None, None, None))
+    early.__enter__()
+    assert make_good() == [] and done == ["late"]
+    early.__exit__(None, None, None)
+    assert done == ["late"]
+
+
+def test_scenes_are_put_back_in_their_variant(monkeypatch):
+    """A plugin in Python computes with the types of the active variant when its parameters change."""
+    renderer, active = tt.TransientRenderer(tt.load(make_room(), variant="llvm_ad_mono"), [WALL_POSE], spp=2), []
+    out = renderer(seed=0).transient.sum()
+    own, once = Scene._settle, [True]
+
+    def cut_off(scene, options):
+        if scene._unsettled and once:
+            once.clear()
+            raise KeyboardInterrupt
+        if scene._unsettled:
+            active.append(mi.variant())
+        own(scene, options)
+
+    mi.set_variant(VARIANT)
+    monkeypatch.setattr(Scene, "_settle", cut_off)
+    with pytest.raises(KeyboardInterrupt):
+        out.backward()
+    assert active == ["llvm_ad_mono"] and mi.variant() == VARIANT and not unfinished._owed
+
+
+def test_the_call_that_builds_a_scene_puts_back_first():
+    done = []
+    unfinished._owed["left"] = lambda: done.append(1)
+    assert not done and tt.load(make_room()).parameters() and done == [1]
+    for ask in (lambda: tt.threads(tt.threads().drjit), lambda: tt.render(make_room(), spp=1)):
+        unfinished._owed["left"] = lambda: done.append(1)
+        ask()
+        assert done.pop() == 1 and not unfinished._owed
+
+
+def test_what_others_set_meanwhile_stays(tmp_path):
+    """Of a file resolver and a level of messages: users set them without any lock."""
+    before, own = mi.file_resolver(), mi.FileResolver()
+    block = _search_path(str(tmp_path))
+    block.__enter__()
+    mi.set_file_resolver(own)
+    try:
+        make_good()
+        assert mi.file_resolver() is own
+        block.__exit__(None, None, None)
+        mi.set_file_resolver(before)
+        with _search_path(str(tmp_path)):
+            assert mi.file_resolver() is not before
+        assert mi.file_resolver() is before
+    finally:
+        mi.set_file_resolver(before)
+    level = mi.logger().log_level()
+    block = quiet()
+    block.__enter__()
+    mi.logger().set_log_level(mi.LogLevel.Info)
+    make_good()
+    assert mi.logger().log_level() == mi.LogLevel.Info
+    mi.logger().set_log_level(level)
+    block.__exit__(None, None, None)
 
 
 # ---------------------------------------------------------------------------------- calls in somebody's except block
@@ -210,3 +298,58 @@ def test_scenes_that_are_loaded_in_an_except_block(handled):
             mi.load_dict(room)
         with pytest.raises(SceneError, match="no_such_plugin"):
             tt.render(room, spp=1)
+
+
+# --------------------------------------------------------------------------------------------------- signals that wait
+
+KINDS = (signal.SIGTERM, signal.SIGALRM, signal.SIGUSR1)
+
+
+@pytest.fixture
+def handlers():
+    """Signals that raise; what they were is put back."""
+    before = {number: signal.getsignal(number) for number in KINDS}
+    heard = []
+
+    def hear(number, frame):
+        heard.append(number)
+        raise KeyboardInterrupt(number)
+
+    for number in KINDS:
+        signal.signal(number, hear)
+    yield heard, hear
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def test_every_signal_that_waits_is_handled(handlers):
+    heard, hear = handlers
+    block = interrupts_wait()
+    block.__enter__()
+    for number in (*KINDS, signal.SIGALRM):
+        signal.raise_signal(number)
+    assert not heard
+    with pytest.raises(KeyboardInterrupt):
+        block.__exit__(None, None, None)
+    assert sorted(heard) == sorted(KINDS)
+    assert all(signal.getsignal(number) is hear for number in KINDS)
+
+
+def test_signals_while_handlers_are_put_back(handlers, monkeypatch):
+    """Each of them is put back, and heard, also where one has raised in between."""
+    heard, hear = handlers
+    own, put_back = signal.signal, []
+
+    def interrupted(number, handler):
+        found = own(number, handler)
+        if handler is hear and number not in put_back:
+            put_back.append(number)
+            signal.raise_signal(number)
+        return found
+
+    monkeypatch.setattr(signal, "signal", interrupted)
+    with pytest.raises(KeyboardInterrupt), interrupts_wait():
+        pass
+    monkeypatch.undo()
+    assert set(put_back) == set(KINDS) <= set(heard)
+    assert all(signal.getsignal(number) is hear for number in KINDS)

@@ -1,4 +1,4 @@
-"""Dr.Jit's threads, and the lock that keeps calls apart: state of the process, which is the same for every variant."""
+"""Dr.Jit's pool of threads and the lock that keeps calls apart: both belong to the process, whatever the variant."""
 
 from __future__ import annotations
 
@@ -18,14 +18,17 @@ from torchtransient.errors import VariantError
 from torchtransient.plugins.unfinished import afterwards
 
 # One lock for everything that touches Mitsuba: the variant, the scenes' parameters and Dr.Jit's graph are shared state.
+# Calls take it through `rendering.variant.at_work`, which makes good what interrupts have left; where it is taken
+# alone, calls inside do not.
 engine_lock = threading.RLock()
 
 _process = {"parent_was_rendering": False}
 
-# The process that has changed Dr.Jit's pool: its threads do not come along in a fork, and waiting for them never ends.
+# Id of the process that has set the size of Dr.Jit's pool, 0 for none: the threads do not come along in a fork, and
+# waiting for them never ends.
 _pool = {"of": 0}
 
-# Seconds that threads may take to end before they are woken, and how often they are.
+# Seconds between two attempts to wake threads that were told to end, and how many attempts are made.
 WAKE_S, MOST_WAKES = 0.1, 600
 
 
@@ -65,11 +68,12 @@ def set_drjit_threads(count: int) -> None:
 
 
 def resize_pool(count: int) -> None:
-    """``dr.set_thread_count``, which waits for ever for a thread that falls asleep while it is told to end.
+    """Set the number of Dr.Jit's threads without the hang of ``dr.set_thread_count``. The engine lock is held, and
+    nothing of Dr.Jit's is running.
 
-    Once in a hundred thousand times nanothread (of Dr.Jit 1.5) neither sees that the thread sleeps nor lets it see that
-    it is to end. A task that is submitted meanwhile wakes it: so another Python thread has to run, which
-    ``dr.set_thread_count`` would keep waiting with the interpreter's lock.
+    Where a worker falls asleep just as it is told to end, nanothread (of Dr.Jit 1.5) waits for it for ever: once in
+    some 250,000 changes. A task that is submitted meanwhile wakes it. ``dr.set_thread_count`` holds the interpreter's
+    lock, which would stop the thread that submits: so the pool is shrunk through ctypes.
     """
     library = _nanothread()
     if library is None or count >= dr.thread_count():
@@ -79,29 +83,34 @@ def resize_pool(count: int) -> None:
     helper = threading.Thread(target=_wake, args=(library, ended), name="torchtransient wakes Dr.Jit", daemon=True)
     try:
         helper.start()
-        library.pool_set_size(None, count, 1)
+        library.pool_set_size(None, count, 1)  # start_parked: of no effect here
     finally:
         ended.set()
-        if helper.ident is not None:
+        if helper.ident is not None:  # an interrupt may have kept it from starting
             helper.join()
-    if dr.thread_count() != count:  # a nanothread that counts otherwise
+    if dr.thread_count() != count:  # another copy of the library than Dr.Jit's, or one that counts otherwise
         dr.set_thread_count(count)
 
 
 def _wake(library: Any, ended: threading.Event) -> None:
-    """Submit a task that does nothing, again and again until the pool has its size; not for ever, should an interrupt
-    come in before that is told.
+    """Submit a task that does nothing, again and again until ``ended`` is set; not for ever, since an interrupt may
+    prevent that it is set.
     """
     for _ in range(MOST_WAKES):
         if ended.wait(WAKE_S):
             return
+        # one unit of work, no function, always in a thread of the pool, no profile
         task = library.task_submit_dep(None, None, 0, 1, None, None, 0, None, 1, 0)
         library.task_release(task)
 
 
 @functools.cache
 def _nanothread() -> Any:
-    """Dr.Jit's pool of threads, which Python does not offer whole; None where it is not found."""
+    """Dr.Jit's pool of threads, which Python does not offer whole; None where it is not found, and where its functions
+    may be others than those of Dr.Jit 1.5: look at nanothread.h again then.
+    """
+    if not dr.__version__.startswith("1.5."):
+        return None
     path = next(Path(dr.__file__).parent.glob("*nanothread*"), None)
     try:
         library = None if path is None else ctypes.CDLL(str(path))
@@ -125,7 +134,8 @@ def threads_for_files() -> Iterator[None]:
     """Hold the engine lock with at least two threads of Dr.Jit: for blocks in which Mitsuba may read or write pictures.
 
     Mitsuba (3.9 at least) submits the blocks of an OpenEXR file to Dr.Jit's pool and waits on a semaphore, without
-    taking part: a pool that is the calling thread alone never gets to them. Also on machines of one core.
+    taking part: a pool that is the calling thread alone never gets to them. Also on machines of one core. An interrupt
+    may leave two threads until the next call.
     """
     with engine_lock:
         before = dr.thread_count()

@@ -5,12 +5,12 @@ from __future__ import annotations
 import re
 
 # Mitsuba hands on the printed traceback of a plugin that it builds, and not the exception.
-_PRINTED = re.compile(r"^KeyboardInterrupt\b", re.MULTILINE)
+_PRINTED = re.compile(r"^(KeyboardInterrupt|SystemExit)\b(?:: (\d+)$)?", re.MULTILINE)
 
 
 def chain_of(error: BaseException, handled: BaseException | None = None) -> list[BaseException]:
-    """An exception and its causes, the first reason last; without what was ``handled`` where it was raised: a call
-    in somebody's ``except`` block has not failed of the error that the block is for.
+    """An exception and what caused it, the root last, hidden contexts (``from None``) included. It ends before
+    ``handled``, what was being handled at the call: a call in an ``except`` block did not fail because of it.
     """
     found = [error]
     while (below := found[-1].__cause__ or found[-1].__context__) is not None and below not in found:
@@ -26,6 +26,11 @@ def interrupt_behind(error: BaseException, handled: BaseException | None = None)
     """
     chain = chain_of(error, handled)
     own = next((cause for cause in reversed(chain) if not isinstance(cause, Exception)), None)
-    if own is None and any(_PRINTED.search(str(cause)) for cause in chain):
+    if own is not None:
+        return own
+    printed = next((found for cause in chain if (found := _PRINTED.search(str(cause)))), None)
+    if printed is None:
+        return None
+    if printed[1] == "KeyboardInterrupt":
         return KeyboardInterrupt()
-    return own
+    return SystemExit(int(printed[2]) if printed[2] else 1)

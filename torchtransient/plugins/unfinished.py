@@ -1,55 +1,67 @@
-"""What a call changes and puts back, also when an interrupt cuts off the putting back: the next call does it first."""
+"""Changes that a call puts back at its end, or, where an interrupt prevents that, the next call at its beginning.
+
+A call is what runs inside of ``rendering.variant.at_work``.
+"""
 
 from __future__ import annotations
 
-import warnings
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from torchtransient.plugins.interrupted import interrupt_behind
 
-# What calls have changed and still have to put back, oldest first.
+# What calls have changed and still have to put back, oldest first. Entries hold their scenes: one that was interrupted
+# lives until the next call.
 _owed: dict[object, Callable[[], object]] = {}
 
 
 @contextmanager
 def afterwards(put_back: Callable[[], object]) -> Iterator[None]:
-    """Call ``put_back`` after the block; where an interrupt keeps it from that, or comes in the middle of it, at the
-    beginning of the next call (:func:`make_good`). So it may run twice, and the second time has to mend the first.
+    """Call ``put_back`` after the block. Where an interrupt prevents that or cuts it off, the outermost call does it at
+    its end, or the next one at its beginning (:func:`make_good`). To be used under the engine lock.
 
-    What is put back late must not be what others set in between without the engine lock, as states of generators.
+    So ``put_back`` may run twice, and before anything was changed: running it again completes a first run that was cut
+    off. Another variant may be active by then, and it must not overwrite what users have set meanwhile, outside of
+    calls: it looks first whether it finds what the block had set.
     """
     key = object()
     try:
         _owed[key] = put_back
         yield
     finally:
-        # By then it may be done: a traceback that is kept keeps this frame waiting.
-        if key in _owed:
-            _carry_out(key)
+        # It may be done already: where a traceback keeps this frame, it ends long after its call.
+        _carry_out(key)
 
 
-def make_good() -> None:
-    """Put back what interrupted calls have left: when no call is under way. Warns of what cannot be put back."""
-    for key in reversed(list(_owed)):
-        try:
-            _carry_out(key)
-        except Exception as error:
-            if interrupt_behind(error) is not None:
-                raise
-            warnings.warn(
-                f"a call was interrupted, and what it had changed cannot be put back: {type(error).__name__}: "
-                f"{str(error)[:300]}. Load its scene again.",
-                RuntimeWarning,
-                stacklevel=2,
-            )
+def make_good() -> list[Exception]:
+    """Put back what interrupted calls have left, newest first; returns why some of it cannot be. To be called under the
+    engine lock where no call is under way.
+    """
+    failed, handled = [], sys.exc_info()[1]
+    try:
+        for key in reversed(list(_owed)):
+            try:
+                _carry_out(key)
+            except Exception as error:
+                if interrupt_behind(error, handled) is not None:
+                    raise
+                failed.append(error)
+        return failed
+    finally:
+        del handled  # its traceback may hold this frame
 
 
 def _carry_out(key: object) -> None:
+    put_back, handled = _owed.get(key), sys.exc_info()[1]
+    if put_back is None:
+        return
     try:
-        _owed[key]()
+        put_back()
     except Exception as error:
-        if interrupt_behind(error) is None:
+        if interrupt_behind(error, handled) is None:
             _owed.pop(key, None)  # it would fail again
         raise
+    finally:
+        del handled
     _owed.pop(key, None)

@@ -160,7 +160,12 @@ def _search_path(folder: str) -> Iterator[None]:
     before = mi.file_resolver()
     resolver = mi.FileResolver(before)
     resolver.prepend(folder)
-    with afterwards(lambda: mi.set_file_resolver(before)):
+
+    def put_back() -> None:
+        if mi.file_resolver() is resolver:  # which nobody has changed meanwhile
+            mi.set_file_resolver(before)
+
+    with afterwards(put_back):
         mi.set_file_resolver(resolver)
         yield
 

@@ -1,7 +1,12 @@
 """Interrupts inside of Mitsuba and Dr.Jit arrive as what they are, and leave nothing changed behind them.
 
 An exception that a signal raises while Python code runs below C++ (a loop that is traced, the constructor of a plugin)
-comes out as a ``RuntimeError`` that names it, and would be taken for an error of the scene.
+comes out as a ``RuntimeError`` that names it, and would be taken for an error of the scene. Recognised are
+``KeyboardInterrupt`` and whatever else is no ``Exception``.
+
+Four things guard against interrupts: :func:`interrupts_pass` raises those that C++ has disguised,
+:func:`interrupts_wait` delays them for changes that must not be left half made, ``plugins.unfinished.afterwards`` is
+for changes that can be put back later, and ``forget_traces`` for the collector.
 """
 
 from __future__ import annotations
@@ -11,7 +16,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 from torchtransient.plugins.interrupted import chain_of, interrupt_behind
@@ -21,6 +26,7 @@ from torchtransient.plugins.unfinished import afterwards
 @contextmanager
 def interrupts_pass() -> Iterator[None]:
     """Raise the interrupt that ended what is inside, in place of the error that C++ has made of it."""
+    # Taken before the block: a call in somebody's except block has not failed because of what is handled there.
     interrupt, handled = None, sys.exc_info()[1]
     try:
         yield
@@ -38,9 +44,9 @@ def interrupts_pass() -> Iterator[None]:
 
 @contextmanager
 def interrupts_wait() -> Iterator[None]:
-    """Let signals that Python handles (control and C, alarms, the ends that schedulers announce) wait until what is
-    inside is done: for changes of the process that would be left half made. Other threads than the main one are never
-    interrupted.
+    """Delay the handlers of signals set in Python (Ctrl-C, alarms, a scheduler's SIGTERM) until the block is done: for
+    changes of the process that must not be left half made. Each is called once, as signals that wait in the system are.
+    Does nothing in other threads than the main one, where Python runs no handlers.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -53,10 +59,20 @@ def interrupts_wait() -> Iterator[None]:
             signal.signal(number, lambda number, frame: came.append((number, frame)))
         yield
     finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-        for number, frame in dict(came).items():
-            handlers[number](number, frame)
+        with ExitStack() as waiting:
+            for number, frame in dict(came).items():
+                waiting.callback(handlers[number], number, frame)  # each of them, also where another one raises
+            _put_back_handlers(list(handlers.items()))
+
+
+def _put_back_handlers(left: list[tuple[int, Any]]) -> None:
+    try:
+        while left:
+            signal.signal(*left[-1])
+            left.pop()
+    finally:
+        if left:  # one of those put back has raised
+            _put_back_handlers(left)
 
 
 def clear_frames(error: BaseException, handled: BaseException | None = None) -> None:
@@ -67,7 +83,8 @@ def clear_frames(error: BaseException, handled: BaseException | None = None) -> 
         traceback.clear_frames(cause.__traceback__)
 
 
-# Mitsuba's level of messages while it is changed: an interrupt may come between a change and its end.
+# Mitsuba's level of messages before :func:`quiet`, while it is changed. No local variable: it may be put back by a
+# later call.
 _before: dict[str, Any] = {}
 
 
@@ -92,5 +109,6 @@ def put_back_log_level() -> None:
     import mitsuba as mi
 
     if "level" in _before:
-        mi.logger().set_log_level(_before["level"])
+        if mi.logger().log_level() == mi.LogLevel.Error:  # which nobody has changed meanwhile
+            mi.logger().set_log_level(_before["level"])
         _before.clear()

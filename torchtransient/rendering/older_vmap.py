@@ -13,13 +13,17 @@ from typing import Any
 
 import torch
 
+# Of torch's older vmap.
+MOST_LEVELS = 64
+
 
 def each_of_older_vmap(function: Callable[..., tuple[torch.Tensor, ...]], *tensors: Any) -> tuple[torch.Tensor, ...]:
     """``function`` of tensors or None, called once for every entry of such a batch; once where there is none."""
     private: Any = torch
     level = private._C._vmapmode_increment_nesting() - 1
     private._C._vmapmode_decrement_nesting()
-    return _each(function, level, tensors)
+    # torch counts the levels by thread, and calls backwards of CUDA tensors in threads of its own, where none is open.
+    return _each(function, level or MOST_LEVELS, tensors)
 
 
 def _each(function: Callable[..., tuple[torch.Tensor, ...]], level: int, tensors: Any) -> tuple[torch.Tensor, ...]:

@@ -7,6 +7,7 @@ be meant to be short. So it is said once, and where it would be a mistake, it ca
 
 from __future__ import annotations
 
+import contextlib
 import math
 import sys
 import warnings
@@ -191,7 +192,7 @@ def are_finite(low: float, high: float) -> bool:
     return math.isfinite(low) and math.isfinite(high)
 
 
-_INSIDE = (str(Path(__file__).parents[1]), str(Path(torch.__file__).parent))
+_INSIDE = (str(Path(__file__).parents[1]), str(Path(torch.__file__).parent), contextlib.__file__)
 
 
 def level_of_user() -> int:

@@ -28,7 +28,7 @@ from torchtransient.rendering.scene_state import put_back, values_of, write
 from torchtransient.rendering.seeds import mix_seed
 from torchtransient.rendering.surroundings import is_typed_structure
 from torchtransient.rendering.trees import Tree, taken_apart
-from torchtransient.rendering.variant import active_variant, at_work, is_differentiable
+from torchtransient.rendering.variant import active_variant, at_work, in_variant, is_differentiable, take_over
 
 Tensors = tuple[torch.Tensor, ...]
 
@@ -302,7 +302,7 @@ class Call:
                 for params, values in zip(self.scenes.params, before, strict=True):
                     put_back(params, values)
 
-        with afterwards(as_before):
+        with afterwards(in_variant(self.variant, as_before)):
             for params, values, now in zip(self.scenes.params, self.scenes.values, before, strict=True):
                 put_back(params, values, now)
             yield
@@ -332,7 +332,11 @@ def working_in(variant: str | None) -> Iterator[None]:
         if variant is not None and is_differentiable(variant):
             stack.enter_context(active_variant(variant))
         else:
-            stack.enter_context(at_work())
+            outermost = stack.enter_context(at_work())
+            if outermost:
+                take_over("cpu")
+            if outermost and torch.cuda.is_initialized():  # type: ignore[no-untyped-call]
+                take_over("cuda")
         _check_fork()
         yield
 

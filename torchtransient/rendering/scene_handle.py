@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from torchtransient.errors import ArgumentError, GradientError, SceneError
-from torchtransient.plugins.drjit_pool import engine_lock
 from torchtransient.quantities import flag, shown
 from torchtransient.rendering.build import BuiltScene, build
 from torchtransient.rendering.build_options import BuildOptions
@@ -22,7 +21,7 @@ from torchtransient.rendering.ready_scenes import described_for_time
 from torchtransient.rendering.recordings import Recordings
 from torchtransient.rendering.saving.save import save_scene
 from torchtransient.rendering.taken import ReadyScene
-from torchtransient.rendering.variant import active_variant, resolve_variant
+from torchtransient.rendering.variant import active_variant, at_work, resolve_variant
 
 # Built scenes kept per description: one for every combination of time axis, depth and substituted plugins in use.
 _MAX_BUILDS = 8
@@ -77,7 +76,7 @@ class Scene:
         return self._parameters(BuildOptions(real_bitmaps=True))
 
     def _parameters(self, options: BuildOptions) -> ParameterTable:
-        with engine_lock:
+        with at_work():
             if self._table is None:
                 with active_variant(self.variant):
                     self._table = parameter_table(self.built(options))
@@ -162,7 +161,7 @@ class Scene:
         if not slots.originals:
             return
         if self._builds.get(options) is not slots.built:
-            if attached:  # dropped where an interrupt came into its putting back, and perhaps still alive
+            if attached:  # its restoring was cut off by an interrupt (`_settle`); others may hold it still
                 slots.restore()
             return
         self._unsettled[options] = slots

@@ -24,7 +24,7 @@ from torchtransient.rendering.mitsuba_words import one_line
 from torchtransient.rendering.physics import PhysicsWatch
 from torchtransient.rendering.scene_state import detached, put_back, values_of
 from torchtransient.rendering.seeds import Item, Seeding
-from torchtransient.rendering.variant import active_variant
+from torchtransient.rendering.variant import active_variant, in_variant
 
 if TYPE_CHECKING:
     from torchtransient.rendering.parameters import SlotTable
@@ -173,8 +173,9 @@ def session_of(job: RenderJob) -> Iterator[Session]:
             slots = job.scene.slots(job.keys, job.options)
             session = Session(job, slots)
             films = [sensor.film() for sensor in session.sensors]
-            attached = True  # where something is raised, whatever it was may hold values
-            with afterwards(lambda: job.scene.leave(job.options, slots, attached)):
+            attached = True  # until the block has ended without an error: what raised may have left derivatives
+            end = in_variant(job.scene.variant, lambda: job.scene.leave(job.options, slots, attached))
+            with afterwards(end):
                 with named_errors(), temporal_filter(job.temporal_filter, session.integrator, films):
                     yield session
                 attached = any(job.needs)
@@ -196,7 +197,7 @@ def _as_at_call(job: RenderJob) -> Iterator[None]:
         with dr.resume_grad():
             put_back(params, now)
 
-    with afterwards(as_before):
+    with afterwards(in_variant(job.scene.variant, as_before)):
         with dr.resume_grad():
             if not job.at_call:
                 job.at_call.append(detached(now))

@@ -10,6 +10,7 @@ import torch
 from torchtransient.errors import DeviceError, UnitError, VariantError
 from torchtransient.plugins.drjit_pool import engine_lock, resize_pool, set_drjit_threads
 from torchtransient.quantities import as_whole, shown
+from torchtransient.rendering.variant import at_work
 
 MOST_THREADS = 1024
 
@@ -31,7 +32,7 @@ class Threads:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        with engine_lock:
+        with at_work():
             _set(*self._before)
 
 
@@ -60,7 +61,8 @@ def threads(n: int | None = None) -> Threads:
     Dr.Jit were at work.
     """
     n = _checked(n)
-    with engine_lock:
+    # What an interrupted call has left may be a number of threads.
+    with engine_lock if n is None else at_work():
         before = _counts()
         if n is not None:
             _set(n, n)

@@ -1,4 +1,4 @@
-"""Which Mitsuba variant a call runs under, and the lock that keeps calls apart.
+"""Which Mitsuba variant a call runs under, and :func:`at_work`, which keeps calls apart.
 
 Mitsuba's variant is a property of the process. A scene of this library is bound to one variant; every call that
 touches it runs inside :func:`active_variant`, which switches to that variant when another one is active and switches
@@ -8,17 +8,21 @@ back afterwards. When no variant was active at all, there is nothing to go back 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+
+import torch
 
 from torchtransient import plugins
 from torchtransient._collection import forget_traces
 from torchtransient._llvm import ensure_llvm
-from torchtransient.errors import VariantError
+from torchtransient.errors import TorchTransientWarning, VariantError
 from torchtransient.plugins.drjit_pool import check_process, engine_lock
 from torchtransient.plugins.unfinished import make_good
 from torchtransient.quantities import shown
 from torchtransient.rendering.interrupts import interrupts_pass, interrupts_wait
+from torchtransient.rendering.mitsuba_words import one_line
+from torchtransient.rendering.physics import level_of_user
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 
@@ -28,21 +32,53 @@ _switches = {"count": 0}
 
 
 @contextmanager
-def at_work() -> Iterator[None]:
-    """Hold the engine lock. Interrupts pass, and what they have left changed is put back at the end, or first thing in
-    the next call. Raises ``VariantError`` as :func:`check_process`.
+def at_work() -> Iterator[bool]:
+    """Hold the engine lock: a call. Raises interrupts as themselves, and puts back what interrupted calls have left, at
+    the end of the outermost call or at the beginning of the next. Yields whether it is the outermost one. Raises
+    ``VariantError`` as :func:`check_process`.
     """
+    check_process()  # before the lock, too: in the child of a fork, a thread that did not come along may hold it
+    # Private, but what threading.Condition asks: there is no other way to ask whether this thread holds it.
     outermost = not engine_lock._is_owned()  # type: ignore[attr-defined]
     with engine_lock, interrupts_pass():
         check_process()
         try:
             if outermost:
                 forget_traces()
-                make_good()
-            yield
+                put_back_what_is_left()
+            yield outermost
         finally:
             if outermost:
-                make_good()
+                put_back_what_is_left()
+
+
+def put_back_what_is_left() -> None:
+    """Carry out :func:`make_good`, with a warning for what cannot be put back. The engine lock is held, and no call is
+    under way.
+    """
+    for error in make_good():
+        warnings.warn(
+            f"a call was interrupted and left a change that cannot be undone: {type(error).__name__}: "
+            f"{one_line(error)}. If it was rendering a scene, load that scene again.",
+            TorchTransientWarning,
+            stacklevel=level_of_user(),
+        )
+
+
+def in_variant(variant: str | None, put_back: Callable[[], object]) -> Callable[[], object]:
+    """For :func:`.unfinished.afterwards`, ``put_back`` of something that belongs to a variant: another one may be
+    active when it runs late.
+    """
+    import mitsuba as mi
+
+    def run() -> None:
+        if variant is None or mi.variant() == variant:
+            put_back()
+            return
+        with active_variant(variant):
+            put_back()
+
+    return run
 
 
 def is_differentiable(variant: str | None) -> bool:
@@ -83,16 +119,32 @@ def stokes_components(variant: str) -> int:
     return 4 if variant.endswith("_polarized") else 1
 
 
+def take_over(device: str) -> None:
+    """Before Dr.Jit works on a device, at the beginning of a call: take over from other threads, and from torch.
+
+    What another thread has made may be read in a block of a later number alone, or Dr.Jit refuses: handles of OptiX are
+    never evaluated, and torch calls backwards of CUDA tensors in threads of its own. A result that was freed may still
+    be read by torch, and Dr.Jit would write to its memory: of torch's streams Dr.Jit's own waits for the default one
+    alone.
+    """
+    import drjit as dr
+
+    dr.detail.new_scope(dr.JitBackend.CUDA if device == "cuda" else dr.JitBackend.LLVM)
+    if device == "cuda" and torch.cuda.is_initialized():  # type: ignore[no-untyped-call]
+        torch.cuda.current_stream().synchronize()
+
+
 @contextmanager
 def active_variant(variant: str) -> Iterator[None]:
     """Hold the engine lock with ``variant`` active and this library's plugins registered for it.
 
-    Another active variant is put back at the end (a switch costs some 50 ms); when none was active, ``variant``
-    stays. Nested calls are free. An interrupt inside of it is raised as such.
+    Another active variant is put back at the end (a switch costs some 0.1 s); when none was active, ``variant``
+    stays. Nested calls are free. An interrupt inside of it is raised as such; one in the last line before the switch
+    back may leave ``variant`` active.
     """
     import mitsuba as mi
 
-    with at_work():
+    with at_work() as outermost:
         before = mi.variant()
         try:
             if before != variant:
@@ -100,6 +152,8 @@ def active_variant(variant: str) -> Iterator[None]:
                 _count_switch(before, variant)
             with interrupts_wait():
                 plugins.sync()
+            if outermost:
+                take_over(device_type(variant))
             yield
         finally:
             if before is not None and mi.variant() != before:
@@ -117,7 +171,7 @@ def _count_switch(before: str | None, variant: str) -> None:
             f"a scene for {variant} is rendered again and again while {before} is active: every call switches to and "
             f"fro, which costs some 0.1 s each way. Call mitsuba.set_variant({variant!r}) once before the loop.",
             UserWarning,
-            stacklevel=2,
+            stacklevel=level_of_user(),
         )
 
 

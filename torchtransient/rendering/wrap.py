@@ -13,7 +13,6 @@ import torch
 
 from torchtransient.errors import ArgumentError, GradientError, ShapeError, UnitError
 from torchtransient.given_types import is_one_of
-from torchtransient.plugins.drjit_pool import engine_lock
 from torchtransient.quantities import as_whole, shown
 from torchtransient.rendering.arguments import as_float
 from torchtransient.rendering.arrays import computable, handle
@@ -25,7 +24,7 @@ from torchtransient.rendering.replay import Call, ScenesAtCall, SeedLeaf, Tensor
 from torchtransient.rendering.scene_state import detached, shapes_of, values_of, variant_of
 from torchtransient.rendering.surroundings import entries_of, is_typed_structure, wants_derivative
 from torchtransient.rendering.trees import taken_apart
-from torchtransient.rendering.variant import device_type
+from torchtransient.rendering.variant import at_work, device_type
 
 
 def wrap(
@@ -235,7 +234,7 @@ class _Wrapped:
         found: dict[int, Any] = {}
         for value in objects:
             if not any(value in params.hierarchy for params in (*known, *found.values())):
-                with engine_lock:
+                with at_work():
                     found[value.ptr] = self.traversed.get(value.ptr) or mi.traverse(value)
         self.traversed = found
         return tuple(found.values())

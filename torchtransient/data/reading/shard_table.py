@@ -90,8 +90,8 @@ class ShardTable:
 
 
 def shard_paths(where: Any) -> list[Path]:
-    """The shards that a folder, a pattern, a file, or a list of them means. Raises StorageError for none. Warns where a
-    folder lacks some of its own.
+    """The shards that a folder, a pattern, a file, or a list of them means. Raises StorageError where there is none;
+    warns where a folder's manifest names shards that are gone.
     """
     if isinstance(where, str | os.PathLike):
         text = os.fspath(where)
@@ -123,13 +123,13 @@ def shard_paths(where: Any) -> list[Path]:
 
 
 def _of_folder(folder: Path) -> list[Path]:
-    """Its shards; those that its manifest names and that are not there are said."""
+    """The shards of a folder, with a warning where its manifest names others."""
     found = shards_of(folder)
     gone = sorted(set(named_shards(folder)) - {path.name for path in found})
     if found and gone:
         warnings.warn(
-            f"{WHAT}: '{folder}': manifest.json names shards that are not there, {len(gone)} of them: {shown(gone)}. "
-            "Their samples are left out; `torchtransient dataset verify` says which, and generate makes them again.",
+            f"{WHAT}: '{folder}' lacks {len(gone)} of the {len(gone) + len(found)} shards of its manifest.json: "
+            f"{shown(gone)}. Their samples are left out; generate makes them again.",
             TorchTransientWarning,
             level_of_user(),
         )

@@ -28,7 +28,7 @@ from torchtransient.rendering.saving.values import mesh_as_file, places_of, writ
 from torchtransient.rendering.saving.xml_nodes import XmlWriter
 from torchtransient.rendering.session import own_array
 from torchtransient.rendering.taken import ReadyScene
-from torchtransient.rendering.variant import active_variant, device_type
+from torchtransient.rendering.variant import active_variant, device_type, in_variant
 
 if TYPE_CHECKING:
     from torchtransient.rendering.scene_handle import Scene
@@ -78,7 +78,7 @@ def _write(scene: Scene, draft: Path, folder: Path, values: Mapping[str, Any]) -
     slots = scene.slots(keys, options)
     built = slots.built
     try:
-        with afterwards(lambda: scene.leave(options, slots, attached=True)):
+        with afterwards(in_variant(scene.variant, lambda: scene.leave(options, slots, attached=True))):
             slots.install([_leaf(slot, values[slot.key], scene.variant) for slot in slots.slots])
             with description.resolved_files(), plugins.plugin_errors():
                 state = _parsed(description, scene.variant)

@@ -1,0 +1,89 @@
+"""Derivatives in threads that are older than the scene: torch calls backwards of CUDA tensors in such ones."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import drjit as dr
+import mitsuba as mi
+import pytest
+import torch
+
+import torchtransient as tt
+from torchtransient.testing.small_room import COLOUR, VARIANT, make_room
+
+
+@pytest.fixture(scope="module")
+def older():
+    """A thread in which Dr.Jit has worked before anything below is made."""
+    mi.set_variant(VARIANT)
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(lambda: dr.eval(dr.arange(mi.Float, 4) + 1)).result()
+        yield lambda function, *args, **options: pool.submit(function, *args, **options).result()
+
+
+@pytest.fixture
+def engine_in_another_thread(older, monkeypatch):
+    """torch's engine as it works for CUDA tensors."""
+    own = torch.autograd._engine_run_backward
+    monkeypatch.setattr(torch.autograd, "_engine_run_backward", lambda *args, **options: older(own, *args, **options))
+
+
+def newer_block():
+    dr.detail.new_scope(dr.JitBackend.LLVM)
+
+
+def test_wrapped_functions_read_what_is_not_evaluated(older):
+    """As handles of OptiX are not: made by a younger block of this thread, read by the derivative in the older one."""
+    mi.set_variant(VARIANT)
+    newer_block()
+    hidden = dr.arange(mi.Float, 4) * mi.Float(dr.opaque(mi.Float, 2))
+
+    @tt.wrap
+    def product(x):
+        return x.array * hidden
+
+    x = torch.ones(4, requires_grad=True)
+    older(lambda: product(x).sum().backward())
+    assert x.grad.tolist() == [0, 2, 4, 6]
+
+
+def test_renders_read_what_is_not_evaluated(older):
+    mi.set_variant(VARIANT)
+    scene = mi.load_dict(make_room())
+    renderer = tt.TransientRenderer(scene, [COLOUR], spp=2, freeze=False)
+    renderer(seed=0).transient.sum().backward()
+    expected = renderer.values[COLOUR].grad.clone()
+    newer_block()
+    params, light = mi.traverse(scene), "light.intensity.value"
+    params[light] = params[light] * dr.opaque(mi.Float, 2)
+    params.update()
+    renderer.zero_grad()
+    older(lambda: renderer(seed=0).transient.sum().backward())
+    torch.testing.assert_close(renderer.values[COLOUR].grad, 2 * expected)
+
+
+@pytest.mark.usefixtures("engine_in_another_thread")
+def test_batches_of_gradients():
+    """Levels of torch's older vmap are counted by thread."""
+
+    @tt.wrap
+    def square(x):
+        return x * x
+
+    x = torch.tensor([1.0, 2.0, 3.0], requires_grad=True)
+    expected = torch.diag(2 * x.detach())
+    assert torch.equal(torch.autograd.grad(square(x), x, torch.eye(3), is_grads_batched=True)[0], expected)
+    assert torch.equal(torch.autograd.functional.jacobian(square, x, vectorize=True), expected)
+    # a batch in a batch
+    rows = torch.stack([torch.eye(3), 2 * torch.eye(3)])
+
+    def rows_of(one):
+        return torch.autograd.grad(square(x), x, one, is_grads_batched=True)[0]
+
+    y = square(x)
+    found = torch._vmap_internals._vmap(
+        lambda one: torch._vmap_internals._vmap(lambda row: torch.autograd.grad(y, x, row, retain_graph=True)[0])(one)
+    )(rows)
+    assert torch.equal(found, rows * 2 * x.detach())
+    assert torch.equal(rows_of(torch.eye(3)), expected)
