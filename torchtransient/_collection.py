@@ -16,7 +16,7 @@ from typing import Any
 
 # Reentrant: freeing objects runs finalizers that free others.
 _lock = threading.RLock()
-# The blocks under way: (thread, token); whether the collector was running when the first of them stopped it; what
+# The blocks under way: (thread or 0, token); whether the collector was running when the first of them stopped it; what
 # `let_go` was given meanwhile. An interrupt may come between any two lines: what it leaves undone here is done by the
 # next block that ends.
 _traces: list[tuple[int, object]] = []
@@ -25,10 +25,12 @@ _kept: list[Any] = []
 
 
 @contextmanager
-def no_collection() -> Iterator[None]:
-    """No garbage collection and no :func:`let_go` inside, in any thread. May be nested; also a decorator."""
+def no_collection(of_call: bool = False) -> Iterator[None]:
+    """No garbage collection and no :func:`let_go` inside, in any thread. May be nested; also a decorator. ``of_call``:
+    it is in a call (``rendering.variant.at_work``), and forgotten when that has ended.
+    """
     global _stopped
-    trace = threading.get_ident(), object()
+    trace = threading.get_ident() if of_call else 0, object()
     try:
         with _lock:
             _traces.append(trace)
@@ -44,8 +46,8 @@ def no_collection() -> Iterator[None]:
 
 
 def forget_traces() -> None:
-    """To be called where this thread is in no :func:`no_collection` block. Forgets those that an interrupt has cut off
-    at their end: each would keep the collector stopped until its traceback is let go of.
+    """To be called where this thread is in no call. Forgets blocks of calls that an interrupt has cut off at their end:
+    each would keep the collector stopped until its traceback is let go of.
     """
     with _lock:
         _traces[:] = [trace for trace in _traces if trace[0] != threading.get_ident()]

@@ -128,7 +128,8 @@ def test_a_thread_that_falls_asleep_while_it_is_told_to_end_is_woken(monkeypatch
 def test_threads_are_woken_by_a_task():
     """Of the pool itself: tasks that do nothing, submitted all the time, leave it as it is."""
     assert drjit_pool._nanothread() is not None
-    ended = threading.Event()
+    ended = threading.Lock()
+    ended.acquire()
     helper = threading.Thread(target=drjit_pool._wake, args=(drjit_pool._nanothread(), ended))
     with tt.threads(2), pytest.MonkeyPatch.context() as patch:
         patch.setattr(drjit_pool, "WAKE_S", 1e-4)
@@ -139,8 +140,36 @@ def test_threads_are_woken_by_a_task():
                 x = dr.arange(dr.llvm.Float, 200_000) + count
                 assert dr.sum(x)[0] == pytest.approx(200_000 * (199_999 / 2 + count), rel=1e-5)
         finally:
-            ended.set()
+            assert helper.is_alive()
+            ended.release()
             helper.join()
+
+
+def test_pools_shrink_where_no_thread_can_be_had(monkeypatch):
+    def refuse(self):
+        raise RuntimeError("can't start new thread")
+
+    with tt.threads(3), monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "start", refuse)
+        assert tt.threads(1).drjit == 1
+
+
+AT_THE_END = """
+import torchtransient as tt
+tt.threads(3)
+class Work:
+    def __init__(self):
+        self.steps = self.blocks()
+        next(self.steps)
+    def blocks(self):
+        with tt.threads(5):
+            yield self
+Work()  # a cycle, collected at the interpreter's end
+"""
+
+
+def test_pools_shrink_at_the_interpreters_end():
+    subprocess.run([sys.executable, "-c", AT_THE_END], check=True, timeout=120)
 
 
 def test_renders_of_other_threads_end_first():

@@ -14,8 +14,10 @@ import torch
 import torchtransient as tt
 from support.interrupts import moments_of
 from torchtransient import _collection
+from torchtransient._collection import no_collection
 from torchtransient.errors import SceneError, ShapeError, TorchTransientWarning
 from torchtransient.plugins import unfinished
+from torchtransient.plugins.drjit_pool import engine_lock
 from torchtransient.plugins.unfinished import afterwards, make_good
 from torchtransient.rendering.description import _search_path
 from torchtransient.rendering.interrupts import interrupts_wait, quiet
@@ -125,6 +127,44 @@ def interrupt_at_the_end(place):
     return cut_off
 
 
+def test_kept_tracebacks_keep_nothing_else():
+    """As sys.last_traceback and notebooks do: an interrupt at the beginning of a block's __exit__ leaves it unended."""
+    jobs, renderer = ready()
+    mi.set_variant("llvm_ad_mono")  # a call switches, and back
+    calls = {
+        "render": lambda: renderer(seed=0),
+        "parameters": lambda: tt.load(make_room(), variant=VARIANT).parameters(),
+        "wrapped": jobs["wrapped"],
+        "backward": jobs["backward"],
+    }
+    for name, call in calls.items():
+        call()
+        moments = moments_of(call)
+        ends = [n for n, (file, function) in enumerate(moments) if file == "contextlib.py" and function == "__exit__"]
+        kept = []
+        for n in random.Random(0).sample(ends, 6):
+            try:
+                moments_of(call, n)
+            except KeyboardInterrupt as interrupt:
+                kept.append(interrupt)
+            where = f"{name}, interrupted at {n} of {len(moments)}"
+            assert not engine_lock._is_owned() and gc.isenabled() and not unfinished._owed, where
+            assert mi.variant() == "llvm_ad_mono", where
+        assert kept
+
+
+def test_blocks_of_mitsubas_own_calls_are_not_forgotten():
+    """A progress report of Mitsuba's own render that renders with the library: a call in no call, but in a trace."""
+    seen = []
+    with no_collection():
+        tt.render(make_room(), spp=1, seed=0)
+        seen.append(gc.isenabled())
+        with active_variant(VARIANT), no_collection(of_call=True):
+            pass
+        seen.append(gc.isenabled())
+    assert seen == [False, False] and gc.isenabled()
+
+
 # ------------------------------------------------------------------------------------------------------- the ledger
 
 
@@ -160,6 +200,26 @@ def test_the_last_change_is_put_back_first_and_before_the_next_call():
 
 def never():
     raise ValueError("gone")
+
+
+def test_what_a_handler_of_a_signal_raises_is_no_failure():
+    """It may be any exception, as the TimeoutError of an alarm."""
+    done, alarms = [], [TimeoutError("an alarm"), TimeoutError("another")]
+
+    def put_back():
+        if alarms:
+            raise alarms.pop()
+        done.append(1)
+
+    alarms.pop()
+    with pytest.raises(TimeoutError, match="an alarm"), afterwards(put_back):
+        pass
+    assert done == [1] and not unfinished._owed
+    alarms.append(TimeoutError("later"))
+    unfinished._owed["left"] = put_back
+    with pytest.raises(TimeoutError, match="later"), active_variant(VARIANT):
+        raise AssertionError("never reached")
+    assert done == [1, 1] and not unfinished._owed
 
 
 @pytest.mark.parametrize("handled", [None, KeyboardInterrupt()])

@@ -8,7 +8,7 @@ import os
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -76,28 +76,34 @@ def resize_pool(count: int) -> None:
     lock, which would stop the thread that submits: so the pool is shrunk through ctypes.
     """
     library = _nanothread()
-    if library is None or count >= dr.thread_count():
+    # At the interpreter's end no thread begins any more, and its start would be waited for.
+    if library is None or count >= dr.thread_count() or sys.is_finalizing():
         dr.set_thread_count(count)
         return
-    ended = threading.Event()
+    ended = threading.Lock()  # whose methods no interrupt can cut off: those of an event are Python's
+    ended.acquire()
     helper = threading.Thread(target=_wake, args=(library, ended), name="torchtransient wakes Dr.Jit", daemon=True)
     try:
-        helper.start()
-        library.pool_set_size(None, count, 1)  # start_parked: of no effect here
+        with suppress(RuntimeError):  # no more threads can be had
+            helper.start()
+        if helper.ident is None:
+            dr.set_thread_count(count)
+        else:
+            library.pool_set_size(None, count, 1)  # start_parked: of no effect here
     finally:
-        ended.set()
+        ended.release()
         if helper.ident is not None:  # an interrupt may have kept it from starting
             helper.join()
     if dr.thread_count() != count:  # another copy of the library than Dr.Jit's, or one that counts otherwise
         dr.set_thread_count(count)
 
 
-def _wake(library: Any, ended: threading.Event) -> None:
-    """Submit a task that does nothing, again and again until ``ended`` is set; not for ever, since an interrupt may
+def _wake(library: Any, ended: threading.Lock) -> None:
+    """Submit a task that does nothing, again and again until ``ended`` is let go; not for ever, since an interrupt may
     prevent that it is set.
     """
     for _ in range(MOST_WAKES):
-        if ended.wait(WAKE_S):
+        if ended.acquire(timeout=WAKE_S):
             return
         # one unit of work, no function, always in a thread of the pool, no profile
         task = library.task_submit_dep(None, None, 0, 1, None, None, 0, None, 1, 0)
@@ -142,6 +148,11 @@ def threads_for_files() -> Iterator[None]:
         if before > 1:
             yield
             return
-        with afterwards(lambda: set_drjit_threads(before)):
+
+        def as_before() -> None:
+            if dr.thread_count() == 2:  # and nobody has set others meanwhile
+                set_drjit_threads(before)
+
+        with afterwards(as_before):
             set_drjit_threads(2)
             yield

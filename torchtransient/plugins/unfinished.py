@@ -25,43 +25,48 @@ def afterwards(put_back: Callable[[], object]) -> Iterator[None]:
     off. Another variant may be active by then, and it must not overwrite what users have set meanwhile, outside of
     calls: it looks first whether it finds what the block had set.
     """
-    key = object()
+    key, failed = object(), None
     try:
         _owed[key] = put_back
         yield
     finally:
-        # It may be done already: where a traceback keeps this frame, it ends long after its call.
-        _carry_out(key)
+        try:
+            # It may be done already: where a traceback keeps this frame, it ends long after its call.
+            failed = _carry_out(key)
+            if failed is not None:
+                raise failed
+        finally:
+            del failed  # its traceback holds this frame
 
 
 def make_good() -> list[Exception]:
     """Put back what interrupted calls have left, newest first; returns why some of it cannot be. To be called under the
     engine lock where no call is under way.
     """
-    failed, handled = [], sys.exc_info()[1]
-    try:
-        for key in reversed(list(_owed)):
-            try:
-                _carry_out(key)
-            except Exception as error:
-                if interrupt_behind(error, handled) is not None:
-                    raise
-                failed.append(error)
-        return failed
-    finally:
-        del handled  # its traceback may hold this frame
+    return [failed for key in reversed(list(_owed)) if (failed := _carry_out(key)) is not None]
 
 
-def _carry_out(key: object) -> None:
+def _carry_out(key: object) -> Exception | None:
+    """Put one thing back; returns why it cannot be."""
     put_back, handled = _owed.get(key), sys.exc_info()[1]
     if put_back is None:
-        return
+        return None
     try:
         put_back()
     except Exception as error:
-        if interrupt_behind(error, handled) is None:
-            _owed.pop(key, None)  # it would fail again
+        if interrupt_behind(error, handled) is not None:
+            raise
+        # Handlers of signals may raise any exception: what one of them has cut off succeeds now.
+        try:
+            put_back()
+        except Exception as again:
+            if interrupt_behind(again, error) is not None:
+                raise
+            _owed.pop(key, None)
+            return error
+        _owed.pop(key, None)
         raise
     finally:
         del handled
     _owed.pop(key, None)
+    return None

@@ -24,6 +24,7 @@ from torchtransient.rendering.broken_numbers import all_finite, broken_entries, 
 from torchtransient.rendering.carry_out import Numbered, carry_out, groups_of
 from torchtransient.rendering.films.choice import FilmChoice
 from torchtransient.rendering.films.choices import of_film
+from torchtransient.rendering.interrupts import ends_frames
 from torchtransient.rendering.memory import check_fits
 from torchtransient.rendering.parameters import needing_slope
 from torchtransient.rendering.physics import are_finite, smallest_and_largest
@@ -33,6 +34,7 @@ from torchtransient.rendering.session import RenderJob, RunLog, Session, own_arr
 # ---------------------------------------------------------------------------------------------------------- primal
 
 
+@ends_frames
 def primal(job: RenderJob, values: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
     """Render every item. Returns (steady, response); a single item is a view of the film's own memory."""
     check_values(job, values)
@@ -123,6 +125,7 @@ def check_values(job: RenderJob, values: Sequence[torch.Tensor]) -> None:
 # ----------------------------------------------------------------------------------------------------- derivatives
 
 
+@ends_frames
 def vjp(
     job: RenderJob, values: Sequence[torch.Tensor], g_steady: torch.Tensor | None, g_response: torch.Tensor | None
 ) -> list[torch.Tensor]:
@@ -190,6 +193,7 @@ def _finish_backward(session: Session, leaves: Sequence[Any]) -> None:
     dr.sync_thread()
 
 
+@ends_frames
 def jvp(
     job: RenderJob, values: Sequence[torch.Tensor], tangents: Sequence[torch.Tensor]
 ) -> tuple[torch.Tensor, torch.Tensor]:

@@ -11,16 +11,24 @@ for changes that can be put back later, and ``forget_traces`` for the collector.
 
 from __future__ import annotations
 
+import functools
 import signal
 import sys
 import threading
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 from torchtransient.plugins.interrupted import chain_of, interrupt_behind
 from torchtransient.plugins.unfinished import afterwards
+
+# Signals that people handle in Python; asking for all that there are takes longer than a short call.
+_NAMES = "INT TERM ALRM HUP QUIT USR1 USR2 VTALRM PROF XCPU CONT CHLD WINCH BREAK".split()
+_SIGNALS = tuple(getattr(signal, f"SIG{name}") for name in _NAMES if hasattr(signal, f"SIG{name}"))
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
 
 
 @contextmanager
@@ -51,7 +59,7 @@ def interrupts_wait() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    found = ((number, signal.getsignal(number)) for number in signal.valid_signals())
+    found = ((number, signal.getsignal(number)) for number in _SIGNALS)
     handlers: dict[int, Any] = {number: handler for number, handler in found if callable(handler)}
     came: list[tuple[int, Any]] = []
     try:
@@ -73,6 +81,28 @@ def _put_back_handlers(left: list[tuple[int, Any]]) -> None:
     finally:
         if left:  # one of those put back has raised
             _put_back_handlers(left)
+
+
+def ends_frames(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Let the frames of a call end with it where an interrupt has ended it. One that comes at the beginning of a
+    block's ``__exit__`` leaves its generator waiting for as long as somebody keeps the traceback
+    (``sys.last_traceback``, notebooks), and with it the lock, the variant and all that was to be put back.
+    """
+
+    @functools.wraps(function)
+    def call(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        handled = sys.exc_info()[1]
+        try:
+            return function(*args, **kwargs)
+        except Exception:
+            raise
+        except BaseException as interrupt:
+            clear_frames(interrupt, handled)
+            raise
+        finally:
+            del handled
+
+    return call
 
 
 def clear_frames(error: BaseException, handled: BaseException | None = None) -> None:

@@ -14,6 +14,8 @@ from typing import Any, ParamSpec, TypeVar
 
 import torch
 
+from torchtransient.rendering.interrupts import ends_frames
+
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
@@ -37,7 +39,7 @@ def opaque(function: Callable[_P, _R]) -> Callable[_P, _R]:
             return function(*args, **kwargs)
         return _untraced(function, disabled, args, kwargs)
 
-    return _stopping(call)
+    return _stopping(ends_frames(call))
 
 
 def _stopping(function: Callable[_P, _R]) -> Callable[_P, _R]:

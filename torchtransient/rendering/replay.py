@@ -22,6 +22,7 @@ from torchtransient.rendering.arrays import as_tensor, as_torch, fresh, handle, 
 from torchtransient.rendering.broken_numbers import carried_on
 from torchtransient.rendering.derivatives import Asked
 from torchtransient.rendering.generators import Generators
+from torchtransient.rendering.interrupts import ends_frames
 from torchtransient.rendering.parameters import is_transform
 from torchtransient.rendering.physics import are_finite, smallest_and_largest
 from torchtransient.rendering.scene_state import put_back, values_of, write
@@ -99,6 +100,7 @@ class Call:
     # What a run has made of Dr.Jit's is let go of inside of the lock: a graph that is freed beside the work of another
     # thread waits for it, and it for the graph.
 
+    @ends_frames
     def primal(self, tensors: Sequence[torch.Tensor]) -> Tensors:
         """The arrays that the function returns."""
         import drjit as dr
@@ -107,6 +109,7 @@ class Call:
         with self._at_work(), dr.resume_grad():
             return self._primal(tensors)
 
+    @ends_frames
     def pullback(self, asked: Asked, tensors: Sequence[torch.Tensor], cotangents: Sequence[torch.Tensor]) -> Tensors:
         """Gradients of <cotangents, outputs>, of the tensors that need one. What cotangents that are not finite
         touch is NaN.
@@ -119,6 +122,7 @@ class Call:
 
         return carried_on(run, cotangents)
 
+    @ends_frames
     def pushforward(self, asked: Asked, tensors: Sequence[torch.Tensor], tangents: Sequence[torch.Tensor]) -> Tensors:
         """Derivatives of the real outputs along tangents of the tensors that need one. What tangents that are not
         finite touch is NaN.
@@ -282,7 +286,7 @@ class Call:
     def _at_work(self) -> Iterator[None]:
         with ExitStack() as stack:
             stack.enter_context(working_in(self.variant))
-            stack.enter_context(no_collection())
+            stack.enter_context(no_collection(of_call=True))
             # A part in torch inside of the function differentiates itself, and in all runs alike.
             stack.enter_context(torch.enable_grad())
             stack.enter_context(_without_autocast())

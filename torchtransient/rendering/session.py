@@ -167,7 +167,7 @@ def _check_flags() -> None:
 
 @contextmanager
 def session_of(job: RenderJob) -> Iterator[Session]:
-    with active_variant(job.scene.variant), no_collection():
+    with active_variant(job.scene.variant), no_collection(of_call=True):
         _check_flags()
         with _as_at_call(job):
             slots = job.scene.slots(job.keys, job.options)

@@ -10,6 +10,7 @@ import torch
 from torchtransient.errors import DeviceError, UnitError, VariantError
 from torchtransient.plugins.drjit_pool import engine_lock, resize_pool, set_drjit_threads
 from torchtransient.quantities import as_whole, shown
+from torchtransient.rendering.interrupts import interrupts_wait
 from torchtransient.rendering.variant import at_work
 
 MOST_THREADS = 1024
@@ -32,7 +33,7 @@ class Threads:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        with at_work():
+        with at_work(), interrupts_wait():
             _set(*self._before)
 
 
@@ -65,7 +66,8 @@ def threads(n: int | None = None) -> Threads:
     with engine_lock if n is None else at_work():
         before = _counts()
         if n is not None:
-            _set(n, n)
+            with interrupts_wait():
+                _set(n, n)
         return Threads(*_counts(), before)
 
 

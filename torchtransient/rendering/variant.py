@@ -18,7 +18,7 @@ from torchtransient._collection import forget_traces
 from torchtransient._llvm import ensure_llvm
 from torchtransient.errors import TorchTransientWarning, VariantError
 from torchtransient.plugins.drjit_pool import check_process, engine_lock
-from torchtransient.plugins.unfinished import make_good
+from torchtransient.plugins.unfinished import afterwards, make_good
 from torchtransient.quantities import shown
 from torchtransient.rendering.interrupts import interrupts_pass, interrupts_wait
 from torchtransient.rendering.mitsuba_words import one_line
@@ -139,26 +139,37 @@ def active_variant(variant: str) -> Iterator[None]:
     """Hold the engine lock with ``variant`` active and this library's plugins registered for it.
 
     Another active variant is put back at the end (a switch costs some 0.1 s); when none was active, ``variant``
-    stays. Nested calls are free. An interrupt inside of it is raised as such; one in the last line before the switch
-    back may leave ``variant`` active.
+    stays. Nested calls are free. An interrupt inside of it is raised as such.
     """
     import mitsuba as mi
 
     with at_work() as outermost:
         before = mi.variant()
-        try:
-            if before != variant:
-                _set_variant(variant)
-                _count_switch(before, variant)
-            with interrupts_wait():
-                plugins.sync()
-            if outermost:
-                take_over(device_type(variant))
-            yield
-        finally:
-            if before is not None and mi.variant() != before:
+
+        def switch_back() -> None:
+            if mi.variant() == variant:  # and nobody has switched meanwhile
+                _put_back(before)
+
+        with afterwards(switch_back):
+            try:
+                if before != variant:
+                    _set_variant(variant)
+                    _count_switch(before, variant)
                 with interrupts_wait():
-                    mi.set_variant(before)
+                    plugins.sync()
+                if outermost:
+                    take_over(device_type(variant))
+                yield
+            finally:
+                _put_back(before)
+
+
+def _put_back(before: str | None) -> None:
+    import mitsuba as mi
+
+    if before is not None and mi.variant() != before:
+        with interrupts_wait():
+            mi.set_variant(before)
 
 
 def _count_switch(before: str | None, variant: str) -> None:
