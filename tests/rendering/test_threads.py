@@ -133,6 +133,7 @@ def test_threads_are_woken_by_a_task():
     helper = threading.Thread(target=drjit_pool._wake, args=(drjit_pool._nanothread(), ended))
     with tt.threads(2), pytest.MonkeyPatch.context() as patch:
         patch.setattr(drjit_pool, "WAKE_S", 1e-4)
+        patch.setattr(drjit_pool, "MOST_WAKES", 10**9)
         helper.start()
         try:
             for count in (1, 3, 2) * 20:

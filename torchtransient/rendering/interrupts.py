@@ -24,7 +24,9 @@ from torchtransient.plugins.interrupted import chain_of, interrupt_behind
 from torchtransient.plugins.unfinished import afterwards
 
 # Signals that people handle in Python; asking for all that there are takes longer than a short call.
-_NAMES = "INT TERM ALRM HUP QUIT USR1 USR2 VTALRM PROF XCPU CONT CHLD WINCH BREAK".split()
+_NAMES = (
+    "INT", "TERM", "ALRM", "HUP", "QUIT", "USR1", "USR2", "VTALRM", "PROF", "XCPU", "CONT", "CHLD", "WINCH", "BREAK",
+)  # fmt: skip
 _SIGNALS = tuple(getattr(signal, f"SIG{name}") for name in _NAMES if hasattr(signal, f"SIG{name}"))
 
 _P = ParamSpec("_P")
