@@ -76,6 +76,7 @@ def check_moments(chosen, names):
                 moments_of(jobs[name], n)
             except KeyboardInterrupt:
                 interrupted += 1
+            assert gc.isenabled(), where
             found = pushed(renderer)
             for one, other in zip(found, expected, strict=True):
                 torch.testing.assert_close(one, other, msg=where)

@@ -44,7 +44,6 @@ def at_work() -> Iterator[bool]:
         check_process()
         try:
             if outermost:
-                forget_traces()
                 put_back_what_is_left()
             yield outermost
         finally:
@@ -53,9 +52,10 @@ def at_work() -> Iterator[bool]:
 
 
 def put_back_what_is_left() -> None:
-    """Carry out :func:`make_good`, with a warning for what cannot be put back. The engine lock is held, and no call is
-    under way.
+    """Carry out :func:`make_good`, with a warning for what cannot be put back, and let the collector go on. The engine
+    lock is held, and no call is under way.
     """
+    forget_traces()
     for error in make_good():
         warnings.warn(
             f"a call was interrupted and left a change that cannot be undone: {type(error).__name__}: "
