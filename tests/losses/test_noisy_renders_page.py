@@ -25,6 +25,7 @@ def names():
     return PAGE.names()
 
 
+@pytest.mark.slow
 def test_its_blocks_say_what_noise_adds(names):
     """The squared error of one render is above that of two by their variance, which is positive."""
     assert names["squares"].item() > 0 and names["noise"].item() > 0

@@ -52,6 +52,7 @@ def test_readme(folder, capsys):
     assert green < 0.38
 
 
+@pytest.mark.slow
 def test_first_render(folder):
     found = Page("docs/first_render.md").names({**SMALL, r"range\(20\)": "range(2)"})
     assert (folder / "light.gif").stat().st_size > 500 and (folder / "peak.png").stat().st_size > 500

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from support.marks import long_pairs
+from support.marks import long_rows
 from torchtransient import plugins
 from torchtransient.errors import ArgumentError, GradientError, SceneError
 from torchtransient.plugins.films import pulsed_filter
@@ -63,10 +63,12 @@ QUICK = {
     for pair in PAIRS
     for filtered in ("", "gaussian")
     if (pair[0] == "histogram" or pair[1] == "smooth histogram") == bool(filtered)
+    # Every film beside the histogram, on one side of it.
+    and (PAIRS.index(pair) % 2 == 0 or pair[0] == "smooth histogram")
 }
 
 
-@pytest.mark.parametrize(("pair", "of_integrator"), long_pairs(PAIRS, ["", "gaussian"], QUICK))
+@pytest.mark.parametrize(("pair", "of_integrator"), long_rows(itertools.product(PAIRS, ["", "gaussian"]), QUICK))
 def test_each_sensor_renders_as_if_it_were_alone(pair, of_integrator):
     settings = {"temporal_filter": of_integrator, "gaussian_stddev": 0.8} if of_integrator else {}
     scene = tt.load(room_of(*(FILMS[name] for name in pair), **settings), variant=VARIANT)
