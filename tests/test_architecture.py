@@ -277,7 +277,7 @@ def from_tests(path):
             yield from (f"the path {node.value}" for part in re.split(r"[/\\\\]", node.value) if part == "tests")
 
 
-@pytest.mark.parametrize("path", BENCHMARKS, ids=lambda p: p.stem)
+@together("path", BENCHMARKS, lambda p: p.stem)
 def test_benchmarks_do_without_tests(path):
     assert list(from_tests(path)) == []
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from support.marks import long
+from support.sweeps import together
 from torchtransient import scenes
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Scan, Wall
@@ -151,8 +152,8 @@ DEVICE = {"name": "d", "description": "a detector", "sources": [], "stages": [{"
 MESH = {"vertices": [[0, 0, 1], [1, 0, 1], [0, 1, 1]], "faces": [[0, 2, 1]]}
 
 
-@pytest.mark.parametrize(
-    ("entries", "error", "message"),
+@together(
+    "entries, error, message",
     [
         ({"samples": 3}, SceneError, "unknown entry 'samples'"),
         ({"hidden": None}, SceneError, "an entry 'hidden'"),

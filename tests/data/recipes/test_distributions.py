@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.sweeps import together
 from torchtransient.data.recipes.distribution import ANYTHING, NUMBERS, POSE, Place
 from torchtransient.data.recipes.streams import Extreme, Fixed, Stream
 from torchtransient.data.recipes.written import read_distribution, written
@@ -237,7 +238,7 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("wrong", WRONG)
+@together("wrong", WRONG)
 def test_what_is_wrong_says_so(wrong):
     make, error, words = WRONG[wrong]
     with pytest.raises(error, match=words):

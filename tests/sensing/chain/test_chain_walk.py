@@ -10,6 +10,7 @@ import torch
 from torch import nn
 
 from support.marks import long_pairs
+from support.sweeps import together
 from torchtransient import TimeAxis, sensing
 from torchtransient.errors import ArgumentError, GradientError, UnitError
 from torchtransient.sensing import Compose, DetectionJitter, GaussianResponse, PixelGroups, SynchronousSPAD
@@ -258,7 +259,7 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("stages, words", REFUSED.values(), ids=REFUSED)
+@together("stages, words", REFUSED.values())
 def test_orders_that_are_refused(stages, words):
     with pytest.raises(UnitError, match=words):
         Compose(stages())

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from support.sensing.event_driven import Afterpulse, compare, detect, exponential_delays, measured_delays
+from support.sweeps import together
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing import (
     Afterpulsing,
@@ -103,7 +104,7 @@ def test_draws_have_the_mean(name):
 
 
 @each_law
-@pytest.mark.parametrize("period", [BINS + 1, 64, 75, 300])
+@together("period", [BINS + 1, 64, 75, 300])
 def test_constant_counts_in_a_window_of_a_longer_period(name, period):
     """What goes on outside of the window triggers afterpulses inside: as in a window of the whole period."""
     whole = LAWS[name]()
