@@ -119,7 +119,7 @@ def test_derivatives_of_second_order(name, way):
     assert torch.autograd.gradgradcheck(scaled, x.clone().requires_grad_(), fast_mode=True)
 
 
-@pytest.mark.parametrize("name", ["LCT", "PhasorField"])
+@pytest.mark.parametrize("name", ["fk", "inverse of lct", "phasor field, single"])
 def test_derivatives_of_second_order_of_some(name):
     _, _, x, scaled = with_operand(name, "forward")
     assert torch.autograd.gradgradcheck(scaled, x.clone().requires_grad_(), fast_mode=True)

@@ -180,6 +180,7 @@ NUMBERS = """
     import os
     import warnings
     warnings.simplefilter("ignore")
+    tt.threads(3)
     child = os.fork()
     if child == 0:
         try:
