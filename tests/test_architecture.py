@@ -296,7 +296,8 @@ def test_what_benchmarks_may_not_do(tmp_path, line):
 def test_tests_share_through_their_support():
     """A bare name of another test file depends on which folders are on the path."""
     shared = {p.stem for p in TESTS.rglob("*.py") if p.parent != TESTS} - {"__init__"}
-    said = re.compile(rf"^\s*(?:from|import)\s.*\b(?:{'|'.join(sorted(shared))})\b", re.MULTILINE)
+    names = "|".join(sorted(shared))
+    said = re.compile(rf"^\s*(?:from\s+(?:{names})\b|import\s+(?:.*[\s,])?(?:{names})\b)", re.MULTILINE)
     for path in TESTS.rglob("*.py"):
         text = path.read_text(encoding="utf-8")
         # Most files import none, by the look of it.

@@ -17,7 +17,9 @@ SOME = {name: 60 if name in _TEXTS else 12 for name in READERS if name not in ("
 
 
 def test_a_few_mutants(tmp_path):
-    for name, report in run(list(SOME), tmp_path, FEW).items():
+    # Shards and captures are read in test_hostile_files.py and test_hostile_shards.py, too; a recipe takes a second.
+    names = [name for name in SOME if name not in ("shard", "recipe", "capture of tal")]
+    for name, report in run(names, tmp_path, FEW).items():
         assert report.findings == []
         assert report.read + report.refused == FEW, name
         assert report.refused > 0

@@ -36,6 +36,9 @@ from torchtransient.reconstruction import (
 ON_GRIDS, ANYWHERE = grid_operators.operators(), scan_operators.operators()
 OPERATORS = ON_GRIDS | ANYWHERE
 every = together("name", OPERATORS)
+# Scans of pairs, lists and first and last legs take the code of single and confocal ones.
+SOME = [name for name in OPERATORS if not any(word in name for word in ("legs", "exhaustive", "lists", "finer"))]
+some, others = together("name", SOME), together("name", [name for name in OPERATORS if name not in SOME])
 on_grids = together("name", ON_GRIDS)
 with_pictures = together("name", [name for name in OPERATORS if hasattr(OPERATORS[name], "reconstruct")])
 CLASSES = [
@@ -100,15 +103,26 @@ def with_operand(name, way):
     return operator, function, x, as_real(lambda v: function(scale * v))
 
 
-@every
-@together("way", ["forward", "adjoint"])
-def test_derivatives_in_both_modes(name, way):
+def has_its_derivatives(name, way):
     operator, function, x, scaled = with_operand(name, way)
     assert torch.autograd.gradcheck(scaled, x.clone().requires_grad_(), check_forward_ad=True, fast_mode=True)
     direction = (volume_of if way == "forward" else data_of)(operator, seed=5)
     value, tangent = torch.func.jvp(function, (x,), (direction,))
     torch.testing.assert_close(value, function(x), rtol=0, atol=0)
     torch.testing.assert_close(tangent, function(direction), rtol=0, atol=0)
+
+
+@some
+@together("way", ["forward", "adjoint"])
+def test_derivatives_in_both_modes(name, way):
+    has_its_derivatives(name, way)
+
+
+@pytest.mark.slow
+@others
+@together("way", ["forward", "adjoint"])
+def test_derivatives_of_the_others_in_both_modes(name, way):
+    has_its_derivatives(name, way)
 
 
 @pytest.mark.slow
@@ -221,8 +235,7 @@ def test_wrong_operands_are_refused(name):
         operator(volume_of(operator).to("meta"))
 
 
-@every
-def test_works_where_its_tables_are(name):
+def works_where_its_tables_are(name):
     # The meta device refuses everything that stays on the CPU.
     operator = copy.deepcopy(OPERATORS[name]).to("meta")
     assert str(operator.device) == "meta" and operator.dtype == torch.float64
@@ -230,6 +243,17 @@ def test_works_where_its_tables_are(name):
     assert operator.adjoint(data_of(operator, 2).to("meta")).shape == (2, *operator.volume_shape)
     if hasattr(operator, "reconstruct"):
         assert operator.reconstruct(data_of(operator, 2).to("meta")).shape == (2, *operator.volume_shape)
+
+
+@some
+def test_works_where_its_tables_are(name):
+    works_where_its_tables_are(name)
+
+
+@pytest.mark.slow
+@others
+def test_the_others_work_where_their_tables_are(name):
+    works_where_its_tables_are(name)
 
 
 @pytest.mark.parametrize("half", long([torch.bfloat16, torch.float16], [torch.bfloat16]))

@@ -12,7 +12,7 @@ each = together("entry", ENTRIES, lambda entry: entry.name)
 # entries take. Each has derivatives in a file of its own.
 LONG = {
     "Afterpulsing-several", "AfterpulsingSPAD-dead-time", "StreakCamera", "CoincidencePixel-weights", "FreeRunningSPAD",
-    "PixelGroups",
+    "PixelGroups", "CoincidencePixel", "ImpulseResponse-composed",
 }  # fmt: skip
 each_quick = together("entry", [e for e in ENTRIES if e.name not in LONG], lambda entry: entry.name)
 each_long = together("entry", [e for e in ENTRIES if e.name in LONG], lambda entry: entry.name)
