@@ -57,13 +57,12 @@ def grad_and_values(renderer):
     return tensor.detach(), renderer.values[WALL_POSE].grad, out.stats.temporal_filter
 
 
-# Every pair once; with a filter of the integrator's, every film once on either side.
+# Every film beside a histogram, on one of its sides or on both; with a filter of the integrator's and without.
 QUICK = {
     (pair, filtered)
     for pair in PAIRS
     for filtered in ("", "gaussian")
     if (pair[0] == "histogram" or pair[1] == "smooth histogram") == bool(filtered)
-    # Every film beside the histogram, on one side of it.
     and (PAIRS.index(pair) % 2 == 0 or pair[0] == "smooth histogram")
 }
 
