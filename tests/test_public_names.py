@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 import torchtransient as tt
+from support.sweeps import together
 
 ROOT = Path(tt.__file__).parent
 PAGES = sorted([ROOT.parent / "README.md", ROOT.parent / "CHANGELOG.md", *(ROOT.parent / "docs").glob("*.md")])
@@ -101,7 +102,7 @@ def test_the_room_of_the_renderer_hides_nothing():
     assert inspect.isfunction(tt.render)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+@together("page", PAGES, lambda page: page.stem)
 def test_names_of_the_pages_exist(page):
     named = set(re.findall(r"\btt((?:\.[A-Za-z]\w*)+)(?![\w*]|\.\w)", page.read_text(encoding="utf-8")))
     missing = []

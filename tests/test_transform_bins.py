@@ -7,6 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
+from support.sweeps import together
 from torchtransient.errors import SceneError
 from torchtransient.transform_bins import fast_length, transform_bins
 
@@ -20,8 +21,8 @@ def test_the_next_length_of_small_factors(multiple):
         assert fast_length(least, multiple) == next(multiple * n for n in SMOOTH if multiple * n >= least)
 
 
-@pytest.mark.parametrize("bins", [1, 2, 63, 64, 300])
-@pytest.mark.parametrize("wl_mean, wl_sigma", [(1.1, 0.6), (0.21, 1.0), (100.0, 2.0), (0.35, 0.1)])
+@together("bins", [1, 2, 63, 64, 300])
+@together("wl_mean, wl_sigma", [(1.1, 0.6), (0.21, 1.0), (100.0, 2.0), (0.35, 0.1)])
 def test_lines_around_a_wavelength(bins, wl_mean, wl_sigma):
     """Beside NumPy's frequencies: from the last line below the mean less three sigma to the first one above it."""
     width = 0.1

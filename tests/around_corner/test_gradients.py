@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import warnings
 
 import drjit as dr
@@ -9,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from support.marks import long_pairs
+from support.marks import long_pairs, long_rows
 from support.moved_captures import MovedCapture, move, turn
 from support.nlos_scenes import film, plane, scan_scene, side, transform
 from torchtransient.errors import TorchTransientWarning
@@ -45,10 +46,12 @@ def plate(**changes):
     return {"a": plane(1.0, 0.6, 0.1, 0.05, **changes)}
 
 
-QUICK_CASES = [(case, ("confocal", "single")[i % 2]) for i, case in enumerate(CASES)]
+QUICK_CASES = [
+    ("depth", "confocal"), ("sideways", "single"), ("albedo", "single"), ("the wall", "single"), ("sensor", "single")
+]  # fmt: skip
 
 
-@pytest.mark.parametrize(("case", "kind"), long_pairs(CASES, ["confocal", "single"], QUICK_CASES))
+@pytest.mark.parametrize(("case", "kind"), long_rows(itertools.product(CASES, ["confocal", "single"]), QUICK_CASES))
 def test_shared_samples(case, kind):
     """Within 0.1 % of finite differences where nothing hides the body and its outline moves; modes agree."""
     key, change, h = CASES[case]
@@ -78,6 +81,7 @@ def test_pose_of_the_laser(kind):
     assert abs(reverse) > 1e-3 * abs(capture.loss(0.0, 0, spp))
 
 
+@pytest.mark.slow
 def test_a_wall_moves_behind_points_that_are_given():
     """The sensor is the wall's, but its rays go to the points and stay."""
     scene = scan_scene(plate(), "single", film(2, **SMOOTH), third_bounce="paths")
@@ -137,7 +141,6 @@ def test_late_light(key):
 
 QUICK_FILMS = {
     ("phasors", "confocal"), ("gates", "single"), ("gaussian", "exhaustive"), ("no steady image", "confocal"),
-    ("gates", "exhaustive"),
 }  # fmt: skip
 
 

@@ -103,12 +103,14 @@ def test_films(name, kind):
     agree(capture, 2**13, spp_differences=2**17 if name == "gates" else 2**16, most_error=0.05)
 
 
+@pytest.mark.slow
 def test_the_steady_image():
     scene = scan_scene(plates(), "single", film(4, **SMOOTH))
     agree(MovedCapture(scene, "front.to_world", move(1, 0, 0), steady=True), spp_differences=2**17)
 
 
-@pytest.mark.parametrize("kind", long(["confocal", "single"], ["single"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["confocal", "single"])
 def test_first_and_last_leg(kind):
     capture = capture_of(
         plates(), "front.to_world", move(1, 0, 0), kind, response=film(4, **SMOOTH | {"bins": 140}),
@@ -179,7 +181,7 @@ def test_a_box_of_six_plates_is_a_cube(kind):
     agree(cube, 2**13, most_error=0.03)
 
 
-@pytest.mark.parametrize("kind", ["confocal", "single"])
+@pytest.mark.parametrize("kind", long(["confocal", "single"], ["single"]))
 def test_what_hides_may_show_its_back(kind):
     """The way around an outline is the other one then: a plate that is turned away hides as a black one does."""
     black = plane(0.9, 0.3, 0.22, 0.1)

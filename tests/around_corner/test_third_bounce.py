@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from support.hidden_shapes import ball, folded_plates, join, mannequin, mesh, plate, scene_of, wall_grid
+from support.marks import long_pairs
 from support.third_bounce_runs import WALL_ALBEDO, BruteForce, captured, confocal, film_of, single, table_of, wall_of
 from torchtransient.plugins.around_corner import launches
 from torchtransient.plugins.around_corner.third_bounce import ThirdBounce, _clear
@@ -59,8 +60,11 @@ DISK = [[-0.5, 0, 0, 0], [0, 0.7, 0, 0], [0, 0, -1, 1.2], [0, 0, 0, 1]]
 SENSORS = np.array([(-0.4, -0.3, 0), (0.1, 0.45, 0), (0.4, 0, 0)])
 
 
-@pytest.mark.parametrize("kind", ["confocal", "single"])
-@pytest.mark.parametrize("name", SCENES)
+QUICK = [("plane", "single"), ("two plates", "confocal"), ("body", "single"), ("V and plate", "confocal"),
+         ("sphere and disk", "single")]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "kind"), long_pairs(SCENES, ["confocal", "single"], QUICK))
 def test_brute_force(name, kind):
     """Totals and times of three points, within three standard errors of the brute force and of twelve seeds."""
     shapes, spot = SCENES[name](), np.array([-0.2, 0.1, 0])

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from support.hidden_shapes import ball, mesh, scene_of, wall_grid
+from support.marks import long
 from support.third_bounce_runs import captured, film_of, wall_of
 from torchtransient.errors import SceneError, ShapeError
 from torchtransient.plugins.around_corner.exhaustive import add_exhaustive
@@ -40,7 +41,7 @@ def test_tiles_are_neighbours_and_all_points_have_one(arm):
     assert ScanTiles(points[:GRID], normals[:GRID], 0.25).count == 2
 
 
-@pytest.mark.parametrize("single", [False, True])
+@pytest.mark.parametrize("single", long([False, True], [False]))
 def test_less_noise_and_no_bias(arm, single):
     shapes, scene, points, normals = arm
     film = film_of(GRID, GRID, bins=40, bin_width=0.05)

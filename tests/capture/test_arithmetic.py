@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from support.sweeps import together
 from torchtransient import vis
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
@@ -47,8 +48,8 @@ FUNCTIONS = {
 }
 
 
-@pytest.mark.parametrize("dtype", NUMBERS, ids=str)
-@pytest.mark.parametrize("name", FUNCTIONS)
+@together("dtype", NUMBERS)
+@together("name", FUNCTIONS)
 def test_numbers_of_every_kind(name, dtype):
     for kind in KINDS:
         scan = scanned(kind)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from support.sweeps import together
 from torchtransient.capture import Scan, Wall
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 
@@ -167,8 +168,8 @@ def points(given=LIST, **changes):
     return Scan.points(given, **{**defaults, **changes})
 
 
-@pytest.mark.parametrize(
-    ("make", "error", "message"),
+@together(
+    "make, error, message",
     [
         (lambda: scan("biaxial"), ArgumentError, "single, confocal, exhaustive"),
         (lambda: scan("single", laser=(0.0, 0.0, 0.3)), SceneError, "0.3 m off"),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from support.sweeps import together
 from torchtransient.capture import Wall
 from torchtransient.capture.triangles import first_hits
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
@@ -164,8 +165,8 @@ BALL = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [-1, -1, -1]])
 TETRAHEDRON = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]
 
 
-@pytest.mark.parametrize(
-    ("make", "error", "message"),
+@together(
+    "make, error, message",
     [
         (lambda: Wall.plane(0.0, 1.0), UnitError, "width: expected a finite number greater than zero"),
         (lambda: Wall.plane(1.0, float("nan")), UnitError, "height: expected a finite number greater than zero"),

@@ -14,6 +14,17 @@ from torchtransient.cli import doctor
 from torchtransient.cli.main import main
 
 
+def test_everything_is_fine(monkeypatch, capsys):
+    """The real probe in this process; processes of their own are the slow test's."""
+    monkeypatch.setattr(sys, "argv", ["-c", "llvm_ad_rgb"])
+    exec(doctor._RENDER, {})
+    monkeypatch.setattr(doctor, "_run", lambda command, environment: (0, "17.0.6" if len(command) == 3 else "", ""))
+    result = CliRunner().invoke(main, ["doctor"])
+    assert result.exit_code == 0, result.output
+    assert "renders and differentiates" in result.stdout and "problem" not in result.stdout
+
+
+@pytest.mark.slow
 def test_everything_is_fine_here():
     result = CliRunner().invoke(main, ["doctor"])
     assert result.exit_code == 0, result.output

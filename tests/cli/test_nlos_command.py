@@ -172,6 +172,7 @@ def test_describe_says_what_comes_and_stops(folder):
     assert not (folder / "own.h5").exists() and not (folder / "own.h5.part").exists()
 
 
+@pytest.mark.slow
 def test_pictures(folder):
     names = {"--transients": "t.png", "--peak-time": "p.png", "--layout": "l.png", "--video": "v.gif"}
     result = run("own.yaml", "--whole", "--quiet", "--every", 10, *(word for pair in names.items() for word in pair))

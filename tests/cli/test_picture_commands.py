@@ -8,6 +8,7 @@ from click.testing import CliRunner
 from PIL import Image
 
 import torchtransient as tt
+from support.marks import long_rows
 from torchtransient.cli.main import main
 from torchtransient.files.result_file import write_result
 
@@ -77,13 +78,13 @@ def test_video_options(folder, result):
     assert done.stderr == ""
 
 
-@pytest.mark.parametrize(
-    ("kind", "more"),
-    [
-        ("overview", ("--pixel", 3, 4)), ("peak-time", ()), ("rainbow", ()), ("fusion", ()), ("streak", ("--row", 2)),
-        ("streak", ("--column", 2)), ("frames", ()), ("histogram", ("--pixel", 3, 4)),
-    ],
-)  # fmt: skip
+KINDS = [
+    ("overview", ("--pixel", 3, 4)), ("peak-time", ()), ("rainbow", ()), ("fusion", ()), ("streak", ("--row", 2)),
+    ("streak", ("--column", 2)), ("frames", ()), ("histogram", ("--pixel", 3, 4)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("kind", "more"), long_rows(KINDS, [KINDS[2], KINDS[3], KINDS[5], KINDS[7]]))
 def test_kinds_of_pictures(folder, result, kind, more):
     done = run("picture", "box.h5", "out.png", "--kind", kind, *more)
     assert done.exit_code == 0, done.output

@@ -12,6 +12,7 @@ import torch
 from click.testing import CliRunner
 
 import torchtransient as tt
+from support.marks import long_rows
 from torchtransient.cli.main import main
 from torchtransient.testing.point_captures import point_capture
 
@@ -48,7 +49,11 @@ def brightest(volume):
     return volume.grid.points.reshape(-1, 3)[index]
 
 
-@pytest.mark.parametrize(("kind", "method"), PAIRS)
+# Each method once.
+ONCE = list({method: (kind, method) for kind, method in PAIRS}.values())
+
+
+@pytest.mark.parametrize(("kind", "method"), long_rows(PAIRS, ONCE))
 def test_a_point_is_found_by_every_method(folder, kind, method):
     captured(kind).write("a.h5")
     result = run("a.h5", "--method", method, "--depths", 0.4, 1.0, "--quiet", "--no-picture")
@@ -60,7 +65,10 @@ def test_a_point_is_found_by_every_method(folder, kind, method):
     torch.testing.assert_close(brightest(volume), torch.tensor(POINT, dtype=torch.float64), rtol=0, atol=0.085)
 
 
-@pytest.mark.parametrize(("kind", "method"), [("confocal", "fk"), ("single", "phasor"), ("exhaustive", "phasor")])
+SUITS = [("confocal", "fk"), ("single", "phasor"), ("exhaustive", "phasor")]
+
+
+@pytest.mark.parametrize(("kind", "method"), long_rows(SUITS, SUITS[1:2]))
 def test_without_a_method_the_one_that_suits_is_taken(folder, kind, method):
     article = "an" if kind == "exhaustive" else "a"
     captured(kind).write("a.npz")
@@ -132,6 +140,7 @@ def test_cut_and_summed_bins(folder):
     assert torch.equal(tt.nlos.read_volume("a_fk.h5").values, expected)
 
 
+@pytest.mark.slow
 def test_films_and_normals(folder):
     captured("single").write("a.h5")
     film = ("--method", "phasor", "--camera", "transient", "--times", 0.6, 1.0, 5)

@@ -31,6 +31,7 @@ def check_line_and_picture(name: str, folder: Path, printed: str) -> None:
     assert (folder / f"{name}.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_fit_albedo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     mi.set_variant("llvm_ad_rgb")  # the example's own: with another one active, every step would switch to and fro
     sizes = ["--steps", "14", "--spp", "16", "--resolution", "16", "--target-spp", "256", "--output"]

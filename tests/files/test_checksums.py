@@ -18,6 +18,7 @@ import torchtransient as tt
 from support.capture_files import grids, made
 from support.killed_writers import output
 from support.sealed_files import as_first_version
+from support.sweeps import together
 from torchtransient.array_files import array_file, hdf5_limits
 from torchtransient.array_files.part_files import whole_file
 from torchtransient.errors import StorageError
@@ -239,7 +240,7 @@ def wrong(**changes):
     return make
 
 
-@pytest.mark.parametrize(
+@together(
     "make",
     [
         wrong(transient=np.zeros((3, 40, 32, 32), "i8") > 0), wrong(transient=np.zeros((3, 40, 32, 32), "c8")),

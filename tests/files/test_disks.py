@@ -69,6 +69,7 @@ def full_disks(folder):
         path.unlink()
 
 
+@pytest.mark.slow
 def test_full_disks(tmp_path):
     """A typed error, the old file, nothing beside it, and a process that lives."""
     code = f"import sys; sys.path[:0] = {sys.path!r}; import torchtransient; from files.test_disks import full_disks; "

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.sweeps import together
 from torchtransient import geometry
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.rendering.cameras import camera_of
@@ -42,10 +43,10 @@ def sensor_rays(axis, size, crop, offset, kind="perspective", pose=POSE):
     return np.array(ray.d).reshape(3, height, width), np.array(ray.o).reshape(3, height, width)
 
 
-@pytest.mark.parametrize("axis", ["x", "y", "diagonal", "smaller", "larger"])
-@pytest.mark.parametrize("size", [(6, 8), (9, 5)])
-@pytest.mark.parametrize("crop", [False, True])
-@pytest.mark.parametrize("offset", [(0.0, 0.0), OFFSET])
+@together("axis", ["x", "y", "diagonal", "smaller", "larger"])
+@together("size", [(6, 8), (9, 5)])
+@together("crop", [False, True])
+@together("offset", [(0.0, 0.0), OFFSET])
 def test_intrinsics_are_mitsubas_rays(axis, size, crop, offset):
     with mi.variant_context(VARIANT):
         directions, origins = sensor_rays(axis, size, crop, offset)

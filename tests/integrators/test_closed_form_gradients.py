@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from support.gradient_cases.unknowns import move, set_color
+from support.marks import long_pairs
 from support.runs import T
 from torchtransient import plugins
 
@@ -160,8 +161,9 @@ def test_mirrors_and_roulette(weight):
     check_mean(rows, 3 * 3.0 * 0.7**4, 0.02)
 
 
-@pytest.mark.parametrize("black", ["first", "second"])
-@pytest.mark.parametrize("weight", [0.0, 1.0])
+@pytest.mark.parametrize(
+    ("weight", "black"), long_pairs([0.0, 1.0], ["first", "second"], [(0.0, "first"), (1.0, "second")])
+)
 def test_light_beyond_one_black_wall_of_two(black, weight):
     """Two plates that face each other, near enough to see nothing else: light comes over both or none, I = ρ1 ρ2 ...,
     and the derivative by the black one's reflectance is what the other one sends on.

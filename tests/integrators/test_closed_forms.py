@@ -4,6 +4,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from support.marks import long
 from torchtransient import plugins, scenes
 from torchtransient.testing import closed_forms as cf
 from torchtransient.testing.statistics import pool_small_bins, standard_error, z_test
@@ -135,7 +136,7 @@ def test_furnace_decay_rate():
     assert abs(decay.mean() - cf.integrating_sphere_decay(1.0, 0.8)) < 4.5 * error
 
 
-@pytest.mark.parametrize("bounce", [1, 2, 5])
+@pytest.mark.parametrize("bounce", long([1, 2, 5], [2]))
 def test_moments_of_one_bounce(bounce):
     radius, width = 1.5, 0.05
     args = {"num_bins": 800, "start_opl": 0.0, "bin_width_opl": width, "spp": 2048}

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 import torch
 
+from support.marks import long_pairs, long_rows
 from torchtransient import plugins
 from torchtransient.testing.dielectric_reference import fresnel_reflectance, rough_dielectric
 from torchtransient.testing.statistics import z_test
@@ -85,15 +88,27 @@ def check_orders(measured, start, orders):
     assert result.passed, str(result)
 
 
-@pytest.mark.parametrize("plugin", ["dielectric", "diff_dielectric"])
-@pytest.mark.parametrize("side", ["reflected", "transmitted"])
-@pytest.mark.parametrize(("n_in", "n_out", "angle_deg"), [(1.5, 1.0, 0.0), (1.5, 1.0, 40.0), (1.0, 1.5, 30.0)])
-def test_slab(plugin, side, n_in, n_out, angle_deg):
+SLABS = {"glass": (1.5, 1.0, 0.0), "glass, oblique": (1.5, 1.0, 40.0), "a gap": (1.0, 1.5, 30.0)}
+
+
+@pytest.mark.parametrize(
+    ("slab", "side", "plugin"),
+    long_rows(
+        itertools.product(SLABS, ["reflected", "transmitted"], ["dielectric", "diff_dielectric"]),
+        [
+            ("glass", "reflected", "dielectric"), ("glass", "transmitted", "diff_dielectric"),
+            ("glass, oblique", "transmitted", "dielectric"), ("glass, oblique", "reflected", "diff_dielectric"),
+            ("a gap", "reflected", "dielectric"), ("a gap", "transmitted", "diff_dielectric"),
+        ],
+    ),
+)  # fmt: skip
+def test_slab(plugin, side, slab):
     """Slab of glass in air, and the gap of air in glass, at normal and oblique incidence.
 
     Lengths count relative to the medium of the camera: light in the gap is 1.5 times as fast.
     """
     thickness, above, below = 0.51, 2.0, 1.0
+    n_in, n_out, angle_deg = SLABS[slab]
     eta, theta = n_in / n_out, np.radians(angle_deg)
     cos_i = np.cos(theta)
     cos_t = np.sqrt(1 - (np.sin(theta) / eta) ** 2)
@@ -208,8 +223,10 @@ def test_arrival_behind_a_principled_interface():
     assert measured[k - 1 : k + 2].sum() == pytest.approx(measured.sum(), rel=1e-5)
 
 
-@pytest.mark.parametrize("side", ["reflected", "transmitted"])
-@pytest.mark.parametrize("angle_deg", [0.0, 40.0])
+@pytest.mark.parametrize(
+    ("angle_deg", "side"),
+    long_pairs([0.0, 40.0], ["reflected", "transmitted"], [(0.0, "transmitted"), (40.0, "reflected")]),
+)
 def test_gradient_of_a_slab_in_its_index(side, angle_deg):
     """Through Fresnel's weight, the refracted direction and the path length, orders m = 0 to 3 of the slab together."""
     thickness, above, below, orders = 0.51, 2.0, 1.0, 4

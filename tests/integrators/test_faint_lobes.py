@@ -68,20 +68,24 @@ def derivative_in_place(scene, key, spp=1024):
     return float(dr.grad(value)[0])
 
 
+def slow(*row):
+    return pytest.param(*row, marks=pytest.mark.slow)
+
+
 @pytest.mark.parametrize(
     ("bsdf", "key", "end"),
     [
         ({"type": "diff_principled", "spec_trans": number(0.0), "roughness": 0.4}, "spec_trans.value", 0.0),
-        ({"type": "diff_principled", "spec_trans": number(0.0), "roughness": 0.4}, "spec_trans.value", 1.0),
-        ({"type": "diff_principled", "clearcoat": number(0.0)}, "clearcoat.value", 0.0),
-        ({"type": "diff_principled", "metallic": number(0.0)}, "metallic.value", 1.0),
+        slow({"type": "diff_principled", "spec_trans": number(0.0), "roughness": 0.4}, "spec_trans.value", 1.0),
+        slow({"type": "diff_principled", "clearcoat": number(0.0)}, "clearcoat.value", 0.0),
+        slow({"type": "diff_principled", "metallic": number(0.0)}, "metallic.value", 1.0),
         ({"type": "diff_principled_thin", "diff_trans": number(0.0)}, "diff_trans.value", 2.0),
-        ({"type": "diff_plastic", "specular_reflectance": number(0.0)}, "specular_reflectance.value", 0.0),
+        slow({"type": "diff_plastic", "specular_reflectance": number(0.0)}, "specular_reflectance.value", 0.0),
         ({"type": "diff_plastic", "diffuse_reflectance": number(0.0)}, "diffuse_reflectance.value", 0.0),
-        ({"type": "diff_rough_plastic", "diffuse_reflectance": number(0.0)}, "diffuse_reflectance.value", 0.0),
-        ({"type": "diff_pplastic", "diffuse_reflectance": number(0.0)}, "diffuse_reflectance.value", 0.0),
+        slow({"type": "diff_rough_plastic", "diffuse_reflectance": number(0.0)}, "diffuse_reflectance.value", 0.0),
+        slow({"type": "diff_pplastic", "diffuse_reflectance": number(0.0)}, "diffuse_reflectance.value", 0.0),
         ({"type": "diff_pplastic", "specular_reflectance": number(0.0)}, "specular_reflectance.value", 0.0),
-        ({"type": "blendbsdf", "weight": number(0.0), "a": DIFFUSE, "b": METAL}, "weight.value", 0.0),
+        slow({"type": "blendbsdf", "weight": number(0.0), "a": DIFFUSE, "b": METAL}, "weight.value", 0.0),
         ({"type": "blendbsdf", "weight": number(0.0), "a": DIFFUSE, "b": MIRROR}, "weight.value", 1.0),
         ({"type": "mask", "opacity": number(0.0), "nested": DIFFUSE}, "opacity.value", 0.0),
     ],

@@ -33,6 +33,16 @@ LONG = {
     "no_transmission_of_a_sheet", "instance_and_its_mirror_turn", "phase_of_weight_1", "normals_in_an_instance",
     "polarized_fluorescent_yield", "area_light_over_a_delayed_wall_moves",
 }  # fmt: skip
+# Nor the first cases of rows whose code a quicker case of another row runs, too: surfaces, media, polarization, lights,
+# sensors, instances, indices and textures are in the default set once or twice each.
+ALIKE = {
+    "wall_under_a_smooth_light", "sun_direction", "hair_longitudinal_roughness", "hair_index",
+    "glass_around_camera_index", "gated_side_albedo", "quantum_yield", "elastic_fraction", "albedo_inside_a_delay",
+    "black_mirror_of_a_plastic", "principled_glass_index", "very_rough_glass", "principled_thin_colour", "no_clearcoat",
+    "medium_albedo_zero", "medium_g", "medium_flakes", "medium_wall_behind", "roughness_of_blended_glass",
+    "mirror_normals_in_a_volume", "polar_metal_of_index_zero", "polar_metal_alpha", "polar_wall_distance",
+    "lens_aperture", "glass_moves", "mirror_moves",
+}  # fmt: skip
 
 
 def marked(cases):
@@ -42,8 +52,9 @@ def marked(cases):
         slow = "slow" in case.tags or case.name in LONG or seen[case.row] >= FIRST
         seen[case.row] += not slow
         later[case.row] += slow
-        kind = pytest.mark.soak if later[case.row] > SECOND else pytest.mark.slow
-        found.append(pytest.param(case, id=case.name, marks=[kind] if slow else []))
+        marks = [pytest.mark.soak if later[case.row] > SECOND else pytest.mark.slow] if slow else []
+        marks += [pytest.mark.slow] if not slow and case.name in ALIKE else []
+        found.append(pytest.param(case, id=case.name, marks=marks))
     return found
 
 

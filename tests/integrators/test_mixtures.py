@@ -26,6 +26,7 @@ from support.gradient_cases.cases_mixtures import (
     seen_through,
     two_sided,
 )
+from support.marks import long
 from torchtransient.errors import SceneError
 from torchtransient.plugins.bsdfs.wrapper_copy import flags_of
 
@@ -89,12 +90,20 @@ def rows(bsdf, room=mirror_room):
     return np.array([np.array(cube).sum((0, 1, 3)) for cube in renders])
 
 
-@pytest.mark.parametrize("name", MIXTURES)
+# The others are the same code around other plugins.
+QUICK = ["diffuse and mirror", "plastic and mirror", "two-sided", "under normals", "weight 0", "blend of blends",
+         "mask of a blend"]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", long(MIXTURES, QUICK))
 def test_mixture_is_the_weighed_sum_of_its_parts(name):
     check_sum(*MIXTURES[name]())
 
 
-@pytest.mark.parametrize("name", THROUGH)
+QUICK_THROUGH = ["paint and rough glass", "under normals, seen through", "mask of rough glass and paint"]
+
+
+@pytest.mark.parametrize("name", long(THROUGH, QUICK_THROUGH))
 def test_mixture_that_is_seen_through_is_the_weighed_sum_of_its_parts(name):
     check_sum(*THROUGH[name](), seen_through)
 

@@ -6,6 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from support.marks import long
 from support.nlos_scenes import captures, film, plane, ratio, scan_scene, side, transform, worst_of_blocks
 from torchtransient.errors import SceneError
 from torchtransient.plugins.transport.strategy import Local
@@ -121,7 +122,7 @@ def test_first_and_last_leg(how):
     assert times[1] - times[0] == pytest.approx(legs, abs=1e-4)
 
 
-@pytest.mark.parametrize("laser_sampling", [True, False])
+@pytest.mark.parametrize("laser_sampling", long([True, False], [True]))
 def test_bounces_are_counted_as_they_are_named(laser_sampling):
     """``filter_bounces = b`` keeps light of b bounces, the laser's spot the first of them."""
     hidden = {"a": plane(), "b": side()}
@@ -192,7 +193,7 @@ def test_a_projector_is_a_laser():
         assert lit.sum() / beam.sum() == pytest.approx(expected, rel=1e-4)
 
 
-@pytest.mark.parametrize("kind", ["confocal", "single"])
+@pytest.mark.parametrize("kind", long(["confocal", "single"], ["single"]))
 def test_a_curved_wall_lights_itself(kind):
     """Light of two bounces runs from wall to wall, and hidden light comes back by way of it."""
     wall = {"type": "sphere", "center": [0, 0, 2.0], "radius": 2.05, "flip_normals": True}
@@ -214,7 +215,7 @@ def test_a_curved_wall_lights_itself(kind):
 # -------------------------------------------------------------------------------------------------- kinds of light
 
 
-@pytest.mark.parametrize("kind", ["confocal", "exhaustive"])
+@pytest.mark.parametrize("kind", long(["confocal", "exhaustive"], ["confocal"]))
 def test_media_behind_the_corner(kind):
     """Fog before a plane: guided paths against paths that follow BSDFs and phase functions."""
     fog = {

@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from support.marks import long
 from support.plain_scenes import camera, check, load, mitsuba_runs
 from support.runs import T, runs
 from torchtransient import plugins
@@ -60,7 +61,7 @@ def room():
     }
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", long(VARIANTS, ["llvm_ad_mono", "llvm_ad_spectral"]))
 def test_steady_image_is_that_of_path(variant):
     mi.set_variant(variant)
     plugins.sync()

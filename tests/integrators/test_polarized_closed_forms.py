@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import mitsuba as mi
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from support.marks import long_rows
 from torchtransient import plugins
 from torchtransient import stokes as st
 from torchtransient.testing.closed_forms import fresnel_reflectances
@@ -91,9 +93,22 @@ def check_arrival(measured, expected, opl, start=2.0, tolerance=ROUNDING):
 # ---------------------------------------------------------------------------------------------------- interfaces
 
 
-@pytest.mark.parametrize("plugin", ["dielectric", "diff_dielectric"])
-@pytest.mark.parametrize("roll_deg", [0.0, 25.0, 90.0])
-@pytest.mark.parametrize("angle_deg", [5.0, 45.0, math.degrees(math.atan(INDEX)), 75.0])
+BREWSTER = math.degrees(math.atan(INDEX))
+# Every angle with a camera that is rolled and with one that is not, every plugin at both.
+GLASS = [
+    (angle, roll, plugin)
+    for number, angle in enumerate((5.0, 45.0, BREWSTER, 75.0))
+    for roll, plugin in ((0.0, ("dielectric", "diff_dielectric")[number % 2]),
+                         (25.0, ("diff_dielectric", "dielectric")[number % 2]))
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("angle_deg", "roll_deg", "plugin"),
+    long_rows(
+        itertools.product([5.0, 45.0, BREWSTER, 75.0], [0.0, 25.0, 90.0], ["dielectric", "diff_dielectric"]), GLASS
+    ),
+)
 def test_reflection_from_glass(plugin, angle_deg, roll_deg):
     """The Stokes vector of a reflection of unpolarized light: (Rs + Rp, Rs - Rp, 0, 0) / 2 across the plane of
     incidence, which lies horizontally here. Completely polarized at Brewster's angle, with a power of 0.14793 / 2.

@@ -8,6 +8,7 @@ import inspect
 import pytest
 import torch
 
+from support.sweeps import together
 from torchtransient import losses
 from torchtransient.errors import ArgumentError
 
@@ -79,8 +80,8 @@ def test_every_likelihood_is_among_them():
     assert losses.PoissonLoss is losses.PoissonNLL and losses.FirstPhotonLoss is losses.FirstPhotonNLL
 
 
-@pytest.mark.parametrize("taker", TAKERS)
-@pytest.mark.parametrize("name", BACKWARDS)
+@together("taker", TAKERS)
+@together("name", BACKWARDS)
 def test_what_takes_no_model_first_is_refused(taker, name):
     with pytest.raises(ArgumentError, match=f"^{taker}: expected compare") as caught:
         TAKERS[taker](BACKWARDS[name])
@@ -88,8 +89,8 @@ def test_what_takes_no_model_first_is_refused(taker, name):
         assert "(input, target)" in str(caught.value) and name in str(caught.value)
 
 
-@pytest.mark.parametrize("taker", TAKERS)
-@pytest.mark.parametrize("name", FORWARDS)
+@together("taker", TAKERS)
+@together("name", FORWARDS)
 def test_what_takes_the_model_first_is_taken(taker, name):
     if name == "free_running_nll" and taker.lower().startswith("multiscale"):  # dead for bins, which are others there
         with pytest.raises(ArgumentError, match="without options in bins"):

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from support.loss_cases import CASES
+from support.sweeps import together
 from torchtransient import losses
 from torchtransient.errors import ShapeError
 
@@ -66,8 +67,8 @@ def test_levels_of_items_in_every_loss(case):
 
 
 @own
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64], ids=str)
-@pytest.mark.parametrize("count", [0, 1, 4, 6, 50])
+@together("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
+@together("count", [0, 1, 4, 6, 50])
 def test_a_model_without_light_has_a_slope(name, loss, dtype, count):
     """Every number of counts, in every precision: towards light where there are counts, to none where there are none.
 

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from support.loss_cases import CASES
+from support.sweeps import together
 from torchtransient import TimeAxis, losses
 from torchtransient.capture import Scan, Wall
 from torchtransient.errors import ArgumentError, ShapeError
@@ -138,7 +139,7 @@ def test_says_what_the_operator_did_not_make():
 PAIRS = [case for case in CASES if case.pair and case.target_shape is None and case.second is None]
 
 
-@pytest.mark.parametrize("case", PAIRS, ids=str)
+@together("case", PAIRS)
 def test_compares_by_every_module_of_the_room(case):
     """As by the function; the module is a part of this one, and its `reduction` is the same."""
     x, y = case.tensors()

@@ -25,6 +25,7 @@ def names():
     return PAGE.names()
 
 
+@pytest.mark.slow
 def test_its_blocks_say_what_noise_adds(names):
     """The squared error of one render is above that of two by their variance, which is positive."""
     assert names["squares"].item() > 0 and names["noise"].item() > 0
@@ -32,6 +33,7 @@ def test_its_blocks_say_what_noise_adds(names):
     assert bool(torch.isfinite(values).all()) and bool(torch.isfinite(values.grad).all())
 
 
+@pytest.mark.slow
 def test_its_schedule_and_its_check(names):
     assert names["schedule"](0) == 16 and names["schedule"](8) == names["schedule"].last > 16
     significance = names["significance"]

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from support.loss_cases import CASES
+from support.sweeps import together
 from torchtransient import losses
 from torchtransient.errors import ArgumentError, TorchTransientError
 
@@ -59,7 +60,7 @@ def refused(call):
     return None
 
 
-@pytest.mark.parametrize("name", CALLS)
+@together("name", CALLS)
 def test_an_option_with_a_gradient_has_it_or_is_refused(name):
     """Never a number in silence, whose derivative is nothing."""
     function, options, call = CALLS[name]
@@ -120,7 +121,7 @@ def results(number):
     return [SimpleNamespace(transient=torch.ones(1, 8, 2, 2), axis=None) for _ in range(number)]
 
 
-@pytest.mark.parametrize("name", FUNCTIONS)
+@together("name", FUNCTIONS)
 def test_a_wrong_call_of_a_function_names_it(name):
     """Arguments missing, too many, and of other names, of tensors and of results."""
     function = FUNCTIONS[name]
@@ -133,7 +134,7 @@ def test_a_wrong_call_of_a_function_names_it(name):
                 function(*arguments, **keywords)
 
 
-@pytest.mark.parametrize("name", MODULES)
+@together("name", MODULES)
 def test_a_wrong_call_of_a_module_names_it(name):
     kind = MODULES[name]
     with pytest.raises(TypeError, match=rf"^{name}\b"):

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from support.loss_cases import AXIS, BAND, BINS, CASES
+from support.sweeps import together
 from torchtransient import TimeAxis, losses
 from torchtransient.errors import ArgumentError, ShapeError, TorchTransientError, UnitError
 
@@ -110,7 +111,7 @@ def test_a_volume_has_no_axis():
         loss(result(x), result(y))
 
 
-@pytest.mark.parametrize("case", [case for case in CASES if two_records(case)], ids=str)
+@together("case", [case for case in CASES if two_records(case)])
 def test_results_on_two_axes(case):
     """A bin of another place, not one of another rounding."""
     x, y = case.tensors()

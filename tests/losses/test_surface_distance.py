@@ -6,6 +6,7 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.sweeps import together
 from torchtransient.errors import DeviceError, ShapeError, UnitError
 from torchtransient.losses.surface_distance import point_triangle_distance
 
@@ -52,8 +53,8 @@ TRIANGLE, FACES = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), torch.tenso
 LIFT = torch.tensor([0.0, 0.0, 0.01])
 
 
-@pytest.mark.parametrize("unit", [1e-30, 1e-19, 1e-12, 1e-9, 1e-7, 1e-6, 1.0, 1e6, 1e19, 1e30])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@together("unit", [1e-30, 1e-19, 1e-12, 1e-9, 1e-7, 1e-6, 1.0, 1e6, 1e19, 1e30])
+@together("dtype", [torch.float32, torch.float64])
 def test_any_unit(unit, dtype):
     """Squares, areas and normals of small things are no smaller than those of large ones."""
     low, high = (unit * t.to(dtype) for t in (TRIANGLE, TRIANGLE + LIFT))

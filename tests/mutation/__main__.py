@@ -1,4 +1,5 @@
-"""Sixty changes of a room's sources, one after the other, and whether its default tests notice.
+"""Sixty changes of a room's sources, one after the other, and whether its tests notice: the default ones, then the slow
+ones that execute what has changed.
 
     make mutants ROOM=losses SEED=1        (or, from tests/: python -m mutation losses 1 [--count 60])
 
@@ -10,8 +11,10 @@ written since. Not a part of the tests: a room takes minutes to hours.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import ctypes
 import difflib
+import functools
 import json
 import os
 import re
@@ -20,7 +23,7 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -37,6 +40,9 @@ FIRST = 4  # test files
 # Tests that do not execute a line notice its change by what others have left in a cache, or in another process. Files
 # of so many seconds are asked: what only longer ones would notice counts as not noticed.
 OTHERS_SECONDS = 90.0
+# In place of the default tests; those that need something else are nobody's.
+SLOW = ("-m", "slow and not soak and not gpu and not peer and not measured")
+HAS_SLOW = re.compile(r"\bslow\b|support\.marks")
 ADOPTS_ORPHANS = 36  # PR_SET_CHILD_SUBREAPER
 
 
@@ -76,12 +82,14 @@ def end_children() -> None:
             os.waitpid(child, 0)
 
 
-def run_tests(folder: Path, tests: list[str], seconds: float, plugin: object = None) -> tuple[str, str]:
-    """('caught', what noticed) or ('survived', ''), from test files in a copy."""
+def run_tests(
+    folder: Path, tests: list[str], seconds: float, plugin: object = None, marked: tuple[str, ...] = ()
+) -> tuple[str, str]:
+    """('caught', what noticed) or ('survived', ''), from test files in a copy: default tests, or those ``marked``."""
     output = folder / "output.txt"
     process = os.fork()
     if process == 0:
-        _be_tested(folder, tests, output, plugin)
+        _be_tested(folder, [*marked, *tests], output, plugin)
     until = time.monotonic() + seconds
     while (ended := os.waitpid(process, os.WNOHANG)) == (0, 0):
         if time.monotonic() > until:
@@ -162,6 +170,15 @@ def rounds(
     yield others, executed.Chosen(without=set().union(*asked.values())), OTHERS_SECONDS - left
 
 
+def slow_round(
+    folder: Path, known: executed.Executed, change: changes.Change, source: bytes
+) -> tuple[list[str], executed.Chosen, float]:
+    """The slow tests that execute a changed line, as :func:`rounds` says it."""
+    asked = known.tests(change.path, executed.range_of(source, change.line))
+    seconds = sum(known.files[name].tests[test] for name, tests in asked.items() for test in tests)
+    return ordered(folder, known, asked, change), executed.Chosen(only=set().union(*asked.values())), seconds
+
+
 def difference(source: bytes, changed: bytes, path: str) -> str:
     """The lines of a change, without those around it."""
     before, after = source.decode().splitlines(), changed.decode().splitlines()
@@ -169,32 +186,45 @@ def difference(source: bytes, changed: bytes, path: str) -> str:
     return "\n".join(line for line in lines if not line.startswith("@@"))
 
 
-def try_change(folder: Path, known: executed.Executed, change: changes.Change) -> dict[str, object]:
-    """The outcome of one change; the copy is as it was afterwards."""
+@contextlib.contextmanager
+def made(folder: Path, change: changes.Change) -> Iterator[None]:
+    """A change of the copy, which is as it was afterwards."""
     target = folder / change.path
     source = target.read_bytes()
-    changed = change.apply(source)
+    # Compiled files are told apart by their second and size, which a change may leave as they were.
+    compiled = target.parent / "__pycache__" / f"{target.stem}.{sys.implementation.cache_tag}.pyc"
+    try:
+        target.write_bytes(change.apply(source))
+        compiled.unlink(missing_ok=True)
+        yield
+    finally:
+        target.write_bytes(source)
+        compiled.unlink(missing_ok=True)
+
+
+def try_change(
+    folder: Path, known: executed.Executed, change: changes.Change, slow: Callable[[], executed.Executed]
+) -> dict[str, object]:
+    """The outcome of one change; ``slow`` says which slow tests execute what, once a change is not noticed."""
+    source = (folder / change.path).read_bytes()
     outcome, by, tests = "survived", "", 0
     begun = time.monotonic()
-    # Compiled files are told apart by their second and size, which a change may leave as they were.
-    compiled = [target.parent / "__pycache__" / f"{target.stem}.{sys.implementation.cache_tag}.pyc"]
-    try:
-        target.write_bytes(changed)
-        for path in compiled:
-            path.unlink(missing_ok=True)
+    with made(folder, change):
         # Most changes are noticed by the tests that speak of them: the others are not even collected.
         for names, chosen, expected in rounds(folder, known, change, source):
             if names and outcome == "survived":
                 tests += len(names)
                 outcome, by = run_tests(folder, names, LEAST_SECONDS + PATIENCE * expected, chosen)
-    finally:
-        target.write_bytes(source)
-        for path in compiled:
-            path.unlink(missing_ok=True)
+    if outcome == "survived":
+        names, chosen, expected = slow_round(folder, slow(), change, source)
+        with made(folder, change):
+            if names:
+                tests += len(names)
+                outcome, by = run_tests(folder, names, LEAST_SECONDS + PATIENCE * expected, chosen, SLOW)
     return {
         "outcome": outcome, "by": by, "operator": change.operator, "path": change.path, "line": change.line,
         "seconds": round(time.monotonic() - begun, 1), "files": tests,
-        "diff": difference(source, changed, change.path),
+        "diff": difference(source, change.apply(source), change.path),
     }  # fmt: skip
 
 
@@ -235,6 +265,13 @@ def main() -> None:
         tests = [path.relative_to(folder).as_posix() for path in room.test_files(folder)]
         known = executed.measured(folder, tests, record.with_name(f"{arguments.room}-executed.json"),
                                   lambda test, data: _seconds_unchanged(folder, test, data))  # fmt: skip
+
+        @functools.cache
+        def slow() -> executed.Executed:
+            some = [test for test in tests if HAS_SLOW.search((folder / test).read_text(encoding="utf-8"))]
+            return executed.measured(folder, some, record.with_name(f"{arguments.room}-executed-slow.json"),
+                                     lambda test, data: _seconds_unchanged(folder, test, data, SLOW))  # fmt: skip
+
         chosen = changes.drawn(folder, room.files(folder), arguments.seed)
         chosen = [change for change, _ in zip(chosen, range(arguments.count), strict=False)]
         if arguments.again:
@@ -243,7 +280,7 @@ def main() -> None:
                                                                                path.read_bytes())]  # fmt: skip
             chosen, results = [c for c in every if (c.path, _of(folder, c)) in left], []
         for number, change in enumerate(chosen[len(results) :], start=len(results) + 1):
-            result = try_change(folder, known, change)
+            result = try_change(folder, known, change, slow)
             results.append(result)
             if not arguments.again:
                 with record.open("a", encoding="utf-8") as file:
@@ -253,9 +290,9 @@ def main() -> None:
     tell(results)
 
 
-def _seconds_unchanged(folder: Path, test: str, data: Path) -> float:
+def _seconds_unchanged(folder: Path, test: str, data: Path, marked: tuple[str, ...] = ()) -> float:
     begun = time.monotonic()
-    outcome, by = run_tests(folder, [test], 3600.0, data)
+    outcome, by = run_tests(folder, [test], 3600.0, data, marked)
     if outcome != "survived":
         sys.exit(f"mutation: the tests have to pass before anything is changed, failed: {by}.")
     return time.monotonic() - begun

@@ -14,6 +14,7 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.marks import long, long_pairs
 from torchtransient import sensing
 from torchtransient.errors import (
     ArgumentError,
@@ -266,12 +267,17 @@ def test_checks_of_sensors_draw_nothing():
 # ------------------------------------------------------------------------------------------------------- without light
 
 
-@pytest.mark.parametrize("tiles", [1, 3])
+DARK = {
+    "confocal": ("confocal", {}), "exhaustive": ("exhaustive", {}),
+    "phasors": ("exhaustive", {"frequencies": [1.0], "time_axis": None}),
+}  # fmt: skip
+
+
 @pytest.mark.parametrize(
-    ("kind", "settings"),
-    [("confocal", {}), ("exhaustive", {}), ("exhaustive", {"frequencies": [1.0], "time_axis": None})],
+    ("dark", "tiles"), long_pairs(DARK, [1, 3], [("confocal", 3), ("exhaustive", 1), ("phasors", 1)])
 )
-def test_captures_without_light_are_said_once(tiles, kind, settings):
+def test_captures_without_light_are_said_once(dark, tiles):
+    kind, settings = DARK[dark]
     found = physics_of(lambda: simulated(AWAY, of=scan(kind), tiles=tiles, **settings))
     assert len(found) == 1 and found[0].startswith("simulate: no light comes back from the hidden things")
     assert ("within the bins" in found[0]) == (kind == "exhaustive" and not settings)
@@ -309,7 +315,7 @@ def test_layers_without_light_say_it_once():
 # ------------------------------------------------------------------------------------------------------------ variants
 
 
-@pytest.mark.parametrize("bounces", [(3, 4, 5), (3, 4, 5, 6, 7, 8), "all"])
+@pytest.mark.parametrize("bounces", long([(3, 4, 5), (3, 4, 5, 6, 7, 8), "all"], [(3, 4, 5)]))
 def test_a_layer_after_another_variant(bounces):
     """What was made for one variant renders and differentiates when classes were made for another in between."""
     layer = renderer(["letter.bsdf.reflectance.value"], bounces=bounces)

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.sweeps import together
 from torchtransient import scenes
 from torchtransient.errors import TorchTransientError
 
@@ -92,7 +93,7 @@ FUNCTIONS = {
 CASES = [(name, argument) for name, (_, _, arguments) in FUNCTIONS.items() for argument in arguments.split()]
 
 
-@pytest.mark.parametrize(("name", "argument"), CASES)
+@together("name, argument", CASES)
 def test_only_errors_of_this_library(name, argument):
     function, right, _ = FUNCTIONS[name]
     messages = []

@@ -6,6 +6,8 @@ import json
 import numpy as np
 import pytest
 
+from support.marks import long
+from support.sweeps import together
 from torchtransient import scenes
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Scan, Wall
@@ -150,8 +152,8 @@ DEVICE = {"name": "d", "description": "a detector", "sources": [], "stages": [{"
 MESH = {"vertices": [[0, 0, 1], [1, 0, 1], [0, 1, 1]], "faces": [[0, 2, 1]]}
 
 
-@pytest.mark.parametrize(
-    ("entries", "error", "message"),
+@together(
+    "entries, error, message",
     [
         ({"samples": 3}, SceneError, "unknown entry 'samples'"),
         ({"hidden": None}, SceneError, "an entry 'hidden'"),
@@ -288,7 +290,10 @@ def _wrong_entries(value):
     yield from ({"sensor": DEVICE | {key: value}} for key in DEVICE)
 
 
-@pytest.mark.parametrize("value", VALUES, ids=lambda value: repr(value)[:20])
+QUICK = (None, -1, 10**400, "x", [30], ["x", "y", "z"], [[0, 1, 0], 30], {"type": 3})
+
+
+@pytest.mark.parametrize("value", long(VALUES, QUICK), ids=lambda value: repr(value)[:20])
 def test_entries_of_any_kind_are_read_or_refused(value):
     """Nothing but errors of this library, whatever stands where."""
     for entries in _wrong_entries(value):

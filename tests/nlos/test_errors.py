@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import torchtransient as tt
+from support.sweeps import together
 from torchtransient.errors import (
     ArgumentError,
     SceneError,
@@ -225,7 +226,7 @@ CASES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", CASES)
+@together("case", CASES)
 def test_what_cannot_be_captured(case):
     made, kind, message = CASES[case]
     with pytest.raises(TorchTransientError, match=message) as caught:

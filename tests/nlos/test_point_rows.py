@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import torch
 
+from support.sweeps import together
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
 from torchtransient.nlos.point_rows import RowLayout
@@ -18,10 +18,10 @@ SCANS = {
 }
 
 
-@pytest.mark.parametrize("kind", list(SCANS))
-@pytest.mark.parametrize("front", [(1,), (3,), (4, 1)])
-@pytest.mark.parametrize("phasor", [False, True])
-@pytest.mark.parametrize("steady", [False, True])
+@together("kind", list(SCANS))
+@together("front", [(1,), (3,), (4, 1)])
+@together("phasor", [False, True])
+@together("steady", [False, True])
 def test_there_and_back(kind, front, phasor, steady):
     scan, generator = SCANS[kind], torch.Generator().manual_seed(0)
     polarized = len(front) == 2

@@ -216,6 +216,7 @@ def test_a_cut_capture_goes_into_an_operator_of_its_bins():
         operator.reconstruct(capture.crop(0.6, 2.6))
 
 
+@pytest.mark.slow
 def test_the_page(tmp_path, monkeypatch):
     """Its blocks run, its command reads what they wrote, its links lead somewhere."""
     monkeypatch.chdir(tmp_path)

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.sweeps import together
 from torchtransient.errors import ShapeError, StorageError, TorchTransientError, UnitError
 from torchtransient.nlos import volume_memory
 from torchtransient.nlos.volume_memory import least_bytes
@@ -54,7 +55,7 @@ def made(name, scan, axis, depths=(0.3, 0.4), pulse=0.4):
 
 
 @every
-@pytest.mark.parametrize("wrong", SIZES)
+@together("wrong", SIZES)
 def test_units_that_are_off_are_told(name, wrong):
     side, axis = SIZES[wrong]
     with pytest.raises(UnitError, match=r"metres|first bin begin"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 
@@ -10,6 +11,7 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.marks import long, long_pairs, long_rows
 from torchtransient.errors import ArgumentError, PhysicsWarning, SceneError, StorageError
 from torchtransient.nlos import work
 from torchtransient.nlos.setup_files import tal_bounces
@@ -54,7 +56,7 @@ def complete(kind="confocal", **settings):
 # ------------------------------------------------------------------------------------------------------- closed forms
 
 
-@pytest.mark.parametrize("tiles", [1, 3])
+@pytest.mark.parametrize("tiles", long([1, 3], [1]))
 def test_a_plane_in_closed_form(tiles):
     """All light of a plane without end is rho_wall^2 rho / (3 pi^2 z^2); beyond 6 m there are 2e-5 of it."""
     plane = {"type": "rectangle", "to_world": tt.scenes.transforms.translate([0, 0, 1.0])
@@ -70,8 +72,13 @@ def test_a_plane_in_closed_form(tiles):
 # --------------------------------------------------------------------------------------------------------- in parts
 
 
-@pytest.mark.parametrize("kind", ["single", "confocal", "exhaustive"])
-@pytest.mark.parametrize("film", [{}, {"frequencies": FREQUENCIES}], ids=["bins", "phasors"])
+@pytest.mark.parametrize(
+    ("film", "kind"),
+    long_rows(
+        itertools.product([{}, {"frequencies": FREQUENCIES}], ["single", "confocal", "exhaustive"]),
+        [({}, "confocal"), ({"frequencies": FREQUENCIES}, "exhaustive")],
+    ),
+)
 def test_parts_in_a_file_and_without(tmp_path, kind, film):
     path = tmp_path / "a.part"
     kept = simulated(of=scan(kind), part=path, tiles=4, **film)
@@ -103,8 +110,13 @@ def test_parts_and_the_whole_have_the_same_mean():
     assert float(a.mean(0).max() / a.mean(0).min()) > 1.05  # points differ
 
 
-@pytest.mark.parametrize("of", ["hidden things", "a complete scene"])
-@pytest.mark.parametrize("stops_at", [0, 1, 3])
+@pytest.mark.parametrize(
+    ("stops_at", "of"),
+    long_pairs(
+        [0, 1, 3], ["hidden things", "a complete scene"],
+        [(0, "hidden things"), (1, "a complete scene"), (3, "hidden things")],
+    ),
+)  # fmt: skip
 def test_a_simulation_that_was_stopped_goes_on(tmp_path, monkeypatch, of, stops_at):
     settings = {"part": tmp_path / "a.part", "tiles": 4, "progress": False, "spp": 10, "seed": 3}
     given = (complete(),) if of == "a complete scene" else (tt.scenes.nlos_z(), scan(size=(4, 2)))

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.sweeps import together
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Wall
 from torchtransient.errors import SceneError, StorageError
@@ -221,8 +222,8 @@ def test_custom_materials(experiment):
     }  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
+@together(
+    "old, new, message",
     [
         ("num_bins: 320", "num_bin: 320", "unknown entry 'num_bin'. Did you mean 'num_bins'"),
         ("num_bins: 320", "num_bins: many", "num_bins: expected a finite number, got 'many'"),

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import re
 
-import pytest
-
 from support.pages import ROOT, Page, all_pages, page_of
+from support.sweeps import together
 
 PAGES = all_pages()
 README, INDEX = Page("README.md"), Page("docs/index.md")
 
 
-@pytest.mark.parametrize("page", PAGES, ids=repr)
+@together("page", PAGES, repr)
 def test_links_lead_somewhere(page):
     for link, (path, anchor) in page.targets().items():
         assert path.exists(), f"{page}: {link}"
@@ -42,7 +41,7 @@ def test_the_readme_is_short():
     assert README.path.stat().st_size <= 10_000
 
 
-@pytest.mark.parametrize("page", PAGES, ids=repr)
+@together("page", PAGES, repr)
 def test_scripts_that_are_named_exist(page):
     for script in set(re.findall(r"\b((?:benchmarks|docs|training_examples)/\w+\.py)", page.text)):
         assert (ROOT / script).is_file(), f"{page}: {script}"

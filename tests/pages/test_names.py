@@ -9,6 +9,7 @@ import pytest
 
 from support.pages import ROOT, Page, all_pages
 from support.recipes import recipes
+from support.sweeps import together
 
 # Pages name files by their place below whatever folder they speak of.
 FILES = [path.relative_to(ROOT).as_posix() for top in ROOT.iterdir() if not top.name.startswith(".") and top.is_dir()
@@ -24,7 +25,7 @@ def dotted_names(text):
     return sorted({name for name in names if not name.endswith((".py", ".md"))})
 
 
-@pytest.mark.parametrize("page", PAGES, ids=repr)
+@together("page", PAGES, repr)
 def test_names_are_there(page):
     gone = []
     for name in set(dotted_names(page.text)) - MODULES:
@@ -35,7 +36,7 @@ def test_names_are_there(page):
     assert gone == []
 
 
-@pytest.mark.parametrize("page", PAGES, ids=repr)
+@together("page", PAGES, repr)
 def test_files_are_there(page):
     named = set(re.findall(r"`((?:\w+/)+[\w]+\.(?:py|sh|md|json))`", page.text))
     assert sorted(file for file in named if not any(f"/{path}".endswith(f"/{file}") for path in [*FILES, *MADE])) == []

@@ -12,6 +12,7 @@ import torch
 import torchtransient as tt
 from support.capture_files import grids, made
 from support.pages import NOT_RUN, ROOT, Page, all_pages
+from support.sweeps import together
 from torchtransient.files.captures.mat_file import write_mat
 
 VARIANT = "llvm_ad_rgb"
@@ -52,6 +53,7 @@ def test_readme(folder, capsys):
     assert green < 0.38
 
 
+@pytest.mark.slow
 def test_first_render(folder):
     found = Page("docs/first_render.md").names({**SMALL, r"range\(20\)": "range(2)"})
     assert (folder / "light.gif").stat().st_size > 500 and (folder / "peak.png").stat().st_size > 500
@@ -131,7 +133,7 @@ def test_blocks_that_are_not_run_say_why():
                 assert len(block.splitlines()[0].removeprefix(NOT_RUN)) > 10, f"{page}: say why it is not run"
 
 
-@pytest.mark.parametrize("page", all_pages(), ids=repr)
+@together("page", all_pages(), repr)
 def test_fences_are_closed(page):
     """A block in another spelling (``py``, indented) would be run by nobody."""
     fences = re.findall(r"^( *)(```+)(\w*)", page.text, flags=re.MULTILINE)

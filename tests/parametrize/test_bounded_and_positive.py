@@ -13,8 +13,8 @@ from torchtransient.errors import ShapeError, UnitError
 from torchtransient.parametrize import bounded, bounded_inverse, positive, positive_inverse, simplex_inverse
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.float16, torch.bfloat16])
-@pytest.mark.parametrize("low, high", [(0.0, 1.0), (0.1, 0.3), (1e-4, 1.0), (-0.99, 0.99), (1.0, 4.0), (-7.0, -3.0)])
+@together("dtype", [torch.float32, torch.float64, torch.float16, torch.bfloat16])
+@together("low, high", [(0.0, 1.0), (0.1, 0.3), (1e-4, 1.0), (-0.99, 0.99), (1.0, 4.0), (-7.0, -3.0)])
 def test_never_beyond_its_bounds(dtype, low, high):
     x = torch.cat([torch.linspace(-60, 60, 2401), torch.tensor([-1e4, 1e4, -math.inf, math.inf])]).to(dtype)
     value = bounded(x, low, high)
@@ -50,8 +50,8 @@ def test_the_ends_need_a_margin(value):
     assert moved[1].item() == pytest.approx(0.01 if value[1] < 0.5 else 0.99, rel=1e-5)
 
 
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
-@pytest.mark.parametrize("low, high", [(0.0, 1.0), (1.0, 4.0), (-0.99, 0.99), (-7.0, -3.0), (1e-4, 1.0), (0.0, 500.0)])
+@together("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
+@together("low, high", [(0.0, 1.0), (1.0, 4.0), (-0.99, 0.99), (-7.0, -3.0), (1e-4, 1.0), (0.0, 500.0)])
 @together("margin", [1e-30, 1e-8, 1e-4, 1e-3, 0.1])
 def test_a_margin_below_the_rounding(dtype, margin, low, high):
     """No nearer than the dtype tells from the bound, and at most as far as two of its steps, or the margin."""

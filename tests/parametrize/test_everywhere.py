@@ -133,9 +133,12 @@ def test_bounds_under_vmap_and_their_gradient():
 @pytest.mark.parametrize(
     "function",
     [
-        lambda x: parametrize.bounded(x, 0.0, 2.0), lambda x: parametrize.bounded(x, x.detach() - 1, 2.0),
-        lambda x: parametrize.positive(x), parametrize.Albedo(), parametrize.Positive(), parametrize.Simplex(),
-        parametrize.PositiveSpectrum(WAVELENGTHS, 6), lambda x: geometry.distance_from_opl(x[None]),
+        lambda x: parametrize.bounded(x, x.detach() - 1, 2.0), parametrize.Albedo(),
+        lambda x: geometry.distance_from_opl(x[None]),
+        *(pytest.param(function, marks=pytest.mark.slow) for function in (
+            lambda x: parametrize.bounded(x, 0.0, 2.0), lambda x: parametrize.positive(x), parametrize.Positive(),
+            parametrize.Simplex(), parametrize.PositiveSpectrum(WAVELENGTHS, 6),
+        )),
     ],
 )  # fmt: skip
 def test_compiled_in_one_graph(function):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from support.sweeps import together
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.parametrize import (
     AxisAnglePose,
@@ -72,8 +73,8 @@ def test_there_and_back_with_derivatives(angle, there, back):
 
 
 @BOTH
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("axis", [[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [0.6, -0.8, 0], [-1 / 3, 2 / 3, -2 / 3]])
+@together("dtype", [torch.float32, torch.float64])
+@together("axis", [[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [0.6, -0.8, 0], [-1 / 3, 2 / 3, -2 / 3]])
 def test_half_a_turn(there, back, dtype, axis):
     x = torch.tensor([*(math.pi * a for a in axis), *SHIFT], dtype=dtype)
     pose = there(x)
@@ -130,8 +131,8 @@ def test_batches_of_bases():
         AxisAnglePose(bases).right_inverse(torch.eye(4).expand(3, 4, 4))
 
 
-@pytest.mark.parametrize("function", [axis_angle_from_pose, twist_from_pose, AxisAnglePose().right_inverse])
-@pytest.mark.parametrize(
+@together("function", [axis_angle_from_pose, twist_from_pose, AxisAnglePose().right_inverse])
+@together(
     "matrix",
     [
         scale(1.1), scale([1.0, 1.0, -1.0]), np.full((4, 4), np.nan), scale([1, 2, 1]), np.diag([1.0, 1.0, 1.0, 2.0]),

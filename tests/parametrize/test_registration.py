@@ -11,6 +11,7 @@ from torch import nn
 from torch.nn.utils import parametrizations as torchs_own
 from torch.nn.utils import parametrize as torch_parametrize
 
+from support.sweeps import together
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, TorchTransientError, UnknownKeyError
 from torchtransient.parametrize import (
     Albedo,
@@ -39,8 +40,8 @@ class Weights(nn.Module):
         self.register_buffer("known", torch.tensor(value))
 
 
-@pytest.mark.parametrize(("first", "value"), KINDS, ids=repr)
-@pytest.mark.parametrize("second", [kind for kind, _ in KINDS], ids=repr)
+@together("first, value", KINDS, repr)
+@together("second", [kind for kind, _ in KINDS], repr)
 def test_a_second_one_keeps_the_value_or_is_refused(first, second, value):
     module = register(Weights(value), "w", copy.deepcopy(first))
     before, numbers = module.w.detach().clone(), original(module, "w").detach().clone()

@@ -10,6 +10,7 @@ import torch
 from torch import nn
 
 import torchtransient as tt
+from support.sweeps import together
 from torchtransient.errors import SceneError, ShapeError
 from torchtransient.parametrize import (
     Albedo,
@@ -68,7 +69,7 @@ def pair(name):
 
 
 @ALL
-@pytest.mark.parametrize("assign", [False, True])
+@together("assign", [False, True])
 def test_the_value_is_that_of_the_state(name, assign):
     saved, other = pair(name)
     assert not torch.allclose(saved(), other(), rtol=1e-3)
@@ -90,7 +91,7 @@ def test_checkpoints(name, tmp_path):
 
 
 @ALL
-@pytest.mark.parametrize("to_half", [nn.Module.half, nn.Module.bfloat16], ids=["half", "bfloat16"])
+@together("to_half", [nn.Module.half, nn.Module.bfloat16])
 def test_settings_survive_half_precision(name, to_half):
     """Numbers behind are rounded, settings are not: they come back in double precision."""
     kind, _, _ = PAIRS[name]

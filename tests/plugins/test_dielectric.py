@@ -125,7 +125,7 @@ def test_smooth_equals_mitsuba(variant):
         )
 
 
-@pytest.mark.parametrize("variant", long(VARIANTS, ["llvm_ad_mono_polarized", "scalar_rgb"]))
+@pytest.mark.parametrize("variant", long(VARIANTS, ["llvm_ad_mono_polarized"]))
 def test_rough_equals_mitsuba(variant):
     activate(variant)
     for (material, roughness), ctx in product(zip(MATERIALS, ROUGHNESSES, strict=True), contexts()):

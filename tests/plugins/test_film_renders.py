@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from support.marks import long
 from torchtransient import plugins
 from torchtransient.errors import SceneError, StorageError
 from torchtransient.testing.statistics import two_sample_z_test
@@ -92,7 +93,9 @@ def test_crop_is_that_of_mitsuba():
     check(steady, steady_runs(glowing_wall(film("hdrfilm", **CROP), "path")))
 
 
-@pytest.mark.parametrize("rfilter", ["gaussian", "tent", "mitchell", "catmullrom", "lanczos"])
+@pytest.mark.parametrize(
+    "rfilter", long(["gaussian", "tent", "mitchell", "catmullrom", "lanczos"], ["gaussian", "mitchell"])
+)
 def test_spatial_filters_converge_to_splatting(rfilter):
     steady, transient = runs(glowing_wall(film(rfilter=rfilter)), 8, 1024)
     # splatting divides by the sum of the weights: a bias of order 1 / spp, a tenth of the noise here

@@ -15,6 +15,7 @@ from support.gradient_cases.cases_metals import slanted
 from support.gradient_cases.scenes import mirror_room, room
 from support.marks import long_pairs
 from support.surface_samples import activate, directions, interaction
+from support.sweeps import together
 from torchtransient.errors import GradientError
 from torchtransient.plugins.mitsuba_compat import METALS, loses_slope_of_metal
 
@@ -220,7 +221,7 @@ def test_ranges_of_textures():
         assert tracker.effect_of(node, "data", flags).stand_in_needed == needed
 
 
-@pytest.mark.parametrize(("slot", "eta", "k", "lost"), [
+@together("slot, eta, k, lost", [
     # Where the other number is zero, the slope truly is.
     ("eta", (0.0, 0.0), (2.0, 2.0), True), ("eta", (0.5, 0.5), (0.0, 0.0), False), ("k", (0.0, 0.0), (2.0, 2.0), False),
     ("k", (0.5, 0.5), (0.0, 0.0), True), ("k", (1.0, 1.0), (0.0, 0.0), False), ("k", (1.5, 1.5), (0.0, 0.0), False),

@@ -10,7 +10,6 @@ import torch
 
 import torchtransient as tt
 from support.gradient_cases.scenes import area_light, room
-from support.marks import long
 from torchtransient.errors import GradientError
 from torchtransient.plugins.black_textures import ALMOST_BLACK
 from torchtransient.plugins.parameters import ParameterTracker, attached_effects
@@ -180,7 +179,8 @@ def test_black_inside_a_normal_map_is_refused(source):
 # -------------------------------------------------------------------------------------------------- against differences
 
 
-@pytest.mark.parametrize("around", long(["", "normalmap"], [""]))
+@pytest.mark.slow
+@pytest.mark.parametrize("around", ["", "normalmap"])
 def test_slope_where_a_lobe_vanishes(around):
     """The plugin is exchanged for what its texture reads off the shape, and numbers that are zero are lifted."""
     paint = {"type": "principled", "roughness": 0.5, "base_color": 0.7, "spec_trans": READER}

@@ -12,6 +12,7 @@ import torchtransient as tt
 from support.gradient_cases.scenes import area_light, camera, glass_slab, room
 from support.marks import long
 from support.surface_samples import start
+from support.sweeps import together
 from torchtransient.errors import GradientError
 
 TWINS = {"principled": "diff_principled", "principledthin": "diff_principled_thin"}
@@ -57,8 +58,8 @@ def interactions(count):
     return si, rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
 
 
-@pytest.mark.parametrize(("kind", "settings"), SETTINGS)
-@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized"])
+@together("kind, settings", SETTINGS)
+@together("variant", ["llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized"])
 def test_values_densities_and_samples_are_those_of_mitsuba(kind, settings, variant):
     theirs, ours = (mi.load_dict({"type": name, **settings}) for name in (kind, TWINS[kind]))
     assert [theirs.flags(i) for i in range(theirs.component_count())] == [

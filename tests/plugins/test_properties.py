@@ -10,6 +10,7 @@ import mitsuba as mi
 import pytest
 
 import torchtransient
+from support.sweeps import together
 from torchtransient import plugins
 from torchtransient.errors import SceneError
 from torchtransient.plugins.properties import number, truth, whole_number
@@ -39,8 +40,8 @@ def _variant():
     plugins.sync()
 
 
-@pytest.mark.parametrize(("plugin", "name", "more"), NUMBERS)
-@pytest.mark.parametrize("wrong", [TEXTURE, "wide", True, float("nan"), float("inf"), [0.1, 0.2, 0.3]], ids=repr)
+@together("plugin, name, more", NUMBERS)
+@together("wrong", [TEXTURE, "wide", True, float("nan"), float("inf"), [0.1, 0.2, 0.3]], repr)
 def test_what_is_no_number_is_refused(plugin, name, more, wrong):
     words = rf"{name}: expected a (finite )?number, got"
     if wrong is TEXTURE and "film" in plugin:

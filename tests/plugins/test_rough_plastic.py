@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
 from support.gradient_cases.scenes import area_light, room
+from support.marks import long_rows
 from torchtransient import plugins
 from torchtransient.errors import GradientError
 from torchtransient.plugins.bsdfs import rough_coating
@@ -134,8 +137,13 @@ def test_the_derivative_of_mitsubas_own_is_refused(key):
     params.update()
 
 
-@pytest.mark.parametrize("ggx", [False, True])
-@pytest.mark.parametrize("table", [external_transmittance, internal_reflectance])
+@pytest.mark.parametrize(
+    ("table", "ggx"),
+    long_rows(
+        itertools.product([external_transmittance, internal_reflectance], [False, True]),
+        [(external_transmittance, False), (internal_reflectance, True)],
+    ),
+)
 def test_slopes_at_an_index_of_exactly_one(table, ggx):
     """An optimizer may come to it: they lie between those of indices that are nearer to one and farther from it."""
     for alpha in (0.02, 0.3):

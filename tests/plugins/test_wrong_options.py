@@ -8,6 +8,7 @@ import torch
 
 import torchtransient as tt
 from support.option_cases import OPTIONS, VALUES, cases, with_option
+from support.sweeps import together
 from torchtransient.errors import SceneError
 from torchtransient.testing.small_room import VARIANT, make_room
 
@@ -57,7 +58,7 @@ def render(description):
     return tt.TransientRenderer(tt.load(description, variant=VARIANT), **axis)(seed=0)
 
 
-@pytest.mark.parametrize(("plugin", "option", "value"), DIED)
+@together("plugin, option, value", DIED)
 def test_wrong_value_is_an_error_of_one_sentence(plugin, option, value):
     with pytest.raises(SceneError, match=r"expected|range|Mitsuba could not build") as failure:
         render(with_option(*case(plugin, option), option, VALUES[value]))

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from support.scan_operators import AXIS, DEPTHS, SCANS, WALL, bent_scan, listed_scan, points_anywhere
+from support.sweeps import together
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
@@ -166,8 +167,8 @@ def pulse_at(pulse, lengths, width):
     return torch.polar(height, 2 * math.pi * lengths / pulse.wavelength)
 
 
-@pytest.mark.parametrize("wavelength, cycles", [(0.02, 4.0), (0.16, 40.0), (1.0, 4.0), (0.08, 20.0), (30.0, 0.5)])
-@pytest.mark.parametrize("samples", [1, 2, 3, 8])
+@together("wavelength, cycles", [(0.02, 4.0), (0.16, 40.0), (1.0, 4.0), (0.08, 20.0), (30.0, 0.5)])
+@together("samples", [1, 2, 3, 8])
 def test_rows_are_convolved_with_the_whole_pulse_and_do_not_wrap(wavelength, cycles, samples):
     pulse, width, bins = PhasorFilter(wavelength, cycles), 0.01, 45
     rows = torch.randn(2, bins, dtype=F64, generator=torch.Generator().manual_seed(0))

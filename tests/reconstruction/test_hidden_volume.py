@@ -10,6 +10,7 @@ from torch.utils import _pytree
 from torch.utils.data import DataLoader
 
 import torchtransient as tt
+from support.sweeps import together
 from torchtransient.errors import ArgumentError, ShapeError, StorageError, UnitError
 
 N = tt.nlos
@@ -118,7 +119,7 @@ def test_pictures_are_sums_over_channels_and_the_highest_of_a_film():
     assert "times=4 of them" in repr(N.HiddenVolume(film, grid, "phasor_field", times=times))
 
 
-@pytest.mark.parametrize("change, error, words", [
+@together("change, error, words", [
     ({"grid": None}, ArgumentError, "expected grid as a VoxelGrid, got None"),
     ({"method": 3}, ArgumentError, "expected method as a name, got 3"),
     ({"method": "f\0k"}, ArgumentError, "expected method as a name"),

@@ -13,6 +13,7 @@ import torch
 
 import torchtransient.reconstruction as room
 from support import grid_operators, scan_operators
+from support.marks import long
 from support.sweeps import together
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
@@ -35,6 +36,9 @@ from torchtransient.reconstruction import (
 ON_GRIDS, ANYWHERE = grid_operators.operators(), scan_operators.operators()
 OPERATORS = ON_GRIDS | ANYWHERE
 every = together("name", OPERATORS)
+# Scans of pairs, lists and first and last legs take the code of single and confocal ones.
+SOME = [name for name in OPERATORS if not any(word in name for word in ("legs", "exhaustive", "lists", "finer"))]
+some, others = together("name", SOME), together("name", [name for name in OPERATORS if name not in SOME])
 on_grids = together("name", ON_GRIDS)
 with_pictures = together("name", [name for name in OPERATORS if hasattr(OPERATORS[name], "reconstruct")])
 CLASSES = [
@@ -88,21 +92,51 @@ def test_adjoint_is_exact(name):
     assert abs(forward - backward) < 1e-10 * abs(forward)
 
 
-@every
-@together("way", ["forward", "adjoint"])
-def test_derivatives_of_first_and_second_order_in_both_modes(name, way):
+def with_operand(name, way):
+    """A method of an operator, what it takes, and the method of small operands: inverses are steep, and rounding stays
+    below the checks' tolerance.
+    """
     operator = OPERATORS[name]
     function = getattr(operator, way)
     x = (volume_of if way == "forward" else data_of)(operator)
-    # Inverses are steep: small operands keep rounding below the checks' tolerance.
     scale = 1 / float(function(x).abs().max())
-    scaled = as_real(lambda v: function(scale * v))
+    return operator, function, x, as_real(lambda v: function(scale * v))
+
+
+def has_its_derivatives(name, way):
+    operator, function, x, scaled = with_operand(name, way)
     assert torch.autograd.gradcheck(scaled, x.clone().requires_grad_(), check_forward_ad=True, fast_mode=True)
-    assert torch.autograd.gradgradcheck(scaled, x.clone().requires_grad_(), fast_mode=True)
     direction = (volume_of if way == "forward" else data_of)(operator, seed=5)
     value, tangent = torch.func.jvp(function, (x,), (direction,))
     torch.testing.assert_close(value, function(x), rtol=0, atol=0)
     torch.testing.assert_close(tangent, function(direction), rtol=0, atol=0)
+
+
+@some
+@together("way", ["forward", "adjoint"])
+def test_derivatives_in_both_modes(name, way):
+    has_its_derivatives(name, way)
+
+
+@pytest.mark.slow
+@others
+@together("way", ["forward", "adjoint"])
+def test_derivatives_of_the_others_in_both_modes(name, way):
+    has_its_derivatives(name, way)
+
+
+@pytest.mark.slow
+@every
+@together("way", ["forward", "adjoint"])
+def test_derivatives_of_second_order(name, way):
+    _, _, x, scaled = with_operand(name, way)
+    assert torch.autograd.gradgradcheck(scaled, x.clone().requires_grad_(), fast_mode=True)
+
+
+@pytest.mark.parametrize("name", ["fk", "inverse of lct", "phasor field, single"])
+def test_derivatives_of_second_order_of_some(name):
+    _, _, x, scaled = with_operand(name, "forward")
+    assert torch.autograd.gradgradcheck(scaled, x.clone().requires_grad_(), fast_mode=True)
 
 
 @every
@@ -201,8 +235,7 @@ def test_wrong_operands_are_refused(name):
         operator(volume_of(operator).to("meta"))
 
 
-@every
-def test_works_where_its_tables_are(name):
+def works_where_its_tables_are(name):
     # The meta device refuses everything that stays on the CPU.
     operator = copy.deepcopy(OPERATORS[name]).to("meta")
     assert str(operator.device) == "meta" and operator.dtype == torch.float64
@@ -212,8 +245,19 @@ def test_works_where_its_tables_are(name):
         assert operator.reconstruct(data_of(operator, 2).to("meta")).shape == (2, *operator.volume_shape)
 
 
+@some
+def test_works_where_its_tables_are(name):
+    works_where_its_tables_are(name)
+
+
+@pytest.mark.slow
+@others
+def test_the_others_work_where_their_tables_are(name):
+    works_where_its_tables_are(name)
+
+
+@pytest.mark.parametrize("half", long([torch.bfloat16, torch.float16], [torch.bfloat16]))
 @every
-@together("half", [torch.bfloat16, torch.float16])
 def test_autocast_does_not_reach_in(name, half):
     operator = copy.deepcopy(OPERATORS[name]).float()
     for function, make in ((operator, volume_of), (operator.adjoint, data_of)):
@@ -244,8 +288,10 @@ def test_batches_may_be_empty(name):
         assert operator.reconstruct(data_of(operator, 0)).shape == (0, *operator.volume_shape)
 
 
+@pytest.mark.parametrize(
+    "kind", long([torch.uint8, torch.int16, torch.float16, torch.bfloat16], [torch.int16, torch.bfloat16])
+)
 @every
-@together("kind", [torch.uint8, torch.int16, torch.float16, torch.bfloat16])
 def test_operands_of_other_kinds_are_converted(name, kind):
     operator = copy.deepcopy(OPERATORS[name]).float()
     for function, make in ((operator, volume_of), (operator.adjoint, data_of)):

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from support.scan_operators import AXIS, DEPTHS, PULSE, SCANS, WALL
+from support.sweeps import together
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Scan
 from torchtransient.errors import ShapeError, UnitError
@@ -49,9 +50,9 @@ CAMERAS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", SCANS)
-@pytest.mark.parametrize("camera", CAMERAS)
-@pytest.mark.parametrize("axis", [AXIS, TimeAxis(1.5, 0.02, 8), TimeAxis(-1.0, 0.02, 60)])
+@together("name", SCANS)
+@together("camera", CAMERAS)
+@together("axis", [AXIS, TimeAxis(1.5, 0.02, 8), TimeAxis(-1.0, 0.02, 60)])
 def test_frequencies_are_as_dense_as_records_and_volumes_are_long(name, camera, axis):
     scan = SCANS[name]
     if camera == "transient camera" and scan.kind != "single":

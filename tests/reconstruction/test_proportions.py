@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from support.sweeps import together
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Scan
 from torchtransient.errors import UnitError
@@ -53,7 +54,7 @@ SIZES = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("scan, axis, words", SIZES)
+@together("scan, axis, words", SIZES)
 def test_walls_and_records_of_one_size(scan, axis, words):
     says(lambda: proportions.check_proportions(scan, TimeAxis(*axis), "test"), words)
 
@@ -89,7 +90,7 @@ REACHES = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("scan, point, axis, words", REACHES)
+@together("scan, point, axis, words", REACHES)
 def test_points_whose_light_comes_within_ten_records(scan, point, axis, words):
     points = torch.tensor([[0.0, 0.0, 0.125], list(map(float, point))], dtype=F64)
     says(lambda: proportions.check_reach(scan, points, TimeAxis(*axis), "test"), words)
@@ -114,8 +115,8 @@ SEEN = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("points", [VOXELS, VOXELS.points], ids=["grid", "points"])
-@pytest.mark.parametrize("scan, axis, words", SEEN)
+@together("points", [VOXELS, VOXELS.points])
+@together("scan, axis, words", SEEN)
 def test_voxels_that_a_record_sees(points, scan, axis, words):
     says(lambda: proportions.check_reach(scan, points, TimeAxis(*axis), "test", seen=True), words)
     # What is not seen may stand there nevertheless.

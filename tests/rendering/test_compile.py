@@ -85,7 +85,8 @@ def test_a_module_around_a_renderer(room_scene, backend):
     same(results(compiled, START, pipeline.code), results(pipeline, START, pipeline.code))
 
 
-@pytest.mark.parametrize("backend", long(BACKENDS, ["aot_eager"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_the_function(room_scene, backend):
     def loss(x):
         return (tt.render(room_scene, {COLOUR: 2 * x}, spp=4, seed=0).steady * 3).square().sum()
@@ -93,6 +94,7 @@ def test_the_function(room_scene, backend):
     same(results(torch.compile(loss, backend=backend), START / 2), results(loss, START / 2))
 
 
+@pytest.mark.slow
 def test_scenes_made_and_read_inside(room):
     def loss(x):
         scene = tt.load(room, variant=VARIANT)

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.sweeps import together
 from torchtransient.errors import SceneError
 from torchtransient.plugins.dictionaries import Pixels
 from torchtransient.rendering import description, ready_scenes
@@ -123,8 +124,8 @@ def test_dictionaries_as_deep_as_they_may_be():
 # ---------------------------------------------------------------------------------------------------------- equality
 
 
-@pytest.mark.parametrize(
-    ("a", "b", "same"),
+@together(
+    "a, b, same",
     [
         ({"a": 1, "b": 2}, {"a": 1, "b": 2}, True), ({"a": 1, "b": 2}, {"b": 2, "a": 1}, False),
         ({"a": 1}, {"a": 1, "b": 2}, False), ({"a": {"b": 1}}, {"a": {"b": 3}}, False), ({"a": 1}, 1, False),

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.sweeps import together
 from torchtransient import plugins
 from torchtransient.errors import SceneError, UnitError
 
@@ -93,8 +94,8 @@ def with_number(place, x):
     return result
 
 
-@pytest.mark.parametrize("x", [NAN, INF, -INF], ids=str)
-@pytest.mark.parametrize("place", PLACES)
+@together("x", [NAN, INF, -INF])
+@together("place", PLACES)
 def test_number_of_a_description(place, x):
     broken = tt.load(with_number(place, x), variant=VARIANT)
     with pytest.raises(SceneError, match=f"finite numbers, got NaN or infinity in .*'{place}"):

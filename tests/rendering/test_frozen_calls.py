@@ -55,7 +55,15 @@ def check(setting, folder, most):
     return found
 
 
-@pytest.mark.parametrize("setting", settings(bare=False), ids=lambda one: one.name)
+# The others have recordings of their own kind in tests/transport/test_freezing.py, too.
+QUICK = ("shape ply", "spectrum regular in reflectance, spectral", "bsdf conductor, mono_polarized")
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [pytest.param(one, marks=[pytest.mark.slow] * (one.name not in QUICK)) for one in settings(bare=False)],
+    ids=lambda one: one.name,
+)
 def test_numbers_of_traced_calls(setting, tmp_path):
     for key, outcome in check(setting, tmp_path, 1).items():
         assert outcome.launched, (key, outcome.said)

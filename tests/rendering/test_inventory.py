@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from support.sweeps import together
 from torchtransient import plugins
 from torchtransient.plugins._registry import PLUGIN_MODULES
 from torchtransient.rendering.inventory import POLARIZING_ELEMENTS, POLARIZING_INTERFACES, like_mitsuba
@@ -60,7 +61,7 @@ def polarizes(matrices: np.ndarray) -> bool:
     return bool((np.minimum(*errors) > 1e-4 * np.abs(matrices).max()).any())
 
 
-@pytest.mark.parametrize("name", [*MITSUBA, *OURS])
+@together("name", [*MITSUBA, *OURS])
 def test_what_polarizes_is_listed(name):
     plugins.sync()
     found = polarizes(mueller_matrices(mi.load_dict({"type": name, **NEEDED.get(name, {})})))

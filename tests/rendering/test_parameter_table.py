@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import torchtransient as tt
+from support.sweeps import together
 from torchtransient.errors import SceneError, UnknownKeyError
 from torchtransient.rendering.parameters import (
     ParameterInfo,
@@ -72,7 +73,7 @@ NAMES = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("name", NAMES)
+@together("name", NAMES)
 def test_kinds_shapes_and_numbers(name):
     assert tuple(cases()) == NAMES
     key, value, kind, shape, numbers = cases()[name]

@@ -8,6 +8,7 @@ import torch
 from torch.autograd import forward_ad
 
 import torchtransient as tt
+from support.marks import long, long_rows
 from torchtransient.rendering.variant import active_variant
 from torchtransient.testing.small_room import CAMERA, COLOUR, GREY, VARIANT, WALL_POSE, make_room, pose
 
@@ -237,7 +238,7 @@ def test_indices_that_bend_nothing_keep_the_box(plugin):
     assert tt.TransientRenderer(scene, parameters=["box.bsdf.eta"]).effective_filter == "box"
 
 
-@pytest.mark.parametrize("key", ["alpha", "eta"])
+@pytest.mark.parametrize("key", long(["alpha", "eta"], ["eta"]))
 def test_rough_plastic_is_built_with_its_derivative(key):
     room = make_room()
     room["box"]["bsdf"] = {"type": "twosided", "nested": {"type": "roughplastic", "alpha": 0.3}}
@@ -360,7 +361,10 @@ def glass_room(plugin: str, **settings) -> dict:
     return room
 
 
-@pytest.mark.parametrize(("plugin", "settings"), [("dielectric", {}), ("roughdielectric", {"alpha": 0.3})])
+GLASS = [("dielectric", {}), ("roughdielectric", {"alpha": 0.3})]
+
+
+@pytest.mark.parametrize(("plugin", "settings"), long_rows(GLASS, GLASS[:1]))
 def test_index_of_refraction_becomes_differentiable(plugin, settings):
     scene = tt.load(glass_room(plugin, **settings), variant=VARIANT)
     info = scene.parameters()["slab.bsdf.eta"]

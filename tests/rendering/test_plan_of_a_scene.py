@@ -11,6 +11,7 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.marks import long_pairs
 from torchtransient.errors import GradientError, SceneError
 from torchtransient.gates import gates_to_text
 from torchtransient.rendering.plan import _check_known, _taken
@@ -133,8 +134,10 @@ def test_a_box_that_was_asked_for_stays_one():
         assert plan.renderer(gates=GATES["rectangular gate"]).gates is not None
 
 
-@pytest.mark.parametrize("kind", GATES)
-@pytest.mark.parametrize("of_scene", [False, True])
+@pytest.mark.parametrize(
+    ("kind", "of_scene"),
+    long_pairs(GATES, [False, True], [("rectangular gate", True), ("tabulated gate", False)]),
+)
 def test_gates_without_a_slope_are_refused_at_once(kind, of_scene):
     room, gates = make_room(), GATES[kind]
     settings = {"pilot": False, "gates": None if of_scene else gates}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from support.sweeps import together
 from torchtransient.rendering.ply_faces import smallest_vertex
 
 FACES = [(0, 1, 2), (2, -7, 1), (1, 2, -3)]
@@ -41,10 +42,10 @@ def _flat(row):
         yield from np.ravel(entry).tolist()
 
 
-@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("before", ["list", "number"])
-@pytest.mark.parametrize("behind", [True, False])
+@together("form", ["ascii", "binary_little_endian", "binary_big_endian"])
+@together("kind", KINDS)
+@together("before", ["list", "number"])
+@together("behind", [True, False])
 def test_the_smallest_number(tmp_path, form, kind, before, behind):
     file = tmp_path / "mesh.ply"
     file.write_bytes(ply(form, kind, before=before, behind=behind))

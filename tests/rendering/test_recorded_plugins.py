@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 
 import torchtransient as tt
 from support import foreign_paint
+from support.marks import long_rows
 from torchtransient.rendering.recordings import LAUNCHED, OWN_ENTRY
 from torchtransient.rendering.variant import active_variant
 from torchtransient.testing.small_room import GREY, VARIANT, make_room
@@ -37,8 +39,11 @@ def steady(renderer, value):
     return float(out.steady.sum()), out.stats.recorded[0]
 
 
-@pytest.mark.parametrize("says", [False, True])
-@pytest.mark.parametrize("kept", foreign_paint.KEPT)
+# What says that it can be recorded, in every way; what does not is told whatever it keeps.
+SAYS = [(kept, True) for kept in foreign_paint.KEPT] + [("float", False), ("generator", False), ("torch", False)]
+
+
+@pytest.mark.parametrize(("kept", "says"), long_rows(itertools.product(foreign_paint.KEPT, [False, True]), SAYS))
 def test_whatever_a_plugin_keeps(kept, says):
     traced, recorded = painted(kept, says)
     said = []

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.sweeps import together
 from support.text_files import SCENE
 from torchtransient.rendering.variant import active_variant
 from torchtransient.testing.small_room import CAMERA, COLOUR, VARIANT, make_room, pose
@@ -324,8 +325,8 @@ def phasor_room(frequencies):
     return room
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 4, 16])
-@pytest.mark.parametrize("kind", [list, tuple, np.array, torch.tensor, lambda row: np.array(row, dtype=np.float32)])
+@together("count", [1, 2, 3, 4, 16])
+@together("kind", [list, tuple, np.array, torch.tensor, lambda row: np.array(row, dtype=np.float32)])
 def test_frequencies_as_a_list_of_any_length(count, kind):
     """Mitsuba takes lists of three only."""
     row = [0.1 * k for k in range(count)]

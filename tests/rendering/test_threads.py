@@ -13,6 +13,7 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.marks import long_rows
 from torchtransient.errors import DeviceError, UnitError
 from torchtransient.plugins import drjit_pool
 from torchtransient.plugins.drjit_pool import engine_lock
@@ -192,7 +193,7 @@ NUMBERS = """
     scene = tt.load(tt.scenes.cornell_box(8, num_bins=16, bin_width_opl=0.4), variant="llvm_ad_rgb")
     renderer = tt.TransientRenderer(scene, parameters=[KEY], spp=16, physics="ignore", freeze={freeze})
     first, said = None, []
-    for n in (1, 1, 1, 4, 4, 4, 2, 16, 1):
+    for n in {counts}:
         tt.threads(n)
         renderer.zero_grad()
         out = renderer(seed=3)
@@ -204,16 +205,37 @@ NUMBERS = """
             torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-5 * float(b.abs().max()))
         said.append(out.stats.recorded[0])
     print("done", said.count("launched"))
+
+    # A child is told that it has nothing of the pool.
+    import os
+    import warnings
+    warnings.simplefilter("ignore")
+    tt.threads(3)
+    child = os.fork()
+    if child == 0:
+        try:
+            print(tt.threads(1).drjit, flush=True)
+        except tt.errors.VariantError as error:
+            print("spawn" in str(error), flush=True)
+        os._exit(0)
+    print("ended", os.waitpid(child, 0)[1])
 """
+# More threads than cores, fewer again, and as many as before.
+LONG, SHORT = (1, 1, 1, 4, 4, 4, 2, 16, 1), (1, 1, 4, 4, 1)
 
 
-@pytest.mark.parametrize("freeze", [True, pytest.param(False, marks=pytest.mark.slow)])
-def test_numbers_are_the_same_whatever_the_count(freeze):
+@pytest.mark.parametrize(
+    ("counts", "freeze"), long_rows([(SHORT, True), (LONG, True), (LONG, False)], [(SHORT, True)])
+)
+def test_numbers_are_the_same_whatever_the_count(counts, freeze):
     """In a process of its own: memory that is sized for fewer threads than write to it ends the process."""
-    done, launched = run(NUMBERS.format(freeze=freeze))
+    if not hasattr(os, "fork"):
+        pytest.skip("needs fork")
+    done, launched, *forked = run(NUMBERS.format(counts=counts, freeze=freeze))
     assert done == "done"
     # A render that came back to a count that has been recorded is launched.
-    assert int(launched) >= 3 if freeze else launched == "0"
+    assert int(launched) >= (3 if counts == LONG else 1) if freeze else launched == "0"
+    assert forked == ["True", "ended", "0"]
 
 
 @pytest.mark.slow
@@ -303,10 +325,11 @@ def test_films_write_pictures_by_one_thread(tmp_path):
     assert (tmp_path / "steady.exr").stat().st_size > 1000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("parent", "child", "said"),
     # A parent that has only asked has no threads to leave behind.
-    [("3", "1", "True"), pytest.param("", "3", "3", marks=pytest.mark.slow)],
+    [("3", "1", "True"), ("", "3", "3")],
 )
 def test_a_forked_child_of_a_process_with_a_pool_is_told(parent, child, said):
     if not hasattr(os, "fork"):

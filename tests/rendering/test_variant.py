@@ -23,11 +23,18 @@ def run(script: str) -> str:
     return result.stdout.strip()
 
 
-def test_import_and_load_need_no_variant():
+def test_import_scenes_and_load_need_no_variant():
+    """Nor is anything said of the versions that are installed here."""
     printed = run("""
+        import warnings
         import torchtransient as tt
+        from torchtransient.errors import VersionWarning
         from torchtransient.testing.small_room import make_room
+        warnings.simplefilter("error", VersionWarning)
         import mitsuba as mi
+        assert mi.variant() is None
+        tt.scenes.cornell_box()
+        tt.scenes.nlos_room()
         assert mi.variant() is None
         scene = tt.load(make_room())
         assert mi.variant() is None

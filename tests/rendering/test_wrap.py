@@ -13,6 +13,7 @@ from torch.autograd import forward_ad
 
 import torchtransient as tt
 from support.mitsuba_room import load_room
+from support.sweeps import together
 from torchtransient.errors import GradientError
 from torchtransient.testing.small_room import COLOUR
 from torchtransient.testing.small_room import VARIANT as VARIANT
@@ -165,8 +166,8 @@ COMPUTED_IN = {
 }
 
 
-@pytest.mark.parametrize("size", [3, 100])
-@pytest.mark.parametrize("dtype", COMPUTED_IN, ids=str)
+@together("size", [3, 100])
+@together("dtype", COMPUTED_IN)
 def test_dtypes(dtype, size):
     x = torch.arange(size).to(dtype)
     weights, y = tt.wrap(lambda x, y: (x, y * mi.TensorXf(x))), torch.ones(size, requires_grad=True)

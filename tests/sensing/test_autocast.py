@@ -5,13 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 
-from support.sensing.all_entries import each
+from support.sensing.all_entries import each_long, each_quick
 from support.sensing.contract import parts
 from torchtransient import TimeAxis, sensing
 
 
-@each
-def test_expectation_and_derivatives_are_those_outside(entry):
+def are_those_outside(entry):
     """First and second derivatives, whether the backward pass runs behind the context, as torch asks for, or in it."""
     module, x = entry.module(torch.float32), entry.x(torch.float32)
 
@@ -30,6 +29,17 @@ def test_expectation_and_derivatives_are_those_outside(entry):
         for a, b in zip(run(*inside), wanted, strict=True):
             assert a.dtype == b.dtype
             assert torch.equal(a, b)
+
+
+@each_quick
+def test_expectation_and_derivatives_are_those_outside(entry):
+    are_those_outside(entry)
+
+
+@pytest.mark.slow
+@each_long
+def test_long_expectations_and_derivatives_are_those_outside(entry):
+    are_those_outside(entry)
 
 
 @pytest.mark.parametrize("code", [None, sensing.hamiltonian_code(3)], ids=["fourier", "by shape"])

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from support.sensing.all_entries import ENTRIES, each
+from support.sensing.all_entries import ENTRIES, LONG, each, each_long, each_quick
 from support.sensing.contract import HALVES, LOOSE, expected, parts, pickled, through_state_dict
 from support.sweeps import together
 from torchtransient import sensing
@@ -16,11 +16,14 @@ from torchtransient.errors import ShapeError
 from torchtransient.sensing import ScoreFunction
 
 each_random = together("entry", [e for e in ENTRIES if e.random], lambda entry: entry.name)
-each_policy = together(
-    "entry, policy",
-    [(e, p) for e in ENTRIES if e.random for p in e.policies],
-    lambda pair: f"{pair[0].name}, {pair[1]}",
-)
+EVERY_POLICY = [(e, p) for e in ENTRIES if e.random for p in e.policies]
+
+
+def named(pair):
+    return f"{pair[0].name}, {pair[1]}"
+
+
+each_policy = together("entry, policy", EVERY_POLICY, named)
 
 
 def test_names_are_unique():
@@ -125,8 +128,7 @@ class Mean(torch.nn.Module):
         return tuple(p for p in parts(expected(self.module, x)) if p.is_floating_point() or p.is_complex())
 
 
-@each
-def test_gradcheck_of_the_expectation(entry):
+def derivatives_are_right(entry):
     """Both modes, in the input and in every learnable parameter."""
     mean, x = Mean(entry.module()), entry.x()[:1].requires_grad_()
     learnable = {name: p.detach().requires_grad_() for name, p in mean.named_parameters() if p.requires_grad}
@@ -138,6 +140,17 @@ def test_gradcheck_of_the_expectation(entry):
     assert torch.autograd.gradcheck(
         f, inputs, atol=1e-6, rtol=1e-4, nondet_tol=1e-12, fast_mode=True, check_forward_ad=True
     )
+
+
+@each_quick
+def test_gradcheck_of_the_expectation(entry):
+    derivatives_are_right(entry)
+
+
+@pytest.mark.slow
+@each_long
+def test_gradcheck_of_long_expectations(entry):
+    derivatives_are_right(entry)
 
 
 # these look at their values
@@ -204,8 +217,7 @@ def test_errors(name, call, error):
         call()
 
 
-@each_policy
-def test_generator_reproduces(entry, policy):
+def reproduces(entry, policy):
     module, x = entry.module(grad=policy), entry.x()
 
     def draw(seed):
@@ -222,8 +234,21 @@ def test_generator_reproduces(entry, policy):
         assert all(torch.equal(a, b) for a, b in zip(first, parts(module(x)), strict=True))
 
 
+# Of the long ones under one policy that draws.
+@together("entry, policy", [(e, p) for e, p in EVERY_POLICY if e.name not in LONG or p == "straight_through"], named)
+def test_generator_reproduces(entry, policy):
+    reproduces(entry, policy)
+
+
+@pytest.mark.slow
+@together("entry, policy", [(e, p) for e, p in EVERY_POLICY if e.name in LONG and p != "straight_through"], named)
+def test_generator_reproduces_under_every_policy(entry, policy):
+    reproduces(entry, policy)
+
+
 # a train of detections takes long to draw; test_bright_light and test_several_hits hold its means to events
-number_of_draws = [(e, 200 if e.name == "FreeRunningSPAD" else 2000) for e in ENTRIES if e.random]
+TRAINS = ("FreeRunningSPAD", "AfterpulsingSPAD-dead-time")
+number_of_draws = [(e, 200 if e.name in TRAINS else 2000) for e in ENTRIES if e.random]
 number_of_draws += [pytest.param(e, 2000, marks=pytest.mark.slow) for e, number in number_of_draws if number < 2000]
 
 

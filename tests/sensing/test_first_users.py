@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.sweeps import together
 from torchtransient import losses, sensing
 from torchtransient.errors import ArgumentError, GradientError, ShapeError, UnitError
 
@@ -67,8 +68,8 @@ SATURATING = {
 }
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, -0.1])
-@pytest.mark.parametrize("make", SATURATING.values(), ids=SATURATING)
+@together("value", [math.nan, math.inf, -0.1])
+@together("make", SATURATING.values())
 def test_no_mean_of_what_is_no_rate(make, value):
     """Formulas of saturation give plausible counts of negative light."""
     sensor, x = make(), with_nan(value=value)

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from support.sweeps import together
 from torchtransient import TimeAxis, sensing
 from torchtransient.errors import ArgumentError, GradientError, ShapeError, StorageError, TorchTransientError, UnitError
 from torchtransient.sensing.base.pixel_maps import check_map
@@ -208,7 +209,7 @@ REFUSED = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", REFUSED)
+@together("name", REFUSED)
 def test_what_is_refused(name):
     call, error, words = REFUSED[name]
     with pytest.raises(error, match=words):

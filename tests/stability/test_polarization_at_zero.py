@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from support.sweeps import together
 from torchtransient import stokes as st
 
 FUNCTIONS = {
@@ -27,8 +28,8 @@ STATES = {
 }
 
 
-@pytest.mark.parametrize("state", STATES)
-@pytest.mark.parametrize("name", FUNCTIONS)
+@together("state", STATES)
+@together("name", FUNCTIONS)
 def test_value_and_gradient_are_finite(name, state):
     """Guards against sqrt'(0), 0 / 0 and atan2'(0, 0), and against a torch.where that hides them in the value but not
     in the gradient. Squares of 1e-30 and 1e30 leave the range of float32: they must not be formed.

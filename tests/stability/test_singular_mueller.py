@@ -9,6 +9,7 @@ import pytest
 from support.gradient_cases.problem import Case, Problem
 from support.gradient_cases.scenes import film, room, transform
 from support.gradient_cases.unknowns import move, rotate, set_color
+from support.marks import long_pairs
 
 VARIANT = "llvm_ad_mono_polarized"
 
@@ -106,20 +107,23 @@ def mirror_square_to_the_rays(bsdf):
     return scene
 
 
+MIRRORS = {
+    "diff_conductor": {"type": "diff_conductor", "eta": 0.5, "k": 2.0},
+    "diff_dielectric": {"type": "diff_dielectric", "int_ior": 1.5, "ext_ior": 1.0},
+}
+MOVES = {
+    "moved": (move("wall.to_world", (0, 0, 1)), 4e-3),
+    "turned": (rotate("wall.to_world", (0, 1, 0)), 0.1),
+}
+
+
 @pytest.mark.parametrize(
-    "bsdf",
-    [
-        {"type": "diff_conductor", "eta": 0.5, "k": 2.0},
-        {"type": "diff_dielectric", "int_ior": 1.5, "ext_ior": 1.0},
-    ],
-    ids=lambda b: b["type"],
+    ("bsdf", "moved"), long_pairs(MIRRORS, MOVES, [("diff_conductor", "turned"), ("diff_dielectric", "moved")])
 )
-@pytest.mark.parametrize(
-    ("apply", "step"), [(move("wall.to_world", (0, 0, 1)), 4e-3), (rotate("wall.to_world", (0, 1, 0)), 0.1)]
-)
-def test_mirror_at_normal_incidence(bsdf, apply, step):
+def test_mirror_at_normal_incidence(bsdf, moved):
     """Guards against the plane of incidence that a ray along the normal does not have."""
-    p = problem(lambda: mirror_square_to_the_rays(bsdf), apply, 0.0, step=step, spp=4096)
+    apply, step = MOVES[moved]
+    p = problem(lambda: mirror_square_to_the_rays(MIRRORS[bsdf]), apply, 0.0, step=step, spp=4096)
     reverse = np.array([p.reverse(s) for s in range(8)])
     forward = np.array([p.forward(s) for s in range(2)])
     differences = np.array([(p.loss(step, s) - p.loss(-step, s)) / (2 * step) for s in range(8)])

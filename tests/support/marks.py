@@ -12,6 +12,14 @@ def long(values, quick):
     return [pytest.param(value, marks=[] if value in quick else [pytest.mark.slow]) for value in values]
 
 
+def long_rows(rows, quick):
+    """Likewise rows of several values each."""
+    rows, quick = list(rows), list(quick)
+    if not all(row in rows for row in quick):
+        raise ValueError(f"long_rows: expected all of {quick} to be among {rows}.")
+    return [pytest.param(*row, marks=[] if row in quick else [pytest.mark.slow]) for row in rows]
+
+
 def long_pairs(first, second, quick):
     """Likewise every pair of two values; every value is in one that is ``quick``."""
     first, second = list(first), list(second)

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
+from support.marks import long
 from torchtransient.errors import StorageError, UnitError
 from torchtransient.training import Batches, Seeds, worker_init
 
@@ -33,7 +34,7 @@ def test_ranks_share_the_batch_of_one():
     assert [a + b + c for a, b, c in zip(*parts, strict=True)] == whole
 
 
-@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize("workers", long([0, 2], [0]))
 def test_goes_on_where_it_was_stopped(workers):
     data = [float(n) for n in range(10)]
 

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import nn
 
+from support.sweeps import together
 from torchtransient.errors import StorageError
 from torchtransient.training.plain_state import plain
 
@@ -24,8 +25,8 @@ def test_tensors_are_kept_without_their_graph():
         plain(nn.LazyLinear(3).weight, "state")
 
 
-@pytest.mark.parametrize("order", ["<", ">"])
-@pytest.mark.parametrize("kind", ["i2", "i4", "i8", "u2", "u4", "u8", "f2", "f4", "f8", "c8", "c16", "?", "i1", "u1"])
+@together("order", ["<", ">"])
+@together("kind", ["i2", "i4", "i8", "u2", "u4", "u8", "f2", "f4", "f8", "c8", "c16", "?", "i1", "u1"])
 def test_arrays_are_tensors_of_their_own(order, kind):
     given = np.array([0, 1, 3], np.dtype(order + kind) if len(kind) > 1 and kind[1] != "1" else kind)
     found = plain(given, "state")

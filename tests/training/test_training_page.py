@@ -18,6 +18,7 @@ def names():
     return TRAINING.names()
 
 
+@pytest.mark.slow
 def test_a_run_in_parts_ends_as_one_in_one_piece(names):
     whole, resumed = (names[name].state_dict() for name in ("whole", "resumed"))
     assert all(torch.equal(whole[name], resumed[name]) for name in whole)
@@ -29,6 +30,7 @@ def test_a_run_in_parts_ends_as_one_in_one_piece(names):
     assert not torch.equal(short["network.1.weight"], whole["network.1.weight"])
 
 
+@pytest.mark.slow
 def test_seeds_know_the_sample_alone(names):
     assert names["apart"] == [names["together"][2], names["together"][0]]
     assert not set(names["other"]) & set(names["together"])

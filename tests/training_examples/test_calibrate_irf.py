@@ -7,6 +7,7 @@ import runpy
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 from torchtransient import sensing
@@ -37,6 +38,7 @@ def frames(folder):
     return path
 
 
+@pytest.mark.slow
 def test_finds_what_was_put_in(tmp_path, capsys):
     options = [
         "--irf", response(tmp_path), "--smoke", "--frames", frames(tmp_path), "--steps", "160",

@@ -26,6 +26,7 @@ def one_thread():
     torch.set_num_threads(before)
 
 
+@pytest.mark.slow
 def test_a_few_steps(example, tmp_path, capsys):
     options = {"--steps": 20, "--points": 10, "--bins": 48, "--scenes": 6, "--test-scenes": 3, "--output": tmp_path}
     errors = example["main"]([str(x) for pair in options.items() for x in pair])

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from support.sweeps import together
+
 FILES = sorted((Path(__file__).parents[2] / "training_examples").glob("*.py"))
 SCRIPTS = [path for path in FILES if '__name__ == "__main__"' in path.read_text(encoding="utf-8")]
 # Those that have no test of their own which runs them so.
@@ -22,7 +24,7 @@ def test_what_is_no_script_is_shared_by_some(part):
     assert imported
 
 
-@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
+@together("script", SCRIPTS, lambda path: path.stem)
 def test_the_small_run_is_called_smoke(script):
     text = script.read_text(encoding="utf-8")
     # Of the script, or of a part that it shares with others.

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import mitsuba as mi
-import pytest
 
+from support.sweeps import together
 from torchtransient.plugins.transport.patterns import emits_by_place, scatters_by_place
 from torchtransient.testing.every_plugin import bsdfs
 
@@ -29,7 +29,7 @@ def test_lights():
     assert not emits_by_place(mi.load_dict({"type": "point"}))
 
 
-@pytest.mark.parametrize("name", [name for name in bsdfs() if name not in VARYING])
+@together("name", [name for name in bsdfs() if name not in VARYING])
 def test_every_bsdf_without_a_varying_texture(name):
     """Guards against names of Mitsuba's classes that have changed: all would count as patterned, at a cost."""
     assert not scatters_by_place(mi.load_dict(bsdfs()[name]))

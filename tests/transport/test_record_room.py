@@ -120,7 +120,8 @@ def test_the_first_thread_is_asked_once_for_each_limit(monkeypatch):
     assert asked == [2**20, 2**21]
 
 
-@pytest.mark.parametrize("variant", [VARIANT, pytest.param("llvm_ad_mono", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", [VARIANT, "llvm_ad_mono"])
 def test_paths_of_twenty_thousand_bounces(variant):
     """Of reflectance 0.999 and emission 1 the radiance is 1 / (1 - 0.999), its derivative the square. In a process of
     its own, which died.

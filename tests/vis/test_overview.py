@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from support.marks import long
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, StorageError, UnitError
 from torchtransient.vis.fit_progress import plot_fit
@@ -90,7 +91,7 @@ def test_exposure_ignores_outliers_and_broken_pixels():
     assert exposure_of(spot) == 4.0
 
 
-@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("channels", long([1, 3], [3]))
 def test_picture(tmp_path, channels):
     cube = pulse(channels)
     path = tmp_path / "overview.png"

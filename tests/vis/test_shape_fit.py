@@ -29,6 +29,7 @@ def page(path=None, **changes):
     return tt.vis.plot_shape_fit(**(given | changes), path=path)
 
 
+@pytest.mark.slow
 def test_meshes_stand_before_the_wall_in_both_views(tmp_path):
     figure = page(tmp_path / "fit.png")
     assert (tmp_path / "fit.png").read_bytes().startswith(b"\x89PNG")

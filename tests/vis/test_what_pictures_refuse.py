@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.sweeps import together
 from torchtransient.errors import ArgumentError, MissingPackageError, ShapeError, StorageError, UnitError
 from torchtransient.vis import colour_maps, files, overview, video_file
 from torchtransient.vis.sources import images_of, real_tensor, steady_of, transient_of
@@ -19,7 +20,7 @@ GATED = SimpleNamespace(gated=torch.arange(1.0, 91.0).reshape(3, 5, 2, 3))
 FRAME = np.zeros((4, 6, 3), np.uint8)
 
 
-@pytest.mark.parametrize(
+@together(
     "call, error, said",
     [
         (lambda: transient_of(GATED, who="streak"), ShapeError, r"^streak: .* holds 5 images of time gates"),

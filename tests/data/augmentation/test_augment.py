@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.sweeps import together
 from torchtransient import geometry
 from torchtransient.data import Affine, Augment, Augmented, Crop, Flip, QuarterTurn
 from torchtransient.data.augmentation.augment import KINDS
@@ -297,8 +298,8 @@ FLIP = Augment(Flip(p=1.0))
 DEPTH, CUBE = torch.ones(4, 5), torch.ones(1, 3, 4, 5)
 
 
-@pytest.mark.parametrize(
-    ("call", "error", "message"),
+@together(
+    "call, error, message",
     [
         (lambda: FLIP({"normals": torch.ones(3, 4, 5)}), SceneError, "give to_world="),
         (lambda: FLIP({"depth": DEPTH, "values": {"box.to_world": 1}}), SceneError, "'box.to_world' is not true"),

@@ -113,6 +113,7 @@ def test_samples_that_are_used_again_are_turned_anew():
     assert found(0) == found(0) != found(1)
 
 
+@pytest.mark.slow
 def test_samples_that_are_rendered_meanwhile():
     online = OnlineDataset(OnlineRecipe(), capacity=4, warm=4, uses=8.0)
     with AugmentedStream(online, Augment(Crop((1, 1))), seed=0) as stream:

@@ -10,6 +10,7 @@ import pytest
 import torch
 from kornia.augmentation import RandomAffine
 
+from support.sweeps import together
 from torchtransient.data import Affine, Augment, Crop, Flip, Operation, PixelMap, QuarterTurn
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 
@@ -46,8 +47,8 @@ def ramp(dtype):
             torch.arange(1, H * W + 1).reshape(H, W)).to(dtype)  # fmt: skip
 
 
-@pytest.mark.parametrize("dtype", TYPES, ids=str)
-@pytest.mark.parametrize("kind", BEYOND)
+@together("dtype", TYPES)
+@together("kind", BEYOND)
 def test_every_type_of_every_kind(kind, dtype):
     image = ramp(dtype)
     plain = image.to(torch.complex128 if dtype.is_complex else torch.float64)
@@ -203,8 +204,8 @@ class Other(Operation):
 DEPTH = {"depth": torch.ones(H, W)}
 
 
-@pytest.mark.parametrize(
-    ("call", "error", "message"),
+@together(
+    "call, error, message",
     [
         (lambda: Augment(Other())(DEPTH), SceneError, r"Other\.draw to return a PixelMap"),
         (lambda: Augment(Given(SHIFT, seen=(2, 2)))(DEPTH), SceneError, r"of images of \(4, 6\)"),

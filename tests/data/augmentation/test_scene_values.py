@@ -64,7 +64,7 @@ def augmented(operation, key, **options):
     return Augment(operation, **options)(sample)
 
 
-@pytest.mark.parametrize("key", STAYS)
+@together("key", STAYS)
 @together("name", OPERATIONS)
 def test_what_stays(key, name):
     if name in STAYS[key].split():

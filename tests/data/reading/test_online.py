@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import itertools
 import math
 import os
 import pickle
@@ -19,6 +20,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
+from support.marks import long_rows
 from support.online_recipe import SHAPE, OnlineRecipe
 from torchtransient.data.reading.online import OnlineDataset
 from torchtransient.data.reading.online_producers import Producers
@@ -96,9 +98,10 @@ def simulate(uses, capacity, speed, draws=4000, producers=2, warm=4):
     return schedule, used
 
 
-@pytest.mark.parametrize("uses", [0.5, 1.0, 5.0, 20.0])
-@pytest.mark.parametrize("capacity", [2, 3, 64])
-@pytest.mark.parametrize("speed", [0.01, 0.2, 5.0])
+RINGS = list(itertools.product([0.01, 0.2, 5.0], [2, 3, 64], [0.5, 1.0, 5.0, 20.0]))
+
+
+@pytest.mark.parametrize(("speed", "capacity", "uses"), long_rows(RINGS, RINGS[::5]))
 def test_mean_use_is_bounded(uses, capacity, speed):
     schedule, used = simulate(uses, capacity, speed, warm=min(4, capacity))
     mean = schedule.drawn / schedule.made

@@ -12,6 +12,7 @@ import torch
 from torch.utils.data import DataLoader
 
 import torchtransient as tt
+from support.marks import long_rows
 from support.stored_samples import cube, folder
 from torchtransient.data.reading.stream import TransientStream
 from torchtransient.errors import StorageError, TorchTransientError
@@ -61,8 +62,10 @@ def test_shuffling_is_even():
     assert np.all(np.abs(np.bincount(first, minlength=6) - 200) < 60)
 
 
-@pytest.mark.parametrize("world_size", [1, 2, 5, 30])
-@pytest.mark.parametrize("even", [False, True])
+@pytest.mark.parametrize(
+    ("even", "world_size"),
+    long_rows(itertools.product([False, True], [1, 2, 5, 30]), [(False, 30), (True, 2), (True, 5)]),
+)
 def test_ranks(data, world_size, even):
     shares = [
         TransientStream(data, fields=["depth"], rank=r, world_size=world_size, even=even) for r in range(world_size)
@@ -150,7 +153,10 @@ def test_parts_and_axis(data):
     assert stream.about["spp"] == 16
 
 
-@pytest.mark.parametrize(("workers", "size", "rank"), [(0, 4, None), (2, 4, None), (3, 2, (1, 2))])
+STOPPED = [(0, 4, None), (2, 4, None), (3, 2, (1, 2))]
+
+
+@pytest.mark.parametrize(("workers", "size", "rank"), long_rows(STOPPED, [STOPPED[0], STOPPED[2]]))
 def test_an_epoch_goes_on_where_it_was_stopped(data, workers, size, rank):
     share = {} if rank is None else {"rank": rank[0], "world_size": rank[1]}
 

@@ -10,13 +10,14 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.sweeps import together
 from torchtransient.data.recipes.distribution import ANYTHING, NUMBERS, POSE, Place
 from torchtransient.data.recipes.streams import Extreme, Fixed, Stream
 from torchtransient.data.recipes.written import read_distribution, written
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 
 D = tt.data
-DRAWS = 5000
+DRAWS = 1250
 NUMBER = Place("x", NUMBERS, ())
 COLOUR = Place("x", NUMBERS, (3,), np.array([0.1, 0.2, 0.3]))
 TURNED = tt.scenes.transforms.rotate([0, 1, 0], 30) @ np.diag([2.0, 1, 1, 1])
@@ -52,7 +53,7 @@ def test_ends_are_reached_and_not_left():
         (D.Uniform(-1, 3), -1, 3), (D.LogUniform(0.1, 10), 0.1, 10), (D.Normal(0, 5, low=-1, high=2), -1, 2),
         (D.Uniform(4, 4), 4, 4), (D.Normal(1, 0), 1, 1), (D.LogUniform(1e-300, 1e300), 1e-300, 1e300),
     ):  # fmt: skip
-        drawn = many(distribution, count=2000)
+        drawn = many(distribution, count=500)
         assert low <= drawn.min() and drawn.max() <= high
         ends = [float(distribution.draw(Extreme(upper), NUMBER)) for upper in (False, True)]
         assert ends == pytest.approx([low, high], abs=1e-9, rel=1e-9)
@@ -237,7 +238,7 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("wrong", WRONG)
+@together("wrong", WRONG)
 def test_what_is_wrong_says_so(wrong):
     make, error, words = WRONG[wrong]
     with pytest.raises(error, match=words):

@@ -464,6 +464,7 @@ def test_what_scenes_have_of_their_own_is_told_by_scene():
     recipe.check()
 
 
+@pytest.mark.slow
 def test_scans_that_vary_are_all_told():
     wall = tt.nlos.Wall.plane(width=1.0, height=1.0)
     parts = (None, (0.2, 0.2, 0.6, 0.6))

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from support.capture_files import FROM_ZERO, ORIGINS, SQUARE, UP, grids, listed, made
+from support.sweeps import together
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import StorageError
@@ -85,8 +86,8 @@ NUMBERS = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("dtype", NUMBERS, ids=str)
-@pytest.mark.parametrize("layout", WRITTEN)
+@together("dtype", NUMBERS)
+@together("layout", WRITTEN)
 def test_numbers_of_every_kind(tmp_path, layout, dtype):
     """Values come back; types as torch computes with them."""
     kind = "single" if layout == "phasor_field" else "confocal"

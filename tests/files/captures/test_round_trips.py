@@ -11,6 +11,7 @@ import torch
 
 import torchtransient as tt
 from support.capture_files import AXIS, FROM_ZERO, SQUARE, WALL, grids, holdable, listed, made
+from support.sweeps import together
 from torchtransient.capture import Capture, files
 from torchtransient.errors import ArgumentError, StorageError
 from torchtransient.files.captures.formats import FORMATS, LAYOUTS, read_capture, write_capture
@@ -20,7 +21,7 @@ ENDINGS = {"torchtransient": "h5"} | {layout.name: layout.endings[0][1:] for lay
 HOLDABLE = {f"{layout}-{name}": (layout, capture) for layout, name, capture in holdable()}
 
 
-@pytest.mark.parametrize("name", list(HOLDABLE))
+@together("name", list(HOLDABLE))
 def test_round_trip(tmp_path, name):
     layout, capture = HOLDABLE[name]
     path = capture.write(tmp_path / f"a.{ENDINGS[layout]}", format=layout)

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from support.capture_files import FROM_ZERO, SQUARE, grids, listed, made
+from support.sweeps import together
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture
 from torchtransient.errors import MissingPackageError, StorageError
@@ -131,7 +132,7 @@ CASES = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("name", "entries", "words"), CASES)
+@together("name, entries, words", CASES)
 def test_entries_that_are_wrong(tmp_path, name, entries, words):
     layout, capture = FILES[name]
     ending = "mat" if layout in ("phasor_field", "rect_data") else "h5"
@@ -247,8 +248,8 @@ def stretched(scan, dx=1.0, dy=1.0, off=0.0, lean=0.0):
     return made(replace(scan, sensor_points=points, laser_points=spot), axis=FROM_ZERO)
 
 
-@pytest.mark.parametrize("kind", ["confocal", "single"])
-@pytest.mark.parametrize(("how", "words"), [
+@together("kind", ["confocal", "single"])
+@together("how, words", [
     ({"dy": 1.0}, None), ({"dy": 1 + 0.9e-3}, None), ({"dy": 1 - 0.9e-3}, None), ({"dx": 1 - 0.9e-3}, None),
     ({"dy": 1 + 1.1e-3}, "(square confocal scans|one distance between points)"),
     ({"dx": 1 + 1.2e-3}, "(square|one dist)"), ({"off": 0.9e-3}, None), ({"off": -0.9e-3}, None),

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from support.marks import long_pairs
+from support.marks import long_rows
 from torchtransient import plugins
 from torchtransient.errors import ArgumentError, GradientError, SceneError
 from torchtransient.plugins.films import pulsed_filter
@@ -57,16 +57,17 @@ def grad_and_values(renderer):
     return tensor.detach(), renderer.values[WALL_POSE].grad, out.stats.temporal_filter
 
 
-# Every pair once; with a filter of the integrator's, every film once on either side.
+# Every film beside a histogram, on one of its sides or on both; with a filter of the integrator's and without.
 QUICK = {
     (pair, filtered)
     for pair in PAIRS
     for filtered in ("", "gaussian")
     if (pair[0] == "histogram" or pair[1] == "smooth histogram") == bool(filtered)
+    and (PAIRS.index(pair) % 2 == 0 or pair[0] == "smooth histogram")
 }
 
 
-@pytest.mark.parametrize(("pair", "of_integrator"), long_pairs(PAIRS, ["", "gaussian"], QUICK))
+@pytest.mark.parametrize(("pair", "of_integrator"), long_rows(itertools.product(PAIRS, ["", "gaussian"]), QUICK))
 def test_each_sensor_renders_as_if_it_were_alone(pair, of_integrator):
     settings = {"temporal_filter": of_integrator, "gaussian_stddev": 0.8} if of_integrator else {}
     scene = tt.load(room_of(*(FILMS[name] for name in pair), **settings), variant=VARIANT)

@@ -9,6 +9,8 @@ import pytest
 import torch
 from torch import nn
 
+from support.marks import long_pairs
+from support.sweeps import together
 from torchtransient import TimeAxis, sensing
 from torchtransient.errors import ArgumentError, GradientError, UnitError
 from torchtransient.sensing import Compose, DetectionJitter, GaussianResponse, PixelGroups, SynchronousSPAD
@@ -100,10 +102,14 @@ def test_a_nested_sensor_is_the_sensor(nested, plain):
         torch.testing.assert_close(spread(found), wanted, rtol=close, atol=0.05)
 
 
-@pytest.mark.parametrize("nested, plain", NESTED.values(), ids=NESTED)
-@pytest.mark.parametrize("policy", POLICIES)
-def test_a_nested_sensor_has_the_policy(nested, plain, policy):
+@pytest.mark.parametrize(
+    ("name", "policy"),
+    # Every chain under one policy, every policy under several chains.
+    long_pairs(NESTED, POLICIES, [(name, POLICIES[number % 3]) for number, name in enumerate(NESTED)]),
+)
+def test_a_nested_sensor_has_the_policy(name, policy):
     """Set from outside, kept by copies, drawn under, and with a gradient; equal generators give equal numbers."""
+    nested, _ = NESTED[name]
     chain = Compose([nested()], grad=policy)
     for made in (chain, copy.deepcopy(chain), pickle.loads(pickle.dumps(chain))):
         assert {m.grad for m in made.modules() if isinstance(m, sensing.RandomSensor)} == {policy}
@@ -253,7 +259,7 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("stages, words", REFUSED.values(), ids=REFUSED)
+@together("stages, words", REFUSED.values())
 def test_orders_that_are_refused(stages, words):
     with pytest.raises(UnitError, match=words):
         Compose(stages())

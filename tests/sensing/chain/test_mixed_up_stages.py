@@ -8,6 +8,7 @@ from copy import deepcopy
 import pytest
 import torch
 
+from support.sweeps import together
 from torchtransient import TimeAxis, sensing
 from torchtransient.errors import ShapeError, StorageError, UnitError
 
@@ -308,8 +309,8 @@ def test_nothing_that_takes_seconds_is_left_out():
     assert {n for n in public if seconds_of(n)} == set(SECONDS) | OTHERS
 
 
-@pytest.mark.parametrize("unit", [1e12, 1e9], ids=["picoseconds", "nanoseconds"])
-@pytest.mark.parametrize("name, argument", [(n, a) for n in SECONDS for a in seconds_of(n) if a in SECONDS[n]])
+@together("unit", [1e12, 1e9])
+@together("name, argument", [(n, a) for n in SECONDS for a in seconds_of(n) if a in SECONDS[n]])
 def test_seconds_in_another_unit_are_told(name, argument, unit):
     made, given = getattr(sensing, name), SECONDS[name]
     assert made(**given) is not None
@@ -352,7 +353,7 @@ NANOSECONDS = {
 }
 
 
-@pytest.mark.parametrize("make", NANOSECONDS.values(), ids=NANOSECONDS)
+@together("make", NANOSECONDS.values())
 def test_numbers_of_another_unit_are_told(make):
     with pytest.raises(UnitError, match=r"expected .* got "):
         make()

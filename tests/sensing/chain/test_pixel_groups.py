@@ -40,7 +40,9 @@ def pulsing(d):
     return AfterpulsingSPAD(free(d), Afterpulsing([0.02, 0.03], [2e-9, 9e-9], d, bin_width_s=WIDTH))
 
 
-@pytest.mark.parametrize("make", [synchronous(), free, pulsing, lambda d: MacroPixel(free(d), 9)])
+@pytest.mark.parametrize(
+    "make", [synchronous(), free, pytest.param(pulsing, marks=pytest.mark.slow), lambda d: MacroPixel(free(d), 9)]
+)
 def test_a_map_of_dead_times_is_a_detector_for_every_pixel(make):
     x = light(1)
     found = PixelGroups.by_value(DEAD * WIDTH, make).expected(x)

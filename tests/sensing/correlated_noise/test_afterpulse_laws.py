@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from support.marks import long_rows
 from support.sensing.event_driven import Afterpulse, compare, detect, exponential_delays, measured_delays
+from support.sweeps import together
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing import (
     Afterpulsing,
@@ -103,7 +105,7 @@ def test_draws_have_the_mean(name):
 
 
 @each_law
-@pytest.mark.parametrize("period", [BINS + 1, 64, 75, 300])
+@together("period", [BINS + 1, 64, 75, 300])
 def test_constant_counts_in_a_window_of_a_longer_period(name, period):
     """What goes on outside of the window triggers afterpulses inside: as in a window of the whole period."""
     whole = LAWS[name]()
@@ -255,8 +257,13 @@ def test_frequent_afterpulses(mode, dead, tau):
             assert found.within(1.5), (total, kind, found)
 
 
-@pytest.mark.parametrize("total", [1.0, 100.0])
-@pytest.mark.parametrize("mode, dead, tau", [("free", 25.0, 3.0), ("several", 1.3, 30.0)])
+@pytest.mark.parametrize(
+    "mode, dead, tau, total",
+    long_rows(
+        [(*mode, total) for mode in (("free", 25.0, 3.0), ("several", 1.3, 30.0)) for total in (1.0, 100.0)],
+        [("free", 25.0, 3.0, 1.0), ("several", 1.3, 30.0, 100.0)],
+    ),
+)
 def test_totals_of_frequent_afterpulses(mode, dead, tau, total):
     """Within 4 standard errors of the runs' totals, of which 30 % of detections leave carriers."""
     rate = light(total, "pulse")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from support.marks import long
 from torchtransient import TimeAxis, sensing
 from torchtransient.sensing.correlated_noise import trapped_carriers as carriers
 from torchtransient.sensing.correlated_noise.trapped_ring import _Chain
@@ -49,7 +50,7 @@ def test_a_gate_dims_photons_and_carriers_alike():
     torch.testing.assert_close(more.sum(1), whole.sum(1), rtol=0.03, atol=0)
 
 
-@pytest.mark.parametrize("kind", ["cycles", "gated", "free"])
+@pytest.mark.parametrize("kind", long(["cycles", "gated", "free"], ["cycles", "gated"]))
 def test_bins_in_parts_are_finer_bins(kind):
     """Carriers of a part of a bin are followed in parts of bins: as where the bins are cut by hand."""
     gated, free = kind == "gated", kind == "free"

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from support.marks import long_pairs
 from support.sensing.event_driven import compare, dense_limit, detect, last_phases, total_variation
 from torchtransient.errors import TorchTransientError
 from torchtransient.sensing import FreeRunningSPAD, ScoreFunction, nonparalyzable_histogram
@@ -76,8 +77,14 @@ def test_dead_time_of_whole_periods(flux, periods):
     torch.testing.assert_close(found, light / (1 + periods * flux), rtol=1e-9, atol=1e-12 * flux / (1 + flux))
 
 
-@pytest.mark.parametrize("flux", FLUXES)
-@pytest.mark.parametrize("dead", [0.7, 12.8, 15.9, 16.0, 31.9, 45.3, 100.5])
+DEAD = [0.7, 12.8, 15.9, 16.0, 31.9, 45.3, 100.5]
+
+
+@pytest.mark.parametrize(
+    ("flux", "dead"),
+    # Every light with two dead times, every dead time with two lights.
+    long_pairs(FLUXES, DEAD, [(flux, DEAD[(n + k) % 7]) for n, flux in enumerate(FLUXES) for k in (0, 3)]),
+)
 def test_the_solver_against_dense_matrices(flux, dead):
     """Iterative, direct and dense solutions of the same chain, nearly reducible ones too."""
     light, whole = flux * shapes(), int(dead)

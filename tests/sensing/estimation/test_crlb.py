@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.marks import long
 from torchtransient import sensing
 from torchtransient.errors import ArgumentError, DeviceError, GradientError, ShapeError, UnitError
 from torchtransient.losses import first_photon_nll, poisson_nll
@@ -137,7 +138,7 @@ def test_pixels_of_any_shape_and_precision():
         )
 
 
-@pytest.mark.parametrize("cycles", [None, 200])
+@pytest.mark.parametrize("cycles", long([None, 200], [200]))
 def test_gradients(cycles):
     """In the pixels and in the device: pulses can be designed by it."""
     values = [place(torch.tensor([20.3, 31.9])), torch.tensor([0.4, 6.0], dtype=torch.float64),

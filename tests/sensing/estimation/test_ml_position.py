@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 
+from support.marks import long_pairs
 from torchtransient import TimeAxis, sensing
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.sensing.estimation.position_likelihood import _top
@@ -35,8 +36,9 @@ def counts_of(response, truth, photons, background, seed=1):
     return torch.poisson(mean, generator=torch.Generator().manual_seed(seed))
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("background", [0.0, 0.6])
+@pytest.mark.parametrize(
+    ("shape", "background"), long_pairs(SHAPES, [0.0, 0.6], [(s, (0.6, 0.0)[n % 2]) for n, s in enumerate(SHAPES)])
+)
 def test_at_the_bound_in_any_shape(shape, background):
     """1000 photons. The ratio of 2000 draws has a deviation of 1.6 %: four of them, and 2 % above the bound."""
     response, truth, photons = SHAPES[shape], planes(), 1000.0

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from support.sweeps import together
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.cameras.electronics import PixelElectronics
@@ -337,7 +338,7 @@ def test_phase_stays_below_a_turn():
     assert bool((phase >= 0).all()) and bool((phase < TURN).all())
 
 
-@pytest.mark.parametrize(
+@together(
     "call, error",
     [
         (lambda: itof_codes.sine_code(1), ShapeError),

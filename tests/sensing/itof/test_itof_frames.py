@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from support.sweeps import together
 from torchtransient import sensing
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import PhysicsWarning, UnitError
@@ -115,9 +116,9 @@ def test_differences_that_are_read_as_taps_have_no_deviation():
     assert right.depth_std_m.mean().item() == pytest.approx(measured.item(), rel=0.12)
 
 
-@pytest.mark.parametrize("electrons", [0.0, 3.0, 100.0, 2e4])
-@pytest.mark.parametrize("readout", ["single", "two_tap", "differential"])
-@pytest.mark.parametrize("code", [sensing.sine_code(4), sensing.square_code(3), sensing.square_code(4, 0.1, 0.3)])
+@together("electrons", [0.0, 3.0, 100.0, 2e4])
+@together("readout", ["single", "two_tap", "differential"])
+@together("code", [sensing.sine_code(4), sensing.square_code(3), sensing.square_code(4, 0.1, 0.3)])
 def test_frames_of_light_have_their_deviation(code, electrons, readout):
     """Whatever light there is, and of every contrast: short pulses have twice the offset as amplitude, at most."""
     gates = code if readout == "single" else sensing.TwoTapCode(code)

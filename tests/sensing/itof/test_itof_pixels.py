@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from support.sweeps import together
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.sensing import (
@@ -105,7 +106,7 @@ def test_every_code_and_readout_gives_the_phase(name, readout):
         torch.testing.assert_close(reading.offset, torch.full_like(reading.offset, 1300.0 / code.num_taps))
 
 
-@pytest.mark.parametrize("num_taps, readout", [p for p in pairs(range(2, 9), READOUTS) if p != (2, "single")])
+@together("num_taps, readout", [p for p in pairs(range(2, 9), READOUTS) if p != (2, "single")])
 def test_the_fourier_sum_means_the_same_in_every_readout(num_taps, readout):
     turns = torch.linspace(0, 0.99, 50, dtype=torch.float64)
     taps = frames(sine_code(num_taps), turns, readout)
@@ -134,8 +135,8 @@ def test_two_quadrature_steps_of_two_taps_wiggle_as_four_taps():
 # ------------------------------------------------------------------------------------------------------------- noise
 
 
-@pytest.mark.parametrize("dark_e, read_noise_e", [(0.0, 0.0), (150.0, 0.0), (40.0, 25.0)])
-@pytest.mark.parametrize("num_taps, readout", [p for p in pairs(range(2, 9), READOUTS) if p != (2, "single")])
+@together("dark_e, read_noise_e", [(0.0, 0.0), (150.0, 0.0), (40.0, 25.0)])
+@together("num_taps, readout", [p for p in pairs(range(2, 9), READOUTS) if p != (2, "single")])
 def test_variance_of_phase_and_depth(num_taps, readout, dark_e, read_noise_e):
     """The deviation of 10 000 drawn pixels against the closed form and against `depth_std_m`.
 
@@ -264,8 +265,8 @@ FREQUENCIES = (30e6, 70e6)
 LIGHT = torch.rand(2, 1, 70, 3, 4, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
 
 
-@pytest.mark.parametrize("within_bin", ["uniform", "center"])
-@pytest.mark.parametrize(
+@together("within_bin", ["uniform", "center"])
+@together(
     "name, direction",
     [*pairs(["sine2", "sine4", "harmonics", "square2", "square3"], [1, -1]), ("measured4", 1)],
 )
@@ -306,14 +307,14 @@ def test_reversed_steps(direction):
     torch.testing.assert_close(back.coefficients([0, 1, 3, -3]), spectrum[:, [0, 1, 3, size - 3]], rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize(
+@together(
     "name, readout",
     [
         *pairs(["sine3", "sine4", "square4", "hamiltonian4", "measured4"], READOUTS),
         *pairs(["sine2", "square2"], READOUTS[1:]),
     ],
 )
-@pytest.mark.parametrize("direction", [1, -1])
+@together("direction", [1, -1])
 def test_what_a_calibration_puts_in_a_reading_takes_off(name, readout, direction):
     """A camera with offsets, reversed steps and maps reads the depths of one without; both through a transient."""
     code = CODES[name]
@@ -440,7 +441,7 @@ def test_frequencies_of_any_kind(given):
     assert read_itof(camera.expected(LIGHT)[..., :3, :, :], torch.tensor(60.6e6), 3).phase.shape[-3] == 1
 
 
-@pytest.mark.parametrize(
+@together(
     "call, error",
     [
         (lambda: TwoTapCode("sine"), UnitError),

@@ -115,7 +115,7 @@ STEPS = [
 ]
 
 
-@pytest.mark.parametrize("n, p", STEPS)
+@together("n, p", STEPS)
 def test_ends_of_the_tables(n, p):
     """Shares on the steps of the tables and beside them, and the most trials that these hold."""
     share = torch.full((50_000,), p)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from support.marks import long, long_pairs
 from support.sensing.event_driven import Events, compare, detect
 from torchtransient.errors import GradientError, ShapeError, UnitError
 from torchtransient.sensing import (
@@ -232,10 +233,15 @@ def test_coincidences_everywhere(mode, dead, total, kind, k):
     assert sum(a.total_variation for a in found) < 1.5 * sum(a.noise for a in found)
 
 
-@pytest.mark.parametrize("mode, window", [("first", 1.6), ("first", 0.7), ("first", 5.0), ("free", 1.6), ("free", 4.3)])
-@pytest.mark.parametrize("k", [1, 2, 3])
-def test_coincidences_of_three_spads_by_quadrature(mode, window, k):
+WINDOWS = [("first", 1.6), ("first", 0.7), ("first", 5.0), ("free", 1.6), ("free", 4.3)]
+
+
+@pytest.mark.parametrize(
+    ("windows", "k"), long_pairs(WINDOWS, [1, 2, 3], [(one, 1 + n % 3) for n, one in enumerate(WINDOWS)])
+)
+def test_coincidences_of_three_spads_by_quadrature(windows, k):
     """One of them detects while k - 1 of the others have within the window: products, at each moment of each bin."""
+    mode, window = windows
     bins, weights, points = 5, [1.0, 2.0, 4.0], 1000
     rate = torch.tensor([[0.3, 2.5, 0.0, 1.2, 0.7], [1.1, 0.2, 0.9, 3.0, 0.1]], dtype=torch.float64)
     x = rate.T.reshape(1, bins, 1, 2)
@@ -349,7 +355,7 @@ def test_no_image_at_all(make):
         assert measure(torch.ones(0, 1, BINS, 2, 2)).shape == (0, 1, BINS, 2, 2)
 
 
-@pytest.mark.parametrize("photons", [1e-3, 40.0, 400.0, 1e12, pytest.param(1e15, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("photons", long([1e-3, 40.0, 400.0, 1e12, 1e15], [1e-3, 40.0, 400.0]))
 def test_coincidences_of_a_bin_with_any_number_of_photons(photons):
     """All light in bin 0, first photons, a window of a bin: one as soon as k of n SPADs have fired, none after that.
 

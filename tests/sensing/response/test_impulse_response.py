@@ -8,6 +8,7 @@ import pytest
 import torch
 from scipy import stats
 
+from support.sweeps import together
 from torchtransient import TimeAxis
 from torchtransient.errors import ArgumentError, UnitError
 from torchtransient.sensing import (
@@ -293,9 +294,9 @@ def numpy_convolution(x, kernel, first, boundary):
     return y
 
 
-@pytest.mark.parametrize("method", ["direct", "fft"])
-@pytest.mark.parametrize("boundary", ["zero", "periodic"])
-@pytest.mark.parametrize(
+@together("method", ["direct", "fft"])
+@together("boundary", ["zero", "periodic"])
+@together(
     "taps, first", [(1, 0), (5, -2), (5, 3), (5, -9), (20, -7), (20, 4), (40, -20), (3, 15), (3, -15)]
 )
 def test_convolution_against_plain_loops(method, boundary, taps, first):

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 import torch
 
+from support.marks import long, long_rows
 from support.sensing.event_driven import arrivals, chi2_per_dof, dense_limit, detections, histogram, total_variation
 from torchtransient.errors import GradientError, UnitError
 from torchtransient.sensing import (
@@ -111,8 +114,14 @@ def test_gmres_solves_rows_of_different_difficulty():
     torch.testing.assert_close(found, torch.linalg.solve(matrices, right), rtol=1e-6, atol=1e-7)
 
 
-@pytest.mark.parametrize("solve", [nonparalyzable_histogram, paralyzable_histogram])
-@pytest.mark.parametrize("dead", [5.3, pytest.param(20.7, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("dead", "solve"),
+    # That of the other is in test_bright_light.py, by random directions.
+    long_rows(
+        itertools.product([5.3, 20.7], [nonparalyzable_histogram, paralyzable_histogram]),
+        [(5.3, paralyzable_histogram)],
+    ),
+)
 def test_gradients(solve, dead):
     x = as_image(pulse(2.0, 12)).clone().requires_grad_()
     d = torch.tensor(dead, dtype=torch.float64, requires_grad=True)
@@ -132,7 +141,7 @@ def test_learnable_dead_time_is_found():
     assert float(spad.dead_time_s.detach()) == pytest.approx(40e-10, rel=0.01)
 
 
-@pytest.mark.parametrize("dead", [10.5, pytest.param(25.2, marks=pytest.mark.slow), 80.5])
+@pytest.mark.parametrize("dead", long([10.5, 25.2, 80.5], [10.5]))
 def test_samples(dead):
     rate, cycles, repeats = as_image(pulse(2.0)), 300, 3000
     spad = FreeRunningSPAD(cycles, dead * 1e-10, bin_width_s=1e-10, grad="straight_through")
