@@ -318,7 +318,7 @@ class Calls:
             self.stopped_at = "".join(traceback.format_stack(frame, limit=8))
             signal.raise_signal(signal.SIGINT)  # as the keyboard does: a change of the variant lets it wait
 
-        previous = signal.signal(signal.SIGALRM, stop)
+        previous, derivatives = signal.signal(signal.SIGALRM, stop), torch.is_grad_enabled()
         try:
             try:
                 signal.setitimer(signal.ITIMER_REAL, max(after, 1e-4))
@@ -329,6 +329,8 @@ class Calls:
             return True
         finally:
             signal.signal(signal.SIGALRM, previous)
+            # Blocks of torch's own, as no_grad, do not survive an interrupt at their ends.
+            torch.set_grad_enabled(derivatives)
         return False
 
 
