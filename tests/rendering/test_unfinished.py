@@ -18,9 +18,10 @@ from torchtransient._collection import no_collection
 from torchtransient.errors import SceneError, ShapeError, TorchTransientWarning
 from torchtransient.plugins import unfinished
 from torchtransient.plugins.drjit_pool import engine_lock
+from torchtransient.plugins.interrupted import interrupts_wait
 from torchtransient.plugins.unfinished import afterwards, make_good
 from torchtransient.rendering.description import _search_path
-from torchtransient.rendering.interrupts import interrupts_wait, quiet
+from torchtransient.rendering.interrupts import quiet
 from torchtransient.rendering.scene_handle import Scene
 from torchtransient.rendering.variant import active_variant
 from torchtransient.testing.small_room import COLOUR, VARIANT, WALL_POSE, make_room

@@ -24,6 +24,7 @@ import torch
 
 import torchtransient as tt
 from torchtransient.errors import TorchTransientError
+from torchtransient.plugins.interrupted import interrupts_wait
 from torchtransient.testing.small_room import COLOUR, GREY, WALL_POSE, make_room
 
 VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_mono_polarized", "scalar_rgb")
@@ -60,7 +61,10 @@ class Case:
 
     def renderer(self) -> tt.TransientRenderer:
         if self.ready:
-            mi.set_variant(self.variant)
+            # A user's own change of the variant: Mitsuba reloads modules, and an interrupt where Python's import lets
+            # go of its lock keeps it, so that other threads wait for ever.
+            with interrupts_wait():
+                mi.set_variant(self.variant)
             scene = tt.load(mi.load_dict(self.scene()))
         else:
             scene = tt.load(self.scene(), variant=self.variant)

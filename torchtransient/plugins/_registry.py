@@ -50,6 +50,7 @@ from torchtransient._llvm import ensure_llvm
 from torchtransient.errors import PluginRegistrationError, TorchTransientError
 from torchtransient.interfaces import missing_members
 from torchtransient.plugins._compat import active_variant, is_jit, require_jit_variant
+from torchtransient.plugins.interrupted import interrupts_wait
 from torchtransient.plugins.tested_versions import warn_of_untested
 
 KINDS = (
@@ -287,7 +288,10 @@ def _on_variant_change(_old: str | None, new: str | None) -> None:
     with _state.lock:
         try:
             if new is not None and new != _state.variant:
-                _load_all(new)
+                # Python's own import keeps its lock for ever where an interrupt comes as it lets go: other threads
+                # would wait at their next change of the variant.
+                with interrupts_wait():
+                    _load_all(new)
         except PluginRegistrationError as error:
             # Under "-W error" the warning itself raises; sync() reports the same problem at the next library call.
             with contextlib.suppress(RuntimeWarning):

@@ -5,29 +5,21 @@ comes out as a ``RuntimeError`` that names it, and would be taken for an error o
 ``KeyboardInterrupt`` and whatever else is no ``Exception``.
 
 Four things guard against interrupts: :func:`interrupts_pass` raises those that C++ has disguised,
-:func:`interrupts_wait` delays them for changes that must not be left half made, ``plugins.unfinished.afterwards`` is
+``plugins.interrupted.interrupts_wait`` delays them for changes that must not be left half made, ``afterwards`` is
 for changes that can be put back later, and ``forget_traces`` for the collector.
 """
 
 from __future__ import annotations
 
 import functools
-import signal
 import sys
-import threading
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from typing import Any, ParamSpec, TypeVar
 
 from torchtransient.plugins.interrupted import chain_of, interrupt_behind
 from torchtransient.plugins.unfinished import afterwards
-
-# Signals that people handle in Python; asking for all that there are takes longer than a short call.
-_NAMES = (
-    "INT", "TERM", "ALRM", "HUP", "QUIT", "USR1", "USR2", "VTALRM", "PROF", "XCPU", "CONT", "CHLD", "WINCH", "BREAK",
-)  # fmt: skip
-_SIGNALS = tuple(getattr(signal, f"SIG{name}") for name in _NAMES if hasattr(signal, f"SIG{name}"))
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -50,39 +42,6 @@ def interrupts_pass() -> Iterator[None]:
         # The frame that raises is in the traceback of what it raises: together they would stay until they are
         # collected, and the scene with them.
         del interrupt, handled
-
-
-@contextmanager
-def interrupts_wait() -> Iterator[None]:
-    """Delay the handlers of signals set in Python (Ctrl-C, alarms, a scheduler's SIGTERM) until the block is done: for
-    changes of the process that must not be left half made. Each is called once, as signals that wait in the system are.
-    Does nothing in other threads than the main one, where Python runs no handlers.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    found = ((number, signal.getsignal(number)) for number in _SIGNALS)
-    handlers: dict[int, Any] = {number: handler for number, handler in found if callable(handler)}
-    came: list[tuple[int, Any]] = []
-    try:
-        for number in handlers:
-            signal.signal(number, lambda number, frame: came.append((number, frame)))
-        yield
-    finally:
-        with ExitStack() as waiting:
-            for number, frame in dict(came).items():
-                waiting.callback(handlers[number], number, frame)  # each of them, also where another one raises
-            _put_back_handlers(list(handlers.items()))
-
-
-def _put_back_handlers(left: list[tuple[int, Any]]) -> None:
-    try:
-        while left:
-            signal.signal(*left[-1])
-            left.pop()
-    finally:
-        if left:  # one of those put back has raised
-            _put_back_handlers(left)
 
 
 def ends_frames(function: Callable[_P, _R]) -> Callable[_P, _R]:

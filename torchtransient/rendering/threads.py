@@ -9,8 +9,8 @@ import torch
 
 from torchtransient.errors import DeviceError, UnitError, VariantError
 from torchtransient.plugins.drjit_pool import engine_lock, resize_pool, set_drjit_threads
+from torchtransient.plugins.interrupted import interrupts_wait
 from torchtransient.quantities import as_whole, shown
-from torchtransient.rendering.interrupts import interrupts_wait
 from torchtransient.rendering.variant import at_work
 
 MOST_THREADS = 1024
