@@ -66,6 +66,7 @@ def check_moments(chosen, names):
     """Interrupts at ``chosen(moments)`` of each job leave all other calls as they were."""
     jobs, renderer = ready()
     level, expected = mi.logger().log_level(), pushed(renderer)
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, *KINDS)}
     for name in names:
         jobs[name]()
         moments = moments_of(jobs[name])
@@ -83,6 +84,7 @@ def check_moments(chosen, names):
                 torch.testing.assert_close(one, other, msg=where)
             assert mi.variant() == VARIANT and mi.logger().log_level() == level, where
             assert gc.isenabled() and not _collection._traces and not unfinished._owed, where
+            assert {number: signal.getsignal(number) for number in handlers} == handlers, where
         assert interrupted > len(ends) / 20 or interrupted > 3
 
 

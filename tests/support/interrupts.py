@@ -4,9 +4,19 @@ call of compiled code.
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Callable
 from typing import Any
+
+# Signals that are delayed (`plugins.interrupted.interrupts_wait`) reach nothing: the first of their handlers is
+# replaced first and put back last.
+WAITING = "interrupts_wait"
+
+
+def signals_wait() -> bool:
+    return WAITING in getattr(signal.getsignal(signal.SIGINT), "__qualname__", "")
+
 
 PLACES = ("/torchtransient/", "contextlib")
 
@@ -19,7 +29,7 @@ def moments_of(job: Callable[[], Any], at: int = -1) -> list[tuple[str, str]]:
 
     def profile(frame, event, arg):
         name = frame.f_code.co_filename
-        if event in ("call", "c_return") and any(place in name for place in PLACES):
+        if event in ("call", "c_return") and any(place in name for place in PLACES) and not signals_wait():
             seen.append((name.rsplit("/", 1)[-1], frame.f_code.co_name))
             if len(seen) - 1 == at:
                 sys.setprofile(None)
