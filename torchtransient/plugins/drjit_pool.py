@@ -100,7 +100,7 @@ def resize_pool(count: int) -> None:
 
 def _wake(library: Any, ended: threading.Lock) -> None:
     """Submit a task that does nothing, again and again until ``ended`` is let go; not for ever, since an interrupt may
-    prevent that it is set.
+    prevent that it is.
     """
     for _ in range(MOST_WAKES):
         if ended.acquire(timeout=WAKE_S):

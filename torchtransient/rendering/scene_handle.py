@@ -21,7 +21,7 @@ from torchtransient.rendering.ready_scenes import described_for_time
 from torchtransient.rendering.recordings import Recordings
 from torchtransient.rendering.saving.save import save_scene
 from torchtransient.rendering.taken import ReadyScene
-from torchtransient.rendering.variant import active_variant, at_work, resolve_variant
+from torchtransient.rendering.variant import active_variant, resolve_variant
 
 # Built scenes kept per description: one for every combination of time axis, depth and substituted plugins in use.
 _MAX_BUILDS = 8
@@ -76,12 +76,12 @@ class Scene:
         return self._parameters(BuildOptions(real_bitmaps=True))
 
     def _parameters(self, options: BuildOptions) -> ParameterTable:
-        with at_work():
-            if self._table is None:
-                with active_variant(self.variant):
-                    self._table = parameter_table(self.built(options))
+        found = self._table
+        if found is None:
+            with active_variant(self.variant):
+                found = self._table = parameter_table(self.built(options))
                 self._table_options = options
-            return self._table
+        return found
 
     def built(self, options: BuildOptions) -> BuiltScene:
         """The Mitsuba scene for some options, with the described values. Must be called inside
