@@ -697,6 +697,8 @@ def same_recorded(make, values, names, hidden=False):
     """Recorded calls with these values against traced ones of a scene of their own; the last two are launched, unless
     arrays are ``hidden``.
     """
+    # Plugins of earlier tests that are collected between two calls would change what these are compiled for.
+    gc.collect()
     recorded, traced = (make(freeze) for freeze in (True, False))
     said, found = [], []
     for given in values:
