@@ -56,22 +56,21 @@ from torchtransient.rendering.physics import scene_findings
 from torchtransient.rendering.placements import mesh_transforms, placements
 from torchtransient.rendering.pulse_properties import PREFIXES, PROPERTIES, write_pulse
 from torchtransient.rendering.taken import ReadyScene, check_taken, pointers
+from torchtransient.rendering.translation import (
+    COUNTERPARTS,
+    FILM_PROPERTIES,
+    PATH_PROPERTIES,
+    STEADY_FILMS,
+    check_stated,
+    depth_of,
+    forget_queries,
+    stated_nodes,
+    tracing,
+)
 from torchtransient.rendering.unread_properties import unread_properties
 
-# Steady integrators, and the transient ones for which their parameters mean the same.
-_COUNTERPARTS = {
-    **dict.fromkeys(("path", "prb", "prb_basic", "prb_projective"), "transient_path"),
-    **dict.fromkeys(("volpath", "volpathmis", "prbvolpath"), "transient_prbvolpath"),
-}
-_PATH_PROPERTIES = ("max_depth", "rr_depth", "hide_emitters")
 _TRANSIENT_PROPERTIES = (
-    *_PATH_PROPERTIES, "camera_unwarp", "discard_direct_light", "temporal_filter", "gaussian_stddev",
-)  # fmt: skip
-# What a transient film takes over from a steady one; file formats and alpha have no meaning for it.
-_STEADY_FILMS = ("hdrfilm", "specfilm")
-_FILM_PROPERTIES = (
-    "width", "height", "crop_width", "crop_height", "crop_offset_x", "crop_offset_y", "sample_border",
-    "exhaustive_scan", "laser_scan_width", "laser_scan_height",
+    *PATH_PROPERTIES, "camera_unwarp", "discard_direct_light", "temporal_filter", "gaussian_stddev",
 )  # fmt: skip
 
 
@@ -126,6 +125,8 @@ def build(description: Description, variant: str, options: BuildOptions) -> Buil
     try:
         with description.resolved_files(), plugins.plugin_errors(), threads_for_files():
             state = description.parse(config)
+            # Files of older versions spell properties in another way.
+            mi.parser.transform_upgrade(config, state)
             _check_root(state)
             check_nodes(state)
             check_mesh_files(state)
@@ -134,16 +135,18 @@ def build(description: Description, variant: str, options: BuildOptions) -> Buil
             if not options.merge:
                 take_merged_apart(state)
                 name_nested(state)
+            stated = stated_nodes(state)
             _override_films(state, options)
             _override_integrator(state, options)
             _override_samplers(state, options)
+            check_stated(config, state, stated)
             _substitute_plugins(state, options)
             transforms = mesh_transforms(state)
             placed = placements(state)
             integrator = find_child(state, state.root, is_integrator)
             plugin = "" if integrator is None else state.nodes[integrator].props.plugin_name()
             check_finite(state)
-            _forget_queries(state)
+            forget_queries(state)
             textures = names_of_textures(state)
             mi.parser.transform_all(config, state)
             scene = mi.parser.instantiate(config, state)
@@ -252,39 +255,43 @@ def _override_film(state: Any, index: int, options: BuildOptions) -> None:
     props, film = state.nodes[index].props, options.film
     plugin = props.plugin_name()
     if film is None:
-        if options.transient and plugin in _STEADY_FILMS:
+        if options.transient and plugin in STEADY_FILMS:
             ways = " or ".join(f"TransientRenderer(..., {kind.example})" for kind in all_films())
             raise SceneError(
                 f"the film is a steady {plugin!r}, which has no time axis. Give one: {ways}, or make the film one of "
                 f"{plugins_in_words()}."
             )
         return
-    if plugin in _STEADY_FILMS and not options.transient:
+    if plugin in STEADY_FILMS and not options.transient:
         return
-    if plugin != film.plugin and (plugin in _STEADY_FILMS or of_plugin(plugin) is not None):
+    if plugin != film.plugin and (plugin in STEADY_FILMS or of_plugin(plugin) is not None):
         if not film.takes_pulse and any(prefix in props for prefix in PREFIXES):
             raise SceneError(
                 f"the film {plugin!r} has a pulse or an irf, which a {film.plugin} would lose; take it out."
             )
-        _become(state, index, film.plugin, keep=_FILM_PROPERTIES + PROPERTIES)
+        _become(state, index, film.plugin, keep=FILM_PROPERTIES + PROPERTIES)
         props = state.nodes[index].props
     if not film.fits(props.plugin_name()):
         raise SceneError(f"the film {plugin!r} cannot become a {film.plugin}; make it one of {plugins_in_words()}.")
     film.write(props)
 
 
-def _become(state: Any, index: int, plugin: str, keep: tuple[str, ...], nested: bool = True) -> None:
-    """Turn a node into another plugin; keep the named properties and, if ``nested``, child objects and spectra."""
+def _become(
+    state: Any, index: int, plugin: str, keep: tuple[str, ...], nested: bool = True, source: int | None = None
+) -> None:
+    """Turn a node into another plugin; keep the named properties, of the node ``source`` or its own, and, if
+    ``nested``, child objects and spectra.
+    """
     import mitsuba as mi
 
-    old = state.nodes[index].props
+    old, given = state.nodes[index].props, state.nodes[index if source is None else source].props
     inner = {key for key, _ in children(state, state.nodes[index])}
     inner |= {key for key in list(old.keys()) if old.type(key) == mi.Properties.Type.Spectrum}
     new = mi.Properties(plugin)
     new.set_id(old.id())
-    for key in list(old.keys()):
+    for key in list(given.keys()):
         if key in keep or (nested and key in inner):
-            new[key] = old[key]
+            new[key] = given[key]
     state.nodes[index].props = new
 
 
@@ -297,18 +304,21 @@ def _override_integrator(state: Any, options: BuildOptions) -> None:
     if options.transient:
         if index is None:
             plugin = "transient_prbvolpath" if media_in_use(state) else "transient_path"
-            _add_child(state, 0, "integrator", plugin, mi.ObjectType.Integrator, {})
+            _add_child(state, 0, "integrator", plugin, mi.ObjectType.Integrator, {"max_depth": depth_of(state, None)})
             index = len(state.nodes) - 1
-        plugin = state.nodes[index].props.plugin_name()
+        plugin, depth = state.nodes[index].props.plugin_name(), depth_of(state, index)
         if options.integrator is not None and plugin != options.integrator:
-            _become(state, index, options.integrator, keep=_TRANSIENT_PROPERTIES, nested=False)
-        elif plugin in _COUNTERPARTS:
-            wanted = "transient_prbvolpath" if media_in_use(state) else _COUNTERPARTS[plugin]
-            _become(state, index, wanted, keep=_PATH_PROPERTIES)
+            source = tracing(state, index)
+            _become(state, index, options.integrator, keep=_TRANSIENT_PROPERTIES, nested=False, source=source)
+            state.nodes[index].props["max_depth"] = depth
+        elif plugin in COUNTERPARTS:
+            wanted = "transient_prbvolpath" if media_in_use(state) else COUNTERPARTS[plugin]
+            _become(state, index, wanted, keep=PATH_PROPERTIES)
+            state.nodes[index].props["max_depth"] = depth
         elif not is_transient_integrator(plugin):
             raise SceneError(
                 f"integrator {plugin!r} has no transient counterpart. Expected transient_path, transient_prbvolpath, "
-                f"or one that they can stand in for: {', '.join(_COUNTERPARTS)}."
+                f"or one that they can stand in for: {', '.join(COUNTERPARTS)}."
             )
     if options.max_depth is not None and index is not None:
         state.nodes[index].props["max_depth"] = int(options.max_depth)
@@ -374,10 +384,3 @@ def _substitute_plugins(state: Any, options: BuildOptions) -> None:
             held = descendants(state, node)
             if any(inner.props.id() in asked and inner.props.plugin_name() in BUILDS_LOBES for inner in held):
                 node.props["allow_transmission"] = True
-
-
-def _forget_queries(state: Any) -> None:
-    """Looking at a property counts as using it: take that back, so that Mitsuba still reports misspelt ones."""
-    for node in state.nodes:
-        for key in list(node.props.keys()):
-            node.props.mark_queried(key, False)

@@ -14,6 +14,7 @@ from torchtransient.rendering.films.choice import FilmChoice
 from torchtransient.rendering.films.choices import of_plugin
 from torchtransient.rendering.inventory_colour import COLOUR, MEASURED, colour_of_node, colour_of_value
 from torchtransient.rendering.nodes import children, find_child, is_film, is_integrator, kind_of_node, reachable, roots
+from torchtransient.rendering.translation import NO_LIMIT, depth_of
 
 # Optical elements whose only purpose is polarization: without it even a single one is drawn wrongly.
 POLARIZING_ELEMENTS = ("polarizer", "retarder", "circular", "pplastic", "measured_polarized")
@@ -44,7 +45,7 @@ class SceneInventory:
 
     ``albedo``: no surface or medium scatters more than this share of the light, 1 when that is not known, with the
     node that sets it in ``brightest``. ``integrator`` and ``film`` are plugin names, with the properties that a plan
-    reads. ``pulsed``: the film spreads arrivals by a pulse or an impulse response.
+    reads; ``max_depth`` is -1 for no limit. ``pulsed``: the film spreads arrivals by a pulse or an impulse response.
     """
 
     media: list[Finding] = field(default_factory=list)
@@ -58,7 +59,7 @@ class SceneInventory:
     albedo: float = 0.0
     brightest: str = ""
     integrator: str | None = None
-    max_depth: int | None = None
+    max_depth: int = NO_LIMIT
     film: str | None = None
     film_axis: TimeAxis | None = None
     temporal_filter: str | None = None
@@ -180,11 +181,7 @@ def _note_integrator(inventory: SceneInventory, state: Any) -> None:
         props = state.nodes[index].props
         if is_integrator(state.nodes[index]):
             inventory.integrator = props.plugin_name()
-            # Mitsuba's `stokes`, `aov` and `moment` measure what a nested integrator traces.
-            nested = find_child(state, state.nodes[index], is_integrator)
-            for inner in (props, *([] if nested is None else [state.nodes[nested].props])):
-                if "max_depth" in inner:
-                    inventory.max_depth = int(inner["max_depth"])
+            inventory.max_depth = int(depth_of(state, index))
             if props.get("temporal_filter", ""):
                 inventory.temporal_filter = str(props["temporal_filter"])
 

@@ -13,13 +13,14 @@ from torchtransient.rendering.films.choice import FilmChoice, PlannedFilm
 from torchtransient.rendering.films.choices import all_films
 from torchtransient.rendering.inventory import Finding, SceneInventory
 from torchtransient.rendering.nodes import is_transient_integrator
+from torchtransient.rendering.translation import NO_LIMIT
 
 # What every film can show beside its own measurement.
 _OF_ANY_FILM = ("steady", "stokes", "bands")
 SURFACES, VOLUMES = "transient_path", "transient_prbvolpath"
 _ALIASES = {"transient_volpath": VOLUMES}
-# Depth of integrators that say nothing, as in Mitsuba's transient plugins.
-PLUGIN_DEPTH = 6
+# They add pictures to what a nested integrator traces.
+_WITH_PICTURES = ("aov", "moment")
 
 
 @dataclass(frozen=True)
@@ -126,6 +127,11 @@ def choose_integrator(inventory: SceneInventory) -> tuple[Choice, list[str]]:
         f"not used: {some(inventory.declared_only)}, declared and referred to by nothing"
     ] if inventory.declared_only else []  # fmt: skip
     own = inventory.integrator or ""
+    if own in _WITH_PICTURES:
+        notes.append(
+            f"not rendered: the pictures that {own!r} adds to its nested integrator; torchtransient.rendering.labels "
+            "has depth, normals, shapes and albedos, standard errors come of renders with several seeds"
+        )
     if is_transient_integrator(own) and _ALIASES.get(own, own) not in (SURFACES, VOLUMES):
         return Choice(own, f"integrator: {own}, the scene's own"), notes
     if inventory.media:
@@ -133,12 +139,16 @@ def choose_integrator(inventory: SceneInventory) -> tuple[Choice, list[str]]:
     return Choice(SURFACES, f"integrator: {SURFACES}, since no medium can be reached from the scene"), notes
 
 
+def depth_in_words(depth: int) -> str:
+    """How reasons call a ``max_depth``."""
+    return "no limit" if depth == NO_LIMIT else str(depth)
+
+
 def depth_by_albedo(inventory: SceneInventory, tail: float) -> tuple[int | None, str]:
     """The depth at which at most ``tail`` of the emitted power is still on its way, if the albedos bound it."""
     if inventory.albedo >= 1:
-        kept = PLUGIN_DEPTH if inventory.max_depth is None else inventory.max_depth
         return None, (
-            f"max_depth: {kept}, kept; not bounded, since {inventory.brightest} may reflect everything and no pilot "
+            f"max_depth: {depth_in_words(inventory.max_depth)}, kept; not bounded, since {inventory.brightest} may reflect everything and no pilot "
             "run was asked for"
         )
     bounces = 1 if inventory.albedo == 0 else max(1, math.ceil(math.log(tail) / math.log(inventory.albedo)))

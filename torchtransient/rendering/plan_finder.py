@@ -153,17 +153,17 @@ class Finder:
     # ------------------------------------------------------------------------------------------------------ depth
 
     def _depth(self, given: int | str | None) -> int | None:
-        own = choices.PLUGIN_DEPTH if self.inventory.max_depth is None else self.inventory.max_depth
+        own = self.inventory.max_depth
         if isinstance(given, str) and given != "scene":
             raise ArgumentError(f"max_depth: expected a number, 'scene' or None, got {given!r}.")
         if given is not None:
             asked = own if given == "scene" else int(given)
             self._note_tail(asked)
-            self.reasons.append(f"max_depth: {asked}, as asked for{self._beyond(asked)}")
+            self.reasons.append(f"max_depth: {choices.depth_in_words(asked)}, as asked for{self._beyond(asked)}")
             return asked
         if self.arrivals is None and self._around_a_corner:
             self.reasons.append(
-                f"max_depth: {own}, kept; what albedos leave of emitted power says little about light around corners"
+                f"max_depth: {choices.depth_in_words(own)}, kept; what albedos leave of emitted power says little about light around corners"
             )
             return None
         if self.arrivals is None:
@@ -171,7 +171,7 @@ class Finder:
             self.reasons.append(reason)
             return depth
         if self.arrivals.dark:
-            self.reasons.append(f"max_depth: {own}, kept, since the pilot run saw no light")
+            self.reasons.append(f"max_depth: {choices.depth_in_words(own)}, kept, since the pilot run saw no light")
             return None
         from torchtransient.plugins.integrators.pilot import PILOT_DEPTH
 

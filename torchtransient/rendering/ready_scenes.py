@@ -8,7 +8,6 @@ steady film and steady path tracers are described by what they show of themselve
 
 from __future__ import annotations
 
-import re
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ import numpy as np
 from torchtransient.plugins.node_walk import objects_of
 from torchtransient.rendering.description import DictDescription, describe_dict
 from torchtransient.rendering.taken import Taken
+from torchtransient.rendering.translation import pixels_of, shown_properties
 from torchtransient.rendering.variant import active_variant
 
 _INTEGRATORS = {
@@ -49,13 +49,8 @@ def described_for_time(scene: Any) -> DictDescription | None:
     return describe_dict(tree) if any(isinstance(entry, dict) for entry in tree.values()) else None
 
 
-def _said(value: Any) -> dict[str, str]:
-    """What an object says of itself, by name."""
-    return dict(re.findall(r"^ *(\w+) = ([^\n,\[]+),?$", str(value), flags=re.MULTILINE))
-
-
 def _integrator(value: Any) -> dict[str, Any] | None:
-    plugin, said = _INTEGRATORS.get(value.class_name()), _said(value)
+    plugin, said = _INTEGRATORS.get(value.class_name()), shown_properties(value)
     if plugin is None or not {"max_depth", "rr_depth"} <= said.keys():
         return None
     # Without a bound it is -1, as a number without sign.
@@ -88,7 +83,7 @@ def _sensor(value: Any) -> dict[str, Any] | None:
 
 
 def _film(film: Any) -> dict[str, Any] | None:
-    rfilter, said = _rfilter(film.rfilter()), _said(film)
+    rfilter = _rfilter(film.rfilter())
     if film.class_name() != "HDRFilm" or film.sensor_response_function() is not None or rfilter is None:
         return None
     (width, height), (crop_width, crop_height) = film.size(), film.crop_size()
@@ -97,7 +92,7 @@ def _film(film: Any) -> dict[str, Any] | None:
         "type": "hdrfilm",
         "width": int(width), "height": int(height), "crop_width": int(crop_width), "crop_height": int(crop_height),
         "crop_offset_x": int(left), "crop_offset_y": int(top), "sample_border": bool(film.sample_border()),
-        "pixel_format": said.get("pixel_format", "rgb").strip(), "rfilter": rfilter,
+        "pixel_format": pixels_of(film), "rfilter": rfilter,
     }
 
 
@@ -114,7 +109,7 @@ def _rfilter(rfilter: Any) -> dict[str, Any] | None:
 
 
 def _sampler(sampler: Any) -> dict[str, Any] | None:
-    plugin, said = _SAMPLERS.get(sampler.class_name()), _said(sampler)
+    plugin, said = _SAMPLERS.get(sampler.class_name()), shown_properties(sampler)
     if plugin is None:
         return None
     found: dict[str, Any] = {"type": plugin, "sample_count": int(sampler.sample_count())}

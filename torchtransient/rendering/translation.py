@@ -1,0 +1,178 @@
+"""Plugins of steady pictures, and the time-resolved ones that are built in their place.
+
+What a node states keeps its meaning, and what it leaves out has the default of the plugin that it names. Mitsuba builds
+that plugin first, so that it refuses what it would refuse in a picture: misspelt properties and values that are none.
+
+| stated | becomes |
+|---|---|
+| size, crop and spatial filter of a film, ``sample_border`` | kept |
+| ``pixel_format`` of an ``hdrfilm`` | refused where it asks for other channels than a time-resolved film has |
+| ``file_format``, ``component_format`` | without effect, since renders are tensors |
+| ``max_depth``, ``rr_depth``, ``hide_emitters`` | kept; in ``aov``, ``moment``, ``stokes`` those of the nested integrator |
+| ``use_spectral_mis`` (``volpathmis``), ``jitter``, ``strength`` (samplers) | without effect but on noise |
+| ``timeout``, ``block_size``, ``samples_per_pass`` | without effect in variants that compile kernels |
+| numbers of samples of silhouettes (``prb_projective``) | refused: those are no part of the derivative here |
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from torchtransient.errors import SceneError
+from torchtransient.rendering.interrupts import quiet
+from torchtransient.rendering.nodes import find_child, is_film, is_integrator, kind_of_node
+
+NO_LIMIT = -1
+# Steady integrators, and the transient ones for which their parameters mean the same.
+COUNTERPARTS = {
+    **dict.fromkeys(("path", "prb", "prb_basic", "prb_projective"), "transient_path"),
+    **dict.fromkeys(("volpath", "volpathmis", "prbvolpath"), "transient_prbvolpath"),
+}
+PATH_PROPERTIES = ("max_depth", "rr_depth", "hide_emitters")
+# What a transient film takes over from a steady one.
+STEADY_FILMS = ("hdrfilm", "specfilm")
+FILM_PROPERTIES = (
+    "width", "height", "crop_width", "crop_height", "crop_offset_x", "crop_offset_y", "sample_border",
+    "exhaustive_scan", "laser_scan_width", "laser_scan_height",
+)  # fmt: skip
+
+# They measure what a nested integrator traces.
+_AROUND_OTHERS = ("aov", "moment", "stokes")
+# `max_depth` of integrators that do not state it; the others are written in Python and have that of the transient ones.
+_DEPTHS = {
+    **dict.fromkeys(("path", "volpath", "volpathmis", "ptracer"), NO_LIMIT),
+    **dict.fromkeys(("direct", "direct_projective"), 2),
+}
+_DEPTH_IN_PYTHON = 6
+_OF_SILHOUETTES = (
+    "sppc", "sppp", "sppi", "guiding", "guiding_proj", "guiding_rounds", "project_seed",
+)  # fmt: skip
+# What an `hdrfilm` prints for some of the values of its `pixel_format`.
+_PRINTED = {"y": "luminance", "ya": "luminance_alpha"}
+
+
+def tracing(state: Any, index: int) -> int:
+    """Index of the integrator that traces the paths of the integrator at ``index``: itself or a nested one."""
+    nested = None
+    if state.nodes[index].props.plugin_name() in _AROUND_OTHERS:
+        nested = find_child(state, state.nodes[index], is_integrator)
+    return index if nested is None else tracing(state, nested)
+
+
+def depth_of(state: Any, index: int | None) -> Any:
+    """``max_depth`` of an integrator, as it is stated or by default, -1 for no limit; None: that of a scene without
+    one, which Mitsuba renders by ``path``.
+    """
+    if index is None:
+        return NO_LIMIT
+    props = state.nodes[tracing(state, index)].props
+    return props.get("max_depth", _DEPTHS.get(props.plugin_name(), _DEPTH_IN_PYTHON))
+
+
+def shown_properties(plugin: Any) -> dict[str, str]:
+    """Properties that a plugin of Mitsuba prints, by name."""
+    return dict(re.findall(r"^ *(\w+) = ([^\n,\[]+),?$", str(plugin), flags=re.MULTILINE))
+
+
+def pixels_of(film: Any) -> str:
+    """``pixel_format`` of a built ``hdrfilm``; its file format and the variant may have replaced the one stated."""
+    printed = shown_properties(film)["pixel_format"].strip()
+    return _PRINTED.get(printed, printed)
+
+
+# ------------------------------------------------------------------------------------------------------------- checks
+
+
+def stated_nodes(state: Any) -> dict[int, Any]:
+    """Copies of the nodes of a parsed scene that may be translated, by index."""
+    import mitsuba as mi
+
+    return {
+        index: mi.parser.SceneNode(node)
+        for index, node in enumerate(state.nodes)
+        if is_film(node) or is_integrator(node) or kind_of_node(node) == "Sampler"
+    }
+
+
+def check_stated(config: Any, state: Any, stated: Mapping[int, Any]) -> None:
+    """Build every node that has become another plugin as it was ``stated``.
+
+    Raises what Mitsuba raises for it, and SceneError for properties that ask for something that is not there.
+    """
+    import mitsuba as mi
+
+    changed = {
+        index: node
+        for index, node in stated.items()
+        if node.props.plugin_name() != state.nodes[index].props.plugin_name() and _is_built(node.props.plugin_name())
+    }
+    if not changed:
+        return
+    alone = mi.parser.ParserConfig(config.variant)
+    alone.parallel = alone.merge_equivalent = alone.merge_meshes = False
+    whole = mi.parser.ParserState(state)
+    for index, node in changed.items():
+        whole.nodes[index] = node
+    forget_queries(whole)
+    mi.parser.transform_resolve(alone, whole)
+    paths = list(whole.node_paths)
+    for index, node in changed.items():
+        # Mitsuba builds the first node and what it refers to.
+        whole.nodes[0] = mi.parser.SceneNode(whole.nodes[index])
+        whole.node_paths = [paths[index], *paths[1:]] if paths else []
+        with quiet():
+            plugin = _built(alone, whole, node.props.plugin_name())
+        if node.props.plugin_name() == "hdrfilm":
+            _check_channels(plugin, state.nodes[index].props.plugin_name())
+        _check_silhouettes(node.props)
+
+
+def forget_queries(state: Any) -> None:
+    """Mark all properties of a parsed scene as unread: looking at one counts as use, and hides misspelt ones."""
+    for node in state.nodes:
+        for key in list(node.props.keys()):
+            node.props.mark_queried(key, False)
+
+
+def _is_built(plugin: str) -> bool:
+    """Return False for films with response curves in variants without wavelengths, which no film of curves takes."""
+    import mitsuba as mi
+
+    return plugin != "specfilm" or bool(mi.is_spectral)
+
+
+def _built(config: Any, state: Any, plugin: str) -> Any:
+    import mitsuba as mi
+
+    if plugin != "stokes" or mi.is_polarized:
+        return mi.parser.instantiate(config, state)
+    # Pilot runs are unpolarized, where Mitsuba has no `stokes`. `moment` reads the same properties.
+    state.nodes[0].props.set_plugin_name("moment")
+    try:
+        return mi.parser.instantiate(config, state)
+    except RuntimeError as error:
+        raise RuntimeError(str(error).replace('plugin of type "moment"', 'plugin of type "stokes"')) from error
+
+
+def _check_channels(film: Any, wanted: str) -> None:
+    import mitsuba as mi
+
+    found, there = pixels_of(film), "luminance" if mi.is_monochromatic else "rgb"
+    if found != there:
+        raise SceneError(
+            f"hdrfilm: pixel_format: expected {there!r}, got {found!r}: a {wanted} has the channels of "
+            f"{mi.variant()}, without alpha. Make it {there!r} or leave it out. Variants '..._mono' have luminance; "
+            "torchtransient.rendering.labels tells what pixels see."
+        )
+
+
+def _check_silhouettes(props: Any) -> None:
+    found = [name for name in _OF_SILHOUETTES if name in props]
+    if found:
+        raise SceneError(
+            f"{props.plugin_name()}: {', '.join(map(repr, found))}: expected no samples of silhouettes, which are no "
+            "part of the derivatives of a transient integrator. Leave it out; spp_grad= says the samples of a "
+            "derivative."
+        )
