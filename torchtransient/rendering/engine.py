@@ -22,6 +22,7 @@ from torchtransient.plugins.parameters import check_slope
 from torchtransient.rendering.batch import Batch, take
 from torchtransient.rendering.broken_numbers import all_finite, broken_entries, fill_broken
 from torchtransient.rendering.carry_out import Numbered, carry_out, groups_of
+from torchtransient.rendering.depth_bound import depth_limit
 from torchtransient.rendering.films.choice import FilmChoice
 from torchtransient.rendering.films.choices import of_film
 from torchtransient.rendering.interrupts import ends_frames
@@ -44,7 +45,8 @@ def primal(job: RenderJob, values: Sequence[torch.Tensor]) -> tuple[torch.Tensor
         check_fits(session.film(job.items[0]).cube_shape(), len(job.items), job.scene.variant)
         steady, response, before, after, said = _render_items(session, values)
         seconds, spp = time.perf_counter() - started, _drawn_samples(session)
-        job.log.append(RunLog(job.items, seconds, session.slots.built.integrator, spp, before, after, said))
+        integrator, depth = session.slots.built.integrator, depth_limit(session.integrator)
+        job.log.append(RunLog(job.items, seconds, integrator, spp, before, after, said, depth))
         channels = len(session.film(job.items[0]).channel_names())
     if job.watch.looks:
         job.watch.window(steady, channels, sum(before), sum(after))

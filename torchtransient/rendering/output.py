@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 
@@ -14,6 +14,9 @@ from torchtransient.gates import Gate
 from torchtransient.rendering.films.choice import FilmChoice
 from torchtransient.rendering.variant import stokes_components
 from torchtransient.tensor_record import TensorRecord
+
+if TYPE_CHECKING:
+    from torchtransient.rendering.session import RenderJob
 
 
 @dataclass(frozen=True)
@@ -25,7 +28,9 @@ class RenderStats:
     axis: sum over pixels of the mean over channels; zero for films without a window (phasors, gates).
     ``temporal_filter`` is empty for films without one. ``seeds`` are the items' seeds. ``recorded``: what became of
     each item's recording, "launched", "recorded", or "traced: " and why; ``derivatives_recorded``: the same of the
-    derivatives that have been asked for since.
+    derivatives that have been asked for since. ``max_depth``: of the paths, -1 for no limit, None for integrators without
+    one. ``light_beyond``: where the scene states no depth and derivatives are asked for, so that ``max_depth`` was found
+    by a pilot run, the share of that run's light in deeper paths; else None.
     """
 
     _: KW_ONLY
@@ -40,6 +45,29 @@ class RenderStats:
     energy_after: tuple[float, ...]
     recorded: tuple[str, ...] = ()
     derivatives_recorded: list[str] = field(default_factory=list, compare=False)
+    max_depth: int | None = None
+    light_beyond: float | None = None
+
+    @classmethod
+    def of_job(cls, job: RenderJob, pixels: int) -> RenderStats:
+        """Those of a job that has run, on films of so many pixels."""
+        runs = job.log
+        items, seconds = [item for run in runs for item in run.items], sum(run.seconds for run in runs)
+        return cls(
+            spp=runs[0].spp,
+            seconds=seconds,
+            samples_per_second=runs[0].spp * pixels * len(items) / seconds,
+            variant=job.scene.variant,
+            integrator=runs[0].integrator,
+            temporal_filter=job.temporal_filter or "",
+            seeds=tuple(item.seed for item in items),
+            energy_before=tuple(energy for run in runs for energy in run.energy_before),
+            energy_after=tuple(energy for run in runs for energy in run.energy_after),
+            recorded=tuple(said for run in runs for said in run.recorded),
+            derivatives_recorded=job.derivative_log,
+            max_depth=runs[0].max_depth,
+            light_beyond=None if job.bound is None else job.bound.beyond,
+        )
 
     @classmethod
     def of_batch(cls, several: Sequence[RenderStats]) -> RenderStats:
@@ -47,7 +75,7 @@ class RenderStats:
         ``ShapeError`` for renders that were not made alike.
         """
         first = several[0]
-        for name in ("spp", "variant", "integrator", "temporal_filter"):
+        for name in ("spp", "variant", "integrator", "temporal_filter", "max_depth"):
             values = list(dict.fromkeys(getattr(stats, name) for stats in several))
             if len(values) > 1:
                 raise ShapeError(
@@ -123,7 +151,10 @@ class RenderOutput(TensorRecord):
         seeds = f"seed {stats.seeds[0]}" if len(stats.seeds) == 1 else f"{len(stats.seeds)} seeds"
         made = f"{stats.spp} spp in {stats.seconds:.3g} s, {stats.integrator}, {stats.variant}, {seeds}"
         outside = sum(stats.energy_before) + sum(stats.energy_after)
-        return {"stats": made + (f", energy outside of the window {outside:.4g}" if outside else "")}
+        made += f", energy outside of the window {outside:.4g}" if outside else ""
+        if stats.light_beyond is not None:
+            made += f", max_depth {stats.max_depth} with {stats.light_beyond:.2g} of the light beyond"
+        return {"stats": made}
 
     @classmethod
     def of(

@@ -16,13 +16,12 @@ from torchtransient.rendering.build_options import BuildOptions
 from torchtransient.rendering.films.choice import FilmChoice, PlannedFilm
 from torchtransient.rendering.inventory import SceneInventory
 from torchtransient.rendering.parameters import needing_slope, unknown_key
-from torchtransient.rendering.plan_pilot import MOST_BINS, Arrivals, PilotReport, axis_over
+from torchtransient.rendering.plan_pilot import MOST_BINS, Arrivals, PilotReport, axis_over, pilot_run
 from torchtransient.rendering.scene_handle import Scene, load
 from torchtransient.rendering.slope import check_filter, filter_for
+from torchtransient.rendering.translation import NO_LIMIT
 from torchtransient.rendering.variant import active_variant
 
-PILOT_PATHS = 32768
-PILOT_PIXELS = 2048
 _AROUND_CORNERS = "transient_nlos"
 # One bin for all times: far beyond the light of any scene when no pilot run says how far it goes.
 _ALL_TIMES = 1e9
@@ -95,7 +94,7 @@ class Finder:
         return Findings(depth, film, filter_name, tuple(self.reasons), self.report)
 
     def _run(self) -> None:
-        """The pilot run, without polarization: it costs most of the time and changes neither depth nor time."""
+        """The pilot run."""
         started = time.perf_counter()
         variant = self.draft.variant.removesuffix("_polarized")
         scene = load(self.draft.scene, variant=variant)
@@ -108,23 +107,10 @@ class Finder:
             pulse=self.draft.pulse,
             irf=self.draft.irf,
         )
-        with active_variant(variant):
-            from torchtransient.plugins.integrators.pilot import pilot_events
-
-            built = scene.built(options).scene
-            sensors = built.sensors()
-            if not 0 <= self.draft.sensor < len(sensors):
-                raise ArgumentError(
-                    f"sensor: the scene has {len(sensors)}, numbered from 0; got {self.draft.sensor}. Give an index."
-                )
-            film = sensors[self.draft.sensor].film()
-            early, late = (sum(p.support_opl[side] for p in film.pulses) for side in (0, 1))
-            self.spread = (early, late)
-            events = pilot_events(
-                built, built.integrator(), self.draft.sensor, seed=self.seed, pixels=PILOT_PIXELS, paths=PILOT_PATHS
-            )
-            scene.drop(options)
-        found = kind.seen(film, Arrivals(events))
+        film, found = pilot_run(scene, options, self.draft.sensor, kind, self.seed)
+        early, late = (sum(p.support_opl[side] for p in film.pulses) for side in (0, 1))
+        self.spread = (early, late)
+        scene.drop(options)
         self.arrivals = found
         dark = found.dark
         self.report = PilotReport(
@@ -159,11 +145,11 @@ class Finder:
         if given is not None:
             asked = own if given == "scene" else int(given)
             self._note_tail(asked)
-            self.reasons.append(f"max_depth: {choices.depth_in_words(asked)}, as asked for{self._beyond(asked)}")
+            self.reasons.append(f"max_depth: {self._in_words(asked)}, as asked for{self._beyond(asked)}")
             return asked
         if self.arrivals is None and self._around_a_corner:
             self.reasons.append(
-                f"max_depth: {choices.depth_in_words(own)}, kept; what albedos leave of emitted power says little about light around corners"
+                f"max_depth: {self._in_words(own)}, kept; what albedos leave of emitted power says little about light around corners"
             )
             return None
         if self.arrivals is None:
@@ -171,7 +157,7 @@ class Finder:
             self.reasons.append(reason)
             return depth
         if self.arrivals.dark:
-            self.reasons.append(f"max_depth: {choices.depth_in_words(own)}, kept, since the pilot run saw no light")
+            self.reasons.append(f"max_depth: {self._in_words(own)}, kept, since the pilot run saw no light")
             return None
         from torchtransient.plugins.integrators.pilot import PILOT_DEPTH
 
@@ -184,6 +170,10 @@ class Finder:
             reason += f"; at the scene's own {own} it would be {self.arrivals.share(self.arrivals.depth > own)[0]:.2g}"
         self.reasons.append(reason)
         return depth
+
+    def _in_words(self, depth: int) -> str:
+        unbounded = depth == NO_LIMIT and self.draft.parameters
+        return choices.depth_in_words(depth) + (" (derivatives: a bound that renderers find)" if unbounded else "")
 
     def _note_tail(self, depth: int) -> None:
         if self.arrivals is not None and self.report is not None and not self.arrivals.dark and depth >= 0:

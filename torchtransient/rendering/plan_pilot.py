@@ -10,13 +10,22 @@ import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from torchtransient.axes import TimeAxis
+from torchtransient.errors import ArgumentError
 from torchtransient.gates import Gate
+from torchtransient.rendering.variant import active_variant
 
+if TYPE_CHECKING:
+    from torchtransient.rendering.build_options import BuildOptions
+    from torchtransient.rendering.films.choice import FilmChoice
+    from torchtransient.rendering.scene_handle import Scene
+
+PILOT_PATHS = 32768
+PILOT_PIXELS = 2048
 # The image is divided into so many blocks along each side; a block may lose so many times the image's share.
 BLOCKS = 8
 BLOCK_ALLOWANCE = 10.0
@@ -133,6 +142,26 @@ class Arrivals:
             else:
                 low = middle + 1
         return float(times[0]), float(times[low])
+
+
+def pilot_run(
+    scene: Scene, options: BuildOptions, sensor: int, kind: type[FilmChoice], seed: int = 0
+) -> tuple[Any, Arrivals]:
+    """(film, arrivals) of a pilot run of a scene in a variant without polarization, which costs most of the time and
+    changes neither depth nor time. ``kind``: what the film measures. Raises ``ArgumentError`` for unknown sensors.
+    """
+    with active_variant(scene.variant):
+        from torchtransient.plugins.integrators.pilot import pilot_events
+
+        built = scene.built(options).scene
+        sensors = built.sensors()
+        if not 0 <= sensor < len(sensors):
+            raise ArgumentError(
+                f"sensor: the scene has {len(sensors)}, numbered from 0; got {sensor}. Give an index."
+            )
+        film = sensors[sensor].film()
+        events = pilot_events(built, built.integrator(), sensor, seed=seed, pixels=PILOT_PIXELS, paths=PILOT_PATHS)
+    return film, kind.seen(film, Arrivals(events))
 
 
 def axis_over(first: float, last: float, bin_width_opl: float | None, num_bins: int | None) -> TimeAxis:

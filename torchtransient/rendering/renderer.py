@@ -37,6 +37,7 @@ from torchtransient.rendering.arguments import (
 )
 from torchtransient.rendering.autograd import rendered
 from torchtransient.rendering.build_options import BuildOptions
+from torchtransient.rendering.depth_bound import DepthBound, depth_bound, may_have_derivative
 from torchtransient.rendering.effects import Effects
 from torchtransient.rendering.films.choice import FilmChoice
 from torchtransient.rendering.films.layout import steady_channels_first
@@ -334,6 +335,7 @@ class TransientRenderer(CopiesParametrized):
             watch=self._watch,
             progress=bar,
             freeze=self.freeze,
+            bound=self._depth_bound(values, tensors),
         )
         try:
             steady, response = rendered(job, per_entry, tensors)
@@ -341,11 +343,11 @@ class TransientRenderer(CopiesParametrized):
             if bar is not None:
                 bar.close()
         leading = (*(() if batch is None else (batch,)), *((len(self._sensors),) if self._stack_sensors else ()))
-        stats, components = self._stats(job), stokes_components(self.scene.variant)
+        pixels, components = self._cube_shape[0] * self._cube_shape[1], stokes_components(self.scene.variant)
         steady = steady_channels_first(steady, leading, components)
         return RenderOutput.of(
             self.film, steady, self.film.channels_first(response, leading, components),
-            stats=stats, channels=self._channels,
+            stats=RenderStats.of_job(job, pixels), channels=self._channels,
         )
 
     def _collect(self, values: Mapping[str, Any] | None) -> tuple[list[torch.Tensor], list[bool], int | None]:
@@ -378,22 +380,12 @@ class TransientRenderer(CopiesParametrized):
             check_filter(moving, temporal_filter, self._pulsed)
             check_slope(moving, *self._response)
 
-    def _stats(self, job: RenderJob) -> RenderStats:
-        runs, pixels = job.log, self._cube_shape[0] * self._cube_shape[1]
-        items, seconds = [item for run in runs for item in run.items], sum(run.seconds for run in runs)
-        return RenderStats(
-            spp=runs[0].spp,
-            seconds=seconds,
-            samples_per_second=runs[0].spp * pixels * len(items) / seconds,
-            variant=self.scene.variant,
-            integrator=runs[0].integrator,
-            temporal_filter=job.temporal_filter or "",
-            seeds=tuple(item.seed for item in items),
-            energy_before=tuple(energy for run in runs for energy in run.energy_before),
-            energy_after=tuple(energy for run in runs for energy in run.energy_after),
-            recorded=tuple(said for run in runs for said in run.recorded),
-            derivatives_recorded=job.derivative_log,
-        )
+    def _depth_bound(self, given: Mapping[str, Any] | None, tensors: Sequence[torch.Tensor]) -> DepthBound | None:
+        """On the depth of a call whose values can have derivatives; None for others, and where a depth is stated."""
+        own = not set(self._keys) <= set(given or ()) and any(p.requires_grad for p in self.parameters())
+        if not own and not any(map(may_have_derivative, tensors)):
+            return None
+        return depth_bound(self.scene, self._options, self._sensors, self.film, self._watch)
 
     def extra_repr(self) -> str:
         """Shown by ``print(renderer)``."""

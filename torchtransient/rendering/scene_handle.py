@@ -51,6 +51,8 @@ class Scene:
         self._table: ParameterTable | None = None
         # Those that the table was made with: a scene that is taken may be built with some alone.
         self._table_options = BuildOptions(real_bitmaps=True)
+        # Bounds on the depth for derivatives, by options and sensors (`rendering.depth_bound`).
+        self.depth_bounds: dict[Any, Any] = {}
         # Which unphysical things were said already (`rendering.physics`).
         self.told: set[str] = set()
 

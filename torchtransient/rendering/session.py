@@ -17,6 +17,7 @@ from torchtransient.errors import SceneError, TorchTransientError, VariantError
 from torchtransient.plugins.black_textures import lifted
 from torchtransient.plugins.unfinished import afterwards
 from torchtransient.rendering.build_options import BuildOptions
+from torchtransient.rendering.depth_bound import DepthBound, limited
 from torchtransient.rendering.filter_override import temporal_filter
 from torchtransient.rendering.interrupts import quiet
 from torchtransient.rendering.kernel_errors import named_errors
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class RunLog:
     """What one primal run reports, item by item. ``energy_before``, ``energy_after``: outside of the window;
-    ``recorded``: what became of its recording.
+    ``recorded``: what became of its recording. ``max_depth``: of the integrator, -1 for no limit.
     """
 
     items: tuple[Item, ...]
@@ -44,6 +45,7 @@ class RunLog:
     energy_before: tuple[float, ...]
     energy_after: tuple[float, ...]
     recorded: tuple[str, ...]
+    max_depth: int | None = None
 
 
 @dataclass(frozen=True)
@@ -51,8 +53,8 @@ class RenderJob:
     """Everything about a call that is not a tensor.
 
     ``items``: the films to fill, where the seed is known; ``seeding`` makes them of a seed that is known later.
-    ``batched[i]``: value i has a leading batch dimension. ``needs[i]``: value i wants a derivative. ``watch``: says
-    what is unphysical. ``freeze``: calls are recorded. ``log`` collects what each primal run reports (seconds, seeds,
+    ``batched[i]``: value i has a leading batch dimension. ``needs[i]``: value i wants a derivative. ``bound``: on the
+    depth, None for the scene's. ``watch``: says what is unphysical. ``freeze``: calls are recorded. ``log`` collects what each primal run reports (seconds, seeds,
     energy outside the window) and belongs to one call: under ``vmap`` a call is several runs. ``derivative_log``: what
     became of the recordings of the call's derivatives. ``at_call``: of a scene that is shared, its values at the call.
     """
@@ -68,6 +70,7 @@ class RenderJob:
     temporal_filter: str | None
     watch: PhysicsWatch
     needs: tuple[bool, ...] = ()
+    bound: DepthBound | None = None
     progress: Callable[[float], None] | None = None
     freeze: bool = True
     at_call: list[Mapping[str, Any]] = field(default_factory=list)
@@ -176,7 +179,12 @@ def session_of(job: RenderJob) -> Iterator[Session]:
             attached = True  # until the block has ended without an error: what raised may have left derivatives
             end = in_variant(job.scene.variant, lambda: job.scene.leave(job.options, slots, attached))
             with afterwards(end):
-                with named_errors(), temporal_filter(job.temporal_filter, session.integrator, films):
+                depth = None if job.bound is None else job.bound.depth
+                with (
+                    named_errors(),
+                    limited(session.integrator, depth),
+                    temporal_filter(job.temporal_filter, session.integrator, films),
+                ):
                     yield session
                 attached = any(job.needs)
 

@@ -1,0 +1,123 @@
+"""A bound on the depth of paths for derivatives of scenes that state none.
+
+A derivative keeps a record of every bounce and needs to know how many there are at most. A pilot run finds the depth
+beyond which the light no longer matters, and a call whose values can have derivatives uses it for both. Renders without
+derivatives have no bound: Russian roulette ends their paths.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch.autograd import forward_ad
+
+from torchtransient.errors import GradientError
+from torchtransient.plugins.unfinished import afterwards
+from torchtransient.rendering.plan_pilot import pilot_run
+from torchtransient.rendering.translation import NO_LIMIT
+from torchtransient.rendering.variant import active_variant
+
+if TYPE_CHECKING:
+    from torchtransient.rendering.build_options import BuildOptions
+    from torchtransient.rendering.films.choice import FilmChoice
+    from torchtransient.rendering.physics import PhysicsWatch
+    from torchtransient.rendering.scene_handle import Scene
+
+# Largest share of the light that a bound leaves to deeper paths, as that of `tt.plan`.
+TAIL = 1e-3
+
+
+@dataclass(frozen=True)
+class DepthBound:
+    """``depth``: the bound. ``beyond``: share of the light of a pilot run in deeper paths, with its standard ``error``."""
+
+    depth: int
+    beyond: float
+    error: float
+
+
+def depth_bound(
+    scene: Scene, options: BuildOptions, sensors: Sequence[int], film: FilmChoice, watch: PhysicsWatch
+) -> DepthBound | None:
+    """The bound for derivatives of a scene, found for its described values when it is first asked for; None where its
+    depth is stated. Raises GradientError where none can be found.
+    """
+    key = options, tuple(sensors)
+    if key not in scene.depth_bounds:
+        scene.depth_bounds[key] = _found(scene, options, sensors, film)
+    bound = scene.depth_bounds[key]
+    if bound is not None and watch.looks:
+        watch.tell(
+            f"max_depth {bound.depth}",
+            f"derivatives need a bound on the depth of paths, and the scene states none: value and derivative have "
+            f"max_depth {bound.depth}, which leaves {bound.beyond:.2g} +- {bound.error:.1g} of the light to deeper "
+            "paths. max_depth= sets another one; renders without derivatives have none.",
+        )
+    return bound
+
+
+def _found(scene: Scene, options: BuildOptions, sensors: Sequence[int], film: FilmChoice) -> DepthBound | None:
+    from torchtransient.rendering.scene_handle import load
+
+    with active_variant(scene.variant):
+        if depth_limit(scene.built(options).scene.integrator()) != NO_LIMIT:
+            return None
+    unpolarized = scene.variant.removesuffix("_polarized")
+    if scene.is_shared and unpolarized != scene.variant:
+        raise GradientError(
+            f"gradients need a bound on the depth of paths, and the integrator, which was taken as it is, has none. "
+            f"Expected a max_depth: no pilot run finds one in {scene.variant}."
+        )
+    found = [pilot_run(load(scene, variant=unpolarized), options, sensor, type(film))[1] for sensor in sensors]
+    if all(arrivals.dark for arrivals in found):
+        raise GradientError(
+            "gradients need a bound on the depth of paths; the scene states none, and a pilot run saw no light. Set "
+            "max_depth, of the renderer or of the scene's integrator."
+        )
+    found = [arrivals for arrivals in found if not arrivals.dark]
+    depth = max(arrivals.enough_depth(TAIL) for arrivals in found)
+    return DepthBound(depth, *max(arrivals.share(arrivals.depth > depth) for arrivals in found))
+
+
+def depth_limit(integrator: Any) -> int | None:
+    """``max_depth`` of a built integrator, -1 for no limit; None for one without."""
+    depth = getattr(integrator, "max_depth", None)
+    return None if depth is None else NO_LIMIT if int(depth) % 2**32 == 2**32 - 1 else int(depth)
+
+
+@contextmanager
+def limited(integrator: Any, depth: int | None) -> Iterator[None]:
+    """Give an integrator a ``max_depth`` inside of the block; None changes nothing."""
+    if depth is None:
+        yield
+        return
+    before = integrator.max_depth
+
+    def put_back() -> None:
+        if integrator.max_depth == depth:
+            integrator.max_depth = before
+
+    with afterwards(put_back):
+        integrator.max_depth = depth
+        yield
+
+
+def may_have_derivative(tensor: torch.Tensor) -> bool:
+    """Return whether autograd, forward mode or a transform of ``torch.func`` may differentiate by a tensor."""
+    transforms = torch._C._functorch
+    while not (tensor.requires_grad or _is_dual(tensor)):
+        if not transforms.is_functorch_wrapped_tensor(tensor):
+            return False
+        tensor = transforms.get_unwrapped(tensor)
+    return True
+
+
+def _is_dual(tensor: torch.Tensor) -> bool:
+    try:
+        return forward_ad.unpack_dual(tensor).tangent is not None
+    except RuntimeError:  # of a batch of `vmap`, which hides what it is made of
+        return False
