@@ -72,7 +72,7 @@ class TorchTransientWarning(_InOneLine, UserWarning):
 
 class PhysicsWarning(TorchTransientWarning):
     """A scene, a value or a render that is computed as it is asked for, and that no physical system can be: more light
-    scattered than arrives, a transform without an inverse, a window that misses the light.
+    scattered than arrives, a transform without an inverse, a window that misses the light, paths that end early.
     """
 
 

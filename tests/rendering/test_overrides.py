@@ -10,7 +10,7 @@ import pytest
 import torchtransient as tt
 from torchtransient import plugins
 from torchtransient.errors import ArgumentError, SceneError
-from torchtransient.rendering import build
+from torchtransient.rendering import build, translation
 from torchtransient.rendering.build_options import BuildOptions
 from torchtransient.rendering.films import Gates, Histogram, Phasors
 
@@ -195,7 +195,7 @@ def test_steady_integrators_become_transient_ones(given, surfaces, volumes):
 
 def test_integrators_where_there_is_none():
     assert integrators(shape("")) == [] and integrators(shape(""), max_depth=3) == []
-    assert integrators(shape(""), transient=True) == [("transient_path", "", {}, {})]
+    assert integrators(shape(""), transient=True) == [("transient_path", "", {"max_depth": -1}, {})]
     assert integrators(shape(FOG), transient=True, max_depth=3) == [("transient_prbvolpath", "", {"max_depth": 3}, {})]
 
 
@@ -349,5 +349,5 @@ def test_looks_at_properties_leave_no_trace():
     state = parsed(shape('<float name="radiuz" value="2"/>'))
     props = next(node.props for node in state.nodes if node.props.plugin_name() == "sphere")
     assert props["radiuz"] == 2 and "radiuz" not in props.unqueried()
-    build._forget_queries(state)
+    translation.forget_queries(state)
     assert "radiuz" in props.unqueried()

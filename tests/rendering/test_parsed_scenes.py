@@ -140,8 +140,8 @@ def test_depths_of_nested_integrators_count():
     assert (inventory(path).integrator, inventory(path).max_depth) == ("path", 7)
     nested = inventory(f'<integrator type="moment">{path}</integrator>')
     assert (nested.integrator, nested.max_depth) == ("moment", 7)
-    assert inventory('<integrator type="moment"/>').max_depth is None
-    assert inventory(shape(DIFFUSE)).integrator is None
+    assert [inventory(f'<integrator type="{name}"/>').max_depth for name in ("volpath", "prb", "direct")] == [-1, 6, 2]
+    assert (inventory(shape(DIFFUSE)).integrator, inventory(shape(DIFFUSE)).max_depth) == (None, -1)
     named = '<integrator type="path"><string name="temporal_filter" value="{}"/></integrator>'
     assert [inventory(named.format(name)).temporal_filter for name in ("tent", "")] == ["tent", None]
 

@@ -85,9 +85,9 @@ def test_depth_that_the_pilot_run_does_not_go_beyond(deepest, bounded):
     assert ("went no deeper than 512, so light beyond it is not bounded" in plan.reasons[-1]) != bounded
 
 
-@pytest.mark.parametrize(("own", "known"), [(11, 11), (None, 6)])
+@pytest.mark.parametrize(("own", "known"), [(11, "11"), (-1, "no limit")])
 def test_depth_that_is_kept(own, known):
-    """As the scene has it, or the plugins where it says nothing."""
+    """As the scene has it."""
     plan = finder(dark(), inventory={"max_depth": own})
     assert plan._depth(None) is None
     assert plan.reasons[-1] == f"max_depth: {known}, kept, since the pilot run saw no light"
@@ -106,7 +106,7 @@ def test_depth_that_is_kept(own, known):
 
 def test_depth_that_is_asked_for():
     found = by_depth()
-    for asked, own, beyond in ((7, None, 7), ("scene", 3, 3), ("scene", None, 6), (0, None, 0)):
+    for asked, own, beyond in ((7, 3, 7), ("scene", 3, 3), (0, -1, 0)):
         plan = finder(found, inventory={"max_depth": own})
         assert plan._depth(asked) == beyond
         left = shown(found, found.depth > beyond)
@@ -116,7 +116,7 @@ def test_depth_that_is_asked_for():
     assert plan._depth(9) == 9
     assert plan.reasons[-1] == "max_depth: 9, as asked for; no light of the pilot run in deeper paths"
     assert plan._depth(-1) == -1
-    assert plan.reasons[-1] == "max_depth: -1, as asked for"
+    assert plan.reasons[-1] == "max_depth: no limit, as asked for"
     for without in (finder(None), finder(dark())):
         without._depth(4)
         assert without.reasons[-1] == "max_depth: 4, as asked for"
@@ -134,7 +134,7 @@ def test_depth_by_albedo():
     assert depth_by_albedo(SceneInventory(albedo=0.0), 0.05)[0] == 2
     assert depth_by_albedo(SceneInventory(albedo=0.01), 0.05)[0] == 2
     assert depth_by_albedo(SceneInventory(albedo=0.5), 0.125)[0] == 4
-    for own, kept in ((None, 6), (3, 3)):
+    for own, kept in ((-1, "no limit"), (3, "3")):
         depth, reason = depth_by_albedo(SceneInventory(albedo=1.0, brightest="lamp", max_depth=own), 0.05)
         assert depth is None and reason.startswith(f"max_depth: {kept}, kept; not bounded, since lamp may reflect")
     assert finder(None, tail=0.05, inventory={"albedo": 1 / 3})._depth(None) == 4

@@ -208,7 +208,7 @@ def test_what_would_change_a_ready_scene_is_refused():
         tt.TransientRenderer(tt.load(mi.load_dict(steady)), time_axis=axis)
 
 
-STEADY_FILM = {"type": "hdrfilm", "width": 6, "height": 4, "rfilter": {"type": "tent"}, "pixel_format": "luminance"}
+STEADY_FILM = {"type": "hdrfilm", "width": 6, "height": 4, "rfilter": {"type": "tent"}}
 STEADY = {
     "crop": ({}, {"crop_width": 3, "crop_height": 2, "crop_offset_x": 1, "crop_offset_y": 1}, {}),
     "lens": ({"type": "thinlens", "aperture_radius": 0.05, "focus_distance": 3.0}, {}, {"max_depth": 2}),

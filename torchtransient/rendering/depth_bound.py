@@ -7,8 +7,7 @@ derivatives have no bound: Russian roulette ends their paths.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +15,7 @@ import torch
 from torch.autograd import forward_ad
 
 from torchtransient.errors import GradientError
-from torchtransient.plugins.unfinished import afterwards
+from torchtransient.rendering.overrides import depth_limit
 from torchtransient.rendering.plan_pilot import pilot_run
 from torchtransient.rendering.translation import NO_LIMIT
 from torchtransient.rendering.variant import active_variant
@@ -33,7 +32,7 @@ TAIL = 1e-3
 
 @dataclass(frozen=True)
 class DepthBound:
-    """``depth``: the bound. ``beyond``: share of the light of a pilot run in deeper paths, with its standard ``error``."""
+    """``depth``: the bound. ``beyond``: share of a pilot run's light in deeper paths; ``error``: its standard error."""
 
     depth: int
     beyond: float
@@ -69,7 +68,7 @@ def _found(scene: Scene, options: BuildOptions, sensors: Sequence[int], film: Fi
     unpolarized = scene.variant.removesuffix("_polarized")
     if scene.is_shared and unpolarized != scene.variant:
         raise GradientError(
-            f"gradients need a bound on the depth of paths, and the integrator, which was taken as it is, has none. "
+            "gradients need a bound on the depth of paths, and the integrator, which was taken as it is, has none. "
             f"Expected a max_depth: no pilot run finds one in {scene.variant}."
         )
     found = [pilot_run(load(scene, variant=unpolarized), options, sensor, type(film))[1] for sensor in sensors]
@@ -81,29 +80,6 @@ def _found(scene: Scene, options: BuildOptions, sensors: Sequence[int], film: Fi
     found = [arrivals for arrivals in found if not arrivals.dark]
     depth = max(arrivals.enough_depth(TAIL) for arrivals in found)
     return DepthBound(depth, *max(arrivals.share(arrivals.depth > depth) for arrivals in found))
-
-
-def depth_limit(integrator: Any) -> int | None:
-    """``max_depth`` of a built integrator, -1 for no limit; None for one without."""
-    depth = getattr(integrator, "max_depth", None)
-    return None if depth is None else NO_LIMIT if int(depth) % 2**32 == 2**32 - 1 else int(depth)
-
-
-@contextmanager
-def limited(integrator: Any, depth: int | None) -> Iterator[None]:
-    """Give an integrator a ``max_depth`` inside of the block; None changes nothing."""
-    if depth is None:
-        yield
-        return
-    before = integrator.max_depth
-
-    def put_back() -> None:
-        if integrator.max_depth == depth:
-            integrator.max_depth = before
-
-    with afterwards(put_back):
-        integrator.max_depth = depth
-        yield
 
 
 def may_have_derivative(tensor: torch.Tensor) -> bool:
@@ -118,6 +94,7 @@ def may_have_derivative(tensor: torch.Tensor) -> bool:
 
 def _is_dual(tensor: torch.Tensor) -> bool:
     try:
-        return forward_ad.unpack_dual(tensor).tangent is not None
+        unpacked: Any = forward_ad.unpack_dual(tensor)  # type: ignore[no-untyped-call]
     except RuntimeError:  # of a batch of `vmap`, which hides what it is made of
         return False
+    return unpacked.tangent is not None

@@ -22,11 +22,11 @@ from torchtransient.plugins.parameters import check_slope
 from torchtransient.rendering.batch import Batch, take
 from torchtransient.rendering.broken_numbers import all_finite, broken_entries, fill_broken
 from torchtransient.rendering.carry_out import Numbered, carry_out, groups_of
-from torchtransient.rendering.depth_bound import depth_limit
 from torchtransient.rendering.films.choice import FilmChoice
 from torchtransient.rendering.films.choices import of_film
 from torchtransient.rendering.interrupts import ends_frames
 from torchtransient.rendering.memory import check_fits
+from torchtransient.rendering.overrides import depth_limit
 from torchtransient.rendering.parameters import needing_slope
 from torchtransient.rendering.physics import are_finite, smallest_and_largest
 from torchtransient.rendering.seeds import Item

@@ -1,5 +1,5 @@
 """What can be rendered and cannot be: more light scattered than arrives, numbers out of their range, transforms without
-an inverse, windows that miss the light.
+an inverse, windows that miss the light, depths that had to be bounded.
 
 Nothing of it stops a computation by itself: an optimiser steps over the edge of [0, 1] and comes back, and a window may
 be meant to be short. So it is said once, and where it would be a mistake, it can be made an error.

@@ -129,8 +129,8 @@ def choose_integrator(inventory: SceneInventory) -> tuple[Choice, list[str]]:
     own = inventory.integrator or ""
     if own in _WITH_PICTURES:
         notes.append(
-            f"not rendered: the pictures that {own!r} adds to its nested integrator; torchtransient.rendering.labels "
-            "has depth, normals, shapes and albedos, standard errors come of renders with several seeds"
+            f"not rendered: the pictures that {own!r} adds to those of its nested integrator; "
+            "torchtransient.rendering.labels has depth, normals, shapes and albedos"
         )
     if is_transient_integrator(own) and _ALIASES.get(own, own) not in (SURFACES, VOLUMES):
         return Choice(own, f"integrator: {own}, the scene's own"), notes
@@ -148,8 +148,8 @@ def depth_by_albedo(inventory: SceneInventory, tail: float) -> tuple[int | None,
     """The depth at which at most ``tail`` of the emitted power is still on its way, if the albedos bound it."""
     if inventory.albedo >= 1:
         return None, (
-            f"max_depth: {depth_in_words(inventory.max_depth)}, kept; not bounded, since {inventory.brightest} may reflect everything and no pilot "
-            "run was asked for"
+            f"max_depth: {depth_in_words(inventory.max_depth)}, kept; not bounded, since {inventory.brightest} may "
+            "reflect everything and no pilot run was asked for"
         )
     bounces = 1 if inventory.albedo == 0 else max(1, math.ceil(math.log(tail) / math.log(inventory.albedo)))
     depth = bounces + 1

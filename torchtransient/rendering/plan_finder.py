@@ -149,7 +149,8 @@ class Finder:
             return asked
         if self.arrivals is None and self._around_a_corner:
             self.reasons.append(
-                f"max_depth: {self._in_words(own)}, kept; what albedos leave of emitted power says little about light around corners"
+                f"max_depth: {self._in_words(own)}, kept; what albedos leave of emitted power says little about light "
+                "around corners"
             )
             return None
         if self.arrivals is None:

@@ -156,9 +156,7 @@ def pilot_run(
         built = scene.built(options).scene
         sensors = built.sensors()
         if not 0 <= sensor < len(sensors):
-            raise ArgumentError(
-                f"sensor: the scene has {len(sensors)}, numbered from 0; got {sensor}. Give an index."
-            )
+            raise ArgumentError(f"sensor: the scene has {len(sensors)}, numbered from 0; got {sensor}. Give an index.")
         film = sensors[sensor].film()
         events = pilot_events(built, built.integrator(), sensor, seed=seed, pixels=PILOT_PIXELS, paths=PILOT_PATHS)
     return film, kind.seen(film, Arrivals(events))

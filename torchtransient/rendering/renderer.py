@@ -68,8 +68,10 @@ class TransientRenderer(CopiesParametrized):
     :class:`FrequencyAxis`, or numbers in cycles per metre; the films become phasor films, and ``out.phasor`` takes the
     place of ``out.transient``. ``gates``: :class:`Gate` objects; the films become gated films with ``out.gated``.
     ``film``: the same as an object of ``torchtransient.rendering.films``, and how films of others are asked for. At
-    most one of the four. ``max_depth``: replaces the integrator's. ``spp``, ``spp_grad``: samples per pixel of the
-    render and of its derivatives; None takes the scene's and the render's.
+    most one of the four. ``max_depth``: replaces the integrator's. Where that is no limit, calls whose values can be
+    differentiated by use a bound that a pilot run finds, for value and derivative: ``out.stats.max_depth``, beyond
+    which ``out.stats.light_beyond`` of the light lies. ``spp``, ``spp_grad``: samples per pixel of the render and of
+    its derivatives; None takes the scene's and the render's.
 
     ``temporal_filter``: "box", "tent", "gaussian", or "auto": the scene's own, except that a box becomes a tent as
     soon as a parameter can change a path length (shapes, light position, sensor pose, index of refraction), because
@@ -94,8 +96,8 @@ class TransientRenderer(CopiesParametrized):
     ``sampler``: plugin name of a Mitsuba sampler that replaces those of the sensors, with the same number of samples.
 
     ``physics``: what becomes of what no physical system has: reflectances, albedos and other shares of the light
-    outside of [0, 1], described or given, transforms without an inverse, and windows that miss more than 5 % of the
-    light. "warn" says each once for a scene, as a ``PhysicsWarning`` with the key and the number; "error" raises
+    outside of [0, 1], described or given, transforms without an inverse, windows that miss more than 5 % of the
+    light, and depths that had to be bounded. "warn" says each once for a scene, as a ``PhysicsWarning`` with the key and the number; "error" raises
     ``PhysicsError``; "ignore" does not look.
 
     ``freeze``: True records what a call launches, so that later calls need no tracing, with the same values, gradients

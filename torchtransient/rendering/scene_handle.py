@@ -7,7 +7,7 @@ from collections import OrderedDict
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from torchtransient.errors import ArgumentError, GradientError, SceneError
 from torchtransient.quantities import flag, shown
@@ -22,6 +22,9 @@ from torchtransient.rendering.recordings import Recordings
 from torchtransient.rendering.saving.save import save_scene
 from torchtransient.rendering.taken import ReadyScene
 from torchtransient.rendering.variant import active_variant, resolve_variant
+
+if TYPE_CHECKING:
+    from torchtransient.rendering.depth_bound import DepthBound
 
 # Built scenes kept per description: one for every combination of time axis, depth and substituted plugins in use.
 _MAX_BUILDS = 8
@@ -52,7 +55,7 @@ class Scene:
         # Those that the table was made with: a scene that is taken may be built with some alone.
         self._table_options = BuildOptions(real_bitmaps=True)
         # Bounds on the depth for derivatives, by options and sensors (`rendering.depth_bound`).
-        self.depth_bounds: dict[Any, Any] = {}
+        self.depth_bounds: dict[tuple[BuildOptions, tuple[int, ...]], DepthBound | None] = {}
         # Which unphysical things were said already (`rendering.physics`).
         self.told: set[str] = set()
 

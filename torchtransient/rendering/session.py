@@ -17,17 +17,17 @@ from torchtransient.errors import SceneError, TorchTransientError, VariantError
 from torchtransient.plugins.black_textures import lifted
 from torchtransient.plugins.unfinished import afterwards
 from torchtransient.rendering.build_options import BuildOptions
-from torchtransient.rendering.depth_bound import DepthBound, limited
-from torchtransient.rendering.filter_override import temporal_filter
 from torchtransient.rendering.interrupts import quiet
 from torchtransient.rendering.kernel_errors import named_errors
 from torchtransient.rendering.mitsuba_words import one_line
+from torchtransient.rendering.overrides import max_depth, temporal_filter
 from torchtransient.rendering.physics import PhysicsWatch
 from torchtransient.rendering.scene_state import detached, put_back, values_of
 from torchtransient.rendering.seeds import Item, Seeding
 from torchtransient.rendering.variant import active_variant, in_variant
 
 if TYPE_CHECKING:
+    from torchtransient.rendering.depth_bound import DepthBound
     from torchtransient.rendering.parameters import SlotTable
     from torchtransient.rendering.scene_handle import Scene
 
@@ -54,9 +54,10 @@ class RenderJob:
 
     ``items``: the films to fill, where the seed is known; ``seeding`` makes them of a seed that is known later.
     ``batched[i]``: value i has a leading batch dimension. ``needs[i]``: value i wants a derivative. ``bound``: on the
-    depth, None for the scene's. ``watch``: says what is unphysical. ``freeze``: calls are recorded. ``log`` collects what each primal run reports (seconds, seeds,
-    energy outside the window) and belongs to one call: under ``vmap`` a call is several runs. ``derivative_log``: what
-    became of the recordings of the call's derivatives. ``at_call``: of a scene that is shared, its values at the call.
+    depth, None for the scene's. ``watch``: says what is unphysical. ``freeze``: calls are recorded. ``log`` collects
+    what each primal run reports (seconds, seeds, energy outside the window) and belongs to one call: under ``vmap`` a
+    call is several runs. ``derivative_log``: what became of the recordings of the call's derivatives. ``at_call``: of a
+    scene that is shared, its values at the call.
     """
 
     scene: Scene
@@ -182,7 +183,7 @@ def session_of(job: RenderJob) -> Iterator[Session]:
                 depth = None if job.bound is None else job.bound.depth
                 with (
                     named_errors(),
-                    limited(session.integrator, depth),
+                    max_depth(depth, session.integrator),
                     temporal_filter(job.temporal_filter, session.integrator, films),
                 ):
                     yield session

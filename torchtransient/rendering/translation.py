@@ -8,7 +8,7 @@ that plugin first, so that it refuses what it would refuse in a picture: misspel
 | size, crop and spatial filter of a film, ``sample_border`` | kept |
 | ``pixel_format`` of an ``hdrfilm`` | refused where it asks for other channels than a time-resolved film has |
 | ``file_format``, ``component_format`` | without effect, since renders are tensors |
-| ``max_depth``, ``rr_depth``, ``hide_emitters`` | kept; in ``aov``, ``moment``, ``stokes`` those of the nested integrator |
+| ``max_depth``, ``rr_depth``, ``hide_emitters`` | kept; of ``aov``, ``moment``, ``stokes`` those of the nested one |
 | ``use_spectral_mis`` (``volpathmis``), ``jitter``, ``strength`` (samplers) | without effect but on noise |
 | ``timeout``, ``block_size``, ``samples_per_pass`` | without effect in variants that compile kernels |
 | numbers of samples of silhouettes (``prb_projective``) | refused: those are no part of the derivative here |

@@ -14,7 +14,7 @@ from support.marks import long_rows
 from torchtransient import plugins
 from torchtransient.errors import ArgumentError, GradientError, SceneError
 from torchtransient.plugins.films import pulsed_filter
-from torchtransient.rendering.filter_override import temporal_filter
+from torchtransient.rendering.overrides import temporal_filter
 from torchtransient.testing.small_room import GREY, WALL_POSE, make_room
 
 VARIANT = "llvm_ad_rgb"

@@ -1,4 +1,4 @@
-"""Another temporal filter on the films of a scene, for as long as a call takes."""
+"""Another temporal filter or depth in a built scene, for as long as a call takes."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 
 from torchtransient.interfaces import is_time_resolved
 from torchtransient.plugins.unfinished import afterwards
+from torchtransient.rendering.translation import NO_LIMIT
 
 
 @contextmanager
@@ -32,3 +33,26 @@ def temporal_filter(name: str | None, integrator: Any, films: Iterable[Any]) -> 
 def _set(restore: ExitStack, target: Any, name: str) -> None:
     restore.enter_context(afterwards(functools.partial(setattr, target, "temporal_filter", target.temporal_filter)))
     target.temporal_filter = name
+
+
+@contextmanager
+def max_depth(depth: int | None, integrator: Any) -> Iterator[None]:
+    """Give an integrator a ``max_depth`` inside of the block; None changes nothing."""
+    if depth is None:
+        yield
+        return
+    before = integrator.max_depth
+
+    def put_back() -> None:
+        if integrator.max_depth == depth:
+            integrator.max_depth = before
+
+    with afterwards(put_back):
+        integrator.max_depth = depth
+        yield
+
+
+def depth_limit(integrator: Any) -> int | None:
+    """``max_depth`` of a built integrator, -1 for no limit; None for one without."""
+    depth = getattr(integrator, "max_depth", None)
+    return None if depth is None else NO_LIMIT if int(depth) % 2**32 == 2**32 - 1 else int(depth)
