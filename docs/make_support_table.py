@@ -38,7 +38,10 @@ NOT_SUPPORTED = (
         "`tt.load` builds `diff_conductor`, `diff_polarizer`, ... in their place: [polarization.md](polarization.md)",
     ),
     ("any path length through an explicit box filter", "not supported: `GradientError`"),
-    ("second derivatives; unlimited depth (`max_depth=-1`) of `mi.render`, where no renderer finds a bound", "not supported: `GradientError`"),
+    (
+        "second derivatives; unlimited depth (`max_depth=-1`) of `mi.render`, where no renderer finds a bound",
+        "not supported: `GradientError`",
+    ),
 )
 
 

@@ -8,7 +8,7 @@ derivatives have no bound: Russian roulette ends their paths.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -45,6 +45,8 @@ def depth_bound(
     """The bound for derivatives of a scene, found for its described values when it is first asked for; None where its
     depth is stated. Raises GradientError where none can be found.
     """
+    # One for all samplers, so that renderers that differ by theirs alone can be compared.
+    options = replace(options, sampler=None)
     key = options, tuple(sensors)
     if key not in scene.depth_bounds:
         scene.depth_bounds[key] = _found(scene, options, sensors, film)
@@ -52,7 +54,7 @@ def depth_bound(
     if bound is not None and watch.looks:
         watch.tell(
             f"max_depth {bound.depth}",
-            f"derivatives need a bound on the depth of paths, and the scene states none: value and derivative have "
+            "derivatives need a bound on the depth of paths, and the scene states none: value and derivative have "
             f"max_depth {bound.depth}, which leaves {bound.beyond:.2g} +- {bound.error:.1g} of the light to deeper "
             "paths. max_depth= sets another one; renders without derivatives have none.",
         )
@@ -71,15 +73,22 @@ def _found(scene: Scene, options: BuildOptions, sensors: Sequence[int], film: Fi
             "gradients need a bound on the depth of paths, and the integrator, which was taken as it is, has none. "
             f"Expected a max_depth: no pilot run finds one in {scene.variant}."
         )
-    found = [pilot_run(load(scene, variant=unpolarized), options, sensor, type(film))[1] for sensor in sensors]
-    if all(arrivals.dark for arrivals in found):
+    lit = []
+    for sensor in sensors:
+        _, arrivals = pilot_run(load(scene, variant=unpolarized), options, sensor, type(film), TAIL)
+        lit += [] if arrivals.dark else [arrivals]
+    if not lit:
         raise GradientError(
             "gradients need a bound on the depth of paths; the scene states none, and a pilot run saw no light. Set "
             "max_depth, of the renderer or of the scene's integrator."
         )
-    found = [arrivals for arrivals in found if not arrivals.dark]
-    depth = max(arrivals.enough_depth(TAIL) for arrivals in found)
-    return DepthBound(depth, *max(arrivals.share(arrivals.depth > depth) for arrivals in found))
+    with active_variant(unpolarized):
+        from torchtransient.plugins.integrators.pilot import PILOT_DEPTH
+    beyond, error = max(arrivals.beyond(PILOT_DEPTH) for arrivals in lit)
+    if beyond > TAIL / 10:
+        return DepthBound(PILOT_DEPTH, beyond, error)
+    depth = max(arrivals.enough_depth(TAIL) for arrivals in lit)
+    return DepthBound(depth, *max(arrivals.share(arrivals.depth > depth) for arrivals in lit))
 
 
 def may_have_derivative(tensor: torch.Tensor) -> bool:

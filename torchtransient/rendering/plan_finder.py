@@ -107,7 +107,7 @@ class Finder:
             pulse=self.draft.pulse,
             irf=self.draft.irf,
         )
-        film, found = pilot_run(scene, options, self.draft.sensor, kind, self.seed)
+        film, found = pilot_run(scene, options, self.draft.sensor, kind, self.tail, self.seed)
         early, late = (sum(p.support_opl[side] for p in film.pulses) for side in (0, 1))
         self.spread = (early, late)
         scene.drop(options)

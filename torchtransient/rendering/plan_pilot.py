@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 
 PILOT_PATHS = 32768
 PILOT_PIXELS = 2048
+# From this depth on a run is made again without Russian roulette. That lets at most 0.95 of the paths go on at a
+# bounce, so that the light of brighter surfaces is left to few paths of great weight: none beyond depth 200 or so.
+DEEP = 48
 # The image is divided into so many blocks along each side; a block may lose so many times the image's share.
 BLOCKS = 8
 BLOCK_ALLOWANCE = 10.0
@@ -128,6 +131,13 @@ class Arrivals:
                 low = middle + 1
         return low
 
+    def beyond(self, deepest: int) -> tuple[float, float]:
+        """Share of the light in paths deeper than the run's ``deepest``, and its standard error: light that has fallen
+        to a share by the middle falls by that once more.
+        """
+        part, error = self.share(self.depth > deepest // 2)
+        return part * part, 2 * part * error
+
     # ----------------------------------------------------------------------------------------------------- window
 
     def window(self, depth: int, missed: float) -> tuple[float, float]:
@@ -145,10 +155,11 @@ class Arrivals:
 
 
 def pilot_run(
-    scene: Scene, options: BuildOptions, sensor: int, kind: type[FilmChoice], seed: int = 0
+    scene: Scene, options: BuildOptions, sensor: int, kind: type[FilmChoice], tail: float, seed: int = 0
 ) -> tuple[Any, Arrivals]:
     """(film, arrivals) of a pilot run of a scene in a variant without polarization, which costs most of the time and
-    changes neither depth nor time. ``kind``: what the film measures. Raises ``ArgumentError`` for unknown sensors.
+    changes neither depth nor time. ``kind``: what the film measures; ``tail``: the share of light that will be left to
+    deeper paths. Raises ``ArgumentError`` for unknown sensors.
     """
     with active_variant(scene.variant):
         from torchtransient.plugins.integrators.pilot import pilot_events
@@ -158,8 +169,12 @@ def pilot_run(
         if not 0 <= sensor < len(sensors):
             raise ArgumentError(f"sensor: the scene has {len(sensors)}, numbered from 0; got {sensor}. Give an index.")
         film = sensors[sensor].film()
-        events = pilot_events(built, built.integrator(), sensor, seed=seed, pixels=PILOT_PIXELS, paths=PILOT_PATHS)
-    return film, kind.seen(film, Arrivals(events))
+        size = {"seed": seed, "pixels": PILOT_PIXELS, "paths": PILOT_PATHS}
+        found = kind.seen(film, Arrivals(pilot_events(built, built.integrator(), sensor, **size)))
+        if not found.dark and found.enough_depth(tail) >= DEEP:
+            events = pilot_events(built, built.integrator(), sensor, **size, roulette=False)
+            found = kind.seen(film, Arrivals(events))
+    return film, found
 
 
 def axis_over(first: float, last: float, bin_width_opl: float | None, num_bins: int | None) -> TimeAxis:

@@ -97,8 +97,8 @@ class TransientRenderer(CopiesParametrized):
 
     ``physics``: what becomes of what no physical system has: reflectances, albedos and other shares of the light
     outside of [0, 1], described or given, transforms without an inverse, windows that miss more than 5 % of the
-    light, and depths that had to be bounded. "warn" says each once for a scene, as a ``PhysicsWarning`` with the key and the number; "error" raises
-    ``PhysicsError``; "ignore" does not look.
+    light, and depths that had to be bounded. "warn" says each once for a scene, as a ``PhysicsWarning`` with the key
+    and the number; "error" raises ``PhysicsError``; "ignore" does not look.
 
     ``freeze``: True records what a call launches, so that later calls need no tracing, with the same values, gradients
     and noise; ``out.stats.recorded`` says what became of it, ``docs/speed.md`` what makes a new recording.

@@ -69,12 +69,12 @@ def pilot_size(film, pixels: int) -> tuple[int, int]:
     return max(1, round(width * shrink)), max(1, round(height * shrink))
 
 
-def pilot_events(scene, integrator, sensor, *, seed: int, pixels: int, paths: int) -> PilotEvents:
+def pilot_events(scene, integrator, sensor, *, seed: int, pixels: int, paths: int, roulette=True) -> PilotEvents:
     """Trace about ``paths`` camera paths of a transient integrator and list what arrives.
 
     ``sensor`` is a sensor of ``scene`` with one of the library's films. ``max_depth`` is :data:`PILOT_DEPTH` for
-    the run, and Russian roulette starts at :data:`PILOT_RR_DEPTH` at the latest. Raises what the integrator raises
-    for scenes that it cannot render.
+    the run, and Russian roulette starts at :data:`PILOT_RR_DEPTH` at the latest, or, without ``roulette``, not at all.
+    Raises what the integrator raises for scenes that it cannot render.
     """
     if mi.is_polarized:
         raise VariantError(
@@ -86,7 +86,7 @@ def pilot_events(scene, integrator, sensor, *, seed: int, pixels: int, paths: in
     slots = _EVENTS_PER_PATH
     while True:
         spp = max(1, min(paths, _MAX_EVENTS // slots) // (size[0] * size[1]))
-        events, spp, most = _trace(scene, integrator, sensor, _PilotFilm(film, size), size, spp, seed, slots)
+        events, spp, most = _trace(scene, integrator, sensor, _PilotFilm(film, size), size, spp, seed, slots, roulette)
         if most <= slots:
             break
         slots = most + most // 8
@@ -105,7 +105,7 @@ def pilot_events(scene, integrator, sensor, *, seed: int, pixels: int, paths: in
 
 
 @no_collection()
-def _trace(scene, integrator, sensor, film, size, spp, seed, slots) -> tuple[EventListSink, int, int]:
+def _trace(scene, integrator, sensor, film, size, spp, seed, slots, roulette) -> tuple[EventListSink, int, int]:
     """The events, the samples per pixel, and the largest number of events of a path, which may be more than it had
     slots for.
     """
@@ -123,7 +123,8 @@ def _trace(scene, integrator, sensor, film, size, spp, seed, slots) -> tuple[Eve
         settings = integrator.settings()
         # Light of one number of bounces alone is not to be told apart by its depth.
         deepest = settings.max_depth if getattr(integrator, "only_bounces", None) is not None else PILOT_DEPTH
-        settings = replace(settings, max_depth=deepest, rr_depth=min(settings.rr_depth, PILOT_RR_DEPTH))
+        first = min(settings.rr_depth, PILOT_RR_DEPTH) if roulette else PILOT_DEPTH
+        settings = replace(settings, max_depth=deepest, rr_depth=first)
         world = integrator.world(scene, contents, settings=settings)
         world.start(rays)
         walk(world, rays.sampler, ray, integrator.first_opl(film, rays), sink, rays.η, rays.leg)
