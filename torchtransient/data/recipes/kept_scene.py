@@ -16,6 +16,7 @@ from torchtransient.data.recipes.distribution import ANYTHING, NUMBERS, POSE, Pl
 from torchtransient.data.recipes.sample import in_order
 from torchtransient.data.recipes.specification import (
     NOISE,
+    RENDER,
     Specification,
 )
 from torchtransient.data.recipes.streams import Draw, Stream
@@ -39,6 +40,8 @@ if TYPE_CHECKING:
 
 # A label that is read off the transient.
 FIRST_RETURN = "first_return"
+# Camera paths at most where only the share of light outside of the window is wanted.
+_PATHS = 2**16
 
 
 @dataclass(frozen=True)
@@ -226,14 +229,26 @@ class Kept:
         """What the film measures of a sample."""
         return self._render(self.values(drawn), seed).tensors[self.renderer.film.measures].cpu().numpy()
 
+    def outside(self, index: int) -> tuple[float, float]:
+        """Shares of the light of a sample before and after the window: those of the sample itself, or, where that
+        takes more than ``_PATHS`` camera paths, of as many.
+        """
+        rows, columns = self.measures.size[:2]
+        spp = min(self.measures.spp, max(1, _PATHS // (rows * columns)))
+        return self._render(self.values(self.draw(index)), self.seed(index), spp).outside
+
+    def seed(self, index: int) -> int:
+        """Seed of the render of a sample."""
+        return Stream(self.recipe.seed, index, RENDER).seed()
+
     def values(self, drawn: Mapping[str, Any]) -> dict[str, torch.Tensor]:
         """What is drawn as the renderer takes it."""
         return {key: torch.as_tensor(np.asarray(drawn[key]), dtype=torch.float32) for key in self.keys}
 
-    def _render(self, values: Mapping[str, torch.Tensor], seed: int) -> _Measured:
+    def _render(self, values: Mapping[str, torch.Tensor], seed: int, spp: int | None = None) -> _Measured:
         measures = self.renderer.film.measures
         with torch.no_grad():
-            out = self.renderer(values, seed=seed)
+            out = self.renderer(values, seed=seed, spp=spp)
         light = out.others[measures] if measures in out.others else getattr(out, measures)
         tensors = {measures: light, "steady": out.steady}
         return _Measured(tensors if self.scan is None else _of_scan(tensors, self.scan), _outside(out))
