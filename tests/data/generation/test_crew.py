@@ -12,8 +12,8 @@ from torchtransient.data.generation.crew import Crew, Member
 from torchtransient.data.generation.generate import (
     Generated,
     _check_choices,
-    _check_timeout,
     _check_recipe,
+    _check_timeout,
     _size,
     _whole_pair,
 )

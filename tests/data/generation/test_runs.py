@@ -289,7 +289,8 @@ def test_calls_out_of_place(tmp_path, monkeypatch):
 def test_recipe_json_that_is_none(tmp_path):
     assert read_description(tmp_path) is None
     place = tmp_path / "recipe.json"
-    for content, words in ((b"[1]", "lacks 'format'"), (b'{"format": 0, "key": 1, "n": 2}', "lacks 'per_shard'"), (b"\xff", "damaged")):
+    some = b'{"format": 0, "key": 1, "n": 2}'
+    for content, words in ((b"[1]", "lacks 'format'"), (some, "lacks 'per_shard'"), (b"\xff", "damaged")):
         place.write_bytes(content)
         with pytest.raises(StorageError, match=words):
             read_description(tmp_path)

@@ -235,8 +235,8 @@ def test_a_forecast_in_words():
         "bytes a sample    2 kB before compression",
         "  store='exact'    1.5 kB, 1.3 times smaller",
         "  store='rounded'  500 B, 4.0 times smaller",
-        "light outside     more than 1% in 16 of 64 samples, 1.23% on average, 25.00% at most; more than 1% in 16.0% to "
-        "36.8% of all samples (95% confidence)",
+        "light outside     more than 1% in 16 of 64 samples, 1.23% on average, 25.00% at most; more than 1% in 16.0% "
+        "to 36.8% of all samples (95% confidence)",
         "standard error    12.5% of a sample's numbers (root mean square)",
         "7200 samples    47.3 minutes of one worker, 3.6 MB to 14.4 MB",
     ]
