@@ -22,7 +22,8 @@ class OnlineDataset(IterableDataset[dict[str, Any]]):
 
     A sample is a dictionary as of :class:`~torchtransient.data.reading.transient_dataset.TransientDataset`: its arrays
     by name as tensors of the caller's own, ``values`` by key, ``outside`` and ``index`` in the recipe.
-    ``DataLoader(data, batch_size=8)`` makes batches; ``num_workers`` other than 0 is an error: the data set has processes of its own. ::
+    ``DataLoader(data, batch_size=8)`` makes batches; ``num_workers`` other than 0 is an error: the data set has
+    processes of its own. ::
 
         with OnlineDataset(recipe, workers=2) as data:
             for step, batch in zip(range(10_000), DataLoader(data, batch_size=8)):

@@ -29,12 +29,12 @@ _WHAT = "RecipeDataset"
 class RecipeDataset(Epochs, Dataset[dict[str, Any]]):
     """Sample n of a recipe as ``dataset[n]``: a map-style data set that renders, of ``size`` samples from ``first`` on.
 
-    A sample is a dictionary as of :class:`~torchtransient.data.reading.transient_dataset.TransientDataset`: its arrays
-    by name, ``values`` by key, ``outside`` and ``index`` in the recipe. It depends on recipe and number alone, and what
-    a ``transform`` draws on ``seed``, too: a run that reads it in the order of :class:`torchtransient.training.Batches` can
-    be stopped and goes on to the bit, which one with :class:`OnlineDataset`, whose order depends on how fast samples are made,
-    cannot. Each sample is rendered every time that it is read; where that is what a step waits for, use OnlineDataset,
-    or generate the data set.
+    A sample is a dictionary as of :class:`~torchtransient.data.reading.transient_dataset.TransientDataset`: its
+    arrays by name, ``values`` by key, ``outside`` and ``index`` in the recipe. It depends on recipe and number alone,
+    and what a ``transform`` draws on ``seed``, too: a run that reads it in the order of
+    :class:`torchtransient.training.Batches` can be stopped and goes on to the bit, which one with
+    :class:`OnlineDataset`, whose order depends on how fast samples are made, cannot. Each sample is rendered every
+    time that it is read; where that is what a step waits for, use OnlineDataset, or generate the data set.
 
     ``DataLoader(data, num_workers=2, multiprocessing_context="spawn", persistent_workers=True,
     worker_init_fn=torchtransient.training.worker_init)`` renders beside the training; processes that were forked raise
