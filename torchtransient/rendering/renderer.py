@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -11,7 +12,7 @@ import torch
 from torch import nn
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
-from torchtransient.errors import ArgumentError, SceneError, ShapeError
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, TorchTransientWarning
 from torchtransient.gates import Gate
 from torchtransient.given_types import is_one_of
 from torchtransient.parametrize.copies import CopiesParametrized
@@ -40,10 +41,11 @@ from torchtransient.rendering.build_options import BuildOptions
 from torchtransient.rendering.effects import Effects
 from torchtransient.rendering.films.choice import FilmChoice
 from torchtransient.rendering.films.layout import steady_channels_first
+from torchtransient.rendering.interrupts import quiet
 from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.output import RenderOutput, RenderStats
 from torchtransient.rendering.parameters import ParameterInfo, needing_slope, unknown_key
-from torchtransient.rendering.physics import PhysicsWatch
+from torchtransient.rendering.physics import PhysicsWatch, level_of_user
 from torchtransient.rendering.progress import Bar
 from torchtransient.rendering.pulse_properties import checked_pulse
 from torchtransient.rendering.scene_handle import Scene, load
@@ -182,6 +184,7 @@ class TransientRenderer(CopiesParametrized):
         self._cube_shape = tuple(films[0].cube_shape())
         self._channels = tuple(films[0].channel_names())
         self._scene_spp = int(found[self._sensors[0]].sampler().sample_count())
+        self._counts = {self._scene_spp: self._scene_spp}
         self._pulsed = all(film.pulses for film in films)
         self._response = response_of(films)
         self._scene_filter = films[0].temporal_filter
@@ -288,8 +291,21 @@ class TransientRenderer(CopiesParametrized):
         """Samples per pixel that a render with ``spp`` really draws: stratified samplers round up."""
         with active_variant(self.scene.variant):
             sampler = self.scene.built(self._options).scene.sensors()[self._sensors[0]].sampler().clone()
-            sampler.set_sample_count(samples("spp", spp) or sampler.sample_count())
+            with quiet():
+                sampler.set_sample_count(samples("spp", spp) or sampler.sample_count())
             return int(sampler.sample_count())
+
+    def _taken(self, spp: int) -> int:
+        """The sampler's number of samples for one that is asked for; another one is said once."""
+        if spp not in self._counts:
+            self._counts[spp] = taken = self.samples_drawn(spp)
+            if taken != spp:
+                warnings.warn(
+                    f"spp={spp} is rounded to {taken}, a number of samples that the scene's sampler can draw.",
+                    TorchTransientWarning,
+                    stacklevel=level_of_user(),
+                )
+        return self._counts[spp]
 
     @opaque
     def forward(
@@ -317,7 +333,7 @@ class TransientRenderer(CopiesParametrized):
         tensors, batched, batch = self._collect(values)
         temporal_filter = self.effective_filter
         self._check_slope(temporal_filter, tensors)
-        used = samples("spp", spp) or self.spp or self._scene_spp
+        used = self._taken(samples("spp", spp) or self.spp or self._scene_spp)
         seeding = Seeding(self._sensors, 1 if batch is None else batch, self.grad_seed)
         number, per_entry = drawn(seed)
         bar = Bar() if progress else None
@@ -329,7 +345,7 @@ class TransientRenderer(CopiesParametrized):
             seeding=seeding,
             batched=tuple(batched),
             spp=used,
-            spp_grad=self.spp_grad or used,
+            spp_grad=self._taken(self.spp_grad) if self.spp_grad else used,
             temporal_filter=temporal_filter or None,
             watch=self._watch,
             progress=bar,

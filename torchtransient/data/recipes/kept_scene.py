@@ -27,7 +27,6 @@ from torchtransient.files.scan_data import scan_data
 from torchtransient.plugins import versions_of_others
 from torchtransient.quantities import shown
 from torchtransient.rendering.labels import LABELS, first_return, label_names, material_names, scene_labels
-from torchtransient.rendering.output import RenderOutput
 from torchtransient.rendering.parameters import ParameterTable, unknown_key
 from torchtransient.rendering.renderer import TransientRenderer
 from torchtransient.rendering.scene_handle import Scene, load
@@ -251,7 +250,7 @@ class Kept:
             out = self.renderer(values, seed=seed, spp=spp)
         light = out.others[measures] if measures in out.others else getattr(out, measures)
         tensors = {measures: light, "steady": out.steady}
-        return _Measured(tensors if self.scan is None else _of_scan(tensors, self.scan), _outside(out))
+        return _Measured(tensors if self.scan is None else _of_scan(tensors, self.scan), out.outside)
 
     def _first_return(self, tensors: Mapping[str, torch.Tensor]) -> torch.Tensor:
         axis = self._axis_of_first_return()
@@ -371,18 +370,6 @@ def versions() -> dict[str, str]:
 
     others = {name: metadata.version(name) for name in ("mitsuba", "drjit", "torch", "numpy")}
     return {"torchtransient": __version__, **others, **versions_of_others()}
-
-
-def _outside(out: RenderOutput) -> tuple[float, float]:
-    """Shares of the light before and after the window, over all sensors."""
-    stats, channels = out.stats, out.steady.shape[-3]
-    before, after = sum(stats.energy_before), sum(stats.energy_after)
-    if before + after <= 0:
-        return 0.0, 0.0
-    # Of polarized light the first Stokes component.
-    steady = out.steady[..., 0, :, :, :] if out.polarized else out.steady
-    total = float(steady.sum(dtype=torch.float64)) / channels
-    return (before / total, after / total) if total > 0 else (0.0, 0.0)
 
 
 def _of_scan(tensors: Mapping[str, torch.Tensor], scan: Scan) -> dict[str, torch.Tensor]:
