@@ -23,6 +23,7 @@ from torchtransient.data.recipes.distributions import LogUniform as LogUniform
 from torchtransient.data.recipes.distributions import Normal as Normal
 from torchtransient.data.recipes.distributions import Scale as Scale
 from torchtransient.data.recipes.distributions import Uniform as Uniform
+from torchtransient.data.recipes.outside_light import OutsideLight as OutsideLight
 from torchtransient.data.recipes.poses import Compose as Compose
 from torchtransient.data.recipes.poses import LookAt as LookAt
 from torchtransient.data.recipes.poses import Offset as Offset
@@ -37,3 +38,7 @@ from torchtransient.data.storage.shard_writing import ShardWriter as ShardWriter
 from torchtransient.data.storage.tal_export import export_tal as export_tal
 from torchtransient.data.storage.web_dataset import export_web_dataset as export_web_dataset
 from torchtransient.data.storage.web_dataset import read_web_dataset as read_web_dataset
+from torchtransient.rendering.labels import first_return as first_return
+from torchtransient.rendering.labels import label_names as label_names
+from torchtransient.rendering.labels import material_names as material_names
+from torchtransient.rendering.labels import scene_labels as scene_labels

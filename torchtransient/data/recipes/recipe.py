@@ -32,7 +32,7 @@ class Recipe(Specification):
     - ``device.STAGE.ARGUMENT`` for an argument of a stage of ``device`` (a kind or a number);
     - ``scan``, of a capture: a :class:`Choice` of scans of one shape.
 
-    ``labels``: names of :func:`torchtransient.rendering.labels.scene_labels` and ``first_return``, of the same scene
+    ``labels``: names of :func:`torchtransient.data.scene_labels` and ``first_return``, of the same scene
     and camera. ``keep``: names of what samples keep, of ``transient`` (``phasor``, ``gated``), ``steady``, labels and
     ``measurement``; None for all. ``["measurement", "depth"]`` makes small data sets.
 
