@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -12,7 +11,7 @@ import torch
 from torch import nn
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
-from torchtransient.errors import ArgumentError, SceneError, ShapeError, TorchTransientWarning
+from torchtransient.errors import ArgumentError, SceneError, ShapeError
 from torchtransient.gates import Gate
 from torchtransient.given_types import is_one_of
 from torchtransient.parametrize.copies import CopiesParametrized
@@ -41,13 +40,13 @@ from torchtransient.rendering.build_options import BuildOptions
 from torchtransient.rendering.effects import Effects
 from torchtransient.rendering.films.choice import FilmChoice
 from torchtransient.rendering.films.layout import steady_channels_first
-from torchtransient.rendering.interrupts import quiet
 from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.output import RenderOutput, RenderStats
 from torchtransient.rendering.parameters import ParameterInfo, needing_slope, unknown_key
-from torchtransient.rendering.physics import PhysicsWatch, level_of_user
+from torchtransient.rendering.physics import PhysicsWatch
 from torchtransient.rendering.progress import Bar
 from torchtransient.rendering.pulse_properties import checked_pulse
+from torchtransient.rendering.sample_counts import SampleCounts, samples_taken
 from torchtransient.rendering.scene_handle import Scene, load
 from torchtransient.rendering.seeds import Item, Seeding, drawn
 from torchtransient.rendering.session import RenderJob
@@ -184,7 +183,7 @@ class TransientRenderer(CopiesParametrized):
         self._cube_shape = tuple(films[0].cube_shape())
         self._channels = tuple(films[0].channel_names())
         self._scene_spp = int(found[self._sensors[0]].sampler().sample_count())
-        self._counts = {self._scene_spp: self._scene_spp}
+        self._counts = SampleCounts({self._scene_spp: self._scene_spp})
         self._pulsed = all(film.pulses for film in films)
         self._response = response_of(films)
         self._scene_filter = films[0].temporal_filter
@@ -290,22 +289,8 @@ class TransientRenderer(CopiesParametrized):
     def samples_drawn(self, spp: int) -> int:
         """Samples per pixel that a render with ``spp`` really draws: stratified samplers round up."""
         with active_variant(self.scene.variant):
-            sampler = self.scene.built(self._options).scene.sensors()[self._sensors[0]].sampler().clone()
-            with quiet():
-                sampler.set_sample_count(samples("spp", spp) or sampler.sample_count())
-            return int(sampler.sample_count())
-
-    def _taken(self, spp: int) -> int:
-        """The sampler's number of samples for one that is asked for; another one is said once."""
-        if spp not in self._counts:
-            self._counts[spp] = taken = self.samples_drawn(spp)
-            if taken != spp:
-                warnings.warn(
-                    f"spp={spp} is rounded to {taken}, a number of samples that the scene's sampler can draw.",
-                    TorchTransientWarning,
-                    stacklevel=level_of_user(),
-                )
-        return self._counts[spp]
+            sensor = self.scene.built(self._options).scene.sensors()[self._sensors[0]]
+            return samples_taken(sensor.sampler().clone(), samples("spp", spp))
 
     @opaque
     def forward(
@@ -333,7 +318,8 @@ class TransientRenderer(CopiesParametrized):
         tensors, batched, batch = self._collect(values)
         temporal_filter = self.effective_filter
         self._check_slope(temporal_filter, tensors)
-        used = self._taken(samples("spp", spp) or self.spp or self._scene_spp)
+        wanted = samples("spp", spp) or self.spp or self._scene_spp
+        used, used_grad = (self._counts.of(n, self.samples_drawn) for n in (wanted, self.spp_grad or wanted))
         seeding = Seeding(self._sensors, 1 if batch is None else batch, self.grad_seed)
         number, per_entry = drawn(seed)
         bar = Bar() if progress else None
@@ -345,7 +331,7 @@ class TransientRenderer(CopiesParametrized):
             seeding=seeding,
             batched=tuple(batched),
             spp=used,
-            spp_grad=self._taken(self.spp_grad) if self.spp_grad else used,
+            spp_grad=used_grad,
             temporal_filter=temporal_filter or None,
             watch=self._watch,
             progress=bar,
@@ -359,10 +345,8 @@ class TransientRenderer(CopiesParametrized):
         leading = (*(() if batch is None else (batch,)), *((len(self._sensors),) if self._stack_sensors else ()))
         stats, components = self._stats(job), stokes_components(self.scene.variant)
         steady = steady_channels_first(steady, leading, components)
-        return RenderOutput.of(
-            self.film, steady, self.film.channels_first(response, leading, components),
-            stats=stats, channels=self._channels,
-        )
+        response = self.film.channels_first(response, leading, components)
+        return RenderOutput.of(self.film, steady, response, stats=stats, channels=self._channels)
 
     def _collect(self, values: Mapping[str, Any] | None) -> tuple[list[torch.Tensor], list[bool], int | None]:
         """The tensors of a call in the order of the keys, which of them are batched, and the batch size."""

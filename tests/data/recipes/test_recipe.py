@@ -208,7 +208,7 @@ def test_samples_whose_light_the_window_misses():
 @pytest.mark.parametrize(("cut", "samples"), [(0, 64), (8, 64), (63, 64), (16, 16)])
 def test_interval_of_the_share_of_samples(cut, samples):
     """Wilson's: its ends p are 1.96 standard deviations of a share of n samples away from k / n."""
-    for p in OutsideLight(samples, cut, 0.0, 0.0).expected:
+    for p in OutsideLight(samples=samples, cut=cut, mean=0.0, most=0.0).expected:
         if 0 < p < 1:
             assert (p - cut / samples) ** 2 == pytest.approx(1.96**2 * p * (1 - p) / samples, rel=1e-9)
         else:

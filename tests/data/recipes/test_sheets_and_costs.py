@@ -211,7 +211,7 @@ def latest_time(folder):
 def cost(**more):
     settings = {
         "values": ("a", "b"), "exchanged": ("c",), "seen": 2, "sample_bytes": 2000,
-        "outside": OutsideLight(64, 16, 0.0123, 0.25),
+        "outside": OutsideLight(samples=64, cut=16, mean=0.0123, most=0.25),
         "structures": (StructureCost("c=x", 3.0, 0.5), StructureCost("", 1.0, 0.25)), "n": 7200,
         "standard_error": 0.125, "stored_bytes": {"exact": 1500.0, "rounded": 500.0, "counts": None},
     }  # fmt: skip

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Self
 
 import numpy as np
@@ -27,6 +27,7 @@ class OutsideLight:
     ``most``: share of the light outside, over samples.
     """
 
+    _: KW_ONLY
     samples: int
     cut: int
     mean: float
@@ -37,8 +38,9 @@ class OutsideLight:
         """Of samples' shares (before, after) the window."""
         missed = np.array([sum(pair) for pair in shares], dtype=np.float64)
         if not len(missed):
-            return cls(0, 0, 0.0, 0.0)
-        return cls(len(missed), int((missed > CUT).sum()), float(missed.mean()), float(missed.max()))
+            return cls(samples=0, cut=0, mean=0.0, most=0.0)
+        cut = int((missed > CUT).sum())
+        return cls(samples=len(missed), cut=cut, mean=float(missed.mean()), most=float(missed.max()))
 
     @property
     def expected(self) -> tuple[float, float]:
