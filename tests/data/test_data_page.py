@@ -119,7 +119,7 @@ def test_what_is_read(names):
     assert names["numbers"].tolist() == list(range(6)) and names["failed"] == {}
     window = names["window"]
     assert (window.axis.start_opl, window.axis.num_bins) == (6.0, 80) and set(window[0]) == {
-        "transient", "depth", "index",
+        "transient", "depth", "outside", "index",
     }  # fmt: skip
     assert torch.equal(window[3]["transient"], rooms[3]["transient"][:, 20:100])
     assert torch.equal(names["corner"][1]["transient"], rooms[1]["transient"][:, :64, :4, 4:])
