@@ -23,7 +23,6 @@ from torchtransient.data.recipes.distributions import LogUniform as LogUniform
 from torchtransient.data.recipes.distributions import Normal as Normal
 from torchtransient.data.recipes.distributions import Scale as Scale
 from torchtransient.data.recipes.distributions import Uniform as Uniform
-from torchtransient.data.recipes.outside_light import OutsideLight as OutsideLight
 from torchtransient.data.recipes.poses import Compose as Compose
 from torchtransient.data.recipes.poses import LookAt as LookAt
 from torchtransient.data.recipes.poses import Offset as Offset

@@ -286,6 +286,15 @@ def test_calls_out_of_place(tmp_path, monkeypatch):
 # ------------------------------------------------------------------------------------------- recipe.json, and words
 
 
+def test_a_folder_whose_first_samples_were_left_out(whole, tmp_path):
+    """By the rule of an earlier format: the others do not go beside them."""
+    place = copied(whole, tmp_path / "set", 3)
+    described = json.loads((whole / "recipe.json").read_text())
+    (place / "recipe.json").write_text(json.dumps(described | {"format": "torchtransient data set", "max_outside": 0.01}))
+    with pytest.raises(StorageError, match="format is 'torchtransient data set' there"):
+        generate(RECIPE, place, **SMALL)
+
+
 def test_recipe_json_that_is_none(tmp_path):
     assert read_description(tmp_path) is None
     place = tmp_path / "recipe.json"
