@@ -290,7 +290,8 @@ def test_a_folder_whose_first_samples_were_left_out(whole, tmp_path):
     """By the rule of an earlier format: the others do not go beside them."""
     place = copied(whole, tmp_path / "set", 3)
     described = json.loads((whole / "recipe.json").read_text())
-    (place / "recipe.json").write_text(json.dumps(described | {"format": "torchtransient data set", "max_outside": 0.01}))
+    earlier = described | {"format": "torchtransient data set", "max_outside": 0.01}
+    (place / "recipe.json").write_text(json.dumps(earlier))
     with pytest.raises(StorageError, match="format is 'torchtransient data set' there"):
         generate(RECIPE, place, **SMALL)
 
