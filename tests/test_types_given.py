@@ -36,6 +36,7 @@ HANDED_ON = {
 LEFT = {
     "data.Generated", "data.Sample", "training.Checkpoint",  # results
     "training.worker_init",  # called by torch
+    "data.scene_labels", "data.label_names", "data.material_names",  # rendering/test_labels.py
     *(f"data.{kind}.draw" for kind in ("Affine", "Crop", "Flip", "Operation", "QuarterTurn", "Distribution", "Choice",
       "LogUniform", "Normal", "Scale", "Uniform", "Compose", "LookAt", "Offset", "Turn")),  # given by the library
     *(f"data.{name}" for name in ("Shard.shape", "Shard.time_axis", "Shard.dtype", "Shard.encoding",

@@ -171,7 +171,7 @@ def main(argv: Sequence[str] | None = None) -> list[dict[str, list[float]]]:
     sizes, measure = SMOKE if options.smoke else FULL, detector()
     recipe, count = moving_letters(sizes.spp), sizes.test + sizes.train
     where = options.output / f"denoise_histograms-{recipe.key()[:8]}-{count}"
-    print(tt.data.generate(recipe, where, count, max_outside=None))
+    print(tt.data.generate(recipe, where, count))
     light = next(iter(DataLoader(tt.data.TransientDataset(where), batch_size=count)))["transient"]
     tables: list[dict[str, list[float]]] = []
     for seed in options.seeds:

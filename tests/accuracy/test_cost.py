@@ -11,6 +11,7 @@ import torchtransient as tt
 from torchtransient.accuracy.cost import cosine_over_the_window
 from torchtransient.accuracy.report import Choice
 from torchtransient.errors import ArgumentError, SceneError
+from torchtransient.scenes import transforms
 
 VARIANT = "llvm_ad_mono"
 ALBEDO, WALL, LIGHT = "wall.bsdf.reflectance.value", "wall.to_world", "light.position"
@@ -31,7 +32,6 @@ def report():
     return tt.cost_of_accuracy(
         wall_renderer(),
         spp=(16, 64, 256, 1024),
-        gradients=[ALBEDO, WALL],
         repeats=8,
         samplers=("independent", "multijitter"),
         temporal_filters=("box", "tent"),
@@ -40,14 +40,23 @@ def report():
 
 
 @pytest.mark.slow
-def test_every_curve_is_there(report):
+def test_every_curve_is_there():
+    report = tt.cost_of_accuracy(
+        wall_renderer(),
+        spp=(16, 64),
+        gradients=[ALBEDO, WALL],
+        repeats=2,
+        samplers=("independent", "multijitter"),
+        temporal_filters=("box", "tent"),
+        progress=False,
+    )
     curves = {(quantity, str(choice)) for quantity, choice, _ in report.curves()}
     names = [f"{sampler}, {name}" for sampler in ("independent", "multijitter") for name in ("box", "tent")]
     assert {name for quantity, name in curves if quantity == "transient"} == set(names)
     for key in (ALBEDO, WALL):
         assert {name for quantity, name in curves if quantity == f"d loss / d {key}"} == {names[1], names[3]}
     assert report.settings["without_gradients"] == [names[0], names[2]]
-    assert all([p.spp for p in curve] == [16, 64, 256, 1024] for _, _, curve in report.curves())
+    assert all([p.spp for p in curve] == [16, 64] for _, _, curve in report.curves())
     assert all(p.seconds > 0 for p in report.points)
 
 
@@ -100,6 +109,60 @@ def test_gradients_against_a_reference():
     )
     assert abs(coarse.squared_error / fine.squared_error / 4 - 1) < 4 * error
     assert "reference of 4096" in report.method
+
+
+def test_gradients_of_a_heavy_tailed_loss_have_no_error():
+    def loss(out):
+        return cosine_over_the_window(out) * float(np.random.default_rng(out.stats.seeds[0]).standard_cauchy())
+
+    report = tt.cost_of_accuracy(
+        wall_renderer(), spp=(4,), gradients=[ALBEDO], samplers=("independent",), loss=loss, progress=False
+    )
+    transient, gradient = report.points
+    assert transient.relative_error > 0 and transient.tail is None
+    assert np.isnan(gradient.relative_error) and gradient.tail.heavy
+    assert f"d loss / d {ALBEDO} [independent, tent]  heavy tailed: no error" in report.table()
+
+
+@pytest.mark.slow
+def test_gradients_of_a_body_with_hollows_have_no_error():
+    """A bumpy sphere before a wall, moved sideways: few of its silhouettes' samples decide, and two pairs of runs say
+    5 % where 64 say 74 %.
+    """
+    n, m = 24, 16
+    turns = np.linspace(0, 2 * np.pi, n, endpoint=False)
+    places = [(t, p) for t in np.linspace(0, np.pi, m + 1)[1:-1] for p in turns]
+    radii = [0.5 * (1 + 0.25 * np.sin(3 * p) * np.sin(t) ** 2) for t, p in places]
+    vertices = [
+        [r * np.sin(t) * np.cos(p), r * np.cos(t), r * np.sin(t) * np.sin(p)]
+        for r, (t, p) in zip(radii, places, strict=True)
+    ]
+    at, top, bottom = (lambda i, j: i * n + j % n), (m - 1) * n, (m - 1) * n + 1
+    faces = [[top, at(0, j + 1), at(0, j)] for j in range(n)]
+    faces += [[bottom, at(m - 2, j), at(m - 2, j + 1)] for j in range(n)]
+    for i in range(m - 2):
+        for j in range(n):
+            faces += [[at(i, j), at(i, j + 1), at(i + 1, j)], [at(i, j + 1), at(i + 1, j + 1), at(i + 1, j)]]
+    film = {"type": "transient_hdr_film", "width": 8, "height": 8, "rfilter": {"type": "box"},
+            "temporal_bins": 128, "start_opl": 5.0, "bin_width_opl": 0.06}  # fmt: skip
+    far = transforms.translate([0, 0, -0.8]) @ transforms.scale([5, 5, 1])
+    scene = {
+        "type": "scene", "integrator": {"type": "transient_path", "max_depth": 3},
+        "sensor": {"type": "perspective", "fov": 40, "near_clip": 1e-3, "film": film,
+                   "to_world": transforms.look_at(origin=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0])},
+        "light": {"type": "point", "position": [0.7, 0.4, 3.8], "intensity": 10.0},
+        "wall": {"type": "rectangle", "to_world": far, "bsdf": {"type": "diffuse", "reflectance": 0.7}},
+        "body": {"type": "mesh_arrays", "vertices": np.array([*vertices, [0, 0.5, 0], [0, -0.5, 0]], np.float32),
+                 "faces": np.array(faces), "face_normals": True,
+                 "bsdf": {"type": "twosided", "b": {"type": "diffuse", "reflectance": 0.6}}},
+    }  # fmt: skip
+    pose, albedo = "body.to_world", "wall.bsdf.reflectance.value"
+    renderer = tt.TransientRenderer(tt.load(scene, variant=VARIANT), [pose, albedo])
+    report = tt.cost_of_accuracy(
+        renderer, spp=(16, 64), gradients=[pose, albedo], samplers=("independent",), progress=False
+    )
+    heavy = {point.quantity: point.tail.heavy for point in report.points if point.tail is not None}
+    assert heavy == {f"d loss / d {pose}": True, f"d loss / d {albedo}": False}
 
 
 def test_sample_counts_are_those_that_were_drawn():

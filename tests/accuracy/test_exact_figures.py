@@ -14,7 +14,7 @@ import torch
 import torchtransient as tt
 from torchtransient.accuracy import measure as measure_module
 from torchtransient.accuracy.cost import cosine_over_the_window
-from torchtransient.accuracy.errors_of_estimates import ErrorTally, Reference
+from torchtransient.accuracy.errors_of_estimates import ErrorTally, Reference, Tail
 from torchtransient.accuracy.measure import Estimates, Task, measure
 from torchtransient.accuracy.report import AccuracyReport, Choice, CostPoint
 from torchtransient.errors import ShapeError, UnitError
@@ -75,6 +75,30 @@ def test_errors_of_given_numbers(time_dim):
         assert found.relative == pytest.approx(math.sqrt(squared.mean() / power.mean()), rel=1e-5)
         of_bins = np.sqrt(np.maximum(squared.mean(0), 0) / power.mean(0))
         assert found.median_bin == pytest.approx(np.median(of_bins[power.mean(0) > 0]), rel=1e-5)
+
+
+@pytest.mark.parametrize("alpha", [0.5, 1.5, 2.5, 6.0])
+def test_tails_of_given_runs(alpha):
+    """Distances at the quantiles of a power law, on either side of 3; Hill's index by its formula."""
+    distances = (np.arange(1, 101) / 101) ** (-1 / alpha)
+    runs = [np.array([3.0 + side * d], np.float32) for d in distances for side in (-1, 1)]
+    found = Tail.of(runs)
+    top = np.repeat(distances, 2)[:9]
+    assert found.index == pytest.approx(1 / np.log(top[:8] / top[8]).mean(), rel=1e-4)
+    assert found.index == pytest.approx(alpha, rel=0.5)
+    assert found.largest == pytest.approx(distances[0] ** 2 / (2 * (distances**2).sum()), rel=1e-4)
+    assert found.heavy == (alpha < 2)
+    squared = np.repeat(distances**2, 2)
+    assert found.spread == pytest.approx(squared.std(ddof=1) / squared.mean(), rel=1e-4)
+
+
+def test_one_run_that_is_far_off_is_a_heavy_tail():
+    runs = np.random.default_rng(0).normal(size=(96, 5)).astype(np.float32)
+    assert not Tail.of(list(runs)).heavy
+    runs[7] += 30
+    assert Tail.of(list(runs)).heavy
+    still = Tail.of([np.ones(3, np.float32)] * 96)
+    assert not still.heavy and still.spread == 0
 
 
 def test_no_light_at_all():

@@ -63,6 +63,39 @@ def test_standard_error_of_the_squared_error():
     assert point.squared_error_standard_error == pytest.approx(expected, rel=0.35)
 
 
+def drawn_gradient(draw):
+    """Runs of one derivative, `draw` the noise of a run of one sample."""
+
+    def run(spp, seed):
+        return Estimates({"key": np.array([3.0 + draw(np.random.default_rng([seed, spp])) / spp**0.5])}, spp)
+
+    return {"gradients": Task(run, tails=True)}
+
+
+@pytest.mark.parametrize("index", [0.7, 1.0, 1.3])
+@pytest.mark.parametrize("reference_spp", [None, 8192])
+def test_a_heavy_tail_has_no_error(index, reference_spp):
+    """Two pairs of runs look as precise as any."""
+    task = drawn_gradient(lambda rng: 0.1 * rng.standard_t(index))
+    report = measure({INDEPENDENT: task}, SPP, reference_spp=reference_spp, progress=False)
+    for point in report.points:
+        assert point.tail.heavy and np.isnan([point.squared_error, point.relative_error, point.median_bin_error]).all()
+        assert point.seconds > 0
+    assert "heavy tailed: no error" in report.table() and "nan" not in report.table()
+    assert report.slope("key", INDEPENDENT) is None and np.isnan(report.gain("key", INDEPENDENT))
+    assert report.to_dict()["points"][0]["relative_error"] is None
+
+
+def test_the_standard_error_of_a_derivative_is_that_of_many_runs():
+    """The square of one normal deviate scatters by sqrt(2) of its mean: two pairs know their error up to its size."""
+    report = measure({INDEPENDENT: drawn_gradient(lambda rng: rng.normal())}, SPP, repeats=4, progress=False)
+    for point in report.points:
+        assert not point.tail.heavy
+        # The spread of 96 squares of normal deviates scatters by some 20 %.
+        assert point.squared_error_standard_error / point.squared_error == pytest.approx(2**0.5 / 2**0.5, rel=0.6)
+        assert f"+- {point.squared_error_standard_error:.1e}" in report.table()
+
+
 def test_pairs_do_not_see_a_bias_and_a_reference_does():
     tally = ErrorTally(None, None)
     rng = np.random.default_rng(0)

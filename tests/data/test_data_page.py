@@ -115,11 +115,11 @@ def test_costs_and_pictures(names, folder):
 @pytest.mark.slow
 def test_what_is_read(names):
     rooms = names["rooms"]
-    assert len(rooms) == 6 and set(names["item"]) == {"transient", "steady", "depth", "values", "index"}
+    assert len(rooms) == 6 and set(names["item"]) == {"transient", "steady", "depth", "values", "outside", "index"}
     assert names["numbers"].tolist() == list(range(6)) and names["failed"] == {}
     window = names["window"]
     assert (window.axis.start_opl, window.axis.num_bins) == (6.0, 80) and set(window[0]) == {
-        "transient", "depth", "index",
+        "transient", "depth", "outside", "index",
     }  # fmt: skip
     assert torch.equal(window[3]["transient"], rooms[3]["transient"][:, 20:100])
     assert torch.equal(names["corner"][1]["transient"], rooms[1]["transient"][:, :64, :4, 4:])
@@ -150,7 +150,7 @@ def test_measurements(names):
     assert not torch.equal(first, again)
     first, again = (names["fixed"][0]["measurement"] for _ in range(2))
     assert torch.equal(first, again) and not torch.equal(first, names["mean"])
-    assert set(names["fixed"][0]) == {"depth", "measurement", "index"}
+    assert set(names["fixed"][0]) == {"depth", "measurement", "outside", "index"}
 
 
 @pytest.mark.slow
@@ -192,7 +192,7 @@ def test_files_of_a_folder(names, folder):
     there = {path.name for path in (folder / "rooms").iterdir()}
     assert rows == {name for name in there if not name.startswith("shard-") or name == "shard-000000.h5"}
     described = json.loads((folder / "rooms" / "recipe.json").read_text())
-    assert {"recipe", "key", "n", "per_shard", "store", "compression", "max_outside", "about"} <= set(described)
+    assert {"recipe", "key", "n", "per_shard", "store", "compression", "about"} <= set(described)
 
 
 @pytest.mark.slow

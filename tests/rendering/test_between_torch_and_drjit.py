@@ -310,15 +310,16 @@ def test_statistics_of_a_batch():
 
 
 def test_how_a_result_shows_its_statistics():
-    """With all light outside of the window, before and after it, in all items."""
+    """With the share of the light outside of the window, before and after it, in all items."""
     made = {"spp": 4, "variant": VARIANT, "integrator": "path", "temporal_filter": "box", "samples_per_second": 1.0}
     for before, after, seeds, said in (
-        ((0.5, 1.0), (3.0, 0.25), (7, 8), "2 seeds, energy outside of the window 4.75"),
+        ((0.5, 1.0), (3.0, 0.25), (7, 8), "2 seeds, 39.58% of the light outside of the window"),
         ((0.0,), (0.0,), (7,), "seed 7"),
     ):
         stats = RenderStats(seconds=2.5, seeds=seeds, energy_before=before, energy_after=after, **made)
-        shown = RenderOutput._shown_notes(SimpleNamespace(stats=stats))
-        assert shown == {"stats": f"4 spp in 2.5 s, path, {VARIANT}, {said}"}
+        # Two channels of 12 units each.
+        shown = repr(RenderOutput(None, torch.ones(2, 3, 4), None, axis=None, stats=stats))
+        assert f"stats=4 spp in 2.5 s, path, {VARIANT}, {said})" in shown
 
 
 @pytest.mark.parametrize("scale", [1.0, 1000.0])

@@ -673,6 +673,9 @@ def test_mistakes_have_typed_errors(room_scene):
             scene_labels(renderer, names=names)
     with pytest.raises(ArgumentError, match="have no mean"):
         scene_labels(renderer, names=["depth", "shape"], average=True)
+    for call in (tt.data.scene_labels, tt.data.label_names, tt.data.material_names):
+        with pytest.raises(ArgumentError, match=r"renderer: expected a TransientRenderer, got .*make one of a scene"):
+            call(room_scene)
     for samples in (0, 1.5, True, 10**6):
         with pytest.raises(UnitError, match="samples"):
             scene_labels(renderer, average=True, samples=samples)

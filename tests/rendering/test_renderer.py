@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import numpy as np
 import pytest
 import torch
 
 import torchtransient as tt
+from torchtransient.errors import TorchTransientWarning
 from torchtransient.rendering import memory
 from torchtransient.rendering.seeds import mix_seed
 from torchtransient.rendering.variant import active_variant
@@ -46,6 +48,19 @@ def test_statistics(room_scene):
     inside = float(out.transient.mean(0).sum())
     assert outside > 0
     assert inside + outside == pytest.approx(float(out.steady.mean(0).sum()), rel=1e-4)
+
+
+def test_a_number_of_samples_that_a_sampler_rounds_is_said_once(room_scene, capfd):
+    """By Python's warnings: Mitsuba's words of its samplers go past them, several times in a call."""
+    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], sampler="multijitter")
+    capfd.readouterr()
+    with pytest.warns(TorchTransientWarning, match="spp=7 is rounded to 8") as said:
+        renderer(seed=0, spp=7).steady.sum().backward()
+    assert len(said) == 1 and said[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert renderer(seed=1, spp=7).stats.spp == 8
+    assert "ounded" not in "".join(capfd.readouterr())
 
 
 def test_function_and_module_agree(room_scene):

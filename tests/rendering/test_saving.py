@@ -66,6 +66,19 @@ def test_an_optimised_scene_has_the_same_picture(tmp_path, variant):
     torch.testing.assert_close(picture(tt.load(path, variant=variant)), expected, rtol=1e-4, atol=1e-5)
 
 
+def test_a_mesh_is_one_file(tmp_path):
+    """Beside the XML lies what it names, whether the mesh came as arrays or from a file."""
+    room = make_room()
+    corners = np.array([[-1, -1, 0.1], [1, -1, 0.1], [0, 1, 0.1]], np.float32)
+    room["star"] = {"type": "mesh_arrays", "vertices": corners, "faces": np.array([[0, 1, 2]])}
+    scene, key = tt.load(room, variant=VARIANT), "star.vertex_positions"
+    for name in ("first", "second"):
+        path = scene.save(tmp_path / f"{name}.xml", {key: corners * 0.5})
+        assert [file.name for file in (tmp_path / f"{name}_files").iterdir()] == ["star.ply"]
+        assert f'value="{name}_files/star.ply"' in path.read_text()
+        scene = tt.load(path, variant=VARIANT)
+
+
 def test_a_grid_is_a_file(tmp_path):
     """And the values of it that were found."""
     room = make_room()

@@ -9,7 +9,10 @@ import textwrap
 import pytest
 import torch
 
-import torchtransient as tt
+import torchtransient as tt  # isort: skip
+import drjit as dr
+import mitsuba as mi
+
 from torchtransient.rendering.variant import active_variant, is_differentiable, resolve_variant
 from torchtransient.testing.small_room import COLOUR, VARIANT, make_room
 
@@ -43,6 +46,31 @@ def test_import_scenes_and_load_need_no_variant():
     """)
     # With no variant active there is none to go back to: the scene's stays.
     assert printed == "True llvm_ad_rgb llvm_ad_rgb"
+
+
+def test_a_change_of_the_variant_transforms_no_source_again(monkeypatch):
+    """Renderers of two variants in one loop: at each change Mitsuba executes its integrators anew."""
+    syntax, transformed = dr.syntax, []
+
+    def counted(f=None, **options):
+        if f is None:
+            return lambda g: counted(g, **options)
+        transformed.append(f)
+        return syntax(f, **options)
+
+    mi.set_variant(VARIANT)
+    monkeypatch.setattr(dr, "syntax", counted)
+    other = "llvm_ad_mono" if VARIANT != "llvm_ad_mono" else "llvm_ad_rgb"
+    for _ in range(2):
+        del transformed[:]
+        for name in (other, VARIANT, other):
+            with active_variant(name):
+                assert mi.variant() == name
+    assert transformed == [] and dr.syntax is counted and mi.variant() == VARIANT
+    # Mitsuba's own integrators are whole.
+    with active_variant(other):
+        image = mi.render(mi.load_dict(mi.cornell_box() | {"integrator": {"type": "prb", "max_depth": 2}}), spp=1)
+        assert float(dr.mean(image, axis=None).array[0]) > 0
 
 
 @pytest.mark.slow

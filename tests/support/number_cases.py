@@ -224,6 +224,7 @@ def _runs() -> dict[str, Case]:
     d, t = tt.data, tt.training
     batches, table = t.Batches(4, 2), Table()
     return {
+        "data.first_return": Case(d.first_return, LIGHT, AXIS, threshold=0.5),
         "data.Augmented": Case(d.Augmented, table, d.Augment(d.Flip()), seed=3),
         "data.Augmented.sample": Case(
             d.Augmented(table, d.Augment(d.Flip()), seed=0).sample,
@@ -355,6 +356,7 @@ LEFT = {
     r"(Gate|Pulse)\((opl|values)\)": "rows of a table, which `tabulated` checks",
     r"nlos\.(CaptureRenderer|simulate|forecast)\b.*": "nlos/test_arguments.py",
     r"nlos\.read_capture\(.*\)": "files/captures",
+    r"data\.scene_labels\(.*\)": "rendering/test_labels.py",
     r"data\.ShardWriter\.(put|fail)\(.*\)": "what tt.data.generate gives",
     r"training\.worker_init\(worker\)|vis\.Frames\(make\)|vis\.plot_fit\(truth\)": "given by torch; no number",
     r"sensing\..*": "sensing/test_given.py and the tests of each sensor",

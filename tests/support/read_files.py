@@ -194,7 +194,7 @@ def _data_sets(folder: Path) -> list[Path]:
         samples = [sample(i, (1, 256, 4, 4)) for i in (2 * number, 2 * number + 1)]
         write(place / f"shard-{number:06d}.h5", samples, shard=number)
     build_manifest(place)
-    described = dict.fromkeys(("key", "n", "per_shard", "store", "compression", "max_outside"), 1)
+    described = dict.fromkeys(("format", "key", "n", "per_shard", "store", "compression"), 1)
     text = json.dumps({**described, "n": 4, "key": "abc123", "about": {"spp": 16}, "recipe": {"n": 4}})
     (place / "recipe.json").write_text(text)
     return sorted(place.iterdir())

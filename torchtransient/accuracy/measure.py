@@ -8,10 +8,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from numpy.typing import ArrayLike
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
-from torchtransient.accuracy.errors_of_estimates import ErrorTally, Reference
+from torchtransient.accuracy.errors_of_estimates import TAIL_RUNS, ErrorTally, Reference, Tail
 from torchtransient.accuracy.report import AccuracyReport, Choice, CostPoint
 from torchtransient.errors import UnitError
 from torchtransient.quantities import as_whole, shown
@@ -29,14 +30,20 @@ class Estimates:
 class Task:
     """One thing that is timed on its own: `run(spp, seed)` must return finished numbers, not pending kernels.
 
-    `time_dims` gives the axis of time bins for the quantities that have one.
+    `time_dims` gives the axis of time bins for the quantities that have one. `tails`: whether the tail of its
+    distribution is looked at first, which holds 96 runs in memory.
     """
 
     run: Callable[[int, int], Estimates]
     time_dims: Mapping[str, int] = field(default_factory=dict)
+    tails: bool = False
 
 
 Candidate = Mapping[str, Task]
+# A quantity of a task of a choice.
+Key = tuple[Choice, str, str]
+# Samples per pixel of the runs that show a tail, at most: sums of many samples hide it from a few runs.
+_TAIL_SPP = 16
 
 
 def measure(
@@ -54,16 +61,21 @@ def measure(
     Each candidate first warms up (kernels are compiled) at the sample count that follows. Within a repeat, the
     candidates take turns, so that a change of the machine's speed meets all of them. Every candidate is compared with
     itself: with its own reference of `reference_spp` samples (two independent halves), or, without one, in pairs of
-    independent runs; then `repeats` must be even. Raises UnitError for values out of range.
+    independent runs; then `repeats` must be even. Of tasks with `tails`, 96 runs of 16 samples (or of the smallest
+    count) come first: where they show a heavy tail, there is no error. Raises UnitError for values out of
+    range.
     """
     counts = checked_counts(spp, repeats, reference_spp)
+    tail_spp = min(_TAIL_SPP, counts[0])
     total = len(candidates) * sum(counts) * (repeats + 1) + len(candidates) * (reference_spp or 0)
+    total += tail_spp * TAIL_RUNS * sum(task.tails for candidate in candidates.values() for task in candidate.values())
     points: list[CostPoint] = []
     with tqdm(total=total, unit="spp", disable=not progress, desc="cost of accuracy") as bar:
         references = _references(candidates, reference_spp, seed, bar)
+        tails = _tails(candidates, tail_spp, seed + 1000 + len(counts) * (repeats + 1), bar)
         for n, count in enumerate(counts):
             first_seed = seed + 1000 + n * (repeats + 1)
-            points += _measure_count(candidates, count, repeats, first_seed, references, bar)
+            points += _measure_count(candidates, count, repeats, first_seed, references, tails, bar)
     method = "in pairs of independent runs" if reference_spp is None else f"against a reference of {reference_spp} spp"
     quantities = list(dict.fromkeys(p.quantity for p in points))
     choices = list(candidates)
@@ -76,7 +88,8 @@ def _measure_count(
     count: int,
     repeats: int,
     first_seed: int,
-    references: Mapping[tuple[Choice, str, str], Reference],
+    references: Mapping[Key, Reference],
+    tails: Mapping[Key, Tail],
     bar: Any,
 ) -> list[CostPoint]:
     """All points at one sample count."""
@@ -85,7 +98,7 @@ def _measure_count(
             task.run(count, first_seed + repeats)
         bar.update(count)
     seconds: dict[tuple[Choice, str], list[float]] = {}
-    tallies: dict[tuple[Choice, str, str], ErrorTally] = {}
+    tallies: dict[Key, ErrorTally] = {}
     drawn: dict[tuple[Choice, str], int] = {}
     for repeat in range(repeats):
         for choice, candidate in candidates.items():
@@ -102,7 +115,8 @@ def _measure_count(
             bar.update(count)
     points = []
     for (choice, name, quantity), tally in tallies.items():
-        error = tally.result()
+        tail = tails.get((choice, name, quantity))
+        error = tally.result(tail)
         points.append(
             CostPoint(
                 choice=choice,
@@ -114,15 +128,31 @@ def _measure_count(
                 relative_error=error.relative,
                 median_bin_error=error.median_bin,
                 repeats=repeats,
+                tail=tail,
             )
         )
     return points
 
 
+def _tails(candidates: Mapping[Choice, Candidate], spp: int, first_seed: int, bar: Any) -> dict[Key, Tail]:
+    found: dict[Key, Tail] = {}
+    for choice, candidate in candidates.items():
+        for name, task in candidate.items():
+            if not task.tails:
+                continue
+            runs: dict[str, list[NDArray[np.float32]]] = {}
+            for run in range(TAIL_RUNS):
+                for quantity, array in task.run(spp, first_seed + run).arrays.items():
+                    runs.setdefault(quantity, []).append(np.array(array, dtype=np.float32))
+                bar.update(spp)
+            found |= {(choice, name, quantity): Tail.of(several) for quantity, several in runs.items()}
+    return found
+
+
 def _references(
     candidates: Mapping[Choice, Candidate], reference_spp: int | None, seed: int, bar: Any
-) -> dict[tuple[Choice, str, str], Reference]:
-    references: dict[tuple[Choice, str, str], Reference] = {}
+) -> dict[Key, Reference]:
+    references: dict[Key, Reference] = {}
     if reference_spp is None:
         return references
     for choice, candidate in candidates.items():

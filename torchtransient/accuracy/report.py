@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from torchtransient.accuracy.errors_of_estimates import TAIL_RUNS, Tail
 from torchtransient.array_files.part_files import write_text
 from torchtransient.testing.statistics import Slope, log_log_slope
 
@@ -32,7 +33,7 @@ class CostPoint:
 
     `quantity`: "transient", "phasor" or the key of a gradient. `spp`: samples per pixel really drawn. `seconds`: median
     wall time of one run (forward for values, forward and backward for gradients). The errors are those of
-    `ErrorEstimate`.
+    `ErrorEstimate`. `tail`: of a gradient, the tail of its distribution; where it is heavy the errors are NaN.
     """
 
     choice: Choice
@@ -44,6 +45,7 @@ class CostPoint:
     relative_error: float
     median_bin_error: float
     repeats: int
+    tail: Tail | None = None
 
 
 @dataclass
@@ -99,7 +101,17 @@ class AccuracyReport:
         for quantity, choice, curve in self.curves():
             slope = self.slope(quantity, choice)
             tail = f"slope {slope.slope:+.2f} +- {slope.standard_error:.2f}, " if slope is not None else ""
-            lines += [f"{quantity} [{choice}]  {tail}gain {self.gain(quantity, choice):.2f}", header]
+            lines.append(f"{quantity} [{choice}]  {tail}gain {self.gain(quantity, choice):.2f}")
+            of_runs = curve[0].tail
+            if of_runs is not None and of_runs.heavy:
+                lines[-1] = f"{quantity} [{choice}]  heavy tailed: no error"
+                lines += [
+                    f"  tail index {of_runs.index:.1f} (below 2 the variance is infinite), one of {TAIL_RUNS} runs has "
+                    f"{of_runs.largest:.0%} of the squared deviations; seconds of a run:"
+                ]
+                lines += [f"  {p.spp:>7} spp {p.seconds:>10.4g}" for p in curve] + [""]
+                continue
+            lines.append(header)
             for p in curve:
                 deviation = p.squared_error_standard_error
                 spread = f"+- {deviation:.1e}" if math.isfinite(deviation) else ""
@@ -109,7 +121,7 @@ class AccuracyReport:
                 )
             lines.append("")
         lines.append(f"error {self.method}; gain: squared error x seconds of the first choice over this one")
-        if any(math.isnan(p.relative_error) for p in self.points):
+        if any(math.isnan(p.relative_error) for p in self.points if not (p.tail and p.tail.heavy)):
             lines.append("-: the noise hides the quantity itself, so that there is nothing to be relative to")
         return "\n".join(lines)
 

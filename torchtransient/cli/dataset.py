@@ -50,8 +50,6 @@ def _share(ctx: click.Context, param: click.Parameter, value: str | None) -> tup
 @click.option("--workers", type=click.IntRange(min=1), default=2, show_default=True, help="Processes, a thread each.")
 @click.option("--store", type=click.Choice(["exact", "rounded", "counts"]), default="exact", show_default=True)
 @click.option("--compression", type=click.Choice(["blosc2", "gzip", "none"]), default="blosc2", show_default=True)
-@click.option("--max-outside", type=click.FloatRange(0, 1), default=0.01, show_default=True,
-              help="Samples with more of their light outside the window fail.")  # fmt: skip
 @click.option("--shard", metavar="I/K", callback=_share, help="Every K-th file from the I-th on: K machines share.")
 @click.option("--per-shard", type=click.IntRange(min=1), help="Samples in a file.  [default: 64 to 256 MB]")
 @click.option("--timeout", "timeout_s", type=click.FloatRange(min=0, min_open=True), metavar="SECONDS",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -92,19 +91,10 @@ def _power(output: Any) -> tuple[Any, Any]:
 
 def _report_energy(output: Any) -> None:
     """Light outside of the time axis is easily overlooked in a picture, so it is said in numbers."""
-    before, after = sum(output.stats.energy_before), sum(output.stats.energy_after)
-    inside = _mean_over_channels(_power(output)[0])
-    total = before + after + inside
-    if before + after > 0.001 * total:
+    before, after = output.outside
+    if before + after > 0.001:
         axis = output.axis
         click.echo(
             f"note: the axis from {axis.start_opl:g} m to {axis.end_opl:g} m misses light: "
-            f"{before / total:.1%} arrives before it and {after / total:.1%} after it."
+            f"{before:.1%} arrives before it and {after:.1%} after it."
         )
-
-
-def _mean_over_channels(transient: Any) -> float:
-    import torch
-
-    sums: Sequence[float] = [float(channel.sum(dtype=torch.float64)) for channel in transient]
-    return sum(sums) / len(sums)

@@ -37,3 +37,7 @@ from torchtransient.data.storage.shard_writing import ShardWriter as ShardWriter
 from torchtransient.data.storage.tal_export import export_tal as export_tal
 from torchtransient.data.storage.web_dataset import export_web_dataset as export_web_dataset
 from torchtransient.data.storage.web_dataset import read_web_dataset as read_web_dataset
+from torchtransient.rendering.labels import first_return as first_return
+from torchtransient.rendering.labels import label_names as label_names
+from torchtransient.rendering.labels import material_names as material_names
+from torchtransient.rendering.labels import scene_labels as scene_labels

@@ -29,6 +29,7 @@ from torchtransient.rendering.memory import check_fits
 from torchtransient.rendering.overrides import depth_limit
 from torchtransient.rendering.parameters import needing_slope
 from torchtransient.rendering.physics import are_finite, smallest_and_largest
+from torchtransient.rendering.sample_counts import samples_taken
 from torchtransient.rendering.seeds import Item
 from torchtransient.rendering.session import RenderJob, RunLog, Session, own_array, session_of, wait_for_torch
 
@@ -81,9 +82,7 @@ def _render_items(
 
 def _drawn_samples(session: Session) -> int:
     """Samples per pixel that are really drawn: stratified samplers round the number that is asked for."""
-    sampler = session.sensors[session.job.items[0].sensor].sampler().clone()
-    sampler.set_sample_count(session.job.spp)
-    return int(sampler.sample_count())
+    return samples_taken(session.sensors[session.job.items[0].sensor].sampler().clone(), session.job.spp)
 
 
 def _fraction(job: RenderJob, n: int) -> Callable[[float], None] | None:

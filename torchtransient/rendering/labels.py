@@ -6,6 +6,7 @@ values that the render uses. They have no derivatives.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -14,7 +15,8 @@ import torch
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.quantities import as_whole, shown
+from torchtransient.given_types import of_class
+from torchtransient.quantities import as_number, as_whole, shown
 from torchtransient.rendering.carry_out import Numbered, check_whole, groups_of, refusal
 from torchtransient.rendering.engine import check_values
 from torchtransient.rendering.opaque import opaque
@@ -104,6 +106,8 @@ def first_return(
     gradients. Filters wider than a bin bring light to the bins before. Raises ShapeError, UnitError. Not supported:
     exhaustive scans.
     """
+    of_class("first_return: transient", transient, torch.Tensor)
+    of_class("first_return: axis", axis, TimeAxis)
     least = 5 if polarized else 4
     if transient.ndim < least or transient.shape[-3] != axis.num_bins or transient.is_complex():
         expected = f"(..., {'4, ' if polarized else ''}C, {axis.num_bins}, H, W)"
@@ -116,10 +120,11 @@ def first_return(
             f"first_return: expected the 4 Stokes components in dimension -5, got {tuple(transient.shape)}; leave out "
             "polarized=True for a transient without them."
         )
-    if not threshold >= 0:
-        raise UnitError(f"first_return: expected a threshold of at least zero, got {threshold!r}.")
+    least_light = as_number(threshold)
+    if least_light is None or not 0 <= least_light < math.inf:
+        raise UnitError(f"first_return: expected a threshold of at least zero, got {shown(threshold)}.")
     light = transient.detach()
-    lit = ((light.select(-5, 0) if polarized else light) > threshold).any(-4)
+    lit = ((light.select(-5, 0) if polarized else light) > least_light).any(-4)
     first = lit.to(torch.uint8).argmax(-3).to(torch.float64)
     path = (axis.start_opl + axis.bin_width_opl * first).to(torch.float32)
     return torch.where(lit.any(-3), path, torch.nan)
@@ -132,6 +137,7 @@ def _labels(
     renderer: TransientRenderer, values: Mapping[str, Any] | None, names: Sequence[str], average: bool, samples: int
 ) -> tuple[dict[str, torch.Tensor], list[str]]:
     """(labels, what became of the recording of each item)."""
+    _renderer(renderer)
     wanted = _checked_names(names, average)
     number = as_whole(samples)
     if number is None or not 1 <= number <= 4096:
@@ -171,6 +177,11 @@ def _labels(
     return labels, said
 
 
+def _renderer(given: Any) -> TransientRenderer:
+    hint = "; make one of a scene: tt.TransientRenderer(scene)"
+    return of_class("labels: renderer", given, TransientRenderer, hint)
+
+
 def _checked_names(names: Sequence[str], average: bool) -> tuple[str, ...]:
     wanted = (names,) if isinstance(names, str) else tuple(names)
     if not wanted or len(set(wanted)) < len(wanted) or not set(wanted) <= set(LABELS):
@@ -191,7 +202,7 @@ def _options(renderer: TransientRenderer) -> Any:
 
 
 def _tables(renderer: TransientRenderer) -> Any:
-    scene: Scene = renderer.scene
+    scene: Scene = _renderer(renderer).scene
     with active_variant(scene.variant):
         return tables_of(scene.built(_options(renderer)))
 

@@ -26,6 +26,7 @@ class RenderStats:
     ``seconds`` is wall time, without loading and without the wait for other threads; ``samples_per_second``
     counts camera paths. ``energy_before`` and ``energy_after`` hold, per rendered item, the light outside the time
     axis: sum over pixels of the mean over channels; zero for films without a window (phasors, gates).
+    ``RenderOutput.outside`` has the shares.
     ``temporal_filter`` is empty for films without one. ``seeds`` are the items' seeds. ``recorded``: what became of
     each item's recording, "launched", "recorded", or "traced: " and why; ``derivatives_recorded``: the same of the
     derivatives that have been asked for since. ``max_depth``: of the paths, -1 for no limit, None for integrators
@@ -142,6 +143,14 @@ class RenderOutput(TensorRecord):
         """Whether the Stokes components come before the channels."""
         return stokes_components(self.stats.variant) > 1
 
+    @property
+    def outside(self) -> tuple[float, float]:
+        """Shares of the light before and after the time window, over all items; of polarized light of S0."""
+        before, after = sum(self.stats.energy_before), sum(self.stats.energy_after)
+        steady = self.steady[..., 0, :, :, :] if self.polarized else self.steady
+        total = float(steady.detach().sum(dtype=torch.float64)) / self.steady.shape[-3]
+        return (before / total, after / total) if total > 0 and before + after > 0 else (0.0, 0.0)
+
     @classmethod
     def merged_notes(cls, records: Sequence[RenderOutput]) -> dict[str, Any]:
         return {"stats": RenderStats.of_batch([record.stats for record in records])}
@@ -150,8 +159,8 @@ class RenderOutput(TensorRecord):
         stats = self.stats
         seeds = f"seed {stats.seeds[0]}" if len(stats.seeds) == 1 else f"{len(stats.seeds)} seeds"
         made = f"{stats.spp} spp in {stats.seconds:.3g} s, {stats.integrator}, {stats.variant}, {seeds}"
-        outside = sum(stats.energy_before) + sum(stats.energy_after)
-        made += f", energy outside of the window {outside:.4g}" if outside else ""
+        outside = sum(self.outside)
+        made += f", {outside:.2%} of the light outside of the window" if outside else ""
         if stats.light_beyond is not None:
             made += f", max_depth {stats.max_depth} with {stats.light_beyond:.2g} of the light beyond"
         return {"stats": made}

@@ -47,6 +47,7 @@ from torchtransient.rendering.parameters import ParameterInfo, needing_slope, un
 from torchtransient.rendering.physics import PhysicsWatch
 from torchtransient.rendering.progress import Bar
 from torchtransient.rendering.pulse_properties import checked_pulse
+from torchtransient.rendering.sample_counts import SampleCounts, samples_taken
 from torchtransient.rendering.scene_handle import Scene, load
 from torchtransient.rendering.seeds import Item, Seeding, drawn
 from torchtransient.rendering.session import RenderJob
@@ -185,6 +186,7 @@ class TransientRenderer(CopiesParametrized):
         self._cube_shape = tuple(films[0].cube_shape())
         self._channels = tuple(films[0].channel_names())
         self._scene_spp = int(found[self._sensors[0]].sampler().sample_count())
+        self._counts = SampleCounts({self._scene_spp: self._scene_spp})
         self._pulsed = all(film.pulses for film in films)
         self._response = response_of(films)
         self._scene_filter = films[0].temporal_filter
@@ -290,9 +292,8 @@ class TransientRenderer(CopiesParametrized):
     def samples_drawn(self, spp: int) -> int:
         """Samples per pixel that a render with ``spp`` really draws: stratified samplers round up."""
         with active_variant(self.scene.variant):
-            sampler = self.scene.built(self._options).scene.sensors()[self._sensors[0]].sampler().clone()
-            sampler.set_sample_count(samples("spp", spp) or sampler.sample_count())
-            return int(sampler.sample_count())
+            sensor = self.scene.built(self._options).scene.sensors()[self._sensors[0]]
+            return samples_taken(sensor.sampler().clone(), samples("spp", spp))
 
     @opaque
     def forward(
@@ -320,7 +321,8 @@ class TransientRenderer(CopiesParametrized):
         tensors, batched, batch = self._collect(values)
         temporal_filter = self.effective_filter
         self._check_slope(temporal_filter, tensors)
-        used = samples("spp", spp) or self.spp or self._scene_spp
+        wanted = samples("spp", spp) or self.spp or self._scene_spp
+        used, used_grad = (self._counts.of(n, self.samples_drawn) for n in (wanted, self.spp_grad or wanted))
         seeding = Seeding(self._sensors, 1 if batch is None else batch, self.grad_seed)
         number, per_entry = drawn(seed)
         bar = Bar() if progress else None
@@ -332,7 +334,7 @@ class TransientRenderer(CopiesParametrized):
             seeding=seeding,
             batched=tuple(batched),
             spp=used,
-            spp_grad=self.spp_grad or used,
+            spp_grad=used_grad,
             temporal_filter=temporal_filter or None,
             watch=self._watch,
             progress=bar,
@@ -347,10 +349,9 @@ class TransientRenderer(CopiesParametrized):
         leading = (*(() if batch is None else (batch,)), *((len(self._sensors),) if self._stack_sensors else ()))
         pixels, components = self._cube_shape[0] * self._cube_shape[1], stokes_components(self.scene.variant)
         steady = steady_channels_first(steady, leading, components)
-        return RenderOutput.of(
-            self.film, steady, self.film.channels_first(response, leading, components),
-            stats=RenderStats.of_job(job, pixels), channels=self._channels,
-        )
+        response = self.film.channels_first(response, leading, components)
+        stats = RenderStats.of_job(job, pixels)
+        return RenderOutput.of(self.film, steady, response, stats=stats, channels=self._channels)
 
     def _collect(self, values: Mapping[str, Any] | None) -> tuple[list[torch.Tensor], list[bool], int | None]:
         """The tensors of a call in the order of the keys, which of them are batched, and the batch size."""

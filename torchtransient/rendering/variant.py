@@ -7,9 +7,11 @@ back afterwards. When no variant was active at all, there is nothing to go back 
 
 from __future__ import annotations
 
+import types
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import torch
 
@@ -27,7 +29,7 @@ from torchtransient.rendering.physics import level_of_user
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 
-# A switch takes some 0.1 s and makes Dr.Jit translate every loop anew; once or twice is fine, at every step it is not.
+# A switch takes longer than a small launched call; once or twice is fine, at every step it is not.
 MANY_SWITCHES = 20
 _switches = {"count": 0}
 
@@ -139,7 +141,7 @@ def take_over(device: str) -> None:
 def active_variant(variant: str) -> Iterator[None]:
     """Hold the engine lock with ``variant`` active and this library's plugins registered for it.
 
-    Another active variant is put back at the end (a switch costs some 0.1 s); when none was active, ``variant``
+    Another active variant is put back at the end (a switch costs some 6 ms); when none was active, ``variant``
     stays. Nested calls are free. An interrupt inside of it is raised as such.
     """
     import mitsuba as mi
@@ -169,8 +171,39 @@ def _put_back(before: str | None) -> None:
     import mitsuba as mi
 
     if before is not None and mi.variant() != before:
-        with interrupts_wait():
+        with interrupts_wait(), _syntax_kept():
             mi.set_variant(before)
+
+
+# Code that Dr.Jit's `syntax` has made, by the code that it was given.
+_transformed: dict[Any, types.CodeType] = {}
+
+
+@contextmanager
+def _syntax_kept() -> Iterator[None]:
+    """Let ``dr.syntax`` transform each function once. It reads and rewrites source, and Mitsuba executes its own
+    integrators anew at every change of the variant: nine tenths of the time of a change.
+    """
+    import drjit as dr
+
+    syntax = dr.syntax
+
+    def kept(f: Any = None, **options: Any) -> Any:
+        if f is None:
+            return lambda g: kept(g, **options)
+        # Equal code objects have the same names, constants and lines.
+        key = (f.__code__, f.__code__.co_filename, *sorted(options.items()))
+        if key not in _transformed:
+            _transformed[key] = syntax(f, **options).__code__
+        found = types.FunctionType(_transformed[key], f.__globals__)
+        found.__defaults__ = f.__defaults__
+        return found
+
+    dr.syntax = kept
+    try:
+        yield
+    finally:
+        dr.syntax = syntax
 
 
 def _count_switch(before: str | None, variant: str) -> None:
@@ -181,7 +214,7 @@ def _count_switch(before: str | None, variant: str) -> None:
     if _switches["count"] == MANY_SWITCHES:
         warnings.warn(
             f"a scene for {variant} is rendered again and again while {before} is active: every call switches to and "
-            f"fro, which costs some 0.1 s each way. Call mitsuba.set_variant({variant!r}) once before the loop.",
+            f"fro, which costs some 6 ms each way. Call mitsuba.set_variant({variant!r}) once before the loop.",
             UserWarning,
             stacklevel=level_of_user(),
         )
@@ -193,7 +226,7 @@ def _set_variant(variant: str) -> None:
     if variant.startswith("llvm"):
         ensure_llvm()
     try:
-        with interrupts_wait():
+        with interrupts_wait(), _syntax_kept():
             mi.set_variant(variant)
     except (ImportError, RuntimeError) as error:
         raise VariantError(

@@ -70,7 +70,11 @@ def _draw(axis: Any, lines: Sequence[Curve], unit: str) -> None:
         x1 = max(*ends, 2 * x0)
         axis.plot([x0, x1], [y0, y0 * x0 / x1], color="0.5", linestyle="--", linewidth=0.8, label="slope -1")
     axis.set_xscale("log")
-    axis.set_yscale("log")
+    if starts:
+        axis.set_yscale("log")
+    else:
+        axis.text(0.5, 0.5, "no error", transform=axis.transAxes, ha="center", va="center", color="0.5")
+        axis.set_yticks([])
     axis.grid(True, which="major", color="0.9", linewidth=0.6)
     # Less than a decade would be labelled at every minor tick, one over the other.
     counts = np.unique(np.concatenate([np.asarray(getattr(curve, unit), dtype=np.float64) for curve in lines]))

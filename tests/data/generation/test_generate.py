@@ -110,7 +110,6 @@ def test_going_on(calm, tmp_path):
         (RECIPE, {"per_shard": 5}, "per_shard is 4 there and 5 here"),
         (RECIPE, {"store": "rounded"}, "store is 'exact' there"),
         (RECIPE, {"compression": "gzip"}, "compression is 'blosc2' there"),
-        (RECIPE, {"max_outside": 0.5}, "max_outside is 0.01 there"),
         (RECIPE, {"resume": False}, "resume=False"),
     ],
 )
@@ -153,15 +152,14 @@ def test_other_versions_of_packages(calm, tmp_path):
 @pytest.mark.slow
 def test_what_fails_is_named(tmp_path, calm):
     """Every kind of failure in one run; all other samples are there."""
-    recipe = FakeRecipe(raising=(3,), crashing=(7,), dying=(12,), hanging=(18,), late=(21,))
+    recipe = FakeRecipe(raising=(3,), crashing=(7,), dying=(12,), hanging=(18,))
     done = generate(recipe, tmp_path, timeout_s=1.5, retries=0, **QUICK)
-    assert (done.samples, done.failed) == (18, 5) and done.restarts == 4
+    assert (done.samples, done.failed) == (19, 4) and done.restarts == 4
     assert failures(tmp_path) == {
         3: "SceneError: sample 3 cannot be made by <object at 0x...>",
         7: DIED, 12: DIED, 18: DIED,
-        21: "0 of its light lies before the window and 0.5 after it, more than max_outside=0.01",
     }  # fmt: skip
-    assert verify(tmp_path).complete and len(verify(tmp_path).failed) == 5
+    assert verify(tmp_path).complete and len(verify(tmp_path).failed) == 4
     with Shard(tmp_path / "shard-000001.h5") as found, Shard(calm / "shard-000001.h5") as expected:
         assert sorted(found.index) == [4, 5, 6]
         for index, row in found.index.items():
@@ -171,7 +169,7 @@ def test_what_fails_is_named(tmp_path, calm):
     ways = {(e["sample"], e["how"].split(" for")[0]) for e in events(tmp_path) if e["event"] == "death"}
     assert ways == {(7, "by SIGSEGV"), (12, "by SIGKILL"), (18, "by no sign of life")}
     again = generate(recipe, tmp_path, timeout_s=1.5, retries=0, **QUICK)
-    assert (again.kept, again.samples, again.failed) == (18, 0, 0)
+    assert (again.kept, again.samples, again.failed) == (19, 0, 0)
 
 
 @pytest.mark.slow
@@ -229,16 +227,10 @@ def test_measuring_checks_with_its_own_scenes_and_says_where_samples_fail(tmp_pa
     told = Told()
     recipe = Checked(raising=(0,))
     with tt.threads(1):
-        found = ShardMaker(Settings(recipe, str(tmp_path), 4, "exact", "blosc2", None, 2)).measure(range(4), told)
+        found = ShardMaker(Settings(recipe, str(tmp_path), 4, "exact", "blosc2", 2)).measure(range(4), told)
     assert found.standard_error == 0.25
     traces = [facts for name, *facts in told.heard if name == "traced"]
     assert [facts[:2] for facts in traces] == [[-1, 0]] and 'fake_recipe.py", line' in traces[0][2]
-
-
-@pytest.mark.slow
-def test_no_sample_has_its_light_in_the_window(tmp_path):
-    with pytest.raises(SceneError, match=r"max_outside=0.01\. Give a time_axis= that holds its light"):
-        generate(FakeRecipe(late=tuple(range(23))), tmp_path, **QUICK)
 
 
 # --------------------------------------------------------------------------------------------------------- arguments
@@ -259,8 +251,7 @@ class Unpicklable(FakeRecipe):
         ({"per_shard": 0}, UnitError, "per_shard"), ({"shard": (2, 2)}, UnitError, "shard"),
         ({"shard": "0/2"}, UnitError, "shard"), ({"shard": (True, 2)}, UnitError, "shard"),
         ({"n": True}, UnitError, "n: expected"), ({"shard": (0, 1, 2)}, UnitError, "shard"),
-        ({"timeout_s": 0}, UnitError, "timeout_s"),
-        ({"max_outside": -0.1}, UnitError, "max_outside"), ({"max_outside": float("nan")}, UnitError, "max_outside"),
+        ({"timeout_s": 0}, UnitError, "timeout_s"), ({"timeout_s": float("nan")}, UnitError, "timeout_s"),
         ({"engine": "dask"}, ArgumentError, "engine"), ({"address": "auto"}, UnitError, "ray"),
         ({"store": "half"}, ArgumentError, "store"), ({"compression": "lzma"}, ArgumentError, "compression"),
         ({"recipe": {}}, ArgumentError, "recipe"), ({"recipe": Unpicklable()}, SceneError, "pickles"),

@@ -30,7 +30,7 @@ RECIPE = FakeRecipe(shape=(1, 2, 2, 3))
 
 
 def settings_of(folder, recipe=RECIPE):
-    return Settings(recipe, str(folder), 4, "exact", "none", None, 0)
+    return Settings(recipe, str(folder), 4, "exact", "none", 0)
 
 
 @pytest.fixture

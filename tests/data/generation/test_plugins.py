@@ -57,7 +57,7 @@ class Paint(mi.BSDF):
 
 register("bsdf", "their_paint", Paint)
 """
-QUICK = {"n": 4, "per_shard": 2, "workers": 1, "progress": False, "max_outside": None}
+QUICK = {"n": 4, "per_shard": 2, "workers": 1, "progress": False}
 
 
 @pytest.fixture
@@ -85,7 +85,7 @@ def painted(**more):
 
 
 def settings_of(recipe, folder, added):
-    return Settings(recipe, str(folder), 4, "exact", "blosc2", None, 0, added)
+    return Settings(recipe, str(folder), 4, "exact", "blosc2", 0, added)
 
 
 def test_what_is_registered_is_handed_on(theirs, tmp_path):

@@ -54,7 +54,7 @@ class FakeRay:
 def crew(tmp_path, monkeypatch, ray, workers):
     monkeypatch.setattr(ray_engine, "ray_package", lambda: ray)
     ledger = Ledger(2, RunLog(tmp_path), SampleBar(0, 0, shown=False))
-    settings = Settings(FakeRecipe(), str(tmp_path), 4, "exact", "blosc2", None, 2)
+    settings = Settings(FakeRecipe(), str(tmp_path), 4, "exact", "blosc2", 2)
     return ray_engine.RayCrew(settings, workers, ledger, None, None)
 
 
@@ -84,7 +84,7 @@ RECIPE = FakeRecipe(shape=(1, 2, 2, 3))
 
 
 def settings_of(folder, recipe=RECIPE):
-    return Settings(recipe, str(folder), 4, "exact", "none", None, 0)
+    return Settings(recipe, str(folder), 4, "exact", "none", 0)
 
 
 def described(folder):

@@ -28,10 +28,10 @@ def test_killed_and_gone_on(tmp_path):
     (tmp_path / "recipe.yaml").write_text(RECIPE)
     recipe = Recipe.read(tmp_path / "recipe.yaml")
     with tt.threads(2):
-        generate(recipe, tmp_path / "calm", workers=1, per_shard=5, max_outside=0.2, progress=False)
+        generate(recipe, tmp_path / "calm", workers=1, per_shard=5, progress=False)
         assert tt.threads().drjit == 2
     rough = tmp_path / "rough"
-    options = ("--out", "rough", "--per-shard", "5", "--max-outside", "0.2", "--quiet")
+    options = ("--out", "rough", "--per-shard", "5", "--quiet")
     child = start_command(tmp_path, "dataset", "recipe.yaml", *options)
     for shards in (2, 12):
         wait_until(lambda: len(list(rough.glob("shard-*.h5"))) >= shards)  # noqa: B023
@@ -40,7 +40,7 @@ def test_killed_and_gone_on(tmp_path):
     kill(child.pid)
     child.communicate()
     assert len(list(rough.glob("shard-*.h5"))) < 60
-    done = generate(recipe, rough, workers=1, max_outside=0.2, progress=False)
+    done = generate(recipe, rough, workers=1, progress=False)
     assert done.kept >= 100 and done.failed == 0
     expected, found = data_files(tmp_path / "calm"), data_files(rough)
     # It tells where the recipe lay on the machine that began.

@@ -41,8 +41,8 @@ class Heard:
 class Making:
     """A recipe whose samples fail as often as ``failing`` says; it is its own maker."""
 
-    def __init__(self, failing=(), outside=(0.0, 0.0), error=0.25, answers=lambda index: index):
-        self.failing, self.outside, self.error, self.answers = dict(failing), outside, error, answers
+    def __init__(self, failing=(), error=0.25, answers=lambda index: index):
+        self.failing, self.error, self.answers = dict(failing), error, answers
         self.asked, self.closed, self.makers = [], 0, 0
 
     def maker(self):
@@ -55,7 +55,7 @@ class Making:
             self.failing[index] -= 1
             raise UnitError(f"sample {index} is bad")
         cube = np.full((1, 2, 3, 5), index, np.float32)
-        return Sample(self.answers(index), 1, arrays={"transient": cube}, outside=self.outside)
+        return Sample(self.answers(index), 1, arrays={"transient": cube})
 
     def standard_error(self, index):
         if isinstance(self.error, Exception):
@@ -74,10 +74,9 @@ class Making:
 
 @pytest.fixture
 def making(tmp_path, monkeypatch):
-    def made(recipe, retries=1, max_outside=None, n=5):
+    def made(recipe, retries=1, n=5):
         settings = SimpleNamespace(
-            recipe=recipe, folder=str(tmp_path), plugins=(), retries=retries, max_outside=max_outside, n=n,
-            store="exact", compression="none",
+            recipe=recipe, folder=str(tmp_path), plugins=(), retries=retries, n=n, store="exact", compression="none",
         )  # fmt: skip
         monkeypatch.setattr(shard_making, "shard_header", lambda *_: {"about": {"spp": 4}})
         monkeypatch.setattr(shard_making, "LatestPicture", lambda folder: pictures.append)
@@ -113,13 +112,6 @@ def test_samples_that_are_others(making):
     assert found == "TorchTransientError: the maker was asked for sample 3 and made 4."
 
 
-@pytest.mark.parametrize(("most", "refused"), [(None, False), (0.75, False), (0.7499, True)])
-def test_light_outside_of_the_window(making, most, refused):
-    found = making(Making(outside=(0.25, 0.5)), max_outside=most)._sample(7, 3, Heard())
-    words = "0.25 of its light lies before the window and 0.5 after it, more than max_outside="
-    assert (isinstance(found, str) and found.startswith(words)) == refused
-
-
 def test_a_shard(making, tmp_path):
     """Suspects first, then as the maker orders; what is given up or fails has its row, too."""
     recipe, heard = Making({3: 9}), Heard({4: "given up"})
@@ -151,8 +143,6 @@ def test_the_first_sample_that_can_be_made_is_measured(making):
         assert making(Making(error=error)).measure(range(5), Heard()).standard_error is None
     with pytest.raises(SceneError, match=r"none of the samples 0 to 1 .* The last one: UnitError: sample 1 is bad$"):
         making(Making({0: 9, 1: 9})).measure(range(2), Heard())
-    with pytest.raises(SceneError, match=r"Give a time_axis= that holds its light, or allow more with max_outside=\.$"):
-        making(Making(outside=(0.9, 0)), max_outside=0.5).measure(range(2), Heard())
 
 
 def test_recipes_that_check_themselves(making):

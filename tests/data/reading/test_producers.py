@@ -20,7 +20,13 @@ from torchtransient.data.reading.online import OnlineDataset
 from torchtransient.data.reading.online_producers import Producers, _check_memory, _interrupts_held_back, _Worker
 from torchtransient.data.reading.online_schedule import Schedule
 from torchtransient.data.reading.online_worker import layout_of, produce
-from torchtransient.errors import ShapeError, StorageError, TorchTransientError, TorchTransientWarning
+from torchtransient.errors import (
+    PhysicsWarning,
+    ShapeError,
+    StorageError,
+    TorchTransientError,
+    TorchTransientWarning,
+)
 
 LAYOUT = layout_of(arrays_of(0))
 
@@ -65,7 +71,7 @@ class Played(Producers):
     def _say(self, worker, *message):
         self.told.append((self._workers.index(worker), *message))
 
-    def makes(self, worker, *indices):
+    def makes(self, worker, *indices, outside=(0.0, 0.0)):
         """A producer makes samples, and says so."""
         for index in indices:
             self.ends[worker].send(("start", index))
@@ -75,7 +81,7 @@ class Played(Producers):
             slot = self.schedule.orders[index].slot
             for name, array in arrays_of(index).items():
                 self._ring[name][slot, ...] = torch.from_numpy(array)
-            self.ends[worker].send(("done", index, values(index)))
+            self.ends[worker].send(("done", index, values(index), outside))
 
 
 @pytest.fixture
@@ -112,7 +118,7 @@ def test_a_draw_is_what_a_producer_has_written(played):
     assert data.told[2][:2] == (0, "ring") and data.told[2][2] is data._ring
     sample = data.draw()
     assert (sample["index"], data.schedule.drawn, data.waited_s) == (3, 1, 0.0)
-    assert set(sample) == {*LAYOUT, "values", "index"}
+    assert set(sample) == {*LAYOUT, "values", "outside", "index"}
     for name, array in arrays_of(3).items():
         assert sample[name].dtype == torch.from_numpy(array).dtype and (sample[name] == 3).all()
     assert sample["values"]["wall.reflectance"].tolist() == [3, 0.5] and sample["values"]["box.filename"] == "3.ply"
@@ -124,6 +130,20 @@ def test_a_draw_is_what_a_producer_has_written(played):
     assert (again["transient"] == 3).all() and again["values"]["wall.reflectance"][0] == 3
     data.makes(0, 4, 5)
     assert {data.draw()["index"] for _ in range(4)} <= {3, 4, 5} and data.schedule.made == 3
+
+
+def test_light_outside_of_the_window_is_said_before_the_first_draw(played):
+    data = played(warm=4, uses=math.inf)
+    for index in range(4):
+        data.makes(0, index, outside=(0.25, 0.5) if index == 3 else (0.0, 0.0))
+        data._listen(0.0)
+    with pytest.warns(PhysicsWarning, match=r"OnlineDataset: .* more than 1% in 1 of 4 samples, 18\.75% on av"):
+        drawn = [data.draw()]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        drawn += [data.draw() for _ in range(6)]
+    assert {tuple(one["outside"].tolist()) for one in drawn if one["index"] == 3} <= {(0.25, 0.5)}
+    assert {tuple(one["outside"].tolist()) for one in drawn if one["index"] < 3} <= {(0.0, 0.0)}
 
 
 def test_a_trainer_waits_for_samples(played, clock, monkeypatch):

@@ -34,7 +34,7 @@ def test_samples(data):
     assert len(found) == 10 and found.axis == tt.TimeAxis(**AXIS) and found.about["spp"] == 16
     for i in (0, 5, 9):
         item, made = found[i], sample(i)
-        assert item["index"] == i and set(item) == {*made.arrays, "values", "index"}
+        assert item["index"] == i and set(item) == {*made.arrays, "values", "outside", "index"}
         for name, array in made.arrays.items():
             assert item[name].dtype == torch.from_numpy(array).dtype and np.array_equal(item[name].numpy(), array)
         assert item["values"]["box.filename"] == f"größe_{i}.ply" and int(item["values"]["count"]) == i
@@ -139,15 +139,16 @@ def test_pixels(data):
 
 
 def test_fields(data):
-    assert set(TransientDataset(data, fields=["depth"])[0]) == {"depth", "index"}
-    assert set(TransientDataset(data, fields=["depth", "values", "index"])[0]) == {"depth", "values", "index"}
+    always = {"outside", "index"}
+    assert set(TransientDataset(data, fields=["depth"])[0]) == {"depth", *always}
+    assert set(TransientDataset(data, fields=["depth", "values", "index"])[0]) == {"depth", "values", *always}
     with pytest.raises(ArgumentError, match="expected fields among"):
         TransientDataset(data, fields=["albedo"])
 
 
 def test_transforms(data, tmp_path):
     found = TransientDataset(data, fields=["depth"], window=slice(0, 64), transform=doubled)
-    assert set(found[2]) == {"depth", "measurement", "index"} == {*found.fields, "index"}
+    assert set(found[2]) == {"depth", "measurement", "outside", "index"} == {*found.fields, "outside", "index"}
     assert np.array_equal(found[2]["measurement"].numpy(), 2 * cube(2)[:, :64])
     chain = tt.sensing.Compose([tt.sensing.ShotNoise()])
     noisy = [TransientDataset(data, transform=chain.sample, seed=seed)[4]["measurement"] for seed in (1, 1, 2)]

@@ -15,7 +15,7 @@ import torchtransient as tt
 from torchtransient.data.recipes import checks, kept_scene
 from torchtransient.data.recipes.checks import _check_light, _check_names, _check_ranges, structures_of
 from torchtransient.data.recipes.distribution import NUMBERS, POSE, Place
-from torchtransient.data.recipes.kept_scene import Kept, Measures, _is_polarized, _outside, changed
+from torchtransient.data.recipes.kept_scene import Kept, Measures, _is_polarized, changed
 from torchtransient.data.recipes.maker import Maker
 from torchtransient.data.recipes.recipe_file import _hidden, from_dict
 from torchtransient.data.recipes.structures import OneOf, Structure, _checked_scan, _exchanged
@@ -53,12 +53,17 @@ def test_shares_of_light_outside(polarized):
     total = float(steady.sum()) / 3
     if polarized:
         steady = torch.stack([steady, 7 - steady, steady * 2, steady * 0], 1)
-    stats = SimpleNamespace(energy_before=(10.0, 20.0), energy_after=(30.0, 30.5))
-    found = _outside(SimpleNamespace(stats=stats, steady=steady, polarized=polarized))
-    assert found == pytest.approx((30 / total, 60.5 / total), rel=1e-12)
+
+    def outside(before, after, light):
+        stats = tt.rendering.output.RenderStats(
+            spp=1, seconds=1.0, samples_per_second=1.0, variant="llvm_ad_rgb" + "_polarized" * polarized, integrator="",
+            temporal_filter="", seeds=(), energy_before=before, energy_after=after,
+        )  # fmt: skip
+        return tt.RenderOutput(None, light, None, axis=None, stats=stats).outside
+
+    assert outside((10.0, 20.0), (30.0, 30.5), steady) == pytest.approx((30 / total, 60.5 / total), rel=1e-12)
     for before, after, light in ((0.0, 0.0, steady), (1.0, 2.0, 0 * steady), (-1.0, 0.5, steady)):
-        stats = SimpleNamespace(energy_before=(before,), energy_after=(after,))
-        assert _outside(SimpleNamespace(stats=stats, steady=light, polarized=polarized)) == (0.0, 0.0)
+        assert outside((before,), (after,), light) == (0.0, 0.0)
 
 
 def test_samples_are_finite():

@@ -16,9 +16,11 @@ import torch
 
 import torchtransient as tt
 from torchtransient.data.recipes.maker import MOST_KEPT
+from torchtransient.data.recipes.outside_light import OutsideLight
 from torchtransient.errors import (
     ArgumentError,
     PhysicsError,
+    PhysicsWarning,
     SceneError,
     ShapeError,
     TorchTransientError,
@@ -184,6 +186,51 @@ def test_light_outside_of_the_window():
     whole = small(time_axis=tt.TimeAxis(0.0, 0.2, 400)).sample(0).arrays["transient"].sum((0, 2, 3), dtype=np.float64)
     assert sample.outside[0] == pytest.approx(whole[:30].sum() / whole.sum(), rel=1e-3)
     assert sample.outside[1] == pytest.approx(whole[40:].sum() / whole.sum(), rel=1e-2)
+
+
+def test_samples_whose_light_the_window_misses():
+    """They are counted before the run as they come in it; no sample is left out for it."""
+    recipe = small(time_axis=tt.TimeAxis(2.0, 0.2, 45), vary={"white.reflectance.value": D.Uniform(0.1, 0.95)})
+    with pytest.warns(PhysicsWarning, match=r"more than 1% in \d+ of 64 samples.* of all samples .*kept all the same"):
+        found = recipe.check()
+    missed = [sum(recipe.sample(index).outside) for index in range(64)]
+    assert found.samples == 64 and found.cut == sum(share > 0.01 for share in missed) and 0 < found.cut < 64
+    assert found.mean == pytest.approx(np.mean(missed), rel=1e-6) and found.most == pytest.approx(max(missed), rel=1e-6)
+    with pytest.warns(PhysicsWarning, match=f"more than 1% in {found.cut} of 64 samples"):
+        data = D.RecipeDataset(recipe, 64)
+    assert float(data[3]["outside"].sum()) == pytest.approx(missed[3], rel=1e-6)
+    # As many others: their share lies within the interval, but once in 20 times.
+    others = sum(sum(recipe.sample(index).outside) > 0.01 for index in range(64, 128))
+    low, high = found.expected
+    assert low < found.cut / 64 < high and low - 0.1 < others / 64 < high + 0.1
+
+
+@pytest.mark.parametrize(("cut", "samples"), [(0, 64), (8, 64), (63, 64), (16, 16)])
+def test_interval_of_the_share_of_samples(cut, samples):
+    """Wilson's: its ends p are 1.96 standard deviations of a share of n samples away from k / n."""
+    for p in OutsideLight(samples=samples, cut=cut, mean=0.0, most=0.0).expected:
+        if 0 < p < 1:
+            assert (p - cut / samples) ** 2 == pytest.approx(1.96**2 * p * (1 - p) / samples, rel=1e-9)
+        else:
+            assert p == cut / samples
+
+
+@pytest.mark.slow
+def test_all_data_sets_have_the_same_samples(tmp_path):
+    recipe = small(time_axis=tt.TimeAxis(2.0, 0.2, 45), vary={"white.reflectance.value": D.Uniform(0.1, 0.95)})
+    with pytest.warns(PhysicsWarning, match="of 64 samples"):
+        done = D.generate(recipe, tmp_path / "set", 8, workers=1, progress=False)
+    with pytest.warns(PhysicsWarning, match="of 64 samples"):
+        read = D.RecipeDataset(recipe, 8)
+    stored = D.TransientDataset(tmp_path / "set")
+    assert (done.samples, done.failed, len(stored)) == (8, 0, 8)
+    with pytest.warns(PhysicsWarning, match="of 8 samples"), D.OnlineDataset(recipe, 8, warm=8, uses=9) as online:
+        drawn = {one["index"]: one for one in (online.draw() for _ in range(40))}
+    for index in range(8):
+        assert torch.allclose(stored[index]["transient"], read[index]["transient"], rtol=1e-4)
+        assert torch.allclose(stored.outside[index], read[index]["outside"], rtol=1e-6)
+    for index in set(drawn) & set(range(8)):
+        assert torch.allclose(drawn[index]["outside"], stored[index]["outside"], rtol=1e-6)
 
 
 def test_standard_error_falls_with_samples():
@@ -355,7 +402,7 @@ def test_a_scene_for_every_sample_is_told(key, words):
     with pytest.warns(TorchTransientWarning, match=words):
         small(scene, vary={key: D.Uniform(0.1, 0.3)}).check()
     with warnings.catch_warnings():
-        warnings.simplefilter("error")
+        warnings.filterwarnings("error", ".*builds a scene of its own")
         small(scene, vary={key: D.Choice([0.1, 0.3])}).check()
 
 

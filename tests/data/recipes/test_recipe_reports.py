@@ -35,7 +35,8 @@ def test_cost(recipe):
     assert 0 < cost.stored_bytes["rounded"] < cost.stored_bytes["exact"] < cost.sample_bytes
     # A histogram of radiances is no number of photons.
     assert cost.stored_bytes["counts"] is None
-    assert 0 <= cost.outside[0] <= cost.outside[1] < 1 and 0 < cost.standard_error < 3
+    assert cost.outside.samples == 64 and 0 <= cost.outside.mean <= cost.outside.most < 1
+    assert 0 < cost.standard_error < 3
     assert all(one.sample_s > 0 for one in cost.structures)
     text = str(cost)
     assert "built when new    small-box.type; 2 structures in 64 samples" in text and "1000 samples" in text

@@ -16,6 +16,7 @@ from torchtransient.data.recipes import contact_sheet as contact_sheets
 from torchtransient.data.recipes import forecast as forecasts
 from torchtransient.data.recipes.contact_sheet import behind_time, cell_of, sheet_of
 from torchtransient.data.recipes.forecast import Cost, StructureCost, _bytes, _duration, forecast
+from torchtransient.data.recipes.outside_light import OutsideLight
 from torchtransient.data.recipes.sample import Sample, in_order
 from torchtransient.data.recipes.structures import Structure
 from torchtransient.data.storage.shard_writing import ShardWriter
@@ -209,7 +210,8 @@ def latest_time(folder):
 
 def cost(**more):
     settings = {
-        "values": ("a", "b"), "exchanged": ("c",), "seen": 2, "sample_bytes": 2000, "outside": (0.0123, 0.25),
+        "values": ("a", "b"), "exchanged": ("c",), "seen": 2, "sample_bytes": 2000,
+        "outside": OutsideLight(samples=64, cut=16, mean=0.0123, most=0.25),
         "structures": (StructureCost("c=x", 3.0, 0.5), StructureCost("", 1.0, 0.25)), "n": 7200,
         "standard_error": 0.125, "stored_bytes": {"exact": 1500.0, "rounded": 500.0, "counts": None},
     }  # fmt: skip
@@ -233,7 +235,8 @@ def test_a_forecast_in_words():
         "bytes a sample    2 kB before compression",
         "  store='exact'    1.5 kB, 1.3 times smaller",
         "  store='rounded'  500 B, 4.0 times smaller",
-        "light outside     1.23% on average, 25.00% at most",
+        "light outside     more than 1% in 16 of 64 samples, 1.23% on average, 25.00% at most; more than 1% in 16.0% "
+        "to 36.8% of all samples (95% confidence)",
         "standard error    12.5% of a sample's numbers (root mean square)",
         "7200 samples    47.3 minutes of one worker, 3.6 MB to 14.4 MB",
     ]
@@ -274,8 +277,7 @@ def test_a_forecast_is_of_what_was_measured(monkeypatch):
     def make(index):
         clock.now += next(seconds)
         called.append(index)
-        return Sample(index, 0, arrays={"a": np.zeros((2, 3 + index), np.float32), "b": np.zeros(5)},
-                      outside=(0.01 * index, 0.25))  # fmt: skip
+        return Sample(index, 0, arrays={"a": np.zeros((2, 3 + index), np.float32), "b": np.zeros(5)})
 
     def of(index):
         return 2 if index == 63 else index % 2
@@ -289,13 +291,14 @@ def test_a_forecast_is_of_what_was_measured(monkeypatch):
     )  # fmt: skip
     maker = SimpleNamespace(sample=make, forget=lambda structure: called.append(structure.text),
                             standard_error=lambda index: 0.5 + index)  # fmt: skip
-    found = forecast(recipe, maker, 3, progress=True)
+    outside = OutsideLight.of([])
+    found = forecast(recipe, maker, 3, progress=True, outside=outside)
     assert called == ["c=0", 0, 2, 4, 6, 8, 10, "c=1", 1, 3, 5, 7, 9, 11, "c=2", *[63] * 6]
     assert bars == [18, *["one more"] * 18, "closed"]
     assert found == Cost(
         values=("a",), exchanged=("c",), seen=3, sample_bytes=24 + 40, stored_bytes={"exact": 18.0}, n=5,
         structures=(StructureCost("c=0", 9.0, 2.0), StructureCost("c=1", 8.0, 0.5), StructureCost("c=2", 7.0, 2.0)),
-        outside=(pytest.approx(0.25 + 0.01 * (66 + 6 * 63) / 18), pytest.approx(0.88)), standard_error=0.5,
+        outside=outside, standard_error=0.5,
     )  # fmt: skip
 
 

@@ -28,7 +28,7 @@ KINDS: dict[str, Kind] = {
     "normals": "direction",
 }
 # What a sample has besides images, by names that `fields` cannot give another meaning.
-_NAMED = ("intrinsics", "to_world", "values")
+_NAMED = ("intrinsics", "to_world", "values", "outside")
 
 
 class Augment:

@@ -9,6 +9,7 @@ import os
 import pickle
 import platform
 import time
+import warnings
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,7 @@ from torchtransient.data.storage.file_names import MANIFEST_FILE, RECIPE_FILE, S
 from torchtransient.errors import ArgumentError, SceneError, StorageError, TorchTransientError, UnitError
 from torchtransient.given_types import a_recipe, is_one_of
 from torchtransient.quantities import as_number, count, shown
+from torchtransient.rendering.physics import level_of_user
 
 ENGINES = ("local", "ray")
 # Samples that are tried until one tells how large all are.
@@ -77,7 +79,6 @@ def generate(
     workers: int = 2,
     store: str = "exact",
     compression: str = "blosc2",
-    max_outside: float | None = 0.01,
     resume: bool = True,
     engine: str = "local",
     shard: tuple[int, int] | None = None,
@@ -94,15 +95,15 @@ def generate(
     Files of a recipe have the same bytes in whatever order, by however many workers and on whichever engine they are
     made, on one kind of processor with the same packages; every worker computes with one thread. A sample that raises
     is tried again ``retries`` times with new scenes; then it stands in its shard as failed, with the reason, and so do
-    samples with more than ``max_outside`` of their light outside the window (None: any), and those over which worker
-    after worker dies or says nothing for ``timeout_s``. To try failed samples again, delete their shard.
+    those over which worker after worker dies or says nothing for ``timeout_s``. To try failed samples again, delete
+    their shard. Light outside of the window is no failure: samples are kept with their shares of it. The first run of a
+    folder checks the recipe (:meth:`Recipe.check`), whose warnings say how many samples that concerns.
 
     ``workers``: processes of one thread each, replaced when they die. ``shard``: (i, k) makes every k-th shard from the
     i-th on, so that k machines that see one folder divide the work. ``per_shard``: samples in a file; by default 64 to
     256 MB before compression, and 64 files at least. ``store``, ``compression``: see ``ShardWriter``. ``timeout_s``:
     seconds for one sample, the compilation of a new scene included; by default 30 times the slowest so far, at least
-    120. ``max_outside``: in [0, 1].
-    ``engine="ray"``: actors on the cluster at ``address``, or a running or new local one; all machines have to see
+    120. ``engine="ray"``: actors on the cluster at ``address``, or a running or new local one; all machines have to see
     ``folder``. ``resume=False``: an error where the folder has a data set.
 
     The folder holds ``recipe.json``, ``shard-*.h5``, ``manifest.json`` (made of the shards), ``log.jsonl`` (times,
@@ -123,10 +124,10 @@ def generate(
     n, workers, retries = _whole("n", n, 1), _whole("workers", workers, 1), _whole("retries", retries, 0)
     per_shard = None if per_shard is None else _whole("per_shard", per_shard, 1)
     shard = None if shard is None else _whole_pair(shard)
-    _check_limits(timeout_s, max_outside)
+    _check_timeout(timeout_s)
     _check_choices(store, compression, engine, address, recipe)
     place = _folder(folder)
-    settings = Settings(recipe, str(place), n, store, compression, max_outside, retries, plugins_here())
+    settings = Settings(recipe, str(place), n, store, compression, retries, plugins_here())
     wanted = description(settings, per_shard or 0, {}, None)
     if per_shard is None:
         del wanted["per_shard"]
@@ -164,6 +165,8 @@ def generate(
 def _begin(crew: Any, settings: Settings, per_shard: int | None, wanted: dict[str, Any]) -> dict[str, Any]:
     """The first run of a folder."""
     measured = crew.measure(range(min(settings.n, MEASURED)))
+    for message, category in measured.warned:
+        warnings.warn(message, category, level_of_user())
     size = per_shard or samples_per_shard(settings.n, measured.sample_bytes)
     described = description(settings, size, measured.about, measured.standard_error)
     place = Path(settings.folder)
@@ -314,13 +317,10 @@ def _whole_pair(shard: Any) -> tuple[int, int]:
     raise UnitError(f"{_WHAT}: expected shard=(i, k) with 0 <= i < k, got {shown(shard)}.")
 
 
-def _check_limits(timeout_s: Any, max_outside: Any) -> None:
-    limits: tuple[tuple[str, Any, float], ...] = (("timeout_s", timeout_s, math.inf), ("max_outside", max_outside, 1.0))
-    for name, value, most in limits:
-        number = as_number(value)
-        if value is not None and (number is None or not 0 <= number <= most or (name == "timeout_s" and number == 0)):
-            wanted = "in [0, 1]" if name == "max_outside" else "above 0"
-            raise UnitError(f"{_WHAT}: expected {name} to be a number {wanted}, or None, got {shown(value)}.")
+def _check_timeout(timeout_s: Any) -> None:
+    number = as_number(timeout_s)
+    if timeout_s is not None and (number is None or not number > 0):
+        raise UnitError(f"{_WHAT}: expected timeout_s to be a number above 0, or None, got {shown(timeout_s)}.")
 
 
 def _check_recipe(recipe: Any, folder: Any) -> None:

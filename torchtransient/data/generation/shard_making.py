@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,8 +21,6 @@ from torchtransient.errors import SceneError, StorageError, TorchTransientError
 
 # Words of a reason at most: it stands in the file for every sample that failed.
 MOST_CHARACTERS = 500
-# Of a sample that is refused.
-_OUTSIDE = "max_outside="
 _FOLDERS = re.compile(r"(?<![\w.])(?:/[^/\s'\":,;()]+)+/(?=[^/\s])")
 _ADDRESS = re.compile(r"\b0x[0-9a-fA-F]{4,}\b")
 
@@ -47,11 +46,14 @@ class Told(Protocol):
 
 @dataclass(frozen=True)
 class Measured:
-    """What the first sample that can be made says about all: bytes before compression, facts, standard error."""
+    """What the first sample that can be made says about all: bytes before compression, facts, standard error.
+    ``warned``: messages and classes of the warnings of the recipe's check, which the caller of ``generate`` gets.
+    """
 
     sample_bytes: int
     about: dict[str, Any]
     standard_error: float | None
+    warned: tuple[tuple[str, type[Warning]], ...] = ()
 
 
 class ShardMaker:
@@ -85,9 +87,12 @@ class ShardMaker:
         """Check the recipe, and make samples until one can be made. Raises what is wrong with the recipe, SceneError
         where none of the samples can be made.
         """
+        warned: list[warnings.WarningMessage] = []
         check = getattr(self.settings.recipe, "check", None)
         if check is not None:
-            check(self._maker)
+            with warnings.catch_warnings(record=True) as warned:
+                warnings.simplefilter("always")
+                check(self._maker)
         reason = ""
         for index in indices:
             reason = told.begin(-1, index) or ""
@@ -96,12 +101,12 @@ class ShardMaker:
                 told.end(-1, index, found if isinstance(found, str) else None)
                 if not isinstance(found, str):
                     size = sum(array.nbytes for array in found.arrays.values())
-                    return Measured(size, plain(self._maker.about()), self._standard_error(index, told))
+                    error = self._standard_error(index, told)
+                    said = tuple((str(one.message), one.category) for one in warned)
+                    return Measured(size, plain(self._maker.about()), error, said)
                 reason = found
-        hint = f". Give a time_axis= that holds its light, or allow more with {_OUTSIDE}." if _OUTSIDE in reason else ""
         raise SceneError(
-            f"generate: none of the samples 0 to {indices.stop - 1} of the recipe can be made. The last one: "
-            f"{reason}{hint}"
+            f"generate: none of the samples 0 to {indices.stop - 1} of the recipe can be made. The last one: {reason}"
         )
 
     def make(
@@ -159,17 +164,8 @@ class ShardMaker:
                 if attempt < self.settings.retries:
                     told.retry(shard, index, reason)
             else:
-                return self._outside(found) or found
+                return found
         return reason
-
-    def _outside(self, sample: Any) -> str | None:
-        before, after = sample.outside
-        most = self.settings.max_outside
-        if most is None or before + after <= most:
-            return None
-        return (
-            f"{before:.3g} of its light lies before the window and {after:.3g} after it, more than {_OUTSIDE}{most:g}"
-        )
 
     def _standard_error(self, index: int, told: Told) -> float | None:
         told.begin(-1, index)

@@ -11,6 +11,7 @@ import numpy as np
 
 from torchtransient.data.generation.settings import read_description
 from torchtransient.data.recipes.contact_sheet import behind_time, sheet_of
+from torchtransient.data.recipes.outside_light import OutsideLight
 from torchtransient.data.recipes.sample import Sample
 from torchtransient.data.storage.file_names import RECIPE_FILE
 from torchtransient.data.storage.manifest import shards_of
@@ -30,11 +31,13 @@ def summary(folder: str | Path) -> str:
     samples = failed = size = 0
     arrays: list[str] = []
     keys: tuple[str, ...] = ()
+    missed: list[Any] = []
     header: dict[str, Any] = described or {}
     for path in paths:
         with Shard(path) as shard:
             samples, failed = samples + len(shard.index), failed + len(shard.failed)
             size += path.stat().st_size
+            missed += [shard.outside[row] for row in shard.index.values()]
             header = header or shard.header
             if shard.index and not arrays:
                 keys = shard.keys
@@ -47,6 +50,7 @@ def summary(folder: str | Path) -> str:
     lines += [f"  values: {', '.join(keys)}"] if keys else []
     lines += [f"  stored: {header.get('store')}, {header.get('compression')}"]
     lines += [f"  {_axis(about['axis'])}"] if about.get("axis") else []
+    lines += [f"  light outside of the window: {OutsideLight.of(missed).shares()}"] if about.get("axis") else []
     lines += [f"  {_frequencies(about['frequencies'])}"] if about.get("frequencies") else []
     spp, error = about.get("spp"), header.get("standard_error")
     lines += [f"  {spp} samples per pixel" + (f", standard error {error:.3g}" if error else "")] if spp else []

@@ -21,8 +21,9 @@ class OnlineDataset(IterableDataset[dict[str, Any]]):
     """Samples of a recipe, rendered while they are used: endless, drawn at random from the latest ``capacity`` of them.
 
     A sample is a dictionary as of :class:`~torchtransient.data.reading.transient_dataset.TransientDataset`: its arrays
-    by name as tensors of the caller's own, ``values`` by key, ``index`` in the recipe. ``DataLoader(data,
-    batch_size=8)`` makes batches; ``num_workers`` other than 0 is an error: the data set has processes of its own. ::
+    by name as tensors of the caller's own, ``values`` by key, ``outside`` and ``index`` in the recipe.
+    ``DataLoader(data, batch_size=8)`` makes batches; ``num_workers`` other than 0 is an error: the data set has
+    processes of its own. ::
 
         with OnlineDataset(recipe, workers=2) as data:
             for step, batch in zip(range(10_000), DataLoader(data, batch_size=8)):
@@ -40,6 +41,9 @@ class OnlineDataset(IterableDataset[dict[str, Any]]):
     used so often: every sample is used about that often, less at first, while the ring fills.
     ``math.inf``: nobody waits, and producers replace what is oldest as fast as they can. ``made``, ``drawn`` and
     ``waited_s`` (seconds) say how it goes.
+
+    Before the first sample is drawn, a PhysicsWarning says how many of those that are there have more than 1 % of their
+    light outside of the time window; they are kept.
 
     ``transform``: function of the transient; its result stands under ``measurement``. ``timeout_s``: so long without
     news from a producer is an error.

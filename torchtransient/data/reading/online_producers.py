@@ -25,6 +25,8 @@ import torch.multiprocessing  # teaches connections to hand over shared tensors
 from torchtransient.data.generation.told_errors import ToldError
 from torchtransient.data.reading.online_schedule import Schedule
 from torchtransient.data.reading.online_worker import Layout, empty_ring, produce, said
+from torchtransient.data.reading.sample_draws import outside_tensor
+from torchtransient.data.recipes.outside_light import OutsideLight
 from torchtransient.data.recipes.plugin_modules import plugins_here
 from torchtransient.errors import ShapeError, StorageError, TorchTransientError, TorchTransientWarning
 from torchtransient.rendering.physics import level_of_user
@@ -66,8 +68,8 @@ class Producers:
         self._workers: list[_Worker] = []
         self._ring: dict[str, torch.Tensor] = {}
         self._layout: Layout | None = None
-        # By place in the ring: number of the sample, and its values.
-        self._beside: dict[int, tuple[int, dict[str, Any]]] = {}
+        # By place in the ring: number of the sample, its values, and shares of its light outside of the window.
+        self._beside: dict[int, tuple[int, dict[str, Any], tuple[float, float]]] = {}
         self._ends: Counter[int | None] = Counter()
         self._failure: BaseException | None = None
         self._closed = False
@@ -103,6 +105,8 @@ class Producers:
                 self._listen(0.0)
                 if not self.schedule.can_draw():
                     self._wait()
+                if not self.schedule.drawn:
+                    OutsideLight.of(outside for _, _, outside in self._beside.values()).warn(WHAT)
                 sample = self._copy(self.schedule.draw())
                 # Not before it is copied: its place may be the oldest, which the next order goes to.
                 self._give_orders()
@@ -115,10 +119,10 @@ class Producers:
 
     def _copy(self, slot: int) -> dict[str, Any]:
         """What stands at a place of the ring, as the caller's own."""
-        index, values = self._beside[slot]
+        index, values, outside = self._beside[slot]
         sample: dict[str, Any] = {name: array[slot].clone() for name, array in self._ring.items()}
         sample["values"] = {key: v if isinstance(v, str) else _own_tensor(v) for key, v in values.items()}
-        sample["index"] = index
+        sample |= {"outside": outside_tensor(outside), "index": index}
         return sample
 
     def _check(self) -> None:
@@ -179,9 +183,9 @@ class Producers:
             self._agree(rest[0])
             self._say(worker, "ring", self._ring)
         elif kind == "done":
-            index, values = rest
+            index, values, outside = rest
             worker.rendering = None
-            self._beside[self.schedule.finished(index)] = index, values
+            self._beside[self.schedule.finished(index)] = index, values, outside
             self._failed_in_a_row = 0
         elif kind == "failed":
             worker.rendering = None

@@ -111,7 +111,7 @@ class _Producer:
                     self._line.say("failed", index, f"{type(error).__name__}: {error}")
                     continue
                 self._write(sample.arrays, index, self._asked.pop(index))
-                self._line.say("done", index, dict(sample.values))
+                self._line.say("done", index, dict(sample.values), tuple(sample.outside))
 
     def _listen(self) -> None:
         """Take in what has been said; waits where nothing is asked for."""

@@ -13,6 +13,7 @@ from torchtransient.data.reading.sample_draws import (
     Epochs,
     checked_seed,
     checked_transform,
+    outside_tensor,
     sample_generator,
     sample_number,
     takes_generator,
@@ -28,12 +29,12 @@ _WHAT = "RecipeDataset"
 class RecipeDataset(Epochs, Dataset[dict[str, Any]]):
     """Sample n of a recipe as ``dataset[n]``: a map-style data set that renders, of ``size`` samples from ``first`` on.
 
-    A sample is a dictionary as of :class:`~torchtransient.data.reading.transient_dataset.TransientDataset`: its arrays
-    by name, ``values`` by key, ``index`` in the recipe. It depends on recipe and number alone, and what a ``transform``
-    draws on ``seed``, too: a run that reads it in the order of :class:`torchtransient.training.Batches` can be stopped
-    and goes on to the bit, which one with :class:`OnlineDataset`, whose order depends on how fast samples are made,
-    cannot. Each sample is rendered every time that it is read; where that is what a step waits for, use OnlineDataset,
-    or generate the data set.
+    A sample is a dictionary as of :class:`~torchtransient.data.reading.transient_dataset.TransientDataset`: its
+    arrays by name, ``values`` by key, ``outside`` and ``index`` in the recipe. It depends on recipe and number alone,
+    and what a ``transform`` draws on ``seed``, too: a run that reads it in the order of
+    :class:`torchtransient.training.Batches` can be stopped and goes on to the bit, which one with
+    :class:`OnlineDataset`, whose order depends on how fast samples are made, cannot. Each sample is rendered every
+    time that it is read; where that is what a step waits for, use OnlineDataset, or generate the data set.
 
     ``DataLoader(data, num_workers=2, multiprocessing_context="spawn", persistent_workers=True,
     worker_init_fn=torchtransient.training.worker_init)`` renders beside the training; processes that were forked raise
@@ -42,7 +43,8 @@ class RecipeDataset(Epochs, Dataset[dict[str, Any]]):
     that it has the same noise whoever reads it, that of a stored sample of this index; :meth:`set_epoch` and
     :meth:`sample` tell epochs apart. None draws from torch's, anew each time.
 
-    It pickles, without what it has built. ``close()`` lets go of that; it is built again when a sample is read. Raises
+    The recipe is checked first (:meth:`Recipe.check`). It pickles, without what it has built. ``close()`` lets go of
+    that; it is built again when a sample is read. Raises
     UnitError for sizes, seeds and epochs, ArgumentError for what is no recipe, no function, and a seed that the
     transform cannot take, IndexError beyond the sizes, and what the render of a sample raises.
     """
@@ -67,6 +69,9 @@ class RecipeDataset(Epochs, Dataset[dict[str, Any]]):
                 f"{_WHAT}: seed= is for a transform that takes generator=, as sensors do, got {shown(transform)}."
             )
         self._maker: Any = None
+        if (check := getattr(recipe, "check", None)) is not None:
+            self._maker = recipe.maker()
+            check(self._maker)
 
     def __len__(self) -> int:
         return self.size
@@ -88,7 +93,7 @@ class RecipeDataset(Epochs, Dataset[dict[str, Any]]):
             found["measurement"] = transformed(self.transform, found["transient"], generator)
         values = made.values.items()
         found["values"] = {key: v if isinstance(v, str) else torch.from_numpy(np.array(v)) for key, v in values}
-        found["index"] = made.index
+        found |= {"outside": outside_tensor(made.outside), "index": made.index}
         return found
 
     def close(self) -> None:

@@ -46,6 +46,11 @@ def sample_number(what: str, number: Any, size: int) -> int:
     return found % size
 
 
+def outside_tensor(shares: Any) -> Tensor:
+    """(2,) float64: shares of a sample's light before and after the window."""
+    return torch.tensor([float(share) for share in shares], dtype=torch.float64)
+
+
 def checked_seed(what: str, seed: Any) -> int | None:
     """A seed from zero on, or None. Raises UnitError."""
     return None if seed is None else count(f"{what}: seed", seed, 0, UnitError, None)

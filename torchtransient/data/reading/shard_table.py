@@ -37,6 +37,7 @@ class ShardTable:
         self._open: OrderedDict[int, Shard] = OrderedDict()
         self._process = os.getpid()
         shards, rows, index = [], [], []
+        outside: list[Any] = []
         first: dict[str, Any] | None = None
         self.failed: dict[int, str] = {}
         self.arrays: dict[str, tuple[int, ...]] = {}
@@ -48,6 +49,7 @@ class ShardTable:
                 shards += [number] * len(shard.index)
                 rows += list(shard.index.values())
                 index += list(shard.index)
+                outside += [shard.outside[row] for row in shard.index.values()]
                 self.failed |= shard.failed
                 if not shard.index:
                     continue
@@ -62,6 +64,7 @@ class ShardTable:
             raise StorageError(f"{WHAT}: expected samples, got none in {len(self.paths)} shards: all of them failed.")
         self.shard, self.row = np.array(shards, np.int64), np.array(rows, np.int64)
         self.index: NDArray[np.int64] = np.array(index, np.int64)
+        self.outside: NDArray[np.float64] = np.array(outside, np.float64).reshape(-1, 2)
         self.repeat = _repeats(self.index)
 
     def __len__(self) -> int:

@@ -16,6 +16,7 @@ from torchtransient.data.reading.sample_draws import (
     Epochs,
     checked_seed,
     checked_transform,
+    outside_tensor,
     sample_generator,
     sample_number,
     takes_generator,
@@ -29,15 +30,16 @@ from torchtransient.given_types import several
 from torchtransient.quantities import count, shown
 
 _MEASURED = "measurement"
-_VALUES, _INDEX, _TRANSIENT = "values", "index", "transient"
+_VALUES, _INDEX, _OUTSIDE, _TRANSIENT = "values", "index", "outside", "transient"
 
 
 class TransientDataset(Epochs, Dataset[dict[str, Any]]):
     """The samples of shards, by number, in the order of the files and their rows; those that failed are left out.
 
     ``where``: a folder, a pattern of names, a shard, or a list of these. A sample is a dictionary of its arrays by
-    name, ``transient`` (C, T, H, W), ``steady`` (C, H, W) and labels, of ``values``, what was drawn for it, by key, and
-    of ``index``, its number in the recipe. ``torch.utils.data.DataLoader`` makes batches of them as they are.
+    name, ``transient`` (C, T, H, W), ``steady`` (C, H, W) and labels, of ``values``, what was drawn for it, by key, of
+    ``outside``, (2,), the shares of its light before and after the time window that it was rendered with, and of
+    ``index``, its number in the recipe. ``torch.utils.data.DataLoader`` makes batches of them as they are.
 
     ``fields``: names of those that are read; all of them by default. ``window``: ``(start_opl, end_opl)`` in metres, or
     a slice of bins: only the slabs that hold them are read, of the transient, and of a measurement with as many bins.
@@ -89,6 +91,11 @@ class TransientDataset(Epochs, Dataset[dict[str, Any]]):
         return torch.from_numpy(self._table.index.copy())
 
     @property
+    def outside(self) -> Tensor:
+        """(N, 2) float64: shares of every sample's light before and after the time window of the render."""
+        return torch.from_numpy(self._table.outside.copy())
+
+    @property
     def failed(self) -> dict[int, str]:
         """Samples that could not be made, with their reasons."""
         return dict(self._table.failed)
@@ -126,7 +133,7 @@ class TransientDataset(Epochs, Dataset[dict[str, Any]]):
         if _VALUES in self._fields:
             values = shard.values(row)
             found[_VALUES] = {k: v if isinstance(v, str) else tensor_in(v) for k, v in values.items()}
-        found[_INDEX] = index
+        found |= {_OUTSIDE: outside_tensor(shard.outside[row]), _INDEX: index}
         return found
 
     def close(self) -> None:

@@ -13,6 +13,7 @@ from torchtransient.data.recipes.distribution import POSE
 from torchtransient.data.recipes.distributions import Choice
 from torchtransient.data.recipes.kept_scene import Kept
 from torchtransient.data.recipes.maker import Maker
+from torchtransient.data.recipes.outside_light import OutsideLight
 from torchtransient.data.recipes.reach import check_reach
 from torchtransient.data.recipes.specification import Specification
 from torchtransient.data.recipes.streams import Draw, Extreme, Fixed, Stream
@@ -45,6 +46,17 @@ def check_recipe(recipe: Specification, maker: Maker) -> None:
             if kept.scan is None:
                 _check_light(built, kept, [drawn for _, drawn in draws])
             check_reach(built, kept, draws)
+
+
+def light_outside(recipe: Specification, maker: Maker) -> OutsideLight:
+    """Light of the first samples that the time window misses; none of films without one."""
+    shares: list[tuple[float, float]] = []
+    for structure, indices in structures_of(recipe, range(SAMPLES)) if maker.measures().axis is not None else ():
+        for index in indices:
+            # A sample that raises is a failed one of the data set, not a wrong recipe.
+            with contextlib.suppress(TorchTransientError):
+                shares.append(maker.kept(structure).outside(index))
+    return OutsideLight.of(shares)
 
 
 def _tell_of_many_scenes(recipe: Specification) -> None:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from torchtransient.data.recipes.checks import SAMPLES, structures_of
+from torchtransient.data.recipes.outside_light import OutsideLight
 from torchtransient.data.recipes.sample import Sample
 from torchtransient.errors import StorageError
 from torchtransient.quantities import count
@@ -41,8 +42,8 @@ class Cost:
     """What :meth:`Recipe.cost` found. ``values``: keys that are only values. ``exchanged``: keys whose every new
     combination is a new structure; ``seen`` of these came among the first 64 samples. ``structures``: those measured.
     ``sample_bytes``: before compression; ``stored_bytes``: on disk, by store, None where it could not be measured.
-    ``outside``: mean and largest share of light outside of the window. ``standard_error``: relative, of one sample's
-    numbers. ``n``: samples of the data set, None where the recipe does not say.
+    ``outside``: light outside of the window, as :meth:`Recipe.check` finds it. ``standard_error``: relative, of one
+    sample's numbers. ``n``: samples of the data set, None where the recipe does not say.
     """
 
     values: tuple[str, ...]
@@ -51,7 +52,7 @@ class Cost:
     structures: tuple[StructureCost, ...]
     sample_bytes: int
     stored_bytes: dict[str, float | None]
-    outside: tuple[float, float]
+    outside: OutsideLight
     standard_error: float
     n: int | None
 
@@ -82,7 +83,8 @@ class Cost:
         for store, size in self.stored_bytes.items():
             if size is not None:
                 yield f"  store={store!r:<10} {_bytes(size)}, {self.sample_bytes / size:.1f} times smaller"
-        yield f"light outside     {self.outside[0]:.2%} on average, {self.outside[1]:.2%} at most"
+        if self.outside.samples:
+            yield f"light outside     {self.outside}"
         yield f"standard error    {self.standard_error:.1%} of a sample's numbers (root mean square)"
         if self.n is not None:
             sizes = [self.n * size for size in (*self.stored_bytes.values(), self.sample_bytes) if size]
@@ -107,7 +109,7 @@ def _bytes(size: float) -> str:
     return f"{size:.3g} TB"
 
 
-def forecast(recipe: Specification, maker: Maker, samples: int, progress: bool) -> Cost:
+def forecast(recipe: Specification, maker: Maker, samples: int, progress: bool, outside: OutsideLight) -> Cost:
     """See :meth:`Recipe.cost`."""
     wanted = count("cost: samples", samples)
     found = structures_of(recipe, range(SAMPLES))
@@ -133,7 +135,6 @@ def forecast(recipe: Specification, maker: Maker, samples: int, progress: bool) 
             costs.append(StructureCost(structure.text, times[0], float(np.median(times[_WARM:]))))
     if bar is not None:
         bar.close()
-    outside = [sum(sample.outside) for sample in rendered]
     return Cost(
         values=tuple(key for key in recipe.vary if key not in recipe.exchanged),
         exchanged=tuple(recipe.exchanged),
@@ -141,7 +142,7 @@ def forecast(recipe: Specification, maker: Maker, samples: int, progress: bool) 
         structures=tuple(costs),
         sample_bytes=sum(array.nbytes for array in rendered[0].arrays.values()),
         stored_bytes=_stored(rendered, maker),
-        outside=(float(np.mean(outside)), max(outside)),
+        outside=outside,
         standard_error=maker.standard_error(found[0][1][0]),
         n=recipe.n,
     )

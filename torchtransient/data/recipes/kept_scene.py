@@ -16,6 +16,7 @@ from torchtransient.data.recipes.distribution import ANYTHING, NUMBERS, POSE, Pl
 from torchtransient.data.recipes.sample import in_order
 from torchtransient.data.recipes.specification import (
     NOISE,
+    RENDER,
     Specification,
 )
 from torchtransient.data.recipes.streams import Draw, Stream
@@ -26,7 +27,6 @@ from torchtransient.files.scan_data import scan_data
 from torchtransient.plugins import versions_of_others
 from torchtransient.quantities import shown
 from torchtransient.rendering.labels import LABELS, first_return, label_names, material_names, scene_labels
-from torchtransient.rendering.output import RenderOutput
 from torchtransient.rendering.parameters import ParameterTable, unknown_key
 from torchtransient.rendering.renderer import TransientRenderer
 from torchtransient.rendering.scene_handle import Scene, load
@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 
 # A label that is read off the transient.
 FIRST_RETURN = "first_return"
+# Camera paths at most where only the share of light outside of the window is wanted.
+_PATHS = 2**16
 
 
 @dataclass(frozen=True)
@@ -226,17 +228,29 @@ class Kept:
         """What the film measures of a sample."""
         return self._render(self.values(drawn), seed).tensors[self.renderer.film.measures].cpu().numpy()
 
+    def outside(self, index: int) -> tuple[float, float]:
+        """Shares of the light of a sample before and after the window: those of the sample itself, or, where that
+        takes more than ``_PATHS`` camera paths, of as many.
+        """
+        rows, columns = self.measures.size[:2]
+        spp = min(self.measures.spp, max(1, _PATHS // (rows * columns)))
+        return self._render(self.values(self.draw(index)), self.seed(index), spp).outside
+
+    def seed(self, index: int) -> int:
+        """Seed of the render of a sample."""
+        return Stream(self.recipe.seed, index, RENDER).seed()
+
     def values(self, drawn: Mapping[str, Any]) -> dict[str, torch.Tensor]:
         """What is drawn as the renderer takes it."""
         return {key: torch.as_tensor(np.asarray(drawn[key]), dtype=torch.float32) for key in self.keys}
 
-    def _render(self, values: Mapping[str, torch.Tensor], seed: int) -> _Measured:
+    def _render(self, values: Mapping[str, torch.Tensor], seed: int, spp: int | None = None) -> _Measured:
         measures = self.renderer.film.measures
         with torch.no_grad():
-            out = self.renderer(values, seed=seed)
+            out = self.renderer(values, seed=seed, spp=spp)
         light = out.others[measures] if measures in out.others else getattr(out, measures)
         tensors = {measures: light, "steady": out.steady}
-        return _Measured(tensors if self.scan is None else _of_scan(tensors, self.scan), _outside(out))
+        return _Measured(tensors if self.scan is None else _of_scan(tensors, self.scan), out.outside)
 
     def _first_return(self, tensors: Mapping[str, torch.Tensor]) -> torch.Tensor:
         axis = self._axis_of_first_return()
@@ -356,18 +370,6 @@ def versions() -> dict[str, str]:
 
     others = {name: metadata.version(name) for name in ("mitsuba", "drjit", "torch", "numpy")}
     return {"torchtransient": __version__, **others, **versions_of_others()}
-
-
-def _outside(out: RenderOutput) -> tuple[float, float]:
-    """Shares of the light before and after the window, over all sensors."""
-    stats, channels = out.stats, out.steady.shape[-3]
-    before, after = sum(stats.energy_before), sum(stats.energy_after)
-    if before + after <= 0:
-        return 0.0, 0.0
-    # Of polarized light the first Stokes component.
-    steady = out.steady[..., 0, :, :, :] if out.polarized else out.steady
-    total = float(steady.sum(dtype=torch.float64)) / channels
-    return (before / total, after / total) if total > 0 else (0.0, 0.0)
 
 
 def _of_scan(tensors: Mapping[str, torch.Tensor], scan: Scan) -> dict[str, torch.Tensor]:

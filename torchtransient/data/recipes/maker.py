@@ -75,7 +75,7 @@ class Maker:
         kept = self.kept(structure)
         kept.measures.check(expected, f"sample {index}", "sample 0")
         varied = kept.draw(index)
-        seed = Stream(self.recipe.seed, index, RENDER).seed()
+        seed = kept.seed(index)
         arrays, outside = kept.arrays(index, varied, seed)
         self._check(index, arrays, expected.name)
         return Sample(

@@ -9,10 +9,11 @@ from typing import Any, Self
 
 from torchtransient.argument_names import own_init
 from torchtransient.data.recipes import recipe_file
-from torchtransient.data.recipes.checks import check_recipe
+from torchtransient.data.recipes.checks import check_recipe, light_outside
 from torchtransient.data.recipes.contact_sheet import contact_sheet
 from torchtransient.data.recipes.forecast import Cost, forecast
 from torchtransient.data.recipes.maker import Maker
+from torchtransient.data.recipes.outside_light import OutsideLight
 from torchtransient.data.recipes.sample import Sample
 from torchtransient.data.recipes.specification import Specification
 from torchtransient.quantities import count
@@ -31,7 +32,7 @@ class Recipe(Specification):
     - ``device.STAGE.ARGUMENT`` for an argument of a stage of ``device`` (a kind or a number);
     - ``scan``, of a capture: a :class:`Choice` of scans of one shape.
 
-    ``labels``: names of :func:`torchtransient.rendering.labels.scene_labels` and ``first_return``, of the same scene
+    ``labels``: names of :func:`torchtransient.data.scene_labels` and ``first_return``, of the same scene
     and camera. ``keep``: names of what samples keep, of ``transient`` (``phasor``, ``gated``), ``steady``, labels and
     ``measurement``; None for all. ``["measurement", "depth"]`` makes small data sets.
 
@@ -78,20 +79,27 @@ class Recipe(Specification):
 
     # --------------------------------------------------------------------------------------- before it is used
 
-    def check(self, maker: Maker | None = None) -> None:
+    def check(self, maker: Maker | None = None) -> OutsideLight:
         """Raise what is wrong with the recipe, before anything is rendered: unknown keys, distributions that do not fit
         them, numbers outside of what is physical, poses whose light leaves the window, a scene without light. Looks at
-        the ends of every distribution and at the first samples. ``maker``: whose scenes are used, None for the recipe's
-        own.
+        the ends of every distribution and at the first 64 samples (of 8 structures at most). ``maker``: whose scenes
+        are used, None for the recipe's own.
+
+        Then renders these samples, with 65536 camera paths each at most, and returns how much of their light the time
+        window misses; where that is more than 1 % of some of them, it is a PhysicsWarning, too.
         """
-        check_recipe(self, self._maker if maker is None else maker)
+        maker = self._maker if maker is None else maker
+        check_recipe(self, maker)
+        found = light_outside(self, maker)
+        found.warn("recipe")
+        return found
 
     def cost(self, samples: int = 5, *, progress: bool = False) -> Cost:
-        """What a sample costs: what is built anew and what is only a value, seconds, bytes, light outside the window.
-        Renders some ``samples`` of each structure that comes first. ``str`` of it is a table.
+        """What a sample costs: what is built anew and what is only a value, seconds, bytes, and the light outside of
+        the window that :meth:`check` finds. Renders some ``samples`` of each structure that comes first. ``str`` of it
+        is a table.
         """
-        self.check()
-        return forecast(self, self._maker, samples, progress)
+        return forecast(self, self._maker, samples, progress, self.check())
 
     def preview(self, samples: int = 16, path: str | Path | None = None, *, progress: bool = False) -> Any:
         """A contact sheet of the first samples: the steady picture (or what stands for it), labels, and the light over

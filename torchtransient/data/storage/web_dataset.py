@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torchtransient.array_files.array_file import check_source, damage_said, path_of
 from torchtransient.array_files.hdf5_limits import check_memory
 from torchtransient.array_files.part_files import whole_file, writing_said
+from torchtransient.data.reading.sample_draws import outside_tensor
 from torchtransient.data.reading.transient_dataset import TransientDataset
 from torchtransient.data.storage.encodings import COUNTED, measured_names
 from torchtransient.errors import MissingPackageError, StorageError
@@ -119,12 +120,13 @@ def _add(tar: tarfile.TarFile, sample: Mapping[str, Any], compressor: Any, measu
     values = {name: v if isinstance(v, str) else np.asarray(v) for name, v in sample.get("values", {}).items()}
     plain = {
         "index": sample["index"],
+        "outside": sample["outside"].tolist(),
         "values": {name: v if isinstance(v, str) else v.tolist() for name, v in values.items()},
         "dtypes": {name: str(v.dtype) for name, v in values.items() if not isinstance(v, str)},
     }
     _member(tar, f"{key}.{_JSON}", json.dumps(plain, sort_keys=True).encode())
     for name in sorted(sample):
-        if name in ("index", "values"):
+        if name in ("index", "outside", "values"):
             continue
         if not isinstance(sample[name], torch.Tensor) or "." in name:
             raise StorageError(f"{_WHAT}: expected '{name}' as a tensor, under a name without points.")
@@ -158,7 +160,9 @@ def _values(content: bytes) -> dict[str, Any]:
         name: value if name not in dtypes else torch.from_numpy(np.array(value, _number_type(dtypes[name])))
         for name, value in plain["values"].items()
     }
-    return {"index": int(plain["index"]), **({"values": values} if values else {})}
+    # Tars of before have no shares.
+    outside = {"outside": outside_tensor(plain["outside"])} if "outside" in plain else {}
+    return {"index": int(plain["index"]), **outside, **({"values": values} if values else {})}
 
 
 def _number_type(name: str) -> np.dtype[Any]:

@@ -126,7 +126,14 @@ def _launch_counts(sampler: Any, spp: int, most: int) -> list[int]:
     """
 
     def drawn(count):
-        sampler.set_sample_count(count)
+        logger = mi.logger()
+        level = logger.log_level()
+        # A number that is tried is no user's.
+        logger.set_log_level(mi.LogLevel.Error)
+        try:
+            sampler.set_sample_count(count)
+        finally:
+            logger.set_log_level(level)
         return sampler.sample_count()
 
     if spp <= most:

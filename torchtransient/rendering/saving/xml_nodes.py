@@ -159,6 +159,8 @@ class XmlWriter:
         found = Path(str(mi.file_resolver().resolve(value))) if "file" in key else None
         if found is None or not found.is_file():
             return value
+        if found.parent == self.folder:
+            return self.name_of(found)  # written for this scene
         copy = self.file(found.stem, found.suffix)
         shutil.copyfile(found, copy)
         return self.name_of(copy)
