@@ -21,7 +21,7 @@ UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
 
 def listed(kind, legs=True):
-    spots = {"single": LIST[1], "confocal": LIST, "exhaustive": LIST[:2]}[kind]
+    spots = {"single": LIST[1], "confocal": LIST, "exhaustive": LIST[:2], "pairs": LIST.flip(0) + 0.05 * UP.roll(1)}[kind]
     up = UP.expand(3, 3)
     return Scan(
         kind, LIST, spots, **{name: torch.tensor(origin) for name, origin in ORIGINS.items()},
@@ -57,6 +57,12 @@ def holdable():
     """Captures by layout and name that the layout holds without loss (but metadata)."""
     with_legs, without = grids(), grids(legs=False)
     yield "torchtransient", "confocal", made(with_legs["confocal"])
+    yield "torchtransient", "pairs", made(listed("pairs"))
+    grid = with_legs["confocal"]
+    grid = replace(grid, kind="pairs", laser_points=grid.laser_points.flip(0))
+    for name, scan in (("pairs", grid), ("pairs list", listed("pairs"))):
+        yield "tal", name, made(scan)
+        yield "tal", f"{name} phasor", made(scan, phasor=True)
     for kind in with_legs:
         yield "tal", kind, made(with_legs[kind])
         yield "tal", f"{kind} from wall to wall", made(without[kind])

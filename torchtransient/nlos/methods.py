@@ -32,6 +32,8 @@ def choose_method(capture: Capture) -> Choice:
         raise ArgumentError(f"choose_method: {not_a_capture(capture)}")
     kind = capture.scan.kind
     this = with_article(kind)
+    if kind == "pairs":
+        return Choice("fbp", "pairs of spots and sensor points, which only backprojection takes; the filter removes its haze")
     if not is_planar(capture.scan):
         reason = f"{this} scan whose points are not a regular grid of a flat wall, which only backprojection takes"
         return Choice("fbp", f"{reason}; the filter removes its haze")
@@ -86,11 +88,12 @@ def pitch_of(scan: Scan) -> float:
 
 def default_wavelength(capture: Capture) -> float:
     """The shortest wavelength, metres of optical path, that shows no ghosts and that the bins hold: two pitches of
-    the sensor points, four of a confocal scan, where laser and sensor move together, and four bins at least.
+    the sensor points, four of confocal scans and of pairs, where the laser moves with the sensor, and four bins at
+    least.
 
     Raises ShapeError for a capture without a transient.
     """
     if capture.axis is None:
         raise ShapeError("reconstruct: expected a capture with a transient, got phasors alone.")
-    turns = 4.0 if capture.scan.kind == "confocal" else 2.0
+    turns = 4.0 if capture.scan.kind in ("confocal", "pairs") else 2.0
     return max(turns * pitch_of(capture.scan), 4 * capture.axis.bin_width_opl)

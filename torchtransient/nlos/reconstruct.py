@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
-from torchtransient.capture import Capture, Scan
+from torchtransient.capture import Capture
 from torchtransient.capture.arithmetic import precision_of
-from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.nlos.measured_light import checked_light
 from torchtransient.nlos.methods import Choice, check_method, choose_method, default_wavelength, is_planar
 from torchtransient.nlos.volume_memory import AT_ONCE, check_volume_fits
@@ -41,8 +41,6 @@ from torchtransient.volume_methods import FILTERS, Method
 
 # Planes of a volume whose depths nobody gave, and how near the first is, as a share of the last one's depth.
 MOST_PLANES, NEAREST = 64, 0.02
-# How far points are off one line, as a share of its length.
-_LINE = 1e-6
 
 
 def reconstruct(
@@ -137,23 +135,11 @@ def default_grid(
         planes = max(2, min(MOST_PLANES, math.ceil((far - near) / (axis.bin_width_opl / 2) - 1e-6)))
     planes = count("reconstruct: planes", planes)
     middles = near + (far - near) * (torch.arange(planes, dtype=torch.float64, device="cpu") + 0.5) / planes
-    if extent is None and not _spans_area(capture.scan):
-        raise SceneError(
-            f"reconstruct: the sensor points of this scan lie on one line ({capture.scan!r}), which says not how wide "
-            "and high a volume is. Give grid=default_grid(capture, extent=(width, height)) in metres, or another grid=."
-        )
     if size is None and not is_planar(capture.scan):
         # As many as points: of a curved wall's grid, or of the square that a list of them would fill.
         shape = capture.scan.sensor_shape
         size = tuple(reversed(shape)) if len(shape) == 2 else math.ceil(math.sqrt(math.prod(shape)))
     return VoxelGrid.before(capture.scan, middles, size=size, extent=extent)
-
-
-def _spans_area(scan: Scan) -> bool:
-    """Whether sensor points are more than one, and not all on one line."""
-    points = scan.sensor_points.cpu().reshape(-1, 3)
-    spread = torch.linalg.svdvals(points - points.mean(0))
-    return len(spread) > 1 and bool(spread[1] > _LINE * spread[0])
 
 
 def checked_depths(depths: Any) -> tuple[float, float]:

@@ -25,13 +25,14 @@ WHAT = "capture file"
 
 class Contents(Protocol):
     """``shapes``: root arrays and structures by name, None for what has no shape; ``source``: the file; ``links``:
-    names that lead elsewhere, which are not followed.
+    names that lead elsewhere, which are not followed; ``reader``: the function of another package that reads it.
 
     ``array(name)``: numbers, None where the name is missing or empty; names of a structure's fields are
     ``structure/field``. ``text(name)`` likewise.
     """
 
     source: Path
+    reader: str
     shapes: Mapping[str, tuple[int, ...] | None]
     attributes: Mapping[str, str]
     links: frozenset[str]
@@ -55,6 +56,8 @@ def opened(path: str | Path) -> Iterator[Contents]:
 
 class Hdf5Contents:
     """An open HDF5 file."""
+
+    reader = "h5py.File"
 
     def __init__(self, source: Path, file: Any) -> None:
         self.source, self._file = source, file
@@ -114,6 +117,8 @@ def _sole(value: Any) -> str:
 
 class MatContents:
     """A MATLAB file of versions 5 to 7."""
+
+    reader = "scipy.io.loadmat"
 
     def __init__(self, source: Path) -> None:
         self.source = source

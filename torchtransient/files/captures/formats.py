@@ -164,7 +164,7 @@ def _found(contents: Contents) -> Layout:
     names = some_of(sorted(held), 120) or "nothing"
     raise StorageError(
         f"{WHAT}: '{contents.source}' has no known layout ({', '.join(FORMATS)}); it holds {names}. Give format= if it "
-        "is one of these; read it with h5py if it is not."
+        f"is one of these; else read it with {contents.reader} and make tt.nlos.Capture(transient, axis, scan) of it."
     )
 
 

@@ -236,6 +236,10 @@ def aims_of(scene: Any, sensor: Any, capture: CaptureType, fov: float | None) ->
     given = sensor.spots() if hasattr(sensor, "spots") and capture is not CaptureType.CONFOCAL else None
     if given is not None:
         return given - origin
+    if capture is CaptureType.PAIRS:
+        raise SceneError(
+            "scan: a capture of pairs has a laser spot for each scanned point. Give laser_points of nlos_capture_meter."
+        )
     if capture is CaptureType.SINGLE:
         return transform @ mi.Vector3f(0, 0, 1)
     if fov is None:
@@ -299,6 +303,12 @@ def check_count(aims: Any, sensor: Any, capture: CaptureType) -> None:
         raise SceneError(
             f"scan: a single capture has one laser spot, got {count} laser_points. Give one, or set capture_type to "
             "exhaustive."
+        )
+    pixels = int(film.crop_size()[0]) * int(film.crop_size()[1])
+    if capture is CaptureType.PAIRS and count != pixels:
+        raise SceneError(
+            f"scan: a capture of pairs has a laser spot for each of its {pixels} scanned points, got {count} "
+            "laser_points. Give as many, in the order of the film's pixels."
         )
     if capture is CaptureType.EXHAUSTIVE and count != film.laser_count():
         raise SceneError(
