@@ -304,8 +304,7 @@ def check_count(aims: Any, sensor: Any, capture: CaptureType) -> None:
             f"scan: a single capture has one laser spot, got {count} laser_points. Give one, or set capture_type to "
             "exhaustive."
         )
-    pixels = int(film.crop_size()[0]) * int(film.crop_size()[1])
-    if capture is CaptureType.PAIRS and count != pixels:
+    if capture is CaptureType.PAIRS and count != (pixels := int(film.crop_size()[0]) * int(film.crop_size()[1])):
         raise SceneError(
             f"scan: a capture of pairs has a laser spot for each of its {pixels} scanned points, got {count} "
             "laser_points. Give as many, in the order of the film's pixels."
