@@ -84,6 +84,27 @@ def holdable():
         yield "rect_data", kind, made(square[kind], axis=FROM_ZERO)
 
 
+def chip_frames(frames=2, zones=9, bins=12):
+    """Frames of a chip as JSON has them: counts, the pulse, where the chip stands, how far away the wall is."""
+    rng = np.random.default_rng(1)
+    pose = [[0.0, -1.0, 0.0, 0.1], [-1.0, 0.0, 0.0, 0.2], [0.0, 0.0, -1.0, 0.3], [0.0, 0.0, 0.0, 1.0]]
+    return [
+        {
+            "hists": rng.poisson(5.0, (zones, bins)).tolist(), "reference_hist": rng.poisson(9.0, bins).tolist(),
+            "pose": pose, "dist_to_plane": 0.25 * (frame + 1), "time_captured": 0, "joint_angles": [0.5] * 6,
+            "distances": [{"temperature": 24, "depths_1": [240 + zone for zone in range(zones)]}],
+        }
+        for frame in range(frames)
+    ]  # fmt: skip
+
+
+def zone_frame():
+    """Arrays of a chip's 4 x 4 zones."""
+    rng = np.random.default_rng(2)
+    points = np.concatenate([rng.uniform(-0.5, 0.5, (16, 2)), rng.normal(0, 0.01, (16, 1))], 1)
+    return {"hists": rng.poisson(5.0, (16, 8)).astype(np.float64), "pt_cloud": points, "cam_z": np.array(0.5)}
+
+
 def read_only():
     """Arrays by name of files that are only read, each with the name of its layout."""
     rng = np.random.default_rng(0)

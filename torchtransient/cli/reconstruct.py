@@ -15,7 +15,7 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 _XYZ = (float, float, float)
 _SIX = (float,) * 6
 # Arguments of read_capture that a file may leave open.
-_OPEN = ("wall_size", "bin_width_s", "start_s", "sensor_origin", "laser_origin")
+_OPEN = ("wall_size", "bin_width_s", "start_s", "sensor_origin", "laser_origin", "frame")
 
 
 class Numbers(click.ParamType):  # type: ignore[type-arg]  # a parameter of newer versions
@@ -46,6 +46,7 @@ def file_options(command: Command) -> Command:
         click.option("--start-s", type=float, help="When the first bin begins, seconds."),
         click.option("--sensor-origin", type=_XYZ, metavar="X Y Z", help="Metres."),
         click.option("--laser-origin", type=_XYZ, metavar="X Y Z", help="Metres."),
+        click.option("--frame", type=click.IntRange(min=0), help="Of a file with several."),
     )
     for option in reversed(options):
         command = option(command)

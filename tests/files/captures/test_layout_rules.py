@@ -411,4 +411,4 @@ def test_orders_of_axes(tmp_path):
 
 
 def test_no_layout_is_forgotten():
-    assert {*WRITTEN, "cdt", "keyhole"} == set(FORMATS)
+    assert {*WRITTEN, "cdt", "keyhole", "tmf8828", "vl53l8"} == set(FORMATS)
