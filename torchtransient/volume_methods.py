@@ -48,7 +48,7 @@ METHODS = {
     "fk": Method("f-k migration", ("confocal",), _MIGRATION),
     "midpoint-fk": Method("f-k migration by midpoints", _APART, _MIGRATION),
     "lct": Method("light-cone transform", ("confocal",), _CONE),
-    "directional-lct": Method("directional light-cone transform", ("confocal",), _CONE),
+    "directional-lct": Method("directional light-cone transform", ("confocal",), _of(**_CONE, taper=0.1)),
     "bp": Method("backprojection", _ALL, _of(falloff=0.0), planar=False, free_grid=True),
     "fbp": Method("filtered backprojection", _ALL, _of(**_BAND, filter="phasor"), planar=False, free_grid=True),
     "phasor": Method("phasor field", _GRIDS, _of(**_BAND, camera=None), free_grid=True),

@@ -92,6 +92,7 @@ def capture_options(command: Command) -> Command:
 @click.option("--taps", type=int, help="Of f-k: 4 interpolate finely, 2 in less time.  [default: 4]")
 @click.option("--snr", type=float, help="Of the light-cone transforms; larger is sharper.  [default: 10]")
 @click.option("--v-bins", type=int, help="Of light-cone transforms: bins of squared depth.  [default: as of time]")
+@click.option("--taper", type=float, help="Share of a side over which directional-lct fades light out.  [default: 0.1]")
 @click.option("--wavelength", type=float, help="Metres (fbp, phasor).  [default: the shortest without ghosts]")
 @click.option("--cycles", type=float, help="Waves of a pulse (fbp, phasor).  [default: 4]")
 @click.option("--falloff", type=float, help="-2 makes up for distance (bp, fbp, phasor).  [default: 0]")

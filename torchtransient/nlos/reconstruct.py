@@ -60,7 +60,7 @@ def reconstruct(
     far), metres: what to look at; planes of the other methods outside of it are left out. ``progress``: show a bar.
 
     ``options``: ``target``, ``floor``, ``taps`` (fk, midpoint-fk), ``target``, ``snr``, ``v_bins`` (lct,
-    directional-lct), ``falloff`` (bp, fbp, phasor), ``wavelength`` in metres, None for the shortest without ghosts, and
+    directional-lct), ``taper`` (directional-lct), ``falloff`` (bp, fbp, phasor), ``wavelength`` in metres, None for the shortest without ghosts, and
     ``cycles`` (fbp, phasor), ``filter`` "phasor" or "laplacian" (fbp), ``camera`` (phasor). First and last legs are
     taken off where a method cannot count them, light before time zero and phasors beside a transient are left out, and
     of polarized captures the intensity is taken.
