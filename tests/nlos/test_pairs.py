@@ -47,7 +47,7 @@ def test_what_a_scan_of_pairs_is():
     assert 0 <= float(lengths.min()) - axis.start_opl < 0.01 + 1e-9 > axis.end_opl - float(lengths.max()) >= 0
     with pytest.raises(ShapeError, match="one for each sensor point"):
         replace(found, laser_points=found.laser_points[:3], laser_normals=None)
-    with pytest.raises(ArgumentError, match="Scan.points"):
+    with pytest.raises(ArgumentError, match=r"Scan\.points"):
         N.Scan.grid(WALL, 2, kind="pairs")
 
 
@@ -115,7 +115,8 @@ def test_derivatives_by_the_place_of_what_is_hidden():
     centers = AXIS.centers_opl.float()[:, None]
 
     def length(shift):
-        light = renderer({"letter.vertex_positions": start + shift * torch.tensor([0.0, 0.0, 1.0])}, seed=1).transient[0]
+        moved = start + shift * torch.tensor([0.0, 0.0, 1.0])
+        light = renderer({"letter.vertex_positions": moved}, seed=1).transient[0]
         return (light * centers).sum() / light.sum()
 
     shift = torch.zeros((), requires_grad=True)
@@ -136,7 +137,7 @@ def test_backprojection_finds_a_point_and_transforms_name_it():
     # Half a voxel along each axis.
     assert ((brightest - torch.tensor(point)).abs() <= 0.026).all()
     for method in ("fk", "midpoint-fk", "lct", "directional-lct", "phasor"):
-        with pytest.raises(ArgumentError, match="this one is pairs. Take one of bp, fbp"):
+        with pytest.raises(ArgumentError, match=r"this one is pairs\. Take one of bp, fbp"):
             N.reconstruct(measured, method)
     without = replace(measured.scan, first_and_last_leg=False)
     of = {"time_axis": measured.axis}

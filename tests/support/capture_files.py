@@ -21,7 +21,8 @@ UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
 
 def listed(kind, legs=True):
-    spots = {"single": LIST[1], "confocal": LIST, "exhaustive": LIST[:2], "pairs": LIST.flip(0) + 0.05 * UP.roll(1)}[kind]
+    apart = LIST.flip(0) + 0.05 * UP.roll(1)
+    spots = {"single": LIST[1], "confocal": LIST, "exhaustive": LIST[:2], "pairs": apart}[kind]
     up = UP.expand(3, 3)
     return Scan(
         kind, LIST, spots, **{name: torch.tensor(origin) for name, origin in ORIGINS.items()},

@@ -208,9 +208,7 @@ class Scan:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """What follows (C, T) in a capture: (Sy, Sx) or (N,), for pairs too; for exhaustive scans the laser's dimensions
-        before it.
-        """
+        """What follows (C, T) in a capture: (Sy, Sx) or (N,); for exhaustive scans the laser's dimensions before it."""
         return (*self.laser_shape, *self.sensor_shape) if self.kind == "exhaustive" else self.sensor_shape
 
     @property

@@ -33,12 +33,13 @@ def choose_method(capture: Capture) -> Choice:
     kind = capture.scan.kind
     this = with_article(kind)
     if kind == "pairs":
-        return Choice("fbp", "pairs of spots and sensor points, which only backprojection takes; the filter removes its haze")
+        return Choice("fbp", "pairs of spots and points, which only backprojection takes; the filter removes its haze")
     if not is_planar(capture.scan):
         reason = f"{this} scan whose points are not a regular grid of a flat wall, which only backprojection takes"
         return Choice("fbp", f"{reason}; the filter removes its haze")
     if kind == "confocal":
-        return Choice("fk", "a confocal scan of a regular grid on a flat wall: the sharpest for it, in seconds")
+        others = "lct or phasor may show more of clean captures and of few photons (docs/nlos_reconstruction.md)"
+        return Choice("fk", f"a confocal scan of a regular grid on a flat wall: it bears background; {others}")
     more = "midpoint-fk is quicker, and approximate"
     return Choice("phasor", f"{this} scan of a regular grid on a flat wall, from plane to plane; {more}")
 

@@ -55,15 +55,17 @@ def reconstruct(
     """The hidden volume of a capture, without gradients (for those, take the operators: :class:`FK` and others).
 
     ``method``: "fk", "midpoint-fk", "lct", "directional-lct", "bp", "fbp", "phasor"; None takes the one that suits the
-    capture, and ``metadata["reason"]`` says why. ``grid``: voxels of bp, fbp and phasor, None for
-    :func:`default_grid`; the other methods have a plane for each bin and a voxel behind each point. ``depths`` (near,
-    far), metres: what to look at; planes of the other methods outside of it are left out. ``progress``: show a bar.
+    scan, and ``metadata["reason"]`` says why. For confocal grids that is f-k, which bears background: a light-cone
+    transform is as good or better where background has been taken off, phasor fields where there are few photons.
+    ``grid``: voxels of bp, fbp and phasor, None for :func:`default_grid`; the other methods have a plane for each bin
+    and a voxel behind each point. ``depths`` (near, far), metres: what to look at; planes of the other methods outside
+    of it are left out. ``progress``: show a bar.
 
     ``options``: ``target``, ``floor``, ``taps`` (fk, midpoint-fk), ``target``, ``snr``, ``v_bins`` (lct,
-    directional-lct), ``taper`` (directional-lct), ``falloff`` (bp, fbp, phasor), ``wavelength`` in metres, None for the shortest without ghosts, and
-    ``cycles`` (fbp, phasor), ``filter`` "phasor" or "laplacian" (fbp), ``camera`` (phasor). First and last legs are
-    taken off where a method cannot count them, light before time zero and phasors beside a transient are left out, and
-    of polarized captures the intensity is taken.
+    directional-lct), ``taper`` (directional-lct), ``falloff`` (bp, fbp, phasor), ``wavelength`` in metres, None for the
+    shortest without ghosts, and ``cycles`` (fbp, phasor), ``filter`` "phasor" or "laplacian" (fbp), ``camera``
+    (phasor). First and last legs are taken off where a method cannot count them, light before time zero and phasors
+    beside a transient are left out, and of polarized captures the intensity is taken.
 
     Raises ArgumentError for a method or an option that does not fit the capture or each other, ShapeError, UnitError
     and DeviceError as the operators.

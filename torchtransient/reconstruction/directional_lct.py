@@ -26,7 +26,6 @@ from torchtransient.reconstruction.cone_operator import DEFAULT_SNR, FALL, ConeO
 from torchtransient.reconstruction.planar_scan import PlanarScan
 from torchtransient.reconstruction.transient_operator import reconstructed
 
-
 DEFAULT_TAPER = 0.1
 
 
@@ -111,7 +110,8 @@ class DirectionalLCT(ConeOperator):
 
 
 def _fading(points: int, share: float) -> Tensor:
-    """(points,) float64: a squared sine from zero at the outer edge of the first cell to one ``share`` of them inside."""
+    """(points,) float64: a squared sine, zero at the outer edges of the first and last cell, one ``share`` of all inside.
+    """
     place = torch.arange(points, dtype=torch.float64, device="cpu") + 0.5
     place = torch.minimum(place, points - place)
     return torch.sin((place / max(share * points, 0.5)).clamp_max(1.0) * (math.pi / 2)) ** 2

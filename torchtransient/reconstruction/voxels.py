@@ -16,7 +16,6 @@ from torchtransient.errors import SceneError, ShapeError, UnitError
 from torchtransient.quantities import Numbers, count, positive, real_array, shown
 from torchtransient.reconstruction.planar_scan import PlanarScan, hidden_side
 
-
 # How far points are off one line at most, as a share of its length.
 ON_ONE_LINE = 1e-6
 
@@ -79,8 +78,8 @@ class VoxelGrid:
         along the world's y as far as it lies in them (z where the wall lies flat).
 
         Raises ShapeError where size and extent are missing and the wall is not flat or the points are a list, and for
-        sizes that are none; UnitError for depths that do not increase; SceneError where points on one line, or one point,
-        do not say an extent.
+        sizes that are none; UnitError for depths that do not increase; SceneError where points on one line, or one
+        point, do not say an extent.
 
         Before the wall is where its normals point. A scan that knows none has its voxels where its sensor and its laser
         stand; where those stand in the wall or on both sides of it, in the direction of along_x times along_y.
@@ -107,8 +106,8 @@ class VoxelGrid:
             spans.append((float(along.max() + along.min()) / 2, spread * cells))
         if extent is None and min(span for _, span in spans) <= ON_ONE_LINE * max(span for _, span in spans):
             raise SceneError(
-                f"VoxelGrid.before: the sensor points of this scan lie on one line of the planes ({scan!r}), which says "
-                "not how wide and high a volume is. Give extent=(width, height) in metres."
+                f"VoxelGrid.before: the sensor points of this scan lie on one line of the planes ({scan!r}), which "
+                "does not say how wide and high a volume is. Give extent=(width, height) in metres."
             )
         given = (spans[0][1], spans[1][1]) if extent is None else _numbers("VoxelGrid.before: extent", extent, 2)
         width, height = (positive("VoxelGrid.before: extent", value) for value in given)

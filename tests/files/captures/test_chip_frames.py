@@ -28,7 +28,7 @@ def frame(**changes):
 
 def test_a_frame_of_several(tmp_path):
     path = written(tmp_path / "a.json", chip_frames(3))
-    with pytest.raises(StorageError, match="holds 3 frames. Give frame= to read_capture, 0 to 2"):
+    with pytest.raises(StorageError, match=r"holds 3 frames\. Give frame= to read_capture, 0 to 2"):
         tt.nlos.Capture.read(path)
     for wrong in (3, -1, 0.5, "1"):
         with pytest.raises(StorageError, match="from 0 to 2"):

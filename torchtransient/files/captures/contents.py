@@ -1,7 +1,7 @@
 """What lies in a file of another program: arrays and texts by name, whatever kind of file it is.
 
-HDF5, MATLAB's files of both kinds (7.3, which are HDF5, and those before), NumPy's ``.npz``, and JSON. Arrays have the order of HDF5 throughout;
-that of MATLAB is the other way round, so that its ``(y, x, t)`` comes as ``(t, x, y)``.
+HDF5, MATLAB's files of both kinds (7.3, which are HDF5, and those before), NumPy's ``.npz``, and JSON. Arrays have the
+order of HDF5 throughout; that of MATLAB is the other way round, so that its ``(y, x, t)`` comes as ``(t, x, y)``.
 """
 
 from __future__ import annotations

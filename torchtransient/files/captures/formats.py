@@ -79,11 +79,11 @@ def read_capture(
 ) -> Capture:
     """Read a capture of any known layout, as tensors on the CPU. Nothing in the file is executed.
 
-    `format`: "torchtransient", "tal", "zaragoza", "dirac", "phasor_field", "keyhole", "rect_data", "cdt",
-    "tmf8828" or "vl53l8"; None finds it from the content, not from the name. Measured arrays are read once, and not copied after that but to sum bounces
-    or to make signed numbers of unsigned ones; axes change places as views. In what is not of this library
-    ``metadata["format"]`` names the layout, ``metadata["assumed"]`` what neither file nor caller said, with the value
-    that was taken, and ``metadata["not_read"]`` what else lies in the file.
+    `format`: "torchtransient", "tal", "zaragoza", "dirac", "phasor_field", "keyhole", "rect_data", "cdt", "tmf8828" or
+    "vl53l8"; None finds it from the content, not from the name. Measured arrays are read once, and not copied after
+    that but to sum bounces or to make signed numbers of unsigned ones; axes change places as views. In what is not of
+    this library ``metadata["format"]`` names the layout, ``metadata["assumed"]`` what neither file nor caller said,
+    with the value that was taken, and ``metadata["not_read"]`` what else lies in the file.
 
     The other arguments say what a file leaves open; docs/capture_files.md tells which layout needs which. `wall_size`:
     metres, one number or (width, height) of a scanned area whose points are the centres of its cells. `bin_width_s`,
@@ -113,8 +113,9 @@ def read_capture(
 def write_capture(path: str | Path, capture: Capture, metadata: Any = None, *, format: str = OWN) -> Path:
     """Write a capture; an existing file is replaced once the new one is complete. Returns the path.
 
-    `format`: as in :func:`read_capture` but "keyhole", "cdt", "tmf8828" and "vl53l8", which are only read. The library's own holds all of a
-    capture, and `metadata`, plain data, beside its own. What another layout cannot hold is an error.
+    `format`: as in :func:`read_capture` but "keyhole", "cdt", "tmf8828" and "vl53l8", which are only read. The
+    library's own holds all of a capture, and `metadata`, plain data, beside its own. What another layout cannot hold is
+    an error.
 
     Raises StorageError for an unknown format or ending, a folder that is missing, a full disk, and captures that the
     format cannot hold.

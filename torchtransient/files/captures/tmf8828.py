@@ -1,15 +1,15 @@
 """Frames of a consumer time-of-flight chip before a wall (ams TMF8820, 8821, 8828) as JSON. Read only.
 
 One frame, or a list of them, as the course on single-photon imaging at ICCP 2025 has them: ``hists`` (zones, T), counts
-of 128 bins; ``reference_hist`` (T,), of the pulse inside the chip; ``pose`` (4, 4), from the chip, which looks along its
-+z, to the world, metres; ``dist_to_plane``, metres along that axis; ``distances``, the chip's own answers, of which
+of 128 bins; ``reference_hist`` (T,), of the pulse inside the chip; ``pose`` (4, 4), from the chip, which looks along
+its +z, to the world, metres; ``dist_to_plane``, metres along that axis; ``distances``, the chip's own answers, of which
 ``depths_1`` (zones,) are millimetres.
 
 No file says the width of a bin, where zero is, or where zones look. Lines through the peaks of that course's 159 frames
-(a plane at 0.1 to 0.4 m) have bins of 93.0 ps and zero 13.56 bins after the start, within 0.06 bins (rms), in the middle
-zone, and paths that grow by 1.3 and 0.5 % more in its neighbours from row to row and from column to column: tangents of
-0.16 and 0.10. The course itself computes with 91 ps and 12.1, other frames of such a chip with 88 ps and 13, and with
-tangents of 0.30 and 0.24.
+(a plane at 0.1 to 0.4 m) have bins of 93.0 ps and zero 13.56 bins after the start, within 0.06 bins (rms), in the
+middle zone, and paths that grow by 1.3 and 0.5 % more in its neighbours from row to row and from column to column:
+tangents of 0.16 and 0.10. The course itself computes with 91 ps and 12.1, other frames of such a chip with 88 ps and
+13, and with tangents of 0.30 and 0.24.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Frames of a consumer time-of-flight chip that looks at a relay wall (ST VL53L8; Somasundaram et al. 2025). Read only.
 
-``hists`` (zones, T): counts of what each zone saw after its own light, which has been cut out, so that bin 0 begins when
-light leaves the wall; bins of 250 ps. ``pt_cloud`` (zones, 3), metres: where each zone meets the wall, z = 0, hidden
-side +z, as the chip itself has measured it. ``cam_z``, metres: how far before the wall the chip stands, at x = y = 0.
-A frame is one file (``.npz``).
+``hists`` (zones, T): counts of what each zone saw after its own light, which has been cut out, so that bin 0 begins
+when light leaves the wall; bins of 250 ps. ``pt_cloud`` (zones, 3), metres: where each zone meets the wall, z = 0,
+hidden side +z, as the chip itself has measured it. ``cam_z``, metres: how far before the wall the chip stands, at
+x = y = 0. A frame is one file (``.npz``).
 """
 
 from __future__ import annotations

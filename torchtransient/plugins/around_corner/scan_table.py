@@ -206,6 +206,19 @@ class LaserSpots:
         return mi.unpolarized_spectrum(weight)
 
 
+def capture_type(given: Any) -> CaptureType:
+    """A capture type by its number or name. Raises SceneError."""
+    if isinstance(given, str) and not given.strip().lstrip("-").isdigit():
+        names = {c.name.lower(): c for c in CaptureType}
+        if given.lower() in names:
+            return names[given.lower()]
+    elif float(given) in (c.value for c in CaptureType):
+        return CaptureType(int(given))
+    raise SceneError(
+        f"transient_nlos_path: capture_type: expected single, confocal, exhaustive or pairs (or 1 to 4), got {given!r}."
+    )
+
+
 def laser_of(scene: Any) -> Any:
     """The one emitter of an NLOS scene. Raises SceneError for another number."""
     emitters = scene.emitters()

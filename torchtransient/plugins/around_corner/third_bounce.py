@@ -76,7 +76,8 @@ class ThirdBounce(ScanJob):
     def _add_each(self, name: str, lasers: WallPoints, apart: bool) -> None:
         if lasers.width != self.sensors.width:
             raise ShapeError(
-                f"{name}: expected a laser spot for every scan point, got {lasers.width} spots and {self.sensors.width} points."
+                f"{name}: expected a laser spot for every scan point, got {lasers.width} spots and "
+                f"{self.sensors.width} points."
             )
         self._check_not_exhaustive(name)
         self.check_region(lasers)
