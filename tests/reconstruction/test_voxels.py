@@ -241,6 +241,9 @@ def test_lists_that_know_no_wall_have_upright_planes_across_their_normal():
         )
         for found, expected in ((grid.along_x, across), (grid.along_y, up), (grid.normal, normal)):
             torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
+    on_it = Scan.points([[0.0, 0, 0], [1, 0, 0]], kind="confocal", sensor_origin=(2, 0, 0), laser_origin=(2, 0, 0))
+    with pytest.raises(ShapeError, match="Give their normals"):
+        VoxelGrid.before(on_it, [0.5], size=2, extent=1.0)
     floor = torch.stack([u, 0 * u, v], -1)
     above = {"sensor_origin": (0.0, 0.5, 0.0), "laser_origin": (0.0, 0.5, 0.0)}
     grid = VoxelGrid.before(Scan.points(floor, kind="confocal", **above), [0.5], size=2)

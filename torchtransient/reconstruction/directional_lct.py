@@ -110,8 +110,7 @@ class DirectionalLCT(ConeOperator):
 
 
 def _fading(points: int, share: float) -> Tensor:
-    """(points,) float64: a squared sine, zero at the outer edges of the first and last cell, one ``share`` of all inside.
-    """
+    """(points,) float64: a squared sine, zero at the outer edges of the outermost cells, one from ``share`` on."""
     place = torch.arange(points, dtype=torch.float64, device="cpu") + 0.5
     place = torch.minimum(place, points - place)
     return torch.sin((place / max(share * points, 0.5)).clamp_max(1.0) * (math.pi / 2)) ** 2

@@ -77,9 +77,9 @@ class VoxelGrid:
         plane that fits the points best (of points on one line: across the way to the sensor); columns run upwards,
         along the world's y as far as it lies in them (z where the wall lies flat).
 
-        Raises ShapeError where size and extent are missing and the wall is not flat or the points are a list, and for
-        sizes that are none; UnitError for depths that do not increase; SceneError where points on one line, or one
-        point, do not say an extent.
+        Raises ShapeError where size and extent are missing and the wall is not flat or the points are a list, where
+        the sensor of a list without normals stands on its one line, and for sizes that are none; UnitError for depths
+        that do not increase; SceneError where points on one line, or one point, do not say an extent.
 
         Before the wall is where its normals point. A scan that knows none has its voxels where its sensor and its laser
         stand; where those stand in the wall or on both sides of it, in the direction of along_x times along_y.
@@ -215,9 +215,15 @@ def _mean_normal(scan: Scan, points: Tensor) -> Tensor:
     towards = scan.sensor_origin.detach().to("cpu", torch.float64) - points.mean(0)
     _, spread, axes = torch.linalg.svd(points - points.mean(0), full_matrices=True)
     if len(spread) > 1 and spread[1] > ON_ONE_LINE * spread[0]:
-        return axes[2] * (1.0 if float(axes[2] @ towards) >= 0 else -1.0)
-    across = towards - (towards @ axes[0]) * axes[0] if len(points) > 1 else towards
-    return across if float(across.norm()) > 0 else axes[2]
+        normal: Tensor = axes[2]
+        return normal if float(normal @ towards) >= 0 else -normal
+    across: Tensor = towards - (towards @ axes[0]) * axes[0] if len(points) > 1 else towards
+    if float(across.norm()) <= ON_ONE_LINE * float(towards.norm()):
+        raise ShapeError(
+            "VoxelGrid.before: expected points that say where the hidden side is, got a sensor on the one line that "
+            "they lie on. Give their normals to Scan.points, or take VoxelGrid.bounds."
+        )
+    return across
 
 
 def _upright(normal: Tensor) -> tuple[Tensor, Tensor]:
