@@ -54,6 +54,22 @@ def draw_foam(folder: Path) -> None:
             torchtransient(arguments, standalone_mode=False)
 
 
+def draw_foam_by_method(folder: Path) -> None:
+    """The front view of all four by the methods that take them, with the same options."""
+    figure = figure_type()(figsize=(7.0, 7.2), layout="constrained")
+    panels = figure.subplots(len(FOAM), len(METHODS["confocal"]), squeeze=False)
+    for line, (name, side) in zip(panels, FOAM.items(), strict=True):
+        capture = tt.nlos.Capture.read(folder / "cdt" / f"{name}.mat", wall_size=side).crop(0.0, 2.0002)
+        capture = tt.nlos.without_slab(tt.nlos.sum_bins(capture, 3), 0.0254, 3e3)
+        for panel, method in zip(line, METHODS["confocal"], strict=True):
+            target = {} if method == "phasor" else {"target": "retroreflective"}
+            volume = tt.nlos.reconstruct(capture, method, depths=(0.06, 0.88), progress=False, **target)
+            panel.imshow(volume.picture().clamp_min(0).amax(0).numpy(), cmap="gray")
+            panel.set(xticks=[], yticks=[], title=method if name == "letter_s" else "")
+        line[0].set_ylabel(name, fontsize=9)
+    save_figure(figure, OUT / "foam_by_method.png", "make_reconstruction_pictures", dpi=70)
+
+
 def draw_keyhole(folder: Path) -> None:
     """By the training example, which knows the track and the response."""
     example = runpy.run_path(str(Path(__file__).parents[1] / "training_examples" / "keyhole_letter.py"))
@@ -113,6 +129,7 @@ def main(given: str | None) -> None:
     OUT.mkdir(parents=True, exist_ok=True)
     if given is not None and given not in SCANS:
         draw_foam(Path(given))
+        draw_foam_by_method(Path(given))
         draw_keyhole(Path(given))
     for kind in [given] if given in SCANS else SCANS:
         draw_simulated(kind)

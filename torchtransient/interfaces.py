@@ -381,8 +381,9 @@ def _undefined(plugin: type, name: str) -> bool:
 
 
 class CaptureType(enum.Enum):
-    """Which laser positions belong to a scanned point: one for all, its own, or each of a grid."""
+    """Which laser positions belong to a scanned point: one for all, itself, each of a grid, or one of its own."""
 
     SINGLE = 1
     CONFOCAL = 2
     EXHAUSTIVE = 3
+    PAIRS = 4

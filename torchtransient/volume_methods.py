@@ -38,19 +38,20 @@ def _of(**options: Any) -> Mapping[str, Any]:
     return MappingProxyType(options)
 
 
-_ALL = ("single", "confocal", "exhaustive")
-_PAIRS = ("single", "exhaustive")
+_GRIDS = ("single", "confocal", "exhaustive")
+_ALL = (*_GRIDS, "pairs")
+_APART = ("single", "exhaustive")
 _MIGRATION = _of(target="diffuse", floor=0.0, taps=4)
 _CONE = _of(target="diffuse", snr=10.0, v_bins=None)
 _BAND = _of(wavelength=None, cycles=4.0, falloff=0.0)
 METHODS = {
     "fk": Method("f-k migration", ("confocal",), _MIGRATION),
-    "midpoint-fk": Method("f-k migration by midpoints", _PAIRS, _MIGRATION),
+    "midpoint-fk": Method("f-k migration by midpoints", _APART, _MIGRATION),
     "lct": Method("light-cone transform", ("confocal",), _CONE),
-    "directional-lct": Method("directional light-cone transform", ("confocal",), _CONE),
+    "directional-lct": Method("directional light-cone transform", ("confocal",), _of(**_CONE, taper=0.1)),
     "bp": Method("backprojection", _ALL, _of(falloff=0.0), planar=False, free_grid=True),
     "fbp": Method("filtered backprojection", _ALL, _of(**_BAND, filter="phasor"), planar=False, free_grid=True),
-    "phasor": Method("phasor field", _ALL, _of(**_BAND, camera=None), free_grid=True),
+    "phasor": Method("phasor field", _GRIDS, _of(**_BAND, camera=None), free_grid=True),
 }
 # Options that are said by the same names on the command line; a camera has `times` beside it.
 SETTINGS = tuple(dict.fromkeys(name for entry in METHODS.values() for name in entry.options if name != "camera"))

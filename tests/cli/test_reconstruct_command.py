@@ -88,13 +88,26 @@ def test_lists_of_points_go_to_filtered_backprojection(folder):
         points, kind="confocal", sensor_origin=scan.sensor_origin, laser_origin=scan.laser_origin
     )
     point_capture(some, [POINT], time_axis=AXIS).write("list.h5")
-    result = run("list.h5", "--quiet")
-    assert result.exit_code == 2 and "--bounds and --voxels" in result.stderr
     box = ("--bounds", -0.5, -0.5, 0.4, 0.5, 0.5, 1.0, "--voxels", "20,20,16")
     result = run("list.h5", *box)
     assert result.exit_code == 0 and "--method fbp" in result.stderr, result.output
     found = brightest(tt.nlos.read_volume("list_fbp.h5"))
     torch.testing.assert_close(found, torch.tensor(POINT, dtype=torch.float64), rtol=0, atol=0.06)
+
+
+def test_lists_on_one_line_are_asked_for_an_extent_and_take_it(folder):
+    scan = captured("confocal").scan
+    line = tt.nlos.Scan.points(
+        scan.sensor_points[3], kind="confocal", sensor_origin=scan.sensor_origin, laser_origin=scan.laser_origin
+    )
+    point_capture(line, [POINT], time_axis=AXIS).write("line.h5")
+    result = run("line.h5", "--quiet")
+    assert result.exit_code == 2 and "Give --extent" in result.stderr
+    options = ("--extent", "0.6,0.5", "--voxels", "5,4,3", "--depths", 0.4, 1.0, "--quiet", "--no-picture")
+    result = run("line.h5", *options)
+    assert result.exit_code == 0, result.stderr
+    grid = tt.nlos.read_volume("line_fbp.h5").grid
+    assert grid.extent == pytest.approx((0.6, 0.5)) and grid.shape == (3, 4, 5)
 
 
 @pytest.mark.parametrize("method", ["fk", "fbp"])

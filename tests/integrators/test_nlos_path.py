@@ -291,21 +291,21 @@ def test_segments_and_guides_of_a_walk():
 
 
 @pytest.mark.parametrize(("given", "kind"), [
-    ("single", 1), ("Confocal", 2), ("EXHAUSTIVE", 3), ("1", 1), (" 2", 2), (3, 3), (2.0, 2),
+    ("single", 1), ("Confocal", 2), ("EXHAUSTIVE", 3), ("1", 1), (" 2", 2), (3, 3), (2.0, 2), ("pairs", 4),
 ])  # fmt: skip
 def test_types_of_captures(given, kind):
     from torchtransient.plugins.integrators.nlos_path import capture_type
 
     assert capture_type(given).value == kind
-    for wrong in ("0", "-1", 4, "both", 1.5):
-        with pytest.raises(SceneError, match="capture_type: expected single, confocal or exhaustive"):
+    for wrong in ("0", "-1", 5, "both", 1.5):
+        with pytest.raises(SceneError, match="capture_type: expected single, confocal, exhaustive or pairs"):
             capture_type(wrong)
 
 
 # ---------------------------------------------------------------------------------------------------------- errors
 
 WRONG = {
-    "capture_type": ({"capture_type": "confokal"}, "single, confocal or exhaustive"),
+    "capture_type": ({"capture_type": "confokal"}, "single, confocal, exhaustive or pairs"),
     "a film for pairs": ({"capture_type": "exhaustive"}, "exhaustive_scan = true"),
     "two filters": ({"filter_bounces": 3, "filter_depth": 4}, "give one"),
     "a filter that leaves nothing": ({"filter_bounces": 4}, "max_depth"),
@@ -313,7 +313,7 @@ WRONG = {
     "min_bounces by other lights": ({"nlos_laser_sampling": False, "min_bounces": 3, "max_depth": 3}, "4 at least"),
     "a filter of what is left out": ({"filter_bounces": 1, "discard_direct_paths": True}, "discard_direct_paths"),
     "a filter below min_bounces": ({"filter_bounces": 2, "min_bounces": 3}, "min_bounces"),
-    "a half capture type": ({"capture_type": 2.7}, "single, confocal or exhaustive"),
+    "a half capture type": ({"capture_type": 2.7}, "single, confocal, exhaustive or pairs"),
     "no bounces": ({"filter_bounces": 0}, "filter_bounces"),
     "camera_unwarp": ({"camera_unwarp": True}, "account_first_and_last_bounces"),
     "third_bounce": ({"third_bounce": "fast"}, "auto, shared or paths"),

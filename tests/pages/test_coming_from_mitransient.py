@@ -14,11 +14,11 @@ REFUSED = Page("docs/coming_from_mitransient.md").text.split("## Scenes that are
 move = tt.scenes.transforms
 
 
-def scene(shape="rectangle", integrator=None, meter=None):
+def scene(shape="rectangle", integrator=None, meter=None, given_film=None):
     """A capture as mitransient 1.x writes it, single, with a projector for a laser."""
     film = {
         "type": "transient_hdr_film", "width": 2, "height": 2, "temporal_bins": 60, "bin_width_opl": 0.2,
-        "start_opl": 0.0, "rfilter": {"type": "box"},
+        "start_opl": 0.0, "rfilter": {"type": "box"}, **(given_film or {}),
     }  # fmt: skip
     sensor = {"type": "nlos_capture_meter", "sensor_origin": [-0.5, 0, 0.25], "film": film, **(meter or {})}
     aim = move.look_at(origin=[-0.5, 0, 0.25], target=[-0.3, 0.1, 0], up=[0, 1, 0])
@@ -53,11 +53,13 @@ def test_all_its_other_parameters_load():
         ({"integrator": {"nlos_hidden_geometry_sampling_max_depth": 3}}, "Leave 'nlos_.*' out: hidden geometry is"),
         ({"meter": {"original_film_width": 8, "original_film_height": 8}}, "Leave 'original_film_width' out"),
         ({"integrator": {"capture_type": "exhaustive", "nlos_laser_sampling": False}}, "need nlos_laser_sampling"),
+        ({"given_film": {"laser_scan_width": 2, "laser_scan_height": 2}}, "have no effect without exhaustive_scan"),
         ({"shape": "disk"}, "a rectangle, a mesh with texture coordinates, or 'points'"),
     ],
 )
 def test_refused(change, said):
-    named = [*change.get("integrator", {}), *change.get("meter", {}), *change.get("shape", "").split()]
+    named = [name for part in ("integrator", "meter", "given_film") for name in change.get(part, {})]
+    named += change.get("shape", "").split()
     assert all(re.search(rf"\b{name}\b", REFUSED) for name in named)
     description = scene(**change)
     if description["integrator"]["capture_type"] == "exhaustive":

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from support.scan_operators import AXIS, DEPTHS, SCANS, WALL, bent_scan, listed_scan, points_anywhere
+from support.scan_operators import AXIS, DEPTHS, SCANS, WALL, bent_scan, listed_scan, paired_scan, points_anywhere
 from support.sweeps import together
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
@@ -27,7 +27,7 @@ from torchtransient.testing.point_captures import point_capture
 
 F64 = torch.float64
 POINTS = points_anywhere()
-ALL = {**SCANS, "bent wall": bent_scan(), "lists": listed_scan()}
+ALL = {**SCANS, "bent wall": bent_scan(), "lists": listed_scan(), "pairs": paired_scan()}
 
 
 def written_out(scan, points, axis, falloff):
@@ -38,7 +38,7 @@ def written_out(scan, points, axis, falloff):
     if scan.kind == "exhaustive":
         pairs = [(a, b) for a in range(len(spots)) for b in range(len(sensors))]
     else:
-        pairs = [(b if scan.kind == "confocal" else 0, b) for b in range(len(sensors))]
+        pairs = [(b if len(spots) > 1 else 0, b) for b in range(len(sensors))]
     matrix = torch.zeros(axis.num_bins, len(pairs), len(points), dtype=F64)
     for row, (a, b) in enumerate(pairs):
         for column, point in enumerate(points):

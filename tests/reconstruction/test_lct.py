@@ -10,6 +10,7 @@ from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.reconstruction import LCT, DirectionalLCT, directional_lct, lct
+from torchtransient.testing.point_captures import point_capture
 
 F64 = torch.float64
 AXIS = TimeAxis(0.0, 0.0192, 192)
@@ -42,6 +43,35 @@ def test_plane_in_closed_form(target, power, z):
     # Bins of v of 4.4e-3 m^2 and depth steps of 1 cm, on an edge that rises over 3 cm.
     assert float((found - expected)[seen].abs().max()) < 0.03 * float(expected.max())
     assert float(found[seen].sum()) == pytest.approx(float(expected[seen].sum()), rel=5e-3)
+
+
+def rim(operator, light):
+    """The brightest voxel of the two outermost rows and columns over the brightest inside."""
+    strength = operator.reconstruct(light).norm(dim=-4)
+    border = torch.ones(strength.shape[-2:], dtype=torch.bool)
+    border[2:-2, 2:-2] = False
+    return float(strength[..., border].max() / strength[..., ~border].max())
+
+
+@pytest.mark.parametrize("outside", [(0.75, 0.0, 0.6), (1.0, 0.0, 0.6)])
+def test_light_of_things_beside_the_scan_makes_no_rim(outside):
+    light = point_capture(SCAN, [(0.0, 0.1, 0.6), outside], time_axis=AXIS).transient[0]
+    bare, faded = (rim(DirectionalLCT(SCAN, time_axis=AXIS, dtype=F64, **of), light) for of in ({"taper": 0.0}, {}))
+    assert bare > 0.2 and faded < 0.6 * bare
+
+
+def test_fading_is_of_the_inverse_alone_and_from_none_to_half():
+    bare, faded = (DirectionalLCT(SCAN, time_axis=AXIS, dtype=F64, taper=taper) for taper in (0.0, 0.25))
+    light = torch.rand(bare.data_shape, dtype=F64, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(bare.adjoint(light), faded.adjoint(light))
+    # A quarter of 24 points: none are changed from the seventh on, the outermost keeps sin^2 of 7.5 degrees.
+    weight = faded.inverse.adjoint(bare.adjoint(light)) / bare.inverse.adjoint(bare.adjoint(light))
+    along = weight[50, 12]
+    torch.testing.assert_close(along[6:18], torch.ones(12, dtype=F64))
+    assert float(along[0]) == pytest.approx(math.sin(math.pi / 24) ** 2, rel=1e-9)
+    for taper in (-0.1, 0.6, math.nan, "wide"):
+        with pytest.raises(UnitError, match="taper"):
+            DirectionalLCT(SCAN, time_axis=AXIS, taper=taper)
 
 
 @pytest.mark.parametrize("target, power", [("diffuse", 4), ("retroreflective", 2)])

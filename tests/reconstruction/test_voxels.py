@@ -82,8 +82,8 @@ def test_what_is_no_grid():
     with pytest.raises(SceneError, match="size"):
         VoxelGrid.before(SCAN, [0.1], size=0)
     listed = Scan.points([[0, 0, 0], [1, 0, 0]], kind="confocal", sensor_origin=(0, 0, 1), laser_origin=(0, 0, 1))
-    with pytest.raises(ShapeError, match=r"say where x and y are"):
-        VoxelGrid.before(listed, [0.1], size=3, extent=1.0)
+    with pytest.raises(SceneError, match=r"extent=\(width, height\)"):
+        VoxelGrid.before(listed, [0.1], size=3)
     with pytest.raises(ShapeError, match="as a grid"):
         VoxelGrid.before(listed, [0.1])
     with pytest.raises(ShapeError, match="bounds"):
@@ -223,8 +223,32 @@ def test_one_row_of_points_takes_the_axes_of_its_wall():
     expected = SCAN.sensor_points[:1] + 0.5 * NORMAL
     torch.testing.assert_close(grid.points[0], expected, rtol=0, atol=1e-12)
     assert VoxelGrid.before(row, [0.5], size=3, extent=(1.2, 0.2)).pitch == pytest.approx((0.2 / 3, 0.4))
-    with pytest.raises(UnitError, match="extent"):
+    with pytest.raises(SceneError, match="extent"):
         VoxelGrid.before(row, [0.5], size=3)
+
+
+def test_lists_that_know_no_wall_have_upright_planes_across_their_normal():
+    """Of a wall turned about y, of points on one line in it, and of one that lies flat; columns run upwards."""
+    turn, generator = 0.5, torch.Generator().manual_seed(0)
+    normal = torch.tensor([math.sin(turn), 0.0, math.cos(turn)], dtype=F64)
+    across, up = torch.tensor([math.cos(turn), 0.0, -math.sin(turn)], dtype=F64), torch.eye(3, dtype=F64)[1]
+    u, v = 2 * torch.rand(2, 9, generator=generator, dtype=F64) - 1
+    origins = {"sensor_origin": 0.5 * normal, "laser_origin": 0.5 * normal}
+    for heights, known in ((v, None), (v, normal.expand(9, 3)), (0 * v, None)):
+        points = u[:, None] * across + heights[:, None] * up
+        grid = VoxelGrid.before(
+            Scan.points(points, kind="confocal", normals=known, **origins), [0.5], size=2, extent=(1.0, 2.0)
+        )
+        for found, expected in ((grid.along_x, across), (grid.along_y, up), (grid.normal, normal)):
+            torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
+    on_it = Scan.points([[0.0, 0, 0], [1, 0, 0]], kind="confocal", sensor_origin=(2, 0, 0), laser_origin=(2, 0, 0))
+    with pytest.raises(ShapeError, match="Give their normals"):
+        VoxelGrid.before(on_it, [0.5], size=2, extent=1.0)
+    floor = torch.stack([u, 0 * u, v], -1)
+    above = {"sensor_origin": (0.0, 0.5, 0.0), "laser_origin": (0.0, 0.5, 0.0)}
+    grid = VoxelGrid.before(Scan.points(floor, kind="confocal", **above), [0.5], size=2)
+    torch.testing.assert_close(torch.stack([grid.along_y, grid.normal]), torch.eye(3, dtype=F64)[[2, 1]])
+    assert grid.extent == pytest.approx((float(u.max() - u.min()), float(v.max() - v.min())))
 
 
 def test_planes_of_a_bent_wall_are_parallel_to_its_mean_one():

@@ -21,7 +21,8 @@ UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
 
 def listed(kind, legs=True):
-    spots = {"single": LIST[1], "confocal": LIST, "exhaustive": LIST[:2]}[kind]
+    apart = LIST.flip(0) + 0.05 * UP.roll(1)
+    spots = {"single": LIST[1], "confocal": LIST, "exhaustive": LIST[:2], "pairs": apart}[kind]
     up = UP.expand(3, 3)
     return Scan(
         kind, LIST, spots, **{name: torch.tensor(origin) for name, origin in ORIGINS.items()},
@@ -57,6 +58,12 @@ def holdable():
     """Captures by layout and name that the layout holds without loss (but metadata)."""
     with_legs, without = grids(), grids(legs=False)
     yield "torchtransient", "confocal", made(with_legs["confocal"])
+    yield "torchtransient", "pairs", made(listed("pairs"))
+    grid = with_legs["confocal"]
+    grid = replace(grid, kind="pairs", laser_points=grid.laser_points.flip(0))
+    for name, scan in (("pairs", grid), ("pairs list", listed("pairs"))):
+        yield "tal", name, made(scan)
+        yield "tal", f"{name} phasor", made(scan, phasor=True)
     for kind in with_legs:
         yield "tal", kind, made(with_legs[kind])
         yield "tal", f"{kind} from wall to wall", made(without[kind])
@@ -76,6 +83,27 @@ def holdable():
     square["single"] = replace(square["single"], laser_points=square["single"].sensor_points[1, 2])
     for kind in ("single", "confocal"):
         yield "rect_data", kind, made(square[kind], axis=FROM_ZERO)
+
+
+def chip_frames(frames=2, zones=9, bins=12):
+    """Frames of a chip as JSON has them: counts, the pulse, where the chip stands, how far away the wall is."""
+    rng = np.random.default_rng(1)
+    pose = [[0.0, -1.0, 0.0, 0.1], [-1.0, 0.0, 0.0, 0.2], [0.0, 0.0, -1.0, 0.3], [0.0, 0.0, 0.0, 1.0]]
+    return [
+        {
+            "hists": rng.poisson(5.0, (zones, bins)).tolist(), "reference_hist": rng.poisson(9.0, bins).tolist(),
+            "pose": pose, "dist_to_plane": 0.25 * (frame + 1), "time_captured": 0, "joint_angles": [0.5] * 6,
+            "distances": [{"temperature": 24, "depths_1": [240 + zone for zone in range(zones)]}],
+        }
+        for frame in range(frames)
+    ]  # fmt: skip
+
+
+def zone_frame():
+    """Arrays of a chip's 4 x 4 zones."""
+    rng = np.random.default_rng(2)
+    points = np.concatenate([rng.uniform(-0.5, 0.5, (16, 2)), rng.normal(0, 0.01, (16, 1))], 1)
+    return {"hists": rng.poisson(5.0, (16, 8)).astype(np.float64), "pt_cloud": points, "cam_z": np.array(0.5)}
 
 
 def read_only():

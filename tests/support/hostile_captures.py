@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import random
 import shutil
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from support.capture_files import holdable, read_only
+from support.capture_files import chip_frames, holdable, read_only, zone_frame
 from torchtransient.files.captures.formats import LAYOUTS
 from torchtransient.files.captures.mat_file import write_mat
 
@@ -38,7 +39,9 @@ def whole_files(folder):
         write_mat(folder / f"{layout}{number}.mat", arrays)
         paths.append(folder / f"{layout}{number}.mat")
     paths.append(old_mat(folder / "old.mat"))
-    return paths
+    (folder / "frames.json").write_text(json.dumps(chip_frames(1)))
+    np.savez_compressed(folder / "zones.npz", **zone_frame())
+    return [*paths, folder / "frames.json", folder / "zones.npz"]
 
 
 def old_mat(path):

@@ -128,7 +128,9 @@ def _read_volume(path: Path) -> str:
 
 def _foreign(layout: str) -> Reader:
     def sources(folder: Path) -> list[Path]:
-        from support.capture_files import holdable, read_only
+        import numpy as np
+
+        from support.capture_files import chip_frames, holdable, read_only, zone_frame
         from support.hostile_captures import ENDINGS, old_mat
         from torchtransient.files.captures.mat_file import write_mat
 
@@ -140,6 +142,12 @@ def _foreign(layout: str) -> Reader:
             if name == layout:
                 found.append(folder / f"only{number}.mat")
                 write_mat(found[-1], arrays)
+        if layout == "tmf8828":
+            found.append(folder / "frames.json")
+            found[-1].write_text(json.dumps(chip_frames(2)))
+        elif layout == "vl53l8":
+            found.append(folder / "zones.npz")
+            np.savez(found[-1], **zone_frame())
         return [*found, old_mat(folder / "old.mat")] if layout == "phasor_field" else found
 
     def read(path: Path) -> None:
@@ -147,7 +155,7 @@ def _foreign(layout: str) -> Reader:
 
         answers = {
             "wall_size": 0.6, "bin_width_s": 1e-11, "start_s": 0.0, "sensor_origin": (0.0, 0.0, 1.0),
-            "laser_origin": (0.0, 0.0, 1.0),
+            "laser_origin": (0.0, 0.0, 1.0), "frame": 0,
         }  # fmt: skip
         said: dict[str, Any] = {}
         while True:
@@ -319,7 +327,7 @@ READERS: dict[str, Reader] = {
     "volume": Reader(_volumes, _read_volume, _is_sealed),
     **{
         f"capture of {layout}": _foreign(layout)
-        for layout in ("tal", "zaragoza", "dirac", "phasor_field", "keyhole", "rect_data", "cdt")
+        for layout in ("tal", "zaragoza", "dirac", "phasor_field", "keyhole", "rect_data", "cdt", "tmf8828", "vl53l8")
     },
     "shard": Reader(_shards, _read_shard, lambda path: True),
     "data set": Reader(_data_sets, _read_data_set),

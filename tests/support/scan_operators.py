@@ -54,6 +54,18 @@ def listed_scan():
     )  # fmt: skip
 
 
+def paired_scan():
+    """A spot of its own for each of five sensor points of a wall that is measured point by point, with its normals."""
+    generator = torch.Generator("cpu").manual_seed(2)
+    points = 0.2 * torch.rand(10, 3, generator=generator, device="cpu").double() - 0.1
+    points[:, 2] *= 0.2
+    normals = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64, device="cpu") + points
+    return Scan.points(
+        points[:5], kind="pairs", laser_points=points[5:], normals=normals[:5], laser_normals=normals[5:],
+        sensor_origin=(0.0, 0.0, 0.06), laser_origin=(0.05, 0.0, 0.05), first_and_last_leg=True,
+    )  # fmt: skip
+
+
 def operators(dtype=torch.float64):
     """Name -> operator."""
     of = {"time_axis": AXIS, "dtype": dtype}
@@ -72,6 +84,10 @@ def operators(dtype=torch.float64):
     return found | {
         "backprojection, bent wall": Backprojection(bent_scan(), points_anywhere(), **of),
         "backprojection, lists": Backprojection(listed_scan(), points_anywhere(), falloff=2.0, **of),
+        "backprojection, pairs": Backprojection(paired_scan(), points_anywhere(), falloff=1.0, **of),
+        "filtered backprojection, pairs": FilteredBackprojection(
+            paired_scan(), points_anywhere(), filter=PULSE, falloff=1.0, **of
+        ),
         "backprojection, compensated": Backprojection(confocal, grid, falloff=-2.0, **of),
         "laplacian": FilteredBackprojection(confocal, grid, filter=LaplacianFilter(0.8), **of),
         "filtered backprojection, lists": FilteredBackprojection(

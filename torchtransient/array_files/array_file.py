@@ -133,7 +133,7 @@ def _values(source: Path, what: str, known: Callable[[str], bool], form: str) ->
 
 
 def _read(source: Path, what: str, known: Callable[[str], bool]) -> dict[str, Any]:
-    return (_read_hdf5 if source.suffix.lower() in HDF5 else _read_npz)(source, what, known)
+    return (_read_hdf5 if source.suffix.lower() in HDF5 else read_npz)(source, what, known)
 
 
 def other_kind(found: str, form: str) -> str:
@@ -217,7 +217,10 @@ def _read_hdf5(path: Path, what: str, known: Callable[[str], bool]) -> dict[str,
         return {**arrays, **read_attributes(file, what, [name for name in file.attrs if known(name)])}
 
 
-def _read_npz(path: Path, what: str, known: Callable[[str], bool]) -> dict[str, Any]:
+def read_npz(path: Path, what: str, known: Callable[[str], bool]) -> dict[str, Any]:
+    """Arrays of the names that are ``known``. Raises StorageError for pickles, for names that stand twice, and for
+    more numbers than a file can hold; and what the packages raise of damage.
+    """
     found: dict[str, Any] = {}
     with zipfile.ZipFile(path) as file:
         for entry in file.infolist():
@@ -231,6 +234,19 @@ def _read_npz(path: Path, what: str, known: Callable[[str], bool]) -> dict[str, 
     return found
 
 
+def npz_shapes(path: Path, what: str) -> dict[str, tuple[int, ...] | None]:
+    """The shape of each array by its name, None for what is none. Raises as :func:`read_npz`."""
+    found: dict[str, tuple[int, ...] | None] = {}
+    with zipfile.ZipFile(path) as file:
+        for entry in file.infolist():
+            name = entry.filename.removesuffix(".npy")
+            found[name] = None
+            if name != entry.filename and entry.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                with file.open(entry) as stream:
+                    found[name] = _head(stream, f"{what}: '{name}'")[0]
+    return found
+
+
 def _check_member(file: zipfile.ZipFile, entry: zipfile.ZipInfo, what: str, size: int) -> None:
     """Compare the shape that an array declares with what is stored of it, before there is memory for it."""
     if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
@@ -240,13 +256,19 @@ def _check_member(file: zipfile.ZipFile, entry: zipfile.ZipInfo, what: str, size
         _check_array(stream, min(entry.compress_size, size), what)
 
 
-def _check_array(stream: Any, stored: int, what: str, *, packed: bool = True) -> None:
-    """Compare what the head of an array declares with the bytes that are ``stored`` of it."""
+def _head(stream: Any, what: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Shape and kind of the numbers of an array that begins here."""
     read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     version = np.lib.format.read_magic(stream)
     if version not in read_header:
         raise StorageError(f"{what} is an array of version {version}, which NumPy writes for none of numbers.")
     shape, _, dtype = read_header[version](stream)
+    return shape, dtype
+
+
+def _check_array(stream: Any, stored: int, what: str, *, packed: bool = True) -> None:
+    """Compare what the head of an array declares with the bytes that are ``stored`` of it."""
+    shape, dtype = _head(stream, what)
     if dtype.kind not in "biufcU":
         raise StorageError(f"{what} holds {str(dtype)[:60]}; expected numbers or a text. No pickle is read.")
     declared = math.prod(shape) * dtype.itemsize

@@ -31,8 +31,8 @@ class Capture(TensorRecord):
 
     Either or both of
 
-    - ``transient``: float32 (C, T, Sy, Sx), or (C, T, N) for a list of points; exhaustive (C, T, Ly, Lx, Sy, Sx), lists
-      (C, T, M, N). Radiance per joule of the laser, summed over each bin of ``axis``;
+    - ``transient``: float32 (C, T, Sy, Sx), or (C, T, N) for a list of points or of pairs; exhaustive
+      (C, T, Ly, Lx, Sy, Sx), lists (C, T, M, N). Radiance per joule of the laser, summed over each bin of ``axis``;
     - ``phasor``: complex64, the same with F of ``frequencies`` in place of T: radiance times
       ``exp(-2 pi i nu (opl - start_opl))``.
 

@@ -63,7 +63,7 @@ def _legs(scan: Scan) -> tuple[Tensor, Tensor]:
 
 
 def _combined(scan: Scan, first: Tensor, last: Tensor, *, longest: bool) -> float:
-    if scan.kind == "confocal":
+    if scan.kind in ("confocal", "pairs"):
         both = first + last
         return float(both.max() if longest else both.min())
     return float(first.max() + last.max()) if longest else float(first.min() + last.min())

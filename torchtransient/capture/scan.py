@@ -19,7 +19,9 @@ from torchtransient.errors import ArgumentError, SceneError, ShapeError
 from torchtransient.quantities import Numbers, as_whole, flag, positive, real_array, shown
 from torchtransient.tensor_record import same
 
-KINDS = ("single", "confocal", "exhaustive")
+# Kinds of a regular grid; "pairs" are given point by point.
+GRID_KINDS = ("single", "confocal", "exhaustive")
+KINDS = (*GRID_KINDS, "pairs")
 # Where origins stand unless they are given: aside of the wall's middle and close to it, as parts of its width.
 _ASIDE, _BEFORE = 0.25, 0.125
 
@@ -29,8 +31,9 @@ class Scan:
     """The points of a capture around a corner. All lengths in metres; tensors float64.
 
     ``kind``: "single", one laser spot for all sensor points; "confocal", each sensor point is lit itself;
-    "exhaustive", all pairs of a spot and a sensor point. ``sensor_points``: (Sy, Sx, 3) or a list (N, 3), on the wall.
-    ``laser_points``: (3,) for single, equal to the sensor points for confocal, (Ly, Lx, 3) or (M, 3) for exhaustive.
+    "exhaustive", all pairs of a spot and a sensor point; "pairs", a spot of its own for each sensor point.
+    ``sensor_points``: (Sy, Sx, 3) or a list (N, 3), on the wall. ``laser_points``: (3,) for single, equal to the sensor
+    points for confocal, (Ly, Lx, 3) or (M, 3) for exhaustive, in the shape of the sensor points for pairs.
     ``sensor_normals``, ``laser_normals``: unit normals of the wall in the same shapes, None until they are known.
     ``sensor_origin``, ``laser_origin``: (3,), where the sensor and the laser stand. ``first_and_last_leg``: whether
     optical path lengths count from the laser's origin to the sensor's; False, from the spot to the sensor point.
@@ -92,9 +95,15 @@ class Scan:
         its middle and an eighth of it before the wall, where they see all of a flat wall.
 
         Raises SceneError where a spot misses the wall, for a laser or a laser grid that the kind has no use for, and
-        for an exhaustive scan of one pair, which is a single one; otherwise as the class and :meth:`Wall.grid`.
+        for an exhaustive scan of one pair, which is a single one; ArgumentError for pairs, which :meth:`points` takes;
+        otherwise as the class and :meth:`Wall.grid`.
         """
         _check_kind(kind)
+        if kind not in GRID_KINDS:
+            raise ArgumentError(
+                "Scan.grid: pairs of spots and sensor points are lists. Use Scan.points(sensor_points, kind='pairs', "
+                "laser_points=...)."
+            )
         surface = Wall.of(wall)
         nx, ny = grid_size(size, "Scan.grid")
         points, normals = surface.grid((nx, ny), extent, cell_centers=cell_centers)
@@ -138,26 +147,35 @@ class Scan:
         laser_origin: Any,
         wall: Any = None,
         normals: Any = None,
+        laser_normals: Any = None,
         first_and_last_leg: bool = False,
     ) -> Scan:
         """A scan of given points: `sensor_points` (N, 3) or (Sy, Sx, 3), metres, tensors with gradients too.
 
         `laser_points` as in the class; left out for confocal scans. `wall` as in :meth:`grid`: all points must lie on
-        it, to 1e-4 of its diagonal, and take its normals; None when the points are known to lie on a wall of a scene.
-        `normals`: those of the sensor points where no wall is given, and of the spots of a confocal scan. Errors as the
-        class.
+        it, to 1e-4 of its diagonal, and take its normals; None when the points are known to lie on a wall of a scene,
+        or are those of a measured one. `normals`, `laser_normals`: of the sensor points and of the spots, in their
+        shapes, where no wall says them; spots of confocal scans have those of the sensor points. Errors as the class.
         """
         _check_kind(kind)
         sensor = float64_points("sensor_points", sensor_points)
+        if wall is not None:
+            for name, given in (("normals", normals), ("laser_normals", laser_normals)):
+                if given is not None:
+                    raise ArgumentError(f"Scan.points: {name} and wall= both say how the wall is turned; give one.")
         if kind == "confocal":
             _refuse("laser_points", laser_points, kind, "its spots are its sensor points")
+            _refuse("laser_normals", laser_normals, kind, "its spots are its sensor points")
             laser = sensor
         elif laser_points is None:
             raise SceneError(f"Scan.points: expected laser_points for kind={kind!r}, got None. Give the laser's spots.")
         else:
             laser = float64_points("laser_points", laser_points, sensor.device)
         sensor_normals = None if normals is None else float64_points("normals", normals, sensor.device)
-        laser_normals = sensor_normals if kind == "confocal" else None
+        if kind == "confocal":
+            laser_normals = sensor_normals
+        elif laser_normals is not None:
+            laser_normals = float64_points("laser_normals", laser_normals, sensor.device)
         shape = None
         if wall is not None:
             surface = Wall.of(wall)
@@ -314,7 +332,7 @@ class Scan:
         size = (points.amax(0) - points.amin(0)).norm()
         sensor = " x ".join(map(str, reversed(self.sensor_shape)))
         spots = " x ".join(map(str, reversed(self.laser_shape)))
-        lasers = {"single": ", 1 spot", "confocal": "", "exhaustive": f", {spots} spots"}[self.kind]
+        lasers = {"single": ", 1 spot", "exhaustive": f", {spots} spots", "pairs": ", a spot each"}.get(self.kind, "")
         legs = ", with first and last leg" if self.first_and_last_leg else ""
         return f"Scan({self.kind}, {sensor} points over {float(size):.4g} m{lasers}{legs})"
 

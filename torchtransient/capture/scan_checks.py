@@ -51,13 +51,15 @@ def check_shapes(scan: Scan) -> None:
     sensor, laser = scan.sensor_points, scan.laser_points
     if sensor.ndim not in (2, 3):
         raise ShapeError(f"Scan: expected sensor_points (Sy, Sx, 3) or (N, 3), got {tuple(sensor.shape)}.")
-    allowed = {"single": (1,), "confocal": (sensor.ndim,), "exhaustive": (2, 3)}[scan.kind]
+    each = scan.kind in ("confocal", "pairs")
+    allowed = {"single": (1,), "exhaustive": (2, 3)}.get(scan.kind, (sensor.ndim,))
     words = {
         "single": "(3,), the one spot",
         "confocal": f"{tuple(sensor.shape)}, the sensor points",
         "exhaustive": "(Ly, Lx, 3) or (M, 3)",
+        "pairs": f"{tuple(sensor.shape)}, one for each sensor point",
     }[scan.kind]
-    if laser.ndim not in allowed or (scan.kind == "confocal" and laser.shape != sensor.shape):
+    if laser.ndim not in allowed or (each and laser.shape != sensor.shape):
         raise ShapeError(f"Scan: expected laser_points {words} for kind={scan.kind!r}, got {tuple(laser.shape)}.")
     if scan.kind == "confocal" and not bool(torch.equal(laser, sensor)):
         raise SceneError("Scan: expected the laser points of a confocal scan to be its sensor points, got others.")

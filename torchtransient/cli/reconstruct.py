@@ -15,7 +15,7 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 _XYZ = (float, float, float)
 _SIX = (float,) * 6
 # Arguments of read_capture that a file may leave open.
-_OPEN = ("wall_size", "bin_width_s", "start_s", "sensor_origin", "laser_origin")
+_OPEN = ("wall_size", "bin_width_s", "start_s", "sensor_origin", "laser_origin", "frame")
 
 
 class Numbers(click.ParamType):  # type: ignore[type-arg]  # a parameter of newer versions
@@ -46,6 +46,7 @@ def file_options(command: Command) -> Command:
         click.option("--start-s", type=float, help="When the first bin begins, seconds."),
         click.option("--sensor-origin", type=_XYZ, metavar="X Y Z", help="Metres."),
         click.option("--laser-origin", type=_XYZ, metavar="X Y Z", help="Metres."),
+        click.option("--frame", type=click.IntRange(min=0), help="Of a file with several."),
     )
     for option in reversed(options):
         command = option(command)
@@ -91,6 +92,7 @@ def capture_options(command: Command) -> Command:
 @click.option("--taps", type=int, help="Of f-k: 4 interpolate finely, 2 in less time.  [default: 4]")
 @click.option("--snr", type=float, help="Of the light-cone transforms; larger is sharper.  [default: 10]")
 @click.option("--v-bins", type=int, help="Of light-cone transforms: bins of squared depth.  [default: as of time]")
+@click.option("--taper", type=float, help="Share of a side over which directional-lct fades light out.  [default: 0.1]")
 @click.option("--wavelength", type=float, help="Metres (fbp, phasor).  [default: the shortest without ghosts]")
 @click.option("--cycles", type=float, help="Waves of a pulse (fbp, phasor).  [default: 4]")
 @click.option("--falloff", type=float, help="-2 makes up for distance (bp, fbp, phasor).  [default: 0]")

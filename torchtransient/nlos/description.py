@@ -24,7 +24,7 @@ from typing import Any
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Scan, Wall
-from torchtransient.capture.scan import KINDS
+from torchtransient.capture.scan import GRID_KINDS
 from torchtransient.errors import SceneError, TorchTransientError
 from torchtransient.files.yaml_files import Section, as_number, file_beside, read_yaml
 from torchtransient.nlos import defaults
@@ -122,7 +122,7 @@ def wall_of(data: Any, folder: Path) -> Wall:
 def scan_of(data: Any, wall: Wall) -> Scan:
     """The scan of an entry 'scan'. Raises SceneError."""
     section = Section(data, "scan", _SCAN)
-    kind = section.choice("kind", KINDS)
+    kind = section.choice("kind", GRID_KINDS)
     lists = {"laser": (2, 3), "sensor_origin": (3,), "laser_origin": (3,), "extent": (4,)}
     sizes = {name: _size(section, name) for name in ("size", "laser_grid") if name in section}
     if "size" not in sizes:

@@ -32,11 +32,14 @@ def choose_method(capture: Capture) -> Choice:
         raise ArgumentError(f"choose_method: {not_a_capture(capture)}")
     kind = capture.scan.kind
     this = with_article(kind)
+    if kind == "pairs":
+        return Choice("fbp", "pairs of spots and points, which only backprojection takes; the filter removes its haze")
     if not is_planar(capture.scan):
         reason = f"{this} scan whose points are not a regular grid of a flat wall, which only backprojection takes"
         return Choice("fbp", f"{reason}; the filter removes its haze")
     if kind == "confocal":
-        return Choice("fk", "a confocal scan of a regular grid on a flat wall: the sharpest for it, in seconds")
+        others = "lct or phasor may show more of clean captures and of few photons (docs/nlos_reconstruction.md)"
+        return Choice("fk", f"a confocal scan of a regular grid on a flat wall: it bears background; {others}")
     more = "midpoint-fk is quicker, and approximate"
     return Choice("phasor", f"{this} scan of a regular grid on a flat wall, from plane to plane; {more}")
 
@@ -86,11 +89,12 @@ def pitch_of(scan: Scan) -> float:
 
 def default_wavelength(capture: Capture) -> float:
     """The shortest wavelength, metres of optical path, that shows no ghosts and that the bins hold: two pitches of
-    the sensor points, four of a confocal scan, where laser and sensor move together, and four bins at least.
+    the sensor points, four of confocal scans and of pairs, where the laser moves with the sensor, and four bins at
+    least.
 
     Raises ShapeError for a capture without a transient.
     """
     if capture.axis is None:
         raise ShapeError("reconstruct: expected a capture with a transient, got phasors alone.")
-    turns = 4.0 if capture.scan.kind == "confocal" else 2.0
+    turns = 4.0 if capture.scan.kind in ("confocal", "pairs") else 2.0
     return max(turns * pitch_of(capture.scan), 4 * capture.axis.bin_width_opl)

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
-from torchtransient.capture import Capture, Scan
+from torchtransient.capture import Capture
 from torchtransient.capture.arithmetic import precision_of
-from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.nlos.measured_light import checked_light
 from torchtransient.nlos.methods import Choice, check_method, choose_method, default_wavelength, is_planar
 from torchtransient.nlos.volume_memory import AT_ONCE, check_volume_fits
@@ -41,8 +41,6 @@ from torchtransient.volume_methods import FILTERS, Method
 
 # Planes of a volume whose depths nobody gave, and how near the first is, as a share of the last one's depth.
 MOST_PLANES, NEAREST = 64, 0.02
-# How far points are off one line, as a share of its length.
-_LINE = 1e-6
 
 
 def reconstruct(
@@ -57,15 +55,17 @@ def reconstruct(
     """The hidden volume of a capture, without gradients (for those, take the operators: :class:`FK` and others).
 
     ``method``: "fk", "midpoint-fk", "lct", "directional-lct", "bp", "fbp", "phasor"; None takes the one that suits the
-    capture, and ``metadata["reason"]`` says why. ``grid``: voxels of bp, fbp and phasor, None for
-    :func:`default_grid`; the other methods have a plane for each bin and a voxel behind each point. ``depths`` (near,
-    far), metres: what to look at; planes of the other methods outside of it are left out. ``progress``: show a bar.
+    scan, and ``metadata["reason"]`` says why. For confocal grids that is f-k, which bears background: a light-cone
+    transform is as good or better where background has been taken off, phasor fields where there are few photons.
+    ``grid``: voxels of bp, fbp and phasor, None for :func:`default_grid`; the other methods have a plane for each bin
+    and a voxel behind each point. ``depths`` (near, far), metres: what to look at; planes of the other methods outside
+    of it are left out. ``progress``: show a bar.
 
     ``options``: ``target``, ``floor``, ``taps`` (fk, midpoint-fk), ``target``, ``snr``, ``v_bins`` (lct,
-    directional-lct), ``falloff`` (bp, fbp, phasor), ``wavelength`` in metres, None for the shortest without ghosts, and
-    ``cycles`` (fbp, phasor), ``filter`` "phasor" or "laplacian" (fbp), ``camera`` (phasor). First and last legs are
-    taken off where a method cannot count them, light before time zero and phasors beside a transient are left out, and
-    of polarized captures the intensity is taken.
+    directional-lct), ``taper`` (directional-lct), ``falloff`` (bp, fbp, phasor), ``wavelength`` in metres, None for the
+    shortest without ghosts, and ``cycles`` (fbp, phasor), ``filter`` "phasor" or "laplacian" (fbp), ``camera``
+    (phasor). First and last legs are taken off where a method cannot count them, light before time zero and phasors
+    beside a transient are left out, and of polarized captures the intensity is taken.
 
     Raises ArgumentError for a method or an option that does not fit the capture or each other, ShapeError, UnitError
     and DeviceError as the operators.
@@ -137,23 +137,11 @@ def default_grid(
         planes = max(2, min(MOST_PLANES, math.ceil((far - near) / (axis.bin_width_opl / 2) - 1e-6)))
     planes = count("reconstruct: planes", planes)
     middles = near + (far - near) * (torch.arange(planes, dtype=torch.float64, device="cpu") + 0.5) / planes
-    if extent is None and not _spans_area(capture.scan):
-        raise SceneError(
-            f"reconstruct: the sensor points of this scan lie on one line ({capture.scan!r}), which says not how wide "
-            "and high a volume is. Give grid=default_grid(capture, extent=(width, height)) in metres, or another grid=."
-        )
     if size is None and not is_planar(capture.scan):
         # As many as points: of a curved wall's grid, or of the square that a list of them would fill.
         shape = capture.scan.sensor_shape
         size = tuple(reversed(shape)) if len(shape) == 2 else math.ceil(math.sqrt(math.prod(shape)))
     return VoxelGrid.before(capture.scan, middles, size=size, extent=extent)
-
-
-def _spans_area(scan: Scan) -> bool:
-    """Whether sensor points are more than one, and not all on one line."""
-    points = scan.sensor_points.cpu().reshape(-1, 3)
-    spread = torch.linalg.svdvals(points - points.mean(0))
-    return len(spread) > 1 and bool(spread[1] > _LINE * spread[0])
 
 
 def checked_depths(depths: Any) -> tuple[float, float]:

@@ -73,7 +73,8 @@ def scan_of_scene(scene: Any, number: int = 0) -> Scan:
         laser_points, laser_normals = points, normals
     else:
         _check_all_meet(spots)
-        shape = (3,) if kind == "single" else (film.laser_scan_height, film.laser_scan_width, 3)
+        grid = (film.laser_scan_height, film.laser_scan_width, 3)
+        shape: Any = {"single": (3,), "pairs": points.shape}.get(kind, grid)
         laser_points, laser_normals = spots.points.reshape(shape), spots.normals.reshape(shape)
     return Scan(
         kind=kind,

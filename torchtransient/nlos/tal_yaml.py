@@ -11,7 +11,7 @@ import torch
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Scan, Wall
-from torchtransient.capture.scan import KINDS
+from torchtransient.capture.scan import GRID_KINDS
 from torchtransient.errors import SceneError
 from torchtransient.files.yaml_files import Section, as_number, file_beside, read_yaml
 from torchtransient.nlos.tal_materials import material, spectrum
@@ -202,7 +202,7 @@ def _placed(part: Section) -> Any:
 
 
 def _scan(section: Section, wall: Wall) -> Scan:
-    kind = section.choice("scan_type", KINDS, "single")
+    kind = section.choice("scan_type", GRID_KINDS, "single")
     size = section.whole("sensor_width", 256), section.whole("sensor_height", 256)
     origins: dict[str, Any] = {f"{who}_origin": _origin(section, who) for who in ("sensor", "laser")}
     legs = section.flag("account_first_and_last_bounces", False)

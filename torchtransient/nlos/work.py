@@ -12,7 +12,7 @@ import torch
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.files.content_key import content_key
-from torchtransient.nlos.renderer import POINTS, CaptureRenderer, as_capture, check_scan
+from torchtransient.nlos.renderer import POINTS, SPOTS, CaptureRenderer, as_capture, check_scan
 from torchtransient.nlos.scene import capture_scene
 from torchtransient.nlos.scene_files import files_of
 from torchtransient.nlos.scene_scan import scan_of_scene
@@ -80,6 +80,8 @@ class HiddenWork:
         """A part as a capture: of a list of points where there are several parts."""
         first, last = self._runs[number]
         values = {} if self.count == 1 else {POINTS: self._points[first:last]}
+        if values and self.scan.kind == "pairs":
+            values[SPOTS] = self.scan.laser_points.reshape(-1, 3)[first:last]
         capture: Capture = self._of(number)(values, seed=seed, spp=spp, progress=progress)
         return capture
 
@@ -88,7 +90,8 @@ class HiddenWork:
         if last - first not in self._renderers:
             scan, parameters = self.scan, ()  # type: Scan, tuple[str, ...]
             if self.count > 1:
-                scan, parameters = _listed(self.scan, first, last), (POINTS,)
+                scan = _listed(self.scan, first, last)
+                parameters = (POINTS, SPOTS) if scan.kind == "pairs" else (POINTS,)
             made = CaptureRenderer(self.hidden, scan, parameters, **self._settings)
             # Parts may be dark; of the whole capture it is said.
             made.says_black = False
@@ -164,4 +167,6 @@ def _listed(scan: Scan, first: int, last: int) -> Scan:
     changed: dict[str, Any] = {"sensor_points": points, "sensor_normals": normals}
     if scan.kind == "confocal":
         changed |= {"laser_points": points, "laser_normals": normals}
+    elif scan.kind == "pairs":
+        changed |= {"laser_points": part(scan.laser_points), "laser_normals": part(scan.laser_normals)}
     return replace(scan, **changed)

@@ -25,8 +25,8 @@ class Backprojection(EllipsoidOperator):
     ``forward`` puts the value of a voxel at the length laser spot - voxel - sensor point of every pair, shared linearly
     between the two bins whose centres are next to it, so that their sum is the value: the transient of isotropic points
     that hide nothing. ``adjoint`` reads the transients there by linear interpolation and adds up. What falls outside of
-    the record counts as zero. Scans of any kind are taken: confocal, single and exhaustive, grids and lists of points,
-    flat and curved walls, with or without first and last legs, in single and double precision.
+    the record counts as zero. Scans of any kind are taken: confocal, single, exhaustive and pairs, grids and lists of
+    points, flat and curved walls, with or without first and last legs, in single and double precision.
 
     ``points``: a :class:`VoxelGrid` or any points (..., 3). ``falloff``: p of a factor (r_laser r_sensor)^-p in both: 0
     leaves distances alone, 2 is the falloff of small diffuse patches, 1 that of retroreflectors in confocal scans; -2

@@ -93,6 +93,7 @@ def confocal_wall(scan: Scan | PlanarScan, who: str) -> PlanarScan:
         return scan
     if not isinstance(scan, Scan):
         raise ShapeError(f"{who}: expected a tt.nlos.Scan or a PlanarScan, got {shown(scan)}.")
+    refuse_pairs(scan, who)
     if scan.kind != "confocal":
         raise ShapeError(
             f"{who}: expected a confocal scan, got {with_article(scan.kind)} one. Take the diagonal of an exhaustive "
@@ -101,6 +102,16 @@ def confocal_wall(scan: Scan | PlanarScan, who: str) -> PlanarScan:
         )
     refuse_legs(scan, who)
     return PlanarScan.of_scan(scan, who)
+
+
+def refuse_pairs(scan: Scan, who: str) -> None:
+    """Raises ShapeError for a spot of its own for each sensor point."""
+    if scan.kind == "pairs":
+        raise ShapeError(
+            f"{who}: expected a spot that stands still, follows the sensor points, or goes with each of them, got "
+            "pairs of any spot and sensor point. Use FilteredBackprojection (phasor fields of any pairs) or "
+            "Backprojection."
+        )
 
 
 def refuse_legs(scan: Scan, who: str) -> None:

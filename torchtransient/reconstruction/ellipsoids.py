@@ -89,8 +89,8 @@ class EllipsoidOperator(ScanOperator):
         if scan.first_and_last_leg:
             bins = bins + scan.sensor_legs.cpu().reshape(-1) / width
             spots = scan.laser_legs.cpu().reshape(-1) / width
-        if scan.kind == "confocal":
-            bins = bins + spots
+        if scan.kind in ("confocal", "pairs"):
+            bins, spots = bins + spots, torch.zeros_like(spots)
         voxels = self.points.reshape(-1, 3)
         self._check_lengths(voxels - middle, sensors - middle, lasers - middle)
         return {
@@ -169,18 +169,22 @@ class EllipsoidOperator(ScanOperator):
         block = CPU_BLOCK if on_cpu else GPU_BLOCK
         size = min(self.voxels.shape[1], CPU_TILE if on_cpu else GPU_BLOCK)
         step = max(1, block // size)
-        confocal = self.scan.kind == "confocal"
+        confocal, pairs = self.scan.kind == "confocal", self.scan.kind == "pairs"
         starts = torch.arange(points, dtype=torch.int32, device=self.voxels.device)[:, None] * length
         sensors, bins = self.sensors[:, group.sensors], self.sensor_bins[group.sensors]
         for a in range(0, self.voxels.shape[1], size):
             tile = slice(a, min(a + size, self.voxels.shape[1]))
             voxels = self.voxels[:, tile]
-            first = None if confocal else _distances(self.lasers[:, group.lasers], voxels)
+            first = None if confocal or pairs else _distances(self.lasers[:, group.lasers], voxels)
             for b in range(0, points, step):
                 part = slice(b, min(b + step, points))
                 last = _distances(sensors[:, part], voxels)
+                to_spot = _distances(self.lasers[:, group.sensors][:, part], voxels) if pairs else None
                 for spot in range(spots):
-                    if first is None:
+                    if to_spot is not None:
+                        position = (last + to_spot).add_(bins[part, None])
+                        weight = self._weight(last, to_spot)
+                    elif first is None:
                         position = (last + last).add_(bins[part, None])
                         weight = self._weight(last, last)
                     else:

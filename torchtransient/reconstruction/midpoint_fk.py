@@ -16,7 +16,13 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import ShapeError
-from torchtransient.reconstruction.capture_checks import check_from_zero, checked_axis, checked_scan, refuse_legs
+from torchtransient.reconstruction.capture_checks import (
+    check_from_zero,
+    checked_axis,
+    checked_scan,
+    refuse_legs,
+    refuse_pairs,
+)
 from torchtransient.reconstruction.capture_roots import stabilized_root
 from torchtransient.reconstruction.confocal_operator import chunk_rows
 from torchtransient.reconstruction.fk import FK
@@ -193,6 +199,7 @@ def _sensors(scan: Scan, time_axis: TimeAxis, who: str) -> PlanarScan:
     """The sensors' grid of a scan. Raises ShapeError, UnitError."""
     if checked_scan(scan, who).kind == "confocal":
         raise ShapeError(f"{who}: expected a single or exhaustive scan, got a confocal one. Use FK.")
+    refuse_pairs(scan, who)
     refuse_legs(scan, who)
     check_from_zero(checked_axis(time_axis, who), who)
     return PlanarScan.of_scan(scan, who)

@@ -14,7 +14,7 @@ from torchtransient.capture import Capture, Scan
 from torchtransient.errors import ArgumentError, SceneError, ShapeError
 from torchtransient.quantities import finite, shown, with_article
 from torchtransient.reconstruction.cameras import Camera, DirectLight, TransientCamera
-from torchtransient.reconstruction.capture_checks import check_falloff
+from torchtransient.reconstruction.capture_checks import check_falloff, refuse_pairs
 from torchtransient.reconstruction.filters import PhasorFilter, check_sampling
 from torchtransient.reconstruction.planar_scan import OFF_GRID, PlanarScan
 from torchtransient.reconstruction.plane_waves import phase_pairs, waves
@@ -60,7 +60,8 @@ class PhasorField(ScanOperator):
     3.9 cycles: all but 2e-8 of its energy. What is left out is 3e-4 of the height of the spectrum at most; a steady
     background is part of it. Distances below half a bin fall off as half a bin does.
     Time grows with planes times frequencies (times laser spots) times sensor points; spectra are made a chunk of
-    frequencies and spots at a time. Raises ShapeError for other scans and grids, SceneError for a transient camera
+    frequencies and spots at a time. Raises ShapeError for other scans (pairs, lists and curved walls go to
+    :class:`FilteredBackprojection`) and grids, SceneError for a transient camera
     without one laser spot, UnitError for what is out of range.
     """
 
@@ -97,6 +98,7 @@ class PhasorField(ScanOperator):
             )
         self.pulse, self.falloff = pulse, finite("PhasorField: falloff", falloff)
         self.real_volume = False
+        refuse_pairs(scan, "PhasorField")
         self.wall = PlanarScan.of_scan(scan, "PhasorField")
         self._check_planes()
         self.lasers = self.wall.local(scan.laser_points).reshape(-1, 3)

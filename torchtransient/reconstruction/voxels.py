@@ -12,9 +12,12 @@ from torch import Tensor
 
 from torchtransient.capture import Scan, Wall
 from torchtransient.capture.distances import bounds_of
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import SceneError, ShapeError, UnitError
 from torchtransient.quantities import Numbers, count, positive, real_array, shown
 from torchtransient.reconstruction.planar_scan import PlanarScan, hidden_side
+
+# How far points are off one line at most, as a share of its length.
+ON_ONE_LINE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,11 +73,13 @@ class VoxelGrid:
         sensor points; ``extent``: (width, height) of the planes in metres from the outer edges of the voxels, or one
         number for both, around the middle of the sensor points; None for what the sensor points fill, each with a cell
         of its own around it. The planes of a curved wall are parallel to its mean plane, depths count from the mean of
-        its points.
+        its points. Of a list of points that knows no wall, planes lie across its mean normal, without normals along the
+        plane that fits the points best (of points on one line: across the way to the sensor); columns run upwards,
+        along the world's y as far as it lies in them (z where the wall lies flat).
 
-        Raises ShapeError for a list of points of a scan without a wall, where nothing says which way is up (give
-        :meth:`bounds` or the class its axes), for a wall that is not flat where size and extent are missing, and for
-        sizes that are none; UnitError for depths that do not increase.
+        Raises ShapeError where size and extent are missing and the wall is not flat or the points are a list, where
+        the sensor of a list without normals stands on its one line, and for sizes that are none; UnitError for depths
+        that do not increase; SceneError where points on one line, or one point, do not say an extent.
 
         Before the wall is where its normals point. A scan that knows none has its voxels where its sensor and its laser
         stand; where those stand in the wall or on both sides of it, in the direction of along_x times along_y.
@@ -99,6 +104,11 @@ class VoxelGrid:
             # Each sensor point of a grid has a cell around it.
             cells = n / (n - 1) if points.ndim == 3 and n > 1 else 1.0
             spans.append((float(along.max() + along.min()) / 2, spread * cells))
+        if extent is None and min(span for _, span in spans) <= ON_ONE_LINE * max(span for _, span in spans):
+            raise SceneError(
+                f"VoxelGrid.before: the sensor points of this scan lie on one line of the planes ({scan!r}), which "
+                "does not say how wide and high a volume is. Give extent=(width, height) in metres."
+            )
         given = (spans[0][1], spans[1][1]) if extent is None else _numbers("VoxelGrid.before: extent", extent, 2)
         width, height = (positive("VoxelGrid.before: extent", value) for value in given)
         dx, dy = width / columns, height / rows
@@ -197,6 +207,34 @@ def _numbers(name: str, value: Any, many: int, *, one: bool = True) -> list[floa
     return numbers
 
 
+def _mean_normal(scan: Scan, points: Tensor) -> Tensor:
+    """The normal (3,) of a list of points, towards the sensor where the scan says none."""
+    if scan.sensor_normals is not None:
+        mean: Tensor = scan.sensor_normals.detach().to("cpu", torch.float64).reshape(-1, 3).mean(0)
+        return mean
+    towards = scan.sensor_origin.detach().to("cpu", torch.float64) - points.mean(0)
+    _, spread, axes = torch.linalg.svd(points - points.mean(0), full_matrices=True)
+    if len(spread) > 1 and spread[1] > ON_ONE_LINE * spread[0]:
+        normal: Tensor = axes[2]
+        return normal if float(normal @ towards) >= 0 else -normal
+    across: Tensor = towards - (towards @ axes[0]) * axes[0] if len(points) > 1 else towards
+    if float(across.norm()) <= ON_ONE_LINE * float(towards.norm()):
+        raise ShapeError(
+            "VoxelGrid.before: expected points that say where the hidden side is, got a sensor on the one line that "
+            "they lie on. Give their normals to Scan.points, or take VoxelGrid.bounds."
+        )
+    return across
+
+
+def _upright(normal: Tensor) -> tuple[Tensor, Tensor]:
+    """Vectors along rows and along columns of planes across ``normal``: the latter upwards, along y or else z."""
+    up = torch.eye(3, dtype=torch.float64, device="cpu")[1]
+    if float(torch.linalg.cross(up, normal).norm()) <= ON_ONE_LINE * float(normal.norm()):
+        up = up.roll(1)
+    along_x = torch.linalg.cross(up, normal)
+    return along_x, torch.linalg.cross(normal, along_x)
+
+
 def _wall_axes(scan: Scan, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Unit vectors along rows, along columns and towards the hidden side, at right angles."""
     if points.ndim == 3 and min(points.shape[:2]) > 1:
@@ -205,10 +243,7 @@ def _wall_axes(scan: Scan, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         surface = Wall.of(scan.wall)
         x, y = torch.from_numpy(surface.half_u), torch.from_numpy(surface.half_v)
     else:
-        raise ShapeError(
-            "VoxelGrid.before: expected a grid of sensor points or a scan with a wall, which say where x and y are, "
-            "got a list of points. Use VoxelGrid.bounds, or VoxelGrid with axes of its own."
-        )
+        x, y = _upright(_mean_normal(scan, points.reshape(-1, 3)))
     along_x = x / x.norm()
     y = y - (y @ along_x) * along_x
     along_y = y / y.norm()

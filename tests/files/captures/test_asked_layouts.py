@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
+import scipy.io
 
 from support.capture_files import holdable, read_only
 from torchtransient.capture import Capture
@@ -35,3 +37,16 @@ def test_files_of_no_layout(tmp_path, layout):
     write_mat(path, {"something": [[1.0, 2.0]]})
     with pytest.raises(StorageError):
         Capture.read(path, layout, wall_size=1.0, bin_width_s=16e-12)
+
+
+def test_files_of_no_layout_name_what_reads_them(tmp_path):
+    writers = {
+        "scipy.io.loadmat": lambda path: scipy.io.savemat(path, {"something": [[1.0, 2.0]]}, appendmat=False),
+        "h5py.File": lambda path: write_mat(path, {"something": [[1.0, 2.0]]}),
+        "numpy.load": lambda path: np.savez(path.open("wb"), something=[1.0, 2.0]),
+        "json.load": lambda path: path.write_text('{"something": [1.0, 2.0]}'),
+    }
+    for number, (reader, write) in enumerate(writers.items()):
+        write(tmp_path / f"{number}.mat")
+        with pytest.raises(StorageError, match=rf"holds something\..*read it with {reader} and make tt\.nlos\.Capture"):
+            Capture.read(tmp_path / f"{number}.mat")

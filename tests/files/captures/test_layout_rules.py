@@ -20,7 +20,7 @@ from torchtransient.files.captures.mat_file import write_mat
 
 ENDINGS = {"torchtransient": "h5"} | {layout.name: layout.endings[0][1:] for layout in LAYOUTS}
 WRITTEN = ["torchtransient", *(layout.name for layout in LAYOUTS if layout.write is not None)]
-KINDS = ("single", "confocal", "exhaustive")
+KINDS = ("single", "confocal", "exhaustive", "pairs")
 
 
 def scans():
@@ -28,7 +28,7 @@ def scans():
     for legs in (True, False):
         settings = {**ORIGINS, "first_and_last_leg": legs}
         for size in ((1, 1), (3, 1), (1, 3), (2, 2)):
-            for kind in KINDS:
+            for kind in KINDS[:3]:
                 for spots in ((1, 1), (2, 1)) if kind == "exhaustive" else (None,):
                     if kind != "exhaustive" or size != (1, 1) or spots != (1, 1):
                         yield Scan.grid(SQUARE, size, kind=kind, laser_grid=spots, **settings)
@@ -38,8 +38,8 @@ def scans():
             whole = listed(kind, legs)
             yield whole
             points = whole.sensor_points[:1]
-            spots = {"single": points[0], "confocal": points, "exhaustive": whole.laser_points}[kind]
-            normals = {"single": UP, "confocal": UP[None]}.get(kind, whole.laser_normals)
+            spots = {"single": points[0], "confocal": points, "pairs": points}.get(kind, whole.laser_points)
+            normals = {"single": UP, "confocal": UP[None], "pairs": UP[None]}.get(kind, whole.laser_normals)
             yield replace(
                 whole, sensor_points=points, sensor_normals=UP[None], laser_points=spots, laser_normals=normals
             )
@@ -253,6 +253,8 @@ def test_confocal_up_to_single_precision_wherever_the_origin_is(tmp_path, layout
         if same:
             found = Capture.read(path)
             assert found.scan.kind == "confocal" and any("aser" in name for name in found.metadata["assumed"])
+        elif layout == "tal":
+            assert Capture.read(path).scan.kind == "pairs"
         else:
             with pytest.raises(StorageError):
                 Capture.read(path)
@@ -409,4 +411,4 @@ def test_orders_of_axes(tmp_path):
 
 
 def test_no_layout_is_forgotten():
-    assert {*WRITTEN, "cdt", "keyhole"} == set(FORMATS)
+    assert {*WRITTEN, "cdt", "keyhole", "tmf8828", "vl53l8"} == set(FORMATS)

@@ -1,11 +1,12 @@
 """What lies in a file of another program: arrays and texts by name, whatever kind of file it is.
 
-HDF5, and MATLAB's files of both kinds: 7.3, which are HDF5, and those before. Arrays have the order of HDF5 throughout;
-that of MATLAB is the other way round, so that its ``(y, x, t)`` comes as ``(t, x, y)``.
+HDF5, MATLAB's files of both kinds (7.3, which are HDF5, and those before), NumPy's ``.npz``, and JSON. Arrays have the
+order of HDF5 throughout; that of MATLAB is the other way round, so that its ``(y, x, t)`` comes as ``(t, x, y)``.
 """
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,24 +15,27 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.array_files.array_file import check_source, damage_said
-from torchtransient.array_files.hdf5_limits import read_attributes, read_dataset
+from torchtransient.array_files.array_file import check_source, damage_said, npz_shapes, read_npz
+from torchtransient.array_files.hdf5_limits import check_memory, read_attributes, read_dataset
 from torchtransient.array_files.hdf5_writing import hdf5_package
 from torchtransient.errors import StorageError
 from torchtransient.files.captures.mat5 import HEADER_BYTES, Mat5File, Other
+from torchtransient.plain_texts import json_data, text_of_file
 
 WHAT = "capture file"
+_START = 64
 
 
 class Contents(Protocol):
     """``shapes``: root arrays and structures by name, None for what has no shape; ``source``: the file; ``links``:
-    names that lead elsewhere, which are not followed.
+    names that lead elsewhere, which are not followed; ``reader``: the function of another package that reads it.
 
     ``array(name)``: numbers, None where the name is missing or empty; names of a structure's fields are
     ``structure/field``. ``text(name)`` likewise.
     """
 
     source: Path
+    reader: str
     shapes: Mapping[str, tuple[int, ...] | None]
     attributes: Mapping[str, str]
     links: frozenset[str]
@@ -43,9 +47,15 @@ class Contents(Protocol):
 
 @contextmanager
 def opened(path: str | Path) -> Iterator[Contents]:
-    """The contents of an HDF5 or MATLAB file. Raises StorageError for others, and for what is damaged."""
+    """The contents of an HDF5, MATLAB, NumPy or JSON file. Raises StorageError for others, and for what is damaged."""
     source = check_source(path, WHAT)
     with damage_said(source, WHAT, "a capture of the layout that was read"):
+        if zipfile.is_zipfile(source):
+            yield NpzContents(source)
+            return
+        if _is_json(source):
+            yield JsonContents(source)
+            return
         if _is_old_mat(source):
             yield MatContents(source)
             return
@@ -55,6 +65,8 @@ def opened(path: str | Path) -> Iterator[Contents]:
 
 class Hdf5Contents:
     """An open HDF5 file."""
+
+    reader = "h5py.File"
 
     def __init__(self, source: Path, file: Any) -> None:
         self.source, self._file = source, file
@@ -115,6 +127,8 @@ def _sole(value: Any) -> str:
 class MatContents:
     """A MATLAB file of versions 5 to 7."""
 
+    reader = "scipy.io.loadmat"
+
     def __init__(self, source: Path) -> None:
         self.source = source
         self._file = Mat5File(source)
@@ -151,6 +165,84 @@ class MatContents:
         if name not in self._kept:
             self._kept[name] = self._file.read(name, WHAT)
         return self._kept[name]
+
+
+class NpzContents:
+    """Arrays of NumPy in one file. Pickles are not read."""
+
+    reader = "numpy.load"
+
+    def __init__(self, source: Path) -> None:
+        self.source = source
+        self.shapes: Mapping[str, tuple[int, ...] | None] = npz_shapes(source, WHAT)
+        self.attributes: Mapping[str, str] = {}
+        self.links: frozenset[str] = frozenset()
+
+    def array(self, name: str, part: tuple[Any, ...] = ()) -> NDArray[Any] | None:
+        array = read_npz(self.source, WHAT, name.__eq__).get(name)
+        if array is not None and array.dtype.kind == "U":
+            raise StorageError(f"{WHAT}: expected numbers in '{name}', got a text.")
+        return None if array is None or array.size == 0 else array[part]
+
+    def text(self, name: str) -> str | None:
+        array = read_npz(self.source, WHAT, name.__eq__).get(name)
+        return None if array is None else _sole(array)
+
+    def fields(self, name: str) -> frozenset[str]:
+        return frozenset()
+
+
+class JsonContents:
+    """A JSON object, or a list of such: frames whose entries have one shape each. Arrays are (frames, ...)."""
+
+    reader = "json.load"
+
+    def __init__(self, source: Path) -> None:
+        self.source = source
+        # Python's objects take some 30 bytes for each letter at most.
+        check_memory(32 * source.stat().st_size, f"{WHAT}: '{source}'")
+        data = json_data(text_of_file(source, WHAT), f"{WHAT}: '{source}'")
+        self._frames = data if isinstance(data, list) else [data]
+        if not self._frames or not all(isinstance(frame, dict) for frame in self._frames):
+            raise StorageError(f"{WHAT}: '{source}': expected a JSON object or a list of objects, got something else.")
+        names = set.intersection(*(set(frame) for frame in self._frames))
+        self.shapes: Mapping[str, tuple[int, ...] | None] = dict.fromkeys(sorted(names))
+        self.attributes: Mapping[str, str] = {}
+        self.links: frozenset[str] = frozenset()
+
+    def array(self, name: str, part: tuple[Any, ...] = ()) -> NDArray[Any] | None:
+        values = [self._entry(frame, name) for frame in self._frames]
+        if all(value is None for value in values):
+            return None
+        try:
+            array = np.array(values)
+        except (ValueError, OverflowError):  # of different shapes
+            array = np.empty((), object)
+        if array.dtype.kind not in "biuf":
+            raise StorageError(f"{WHAT}: expected numbers of one shape in '{name}' of every frame, got others.")
+        return None if array.size == 0 else array[part]
+
+    def text(self, name: str) -> str | None:
+        value = self._entry(self._frames[0], name)
+        return value if isinstance(value, str) else None
+
+    def fields(self, name: str) -> frozenset[str]:
+        value = self._entry(self._frames[0], name)
+        return frozenset(value) if isinstance(value, dict) else frozenset()
+
+    @staticmethod
+    def _entry(frame: Any, name: str) -> Any:
+        """``a/b``: the entry b of the object a, or of the one object in a list."""
+        for part in name.split("/"):
+            frame = frame[0] if isinstance(frame, list) and len(frame) == 1 else frame
+            frame = frame.get(part) if isinstance(frame, dict) else None
+        return frame
+
+
+def _is_json(source: Path) -> bool:
+    """Whether a file begins as an object or a list of JSON does."""
+    with source.open("rb") as file:
+        return file.read(_START).lstrip(b"\xef\xbb\xbf \t\r\n")[:1] in (b"{", b"[")
 
 
 def _words(value: Any) -> str:

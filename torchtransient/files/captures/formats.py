@@ -17,7 +17,17 @@ from torchtransient.capture import Capture
 from torchtransient.capture.files import register_files
 from torchtransient.errors import ArgumentError, StorageError
 from torchtransient.files import capture_file
-from torchtransient.files.captures import cdt, dirac, keyhole, phasor_field, rect_data, tal, zaragoza
+from torchtransient.files.captures import (
+    cdt,
+    dirac,
+    keyhole,
+    phasor_field,
+    rect_data,
+    tal,
+    tmf8828,
+    vl53l8,
+    zaragoza,
+)
 from torchtransient.files.captures.contents import WHAT, Contents, opened
 from torchtransient.files.captures.gaps import Gaps
 from torchtransient.given_types import is_one_of
@@ -49,7 +59,8 @@ def _layout(module: ModuleType, endings: tuple[str, ...]) -> Layout:
 # In the order in which they are tried: names of variables that say most come first.
 LAYOUTS = (
     _layout(tal, HDF5), _layout(zaragoza, HDF5), _layout(dirac, HDF5), _layout(phasor_field, _MAT),
-    _layout(keyhole, _MAT), _layout(rect_data, _MAT), _layout(cdt, _MAT),
+    _layout(keyhole, _MAT), _layout(rect_data, _MAT), _layout(cdt, _MAT), _layout(tmf8828, (".json",)),
+    _layout(vl53l8, (".npz",)),
 )  # fmt: skip
 FORMATS = (OWN, *(layout.name for layout in LAYOUTS))
 
@@ -64,25 +75,27 @@ def read_capture(
     sensor_origin: Any = None,
     laser_origin: Any = None,
     frequencies: FrequencyAxis | None = None,
+    frame: int | None = None,
 ) -> Capture:
     """Read a capture of any known layout, as tensors on the CPU. Nothing in the file is executed.
 
-    `format`: "torchtransient", "tal", "zaragoza", "dirac", "phasor_field", "keyhole", "rect_data" or "cdt"; None finds
-    it from the content, not from the name. Measured arrays are read once, and not copied after that but to sum bounces
-    or to make signed numbers of unsigned ones; axes change places as views. In what is not of this library
-    ``metadata["format"]`` names the layout, ``metadata["assumed"]`` what neither file nor caller said, with the value
-    that was taken, and ``metadata["not_read"]`` what else lies in the file.
+    `format`: "torchtransient", "tal", "zaragoza", "dirac", "phasor_field", "keyhole", "rect_data", "cdt", "tmf8828" or
+    "vl53l8"; None finds it from the content, not from the name. Measured arrays are read once, and not copied after
+    that but to sum bounces or to make signed numbers of unsigned ones; axes change places as views. In what is not of
+    this library ``metadata["format"]`` names the layout, ``metadata["assumed"]`` what neither file nor caller said,
+    with the value that was taken, and ``metadata["not_read"]`` what else lies in the file.
 
     The other arguments say what a file leaves open; docs/capture_files.md tells which layout needs which. `wall_size`:
     metres, one number or (width, height) of a scanned area whose points are the centres of its cells. `bin_width_s`,
-    `start_s`: seconds. `sensor_origin`, `laser_origin`: (3,) metres. `frequencies`: of phasors.
+    `start_s`: seconds. `sensor_origin`, `laser_origin`: (3,) metres. `frequencies`: of phasors. `frame`: which one
+    of a file that holds several, from 0.
 
     Raises StorageError for files that are missing, damaged, of no known layout, or that hold what is no capture of this
     library; where something is left open that counts; where an argument has no meaning or the file says it itself.
     """
     given = {
         "wall_size": wall_size, "bin_width_s": bin_width_s, "start_s": start_s, "sensor_origin": sensor_origin,
-        "laser_origin": laser_origin, "frequencies": frequencies,
+        "laser_origin": laser_origin, "frequencies": frequencies, "frame": frame,
     }  # fmt: skip
     _check_name(format, FORMATS)
     source = path_of(path, WHAT)
@@ -100,8 +113,9 @@ def read_capture(
 def write_capture(path: str | Path, capture: Capture, metadata: Any = None, *, format: str = OWN) -> Path:
     """Write a capture; an existing file is replaced once the new one is complete. Returns the path.
 
-    `format`: as in :func:`read_capture` but "keyhole" and "cdt", which are only read. The library's own holds all of a
-    capture, and `metadata`, plain data, beside its own. What another layout cannot hold is an error.
+    `format`: as in :func:`read_capture` but "keyhole", "cdt", "tmf8828" and "vl53l8", which are only read. The
+    library's own holds all of a capture, and `metadata`, plain data, beside its own. What another layout cannot hold is
+    an error.
 
     Raises StorageError for an unknown format or ending, a folder that is missing, a full disk, and captures that the
     format cannot hold.
@@ -136,7 +150,8 @@ def _is_own(source: Path) -> bool:
     if not source.is_file():
         return False
     if zipfile.is_zipfile(source):
-        return True
+        with damage_said(source, WHAT), zipfile.ZipFile(source) as file:
+            return "format.npy" in file.namelist()
     with damage_said(source, WHAT), source.open("rb") as file:
         if file.read(8) != b"\x89HDF\r\n\x1a\n":
             return False
@@ -164,7 +179,7 @@ def _found(contents: Contents) -> Layout:
     names = some_of(sorted(held), 120) or "nothing"
     raise StorageError(
         f"{WHAT}: '{contents.source}' has no known layout ({', '.join(FORMATS)}); it holds {names}. Give format= if it "
-        "is one of these; read it with h5py if it is not."
+        f"is one of these; else read it with {contents.reader} and make tt.nlos.Capture(transient, axis, scan) of it."
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,14 +17,16 @@ from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import StorageError
 from torchtransient.files.captures.contents import WHAT
-from torchtransient.quantities import finite, positive, real_array, shown
-from torchtransient.units import seconds_to_opl
+from torchtransient.quantities import as_whole, finite, positive, real_array, shown
+from torchtransient.units import opl_to_seconds, seconds_to_opl
 
 Numbers = NDArray[Any]
 _NEEDED = object()
 _WHO = ("sensor", "laser")
 # Of coordinates: some steps of single precision.
 _ROUNDING = 1e-6
+# Zones of a chip in three rows of six.
+_WIDE = 18
 _MOST, _MOST_BYTES = 2**63 - 1, 8
 # Torch computes with few of NumPy's unsigned numbers.
 _SIGNED = {np.dtype(np.uint16): np.int32, np.dtype(np.uint32): np.int64, np.dtype(np.uint64): np.int64}
@@ -64,9 +67,9 @@ class Gaps:
         found = self.fill("bin_width_s", stored, default_s)
         return float(found) if stored is not None else seconds_to_opl(positive("read_capture: bin_width_s", found))
 
-    def start(self, stored: float | None) -> float:
-        """Start of the bins in metres: ``stored`` in metres, or ``start_s``, or 0."""
-        found = self.fill("start_s", stored, 0.0)
+    def start(self, stored: float | None, default_s: float = 0.0) -> float:
+        """Start of the bins in metres: ``stored`` in metres, or ``start_s``, or its default."""
+        found = self.fill("start_s", stored, default_s)
         return float(found) if stored is not None else seconds_to_opl(finite("read_capture: start_s", found))
 
     def origin(self, name: str, stored: NDArray[Any] | None, points: NDArray[Any], normals: Any, legs: bool) -> Any:
@@ -78,6 +81,18 @@ class Gaps:
         if found is None or found.shape != (3,):
             raise self.error(f"expected {name} (3,), got {shown(found)}.")
         return found
+
+    def frame(self, frames: int) -> int:
+        """Which of a file's frames is read: ``frame``, which a file of one needs not be told."""
+        given = self.fill("frame", None, 0) if frames == 1 else self._given.get("frame")
+        self._used.add("frame")
+        self.assumed.pop("frame", None)
+        if given is None:
+            raise self.error(f"it holds {frames} frames. Give frame= to read_capture, 0 to {frames - 1}.")
+        number = as_whole(given)
+        if number is None or not 0 <= number < frames:
+            raise self.error(f"expected frame as a whole number from 0 to {frames - 1}, got {shown(given)}.")
+        return number
 
     def extent(self, stored: tuple[float, float] | None) -> tuple[float, float]:
         """Width along x and height along y of a scanned area, metres."""
@@ -171,11 +186,22 @@ def grid_points(size: tuple[int, int], extent: tuple[float, float]) -> NDArray[n
     return np.stack(np.broadcast_arrays(x[None, :], y[:, None], 0.0), -1)
 
 
-def flat_scan(kind: str, points: NDArray[np.float64], gaps: Gaps, spot: Any = None) -> Scan:
-    """A scan of a grid or list on the plane z = 0 whose hidden side is that of +z; lengths count from wall to wall."""
+def zone_grid(zones: int) -> tuple[int, ...]:
+    """(rows, columns) of a chip's zones where they are a square or 3 x 6, else (zones,)."""
+    side = math.isqrt(zones)
+    return (side, side) if side * side == zones else (3, 6) if zones == _WIDE else (zones,)
+
+
+def flat_scan(
+    kind: str, points: NDArray[np.float64], gaps: Gaps, spot: Any = None, origin: NDArray[np.float64] | None = None
+) -> Scan:
+    """A scan of a grid or list on the plane z = 0 whose hidden side is that of +z; lengths count from wall to wall.
+
+    ``origin`` (3,): where laser and sensor stand, as a file says it.
+    """
     normals = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
     laser = points if spot is None else np.asarray(spot, np.float64)
-    sensor_origin, laser_origin = (gaps.origin(f"{who}_origin", None, points, normals, False) for who in _WHO)
+    sensor_origin, laser_origin = (gaps.origin(f"{who}_origin", origin, points, normals, False) for who in _WHO)
     laser_normals = np.broadcast_to([0.0, 0.0, 1.0], laser.shape)
     return scan_of(kind, points, laser, sensor_origin, laser_origin, normals, laser_normals, False)
 
@@ -235,11 +261,14 @@ def cannot(layout: str, holds: str, got: str) -> StorageError:
     )
 
 
-def time_axis(gaps: Gaps, start: float | None, width: float | None, bins: int, default_s: Any = _NEEDED) -> TimeAxis:
-    """The axis of a file that says its start and width in metres, or leaves them open."""
-    if width is None and default_s is not _NEEDED:
-        return TimeAxis(gaps.start(start), gaps.width(None, default_s), bins)
-    return TimeAxis(gaps.start(start), gaps.width(width), bins)
+def time_axis(
+    gaps: Gaps, start: float | None, width: float | None, bins: int, default_s: Any = _NEEDED, start_bins: float = 0.0
+) -> TimeAxis:
+    """The axis of a file that says its start and width in metres, or leaves them open; ``start_bins``: the start then,
+    in bins.
+    """
+    found = gaps.width(width, default_s)
+    return TimeAxis(gaps.start(start, opl_to_seconds(start_bins * found)), found, bins)
 
 
 def frequency_axis(gaps: Gaps, stored: FrequencyAxis | None) -> FrequencyAxis:

@@ -109,8 +109,8 @@ def write(target: Path, capture: Capture) -> None:
     are not known.
     """
     transient, scan = only_transient(capture, NAME, legs=True), capture.scan
-    if scan.kind == "confocal":
-        raise cannot(NAME, "single captures and all pairs", "a confocal one")
+    if scan.kind in ("confocal", "pairs"):
+        raise cannot(NAME, "single captures and all pairs", repr(scan))
     if scan.kind == "exhaustive" and scan.sensor_points.numel() == 3:
         raise cannot(NAME, "pairs with one sensor point as single captures, laser and camera exchanged", "such pairs")
     if scan.sensor_normals is None or scan.laser_normals is None:

@@ -106,7 +106,7 @@ def write(target: Path, capture: Capture) -> None:
     """
     transient, scan = only_transient(capture, NAME, legs=False), capture.scan
     points = array_of(scan.sensor_points, WHAT)
-    if scan.kind == "exhaustive" or points.ndim != 3 or min(points.shape[:2]) < 2:
+    if scan.kind not in ("confocal", "single") or points.ndim != 3 or min(points.shape[:2]) < 2:
         raise cannot(NAME, "confocal and single captures of grids", repr(scan))
     assert capture.axis is not None  # a transient has one
     if capture.axis.start_opl != 0:

@@ -82,8 +82,8 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     """The capture of a file of y-tal. ``metadata`` holds ``scene_info`` as plain data, and under ``tal`` what makes a
     file that is written of it the same again.
 
-    Origins that are missing are assumed where their distance does not count. Raises StorageError for laser points that
-    are neither one, nor those of the sensor, nor a dimension of their own.
+    Origins that are missing are assumed where their distance does not count. Laser points of ``T_Si`` and ``T_Sx_Sy``
+    are one (single), those of the sensor (confocal), or as many elsewhere (pairs). Raises StorageError for others.
     """
     number = _whole(contents, "H_format", gaps)
     form = next((form for form in _FORMATS.values() if form.number == number), None)
@@ -196,10 +196,7 @@ def _kind(sensor: NDArray[Any], laser: NDArray[Any], form: HFormat, gaps: Gaps) 
                 gaps.assumed["laser_grid_xyz"] = "that of the sensor"
             return "confocal"
         if laser.size != 3:
-            raise gaps.error(
-                "each sensor point has a laser point of its own elsewhere, which is no scan of this library. Read H "
-                "and the grids with h5py."
-            )
+            return "pairs"
     if laser.size != 3:
         raise gaps.error(
             f"expected one laser point, or those of the sensor {sensor.shape}, as H has no laser dimensions, got "
@@ -311,6 +308,9 @@ def _h(capture: Capture) -> tuple[str, NDArray[Any]]:
     sensor, laser = (array_of(points, WHAT).reshape(-1, 3) for points in (scan.sensor_points, scan.laser_points))
     if scan.kind == "single" and same_points(sensor, laser):
         raise cannot(NAME, "scans of one point that lights itself as confocal ones", "a single one; say so")
+    if scan.kind == "pairs" and (same_points(sensor, laser) or len(sensor) == 1):
+        kind = "single" if len(sensor) == 1 else "confocal"
+        raise cannot(NAME, f"such pairs as {kind} scans", f"ones of kind='pairs'; make the scan a {kind} one")
     dims = {1: "Si", 2: "Sx_Sy"}[len(scan.sensor_shape)]
     lasers = {"Si": "Li_", "Sx_Sy": "Lx_Ly_"}[dims] if scan.kind == "exhaustive" else ""
     name = f"{'F' if tensor.is_complex() else 'T'}_{lasers}{dims}"

@@ -164,6 +164,8 @@ def write(target: Path, capture: Capture) -> None:
     the first and the last leg, for normals that are not known, and for what no foreign layout holds.
     """
     transient, scan = only_transient(capture, NAME, legs=True), capture.scan
+    if scan.kind == "pairs":
+        raise cannot(NAME, "single, confocal and exhaustive scans", "pairs of spots and sensor points")
     if len(scan.sensor_shape) != 2 or len(scan.laser_shape) == 1:
         raise cannot(NAME, "grids", f"lists of points {scan.sensor_shape}")
     if scan.kind == "exhaustive" and scan.laser_points.numel() == 3:

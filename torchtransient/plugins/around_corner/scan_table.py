@@ -206,6 +206,19 @@ class LaserSpots:
         return mi.unpolarized_spectrum(weight)
 
 
+def capture_type(given: Any) -> CaptureType:
+    """A capture type by its number or name. Raises SceneError."""
+    if isinstance(given, str) and not given.strip().lstrip("-").isdigit():
+        names = {c.name.lower(): c for c in CaptureType}
+        if given.lower() in names:
+            return names[given.lower()]
+    elif float(given) in (c.value for c in CaptureType):
+        return CaptureType(int(given))
+    raise SceneError(
+        f"transient_nlos_path: capture_type: expected single, confocal, exhaustive or pairs (or 1 to 4), got {given!r}."
+    )
+
+
 def laser_of(scene: Any) -> Any:
     """The one emitter of an NLOS scene. Raises SceneError for another number."""
     emitters = scene.emitters()
@@ -236,6 +249,10 @@ def aims_of(scene: Any, sensor: Any, capture: CaptureType, fov: float | None) ->
     given = sensor.spots() if hasattr(sensor, "spots") and capture is not CaptureType.CONFOCAL else None
     if given is not None:
         return given - origin
+    if capture is CaptureType.PAIRS:
+        raise SceneError(
+            "scan: a capture of pairs has a laser spot for each scanned point. Give laser_points of nlos_capture_meter."
+        )
     if capture is CaptureType.SINGLE:
         return transform @ mi.Vector3f(0, 0, 1)
     if fov is None:
@@ -299,6 +316,11 @@ def check_count(aims: Any, sensor: Any, capture: CaptureType) -> None:
         raise SceneError(
             f"scan: a single capture has one laser spot, got {count} laser_points. Give one, or set capture_type to "
             "exhaustive."
+        )
+    if capture is CaptureType.PAIRS and count != (pixels := int(film.crop_size()[0]) * int(film.crop_size()[1])):
+        raise SceneError(
+            f"scan: a capture of pairs has a laser spot for each of its {pixels} scanned points, got {count} "
+            "laser_points. Give as many, in the order of the film's pixels."
         )
     if capture is CaptureType.EXHAUSTIVE and count != film.laser_count():
         raise SceneError(

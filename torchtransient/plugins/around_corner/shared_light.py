@@ -186,6 +186,8 @@ class SharedThirdBounce:
             third.add_confocal(self.light.spots)
         elif self.capture is CaptureType.SINGLE:
             third.add_single(self.light.spots)
+        elif self.capture is CaptureType.PAIRS:
+            third.add_pairs(self.light.spots)
         else:
             add_exhaustive(third, self.light.spots)
 

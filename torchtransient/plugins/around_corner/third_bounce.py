@@ -30,7 +30,8 @@ from torchtransient.plugins.transport.strategy import Local
 
 
 class ThirdBounce(ScanJob):
-    """One capture: scene, film and samples, and the points that ``add_confocal`` and ``add_single`` go through.
+    """One capture: scene, film and samples, and the points that ``add_confocal``, ``add_pairs`` and ``add_single`` go
+    through.
 
     ``film``: one with a pixel for each scan point, row by row, on which ``prepare`` was called (and ``finish_render``
     will be): light is added to what it holds. ``sensors``: the scan points; ``energy`` (J, a number or an
@@ -62,19 +63,25 @@ class ThirdBounce(ScanJob):
         self.tile = tile
         self.check_region(sensors)
 
+    def add_pairs(self, lasers: WallPoints) -> None:
+        """The laser falls on a spot of its own for each scan point."""
+        self._add_each("add_pairs", lasers, apart=True)
+
     def add_confocal(self, lasers: WallPoints | None = None) -> None:
         """The laser falls on each scan point while that one is looked at. ``lasers``: the same points with the legs and
         albedo of the laser's side, where those differ.
         """
-        lasers = self.sensors if lasers is None else lasers
+        self._add_each("add_confocal", self.sensors if lasers is None else lasers, apart=False)
+
+    def _add_each(self, name: str, lasers: WallPoints, apart: bool) -> None:
         if lasers.width != self.sensors.width:
             raise ShapeError(
-                "add_confocal: expected a laser spot for every scan point, got "
-                f"{lasers.width} spots and {self.sensors.width} points."
+                f"{name}: expected a laser spot for every scan point, got {lasers.width} spots and "
+                f"{self.sensors.width} points."
             )
-        self._check_not_exhaustive("add_confocal")
+        self._check_not_exhaustive(name)
         self.check_region(lasers)
-        self._run(SampleTable(self.samples), lasers)
+        self._run(SampleTable(self.samples), lasers, apart)
 
     def add_single(self, laser: WallPoints) -> None:
         """The laser falls on one spot all the time."""
@@ -99,17 +106,17 @@ class ThirdBounce(ScanJob):
                 "exhaustive.add_exhaustive, or set exhaustive_scan to false."
             )
 
-    def _run(self, table: SampleTable, lasers: WallPoints) -> None:
+    def _run(self, table: SampleTable, lasers: WallPoints, apart: bool = False) -> None:
         launches = launches_of(self.film, self.sensors.width, table.count)
         for i, launch in enumerate(launches):
-            self._launch(table, lasers, launch)
+            self._launch(table, lasers, launch, apart)
             self.done((i + 1) / len(launches), launch.band)
 
-    def _launch(self, table: SampleTable, lasers: WallPoints, launch: Launch) -> None:
+    def _launch(self, table: SampleTable, lasers: WallPoints, launch: Launch, apart: bool) -> None:
         film = self.film
         pixel, first, last = launch.lanes()
         tile = mi.UInt32(0) if self.tile is None else dr.gather(mi.UInt32, self.tile, pixel)
-        lane = ScanLanes(self, lasers, pixel, table.lit)
+        lane = ScanLanes(self, lasers, pixel, table.lit, apart)
         block = film.create_event_block(
             launch,
             launch.base(film, pixel),
@@ -132,12 +139,19 @@ class ThirdBounce(ScanJob):
 
 
 class ScanLanes:
-    """What the lanes of a launch know of their scan points and laser spots: constants of the loop, a plain object."""
+    """Scan points and laser spots of the lanes of a launch: constants of the loop, a plain object.
 
-    def __init__(self, job: ThirdBounce, lasers: WallPoints, pixel: Any, lit: bool) -> None:
+    ``apart``: whether spots are others than the scan points; then ``spot_p``, ``spot_n``.
+    """
+
+    def __init__(self, job: ThirdBounce, lasers: WallPoints, pixel: Any, lit: bool, apart: bool) -> None:
         self.p, n, value, leg = job.sensors.take(pixel)
         self.n = mi.Vector3f(n)
-        _, _, laser_value, laser_leg = lasers.take(mi.UInt32(0) if lit else pixel)
+        spot_p, spot_n, laser_value, laser_leg = lasers.take(mi.UInt32(0) if lit else pixel)
+        self.apart = apart
+        if apart:
+            self.spot_p, self.spot_n = spot_p, mi.Vector3f(spot_n)
+            dr.eval(self.spot_p, self.spot_n)
         # What arrives at the samples of one spot holds neither the spot's albedo nor the energy.
         self.factor = value * job.energy * laser_value
         self.origin = leg + laser_leg - job.film.start_opl
@@ -160,7 +174,13 @@ def deposit(job, table, lane, block, kept, k, rays):
     """One sample's light."""
     sample = table.load(k)
     line = span(sample, lane.p, lane.n)
-    if table.lit:
+    to_spot = span(sample, lane.spot_p, lane.spot_n) if lane.apart else None
+    if lane.apart:
+        side, opl = line.cos * to_spot.cos > 0, line.r + to_spot.r
+        value = dr.select(line.cos > 0, sample.front, sample.back)
+        geometry = dr.abs(line.geometric_cos * to_spot.cos) * line.wall_cos * line.inverse_square
+        geometry *= to_spot.wall_cos * to_spot.inverse_square
+    elif table.lit:
         side, value, opl = line.cos > 0, sample.front, line.r + sample.delay
         geometry = dr.abs(line.geometric_cos) * line.wall_cos * line.inverse_square
     else:
@@ -173,6 +193,8 @@ def deposit(job, table, lane, block, kept, k, rays):
         active &= job.window.counts(block.counted(opl))
     if rays:
         active &= ~occluded(job.scene, sample, line, lane.p, lane.n, active)
+        if lane.apart:
+            active &= ~occluded(job.scene, sample, to_spot, lane.spot_p, lane.spot_n, active)
     value = value * lane.factor
     kept["L"] = kept["L"] + dr.select(active, value, 0)
     before, after = block.put(kept["block"], opl, value, active)

@@ -15,7 +15,7 @@ from torchtransient.plugins._registry import register
 from torchtransient.plugins.around_corner.division import BOUNCES, Division
 from torchtransient.plugins.around_corner.late_light import FIRST, MOST
 from torchtransient.plugins.around_corner.outlines import follows_outlines, mutual_occlusion, silhouettes
-from torchtransient.plugins.around_corner.scan_table import ScanTable, laser_of, scan_rays
+from torchtransient.plugins.around_corner.scan_table import ScanTable, capture_type, laser_of, scan_rays
 from torchtransient.plugins.around_corner.shared_light import (
     SharedThirdBounce,
     add_late_light,
@@ -42,6 +42,7 @@ from torchtransient.plugins.transport.world import PathSettings, World
 
 # Share of the samples drawn over the hidden area: at the relay wall, and beyond it.
 AT_WALL, BEYOND = 0.9, 0.25
+_EVERY_PAIR = (CaptureType.EXHAUSTIVE, CaptureType.PAIRS)
 NOT_FLAT = (
     "the wall is not flat, or scanned points and laser spots lie off it, and points of walls that see each other from "
     "nearby weigh without bound"
@@ -53,9 +54,9 @@ class TransientNLOSPath(base.TransientIntegrator):
 
     Parameters beside those of :class:`TransientIntegrator`:
 
-    ``capture_type`` (``single`` | ``confocal`` | ``exhaustive``, or 1, 2, 3; single)
+    ``capture_type`` (``single`` | ``confocal`` | ``exhaustive`` | ``pairs``, or 1 to 4; single)
         One laser spot for all scanned points; the spot follows the scanned point; every laser position for every
-        scanned point (the film needs ``exhaustive_scan``).
+        scanned point (the film needs ``exhaustive_scan``); one of ``laser_points`` for each scanned point.
     ``account_first_and_last_bounces`` (bool, false)
         Whether the way from the laser to its spot and from the scanned point to the sensor counts in time.
     ``filter_bounces`` (int, -1)
@@ -82,11 +83,11 @@ class TransientNLOSPath(base.TransientIntegrator):
         be drawn on every hidden shape, no surface in another, an ``nlos_capture_meter``, one flat wall that scan and
         laser meet, and a variant without wavelengths and polarization. Both have the same mean. Where a wall lights
         itself, points of it next to a scanned one weigh without bound, and ``auto`` takes paths. So do derivatives of
-        exhaustive captures.
+        exhaustive captures and of pairs.
     ``late_light`` (``auto`` | ``chains`` | ``paths``; auto)
         Light of four to seven bounces from chains that scanned points far from each other share
         (:mod:`..around_corner.late_light`), or from paths, as light of more bounces is. ``auto`` chooses as for
-        ``third_bounce``; both have the same mean, and derivatives come from paths.
+        ``third_bounce``; both have the same mean, and derivatives come from paths. So does late light of pairs.
     ``force_equal_illumination_scanning`` (bool, true), ``illumination_scan_fov`` (degrees, 20)
         Whether the laser positions of an exhaustive capture are the scanned points; if not, they lie on a grid of this
         horizontal field of view around the laser's axis.
@@ -173,8 +174,11 @@ class TransientNLOSPath(base.TransientIntegrator):
                 f"transient_nlos_path: expected a film with exhaustive_scan = {str(exhaustive).lower()} for capture "
                 f"type {self.capture.name.lower()}, got {str(film.exhaustive_scan).lower()}."
             )
-        if exhaustive and not self.laser_sampling:
-            raise SceneError("transient_nlos_path: exhaustive captures need nlos_laser_sampling; set it to true.")
+        if self.capture in _EVERY_PAIR and not self.laser_sampling:
+            kind = self.capture.name.lower()
+            raise SceneError(f"transient_nlos_path: {kind} captures need nlos_laser_sampling; set it to true.")
+        if self.capture is CaptureType.PAIRS and self.late_light == "chains":
+            raise SceneError("transient_nlos_path: late_light is 'chains', which pairs do not share; set it to 'auto'.")
         if self.laser_sampling:
             laser_of(scene)
         return sensor, film
@@ -217,8 +221,10 @@ class TransientNLOSPath(base.TransientIntegrator):
         """
         settings = self.settings()
         asked = {"third_bounce": (self.third_bounce, BOUNCES, BOUNCES), "late_light": (self.late_light, FIRST, MOST)}
-        if wanted is not None:  # chains have no derivatives, nor have exhaustive captures from shared samples
-            asked = {} if self.capture is CaptureType.EXHAUSTIVE else {"third_bounce": asked["third_bounce"]}
+        if wanted is not None or self.capture is CaptureType.PAIRS:  # chains have no derivatives, and no spot a point
+            del asked["late_light"]
+        if wanted is not None and self.capture in _EVERY_PAIR:  # nor have shared samples
+            asked = {}
         ranges = {
             name: (choice, range(max(first, settings.min_depth), min(last, settings.max_depth) + 1))
             for name, (choice, first, last) in asked.items()
@@ -330,7 +336,7 @@ class TransientNLOSPath(base.TransientIntegrator):
         if self.capture is CaptureType.EXHAUSTIVE and laser is None:
             count = sensor.film().laser_count()
             laser = dr.minimum(mi.UInt32(rays.sampler.next_1d() * count), count - 1)
-        rays.spot = {CaptureType.SINGLE: mi.UInt32(0), CaptureType.CONFOCAL: pixel}.get(self.capture, laser)
+        rays.spot = {CaptureType.SINGLE: mi.UInt32(0), CaptureType.EXHAUSTIVE: laser}.get(self.capture, pixel)
         return rays
 
     # ----------------------------------------------------------------------------------- derivatives
@@ -381,19 +387,6 @@ def _scanned(scene: Any, sensor: Any) -> Any:
     found = scene.ray_intersect_preliminary(scan_rays(sensor), coherent=True)
     dr.eval(found)
     return found
-
-
-def capture_type(given: Any) -> CaptureType:
-    """A capture type by its number or name. Raises SceneError."""
-    if isinstance(given, str) and not given.strip().lstrip("-").isdigit():
-        names = {c.name.lower(): c for c in CaptureType}
-        if given.lower() in names:
-            return names[given.lower()]
-    elif float(given) in (c.value for c in CaptureType):
-        return CaptureType(int(given))
-    raise SceneError(
-        f"transient_nlos_path: capture_type: expected single, confocal or exhaustive (or 1, 2, 3), got {given!r}."
-    )
 
 
 register("integrator", "transient_nlos_path", TransientNLOSPath)

@@ -26,8 +26,8 @@ class NLOSCaptureMeter(mi.Sensor):
         so that no two pixels share one: of a rectangle, or of a mesh with texture coordinates that say of all of them
         where they are. Other shapes need ``points``.
     ``laser_points`` (array (M, 3) or (Lh, Lw, 3); none)
-        Where the laser points, for captures of type single (M = 1) and exhaustive; without them as the integrator
-        ``transient_nlos_path`` says.
+        Where the laser points, for captures of type single (M = 1), exhaustive and pairs (one for each pixel); without
+        them as the integrator ``transient_nlos_path`` says.
     ``laser_origin`` (point; that of the scene's emitter)
         Where the laser stands.
     ``laser_lookat_pixel`` (point; none)
