@@ -77,7 +77,8 @@ class TDC(MovedCounts):
     Light of a true bin is taken to be spread evenly over it. `sliding_scale`: number of known offsets,
     0, 1, 2, ... mean code widths, one of which is added before every conversion, at random, and taken off its code. That
     evens the DNL out; the mean of the INL at the codes used stays. Beyond the last code the widths begin again.
-    `dither`: an unknown time, uniform over one bin, that is added before the conversion and not taken off: of equal codes, half the events get the next one.
+    `dither`: an unknown time, uniform over one bin, that is added before the conversion and not taken off: of equal
+    codes, half the events get the next one.
     `offset_bins`: where, in true bins, the first code begins; light then gets earlier codes by as much.
 
     `acts_on` "detections": the input are counts behind a detector. Each of them gets its code: whole counts by a draw,
