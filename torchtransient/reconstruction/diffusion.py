@@ -71,7 +71,8 @@ class DiffusionDeconvolution(ConfocalOperator):
     ``operator(transient)``: what arrives through the slab, (..., T, Y, X), of what would be measured at its far side;
     ``operator.adjoint``: its adjoint; ``operator.inverse``: the Wiener inverse, an operator itself;
     ``operator.reconstruct(transient)``: the capture without the slab, whose volume another operator finds. Linear and
-    differentiable; the inverse's results go below zero. ``passes``: how often light crosses the slab, 2 of confocal captures.
+    differentiable; results of the inverse go below zero. ``passes``: how often light crosses the slab, 2 of confocal
+    captures.
 
     ``thickness`` in metres. ``properties``: (reduced scattering per metre, absorption per metre, index of refraction,
     extrapolation length in metres, at which behind its sides the fluence vanishes); the defaults of both are those

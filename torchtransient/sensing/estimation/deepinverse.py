@@ -50,9 +50,9 @@ class LinearSensorPhysics(LinearPhysics):  # type: ignore[misc]
     """A linear sensor without its offset: ``A x = expected(x) - expected(0)``, with its exact transpose.
 
     DeepInverse asks for ``A(0) = 0`` of every `LinearPhysics`. What ambient light and dark counts add is `offset`, and
-    ``forward`` is a measurement less the offset: ``A x`` plus noise of zero mean, hence below zero at times. Measurements
-    from elsewhere are handed to DeepInverse as ``y - physics.offset()``; its Poisson likelihood takes them as they are,
-    with ``bkg=physics.offset()``. ``img_size``: (C, T, H, W) of the inputs.
+    ``forward`` is a measurement less the offset: ``A x`` plus noise of zero mean, hence below zero at times.
+    Measurements from elsewhere are handed to DeepInverse as ``y - physics.offset()``; its Poisson likelihood takes them
+    as they are, with ``bkg=physics.offset()``. ``img_size``: (C, T, H, W) of the inputs.
     """
 
     def __init__(self, sensor: Sensor, img_size: tuple[int, ...], **keywords: Any) -> None:

@@ -252,10 +252,6 @@ class CoincidencePixel(RandomSensor):
         ways = math.lgamma(self.cycles + 1) - torch.lgamma(n + 1) - torch.lgamma(quiet + 1)
         return (value + ways).sum(TIME).to(x.dtype)
 
-    def extra_repr(self) -> str:
-        own = f"spads={self.spads}, coincidence={self.coincidence}, window_s={self.window_s:g}"
-        return f"{own}, {super().extra_repr()}"
-
 
 def _binomials(q: Tensor, number: int, most: int) -> list[Tensor]:
     """Chance that 0, 1, ... up to `most` of `number` lines are up."""

@@ -75,8 +75,8 @@ class TDC(MovedCounts):
 
     `code_widths`: (T,) relative widths (mean about 1): their deviations are the DNL, the running sum of these the INL.
     Light of a true bin is taken to be spread evenly over it. `sliding_scale`: number of known offsets,
-    0, 1, 2, ... mean code widths, one of which is added before every conversion, at random, and taken off its code. That
-    evens the DNL out; the mean of the INL at the codes used stays. Beyond the last code the widths begin again.
+    0, 1, 2, ... mean code widths, one of which is added before every conversion, at random, and taken off its code.
+    That evens the DNL out; the mean of the INL at the codes used stays. Beyond the last code the widths begin again.
     `dither`: an unknown time, uniform over one bin, that is added before the conversion and not taken off: of equal
     codes, half the events get the next one.
     `offset_bins`: where, in true bins, the first code begins; light then gets earlier codes by as much.
@@ -220,7 +220,3 @@ class TDC(MovedCounts):
             return super().sample(x, generator)
         with torch.no_grad():
             return self.expected(x)
-
-    def extra_repr(self) -> str:
-        converter = f"num_bins={self.bands.shape[0]}, sliding_scale={self.sliding_scale}, dither={self.dither}"
-        return f"{converter}, acts_on={self.acts_on!r}, boundary={self.boundary!r}, {super().extra_repr()}"
