@@ -95,7 +95,8 @@ def _convolve(rows: Tensor, kernel: Tensor) -> Tensor:
         if not rows.is_complex():
             transfer = torch.fft.rfft(kernel, n=length)
             return filter_rows(rows.double(), transfer, length, 0, length).to(rows.dtype)
-        back: Tensor = torch.fft.ifft(torch.fft.fft(rows.cdouble(), n=length) * torch.fft.fft(kernel, n=length))
+        wide = rows.to(torch.complex128)
+        back: Tensor = torch.fft.ifft(torch.fft.fft(wide, n=length) * torch.fft.fft(kernel, n=length))
         return back.to(rows.dtype)
     flat = rows.reshape(-1, 1, rows.shape[-1])
     weights = kernel.flip(0).to(rows.dtype).view(1, 1, -1)
