@@ -105,7 +105,7 @@ ENTRIES = [
     ),
     Entry(
         "CoincidencePixel",
-        lambda **k: sensing.CoincidencePixel(sensing.SynchronousSPAD(300), 6, coincidence=2, window_s=50 * PS,
+        lambda **k: sensing.CoincidencePixel(sensing.SynchronousSPAD(60), 6, coincidence=2, window_s=50 * PS,
             bin_width_s=20 * PS, **k),
         shape=(2, 1, 8, 1, 2),
         random=True,
