@@ -134,6 +134,35 @@ def test_a_black_lobe_has_its_slope(kind, lobe):
     assert error < 0.1 * expected.mean()
 
 
+@pytest.mark.parametrize(
+    ("kind", "lobe"),
+    long_rows([("plastic", LOBES[0]), ("roughplastic", LOBES[1]), ("pplastic", LOBES[0])], [("plastic", LOBES[0])]),
+)
+def test_a_texture_without_a_mean(kind, lobe):
+    """An attribute of the shape, under a checkerboard, gives the light and the slope of what it stands for."""
+
+    def moments(texture, key, **attributes):
+        scene = room(bsdf={"type": kind, lobe: texture}, light=area_light())
+        scene["wall"] |= attributes
+        renderer = tt.TransientRenderer(tt.load(scene, variant="llvm_ad_mono"), parameters=[key], spp=512)
+        found = []
+        for seed in range(6):
+            renderer.zero_grad()
+            light = renderer(seed=seed).steady.double().sum()
+            light.backward()
+            found.append([float(light.detach()), float(renderer.values[key].grad.sum())])
+        found = torch.tensor(found, dtype=torch.float64)
+        return found.mean(0), found.var(0) / 6
+
+    half = {"type": "checkerboard", "color1": 0.0}
+    paint = {"type": "uniform", "value": 0.3}
+    mean, noise = moments(half | {"color0": paint}, f"wall.bsdf.{lobe}.color0.value")
+    read = half | {"color0": {"type": "mesh_attribute", "name": "vertex_paint"}}
+    found, beside = moments(read, "wall.vertex_paint.value", vertex_paint=paint)
+    assert bool(((found - mean).abs() < 5 * (noise + beside).sqrt()).all())
+    assert bool(((noise + beside).sqrt() < 0.06 * mean.abs()).all())
+
+
 def test_the_index_of_a_described_plastic():
     scene = scene_with("plastic")
     info = scene.parameters()["wall.bsdf.eta"]

@@ -69,6 +69,27 @@ def test_plain_data_of_mitsuba_and_drjit():
     assert isinstance(pixels, Pixels) and np.array(pixels.values).ravel().tolist() == list(range(12))
 
 
+def test_tensors_of_three_rows_are_no_colours_or_points(capfd):
+    """Pixels, voxels and distances arrive as they are, and without a line of nanobind for each kind tried."""
+    rng = np.random.default_rng(0)
+    pixels = rng.random((3, 4, 3), dtype=np.float32)
+    voxels = rng.random((3, 3, 2, 1), dtype=np.float32) - np.float32(0.5)
+    grid = {"type": "gridvolume", "data": voxels, "raw": True}
+    paint = {
+        "wall": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": {
+            "type": "bitmap", "data": pixels, "raw": True}}},
+        "floor": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": {
+            "type": "volume", "volume": grid}}},
+        "ball": {"type": "sdfgrid", "grid": torch.from_numpy(voxels)},
+    }  # fmt: skip
+    scene = tt.load({"type": "scene", **paint}, variant=VARIANT)
+    values = {key: info.value for key, info in scene.parameters().items()}
+    assert np.array_equal(np.array(values["wall.bsdf.reflectance.data"]), pixels)
+    assert np.array_equal(np.array(values["floor.bsdf.reflectance.volume.data"]), voxels)
+    assert np.array_equal(np.array(values["ball.grid"]).ravel(), voxels.ravel())
+    assert capfd.readouterr().err == ""
+
+
 @pytest.mark.parametrize(
     ("value", "words"),
     [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 
 import pytest
@@ -15,8 +16,9 @@ TEXT = PAGE.text
 
 
 @pytest.fixture(scope="module")
-def page():
-    return PAGE.names()
+def page(tmp_path_factory):
+    with contextlib.chdir(tmp_path_factory.mktemp("page")):
+        return PAGE.names()
 
 
 def test_figures(page):
@@ -45,6 +47,20 @@ def test_widths_add(page):
     wanted = (120**2 + 300**2 + (2.355 * 20) ** 2) / 2.3548**2 / 25**2 + 2 / 6
     assert float(variance) == pytest.approx(wanted, rel=0.02)
     assert round((120**2 + 300**2 + (2.355 * 20) ** 2) ** 0.5) == 327
+
+
+def test_a_chain_as_a_device_measures_the_samples_of_a_recipe(page):
+    """Its counts are those of the chain on the light of the same sample, with the ambient light that was drawn."""
+    sample = page["measured"].sample(0)
+    light, counts = (torch.from_numpy(sample.arrays[name]).double() for name in ("transient", "measurement"))
+    ambient = float(sample.values["device.PhotonBudget.ambient_rate_hz"])
+    assert 1e3 <= ambient <= 1e6
+    mean = page["device"].changed("PhotonBudget", ambient_rate_hz=ambient).sensor().expected(light)
+    assert torch.equal(counts, counts.round())
+    # sums of pixels: binomials of 1e5 cycles of less than one detection each
+    z = (counts - mean).sum((0, 1)) / mean.sum((0, 1)).clamp_min(1).sqrt()
+    assert float(z.abs().max()) < 5
+    assert float(counts.sum()) > 1000
 
 
 def test_names_exist_and_pages_link():

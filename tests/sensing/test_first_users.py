@@ -195,6 +195,34 @@ def test_darkness_behind_a_transform_is_dark():
     torch.testing.assert_close(there, back, rtol=1e-12, atol=1e-12)
 
 
+def pulse_of_a_nanosecond(x):
+    return sensing.apply_pulse(x, tt.TimeAxis.from_seconds(0.0, 10 * PS, 600), tt.Pulse.gaussian_s(1e-9))
+
+
+def afterpulses_of_a_window(x):
+    return sensing.add_afterpulses(x, 0.1, sensing.afterpulse_kernel(3e-10, 1e-9, 1e-11, period_bins=600))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("convolve", [pulse_of_a_nanosecond, afterpulses_of_a_window])
+def test_convolutions_by_transforms_are_those_of_sums(convolve, dtype):
+    """Against the matrix of single impulses: not negative for light, linear for signed operands, and in the derivative,
+    where the value is 0 by rounding too.
+    """
+    x = torch.zeros(1, 600, 1, 2, dtype=dtype)
+    x[0, 50], x[0, 300, 0, 1] = 1.0, 1e6
+    found = convolve(x)
+    assert float(found.min()) >= 0 and bool(torch.isfinite(found.sqrt()).all())
+    torch.testing.assert_close(convolve(x - x.flip(-1)), found - found.flip(-1), rtol=1e-6, atol=1e-9)
+    # all bins of the result weigh the same: the derivative by a bin is the light that stays in the window
+    leaf = x.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(convolve(leaf).sum(), leaf)
+    for t in (0, 50, 590):
+        impulse = torch.zeros_like(x)
+        impulse[:, t] = 1.0
+        torch.testing.assert_close(slope[0, t, 0, 0], convolve(impulse)[..., 0].sum(), rtol=1e-6, atol=0)
+
+
 def test_a_billion_frames():
     """Mean and variance of N = 1e9 binary frames in float32: 2e4 draws know the variance to 1 %, 5 sigma are 5 %."""
     frames, mean = 10**9, 0.4

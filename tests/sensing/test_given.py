@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 import warnings
 from functools import partial
 
@@ -130,6 +131,20 @@ def test_arrays_are_taken_where_tensors_are(name):
             assert torch.equal(a, b)
     for a, b in zip(tensors_of(found), tensors_of(wanted), strict=True):
         assert torch.equal(a, b)
+
+
+MODULES = [n for n in sorted(CALLS) if inspect.isclass(m := getattr(sensing, n)) and issubclass(m, nn.Module)]
+# A period is its number of bins, and a floor is taken off the counts.
+ANOTHER_WORD = {("FreeRunningSPAD", "period_s"), ("MeasuredDelays", "floor"), ("MeasuredResponse", "floor")}
+
+
+@together("name", MODULES)
+def test_a_repr_shows_the_numbers(name):
+    numbers, rest = CALLS[name]
+    text = repr(getattr(sensing, name)(**numbers, **rest))
+    for argument, value in numbers.items():
+        if value.ndim == 0 and (name, argument) not in ANOTHER_WORD:
+            assert re.search(rf"=\(?{re.escape(f'{float(value):g}')}[,)\n]", text), f"{argument} in {text}"
 
 
 def test_buffers_are_learnt_by_functional_call():

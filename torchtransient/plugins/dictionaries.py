@@ -138,6 +138,29 @@ def _array(value: np.ndarray, key: str) -> Any:
     return value.item() if value.ndim == 0 else mi.TensorXf(np.ascontiguousarray(value, dtype=np.float32))
 
 
+def parsed(config: Any, tree: Mapping[str, Any]) -> Any:
+    """Mitsuba's parser state of a dictionary.
+
+    Tensors enter with one row and get their own once the parser keeps them: what has three rows Mitsuba tries as a
+    point and as two kinds of colours first, and nanobind prints a line on stderr for each.
+    """
+    kept: list[tuple[Any, Any]] = []
+    state = mi.parser.parse_dict(config, _with_one_row(for_mitsuba(tree), kept))
+    for entered, tensor in kept:
+        entered.__init__(tensor)
+    return state
+
+
+def _with_one_row(value: Any, kept: list[tuple[Any, Any]]) -> Any:
+    """A dictionary with stand-ins for tensors of three rows; ``kept`` gets the pairs of both."""
+    if isinstance(value, dict):
+        return {name: _with_one_row(item, kept) for name, item in value.items()}
+    if dr.is_tensor_v(value) and value.ndim > 1 and value.shape[0] == 3:
+        kept.append((type(value)(0, (1,) * value.ndim), value))
+        return kept[-1][0]
+    return value
+
+
 def double_transform() -> Any:
     """Mitsuba's scalar transform in double precision, which has no public name in single precision variants."""
     properties = mi.Properties()

@@ -92,9 +92,7 @@ PIXELS = "data"
 
 
 def is_bump_map(bsdf: Any) -> bool:
-    """Whether a BSDF takes its normals from the slope of a texture, which Mitsuba keeps between the texels of a bitmap:
-    it jumps at each of them.
-    """
+    """Whether a BSDF takes its normals from the slope of a texture, which jumps at each texel of a bitmap."""
     return bool(bsdf.class_name() == "BumpMap")
 
 
@@ -182,6 +180,8 @@ POLARIZED_PLUGINS = {
 # These stand in for Mitsuba's always, which lack methods that every plugin of their kind may be asked for:
 # `eval_direction` of a `directionalarea`, which raises while kernels are traced, for the other lights of a scene too.
 COMPLETED_PLUGINS = {"directionalarea": "diff_directionalarea"}
+# Textures that know no mean, which Mitsuba's plastics ask for: with one of these their twins are built.
+TEXTURES_WITHOUT_MEAN = {"mesh_attribute": "MeshAttribute", "volume": "VolumeAdapter"}
 
 # ------------------------------------------------------------------------------------------------------ shapes, lights
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.mitsuba_compat import attribute_name, has_surface, is_instance
+from torchtransient.plugins.mitsuba_compat import TEXTURES_WITHOUT_MEAN, attribute_name, has_surface, is_instance
 
 
 class ShownValue(NamedTuple):
@@ -91,6 +91,12 @@ def objects_below(node: Any, kind: type, through: bool = True) -> list[Any]:
                 continue
         waiting += objects_of(value)[::-1]
     return list(found.values())
+
+
+def has_mean(texture: Any) -> bool:
+    """Whether Mitsuba knows the mean of a texture, and those of the textures that it holds."""
+    held = (texture, *objects_below(texture, mi.Texture))
+    return not any(t.class_name() in TEXTURES_WITHOUT_MEAN.values() for t in held)
 
 
 def carries_derivatives(node: Any) -> bool:

@@ -71,7 +71,8 @@ class DiffusionDeconvolution(ConfocalOperator):
     ``operator(transient)``: what arrives through the slab, (..., T, Y, X), of what would be measured at its far side;
     ``operator.adjoint``: its adjoint; ``operator.inverse``: the Wiener inverse, an operator itself;
     ``operator.reconstruct(transient)``: the capture without the slab, whose volume another operator finds. Linear and
-    differentiable; results go below zero. ``passes``: how often light crosses the slab, 2 of confocal captures.
+    differentiable; results of the inverse go below zero. ``passes``: how often light crosses the slab, 2 of confocal
+    captures.
 
     ``thickness`` in metres. ``properties``: (reduced scattering per metre, absorption per metre, index of refraction,
     extrapolation length in metres, at which behind its sides the fluence vanishes); the defaults of both are those
@@ -173,10 +174,10 @@ class DiffusionDeconvolution(ConfocalOperator):
         return max(2 * points, math.ceil((points + math.sqrt(points**2 + strays)) / 2)) + 1
 
     def map_(self, x: Tensor) -> Tensor:
-        return each(lambda item: self._filtered(item, torch.view_as_complex(self.kernel)), x, 3)
+        return each(lambda item: self._spread(item, torch.view_as_complex(self.kernel)), x, 3)
 
     def adjoint_(self, y: Tensor) -> Tensor:
-        return each(lambda item: self._filtered(item, torch.view_as_complex(self.kernel).conj()), y, 3)
+        return each(lambda item: self._spread(item, torch.view_as_complex(self.kernel).conj()), y, 3)
 
     @property
     def inverse(self) -> SlabInverse:
@@ -189,6 +190,14 @@ class DiffusionDeconvolution(ConfocalOperator):
         """
         found: Tensor = self.inverse(self.transients(transient))
         return found
+
+    def _spread(self, x: Tensor, spectrum: Tensor) -> Tensor:
+        """Convolution with the kernel, which is not negative: of light without negative values it has none either, and
+        those that the rounding of the transform leaves are 0. Signed operands keep them, and the derivative is the
+        linear map's.
+        """
+        found = self._filtered(x, spectrum)
+        return found.clamp_(min=torch.where((x >= 0).all(), 0.0, -math.inf).to(found))
 
     def _filtered(self, x: Tensor, spectrum: Tensor) -> Tensor:
         bins, rows, columns = self.data_shape

@@ -24,9 +24,12 @@ from torchtransient.plugins.mitsuba_compat import (
     BUILDS_LOBES,
     COMPLETED_PLUGINS,
     DIFFERENTIABLE_PLUGINS,
+    PLASTICS,
     POLARIZED_PLUGINS,
+    TEXTURES_WITHOUT_MEAN,
     is_dark,
 )
+from torchtransient.plugins.node_walk import has_mean
 from torchtransient.plugins.parameter_effect import class_of
 from torchtransient.plugins.physical_ranges import described_ranges
 from torchtransient.rendering.build_options import BuildOptions
@@ -375,6 +378,8 @@ def _substitute_plugins(state: Any, options: BuildOptions) -> None:
             node.props.set_plugin_name(DIFFERENTIABLE_PLUGINS[plugin])
             if plugin in BUILDS_LOBES:
                 node.props["lobes"] = ",".join(sorted(asked[name]))
+        elif plugin in PLASTICS.values() and _lacks_mean(state, node):
+            node.props.set_plugin_name(DIFFERENTIABLE_PLUGINS[plugin])
         elif plugin in COMPLETED_PLUGINS:
             node.props.set_plugin_name(COMPLETED_PLUGINS[plugin])
         elif plugin == "bitmap" and options.real_bitmaps:
@@ -384,3 +389,11 @@ def _substitute_plugins(state: Any, options: BuildOptions) -> None:
             held = descendants(state, node)
             if any(inner.props.id() in asked and inner.props.plugin_name() in BUILDS_LOBES for inner in held):
                 node.props["allow_transmission"] = True
+
+
+def _lacks_mean(state: Any, node: Any) -> bool:
+    """Return whether one of a plugin's textures, or of those that they hold, has no mean."""
+    import mitsuba as mi
+
+    described = any(inner.props.plugin_name() in TEXTURES_WITHOUT_MEAN for inner in descendants(state, node))
+    return described or any(isinstance(v, mi.Texture) and not has_mean(v) for _, v in node.props.items())

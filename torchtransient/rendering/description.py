@@ -20,7 +20,7 @@ import numpy as np
 from torchtransient import plugins
 from torchtransient.errors import SceneError, StorageError
 from torchtransient.file_places import check_special, path_of
-from torchtransient.plugins.dictionaries import NUMBERS_IN_TEXT, Pixels, Voxels, for_mitsuba, is_ours, numbers_in_text
+from torchtransient.plugins.dictionaries import NUMBERS_IN_TEXT, Pixels, Voxels, is_ours, numbers_in_text, parsed
 from torchtransient.plugins.unfinished import afterwards
 from torchtransient.quantities import shown
 from torchtransient.rendering.node_checks import MOST_LEVELS
@@ -102,7 +102,7 @@ class DictDescription:
         """Mitsuba's parser state."""
         import mitsuba as mi
 
-        state = mi.parser.parse_dict(config, for_mitsuba(self.tree))
+        state = parsed(config, self.tree)
         for node in state.nodes:
             # Mitsuba learns the kind of a plugin written in Python when it builds it.
             if node.type == mi.ObjectType.Unknown and plugins.kind_of(node.props.plugin_name()) == "shape":

@@ -66,6 +66,28 @@ def test_a_linear_sensor(deepinv):
     assert torch.equal(drawn, sensing.poisson(10 * x, torch.Generator().manual_seed(2)))
 
 
+def test_ambient_light_and_dark_counts_are_the_offset(deepinv):
+    """Of 0.25 x 2e6 ambient and 4e5 dark counts a second, in bins of 0.1 ns: 9e-5 per bin; the gain by hand."""
+    optics = sensing.Optics(solid_angle_sr=0.5, pixel_area_m2=1e-10)
+    ambient = torch.nn.Parameter(torch.tensor(2e6, dtype=torch.float64))
+    budget = sensing.PhotonBudget(
+        optics, pulse_energy_j=1e-9, wavelength_m=905e-9, repetition_rate_hz=1e7, cycles=100, ambient_rate_hz=ambient,
+        dark_count_rate_hz=4e5, quantum_efficiency=0.25, axis=AXIS,
+    )  # fmt: skip
+    physics = sensing.deepinv_physics(budget, (1, 12, 2, 3))
+    x = light()
+    gain = 0.25 * 1e-9 * 0.5 * 1e-10 * 905e-9 / (6.62607015e-34 * 299792458.0)
+    torch.testing.assert_close(physics.A(x), gain * x, rtol=1e-12, atol=1e-16)
+    assert physics.offset().shape == (1, 1, 12, 2, 3)
+    torch.testing.assert_close(physics.offset().double(), torch.full((1, 1, 12, 2, 3), 9e-5).double())
+    torch.testing.assert_close(physics.A(x) + physics.offset(x), sensing.deepinv_physics(budget).A(x))
+    # a background that is learnt is no part of A, and all of the offset
+    (of_offset,) = torch.autograd.grad(physics.offset(x).sum(), ambient)
+    torch.testing.assert_close(float(of_offset), x.numel() * 0.25e-10)
+    (of_linear,) = torch.autograd.grad(physics.A(x).sum(), ambient)
+    assert abs(float(of_linear)) < 1e-12 * x.numel() * 0.25e-10
+
+
 def test_a_sensor_that_is_not_linear(deepinv):
     """A is the mean and A_vjp the transpose of its derivative, which can be differentiated where that is asked for."""
     spad = sensing.SynchronousSPAD(7)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from support.marks import long, long_pairs
+from support.marks import long, long_pairs, long_rows
 from support.sensing.event_driven import Events, compare, detect
 from torchtransient.errors import GradientError, ShapeError, UnitError
 from torchtransient.sensing import (
@@ -233,6 +233,70 @@ def test_coincidences_everywhere(mode, dead, total, kind, k):
     assert sum(a.total_variation for a in found) < 1.5 * sum(a.noise for a in found)
 
 
+# Variance of totals: of independent bins four times that of events, five times, and one and a half times.
+TOTALS = [
+    ("first", 9.5, "pulse", 10.0, 4, "straight_through"),
+    ("first", 9.5, "pulse", 10.0, 4, "gaussian"),
+    ("free", 9.3, "edges", 10.0, 4, "straight_through"),
+    ("several", 4.4, "constant", 30.0, 2, "straight_through"),
+]
+
+
+@pytest.mark.parametrize("mode, dead, kind, total, k, policy", TOTALS)
+def test_totals_of_coincidences_vary_as_those_of_events(mode, dead, kind, total, k, policy):
+    """And so do bins; the logarithm of a variance of n totals has the standard deviation sqrt(2 / (n - 1))."""
+    cycles, number = 60, 300
+    rate, found = light(total, kind), []
+    for seed in range(5):
+        events = zone(np.random.default_rng(seed), mode, dead, rate, [1] * 16, cycles)
+        found.append(coincidences(events, k, 3.4, in_step=mode != "free").counts)
+    seen = np.concatenate(found)
+    sensor = CoincidencePixel(
+        detector(mode, dead, cycles), 16, coincidence=k, window_s=3.4 * WIDTH, bin_width_s=WIDTH, grad=policy
+    )
+    drawn = sensor(image(rate).expand(number, 1, BINS, 1, 1), generator=torch.Generator().manual_seed(0))
+    drawn = drawn.view(number, BINS).numpy()
+    slack = 5 * math.sqrt(2 / (len(seen) - 1) + 2 / (number - 1))
+    assert abs(math.log(drawn.sum(1).var(ddof=1) / seen.sum(1).var(ddof=1))) < slack
+    most = sensor.expected(image(rate)).numpy().ravel()  # binomials vary less than their mean
+    assert (np.abs(drawn.mean(0) - seen.mean(0)) < 5 * np.sqrt(most / number + most / len(seen)) + 1e-3).all()
+
+
+@pytest.mark.parametrize(
+    ("mode", "dead"), long_rows([("first", 9.5), ("several", 4.4), ("free", 9.3)], [("first", 9.5)])
+)
+def test_scores_of_coincidences(mode, dead):
+    """d/da of the mean total, and of its mean square by a difference quotient of draws, at a times the light."""
+    cycles, number = 4, 10_000
+    x = image(light(6.0)).expand(number, 1, BINS, 1, 1)
+    sensor = CoincidencePixel(
+        detector(mode, dead, cycles), 4, coincidence=2, window_s=3.4 * WIDTH, weights=[1, 1, 1, 2], bin_width_s=WIDTH,
+        grad="score",
+    )  # fmt: skip
+    a = torch.ones(number, dtype=torch.float64, requires_grad=True)
+    with ScoreFunction() as score:
+        total = sensor(x * a.view(-1, 1, 1, 1, 1), generator=torch.Generator().manual_seed(0)).sum((1, 2, 3, 4))
+    for power in (1, 2):
+        (slopes,) = torch.autograd.grad(
+            score.surrogate(total**power, baseline="leave_one_out").sum(), a, retain_graph=True
+        )
+        near = [
+            sensor.sample(s * x, torch.Generator().manual_seed(1 + k)).sum((1, 2, 3, 4)) ** power
+            for k, s in enumerate((0.9, 1.1))
+        ]
+        wanted = float(near[1].mean() - near[0].mean()) / 0.2
+        noise = math.sqrt(float(slopes.var() + (near[0].var() + near[1].var()) / 0.04) / number)
+        assert abs(float(slopes.mean()) - wanted) < 5 * noise + 0.02 * abs(wanted)  # and a third derivative
+        assert noise < 0.1 * abs(wanted)
+
+
+def test_the_score_of_a_learnt_dead_time_is_refused():
+    spad = detector("free", 9.3, learnable=True)
+    sensor = CoincidencePixel(spad, 4, coincidence=2, window_s=3 * WIDTH, bin_width_s=WIDTH, grad="score")
+    with ScoreFunction(), pytest.raises(GradientError, match="a dead time that is not learnt"):
+        sensor(image(light(1.0)))
+
+
 WINDOWS = [("first", 1.6), ("first", 0.7), ("first", 5.0), ("free", 1.6), ("free", 4.3)]
 
 
@@ -305,10 +369,14 @@ def test_windows_of_coincidences():
             pixel(1.0, weights=wrong)
     with pytest.raises(UnitError, match="CoincidencePixel: expected detector to be a SynchronousSPAD"):
         CoincidencePixel(ZoneSum(1, 1), 3, coincidence=2, window_s=WIDTH, bin_width_s=WIDTH)
-    # several coincidences of a cycle in a bin are no probability
-    crowd = CoincidencePixel(detector("free", 1.0), 90, coincidence=1, window_s=0.02 * WIDTH, bin_width_s=WIDTH)
+    # several coincidences of a cycle in a bin are no probability, which is what paralyzable detectors draw by
+    few = {"coincidence": 1, "window_s": 0.02 * WIDTH, "bin_width_s": WIDTH}
     with pytest.raises(UnitError, match="at most one coincidence per cycle in a bin, got"):
-        crowd.sample(100 * x)
+        CoincidencePixel(detector("free", 1.0, kind="paralyzable"), 90, **few).sample(100 * x)
+    crowd = CoincidencePixel(detector("free", 1.0, cycles=2000), 90, **few)
+    mean = float(crowd.expected(100 * x).sum())
+    assert mean > 4 * 2000
+    assert float(crowd.sample(100 * x, torch.Generator().manual_seed(0)).sum()) == pytest.approx(mean, rel=0.02)
 
 
 @pytest.mark.parametrize("k", [1, 2, 3, 5])
@@ -376,7 +444,8 @@ def test_coincidences_of_a_bin_with_any_number_of_photons(photons):
 
 def test_coincidences_that_round_to_more_than_one_per_cycle(monkeypatch):
     """One in every cycle: no other number of them is possible, and none is NaN."""
-    pixel = CoincidencePixel(SynchronousSPAD(3), 2, coincidence=1, window_s=WIDTH, bin_width_s=WIDTH)
+    spad = detector("free", 1.0, 3, kind="paralyzable")
+    pixel = CoincidencePixel(spad, 2, coincidence=1, window_s=WIDTH, bin_width_s=WIDTH)
     monkeypatch.setattr(CoincidencePixel, "probabilities", lambda self, x: torch.full_like(x, 1 + 1e-7).double())
     x = torch.ones(1, 1, 1, 2, dtype=torch.float64)
     assert pixel.sample(x).flatten().tolist() == [3.0, 3.0] and pixel.variance(x).flatten().tolist() == [0.0, 0.0]

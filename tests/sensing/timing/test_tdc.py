@@ -36,13 +36,11 @@ def test_against_single_photons(options, boundary):
     shift = rng.integers(0, options.get("sliding_scale", 1), times.size)
     # an unknown time of up to a bin on top
     dither = rng.random(times.size) * bool(options.get("dither"))
-    codes = np.full(times.size, -1)
-    for s in range(options.get("sliding_scale", 1)):
-        edges = np.concatenate([[0.0], np.cumsum(np.roll(w.numpy(), -s))])
-        pick = shift == s
-        local = (times + dither)[pick] - options.get("offset_bins", 0.0)
-        local = local % n if boundary == "periodic" else local
-        codes[pick] = np.searchsorted(edges, local, side="right") - 1
+    # the converter's own edges, to which a whole number of nominal steps is added, and taken off the code
+    edges = np.concatenate([[0.0], np.cumsum(np.tile(w.numpy(), 3))]) - n
+    local = times + dither - options.get("offset_bins", 0.0) + shift
+    codes = np.searchsorted(edges, local, side="right") - 1 - n - shift
+    codes = codes % n if boundary == "periodic" else codes
     seen = np.bincount(codes[(codes >= 0) & (codes < n)], minlength=n)
     converter = TDC(w, boundary=boundary, **options)
     counts = image(np.bincount(times.astype(int), minlength=n))
@@ -97,6 +95,18 @@ def test_ideal_converter_changes_nothing_and_widths_show_in_even_light():
     torch.testing.assert_close(converter.differential_nonlinearity, w - 1)
     evened = TDC(w, sliding_scale=24)(image(torch.ones(24))).flatten()[4:-4]
     assert float((evened - 1).abs().max()) < 0.1 * float((w - 1).abs().max())
+
+
+def test_a_sliding_scale_leaves_the_mean_of_the_non_linearity():
+    """Light at one time, read with offsets of nominal steps: its mean code is off by the mean INL of the codes used."""
+    steep = torch.tensor([1.0, 1.0, 1.3, 1.3, 0.9, 0.7, 0.8, 1.0], dtype=torch.float64)
+    x = image([0.0, 1.0, 0, 0, 0, 0, 0, 0])
+    codes = torch.arange(8, dtype=torch.float64).view(-1, 1, 1)
+    # a bin spreads evenly over the codes that it meets: edges at 0 1 2 3.3 4.6 5.5 6.2 7.0
+    by_hand = {1: 1.0, 2: 1.0, 4: 1 - (0.3 + 0.6) / 4, 5: 1 - (0.3 + 0.6 + 0.5) / 5}
+    for offsets, mean in by_hand.items():
+        y = TDC(steep, sliding_scale=offsets)(x)
+        assert float((codes * y).sum()) == pytest.approx(mean, abs=1e-12)
 
 
 def test_what_falls_inside_is_conserved():

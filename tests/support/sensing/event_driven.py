@@ -66,17 +66,15 @@ class Events:
     def coded(self, rng, widths, *, dither=False, sliding_scale=1, offset_bins=0.0):
         """Codes of unequal `widths` (bins,) instead of times; dither adds an unknown time of up to one bin before.
 
-        `sliding_scale` conversions start 0, 1, 2, ... codes late, in turn, and know it. Events beyond the last code
-        are lost.
+        One of `sliding_scale` offsets of 0, 1, 2, ... mean widths is added to every event and taken off its code.
+        Beyond the last code the widths begin again; codes outside of the window are lost.
         """
         inside, period = self.times % self.bins, np.floor(self.times / self.bins)
         if dither:
             inside = inside + rng.random(len(self))
         shift = rng.integers(0, sliding_scale, len(self))
-        code = np.empty(len(self))
-        for s in range(sliding_scale):
-            edges = offset_bins + np.concatenate([[0.0], np.cumsum(np.roll(widths, -s))])
-            code[shift == s] = np.searchsorted(edges, inside[shift == s], side="right") - 1
+        edges = offset_bins + np.concatenate([[0.0], np.cumsum(np.tile(widths, 3))])
+        code = np.searchsorted(edges, inside + shift * np.mean(widths), side="right") - 1 - shift
         kept = (code >= 0) & (code < self.bins)
         return replace(self, times=code + 0.5 + period * self.bins).chosen(kept)
 

@@ -44,7 +44,8 @@ class Recipe(Specification):
     :class:`~torchtransient.nlos.CaptureRenderer`, and a time axis (or frequencies) has to be given, since what is
     hidden moves.
 
-    ``device``: a :class:`~torchtransient.sensing.Device`, or its name or file: what the transient is measured with. Its
+    ``device``: a :class:`~torchtransient.sensing.Device`, or its name or file: what the transient is measured with. A
+    chain of one's own is written as one, see docs/data_sheet_to_chain.md. Its
     draw is ``measurement``, beside the transient itself. ``physics``: "ignore" or "error", as in the renderer.
 
     ``seed``: another one is another data set. Every number of sample i is drawn from (seed, i, key) alone: samples can

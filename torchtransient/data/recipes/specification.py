@@ -220,7 +220,10 @@ def _device(given: Any) -> Device | None:
             known = ", ".join(sorted(DEVICES))
             raise SceneError(f"recipe: device: expected a device, its file, or one of {known}; got {str(given)!r}.")
         return Device.from_json(Path(given)) if Path(given).suffix == ".json" else Device.from_yaml(Path(given))
-    raise SceneError(f"recipe: device: expected a device, its name or its file, got {shown(given)}.")
+    raise SceneError(
+        f"recipe: device: expected a device, its name or its file, got {shown(given)}. "
+        "sensing.Device(..., stages=[...]) describes a chain of one's own."
+    )
 
 
 def is_entry(value: Any) -> bool:

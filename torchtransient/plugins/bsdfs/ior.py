@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.errors import SceneError
+from torchtransient.plugins.node_walk import has_mean
 
 # Each of two lobes is drawn at least this often where one of them is black, and in derivatives by their reflectances:
 # the slope of a faint lobe is that of a bright one.
@@ -38,11 +39,11 @@ def optional_texture(props: Any, name: str) -> Any | None:
 
 def specular_share(specular: Any | None, diffuse: Any, followed: bool) -> Any:
     """Detached share of the specular lobe among the samples, by the mean reflectances of both lobes' textures;
-    ``followed``: for derivatives by one of them.
+    ``followed``: for derivatives by one of them. Textures that know no mean count as 0.5: any share is right.
     """
     with dr.suspend_grad():
-        d = mi.Float(diffuse.mean())
-        s = mi.Float(1) if specular is None else mi.Float(specular.mean())
+        d = mi.Float(diffuse.mean() if has_mean(diffuse) else 0.5)
+        s = mi.Float(1 if specular is None else specular.mean() if has_mean(specular) else 0.5)
         share = s / dr.select(d + s > 0, d + s, 1)
         both = dr.clip(share, LEAST_SHARE, 1 - LEAST_SHARE)
         return opaque(both if followed else dr.select((d <= 0) | (s <= 0), both, share))

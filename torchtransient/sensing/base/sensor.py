@@ -5,12 +5,13 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable
+from dataclasses import fields, is_dataclass
 from typing import Any, Literal, Self
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from torchtransient.errors import GradientError, ShapeError
+from torchtransient.errors import GradientError, ShapeError, TorchTransientError
 from torchtransient.floating import in_single
 from torchtransient.scalar_state import ScalarState
 from torchtransient.sensing.base.given import careful_init
@@ -49,6 +50,41 @@ class PhysicalModule(ScalarState):
                 child._apply(fn)  # type: ignore[no-untyped-call]
         super()._apply(careful, recurse=False)  # type: ignore[no-untyped-call]
         return self
+
+    def extra_repr(self) -> str:
+        """What the module was made with, by the names of its constructors; tensors of many numbers by their size."""
+        made = [cls.__init__ for cls in type(self).__mro__ if "__init__" in cls.__dict__ and issubclass(cls, nn.Module)]
+        names = [name for init in made for name in inspect.signature(init).parameters]
+        given = {name: _shown(self, name) for name in [*names, "bin_width_s", "num_bins"]}
+        return ", ".join(f"{name}={text}" for name, text in given.items() if text)
+
+
+_FEW = 8  # numbers of a list that a repr shows
+
+
+def _shown(module: nn.Module, name: str) -> str:
+    """An attribute as a repr shows it; nothing for one that is not there, or has learnt what it must not be."""
+    try:
+        return _text(getattr(module, name, None))
+    except TorchTransientError:
+        return ""
+
+
+def _text(value: object) -> str:
+    """A number, a choice or a record; nothing for None and for what torch shows itself."""
+    if isinstance(value, Tensor):
+        if value.ndim > 1 or value.numel() > _FEW:
+            return f"(size {'x'.join(map(str, value.shape))})"
+        value = value.detach().tolist()
+    if isinstance(value, (list, tuple)):
+        items = [_text(item) for item in value]
+        return f"({', '.join(items)})" if items and all(items) and len(items) <= _FEW else ""
+    if isinstance(value, float):
+        return f"{value:g}"
+    if is_dataclass(value):
+        held = {field.name: _text(getattr(value, field.name)) for field in fields(value)}
+        return f"{type(value).__name__}({', '.join(f'{name}={text}' for name, text in held.items() if text)})"
+    return repr(value) if isinstance(value, (bool, int, str)) else ""
 
 
 # What stages hand on: W / (m^2 sr) per bin, detections per laser cycle and bin, the mean charge (or photons) of a whole
@@ -160,6 +196,3 @@ class RandomSensor(Sensor):
             return straight_through(measurement, self.expected(x)) if torch.is_grad_enabled() else measurement
         record_score(lambda: self.log_prob(measurement, x), type(self).__name__)
         return measurement
-
-    def extra_repr(self) -> str:
-        return f"grad={self.grad!r}"

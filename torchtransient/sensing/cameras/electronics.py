@@ -253,11 +253,6 @@ class PixelElectronics(RandomSensor):
             )
         return values.to(x.dtype)
 
-    def extra_repr(self) -> str:
-        names = ("full_well_e", "read_noise_e", "ktc_noise_e", "excess_noise", "dark_e", "gain_e_per_dn", "bits")
-        signed = ["signed=True"] if self.signed else []
-        return ", ".join([*(f"{n}={getattr(self, n)!r}" for n in names), *signed, super().extra_repr()])
-
 
 def _density(t: Tensor) -> Tensor:
     return torch.exp(-0.5 * t * t) / math.sqrt(2 * math.pi)

@@ -122,11 +122,21 @@ class GatedIntegration(Sensor):
             else:
                 self.register_buffer(name, value)
 
+    @property
+    def delays_s(self) -> Tensor:
+        """(G,) float64: opening times of the gates, in seconds."""
+        return self.delay_ps.double() * 1e-12
+
+    @property
+    def widths_s(self) -> Tensor:
+        """(G,) float64: open times of the gates, in seconds."""
+        return self.log_width_s.double().exp()
+
     def profiles(self) -> Tensor:
         """(G, T) float64: the gates as they are now."""
         return gate_profiles(
-            self.delay_ps.double() * 1e-12,
-            self.log_width_s.double().exp(),
+            self.delays_s,
+            self.widths_s,
             self.axis,
             rise_s=self.rise_s,
             fall_s=self.fall_s,
@@ -136,13 +146,9 @@ class GatedIntegration(Sensor):
     def outside(self) -> Tensor:
         """(G,) float64: share of each gate's open time that lies outside the window, leakage left out."""
         with torch.no_grad():
-            widths = self.log_width_s.double().exp()
-            delays = self.delay_ps.double() * 1e-12
-            inside = gate_profiles(delays, widths, self.axis, rise_s=self.rise_s, fall_s=self.fall_s)
+            widths = self.widths_s
+            inside = gate_profiles(self.delays_s, widths, self.axis, rise_s=self.rise_s, fall_s=self.fall_s)
             return 1 - inside.sum(1) * self.axis.bin_width_s / widths
 
     def expected(self, x: Tensor) -> Tensor:
         return correlate(x, self.profiles()) * self.electrons_per_unit
-
-    def extra_repr(self) -> str:
-        return f"gates={self.delay_ps.numel()}, rise_s={self.rise_s:g}, leakage={self.leakage:g}"

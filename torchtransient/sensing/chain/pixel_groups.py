@@ -182,6 +182,3 @@ class PixelGroups(RandomSensor):
             places = [place for _, place in self._apart(x)]
             record_score(lambda: self._together(scores, places), "PixelGroups")
         return y
-
-    def extra_repr(self) -> str:
-        return f"sensors={len(self.sensors)}, pixels={tuple(self.which.shape)}"

@@ -123,6 +123,11 @@ class PowerLawDelays(AfterpulseDelays):
             "the probability of what comes after the dead time."
         )
 
+    @property
+    def exponent(self) -> Tensor:
+        """Exponent of the law, float64."""
+        return self.log_exponent.double().exp()
+
     def _limits(self, dead_time_s: float) -> float:
         if not 0 < dead_time_s < self.longest_s:
             raise UnitError(
@@ -133,7 +138,7 @@ class PowerLawDelays(AfterpulseDelays):
 
     def _growth(self, log_x: Tensor) -> Tensor:
         """Integral of x^-exponent from 1 on, by the logarithm of x."""
-        a = 1 - self.log_exponent.double().exp()
+        a = 1 - self.exponent
         flat = a.abs() < 1e-6
         safe = torch.where(flat, torch.ones_like(a), a)
         return torch.where(flat, log_x * (1 + a * log_x / 2), torch.expm1(safe * log_x) / safe)
@@ -153,13 +158,10 @@ class PowerLawDelays(AfterpulseDelays):
     def draw(self, number: int, dead_time_s: float, generator: torch.Generator | None) -> Tensor:
         end, device = self._limits(dead_time_s), self.log_exponent.device
         u = torch.rand(number, dtype=torch.float64, device=device, generator=generator)
-        a = 1 - float(self.log_exponent.detach().double().exp())
+        a = 1 - float(self.exponent.detach())
         if abs(a) < 1e-6:
             return dead_time_s * torch.exp(u * end)
         return dead_time_s * torch.exp(torch.log1p(u * math.expm1(a * end)) / a)
-
-    def extra_repr(self) -> str:
-        return f"exponent={float(self.log_exponent.detach().exp()):g}, longest_s={self.longest_s:g}"
 
 
 class MeasuredDelays(AfterpulseDelays):

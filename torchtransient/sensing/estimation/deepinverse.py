@@ -47,10 +47,12 @@ class SensorPhysics(Physics):  # type: ignore[misc]
 
 
 class LinearSensorPhysics(LinearPhysics):  # type: ignore[misc]
-    """A linear sensor: ``A x = expected(x) - expected(0)``, with its exact transpose.
+    """A linear sensor without its offset: ``A x = expected(x) - expected(0)``, with its exact transpose.
 
-    The offset (background, dark counts) is not part of ``A``: ``forward`` has it taken off the measurement, so that
-    ``forward`` is ``A x`` plus noise of zero mean. ``img_size``: (C, T, H, W) of the inputs.
+    DeepInverse asks for ``A(0) = 0`` of every `LinearPhysics`. What ambient light and dark counts add is `offset`, and
+    ``forward`` is a measurement less the offset: ``A x`` plus noise of zero mean, hence below zero at times.
+    Measurements from elsewhere are handed to DeepInverse as ``y - physics.offset()``; its Poisson likelihood takes them
+    as they are, with ``bkg=physics.offset()``. ``img_size``: (C, T, H, W) of the inputs.
     """
 
     def __init__(self, sensor: Sensor, img_size: tuple[int, ...], **keywords: Any) -> None:
@@ -59,10 +61,14 @@ class LinearSensorPhysics(LinearPhysics):  # type: ignore[misc]
             raise ShapeError(f"LinearSensorPhysics: expected img_size (C, T, H, W), got {img_size}.")
         self.sensor_module = sensor
 
-    def offset(self, x: Tensor) -> Tensor:
-        """The measurement's mean in the dark, for inputs like ``x``."""
-        with torch.no_grad():
-            return self.sensor_module.expected(torch.zeros_like(x))
+    def offset(self, x: Tensor | None = None) -> Tensor:
+        """The measurement's mean in the dark, for inputs like ``x``, by default one of ``img_size`` in float32.
+
+        Differentiable in the sensor's parameters.
+        """
+        if x is None:
+            x = torch.zeros(1, *self.img_size, device=next(self.sensor_module.buffers(), torch.empty(0)).device)
+        return self.sensor_module.expected(torch.zeros_like(x))
 
     def A(self, x: Tensor, **kwargs: Any) -> Tensor:
         """The linear part of the mean."""

@@ -19,9 +19,11 @@ def deepinv_physics(sensor: Sensor, img_size: Sequence[int] | None = None, *, ch
     """The sensor as a DeepInverse physics, ``y = physics(x)`` with x (B, C, T, H, W).
 
     With ``img_size`` (C, T, H, W): a `LinearPhysics` with ``A``, ``A_adjoint``, and all that DeepInverse derives from
-    them (``check`` tries the linearity on random light first: UnitError when it fails by more than 1e-4). Without: a
-    `Physics` of any sensor, with ``A`` and ``A_vjp``. Raises MissingPackageError when ``deepinv`` is not installed
-    (``pip install 'torchtransient[deepinv]'``).
+    them (``check`` tries the linearity on random light first: UnitError when it fails by more than 1e-4). ``A`` is the
+    linear part of the mean alone, with ``A(0) = 0``: ambient light and dark counts are ``physics.offset()``,
+    (1, ...) in the shape of a measurement, and ``physics(x)`` is a measurement less the offset. Take it off measured
+    data as well. Without ``img_size``: a `Physics` of any sensor, with ``A``, the whole mean, and ``A_vjp``. Raises
+    MissingPackageError when ``deepinv`` is not installed (``pip install 'torchtransient[deepinv]'``).
     """
     try:
         from torchtransient.sensing.estimation import deepinverse

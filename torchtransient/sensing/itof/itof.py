@@ -396,5 +396,4 @@ class ItofCorrelation(Sensor):
         return taps * self.electrons_per_unit + self.background_e / self.code.num_taps
 
     def extra_repr(self) -> str:
-        megahertz = ", ".join(f"{f / 1e6:g}" for f in self.frequencies_hz)
-        return f"taps={self.code.num_taps}, frequencies_MHz=({megahertz}), contrast={self.contrast:g}"
+        return f"{super().extra_repr()}, taps={self.code.num_taps}"

@@ -224,6 +224,7 @@ class PhotonBudget(Sensor):
         self.optics = optics
         self.pulse_energy_j = check_number(pulse_energy_j, "pulse_energy_j", where, high=1e3)
         self.photon_energy_j = photon_energy_j(wavelength_m)
+        self.wavelength_m = float(wavelength_m)
         self.repetition_rate_hz = check_number(repetition_rate_hz, "repetition_rate_hz", where, open_low=True)
         keep_map(self, "quantum_efficiency", check_map(quantum_efficiency, "quantum_efficiency", where, high=1.0))
         keep_map(self, "ambient_rate_hz", check_map(ambient_rate_hz, "ambient_rate_hz", where))

@@ -199,9 +199,6 @@ class PolarizationMosaic(Sensor):
         """(..., 4, C, T, H, W): Stokes vectors of raw light (..., C, T, H, W), by `demosaic` and least squares."""
         return stokes_from(self.demosaic(raw), self.rows.flatten(0, 1))
 
-    def extra_repr(self) -> str:
-        return f"block={tuple(self.rows.shape[:2])}"
-
 
 def _behind_mosaic(stokes: Tensor, weights: Tensor) -> Tensor:
     # No product of matrices, which autocast would round.

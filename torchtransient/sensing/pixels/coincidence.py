@@ -16,25 +16,27 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
-from torchtransient.errors import UnitError
+from torchtransient.errors import GradientError, UnitError
 from torchtransient.floating import in_single
 from torchtransient.quantities import Numbers
 from torchtransient.sensing.base.layout import (
     TIME,
     bin_width_of,
     check_count,
+    check_generator,
     check_seconds,
     check_tensor,
     check_transient,
 )
 from torchtransient.sensing.base.own_bins import common_bins
-from torchtransient.sensing.base.policies import GradPolicy
+from torchtransient.sensing.base.policies import VARIANCE_FLOOR, GradPolicy, record_score
 from torchtransient.sensing.base.sensor import RandomSensor
 from torchtransient.sensing.base.wrapped_detector import cycles_of, several_of
 from torchtransient.sensing.correlated_noise.afterpulsing_spad import AfterpulsingSPAD
 from torchtransient.sensing.dead_time.dead_time_cycle import highest_level
 from torchtransient.sensing.dead_time.free_running_draws import log_likelihood
 from torchtransient.sensing.numerics.draws import check_rates
+from torchtransient.sensing.pixels.coincidence_draws import Seen, Trains, draw_coincidences
 from torchtransient.sensing.pixels.macro_pixel import checked_detector, groups_of
 from torchtransient.sensing.spad.free_running import FreeRunningSPAD
 from torchtransient.sensing.spad.spad import SynchronousSPAD
@@ -47,6 +49,7 @@ _WEIGHTS = (*_SIDES, *reversed(_SIDES))
 _PHOTONS = 4.0  # of all SPADs in a piece, which 8 points integrate
 _ROUNDED = 1e-6  # of a probability
 _FLOOD = 1e8  # photons of a bin, from which on first ones are where it begins
+_PARTS = 64  # of the cycles, that the normal surrogate weighs
 
 
 @dataclass(frozen=True)
@@ -109,10 +112,17 @@ class CoincidencePixel(RandomSensor):
     thousands of photons in a bin takes ten times as long, for the whole image.
     Lines are down at the start of a cycle of a SynchronousSPAD, and come round the period of a FreeRunningSPAD.
 
-    Samples are independent binomials of the cycles, with the exact mean: neighbouring bins of a cycle exclude each
-    other a little, which they leave out. Policies: all. Raises UnitError for more SPADs in coincidence than there are,
-    a window longer than the dead time, a detector
-    made for other bins, and light that has more than one coincidence per cycle in a bin.
+    Samples follow every SPAD through every cycle, so that coincidences of a cycle exclude or bring one another as those
+    of events do: in a pulse a total varies several times less than of independent bins. Time grows with cycles times
+    SPADs, a few 1e6 of which take a second. Of paralyzable detectors they are independent binomials, as the detector's
+    own.
+
+    Policies: all. `gaussian`: normal numbers with the covariance of the draws, whose size is differentiated as that of
+    independent bins; `score`: that of the detections of all SPADs. `variance` and `log_prob` are those of single bins
+    with at most one coincidence per cycle, and of bins taken as independent. Raises UnitError for more SPADs in
+    coincidence than there are, a window longer than the dead time, and a detector made for other bins; of paralyzable
+    detectors for draws of light that has more than one coincidence per cycle in a bin. GradientError for the score of a
+    learnt dead time.
     """
 
     takes, gives = ("rate",), "counts"
@@ -141,12 +151,12 @@ class CoincidencePixel(RandomSensor):
         given = None if axis is None else axis.num_bins
         self.num_bins = common_bins([detector], where, (self.bin_width_s, given))[1]
         self.window_s = check_seconds(window_s, "window_s", where, open_low=True)
-        inner = detector.detector if isinstance(detector, AfterpulsingSPAD) else detector
-        self.periodic = isinstance(inner, FreeRunningSPAD)
-        dead = inner.dead_time_s
-        if dead is not None and self.window_s > float(dead) * (1 + 1e-9):
+        self.periodic = isinstance(self._inner, FreeRunningSPAD)
+        dead = self._inner.dead_time_s
+        dead = float(dead.detach()) if isinstance(dead, Tensor) else dead
+        if dead is not None and self.window_s > dead * (1 + 1e-9):
             raise UnitError(
-                f"{where}: expected window_s of at most the dead time of {float(dead):g} s, got {self.window_s:g} s. A "
+                f"{where}: expected window_s of at most the dead time of {dead:g} s, got {self.window_s:g} s. A "
                 "SPAD that fires twice in a window would count twice."
             )
 
@@ -163,11 +173,8 @@ class CoincidencePixel(RandomSensor):
     def probabilities(self, x: Tensor) -> Tensor:
         """Expected coincidences per cycle and bin."""
         check_transient(x, "CoincidencePixel")
-        bins, window = x.shape[TIME], self.window_s / self.bin_width_s
-        if window > bins:
-            raise UnitError(
-                f"CoincidencePixel: expected window_s within the {bins} bins of the light, got {window:g} bins."
-            )
+        self._check_window(x)
+        window = self.window_s / self.bin_width_s
         parts = [self._one(x * share, share, number) for share, number in self.groups]
         whole = math.floor(window)
         total = torch.zeros_like(x, dtype=torch.float64)
@@ -180,6 +187,14 @@ class CoincidencePixel(RandomSensor):
                     at = begin + (end - begin) * place
                     total = total + (end - begin) * weight * self._reached(parts, at, window)
         return total.to(x.dtype)
+
+    def _check_window(self, x: Tensor) -> Tensor:
+        bins, window = x.shape[TIME], self.window_s / self.bin_width_s
+        if window > bins:
+            raise UnitError(
+                f"CoincidencePixel: expected window_s within the {bins} bins of the light, got {window:g} bins."
+            )
+        return x
 
     def _one(self, rate: Tensor, share: float, number: int) -> _Group:
         """A SPAD at its rate (..., T, H, W), one of `number` with a `share` of the pixel."""
@@ -230,9 +245,96 @@ class CoincidencePixel(RandomSensor):
         return variance
 
     def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        if not self._paralyzable:
+            return self._drawn(x, generator)
         with torch.no_grad():
             p = self._chances(check_tensor(x, "CoincidencePixel").double())
             return torch.binomial(torch.full_like(p, float(self.cycles)), p, generator=generator).to(x.dtype)
+
+    def gaussian(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        if self._paralyzable:
+            return super().gaussian(x, generator)
+        # A normal number for each of several parts of the cycles, times what the part has drawn beside its mean: normal
+        # numbers with the covariance of the draws.
+        pixels, parts = x.select(TIME, 0).shape, min(self.cycles, _PARTS)
+        normal = torch.randn(*pixels, parts, dtype=torch.float64, device=x.device, generator=generator)
+        cycles = torch.full((parts,), float(self.cycles // parts), dtype=torch.float64, device=x.device)
+        cycles[: self.cycles % parts] += 1
+        p = self.probabilities(x)
+        mean = p.detach() * (normal @ cycles).unsqueeze(TIME)
+        noise = self._drawn(x, generator, weights=normal.view(-1, parts)) - mean
+        width = (self.variance(x) + VARIANCE_FLOOR).sqrt()
+        return self.cycles * p + noise.to(x.dtype) * (width / width.detach())
+
+    @property
+    def _paralyzable(self) -> bool:
+        inner = self._inner
+        return isinstance(inner, FreeRunningSPAD) and inner.kind == "paralyzable"
+
+    @property
+    def _inner(self) -> SynchronousSPAD | FreeRunningSPAD:
+        inner = self.detector.detector if isinstance(self.detector, AfterpulsingSPAD) else self.detector
+        assert isinstance(inner, (SynchronousSPAD, FreeRunningSPAD))  # as was checked
+        return inner
+
+    def _lit(self, x: Tensor, share: float) -> tuple[Tensor, float]:
+        """Rate of one SPAD with a `share` of the light, per cycle and bin, and its dead time in bins."""
+        inner = several_of(self.detector, 1, share)
+        rate = x * share
+        if isinstance(inner, AfterpulsingSPAD):
+            rate, inner = inner.rate(rate), inner.detector
+        if isinstance(inner, SynchronousSPAD):
+            return inner._gated(rate), math.inf if inner.dead_bins is None else inner.dead_bins
+        return rate, float(inner.dead_time_s.detach()) / self.bin_width_s  # type: ignore[operator]
+
+    def _drawn(
+        self,
+        x: Tensor,
+        generator: torch.Generator | None,
+        seen: list[Seen] | None = None,
+        weights: Tensor | None = None,
+    ) -> Tensor:
+        """A draw, and what was `seen` of the SPADs of every share, whose pixels are rows; `weights` of coincidences."""
+        with torch.no_grad():
+            wide = self._check_window(check_rates(check_tensor(x, "CoincidencePixel"), "CoincidencePixel")).double()
+            if x.numel() == 0:
+                return torch.zeros_like(x)
+            groups = []
+            for share, number in self.groups:
+                rate, dead = self._lit(wide, share)
+                groups.append(Trains(rate.movedim(TIME, -1).reshape(-1, x.shape[TIME]), dead, number))
+            if seen is not None:
+                seen += [Seen(torch.zeros_like(g.rate), torch.zeros_like(g.rate)) for g in groups]
+            rows = draw_coincidences(
+                groups, self.cycles, self.coincidence, self.window_s / self.bin_width_s,
+                free=self.periodic, generator=generator, seen=seen, weights=weights,
+            )  # fmt: skip
+            return rows.view(wide.movedim(TIME, -1).shape).movedim(-1, TIME).to(x.dtype)
+
+    def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        if self.grad != "score" or self._paralyzable:
+            return super().forward(x, generator)
+        dead = self._inner.dead_time_s
+        if isinstance(dead, Tensor) and dead.requires_grad and torch.is_grad_enabled():
+            raise GradientError(
+                "CoincidencePixel: expected a dead time that is not learnt, whose score is not supported, got one. "
+                "Choose grad='expected', 'gaussian' or 'straight_through'."
+            )
+        check_generator(generator, "CoincidencePixel")
+        seen: list[Seen] = []
+        measurement = self._drawn(x, generator, seen)
+
+        def log_prob() -> Tensor:
+            """Of the detections of all SPADs: armed detectors fire at the rate of the light."""
+            total = torch.zeros_like(x.select(TIME, 0), dtype=torch.float64)
+            for (share, _), known in zip(self.groups, seen, strict=True):
+                rate = self._lit(x.double(), share)[0].movedim(TIME, -1)
+                detected, armed = (rows.view(rate.shape) for rows in (known.detected, known.armed))
+                total = total + (log_likelihood(detected, rate) - armed * rate).sum(-1)
+            return total
+
+        record_score(log_prob, "CoincidencePixel")
+        return measurement
 
     def _chances(self, x: Tensor) -> Tensor:
         """`probabilities` when they are some, else UnitError."""
@@ -245,16 +347,12 @@ class CoincidencePixel(RandomSensor):
         return p
 
     def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
-        """Of the draws as described: independent binomials."""
+        """Of bins as independent binomials, each of which is exact; `grad="score"` scores the draws themselves."""
         p, n = self.probabilities(x.double()).clamp_max(1), measurement.double()
         quiet = self.cycles - n
         value = log_likelihood(n, p) + log_likelihood(quiet, 1 - p)
         ways = math.lgamma(self.cycles + 1) - torch.lgamma(n + 1) - torch.lgamma(quiet + 1)
         return (value + ways).sum(TIME).to(x.dtype)
-
-    def extra_repr(self) -> str:
-        own = f"spads={self.spads}, coincidence={self.coincidence}, window_s={self.window_s:g}"
-        return f"{own}, {super().extra_repr()}"
 
 
 def _binomials(q: Tensor, number: int, most: int) -> list[Tensor]:

@@ -115,7 +115,7 @@ class MacroPixel(WrappedDetector):
         return added(detector(rate, generator=generator) for detector, rate in self._parts(x))
 
     def extra_repr(self) -> str:
-        return f"spads={self.spads}, shares={len(self.groups)}, {super().extra_repr()}"
+        return f"{super().extra_repr()}, shares={len(self.groups)}"
 
 
 class ZoneSum(Sensor):
@@ -141,6 +141,3 @@ class ZoneSum(Sensor):
             )
         down, across = height // self.rows, width // self.columns
         return x.reshape(*x.shape[:-2], down, self.rows, across, self.columns).sum((-3, -1))
-
-    def extra_repr(self) -> str:
-        return f"rows={self.rows}, columns={self.columns}"

@@ -12,7 +12,7 @@ from torchtransient.errors import ShapeError, UnitError
 from torchtransient.given_types import is_one_of, several
 from torchtransient.quantities import MOST_MADE, as_whole, shown
 from torchtransient.sensing.base.layout import check_seconds, reals
-from torchtransient.sensing.numerics.time_convolution import check_choice
+from torchtransient.sensing.numerics.time_convolution import check_choice, filter_rows
 from torchtransient.sensing.response.response_shapes import (
     above_floor,
     integrated_counts,
@@ -223,6 +223,4 @@ def _gathered(fine_shares: Tensor, before: int, fine: int, bins: int) -> Tensor:
 
 def _full_convolution(a: Tensor, b: Tensor) -> Tensor:
     length = a.numel() + b.numel() - 1
-    both: Tensor = torch.fft.irfft(torch.fft.rfft(a, n=length) * torch.fft.rfft(b, n=length), n=length)
-    # a transform leaves 1e-17 of either sign where there is nothing
-    return both.clamp_min(0)
+    return filter_rows(a, torch.fft.rfft(b, n=length), length, 0, length)

@@ -68,7 +68,3 @@ class ImpulseResponse(Sensor):
     def expected(self, x: Tensor) -> Tensor:
         first, kernel = kernel_of(self.response, self.bin_width_s, self.within_bin)
         return convolve_time(x, kernel, first, boundary=self.boundary, method=self.method)
-
-    def extra_repr(self) -> str:
-        choices = f"boundary={self.boundary!r}, method={self.method!r}, within_bin={self.within_bin!r}"
-        return f"bin_width_s={self.bin_width_s:g}, {choices}"

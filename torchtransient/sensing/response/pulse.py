@@ -15,6 +15,7 @@ from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.pulses import Pulse, cumulative_of_sum
 from torchtransient.sensing.base.layout import check_tensor, check_time_axis, without_autocast
+from torchtransient.sensing.numerics.time_convolution import filter_rows
 
 # Longer kernels are applied by a Fourier transform in double precision, whose rounding stays 1e-12 below the largest
 # bin where one in single precision would drown the late ones.
@@ -91,11 +92,11 @@ def _convolve(rows: Tensor, kernel: Tensor) -> Tensor:
     """Full convolution along the last dimension: T + K - 1 entries."""
     length = rows.shape[-1] + kernel.numel() - 1
     if min(kernel.numel(), rows.shape[-1]) > _DIRECT_TAPS:
-        transform = torch.fft.fft if rows.is_complex() else torch.fft.rfft
-        inverse = torch.fft.ifft if rows.is_complex() else torch.fft.irfft
-        wide = rows.to(torch.promote_types(rows.dtype, torch.float64))
-        product = transform(wide, n=length) * transform(kernel.to(wide.dtype), n=length)
-        back: Tensor = inverse(product, n=length)
+        if not rows.is_complex():
+            transfer = torch.fft.rfft(kernel, n=length)
+            return filter_rows(rows.double(), transfer, length, 0, length).to(rows.dtype)
+        wide = rows.to(torch.complex128)
+        back: Tensor = torch.fft.ifft(torch.fft.fft(wide, n=length) * torch.fft.fft(kernel, n=length))
         return back.to(rows.dtype)
     flat = rows.reshape(-1, 1, rows.shape[-1])
     weights = kernel.flip(0).to(rows.dtype).view(1, 1, -1)

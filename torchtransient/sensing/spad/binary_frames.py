@@ -70,6 +70,3 @@ class BinaryFrames(RandomSensor):
         total = torch.lgamma(torch.tensor(self.frames + 1.0, dtype=torch.float64))
         value = value + (total - torch.lgamma(n + 1) - torch.lgamma(self.frames - n + 1))
         return value.sum(TIME).to(x.dtype)
-
-    def extra_repr(self) -> str:
-        return f"frames={self.frames}, {super().extra_repr()}"

@@ -292,7 +292,3 @@ class FreeRunningSPAD(RandomSensor):
 
         record_score(log_prob, type(self).__name__)
         return path.counts.to(x.dtype)
-
-    def extra_repr(self) -> str:
-        dead_time_s = float(self.dead_time_s.detach())
-        return f"cycles={self.cycles}, dead_time_s={dead_time_s:g}, kind={self.kind!r}, {super().extra_repr()}"

@@ -291,9 +291,6 @@ class SynchronousSPAD(RandomSensor):
         rate = torch.where(is_open, estimate.rate / gate.clamp_min(1e-12), torch.zeros_like(estimate.rate))
         return CoatesEstimate(rate, estimate.valid & is_open)
 
-    def extra_repr(self) -> str:
-        return f"cycles={self.cycles}, dead_time_s={self.dead_time_s}, {super().extra_repr()}"
-
 
 def log_of_firing(rate: Tensor) -> Tensor:
     """log(1 - exp(-rate)), the log-probability that an armed detector fires, with all digits of dark and bright bins.

@@ -62,6 +62,3 @@ class DetectionJitter(MovedCounts):
         if not kernel.numel():
             kernel, first = torch.zeros(1, dtype=torch.float64, device=x.device), 0
         return Moves(first, kernel, self.boundary)
-
-    def extra_repr(self) -> str:
-        return f"bin_width_s={self.bin_width_s:g}, boundary={self.boundary!r}, {super().extra_repr()}"

@@ -77,6 +77,11 @@ class _Delays(PhysicalModule):
         else:
             self.register_buffer("delay_ps", delay * 1e12)
 
+    @property
+    def delay_s(self) -> Tensor:
+        """Delay of all pixels, or of every one, in seconds."""
+        return self.delay_ps.double() * 1e-12
+
     def bins(self, x: Tensor, where: str) -> Tensor:
         """(..., C, H, W) or (), float64, checked against the pixels of `x`."""
         pixels_of(self.delay_ps, x, "delay_s", where)
@@ -157,9 +162,6 @@ class PixelSkew(Sensor):
         check_transient(x, "PixelSkew")
         return shift_time(x, self.delays.bins(x, "PixelSkew"), boundary=self.boundary)
 
-    def extra_repr(self) -> str:
-        return f"delays={tuple(self.delays.delay_ps.shape)}, boundary={self.boundary!r}"
-
 
 class DetectionSkew(MovedCounts):
     """Detections (counts) of every pixel later by a delay of its own: a signal tree, a converter that starts late.
@@ -205,6 +207,3 @@ class DetectionSkew(MovedCounts):
     def moves(self, x: Tensor) -> Delayed:
         whole, part = _whole_and_part(self._delay_bins(x), x)
         return Delayed(whole, part, self.boundary)
-
-    def extra_repr(self) -> str:
-        return f"delays={tuple(self.delays.delay_ps.shape)}, boundary={self.boundary!r}, {super().extra_repr()}"

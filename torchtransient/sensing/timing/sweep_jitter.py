@@ -98,7 +98,3 @@ class SweepJitter(RandomSensor):
                 f"{type(self).__name__}: expected jitter below the window of {x.shape[TIME] * self.bin_width_s:g} s, "
                 f"got jitter_fwhm_s={self.jitter_fwhm_s!r}. Picoseconds? 1 ps is 1e-12."
             )
-
-    def extra_repr(self) -> str:
-        jitter = f"jitter_fwhm_s={self.jitter_fwhm_s:g}, sweeps={self.sweeps}, boundary={self.boundary!r}"
-        return f"{jitter}, {super().extra_repr()}"

@@ -1,4 +1,8 @@
-"""Time-to-digital converters: codes of unequal width (DNL, INL), sliding scale, dither."""
+"""Time-to-digital converters: codes of unequal width (DNL, INL), sliding scale, dither.
+
+Source: Cottini, Gatti, Svelto, A new method for analog to digital conversion (Nuclear Instruments and Methods 24,
+1963), the sliding scale.
+"""
 
 from __future__ import annotations
 
@@ -70,9 +74,11 @@ class TDC(MovedCounts):
     """Turns equal true bins into the codes of a real converter, (..., C, T, H, W) to the same shape.
 
     `code_widths`: (T,) relative widths (mean about 1): their deviations are the DNL, the running sum of these the INL.
-    Light of a true bin is taken to be spread evenly over it. `sliding_scale`: number of known start offsets, one code
-    apart, over which conversions are averaged, which evens the DNL out. `dither`: an unknown time, uniform over one
-    bin, that is added before the conversion and not taken off: of equal codes, half the events get the next one.
+    Light of a true bin is taken to be spread evenly over it. `sliding_scale`: number of known offsets,
+    0, 1, 2, ... mean code widths, one of which is added before every conversion, at random, and taken off its code.
+    That evens the DNL out; the mean of the INL at the codes used stays. Beyond the last code the widths begin again.
+    `dither`: an unknown time, uniform over one bin, that is added before the conversion and not taken off: of equal
+    codes, half the events get the next one.
     `offset_bins`: where, in true bins, the first code begins; light then gets earlier codes by as much.
 
     `acts_on` "detections": the input are counts behind a detector. Each of them gets its code: whole counts by a draw,
@@ -142,14 +148,15 @@ class TDC(MovedCounts):
         codes, periodic = widths.shape[0], self.goes_round
         if periodic:
             widths = widths * (codes / widths.sum())
+        step = widths.mean()
+        two_turns = torch.nn.functional.pad(widths.repeat(2).cumsum(0), (1, 0)) + self.offset_bins
         parts = []
         for shift in range(self.sliding_scale):
-            # a conversion that starts `shift` codes late sees the widths of later codes, round the converter
-            seen = widths.roll(-shift)
-            edges = torch.nn.functional.pad(seen.cumsum(0), (1, 0)) + self.offset_bins
+            later = shift % codes  # whole turns change nothing
+            edges = two_turns[later : later + codes + 1] - later * step
             if periodic:
                 # exactly one turn: rounding at the last edge would leave a gap
-                edges[-1] = self.offset_bins + codes
+                edges[-1] = edges[0] + codes
             parts.append(code_bands(edges, codes, periodic=periodic, dither=self.dither))
         low = min(first for first, _ in parts)
         high = max(first + band.shape[1] for first, band in parts)
@@ -213,7 +220,3 @@ class TDC(MovedCounts):
             return super().sample(x, generator)
         with torch.no_grad():
             return self.expected(x)
-
-    def extra_repr(self) -> str:
-        converter = f"num_bins={self.bands.shape[0]}, sliding_scale={self.sliding_scale}, dither={self.dither}"
-        return f"{converter}, acts_on={self.acts_on!r}, boundary={self.boundary!r}, {super().extra_repr()}"
