@@ -31,6 +31,7 @@ class ShapeLights:
         numbers = [n for n, emitter in enumerate(scene.emitters()) if _is_listed(emitter)]
         lights = [scene.emitters()[n] for n in numbers]
         self._shapes = [(shape, _is_inside_out(shape)) for shape in (light.get_shape() for light in lights)]
+        self._all = len(lights) == len(scene.emitters())
         if lights:
             # One plus the place in this list, zero for all others.
             self._marks = PointerTable(lights, [1 + n for n in range(len(lights))])
@@ -57,6 +58,8 @@ class ShapeLights:
         ds.emitter = emitter
         ds.pdf = dr.select(dr.dot(ds.d, ds.n) < 0, ds.pdf, 0)
         weight = emitter.eval_direction(ref, ds, listed) * dr.select(ds.pdf > 0, dr.rcp(ds.pdf), 0)
+        if self._all:
+            return ds, weight
         other, other_weight = emitter.sample_direction(ref, u, active & ~listed)
         return dr.select(listed, ds, other), dr.select(listed, weight, other_weight)
 
@@ -70,6 +73,8 @@ class ShapeLights:
         with dr.suspend_grad():
             pdf = _asked([shape.pdf_direction for shape, _ in self._shapes], slot, lit, ref, ds)
         pdf *= scene.pdf_emitter(dr.gather(mi.UInt32, self._numbers, slot - 1, listed), listed)
+        if self._all:
+            return pdf
         return dr.select(listed, pdf, scene.pdf_emitter_direction(ref, ds, active & ~listed))
 
 

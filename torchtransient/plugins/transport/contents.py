@@ -18,8 +18,8 @@ from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene, shapes
 from torchtransient.plugins.pointer_table import PointerTable
 from torchtransient.plugins.remembered import Remembered
 from torchtransient.plugins.sampling.distant import DistantReference
-from torchtransient.plugins.sampling.sphere_lights import SphereLights
 from torchtransient.plugins.sampling.shape_lights import ShapeLights
+from torchtransient.plugins.sampling.sphere_lights import SphereLights
 from torchtransient.plugins.sensors.surroundings import Surroundings
 from torchtransient.plugins.transport.hits import DetachedHits
 from torchtransient.plugins.transport.instances import Instances
