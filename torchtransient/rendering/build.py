@@ -361,9 +361,9 @@ def _substitute_plugins(state: Any, options: BuildOptions) -> None:
         plugin, name = node.props.plugin_name(), node.props.id()
         if mi.is_polarized and plugin in POLARIZED_PLUGINS:
             node.props.set_plugin_name(POLARIZED_PLUGINS[plugin])
-        elif plugin in DIFFERENTIABLE_PLUGINS and name in asked:
+        elif plugin in DIFFERENTIABLE_PLUGINS and (name in asked or _has_index_of_one(node.props)):
             node.props.set_plugin_name(DIFFERENTIABLE_PLUGINS[plugin])
-            if plugin in BUILDS_LOBES:
+            if plugin in BUILDS_LOBES and name in asked:
                 node.props["lobes"] = ",".join(sorted(asked[name]))
         elif plugin in COMPLETED_PLUGINS:
             node.props.set_plugin_name(COMPLETED_PLUGINS[plugin])
@@ -374,6 +374,15 @@ def _substitute_plugins(state: Any, options: BuildOptions) -> None:
             held = descendants(state, node)
             if any(inner.props.id() in asked and inner.props.plugin_name() in BUILDS_LOBES for inner in held):
                 node.props["allow_transmission"] = True
+
+
+def _has_index_of_one(props: Any) -> bool:
+    """Whether a node is a principled surface without a dielectric. Mitsuba's loses its mirror lobe there, that of its
+    metal too; its twin has the limit, as it does for derivatives.
+    """
+    if props.plugin_name() != "principled":
+        return False
+    return any(name in props and abs(props[name] - one) < 1e-12 for name, one in (("specular", 0), ("eta", 1)))
 
 
 def _forget_queries(state: Any) -> None:
