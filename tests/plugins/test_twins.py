@@ -74,11 +74,11 @@ def asked_for_all(plugin, settings):
     """The twin in a job of derivatives by everything."""
     bsdf = mi.load_dict({"type": plugin, **settings})
     params = mi.traverse(bsdf)
-    for key in params.keys():
-        if dr.is_array_v(params[key]):
-            value = type(params[key])(params[key])
-            dr.enable_grad(value)
-            params[key] = value
+    for key, value in list(params):
+        if dr.is_array_v(value):
+            attached = type(value)(value)
+            dr.enable_grad(attached)
+            params[key] = attached
     params.update()
     return bsdf
 
@@ -107,11 +107,7 @@ def test_principled_surfaces_without_an_index_are_the_limit(end, beside):
         check_alike(scattered(mi.load_dict({"type": "diff_principled", **end, **more})), limit, more)
         check_alike(scattered(asked_for_all("diff_principled", {**end, **more})), limit, more)
     metal = mi.load_dict({"type": "principled", **end, "metallic": 1.0})
-    assert scattered(metal)[1] == 0, "Mitsuba has mended it: build.py need not exchange such surfaces any more"
-
-
-def wall_of(bsdf):
-    return room(wall={"type": "rectangle", "bsdf": bsdf}, depth=3, sensor=camera())
+    assert scattered(metal)[1] == 0, "mended by Mitsuba: nothing needs to be exchanged"
 
 
 METAL = {"type": "principled", "metallic": 0.5, "specular": 0.0}
