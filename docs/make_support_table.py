@@ -28,7 +28,7 @@ NOT_SUPPORTED = (
         "weights of lobes of Mitsuba's own `principled`, `principledthin`",
         "taken over by `diff_principled`, `diff_principled_thin` when the key is asked for",
     ),
-    ("parameters of Mitsuba's own `hair`", "taken over by `diff_hair` when the key is asked for"),
+    ("parameters of Mitsuba's own `hair`", "taken over by `diff_hair`, always"),
     (
         "eta of Mitsuba's own `dielectric`, `roughdielectric`",
         "taken over by `diff_dielectric`, `diff_rough_dielectric` when the key is asked for",

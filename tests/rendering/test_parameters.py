@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mitsuba as mi
 import numpy as np
 import pytest
 import torch
@@ -257,7 +258,8 @@ def test_rough_plastic_is_built_with_its_derivative(key):
 
 def test_table_of_a_scene_with_a_parameter_that_is_not_set():
     room = make_room()
-    room["box"]["bsdf"] = {"type": "hair"}
+    with mi.variant_context(VARIANT):
+        room["box"]["bsdf"] = mi.load_dict({"type": "hair"})
     scene = tt.load(room, variant=VARIANT)
     absorption = scene.parameters()["box.bsdf.sigma_a"]
     assert absorption.value is None and absorption.shape is None and not absorption.differentiable

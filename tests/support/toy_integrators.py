@@ -55,6 +55,15 @@ class GuidedWithPointLight(Guided):
         return segment, scattering, [*connections, OwnPointLight([0.5, 0.0, 4.0], 10.0)]
 
 
+class FoundLights(volpath.TransientVolpath):
+    """Lights are not sampled: paths have to run into them."""
+
+    def strategies(self, contents):
+        segment, scattering, _ = super().strategies(contents)
+        return segment, scattering, [EmitterFound()]
+
+
+register("integrator", "transient_found_lights", FoundLights)
 register("integrator", "transient_guided_with_point_light", GuidedWithPointLight)
 register("integrator", "transient_three_emitter_samples", ThreeEmitterSamples)
 register("integrator", "transient_two_emitter_samples", TwoEmitterSamples)

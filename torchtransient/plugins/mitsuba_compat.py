@@ -177,9 +177,9 @@ POLARIZED_PLUGINS = {
     **{name: f"diff_{name}" for name in ("dielectric", "conductor", "polarizer", "retarder", "circular")},
     "roughdielectric": "diff_rough_dielectric",
 }
-# These stand in for Mitsuba's always, which lack methods that every plugin of their kind may be asked for:
-# `eval_direction` of a `directionalarea`, which raises while kernels are traced, for the other lights of a scene too.
-COMPLETED_PLUGINS = {"directionalarea": "diff_directionalarea"}
+# These stand in for Mitsuba's always. `directionalarea` lacks `eval_direction`: it raises while kernels are traced, for
+# the other lights of a scene too. `hair` is wrong as said above, and black or infinite where it is hardly rough.
+COMPLETED_PLUGINS = {"directionalarea": "diff_directionalarea", "hair": "diff_hair"}
 # Textures that know no mean, which Mitsuba's plastics ask for: with one of these their twins are built.
 TEXTURES_WITHOUT_MEAN = {"mesh_attribute": "MeshAttribute", "volume": "VolumeAdapter"}
 

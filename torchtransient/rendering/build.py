@@ -374,9 +374,9 @@ def _substitute_plugins(state: Any, options: BuildOptions) -> None:
         plugin, name = node.props.plugin_name(), node.props.id()
         if mi.is_polarized and plugin in POLARIZED_PLUGINS:
             node.props.set_plugin_name(POLARIZED_PLUGINS[plugin])
-        elif plugin in DIFFERENTIABLE_PLUGINS and name in asked:
+        elif plugin in DIFFERENTIABLE_PLUGINS and (name in asked or _has_index_of_one(node.props)):
             node.props.set_plugin_name(DIFFERENTIABLE_PLUGINS[plugin])
-            if plugin in BUILDS_LOBES:
+            if plugin in BUILDS_LOBES and name in asked:
                 node.props["lobes"] = ",".join(sorted(asked[name]))
         elif plugin in PLASTICS.values() and _lacks_mean(state, node):
             node.props.set_plugin_name(DIFFERENTIABLE_PLUGINS[plugin])
@@ -397,3 +397,13 @@ def _lacks_mean(state: Any, node: Any) -> bool:
 
     described = any(inner.props.plugin_name() in TEXTURES_WITHOUT_MEAN for inner in descendants(state, node))
     return described or any(isinstance(v, mi.Texture) and not has_mean(v) for _, v in node.props.items())
+
+
+def _has_index_of_one(props: Any) -> bool:
+    """Return whether a node is a principled surface without a dielectric. Mitsuba's loses its mirror lobe there, that of
+    its metal too; its twin has the limit, as it does for derivatives.
+    """
+    if props.plugin_name() != "principled":
+        return False
+    found = [(props.get(name), one) for name, one in (("specular", 0), ("eta", 1))]
+    return any(isinstance(value, float) and abs(value - one) < 1e-12 for value, one in found)

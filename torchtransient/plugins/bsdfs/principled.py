@@ -26,6 +26,9 @@ AWAY = 0.25
 # From zero, and from larger ends relative to them: the least steps that a comparison notices.
 STEP, RELATIVE_STEP = 1e-30, 6e-8
 
+# What stands for an index of one in single precision, at which Mitsuba loses the mirror lobe: 1.001, or what makes it.
+ONE = {"eta": (1.0, 1.001), "specular": (0.0, (0.001 / 2.001) ** 2 / 0.08)}
+
 # A base colour of zero, where its root is differentiated.
 LEAST_COLOUR = 1e-4
 
@@ -160,7 +163,7 @@ class DiffPrincipled(mi.BSDF):
             held[name] = Weight(name, self.textures[name], ends[name], self.reading)
         held["base_color"] = Colour(self.textures["base_color"], self.reading)
         if self.index:
-            held[self.index] = float(dr.slice(dr.detach(self.index_value), 0))
+            held[self.index] = float(dr.slice(dr.detach(self._away_from_one()), 0))
         self.own = mi.load_dict({"type": self.plugin, **self.fixed, **held})
         self.m_components = [self.own.flags(i) for i in range(self.own.component_count())]
         self.m_flags = self.own.flags()
@@ -201,13 +204,16 @@ class DiffPrincipled(mi.BSDF):
     def _hand_index_on(self) -> None:
         if not self.index:
             return
-        value = opaque(self.index_value)
-        self._handed_on = attached_as(value)
-        # Mitsuba takes the same for an index of one, and loses the derivative.
-        one, instead = (0, 1e-3) if self.index == "specular" else (1, 1.001)
+        self._handed_on = attached_as(opaque(self.index_value))
         params = mi.traverse(self.own)
-        params[self.index] = dr.select(value == one, value + (instead - one), value)
+        params[self.index] = self._away_from_one()
         params.update()
+
+    def _away_from_one(self) -> Any:
+        """The index as Mitsuba is handed it, with the derivative."""
+        one, instead = ONE[self.index]
+        value = self.index_value
+        return dr.select(dr.abs(value - one) < 1e-12, value + (instead - one), value)
 
     # ------------------------------------------------------------------------------------------- as it is read
 

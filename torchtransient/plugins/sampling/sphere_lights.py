@@ -20,19 +20,22 @@ from torchtransient.plugins.mitsuba_compat import is_sphere, samples_its_shape
 from torchtransient.plugins.node_walk import objects_below, shown_by
 from torchtransient.plugins.pointer_table import PointerTable
 from torchtransient.plugins.sampling.rare_lights import least_probability
+from torchtransient.plugins.sampling.shape_lights import ShapeLights
 
 # How many numbers of a light kernels load at once.
 _PACKET = 4
 
 
 class SphereLights:
-    """The spherical lights among ``lights``, the emitters of one scene; ``numbers``: which ones. ``all``: there are no
-    others. ``textured``: one of them has a texture. ``marks``: one plus the place of each in the table, zero for all
-    others. ``least_pmf``: of lights that are hardly ever drawn less (:mod:`.rare_lights`).
+    """The spherical lights among those of a scene; ``numbers``: which ones. ``all``: there are no others; ``others``:
+    how these are sampled. ``textured``: one of them has a texture. ``marks``: one plus the place of each in the table,
+    zero for all others. ``least_pmf``: of lights that are hardly ever drawn less (:mod:`.rare_lights`).
     """
 
-    def __init__(self, lights: list[Any], numbers: list[int]) -> None:
+    def __init__(self, scene: Any, numbers: list[int]) -> None:
+        lights = scene.emitters()
         emitters = [lights[n] for n in numbers]
+        self.others = ShapeLights(scene)
         self._numbers, self.all = numbers, len(numbers) == len(lights)
         self.least_pmf = least_probability(len(lights))
         self._shapes = [emitter.get_shape() for emitter in emitters]
@@ -44,9 +47,8 @@ class SphereLights:
     @staticmethod
     def of(scene: Any) -> SphereLights | None:
         """Those of ``scene``, None when it has none."""
-        lights = scene.emitters()
-        numbers = [n for n, emitter in enumerate(lights) if _is_sphere_light(emitter)]
-        return SphereLights(lights, numbers) if numbers else None
+        numbers = [n for n, emitter in enumerate(scene.emitters()) if _is_sphere_light(emitter)]
+        return SphereLights(scene, numbers) if numbers else None
 
     def read(self, scene: Any) -> SphereLightTable:
         """Where they are now, attached where their shapes are; to be called outside of loops, once a job."""
@@ -94,6 +96,7 @@ class SphereLightTable:
 
     def __init__(self, lights: SphereLights, rows: list[list[Any]]) -> None:
         self._marks, self.all, self._least_pmf = lights.marks, lights.all, lights.least_pmf
+        self._others = lights.others
         self._rows, self._width = rows, len(rows[0])
         # Where there is only one, kernels read its numbers as they are instead of looking them up.
         self._only = rows[0] if len(rows) == 1 else None
@@ -146,7 +149,7 @@ class SphereLightTable:
         ds.pdf *= sphere.pmf
         if self.all:
             return ds, weight
-        other, other_weight = emitter.sample_direction(ref, mi.Point2f(x, u.y), active & ~spherical)
+        other, other_weight = self._others.sample_direction(emitter, ref, mi.Point2f(x, u.y), active & ~spherical)
         other.pdf *= scene.pdf_emitter(number, active)
         return dr.select(spherical, ds, other), dr.select(spherical, weight, other_weight * choice)
 
@@ -157,7 +160,7 @@ class SphereLightTable:
         pdf = dr.select(spherical, sphere.density(ds, -dr.dot(ds.d, ds.n)) * sphere.pmf, 0)
         if self.all:
             return pdf
-        return dr.select(spherical, pdf, scene.pdf_emitter_direction(ref, ds, active & ~spherical))
+        return dr.select(spherical, pdf, self._others.pdf(scene, ref, ds, active & ~spherical))
 
     def numbers(self, emitter: Any, active: Any) -> list[Any]:
         """The numbers of the lights that an array of pointers points to."""

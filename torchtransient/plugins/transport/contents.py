@@ -18,6 +18,7 @@ from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene, shapes
 from torchtransient.plugins.pointer_table import PointerTable
 from torchtransient.plugins.remembered import Remembered
 from torchtransient.plugins.sampling.distant import DistantReference
+from torchtransient.plugins.sampling.shape_lights import ShapeLights
 from torchtransient.plugins.sampling.sphere_lights import SphereLights
 from torchtransient.plugins.sensors.surroundings import Surroundings
 from torchtransient.plugins.transport.hits import DetachedHits
@@ -42,7 +43,8 @@ class SceneContents:
     masks and blends, of which a path may be handed one part. ``two_sided``: the two-sided BSDFs in polarized variants.
     ``hidden_probability``: BSDFs whose delta lobes hide the derivative of their probability. ``media``: the
     participating media (:class:`.media_contents.MediaContents`). ``sphere_lights``: the spherical area lights
-    (:class:`~..sampling.sphere_lights.SphereLights`). ``emitting_meshes``: those with vertices of their own;
+    (:class:`~..sampling.sphere_lights.SphereLights`). ``shape_lights``: the area lights that are sampled over their
+    shapes (:class:`~..sampling.shape_lights.ShapeLights`). ``emitting_meshes``: those with vertices of their own;
     ``meshes``: all of those; ``smooth_lights``: lights on meshes with normals at their vertices. Tables, instances,
     surroundings, mixtures, media and lights are None where the scene has no such thing.
 
@@ -70,6 +72,7 @@ class SceneContents:
         self.hidden_probability = PointerTable.marking([bsdf for bsdf in self.bsdfs if hides_lobe_probability(bsdf)])
         self.media = media_of(scene, sensor)
         self.sphere_lights = SphereLights.of(scene)
+        self.shape_lights = ShapeLights(scene) if self.sphere_lights is None else self.sphere_lights.others
         self.smooth_lights = PointerTable.marking([e for e in scene.emitters() if has_smooth_shape(e)])
         self.emitting_meshes = PointerTable.marking([s for s in scene.shapes() if s.is_emitter() and has_vertices(s)])
         self.meshes = PointerTable.marking([s for s in scene.shapes() if has_vertices(s)])

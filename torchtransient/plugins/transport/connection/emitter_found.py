@@ -57,7 +57,8 @@ class EmitterFound(Connection):
         prev.time, prev.wavelengths = path.ray.time, path.ray.wavelengths
         ds = mi.DirectionSample3f(world.scene, si=vertex.si, ref=prev)
         if world.contents.smooth_lights is not None:
-            ds.n = vertex.si.n
+            # The face's area, on the side that emission is told by: on a mirrored mesh it is the other one.
+            ds.n = dr.mulsign(vertex.si.n, dr.dot(vertex.si.n, ds.d) * dr.dot(ds.n, ds.d))
         connected = hit & ~path.prev_unconnected
         sampled = [c.density(world, prev, ds, connected) for c in world.connections if c is not self]
         sampled = sum(density for density in sampled if density is not None)

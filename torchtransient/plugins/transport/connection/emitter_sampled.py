@@ -19,7 +19,7 @@ from torchtransient.plugins.transport.strategy import Connection, Event, EventTe
 
 
 class EmitterSampled(Connection):
-    """A point of an emitter, drawn by Mitsuba's sampling of emitters, but for spheres."""
+    """A point of an emitter, drawn by Mitsuba's sampling of emitters, but for spheres and most textured lights."""
 
     name = "emitter_sampled"
     light_of_scene_alone = True
@@ -37,10 +37,8 @@ class EmitterSampled(Connection):
 
     def sample(self, world, ref, u, active):
         """(direction sample, emission over density) towards an emitter."""
-        if self.spheres is not None:
-            found = self.spheres.sample(world.scene, ref, u, active)
-        else:
-            found = world.scene.sample_emitter_direction(ref, u, False, active)
+        lights = world.contents.shape_lights if self.spheres is None else self.spheres
+        found = lights.sample(world.scene, ref, u, active)
         return found if world.contents.smooth_lights is None else self._by_faces(world, ref, *found, active)
 
     def _by_faces(self, world, ref, ds, weight, active):
@@ -57,16 +55,15 @@ class EmitterSampled(Connection):
         active = world.deep_enough(vertex.goes_on & vertex.connectable, path.depth + 2)
         u = sampler.next_2d()
         ds, weight = self.sample(world, vertex.at, u, active)
-        active &= ds.pdf != 0
+        active &= ds.pdf > 0
         return Proposal(d=ds.d, active=active, ds=ds, weight=weight, u=u, sampler=sampler)
 
     def density(self, world, ref, ds, active):
         smooth = active & ~ds.delta
-        if self.spheres is not None:
-            pdf = self.spheres.pdf(world.scene, ref, ds, smooth)
-        else:
-            pdf = world.scene.pdf_emitter_direction(ref, ds, smooth)
-        return dr.select(ds.delta, ds.pdf, pdf)
+        lights = world.contents.shape_lights if self.spheres is None else self.spheres
+        pdf = lights.pdf(world.scene, ref, ds, smooth)
+        # An environment map that shines in the rows at its poles alone has no distribution: NaN.
+        return dr.select(ds.delta, ds.pdf, dr.select(pdf > 0, pdf, 0))
 
     def connect(self, world, path, vertex, proposal, answer, zeros):
         ds, active = proposal.ds, proposal.active
