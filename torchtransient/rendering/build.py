@@ -400,10 +400,11 @@ def _lacks_mean(state: Any, node: Any) -> bool:
 
 
 def _has_index_of_one(props: Any) -> bool:
-    """Return whether a node is a principled surface without a dielectric. Mitsuba's loses its mirror lobe there, that of
-    its metal too; its twin has the limit, as it does for derivatives.
+    """Return whether a node is a principled surface without a dielectric.
+
+    Mitsuba's loses its mirror lobe there, that of its metal too; its twin has the limit, as it does for derivatives.
     """
     if props.plugin_name() != "principled":
         return False
     found = [(props.get(name), one) for name, one in (("specular", 0), ("eta", 1))]
-    return any(isinstance(value, float) and abs(value - one) < 1e-12 for value, one in found)
+    return any(isinstance(value, int | float) and abs(value - one) < 1e-12 for value, one in found)
