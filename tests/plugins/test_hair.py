@@ -12,7 +12,7 @@ from scipy import special, stats
 import torchtransient as tt
 from support.gradient_cases.scenes import area_light, room
 from support.hair_model import scattered
-from support.marks import long_pairs
+from support.marks import long, long_pairs
 from support.surface_samples import activate
 from torchtransient import plugins
 from torchtransient.errors import GradientError, SceneError
@@ -123,11 +123,11 @@ def test_values_of_mitsuba_differ_by_its_bessel_function(fibre):
             assert -lost - 3e-4 < low and high < 1e-3
 
 
-@pytest.mark.parametrize("variant", [RGB, "llvm_ad_spectral", "llvm_ad_mono_polarized"])
+@pytest.mark.parametrize("variant", long([RGB, "llvm_ad_spectral", "llvm_ad_mono_polarized"], [RGB]))
 def test_colours_are_those_of_mitsuba(variant):
     activate(variant)
     rough = {"longitudinal_roughness": 0.7, "azimuthal_roughness": 0.6, **INDEX}  # where the Bessel function is right
-    colours = [{"eumelanin": 0.4, "pheomelanin": 0.3}, {"sigma_a": {"type": "rgb", "value": [0.1, 0.3, 0.9]}}, {}]
+    colours = [{"eumelanin": 0.4, "pheomelanin": 0.3}, {"sigma_a": {"type": "rgb", "value": [0.1, 0.3, 0.9]}}]
     if mi.is_monochromatic:
         colours = [{"sigma_a": 0.4, "scale": 2.0}]
     for colour in colours:
@@ -250,6 +250,7 @@ def test_derivatives_are_those_of_the_model(fibre, key):
     assert abs(found.sum() - expected.sum()) < 1e-3 * np.abs(expected).sum()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [
     {"longitudinal_roughness": 0.0}, {"azimuthal_roughness": 0.0}, {"longitudinal_roughness": 1.0},
     {"azimuthal_roughness": 1.0}, {"int_ior": 1.0}, {"int_ior": 0.7}, {"sigma_a": 0.0}, {"sigma_a": 1e4},
@@ -296,23 +297,15 @@ def test_hair_is_built_with_its_derivatives():
     infos = [scene.parameters()[key] for key in keys]
     assert all(i.differentiable and not i.biased and not i.moves_path_length for i in infos)
     assert all("diff_hair" in i.reason for i in infos)
-    renderer = tt.TransientRenderer(scene, parameters=keys, spp=64)
-    renderer(seed=0).steady.sum().backward()
-    assert all(float(renderer.values[key].grad.abs()) > 1e-5 for key in keys)
-    own = tt.TransientRenderer(scene, parameters=["wall.bsdf.opacity.value"], spp=256)
-    image, theirs = (r(seed=0, spp=256).steady.detach().sum() for r in (renderer, own))
-    assert float(image) == pytest.approx(float(theirs), rel=0.02)
 
 
 def test_its_absorption_is_built_with_it():
     scene = scene_with({"type": "hair", "sigma_a": {"type": "rgb", "value": [0.2, 0.3, 0.4]}})
     key = "wall.bsdf.sigma_a.value"
     assert "diff_hair" in scene.parameters()[key].reason
-    renderer = tt.TransientRenderer(scene, parameters=[key], spp=64)
+    renderer = tt.TransientRenderer(scene, parameters=[key, "wall.bsdf.eumelanin"], spp=64)
     renderer(seed=0).steady.sum().backward()
     assert (renderer.values[key].grad < 0).all()
-    renderer = tt.TransientRenderer(scene, parameters=["wall.bsdf.eumelanin"], spp=16)
-    renderer(seed=0).steady.sum().backward()
     assert torch.equal(renderer.values["wall.bsdf.eumelanin"].grad, torch.zeros(()))
 
 
