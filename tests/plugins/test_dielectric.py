@@ -76,6 +76,7 @@ def evaluate_all(bsdf, ctx):
         return [np.stack([np.array(x, dtype=float) for x in column], -1) for column in zip(*lanes, strict=True)]
     wi, wo, u1, u2 = inputs(LANES)
     result = call(mi.Vector3f(wi.T), mi.Vector3f(wo.T), mi.Float(u1), mi.Point2f(u2.T))
+    dr.eval(result)  # in one kernel
     arrays = [np.asarray(np.array(x), dtype=float) for x in result]
     return [np.broadcast_to(a, (*a.shape[:-1], LANES)) for a in arrays]  # constants come as one entry
 
