@@ -301,6 +301,7 @@ def test_hair_is_built_with_its_derivatives():
     assert all("diff_hair" in i.reason for i in infos)
 
 
+@pytest.mark.slow
 def test_its_absorption_is_built_with_it():
     scene = scene_with({"type": "hair", "sigma_a": {"type": "rgb", "value": [0.2, 0.3, 0.4]}})
     key = "wall.bsdf.sigma_a.value"

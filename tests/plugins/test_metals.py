@@ -61,9 +61,9 @@ def test_rough_metal_equals_mitsubas(variant, chosen):
         assert (ours.flags(), ours.component_count()) == (theirs.flags(), theirs.component_count())
         for mode in (mi.TransportMode.Radiance, mi.TransportMode.Importance)[: 1 + mi.is_polarized]:
             ctx = mi.BSDFContext(mode)
-            ask = [(bsdf.eval(ctx, si, wo), bsdf.pdf(ctx, si, wo), *bsdf.eval_pdf(ctx, si, wo)) for bsdf in (ours, theirs)]
-            dr.eval(ask)  # in one kernel
-            (got, density, *both), (expected, their_density, *_) = ask
+            asked = [(b.eval(ctx, si, wo), b.pdf(ctx, si, wo), *b.eval_pdf(ctx, si, wo)) for b in (ours, theirs)]
+            dr.eval(asked)  # in one kernel
+            (got, density, *both), (expected, their_density, *_) = asked
             # Phases of a total reflection have a few digits less in Mitsuba's matrices.
             close = {"rtol": 2e-5, "atol": 1e-4 if mi.is_polarized else 1e-6}
             for value in (got, both[0]):

@@ -216,7 +216,8 @@ def test_a_lobe_of_transmission_that_is_asked_for_refracts(around):
 BETWEEN = ["normalmap", "bumpmap", "blendbsdf", "blendbsdf of a bumpmap", "reference"]
 
 
-@pytest.mark.parametrize("between", long(BETWEEN, ["normalmap"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("between", BETWEEN)
 def test_a_lobe_of_transmission_deep_inside_two_sides(between):
     """Mitsuba refuses transmission under ``twosided`` unless it is told that it is meant."""
     paint = {"type": "principled", "base_color": 0.6}
