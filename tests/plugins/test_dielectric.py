@@ -260,7 +260,7 @@ def test_smooth_sample_is_attached_to_the_incident_direction():
 ATTACHED = [(True, (0.1, 0.5)), (False, (0.3, 0.3)), (True, (0.02, 0.02)), (False, (0.02, 0.02))]
 
 
-@pytest.mark.parametrize(("ggx", "alphas"), long_rows(ATTACHED, ATTACHED[:2]))
+@pytest.mark.parametrize(("ggx", "alphas"), long_rows(ATTACHED, ATTACHED[:1]))
 def test_rough_eval_and_pdf_are_attached(ggx, alphas):
     """Derivatives in the index, both roughnesses and both directions against autograd in double precision."""
     activate("llvm_ad_mono")

@@ -64,6 +64,7 @@ def put_each(film, x, value=1.0):
     cube = storage(film, n * film.entries_per_pixel())
     base = dr.arange(mi.UInt32, n) * film.entries_per_pixel()
     before, after = film.put(0, base, mi.Float64(x * WIDTH), [mi.Float(value)] * channels, mi.Bool(True))
+    dr.eval(cube, before, after)  # in one kernel
     return np.array(cube, dtype=float).reshape(n, BINS, channels), np.array(before), np.array(after)
 
 
@@ -109,6 +110,7 @@ def test_read_is_the_transpose_of_put(name, stddev, layout):
     else:  # (C, T, pixels), as a torch gradient comes
         adjoint, base = (mi.Float(g.transpose(2, 1, 0).ravel()), pixels, BINS * pixels), mi.UInt32(pixel)
     A, _ = film.read(adjoint, base, opl, active)
+    dr.eval(cube, A)
     stored = np.array(cube, dtype=float).reshape(g.shape)
     read = sum((np.array(A[c], dtype=float) * value[c] * np.array(active)).sum() for c in range(3))
     scale = np.abs(stored * g).sum()
@@ -126,6 +128,7 @@ def test_slope_is_the_derivative_of_what_is_read(name, stddev):
 
     def read(shift):
         A, slope = film.read(adjoint, mi.UInt32(0), mi.Float64((x + shift) * WIDTH), mi.Bool(True))
+        dr.eval(A, slope)
         return [np.array(v, dtype=float) for v in A], [np.array(v, dtype=float) for v in slope]
 
     _, slope = read(0)
@@ -153,6 +156,7 @@ def test_forward_splat_is_the_transpose_of_value_and_slope(name, stddev):
     cube = storage(film, BINS * 3)
     film.put_slope(0, mi.UInt32(0), opl, [mi.Float(v) for v in df], [mi.Float(v) for v in f_dtau], active)
     A, slope = film.read((mi.Float(g), 3, 1), mi.UInt32(0), opl, active)
+    dr.eval(cube, A, slope)
     read = sum((np.array(A[c]) * df[c] + np.array(slope[c]) * f_dtau[c]).sum(dtype=float) for c in range(3))
     stored = np.array(cube, dtype=float)
     assert abs(stored @ g - read) < 1e-5 * np.abs(stored * g).sum()
@@ -324,6 +328,7 @@ def test_the_adjoint_of_the_sum_over_the_bins(settings):
     rows = np.random.default_rng(1).normal(size=(BINS, 3))
     for adjoint, own in ((None, 0), ((mi.Float(rows.ravel()), 3, 1), rows)):
         A, slope = film.read(adjoint, mi.UInt32(0), opl, active, steady)
+        dr.eval(A, slope)
         for found, shares in ((A, weights), (slope, slopes)):
             expected = shares @ (own + np.broadcast_to([2.0, 3.0, 5.0], (BINS, 3)))
             np.testing.assert_allclose(np.array(found).T, expected, atol=2e-5 * np.abs(shares).sum(1).max() * 8)

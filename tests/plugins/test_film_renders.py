@@ -88,9 +88,7 @@ def test_crop_is_the_crop_of_the_full_render():
     assert not two_sample_z_test(steady, full_steady[:, 2:6, 5:8]).passed
 
 
-@pytest.mark.parametrize(
-    "rfilter", long(["gaussian", "tent", "mitchell", "catmullrom", "lanczos"], ["mitchell"])
-)
+@pytest.mark.parametrize("rfilter", long(["gaussian", "tent", "mitchell", "catmullrom", "lanczos"], ["mitchell"]))
 def test_spatial_filters_converge_to_splatting(rfilter):
     steady, transient = runs(glowing_wall(film(rfilter=rfilter)), 8, 1024)
     # splatting divides by the sum of the weights: a bias of order 1 / spp, a tenth of the noise here

@@ -169,7 +169,7 @@ def grid():
 
 @pytest.mark.parametrize(
     ("fibre", "light"),
-    long_pairs(FIBRES[:3], LIGHT, [(one, light) for n, one in enumerate(FIBRES[:3]) for light in LIGHT[n % 2 :: 2]]),
+    long_pairs(FIBRES[:3], LIGHT, [(FIBRES[n % 3], light) for n, light in enumerate(LIGHT)]),
     ids=str,
 )
 def test_samples_have_their_density(fibre, light):
@@ -196,8 +196,7 @@ def test_samples_have_their_density(fibre, light):
     assert chi2 < stats.chi2.isf(1e-5, often.sum() - 1)
 
 
-@pytest.mark.parametrize("light", LIGHT, ids=str)
-@pytest.mark.parametrize("fibre", FIBRES[:3], ids=str)
+@pytest.mark.parametrize(("fibre", "light"), [(FIBRES[n % 3], light) for n, light in enumerate(LIGHT)], ids=str)
 def test_nothing_is_lost_where_nothing_is_absorbed(fibre, light):
     roughness, tilt, eta, _ = fibre
     bsdf = mi.load_dict(described(roughness, tilt, eta, 0.0))
@@ -223,7 +222,7 @@ def model_with(fibre, key, x):
 
 @pytest.mark.parametrize(
     ("fibre", "key"),
-    long_pairs(FIBRES, UNKNOWNS, [(fibre, key) for n, fibre in enumerate(FIBRES) for key in UNKNOWNS[n % 2 :: 2]]),
+    long_pairs(FIBRES, UNKNOWNS, [(FIBRES[n % 4], key) for n, key in enumerate(UNKNOWNS)]),
     ids=str,
 )
 def test_derivatives_are_those_of_the_model(fibre, key):
@@ -239,7 +238,9 @@ def test_derivatives_are_those_of_the_model(fibre, key):
     params.update()
     value = bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(wo))[0]
     dr.forward(x)
-    found = np.array(dr.grad(value))
+    slope = dr.grad(value)
+    dr.eval(value, slope)  # in one kernel
+    found = np.array(slope)
     step = 1e-4 * abs(start)
     far, near = (
         scattered(wi.astype(float), wo.astype(float), *model_with(fibre, key, start + s)) for s in (step, -step)

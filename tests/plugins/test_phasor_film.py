@@ -187,10 +187,9 @@ def test_paths_with_more_events_than_fit(monkeypatch, tangents):
     np.testing.assert_allclose(tight, exact_sums(film.frequencies, opl, value, active, 2, slope), atol=5e-6 * scale)
 
 
-@pytest.mark.parametrize("frequencies", [GRID, LIST], ids=["grid", "list"])
-def test_tangents(frequencies):
+def test_tangents():
     """Forward mode writes ``k df + f k' dtau``."""
-    film, rng = make_film(2, 2, **frequencies), np.random.default_rng(2)
+    film, rng = make_film(2, 2, **GRID), np.random.default_rng(2)
     opl, value, active = random_events(4 * 9, 5, 3, rng)
     slope = rng.normal(size=value.shape)
     found = summed(film, Job(0, 2, 9), opl, value, active, slope)

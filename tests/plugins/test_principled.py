@@ -188,7 +188,8 @@ def arrival(image):
     return float((light * torch.arange(len(light))).sum() / light.sum())
 
 
-@pytest.mark.parametrize("around", long(["nothing", "mask", "twosided"], ["twosided"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("around", ["nothing", "mask", "twosided"])
 def test_a_lobe_of_transmission_that_is_asked_for_refracts(around):
     """Light behind the surface counts with its index, although the description lacks the lobe."""
 

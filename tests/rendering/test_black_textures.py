@@ -45,7 +45,7 @@ def described(kind, nested):
     return room(bsdf=wall, light=area_light(), side_reflectance=0.95)
 
 
-QUICK = [("normalmap", "diffuse"), ("bumpmap", "mirror")]
+QUICK = [("normalmap", "diffuse")]
 
 
 @pytest.mark.parametrize(("kind", "name"), long_rows(itertools.product(MAPS, NESTED), QUICK))
@@ -99,6 +99,7 @@ def test_a_sky_without_light():
     compare(tt.load(scene, variant=VARIANT), "light.data", 1024)
 
 
+@pytest.mark.slow
 def test_black_that_weighs_elsewhere():
     """One texture in a normal map and as the weight of a mixture."""
     shared = {"type": "ref", "id": "nothing"}

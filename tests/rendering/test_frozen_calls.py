@@ -56,15 +56,8 @@ def check(setting, folder, most):
     return found
 
 
-# The others have recordings of their own kind in tests/transport/test_freezing.py, too.
-QUICK = ("shape ply",)
-
-
-@pytest.mark.parametrize(
-    "setting",
-    [pytest.param(one, marks=[pytest.mark.slow] * (one.name not in QUICK)) for one in settings(bare=False)],
-    ids=lambda one: one.name,
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("setting", settings(bare=False), ids=lambda one: one.name)
 def test_numbers_of_traced_calls(setting, tmp_path):
     for key, outcome in check(setting, tmp_path, 1).items():
         assert outcome.launched, (key, outcome.said)
@@ -223,7 +216,7 @@ def test_scenes_that_come_and_go():
 
 
 def test_several_renders_before_their_backward_passes(room_scene):
-    traced, recorded = pair(room_scene, parameters=[COLOUR, WALL_POSE], spp=4)
+    traced, recorded = pair(room_scene, parameters=[COLOUR, GREY], spp=4)
     grads = []
     for renderer in (traced, recorded):
         for round_ in range(3):

@@ -63,6 +63,7 @@ def test_gates_and_steady():
     torch.testing.assert_close(gated.steady, gated.gated.sum(-3))
 
 
+@pytest.mark.slow
 def test_phasors_of_channels_and_delays():
     node = room(bands=True, late=LATE)
     frequencies = [0.0, 0.25, 0.5]

@@ -48,6 +48,7 @@ def test_tensor_is_the_films_own_memory(room_scene, monkeypatch):
     assert renderer({COLOUR: torch.rand(1, 3)}, seed=0).transient.data_ptr() == addresses[1]
 
 
+@pytest.mark.slow
 def test_peak_of_render_and_backward_is_one_cube_each():
     cube = 64 * 64 * 4096 * 3 * 4
     scene = tt.load(big_room(4096), variant=VARIANT)
