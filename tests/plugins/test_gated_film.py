@@ -244,7 +244,7 @@ def test_cut_windows_with_a_pulse():
 
 
 def test_derivatives_through_torch():
-    scene = tt.load(mirrored(), variant=VARIANT)
+    scene = tt.load(make_room(), variant=VARIANT)
     renderer = tt.TransientRenderer(scene, parameters=[GREY], gates=GATES[:2], spp=256, grad_seed="same")
     weights = torch.tensor([1.0, -0.5])
 

@@ -138,6 +138,7 @@ def test_flat_vertices_are_taken(room_scene):
     assert torch.equal(batch[0], out.detach())
 
 
+@pytest.mark.slow
 def test_a_pattern_that_shifts_over_a_light_is_sampled_where_it_is(tmp_path):
     """Mitsuba samples patterns by a map that it keeps when texture coordinates alone change."""
     pixels = np.linspace(0.1, 9.0, 16, dtype=np.float32).reshape(4, 4, 1).repeat(3, axis=2)
@@ -169,6 +170,7 @@ def test_a_pattern_that_shifts_over_a_light_is_sampled_where_it_is(tmp_path):
     assert (before(seed=1).transient.sum() - expected.sum()).abs() > 0.01 * expected.sum()
 
 
+@pytest.mark.slow
 def test_mesh_pose_keeps_authored_normals(tmp_path):
     import mitsuba as mi
 
