@@ -5,6 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from support.marks import long
 from torchtransient import plugins
 from torchtransient.errors import SceneError
 
@@ -37,7 +38,7 @@ def mean(scene, seeds=8, spp=4096):
     return np.mean(values), np.std(values, ddof=1) / np.sqrt(seeds)
 
 
-@pytest.mark.parametrize("height", [1.0, 2.0, 3.0])
+@pytest.mark.parametrize("height", long([1.0, 3.0], [3.0]))
 def test_inside_the_beam_it_is_an_area_light_at_every_distance(height):
     """The peer's has an additional 1/d^2: 0.82, 0.23 and 0.11 of the area light at 1, 2 and 3 m."""
     wide, wide_error = mean(lamp_over_floor({"type": "area", "radiance": 5.0}, height))

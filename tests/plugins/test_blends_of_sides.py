@@ -79,6 +79,7 @@ def test_values():
     assert blended == pytest.approx(once, abs=4 * np.hypot(error, other) + 0.01 * once)
 
 
+@pytest.mark.slow
 def test_derivative_by_the_roughness():
     """It was 35 % too large."""
     scene = tt.load(between_lights(blend(GLASS)), variant="llvm_ad_rgb")

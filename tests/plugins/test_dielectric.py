@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from support.marks import long
+from support.marks import long, long_rows
 from torchtransient.testing.dielectric_reference import fresnel_reflectance, refracted_direction, rough_dielectric
 
 LANES = 4000
@@ -76,6 +76,7 @@ def evaluate_all(bsdf, ctx):
         return [np.stack([np.array(x, dtype=float) for x in column], -1) for column in zip(*lanes, strict=True)]
     wi, wo, u1, u2 = inputs(LANES)
     result = call(mi.Vector3f(wi.T), mi.Vector3f(wo.T), mi.Float(u1), mi.Point2f(u2.T))
+    dr.eval(result)  # in one kernel
     arrays = [np.asarray(np.array(x), dtype=float) for x in result]
     return [np.broadcast_to(a, (*a.shape[:-1], LANES)) for a in arrays]  # constants come as one entry
 
@@ -86,6 +87,12 @@ def contexts():
         if component is not None:
             ctx.component = component
         yield ctx
+
+
+def asked(materials):
+    """The last material in every context, the others in that of paths from the sensor."""
+    *others, last = materials
+    return [*((one, mi.BSDFContext()) for one in others), *((last, ctx) for ctx in contexts())]
 
 
 def compare(ours, theirs, ctx, power_alone=False):
@@ -116,19 +123,19 @@ def compare(ours, theirs, ctx, power_alone=False):
 VARIANTS = ["llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized", "scalar_rgb"]
 
 
-@pytest.mark.parametrize("variant", long(VARIANTS, ["llvm_ad_mono", "llvm_ad_spectral", "llvm_ad_mono_polarized"]))
+@pytest.mark.parametrize("variant", long(VARIANTS, ["llvm_ad_mono_polarized"]))
 def test_smooth_equals_mitsuba(variant):
     activate(variant)
-    for material, ctx in product(MATERIALS, contexts()):
+    for material, ctx in asked(MATERIALS):
         compare(
             mi.load_dict({"type": "diff_dielectric", **material}), mi.load_dict({"type": "dielectric", **material}), ctx
         )
 
 
-@pytest.mark.parametrize("variant", long(VARIANTS, ["llvm_ad_mono_polarized"]))
+@pytest.mark.parametrize("variant", long(VARIANTS, ["llvm_ad_mono"]))
 def test_rough_equals_mitsuba(variant):
     activate(variant)
-    for (material, roughness), ctx in product(zip(MATERIALS, ROUGHNESSES, strict=True), contexts()):
+    for (material, roughness), ctx in asked(zip(MATERIALS, ROUGHNESSES, strict=True)):
         both = {**material, **roughness}
         ours = mi.load_dict({"type": "diff_rough_dielectric", **both})
         # Mitsuba's depolarises
@@ -170,8 +177,7 @@ def test_grazing_mueller_matrix():
     np.testing.assert_allclose(np.array(weight)[0, 0].ravel(), 1 / 2.25, rtol=1e-4)
 
 
-@pytest.mark.parametrize("sample_visible", [True, False])
-@pytest.mark.parametrize("roughness", ROUGHNESSES)
+@pytest.mark.parametrize(("roughness", "sample_visible"), [(ROUGHNESSES[2], True), (ROUGHNESSES[3], False)])
 def test_sample_agrees_with_eval_and_pdf(roughness, sample_visible):
     activate("llvm_ad_mono")
     bsdf = mi.load_dict({"type": "diff_rough_dielectric", "sample_visible": sample_visible, **roughness})
@@ -251,8 +257,10 @@ def test_smooth_sample_is_attached_to_the_incident_direction():
             np.testing.assert_allclose(tangents @ got, tangents @ slope.numpy()[0], atol=2e-6)
 
 
-@pytest.mark.parametrize("ggx", [True, False])
-@pytest.mark.parametrize("alphas", [(0.3, 0.3), (0.1, 0.5), (0.02, 0.02)])
+ATTACHED = [(True, (0.1, 0.5)), (False, (0.3, 0.3)), (True, (0.02, 0.02)), (False, (0.02, 0.02))]
+
+
+@pytest.mark.parametrize(("ggx", "alphas"), long_rows(ATTACHED, ATTACHED[:1]))
 def test_rough_eval_and_pdf_are_attached(ggx, alphas):
     """Derivatives in the index, both roughnesses and both directions against autograd in double precision."""
     activate("llvm_ad_mono")
@@ -318,10 +326,23 @@ def test_detached_estimator_of_a_rough_lobe(side):
     wi = mi.Vector3f(dr.normalize(mi.Vector3f(0.4, 0.2, 0.9 * side)))
     weigh = mi.Vector3f(0.3, -0.5, 0.7)
 
-    count = 400000
+    # Midpoint rule over the sphere, in double precision.
+    z = (np.arange(400) + 0.5) / 200 - 1
+    phi = (np.arange(400) + 0.5) * (2 * np.pi / 400)
+    Z, P = (torch.tensor(x.ravel()) for x in np.meshgrid(z, phi))
+    R = torch.sqrt(1 - Z * Z)
+    wo = torch.stack([R * torch.cos(P), R * torch.sin(P), Z], -1)
+    w = torch.tensor(wi.numpy()[:, 0], dtype=torch.float64).expand_as(wo)
+    eta = torch.tensor(1.5, dtype=torch.float64, requires_grad=True)
+    alpha = torch.tensor(0.4, dtype=torch.float64, requires_grad=True)
+    value, _ = rough_dielectric(w, wo, eta.expand(len(wo)), alpha.expand(len(wo)), alpha.expand(len(wo)), True)
+    integrand = value * (1 + wo @ torch.tensor(weigh.numpy()[:, 0], dtype=torch.float64))
+    slopes = torch.autograd.grad(integrand.sum() * (4 * np.pi / len(wo)), (eta, alpha))
+
+    count = 200000
     rng = np.random.default_rng(3)
     u1, u2 = mi.Float(rng.random(count)), mi.Point2f(rng.random((2, count)))
-    for key in ("eta", "alpha.value"):
+    for key, slope in zip(("eta", "alpha.value"), slopes, strict=True):
         bsdf = mi.load_dict(plugin)
         params = mi.traverse(bsdf)
         dr.enable_grad(params[key])
@@ -332,20 +353,6 @@ def test_detached_estimator_of_a_rough_lobe(side):
         dr.set_grad(params[key], 1)
         samples = dr.forward_to(estimate).numpy()
         mean, error = samples.mean(), samples.std() / np.sqrt(count)
-
-        # Midpoint rule over the sphere, in double precision.
-        z = (np.arange(800) + 0.5) / 400 - 1
-        phi = (np.arange(800) + 0.5) * (2 * np.pi / 800)
-        Z, P = (torch.tensor(x.ravel()) for x in np.meshgrid(z, phi))
-        R = torch.sqrt(1 - Z * Z)
-        wo = torch.stack([R * torch.cos(P), R * torch.sin(P), Z], -1)
-        w = torch.tensor(wi.numpy()[:, 0], dtype=torch.float64).expand_as(wo)
-        eta = torch.tensor(1.5, dtype=torch.float64, requires_grad=True)
-        alpha = torch.tensor(0.4, dtype=torch.float64, requires_grad=True)
-        value, _ = rough_dielectric(w, wo, eta.expand(len(wo)), alpha.expand(len(wo)), alpha.expand(len(wo)), True)
-        integrand = value * (1 + wo @ torch.tensor(weigh.numpy()[:, 0], dtype=torch.float64))
-        total = integrand.sum() * (4 * np.pi / len(wo))
-        (slope,) = torch.autograd.grad(total, eta if key == "eta" else alpha)
         assert abs(mean - slope.item()) < 4 * error + 2e-3 * abs(slope.item()), key
 
 

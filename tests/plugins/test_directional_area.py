@@ -29,7 +29,8 @@ def scene(folder, beside, dark):
     return lit_by(lamp) | {"dark": panel | light}
 
 
-@pytest.mark.parametrize("beside", ["rectangle", pytest.param("sphere", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("beside", ["rectangle", "sphere"])
 def test_other_lights_and_their_derivatives_beside_one(tmp_path, beside):
     """Mitsuba's raises in every kernel that asks lights for their emission in a direction."""
     found = []

@@ -88,14 +88,7 @@ def test_crop_is_the_crop_of_the_full_render():
     assert not two_sample_z_test(steady, full_steady[:, 2:6, 5:8]).passed
 
 
-def test_crop_is_that_of_mitsuba():
-    steady, _ = runs(glowing_wall(film(**CROP)))
-    check(steady, steady_runs(glowing_wall(film("hdrfilm", **CROP), "path")))
-
-
-@pytest.mark.parametrize(
-    "rfilter", long(["gaussian", "tent", "mitchell", "catmullrom", "lanczos"], ["gaussian", "mitchell"])
-)
+@pytest.mark.parametrize("rfilter", long(["gaussian", "tent", "mitchell", "catmullrom", "lanczos"], ["mitchell"]))
 def test_spatial_filters_converge_to_splatting(rfilter):
     steady, transient = runs(glowing_wall(film(rfilter=rfilter)), 8, 1024)
     # splatting divides by the sum of the weights: a bias of order 1 / spp, a tenth of the noise here
@@ -104,16 +97,8 @@ def test_spatial_filters_converge_to_splatting(rfilter):
     np.testing.assert_allclose(transient.sum(3), steady, atol=2e-6)
 
 
-@pytest.mark.parametrize("rfilter", ["gaussian", "mitchell", "lanczos"])
-def test_spatial_filters_have_the_mass_of_one(rfilter):
-    steady, _ = runs(glowing_wall(film(rfilter=rfilter), radiance=2.0), 8, 1024)
-    error = steady[..., 0].std() / np.sqrt(steady[..., 0].size)
-    assert abs(steady[..., 0].mean() - 2) < 4 * error
-    assert error < 5e-3
-
-
-@pytest.mark.parametrize("rows", [1, 2, 4])
-def test_storage_bands(monkeypatch, rows):
+def test_storage_bands(monkeypatch):
+    rows = 4
     whole = glowing_wall(film())
     _, transient = runs(whole)
     monkeypatch.setattr(ENTRIES, rows * 9 * 40 * 3 + 5)
@@ -153,11 +138,11 @@ def gradient_of_radiance(scene, seed, spp=16):
     return slope, loss
 
 
-@pytest.mark.parametrize("what", ["one pass", "bands", "rows", "samples"])
+@pytest.mark.parametrize("what", long(["bands", "rows", "samples"], ["bands", "samples"]))
 def test_adjoint_of_every_layout(monkeypatch, what):
     if what == "bands":
         monkeypatch.setattr(ENTRIES, 4 * 9 * 40 * 3)
-    elif what != "one pass":
+    else:
         monkeypatch.setattr(LANES, 20 if what == "rows" else 54 * 7)
     scene = glowing_wall(film(), radiance={"type": "rgb", "value": [1.0, 1.0, 1.0]})
     slope, loss = gradient_of_radiance(scene, seed=11)
@@ -166,7 +151,7 @@ def test_adjoint_of_every_layout(monkeypatch, what):
     assert abs(loss) > 0.1
 
 
-@pytest.mark.parametrize("lanes, spp", [(54 * 24, 64), (54 * 7, 64), pytest.param(20, 8, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("lanes, spp", [(54 * 7, 64), pytest.param(20, 8, marks=pytest.mark.slow)])
 def test_many_passes(monkeypatch, lanes, spp):
     full, transient = runs(glowing_wall(film()))
     monkeypatch.setattr(LANES, lanes)
@@ -205,7 +190,7 @@ def test_total_weight_with_any_sampler_and_count(monkeypatch, sampler, lanes):
 def test_total_weight_in_bands_of_different_height(monkeypatch):
     monkeypatch.setattr(ENTRIES, 4 * 9 * 40 * 3)
     monkeypatch.setattr(LANES, 9 * 4 * 10)
-    scene = glowing_wall(film(), radiance=1.0, sampler="multijitter")
+    scene = glowing_wall(film(), radiance=1.0)
     scene.integrator().render(scene, spp=23, develop=False)
     np.testing.assert_allclose(np.array(scene.sensors()[0].film().steady), 1, rtol=1e-5)
 
@@ -225,7 +210,7 @@ def cornell(start, bins, filter):
     return mi.load_dict(description)
 
 
-@pytest.mark.parametrize("filter", ["box", "tent", "gaussian"])
+@pytest.mark.parametrize("filter", long(["box", "tent", "gaussian"], ["tent"]))
 def test_energy_outside_is_that_of_a_wider_window(filter):
     wide, narrow = cornell(0.0, 120, filter), cornell(5.0, 16, filter)
     cube = np.array(wide.integrator().render(wide, seed=2, spp=64)[1], dtype=float)

@@ -13,7 +13,6 @@ import pytest
 import torchtransient as tt
 from support.gradient_cases.cases_metals import slanted
 from support.gradient_cases.scenes import mirror_room, room
-from support.marks import long_pairs
 from support.surface_samples import activate, directions, interaction
 from support.sweeps import together
 from torchtransient.errors import GradientError
@@ -29,6 +28,7 @@ def number(value):
 
 def entries(value):
     """The numbers of a BSDF value, the lane last."""
+    dr.eval(value)  # in one kernel
     values = [value[i, j] for i in range(4) for j in range(4)] if mi.is_polarized else [value]
     return np.concatenate([np.broadcast_to(np.array(x), (len(x), LANES)) for x in values]).astype(float)
 
@@ -46,8 +46,8 @@ ROUGH_METALS = [
 
 
 # Of Mueller matrices, which take long to compile, one metal alone is in the default set.
-CHOICES = [(MONO, slice(6)), ("llvm_ad_rgb", slice(6)), ("llvm_ad_spectral", slice(6)), (POLARIZED, slice(1, 2))]
-LONG = [(POLARIZED, slice(2, 4)), ("llvm_ad_spectral_polarized", slice(1, 4))]
+CHOICES = [(MONO, slice(6)), (POLARIZED, slice(1, 2))]
+LONG = [("llvm_ad_spectral", slice(6)), (POLARIZED, slice(2, 4)), ("llvm_ad_spectral_polarized", slice(1, 4))]
 
 
 @pytest.mark.parametrize(("variant", "chosen"), CHOICES + [pytest.param(*c, marks=pytest.mark.slow) for c in LONG])
@@ -61,12 +61,17 @@ def test_rough_metal_equals_mitsubas(variant, chosen):
         assert (ours.flags(), ours.component_count()) == (theirs.flags(), theirs.component_count())
         for mode in (mi.TransportMode.Radiance, mi.TransportMode.Importance)[: 1 + mi.is_polarized]:
             ctx = mi.BSDFContext(mode)
-            got, expected = (entries(bsdf.eval(ctx, si, wo)) for bsdf in (ours, theirs))
+            asked = [(b.eval(ctx, si, wo), b.pdf(ctx, si, wo), *b.eval_pdf(ctx, si, wo)) for b in (ours, theirs)]
+            dr.eval(asked)  # in one kernel
+            (got, density, *both), (expected, their_density, *_) = asked
             # Phases of a total reflection have a few digits less in Mitsuba's matrices.
-            np.testing.assert_allclose(got, expected, rtol=2e-5, atol=1e-4 if mi.is_polarized else 1e-6)
-            got, expected = (np.array(bsdf.pdf(ctx, si, wo)) for bsdf in (ours, theirs))
-            np.testing.assert_allclose(got, expected, rtol=2e-5, atol=1e-6)
+            close = {"rtol": 2e-5, "atol": 1e-4 if mi.is_polarized else 1e-6}
+            for value in (got, both[0]):
+                np.testing.assert_allclose(entries(value), entries(expected), **close)
+            for value in (density, both[1]):
+                np.testing.assert_allclose(np.array(value), np.array(their_density), rtol=2e-5, atol=1e-6)
             (bs, got), (their_bs, expected) = (bsdf.sample(ctx, si, 0.3, u) for bsdf in (ours, theirs))
+            dr.eval(bs, got, their_bs, expected)
             got, expected = entries(got), entries(expected)
             drawn = np.abs(expected).max(axis=0) > 0
             assert 0.5 < drawn.mean() < 1
@@ -157,10 +162,11 @@ def test_where_mitsubas_metals_lose_their_slopes(variant, plugin):
 
 
 OF_SLOTS = {"eta": (0.0, 2.0), "k": (0.4, 0.0)}
-QUICK = [("conductor", "eta"), ("roughconductor", "k")]
 
 
-@pytest.mark.parametrize(("plugin", "slot"), long_pairs(METALS.values(), OF_SLOTS, QUICK))
+@pytest.mark.slow
+@pytest.mark.parametrize("slot", OF_SLOTS)
+@pytest.mark.parametrize("plugin", METALS.values())
 def test_a_described_metal_is_built_anew(plugin, slot):
     index = OF_SLOTS[slot]
     bsdf = {"type": plugin, "eta": number(index[0]), "k": number(index[1])}
@@ -177,9 +183,7 @@ def test_a_described_metal_is_built_anew(plugin, slot):
 @pytest.mark.parametrize("plugin", METALS.values())
 def test_mitsubas_own_is_refused_where_it_has_no_slope(plugin):
     activate(MONO)
-    for index, slot, lost in (
-        ((0.0, 2.0), "eta", True), ((0.0, 2.0), "k", False), ((0.4, 0.0), "k", True), ((0.3, 2.0), "eta", False),
-    ):  # fmt: skip
+    for index, slot in (((0.0, 2.0), "eta"), ((0.4, 0.0), "k")):
         scene = mi.load_dict(room({"type": plugin, "eta": number(index[0]), "k": number(index[1])}), optimize=False)
         params, x = mi.traverse(scene), mi.Float(index[slot == "k"])
         dr.enable_grad(x)
@@ -187,15 +191,8 @@ def test_mitsubas_own_is_refused_where_it_has_no_slope(plugin):
         params.update()
         film = scene.sensors()[0].film()
         adjoint = mi.TensorXf(np.ones(film.cube_shape(), dtype=np.float32))
-
-        def backward(scene=scene, params=params, adjoint=adjoint):
+        with pytest.raises(GradientError, match="diff_"):
             scene.integrator().render_backward(scene, params, (None, adjoint), seed=0, spp=4)
-
-        if lost:
-            with pytest.raises(GradientError, match="diff_"):
-                backward()
-        else:
-            backward()
         params[f"wall.bsdf.{slot}.value"] = dr.detach(x)
         params.update()
 

@@ -185,20 +185,6 @@ def test_rough_dielectric_depolarises():
     assert not theirs[1:, 1:].any() and abs(ours[1, 1]) > 0.5 * ours[0, 0]
 
 
-def test_wave_plate_jumps_at_oblique_incidence():
-    activate(POLARIZED)
-
-    def jump(plugin):
-        plate = mi.load_dict({"type": plugin})
-        beside = [
-            plate.sample(mi.BSDFContext(), interaction(unit(0.5, y, 1.0)), mi.Float(0.3), mi.Point2f(0.3))[1]
-            for y in (1e-4, -1e-4)
-        ]
-        return np.abs(matrix(beside[0]) - matrix(beside[1])).max()
-
-    assert jump("retarder") > 0.5 and jump(compat.POLARIZED_PLUGINS["retarder"]) < 1e-2
-
-
 # ------------------------------------------------------------------------------------------- samples, lobes and tables
 
 
@@ -224,6 +210,7 @@ def test_samples_that_are_thrown_away_have_a_density(plugin):
     assert dr.count(lost)[0] > 20
 
 
+@pytest.mark.slow
 def test_samples_that_are_thrown_away_where_the_other_lobe_is_black():
     """There neither weight nor value tell them from samples of the black lobe, whose slope is not zero."""
     activate(RGB)
@@ -289,6 +276,7 @@ def test_metals_lose_their_slopes_without_index_or_absorption(plugin, slot, inde
     assert compat.loses_slope_of_metal(slot, (index[0],) * 2, (index[1],) * 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cls", compat.PLASTICS)
 @pytest.mark.parametrize("black", [0, 1])
 def test_black_lobes_of_plastics_are_never_sampled(cls, black):
@@ -307,6 +295,7 @@ def test_black_lobes_of_plastics_are_never_sampled(cls, black):
     assert compat.lost_at(mi.load_dict({"type": compat.PLASTICS[cls]}), lobes[black]) == (0,)
 
 
+@pytest.mark.slow
 def test_rough_plastic_has_no_derivative_through_its_tables():
     activate(RGB)
     context = mi.BSDFContext()

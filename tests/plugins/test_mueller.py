@@ -166,7 +166,7 @@ def test_products():
     assert float(np.array(polarized.intensity(as_stokes(v))).ravel()[0]) == 1.0
 
 
-@pytest.mark.parametrize("angle", [0.0, 0.3, -0.7, 1.2, math.pi / 2, 2.5])
+@pytest.mark.parametrize("angle", [0.0, -0.7, 2.5])
 def test_turns_of_a_frame(angle):
     """By vectors of any length, and by products of matrices."""
     forward, current = mi.Vector3f(0, 0, 1), mi.Vector3f(3, 0, 0)

@@ -87,6 +87,7 @@ def test_coordinates_that_are_turned(tmp_path):
     torch.testing.assert_close(points, torch.stack([x, y, 0 * x], -1), rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_every_point_of_a_mesh_is_another(tmp_path):
     points = simulate(on(wall_file(tmp_path, UPRIGHT), size=(17, 13))).scan.sensor_points
     expected = torch.tensor(WALL.grid((17, 13))[0])

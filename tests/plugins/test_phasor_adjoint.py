@@ -44,7 +44,8 @@ def kernel(film, opl):
     parts, slopes = [], []
     for part in range(2):
         base = dr.arange(mi.UInt32, F) * (4 * F) + 2 * part
-        A, slope = film.read((flat, 4, 1), base, mi.Float64(opl), mi.Bool(True))
+        A, slope = film.read((flat, 4, 1), base, dr.opaque(mi.Float64, opl), mi.Bool(True))
+        dr.eval(A, slope)  # in one kernel, for all lengths
         parts.append(np.array(A[0], dtype=np.float64))
         slopes.append(np.array(slope[0], dtype=np.float64))
     ω = 2 * np.pi * film.frequencies
@@ -65,7 +66,7 @@ def worst(film, lengths=LENGTHS):
     return found
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 16, 17, 301, 1025])
+@pytest.mark.parametrize("count", [1, 2, 17, 1025])
 def test_phases_of_a_grid(count):
     film = make_film(frequency_first=0.1, frequency_step=99.9 / 1024, frequency_count=count)
     assert film.step is not None and worst(film) < CYCLES

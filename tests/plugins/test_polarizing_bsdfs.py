@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 
 import drjit as dr
@@ -12,8 +11,8 @@ import pytest
 
 import torchtransient as tt
 from support.gradient_cases.scenes import mirror_room
+from support.marks import long
 from support.surface_samples import activate, directions, interaction
-from torchtransient.errors import GradientError
 from torchtransient.plugins import mitsuba_compat as compat
 
 MONO, SPECTRAL = "llvm_ad_mono_polarized", "llvm_ad_spectral_polarized"
@@ -43,7 +42,7 @@ METALS = [{"material": "Au"}, {"material": "none"}, {"material": "Al", "specular
 INDICES = [{"eta": 1.5, "k": 0.0}, {"eta": 0.2, "k": 3.0}, {"eta": 1.2, "k": 1e-3}]
 
 
-@pytest.mark.parametrize("variant", [MONO, SPECTRAL, "llvm_ad_mono", "llvm_ad_rgb"])
+@pytest.mark.parametrize("variant", long([MONO, SPECTRAL], [MONO]))
 def test_metal_equals_mitsubas(variant):
     activate(variant)
     for metal in METALS + ([] if mi.is_spectral else INDICES):
@@ -111,7 +110,7 @@ def test_rough_glass_reflects_as_a_rough_metal_without_absorption():
         np.testing.assert_allclose(got, expected, atol=3e-5 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("wi_z", [0.2, 0.9, -0.9, -0.4])
+@pytest.mark.parametrize("wi_z", [0.9, -0.4])
 def test_rough_glass_samples_what_it_evaluates(wi_z):
     """The weight of a sample is value over density, for all entries of the matrix."""
     activate(MONO)
@@ -144,8 +143,9 @@ PLUGINS = {
 }
 
 
-@pytest.mark.parametrize("plugin", PLUGINS)
-@pytest.mark.parametrize("wi", [(0, 0, 1), (0.3, -0.2, 0.93), (0, 0.8, 0.6)])
+@pytest.mark.parametrize(
+    ("plugin", "wi"), [("diff_retarder", (0, 0, 1)), *((plugin, (0.3, -0.2, 0.93)) for plugin in PLUGINS)]
+)
 def test_derivatives(plugin, wi):
     """Reverse mode against central differences, by every parameter and by the direction's two angles."""
     activate(MONO)
@@ -225,36 +225,6 @@ def reflectance(slot, value, other, cosine):
     return float(abs(s) ** 2 + abs(r) ** 2) / 2
 
 
-ROUGH = [
-    {"eta": 0.2, "k": 3.0, "alpha": 0.3},
-    {"eta": 1.2, "k": 0.5, "alpha_u": 0.1, "alpha_v": 0.5, "distribution": "ggx", "sample_visible": False},
-    {"eta": 0.0, "k": 1.0, "alpha": 0.2, "specular_reflectance": 0.7},
-]
-
-
-@pytest.mark.parametrize("variant", [MONO, SPECTRAL, "llvm_ad_mono", "llvm_ad_rgb"])
-def test_rough_metal_equals_mitsubas(variant):
-    activate(variant)
-    metals = [{"material": "Au", "alpha": 0.3, "distribution": "ggx"}, *([] if mi.is_spectral else ROUGH)]
-    wi, wo = directions(3, LANES), directions(4, LANES, 0.0)
-    for metal in metals:
-        theirs, ours = (mi.load_dict({"type": name, **metal}) for name in ("roughconductor", "diff_rough_conductor"))
-        one, other = mi.traverse(theirs), mi.traverse(ours)
-        assert set(one.properties) == set(other.properties)
-        assert all(one.flags(key) == other.flags(key) for key in one.properties)
-        for mode in (mi.TransportMode.Radiance, mi.TransportMode.Importance):
-            ctx = mi.BSDFContext(mode)
-            (expected, p), (got, q) = (b.eval_pdf(ctx, interaction(wi), wo) for b in (theirs, ours))
-            dr.eval(expected, p, got, q)
-            expected, got = entries(expected), entries(got)
-            assert np.abs(expected).max() > 0.04
-            np.testing.assert_allclose(got, expected, atol=3e-5 * np.abs(expected).max())
-            np.testing.assert_array_equal(np.array(q), np.array(p))
-            (expected_out, expected), (out, got) = (sampled(bsdf, wi, mode) for bsdf in (theirs, ours))
-            np.testing.assert_array_equal(out, expected_out)
-            np.testing.assert_allclose(got, expected, atol=3e-5 * np.abs(expected).max())
-
-
 def test_a_described_metal_of_index_zero_is_built_anew():
     metal = {"type": "conductor", "eta": {"type": "uniform", "value": 0.0}, "k": 2.0}
     scene = tt.load(mirror_room(metal), variant="llvm_ad_mono")
@@ -266,20 +236,3 @@ def test_a_described_metal_of_index_zero_is_built_anew():
     # Mirrored light falls by 4 / (1 + k^2) for each unit, near normal incidence.
     slope = renderer.values["wall.bsdf.eta.value"].grad / image.detach()
     assert float(slope) == pytest.approx(-4 / 5, rel=0.1)
-
-
-@pytest.mark.parametrize("plugin", ["conductor", "roughconductor"])
-@pytest.mark.parametrize("slot", ["eta", "k"])
-def test_rates_of_a_metal_that_mitsuba_loses_are_refused(plugin, slot):
-    """Not only at zero: single precision has no slope left beside it either."""
-    activate("llvm_ad_mono")
-    metal = {"type": plugin, "eta": {"type": "uniform", "value": 0.5}, "k": {"type": "uniform", "value": 0.5}}
-    for value, refused in ((0.0, True), (1e-4, True), (0.1, False)):
-        scene = mi.load_dict(mirror_room({**metal, slot: {"type": "uniform", "value": value}}), optimize=False)
-        params, x = mi.traverse(scene), mi.Float(value)
-        dr.enable_grad(x)
-        params[f"wall.bsdf.{slot}.value"] = x
-        params.update()
-        adjoint = dr.ones(mi.TensorXf, scene.sensors()[0].film().cube_shape())
-        with pytest.raises(GradientError, match="diff_") if refused else contextlib.nullcontext():
-            scene.integrator().render_backward(scene, params, (None, adjoint), spp=4)

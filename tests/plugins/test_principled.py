@@ -10,7 +10,7 @@ import torch
 
 import torchtransient as tt
 from support.gradient_cases.scenes import area_light, camera, glass_slab, room
-from support.marks import long
+from support.marks import long, long_rows
 from support.surface_samples import start
 from support.sweeps import together
 from torchtransient.errors import GradientError
@@ -59,7 +59,9 @@ def interactions(count):
 
 
 @together("kind, settings", SETTINGS)
-@together("variant", ["llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized"])
+@pytest.mark.parametrize(
+    "variant", long(["llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized"], ["llvm_ad_mono"])
+)
 def test_values_densities_and_samples_are_those_of_mitsuba(kind, settings, variant):
     theirs, ours = (mi.load_dict({"type": name, **settings}) for name in (kind, TWINS[kind]))
     assert [theirs.flags(i) for i in range(theirs.component_count())] == [
@@ -71,6 +73,7 @@ def test_values_densities_and_samples_are_those_of_mitsuba(kind, settings, varia
     counts = dr.max(mi.unpolarized_spectrum(weight_a)) > 0
     pairs = [(weight_a, weight_b), (a.wo, b.wo), (dr.select(counts, a.pdf, 0), b.pdf)]
     pairs += zip(theirs.eval_pdf(ctx, si, wo), ours.eval_pdf(ctx, si, wo), strict=True)
+    dr.eval(pairs)  # in one kernel
     for one, other in pairs:
         np.testing.assert_allclose(np.array(other), np.array(one), rtol=1e-5, atol=1e-7)
 
@@ -112,7 +115,10 @@ def test_slopes_at_the_ends(kind, slot, end, others, wi, wo):
     assert float(bsdf.pdf(mi.BSDFContext(), si, at(wo))[0]) > 1e-3
 
 
-@pytest.mark.parametrize(("kind", "slot", "end"), [entry[:3] for entry in ENDS])
+OF_ENDS = [entry[:3] for entry in ENDS]
+
+
+@pytest.mark.parametrize(("kind", "slot", "end"), long_rows(OF_ENDS, OF_ENDS[2::5]))
 def test_samples_at_the_ends_fit_their_density(kind, slot, end):
     """Share of the samples in each of two times two parts of the sphere, against the integral of the density."""
     bsdf = mi.load_dict({"type": TWINS[kind], slot: {"type": "uniform", "value": end}, "roughness": 0.6})
@@ -169,10 +175,7 @@ def test_a_described_surface_is_built_anew():
     assert table[key].differentiable and not table[key].biased and "diff_principled" in table[key].reason
     assert not table["wall.bsdf.brdf_0.base_color.value"].substitute
     renderer = tt.TransientRenderer(scene, parameters=[key], spp=4096)
-    plain = tt.TransientRenderer(scene, parameters=["light.emitter.radiance.value"], spp=4096)
-    image = renderer(seed=0).steady.sum()
-    assert float(image.detach()) == pytest.approx(float(plain(seed=0).steady.detach().sum()), rel=0.03)
-    image.backward()
+    renderer(seed=0).steady.sum().backward()
     with torch.no_grad():
         near, far = (float(renderer(values={key: torch.tensor(x)}, seed=0).steady.sum()) for x in (0.2, 0.4))
     # Brightness is linear in the weight of the coat.
@@ -185,7 +188,8 @@ def arrival(image):
     return float((light * torch.arange(len(light))).sum() / light.sum())
 
 
-@pytest.mark.parametrize("around", long(["nothing", "mask", "twosided"], ["twosided"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("around", ["nothing", "mask", "twosided"])
 def test_a_lobe_of_transmission_that_is_asked_for_refracts(around):
     """Light behind the surface counts with its index, although the description lacks the lobe."""
 
@@ -213,7 +217,8 @@ def test_a_lobe_of_transmission_that_is_asked_for_refracts(around):
 BETWEEN = ["normalmap", "bumpmap", "blendbsdf", "blendbsdf of a bumpmap", "reference"]
 
 
-@pytest.mark.parametrize("between", long(BETWEEN, ["normalmap", "reference"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("between", BETWEEN)
 def test_a_lobe_of_transmission_deep_inside_two_sides(between):
     """Mitsuba refuses transmission under ``twosided`` unless it is told that it is meant."""
     paint = {"type": "principled", "base_color": 0.6}

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from support.gradient_cases.scenes import area_light, room
-from support.marks import long_rows
+from support.marks import long, long_rows
 from torchtransient import plugins
 from torchtransient.errors import GradientError
 from torchtransient.plugins.bsdfs import rough_coating
@@ -34,7 +34,7 @@ def pair(**settings):
     return [mi.load_dict({"type": name, "ext_ior": 1.0, **settings}) for name in ("roughplastic", "diff_rough_plastic")]
 
 
-@pytest.mark.parametrize("settings", CASES, ids=lambda s: str(s["alpha"]))
+@pytest.mark.parametrize("settings", long(CASES, CASES[1:3]), ids=lambda s: str(s["alpha"]))
 def test_values_densities_and_samples_are_those_of_mitsuba(settings):
     theirs, ours = pair(diffuse_reflectance=0.6, **settings)
     count = 20000
@@ -49,6 +49,7 @@ def test_values_densities_and_samples_are_those_of_mitsuba(settings):
         (a, weight_a), (b, weight_b) = (bsdf.sample(ctx, si, u, v) for bsdf in (theirs, ours))
         above = a.wo.z > 1e-3
         (value_a, pdf_a), (value_b, pdf_b) = (bsdf.eval_pdf(ctx, si, a.wo, above) for bsdf in (theirs, ours))
+        dr.eval(a, weight_a, b, weight_b, value_a, pdf_a, value_b, pdf_b)  # in one kernel
         pairs = [(weight_a[0], weight_b[0]), (value_a[0], value_b[0]), (pdf_a, pdf_b)]
         for one, other in pairs:
             one, other = (np.array(dr.select(above, x, 0)) for x in (one, other))
@@ -65,9 +66,7 @@ def test_names_of_distributions():
         assert mi.load_dict({"type": "diff_rough_plastic", "distribution": right}).ggx == ggx
 
 
-QUICK = [
-    (external_transmittance, False, 0.1), (external_transmittance, True, 0.6), (internal_reflectance, True, 0.6)
-]  # fmt: skip
+QUICK = [(external_transmittance, True, 0.6)]
 TABLES = [
     pytest.param(table, ggx, alpha, eta, marks=[] if (table, ggx, alpha) in QUICK else [pytest.mark.slow])
     for table in (external_transmittance, internal_reflectance)
@@ -122,7 +121,7 @@ def test_bad_settings(settings):
         mi.load_dict({"type": "diff_rough_plastic", **settings})
 
 
-@pytest.mark.parametrize("key", ["alpha", "eta"])
+@pytest.mark.parametrize("key", ["eta"])
 def test_the_derivative_of_mitsubas_own_is_refused(key):
     scene = mi.load_dict(room(bsdf={"type": "roughplastic", "alpha": 0.3}, light=area_light()), optimize=False)
     params = mi.traverse(scene)
@@ -141,7 +140,7 @@ def test_the_derivative_of_mitsubas_own_is_refused(key):
     ("table", "ggx"),
     long_rows(
         itertools.product([external_transmittance, internal_reflectance], [False, True]),
-        [(external_transmittance, False), (internal_reflectance, True)],
+        [(internal_reflectance, True)],
     ),
 )
 def test_slopes_at_an_index_of_exactly_one(table, ggx):

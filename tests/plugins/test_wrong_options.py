@@ -67,8 +67,10 @@ def test_wrong_value_is_an_error_of_one_sentence(plugin, option, value):
     assert "\n" not in message and "Traceback" not in message and len(message) < 700
 
 
-@pytest.mark.parametrize("value", ["np.int64(5)", "torch.tensor(3)"])
-@pytest.mark.parametrize(("plugin", "option"), [("transient_hdr_film", "width"), ("independent", "sample_count")])
+@pytest.mark.parametrize(
+    ("plugin", "option", "value"),
+    [("transient_hdr_film", "width", "np.int64(5)"), ("independent", "sample_count", "torch.tensor(3)")],
+)
 def test_whole_numbers_of_other_libraries_are_right(plugin, option, value):
     place, node = case(plugin, option)
     found = render(with_option(place, node, option, VALUES[value]))

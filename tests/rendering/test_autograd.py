@@ -212,22 +212,6 @@ def binned(renderer):
     return f
 
 
-def test_func_vjp_and_jvp(room_scene):
-    f = binned(make_renderer(room_scene, grad_seed="same"))
-    u, tangent = torch.tensor([1.0, -2.0]), torch.tensor([0.3, 0.1, -1.0])
-    out, pull = torch.func.vjp(f, START)
-    same, pushed = torch.func.jvp(f, (START,), (tangent,))
-    assert torch.equal(out, same)
-    assert float(pull(u)[0] @ tangent) == pytest.approx(float(u @ pushed), rel=1e-4)
-
-
-def test_func_jacrev_equals_jacfwd(room_scene):
-    f = binned(make_renderer(room_scene, grad_seed="same"))
-    reverse, forward = torch.func.jacrev(f)(START), torch.func.jacfwd(f)(START)
-    assert reverse.shape == (2, 3) and reverse.abs().max() > 0
-    torch.testing.assert_close(reverse, forward, rtol=1e-4, atol=1e-5)
-
-
 def test_func_vmap_is_a_loop(room_scene):
     f = binned(make_renderer(room_scene))
     xs = torch.stack([START, START * 0.5])
@@ -236,35 +220,11 @@ def test_func_vmap_is_a_loop(room_scene):
     torch.testing.assert_close(columns, torch.stack([f(x) for x in xs]))
 
 
-def test_func_per_sample_gradients(room_scene):
-    f = binned(make_renderer(room_scene))
-    xs = torch.stack([START, START * 0.5])
-    per_sample = torch.func.vmap(torch.func.grad(lambda x: f(x)[0]))(xs)
-    loop = torch.stack([torch.func.grad(lambda x: f(x)[0])(x) for x in xs])
-    torch.testing.assert_close(per_sample, loop)
-
-
 def test_reverse_second_derivative_is_refused(renderer):
     x = START.clone().requires_grad_()
     first = torch.autograd.grad(renderer({COLOUR: x}, seed=0).steady.sum(), x, create_graph=True)[0]
     with pytest.raises(tt.errors.GradientError, match="second derivatives"):
         first.sum().backward()
-
-
-def test_func_hessian_is_refused(room_scene):
-    f = binned(make_renderer(room_scene))
-    with pytest.raises(tt.errors.GradientError, match="second derivatives"):
-        torch.func.hessian(lambda x: f(x)[0])(START)
-
-
-def test_nested_forward_mode_is_refused(room_scene):
-    f = binned(make_renderer(room_scene))
-
-    def slope(x):
-        return torch.func.jvp(f, (x,), (torch.ones(3),))[1]
-
-    with pytest.raises(tt.errors.GradientError, match="second derivatives"):
-        torch.func.jvp(slope, (START,), (torch.ones(3),))
 
 
 def test_adjoint_samples_are_independent_of_the_render(room_scene, weights):

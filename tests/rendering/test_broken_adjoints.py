@@ -28,8 +28,7 @@ def render(renderer, x):
     return renderer({COLOUR: x}, seed=0).transient
 
 
-@pytest.mark.parametrize("number", [NAN, INF])
-@pytest.mark.parametrize("everywhere", [True, False])
+@pytest.mark.parametrize(("number", "everywhere"), [(NAN, True), (INF, False)])
 def test_adjoint_that_is_not_finite_makes_all_gradients_nan(renderer, number, everywhere):
     x = START.clone().requires_grad_()
     out = render(renderer, x)

@@ -102,10 +102,6 @@ def test_number_of_a_description(place, x):
         tt.TransientRenderer(broken)
 
 
-def test_the_scene_itself_is_right():
-    assert torch.isfinite(tt.TransientRenderer(tt.load(scene(), variant=VARIANT))(seed=0, spp=2).transient).all()
-
-
 @pytest.mark.parametrize("ask", ["parameters", "plan"])
 def test_found_by_whatever_builds(ask):
     broken = tt.load(with_number("lamp.intensity", NAN), variant=VARIANT)

@@ -14,6 +14,7 @@ import torch
 
 import torchtransient as tt
 from support.frozen_runs import Runs
+from support.marks import long
 from torchtransient.rendering import recordings
 from torchtransient.rendering.recordings import FIRST, LAUNCHED, NO_FREEZING, PROGRESS, RECORDED, SEVERAL, SWITCHED_OFF
 from torchtransient.rendering.variant import active_variant
@@ -55,15 +56,8 @@ def check(setting, folder, most):
     return found
 
 
-# The others have recordings of their own kind in tests/transport/test_freezing.py, too.
-QUICK = ("shape ply", "spectrum regular in reflectance, spectral", "bsdf conductor, mono_polarized")
-
-
-@pytest.mark.parametrize(
-    "setting",
-    [pytest.param(one, marks=[pytest.mark.slow] * (one.name not in QUICK)) for one in settings(bare=False)],
-    ids=lambda one: one.name,
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("setting", settings(bare=False), ids=lambda one: one.name)
 def test_numbers_of_traced_calls(setting, tmp_path):
     for key, outcome in check(setting, tmp_path, 1).items():
         assert outcome.launched, (key, outcome.said)
@@ -93,7 +87,6 @@ def test_numbers_of_traced_calls_for_every_plugin(setting, tmp_path):
 
 FILMS = {
     "histogram": {},
-    "tent": {"temporal_filter": "tent"},
     "gaussian": {"temporal_filter": "gaussian"},
     "pulse": {"pulse": tt.Pulse.gaussian(0.3)},
     "phasors": {"frequencies": [0.0, 0.25, 0.5, 1.0]},
@@ -125,7 +118,7 @@ def same(a, b, black=False):
     torch.testing.assert_close(b, a, rtol=TOLERANCE, atol=TOLERANCE * scale)
 
 
-@pytest.mark.parametrize("film", FILMS)
+@pytest.mark.parametrize("film", long(FILMS, ["histogram", "phasors", "gates"]))
 def test_every_film(room_scene, film):
     traced, recorded = pair(room_scene, parameters=[COLOUR, GREY], spp=4, **FILMS[film])
     for seed in range(4):
@@ -197,7 +190,7 @@ def two_views():
 
 def test_two_scenes_by_turns():
     rooms = [tt.load(make_room(), variant=VARIANT) for _ in range(2)]
-    pairs = [pair(room, parameters=[COLOUR], spp=4) for room in rooms]
+    pairs = [pair(room, parameters=[COLOUR, GREY], spp=4) for room in rooms]
     with torch.no_grad():
         for renderer in pairs[1]:
             renderer.values[COLOUR].fill_(0.2)
@@ -210,20 +203,20 @@ def test_two_scenes_by_turns():
 
 def test_scenes_that_come_and_go():
     alive = []
-    for number in range(6):
+    for number in range(3):
         scene = tt.load(make_room(), variant=VARIANT)
-        renderer = tt.TransientRenderer(scene, parameters=[COLOUR], spp=4)
+        renderer = tt.TransientRenderer(scene, parameters=[COLOUR, GREY], spp=4)
         for seed in range(3):
             out, _ = step(renderer, seed)
         assert out.stats.recorded == (LAUNCHED,), number
         alive.append(weakref.ref(scene))
         del scene, renderer, out
     gc.collect()
-    assert [one() for one in alive] == [None] * 6
+    assert [one() for one in alive] == [None] * 3
 
 
 def test_several_renders_before_their_backward_passes(room_scene):
-    traced, recorded = pair(room_scene, parameters=[COLOUR, WALL_POSE], spp=4)
+    traced, recorded = pair(room_scene, parameters=[COLOUR, GREY], spp=4)
     grads = []
     for renderer in (traced, recorded):
         for round_ in range(3):
@@ -239,9 +232,8 @@ def test_several_renders_before_their_backward_passes(room_scene):
 
 def test_other_flags_of_gradients(room_scene):
     """Which values need a derivative changes from call to call; so do the adjoint's layout and what it is of."""
-    traced, recorded = pair(room_scene, parameters=[COLOUR, GREY, WALL_POSE], spp=4)
+    traced, recorded = pair(room_scene, parameters=[COLOUR, GREY], spp=4)
     losses = (
-        lambda out: out.transient.square().sum(),
         lambda out: out.steady.sum(),
         lambda out: (out.transient.permute(3, 2, 1, 0).contiguous() ** 2).sum() + out.steady.square().sum(),
         lambda out: out.transient[:, 3:9, 1].sum(),
@@ -255,14 +247,14 @@ def test_other_flags_of_gradients(room_scene):
                     parameter.requires_grad_(k != n)
                 loss(renderer(seed=10 * round_ + n)).backward()
                 grads.append([p.grad for p in renderer.parameters() if p.grad is not None])
-            assert len(grads[0]) == len(grads[1]) >= 2
+            assert len(grads[0]) == len(grads[1]) >= 1
             assert sum(float(a.abs().sum()) for a in grads[0]) > 0
             for a, b in zip(*grads, strict=True):
                 same(a, b, black=True)
 
 
 def test_threads(room_scene):
-    traced, recorded = pair(room_scene, parameters=[COLOUR], spp=4)
+    traced, recorded = pair(room_scene, parameters=[COLOUR, GREY], spp=4)
     expected = {seed: step(traced, seed)[0].transient for seed in range(4)}
     got, failed = {}, []
 
@@ -284,11 +276,10 @@ def test_threads(room_scene):
         same(expected[seed], transient)
 
 
-@pytest.mark.parametrize("stage", ["recorded", "launched"])
-@pytest.mark.parametrize("kind", ["render", "backward"])
+@pytest.mark.parametrize(("stage", "kind"), [("recorded", "render"), ("launched", "backward")])
 def test_interrupts_leave_everything_as_it_was(stage, kind, monkeypatch):
     scene = tt.load(make_room(), variant=VARIANT)
-    traced, recorded = pair(scene, parameters=[COLOUR, WALL_POSE], spp=4)
+    traced, recorded = pair(scene, parameters=[COLOUR, GREY], spp=4)
     for seed in range(1 if stage == "recorded" else 3):
         step(recorded, seed)
     out = recorded(seed=7) if kind == "backward" else None
@@ -329,8 +320,8 @@ def scene_integrator(renderer):
 
 def test_several_launches_are_traced(room_scene, monkeypatch):
     monkeypatch.setattr("torchtransient.plugins.integrators.launch.MAX_LANES", 20)
-    traced, recorded = pair(room_scene, parameters=[COLOUR], spp=4)
-    for seed in range(3):
+    traced, recorded = pair(room_scene, parameters=[COLOUR, GREY], spp=4)
+    for seed in range(2):
         expected, got = step(traced, seed), step(recorded, seed)
         same(expected[0].transient, got[0].transient)
         same(expected[1][0], got[1][0])
@@ -342,8 +333,8 @@ def test_a_large_batch_is_rendered_in_place(monkeypatch, room_scene):
     for name in ("carry_out", "batch"):
         monkeypatch.setattr(sys.modules[f"torchtransient.rendering.{name}"], "LARGE_FILM", 1)
     colours = torch.tensor([[0.9, 0.1, 0.3], [0.2, 0.8, 0.5]])
-    for film in ({}, {"frequencies": [0.0, 0.5]}, {"gates": [tt.Gate.gaussian(9.0, 2.0)]}, {"steady": False}):
-        renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=4, physics="ignore", **film)
+    for film in ({}, {"gates": FILMS["gates"]["gates"]}):
+        renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR, GREY], spp=4, physics="ignore", **film)
         out = renderer({COLOUR: colours}, seed=5)
         for n, seed in enumerate(out.stats.seeds):
             single = renderer({COLOUR: colours[n]}, seed=seed)
@@ -355,7 +346,7 @@ def test_a_large_batch_is_rendered_in_place(monkeypatch, room_scene):
 def test_what_dr_jit_cannot_record_is_traced(room_scene, monkeypatch):
     """A plugin that reads numbers while it is traced: said once, right every time."""
     scene = tt.load(make_room(), variant=VARIANT)
-    traced, recorded = pair(scene, parameters=[COLOUR], spp=4)
+    traced, recorded = pair(scene, parameters=[COLOUR, GREY], spp=4)
     cls = type(scene_integrator(recorded))
     offset = cls.offset_in_pixel
 
@@ -420,12 +411,12 @@ def test_recordings_are_bounded_and_said(monkeypatch):
     assert len(kept) == 3
     with warnings.catch_warnings(), torch.no_grad():  # once
         warnings.simplefilter("error")
-        for spp in range(1, 30):
+        for spp in range(1, 10):
             renderer(seed=0, spp=spp)
 
 
 def test_calls_that_are_launched_do_not_warn(room_scene):
-    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=2)
+    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR, GREY], spp=4)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for seed in range(30):

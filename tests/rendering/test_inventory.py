@@ -45,6 +45,7 @@ def mueller_matrices(bsdf) -> np.ndarray:
     u, v = mi.Float(generator.random(count)), mi.Point2f(generator.random((2, count)))
     sample, weight = bsdf.sample(mi.BSDFContext(), si, u, v)
     value = bsdf.eval(mi.BSDFContext(), si, sample.wo)
+    dr.eval(weight, value)  # in one kernel
     found = [
         [[np.broadcast_to(np.array(m[i, j]).ravel(), count) for j in range(4)] for i in range(4)]
         for m in (weight, value)

@@ -45,6 +45,7 @@ def test_a_reason_inside_a_kernel_that_is_recorded(unreadable):
     assert len(set(said)) == 1
 
 
+@pytest.mark.slow
 def test_forward_mode_after_an_error(unreadable):
     """What is attached does not live on in the frames of an exception that somebody holds."""
     key, right = "wall.bsdf.reflectance.value", tt.load(room(), variant="llvm_ad_rgb")

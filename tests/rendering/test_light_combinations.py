@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.marks import long_rows
 from torchtransient.sensing.response.pulse import apply_pulse
 from torchtransient.testing.small_room import make_room
 
@@ -38,7 +39,7 @@ def render(node, variant, **settings):
 
 @pytest.mark.parametrize(
     "bands, late",
-    [(True, None), (False, LATE), (True, {**LATE, **SHIFT})],
+    long_rows([(True, None), (False, LATE), (True, {**LATE, **SHIFT})], [(True, {**LATE, **SHIFT})]),
     ids=["at once", "late", "shifted"],
 )
 def test_intensity_of_polarized_renders(bands, late):
@@ -51,8 +52,8 @@ def test_intensity_of_polarized_renders(bands, late):
     assert polarized.transient[1:].abs().max() == 0
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_mono_polarized"])
-def test_gates_and_steady(variant):
+def test_gates_and_steady():
+    variant = "llvm_ad_mono_polarized"
     gates = (tt.Gate.gaussian(8.0, 0.3), tt.Gate.tabulated([8, 8.5, 12], [0, 1, 0]))
     fine = render(room(late=LATE), variant, time_axis=tt.TimeAxis(6.0, 0.005, 2000))
     gated = render(room(late=LATE), variant, gates=gates)
@@ -62,6 +63,7 @@ def test_gates_and_steady(variant):
     torch.testing.assert_close(gated.steady, gated.gated.sum(-3))
 
 
+@pytest.mark.slow
 def test_phasors_of_channels_and_delays():
     node = room(bands=True, late=LATE)
     frequencies = [0.0, 0.25, 0.5]
@@ -77,6 +79,7 @@ def test_phasors_of_channels_and_delays():
     assert difference < 5e-3 * float(phasor.steady.max())
 
 
+@pytest.mark.slow
 def test_a_pulse_on_delayed_light():
     pulse = tt.Pulse.tabulated([0, 0.1, 0.6], [0, 1, 0])
     plain = render(room(late=LATE), "llvm_ad_rgb", time_axis=AXIS)

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.marks import long_rows
 from torchtransient.rendering.node_names import _free_name, name_nested, name_nodes, take_merged_apart
 from torchtransient.rendering.nodes import children
 from torchtransient.testing.small_room import VARIANT, make_room
@@ -84,8 +85,9 @@ SHARED = {
 }
 
 
-@pytest.mark.parametrize("named", [True, False])
-@pytest.mark.parametrize("kind", SHARED)
+@pytest.mark.parametrize(
+    ("kind", "named"), long_rows([("bitmap", True), ("bitmap", False), ("d65", True)], [("bitmap", True)])
+)
 def test_shared_textures_that_become_other_objects(kind, named):
     """Their keys are no addresses, and the derivative is that of both places together."""
     texture, key = SHARED[kind]

@@ -131,15 +131,12 @@ def linear(out, weights):
     return (out.phasor * weights.conj()).sum().real + 0.3 * out.steady.sum()
 
 
-@pytest.mark.parametrize("key", [COLOUR, WALL_POSE])
-def test_forward_and_reverse_mode_agree(scene, weights, key):
+def test_forward_and_reverse_mode_agree(scene, weights):
+    key = WALL_POSE
     renderer = renderer_of(scene, key)
     value = renderer.values[key].detach()
     tangent = torch.zeros_like(value)
-    if key == WALL_POSE:
-        tangent[2, 3] = 1.0
-    else:
-        tangent[:] = torch.tensor([0.3, -0.2, 0.5])
+    tangent[2, 3] = 1.0
     _, (d_phasor, d_steady) = torch.func.jvp(
         lambda x: (lambda out: (out.phasor, out.steady))(renderer({key: x}, seed=2)), (value,), (tangent,)
     )
@@ -179,7 +176,8 @@ def test_losses_of_complex_numbers(scene, loss):
     tangent[2, 3] = 1.0
 
     def function(x):
-        return functions[loss](renderer({WALL_POSE: x}, seed=4).phasor)
+        out = renderer({WALL_POSE: x}, seed=4)
+        return functions[loss](out.phasor) + 0.3 * out.steady.sum()
 
     x = value.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(function(x), x)
@@ -222,7 +220,7 @@ def test_vmap_and_jacobians(scene):
 
 
 def test_copies_and_pickles_keep_the_frequencies(histogram_scene):
-    renderer = tt.TransientRenderer(histogram_scene, parameters=[COLOUR], frequencies=AXIS, spp=4)
+    renderer = tt.TransientRenderer(histogram_scene, parameters=[COLOUR], frequencies=AXIS)
     expected = renderer(seed=1).phasor
     for twin in (copy.deepcopy(renderer), pickle.loads(pickle.dumps(renderer))):
         torch.testing.assert_close(twin(seed=1).phasor, expected)

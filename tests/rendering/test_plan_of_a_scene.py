@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from support.marks import long_pairs
+from support.marks import long_rows
 from torchtransient.errors import GradientError, SceneError
 from torchtransient.gates import gates_to_text
 from torchtransient.rendering.plan import _check_known, _taken
@@ -136,7 +136,7 @@ def test_a_box_that_was_asked_for_stays_one():
 
 @pytest.mark.parametrize(
     ("kind", "of_scene"),
-    long_pairs(GATES, [False, True], [("rectangular gate", True), ("tabulated gate", False)]),
+    long_rows([("rectangular gate", True), ("tabulated gate", False)], [("rectangular gate", True)]),
 )
 def test_gates_without_a_slope_are_refused_at_once(kind, of_scene):
     room, gates = make_room(), GATES[kind]

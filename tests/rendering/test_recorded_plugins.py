@@ -39,8 +39,10 @@ def steady(renderer, value):
     return float(out.steady.sum()), out.stats.recorded[0]
 
 
-# What says that it can be recorded, in every way; what does not is told whatever it keeps.
-SAYS = [(kept, True) for kept in foreign_paint.KEPT] + [("float", False), ("generator", False), ("torch", False)]
+# One of each kind of what is walked through; what does not say that it can be recorded is told whatever it keeps.
+SAYS = [(kept, True) for kept in (
+    "float", "list", "slots", "partial", "NumPy", "torch", "generator", "array of Dr.Jit in a plain object"
+)] + [("float", False)]  # fmt: skip
 
 
 @pytest.mark.parametrize(("kept", "says"), long_rows(itertools.product(foreign_paint.KEPT, [False, True]), SAYS))

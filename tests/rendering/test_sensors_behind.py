@@ -49,6 +49,7 @@ def test_a_spad_behind_the_renderer(renderer):
         device.sensor(device.axis())(renderer(seed=0))
 
 
+@pytest.mark.slow
 def test_phasor_image_and_histogram_give_the_same_taps(renderer):
     frequencies = tt.FrequencyAxis.from_hertz([0.0, 30e6])
     phasors = tt.TransientRenderer(renderer.scene, spp=1024, frequencies=frequencies)

@@ -85,6 +85,7 @@ def deadly():
     plugins.sync()
 
 
+@pytest.mark.slow
 def test_a_signal_is_named(deadly):
     with pytest.raises(SceneError, match=r"the signal SIGSEGV, which ended the process in which it was tried"):
         tt.load(deadly("ends_the_process"), variant=VARIANT, trusted=False)

@@ -428,6 +428,7 @@ def test_a_part_in_torch_inside():
     torch.testing.assert_close(x.grad, 2 * torch.cos(2 * x.detach()))
 
 
+@pytest.mark.slow
 def test_an_integrator_of_ones_own_and_aovs():
     scene, params = load_room()
     aov = mi.load_dict({"type": "aov", "aovs": "depth:depth,albedo:albedo", "inner": {"type": "direct"}})

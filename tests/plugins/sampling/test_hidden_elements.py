@@ -55,6 +55,7 @@ def test_draws_lie_on_the_shape_with_its_normals(name):
     ray.o, ray.d = mi.Point3f(p + length * mi.Vector3f(n)), -mi.Vector3f(n)
     ray.maxt = mi.Float(1)
     si = scene.ray_intersect(ray)
+    dr.eval(p, n, si)
     # A ray along a rim may pass by it.
     hit = np.array(si.is_valid())
     assert hit.mean() > 0.999

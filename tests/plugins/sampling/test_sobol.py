@@ -11,7 +11,7 @@ VARIANT = "llvm_ad_mono"
 
 
 def coordinates(first, count, dimension, seed=3):
-    index = dr.arange(mi.UInt32, count) + mi.UInt32(first)
+    index = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
     return np.array(unit_double(sobol(index, dimension, dr.opaque(mi.UInt32, seed))))
 
 

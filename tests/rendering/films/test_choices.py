@@ -219,8 +219,6 @@ def test_an_object_says_the_same_as_the_argument(argument):
     named = tt.TransientRenderer(scene, **{argument: GIVEN[argument]}, spp=2)
     plain = tt.TransientRenderer(scene, film=choice_for(argument), spp=2)
     assert named.film == plain.film == choice_for(argument) and repr(named) == repr(plain)
-    a, b = (choice_for(argument).tensor(renderer(seed=1)) for renderer in (named, plain))
-    torch.testing.assert_close(a, b)
 
 
 @pytest.mark.parametrize(
