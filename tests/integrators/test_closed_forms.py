@@ -4,24 +4,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from support.marks import long
+from support.marks import long, long_rows
 from torchtransient import plugins, scenes
 from torchtransient.testing import closed_forms as cf
 from torchtransient.testing.statistics import pool_small_bins, standard_error, z_test
 
+VARIANT = "llvm_ad_mono"
 RUNS = 12
-
-
-@pytest.fixture(scope="module", params=["llvm_ad_rgb", "llvm_ad_mono"])
-def variant(request):
-    """Of the module, so that all tests of a variant come one after the other."""
-    return request.param
-
-
-@pytest.fixture(autouse=True)
-def _active(variant):
-    mi.set_variant(variant)
-    plugins.sync()
 
 
 def build(node):
@@ -93,8 +82,9 @@ def test_furnace_bins(emitter_sampling):
     np.testing.assert_allclose(in_window[-1] + outside, steady[-1], rtol=1e-5)
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)
 def test_furnace_in_spectral():
+    mi.set_variant("llvm_ad_spectral")
+    plugins.sync()
     description = scenes.furnace(1.0, 0.8, 2.0, **FURNACE)
     _, transient, _ = runs(description)
     expected = cf.furnace(edges_of(description), 1.0, 0.8, 2.0, max_bounces=47)
@@ -183,7 +173,10 @@ def test_light_over_plane_bins():
     check_bins(transient, expected, minimum=3e-3)
 
 
-@pytest.mark.parametrize("light, side, air", [("behind", "transmitted", 2.0), ("front", "reflected", 3.0)])
+@pytest.mark.parametrize(
+    ("light", "side", "air"),
+    long_rows([("behind", "transmitted", 2.0), ("front", "reflected", 3.0)], [("front", "reflected", 3.0)]),
+)
 def test_etalon_orders(light, side, air):
     description = scenes.etalon_slab(
         0.5, 1.5, light=light, num_bins=160, start_opl=0.025, bin_width_opl=0.05, spp=16384, max_depth=12

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import drjit as dr
@@ -27,6 +26,7 @@ from support.lights_and_sensors import (
     plane,
     scene,
 )
+from support.marks import long_rows
 from support.runs import T
 from torchtransient import plugins
 from torchtransient._collection import no_collection
@@ -333,8 +333,10 @@ def pair(sensor, light, integrator):
 
 
 KINDS = ("perspective", "thinlens", "orthographic", "radiancemeter", "irradiancemeter", "distant", "batch")
-PAIRS = list(itertools.product(KINDS, LIGHTS))
-QUICK = [(sensor, "area") for sensor in KINDS] + [("perspective", light) for light in LIGHTS if light != "area"]
+# Whatever the sensor, the light is sampled as it is for the others, but where both are at infinity.
+PAIRS = [(sensor, "area") for sensor in KINDS] + [("perspective", light) for light in LIGHTS if light != "area"]
+PAIRS += [("distant", "directional"), ("distant", "constant")]
+QUICK = [("batch", "area"), ("irradiancemeter", "area"), ("perspective", "envmap")]
 
 
 def check_pair(sensor, light, count=6, spp=512):
@@ -352,14 +354,8 @@ def check_pair(sensor, light, count=6, spp=512):
     assert result.passed, str(result)
 
 
-@pytest.mark.parametrize(("sensor", "light"), QUICK)
+@pytest.mark.parametrize(("sensor", "light"), long_rows(PAIRS, QUICK))
 def test_sum_over_time_is_what_mitsuba_renders(sensor, light):
-    check_pair(sensor, light)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("sensor", "light"), [p for p in PAIRS if p not in QUICK])
-def test_sum_over_time_of_the_other_pairs(sensor, light):
     check_pair(sensor, light)
 
 

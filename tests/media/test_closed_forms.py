@@ -64,7 +64,7 @@ def positions_at(time, points, lengths):
     return a + fraction[:, None] * (b - a)
 
 
-@pytest.mark.parametrize("g", [0.0, 0.5, 0.8])
+@pytest.mark.parametrize("g", long([0.0, 0.5, 0.8], [0.5]))
 def test_moments_of_the_random_walk(g):
     """<z> = l (1 - exp(-t/l)) and <r^2> = 2 l t - 2 l^2 (1 - exp(-t/l)), with l the transport mean free path."""
     μ_s = 1.3
@@ -149,7 +149,7 @@ def test_single_scattering_formula():
     np.testing.assert_allclose(total, expected, rtol=2e-3)
 
 
-@pytest.mark.parametrize("angle", [0.5, 1.5, 2.5])
+@pytest.mark.parametrize("angle", [0.5, 2.5])
 def test_single_scattering(angle):
     radius, μ_s, μ_a = 1.5, 0.7, 0.2
     direction = (np.sin(angle), 0, np.cos(angle))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -10,6 +12,7 @@ import scipy.interpolate
 import scipy.spatial.transform
 
 from support.gradient_cases.cases_curves import DIFFUSE, ellipsoid, file_of, seen_wall
+from support.marks import long_rows
 from torchtransient.plugins.transport.hits import DetachedHits, _spline, _starts
 from torchtransient.plugins.transport.instances import AttachedSurfaces, Instances, distance_to, surface_interaction
 from torchtransient.plugins.transport.strategy import Local
@@ -246,8 +249,13 @@ def ellipsoid_hits(keys, moves_rays, x):
 KEYS = {"ellipsoids": "data", "linearcurve": "control_points", "bsplinecurve": "control_points"}
 
 
-@pytest.mark.parametrize("moved", ["first", "second and rays"])
-@pytest.mark.parametrize("kind", list(KEYS))
+@pytest.mark.parametrize(
+    ("kind", "moved"),
+    long_rows(
+        itertools.product(KEYS, ["first", "second and rays"]),
+        [("ellipsoids", "second and rays"), ("linearcurve", "first"), ("bsplinecurve", "second and rays")],
+    ),
+)
 def test_hits_follow_shapes_and_rays(kind, moved):
     scene = mi.load_dict({"type": "scene", **two_of_each(kind)}, optimize=False)
     rays = moved != "first"
