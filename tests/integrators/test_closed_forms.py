@@ -53,7 +53,7 @@ def check_bins(transient, expected, minimum, one_group_until=0):
 FURNACE = {"num_bins": 400, "start_opl": 0.025, "bin_width_opl": 0.05, "spp": 2048, "max_depth": 48}
 
 
-@pytest.mark.parametrize("emitter_sampling", [False, True])
+@pytest.mark.parametrize("emitter_sampling", long([False, True], [False]))
 def test_furnace_bins(emitter_sampling):
     description = scenes.furnace(1.0, 0.8, 2.0, **FURNACE, emitter_sampling=emitter_sampling)
     steady, transient, film = runs(description)
@@ -94,6 +94,7 @@ def test_furnace_in_spectral():
     check_bins(shares, expected / expected.sum(), minimum=2e-3, one_group_until=24)
 
 
+@pytest.mark.slow
 def test_furnace_behind_a_far_near_clip_plane():
     # Mitsuba starts its rays on the near clip plane; the clock starts at the pinhole.
     description = scenes.furnace(
@@ -105,6 +106,7 @@ def test_furnace_behind_a_far_near_clip_plane():
     check_bins(transient, expected, minimum=0.01, one_group_until=24)
 
 
+@pytest.mark.slow
 def test_furnace_without_the_camera_leg():
     description = scenes.furnace(
         1.0, 0.5, 2.0, num_bins=60, start_opl=-0.025, bin_width_opl=0.05, spp=2048, max_depth=16

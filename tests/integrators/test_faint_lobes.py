@@ -75,7 +75,7 @@ def slow(*row):
 @pytest.mark.parametrize(
     ("bsdf", "key", "end"),
     [
-        ({"type": "diff_principled", "spec_trans": number(0.0), "roughness": 0.4}, "spec_trans.value", 0.0),
+        slow({"type": "diff_principled", "spec_trans": number(0.0), "roughness": 0.4}, "spec_trans.value", 0.0),
         slow({"type": "diff_principled", "spec_trans": number(0.0), "roughness": 0.4}, "spec_trans.value", 1.0),
         slow({"type": "diff_principled", "clearcoat": number(0.0)}, "clearcoat.value", 0.0),
         slow({"type": "diff_principled", "metallic": number(0.0)}, "metallic.value", 1.0),
@@ -103,7 +103,7 @@ def test_no_noisier_beside_an_end_than_at_it(bsdf, key, end):
     [
         slow({"type": "diff_principled", "spec_trans": number(0.0)}, "spec_trans.value"),
         slow({"type": "diff_principled", "clearcoat": 0.0}, "clearcoat.value"),
-        ({"type": "diff_principled", "spec_trans": 0.5, "eta": 1.4}, "eta"),
+        slow({"type": "diff_principled", "spec_trans": 0.5, "eta": 1.4}, "eta"),
         slow({"type": "diff_principled_thin", "diff_trans": 0.0}, "diff_trans.value"),
         ({"type": "diff_plastic", "specular_reflectance": number(0.0)}, "specular_reflectance.value"),
         slow({"type": "diff_rough_plastic"}, "alpha"),
@@ -143,6 +143,7 @@ def test_two_surfaces_with_one_texture(kind, slot, value):
     assert abs(rates[1]) > 1e-3 and rates[0] == pytest.approx(rates[1], rel=1e-3)
 
 
+@pytest.mark.slow
 def test_renders_are_sampled_as_by_mitsuba():
     """Whatever derivatives were asked for before, and although the value is attached."""
     scene = scene_of({"type": "diff_principled", "spec_trans": number(1e-4)})

@@ -70,6 +70,7 @@ def test_lobe_probabilities_that_a_nested_bsdf_hides(plugin):
     assert slope(tint(THIN_GLASS, plugin), "inner.eta") == pytest.approx(0.5 * slope(THIN_GLASS, "eta"), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_matrices_of_a_nested_two_sided_surface_from_behind():
     activate(POLARIZED)
     metal = two_sided({**METAL, "alpha": 0.3, "eta": 0.5, "k": 2.0})
@@ -97,6 +98,7 @@ def test_derivatives_by_a_mixture_inside():
     assert inside == pytest.approx(0.5 * bare, rel=2e-2)
 
 
+@pytest.mark.slow
 def test_a_mixture_inside_one_that_is_taken_apart():
     activate(MONO)
     inner = blend(DIFFUSE, METAL, 0.5)

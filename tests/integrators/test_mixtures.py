@@ -91,7 +91,7 @@ def rows(bsdf, room=mirror_room):
 
 
 # The others are the same code around other plugins.
-QUICK = ["plastic and mirror", "under normals", "weight 0", "blend of blends"]
+QUICK = ["under normals", "blend of blends"]
 
 
 @pytest.mark.parametrize("name", long(MIXTURES, QUICK))
@@ -142,7 +142,9 @@ def around_metal(normals, paint, flags):
 
 
 @pytest.mark.parametrize(
-    ("first", "flags"), [((FLAT, 0.8), FLAGS[1]), ((TILTED, 0.0), FLAGS[2])], ids=["flat", "black"]
+    ("first", "flags"),
+    [((FLAT, 0.8), FLAGS[1]), pytest.param((TILTED, 0.0), FLAGS[2], marks=pytest.mark.slow)],
+    ids=["flat", "black"],
 )
 def test_wrappers_of_parts_do_not_depend_on_what_was_rendered_first(first, flags):
     """Flags of a normal map show in no parameter, and not in what a flat one or a black surface scatters."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import drjit as dr
 import numpy as np
+import pytest
 
 from support.plain_scenes import camera, load
 from support.runs import T
@@ -134,6 +135,7 @@ def test_light_is_not_lost():
     assert (film.energy_before, film.energy_after) == (0.0, 0.0)
 
 
+@pytest.mark.slow
 def test_deep_paths_and_no_limit():
     """More bounces than a path's memory has room for: equal to enough room, and right without any limit."""
     scene = scene_of(phasor_camera(), max_depth=20, rr_depth=50)
@@ -150,6 +152,7 @@ def test_deep_paths_and_no_limit():
     np.testing.assert_allclose(render(unlimited)[1], render(limited)[1], rtol=1e-3, atol=1e-4 * np.abs(a).max())
 
 
+@pytest.mark.slow
 def test_several_launches_and_bands(monkeypatch):
     """Jobs that are split by samples, by rows and into storage bands add up."""
     scene = scene_of(phasor_camera())

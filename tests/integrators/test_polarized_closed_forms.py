@@ -100,7 +100,7 @@ BREWSTER = math.degrees(math.atan(INDEX))
     ("angle_deg", "roll_deg", "plugin"),
     long_rows(
         itertools.product([5.0, 45.0, BREWSTER, 75.0], [0.0, 25.0, 90.0], ["dielectric", "diff_dielectric"]),
-        [(45.0, 25.0, "dielectric"), (BREWSTER, 0.0, "diff_dielectric")],
+        [(BREWSTER, 25.0, "diff_dielectric")],
     ),
 )
 def test_reflection_from_glass(plugin, angle_deg, roll_deg):
@@ -144,7 +144,7 @@ def test_reflection_from_metal():
     ("plugin", "angle_deg", "sign"),
     long_rows(
         itertools.product(["dielectric", "diff_dielectric"], [43.0, 51.671], [1, -1]),
-        [("dielectric", 51.671, -1), ("diff_dielectric", 43.0, 1)],
+        [("diff_dielectric", 51.671, -1)],
     ),
 )
 def test_retardance_of_total_reflection(plugin, angle_deg, sign):
@@ -176,7 +176,9 @@ def test_retardance_of_total_reflection(plugin, angle_deg, sign):
     assert math.copysign(1, s3) == sign == -math.copysign(1, s2)
 
 
-@pytest.mark.parametrize(("side", "angle_deg"), [("reflected", 40.0), ("transmitted", 65.0)])
+@pytest.mark.parametrize(
+    ("side", "angle_deg"), long_rows([("reflected", 40.0), ("transmitted", 65.0)], [("transmitted", 65.0)])
+)
 def test_slab_order_by_order(side, angle_deg):
     """A glass plate in time, for each polarization: R, then T^2 R^(2m - 1) after 2 m crossings; T^2 R^(2m) behind it
     after 2 m + 1. A crossing takes n d / cos(theta_t). Per order, power and S1 follow from the sum and the difference.
@@ -278,7 +280,7 @@ def in_torch(kind, theta=0.0, delta=0.0):
     ("name", "prefix"),
     long_rows(
         itertools.product(ELEMENTS, ["", "diff_"]),
-        [("Malus", ""), ("right circular", ""), ("half-wave plate", "diff_"), ("any plate", "diff_")],
+        [("right circular", ""), ("half-wave plate", "diff_"), ("any plate", "diff_")],
     ),
 )
 def test_chain_of_elements(name, prefix):

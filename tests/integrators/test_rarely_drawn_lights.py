@@ -49,13 +49,14 @@ def gradients(lit):
     return {key: value.grad for key, value in lit.values.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("lit", "other", "weight"),
     [
-        pytest.param(under_a_sphere, WALL_POSE, 0.0, marks=pytest.mark.slow),
+        (under_a_sphere, WALL_POSE, 0.0),
         (under_a_sphere, WALL_POSE, 1e-6),
-        pytest.param(under_a_sun, SUN, 0.0, marks=pytest.mark.slow),
-        pytest.param(under_a_sun, SUN, 1e-6, marks=pytest.mark.slow),
+        (under_a_sun, SUN, 0.0),
+        (under_a_sun, SUN, 1e-6),
     ],
 )
 def test_a_length_beside_it_changes_no_derivative_by_an_albedo(lit, other, weight):

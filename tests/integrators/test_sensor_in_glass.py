@@ -98,7 +98,7 @@ BODIES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("body", long(BODIES, ["cube", "instance", "masked", "turned inside out", "behind a window"]))
+@pytest.mark.parametrize("body", long(BODIES, ["instance", "masked", "turned inside out"]))
 def test_bodies(body):
     check(scene(at(), depth=4, **BODIES[body]()), N * 1.0 + 2.0)
 
@@ -130,9 +130,8 @@ def test_shells_of_one_material():
     check(scene(at(), depth=4, **objects), N * N * 0.4 + N * 0.6 + 2.0)
 
 
-@pytest.mark.parametrize("near", [1e-3, 0.9])
-def test_near_clip_lies_in_glass(near):
-    check(scene(at(near=near), body=CUBE | {"bsdf": glass()}), N * 1.0 + 2.0)
+def test_near_clip_lies_in_glass():
+    check(scene(at(near=0.9), body=CUBE | {"bsdf": glass()}), N * 1.0 + 2.0)
 
 
 def test_outside_of_bodies():
@@ -142,9 +141,9 @@ def test_outside_of_bodies():
     check(scene(at(), depth=4, ahead=ahead, behind=behind), 3.0 + 0.6 * (N - 1))
 
 
-@pytest.mark.parametrize("z", [0.0, -0.5])
-def test_under_an_open_surface(z):
+def test_under_an_open_surface():
     """A lake: its surface has no other side."""
+    z = -0.5
     surface = {"type": "rectangle", "to_world": T().translate([0, 0, 1]).scale(20.0), "bsdf": glass(inside=WATER)}
     check(scene(at(z), lake=surface), WATER * (1.0 - z) + 2.0)
     small = {"type": "rectangle", "to_world": T().translate([0, 0, 1]).scale(0.1), "bsdf": glass(inside=WATER)}
@@ -290,7 +289,7 @@ def test_sensor_in_a_medium_in_glass():
     assert START + (np.argmax(bins) + 0.5) * BIN == pytest.approx(N + 2.0 + TO_LAMP, abs=1.5 * BIN)
 
 
-@pytest.mark.parametrize("where", ["outside", "inside"])
+@pytest.mark.parametrize("where", long(["outside", "inside"], ["inside"]))
 def test_light_in_glass(where):
     """A lamp in the glass, seen through its face or from within."""
     pose = T().translate([0, 0, 0.5]).rotate([0, 1, 0], 180).scale(0.1)

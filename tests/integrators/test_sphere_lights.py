@@ -164,7 +164,7 @@ def test_found_and_sampled_light_share_the_weight(ratio, alpha):
     assert both.mean() > 0
 
 
-@pytest.mark.parametrize("number", [1, 2])
+@pytest.mark.parametrize("number", long([1, 2], [2]))
 def test_lights_that_move(number):
     """What is kept of the lights is looked up again: one alone and several are kept in different ways."""
     scene = over_a_plane(*[lamp(0.01, center=[0.3 * n, 0, DISTANCE]) for n in range(number)])
@@ -211,8 +211,7 @@ def test_texture_coordinates_of_samples(inside):
     assert np.quantile(off, 0.999) < 1e-4 and np.array(ds.uv).min() >= 0 and np.array(ds.uv).max() <= 1
 
 
-@pytest.mark.parametrize("flipped", [False, True])
-@pytest.mark.parametrize("ratio", [1e-6, 1e-3, 0.99, 1.5])
+@pytest.mark.parametrize(("ratio", "flipped"), [(1e-6, False), (1e-3, True), (0.99, False), (1.5, False), (1.5, True)])
 def test_densities_agree_and_integrate_to_the_solid_angle(ratio, flipped):
     scene = over_a_plane(lamp(ratio, flip_normals=flipped), {"type": "point", "position": [0, 0, 1], "intensity": 1})
     table = SphereLights.of(scene).read(scene)
@@ -240,7 +239,7 @@ def test_densities_agree_and_integrate_to_the_solid_angle(ratio, flipped):
     ("ratio", "key"),
     long_rows(
         [(1e-5, "radius"), (1e-3, "height"), (0.1, "radiance"), (0.9, "radius"), (0.9, "height")],
-        [(1e-3, "height"), (0.9, "radius")],
+        [(1e-3, "height")],
     ),
 )
 def test_derivatives(ratio, key):

@@ -57,6 +57,7 @@ def test_steady_sum(name):
     assert total.passed, str(total)
 
 
+@pytest.mark.slow
 def test_sensor_inside_a_medium():
     """A fog around everything, camera included: the sensor and the walls name the medium."""
     fog = homogeneous(0.5, 0.3, 0.3)
@@ -84,7 +85,8 @@ def test_sensor_inside_a_medium():
     assert expected.mean() < 0.8 * clear, "the fog must matter"
 
 
-@pytest.mark.parametrize("hide_emitters", long([False, True], [True]))
+@pytest.mark.slow
+@pytest.mark.parametrize("hide_emitters", [False, True])
 def test_hidden_emitters(hide_emitters):
     objects = block(clouds())
     objects["lamp"]["to_world"] = T().translate([0, 0.3, 1.5]).rotate([1, 0, 0], 180).scale(0.5)
@@ -173,6 +175,7 @@ def test_without_media_it_is_the_surface_integrator():
     assert max(sizes[0]) > 1000 and sizes[1][-3:] == sizes[2][-3:] == sizes[0][-3:]
 
 
+@pytest.mark.slow
 def test_media_inside_instances():
     objects = block(homogeneous(1.0, 0.8))
     group = {"type": "shapegroup", "block": objects.pop("block")}

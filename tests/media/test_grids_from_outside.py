@@ -62,6 +62,7 @@ def test_light_through_a_grid(start, light):
     assert histogram.sum(1).std() < 0.1 * expected
 
 
+@pytest.mark.slow
 def test_where_a_grid_scatters():
     """As a homogeneous block of the grid's size does, bin by bin: collisions begin at the grid and not at its shape."""
     histograms = []

@@ -76,6 +76,7 @@ def test_medium_in_a_glass_slab():
         assert result.passed, (m, str(result))
 
 
+@pytest.mark.slow
 def test_scattering_medium_of_another_index():
     """The same medium in a block with and without an index: scattered light is later by the index, not weaker. A rough
     boundary of nearly the same index on both sides is the open one.

@@ -107,11 +107,8 @@ def unknown():
     return x
 
 
-@pytest.mark.parametrize(
-    "names",
-    long([("first",), ("second", "rays", "shapes")], [("second", "rays", "shapes")]),
-    ids=lambda names: names[0],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("names", [("first",), ("second", "rays", "shapes")], ids=lambda names: names[0])
 def test_interactions_follow_what_moves(names):
     scene = scene_of()
     params = mi.traverse(scene)

@@ -155,7 +155,7 @@ def test_light_inside_a_short_window():
     assert gated == pytest.approx(expected, rel=0.01) and gated > 0
 
 
-@pytest.mark.parametrize("plugin", ["transient_with_point_light", "transient_guided_with_point_light"])
+@pytest.mark.parametrize("plugin", ["transient_guided_with_point_light"])
 def test_own_light_equals_the_scene_s(plugin):
     """A light of our own is the scene's: as bright, and at the same time."""
     dark = {"type": "point", "position": [0.5, 0.0, 4.0], "intensity": 1e-20}

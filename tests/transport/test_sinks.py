@@ -64,7 +64,8 @@ def test_adjoint_sum_is_the_product_with_the_render(kind):
     assert np.array(kept["sum"], dtype=np.float64).sum() == pytest.approx(expected, rel=1e-4)
 
 
-@pytest.mark.parametrize("kind", long(["plain", "fog", "glass"], ["fog"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["plain", "fog", "glass"])
 def test_depth_of_an_event_is_that_of_the_render_that_has_it(kind):
     def sink_of(integrator, contents, film, rays, job):
         match = integrator.channel_match(contents, film, rays)
