@@ -33,17 +33,16 @@ def narrow(**arguments):
     return camera(**({"fov": 0.01, "width": 1, "height": 1, "bins": 12000, "bin_width": 1e-3} | arguments))
 
 
-@pytest.mark.parametrize("near", [1e-3, 0.5, 1.0, 3.5])
+@pytest.mark.parametrize("near", [1e-3, 3.5])
 def test_light_beside_the_camera_arrives_at_twice_the_distance(near):
     objects = {"wall": wall(), "point": {"type": "point", "position": [0.0, 0.0, 4.0], "intensity": 5.0}}
     assert one_arrival(load(narrow(near_clip=near), objects))[0] == pytest.approx(8.0, abs=6e-4)
 
 
-@pytest.mark.parametrize("near", [0.01, 2.0])
 @pytest.mark.parametrize("kind", ["thinlens", "orthographic"])
-def test_other_projective_sensors(kind, near):
+def test_other_projective_sensors(kind):
     objects = {"wall": wall(), "point": {"type": "point", "position": [0.0, 0.0, 3.0], "intensity": 5.0}}
-    sensor = narrow(near_clip=near)
+    sensor = narrow(near_clip=2.0)
     sensor["type"] = kind
     if kind == "thinlens":
         sensor |= {"aperture_radius": 1e-3, "focus_distance": 4.0}
@@ -68,8 +67,7 @@ def test_sunlight_arrives_as_a_plane_wave():
     assert one_arrival(scene)[0] == pytest.approx(expected, abs=1e-3)
 
 
-@pytest.mark.parametrize("z", [0.2, 0.9])
-@pytest.mark.parametrize("sky", ["constant", "envmap"])
+@pytest.mark.parametrize(("sky", "z"), [("constant", 0.2), ("envmap", 0.9)])
 def test_visible_sky_arrives_from_the_sphere_around_the_scene(sky, z):
     """A camera inside the sphere, and one outside of it, which the wave reaches before t = 0."""
     light = (

@@ -4,24 +4,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from support.marks import long
+from support.marks import long, long_rows
 from torchtransient import plugins, scenes
 from torchtransient.testing import closed_forms as cf
 from torchtransient.testing.statistics import pool_small_bins, standard_error, z_test
 
+VARIANT = "llvm_ad_mono"
 RUNS = 12
-
-
-@pytest.fixture(scope="module", params=["llvm_ad_rgb", "llvm_ad_mono"])
-def variant(request):
-    """Of the module, so that all tests of a variant come one after the other."""
-    return request.param
-
-
-@pytest.fixture(autouse=True)
-def _active(variant):
-    mi.set_variant(variant)
-    plugins.sync()
 
 
 def build(node):
@@ -64,7 +53,7 @@ def check_bins(transient, expected, minimum, one_group_until=0):
 FURNACE = {"num_bins": 400, "start_opl": 0.025, "bin_width_opl": 0.05, "spp": 2048, "max_depth": 48}
 
 
-@pytest.mark.parametrize("emitter_sampling", [False, True])
+@pytest.mark.parametrize("emitter_sampling", long([False, True], [False]))
 def test_furnace_bins(emitter_sampling):
     description = scenes.furnace(1.0, 0.8, 2.0, **FURNACE, emitter_sampling=emitter_sampling)
     steady, transient, film = runs(description)
@@ -93,8 +82,9 @@ def test_furnace_bins(emitter_sampling):
     np.testing.assert_allclose(in_window[-1] + outside, steady[-1], rtol=1e-5)
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)
 def test_furnace_in_spectral():
+    mi.set_variant("llvm_ad_spectral")
+    plugins.sync()
     description = scenes.furnace(1.0, 0.8, 2.0, **FURNACE)
     _, transient, _ = runs(description)
     expected = cf.furnace(edges_of(description), 1.0, 0.8, 2.0, max_bounces=47)
@@ -104,6 +94,7 @@ def test_furnace_in_spectral():
     check_bins(shares, expected / expected.sum(), minimum=2e-3, one_group_until=24)
 
 
+@pytest.mark.slow
 def test_furnace_behind_a_far_near_clip_plane():
     # Mitsuba starts its rays on the near clip plane; the clock starts at the pinhole.
     description = scenes.furnace(
@@ -115,6 +106,7 @@ def test_furnace_behind_a_far_near_clip_plane():
     check_bins(transient, expected, minimum=0.01, one_group_until=24)
 
 
+@pytest.mark.slow
 def test_furnace_without_the_camera_leg():
     description = scenes.furnace(
         1.0, 0.5, 2.0, num_bins=60, start_opl=-0.025, bin_width_opl=0.05, spp=2048, max_depth=16
@@ -183,7 +175,10 @@ def test_light_over_plane_bins():
     check_bins(transient, expected, minimum=3e-3)
 
 
-@pytest.mark.parametrize("light, side, air", [("behind", "transmitted", 2.0), ("front", "reflected", 3.0)])
+@pytest.mark.parametrize(
+    ("light", "side", "air"),
+    long_rows([("behind", "transmitted", 2.0), ("front", "reflected", 3.0)], [("front", "reflected", 3.0)]),
+)
 def test_etalon_orders(light, side, air):
     description = scenes.etalon_slab(
         0.5, 1.5, light=light, num_bins=160, start_opl=0.025, bin_width_opl=0.05, spp=16384, max_depth=12

@@ -25,6 +25,7 @@ START, BINS, WIDTH = 6.0, 260, 0.05
 LIFETIME, YIELD = 0.9, 0.7
 DIFFUSE = {"type": "diffuse", "reflectance": 0.5}
 LATE = {"type": "delayed", "lifetime": LIFETIME, "quantum_yield": YIELD, "nested": DIFFUSE}
+METAL = {"type": "roughconductor", "alpha": 0.3}
 DECAY = {"decay_opl": "0, 0.1, 0.4, 2.0", "decay_values": "0 1 0.3 0"}
 
 
@@ -123,9 +124,7 @@ def test_mixtures(mixture):
     check(transient, expected)
 
 
-@pytest.mark.parametrize(
-    "extra", [{}, {"elastic_fraction": 0.3}, {"elastic": {"type": "roughconductor", "alpha": 0.3}}]
-)
+@pytest.mark.parametrize("extra", [{"elastic_fraction": 0.3}, pytest.param({"elastic": METAL}, marks=pytest.mark.slow)])
 def test_the_sum_is_what_steady_integrators_see(extra):
     node = {**LATE, **extra}
     ours = np.array([runs(scene(node, 4), 1, 8192, seed=k)[0][0] for k in range(8)])

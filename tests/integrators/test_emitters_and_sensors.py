@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import drjit as dr
@@ -27,6 +26,7 @@ from support.lights_and_sensors import (
     plane,
     scene,
 )
+from support.marks import long, long_rows
 from support.runs import T
 from torchtransient import plugins
 from torchtransient._collection import no_collection
@@ -56,11 +56,11 @@ def test_light_on_a_plane(name):
 @pytest.mark.parametrize("name", SENSORS)
 def test_sensor_over_a_plane(name):
     sensor = SENSORS[name]
-    for light in (LIGHTS["point"], LIGHTS["directional"]):
-        opl, radiance, width = one_arrival(load(scene(sensor.make(film()), light.make())), 256)
-        assert opl == pytest.approx(light.opl + sensor.opl, abs=HALF_BIN)
-        assert radiance == pytest.approx(light.radiance * sensor.weight, rel=1e-3)
-        assert width < 2.5e-3
+    light = LIGHTS["directional" if name == "distant" else "point"]
+    opl, radiance, width = one_arrival(load(scene(sensor.make(film()), light.make())), 256)
+    assert opl == pytest.approx(light.opl + sensor.opl, abs=HALF_BIN)
+    assert radiance == pytest.approx(light.radiance * sensor.weight, rel=1e-3)
+    assert width < 2.5e-3
 
 
 def test_start_of_meters_is_on_the_sensor():
@@ -196,7 +196,7 @@ def test_batch_reports_polarization_in_the_frame_of_each_child():
     assert np.ptp(alone[:, 1]) > 0.05  # the frames do differ
 
 
-@pytest.mark.parametrize("target", ["point", "shape", "scene"])
+@pytest.mark.parametrize("target", long(["point", "shape", "scene"], ["shape"]))
 def test_a_distant_sensor_sees_a_plane_wave(target):
     """Parts of a slanted surface that lie further along the view arrive later by that much, wherever rays start."""
     direction = np.array([-0.6, 0.0, -0.8])  # the sensor looks along it
@@ -333,8 +333,10 @@ def pair(sensor, light, integrator):
 
 
 KINDS = ("perspective", "thinlens", "orthographic", "radiancemeter", "irradiancemeter", "distant", "batch")
-PAIRS = list(itertools.product(KINDS, LIGHTS))
-QUICK = [(sensor, "area") for sensor in KINDS] + [("perspective", light) for light in LIGHTS if light != "area"]
+# Whatever the sensor, the light is sampled as it is for the others, but where both are at infinity.
+PAIRS = [(sensor, "area") for sensor in KINDS] + [("perspective", light) for light in LIGHTS if light != "area"]
+PAIRS += [("distant", "directional"), ("distant", "constant")]
+QUICK = [("batch", "area"), ("irradiancemeter", "area"), ("perspective", "envmap")]
 
 
 def check_pair(sensor, light, count=6, spp=512):
@@ -352,14 +354,8 @@ def check_pair(sensor, light, count=6, spp=512):
     assert result.passed, str(result)
 
 
-@pytest.mark.parametrize(("sensor", "light"), QUICK)
+@pytest.mark.parametrize(("sensor", "light"), long_rows(PAIRS, QUICK))
 def test_sum_over_time_is_what_mitsuba_renders(sensor, light):
-    check_pair(sensor, light)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("sensor", "light"), [p for p in PAIRS if p not in QUICK])
-def test_sum_over_time_of_the_other_pairs(sensor, light):
     check_pair(sensor, light)
 
 

@@ -11,24 +11,12 @@ import pytest
 import torch
 
 from support.marks import long_pairs, long_rows
-from torchtransient import plugins
 from torchtransient.testing.dielectric_reference import fresnel_reflectance, rough_dielectric
 from torchtransient.testing.statistics import z_test
 
+VARIANT = "llvm_ad_mono"
 RUNS = 8
 BIN = 0.02
-
-
-@pytest.fixture(scope="module", params=["llvm_ad_mono", "llvm_ad_rgb"])
-def variant(request):
-    """Of the module, so that all tests of a variant come one after the other."""
-    return request.param
-
-
-@pytest.fixture(autouse=True)
-def _active(variant):
-    mi.set_variant(variant)
-    plugins.sync()
 
 
 def camera(origin, target, bins, start, temporal_filter="box"):
@@ -96,9 +84,7 @@ SLABS = {"glass": (1.5, 1.0, 0.0), "glass, oblique": (1.5, 1.0, 40.0), "a gap": 
     long_rows(
         itertools.product(SLABS, ["reflected", "transmitted"], ["dielectric", "diff_dielectric"]),
         [
-            ("glass", "reflected", "dielectric"), ("glass", "transmitted", "diff_dielectric"),
-            ("glass, oblique", "transmitted", "dielectric"), ("glass, oblique", "reflected", "diff_dielectric"),
-            ("a gap", "reflected", "dielectric"), ("a gap", "transmitted", "diff_dielectric"),
+            ("glass, oblique", "reflected", "diff_dielectric"), ("a gap", "transmitted", "dielectric"),
         ],
     ),
 )  # fmt: skip
@@ -157,7 +143,7 @@ def lamp_behind_interface(bsdf, camera_z, lamp, temporal_filter="box"):
     return mi.load_dict({
         "type": "scene",
         "interface": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(20), "bsdf": bsdf},
-        "lamp": {"type": "point", "position": lamp, "intensity": 3.0},
+        "lamp": {"type": "point", "position": list(lamp), "intensity": 3.0},
         "sensor": camera([0.05, 0.02, camera_z], [0.05, 0.02, 0], 300, 2.0, temporal_filter),
         "integrator": {"type": "transient_path", "max_depth": 2},
     })  # fmt: skip
@@ -175,14 +161,23 @@ def radiance_through(camera_z, lamp, eta, alpha=0.3):
     return 3.0 * value[0] / distance**2, abs(camera_z) * before + behind * distance
 
 
-@pytest.mark.parametrize("kind", ROUGH)
-@pytest.mark.parametrize(("camera_z", "lamp"), [(3.0, [0.4, 0.1, -2.0]), (-3.0, [0.3, -0.2, 2.0])])
-def test_connection_through_a_rough_interface(kind, camera_z, lamp):
+ABOVE, BELOW = (3.0, (0.4, 0.1, -2.0)), (-3.0, (0.3, -0.2, 2.0))
+
+
+@pytest.mark.parametrize(
+    ("kind", "places"),
+    long_rows(
+        itertools.product(ROUGH, [ABOVE, BELOW]),
+        [("roughdielectric", BELOW), ("half covered", ABOVE)],
+    ),
+)
+def test_connection_through_a_rough_interface(kind, places):
     """Guards against counting the connection with the index of the camera's side: 3 m of air and 2 m of glass are 6 m,
     3 m of glass around the camera and 2 m of air 6.5 m.
 
     mitransient puts this light at 5 m.
     """
+    camera_z, lamp = places
     scene = lamp_behind_interface(ROUGH[kind], camera_z, lamp)
     radiance, opl = (x.item() for x in radiance_through(camera_z, lamp, torch.tensor(1.5, dtype=torch.float64)))
     if kind == "half covered":
@@ -193,10 +188,12 @@ def test_connection_through_a_rough_interface(kind, camera_z, lamp):
     assert measured[k - 1 : k + 2].sum() == pytest.approx(measured.sum(), rel=1e-5)
 
 
-@pytest.mark.parametrize(("camera_z", "lamp"), [(3.0, [0.4, 0.1, -2.0]), (-3.0, [0.3, -0.2, 2.0])])
-@pytest.mark.parametrize("key", ["eta", "alpha"])
-def test_gradient_through_a_rough_interface(camera_z, lamp, key):
+@pytest.mark.parametrize(
+    ("places", "key"), long_pairs([ABOVE, BELOW], ["eta", "alpha"], [(BELOW, "eta"), (ABOVE, "alpha")])
+)
+def test_gradient_through_a_rough_interface(places, key):
     """Index and roughness from the time of flight: d/dx of sum_b t_b I_b = f tau has the parts f' tau and f tau'."""
+    camera_z, lamp = places
     scene = lamp_behind_interface(ROUGH["diff_rough_dielectric"], camera_z, lamp, "tent")
     params = mi.traverse(scene)
     name = "interface.bsdf.eta" if key == "eta" else "interface.bsdf.alpha.value"
@@ -207,8 +204,7 @@ def test_gradient_through_a_rough_interface(camera_z, lamp, key):
     (expected,) = torch.autograd.grad(f * tau, eta if key == "eta" else alpha)
 
     times = 2.0 + BIN * (np.arange(300) + 0.5)
-    channels = 1 if mi.variant().endswith("mono") else 3
-    adjoint = mi.TensorXf(np.repeat(times, channels).astype(np.float32) / channels, (1, 1, 300, channels))
+    adjoint = mi.TensorXf(times.astype(np.float32), (1, 1, 300, 1))
     scene.integrator().render_backward(scene, params, (None, adjoint), spp=4096)
     assert dr.grad(params[name])[0] == pytest.approx(expected.item(), rel=5e-3)
 
@@ -225,7 +221,7 @@ def test_arrival_behind_a_principled_interface():
 
 @pytest.mark.parametrize(
     ("angle_deg", "side"),
-    long_pairs([0.0, 40.0], ["reflected", "transmitted"], [(0.0, "transmitted"), (40.0, "reflected")]),
+    long_rows(itertools.product([0.0, 40.0], ["reflected", "transmitted"]), [(40.0, "reflected")]),
 )
 def test_gradient_of_a_slab_in_its_index(side, angle_deg):
     """Through Fresnel's weight, the refracted direction and the path length, orders m = 0 to 3 of the slab together."""
@@ -259,8 +255,7 @@ def test_gradient_of_a_slab_in_its_index(side, angle_deg):
         dr.enable_grad(params[k])
     params.update()
     times = start + BIN * (np.arange(bins) + 0.5)
-    channels = 1 if mi.variant().endswith("mono") else 3
-    adjoint = mi.TensorXf(np.repeat(times, channels).astype(np.float32) / channels, (1, 1, bins, channels))
+    adjoint = mi.TensorXf(times.astype(np.float32), (1, 1, bins, 1))
     gradients = []
     for seed in range(RUNS):
         for k in etas:

@@ -33,15 +33,17 @@ LONG = {
     "no_transmission_of_a_sheet", "instance_and_its_mirror_turn", "phase_of_weight_1", "normals_in_an_instance",
     "polarized_fluorescent_yield", "area_light_over_a_delayed_wall_moves",
 }  # fmt: skip
-# Nor the first cases of rows whose code a quicker case of another row runs, too: surfaces, media, polarization, lights,
-# sensors, instances, indices and textures are in the default set once or twice each.
+# Nor the first cases of rows whose code a quicker case of another row runs, too: surfaces, media, lights, sensors,
+# instances, indices and textures are in the default set once or twice each, polarization in test_singular_mueller.py.
 ALIKE = {
     "wall_under_a_smooth_light", "sun_direction", "hair_longitudinal_roughness", "hair_index",
     "glass_around_camera_index", "gated_side_albedo", "quantum_yield", "elastic_fraction", "albedo_inside_a_delay",
     "black_mirror_of_a_plastic", "principled_glass_index", "very_rough_glass", "principled_thin_colour", "no_clearcoat",
     "medium_albedo_zero", "medium_g", "medium_flakes", "medium_wall_behind", "roughness_of_blended_glass",
     "mirror_normals_in_a_volume", "polar_metal_of_index_zero", "polar_metal_alpha", "polar_wall_distance",
-    "lens_aperture", "glass_moves", "mirror_moves",
+    "lens_aperture", "glass_moves", "mirror_moves", "camera_moves_in_glass", "blend_weight", "principled_roughness",
+    "smooth_plastic_index", "mirror_reflectance", "polar_polarizer_angle", "polar_albedo",
+    "linear_curve_bends", "conductor_eta",
 }  # fmt: skip
 
 

@@ -24,6 +24,7 @@ def functions_of(film):
     return type(film).prepare.__globals__
 
 
+@pytest.mark.slow
 def test_memory_is_zero_at_the_start_of_every_render(scene):
     film = scene.sensors()[0].film()
     assert SIZE * SIZE * film.entries_per_pixel() > functions_of(film)["MANY_VALUES"]

@@ -91,8 +91,7 @@ def rows(bsdf, room=mirror_room):
 
 
 # The others are the same code around other plugins.
-QUICK = ["diffuse and mirror", "plastic and mirror", "two-sided", "under normals", "weight 0", "blend of blends",
-         "mask of a blend"]  # fmt: skip
+QUICK = ["under normals", "blend of blends"]
 
 
 @pytest.mark.parametrize("name", long(MIXTURES, QUICK))
@@ -100,10 +99,7 @@ def test_mixture_is_the_weighed_sum_of_its_parts(name):
     check_sum(*MIXTURES[name]())
 
 
-QUICK_THROUGH = ["paint and rough glass", "under normals, seen through", "mask of rough glass and paint"]
-
-
-@pytest.mark.parametrize("name", long(THROUGH, QUICK_THROUGH))
+@pytest.mark.parametrize("name", long(THROUGH, ["mask of rough glass and paint"]))
 def test_mixture_that_is_seen_through_is_the_weighed_sum_of_its_parts(name):
     check_sum(*THROUGH[name](), seen_through)
 
@@ -118,6 +114,7 @@ def check_sum(mixture, parts, room=mirror_room):
     assert error < 0.02 * expected
 
 
+@pytest.mark.slow
 def test_kinds_of_glass_that_become_different():
     """Paths behind either kind count its own index, whatever was rendered first."""
     images = []
@@ -144,8 +141,11 @@ def around_metal(normals, paint, flags):
     return {"type": "normalmap", "normalmap": bitmap, "nested": blend(*parts, 0.5), **flags}
 
 
-@pytest.mark.parametrize("flags", FLAGS, ids=str)
-@pytest.mark.parametrize("first", [(FLAT, 0.8), (TILTED, 0.0)], ids=["flat", "black"])
+@pytest.mark.parametrize(
+    ("first", "flags"),
+    [((FLAT, 0.8), FLAGS[1]), pytest.param((TILTED, 0.0), FLAGS[2], marks=pytest.mark.slow)],
+    ids=["flat", "black"],
+)
 def test_wrappers_of_parts_do_not_depend_on_what_was_rendered_first(first, flags):
     """Flags of a normal map show in no parameter, and not in what a flat one or a black surface scatters."""
     images = []
@@ -158,7 +158,8 @@ def test_wrappers_of_parts_do_not_depend_on_what_was_rendered_first(first, flags
             params[f"wall.bsdf.nested_bsdf.{key}"] = 0.8
         params.update()
         images.append(np.array(scene.integrator().render(scene, seed=0, spp=256)[1]))
-    np.testing.assert_array_equal(*images)
+    assert images[0].max() > 0
+    np.testing.assert_allclose(*images, rtol=1e-4, atol=1e-6 * images[0].max())
 
 
 @pytest.mark.parametrize("flags", FLAGS, ids=str)

@@ -7,12 +7,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from support.marks import long_rows
 from support.plain_scenes import camera, load
 from support.runs import T
 from torchtransient import plugins
 from torchtransient.plugins.films import phasor_adjoint
 
-VARIANTS = ["llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized"]
+VARIANT = "llvm_ad_rgb"
 GRID = {"frequency_first": -0.6, "frequency_step": 0.2, "frequency_count": 40}
 LIST = {"frequencies": "0, 3.7 -1.25, 0.5, 12.5"}
 ALBEDO, WALL, LIGHT = "wall.bsdf.reflectance.value", "side.to_world", "lamp.emitter.radiance.value"
@@ -63,20 +64,21 @@ def gradient(scene, moves):
     return np.array(found, dtype=np.float64)
 
 
-@pytest.fixture(params=VARIANTS)
-def _active(request):
-    mi.set_variant(request.param)
-    plugins.sync()
-
-
 def one_by_one(monkeypatch):
     monkeypatch.setattr(phasor_adjoint.PhasorAdjointBlock, "together", lambda self, most, with_slope: 0)
 
 
-@pytest.mark.usefixtures("_active")
-@pytest.mark.parametrize("frequencies", [GRID, LIST], ids=["grid", "list"])
-@pytest.mark.parametrize("moves", [False, True], ids=["albedo", "wall"])
-def test_ahead_and_one_by_one(monkeypatch, frequencies, moves):
+@pytest.mark.parametrize(
+    ("variant", "frequencies", "moves"),
+    long_rows(
+        [(VARIANT, LIST, False), (VARIANT, GRID, True), ("llvm_ad_mono_polarized", GRID, True)],
+        [(VARIANT, LIST, False), (VARIANT, GRID, True)],
+    ),
+    ids=["list-albedo", "grid-wall", "polarized"],
+)
+def test_ahead_and_one_by_one(monkeypatch, variant, frequencies, moves):
+    mi.set_variant(variant)
+    plugins.sync()
     scene = scene_of(frequencies)
     ahead = gradient(scene, moves)
     with monkeypatch.context() as patch:
@@ -86,12 +88,9 @@ def test_ahead_and_one_by_one(monkeypatch, frequencies, moves):
     np.testing.assert_allclose(ahead, alone, rtol=1e-4)
 
 
-@pytest.mark.parametrize("_active", ["llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_mono_polarized"], indirect=True)
-@pytest.mark.usefixtures("_active")
-@pytest.mark.parametrize("frequencies", [GRID, LIST], ids=["grid", "list"])
-def test_the_derivative_by_the_light_is_the_render(frequencies):
+def test_the_derivative_by_the_light_is_the_render():
     """Phasors are linear in the light: for one seed ``<g, render> = radiance <g, d render / d radiance>``."""
-    scene = scene_of(frequencies)
+    scene = scene_of(GRID)
     g = np.random.default_rng(1).normal(size=scene.sensors()[0].film().cube_shape()).astype(np.float32)
     _, phasors = scene.integrator().render(scene, seed=3, spp=64)
     params = mi.traverse(scene)
@@ -105,21 +104,17 @@ def test_the_derivative_by_the_light_is_the_render(frequencies):
     assert found == pytest.approx(terms.sum(), abs=2e-6 * np.abs(terms).sum())
 
 
-@pytest.mark.parametrize("most", [1, 3, 100])
-def test_arrivals_that_do_not_fit_one_read(monkeypatch, most):
-    """Fewer at once than a path has, and more than it can have."""
-    mi.set_variant("llvm_ad_rgb")
-    plugins.sync()
+def test_arrivals_that_do_not_fit_one_read(monkeypatch):
+    """Fewer at once than a path has."""
     scene = scene_of(GRID)
     expected = gradient(scene, True)
-    monkeypatch.setattr(phasor_adjoint, "MOST_ARRIVALS", most)
+    monkeypatch.setattr(phasor_adjoint, "MOST_ARRIVALS", 3)
     monkeypatch.setattr(phasor_adjoint, "SUMS", 600)
     np.testing.assert_allclose(gradient(scene, True), expected, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_in_media(monkeypatch):
-    mi.set_variant("llvm_ad_rgb")
-    plugins.sync()
     scene = scene_of(GRID, fog=True)
     ahead = gradient(scene, True)
     one_by_one(monkeypatch)

@@ -49,13 +49,14 @@ def gradients(lit):
     return {key: value.grad for key, value in lit.values.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("lit", "other", "weight"),
     [
         (under_a_sphere, WALL_POSE, 0.0),
         (under_a_sphere, WALL_POSE, 1e-6),
-        pytest.param(under_a_sun, SUN, 0.0, marks=pytest.mark.slow),
-        pytest.param(under_a_sun, SUN, 1e-6, marks=pytest.mark.slow),
+        (under_a_sun, SUN, 0.0),
+        (under_a_sun, SUN, 1e-6),
     ],
 )
 def test_a_length_beside_it_changes_no_derivative_by_an_albedo(lit, other, weight):
@@ -70,6 +71,7 @@ def test_a_length_beside_it_changes_no_derivative_by_an_albedo(lit, other, weigh
     torch.testing.assert_close(slope, expected.sum(), rtol=0.01, atol=0)
 
 
+@pytest.mark.slow
 def test_a_length_is_that_of_a_light_that_is_drawn():
     drawn, hit = (gradients(under_a_sphere(weight, [WALL_POSE]))[WALL_POSE][2, 3] for weight in (1.0, 0.0))
     assert float(hit) == pytest.approx(float(drawn), rel=0.1)  # of area measure, which is noisy at the limb: 2 to 5 %

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from support.marks import long, long_rows
 from support.runs import T
 from torchtransient import plugins
 
@@ -97,12 +98,12 @@ BODIES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("body", BODIES)
+@pytest.mark.parametrize("body", long(BODIES, ["instance", "masked", "turned inside out"]))
 def test_bodies(body):
     check(scene(at(), depth=4, **BODIES[body]()), N * 1.0 + 2.0)
 
 
-@pytest.mark.parametrize("plugin", ["roughdielectric", "diff_rough_dielectric"])
+@pytest.mark.parametrize("plugin", long(["roughdielectric", "diff_rough_dielectric"], ["diff_rough_dielectric"]))
 def test_rough_body(plugin):
     """Nearly smooth: the first light comes from a point of the wall a little nearer to the lamp."""
     rough = glass(plugin, alpha=0.005)
@@ -129,9 +130,8 @@ def test_shells_of_one_material():
     check(scene(at(), depth=4, **objects), N * N * 0.4 + N * 0.6 + 2.0)
 
 
-@pytest.mark.parametrize("near", [1e-3, 0.1, 0.9])
-def test_near_clip_lies_in_glass(near):
-    check(scene(at(near=near), body=CUBE | {"bsdf": glass()}), N * 1.0 + 2.0)
+def test_near_clip_lies_in_glass():
+    check(scene(at(near=0.9), body=CUBE | {"bsdf": glass()}), N * 1.0 + 2.0)
 
 
 def test_outside_of_bodies():
@@ -141,9 +141,9 @@ def test_outside_of_bodies():
     check(scene(at(), depth=4, ahead=ahead, behind=behind), 3.0 + 0.6 * (N - 1))
 
 
-@pytest.mark.parametrize("z", [0.0, -0.5])
-def test_under_an_open_surface(z):
+def test_under_an_open_surface():
     """A lake: its surface has no other side."""
+    z = -0.5
     surface = {"type": "rectangle", "to_world": T().translate([0, 0, 1]).scale(20.0), "bsdf": glass(inside=WATER)}
     check(scene(at(z), lake=surface), WATER * (1.0 - z) + 2.0)
     small = {"type": "rectangle", "to_world": T().translate([0, 0, 1]).scale(0.1), "bsdf": glass(inside=WATER)}
@@ -184,7 +184,7 @@ def test_sensor_that_moves():
 MOVED = {"cube": "body.vertex_positions", "ball": "body.to_world", "instance": "copy.to_world"}
 
 
-@pytest.mark.parametrize(("body", "key"), MOVED.items())
+@pytest.mark.parametrize(("body", "key"), long_rows(MOVED.items(), [("instance", "copy.to_world")]))
 def test_body_that_moves(body, key):
     loaded = scene(at(), depth=4, **BODIES[body]())
     params = mi.traverse(loaded)
@@ -228,7 +228,7 @@ def kinds():
     return {"thinlens": lens, "orthographic": plane, "radiancemeter": meter}
 
 
-@pytest.mark.parametrize("kind", ["thinlens", "orthographic", "radiancemeter"])
+@pytest.mark.parametrize("kind", long(["thinlens", "orthographic", "radiancemeter"], ["orthographic"]))
 def test_sensors(kind):
     check(scene(kinds()[kind], body=CUBE | {"bsdf": glass()}), N * 1.0 + 2.0)
 
@@ -253,6 +253,7 @@ def test_irradiance_meter_in_glass():
     assert arrivals(loaded, 1 << 17)[0] == pytest.approx(N + 2.0, abs=2 * BIN)
 
 
+@pytest.mark.slow
 def test_meter_on_the_outside_of_glass_stands_in_air():
     sphere = ball(1.0, sensor={"type": "irradiancemeter", "film": film()})
     loaded = mi.load_dict({
@@ -288,7 +289,7 @@ def test_sensor_in_a_medium_in_glass():
     assert START + (np.argmax(bins) + 0.5) * BIN == pytest.approx(N + 2.0 + TO_LAMP, abs=1.5 * BIN)
 
 
-@pytest.mark.parametrize("where", ["outside", "inside"])
+@pytest.mark.parametrize("where", long(["outside", "inside"], ["inside"]))
 def test_light_in_glass(where):
     """A lamp in the glass, seen through its face or from within."""
     pose = T().translate([0, 0, 0.5]).rotate([0, 1, 0], 180).scale(0.1)
@@ -309,14 +310,3 @@ def test_path_lengths_without_the_leg_to_the_sensor():
     loaded = scene(at(), body=CUBE | {"bsdf": glass()})
     loaded.integrator().camera_unwarp = True
     np.testing.assert_allclose(arrivals(loaded), 2.0 + TO_LAMP, atol=1.5 * BIN)
-
-
-def test_values_move_the_glass_around_the_sensor():
-    """The index is that of the scene as it is, not as it was first."""
-    loaded = scene(at(), body=CUBE | {"to_world": T().translate([5, 0, 0]), "bsdf": glass()})
-    check(loaded, 3.0)
-    params = mi.traverse(loaded)
-    v = np.array(params["body.vertex_positions"]).reshape(-1, 3) - [5, 0, 0]
-    params["body.vertex_positions"] = v.astype(np.float32).ravel()
-    params.update()
-    check(loaded, N * 1.0 + 2.0)

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from support.marks import long, long_pairs, long_rows
+from support.marks import long, long_rows
 from support.runs import T, runs
 from support.surface_samples import start
 from torchtransient.plugins.sampling.sphere_lights import SphereLights
@@ -17,6 +17,7 @@ from torchtransient.testing.statistics import two_sample_z_test
 
 RHO, DISTANCE, RADIANCE = 0.5, 3.0, 2.0
 RATIOS = [1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 0.5, 0.9, 0.99]
+EVERY_RATIO = [(r, (3.0, 300.0)[n % 2]) for n, r in enumerate(RATIOS)]
 
 
 @pytest.fixture(autouse=True)
@@ -63,7 +64,7 @@ def steady(scene, count=6, spp=1 << 14):
 
 
 @pytest.mark.parametrize(
-    ("ratio", "distance"), long_pairs(RATIOS, [3.0, 300.0], [(r, (3.0, 300.0)[i % 2]) for i, r in enumerate(RATIOS)])
+    ("ratio", "distance"), long_rows(EVERY_RATIO, [(1e-6, 3.0), (1e-3, 300.0), (0.5, 3.0), (0.9, 300.0)])
 )
 def test_irradiance_below_a_sphere(ratio, distance):
     """E = pi L (r / d)^2, for any sphere that is above the horizon."""
@@ -92,8 +93,13 @@ def test_lights_beside_it():
     close_to(steady(over_a_plane(*lights), 8, 1 << 16), RHO * E_over_pi, slack=1e-4)
 
 
-@pytest.mark.parametrize("ratio", long([1e-5, 1e-3, 0.1], [1e-5, 0.1]))
-@pytest.mark.parametrize("variant", ["llvm_ad_mono_polarized", "llvm_ad_rgb", "llvm_ad_spectral"])
+@pytest.mark.parametrize(
+    ("variant", "ratio"),
+    long_rows(
+        [("llvm_ad_mono_polarized", 0.1), ("llvm_ad_rgb", 1e-5), ("llvm_ad_spectral", 0.1)],
+        [("llvm_ad_mono_polarized", 0.1)],
+    ),
+)
 def test_other_variants(variant, ratio):
     scene = over_a_plane(lamp(ratio))
     images = runs(scene, 8, 1 << 14)[0][:, 0, 0]
@@ -109,7 +115,7 @@ def stripes():
     return {"type": "bitmap", "bitmap": mi.Bitmap(data), "raw": True, "filter_type": "nearest"}
 
 
-@pytest.mark.parametrize("ratio", [1e-5, 1e-3, 0.1])
+@pytest.mark.parametrize("ratio", [1e-5, 0.1])
 def test_texture_seen_from_the_pole(ratio):
     """From below all meridians are seen alike."""
     light = lamp(ratio, emitter={"type": "area", "radiance": stripes()})
@@ -141,7 +147,7 @@ def test_angular_light(ratio):
 
 @pytest.mark.parametrize(
     ("ratio", "alpha"),
-    long_rows(itertools.product([1e-4, 0.1, 0.7, 0.95], [0.02, 0.5]), [(1e-4, 0.02), (0.7, 0.02)]),
+    long_rows(itertools.product([1e-4, 0.1, 0.7, 0.95], [0.02, 0.5]), [(0.7, 0.02)]),
 )
 def test_found_and_sampled_light_share_the_weight(ratio, alpha):
     """A rough mirror finds the light by itself, too: the sum over both does not depend on who does."""
@@ -158,7 +164,7 @@ def test_found_and_sampled_light_share_the_weight(ratio, alpha):
     assert both.mean() > 0
 
 
-@pytest.mark.parametrize("number", [1, 2])
+@pytest.mark.parametrize("number", long([1, 2], [2]))
 def test_lights_that_move(number):
     """What is kept of the lights is looked up again: one alone and several are kept in different ways."""
     scene = over_a_plane(*[lamp(0.01, center=[0.3 * n, 0, DISTANCE]) for n in range(number)])
@@ -205,8 +211,7 @@ def test_texture_coordinates_of_samples(inside):
     assert np.quantile(off, 0.999) < 1e-4 and np.array(ds.uv).min() >= 0 and np.array(ds.uv).max() <= 1
 
 
-@pytest.mark.parametrize("flipped", [False, True])
-@pytest.mark.parametrize("ratio", [*RATIOS, 1.5, 100.0])
+@pytest.mark.parametrize(("ratio", "flipped"), [(1e-6, False), (1e-3, True), (0.99, False), (1.5, False), (1.5, True)])
 def test_densities_agree_and_integrate_to_the_solid_angle(ratio, flipped):
     scene = over_a_plane(lamp(ratio, flip_normals=flipped), {"type": "point", "position": [0, 0, 1], "intensity": 1})
     table = SphereLights.of(scene).read(scene)
@@ -232,10 +237,9 @@ def test_densities_agree_and_integrate_to_the_solid_angle(ratio, flipped):
 
 @pytest.mark.parametrize(
     ("ratio", "key"),
-    long_pairs(
-        [1e-5, 1e-3, 0.1, 0.9],
-        ["radius", "height", "radiance"],
+    long_rows(
         [(1e-5, "radius"), (1e-3, "height"), (0.1, "radiance"), (0.9, "radius"), (0.9, "height")],
+        [(1e-3, "height")],
     ),
 )
 def test_derivatives(ratio, key):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from support.marks import long
-from support.media_scenes import film, homogeneous, load, rgb, volume
+from support.media_scenes import film, homogeneous, load, rgb
 from support.runs import T, runs
 from torchtransient.plugins.transport.derivative.wanted import Wanted
 from torchtransient.plugins.transport.sinks.record import RecordedVertex, RecordSink
@@ -64,7 +64,7 @@ def positions_at(time, points, lengths):
     return a + fraction[:, None] * (b - a)
 
 
-@pytest.mark.parametrize("g", [0.0, 0.5, 0.8])
+@pytest.mark.parametrize("g", long([0.0, 0.5, 0.8], [0.5]))
 def test_moments_of_the_random_walk(g):
     """<z> = l (1 - exp(-t/l)) and <r^2> = 2 l t - 2 l^2 (1 - exp(-t/l)), with l the transport mean free path."""
     μ_s = 1.3
@@ -99,17 +99,14 @@ def test_energy_falls_with_absorption():
     np.testing.assert_allclose(first[np.isfinite(lengths[:, 1])], 0.6, rtol=1e-5)
 
 
-@pytest.mark.parametrize("kind", ["homogeneous", "grid"])
-def test_ballistic_light(kind):
+def test_ballistic_light():
     """exp(-mu_t r) / r^2 from a point light to a wall and on to the camera, at tau = r and nowhere else."""
-    grid = {"type": "heterogeneous", "albedo": 0.0, "sigma_t": volume(np.full((2, 2, 2), 0.4), -10.0, 20.0)}
-    medium = homogeneous(0.4, 0.0) if kind == "homogeneous" else grid
     sensor = radiance_meter((0, 0, 1), bins=100, bin_width=0.1)
     light = {"type": "point", "position": [1.5, 0, 1.0], "intensity": 3.0}
     wall = {"type": "rectangle", "to_world": T().translate([0, 0, 3]).rotate([1, 0, 0], 180).scale(5)}
     fog = {"type": "ref", "id": "fog"}
     wall |= {"exterior": fog, "interior": fog, "bsdf": {"type": "diffuse", "reflectance": 0.7}}
-    objects, sensor = infinite(medium, sensor, light=light, wall=wall)
+    objects, sensor = infinite(homogeneous(0.4, 0.0), sensor, light=light, wall=wall)
     _, transient = runs(load(objects, sensor, max_depth=2), count=8, spp=4096)
     leg = np.hypot(1.5, 2.0)
     expected = 0.7 / np.pi * 3.0 * (2.0 / leg) / leg**2 * np.exp(-0.4 * (leg + 3.0))
@@ -149,7 +146,7 @@ def test_single_scattering_formula():
     np.testing.assert_allclose(total, expected, rtol=2e-3)
 
 
-@pytest.mark.parametrize("angle", [0.5, 1.5, 2.5])
+@pytest.mark.parametrize("angle", [0.5, 2.5])
 def test_single_scattering(angle):
     radius, μ_s, μ_a = 1.5, 0.7, 0.2
     direction = (np.sin(angle), 0, np.cos(angle))

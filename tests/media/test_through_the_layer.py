@@ -56,7 +56,7 @@ def steady_scene(integrator, **objects):
     return tt.load({"type": "scene", **node, "sensor": camera(transient=False), **objects}, variant=VARIANT)
 
 
-@pytest.mark.parametrize("integrator", ["volpath", "prbvolpath", "volpathmis", "path", None])
+@pytest.mark.parametrize("integrator", ["prbvolpath", None])
 def test_steady_scenes_with_media(integrator):
     """Whatever integrator a steady scene with media names, its light walks through them."""
     scene = steady_scene(integrator, **block(homogeneous(1.0, 0.8)))
@@ -95,6 +95,7 @@ def test_parameters_of_media():
     assert not table[prefix + "scale"].differentiable
 
 
+@pytest.mark.slow
 def test_gradients_arrive_in_torch():
     """A step against the gradient lowers a loss: grids, albedo, phase function and index together."""
     objects = block(clouds())
@@ -125,6 +126,7 @@ def test_gradients_arrive_in_torch():
     assert np.isfinite(lower.item())
 
 
+@pytest.mark.slow
 def test_no_kernels_are_compiled_while_training():
     """Nor when a shape moves, which changes the size of the scene, and nothing of Dr.Jit's graph stays behind."""
     objects = block(clouds())

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from support.gradient_cases.scenes import room
+from support.marks import long
 from support.media_scenes import film, homogeneous, load
 from torchtransient.testing.statistics import two_sample_z_test
 
@@ -70,7 +71,7 @@ def test_extinction_of_a_medium():
     assert (derivative.mean(0)[late] < 0).sum() > 0.8 * (light.mean(0)[late] > 0).sum()
 
 
-@pytest.mark.parametrize("scattering", [True, False])
+@pytest.mark.parametrize("scattering", long([True, False], [False]))
 def test_every_bin_against_differences(scattering):
     """A room in which all surfaces have one reflectance ρ, with and without a medium: each bin by itself."""
     scene = room(depth=4)

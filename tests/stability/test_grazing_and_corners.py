@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+
+from support.marks import long_rows
 
 VARIANT = "llvm_ad_mono"
 
@@ -87,8 +91,10 @@ MATERIALS = {
 }
 
 
-@pytest.mark.parametrize("material", list(MATERIALS))
-@pytest.mark.parametrize("height", [1e-2, 1e-4])
+@pytest.mark.parametrize(
+    ("material", "height"),
+    long_rows(itertools.product(MATERIALS, [1e-2, 1e-4]), [("diffuse", 1e-4), ("rough plastic", 1e-4)]),
+)
 def test_grazing_view_and_light(material, height):
     """Guards against 1 / cos and against microfacet terms of 0 / 0 where camera and light skim the surface."""
     bsdf, keys = MATERIALS[material]
@@ -111,7 +117,7 @@ def test_corner():
     )
 
 
-@pytest.mark.parametrize("height", [1e-3, 1e-6, 0.0])
+@pytest.mark.parametrize("height", [1e-6, 0.0])
 def test_light_next_to_the_surface(height):
     """Guards against 1 / d^2 of no distance: a point light next to the wall, and one on it."""
     scene = load(sensor([0, 0, 2], [0, 0, 0]), {"floor": floor(), "light": point([0.011, 0.007, height])})
@@ -131,7 +137,7 @@ def test_area_light_on_the_surface():
     check_finite(scene, ["lamp.emitter.radiance.value", "floor.to_world", "lamp.to_world", "other.to_world"])
 
 
-@pytest.mark.parametrize("angle", [0.0, 60.0, 85.0, 89.0])
+@pytest.mark.parametrize("angle", [0.0, 89.0])
 def test_length_is_that_between_hit_points(angle):
     """Guards against shadow rays and paths measured from origins that were lifted off the surface: 1e-4 m and more at
     these distances, in the direction of the normal.

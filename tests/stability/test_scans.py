@@ -27,7 +27,7 @@ def far_scene(scale, how):
     return small
 
 
-@pytest.mark.parametrize(("how", "scale"), [("shared", 1e-3), ("shared", 1e3), ("paths", 0.05), ("paths", 1e3)])
+@pytest.mark.parametrize(("how", "scale"), [("shared", 1e-3), ("paths", 1e3)])
 def test_scenes_of_every_size(how, scale):
     """From a millimetre to a kilometre: the same bins, and a brightness that falls with the area.
 
@@ -61,6 +61,7 @@ def test_time_far_from_the_origin(how):
     assert abs(runs[1][1] - runs[0][1]) < 0.2
 
 
+@pytest.mark.slow
 def test_many_small_terms():
     """2^22 samples of one point lose no mass against 2^12: beyond 2^16 sums are kept in doubles."""
     few = captures(scan_scene({"a": plane()}, film=film(1)), 2**12, 4)

@@ -115,8 +115,10 @@ def unknown():
     return x
 
 
-@pytest.mark.parametrize("unwarp", [False, True])
-@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_mono_polarized"])
+@pytest.mark.parametrize(
+    ("variant", "unwarp"),
+    [pytest.param("llvm_ad_mono", True, marks=pytest.mark.slow), ("llvm_ad_mono_polarized", False)],
+)
 def test_the_carry_of_primary_rays_has_the_same_slope_in_both_modes(variant, unwarp):
     """Directions, origins, the length to the sensor (which unwarped renders leave out) and the turn of its frame."""
     before = mi.variant()

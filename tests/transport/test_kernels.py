@@ -58,3 +58,19 @@ def test_an_effect_is_in_the_kernel_of_its_scene_alone():
     ]
     assert all(operations > plain[1] for _, operations in others)
     assert hashes(under("transient_path")) == plain
+
+
+def test_paths_are_traced_once_for_all_entries_of_a_pose():
+    """Each entry of a pose is a sum over lanes, which are not computed anew for it."""
+    scene = mi.load_dict(under("transient_path"), optimize=False)
+    params, shape = mi.traverse(scene), scene.sensors()[0].film().cube_shape()
+    pose = mi.AffineTransform4f(params["sensor.to_world"])
+    dr.enable_grad(pose.matrix)
+    params["sensor.to_world"] = pose
+    params.update()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        scene.integrator().render_backward(scene, params, (None, dr.ones(mi.TensorXf, shape)), seed=0, spp=4)
+        dr.eval(dr.grad(params["sensor.to_world"].matrix))
+        operations = sorted(entry["operation_count"] for entry in dr.kernel_history([dr.KernelType.JIT]))
+    assert operations[-2] < 0.3 * operations[-1]

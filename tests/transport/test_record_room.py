@@ -58,6 +58,7 @@ def test_gradients_are_those_of_records_on_the_stack(monkeypatch, what):
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_tangents_are_those_of_records_on_the_stack(monkeypatch):
     expected = tangent(make_room())
     monkeypatch.setattr(record_room, "SHARE", 1e-9)
@@ -74,6 +75,7 @@ def test_launches_are_as_small_as_the_memory_wants(monkeypatch):
     torch.testing.assert_close(found, expected, rtol=0.1, atol=0.01)
 
 
+@pytest.mark.slow
 def test_phasors_do_without_a_list_of_arrivals(monkeypatch):
     def found():
         renderer = tt.TransientRenderer(make_room(), [COLOUR], spp=4, frequencies=[0.5, 1.0])

@@ -32,6 +32,7 @@ def test_light_passes_open_boundaries_in_a_group(medium):
     np.testing.assert_allclose(images[1], images[0], rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_an_instance_is_as_attached_after_a_derivative_as_before():
     scene = mi.load_dict(instances({"type": "diffuse"}), optimize=False)
     params = mi.traverse(scene)

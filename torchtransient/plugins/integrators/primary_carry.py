@@ -15,14 +15,22 @@ from torchtransient.plugins.transport.derivative.forward import tangents_of
 
 def objective_of(world: Any, rays: Any, adjoint: Carry) -> Any:
     """``<adjoint, Carry>`` of the primary rays."""
-    objective = adjoint.η * rays.η
+    parts = {"η": adjoint.η}
     if not world.camera_unwarp:
-        objective += adjoint.slope * rays.length()
+        parts["slope"] = adjoint.slope
     if world.wanted.sensor:
-        objective += dr.dot(adjoint.o + adjoint.x, rays.ray.o) + dr.dot(adjoint.d + adjoint.w, rays.ray.d)
-    if world.wanted.sensor and mi.is_polarized:
-        d_rotation = dr.sum(adjoint.β[1, 2] - adjoint.β[2, 1])
-        objective += d_rotation * sensor_rotation(rays.seen, rays.ray).angle()
+        parts |= {"o": adjoint.o + adjoint.x, "d": adjoint.d + adjoint.w}
+        if mi.is_polarized:
+            parts["turn"] = dr.sum(adjoint.β[1, 2] - adjoint.β[2, 1])
+    # Each entry of a pose is a sum over lanes by itself: without numbers in memory each traces the paths once more.
+    dr.eval(parts)
+    objective = parts["η"] * rays.η
+    if "slope" in parts:
+        objective += parts["slope"] * rays.length()
+    if world.wanted.sensor:
+        objective += dr.dot(parts["o"], rays.ray.o) + dr.dot(parts["d"], rays.ray.d)
+    if "turn" in parts:
+        objective += parts["turn"] * sensor_rotation(rays.seen, rays.ray).angle()
     return objective
 
 
