@@ -55,6 +55,7 @@ from torchtransient.rendering.nodes import (
 from torchtransient.rendering.physics import scene_findings
 from torchtransient.rendering.placements import mesh_transforms, placements
 from torchtransient.rendering.pulse_properties import PREFIXES, PROPERTIES, write_pulse
+from torchtransient.rendering.steady_integrators import ADVICE, path_tracer_of
 from torchtransient.rendering.taken import ReadyScene, check_taken, pointers
 from torchtransient.rendering.unread_properties import unread_properties
 
@@ -299,6 +300,7 @@ def _override_integrator(state: Any, options: BuildOptions) -> None:
             plugin = "transient_prbvolpath" if media_in_use(state) else "transient_path"
             _add_child(state, 0, "integrator", plugin, mi.ObjectType.Integrator, {})
             index = len(state.nodes) - 1
+        index = path_tracer_of(state, index)
         plugin = state.nodes[index].props.plugin_name()
         if options.integrator is not None and plugin != options.integrator:
             _become(state, index, options.integrator, keep=_TRANSIENT_PROPERTIES, nested=False)
@@ -308,7 +310,7 @@ def _override_integrator(state: Any, options: BuildOptions) -> None:
         elif not is_transient_integrator(plugin):
             raise SceneError(
                 f"integrator {plugin!r} has no transient counterpart. Expected transient_path, transient_prbvolpath, "
-                f"or one that they can stand in for: {', '.join(_COUNTERPARTS)}."
+                f"or one that they can stand in for: {', '.join(_COUNTERPARTS)}, direct, stokes. {ADVICE.get(plugin, '')}"
             )
     if options.max_depth is not None and index is not None:
         state.nodes[index].props["max_depth"] = int(options.max_depth)
