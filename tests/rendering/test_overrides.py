@@ -226,7 +226,8 @@ def test_depths_are_written_into_every_integrator():
 
 def test_integrators_that_are_a_path_tracer_in_another_form():
     """``direct`` is the path of two vertices, and the one inside of ``stokes`` shows Stokes vectors by itself."""
-    direct = '<integrator type="direct"><boolean name="hide_emitters" value="true"/><integer name="{}" value="{}"/></integrator>'
+    samples = '<boolean name="hide_emitters" value="true"/><integer name="{}" value="{}"/>'
+    direct = f'<integrator type="direct">{samples}</integrator>'
     assert integrators(direct.format("shading_samples", 3), transient=True) == [
         ("transient_path", "", {"max_depth": 2, "hide_emitters": True}, {})
     ]

@@ -71,18 +71,17 @@ _OF_MEDIA = {"albedo": SHARE, "sigma_t": EXTINCTION}
 _OF_EMITTERS = dict.fromkeys(("radiance", "intensity", "irradiance", "energy"), LIGHT)
 _OF_SENSORS = {"x_fov": ANGLE, "aperture_radius": LENGTH, "focus_distance": LENGTH}
 
-def ranges_of(params: Any, keys: Iterable[str] | None = None) -> dict[str, PhysicalRange]:
-    """The ranges of those of ``keys`` that have one (None: of all), by key of ``mi.traverse``.
+def ranges_of(params: Any) -> dict[str, PhysicalRange]:
+    """The ranges of the parameters that have one, by key of ``mi.traverse``.
 
     The numbers of textures, volumes and attributes of meshes have the range of what they supply, through whatever
     textures they are read. Coefficients of spectral models have none.
     """
     tracker, found = ParameterTracker.of(params), {}
-    for key in params.properties if keys is None else keys:
-        if key in params.properties:
-            limits = list(_ranges_at(tracker, params.properties[key][2], key.rsplit(".", 1)[-1]))
-            if limits:  # one that serves for several things: the one with the least room
-                found[key] = min(limits, key=lambda one: one.high)
+    for key in params.properties:
+        limits = list(_ranges_at(tracker, params.properties[key][2], key.rsplit(".", 1)[-1]))
+        if limits:  # one that serves for several things: the one with the least room
+            found[key] = min(limits, key=lambda one: one.high)
     return found
 
 

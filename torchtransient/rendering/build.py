@@ -28,7 +28,7 @@ from torchtransient.plugins.mitsuba_compat import (
     is_dark,
 )
 from torchtransient.plugins.parameter_effect import class_of
-from torchtransient.plugins.physical_ranges import described_ranges
+from torchtransient.plugins.physical_ranges import PhysicalRange, described_ranges, ranges_of
 from torchtransient.rendering.build_options import BuildOptions
 from torchtransient.rendering.description import Description
 from torchtransient.rendering.films.choices import all_films, of_plugin, plugins_in_words
@@ -99,6 +99,14 @@ class BuiltScene:
         return self._findings
 
     _findings: dict[str, str] | None = None
+
+    def ranges(self) -> dict[str, PhysicalRange]:
+        """The ranges of what has one, by key."""
+        if self._ranges is None:
+            self._ranges = ranges_of(self.params)
+        return self._ranges
+
+    _ranges: dict[str, PhysicalRange] | None = None
 
     def __del__(self) -> None:
         contents = list(self.__dict__.values())
@@ -310,7 +318,8 @@ def _override_integrator(state: Any, options: BuildOptions) -> None:
         elif not is_transient_integrator(plugin):
             raise SceneError(
                 f"integrator {plugin!r} has no transient counterpart. Expected transient_path, transient_prbvolpath, "
-                f"or one that they can stand in for: {', '.join(_COUNTERPARTS)}, direct, stokes. {ADVICE.get(plugin, '')}"
+                f"or one that they can stand in for: {', '.join(_COUNTERPARTS)}, direct, stokes."
+                f"{ADVICE.get(plugin, '')}"
             )
     if options.max_depth is not None and index is not None:
         state.nodes[index].props["max_depth"] = int(options.max_depth)

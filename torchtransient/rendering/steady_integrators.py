@@ -1,4 +1,4 @@
-"""Integrators of Mitsuba that hold a path tracer, or are one of a fixed depth: what stands in their place through time."""
+"""Integrators of Mitsuba that hold a path tracer, or are one of a fixed depth, and the path tracers in their place."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from torchtransient.rendering.nodes import children, find_child, is_integrator
 
 # What to do about those that show something beside light.
 ADVICE = {
-    "aov": "Give the integrator inside of it alone; depths, normals and numbers of shapes are "
+    "aov": " Give the integrator inside of it alone; depths, normals and numbers of shapes are "
     "torchtransient.rendering.labels.scene_labels.",
-    "moment": "Give the integrator inside of it alone; errors of the light are tt.cost_of_accuracy.",
+    "moment": " Give the integrator inside of it alone; errors of the light are tt.cost_of_accuracy.",
 }
 
 
 def path_tracer_of(state: Any, index: int) -> int:
     """Index of the integrator that is rendered in place of the one at ``index``: of a ``stokes`` the one inside, since
-    films hold Stokes vectors in polarized variants; a ``direct`` becomes the ``path`` of two vertices that it is; others
-    stay.
+    films hold Stokes vectors in polarized variants; a ``direct`` becomes the ``path`` of two vertices that it is, and
+    others stay.
 
     Raises SceneError for a ``stokes`` in an unpolarized variant and a ``direct`` that leaves out a kind of samples.
     """

@@ -29,7 +29,6 @@ from torchtransient.errors import (
     UnitError,
 )
 from torchtransient.plugins.dictionaries import Pixels
-from torchtransient.plugins.physical_ranges import ranges_of
 
 D = tt.data
 VARIANT = "llvm_ad_mono"
@@ -156,7 +155,7 @@ def test_ranges_at_their_ends():
     kept = SimpleNamespace(places={"red.reflectance.value": Place("red.reflectance.value", NUMBERS, (2,))})
     maker = recipe(vary={"red.reflectance.value": D.Uniform(0, 1)})._maker
     found = maker.kept(maker.recipe.structure(0))
-    ranges = ranges_of(found.renderer.scene.built(found.renderer._options).params, kept.places)
+    ranges = found.renderer.scene.built(found.renderer._options).ranges()
     for value, wrong in ((1.0, False), (0.0, False), (1.001, True), (-0.001, True)):
         drawn = {"red.reflectance.value": np.array([0.5, value])}
         if not wrong:

@@ -18,7 +18,7 @@ from torchtransient.data.recipes.specification import Specification
 from torchtransient.data.recipes.streams import Draw, Extreme, Fixed, Stream
 from torchtransient.data.recipes.structures import Structure
 from torchtransient.errors import SceneError, TorchTransientError, TorchTransientWarning, UnitError
-from torchtransient.plugins.physical_ranges import PhysicalRange, ranges_of
+from torchtransient.plugins.physical_ranges import PhysicalRange
 from torchtransient.rendering.physics import is_singular, level_of_user, outside_message, singular_message
 from torchtransient.rendering.variant import active_variant
 
@@ -41,7 +41,7 @@ def check_recipe(recipe: Specification, maker: Maker) -> None:
             kept.check_device(drawn)
         with active_variant(recipe.variant):
             built = kept.renderer.scene.built(kept.renderer._options)
-            ranges = ranges_of(built.params, kept.places)
+            ranges = built.ranges()
             for where, drawn in draws:
                 _check_ranges(ranges, kept, where, drawn)
             if kept.scan is None:
