@@ -128,10 +128,11 @@ def compare(path: Path, spp: int, count: int) -> dict[str, Any]:
     ratio = energies[0].mean() / energies[1].mean()
     spread = [np.std(side, ddof=1) / abs(side.mean()) / count**0.5 for side in energies]
     # Tails of filters, which no sample of the one side fell into.
-    test = two_sample_z_test(a, b, rounding=1e-3 * float(np.abs(b).mean()))
+    rounding = 1e-3 * float(np.abs(b).mean())
+    test, whole = two_sample_z_test(a, b, rounding=rounding), two_sample_z_test(*energies, rounding=rounding)
     return {
         "ratio": float(ratio), "error": float(ratio * np.hypot(*spread)), "worst": float(np.abs(test.z).max()),
-        "same": bool(test.passed), "seconds": time.perf_counter() - start,
+        "same": bool(test.passed and whole.passed), "seconds": time.perf_counter() - start,
     }  # fmt: skip
 
 

@@ -121,7 +121,8 @@ def test_quick_runs_leave_the_kept_numbers(script, tmp_path):
 
 SCENE = """<scene version="3.0.0"><path value="../../common"/>
   <sensor type="perspective">
-  <film type="hdrfilm"><integer name="width" value="960"/><integer name="height" value="720"/></film><sampler type="independent"><integer name="sample_count" value="$spp"/></sampler>
+  <film type="hdrfilm"><integer name="width" value="960"/><integer name="height" value="720"/></film>
+  <sampler type="independent"><integer name="sample_count" value="$spp"/></sampler>
   <transform name="to_world"><lookat origin="0, 0, -4" target="0, 0, 0" up="0, 1, 0"/></transform></sensor>
   <emitter type="constant"/> {} </scene>"""
 
