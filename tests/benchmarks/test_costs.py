@@ -117,3 +117,29 @@ def test_quick_runs_leave_the_kept_numbers(script, tmp_path):
     assert done.returncode == 0, done.stderr[-3000:]
     assert [path.name for path in tmp_path.iterdir()] == ["temporary"]
     assert len(list((tmp_path / "temporary" / "torchtransient_quick_runs").iterdir())) == 2
+
+
+SCENE = """<scene version="3.0.0"><path value="../../common"/>
+  <sensor type="perspective">
+  <film type="hdrfilm"><integer name="width" value="960"/><integer name="height" value="720"/></film>
+  <sampler type="independent"><integer name="sample_count" value="$spp"/></sampler>
+  <transform name="to_world"><lookat origin="0, 0, -4" target="0, 0, 0" up="0, 1, 0"/></transform></sensor>
+  <emitter type="constant"/> {} </scene>"""
+
+
+@pytest.mark.slow
+def test_scenes_of_mitsuba_beside_it(tmp_path):
+    contents = {
+        "same": '<integrator type="path"/><shape type="sphere"/>',
+        "refused": '<integrator type="aov"><string name="aovs" value="d:depth"/><integrator type="path"/></integrator>',
+        "absent": '<shape type="ply"><string name="filename" value="nowhere.ply"/></shape>',
+    }
+    (tmp_path / "common").mkdir()
+    scenes = tmp_path / "docs" / "scenes"
+    scenes.mkdir(parents=True)
+    for name, content in contents.items():
+        (scenes / f"{name}.xml").write_text(SCENE.replace("{}", content))
+    report, printed = run("mitsuba_scenes.py", tmp_path, "--data", str(tmp_path))
+    assert report["scenes"]["same"]["same"] and report["settings"]["size"] == 24
+    assert "labels" in report["scenes"]["refused"]["refused"] and "nowhere.ply" in report["scenes"]["absent"]["absent"]
+    assert "same 1, different 0, refused 1, absent 1" in printed

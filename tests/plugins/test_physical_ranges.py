@@ -10,7 +10,7 @@ import pytest
 
 from torchtransient import plugins
 from torchtransient.plugins import physical_ranges as ranges
-from torchtransient.plugins.physical_ranges import described_ranges, physical_range
+from torchtransient.plugins.physical_ranges import described_ranges, ranges_of
 
 VARIANT = "llvm_ad_mono"
 VALUE = {"type": "uniform", "value": 0.25}
@@ -97,6 +97,103 @@ def test_what_has_no_range():
     colour = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.1, 0.2, 0.3]}}
     params = mi.traverse(mi.load_dict({"type": "scene", **on_a_disk(colour=colour)}))
     (key,) = (key for key in params.properties if "reflectance" in key)
-    assert physical_range(params, key) is None
-    assert physical_range(params, "colour.bsdf.reflectance.none") is None
-    assert physical_range(params, "colour.to_world") is None
+    assert not {key, "colour.to_world"} & ranges_of(params).keys()
+
+
+def bitmap(number, channels=1):
+    return {"type": "bitmap", "raw": True, "data": mi.TensorXf(np.full((2, 2, channels), number, np.float32))}
+
+
+def grid(number, channels=1):
+    return {"type": "gridvolume", "raw": True, "grid": mi.VolumeGrid(np.full((2, 2, 2, channels), number, np.float32))}
+
+
+def attribute(**settings):
+    return {"type": "mesh_attribute", "name": "vertex_share", **settings}
+
+
+def triangle(number, surface):
+    """A mesh of one triangle with an attribute."""
+    mesh = mi.Mesh("mesh", 3, 1, props=mi.Properties() if surface is None else with_surface(surface))
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0]
+    params["faces"] = [0, 1, 2]
+    params.update()
+    mesh.add_attribute("vertex_share", 1, [number, 0.0, 0.5])
+    return mesh
+
+
+def with_surface(surface):
+    props = mi.Properties()
+    props["bsdf"] = mi.load_dict(surface)
+    return props
+
+
+DIFFUSE = {"type": "diffuse"}
+NESTED = {"type": "checkerboard", "color0": {"type": "checkerboard", "color1": {"type": "ref", "id": "shared"}}}
+# Where a number comes from: (objects, key of what supplies it, largest number in its range).
+SUPPLIERS = {
+    "texture of its own": lambda x: (on_a_disk(a={"type": "diffuse", "reflectance": bitmap(x)}), "reflectance.data", 1),
+    "texture that is shared": lambda x: (
+        {"shared": bitmap(x), **on_a_disk(
+            a={"type": "roughconductor", "alpha": {"type": "ref", "id": "shared"}},
+            b={"type": "diffuse", "reflectance": {"type": "ref", "id": "shared"}},
+        )},
+        ".data", 1,
+    ),
+    "texture in textures": lambda x: (
+        {"shared": bitmap(x), **on_a_disk(a={"type": "twosided", "b": {"type": "diffuse", "reflectance": NESTED}})},
+        ".data", 1,
+    ),
+    "surface that is shared": lambda x: (
+        {"paint": {"type": "diffuse", "reflectance": x}, **on_a_disk(a={"type": "ref", "id": "paint"})},
+        "reflectance.value", 1,
+    ),
+    "weight of a blend": lambda x: (
+        on_a_disk(a={"type": "blendbsdf", "weight": bitmap(x), "a": DIFFUSE, "b": DIFFUSE}), "weight.data", 1,
+    ),
+    "opacity of a mask": lambda x: (
+        on_a_disk(a={"type": "mask", "opacity": {"type": "checkerboard", "color1": x}, "a": DIFFUSE}),
+        "color1.value", 1,
+    ),
+    "volume as a texture": lambda x: (
+        on_a_disk(a={"type": "diffuse", "reflectance": {"type": "volume", "volume": grid(x)}}), "volume.data", 1,
+    ),
+    "attribute of a mesh": lambda x: (
+        {"mesh": triangle(x, {"type": "diffuse", "reflectance": attribute()})}, "vertex_share", 1,
+    ),
+    "attribute in a texture": lambda x: (
+        {"mesh": triangle(x, {"type": "diffuse", "reflectance": {"type": "checkerboard", "color0": attribute()}})},
+        "vertex_share", 1,
+    ),
+    "scaled attribute": lambda x: (
+        {"mesh": triangle(x, {"type": "diffuse", "reflectance": attribute(scale=1 / 255)})}, "vertex_share", 255,
+    ),
+    "attribute that is a texture": lambda x: (
+        {"plate": {"type": "rectangle", "vertex_share": bitmap(x), "bsdf": DIFFUSE | {"reflectance": attribute()}}},
+        "vertex_share.data", 1,
+    ),
+    "albedo of a shared medium": lambda x: (
+        {"air": {"type": "heterogeneous", "albedo": {"type": "ref", "id": "cells"}, "sigma_t": 1.0}, "cells": grid(x),
+         "box": {"type": "cube", "bsdf": {"type": "null"}, "interior": {"type": "ref", "id": "air"}}},
+        ".data", 1,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", SUPPLIERS)
+def test_ranges_follow_what_supplies_a_number(case):
+    """Through references, textures in textures, and attributes of shapes."""
+    for excess in (1.5, -0.5):
+        mi.set_variant(VARIANT)
+        most = SUPPLIERS[case](0.0)[2]
+        objects, key, _ = SUPPLIERS[case](excess * most)
+        table = {name: entry for name, entry in found(objects).items() if name.endswith(key)}
+        ((limits, low, high),) = table.values()
+        assert (limits.low, limits.high) == (0, pytest.approx(most))
+        assert limits.above(high) == (excess > 1) and limits.below(low) == (excess < 0)
+
+
+def test_attributes_that_nothing_reads_have_no_range():
+    mi.set_variant(VARIANT)
+    assert not any("vertex_share" in key for key in found({"mesh": triangle(7.0, DIFFUSE)}))

@@ -224,7 +224,27 @@ def test_depths_are_written_into_every_integrator():
         assert integrators(PATH.format("transient_path"), **options)[0][2]["max_depth"] == 9
 
 
-@pytest.mark.parametrize("plugin", ["ptracer", "aov", "direct"])
+def test_integrators_that_are_a_path_tracer_in_another_form():
+    """``direct`` is the path of two vertices, and the one inside of ``stokes`` shows Stokes vectors by itself."""
+    samples = '<boolean name="hide_emitters" value="true"/><integer name="{}" value="{}"/>'
+    direct = f'<integrator type="direct">{samples}</integrator>'
+    assert integrators(direct.format("shading_samples", 3), transient=True) == [
+        ("transient_path", "", {"max_depth": 2, "hide_emitters": True}, {})
+    ]
+    for kind in ("bsdf_samples", "emitter_samples"):
+        with pytest.raises(SceneError, match="integrator 'direct': expected samples of emitters and of BSDFs"):
+            integrators(direct.format(kind, 0), transient=True)
+    stokes = f'<integrator type="stokes">{PATH.format("path")}</integrator>'
+    with pytest.raises(SceneError, match="integrator 'stokes': expected a polarized variant, got"):
+        integrators(stokes, transient=True)
+    state = parsed(stokes)
+    with mi.variant_context("llvm_ad_mono_polarized"):
+        build._override_integrator(state, BuildOptions(transient=True, max_depth=4))
+    node = state.nodes[build.find_child(state, state.root, build.is_integrator)]
+    assert node.props.plugin_name() == "transient_path" and node.props["max_depth"] == 4 and node.props.id() == "i"
+
+
+@pytest.mark.parametrize("plugin", ["ptracer", "aov", "moment"])
 def test_integrators_without_a_counterpart(plugin):
     with pytest.raises(SceneError, match=f"integrator '{plugin}' has no transient counterpart"):
         integrators(f'<integrator type="{plugin}"/>', transient=True)

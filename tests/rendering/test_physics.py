@@ -81,6 +81,54 @@ def test_surfaces_of_the_description(room, case):
         tt.TransientRenderer(scene, spp=1, physics="error")
 
 
+BYTES = """ply
+format ascii 1.0
+element vertex 3
+property float x
+property float y
+property float z
+property uchar r
+property uchar g
+property uchar b
+element face 1
+property list uchar int vertex_indices
+end_header
+-3 -3 0 0 51 153
+3 -3 0 0 51 153
+0 3 0 0 51 153
+3 0 1 2
+"""
+
+
+def test_colours_of_a_mesh_file(room, tmp_path):
+    """Bytes are 0 to 255, which the texture that reads them can scale; so are values that are given later."""
+    (tmp_path / "wall.ply").write_text(BYTES)
+    colour = {"type": "mesh_attribute", "name": "vertex_color"}
+    paint = {"type": "diffuse", "reflectance": colour}
+    room["wall"] = {"type": "ply", "filename": str(tmp_path / "wall.ply"), "bsdf": paint}
+    _, messages = said(tt.TransientRenderer, loaded(room), spp=1)
+    assert len(messages) == 1 and "'wall.vertex_color'" in messages[0] and "reaches 153," in messages[0]
+    assert "1/255" in messages[0]
+    with pytest.raises(PhysicsError, match="reaches 153"):
+        tt.TransientRenderer(loaded(room), spp=1, physics="error")
+    colour["scale"] = 1 / 255
+    scene, key = loaded(room), "wall.vertex_color"
+    assert said(tt.TransientRenderer, scene, spp=1)[1] == []
+    assert said(tt.render, scene, {key: _filled(scene, key, 250.0)}, spp=1, seed=0)[1] == []
+    with pytest.raises(PhysicsError, match="reaches 300: expected at least 0 and at most 255"):
+        tt.render(scene, {key: _filled(scene, key, 300.0)}, spp=1, seed=0, physics="error")
+
+
+def test_textures_that_are_referred_to(room):
+    """They have names of their own, which say nothing of what they are for."""
+    cells = {"type": "bitmap", "raw": True, "bitmap": np.full((2, 2, 1), 1.25)}
+    room["wall"]["bsdf"] = {"type": "mask", "opacity": {"type": "ref", "id": "cells"}, "bsdf": {"type": "diffuse"}}
+    scene, key = loaded({"cells": cells, **room}), "cells.data"
+    _, messages = said(tt.TransientRenderer, scene, spp=1)
+    assert len(messages) == 1 and repr(key) in messages[0] and "reaches 1.25," in messages[0]
+    assert said(tt.render, scene, {key: _filled(scene, key, 0.5)}, spp=1, seed=0)[1] == []
+
+
 RANGES = {
     "weight of a lobe": ({"type": "principled", "metallic": 1.5}, "metallic.value", "1.5", "at most 1"),
     "roughness": ({"type": "roughconductor", "alpha": -0.1}, "alpha.value", "-0.1", "at least 0"),

@@ -360,6 +360,11 @@ def attribute_name(texture: Any) -> str | None:
     return found.group(1) if found else None
 
 
+def attribute_scale(texture: Any) -> float:
+    """The factor of the attribute that a texture reads, 1 for other textures and volumes."""
+    return 1.0 if texture.class_name() != "MeshAttribute" else float(mi.traverse(texture)["scale"])
+
+
 # Slots of BSDFs of which Mitsuba reads a single number, and those of BSDFs and emitters of which it reads a spectrum.
 _SINGLE = frozenset((
     "opacity", "weight", "alpha", "alpha_u", "alpha_v", "roughness", "anisotropic", "metallic", "spec_trans",
@@ -390,11 +395,5 @@ def varies(texture: Any) -> bool:
     return bool(texture.is_spatially_varying() or texture.class_name() == "MeshAttribute")
 
 
-_COEFFICIENT_CLASSES = ("SRGBReflectanceSpectrum", "BitmapTextureImpl", "D65Spectrum")
-
-
-def keeps_coefficients(texture: Any) -> bool:
-    """Whether the numbers of a texture are coefficients of a smooth spectrum (Jakob and Hanika 2019) instead of a
-    colour: two kinds of textures, in spectral variants.
-    """
-    return bool(mi.is_spectral and texture.class_name().startswith(_COEFFICIENT_CLASSES))
+# Of a texture or volume the numbers, not where they lie.
+NUMBERS = ("value", "values", "data", "color0", "color1")

@@ -15,11 +15,11 @@ from torchtransient.plugins.mitsuba_compat import (
     LOSING,
     LOST_AT,
     METALS,
+    NUMBERS,
     PLASTICS,
     is_absorption_of_hair,
     is_bump_map,
     is_dark,
-    keeps_coefficients,
     loses_slope_of_metal,
     lost_at,
     normal_texture,
@@ -35,7 +35,7 @@ from torchtransient.plugins.parameter_effect import (
     Site,
     declare_effects,
 )
-from torchtransient.plugins.physical_ranges import NUMBERS
+from torchtransient.plugins.spectral_colours import keeps_coefficients
 
 VERTICES = ("vertex_positions", "vertex_normals", "vertex_texcoords")
 # What moves the rays of a sensor.
@@ -226,10 +226,11 @@ def _range_of(texture: Any) -> tuple[float, float] | None:
     """Smallest and largest number of a texture, None if it shows none."""
     found: list[float] = []
     for node in (texture, *objects_below(texture, mi.Texture)):
-        if keeps_coefficients(node):
+        shown_here = [shown for shown in shown_by(node)[0] if shown.key in NUMBERS]
+        if any(keeps_coefficients(node, shown.key) for shown in shown_here):
             found += [float(dr.slice(mi.Float(node.mean()), 0))]
             continue
-        numbers = [shown.read(node) for shown in shown_by(node)[0] if shown.key in NUMBERS]
+        numbers = [shown.read(node) for shown in shown_here]
         for value in numbers:
             value = mi.Float(value) if isinstance(value, float) else dr.detach(value)
             value = value.array if dr.is_tensor_v(value) else dr.ravel(value)

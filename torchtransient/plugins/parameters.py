@@ -7,7 +7,7 @@ taken, ``scene.parameters()``, the plan, the page of gradients. How rows are ent
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -17,12 +17,13 @@ import mitsuba as mi
 from torchtransient.errors import GradientError
 from torchtransient.plugins import mitsuba_parameters as mitsuba_parameters
 from torchtransient.plugins.black_textures import Attached, check_black, loses_black
-from torchtransient.plugins.mitsuba_compat import attribute_name, is_replaced_for, keeps_coefficients
+from torchtransient.plugins.mitsuba_compat import attribute_name, is_replaced_for
 from torchtransient.plugins.node_walk import ShownValue, objects_of, owners_of, shown_by
 from torchtransient.plugins.parameter_effect import CORRECT as CORRECT
 from torchtransient.plugins.parameter_effect import SILHOUETTES as SILHOUETTES
 from torchtransient.plugins.parameter_effect import ParameterEffect as ParameterEffect
 from torchtransient.plugins.parameter_effect import Site, class_of, matching_effect
+from torchtransient.plugins.spectral_colours import keeps_coefficients
 from torchtransient.plugins.swept_parameters import location_of
 
 
@@ -40,7 +41,7 @@ def effect_of(node: Any, key: str, flags: int = 0, owners: Sequence[tuple[Any, s
     if flags & int(mi.ParamFlags.NonDifferentiable) and not effect.trusted:
         reason = f"Mitsuba marks it as not differentiable ({class_of(node)})"
         return replace(effect, supported=False, reason=reason)
-    if effect.reason == CORRECT and site.key in ("value", "data") and keeps_coefficients(node):
+    if effect.reason == CORRECT and keeps_coefficients(node, site.key):
         reason = f"{CORRECT}; the numbers are coefficients of Mitsuba's spectral model, not a colour"
         return replace(effect, reason=reason)
     return effect
@@ -60,13 +61,8 @@ def attached_effects(params: Any) -> list[tuple[Any, str, ParameterEffect]]:
         if can_carry_gradients(value) and dr.grad_enabled(value):
             attached.append((node, name.rsplit(".", 1)[-1], flags))
     # A walk of its own: the names in ``params`` tell of one holder of each plugin, and not of what reads an attribute.
-    tracker = ParameterTracker(_root_of(params.hierarchy)) if attached else None
+    tracker = ParameterTracker.of(params) if attached else None
     return [(node, key, tracker.effect_of(node, key, flags)) for node, key, flags in attached]
-
-
-def _root_of(hierarchy: Mapping[Any, Any]) -> Any:
-    """The plugin that ``mi.traverse`` started at."""
-    return next(node for node, (holder, *_) in hierarchy.items() if holder is None)
 
 
 class ParameterTracker:
@@ -85,6 +81,11 @@ class ParameterTracker:
         self._fixed: list[tuple[Any, ShownValue]] = []
         self._shown_anew: list[tuple[Any, int]] = []
         self._walk(root)
+
+    @staticmethod
+    def of(params: Any) -> ParameterTracker:
+        """The parameters below the plugin that ``mi.traverse`` started at to return ``params``."""
+        return ParameterTracker(next(node for node, (holder, *_) in params.hierarchy.items() if holder is None))
 
     def _walk(self, root: Any) -> None:
         visited = {root.ptr}
@@ -115,6 +116,13 @@ class ParameterTracker:
             for own, texture in objects_of(shape):
                 if own == name:
                     self._holders[texture.ptr].append((reader, name))
+
+    def holders_of(self, node: Any, key: str = "") -> list[tuple[Any, str]]:
+        """What holds a plugin directly, as (holder, the name there), and before that the textures that read its
+        attribute ``key``.
+        """
+        readers = [(reader, key) for reader in self._readers.get((node.ptr, key), ())]
+        return readers + self._holders.get(node.ptr, [])
 
     def _owners_of(self, node: Any, key: str = "") -> tuple[tuple[Any, str], ...]:
         """What holds the parameter ``key`` of a plugin, as in :class:`Site`."""

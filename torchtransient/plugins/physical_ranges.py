@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
-from torchtransient.plugins.mitsuba_compat import keeps_coefficients
+from torchtransient.plugins.mitsuba_compat import NUMBERS, attribute_scale
 from torchtransient.plugins.node_walk import unshared
+from torchtransient.plugins.parameters import ParameterTracker, is_attribute
+from torchtransient.plugins.spectral_colours import keeps_coefficients
 
 # What single precision makes of the ends of a range.
 _SLACK = 1e-5
-# Of a texture or volume the numbers, not where they lie.
-NUMBERS = ("value", "values", "data", "color0", "color1")
 
 
 @dataclass(frozen=True)
@@ -70,24 +70,40 @@ _OF_BSDFS = {
 _OF_MEDIA = {"albedo": SHARE, "sigma_t": EXTINCTION}
 _OF_EMITTERS = dict.fromkeys(("radiance", "intensity", "irradiance", "energy"), LIGHT)
 _OF_SENSORS = {"x_fov": ANGLE, "aperture_radius": LENGTH, "focus_distance": LENGTH}
-_NAMES = frozenset((*_OF_BSDFS, *_OF_MEDIA, *_OF_EMITTERS, *_OF_SENSORS, "g"))
+
+def ranges_of(params: Any) -> dict[str, PhysicalRange]:
+    """The ranges of the parameters that have one, by key of ``mi.traverse``.
+
+    The numbers of textures, volumes and attributes of meshes have the range of what they supply, through whatever
+    textures they are read. Coefficients of spectral models have none.
+    """
+    tracker, found = ParameterTracker.of(params), {}
+    for key in params.properties:
+        limits = list(_ranges_at(tracker, params.properties[key][2], key.rsplit(".", 1)[-1]))
+        if limits:  # one that serves for several things: the one with the least room
+            found[key] = min(limits, key=lambda one: one.high)
+    return found
 
 
-def physical_range(params: Any, key: str) -> PhysicalRange | None:
-    """The range of a key of ``mi.traverse``, None for none. Coefficients of spectral models have none."""
-    names = key.split(".")
-    if _NAMES.isdisjoint(names) or key not in params.properties:
-        return None
-    node = params.properties[key][2]
-    if names[-1] in _NAMES:
-        return _range_in(node, names[-1])
-    if names[-1] not in NUMBERS or not isinstance(node, mi.Texture | mi.Volume) or keeps_coefficients(node):
-        return None
-    for name in reversed(names[:-1]):
-        node = params.hierarchy[node][0]
-        if not isinstance(node, mi.Texture | mi.Volume):
-            return None if node is None else _range_in(node, name)
-    return None
+def _ranges_at(tracker: ParameterTracker, node: Any, name: str) -> Iterator[PhysicalRange]:
+    """The ranges of a parameter of a plugin."""
+    if isinstance(node, mi.Texture | mi.Volume):
+        supplies = name in NUMBERS and not keeps_coefficients(node, name)
+    else:
+        own = _range_in(node, name)
+        if own is not None:
+            yield own
+        supplies = is_attribute(node, name) and not keeps_coefficients(node, name)
+    waiting = [(node, name, 1.0)] if supplies else []
+    while waiting:
+        supplier, attribute, scale = waiting.pop()
+        for holder, slot in tracker.holders_of(supplier, attribute):
+            if isinstance(holder, mi.Texture | mi.Volume):
+                factor = attribute_scale(holder)
+                if factor > 0:
+                    waiting.append((holder, "", scale * factor))
+            elif (limits := _range_in(holder, slot)) is not None:
+                yield limits if scale == 1 else replace(limits, low=limits.low / scale, high=limits.high / scale)
 
 
 def _range_in(node: Any, name: str) -> PhysicalRange | None:
@@ -104,12 +120,10 @@ def _range_in(node: Any, name: str) -> PhysicalRange | None:
 
 def described_ranges(params: Any) -> Iterator[tuple[str, PhysicalRange, float, float]]:
     """(key, range, smallest, largest) of what has a range in a scene, as it is now."""
-    for key in params.properties:
-        found = physical_range(params, key)
-        if found is not None:
-            numbers = np.array(unshared(params[key]))
-            if numbers.size:
-                yield key, found, float(numbers.min()), float(numbers.max())
+    for key, limits in ranges_of(params).items():
+        numbers = np.array(unshared(params[key]))
+        if numbers.size:
+            yield key, limits, float(numbers.min()), float(numbers.max())
 
 
 def sun_axes(params: Any, keys: Iterable[str]) -> dict[str, np.ndarray]:

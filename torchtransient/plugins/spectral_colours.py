@@ -1,4 +1,5 @@
-"""The colours whose smooth spectra have given coefficients: the inverse of ``mi.srgb_model_fetch``.
+"""Coefficients of smooth spectra: what keeps them, and the colours that they belong to, the inverse of
+``mi.srgb_model_fetch``.
 
 Mitsuba keeps a reflectance in spectral variants as three coefficients of a smooth spectrum, which it looks up in a
 table by the colour (Jakob and Hanika 2019, A Low-Dimensional Function Space for Efficient Spectral Upsampling). The
@@ -7,6 +8,9 @@ table is inverted here by Gauss-Newton steps with damping, on the spectrum at so
 
 from __future__ import annotations
 
+from typing import Any
+
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -16,6 +20,29 @@ _WAVELENGTHS = np.linspace(380.0, 740.0, 19)
 _STEP, _STEPS = 1e-3, 40
 # Largest difference of the spectra of a colour that counts as found.
 TOLERANCE = 2e-5
+
+
+def keeps_coefficients(node: Any, key: str) -> bool:
+    """Whether the numbers ``key`` of a texture, volume or mesh are coefficients of a smooth spectrum (Jakob and Hanika
+    2019) instead of a colour: those of colours, in spectral variants.
+    """
+    if not mi.is_spectral:
+        return False
+    name = node.class_name()
+    if isinstance(node, mi.Mesh):
+        attribute = "color" in key and key.startswith(("vertex_", "face_"))
+        return attribute and dr.width(mi.traverse(node)[key]) == 3 * _places(node, key)
+    if name.startswith(("SRGBReflectanceSpectrum", "D65Spectrum")):
+        return key == "value"
+    if key != "data" or not name.startswith(("BitmapTextureImpl", "GridVolume")):
+        return False
+    channels = mi.traverse(node)[key].shape[-1]
+    # Beside the three of a grid is the factor of its colour.
+    return channels == 4 if name.startswith("GridVolume") else channels == 3 and "raw = 0" in str(node)
+
+
+def _places(mesh: Any, attribute: str) -> int:
+    return int(mesh.vertex_count() if attribute.startswith("vertex_") else mesh.face_count())
 
 
 def colours_of(coefficients: np.ndarray) -> tuple[np.ndarray, float]:

@@ -31,7 +31,7 @@ from torchtransient.plugins.mitsuba_compat import (
 )
 from torchtransient.plugins.node_walk import has_mean
 from torchtransient.plugins.parameter_effect import class_of
-from torchtransient.plugins.physical_ranges import described_ranges
+from torchtransient.plugins.physical_ranges import PhysicalRange, described_ranges, ranges_of
 from torchtransient.rendering.build_options import BuildOptions
 from torchtransient.rendering.description import Description
 from torchtransient.rendering.films.choices import all_films, of_plugin, plugins_in_words
@@ -60,6 +60,7 @@ from torchtransient.rendering.placements import mesh_transforms, placements
 from torchtransient.rendering.pulse_properties import PREFIXES, PROPERTIES, write_pulse
 from torchtransient.rendering.taken import ReadyScene, check_taken, pointers
 from torchtransient.rendering.translation import (
+    ADVICE,
     COUNTERPARTS,
     FILM_PROPERTIES,
     PATH_PROPERTIES,
@@ -67,6 +68,7 @@ from torchtransient.rendering.translation import (
     check_stated,
     depth_of,
     forget_queries,
+    path_tracer_of,
     stated_nodes,
     tracing,
 )
@@ -100,6 +102,14 @@ class BuiltScene:
         return self._findings
 
     _findings: dict[str, str] | None = None
+
+    def ranges(self) -> dict[str, PhysicalRange]:
+        """The ranges of what has one, by key."""
+        if self._ranges is None:
+            self._ranges = ranges_of(self.params)
+        return self._ranges
+
+    _ranges: dict[str, PhysicalRange] | None = None
 
     def __del__(self) -> None:
         contents = list(self.__dict__.values())
@@ -309,6 +319,7 @@ def _override_integrator(state: Any, options: BuildOptions) -> None:
             plugin = "transient_prbvolpath" if media_in_use(state) else "transient_path"
             _add_child(state, 0, "integrator", plugin, mi.ObjectType.Integrator, {"max_depth": depth_of(state, None)})
             index = len(state.nodes) - 1
+        index = path_tracer_of(state, index, replaced=options.integrator is not None)
         plugin, depth = state.nodes[index].props.plugin_name(), depth_of(state, index)
         if options.integrator is not None and plugin != options.integrator:
             source = tracing(state, index)
@@ -321,7 +332,8 @@ def _override_integrator(state: Any, options: BuildOptions) -> None:
         elif not is_transient_integrator(plugin):
             raise SceneError(
                 f"integrator {plugin!r} has no transient counterpart. Expected transient_path, transient_prbvolpath, "
-                f"or one that they can stand in for: {', '.join(COUNTERPARTS)}."
+                f"or one that they can stand in for: {', '.join(COUNTERPARTS)}, direct, stokes."
+                f"{ADVICE.get(plugin, '')}"
             )
     if options.max_depth is not None and index is not None:
         state.nodes[index].props["max_depth"] = int(options.max_depth)

@@ -147,10 +147,13 @@ def outside_message(key: str, limits: PhysicalRange, low: float, high: float) ->
     """The message for a number outside of its range."""
     if limits == SHARE:
         number = f"{high:.6g}, more than all" if limits.above(high) else f"{low:.6g}, less than nothing"
-        return (
+        message = (
             f"{key!r} is a share of the light and reaches {number}: no surface or medium scatters so. Keep it in "
             "[0, 1], by a sigmoid or, after each step, by torch.no_grad() and x.clamp_(0, 1)."
         )
+        if key.rsplit(".", 1)[-1].startswith(("vertex_", "face_")) and 1 < high <= 255:
+            message += " Bytes of a PLY file (uchar) are 0 to 255: give the 'mesh_attribute' a scale of 1/255."
+        return message
     least = f"{'more than' if limits.is_open else 'at least'} {limits.low:g}"
     most = f" and {'less than' if limits.is_open else 'at most'} {limits.high:g}" if math.isfinite(limits.high) else ""
     return (

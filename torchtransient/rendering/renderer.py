@@ -16,7 +16,7 @@ from torchtransient.gates import Gate
 from torchtransient.given_types import is_one_of
 from torchtransient.parametrize.copies import CopiesParametrized
 from torchtransient.plugins.parameters import check_slope
-from torchtransient.plugins.physical_ranges import physical_range, sun_axes
+from torchtransient.plugins.physical_ranges import sun_axes
 from torchtransient.pulses import Pulse
 from torchtransient.quantities import Numbers, shown
 from torchtransient.rendering import engine
@@ -212,8 +212,8 @@ class TransientRenderer(CopiesParametrized):
             if self.film.count > 1 or self.effective_filter in ("", "box"):
                 # Of one bin for all times a wider filter spreads up to a half over the rim, and nobody looks there.
                 self._watch.window_name = f"window of {self.film.describe('')}"
-            ranges = {key: physical_range(built.params, key) for key in self._keys}
-            self._watch.ranges = {key: limits for key, limits in ranges.items() if limits is not None}
+            ranges = built.ranges() if self._keys else {}
+            self._watch.ranges = {key: ranges[key] for key in self._keys if key in ranges}
             self._watch.transforms = frozenset(slot.key for slot in slots if slot.kind.endswith("transform"))
             self._watch.directions = sun_axes(built.params, self._keys)
             # What is given replaces what is described.

@@ -22,7 +22,7 @@ from typing import Any
 
 from torchtransient.errors import SceneError
 from torchtransient.rendering.interrupts import quiet
-from torchtransient.rendering.nodes import find_child, is_film, is_integrator, kind_of_node
+from torchtransient.rendering.nodes import children, find_child, is_film, is_integrator, kind_of_node
 
 NO_LIMIT = -1
 # Steady integrators, and the transient ones for which their parameters mean the same.
@@ -38,6 +38,12 @@ FILM_PROPERTIES = (
     "exhaustive_scan", "laser_scan_width", "laser_scan_height",
 )  # fmt: skip
 
+# What to do about those that show something beside light.
+ADVICE = {
+    "aov": " Give the integrator inside of it alone; depths, normals and numbers of shapes are "
+    "torchtransient.rendering.labels.scene_labels.",
+    "moment": " Give the integrator inside of it alone; errors of the light are tt.cost_of_accuracy.",
+}
 # They measure what a nested integrator traces.
 _AROUND_OTHERS = ("aov", "moment", "stokes")
 # `max_depth` of integrators that do not state it; the others are written in Python and have that of the transient ones.
@@ -69,6 +75,52 @@ def depth_of(state: Any, index: int | None) -> Any:
         return NO_LIMIT
     props = state.nodes[tracing(state, index)].props
     return props.get("max_depth", _DEPTHS.get(props.plugin_name(), _DEPTH_IN_PYTHON))
+
+
+def path_tracer_of(state: Any, index: int, replaced: bool) -> int:
+    """Index of the integrator that is rendered in place of the one at ``index``: of a ``stokes`` the one inside, since
+    films hold Stokes vectors in polarized variants; a ``direct`` becomes the ``path`` of two vertices that it is, and
+    others stay. ``replaced``: whether another plugin takes its place anyway, as in pilot runs.
+
+    Raises SceneError for a ``stokes`` in an unpolarized variant and a ``direct`` that leaves out a kind of samples.
+    """
+    plugin = state.nodes[index].props.plugin_name()
+    if plugin == "direct":
+        _become_path(state, index)
+    inner = find_child(state, state.nodes[index], is_integrator) if plugin == "stokes" and not replaced else None
+    return index if inner is None else _taken_out(state, index, inner)
+
+
+def _taken_out(state: Any, index: int, inner: int) -> int:
+    import mitsuba as mi
+
+    if not mi.is_polarized:
+        raise SceneError(
+            f"integrator 'stokes': expected a polarized variant, got {mi.variant()!r}. Load the scene with "
+            "variant='llvm_ad_spectral_polarized', or give the integrator inside of it alone."
+        )
+    for name, child in children(state, state.root):
+        if child == index:
+            state.root.props[name] = mi.Properties.ResolvedReference(inner)
+    # Nothing refers to it any more: `check_stated` builds it as it was stated, for its own misspelt properties.
+    state.nodes[index].props.set_plugin_name(state.nodes[inner].props.plugin_name())
+    return inner
+
+
+def _become_path(state: Any, index: int) -> None:
+    import mitsuba as mi
+
+    old, props = state.nodes[index].props, mi.Properties("path")
+    if any(key in old and old[key] == 0 for key in ("emitter_samples", "bsdf_samples")):
+        raise SceneError(
+            "integrator 'direct': expected samples of emitters and of BSDFs, got one kind alone, which shows a way of "
+            "sampling. Leave out emitter_samples and bsdf_samples, or describe it as 'path' with max_depth = 2."
+        )
+    props.set_id(old.id())
+    props["max_depth"] = 2
+    if "hide_emitters" in old:
+        props["hide_emitters"] = old["hide_emitters"]
+    state.nodes[index].props = props
 
 
 def shown_properties(plugin: Any) -> dict[str, str]:

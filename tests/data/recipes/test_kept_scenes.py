@@ -152,7 +152,7 @@ def test_numbers_that_are_none(number):
     kept = SimpleNamespace(places={"a.b": Place("a.b", NUMBERS, (3,))})
     drawn = {"a.b": Broken(number).draw(None, kept.places["a.b"])}
     with pytest.raises(UnitError, match=r"'a\.b' at the end: expected finite numbers, got \[(nan|inf), "):
-        _check_ranges(SimpleNamespace(params={}), kept, "at the end", drawn)
+        _check_ranges({}, kept, "at the end", drawn)
 
 
 def test_ranges_at_their_ends():
@@ -160,17 +160,17 @@ def test_ranges_at_their_ends():
     kept = SimpleNamespace(places={"red.reflectance.value": Place("red.reflectance.value", NUMBERS, (2,))})
     maker = recipe(vary={"red.reflectance.value": D.Uniform(0, 1)})._maker
     found = maker.kept(maker.recipe.structure(0))
-    built = found.renderer.scene.built(found.renderer._options)
+    ranges = found.renderer.scene.built(found.renderer._options).ranges()
     for value, wrong in ((1.0, False), (0.0, False), (1.001, True), (-0.001, True)):
         drawn = {"red.reflectance.value": np.array([0.5, value])}
         if not wrong:
-            _check_ranges(built, kept, "here", drawn)
+            _check_ranges(ranges, kept, "here", drawn)
             continue
         with pytest.raises(UnitError, match=r"recipe: vary: here, .* Choose a smaller range, or cut it off"):
-            _check_ranges(built, kept, "here", drawn)
+            _check_ranges(ranges, kept, "here", drawn)
     kept.places = {"red.to_world": Place("red.to_world", POSE, (4, 4))}
     with pytest.raises(UnitError, match=r"recipe: vary: here: .*no inverse"):
-        _check_ranges(SimpleNamespace(params={}), kept, "here", {"red.to_world": np.diag([1.0, 0, 1, 1])})
+        _check_ranges({}, kept, "here", {"red.to_world": np.diag([1.0, 0, 1, 1])})
 
 
 def lit(monkeypatch, described, drawn, lights=("lamp",), emitters=("lamp",)):

@@ -19,6 +19,7 @@ from torchtransient.data.recipes.specification import Specification
 from torchtransient.data.recipes.streams import Draw, Extreme, Fixed, Stream
 from torchtransient.data.recipes.structures import Structure
 from torchtransient.errors import SceneError, TorchTransientError, TorchTransientWarning, UnitError
+from torchtransient.plugins.physical_ranges import PhysicalRange
 from torchtransient.rendering.physics import is_singular, level_of_user, outside_message, singular_message
 from torchtransient.rendering.variant import active_variant
 
@@ -41,8 +42,9 @@ def check_recipe(recipe: Specification, maker: Maker) -> None:
             kept.check_device(drawn)
         with active_variant(recipe.variant):
             built = kept.renderer.scene.built(kept.renderer._options)
+            ranges = built.ranges()
             for where, drawn in draws:
-                _check_ranges(built, kept, where, drawn)
+                _check_ranges(ranges, kept, where, drawn)
             if kept.scan is None:
                 _check_light(built, kept, [drawn for _, drawn in draws])
             check_reach(built, kept, draws)
@@ -119,15 +121,13 @@ def _check_names(expected: Mapping[str, list[str]], kept: Kept) -> None:
             )
 
 
-def _check_ranges(built: Any, kept: Kept, where: str, drawn: Mapping[str, Any]) -> None:
-    from torchtransient.plugins.physical_ranges import physical_range
-
+def _check_ranges(ranges: Mapping[str, PhysicalRange], kept: Kept, where: str, drawn: Mapping[str, Any]) -> None:
     for key, place in kept.places.items():
         with np.errstate(over="ignore"):
             value = np.asarray(drawn[key], dtype=np.float32)
         if not np.isfinite(value).all():
             raise UnitError(f"recipe: vary: {key!r} {where}: expected finite numbers, got {value.tolist()}.")
-        limits = physical_range(built.params, key)
+        limits = ranges.get(key)
         if limits is not None and (limits.above(float(value.max())) or limits.below(float(value.min()))):
             message = outside_message(key, limits, float(value.min()), float(value.max()))
             first = message.split(". Keep ")[0].split(": expected ")

@@ -11,10 +11,10 @@ import numpy as np
 from torchtransient.errors import UnitError
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.finite_values import numbers_of
-from torchtransient.plugins.mitsuba_compat import keeps_coefficients
+from torchtransient.plugins.mitsuba_compat import NUMBERS
 from torchtransient.plugins.node_walk import shown_by
 from torchtransient.plugins.parameter_effect import ANY_KEY, VALUE, ParameterEffect, declare_effects
-from torchtransient.plugins.physical_ranges import NUMBERS
+from torchtransient.plugins.spectral_colours import keeps_coefficients
 
 
 class LaserBeam(mi.Emitter):
@@ -79,7 +79,8 @@ class LaserBeam(mi.Emitter):
 def _check_light(energy: Any) -> None:
     """Raise UnitError for joules below zero or that are no number."""
     for value in shown_by(energy)[0]:
-        numbers = numbers_of(value.read(energy)) if value.key in NUMBERS and not keeps_coefficients(energy) else None
+        plain = value.key in NUMBERS and not keeps_coefficients(energy, value.key)
+        numbers = numbers_of(value.read(energy)) if plain else None
         if numbers is not None and not (np.isfinite(numbers) & (numbers >= 0)).all():
             raise UnitError(
                 f"laser_beam: energy: expected joules of at least 0, finite ones, got {numbers.reshape(-1).tolist()}."

@@ -20,7 +20,7 @@ from torchtransient.plugins.integrators.seen_scene import SeenScene
 from torchtransient.plugins.parameter_effect import class_of
 from torchtransient.plugins.parameters import SILHOUETTES, ParameterTracker, check_slope, check_stand_ins, moving_names
 from torchtransient.plugins.properties import number, truth, whole_number
-from torchtransient.plugins.sensors.origin import PrimaryRays, index_at_sensor, sample_rays, views
+from torchtransient.plugins.sensors.origin import PrimaryRays, index_at_sensor, sample_rays, start_at_sensor, views
 from torchtransient.plugins.sensors.stokes_frame import sensor_rotation
 from torchtransient.plugins.transport.contents import SceneContents
 from torchtransient.plugins.transport.derivative.forward import propagate_tangents
@@ -185,11 +185,13 @@ class TransientIntegrator(mi.CppADIntegrator):
             ray, ray_weight = sample_rays(sensor, seen, time, wavelength, position, aperture)
             if film.curves is not None:
                 ray, ray_weight = film.curves.draw(sensor, ray, ray_weight, wavelength)
-            η = index_at_sensor(seen, contents.surroundings, scene)
+            η, clip = index_at_sensor(seen, contents.surroundings, scene), None
+            if contents.media is not None and contents.media.at_sensor is not None:
+                ray, clip = start_at_sensor(seen, ray)
         scale = dr.opaque(mi.Float, 1 / job.total)
         if weight is not None:
             scale *= weight
-        return PrimaryRays(sampler, ray, ray_weight, scale, row, column, seen, η, laser, (stratum, spp))
+        return PrimaryRays(sampler, ray, ray_weight, scale, row, column, seen, η, laser, (stratum, spp), clip)
 
     def offset_in_pixel(self, film, sensor, sampler):
         """(offset of a sample from its pixel's centre, weight or None for one)."""

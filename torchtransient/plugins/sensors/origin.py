@@ -41,17 +41,19 @@ class PrimaryRays:
     in its pixel), ``row`` and ``column`` of the pixel, the :class:`View` of every sensor (``seen``),
     and the index of refraction ``η`` where the rays start (attached to the glass that they start in); ``laser``:
     number of the laser position in an exhaustive scan, else None; ``strata``: (number of the sample in its pixel, how
-    many there are); ``leg``: how the first segment ends where that is known. A plain object, which Dr.Jit loops leave
-    alone.
+    many there are); ``leg``: how the first segment ends where that is known; ``clip``: distance from ``ray.o`` at
+    which the first surface can be, None for 0. A plain object, which Dr.Jit loops leave alone.
     """
 
-    def __init__(self, sampler, ray, weight, scale, row, column, seen, η, laser=None, strata=None):
+    def __init__(self, sampler, ray, weight, scale, row, column, seen, η, laser=None, strata=None, clip=None):
         self.sampler, self.ray, self.weight, self.scale = sampler, ray, weight, scale
         self.row, self.column, self.seen, self.η, self.laser, self.leg = row, column, seen, η, laser, None
-        self.strata = strata
+        self.strata, self.clip = strata, clip
 
     def length(self):
         """Optical length from the sensor's origin to where the rays start, attached."""
+        if self.clip is not None:
+            return mi.Float(0)
         return length_to_sensor_origin(self.seen, self.ray) * self.η
 
 
@@ -117,6 +119,20 @@ def length_to_sensor_origin(seen: list[View], ray: Any) -> Any:
     for view in seen[1:]:
         length = dr.select(view.active, view.length(ray), length)
     return length
+
+
+def start_at_sensor(seen: list[View], ray: Any) -> tuple[Any, Any]:
+    """(``ray`` from the origin of a projective camera on, attached where it is; distance to its near clip plane,
+    detached, None for other sensors): a medium around the camera attenuates and scatters light there, too.
+    """
+    if any(near_clip(view.sensor) is None for view in seen):
+        return ray, None
+    length = length_to_sensor_origin(seen, ray)
+    ray = mi.Ray3f(ray)
+    ray.o = ray(-length)
+    clip = dr.detach(length)
+    ray.maxt = ray.maxt + clip
+    return ray, clip
 
 
 def index_at_sensor(seen: list[View], surroundings: Any, scene: Any) -> Any:

@@ -16,9 +16,8 @@ from torchtransient import plugins
 from torchtransient.array_files.part_files import writing_said
 from torchtransient.errors import SceneError, ShapeError, TorchTransientError, UnitError
 from torchtransient.file_places import check_folder, path_of
-from torchtransient.plugins.mitsuba_compat import keeps_coefficients
 from torchtransient.plugins.node_walk import ShownValue, objects_below
-from torchtransient.plugins.spectral_colours import same_spectra
+from torchtransient.plugins.spectral_colours import keeps_coefficients, same_spectra
 from torchtransient.plugins.unfinished import afterwards
 from torchtransient.rendering.arguments import as_float, fit_shape
 from torchtransient.rendering.build_options import BuildOptions
@@ -155,7 +154,7 @@ def _compare(again: Scene, wanted: dict[str, Any], keys: tuple[str, ...]) -> Non
     params = built.params.properties
     for key, value in wanted.items():
         if key in found and not _same(value, found[key]):
-            spectral = keeps_coefficients(params[key][2]) and key.endswith((".value", ".data"))
+            spectral = keeps_coefficients(params[key][2], key.rsplit(".", 1)[-1])
             if not (spectral and same_spectra(value, found[key])):
                 other.append(key)
     if other:

@@ -9,9 +9,9 @@ import numpy as np
 from torchtransient.errors import SceneError
 from torchtransient.plugins import kind_of
 from torchtransient.plugins.dictionaries import double_transform
-from torchtransient.plugins.mitsuba_compat import DIFFERENTIABLE_PLUGINS, POLARIZED_PLUGINS, keeps_coefficients
+from torchtransient.plugins.mitsuba_compat import DIFFERENTIABLE_PLUGINS, POLARIZED_PLUGINS
 from torchtransient.plugins.node_walk import objects_of
-from torchtransient.plugins.spectral_colours import as_colours
+from torchtransient.plugins.spectral_colours import as_colours, keeps_coefficients
 from torchtransient.rendering.nodes import children, kind_of_node
 
 if TYPE_CHECKING:
@@ -111,7 +111,7 @@ def write_value(writer: XmlWriter, built: Any, places: dict[int, Place], slot: S
     place = places.get(owner.ptr)
     if place is None:
         raise SceneError(f"scene.save: {slot.key!r} has no place in the description, and cannot be said in XML.")
-    if name == "value" and keeps_coefficients(owner):
+    if name == "value" and keeps_coefficients(owner, name):
         if not owner.class_name().startswith("SRGBReflectance"):
             raise SceneError(
                 f"scene.save: {slot.key!r} cannot be said in XML: in {mi.variant()} its numbers are those of a "

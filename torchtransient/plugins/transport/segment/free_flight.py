@@ -143,13 +143,20 @@ def cross_boundary(scene, ray, pi, medium, passes):
     changes = passes & si.is_medium_transition()
     medium = dr.select(changes, si.target_medium(ray.d), medium)
     # The search goes on along the line itself: an origin lifted off along the normal would land beside it.
-    start = pi.t + past(si.p)
+    found = surface_beyond(scene, ray, pi.t + past(si.p), passes)
+    return dr.select(passes, found, pi), medium
+
+
+def surface_beyond(scene, ray, start, active, coherent=False):
+    """The first surface along ``ray`` at a distance of ``start`` (None for 0) or more, counted from ``ray.o``."""
+    if start is None:
+        return scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
     onward = mi.Ray3f(ray)
     onward.o = ray(start)
     onward.maxt = ray.maxt - start
-    found = scene.ray_intersect_preliminary(onward, active=passes)
+    found = scene.ray_intersect_preliminary(onward, coherent=coherent, active=active)
     found.t += start
-    return dr.select(passes, found, pi), medium
+    return found
 
 
 @dr.syntax
@@ -176,12 +183,13 @@ def lets_through(media, ray, pi, hide):
 
 
 @dr.syntax
-def sample_free_flight(scene, media, ray, medium, carried, u, lanes, active, first=False):
+def sample_free_flight(scene, media, ray, medium, carried, u, lanes, active, first=False, clip=None):
     """Walk from ``ray.o`` in ``medium`` to the next event; returns a :class:`FreeFlight`.
 
     ``carried``: light per channel at the start, which only steers the choice of channels. ``u``: a number of the
     sampler, which chooses the first flight and starts the generator of the others; the same arguments give the same
-    walk. ``first``: the ray comes from the sensor. ``hide`` in ``media`` makes it pass light sources then.
+    walk. ``first``: the ray comes from the sensor. ``hide`` in ``media`` makes it pass light sources then, and
+    surfaces nearer than ``clip`` are not there.
     """
     rng = generator([u], lanes, WALK)
     u = mi.Float(u)
@@ -192,7 +200,7 @@ def sample_free_flight(scene, media, ray, medium, carried, u, lanes, active, fir
     hide = first and media.hide_emitters
     entry = dr.zeros(mi.PreliminaryIntersection3f, dr.width(lanes))
     entry.t = dr.full(mi.Float, dr.inf, dr.width(lanes))
-    pi = scene.ray_intersect_preliminary(ray, coherent=first, active=active)
+    pi = surface_beyond(scene, ray, clip, active, coherent=first)
     if dr.hint(media.one_stretch and not hide, mode="scalar"):
         inside = active & (medium != None)  # noqa: E711 (a Dr.Jit comparison)
         scatter, _, t, weight = tentative_flight(media, medium, ray, t, pi.t, carried, u, rng, inside)

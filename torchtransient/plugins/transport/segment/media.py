@@ -49,8 +49,13 @@ class Media(Vacuum):
     medium at its start) and ``entry`` (the boundary passed last).
     """
 
+    clip = None
+
     def prepare(self, world):
         self.settings = FlightSettings(world.contents.media, world.wanted, world.hide_emitters, world.surfaces)
+
+    def start(self, world, rays):
+        self.clip = rays.clip
 
     # ------------------------------------------------------------------------------------------------- primal
 
@@ -66,7 +71,8 @@ class Media(Vacuum):
 
     def _leg(self, world, ray, medium, carried, sampler, active, first=False):
         u, lanes = sampler.next_1d(), lane_numbers(sampler)
-        end = sample_free_flight(world.scene, self.settings, ray, medium, carried, u, lanes, active, first=first)
+        clip = self.clip if first else None
+        end = sample_free_flight(world.scene, self.settings, ray, medium, carried, u, lanes, active, first, clip)
         t = end.t
         if self.settings.geometry:
             # A collision on top of the vertex before has no direction to it: as far as single precision can tell apart.
@@ -148,7 +154,8 @@ class Media(Vacuum):
         vertex = self.arrived(world, v, carry, ray, si, wanted)
         vertex.scatter, vertex.mei = v.scatter, mei
         far = ~vertex.sid.is_valid()
-        leg = Leg(v, v.ray.o, vertex.sid.p, v.ray.d, far, v.begin, ARRIVING)
+        clip = None if self.clip is None else dr.select(v.k == 0, self.clip, 0)
+        leg = Leg(v, v.ray.o, vertex.sid.p, v.ray.d, far, v.begin, ARRIVING, clip)
         T = v.weight * with_log_slope(world.scene, self.settings, leg, carry.x, si.p, carry.β[0], v.active)
         if wanted.geometry:
             T *= dr.relative_grad(dr.select(v.scatter, stretch, 1))

@@ -13,7 +13,12 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.transport.instances import distance_to
-from torchtransient.plugins.transport.segment.free_flight import cross_boundary, generator, medium_interaction
+from torchtransient.plugins.transport.segment.free_flight import (
+    cross_boundary,
+    generator,
+    medium_interaction,
+    surface_beyond,
+)
 
 # Streams of random numbers, one for each kind of leg.
 ARRIVING, CONNECTING, EMITTING = 0xC2B2AE35, 0x27D4EB2F, 0x165667B1
@@ -21,18 +26,19 @@ ARRIVING, CONNECTING, EMITTING = 0xC2B2AE35, 0x27D4EB2F, 0x165667B1
 
 class Leg:
     """A straight leg from ``x0`` to ``x1``, or without end in direction ``d`` where ``far``, starting in ``medium``.
+    Surfaces nearer to ``x0`` than ``clip`` are not there (None: all are).
 
     A plain object that only lives within one iteration.
     """
 
-    def __init__(self, v, x0, x1, d, far, medium, stream):
+    def __init__(self, v, x0, x1, d, far, medium, stream, clip=None):
         self.x0, self.x1, self.far, self.medium = mi.Point3f(x0), mi.Point3f(x1), far, medium
         self.length = dr.select(far, dr.inf, dr.norm(self.x1 - self.x0))
         self.d = dr.select(far, d, dr.normalize(self.x1 - self.x0))
         self.ray = mi.Ray3f(v.ray)
         self.ray.o, self.ray.d = self.x0, self.d
         self.ray.maxt = self.length * (1 - mi.math.ShadowEpsilon)
-        self.numbers = v.numbers()
+        self.clip, self.numbers = clip, v.numbers()
         self.lanes, self.stream = dr.arange(mi.UInt32, dr.width(v.ray.d)), stream
 
 
@@ -74,7 +80,7 @@ def first_stretch(scene, media, leg, active):
     nothing.t = dr.full(mi.Float, dr.inf, dr.width(leg.lanes))
     if not media.open_boundaries:
         return rng, nothing, nothing
-    return rng, scene.ray_intersect_preliminary(leg.ray, active=active), nothing
+    return rng, surface_beyond(scene, leg.ray, leg.clip, active), nothing
 
 
 @dr.syntax
