@@ -82,6 +82,7 @@ def test_furnace_bins(emitter_sampling):
     np.testing.assert_allclose(in_window[-1] + outside, steady[-1], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_furnace_in_spectral():
     mi.set_variant("llvm_ad_spectral")
     plugins.sync()

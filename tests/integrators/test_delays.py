@@ -111,7 +111,7 @@ def test_measured_decay():
     check(transient, YIELD * exact_delays(undelayed(2), 0.001, lambda x: pulse.cumulative(x / 2)), slack=1e-4)
 
 
-@pytest.mark.parametrize("mixture", ["child", "fraction"])
+@pytest.mark.parametrize("mixture", [pytest.param("child", marks=pytest.mark.slow), "fraction"])
 def test_mixtures(mixture):
     arrivals = undelayed(2)
     edges = np.add.reduceat(arrivals, np.arange(0, 13000, 50))

@@ -336,7 +336,7 @@ KINDS = ("perspective", "thinlens", "orthographic", "radiancemeter", "irradiance
 # Whatever the sensor, the light is sampled as it is for the others, but where both are at infinity.
 PAIRS = [(sensor, "area") for sensor in KINDS] + [("perspective", light) for light in LIGHTS if light != "area"]
 PAIRS += [("distant", "directional"), ("distant", "constant")]
-QUICK = [("batch", "area"), ("irradiancemeter", "area"), ("perspective", "envmap")]
+QUICK = [("batch", "area"), ("perspective", "envmap")]
 
 
 def check_pair(sensor, light, count=6, spp=512):

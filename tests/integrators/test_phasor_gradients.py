@@ -72,7 +72,7 @@ def one_by_one(monkeypatch):
     ("variant", "frequencies", "moves"),
     long_rows(
         [(VARIANT, LIST, False), (VARIANT, GRID, True), ("llvm_ad_mono_polarized", GRID, True)],
-        [(VARIANT, LIST, False), (VARIANT, GRID, True)],
+        [(VARIANT, GRID, True)],
     ),
     ids=["list-albedo", "grid-wall", "polarized"],
 )

@@ -106,6 +106,7 @@ def test_the_sum_over_time_is_mitsubas_stokes_image(variant):
     assert result.passed, str(result)
 
 
+@pytest.mark.slow
 def test_energy_outside_the_window_is_that_of_the_power():
     scene = ours(everything(), start=6.0, bins=6)
     steady, transient = (np.array(x, dtype=np.float64) for x in scene.integrator().render(scene, seed=1, spp=SPP))

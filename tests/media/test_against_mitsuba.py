@@ -121,6 +121,7 @@ def test_wavelengths():
     assert total.passed, str(total)
 
 
+@pytest.mark.slow
 def test_scattering_in_a_medium_leaves_no_polarization():
     """A phase function of one number says nothing of polarization, and light that is scattered once has none."""
     with mi.variant_context("llvm_ad_mono_polarized"):

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.marks import long
 from support.media_scenes import block, camera, clouds, homogeneous
 from torchtransient.errors import SceneError
 from torchtransient.rendering.variant import active_variant
@@ -56,7 +57,7 @@ def steady_scene(integrator, **objects):
     return tt.load({"type": "scene", **node, "sensor": camera(transient=False), **objects}, variant=VARIANT)
 
 
-@pytest.mark.parametrize("integrator", ["prbvolpath", None])
+@pytest.mark.parametrize("integrator", long(["prbvolpath", None], ["prbvolpath"]))
 def test_steady_scenes_with_media(integrator):
     """Whatever integrator a steady scene with media names, its light walks through them."""
     scene = steady_scene(integrator, **block(homogeneous(1.0, 0.8)))
@@ -156,7 +157,7 @@ def test_no_kernels_are_compiled_while_training():
     assert all(entry["cache_hit"] for entry in kernels)
 
 
-@pytest.mark.parametrize("explode", [False, True])
+@pytest.mark.parametrize("explode", long([False, True], [False]))
 def test_dropped_scenes_stay_until_a_kernel_is_traced(monkeypatch, explode):
     """A scene freed between two method calls of one trace makes Dr.Jit write a function twice, and LLVM abort.
 
