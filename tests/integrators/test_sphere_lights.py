@@ -137,16 +137,18 @@ def test_texture_of_a_turned_sphere():
     assert abs(sampled.mean() / (RHO * 0.16) - 1) > 0.02  # the texture shows
 
 
-@pytest.mark.parametrize("ratio", long([1e-5, 1e-3, 1e-2], [1e-3]))
+@pytest.mark.slow
+@pytest.mark.parametrize("ratio", [1e-5, 1e-3, 1e-2])
 def test_angular_light(ratio):
     """Emission into a cone of half angle c: as if the sphere had the radius r sin(c), up to r / d."""
     emitter = {"type": "angulararea", "radiance": RADIANCE, "cutoff_angle": 30.0}
     close_to(steady(over_a_plane(lamp(ratio, emitter=emitter)), 8, 1 << 18), RHO * RADIANCE * ratio**2 / 4, 2 * ratio)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ratio", "alpha"),
-    long_rows(itertools.product([1e-4, 0.1, 0.7, 0.95], [0.02, 0.5]), [(0.7, 0.02)]),
+    list(itertools.product([1e-4, 0.1, 0.7, 0.95], [0.02, 0.5])),
 )
 def test_found_and_sampled_light_share_the_weight(ratio, alpha):
     """A rough mirror finds the light by itself, too: the sum over both does not depend on who does."""
@@ -210,7 +212,7 @@ def test_texture_coordinates_of_samples(inside):
     assert np.quantile(off, 0.999) < 1e-4 and np.array(ds.uv).min() >= 0 and np.array(ds.uv).max() <= 1
 
 
-@pytest.mark.parametrize(("ratio", "flipped"), [(1e-6, False), (1e-3, True), (0.99, False), (1.5, False), (1.5, True)])
+@pytest.mark.parametrize(("ratio", "flipped"), [(1e-6, False), (0.99, False), (0.5, True), (1.5, True)])
 def test_densities_agree_and_integrate_to_the_solid_angle(ratio, flipped):
     scene = over_a_plane(lamp(ratio, flip_normals=flipped), {"type": "point", "position": [0, 0, 1], "intensity": 1})
     table = SphereLights.of(scene).read(scene)

@@ -157,6 +157,7 @@ def test_spherical_lights_need_connections():
         scene.integrator().render_backward(scene, params, (None, adjoint), spp=1)
 
 
+@pytest.mark.slow
 def test_without_media_it_is_the_surface_integrator():
     """The same numbers from kernels of the same size: walks are not there at all."""
     objects = block(clouds())

@@ -57,7 +57,8 @@ def steady_scene(integrator, **objects):
     return tt.load({"type": "scene", **node, "sensor": camera(transient=False), **objects}, variant=VARIANT)
 
 
-@pytest.mark.parametrize("integrator", long(["prbvolpath", None], ["prbvolpath"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", ["prbvolpath", None])
 def test_steady_scenes_with_media(integrator):
     """Whatever integrator a steady scene with media names, its light walks through them."""
     scene = steady_scene(integrator, **block(homogeneous(1.0, 0.8)))

@@ -130,7 +130,8 @@ def test_black_medium(albedo):
     assert error < 0.1 * abs(grey.mean())
 
 
-@pytest.mark.parametrize("g", long([0.999, -0.999, 0.99999, -0.99999], [-0.99999]))
+@pytest.mark.slow
+@pytest.mark.parametrize("g", [0.999, 0.99999, -0.99999])
 def test_narrow_phase_functions(g):
     """Almost a delta function forwards or backwards: numbers, and in a furnace the right ones."""
     objects = {
