@@ -159,6 +159,7 @@ def lit_polarizer(film, kind="polarizer"):
 STATE = np.array([1.0, np.cos(np.radians(50.0)), np.sin(np.radians(50.0)), 0.0])
 
 
+@pytest.mark.slow
 def test_phasors_of_stokes_vectors():
     """``S exp(-2 pi i nu opl)``, the components in front of channels and frequencies."""
     film = {"type": "phasor_hdr_film", "frequencies": "0, 0.7, 12.3"}

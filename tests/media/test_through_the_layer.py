@@ -10,7 +10,6 @@ import pytest
 import torch
 
 import torchtransient as tt
-from support.marks import long
 from support.media_scenes import block, camera, clouds, homogeneous
 from torchtransient.errors import SceneError
 from torchtransient.rendering.variant import active_variant
@@ -158,7 +157,8 @@ def test_no_kernels_are_compiled_while_training():
     assert all(entry["cache_hit"] for entry in kernels)
 
 
-@pytest.mark.parametrize("explode", long([False, True], [False]))
+@pytest.mark.slow
+@pytest.mark.parametrize("explode", [False, True])
 def test_dropped_scenes_stay_until_a_kernel_is_traced(monkeypatch, explode):
     """A scene freed between two method calls of one trace makes Dr.Jit write a function twice, and LLVM abort.
 

@@ -146,6 +146,7 @@ def test_narrow_phase_functions(g):
     assert np.isfinite(gradient(scene, "ball.interior_medium.phase_function.g", 1, 64)).all()
 
 
+@pytest.mark.slow
 def test_grid_that_touches_its_majorant():
     """Where the density is the majorant, nothing is let through by chance and the derivative is still there."""
     density = np.zeros((2, 2, 2))

@@ -70,6 +70,7 @@ def test_many_small_terms():
     assert many.sum() == pytest.approx(few.sum() / 4, rel=2e-4)
 
 
+@pytest.mark.slow
 def test_edges_of_time():
     """A window that starts and ends amid the light counts what it misses, and holds the bins of a longer one."""
     scene = mi.load_dict(scan_scene({"a": plane()}, film=film(2, start=1.0, width=0.01, bins=400)))

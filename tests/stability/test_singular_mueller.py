@@ -53,7 +53,8 @@ def polarizer(angle):
     return {"type": "diff_polarizer", "theta": angle}
 
 
-@pytest.mark.parametrize("albedo", long([0.0, 1e-8], [0.0]))
+@pytest.mark.slow
+@pytest.mark.parametrize("albedo", [0.0, 1e-8])
 def test_albedo_behind_two_polarizers(albedo):
     """Guards against the light beyond a vertex being recovered by an inverse matrix: a diffuse wall forgets the
     polarization and a polarizer half of the light, neither can be undone. At albedo zero nothing is left at all.
