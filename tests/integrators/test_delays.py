@@ -84,6 +84,7 @@ def test_one_bounce_is_a_convolution_with_the_lifetime():
         check(transient, exact_delays(undelayed(2), 0.001, lambda x: YIELD * exponential(x * 1.05)))
 
 
+@pytest.mark.slow
 def test_two_bounces_are_two_convolutions():
     late_side = {**LATE, "nested": {"type": "diffuse", "reflectance": 0.8}}
     side = {"type": "diffuse", "reflectance": 0.8}
@@ -111,7 +112,7 @@ def test_measured_decay():
     check(transient, YIELD * exact_delays(undelayed(2), 0.001, lambda x: pulse.cumulative(x / 2)), slack=1e-4)
 
 
-@pytest.mark.parametrize("mixture", ["child", "fraction"])
+@pytest.mark.parametrize("mixture", [pytest.param("child", marks=pytest.mark.slow), "fraction"])
 def test_mixtures(mixture):
     arrivals = undelayed(2)
     edges = np.add.reduceat(arrivals, np.arange(0, 13000, 50))
@@ -158,6 +159,7 @@ def test_seconds():
     assert float(bsdf.lifetime[0]) == pytest.approx(2e-9 * SPEED_OF_LIGHT)
 
 
+@pytest.mark.slow
 def test_a_delay_behind_a_mirror_and_no_delay_elsewhere():
     """Surfaces beside a delayed one answer at once: the render is that of a scene without it."""
     hidden = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -5]), "bsdf": LATE}

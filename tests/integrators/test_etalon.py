@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from support.marks import long_pairs, long_rows
+from support.marks import long_rows
 from torchtransient.testing.dielectric_reference import fresnel_reflectance, rough_dielectric
 from torchtransient.testing.statistics import z_test
 
@@ -84,7 +84,7 @@ SLABS = {"glass": (1.5, 1.0, 0.0), "glass, oblique": (1.5, 1.0, 40.0), "a gap": 
     long_rows(
         itertools.product(SLABS, ["reflected", "transmitted"], ["dielectric", "diff_dielectric"]),
         [
-            ("glass, oblique", "reflected", "diff_dielectric"), ("a gap", "transmitted", "dielectric"),
+            ("a gap", "transmitted", "dielectric"),
         ],
     ),
 )  # fmt: skip
@@ -168,7 +168,7 @@ ABOVE, BELOW = (3.0, (0.4, 0.1, -2.0)), (-3.0, (0.3, -0.2, 2.0))
     ("kind", "places"),
     long_rows(
         itertools.product(ROUGH, [ABOVE, BELOW]),
-        [("roughdielectric", BELOW), ("half covered", ABOVE)],
+        [("roughdielectric", BELOW)],
     ),
 )
 def test_connection_through_a_rough_interface(kind, places):
@@ -189,7 +189,7 @@ def test_connection_through_a_rough_interface(kind, places):
 
 
 @pytest.mark.parametrize(
-    ("places", "key"), long_pairs([ABOVE, BELOW], ["eta", "alpha"], [(BELOW, "eta"), (ABOVE, "alpha")])
+    ("places", "key"), long_rows([(BELOW, "eta"), (ABOVE, "eta"), (ABOVE, "alpha")], [(BELOW, "eta")])
 )
 def test_gradient_through_a_rough_interface(places, key):
     """Index and roughness from the time of flight: d/dx of sum_b t_b I_b = f tau has the parts f' tau and f tau'."""
@@ -209,6 +209,7 @@ def test_gradient_through_a_rough_interface(places, key):
     assert dr.grad(params[name])[0] == pytest.approx(expected.item(), rel=5e-3)
 
 
+@pytest.mark.slow
 def test_arrival_behind_a_principled_interface():
     bsdf = {"type": "principled", "spec_trans": 1.0, "eta": 1.5, "roughness": 0.5, "base_color": 1.0}
     lamp = [0.4, 0.1, -2.0]

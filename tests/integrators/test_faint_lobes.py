@@ -81,7 +81,7 @@ def slow(*row):
         slow({"type": "diff_principled", "metallic": number(0.0)}, "metallic.value", 1.0),
         slow({"type": "diff_principled_thin", "diff_trans": number(0.0)}, "diff_trans.value", 2.0),
         slow({"type": "diff_plastic", "specular_reflectance": number(0.0)}, "specular_reflectance.value", 0.0),
-        ({"type": "diff_plastic", "diffuse_reflectance": number(0.0)}, "diffuse_reflectance.value", 0.0),
+        slow({"type": "diff_plastic", "diffuse_reflectance": number(0.0)}, "diffuse_reflectance.value", 0.0),
         slow({"type": "diff_rough_plastic", "diffuse_reflectance": number(0.0)}, "diffuse_reflectance.value", 0.0),
         slow({"type": "diff_pplastic", "diffuse_reflectance": number(0.0)}, "diffuse_reflectance.value", 0.0),
         slow({"type": "diff_pplastic", "specular_reflectance": number(0.0)}, "specular_reflectance.value", 0.0),

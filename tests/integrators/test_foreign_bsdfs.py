@@ -90,6 +90,7 @@ def test_mixtures_inside_that_mitsuba_samples_rightly(mixture):
     np.testing.assert_allclose(image(tint(mixture)), 0.5 * image(mixture), rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_derivatives_by_a_mixture_inside():
     activate(MONO)
     mixture = blend(DIFFUSE, METAL)

@@ -43,7 +43,8 @@ ALIKE = {
     "mirror_normals_in_a_volume", "polar_metal_of_index_zero", "polar_metal_alpha", "polar_wall_distance",
     "lens_aperture", "glass_moves", "mirror_moves", "camera_moves_in_glass", "blend_weight", "principled_roughness",
     "smooth_plastic_index", "mirror_reflectance", "polar_polarizer_angle", "polar_albedo",
-    "linear_curve_bends", "conductor_eta",
+    "linear_curve_bends", "conductor_eta", "side_moves", "medium_sigma_t", "index_of_masked_thin_glass", "sky_radiance",
+    "wall_under_short_pulse", "bare_light_grows",
 }  # fmt: skip
 
 

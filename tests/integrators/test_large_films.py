@@ -37,6 +37,7 @@ def test_memory_is_zero_at_the_start_of_every_render(scene):
     assert film.band_array(0).state == dr.VarState.Evaluated
 
 
+@pytest.mark.slow
 def test_direct_sums_lose_nothing(scene, monkeypatch):
     """The transient of lanes that add each by itself is that of lanes that add together, and sums to the image."""
     film = scene.sensors()[0].film()

@@ -52,6 +52,7 @@ def test_brightness_does_not_depend_on_the_normals(integrator):
     assert abs(a - b) < 4 * error + 2e-4 * a and error < 5e-3 * a
 
 
+@pytest.mark.slow
 def test_mitsuba_takes_the_interpolated_normal():
     """Fails when Mitsuba mends it: then ``has_smooth_shape`` can go."""
     sums = []

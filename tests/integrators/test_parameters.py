@@ -81,7 +81,8 @@ def lit_wall(**lamp):
     }
 
 
-@pytest.mark.parametrize("depth", [0, 1, 3])
+@pytest.mark.slow
+@pytest.mark.parametrize("depth", [0, 1, 3, -1])
 def test_max_depth(depth):
     steady, transient = runs(load(camera(), lit_wall(), max_depth=depth), 6, 128)
     np.testing.assert_allclose(transient.sum(3), steady, atol=1e-5)

@@ -7,7 +7,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from support.marks import long_rows
 from support.plain_scenes import camera, load
 from support.runs import T
 from torchtransient import plugins
@@ -68,12 +67,10 @@ def one_by_one(monkeypatch):
     monkeypatch.setattr(phasor_adjoint.PhasorAdjointBlock, "together", lambda self, most, with_slope: 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("variant", "frequencies", "moves"),
-    long_rows(
-        [(VARIANT, LIST, False), (VARIANT, GRID, True), ("llvm_ad_mono_polarized", GRID, True)],
-        [(VARIANT, LIST, False), (VARIANT, GRID, True)],
-    ),
+    [(VARIANT, LIST, False), (VARIANT, GRID, True), ("llvm_ad_mono_polarized", GRID, True)],
     ids=["list-albedo", "grid-wall", "polarized"],
 )
 def test_ahead_and_one_by_one(monkeypatch, variant, frequencies, moves):

@@ -97,6 +97,7 @@ def test_at_least_one_sample_a_pixel():
     assert (events.size, events.paths) == ((6, 4), 24)
 
 
+@pytest.mark.slow
 def test_more_events_than_there_was_room_for(monkeypatch):
     """None is lost; where memory is short there are fewer paths."""
     inside = {"type": "sphere", "radius": 9.0, "flip_normals": True, "bsdf": {"type": "diffuse", "reflectance": 0.9}}

@@ -93,12 +93,10 @@ def test_lights_beside_it():
     close_to(steady(over_a_plane(*lights), 8, 1 << 16), RHO * E_over_pi, slack=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("variant", "ratio"),
-    long_rows(
-        [("llvm_ad_mono_polarized", 0.1), ("llvm_ad_rgb", 1e-5), ("llvm_ad_spectral", 0.1)],
-        [("llvm_ad_mono_polarized", 0.1)],
-    ),
+    [("llvm_ad_mono_polarized", 0.1), ("llvm_ad_rgb", 1e-5), ("llvm_ad_spectral", 0.1)],
 )
 def test_other_variants(variant, ratio):
     scene = over_a_plane(lamp(ratio))
@@ -115,7 +113,7 @@ def stripes():
     return {"type": "bitmap", "bitmap": mi.Bitmap(data), "raw": True, "filter_type": "nearest"}
 
 
-@pytest.mark.parametrize("ratio", [1e-5, 0.1])
+@pytest.mark.parametrize("ratio", long([1e-5, 0.1], [0.1]))
 def test_texture_seen_from_the_pole(ratio):
     """From below all meridians are seen alike."""
     light = lamp(ratio, emitter={"type": "area", "radiance": stripes()})
@@ -131,6 +129,7 @@ def on_its_side(weight):
 DARK = {"type": "point", "position": [0, 0, 1], "intensity": 1e-30}
 
 
+@pytest.mark.slow
 def test_texture_of_a_turned_sphere():
     """The meridians differ: which texel is where, as rays find it that run into the sphere."""
     sampled, found = (steady(over_a_plane(on_its_side(weight), DARK), 8, 1 << 15) for weight in (1.0, 0.0))
@@ -138,16 +137,18 @@ def test_texture_of_a_turned_sphere():
     assert abs(sampled.mean() / (RHO * 0.16) - 1) > 0.02  # the texture shows
 
 
-@pytest.mark.parametrize("ratio", long([1e-5, 1e-3, 1e-2], [1e-3]))
+@pytest.mark.slow
+@pytest.mark.parametrize("ratio", [1e-5, 1e-3, 1e-2])
 def test_angular_light(ratio):
     """Emission into a cone of half angle c: as if the sphere had the radius r sin(c), up to r / d."""
     emitter = {"type": "angulararea", "radiance": RADIANCE, "cutoff_angle": 30.0}
     close_to(steady(over_a_plane(lamp(ratio, emitter=emitter)), 8, 1 << 18), RHO * RADIANCE * ratio**2 / 4, 2 * ratio)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ratio", "alpha"),
-    long_rows(itertools.product([1e-4, 0.1, 0.7, 0.95], [0.02, 0.5]), [(0.7, 0.02)]),
+    list(itertools.product([1e-4, 0.1, 0.7, 0.95], [0.02, 0.5])),
 )
 def test_found_and_sampled_light_share_the_weight(ratio, alpha):
     """A rough mirror finds the light by itself, too: the sum over both does not depend on who does."""
@@ -211,7 +212,7 @@ def test_texture_coordinates_of_samples(inside):
     assert np.quantile(off, 0.999) < 1e-4 and np.array(ds.uv).min() >= 0 and np.array(ds.uv).max() <= 1
 
 
-@pytest.mark.parametrize(("ratio", "flipped"), [(1e-6, False), (1e-3, True), (0.99, False), (1.5, False), (1.5, True)])
+@pytest.mark.parametrize(("ratio", "flipped"), [(1e-6, False), (0.99, False), (0.5, True), (1.5, True)])
 def test_densities_agree_and_integrate_to_the_solid_angle(ratio, flipped):
     scene = over_a_plane(lamp(ratio, flip_normals=flipped), {"type": "point", "position": [0, 0, 1], "intensity": 1})
     table = SphereLights.of(scene).read(scene)

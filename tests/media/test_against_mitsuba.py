@@ -121,6 +121,7 @@ def test_wavelengths():
     assert total.passed, str(total)
 
 
+@pytest.mark.slow
 def test_scattering_in_a_medium_leaves_no_polarization():
     """A phase function of one number says nothing of polarization, and light that is scattered once has none."""
     with mi.variant_context("llvm_ad_mono_polarized"):
@@ -156,6 +157,7 @@ def test_spherical_lights_need_connections():
         scene.integrator().render_backward(scene, params, (None, adjoint), spp=1)
 
 
+@pytest.mark.slow
 def test_without_media_it_is_the_surface_integrator():
     """The same numbers from kernels of the same size: walks are not there at all."""
     objects = block(clouds())

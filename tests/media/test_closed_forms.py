@@ -129,6 +129,7 @@ def single_scattering(radius, cosine, μ_s, μ_t, edges):
     return np.histogram(s + d, edges, weights=value)[0]
 
 
+@pytest.mark.slow
 def test_single_scattering_formula():
     """The radiance above, integrated over all directions, is the energy density of Sato's formula."""
     radius, μ_s = 1.5, 0.7

@@ -349,7 +349,7 @@ def test_transmittances_that_nothing_changes():
     assert optical_depth.with_log_slope(None, settings(extinction_changes=False), None, None, None, None, None) == 1
 
 
-@pytest.mark.parametrize(("geometry", "forward"), [(False, False), (True, False), (True, True)])
+@pytest.mark.parametrize(("geometry", "forward"), [(True, False), (True, True)])
 def test_derivatives_of_a_leg_through_two_blocks(geometry, forward):
     """Minus the length within each by its own rate, whatever lies between; of its ends, the one in a medium counts."""
     blocks = {}

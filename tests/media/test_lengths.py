@@ -4,7 +4,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from support.marks import long
 from support.media_scenes import block, camera, film, homogeneous, load, volume
 from support.runs import T, runs
 from torchtransient.plugins.transport.media_contents import is_open
@@ -14,7 +13,8 @@ from torchtransient.testing.statistics import two_sample_z_test, z_test
 VARIANT = "llvm_ad_mono"
 
 
-@pytest.mark.parametrize("majorant", long([1.2, 4.0], [4.0]))
+@pytest.mark.slow
+@pytest.mark.parametrize("majorant", [1.2, 4.0])
 def test_grid_of_one_density_is_homogeneous(majorant):
     """In every bin, however many null collisions a majorant above the density makes."""
     density = volume(np.full((3, 3, 3), 1.2)) | {"max_value": majorant}
@@ -91,6 +91,7 @@ def test_scattering_medium_of_another_index():
     assert result.passed, str(result)
 
 
+@pytest.mark.slow
 def test_unwarped_first_leg():
     """Without the first leg everything comes earlier, and no more or less of it."""
     objects = block(homogeneous(1.0, 0.8))

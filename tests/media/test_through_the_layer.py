@@ -56,6 +56,7 @@ def steady_scene(integrator, **objects):
     return tt.load({"type": "scene", **node, "sensor": camera(transient=False), **objects}, variant=VARIANT)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["prbvolpath", None])
 def test_steady_scenes_with_media(integrator):
     """Whatever integrator a steady scene with media names, its light walks through them."""
@@ -156,6 +157,7 @@ def test_no_kernels_are_compiled_while_training():
     assert all(entry["cache_hit"] for entry in kernels)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("explode", [False, True])
 def test_dropped_scenes_stay_until_a_kernel_is_traced(monkeypatch, explode):
     """A scene freed between two method calls of one trace makes Dr.Jit write a function twice, and LLVM abort.

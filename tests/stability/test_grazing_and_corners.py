@@ -93,7 +93,7 @@ MATERIALS = {
 
 @pytest.mark.parametrize(
     ("material", "height"),
-    long_rows(itertools.product(MATERIALS, [1e-2, 1e-4]), [("diffuse", 1e-4), ("rough plastic", 1e-4)]),
+    long_rows(itertools.product(MATERIALS, [1e-2, 1e-4]), [("rough plastic", 1e-4)]),
 )
 def test_grazing_view_and_light(material, height):
     """Guards against 1 / cos and against microfacet terms of 0 / 0 where camera and light skim the surface."""

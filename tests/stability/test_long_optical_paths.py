@@ -6,6 +6,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from support.marks import long_rows
+
 VARIANT = "llvm_ad_mono"
 
 
@@ -27,13 +29,12 @@ def pixel(start, bins, width, filter="box", near=0.1, far=1e4):
     return {"type": "perspective", "fov": 1e-4, "near_clip": near, "far_clip": far, "film": film}
 
 
-@pytest.mark.parametrize("distance", [50.0, 123.456, 500.0])
-def test_one_leg_there_and_back(distance):
+def test_one_leg_there_and_back():
     """Guards against lengths kept in single precision from the sensor on: at 1000 m their grain is 6e-5 m, and sums of
     them with a start of the window that is not subtracted first are late or early by more than a tenth of a millimetre.
     """
-    z = float(np.float32(distance))
-    for late in (0.1, 0.5, 0.9):  # where in bin 10 the light should arrive
+    z = float(np.float32(487.654))
+    for late in (0.1, 0.9):  # where in bin 10 the light should arrive
         scene = mi.load_dict(
             {
                 "type": "scene",
@@ -78,7 +79,8 @@ def slab(index, thickness, order, window, bins):
 
 
 @pytest.mark.parametrize(
-    "index, thickness, order, tolerance", [(10.0, 0.1234, 8, 1e-5), (10.0, 0.5432, 10, 2e-5), (40.0, 1.8765, 7, 2e-4)]
+    ("index", "thickness", "order", "tolerance"),
+    long_rows([(10.0, 0.1234, 8, 1e-5), (10.0, 0.5432, 10, 2e-5), (40.0, 1.8765, 7, 2e-4)], [(40.0, 1.8765, 7, 2e-4)]),
 )
 def test_many_legs(index, thickness, order, tolerance):
     """Guards against two errors that grow with the number of bounces (24, 113 and 1055 m here): sums in single

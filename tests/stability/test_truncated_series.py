@@ -27,7 +27,7 @@ def furnace(max_depth, rr_depth):
     return mi.load_dict(build(description))
 
 
-@pytest.mark.parametrize("depth", [1, 2, 64])
+@pytest.mark.parametrize("depth", [1, 64])
 def test_truncated_series(depth):
     """Guards against a depth that is off by one, and against a roulette that cuts below rr_depth: n vertices give
     Le (1 - rho^n) / (1 - rho), which lacks Le rho^n / (1 - rho), without any noise."""
@@ -40,10 +40,10 @@ def test_truncated_series(depth):
     assert total == pytest.approx(steady.sum(), rel=2e-5)
 
 
-LONG = [pytest.param(*pair, marks=pytest.mark.slow) for pair in [(64, 1), (-1, 10)]]
+LONG = [pytest.param(*pair, marks=pytest.mark.slow) for pair in [(64, 1), (64, 5), (-1, 10)]]
 
 
-@pytest.mark.parametrize("depth, rr_depth", [(64, 5), (-1, 1), *LONG])
+@pytest.mark.parametrize("depth, rr_depth", [(-1, 1), *LONG])
 def test_roulette_is_unbiased(depth, rr_depth):
     """Guards against survivors that are not weighted up (or are, twice): the mean is that of the series, with or
     without a bound.

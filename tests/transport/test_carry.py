@@ -115,10 +115,8 @@ def unknown():
     return x
 
 
-@pytest.mark.parametrize(
-    ("variant", "unwarp"),
-    [pytest.param("llvm_ad_mono", True, marks=pytest.mark.slow), ("llvm_ad_mono_polarized", False)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("variant", "unwarp"), [("llvm_ad_mono", True), ("llvm_ad_mono_polarized", False)])
 def test_the_carry_of_primary_rays_has_the_same_slope_in_both_modes(variant, unwarp):
     """Directions, origins, the length to the sensor (which unwarped renders leave out) and the turn of its frame."""
     before = mi.variant()

@@ -132,7 +132,7 @@ def hashes(scene, **call):
         return [entry["hash"] for entry in dr.kernel_history([dr.KernelType.JIT])]
 
 
-@pytest.mark.parametrize("kind", long(["surfaces", "media", "phasors", "gates"], ["media", "phasors"]))
+@pytest.mark.parametrize("kind", long(["surfaces", "media", "phasors", "gates"], ["media"]))
 def test_numbers_of_a_call_are_no_literals(kind, monkeypatch):
     """Other seeds, other rows and other numbers of samples find the same kernels."""
     scene = mi.load_dict(scene_of(kind), optimize=False)

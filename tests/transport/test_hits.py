@@ -93,6 +93,7 @@ def slopes_of_hits(ours):
     return [np.array(dr.grad(part)) for part in attached], differences
 
 
+@pytest.mark.slow
 def test_mitsuba_misplaces_hits_of_splines():
     """Fails when Mitsuba mends it: then ``misplaces_hits`` can go."""
     found, expected = slopes_of_hits(ours=False)
@@ -248,7 +249,7 @@ KEYS = {"ellipsoids": "data", "linearcurve": "control_points", "bsplinecurve": "
     ("kind", "moved"),
     long_rows(
         itertools.product(KEYS, ["first", "second and rays"]),
-        [("ellipsoids", "second and rays"), ("linearcurve", "first"), ("bsplinecurve", "second and rays")],
+        [("ellipsoids", "second and rays"), ("bsplinecurve", "second and rays")],
     ),
 )
 def test_hits_follow_shapes_and_rays(kind, moved):
@@ -282,7 +283,7 @@ def test_slopes_backwards_are_finite(kind):
     assert np.isfinite(slope).all() and slope.any()
 
 
-@pytest.mark.parametrize("kind", long(KEYS, ["ellipsoids", "bsplinecurve"]))
+@pytest.mark.parametrize("kind", long(KEYS, ["bsplinecurve"]))
 def test_what_is_none_of_theirs_moves_as_it_did(kind):
     """The lanes of other shapes, of nothing and of what is not asked for: no infinity reaches their rays and points."""
     scene = mi.load_dict({"type": "scene", **two_of_each(kind)}, optimize=False)

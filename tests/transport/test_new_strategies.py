@@ -128,8 +128,7 @@ TOYS = ("transient_guided", "transient_three_emitter_samples")
 
 QUICK = [
     ("transient_guided", ("histogram", "something before the panel")),
-    ("transient_three_emitter_samples", ("histogram", "glossy and mirror")),
-    ("transient_guided", ("phasors", "area light")),
+    ("transient_three_emitter_samples", ("phasors", "area light")),
 ]
 
 

@@ -175,7 +175,7 @@ class ReadTogether:
         return A, slope
 
 
-@pytest.mark.parametrize("with_slope", [False, True])
+@pytest.mark.parametrize("with_slope", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_arrivals_of_a_path_are_read_ahead(with_slope):
     block = ReadTogether()
     block.base = dr.arange(mi.UInt32, 3)
