@@ -69,7 +69,7 @@ SENSING = {
     "cameras": 4, "spad": 4, "correlated_noise": 5, "pixels": 6, "chain": 7, "devices": 8,
 }  # fmt: skip
 FILES = sorted(PACKAGE.rglob("*.py"))
-MOST_LINES = {"file": 400, "function": 160}
+MOST_LINES = {"file": 800, "function": 160}
 MOST_FILES = 14  # of a room
 
 

@@ -164,6 +164,7 @@ def test_search_that_finds_nothing_says_what_to_install(tmp_path):
     assert "pip install" in result.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("exists", [True, False])
 def test_the_users_own_choice_is_refused_and_left_as_it_was(tmp_path, exists):
     path = tmp_path / "mine" / "libLLVM.so"
@@ -233,6 +234,7 @@ def test_dr_jit_imported_first_with_an_old_library_is_warned_of_at_the_import(tm
     assert "import torchtransient before drjit and mitsuba" in message
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("version", [(17, 0, 6), (0, 0, 0)])
 def test_a_library_that_works_or_none_is_not_warned_of(tmp_path, version):
     code = f"""

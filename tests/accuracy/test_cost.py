@@ -146,6 +146,7 @@ def test_errors():
         tt.cost_of_accuracy(renderer, spp=(4,), repeats=2, temporal_filters=("round",), progress=False)
 
 
+@pytest.mark.slow
 def test_phasors_have_a_cost_too():
     scene = tt.load(tt.scenes.moving_wall(resolution=2, num_bins=64, bin_width_opl=0.05), variant=VARIANT)
     renderer = tt.TransientRenderer(scene, parameters=[WALL], frequencies=[0.0, 0.4])

@@ -44,6 +44,7 @@ def slope_of(loss, x, y, **more):
     return value.detach(), slope
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES, ids=str)
 def test_levels_of_items_in_every_loss(case):
     """Counts of 0 to 50 against models of any level, none at all included."""

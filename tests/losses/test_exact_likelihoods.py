@@ -53,6 +53,7 @@ def pulse(position, sigma=1.5, bins=BINS):
     return (0.5 * torch.erf((edges - position) / (sigma * math.sqrt(2)))).diff().reshape(1, -1, 1, 1)
 
 
+@pytest.mark.slow
 @SINGLE
 def test_background_under_a_bright_peak(dtype):
     """0.2 counts a bin beside 2000 in a peak: a floor of 1e-3 of the mean bin, 0.03, took a seventh of them away.

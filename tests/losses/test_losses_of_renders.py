@@ -230,6 +230,7 @@ def test_two_seeds_are_the_squared_error_of_a_render_without_noise(draws):
     assert float(deviations(one, wanted)[0]) > 8
 
 
+@pytest.mark.slow
 def test_the_noise_of_two_seeds_is_independent(renderer, converged):
     """Residuals of two seeds are not correlated; those of one seed are the same."""
     light = converged[0]

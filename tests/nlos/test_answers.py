@@ -77,6 +77,7 @@ def test_depths_are_said_by_bounces():
         renderer(max_depth=5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spp", [np.int64(8), np.uint16(8), torch.tensor(8)])
 def test_samples_of_any_library(spp):
     expected = renderer(spp=8)(seed=0)
@@ -88,6 +89,7 @@ def test_samples_of_any_library(spp):
             renderer(spp=wrong)
 
 
+@pytest.mark.slow
 def test_what_metadata_say():
     """The names of a simulation's, as far as a layer knows them; the seed of a call is the one that draws it again."""
     layer, made = renderer([VERTICES]), simulated(seed=3).metadata
@@ -293,6 +295,7 @@ def test_dark_parts_of_a_capture_are_none():
     assert bool((made[0].steady[..., :2] > 0).all()) and not bool(made[0].steady[..., 2:].any())
 
 
+@pytest.mark.slow
 def test_layers_without_light_say_it_once():
     layer = renderer(hidden=AWAY)
     found = physics_of(lambda: [layer(seed=seed) for seed in range(3)])
@@ -315,6 +318,7 @@ def test_layers_without_light_say_it_once():
 # ------------------------------------------------------------------------------------------------------------ variants
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bounces", long([(3, 4, 5), (3, 4, 5, 6, 7, 8), "all"], [(3, 4, 5)]))
 def test_a_layer_after_another_variant(bounces):
     """What was made for one variant renders and differentiates when classes were made for another in between."""

@@ -44,6 +44,7 @@ ROUTES = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("route", ROUTES)
 def test_a_mesh_that_changed_is_another_simulation(tmp_path, route):
     named, parameters, mesh = ROUTES[route]

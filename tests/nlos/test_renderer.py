@@ -54,6 +54,7 @@ def test_a_key_that_the_scan_brings_too(key):
     assert set(layer.values) == {VERTICES, key}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("as_leaf", ["as it is", "transposed", "of a larger one"])
 def test_points_that_an_optimizer_changes(as_leaf):
     """However their numbers lie in memory, a call renders those of now and gives their gradient to the leaf."""
@@ -166,6 +167,7 @@ def moved(layer, z):
     return layer.values[VERTICES].detach() + torch.tensor([0.0, 0.0, z])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("z", SAID)
 @pytest.mark.parametrize("batch", [False, True])
 def test_values_that_hide_the_scan_are_said_once(z, batch):

@@ -152,6 +152,7 @@ def test_a_finished_part_file_is_the_capture(tmp_path, monkeypatch):
     assert torch.equal(first.transient, again.transient) and again.metadata["seconds"] == first.metadata["seconds"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changed",
     [{"seed": 1}, {"spp": 65}, {"tiles": 3}, {"time_axis": tt.TimeAxis(1.9, 0.02, 101)}, {"bounces": (3, 4)},
@@ -295,6 +296,7 @@ OLDER = """<scene version="3.3.0">
 </scene>"""
 
 
+@pytest.mark.slow
 def test_an_older_scene_of_mitransient(tmp_path):
     """As its examples are written: the spot at a place of the film, a projector, properties that say nothing."""
     (tmp_path / "older.xml").write_text(OLDER)
@@ -310,6 +312,7 @@ def test_an_older_scene_of_mitransient(tmp_path):
 # ---------------------------------------------------------------------------------------------- variants, forecasts
 
 
+@pytest.mark.slow
 def test_the_cheapest_variant():
     grey = simulated()
     assert grey.channels == ("L",) and grey.metadata["variant"] == "llvm_ad_mono"
@@ -333,6 +336,7 @@ def test_colours_agree_with_one_channel():
     torch.testing.assert_close(a.sum(), b[:, 0].sum(), rtol=1e-5, atol=0)
 
 
+@pytest.mark.slow
 def test_the_light_is_explained():
     def light(**settings):
         return simulated(spp=4, **settings).metadata["light"]
@@ -404,6 +408,7 @@ def test_bounces_of_mitransient_that_leave_nothing(settings):
         tal_bounces(*settings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["single", "confocal", "exhaustive"])
 def test_points_on_the_edges_of_the_wall(kind):
     """They stand where rays in single precision meet it."""

@@ -216,6 +216,7 @@ def test_spots_around_the_axis_of_a_laser(kind):
                                rtol=0, atol=1e-6)  # fmt: skip
 
 
+@pytest.mark.slow
 def test_forecasts_know_of_the_light():
     """Which bounces, and which energy."""
     found = N.forecast(Z, scan(), time_axis=AXIS, spp=4, bounces=(3, 4), energy={"type": "rgb", "value": [1, 0.5, 0.2]})

@@ -130,6 +130,7 @@ def test_bounds_under_vmap_and_their_gradient():
     assert torch.allclose(slope, torch.full((3,), 0.5))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "function",
     [

@@ -108,6 +108,7 @@ def copies():
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", copies())
 def test_copies_are_renderers_of_their_own(renderer, how):
     with torch.no_grad():

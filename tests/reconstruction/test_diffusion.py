@@ -174,6 +174,7 @@ def alphabet():
     return torch.stack([rendered(letter, poses) for letter in string.ascii_uppercase])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("letter", ["s", "t"])
 def test_letters_behind_foam_are_read(alphabet, letter):
     picture = front_view(f"letter_{letter}").flatten()

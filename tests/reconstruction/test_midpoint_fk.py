@@ -112,6 +112,7 @@ def test_front_view_of_a_letter(name, least):
     assert float((front * truth).sum() / (front.norm() * truth.norm())) > least
 
 
+@pytest.mark.slow
 def test_captures():
     scan = SCANS["single"]
     light = capture_of([(0.0, 0.0, 0.8)], scan)

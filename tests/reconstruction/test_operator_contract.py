@@ -139,6 +139,7 @@ def test_derivatives_of_second_order_of_some(name):
     assert torch.autograd.gradgradcheck(scaled, x.clone().requires_grad_(), fast_mode=True)
 
 
+@pytest.mark.slow
 @every
 def test_batches_and_channels_are_items_on_their_own(name):
     operator = OPERATORS[name]
@@ -245,6 +246,7 @@ def works_where_its_tables_are(name):
         assert operator.reconstruct(data_of(operator, 2).to("meta")).shape == (2, *operator.volume_shape)
 
 
+@pytest.mark.slow
 @some
 def test_works_where_its_tables_are(name):
     works_where_its_tables_are(name)
@@ -256,6 +258,7 @@ def test_the_others_work_where_their_tables_are(name):
     works_where_its_tables_are(name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("half", long([torch.bfloat16, torch.float16], [torch.bfloat16]))
 @every
 def test_autocast_does_not_reach_in(name, half):

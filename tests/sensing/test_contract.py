@@ -85,6 +85,7 @@ def same_as_in_single(entry, dtype, policies):
     assert gradient.dtype == dtype
 
 
+@pytest.mark.slow
 @each
 def test_half_precision_is_measured_in_single(entry):
     same_as_in_single(entry, torch.bfloat16, ["straight_through" if entry.random else None])
@@ -157,6 +158,7 @@ def test_gradcheck_of_long_expectations(entry):
 not_transformed = {"FreeRunningSPAD": ("vmap", "grad"), "EquiDepthHistogram": ("vmap",)}
 
 
+@pytest.mark.slow
 @each
 def test_functional_transforms(entry):
     """torch.func of the mean: mapped items are those of a batch, gradients those of autograd."""
@@ -189,6 +191,7 @@ def test_input_is_left_alone(entry):
     assert torch.equal(x, before)
 
 
+@pytest.mark.slow
 @each
 def test_copies_give_the_same(entry):
     module, x = entry.module(), entry.x()

@@ -43,6 +43,7 @@ def counts_of(mean, seed=0):
 # --------------------------------------------------------------------------------------------------- plain numbers
 
 
+@pytest.mark.slow
 @each
 def test_sensors_make_no_number_of_what_has_a_gradient(entry):
     """torch warns of it, once in a process; and draws have no gradient, whoever asks for them."""

@@ -344,6 +344,7 @@ def test_random_numbers_of_other_devices_change_nothing(tmp_path):
     assert model.weight[0, 0] == 3.0
 
 
+@pytest.mark.slow
 def test_compiled_modules_are_stored_as_they_were(tmp_path):
     path, model = tmp_path / "run.pt", tiny(3.0)
     save_checkpoint(path, {"model": torch.compile(tiny(1.0))}, step=1)

@@ -46,6 +46,7 @@ def test_bits_of_neighbours_are_unrelated(a, b):
     assert (differing.double().mean(0) - 0.5).abs().max() < 5 * 0.5 / count**0.5
 
 
+@pytest.mark.slow
 def test_renders_of_neighbours_are_uncorrelated():
     renderer = tt.TransientRenderer(tt.load(make_room(), variant=VARIANT), spp=4)
     draws = 200

@@ -37,6 +37,7 @@ def test_seeds_know_the_sample_alone(names):
     assert names["noise"].shape == (2,)
 
 
+@pytest.mark.slow
 def test_iterators_draw_from_the_global_generator(names):
     assert names["after_a_loader"] != names["untouched"]
     assert names["after_batches"] == names["untouched"]

@@ -91,6 +91,7 @@ def test_exposure_ignores_outliers_and_broken_pixels():
     assert exposure_of(spot) == 4.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("channels", long([1, 3], [3]))
 def test_picture(tmp_path, channels):
     cube = pulse(channels)

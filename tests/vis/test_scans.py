@@ -42,6 +42,7 @@ def curves(figure):
     return [panel.patches[0].get_data().values for panel in figure.axes]
 
 
+@pytest.mark.slow
 def test_curves_stand_where_their_points_do(tmp_path):
     capture, index = tilted()
     figure = tt.vis.transients_grid(capture, tmp_path / "a.png", rows=3, columns=4)

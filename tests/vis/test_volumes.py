@@ -68,6 +68,7 @@ def test_what_is_no_number_is_seen():
     assert tuple(panel.get_cmap()(np.ma.masked)) not in [(0.0, 0.0, 0.0, 1.0), (1.0, 1.0, 1.0, 1.0)]
 
 
+@pytest.mark.slow
 def test_depth_and_normals_beside_them(tmp_path):
     depth, mask = torch.full((5, 6), 0.7), torch.zeros(5, 6, dtype=torch.bool)
     mask[1, 0] = True

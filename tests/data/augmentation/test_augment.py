@@ -149,6 +149,7 @@ def behind_a_pane():
     return see
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_circular_light_is_that_of_the_scene_rendered_anew(behind_a_pane, name):
     operations, scene = CASES[name]

@@ -61,6 +61,7 @@ def cut(folder, left_out):
     os.truncate(folder / NAMES[1], (folder / NAMES[1]).stat().st_size - left_out)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("verified", [False, True])
 @pytest.mark.parametrize(
     "damage",

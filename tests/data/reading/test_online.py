@@ -170,6 +170,7 @@ def test_every_sample_is_made_once():
     assert max(seen) < 300 + 8 + 3
 
 
+@pytest.mark.slow
 def test_a_place_is_ordered_anew_only_when_what_was_drawn_there_is_copied(monkeypatch):
     """A producer may write as soon as it is told: here it has written before it is."""
     say = Producers._say

@@ -109,6 +109,7 @@ def test_another_process_makes_the_same_bytes(tmp_path):
     assert done.stdout.split() == [recipe.key(), mine]
 
 
+@pytest.mark.slow
 def test_structures_are_kept_and_come_back_the_same():
     """More structures than are kept: a scene that is built again makes the same bytes."""
     sizes = [0.1 + 0.02 * number for number in range(MOST_KEPT + 2)]
@@ -140,6 +141,7 @@ def test_scenes_one_of():
     assert abs(share - 2 / 3) < 4 * np.sqrt(2 / 9 / 1000)
 
 
+@pytest.mark.slow
 def test_nodes_and_texts_are_exchanged():
     d = box()
     nodes = [d["small-box"], {"type": "sphere", "to_world": d["small-box"]["to_world"], "bsdf": d["small-box"]["bsdf"]}]
@@ -186,6 +188,7 @@ def test_light_outside_of_the_window():
     assert sample.outside[1] == pytest.approx(whole[40:].sum() / whole.sum(), rel=1e-2)
 
 
+@pytest.mark.slow
 def test_standard_error_falls_with_samples():
     """As the square root; of renders that are little but noise it is close to one."""
     plane = tt.scenes.light_over_plane()
@@ -407,6 +410,7 @@ class Steps(D.Uniform):
         return np.round(super().draw(random, place) * 4) / 4
 
 
+@pytest.mark.slow
 def test_entries_that_look_alike_are_other_structures():
     scene = box() | {"white": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.1] * 3}}}
     recipe = small(scene, {"white.reflectance": Blob()}, variant="llvm_ad_rgb", labels=["albedo"])
@@ -497,6 +501,7 @@ def test_nodes_are_exchanged_before_what_is_in_them():
         small(scene, lacking).check()
 
 
+@pytest.mark.slow
 def test_values_of_a_key_are_of_one_kind():
     mixed = small(vary={"red.reflectance": D.Choice([0.5, {"type": "rgb", "value": [0.1, 0.2, 0.3]}])})
     assert {type(mixed.sample(index).values["red.reflectance"]) for index in range(6)} == {str}
@@ -507,6 +512,7 @@ def test_values_of_a_key_are_of_one_kind():
     assert numbers.key() == again.key() and numbers.structure(0).text == again.structure(0).text
 
 
+@pytest.mark.slow
 def test_texts_of_structures_do_not_depend_on_how_arrays_are_printed():
     scene = box() | {"thing": {"type": "sphere", "radius": 0.9, "center": [0.0, 0.0, 0.5]}}
     vary = {"thing.center": D.Uniform([0.01] * 3, [0.04] * 3)}

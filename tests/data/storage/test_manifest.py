@@ -53,6 +53,7 @@ def test_failures_are_told(data):
     assert report.complete and report.failed == {1: "dark"} and report.samples == 9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", [0.1, 0.5, 0.9, 0.99999])
 def test_one_bit(data, place):
     build_manifest(data)
@@ -125,6 +126,7 @@ def test_other_stores_and_manifests(data):
     assert "manifest.json" not in verify(data).faults
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "words"),
     [

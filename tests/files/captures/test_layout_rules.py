@@ -86,6 +86,7 @@ NUMBERS = (
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @together("dtype", NUMBERS)
 @together("layout", WRITTEN)
 def test_numbers_of_every_kind(tmp_path, layout, dtype):

@@ -156,6 +156,7 @@ def test_gradient_through_the_jitter_is_that_of_the_draw(policy):
     assert torch.autograd.gradcheck(lambda v: jitter(v, torch.Generator().manual_seed(3)), x)
 
 
+@pytest.mark.slow
 def test_streak_camera_moments():
     """Mean and variance of a flat field: gain noise and read noise; neighbours are correlated by the phosphor."""
     axis = TimeAxis.from_seconds(0.0, 1e-12, 24)

@@ -102,6 +102,7 @@ def test_a_nested_sensor_is_the_sensor(nested, plain):
         torch.testing.assert_close(spread(found), wanted, rtol=close, atol=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "policy"),
     # Every chain under one policy, every policy under several chains.

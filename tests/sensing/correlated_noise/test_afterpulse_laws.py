@@ -257,6 +257,7 @@ def test_frequent_afterpulses(mode, dead, tau):
             assert found.within(1.5), (total, kind, found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "mode, dead, tau, total",
     long_rows(

@@ -146,6 +146,7 @@ def test_bright_light_takes_few_steps():
     assert float(gmres(operator, u, u, 1e-11)[1].max()) > 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flux, bound", [(1.0, 1e-5), (10.0, 2e-3), (30.0, 5e-3), (100.0, 1e-2)])
 @pytest.mark.parametrize("dead", [12.8, 45.3])
 def test_against_the_dense_limit(flux, bound, dead):
@@ -202,6 +203,7 @@ def test_a_phase_locked_at_the_edge_of_a_bin(monkeypatch):
         nonparalyzable_histogram(image(light), 31.9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flux, dead", [slow(100.0, 5.3), slow(100.0, 11.5), (40.0, 12.4)])
 def test_gradients_in_bright_light(flux, dead):
     x = image(flux * shapes(12)[:3]).clone().requires_grad_()
@@ -261,6 +263,7 @@ def test_draws_near_resonance(flux, dead, periods):
     assert far.max() < 5.5
 
 
+@pytest.mark.slow
 def test_a_phase_that_is_remembered():
     """Two bright bins, each of which leads back to itself: a train stays with the one where it began."""
     row = np.full(16, 1e-3)
@@ -280,6 +283,7 @@ def test_more_detections_than_can_be_drawn(monkeypatch):
         spad.sample(torch.full((1, 16, 1, 1), 1000 / 16.0))
 
 
+@pytest.mark.slow
 def test_totals_in_saturation():
     """Renewal theory: a Fano factor of 1/(1 + n d)^2, 0.010 where independent periods have 0.41."""
     n, dead, periods = 1.5, 6.0, 10_000
@@ -307,6 +311,7 @@ def test_trains_of_one_period_and_of_the_dark():
         assert FreeRunningSPAD(5, 5e-10, bin_width_s=1e-10, grad=grad)(empty).shape == empty.shape
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind, dead", [slow("non_paralyzable", 2.3), slow("non_paralyzable", 7.5), ("paralyzable", 2.3)]
 )

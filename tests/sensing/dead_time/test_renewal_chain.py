@@ -171,6 +171,7 @@ def test_rows_that_do_not_converge_are_solved_directly(monkeypatch):
         torch.autograd.grad(pi[:, 0].sum(), leaf)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("whole, part", [(0, 0.7), (5, 0.1)])
 def test_carriers_on_a_ring_are_those_of_the_matrix(whole, part):
     """x = F (kept x + source), F the step of the losses; differentiable in all that is given, in both modes."""

@@ -83,6 +83,7 @@ def test_the_error_of_the_review():
     np.testing.assert_allclose(found[bins], events.mean[bins], rtol=0.06)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape, total", [("pulse", 3.0), ("pulse", 30.0), ("ends", 100.0), ("spike", 60.0)])
 @pytest.mark.parametrize("dead", [0.6, 1.3, 7.0])
 def test_bins_cut_or_not_give_the_same(shape, total, dead):
@@ -148,6 +149,7 @@ def test_pixels_of_all_levels():
     assert sample_detections(torch.zeros(0, 1, 8, 2, 2), 10, 1.3).shape == (0, 1, 8, 2, 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dead", [0.6, 1.0, 1.3, 5.0, 5.6, 40.4])
 def test_the_walk_is_the_recursion_in_steps(dead):
     """Means and gradients by columns and their adjoint: float64 rounding beside autograd through the recursion."""
@@ -194,6 +196,7 @@ def test_forward_derivatives_where_no_graph_is_built():
         torch.testing.assert_close(found[1], found[0], rtol=1e-12, atol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dead", [slow(0.7), 1.3])
 def test_gradients(dead):
     x = mixed()[..., :2] + 0.01  # not cut, and cut
@@ -259,6 +262,7 @@ def test_estimates_have_gradients_where_no_cycle_is_armed():
     assert bool(slope.isfinite().all()) and bool((slope[:, 3:] != 0).all())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dead", [1.0, 1.4, 2.3])
 def test_slopes_of_estimates_where_nothing_was_detected(dead):
     """A detection more in a bin without one: the rate rises by the time that cycles are armed in it, as it does."""

@@ -197,6 +197,7 @@ def test_lines_that_dip_below_zero_are_drawn_from_within_limits():
     assert torch.equal(state.armed, armed.clamp(0, 1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dead", [1.3, 2.0, 11.7])
 def test_stationary_states_in_bright_light_are_within_limits(dead):
     """Straight lines miss the edges of bins by up to a third of what is in them; no number of a state does."""

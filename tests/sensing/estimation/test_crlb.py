@@ -310,6 +310,7 @@ def test_errors():
 # ---------------------------------------------------------------------------------------------------------- estimators
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fwhm_bins", [1.5, 5.0])
 @pytest.mark.parametrize("background", [0.0, 0.05, 0.6])
 @pytest.mark.parametrize("photons", [50.0, 2000.0])

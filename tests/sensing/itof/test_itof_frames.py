@@ -116,6 +116,7 @@ def test_differences_that_are_read_as_taps_have_no_deviation():
     assert right.depth_std_m.mean().item() == pytest.approx(measured.item(), rel=0.12)
 
 
+@pytest.mark.slow
 @together("electrons", [0.0, 3.0, 100.0, 2e4])
 @together("readout", ["single", "two_tap", "differential"])
 @together("code", [sensing.sine_code(4), sensing.square_code(3), sensing.square_code(4, 0.1, 0.3)])

@@ -135,6 +135,7 @@ def test_two_quadrature_steps_of_two_taps_wiggle_as_four_taps():
 # ------------------------------------------------------------------------------------------------------------- noise
 
 
+@pytest.mark.slow
 @together("dark_e, read_noise_e", [(0.0, 0.0), (150.0, 0.0), (40.0, 25.0)])
 @together("num_taps, readout", [p for p in pairs(range(2, 9), READOUTS) if p != (2, "single")])
 def test_variance_of_phase_and_depth(num_taps, readout, dark_e, read_noise_e):
@@ -307,6 +308,7 @@ def test_reversed_steps(direction):
     torch.testing.assert_close(back.coefficients([0, 1, 3, -3]), spectrum[:, [0, 1, 3, size - 3]], rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 @together(
     "name, readout",
     [
@@ -490,6 +492,7 @@ def test_errors(call, error):
         call()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("readout", ["two_tap", "differential", "single"])
 def test_the_standard_deviation_at_the_corners_of_a_square_code(readout):
     """The slope has two values at a corner: one of them was claimed, up to 19 % too small."""

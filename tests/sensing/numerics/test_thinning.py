@@ -62,6 +62,7 @@ def test_frequencies(draw, dtype):
         chi_square_is_small(found[case == k].numpy(), number, exact)
 
 
+@pytest.mark.slow
 @together("n, p", CASES)
 def test_frequencies_of_equal_entries(n, p):
     """Every case alone: blocks take the way that suits all of their entries."""

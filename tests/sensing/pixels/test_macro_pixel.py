@@ -123,6 +123,7 @@ def test_draws_of_equal_spads_are_one_draw_of_more_cycles():
     assert float(error.max()) < 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("policy", ["gaussian", "straight_through"])
 def test_totals_of_free_spads_vary_as_those_of_independent_ones(policy):
     """50 photons a period on each, dead for 33.7 of 32 bins: one train of N times the periods varies N times less.
@@ -355,6 +356,7 @@ def test_no_image_at_all(make):
         assert measure(torch.ones(0, 1, BINS, 2, 2)).shape == (0, 1, BINS, 2, 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("photons", long([1e-3, 40.0, 400.0, 1e12, 1e15], [1e-3, 40.0, 400.0]))
 def test_coincidences_of_a_bin_with_any_number_of_photons(photons):
     """All light in bin 0, first photons, a window of a bin: one as soon as k of n SPADs have fired, none after that.

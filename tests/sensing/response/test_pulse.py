@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.marks import long
 from torchtransient import plugins
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.response.pulse import apply_pulse, axis_with_margin, pulse_kernel
@@ -147,7 +148,7 @@ def room():
     return tt.load(make_room(), variant=VARIANT)
 
 
-@pytest.mark.parametrize("name", PULSES)
+@pytest.mark.parametrize("name", long(PULSES, ["both"]))
 def test_render_time_and_torch_agree(room, name):
     """Same seed, same paths: what differs is where in its bin an arrival is."""
     pulses = PULSES[name]

@@ -315,6 +315,7 @@ def test_counts_behind_a_shut_gate_say_nothing():
     assert found.valid.flatten().tolist() == [True, False, True]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dead", [None, 2.0, 2.5])
 def test_where_counts_tell_the_rate(dead):
     """Up to a share of 1 - 1/2N of what is armed, half a cycle is none; those that come back are armed anew."""
