@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from support.sensing.all_entries import ENTRIES, LONG, each, each_long, each_quick
+from support.sensing.all_entries import ENTRIES, each, each_long, each_quick
 from support.sensing.contract import HALVES, LOOSE, expected, parts, pickled, through_state_dict
 from support.sweeps import together
 from torchtransient import sensing
@@ -139,8 +139,9 @@ def derivatives_are_right(entry):
 
     inputs = (x, *learnable.values())
     assert torch.autograd.gradcheck(
-        f, inputs, atol=1e-6, rtol=1e-4, nondet_tol=1e-12, fast_mode=True, check_forward_ad=True
-    )
+        f, inputs, atol=1e-6, rtol=1e-4, nondet_tol=1e-12, fast_mode=True, check_forward_ad=True,
+        check_undefined_grad=False,
+    )  # fmt: skip
 
 
 @each_quick
@@ -237,14 +238,14 @@ def reproduces(entry, policy):
         assert all(torch.equal(a, b) for a, b in zip(first, parts(module(x)), strict=True))
 
 
-# Of the long ones under one policy that draws.
-@together("entry, policy", [(e, p) for e, p in EVERY_POLICY if e.name not in LONG or p == "straight_through"], named)
+# Under one policy that draws.
+@together("entry, policy", [(e, p) for e, p in EVERY_POLICY if p == "straight_through"], named)
 def test_generator_reproduces(entry, policy):
     reproduces(entry, policy)
 
 
 @pytest.mark.slow
-@together("entry, policy", [(e, p) for e, p in EVERY_POLICY if e.name in LONG and p != "straight_through"], named)
+@together("entry, policy", [(e, p) for e, p in EVERY_POLICY if p in ("gaussian", "score")], named)
 def test_generator_reproduces_under_every_policy(entry, policy):
     reproduces(entry, policy)
 

@@ -82,8 +82,7 @@ DEAD = [0.7, 12.8, 15.9, 16.0, 31.9, 45.3, 100.5]
 
 @pytest.mark.parametrize(
     ("flux", "dead"),
-    # Every light with two dead times, every dead time with two lights.
-    long_pairs(FLUXES, DEAD, [(flux, DEAD[(n + k) % 7]) for n, flux in enumerate(FLUXES) for k in (0, 3)]),
+    long_pairs(FLUXES, DEAD, list(zip(FLUXES, DEAD[3:] + DEAD[:3], strict=True))),
 )
 def test_the_solver_against_dense_matrices(flux, dead):
     """Iterative, direct and dense solutions of the same chain, nearly reducible ones too."""
@@ -238,7 +237,7 @@ def test_draws_are_those_of_one_detector(which, flux, dead):
 
 
 RESONANT = [
-    (5.0, 10.3, 3), (10.0, 10.3, 10), (100.0, 31.68, 200), (100.0, 15.7, 200), (20.0, 30.4, 200),
+    (10.0, 10.3, 10), (100.0, 31.68, 200), slow(5.0, 10.3, 3), slow(20.0, 30.4, 200),
     *(slow(r, d, n) for r in (0.1, 1.0, 10.0, 100.0) for d in (9.6, 10.35, 15.7, 31.68, 63.0, 96.0)
       for n in (1, 2, 10, 100, 2000) if not (r == 0.1 and n == 2000)),
 ]  # fmt: skip
@@ -276,6 +275,7 @@ def test_a_phase_that_is_remembered():
     assert bool(((first > 0.99) | (first < 0.01)).all()) and 0 < float(first.mean()) < 1
 
 
+@pytest.mark.slow
 def test_more_detections_than_can_be_drawn(monkeypatch):
     monkeypatch.setattr(free_running_ring, "MOST_ONE_BY_ONE", 1100)
     spad = FreeRunningSPAD(1200, 15.984e-10, bin_width_s=1e-10)
@@ -350,7 +350,7 @@ def test_score_is_unbiased(kind, dead):
     assert float(wanted.abs().max()) > 0.2
 
 
-@pytest.mark.parametrize("dead, peak", [(3.3, 30.0), (12.8, 60.0)])
+@pytest.mark.parametrize("dead, peak", [(3.3, 30.0)])
 def test_bins_are_cut_where_light_changes(dead, peak):
     """Pulses in which detectors are armed again, beside bins cut in 64."""
     from torchtransient.sensing.dead_time.free_running_state import _solved, stationary_state

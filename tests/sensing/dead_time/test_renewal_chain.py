@@ -89,18 +89,6 @@ def test_the_transpose_is_one(bins, whole, part, high):
     torch.testing.assert_close(back, forwards.mT, rtol=1e-11, atol=1e-13)
 
 
-@pytest.mark.parametrize("bins, whole, part", [(5, 2, 0.3), (7, 0, 0.6), (25, 22, 0.9)])
-@pytest.mark.parametrize("transposed", [False, True])
-def test_the_banded_solution_is_that_of_the_dense_matrix(bins, whole, part, transposed):
-    rate = rates(bins)
-    right = torch.rand(2, 2 * bins, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    pinned = torch.tensor([1, 3])
-    found = solve_banded(chain_of(rate, whole, part), right, pinned, transposed=transposed)
-    matrix = torch.eye(2 * bins, dtype=torch.float64) - matrices(rate, whole, part, transposed=transposed)
-    matrix = matrix + torch.diag_embed(torch.nn.functional.one_hot(pinned, 2 * bins).double())
-    torch.testing.assert_close(found, torch.linalg.solve(matrix, right), rtol=1e-9, atol=1e-10)
-
-
 def solved(rate, part, whole):
     """Stationary lines, their derivatives in both modes by light and dead time, and what becomes of a change."""
     leaves = rate.clone().requires_grad_(), part.clone().requires_grad_()

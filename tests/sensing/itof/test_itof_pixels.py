@@ -75,7 +75,12 @@ def frames(code, turns, readout, light=1000.0, contrast=0.7, background=300.0):
     return found[None, :, None]
 
 
-@pytest.mark.parametrize("name, readout", list(pairs(CODES, READOUTS)))
+@pytest.mark.parametrize("name, readout", [
+        (name, readout)
+        for n, name in enumerate(CODES)
+        for readout in (READOUTS if CODES[name].num_taps in (2, 4) else READOUTS[n % 3 :][:1])
+    ],
+)
 def test_every_code_and_readout_gives_the_phase(name, readout):
     """Decoded by shape, through a transient and through the definition; two steps of one tap are refused."""
     code, turns = CODES[name], torch.linspace(0.003, 0.997, 101, dtype=torch.float64)
@@ -254,7 +259,7 @@ def test_readings_have_gradients(readout):
         found = read_itof(taps, F, 4, readout=readout, calibration=known, noise=noise)
         return found.depth_m, found.amplitude, found.depth_std_m
 
-    assert torch.autograd.gradcheck(read, taps)
+    assert torch.autograd.gradcheck(read, taps, fast_mode=True)
 
 
 # ------------------------------------------------------------------------------------------------------- calibration
@@ -430,10 +435,10 @@ def test_raw_frames_of_whole_numbers(kind):
 @pytest.mark.parametrize(
     "given",
     [
-        [60.6e6, 20e6], (60.6e6, 20e6), np.array([60.6e6, 20e6]), torch.tensor([60.6e6, 20e6]),
-        [torch.tensor(60.6e6), np.float64(20e6)], np.array([60_600_000, 20_000_000]),
+        [60.6e6, 20e6], torch.tensor([60.6e6, 20e6]), [torch.tensor(60.6e6), np.float64(20e6)],
+        np.array([60_600_000, 20_000_000]),
     ],
-    ids=["list", "tuple", "array", "tensor", "numbers", "whole"],
+    ids=["list", "tensor", "numbers", "whole"],
 )  # fmt: skip
 def test_frequencies_of_any_kind(given):
     camera = ItofCorrelation(sine_code(3), given, AXIS)

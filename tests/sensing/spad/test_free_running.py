@@ -143,7 +143,7 @@ def test_learnable_dead_time_is_found():
 
 @pytest.mark.parametrize("dead", long([10.5, 25.2, 80.5], [10.5]))
 def test_samples(dead):
-    rate, cycles, repeats = as_image(pulse(2.0)), 300, 3000
+    rate, cycles, repeats = as_image(pulse(2.0)), 300, 800
     spad = FreeRunningSPAD(cycles, dead * 1e-10, bin_width_s=1e-10, grad="straight_through")
     h = spad(rate.unsqueeze(0).expand(repeats, 1, BINS, 1, 1), generator=torch.Generator().manual_seed(0)).squeeze()
     mean, variance = spad.expected(rate).flatten(), spad.variance(rate).flatten()

@@ -113,7 +113,7 @@ def test_multinomial_of_many_trials():
     assert single.dtype == torch.float32
 
 
-@pytest.mark.parametrize("bins", [1, 2, 5, 64, 97])
+@pytest.mark.parametrize("bins", [1, 5, 97])
 def test_first_photons_are_the_multinomial_of_their_probabilities(bins):
     """Chi-square over bins and "none", for weak light, strong light and a flood, without any running sum."""
     g, cycles = torch.Generator().manual_seed(4), 200
@@ -231,7 +231,7 @@ def test_the_score_has_mean_zero_and_coates_makes_it_vanish(dead_bins):
 )
 def test_policies_against_finite_differences(policy, f, bias):
     """Gradient in the brightness of the pulse, of a loss on the peak bin; pile-up makes it negative."""
-    rate, cycles, draws = pulse(1.0, 8), 30, 60_000
+    rate, cycles, draws = pulse(1.0, 8), 30, 20_000
     brightness = torch.full((draws, 1, 1, 1, 1), 1.6, dtype=torch.float64, requires_grad=True)
     losses = {
         "linear": lambda y: y[:, 0, 6],
