@@ -199,6 +199,7 @@ def test_debug_shows_where_an_error_comes_from(folder):
     assert isinstance(result.exception, tt.errors.SceneError)
 
 
+@pytest.mark.slow
 def test_cost(folder):
     result = run(
         "cost", "box.xml", "--spp", "4,8", "--repeats", 2, "--gradient", "grey.reflectance.value", "--sampler",

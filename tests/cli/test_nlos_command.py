@@ -16,6 +16,7 @@ import torch
 from click.testing import CliRunner
 
 import torchtransient as tt
+from support.marks import long
 from torchtransient.cli.main import main
 
 VARIANT = "llvm_ad_mono"
@@ -93,7 +94,7 @@ def run(*arguments):
     return CliRunner().invoke(main, ["nlos", *map(str, arguments)])
 
 
-@pytest.mark.parametrize("kind", ["single", "confocal", "exhaustive"])
+@pytest.mark.parametrize("kind", long(["single", "confocal", "exhaustive"], ["single"]))
 def test_a_capture_of_a_description(folder, kind):
     (folder / "own.yaml").write_text(OWN % kind)
     result = run("own.yaml", "--parts", 3, "--quiet")

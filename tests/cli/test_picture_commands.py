@@ -85,7 +85,7 @@ KINDS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("kind", "more"), long_rows(KINDS, [KINDS[2], KINDS[3], KINDS[5], KINDS[7]]))
+@pytest.mark.parametrize(("kind", "more"), long_rows(KINDS, [KINDS[3], KINDS[5]]))
 def test_kinds_of_pictures(folder, result, kind, more):
     done = run("picture", "box.h5", "out.png", "--kind", kind, *more)
     assert done.exit_code == 0, done.output

@@ -11,7 +11,7 @@ from support.mutated_files import run
 from support.read_files import READERS
 
 # Of each reader, in one process.
-FEW = 6
+FEW = 3
 _TEXTS = ("WebDataset", "device", "setup", "scene", "capture of cdt", "capture of keyhole", "result")
 SOME = {name: 60 if name in _TEXTS else 12 for name in READERS if name not in ("built scene", "data set")}
 

@@ -234,9 +234,9 @@ def test_gradcheck_in_the_dark(loss, exposures):
     assert bool(torch.isfinite(slope).all())
 
 
-@pytest.mark.parametrize("cycles", [40, 1000, 30_000])
-@pytest.mark.parametrize("reduction", ["mean", "sum"])
-@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize(
+    "cycles, reduction, masked", [(40, "mean", False), (1000, "sum", True), (30_000, "sum", False)]
+)
 def test_slopes_of_half_precision_are_numbers_whatever_the_cycles(cycles, reduction, masked):
     """Slopes are counts over the level, times cycles: -inf of float16 from three cycles on, and of coarse bins."""
     n = torch.zeros(1, 8, 1, 2)

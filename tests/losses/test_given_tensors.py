@@ -140,10 +140,11 @@ def test_records_have_bins(case):
 
 WHOLE = (torch.uint8, torch.int8, torch.int16, torch.uint16, torch.int32, torch.uint32, torch.int64, torch.uint64)
 FLOATING = (torch.float16, torch.bfloat16, torch.float8_e4m3fn, torch.float8_e5m2)
+SOME = (torch.uint8, torch.int16, torch.uint64, torch.bfloat16, torch.float8_e5m2, torch.bool)
 
 
 @over(lambda case: case.pair and not case.tensors()[0].is_complex())
-@together("dtype", [*WHOLE, *FLOATING, torch.bool])
+@together("dtype", SOME)
 def test_targets_of_every_kind(case, dtype):
     x, y = case.tensors(dtype=torch.float32)
     y = (y if case.draw_target is not None else 100 * y).to(dtype)
@@ -160,7 +161,7 @@ def real_pair(case):
 
 
 @over(real_pair)
-@together("dtype", [*WHOLE, *FLOATING, torch.bool])
+@together("dtype", SOME)
 def test_inputs_of_every_kind(case, dtype):
     x, y = case.tensors(dtype=torch.float32)
     x = (100 * x).to(dtype)
@@ -214,18 +215,16 @@ def test_anscombe_of_every_kind(dtype):
 
 
 @over(lambda case: case.function is not losses.measurement_consistency)  # its operator is the user's
-@together("half", [torch.float16, torch.bfloat16])
-def test_autocast_does_not_reach_in(case, half):
-    for dtype in (torch.float32, torch.float64):
-        pair = [t.requires_grad_() for t in case.tensors(dtype=dtype)]
-        leaves = pair if case.pair else pair[:1]
-        wanted = case(*pair)
-        slopes = torch.autograd.grad(wanted, leaves)
-        with torch.autocast("cpu", dtype=half):
-            found = case(*pair)
-            narrowed = torch.autograd.grad(found, leaves)
-        torch.testing.assert_close(found, wanted, rtol=0, atol=0)
-        torch.testing.assert_close(narrowed, slopes, rtol=0, atol=0)
+def test_autocast_does_not_reach_in(case):
+    pair = [t.requires_grad_() for t in case.tensors(dtype=torch.float32)]
+    leaves = pair if case.pair else pair[:1]
+    wanted = case(*pair)
+    slopes = torch.autograd.grad(wanted, leaves)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        found = case(*pair)
+        narrowed = torch.autograd.grad(found, leaves)
+    torch.testing.assert_close(found, wanted, rtol=0, atol=0)
+    torch.testing.assert_close(narrowed, slopes, rtol=0, atol=0)
 
 
 # ---------------------------------------------------------------------------------------------------------- of nothing

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 import torchtransient as tt
+from support.marks import long
 
 VARIANT = "llvm_ad_mono"
 WALL = tt.nlos.Wall.plane(2.0, 1.6, albedo=0.7)
@@ -25,7 +26,7 @@ def light(plan):
     return next(line for line in plan.reasons if line.startswith("light: "))
 
 
-@pytest.mark.parametrize("kind", ["single", "confocal", "exhaustive"])
+@pytest.mark.parametrize("kind", long(["single", "confocal", "exhaustive"], ["confocal"]))
 def test_a_capture_is_planned_and_rendered(kind):
     plan = tt.plan(scene(kind, filter_bounces=3, min_bounces=0))
     assert (plan.variant, plan.integrator, plan.max_depth) == ("llvm_ad_mono", "transient_nlos_path", 3)

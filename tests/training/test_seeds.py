@@ -23,6 +23,7 @@ def test_a_function_of_run_step_and_sample_alone():
     assert Seeds(0).generator(0).initial_seed() == 4575342053079085010
 
 
+@pytest.mark.slow
 def test_no_collisions_in_a_step():
     seeds = Seeds(0)(12, range(200_000))
     # Of so many random numbers 4.7 pairs would collide, exp(-4.7) = 0.009 is the chance of none.

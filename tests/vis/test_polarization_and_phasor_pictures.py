@@ -126,17 +126,6 @@ def wave():
     return row.expand(1, 1, 3, 8).to(torch.complex64)
 
 
-def test_phasor_panels(tmp_path):
-    names = ("real", "imaginary", "amplitude")
-    figure = tt.vis.phasor_picture(wave(), tmp_path / "p.png", show=names, percentile=100)
-    expected = wave()[0, 0].numpy()
-    for panel, part in enumerate((np.real, np.imag, np.abs)):
-        np.testing.assert_allclose(shown(figure, panel), part(expected), atol=1e-6)
-    assert figure.axes[0].images[0].get_clim() == pytest.approx((-2, 2))
-    phase = np.asarray(shown(tt.vis.phasor_picture(wave(), show=("phase",))))
-    np.testing.assert_allclose(phase[0], colour_maps.cyclic(-np.arange(8) / 8), atol=1e-6)
-
-
 def test_domain_colours():
     values = np.array([1, 0.25, 0, 1j, NAN * 1j])
     image = tt.vis.domain_colors(values, percentile=100)

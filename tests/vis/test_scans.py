@@ -158,8 +158,7 @@ MESH = scenes.triangle_mesh(VERTICES, FACES)
 @pytest.mark.parametrize(
     "hidden",
     [
-        (VERTICES, FACES), [VERTICES.tolist(), FACES.tolist()], SimpleNamespace(vertices=VERTICES, faces=FACES), MESH,
-        {"a": MESH}, {"type": "scene", "a": MESH}, (torch.tensor(VERTICES, requires_grad=True), torch.tensor(FACES)),
+        SimpleNamespace(vertices=VERTICES, faces=FACES), MESH, (torch.tensor(VERTICES, requires_grad=True), FACES),
         {"white": {"type": "diffuse"}, "a": MESH | {"bsdf": {"type": "ref", "id": "white"}}},
     ],
 )  # fmt: skip

@@ -107,8 +107,8 @@ def test_going_on(calm, tmp_path):
     [
         (FakeRecipe(seed=1), {}, "recipe is another one .seed is 0 there and 1 here"),
         (RECIPE, {"store": "rounded"}, "store is 'exact' there"),
-        (RECIPE, {"max_outside": 0.5}, "max_outside is 0.01 there"),
-        (RECIPE, {"resume": False}, "resume=False"),
+        pytest.param(RECIPE, {"max_outside": 0.5}, "max_outside is 0.01 there", marks=pytest.mark.slow),
+        pytest.param(RECIPE, {"resume": False}, "resume=False", marks=pytest.mark.slow),
     ],
 )
 def test_the_folder_of_another_data_set(calm, recipe, changes, words):

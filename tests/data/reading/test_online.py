@@ -101,7 +101,7 @@ def simulate(uses, capacity, speed, draws=4000, producers=2, warm=4):
 RINGS = list(itertools.product([0.01, 0.2, 5.0], [2, 3, 64], [0.5, 1.0, 5.0, 20.0]))
 
 
-@pytest.mark.parametrize(("speed", "capacity", "uses"), long_rows(RINGS, RINGS[::5]))
+@pytest.mark.parametrize(("speed", "capacity", "uses"), long_rows(RINGS, RINGS[::9]))
 def test_mean_use_is_bounded(uses, capacity, speed):
     schedule, used = simulate(uses, capacity, speed, warm=min(4, capacity))
     mean = schedule.drawn / schedule.made

@@ -27,7 +27,7 @@ def scans():
     """Of every kind with few points, and with one."""
     for legs in (True, False):
         settings = {**ORIGINS, "first_and_last_leg": legs}
-        for size in ((1, 1), (3, 1), (1, 3), (2, 2)):
+        for size in ((1, 1), (3, 1), (1, 3), (2, 2)) if legs else ((2, 2),):
             for kind in KINDS:
                 for spots in ((1, 1), (2, 1)) if kind == "exhaustive" else (None,):
                     if kind != "exhaustive" or size != (1, 1) or spots != (1, 1):
@@ -296,8 +296,8 @@ def test_counts_of_few_photons(tmp_path):
     """MATLAB packs them into less than a bit each; what is unpacked is compared with what is stored."""
     import scipy.io
 
-    counts = np.random.default_rng(0).random((64, 64, 512)) < 1e-4
-    for kind in (np.uint8, np.uint16, np.float32, np.float64):
+    counts = np.random.default_rng(0).random((32, 32, 512)) < 1e-4
+    for kind in (np.uint8, np.uint16, np.float64):
         scipy.io.savemat(
             tmp_path / "a.mat", {"rect_data": counts.astype(kind), "width": 0.5, "ts": 4e-12}, do_compression=True
         )
