@@ -265,4 +265,4 @@ def test_import_leaves_heavy_packages_alone():
     assert result.returncode == 0, result.stderr
     heavy, count = result.stdout.split("\n")[:2]
     assert heavy == ""
-    assert int(count) < 120  # the package's own modules and a few of the standard library
+    assert int(count) < 150  # the package's own modules and some of the standard library

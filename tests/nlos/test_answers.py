@@ -62,7 +62,7 @@ def physics_of(act):
 # ------------------------------------------------------------------------------------------------------------ settings
 
 
-@pytest.mark.parametrize("parameters", long([(), [VERTICES]], [[VERTICES]]))
+@pytest.mark.parametrize("parameters", long([(), [VERTICES]], [()]))
 def test_bins_that_nobody_gave(parameters):
     """Those of `simulate`: they hold all light of three bounces, but what a wider filter spreads over their rim."""
     made = renderer(parameters, time_axis=None)(seed=0)
@@ -109,7 +109,7 @@ def test_what_metadata_say():
 # --------------------------------------------------------------------------------------------------- points of a call
 
 
-@pytest.mark.parametrize("key", POINT_TENSORS)
+@pytest.mark.parametrize("key", long(POINT_TENSORS, [POINTS, LASER_ORIGIN]))
 def test_captures_know_the_points_of_their_call(key):
     of = scan("single")
     layer, old = renderer([key], of=of), getattr(of, POINT_TENSORS[key])
@@ -133,6 +133,7 @@ def test_spots_of_confocal_scans_follow_their_points():
     assert torch.equal(made.sensor_points.reshape(-1, 3), moved)
 
 
+@pytest.mark.slow
 def test_scans_stay_what_they_were():
     """A step of an optimizer changes its leaves, not the captures before it."""
     leaf = torch.nn.Parameter(scan().sensor_points.clone())

@@ -52,9 +52,9 @@ def test_later_light_is_told():
 def test_why_paths():
     metal = tt.scenes.nlos_z()
     metal["letter"]["bsdf"] = {"type": "roughconductor", "alpha": 0.3, "id": "metal"}
-    plan = tt.plan(scene(hidden=metal))
+    plan = tt.plan(scene(hidden=metal), pilot=False)
     assert "light of three bounces from paths, since not all surfaces are diffuse" in light(plan)
-    assert "as third_bounce asks for" in light(tt.plan(scene(third_bounce="paths")))
+    assert "as third_bounce asks for" in light(tt.plan(scene(third_bounce="paths"), pilot=False))
 
 
 def test_without_a_pilot_run_the_depth_is_kept():

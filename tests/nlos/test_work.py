@@ -21,7 +21,7 @@ from torchtransient.nlos.work import Film, HiddenWork
 
 N = tt.nlos
 VARIANT = "llvm_ad_mono"
-AXIS = tt.TimeAxis(1.9, 0.05, 40)
+AXIS = tt.TimeAxis(1.9, 0.02, 100)
 WALL = N.Wall.plane(2.0, 1.6, albedo=0.9)
 Z = tt.scenes.nlos_z()
 simulation = importlib.import_module("torchtransient.nlos.simulation")

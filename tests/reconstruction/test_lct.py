@@ -135,7 +135,8 @@ def tilted_plate(angle, squared):
 )
 def test_normals_of_plates(angle, squared, least, most):
     light = tilted_plate(angle, squared)
-    vectors = DirectionalLCT(SCAN, time_axis=AXIS, snr=100.0, dtype=F64).reconstruct(light)
+    operator = DirectionalLCT(SCAN, time_axis=AXIS, snr=100.0, dtype=F64)
+    vectors = operator.reconstruct(light)
     albedo = vectors.norm(dim=0)
     bright = albedo > 0.5 * albedo.max()
     mean = vectors[:, bright].sum(1)
@@ -143,7 +144,7 @@ def test_normals_of_plates(angle, squared, least, most):
     # The shortest explanation leans towards the wall: three quarters of the angle, 17 degrees.
     assert least < found < most
     assert abs(float(mean[1])) < 0.02 * float(mean.norm())
-    depth = float(DirectionalLCT(SCAN, time_axis=AXIS).depths[albedo.amax((1, 2)).argmax()])
+    depth = float(operator.depths[albedo.amax((1, 2)).argmax()])
     assert abs(depth - 0.8) < 0.2 * math.sin(abs(angle)) + 0.02
 
 

@@ -105,7 +105,9 @@ def with_operand(name, way):
 
 def has_its_derivatives(name, way):
     operator, function, x, scaled = with_operand(name, way)
-    assert torch.autograd.gradcheck(scaled, x.clone().requires_grad_(), check_forward_ad=True, fast_mode=True)
+    assert torch.autograd.gradcheck(
+        scaled, x.clone().requires_grad_(), check_forward_ad=True, fast_mode=True, check_undefined_grad=False
+    )
     direction = (volume_of if way == "forward" else data_of)(operator, seed=5)
     value, tangent = torch.func.jvp(function, (x,), (direction,))
     torch.testing.assert_close(value, function(x), rtol=0, atol=0)

@@ -102,13 +102,14 @@ def test_going_on(calm, tmp_path):
     assert (again.samples, again.kept) == (0, 23)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("recipe", "changes", "words"),
     [
         (FakeRecipe(seed=1), {}, "recipe is another one .seed is 0 there and 1 here"),
         (RECIPE, {"store": "rounded"}, "store is 'exact' there"),
-        pytest.param(RECIPE, {"max_outside": 0.5}, "max_outside is 0.01 there", marks=pytest.mark.slow),
-        pytest.param(RECIPE, {"resume": False}, "resume=False", marks=pytest.mark.slow),
+        (RECIPE, {"max_outside": 0.5}, "max_outside is 0.01 there"),
+        (RECIPE, {"resume": False}, "resume=False"),
     ],
 )
 def test_the_folder_of_another_data_set(calm, recipe, changes, words):

@@ -201,6 +201,7 @@ def test_standard_error_falls_with_samples():
     assert 0.8 < small(spp=1, time_axis=tt.TimeAxis(2.0, 0.01, 1200))._maker.standard_error(0) < 1.1
 
 
+@pytest.mark.slow
 def test_several_sensors_phasors_polarization_and_gates():
     both = small(box() | {"eye": box()["sensor"]}, sensors="all").sample(0)
     assert both.arrays["transient"].shape == (2, 1, 60, 8, 8)
@@ -485,6 +486,7 @@ def test_scans_that_vary_are_all_told():
 # ------------------------------------------------------------------------------------------------ orders, kinds, ends
 
 
+@pytest.mark.slow
 def test_nodes_are_exchanged_before_what_is_in_them():
     """Whatever the order of the keys."""
     colours = [{"type": "diffuse", "reflectance": value} for value in (0.2, 0.7)]
