@@ -117,6 +117,7 @@ def test_sample_counts_are_those_that_were_drawn():
     assert report.points[0].spp == 16
 
 
+@pytest.mark.slow
 def test_the_renderer_is_left_as_it_was():
     renderer = wall_renderer(spp=4)
     before = renderer(seed=3).transient.clone()

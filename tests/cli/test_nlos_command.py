@@ -274,6 +274,7 @@ def test_a_killed_simulation_goes_on(folder, signal_name):
     assert sorted(p.name for p in folder.glob("a.h5*")) == ["a.h5"]
 
 
+@pytest.mark.slow
 def test_a_part_file_of_other_settings(folder, monkeypatch):
     from torchtransient.nlos.work import HiddenWork
 

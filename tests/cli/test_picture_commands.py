@@ -62,6 +62,7 @@ def test_render_with_every_picture(folder):
     assert (folder / "r.png").read_bytes() == (folder / "r2.png").read_bytes()
 
 
+@pytest.mark.slow
 def test_video_options(folder, result):
     done = run("video", "box.h5", "v.gif", "--fps", 10, "--every", 4, "--accumulate", "--no-stamp", "--scale", 2)
     assert done.exit_code == 0, done.output

@@ -139,7 +139,6 @@ def test_records_have_bins(case):
 
 
 WHOLE = (torch.uint8, torch.int8, torch.int16, torch.uint16, torch.int32, torch.uint32, torch.int64, torch.uint64)
-FLOATING = (torch.float16, torch.bfloat16, torch.float8_e4m3fn, torch.float8_e5m2)
 SOME = (torch.uint8, torch.int16, torch.uint64, torch.bfloat16, torch.float8_e5m2, torch.bool)
 
 

@@ -171,6 +171,7 @@ def in_one_call(renderer, x, target, seeds):
     return losses.two_render_loss(out[0], out[1], target, reduction="sum")
 
 
+@pytest.mark.slow
 def test_two_seeds_in_one_call_are_two_calls(renderer, shared):
     target = shared[1].transient
     x = torch.tensor(0.45, requires_grad=True)

@@ -109,7 +109,7 @@ def test_what_metadata_say():
 # --------------------------------------------------------------------------------------------------- points of a call
 
 
-@pytest.mark.parametrize("key", long(POINT_TENSORS, [POINTS, LASER_ORIGIN]))
+@pytest.mark.parametrize("key", long(POINT_TENSORS, [POINTS]))
 def test_captures_know_the_points_of_their_call(key):
     of = scan("single")
     layer, old = renderer([key], of=of), getattr(of, POINT_TENSORS[key])
@@ -186,6 +186,7 @@ class Plain(torch.nn.Module):
         return 2 * transient
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["exhaustive"])
 def test_sensors_without_a_generator(kind):
     of, generator = scan(kind), torch.Generator().manual_seed(0)
@@ -278,7 +279,7 @@ DARK = {
 
 
 @pytest.mark.parametrize(
-    ("dark", "tiles"), long_rows(itertools.product(DARK, [1, 3]), [("confocal", 3), ("exhaustive", 1)])
+    ("dark", "tiles"), long_rows(itertools.product(DARK, [1, 3]), [("confocal", 3)])
 )
 def test_captures_without_light_are_said_once(dark, tiles):
     kind, settings = DARK[dark]

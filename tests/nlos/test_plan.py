@@ -63,6 +63,7 @@ def test_without_a_pilot_run_the_depth_is_kept():
     assert plan.max_depth is None and "max_depth: 3, kept" in str(plan) and light(plan).startswith(SHARED)
 
 
+@pytest.mark.slow
 def test_colours_and_phasors():
     coloured = tt.plan(scene(hidden=tt.scenes.nlos_z(albedo=(0.2, 0.5, 0.9))))
     assert coloured.variant == "llvm_ad_rgb"

@@ -35,7 +35,7 @@ def scanned(kind, size=12, **more):
     ("kind", "method"),
     long_rows(
         [("confocal", "fk"), ("single", "phasor"), ("exhaustive", "phasor"), ("exhaustive", "midpoint-fk")],
-        [("confocal", "fk"), ("exhaustive", "midpoint-fk")],
+        [("exhaustive", "midpoint-fk")],
     ),
 )
 def test_from_the_simulation_through_a_file_to_the_volume(tmp_path, kind, method):

@@ -81,6 +81,7 @@ def test_points_that_an_optimizer_changes(as_leaf):
     assert float((after - before).abs().max()) > 1e-3 * float(before.max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("computed", long(["in single precision", "of an offset"], ["of an offset"]))
 def test_points_that_were_computed_do_not_follow(computed):
     if computed == "of an offset":

@@ -90,6 +90,7 @@ def test_points_come_out_where_they_are(z, dtype):
     assert float((found - point).abs().max()) < 1e-3
 
 
+@pytest.mark.slow
 def test_pictures_are_linear_in_the_light():
     # |psi|^2 is linear in the light: one quarter of the albedo shows one quarter. y-tal 0.20 shows a sixteenth.
     axis = TimeAxis(0.0, 0.0192, 256)

@@ -31,6 +31,7 @@ def test_no_collisions_in_a_step():
     assert 0 <= min(seeds) <= max(seeds) < 2**32
 
 
+@pytest.mark.slow
 def test_over_steps_they_collide_as_random_numbers_do():
     drawn = [seed for step in range(400) for seed in Seeds(1)(step, range(250))]
     # 1e5^2 / 2 / 2^32 = 1.16 pairs; eight or more have a chance of 1e-4.

@@ -43,6 +43,7 @@ def test_iterators_draw_from_the_global_generator(names):
     assert names["after_batches"] == names["untouched"]
 
 
+@pytest.mark.slow
 def test_one_rank_is_the_run_without_ranks(names):
     assert len(names["losses"]) == 2
     assert all(0 < loss < 1e3 for loss in names["losses"])

@@ -78,6 +78,7 @@ def test_one_bin_of_a_transient(tmp_path):
     assert np.ma.filled(shown(one), NAN).ravel()[0] == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_broken_pixels_have_no_degree():
     vectors = light().clone()
     vectors[1, 0, 0, 0] = NAN

@@ -71,6 +71,7 @@ def test_more_panels_than_points_show_every_point_once():
     ]
 
 
+@pytest.mark.slow
 def test_lists_are_an_image_of_points_against_time(tmp_path):
     figure = tt.vis.transients_grid(of_list(), tmp_path / "list.png")
     shown = np.asarray(figure.axes[0].images[0].get_array())

@@ -80,6 +80,7 @@ def test_bytes_depend_on_recipe_and_number_alone():
     assert out.transient.numpy().tobytes() == forwards[2].arrays["transient"].tobytes()
 
 
+@pytest.mark.slow
 def test_what_is_kept_of_a_sample():
     settings = {"device": "vl53l8_like", "labels": ("depth", "first_return")}
     whole, kept = small(**settings), small(**settings, keep=["first_return", "measurement"])
@@ -563,6 +564,7 @@ def test_a_recipe_does_not_change():
         recipe.vary["x"] = D.Uniform(0, 1)
 
 
+@pytest.mark.slow
 def test_transforms_of_mitsuba():
     import mitsuba as mi
 

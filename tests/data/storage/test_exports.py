@@ -231,6 +231,7 @@ def rendered(place, samples=3, **settings):
     (place / "out").mkdir()
 
 
+@pytest.mark.slow
 def test_what_a_summary_says_of_phasors(tmp_path):
     rendered(tmp_path, samples=1, frequencies=[1.0, 2.0, 3.0])
     assert "3 frequencies, 1 to 3 cycles per metre" in summary(tmp_path)

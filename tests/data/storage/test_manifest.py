@@ -15,9 +15,14 @@ from torchtransient.data.storage.shard_file import Shard
 from torchtransient.errors import StorageError
 
 
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    return folder(tmp_path_factory.mktemp("written") / "set")
+
+
 @pytest.fixture
-def data(tmp_path):
-    return folder(tmp_path / "set")
+def data(written, tmp_path):
+    return shutil.copytree(written, tmp_path / "set")
 
 
 def test_a_manifest_of_its_shards(data):

@@ -101,7 +101,7 @@ def test_converter_reports_its_steps_and_range():
     assert abs(float(y.mean()) - float(model.expected(pixels(20.0)[..., :1]))) < 0.3
 
 
-@pytest.mark.parametrize("policy", ["gaussian", "straight_through", "score"])
+@pytest.mark.parametrize("policy", ["gaussian", "score"])
 def test_gradient_of_a_linear_loss(policy):
     """d E[y] / dm against finite differences of the expectation, in the middle and at the edge of the full well."""
     for mean in (60.0, 100.0):

@@ -99,14 +99,13 @@ def test_crosstalk_against_loops():
 
 
 @pytest.mark.parametrize(
-    "make",
+    "make, policy",
     [
-        lambda **k: Afterpulsing(0.05, 30e-10, 20e-10, bin_width_s=1e-10, learnable=True, **k),
-        lambda **k: Crosstalk(0.05, learnable=True, **k),
+        (lambda **k: Afterpulsing(0.05, 30e-10, 20e-10, bin_width_s=1e-10, learnable=True, **k), "gaussian"),
+        (lambda **k: Crosstalk(0.05, learnable=True, **k), "score"),
     ],
     ids=["afterpulsing", "crosstalk"],
 )
-@pytest.mark.parametrize("policy", ["gaussian", "score"])
 def test_policies_keep_the_gradient_of_what_passes(make, policy):
     """Loss: square of one bin. Exact: 2 y + (variance of what is added)', in the probability's logit."""
     module, draws = make(grad=policy), 30_000

@@ -293,6 +293,7 @@ def test_in_a_flood_coates_looks_no_closer(monkeypatch):
     assert wrong == pytest.approx(0.1, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_coates_of_draws_is_unbiased():
     rate, repeats, cycles = image(5 * shapes()["pulse"]), 200, 20_000
     h = spad(2.6, cycles).sample(rate.unsqueeze(0).expand(repeats, 1, BINS, 1, 1), torch.Generator().manual_seed(0))

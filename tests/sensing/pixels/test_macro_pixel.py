@@ -203,6 +203,7 @@ CASES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode, dead, total, weights, k, window", CASES)
 def test_coincidences_are_those_of_events(mode, dead, total, weights, k, window):
     rate = light(total)
