@@ -86,6 +86,7 @@ def test_without_a_method_the_one_that_suits_is_taken(folder, kind, method):
     assert "v.npz: 1 x " in result.stdout and (folder / "v.png").stat().st_size > 5000
 
 
+@pytest.mark.slow
 def test_lists_of_points_go_to_filtered_backprojection(folder):
     scan = captured("confocal").scan
     points = scan.sensor_points.reshape(-1, 3)[::2]

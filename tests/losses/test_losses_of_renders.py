@@ -137,6 +137,7 @@ def test_of_pictures_volumes_and_a_second_render(renderer, shared):
     slope_of(found, renderer)
 
 
+@pytest.mark.slow
 def test_of_phasor_films(phasors):
     renderer, out, target = phasors
     for loss in (losses.phasor_loss, losses.squared_loss, functools.partial(losses.phasor_loss, phase_only=True)):

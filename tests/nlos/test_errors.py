@@ -235,6 +235,7 @@ def test_what_cannot_be_captured(case):
     assert "Traceback" not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_one_point_is_a_scan():
     """As a grid, a list, and with its own laser."""
     for of in (scan(size=1), scan("single", size=1, laser=(0.3, 0.3)), scan("exhaustive", size=1, laser_grid=(2, 2))):

@@ -77,7 +77,7 @@ def test_points_that_carry_gradients_are_simulated_without():
     plain = scan()
     points = plain.sensor_points.clone().requires_grad_()
     carrying = replace(plain, sensor_points=points, laser_points=points)
-    for settings in ({"time_axis": None}, {"tiles": 2}):
+    for settings in ({}, {"tiles": 2}):
         with no_gradient_is_lost():
             found = simulated(carrying, **settings)
         expected = simulated(plain, **settings)

@@ -56,7 +56,7 @@ def test_a_point_sends_all_its_light(target, power):
     torch.testing.assert_close(mean, 2 * r, rtol=0, atol=0.005)
 
 
-@pytest.mark.parametrize("z", [0.6, 1.0, 1.4])
+@pytest.mark.parametrize("z", [0.6, 1.4])
 def test_points_come_out_where_they_are(z):
     operator = LCT(SCAN, time_axis=AXIS, v_bins=384, dtype=F64)
     light = confocal_points([(0.1041666, -0.1458333, z)], SCAN, AXIS)

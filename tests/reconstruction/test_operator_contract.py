@@ -155,16 +155,6 @@ def test_batches_and_channels_are_items_on_their_own(name):
         torch.testing.assert_close(torch.vmap(function, in_dims=1, out_dims=1)(x), together, **close)
 
 
-@every
-def test_linear(name):
-    operator = OPERATORS[name]
-    for function, make in ((operator, volume_of), (operator.adjoint, data_of)):
-        a, b = make(operator, seed=2), make(operator, seed=3)
-        expected = 2 * function(a) - 3 * function(b)
-        slack = 1e-11 * max(1.0, float(expected.abs().max()))
-        torch.testing.assert_close(function(2 * a - 3 * b), expected, rtol=1e-11, atol=slack)
-
-
 @on_grids
 def test_pieces_do_not_show(name, monkeypatch):
     operator = OPERATORS[name]

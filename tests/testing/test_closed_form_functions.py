@@ -38,7 +38,7 @@ def exact_cdf(n, x):
     return total * 2**n
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 7, 13, 25])
+@pytest.mark.parametrize("n", [1, 2, 7, 25])
 def test_sphere_flights_against_exact_polynomials(n):
     edges = [Fraction(k * n, 23) for k in range(24)]
     got = masses(fl.sphere_chord(0.5), [float(e) for e in edges], n)[n]
@@ -46,7 +46,7 @@ def test_sphere_flights_against_exact_polynomials(n):
     np.testing.assert_allclose(got, expected, rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("n", long([1, 2, 5, 12, 40, 100], [1, 2, 5, 12]))
+@pytest.mark.parametrize("n", long([1, 2, 5, 12, 40, 100], [1, 2, 12]))
 def test_sphere_flights_have_their_moments(n):
     radius = 1.7
     edges = np.linspace(0.0, 2 * radius * n * 1.0001, 40_001)

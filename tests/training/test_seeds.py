@@ -38,7 +38,7 @@ def test_over_steps_they_collide_as_random_numbers_do():
     assert len(drawn) - len(set(drawn)) < 8
 
 
-@pytest.mark.parametrize(("a", "b"), [((0, 0), (0, 1)), ((0, 0), (1, 0)), ((5, 2), (6, 1))])
+@pytest.mark.parametrize(("a", "b"), [((0, 0), (0, 1)), ((5, 2), (6, 1))])
 def test_bits_of_neighbours_are_unrelated(a, b):
     count = 4000
     first = torch.tensor([Seeds(n)(a[0], [a[1]])[0] for n in range(count)])

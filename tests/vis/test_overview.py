@@ -124,6 +124,7 @@ def test_refused(tmp_path):
         exposure_of(torch.zeros(1, 2, 2), quantile=0)
 
 
+@pytest.mark.slow
 def test_fit_picture(tmp_path):
     images = {"start": torch.rand(3, 5, 6), "truth": torch.rand(3, 5, 6)}
     path = tmp_path / "fit.png"

@@ -28,6 +28,7 @@ def test_three_views_show_the_voxel_from_their_sides(tmp_path):
     assert (tmp_path / "views.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_brightness():
     values = torch.tensor([0.0, 0.25, 1.0, -3.0]).reshape(1, 1, 4)
     figure = vis.volume_views(values, gamma=0.5)

@@ -68,7 +68,7 @@ def test_bytes_do_not_tell_the_order(tmp_path, store, compression):
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("BLOSC_NTHREADS", "2"), ("BLOSC_CLEVEL", "9"), ("BLOSC_BLOCKSIZE", "4096")]
+    ("name", "value"), [("BLOSC_NTHREADS", "2"), ("BLOSC_CLEVEL", "9")]
 )
 def test_bytes_do_not_tell_the_environment(tmp_path, monkeypatch, name, value):
     samples = [sample(0, (1, 256, 32, 32))]

@@ -72,6 +72,7 @@ def test_bins_in_parts_are_finer_bins(kind):
     assert bool(((drawn - coarse(x)).abs() < 5 * (coarse(x) / 20).sqrt() + 0.5).all())
 
 
+@pytest.mark.slow
 def test_pixels_of_several_levels_are_those_of_each():
     """Dim and bright ones together, in a batch, mapped by torch.func, and their derivatives."""
     module = obeyed(spad())
@@ -110,6 +111,7 @@ def test_what_does_not_reach_the_window_leaves_nothing_below_zero():
                 assert float(module.released(x).min()) >= 0
 
 
+@pytest.mark.slow
 def test_transforms_of_detectors_with_dead_time():
     """Gradients mapped over pixels, of one level and of several: those of autograd."""
     detector = spad()
