@@ -7,11 +7,12 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 BIN := $(VENV)/bin
 READY := $(VENV)/.installed
 
-.PHONY: demo test test-slow soak test-lowest release-check audit lint doctor docs sweep mutants environment clean help
+.PHONY: demo test test-portable test-slow soak test-lowest release-check audit lint doctor docs sweep mutants environment clean help
 
 help:
 	@echo "make demo       render a scene, fit a parameter, write pictures to demo_output/"
 	@echo "make test       default tests          make test-slow  the long ones"
+	@echo "make test-portable  sensors, losses and reconstruction with the arithmetic of an older processor"
 	@echo "make soak       sweeps: ten thousand mutated files for each reader, a thousand kills (up to 3 h)"
 	@echo "make lint       ruff and mypy          make doctor     check the machine"
 	@echo "make test-lowest  smoke tests with the lowest versions that are allowed, in an environment of its own (6 GB)"
@@ -51,6 +52,11 @@ PARALLEL ?= -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder --ma
 
 test: $(READY)
 	env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -q $(PARALLEL)
+
+# Rounding as on an older processor: the kernels of torch and MKL that every x86-64 has. Nothing may rest on its digits.
+test-portable: $(READY)
+	env -u PYTHONDONTWRITEBYTECODE ATEN_CPU_CAPABILITY=default MKL_CBWR=COMPATIBLE \
+		$(BIN)/python -m pytest -q $(PARALLEL) tests/sensing tests/losses tests/reconstruction
 
 test-slow: $(READY)
 	env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -q -m slow $(PARALLEL)

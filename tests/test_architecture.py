@@ -1,4 +1,5 @@
-"""Imports go down the levels or stay in their room, without circles; the two pillars meet in `rendering/`.
+"""Imports go down the levels or stay in their room, without circles; the two pillars meet in `rendering/`. Errors are
+the library's own for what users do; bare ones of Python only where they stay inside.
 
 Every import of every file is read with `ast`, the ones inside functions too. Tests share through `tests/support`, and
 benchmarks do without tests.
@@ -7,6 +8,7 @@ benchmarks do without tests.
 from __future__ import annotations
 
 import ast
+import builtins
 import functools
 import re
 from pathlib import Path
@@ -15,7 +17,7 @@ import pytest
 
 import torchtransient
 from support.sweeps import together
-from support.syntax import syntax_of
+from support.syntax import statements, syntax_of
 
 PACKAGE = Path(torchtransient.__file__).parent
 TESTS = Path(__file__).parent
@@ -267,8 +269,11 @@ def test_the_rules_of_sensing_bite(tmp_path, place, line, message):
 def from_tests(path):
     """What a file takes from the tests: imports of their modules, and paths into their folder."""
     own = {p.stem for p in TESTS.glob("*") if not p.name.startswith("_")} | {"tests"}
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    for node in ast.walk(tree):
+    text = path.read_text(encoding="utf-8")
+    # Most files name none of them where an import or a path could stand.
+    if not re.search(rf"\btests\b|^\s*(?:from|import)\s.*\b(?:{'|'.join(sorted(own))})\b", text, re.MULTILINE):
+        return
+    for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Import):
             yield from (f"import {a.name}" for a in node.names if a.name.split(".")[0] in own)
         elif isinstance(node, ast.ImportFrom) and not node.level and (node.module or "").split(".")[0] in own:
@@ -429,3 +434,79 @@ def test_files_of_the_structure_page_exist():
     known = {path.relative_to(PACKAGE).as_posix() for path in FILES}
     missing = [name for name in named if not any(path == name or path.endswith(f"/{name}") for path in known)]
     assert missing == []
+
+
+# ---------------------------------------------------------------------------------------------- errors that are raised
+
+
+PYTHONS = {
+    name for name, value in vars(builtins).items() if isinstance(value, type) and issubclass(value, BaseException)
+}
+# Bare errors of Python that are raised on purpose, by file, and who takes them.
+BARE = {
+    "__init__.py": {"AttributeError"},  # the protocol of modules
+    "argument_names.py": {"TypeError"},  # a wrong keyword argument, as Python says it
+    "capture/capture.py": {"TypeError"},  # caught where tensors are made, and told
+    "capture/metadata.py": {"TypeError"},  # caught by its callers, who know the file
+    "data/augmentation/augmented.py": {"AttributeError"},  # the protocol of objects
+    "data/reading/sample_draws.py": {"IndexError"},  # the protocol of sequences, which ends loops
+    "data/storage/shard_file.py": {"ValueError"},  # caught where files are opened, and told with their names
+    "data/storage/web_dataset.py": {"ValueError"},  # likewise
+    "files/captures/mat5.py": {"ValueError"},  # likewise
+    "files/entries.py": {"ValueError"},  # likewise
+    "files/result_file.py": {"ValueError"},  # likewise
+    "nlos/part_file.py": {"ValueError"},  # caught in the same function
+    "losses/results.py": {"TypeError"},  # a wrong keyword argument, as Python says it
+    "plugins/transport/contents.py": {"AttributeError"},  # the protocol of objects
+    "plugins/transport/world.py": {"AttributeError"},
+    "rendering/films/choices.py": {"KeyError"},  # caught by its callers
+    "sensing/base/given.py": {"TypeError"},  # a wrong keyword argument, as Python says it
+    "sensing/itof/itof_reading.py": {"AttributeError"},  # the protocol of objects
+    "sensing/dead_time/free_running_ring.py": {"AssertionError"},  # what its own calls rule out
+    "tensor_record.py": {"AttributeError"},  # the protocol of objects
+    "vis/video.py": {"IndexError"},  # the protocol of sequences
+}
+ABSTRACT = "NotImplementedError"  # what a subclass has to define
+
+
+def raised(tree):
+    """(line, name) of every error that a file raises by its name."""
+    for node in statements(tree):
+        if isinstance(node, ast.Raise) and node.exc is not None:
+            error = node.exc.func if isinstance(node.exc, ast.Call) else node.exc
+            if isinstance(error, ast.Name):
+                yield node.lineno, error.id
+
+
+def bare(path, package=PACKAGE):
+    """The errors of Python's own that a file raises and may not, as (line, name)."""
+    allowed = {*BARE.get(path.relative_to(package).as_posix(), ()), ABSTRACT, "SystemExit"}
+    tree = syntax_of(path)
+    return [(line, name) for line, name in raised(tree) if name in PYTHONS - allowed]
+
+
+def test_errors_are_typed():
+    wrong = {path.relative_to(PACKAGE).as_posix(): found for path in FILES if (found := bare(path))}
+    assert not wrong, "raise an error of torchtransient.errors, or list the file and who takes the error"
+
+
+def test_the_list_of_bare_errors_holds_nothing_else():
+    for name, allowed in BARE.items():
+        tree = syntax_of(PACKAGE / name)
+        assert allowed <= {error for _, error in raised(tree)}, name
+
+
+@pytest.mark.parametrize("line", ["raise ValueError('a')", "raise TypeError", "raise ImportError('x') from None"])
+def test_a_new_bare_error_is_found(tmp_path, line):
+    path = tmp_path / "module.py"
+    path.write_text(f"def f():\n    {line}\n", encoding="utf-8")
+    assert [number for number, _ in bare(path, tmp_path)] == [2]
+
+
+@together("path", FILES, lambda path: path.relative_to(PACKAGE).as_posix())
+def test_missing_packages_have_their_error(path):
+    """What is made of an ImportError says which package to install, in its own type."""
+    for node in ast.walk(syntax_of(path)) if "ImportError" in path.read_text(encoding="utf-8") else ():
+        if isinstance(node, ast.ExceptHandler) and isinstance(node.type, ast.Name) and node.type.id == "ImportError":
+            names = [name for _, name in raised(node)]
+            assert set(names) <= {"MissingPackageError", "missing"}, f"{path.name}:{node.lineno}"

@@ -68,8 +68,7 @@ def test_sequence_and_seconds():
 PULSES = [Pulse.gaussian(0.1), Pulse.rectangular(0.3, 0.2), Pulse.tabulated([-0.05, 0.02, 0.3], [0.2, 1.0, 0.0])]
 
 
-@pytest.mark.parametrize("pulse", PULSES, ids=lambda p: p.kind)
-@pytest.mark.parametrize("gate", GATES[:3], ids=lambda g: g.kind)
+@pytest.mark.parametrize("pulse, gate", list(zip(PULSES, GATES, strict=False)), ids=lambda one: one.kind)
 def test_spread_by_a_pulse(gate, pulse):
     seen = gate.spread(pulse)
     assert seen.is_continuous

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import mitsuba as mi
+import pytest
 
 from support.gradient_cases.all_cases import ALL_CASES
 
@@ -15,6 +16,7 @@ VARIANT = "llvm_ad_rgb"
 DOCS = Path(__file__).parent.parent / "docs"
 
 
+@pytest.mark.slow
 def test_table_is_up_to_date(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["make_gradients_page.py", "--check"])
     level = mi.log_level()

@@ -120,16 +120,19 @@ def check_right(entry, makers=None):
         case(**{argument: case.in_place(argument, make(number))})
 
 
+@pytest.mark.slow
 @together("entry", WHOLES, **of_one)
 def test_what_is_no_whole_number(entry):
     check_wrong(entry)
 
 
+@pytest.mark.slow
 @together("entry", REALS, **of_one)
 def test_what_is_no_real_number(entry):
     check_wrong(entry)
 
 
+@pytest.mark.slow
 @together("entry", QUICK, **of_one)
 def test_numbers_of_other_libraries(entry):
     check_right(entry)

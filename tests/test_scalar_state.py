@@ -53,6 +53,7 @@ def load_several(make):
     return len(singles)
 
 
+@pytest.mark.slow
 @together("name", MODULES)
 def test_several_numbers_are_not_loaded_as_one(name):
     assert load_several(MODULES[name]) > 0

@@ -80,6 +80,7 @@ ARGUMENTS = [
 ]
 
 
+@pytest.mark.slow
 @together("entry", ARGUMENTS, name=lambda entry: f"{entry[0]}({entry[1]})")
 def test_what_is_of_a_wrong_type(entry):
     name, argument = entry

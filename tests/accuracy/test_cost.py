@@ -27,8 +27,7 @@ def wall_renderer(**settings):
     return tt.TransientRenderer(scene, parameters=[ALBEDO, WALL], **settings)
 
 
-@pytest.fixture(scope="module")
-def report():
+def cost(**settings):
     return tt.cost_of_accuracy(
         wall_renderer(),
         spp=(16, 64, 256, 1024),
@@ -36,7 +35,13 @@ def report():
         samplers=("independent", "multijitter"),
         temporal_filters=("box", "tent"),
         progress=False,
+        **settings,
     )
+
+
+@pytest.fixture(scope="module")
+def report():
+    return cost()
 
 
 @pytest.mark.slow
@@ -175,6 +180,7 @@ def test_sample_counts_are_those_that_were_drawn():
     assert report.points[0].spp == 16
 
 
+@pytest.mark.slow
 def test_the_renderer_is_left_as_it_was():
     renderer = wall_renderer(spp=4)
     before = renderer(seed=3).transient.clone()
@@ -209,6 +215,7 @@ def test_errors():
         tt.cost_of_accuracy(renderer, spp=(4,), repeats=2, temporal_filters=("round",), progress=False)
 
 
+@pytest.mark.slow
 def test_phasors_have_a_cost_too():
     scene = tt.load(tt.scenes.moving_wall(resolution=2, num_bins=64, bin_width_opl=0.05), variant=VARIANT)
     renderer = tt.TransientRenderer(scene, parameters=[WALL], frequencies=[0.0, 0.4])

@@ -142,6 +142,7 @@ def test_runs_take_turns_and_warm_up_is_not_timed():
     assert len({seed for _, _, seed in timed}) == len(timed)  # no two runs share a seed
 
 
+@pytest.mark.slow
 def test_table_json_and_plot(tmp_path):
     report = measure(
         {INDEPENDENT: synthetic(2.0), OTHER: synthetic(0.5, salt=3)},

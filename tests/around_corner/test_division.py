@@ -48,7 +48,7 @@ def scan(points, spot, **integrator):
 
 ON_AND_OFF = ("both on", "spot off", "points off", "both off")
 BOUNCES = {"all to three": (0, 3), "three": (3, 3), "four": (4, 4)}
-QUICK = [("both on", "all to three"), ("spot off", "all to three"), ("points off", "three")]
+QUICK = [("both on", "all to three"), ("points off", "three")]
 
 
 @pytest.mark.parametrize(("where", "which"), long_rows(itertools.product(ON_AND_OFF, BOUNCES), QUICK))
@@ -118,12 +118,11 @@ def properties(albedo, two_sided):
     return props
 
 
-@pytest.mark.parametrize("kind", ["confocal", "single"])
-@pytest.mark.parametrize("way", EVERY_WAY)
-def test_a_black_sheet_hides_what_is_just_behind_it(kind, way):
+@pytest.mark.parametrize("way", ["auto", "paths"])
+def test_a_black_sheet_hides_what_is_just_behind_it(way):
     hidden = {"a": plate(1.0), "sheet": plate(1.0 - 1e-5, 0.0, name="sheet")}
-    open_plate = captures(scan_scene({"a": plate(1.0)}, kind, **EVERY_WAY[way]), 256, 1)
-    assert captures(scan_scene(hidden, kind, **EVERY_WAY[way]), 256, 1).sum() < 1e-4 * open_plate.sum()
+    open_plate = captures(scan_scene({"a": plate(1.0)}, "single", **EVERY_WAY[way]), 256, 1)
+    assert captures(scan_scene(hidden, "single", **EVERY_WAY[way]), 256, 1).sum() < 1e-4 * open_plate.sum()
 
 
 TWICE = ((0, 2, 1), (1, 2, 3), (0, 2, 1), (2, 3, 1))
@@ -196,6 +195,7 @@ OVERLAPS = {
 
 
 ALIKE = (
+    "both sides, two-sided", "a millionth before", "box on a floor",
     "two plates", "other diagonal", "tile in a plate", "disk in a plate", "a millionth behind", "disk in a disk",
     "spheres", "side by side", "balls that cross",
 )  # fmt: skip
@@ -299,7 +299,7 @@ SIDES = {
 
 
 # By turns.
-QUICK_SIDES = [("as it is", False), ("x", True), ("x, flipped", False), ("normals against corners", True)]
+QUICK_SIDES = [("x", True), ("normals against corners", True)]
 
 
 @pytest.mark.parametrize(("name", "two_sided"), long_rows(itertools.product(SIDES, [False, True]), QUICK_SIDES))
@@ -326,7 +326,7 @@ def test_fronts_are_where_shading_normals_point(name, two_sided):
             ([-0.5, 0.5, 1], False, False), ([-0.5, 0.5, 1], True, True),
             ([0.5, 0.5, -1], True, False), ([0.5, 0.5, -1], False, True),
         ],
-        [([-0.5, 0.5, 1], True, True), ([0.5, 0.5, -1], True, False)],
+        [([-0.5, 0.5, 1], True, True)],
     ),
 )  # fmt: skip
 def test_mirrored_walls(scale, flip, two_sided, kind):
@@ -349,7 +349,7 @@ def seen_on_the_plate(size=800):
     return (0.9 * 0.7 / np.pi**2 * to[:, 0] * to[:, 2] / r**4).sum() / size**2
 
 
-@pytest.mark.parametrize("size", [1, 2, 8])
+@pytest.mark.parametrize("size", long([1, 2, 8], [2]))
 def test_cameras_whose_pixel_centres_lie_on_a_wall_see_more(size):
     """Light of two bounces comes by way of a plate between the pixels' centres, or at their edges."""
     look = transform().look_at([0, 0, 1.0], [0, 0, 0], [0, 1, 0])

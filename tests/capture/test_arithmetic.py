@@ -48,6 +48,7 @@ FUNCTIONS = {
 }
 
 
+@pytest.mark.slow
 @together("dtype", NUMBERS)
 @together("name", FUNCTIONS)
 def test_numbers_of_every_kind(name, dtype):
@@ -82,6 +83,7 @@ def test_legs_are_taken_off_counts_as_linear_interpolation_does():
         np.testing.assert_allclose(found.transient[0, :, y, x].numpy(), expected, atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.uint16, torch.float16, torch.bool], ids=str)
 def test_volumes_and_pictures_of_counts(dtype):
     scan = scanned("confocal")

@@ -90,8 +90,7 @@ def test_legs():
     torch.testing.assert_close(single.legs, single.sensor_legs + 3.0)
 
 
-@pytest.mark.parametrize("legs", [False, True])
-@pytest.mark.parametrize("kind", ["single", "confocal", "exhaustive"])
+@pytest.mark.parametrize("kind, legs", [("single", True), ("confocal", False), ("exhaustive", True)])
 def test_default_axis_holds_every_path_and_little_else(kind, legs):
     made = scan(kind, first_and_last_leg=legs)
     box = np.array([[-0.3, -0.2, 0.8], [0.5, 0.4, 1.1]])

@@ -45,6 +45,7 @@ def run(folder, *arguments):
         os.chdir(before)
 
 
+@pytest.mark.slow
 def test_verify(made):
     result = run(made, "verify", "set", "--quiet")
     assert result.exit_code == 0 and "6 samples in 3 shards, 0 failed" in result.stdout and "complete" in result.stdout

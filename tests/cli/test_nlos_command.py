@@ -16,6 +16,7 @@ import torch
 from click.testing import CliRunner
 
 import torchtransient as tt
+from support.marks import long
 from torchtransient.cli.main import main
 
 VARIANT = "llvm_ad_mono"
@@ -93,7 +94,7 @@ def run(*arguments):
     return CliRunner().invoke(main, ["nlos", *map(str, arguments)])
 
 
-@pytest.mark.parametrize("kind", ["single", "confocal", "exhaustive"])
+@pytest.mark.parametrize("kind", long(["single", "confocal", "exhaustive"], ["single"]))
 def test_a_capture_of_a_description(folder, kind):
     (folder / "own.yaml").write_text(OWN % kind)
     result = run("own.yaml", "--parts", 3, "--quiet")
@@ -273,6 +274,7 @@ def test_a_killed_simulation_goes_on(folder, signal_name):
     assert sorted(p.name for p in folder.glob("a.h5*")) == ["a.h5"]
 
 
+@pytest.mark.slow
 def test_a_part_file_of_other_settings(folder, monkeypatch):
     from torchtransient.nlos.work import HiddenWork
 

@@ -279,6 +279,7 @@ class Linear(torch.nn.Module):
         return SimpleNamespace(transient=self.pattern * self.colour[:, None, None, None])
 
 
+@pytest.mark.slow
 def test_the_fit_of_a_colour():
     """Means over 2 bins and 8 x 8 pixels, relative to their size and the mean; the way there is kept as numbers."""
     torch.manual_seed(0)
@@ -298,6 +299,7 @@ def test_the_fit_of_a_colour():
     assert bright.found == [1.0, 1.0, 1.0] and max(max(colour) for colour in bright.colours) == 1.0
 
 
+@pytest.mark.slow
 def test_samples_of_the_demo(monkeypatch, tmp_path):
     """Of the truth sixteen times those of a step, of the pictures four times; two steps."""
     asked = []

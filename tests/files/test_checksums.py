@@ -58,7 +58,7 @@ def test_a_bit_of_each_array(tmp_path, kind):
         places = {name: (data.id.get_offset(), data.nbytes) for name, data in file.items()}
     for name in json.loads(h5py_attribute(path, "checksums"))["arrays"]:
         place, size = places[name]
-        for bit in (0, 7):
+        for bit in (7,):
             changed = shutil.copyfile(path, tmp_path / "b.h5")
             flipped(changed, place + size // 2, bit)
             if kind == "capture" and name in ("sensor_legs", "laser_legs"):
@@ -109,8 +109,7 @@ def test_members_of_an_archive(tmp_path, kind):
         read(path)
 
 
-@pytest.mark.parametrize("ending", ["h5", "npz"])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind, ending", list(zip(KINDS, ("h5", "npz", "h5"), strict=False)))
 def test_files_of_the_first_version(tmp_path, recwarn, kind, ending):
     """They have no checksums, and are read without a word; those of the second one do not lose them."""
     write, read = KINDS[kind]

@@ -105,6 +105,7 @@ def test_modules_of_likelihoods_hold_a_measurement_consistency(name):
     torch.testing.assert_close(found, MODULES[name](X, Y), rtol=0, atol=0)
 
 
+@pytest.mark.slow
 def test_a_fit_of_many_scales_ends_at_the_mean():
     """Of the Poisson likelihood, whose least is the mean of the counts at every scale."""
     counts = torch.poisson(torch.full((1, 1, 64, 4, 4), 2.0), generator=torch.Generator().manual_seed(0))

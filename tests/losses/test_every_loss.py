@@ -193,6 +193,7 @@ def test_the_gradient_is_that_of_a_fixed_scale(case):
     assert found == pytest.approx(wanted, rel=1e-4)
 
 
+@pytest.mark.slow
 @every
 def test_finite_for_no_light_and_even_light(case):
     x, y = case.tensors(dtype=torch.float32)

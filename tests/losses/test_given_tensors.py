@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-
 import pytest
 import torch
 
@@ -59,15 +57,13 @@ def test_every_layout_has_the_numbers_of_images(case, dim, laid_out):
     x, y = pair_of(case)
     if dim == -1:
         x, y = x[..., :1, :1], y[..., :1, :1]
-    for mask in (None, torch.rand(y.shape, generator=torch.Generator().manual_seed(9)) < 0.6):
-        given = laid_out(x), laid_out(y), None if mask is None else laid_out(mask)
-        for reduction in ("none", "mean"):
-            wanted = case(x, y, mask, reduction)
-            found = case(*given, reduction, dim=dim)
-            if reduction == "none":
-                wanted = laid_out(wanted)
-            torch.testing.assert_close(found, wanted)
-            torch.testing.assert_close(case(*given, reduction, dim=dim + given[0].ndim), found)
+    mask = torch.rand(y.shape, generator=torch.Generator().manual_seed(9)) < 0.6
+    given = laid_out(x), laid_out(y), laid_out(mask)
+    for reduction in ("none", "mean"):
+        wanted = case(x, y, mask, reduction)
+        found = case(*given, reduction, dim=dim)
+        torch.testing.assert_close(found, laid_out(wanted) if reduction == "none" else wanted)
+    torch.testing.assert_close(case(*given, "mean", dim=dim + given[0].ndim), found)
     module = case.module(**case.options, dim=dim)
     torch.testing.assert_close(module(*case.arguments(*given[:2])), case(*given[:2], dim=dim))
 
@@ -139,11 +135,11 @@ def test_records_have_bins(case):
 
 
 WHOLE = (torch.uint8, torch.int8, torch.int16, torch.uint16, torch.int32, torch.uint32, torch.int64, torch.uint64)
-FLOATING = (torch.float16, torch.bfloat16, torch.float8_e4m3fn, torch.float8_e5m2)
+SOME = (torch.uint8, torch.int16, torch.uint64, torch.bfloat16, torch.float8_e5m2, torch.bool)
 
 
 @over(lambda case: case.pair and not case.tensors()[0].is_complex())
-@together("dtype", [*WHOLE, *FLOATING, torch.bool])
+@together("dtype", SOME)
 def test_targets_of_every_kind(case, dtype):
     x, y = case.tensors(dtype=torch.float32)
     y = (y if case.draw_target is not None else 100 * y).to(dtype)
@@ -160,7 +156,7 @@ def real_pair(case):
 
 
 @over(real_pair)
-@together("dtype", [*WHOLE, *FLOATING, torch.bool])
+@together("dtype", SOME)
 def test_inputs_of_every_kind(case, dtype):
     x, y = case.tensors(dtype=torch.float32)
     x = (100 * x).to(dtype)
@@ -214,18 +210,16 @@ def test_anscombe_of_every_kind(dtype):
 
 
 @over(lambda case: case.function is not losses.measurement_consistency)  # its operator is the user's
-@together("half", [torch.float16, torch.bfloat16])
-def test_autocast_does_not_reach_in(case, half):
-    for dtype in (torch.float32, torch.float64):
-        pair = [t.requires_grad_() for t in case.tensors(dtype=dtype)]
-        leaves = pair if case.pair else pair[:1]
-        wanted = case(*pair)
-        slopes = torch.autograd.grad(wanted, leaves)
-        with torch.autocast("cpu", dtype=half):
-            found = case(*pair)
-            narrowed = torch.autograd.grad(found, leaves)
-        torch.testing.assert_close(found, wanted, rtol=0, atol=0)
-        torch.testing.assert_close(narrowed, slopes, rtol=0, atol=0)
+def test_autocast_does_not_reach_in(case):
+    pair = [t.requires_grad_() for t in case.tensors(dtype=torch.float32)]
+    leaves = pair if case.pair else pair[:1]
+    wanted = case(*pair)
+    slopes = torch.autograd.grad(wanted, leaves)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        found = case(*pair)
+        narrowed = torch.autograd.grad(found, leaves)
+    torch.testing.assert_close(found, wanted, rtol=0, atol=0)
+    torch.testing.assert_close(narrowed, slopes, rtol=0, atol=0)
 
 
 # ---------------------------------------------------------------------------------------------------------- of nothing
@@ -233,7 +227,7 @@ def test_autocast_does_not_reach_in(case, half):
 
 @every
 # Items, channels, pixels.
-@together("place, masked", itertools.product([0, 1, -1], [False, True]))
+@together("place, masked", [(0, False), (1, True), (-1, False)])
 def test_of_nothing_is_zero(case, place, masked):
     x, y = (t.narrow(place, 0, 0) for t in case.tensors())
     mask = torch.ones(y.shape, dtype=torch.bool) if masked else None

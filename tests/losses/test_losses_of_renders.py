@@ -137,6 +137,7 @@ def test_of_pictures_volumes_and_a_second_render(renderer, shared):
     slope_of(found, renderer)
 
 
+@pytest.mark.slow
 def test_of_phasor_films(phasors):
     renderer, out, target = phasors
     for loss in (losses.phasor_loss, losses.squared_loss, functools.partial(losses.phasor_loss, phase_only=True)):
@@ -171,6 +172,7 @@ def in_one_call(renderer, x, target, seeds):
     return losses.two_render_loss(out[0], out[1], target, reduction="sum")
 
 
+@pytest.mark.slow
 def test_two_seeds_in_one_call_are_two_calls(renderer, shared):
     target = shared[1].transient
     x = torch.tensor(0.45, requires_grad=True)
@@ -230,6 +232,7 @@ def test_two_seeds_are_the_squared_error_of_a_render_without_noise(draws):
     assert float(deviations(one, wanted)[0]) > 8
 
 
+@pytest.mark.slow
 def test_the_noise_of_two_seeds_is_independent(renderer, converged):
     """Residuals of two seeds are not correlated; those of one seed are the same."""
     light = converged[0]

@@ -11,7 +11,7 @@ from torchtransient.losses.surface_distance import point_triangle_distance
 from torchtransient.losses.triangles import check_faces, unit_normals
 
 
-@pytest.mark.parametrize("size", [1e-30, 1e-3, 1.0, 1e30])
+@pytest.mark.parametrize("size", [1e-30, 1e30])
 def test_normals_of_any_size(size):
     g = torch.Generator().manual_seed(0)
     u, v = torch.randn(2, 50, 3, generator=g, dtype=torch.float64)

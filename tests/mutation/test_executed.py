@@ -93,6 +93,7 @@ raise SystemExit(int(code))
 """
 
 
+@pytest.mark.slow
 def test_what_tests_and_their_fixtures_execute(tmp_path):
     package = tmp_path / "package"
     package.mkdir()

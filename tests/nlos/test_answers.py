@@ -5,6 +5,7 @@ fit, and captures without light.
 from __future__ import annotations
 
 import copy
+import itertools
 import json
 import warnings
 
@@ -14,7 +15,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from support.marks import long, long_pairs
+from support.marks import long, long_rows
 from torchtransient import sensing
 from torchtransient.errors import (
     ArgumentError,
@@ -61,7 +62,7 @@ def physics_of(act):
 # ------------------------------------------------------------------------------------------------------------ settings
 
 
-@pytest.mark.parametrize("parameters", [(), [VERTICES]])
+@pytest.mark.parametrize("parameters", long([(), [VERTICES]], [()]))
 def test_bins_that_nobody_gave(parameters):
     """Those of `simulate`: they hold all light of three bounces, but what a wider filter spreads over their rim."""
     made = renderer(parameters, time_axis=None)(seed=0)
@@ -77,6 +78,7 @@ def test_depths_are_said_by_bounces():
         renderer(max_depth=5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spp", [np.int64(8), np.uint16(8), torch.tensor(8)])
 def test_samples_of_any_library(spp):
     expected = renderer(spp=8)(seed=0)
@@ -88,6 +90,7 @@ def test_samples_of_any_library(spp):
             renderer(spp=wrong)
 
 
+@pytest.mark.slow
 def test_what_metadata_say():
     """The names of a simulation's, as far as a layer knows them; the seed of a call is the one that draws it again."""
     layer, made = renderer([VERTICES]), simulated(seed=3).metadata
@@ -106,7 +109,7 @@ def test_what_metadata_say():
 # --------------------------------------------------------------------------------------------------- points of a call
 
 
-@pytest.mark.parametrize("key", POINT_TENSORS)
+@pytest.mark.parametrize("key", long(POINT_TENSORS, [POINTS]))
 def test_captures_know_the_points_of_their_call(key):
     of = scan("single")
     layer, old = renderer([key], of=of), getattr(of, POINT_TENSORS[key])
@@ -130,6 +133,7 @@ def test_spots_of_confocal_scans_follow_their_points():
     assert torch.equal(made.sensor_points.reshape(-1, 3), moved)
 
 
+@pytest.mark.slow
 def test_scans_stay_what_they_were():
     """A step of an optimizer changes its leaves, not the captures before it."""
     leaf = torch.nn.Parameter(scan().sensor_points.clone())
@@ -182,7 +186,8 @@ class Plain(torch.nn.Module):
         return 2 * transient
 
 
-@pytest.mark.parametrize("kind", ["confocal", "exhaustive"])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["exhaustive"])
 def test_sensors_without_a_generator(kind):
     of, generator = scan(kind), torch.Generator().manual_seed(0)
     bare, doubled = simulated(of=of), simulated(of=of, sensor=Plain(), generator=generator)
@@ -274,7 +279,7 @@ DARK = {
 
 
 @pytest.mark.parametrize(
-    ("dark", "tiles"), long_pairs(DARK, [1, 3], [("confocal", 3), ("exhaustive", 1), ("phasors", 1)])
+    ("dark", "tiles"), long_rows(itertools.product(DARK, [1, 3]), [("confocal", 3)])
 )
 def test_captures_without_light_are_said_once(dark, tiles):
     kind, settings = DARK[dark]
@@ -293,6 +298,7 @@ def test_dark_parts_of_a_capture_are_none():
     assert bool((made[0].steady[..., :2] > 0).all()) and not bool(made[0].steady[..., 2:].any())
 
 
+@pytest.mark.slow
 def test_layers_without_light_say_it_once():
     layer = renderer(hidden=AWAY)
     found = physics_of(lambda: [layer(seed=seed) for seed in range(3)])
@@ -315,6 +321,7 @@ def test_layers_without_light_say_it_once():
 # ------------------------------------------------------------------------------------------------------------ variants
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bounces", long([(3, 4, 5), (3, 4, 5, 6, 7, 8), "all"], [(3, 4, 5)]))
 def test_a_layer_after_another_variant(bounces):
     """What was made for one variant renders and differentiates when classes were made for another in between."""

@@ -293,6 +293,7 @@ def _wrong_entries(value):
 QUICK = (None, -1, 10**400, "x", [30], ["x", "y", "z"], [[0, 1, 0], 30], {"type": 3})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", long(VALUES, QUICK), ids=lambda value: repr(value)[:20])
 def test_entries_of_any_kind_are_read_or_refused(value):
     """Nothing but errors of this library, whatever stands where."""

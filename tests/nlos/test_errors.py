@@ -21,7 +21,7 @@ from torchtransient.errors import (
 )
 
 VARIANT = "llvm_ad_mono"
-AXIS = tt.TimeAxis(1.9, 0.02, 50)
+AXIS = tt.TimeAxis(1.9, 0.02, 100)
 WALL = tt.nlos.Wall.plane(2.0, 1.6, albedo=0.7)
 Z = tt.scenes.nlos_z()
 ASIDE = {"sensor_origin": [-0.5, 0.0, 0.25], "laser_origin": [-0.5, 0.0, 0.25]}
@@ -36,7 +36,7 @@ def complete(kind="confocal", hidden=None, meter=None, integrator=None, without=
     settings = {"laser_grid": (2, 1)} if kind == "exhaustive" else {}
     described = tt.nlos.capture_scene(Z if hidden is None else hidden, scan(kind, **settings))
     sensor = described["wall"]["sensor"]
-    sensor["film"] |= {"start_opl": AXIS.start_opl, "bin_width_opl": AXIS.bin_width_opl, "temporal_bins": 50}
+    sensor["film"] |= {"start_opl": AXIS.start_opl, "bin_width_opl": AXIS.bin_width_opl, "temporal_bins": 100}
     sensor |= meter or {}
     described["integrator"] |= integrator or {}
     return {name: node for name, node in described.items() if name not in without}
@@ -235,6 +235,7 @@ def test_what_cannot_be_captured(case):
     assert "Traceback" not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_one_point_is_a_scan():
     """As a grid, a list, and with its own laser."""
     for of in (scan(size=1), scan("single", size=1, laser=(0.3, 0.3)), scan("exhaustive", size=1, laser_grid=(2, 2))):

@@ -48,6 +48,7 @@ def capture(hidden, **settings):
     return tt.nlos.simulate(hidden, settings.pop("scan", scan), **settings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", [".obj", ".ply", ".npz"])
 def test_files_arrays_and_descriptions_agree(tmp_path, ending):
     path = written(tmp_path, ending)

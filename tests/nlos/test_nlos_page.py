@@ -71,6 +71,7 @@ def test_every_block_runs(folder):
     assert renderer(seed=0).metadata["spp"] == 4
 
 
+@pytest.mark.slow
 def test_the_file_holds_all_light_of_its_things(folder):
     setup = tt.nlos.read_setup("capture.yaml")
     bare = tt.nlos.simulate(**setup | {"sensor": None, "progress": False})
@@ -101,6 +102,7 @@ def test_the_commands_are_what_python_does(folder):
     assert tt.nlos.read_capture("capture.npz").metadata["spp"] == 1000
 
 
+@pytest.mark.slow
 def test_surfaces_face_the_wall():
     """As the page says: rectangles of Mitsuba look away from a wall that looks along +z."""
     scan = tt.nlos.Scan.grid(tt.nlos.Wall.plane(2.0, 2.0), 2, kind="confocal")

@@ -154,6 +154,7 @@ def test_a_disk_that_is_really_full(path):
     assert not path.exists()
 
 
+@pytest.mark.slow
 def test_one_process_at_a_time(path):
     script = (
         "import sys, time; from pathlib import Path; from torchtransient.nlos.part_file import PartFile\n"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 import torchtransient as tt
+from support.marks import long
 
 VARIANT = "llvm_ad_mono"
 WALL = tt.nlos.Wall.plane(2.0, 1.6, albedo=0.7)
@@ -25,7 +26,7 @@ def light(plan):
     return next(line for line in plan.reasons if line.startswith("light: "))
 
 
-@pytest.mark.parametrize("kind", ["single", "confocal", "exhaustive"])
+@pytest.mark.parametrize("kind", long(["single", "confocal", "exhaustive"], ["confocal"]))
 def test_a_capture_is_planned_and_rendered(kind):
     plan = tt.plan(scene(kind, filter_bounces=3, min_bounces=0))
     assert (plan.variant, plan.integrator, plan.max_depth) == ("llvm_ad_mono", "transient_nlos_path", 3)
@@ -51,9 +52,9 @@ def test_later_light_is_told():
 def test_why_paths():
     metal = tt.scenes.nlos_z()
     metal["letter"]["bsdf"] = {"type": "roughconductor", "alpha": 0.3, "id": "metal"}
-    plan = tt.plan(scene(hidden=metal))
+    plan = tt.plan(scene(hidden=metal), pilot=False)
     assert "light of three bounces from paths, since not all surfaces are diffuse" in light(plan)
-    assert "as third_bounce asks for" in light(tt.plan(scene(third_bounce="paths")))
+    assert "as third_bounce asks for" in light(tt.plan(scene(third_bounce="paths"), pilot=False))
 
 
 def test_without_a_pilot_run_the_depth_is_kept():
@@ -62,6 +63,7 @@ def test_without_a_pilot_run_the_depth_is_kept():
     assert plan.max_depth is None and "max_depth: 3, kept" in str(plan) and light(plan).startswith(SHARED)
 
 
+@pytest.mark.slow
 def test_colours_and_phasors():
     coloured = tt.plan(scene(hidden=tt.scenes.nlos_z(albedo=(0.2, 0.5, 0.9))))
     assert coloured.variant == "llvm_ad_rgb"

@@ -44,6 +44,7 @@ ROUTES = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("route", ROUTES)
 def test_a_mesh_that_changed_is_another_simulation(tmp_path, route):
     named, parameters, mesh = ROUTES[route]
@@ -64,6 +65,7 @@ def test_a_mesh_that_changed_is_another_simulation(tmp_path, route):
         capture()
 
 
+@pytest.mark.slow
 def test_a_parameter_that_changed_is_another_simulation(tmp_path):
     for name in ("default.obj", "given.obj"):
         (tmp_path / name).write_text(MESH.format(z=1))

@@ -11,6 +11,7 @@ import torch
 from click.testing import CliRunner
 
 import torchtransient as tt
+from support.marks import long_rows
 from support.pages import Page
 from torchtransient.capture import Wall
 from torchtransient.cli.main import main
@@ -32,7 +33,10 @@ def scanned(kind, size=12, **more):
 
 @pytest.mark.parametrize(
     ("kind", "method"),
-    [("confocal", "fk"), ("single", "phasor"), ("exhaustive", "phasor"), ("exhaustive", "midpoint-fk")],
+    long_rows(
+        [("confocal", "fk"), ("single", "phasor"), ("exhaustive", "phasor"), ("exhaustive", "midpoint-fk")],
+        [("exhaustive", "midpoint-fk")],
+    ),
 )
 def test_from_the_simulation_through_a_file_to_the_volume(tmp_path, kind, method):
     moves = tt.scenes.transforms
@@ -105,11 +109,10 @@ def test_channels_and_batches():
 
 
 @pytest.mark.parametrize(
-    ("name", "method", "kind"),
-    [("FK", "fk", "confocal"), ("MidpointFK", "midpoint-fk", "single"),
-     ("LCT", "lct", "confocal"), ("DirectionalLCT", "directional-lct", "confocal")],
+    ("name", "method", "kind", "dtype"),
+    [("FK", "fk", "confocal", torch.float64), ("MidpointFK", "midpoint-fk", "single", torch.float32),
+     ("DirectionalLCT", "directional-lct", "confocal", torch.float32)],
 )  # fmt: skip
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_channels_share_one_operator(monkeypatch, name, method, kind, dtype):
     """Whose tables cost as much as a channel; with the values and places of the operator alone."""
     one = point_capture(scanned(kind), [PLATE], time_axis=AXIS).to(dtype)

@@ -43,6 +43,7 @@ def render(description):
     return tt.render(tt.load(description, variant=VARIANT), spp=16, seed=0)
 
 
+@pytest.mark.slow
 def test_all_its_other_parameters_load():
     assert float(render(scene()).transient.sum()) > 0
 

@@ -71,6 +71,7 @@ def test_everything_else_that_is_named_is_there():
         assert re.search(rf"^{goal}:", make, re.MULTILINE), goal
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("recipe", WHOLE, ids=str)
 def test_examples_are_python(recipe):
     """Blocks as they stand, and files with their entries, which come once."""

@@ -61,11 +61,13 @@ def test_first_render(folder):
     assert bool(torch.isfinite(found["loss"]))
 
 
+@pytest.mark.slow
 def test_light(folder):
     found = Page("docs/light.md").names({r"resolution=\d+": "resolution=4", r"count=20": "count=3"})
     assert found["out"].gated.shape == (3, 3, 4, 4) and found["out"].transient is None
 
 
+@pytest.mark.slow
 def test_phasors(folder):
     found = Page("docs/phasors.md").names(SMALL)
     assert found["out"].phasor.shape == (3, 2, 6, 6)
@@ -82,6 +84,7 @@ def test_plan(folder, capsys):
     assert "variant: " in capsys.readouterr().out and found["out"].transient.shape[-2:] == (4, 8)
 
 
+@pytest.mark.slow
 def test_polarization(folder):
     found = Page("docs/polarization.md").names({r"spp=\d+": "spp=4"})
     assert found["out"].transient.shape == (4, 1, 40, 4, 8)
@@ -93,6 +96,7 @@ def test_accuracy(folder, capsys):
     assert set(found["report"].quantities()) and "red.reflectance.value" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_torch_layer(folder):
     found = Page("docs/torch_layer.md").names({"resx=64": "resx=6", "spp=64": "spp=4"})
     assert found["out"].transient.shape == (3, 40, 4, 6)

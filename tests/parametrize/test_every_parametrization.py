@@ -78,9 +78,9 @@ def test_derivatives(name, place):
     function, value = CASES[name]
     x = function.right_inverse(value)
     x = {"value": x, "zero": torch.zeros_like(x), "far": torch.full_like(x, 1.7)}[place].requires_grad_()
-    assert torch.autograd.gradcheck(function, (x,), check_forward_ad=True)
+    assert torch.autograd.gradcheck(function, (x,), check_forward_ad=True, fast_mode=True, check_undefined_grad=False)
     if place == "zero":
-        assert torch.autograd.gradgradcheck(function, (x,))
+        assert torch.autograd.gradgradcheck(function, (x,), fast_mode=True, check_undefined_grad=False)
 
 
 @ALL

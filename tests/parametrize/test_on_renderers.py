@@ -108,6 +108,7 @@ def copies():
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", copies())
 def test_copies_are_renderers_of_their_own(renderer, how):
     with torch.no_grad():
@@ -203,6 +204,7 @@ def test_what_is_wrong_is_said(renderer, plain):
     assert torch_parametrize.is_parametrized(plain, COLOUR.replace(".", "/"))
 
 
+@pytest.mark.slow
 def test_a_principled_roughness_has_a_clamp_of_its_own():
     """Below it, renders are the same and slopes are zero; from its lower end on, they are not."""
     key = "wall.bsdf.roughness.value"

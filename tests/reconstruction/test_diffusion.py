@@ -89,8 +89,7 @@ def written_out(light, thickness, passes, pitch, width, reach):
     return wide[:, reach:-reach, reach:-reach]
 
 
-@pytest.mark.parametrize("thickness", [0.0254, 0.06, 0.1])
-@pytest.mark.parametrize("passes", [1, 2])
+@pytest.mark.parametrize("thickness, passes", [(0.0254, 2), (0.1, 1)])
 def test_crossings_are_convolutions_that_do_not_wrap(thickness, passes):
     axis, scan = TimeAxis(0.0, 0.04, 12), Scan.grid(Wall.plane(0.4, 0.3), (4, 3), kind="confocal")
     operator = DiffusionDeconvolution(scan, time_axis=axis, thickness=thickness, passes=passes, dtype=F64)
@@ -174,6 +173,7 @@ def alphabet():
     return torch.stack([rendered(letter, poses) for letter in string.ascii_uppercase])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("letter", ["s", "t"])
 def test_letters_behind_foam_are_read(alphabet, letter):
     picture = front_view(f"letter_{letter}").flatten()

@@ -79,7 +79,7 @@ def test_start_and_unequal_sides_are_those_of_the_direct_transform():
 
 @pytest.mark.parametrize(
     ("z", "dtype"),
-    long_rows(itertools.product([0.45, 1.0, 1.55, 2.1], [torch.float32, F64]), [(0.45, torch.float32), (2.1, F64)]),
+    long_rows(itertools.product([0.45, 1.0, 1.55, 2.1], [torch.float32, F64]), [(2.1, torch.float32)]),
 )
 def test_points_come_out_where_they_are(z, dtype):
     axis = TimeAxis(0.0, 0.0096, 512)
@@ -90,6 +90,7 @@ def test_points_come_out_where_they_are(z, dtype):
     assert float((found - point).abs().max()) < 1e-3
 
 
+@pytest.mark.slow
 def test_pictures_are_linear_in_the_light():
     # |psi|^2 is linear in the light: one quarter of the albedo shows one quarter. y-tal 0.20 shows a sixteenth.
     axis = TimeAxis(0.0, 0.0192, 256)
@@ -100,7 +101,7 @@ def test_pictures_are_linear_in_the_light():
     assert ratio == pytest.approx(0.25, rel=1e-12)
 
 
-@pytest.mark.parametrize("tilt", [0.0, 0.5])
+@pytest.mark.parametrize("tilt", long([0.0, 0.5], [0.5]))
 def test_migration_of_the_model_is_the_cosine_of_the_wave(tilt):
     # A wave packet whose direction has the cosine J: model, then migration, give J / 2 of it, the half since of the
     # real wavefield each of the two signs of frequency has one half.

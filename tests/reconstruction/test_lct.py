@@ -24,8 +24,7 @@ def slab_of(operator, z, sigma=0.03):
     return (profile / (profile.sum() * float(operator.depths.diff()[0])))[:, None, None]
 
 
-@pytest.mark.parametrize("target, power", [("diffuse", 4), ("retroreflective", 2)])
-@pytest.mark.parametrize("z", [0.6, 1.2])
+@pytest.mark.parametrize("target, power, z", [("diffuse", 4, 1.2), ("retroreflective", 2, 0.6)])
 def test_plane_in_closed_form(target, power, z):
     # Isotropic points of one per m^2 on an infinite plane: H = int r^-p dA, dA = 2 pi r dr, from r_a to r_b >= z.
     scan = Scan.grid(Wall.plane(2.0, 2.0), 32, kind="confocal")
@@ -87,7 +86,7 @@ def test_a_point_sends_all_its_light(target, power):
     torch.testing.assert_close(mean, 2 * r, rtol=0, atol=0.005)
 
 
-@pytest.mark.parametrize("z", [0.6, 1.0, 1.4])
+@pytest.mark.parametrize("z", [0.6, 1.4])
 def test_points_come_out_where_they_are(z):
     operator = LCT(SCAN, time_axis=AXIS, v_bins=384, dtype=F64)
     light = confocal_points([(0.1041666, -0.1458333, z)], SCAN, AXIS)
@@ -140,7 +139,7 @@ def test_cones_do_not_come_round():
 
 def tilted_plate(angle, squared):
     """Light of a plate of 0.4 m, 0.8 m behind the wall; ``squared``: with the cosine squared."""
-    g = torch.linspace(-0.2, 0.2, 15, dtype=F64)
+    g = torch.linspace(-0.2, 0.2, 9, dtype=F64)
     y, x = torch.meshgrid(g, g, indexing="ij")
     normal = torch.tensor([math.sin(angle), 0.0, -math.cos(angle)], dtype=F64)
     points = torch.stack([x * math.cos(angle), y, 0.8 + x * math.sin(angle)], -1).reshape(-1, 3)
@@ -166,7 +165,8 @@ def tilted_plate(angle, squared):
 )
 def test_normals_of_plates(angle, squared, least, most):
     light = tilted_plate(angle, squared)
-    vectors = DirectionalLCT(SCAN, time_axis=AXIS, snr=100.0, dtype=F64).reconstruct(light)
+    operator = DirectionalLCT(SCAN, time_axis=AXIS, snr=100.0, dtype=F64)
+    vectors = operator.reconstruct(light)
     albedo = vectors.norm(dim=0)
     bright = albedo > 0.5 * albedo.max()
     mean = vectors[:, bright].sum(1)
@@ -174,7 +174,7 @@ def test_normals_of_plates(angle, squared, least, most):
     # The shortest explanation leans towards the wall: three quarters of the angle, 17 degrees.
     assert least < found < most
     assert abs(float(mean[1])) < 0.02 * float(mean.norm())
-    depth = float(DirectionalLCT(SCAN, time_axis=AXIS).depths[albedo.amax((1, 2)).argmax()])
+    depth = float(operator.depths[albedo.amax((1, 2)).argmax()])
     assert abs(depth - 0.8) < 0.2 * math.sin(abs(angle)) + 0.02
 
 

@@ -9,6 +9,7 @@ import torch
 from torch import nn
 
 from support import grid_operators, scan_operators
+from support.marks import long
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import GradientError, ShapeError, StorageError, UnitError
@@ -221,7 +222,7 @@ def test_light_before_time_zero_is_refused_alike(target):
     assert slab.reconstruct(torch.rand(slab.data_shape)).isfinite().all()
 
 
-@pytest.mark.parametrize("how", ["default", "with"])
+@pytest.mark.parametrize("how", long(["default", "with"], ["default"]))
 def test_default_devices_of_torch_do_not_matter(how):
     def made():
         found = grid_operators.operators() | scan_operators.operators()

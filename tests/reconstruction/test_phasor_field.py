@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from support.marks import long
 from support.scan_operators import AXIS, DEPTHS, PULSE, SCANS, WALL, bent_scan
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Scan
@@ -85,7 +86,7 @@ def test_transient_camera_is_the_sum_that_is_written_out():
     torch.testing.assert_close(operator.adjoint(light), expected, rtol=0, atol=1e-11 * float(expected.abs().max()))
 
 
-@pytest.mark.parametrize("name", SCANS)
+@pytest.mark.parametrize("name", long(SCANS, [*SCANS][::3]))
 def test_pieces_do_not_show(name, monkeypatch):
     scan = SCANS[name]
     operator = PhasorField(scan, VoxelGrid.before(scan, DEPTHS), time_axis=AXIS, pulse=PULSE, dtype=F64)

@@ -58,6 +58,7 @@ def test_descriptions_are_plain_data(name):
         assert shape["type"] in ("mesh_arrays", "rectangle", "cube") and shape["bsdf"]["type"] == "diffuse"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ALL)
 def test_mitsuba_builds_them_where_they_are_told(name):
     shapes = ALL[name]()

@@ -31,6 +31,7 @@ def are_those_outside(entry):
             assert torch.equal(a, b)
 
 
+@pytest.mark.slow
 @each_quick
 def test_expectation_and_derivatives_are_those_outside(entry):
     are_those_outside(entry)

@@ -81,6 +81,7 @@ def halved(numbers, dtype):
 KEEP_HALF = ("blur_image", "convolve_time", "straight_through")
 
 
+@pytest.mark.slow
 @every_call
 @together("dtype", [torch.float16, torch.bfloat16])
 def test_functions_measure_half_precision_in_single(name, dtype):
@@ -258,6 +259,7 @@ def wrong_for(value):
         yield value[..., :0, :, :] if value.ndim >= 4 else value[:0]
 
 
+@pytest.mark.slow
 @together("name", sorted(CALLS))
 def test_what_is_no_tensor_of_numbers_is_said_in_one_sentence(name):
     call, (numbers, rest) = getattr(sensing, name), CALLS[name]

@@ -96,6 +96,7 @@ def test_a_position_that_is_left_behind():
     next(iter(loader))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [0, 1])
 def test_workers_of_ranks_draw_other_numbers(workers):
     def drawn(rank, step=0, seed=0):

@@ -70,27 +70,27 @@ def test_goes_on_to_the_bit(tmp_path, scene):
     with tt.threads(1):
         whole = Run(scene)
         seed_all()
-        whole.go(0, 6)
+        whole.go(0, 4)
         stopped = Run(scene)
         seed_all()
-        stopped.go(0, 3)
-        save_checkpoint(tmp_path / "run.pt", stopped.parts, step=3, values={"losses": [1.0, np.float64(2.0)]})
+        stopped.go(0, 2)
+        save_checkpoint(tmp_path / "run.pt", stopped.parts, step=2, values={"losses": [1.0, np.float64(2.0)]})
         # Elsewhere: other random numbers, and a scene of its own that has rendered nothing.
         resumed = Run(tt.load(make_room(), variant=VARIANT))
         random.seed(77)
         np.random.seed(77)  # noqa: NPY002
         torch.manual_seed(77)
         found = load_checkpoint(tmp_path / "run.pt", resumed.parts)
-        assert (found.step, found.values, found.ranks) == (3, {"losses": [1.0, 2.0]}, 1)
+        assert (found.step, found.values, found.ranks) == (2, {"losses": [1.0, 2.0]}, 1)
         assert found.libraries["torch"] == torch.__version__
-        resumed.go(found.step, 6)
+        resumed.go(found.step, 4)
     assert_same(whole.model, resumed.model)
     assert whole.scaler.get_scale() == resumed.scaler.get_scale() > 8
     assert whole.schedule.get_last_lr() == resumed.schedule.get_last_lr()
     # Without the random numbers it is another run, so that the test can fail.
     other = Run(scene)
     load_checkpoint(tmp_path / "run.pt", other.parts, random=False)
-    other.go(3, 6)
+    other.go(2, 4)
     assert not torch.equal(other.model["network"][0].weight, whole.model["network"][0].weight)
 
 
@@ -344,6 +344,7 @@ def test_random_numbers_of_other_devices_change_nothing(tmp_path):
     assert model.weight[0, 0] == 3.0
 
 
+@pytest.mark.slow
 def test_compiled_modules_are_stored_as_they_were(tmp_path):
     path, model = tmp_path / "run.pt", tiny(3.0)
     save_checkpoint(path, {"model": torch.compile(tiny(1.0))}, step=1)

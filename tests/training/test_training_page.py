@@ -37,11 +37,13 @@ def test_seeds_know_the_sample_alone(names):
     assert names["noise"].shape == (2,)
 
 
+@pytest.mark.slow
 def test_iterators_draw_from_the_global_generator(names):
     assert names["after_a_loader"] != names["untouched"]
     assert names["after_batches"] == names["untouched"]
 
 
+@pytest.mark.slow
 def test_one_rank_is_the_run_without_ranks(names):
     assert len(names["losses"]) == 2
     assert all(0 < loss < 1e3 for loss in names["losses"])

@@ -56,6 +56,7 @@ def test_counter_and_scenes_are_learnt_together(example, tmp_path, capsys):
     assert (tmp_path / "self_calibration.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_unknowns_are_those_of_the_recipe(example):
     walls = example("two_walls")
     unknowns, light = walls.scenes(7, 3, 1024, "test")

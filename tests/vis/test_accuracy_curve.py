@@ -94,6 +94,7 @@ def test_ticks(drawn):
     assert ticks(wide[0, 0])[1] == ["0.01", "0.02", "0.05", "0.1", "0.2", "0.5", "1", "2", "5", "10", "20"]
 
 
+@pytest.mark.slow
 def test_the_file(tmp_path):
     plot_accuracy(CURVES[2:], tmp_path / "a.png")
     with PIL.Image.open(tmp_path / "a.png") as picture:

@@ -42,7 +42,7 @@ def test_samples_stand_in_rows_from_the_upper_left():
 
 @pytest.mark.parametrize(
     "count, curves, across, down",
-    [(1, True, 1, 1), (2, False, 1, 2), (5, True, 2, 3), (4, False, 1, 4), (3, True, 1, 3)],
+    [(2, False, 1, 2), (5, True, 2, 3)],
 )
 def test_a_sheet_is_about_as_high_as_it_is_wide(count, curves, across, down):
     size = tt.vis.contact_sheet(cells(count, curves)).get_size_inches()

@@ -91,6 +91,7 @@ def test_exposure_ignores_outliers_and_broken_pixels():
     assert exposure_of(spot) == 4.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("channels", long([1, 3], [3]))
 def test_picture(tmp_path, channels):
     cube = pulse(channels)
@@ -123,6 +124,7 @@ def test_refused(tmp_path):
         exposure_of(torch.zeros(1, 2, 2), quantile=0)
 
 
+@pytest.mark.slow
 def test_fit_picture(tmp_path):
     images = {"start": torch.rand(3, 5, 6), "truth": torch.rand(3, 5, 6)}
     path = tmp_path / "fit.png"

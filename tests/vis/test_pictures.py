@@ -168,19 +168,6 @@ def test_rainbow_of_broken_and_dark_cubes(style):
 # ----------------------------------------------------------------------------------- slices, sheets, histograms
 
 
-@pytest.mark.parametrize("axis", [AXIS, None])
-def test_streak(tmp_path, axis):
-    figure = tt.vis.streak(sweep(), tmp_path / "s.png", row=1, axis=axis)
-    image = shown(figure)
-    assert image.shape == (10, 10, 3)  # time downwards, columns to the right
-    np.testing.assert_allclose(image[..., 0], np.eye(10), atol=1e-12)
-    end = 10.0 if axis is None else 7.0
-    assert figure.axes[0].get_ylim() == (end, 0.0 if axis is None else 2.0)
-    column = shown(tt.vis.streak(sweep(), column=3))
-    assert column.shape == (10, 6, 3)
-    assert column[3, :5, 0].min() > 0.999 and column.sum() == pytest.approx(15)
-
-
 def test_frame_grid(tmp_path):
     figure = tt.vis.frame_grid(sweep(), tmp_path / "g.png", axis=AXIS, bins=(2, 9), exposure=1.0)
     for panel, index in ((0, 2), (1, 9)):
@@ -189,20 +176,6 @@ def test_frame_grid(tmp_path):
     assert figure.axes[0].get_title().startswith("3.3 m = ") or figure.axes[0].get_title().startswith("3.2 m = ")
     figure = tt.vis.frame_grid(sweep(), count=5)
     assert [(shown(figure, k)[0, :, 0] > 0).nonzero()[0].tolist() for k in range(5)] == [[0], [2], [4], [6], [8]]
-
-
-def test_histogram(tmp_path):
-    cube = sweep()
-    figure = tt.vis.histogram(cube, tmp_path / "h.png", axis=AXIS, pixels=[(0, 3), (1, 7)])
-    for panel, column in ((0, 3), (1, 7)):
-        values, edges, _ = figure.axes[panel].patches[0].get_data()
-        assert values.tolist() == cube[0, :, 0, column].tolist()
-        np.testing.assert_allclose(edges, AXIS.edges_opl.numpy())
-    bands = torch.rand(8, 5, 2, 2)
-    assert len(tt.vis.histogram(bands, pixels=[(0, 0)]).axes[0].patches) == 8
-    log = tt.vis.histogram(cube, pixels=[(0, 3)], log=True).axes[0]
-    assert log.get_yscale() == "log"
-    assert tt.vis.histogram(torch.zeros(1, 4, 1, 1), pixels=[(0, 0)], log=True).axes[0].get_yscale() == "linear"
 
 
 # --------------------------------------------------------------------------------------------------- gradients

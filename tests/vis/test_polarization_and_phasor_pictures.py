@@ -78,6 +78,7 @@ def test_one_bin_of_a_transient(tmp_path):
     assert np.ma.filled(shown(one), NAN).ravel()[0] == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_broken_pixels_have_no_degree():
     vectors = light().clone()
     vectors[1, 0, 0, 0] = NAN
@@ -124,17 +125,6 @@ def wave():
     turns = -torch.arange(8) / 8
     row = 2 * torch.exp(2j * torch.pi * turns)
     return row.expand(1, 1, 3, 8).to(torch.complex64)
-
-
-def test_phasor_panels(tmp_path):
-    names = ("real", "imaginary", "amplitude")
-    figure = tt.vis.phasor_picture(wave(), tmp_path / "p.png", show=names, percentile=100)
-    expected = wave()[0, 0].numpy()
-    for panel, part in enumerate((np.real, np.imag, np.abs)):
-        np.testing.assert_allclose(shown(figure, panel), part(expected), atol=1e-6)
-    assert figure.axes[0].images[0].get_clim() == pytest.approx((-2, 2))
-    phase = np.asarray(shown(tt.vis.phasor_picture(wave(), show=("phase",))))
-    np.testing.assert_allclose(phase[0], colour_maps.cyclic(-np.arange(8) / 8), atol=1e-6)
 
 
 def test_domain_colours():

@@ -44,13 +44,6 @@ def test_meshes_stand_before_the_wall_in_both_views(tmp_path):
         np.testing.assert_allclose(lines["start"][:, 0].mean() - lines["truth"][:, 0].mean(), 0.2, atol=1e-6)
 
 
-def test_fine_bins_are_added_up():
-    panel = page().subfigs[1].axes[0]
-    values = panel.patches[0].get_data().values
-    # 300 bins are drawn as 100 of three
-    np.testing.assert_allclose(values, 9 * np.arange(100) + 3)
-
-
 def test_three_points_of_the_diagonal():
     cube = torch.arange(5 * 3 * 6.0).reshape(5, 3, 6) ** 2
     axis = tt.TimeAxis(1.0, 0.25, 5)

@@ -28,6 +28,7 @@ def test_three_views_show_the_voxel_from_their_sides(tmp_path):
     assert (tmp_path / "views.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_brightness():
     values = torch.tensor([0.0, 0.25, 1.0, -3.0]).reshape(1, 1, 4)
     figure = vis.volume_views(values, gamma=0.5)
@@ -68,6 +69,7 @@ def test_what_is_no_number_is_seen():
     assert tuple(panel.get_cmap()(np.ma.masked)) not in [(0.0, 0.0, 0.0, 1.0), (1.0, 1.0, 1.0, 1.0)]
 
 
+@pytest.mark.slow
 def test_depth_and_normals_beside_them(tmp_path):
     depth, mask = torch.full((5, 6), 0.7), torch.zeros(5, 6, dtype=torch.bool)
     mask[1, 0] = True

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.marks import long
 from support.sweeps import together
 from torchtransient import geometry
 from torchtransient.data import Affine, Augment, Augmented, Crop, Flip, QuarterTurn
@@ -105,7 +106,7 @@ CASES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", long(CASES, ["crop", "turn and flip"]))
 def test_it_is_the_scene_rendered_anew(sample, name):
     operations, scene = CASES[name]
     found = Augment(operations, polarized=True)(sample)
@@ -149,6 +150,7 @@ def behind_a_pane():
     return see
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_circular_light_is_that_of_the_scene_rendered_anew(behind_a_pane, name):
     operations, scene = CASES[name]

@@ -132,6 +132,7 @@ def test_no_name_that_stays_is_a_place_in_the_table():
             assert key not in UNAFFECTED, f"{cls}.{key}"
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:phasor_hdr_film:torchtransient.errors.TorchTransientWarning")
 def test_every_parameter_of_every_plugin(tmp_path):
     """No place stays in a mirror, nothing of a camera in a window and a turn, and what moves nothing stays in all."""

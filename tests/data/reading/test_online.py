@@ -101,7 +101,7 @@ def simulate(uses, capacity, speed, draws=4000, producers=2, warm=4):
 RINGS = list(itertools.product([0.01, 0.2, 5.0], [2, 3, 64], [0.5, 1.0, 5.0, 20.0]))
 
 
-@pytest.mark.parametrize(("speed", "capacity", "uses"), long_rows(RINGS, RINGS[::5]))
+@pytest.mark.parametrize(("speed", "capacity", "uses"), long_rows(RINGS, RINGS[::9]))
 def test_mean_use_is_bounded(uses, capacity, speed):
     schedule, used = simulate(uses, capacity, speed, warm=min(4, capacity))
     mean = schedule.drawn / schedule.made
@@ -170,6 +170,7 @@ def test_every_sample_is_made_once():
     assert max(seen) < 300 + 8 + 3
 
 
+@pytest.mark.slow
 def test_a_place_is_ordered_anew_only_when_what_was_drawn_there_is_copied(monkeypatch):
     """A producer may write as soon as it is told: here it has written before it is."""
     say = Producers._say

@@ -62,6 +62,7 @@ def test_shuffling_is_even():
     assert np.all(np.abs(np.bincount(first, minlength=6) - 200) < 60)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("even", "world_size"),
     long_rows(itertools.product([False, True], [1, 2, 5, 30]), [(False, 30), (True, 2), (True, 5)]),
@@ -156,6 +157,7 @@ def test_parts_and_axis(data):
 STOPPED = [(0, 4, None), (2, 4, None), (3, 2, (1, 2))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("workers", "size", "rank"), long_rows(STOPPED, [STOPPED[0], STOPPED[2]]))
 def test_an_epoch_goes_on_where_it_was_stopped(data, workers, size, rank):
     share = {} if rank is None else {"rank": rank[0], "world_size": rank[1]}

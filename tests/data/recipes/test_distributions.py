@@ -17,7 +17,7 @@ from torchtransient.data.recipes.written import read_distribution, written
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 
 D = tt.data
-DRAWS = 1250
+DRAWS = 400
 NUMBER = Place("x", NUMBERS, ())
 COLOUR = Place("x", NUMBERS, (3,), np.array([0.1, 0.2, 0.3]))
 TURNED = tt.scenes.transforms.rotate([0, 1, 0], 30) @ np.diag([2.0, 1, 1, 1])

@@ -82,6 +82,7 @@ def test_bytes_depend_on_recipe_and_number_alone():
     assert out.transient.numpy().tobytes() == forwards[2].arrays["transient"].tobytes()
 
 
+@pytest.mark.slow
 def test_what_is_kept_of_a_sample():
     settings = {"device": "vl53l8_like", "labels": ("depth", "first_return")}
     whole, kept = small(**settings), small(**settings, keep=["first_return", "measurement"])
@@ -111,6 +112,7 @@ def test_another_process_makes_the_same_bytes(tmp_path):
     assert done.stdout.split() == [recipe.key(), mine]
 
 
+@pytest.mark.slow
 def test_structures_are_kept_and_come_back_the_same():
     """More structures than are kept: a scene that is built again makes the same bytes."""
     sizes = [0.1 + 0.02 * number for number in range(MOST_KEPT + 2)]
@@ -142,6 +144,7 @@ def test_scenes_one_of():
     assert abs(share - 2 / 3) < 4 * np.sqrt(2 / 9 / 1000)
 
 
+@pytest.mark.slow
 def test_nodes_and_texts_are_exchanged():
     d = box()
     nodes = [d["small-box"], {"type": "sphere", "to_world": d["small-box"]["to_world"], "bsdf": d["small-box"]["bsdf"]}]
@@ -233,6 +236,7 @@ def test_all_data_sets_have_the_same_samples(tmp_path):
         assert torch.allclose(drawn[index]["outside"], stored[index]["outside"], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_standard_error_falls_with_samples():
     """As the square root; of renders that are little but noise it is close to one."""
     plane = tt.scenes.light_over_plane()
@@ -245,6 +249,7 @@ def test_standard_error_falls_with_samples():
     assert 0.8 < small(spp=1, time_axis=tt.TimeAxis(2.0, 0.01, 1200))._maker.standard_error(0) < 1.1
 
 
+@pytest.mark.slow
 def test_several_sensors_phasors_polarization_and_gates():
     both = small(box() | {"eye": box()["sensor"]}, sensors="all").sample(0)
     assert both.arrays["transient"].shape == (2, 1, 60, 8, 8)
@@ -454,6 +459,7 @@ class Steps(D.Uniform):
         return np.round(super().draw(random, place) * 4) / 4
 
 
+@pytest.mark.slow
 def test_entries_that_look_alike_are_other_structures():
     scene = box() | {"white": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.1] * 3}}}
     recipe = small(scene, {"white.reflectance": Blob()}, variant="llvm_ad_rgb", labels=["albedo"])
@@ -528,6 +534,7 @@ def test_scans_that_vary_are_all_told():
 # ------------------------------------------------------------------------------------------------ orders, kinds, ends
 
 
+@pytest.mark.slow
 def test_nodes_are_exchanged_before_what_is_in_them():
     """Whatever the order of the keys."""
     colours = [{"type": "diffuse", "reflectance": value} for value in (0.2, 0.7)]
@@ -544,6 +551,7 @@ def test_nodes_are_exchanged_before_what_is_in_them():
         small(scene, lacking).check()
 
 
+@pytest.mark.slow
 def test_values_of_a_key_are_of_one_kind():
     mixed = small(vary={"red.reflectance": D.Choice([0.5, {"type": "rgb", "value": [0.1, 0.2, 0.3]}])})
     assert {type(mixed.sample(index).values["red.reflectance"]) for index in range(6)} == {str}
@@ -554,6 +562,7 @@ def test_values_of_a_key_are_of_one_kind():
     assert numbers.key() == again.key() and numbers.structure(0).text == again.structure(0).text
 
 
+@pytest.mark.slow
 def test_texts_of_structures_do_not_depend_on_how_arrays_are_printed():
     scene = box() | {"thing": {"type": "sphere", "radius": 0.9, "center": [0.0, 0.0, 0.5]}}
     vary = {"thing.center": D.Uniform([0.01] * 3, [0.04] * 3)}
@@ -602,6 +611,7 @@ def test_a_recipe_does_not_change():
         recipe.vary["x"] = D.Uniform(0, 1)
 
 
+@pytest.mark.slow
 def test_transforms_of_mitsuba():
     import mitsuba as mi
 

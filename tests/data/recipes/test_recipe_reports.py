@@ -79,6 +79,7 @@ def test_cost_counts_what_is_built():
     assert cost.seen == 64 and cost.sample_s >= np.mean([one.first_s for one in cost.structures[1:]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", long(["exhaustive", "list"], ["list"]))
 def test_sheets_of_other_scans(kind, tmp_path):
     wall = tt.nlos.Wall.plane(width=1.0, height=1.0)

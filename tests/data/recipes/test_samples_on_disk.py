@@ -43,6 +43,7 @@ RECIPES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", long(RECIPES, set(RECIPES) - {"two sensors", "polarized"}))
 def test_windows(kind, tmp_path):
     recipe = RECIPES[kind]()

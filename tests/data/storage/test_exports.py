@@ -178,7 +178,7 @@ def captures(place, scan, capture, name="transient", **about):
     return write(place / "shard-000000.h5", samples, about={**header()["about"], **entries})
 
 
-@pytest.mark.parametrize("kind", ["single", "confocal", "exhaustive"])
+@pytest.mark.parametrize("kind", ["single", "exhaustive"])
 def test_captures_of_y_tal(tmp_path, kind):
     scan = grids()[kind]
     capture = made(scan)
@@ -201,6 +201,7 @@ def test_phasors(tmp_path):
     assert torch.equal(found.phasor, capture.phasor) and found.frequencies == capture.frequencies
 
 
+@pytest.mark.slow
 def test_phasors_of_a_recipe(tmp_path):
     """What its maker says about itself is what the export reads."""
     scan = tt.nlos.Scan.grid(tt.nlos.Wall.plane(1.0, 1.0), (4, 3), kind="confocal")
@@ -231,6 +232,7 @@ def rendered(place, samples=3, **settings):
     (place / "out").mkdir()
 
 
+@pytest.mark.slow
 def test_what_a_summary_says_of_phasors(tmp_path):
     rendered(tmp_path, samples=1, frequencies=[1.0, 2.0, 3.0])
     assert "3 frequencies, 1 to 3 cycles per metre" in summary(tmp_path)

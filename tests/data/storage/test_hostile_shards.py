@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import multiprocessing
 import os
@@ -10,6 +11,7 @@ import resource
 import signal
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import h5py
@@ -67,8 +69,15 @@ def test_mutated_files(tmp_path):
     assert good < 150 and grown < 100e6
 
 
+@functools.cache
+def two_samples():
+    with tempfile.TemporaryDirectory() as folder:
+        return write(Path(folder) / "a.h5", [sample(0), sample(1)]).read_bytes()
+
+
 def changed(tmp_path, change):
-    path = write(tmp_path / "a.h5", [sample(0), sample(1)])
+    path = tmp_path / "a.h5"
+    path.write_bytes(two_samples())
     with h5py.File(path, "r+") as file:
         change(file)
     return path

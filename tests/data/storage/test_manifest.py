@@ -15,9 +15,14 @@ from torchtransient.data.storage.shard_file import Shard
 from torchtransient.errors import StorageError
 
 
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    return folder(tmp_path_factory.mktemp("written") / "set")
+
+
 @pytest.fixture
-def data(tmp_path):
-    return folder(tmp_path / "set")
+def data(written, tmp_path):
+    return shutil.copytree(written, tmp_path / "set")
 
 
 def test_a_manifest_of_its_shards(data):
@@ -53,6 +58,7 @@ def test_failures_are_told(data):
     assert report.complete and report.failed == {1: "dark"} and report.samples == 9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", [0.1, 0.5, 0.9, 0.99999])
 def test_one_bit(data, place):
     build_manifest(data)
@@ -78,7 +84,7 @@ def test_every_byte_counts(tmp_path):
         assert "shard-000000.h5" in verify(tmp_path).faults, place
 
 
-@pytest.mark.parametrize("cut", [1, 40, 5000])
+@pytest.mark.parametrize("cut", [1, 5000])
 def test_cut_files(data, cut):
     path = data / "shard-000001.h5"
     path.write_bytes(path.read_bytes()[:-cut])
@@ -125,6 +131,7 @@ def test_other_stores_and_manifests(data):
     assert "manifest.json" not in verify(data).faults
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "words"),
     [

@@ -68,7 +68,7 @@ def test_bytes_do_not_tell_the_order(tmp_path, store, compression):
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("BLOSC_NTHREADS", "2"), ("BLOSC_CLEVEL", "9"), ("BLOSC_BLOCKSIZE", "4096")]
+    ("name", "value"), [("BLOSC_NTHREADS", "2"), ("BLOSC_CLEVEL", "9")]
 )
 def test_bytes_do_not_tell_the_environment(tmp_path, monkeypatch, name, value):
     samples = [sample(0, (1, 256, 32, 32))]
@@ -77,6 +77,7 @@ def test_bytes_do_not_tell_the_environment(tmp_path, monkeypatch, name, value):
     assert digest(write(tmp_path / "b.h5", samples)) == before and os.environ[name] == value
 
 
+@pytest.mark.slow
 def test_chunks_are_compressed_without_threads(tmp_path):
     """Threads of each of 32 chunks would wait 128 times here, and two workers would be hardly faster than one."""
     samples = [sample(i, (1, 1024, 32, 32)) for i in range(4)]

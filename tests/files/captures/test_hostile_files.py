@@ -59,8 +59,8 @@ def _memory():
 
 
 def test_mutated_files(tmp_path):
-    good, _ = read_mutants(tmp_path, range(40))
-    assert 0 < good < 40
+    good, _ = read_mutants(tmp_path, range(12))
+    assert 0 < good < 12
 
 
 @pytest.mark.soak
@@ -150,8 +150,10 @@ def test_texts_that_say_they_are_gigabytes(tmp_path, layout, libver):
     assert changed and _memory() - before < 50e6
 
 
-@pytest.mark.parametrize("kind", ["external", "virtual", "link", "soft link"])
-@pytest.mark.parametrize("layout", ["tal", "torchtransient"])
+@pytest.mark.parametrize(
+    "layout, kind",
+    [("tal", "external"), ("torchtransient", "virtual"), ("tal", "link"), ("torchtransient", "soft link")],
+)
 def test_other_files_are_not_read(tmp_path, layout, kind):
     secret = tmp_path / "secret"
     secret.write_bytes(bytes(4 * 7 * 12))

@@ -27,7 +27,7 @@ def scans():
     """Of every kind with few points, and with one."""
     for legs in (True, False):
         settings = {**ORIGINS, "first_and_last_leg": legs}
-        for size in ((1, 1), (3, 1), (1, 3), (2, 2)):
+        for size in ((1, 1), (1, 3), (2, 2)) if legs else ((2, 2),):
             for kind in KINDS[:3]:
                 for spots in ((1, 1), (2, 1)) if kind == "exhaustive" else (None,):
                     if kind != "exhaustive" or size != (1, 1) or spots != (1, 1):
@@ -86,6 +86,7 @@ NUMBERS = (
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @together("dtype", NUMBERS)
 @together("layout", WRITTEN)
 def test_numbers_of_every_kind(tmp_path, layout, dtype):
@@ -263,7 +264,7 @@ def test_confocal_up_to_single_precision_wherever_the_origin_is(tmp_path, layout
 # ------------------------------------------------------------------------------------------------ words and arguments
 
 
-@pytest.mark.parametrize("value", [5, "big", {"hiddenVolumeSize": "big", "minimalpos": [1.0]}, [1, 2], None])
+@pytest.mark.parametrize("value", [5, {"hiddenVolumeSize": "big", "minimalpos": [1.0]}, None])
 @pytest.mark.parametrize(("layout", "kind"), [("zaragoza", "confocal"), ("phasor_field", "single")])
 def test_hidden_volumes_of_anyone(tmp_path, layout, kind, value):
     capture = made(listed(kind) if layout == "phasor_field" else grids()[kind], metadata={"hidden_volume": value})
@@ -297,8 +298,8 @@ def test_counts_of_few_photons(tmp_path):
     """MATLAB packs them into less than a bit each; what is unpacked is compared with what is stored."""
     import scipy.io
 
-    counts = np.random.default_rng(0).random((64, 64, 512)) < 1e-4
-    for kind in (np.uint8, np.uint16, np.float32, np.float64):
+    counts = np.random.default_rng(0).random((32, 32, 512)) < 1e-4
+    for kind in (np.uint8, np.uint16, np.float64):
         scipy.io.savemat(
             tmp_path / "a.mat", {"rect_data": counts.astype(kind), "width": 0.5, "ts": 4e-12}, do_compression=True
         )

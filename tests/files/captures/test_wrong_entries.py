@@ -132,6 +132,7 @@ CASES = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 @together("name, entries, words", CASES)
 def test_entries_that_are_wrong(tmp_path, name, entries, words):
     layout, capture = FILES[name]

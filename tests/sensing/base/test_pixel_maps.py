@@ -43,7 +43,7 @@ def uniform(*shape, seed=0):
 # --- the budget -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("shape", [(), (3, 4), (3, 1), (2, 1, 1), (2, 3, 4), (5, 2, 3, 4)])
+@pytest.mark.parametrize("shape", [(), (3, 1), (2, 3, 4), (5, 2, 3, 4)])
 @pytest.mark.parametrize("name", ["quantum_efficiency", "ambient_rate_hz", "dark_count_rate_hz"])
 def test_a_map_is_a_budget_for_every_pixel(name, shape):
     """Pixel by pixel the map gives what the number gives, and the report adds up to the light."""

@@ -60,7 +60,7 @@ def test_draws_have_the_mean_of_their_pixel():
     assert bool(((y.mean(0) - mean[0]).abs() < 5 * (y.var(0) / 3000).sqrt() + 2e-3).all())
 
 
-@pytest.mark.parametrize("policy", ["gaussian", "straight_through", "score"])
+@pytest.mark.parametrize("policy", ["gaussian", "score"])
 def test_policies_of_losses_of_pixels(policy):
     """One loss for each pixel: its gradient is that of its own light. Linear losses, for which all are unbiased."""
     sensor = PixelGroups.by_value(DEAD * WIDTH, synchronous(100), grad=policy)

@@ -105,7 +105,7 @@ def test_draws_have_the_mean(name):
 
 
 @each_law
-@together("period", [BINS + 1, 64, 75, 300])
+@together("period", [BINS + 1, 75, 300])
 def test_constant_counts_in_a_window_of_a_longer_period(name, period):
     """What goes on outside of the window triggers afterpulses inside: as in a window of the whole period."""
     whole = LAWS[name]()
@@ -207,7 +207,7 @@ def two(dead):
     return exponentials(dead, *parts), [Afterpulse(p, exponential_delays(t, after=dead)) for p, t in parts]
 
 
-@pytest.mark.parametrize("mode, dead, total", [("first", 12.3, 10.0), ("free", 12.3, 10.0), ("free", 55.7, 100.0)])
+@pytest.mark.parametrize("mode, dead, total", [("first", 12.3, 10.0), ("free", 12.3, 10.0)])
 def test_events(mode, dead, total):
     """As events do that walk through every carrier, dead times and all. One run's ratio scatters by some 0.3."""
     assert agreement(mode, dead, total, "pulse", *two(dead)).ratio < 1.5
@@ -257,6 +257,7 @@ def test_frequent_afterpulses(mode, dead, tau):
             assert found.within(1.5), (total, kind, found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "mode, dead, tau, total",
     long_rows(
@@ -300,20 +301,20 @@ def test_totals_of_draws_vary_less_than_those_of_events(total, probability):
         assert short > noise
 
 
-@pytest.mark.parametrize("mode, dead", [("several", 1.3), ("free", 12.3)])
-@pytest.mark.parametrize("tau", [0.4, 30.0])
+@pytest.mark.parametrize("mode, dead, tau", [("several", 1.3, 30.0), ("free", 12.3, 0.4)])
 def test_hardly_any_afterpulses_are_none(mode, dead, tau):
     x = torch.as_tensor(light(20.0, "pulse")).view(1, -1, 1, 1)
     sensor = AfterpulsingSPAD(detector(mode, dead), exponentials(dead, (1e-10, tau)))
     torch.testing.assert_close(sensor.expected(x), detector(mode, dead).expected(x), rtol=1e-6, atol=1e-9)
 
 
-@pytest.mark.parametrize("total", [0.1, 1.0, 10.0, 100.0])
-@pytest.mark.parametrize("dead", [12.3, 55.7])
-def test_constant_light_stays_constant(dead, total):
+@pytest.mark.parametrize(
+    "dead, total, p", [(12.3, 0.1, 0.3), (55.7, 1.0, 0.04), (12.3, 10.0, 0.04), (55.7, 100.0, 0.3)]
+)
+def test_constant_light_stays_constant(dead, total, p):
     """Free-running, of photons at a rate n: 1/m = dead + (1 - p)/n + p/(n + 1/tau) of carriers gone with a dead time.
     """
-    n, p, tau = total / BINS, 0.04, 1.0
+    n, tau = total / BINS, 1.0
     light_ = torch.full((1, BINS, 1, 1), n, dtype=torch.float64)
     y = AfterpulsingSPAD(detector("free", dead), two(dead)[0])(light_)
     assert float(y.max() / y.min() - 1) < 1e-6

@@ -50,7 +50,7 @@ def test_a_gate_dims_photons_and_carriers_alike():
     torch.testing.assert_close(more.sum(1), whole.sum(1), rtol=0.03, atol=0)
 
 
-@pytest.mark.parametrize("kind", long(["cycles", "gated", "free"], ["cycles", "gated"]))
+@pytest.mark.parametrize("kind", long(["cycles", "gated", "free"], ["gated"]))
 def test_bins_in_parts_are_finer_bins(kind):
     """Carriers of a part of a bin are followed in parts of bins: as where the bins are cut by hand."""
     gated, free = kind == "gated", kind == "free"
@@ -72,6 +72,7 @@ def test_bins_in_parts_are_finer_bins(kind):
     assert bool(((drawn - coarse(x)).abs() < 5 * (coarse(x) / 20).sqrt() + 0.5).all())
 
 
+@pytest.mark.slow
 def test_pixels_of_several_levels_are_those_of_each():
     """Dim and bright ones together, in a batch, mapped by torch.func, and their derivatives."""
     module = obeyed(spad())
@@ -110,6 +111,7 @@ def test_what_does_not_reach_the_window_leaves_nothing_below_zero():
                 assert float(module.released(x).min()) >= 0
 
 
+@pytest.mark.slow
 def test_transforms_of_detectors_with_dead_time():
     """Gradients mapped over pixels, of one level and of several: those of autograd."""
     detector = spad()
@@ -171,6 +173,7 @@ class Watched(carriers.RingTrain):
         return super().trapped(rate, lost, back, source)
 
 
+@pytest.mark.slow
 def test_no_rate_of_other_carriers_is_below_zero():
     """Of pairs in the dark before a flash, where each of them makes others less likely."""
     first = number([[1e-6, 1e-6, 1.0, 1e-6, 1e-6, 1e-6]])

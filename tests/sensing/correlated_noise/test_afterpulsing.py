@@ -99,14 +99,13 @@ def test_crosstalk_against_loops():
 
 
 @pytest.mark.parametrize(
-    "make",
+    "make, policy",
     [
-        lambda **k: Afterpulsing(0.05, 30e-10, 20e-10, bin_width_s=1e-10, learnable=True, **k),
-        lambda **k: Crosstalk(0.05, learnable=True, **k),
+        (lambda **k: Afterpulsing(0.05, 30e-10, 20e-10, bin_width_s=1e-10, learnable=True, **k), "gaussian"),
+        (lambda **k: Crosstalk(0.05, learnable=True, **k), "score"),
     ],
     ids=["afterpulsing", "crosstalk"],
 )
-@pytest.mark.parametrize("policy", ["gaussian", "score"])
 def test_policies_keep_the_gradient_of_what_passes(make, policy):
     """Loss: square of one bin. Exact: 2 y + (variance of what is added)', in the probability's logit."""
     module, draws = make(grad=policy), 30_000
@@ -145,10 +144,9 @@ def test_counts_below_zero_trigger_nothing():
         torch.testing.assert_close(stage.log_prob(lit - 1, lit), alike, rtol=1e-12, atol=0)
 
 
-@pytest.mark.parametrize("together", [1, 3, 7, 20])
-def test_frames_that_are_followed_some_at_a_time(together, monkeypatch):
+def test_frames_that_are_followed_some_at_a_time(monkeypatch):
     """Each has crosstalk of its own detections, and all of it, however many fit into a block."""
-    monkeypatch.setattr(crosstalk, "_BLOCK", together * 2 * 3 + 1)
+    monkeypatch.setattr(crosstalk, "_BLOCK", 3 * 2 * 3 + 1)
     x = torch.full((100, 2, 3), 20.0)
     stage = Crosstalk(0.1, diagonal_ratio=0.5)
     found = stage.sample(x.unsqueeze(0), torch.Generator().manual_seed(0))[0] - x
@@ -185,7 +183,11 @@ def test_crosstalk_is_a_binomial_number_of_every_neighbour():
     torch.testing.assert_close(module.variance(x)[0].flatten()[1], torch.tensor((n + 7) * p * (1 - p)))
 
 
-@pytest.mark.parametrize("period_bins, tau, dead", [(40, 6.0, 4.0), (64, 30.0, 2.5), (100, 0.4, 1.0)])
+@pytest.mark.parametrize("period_bins, tau, dead", [
+        (40, 6.0, 4.0), pytest.param(64, 30.0, 2.5, marks=pytest.mark.slow),
+        pytest.param(100, 0.4, 1.0, marks=pytest.mark.slow),
+    ],
+)  # fmt: skip
 def test_afterpulses_are_followed_one_by_one(period_bins, tau, dead):
     """Mean of every bin, and the variance of the total: a geometric number per detection, p / (1 - p)^2."""
     n, p, pixels = 300, 0.3, 16_384
@@ -225,6 +227,7 @@ def test_means_and_floods_take_poisson_numbers(make):
         assert float(added.sum()) == pytest.approx(float(mean.sum()), abs=5 * float(mean.sum()) ** 0.5 + 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "make", [lambda: Crosstalk(0.02), lambda: Afterpulsing(0.05, 30e-10, 20e-10, bin_width_s=1e-10)]
 )

@@ -41,7 +41,7 @@ def slow(*values):
 
 
 CASES = [
-    ("pulse", 1.0, 6.5), ("pulse", 100.0, 1.3), ("ends", 100.0, 0.6), ("spike", 30.0, 0.7), ("ends", 10.0, 3.4),
+    ("pulse", 1.0, 6.5), ("ends", 100.0, 0.6),
     *(slow(s, r, d) for s in shapes() for r in (0.1, 1.0, 10.0, 100.0) for d in (0.83, 1.3, 23.7)),
 ]  # fmt: skip
 
@@ -83,6 +83,7 @@ def test_the_error_of_the_review():
     np.testing.assert_allclose(found[bins], events.mean[bins], rtol=0.06)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape, total", [("pulse", 3.0), ("pulse", 30.0), ("ends", 100.0), ("spike", 60.0)])
 @pytest.mark.parametrize("dead", [0.6, 1.3, 7.0])
 def test_bins_cut_or_not_give_the_same(shape, total, dead):
@@ -148,6 +149,7 @@ def test_pixels_of_all_levels():
     assert sample_detections(torch.zeros(0, 1, 8, 2, 2), 10, 1.3).shape == (0, 1, 8, 2, 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dead", [0.6, 1.0, 1.3, 5.0, 5.6, 40.4])
 def test_the_walk_is_the_recursion_in_steps(dead):
     """Means and gradients by columns and their adjoint: float64 rounding beside autograd through the recursion."""
@@ -163,6 +165,7 @@ def test_the_walk_is_the_recursion_in_steps(dead):
         torch.testing.assert_close(walked, stepped, rtol=1e-11, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_batches_of_autograd_and_of_func():
     """Jacobians and Hessians of every kind, one pixel."""
     x = image(np.linspace(0.05, 0.3, 4))
@@ -181,6 +184,7 @@ def test_batches_of_autograd_and_of_func():
     torch.testing.assert_close(bend, numeric, rtol=1e-11, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_forward_derivatives_where_no_graph_is_built():
     """`no_grad` is about graphs: tangents of the light and of the dead time go on."""
     x, d = mixed()[..., :2] + 0.01, torch.tensor(1.3, dtype=torch.float64)
@@ -194,6 +198,7 @@ def test_forward_derivatives_where_no_graph_is_built():
         torch.testing.assert_close(found[1], found[0], rtol=1e-12, atol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dead", [slow(0.7), 1.3])
 def test_gradients(dead):
     x = mixed()[..., :2] + 0.01  # not cut, and cut
@@ -225,7 +230,7 @@ def test_score_of_draws_gives_the_gradient_of_the_mean():
 
 
 @pytest.mark.parametrize(
-    "total, dead", [(1.0, 1.3), (2.0, 40.0), slow(30.0, 7.9), slow(30.0, 1.0), slow(100.0, 1.3), slow(100.0, 2.2)]
+    "total, dead", [(1.0, 1.3), slow(2.0, 40.0), slow(30.0, 7.9), slow(30.0, 1.0), slow(100.0, 1.3), slow(100.0, 2.2)]
 )
 def test_coates_undoes_the_mean(total, dead):
     rate, cycles = image(total * shapes()["pulse"]), 10_000
@@ -259,6 +264,7 @@ def test_estimates_have_gradients_where_no_cycle_is_armed():
     assert bool(slope.isfinite().all()) and bool((slope[:, 3:] != 0).all())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dead", [1.0, 1.4, 2.3])
 def test_slopes_of_estimates_where_nothing_was_detected(dead):
     """A detection more in a bin without one: the rate rises by the time that cycles are armed in it, as it does."""
@@ -287,6 +293,7 @@ def test_in_a_flood_coates_looks_no_closer(monkeypatch):
     assert wrong == pytest.approx(0.1, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_coates_of_draws_is_unbiased():
     rate, repeats, cycles = image(5 * shapes()["pulse"]), 200, 20_000
     h = spad(2.6, cycles).sample(rate.unsqueeze(0).expand(repeats, 1, BINS, 1, 1), torch.Generator().manual_seed(0))

@@ -91,6 +91,7 @@ def test_one_detection_per_cycle_where_the_dead_time_is_longer_than_the_window(n
     assert "dead_time_s" not in stage(name, "SynchronousSPAD")
 
 
+@pytest.mark.slow
 def test_only_the_fast_counter_sees_a_second_photon():
     """Two pulses of 9 expected detections, 3 ns apart: each is seen with a probability of 1 - exp(-9)."""
     seen = {}

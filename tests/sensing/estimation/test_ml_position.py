@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import pytest
 import torch
 
-from support.marks import long_pairs
+from support.marks import long_rows
 from torchtransient import TimeAxis, sensing
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.sensing.estimation.position_likelihood import _top
@@ -37,7 +38,9 @@ def counts_of(response, truth, photons, background, seed=1):
 
 
 @pytest.mark.parametrize(
-    ("shape", "background"), long_pairs(SHAPES, [0.0, 0.6], [(s, (0.6, 0.0)[n % 2]) for n, s in enumerate(SHAPES)])
+    ("shape", "background"), long_rows(
+        itertools.product(SHAPES, [0.0, 0.6]), [("tail of 2 bins", 0.6), ("rectangle", 0.0), ("wide", 0.6)]
+    )
 )
 def test_at_the_bound_in_any_shape(shape, background):
     """1000 photons. The ratio of 2000 draws has a deviation of 1.6 %: four of them, and 2 % above the bound."""

@@ -75,7 +75,12 @@ def frames(code, turns, readout, light=1000.0, contrast=0.7, background=300.0):
     return found[None, :, None]
 
 
-@pytest.mark.parametrize("name, readout", list(pairs(CODES, READOUTS)))
+@pytest.mark.parametrize("name, readout", [
+        (name, readout)
+        for n, name in enumerate(CODES)
+        for readout in (READOUTS if CODES[name].num_taps in (2, 4) else READOUTS[n % 3 :][:1])
+    ],
+)
 def test_every_code_and_readout_gives_the_phase(name, readout):
     """Decoded by shape, through a transient and through the definition; two steps of one tap are refused."""
     code, turns = CODES[name], torch.linspace(0.003, 0.997, 101, dtype=torch.float64)
@@ -135,6 +140,7 @@ def test_two_quadrature_steps_of_two_taps_wiggle_as_four_taps():
 # ------------------------------------------------------------------------------------------------------------- noise
 
 
+@pytest.mark.slow
 @together("dark_e, read_noise_e", [(0.0, 0.0), (150.0, 0.0), (40.0, 25.0)])
 @together("num_taps, readout", [p for p in pairs(range(2, 9), READOUTS) if p != (2, "single")])
 def test_variance_of_phase_and_depth(num_taps, readout, dark_e, read_noise_e):
@@ -253,7 +259,7 @@ def test_readings_have_gradients(readout):
         found = read_itof(taps, F, 4, readout=readout, calibration=known, noise=noise)
         return found.depth_m, found.amplitude, found.depth_std_m
 
-    assert torch.autograd.gradcheck(read, taps)
+    assert torch.autograd.gradcheck(read, taps, fast_mode=True)
 
 
 # ------------------------------------------------------------------------------------------------------- calibration
@@ -307,6 +313,7 @@ def test_reversed_steps(direction):
     torch.testing.assert_close(back.coefficients([0, 1, 3, -3]), spectrum[:, [0, 1, 3, size - 3]], rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 @together(
     "name, readout",
     [
@@ -428,10 +435,10 @@ def test_raw_frames_of_whole_numbers(kind):
 @pytest.mark.parametrize(
     "given",
     [
-        [60.6e6, 20e6], (60.6e6, 20e6), np.array([60.6e6, 20e6]), torch.tensor([60.6e6, 20e6]),
-        [torch.tensor(60.6e6), np.float64(20e6)], np.array([60_600_000, 20_000_000]),
+        [60.6e6, 20e6], torch.tensor([60.6e6, 20e6]), [torch.tensor(60.6e6), np.float64(20e6)],
+        np.array([60_600_000, 20_000_000]),
     ],
-    ids=["list", "tuple", "array", "tensor", "numbers", "whole"],
+    ids=["list", "tensor", "numbers", "whole"],
 )  # fmt: skip
 def test_frequencies_of_any_kind(given):
     camera = ItofCorrelation(sine_code(3), given, AXIS)
@@ -490,6 +497,7 @@ def test_errors(call, error):
         call()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("readout", ["two_tap", "differential", "single"])
 def test_the_standard_deviation_at_the_corners_of_a_square_code(readout):
     """The slope has two values at a corner: one of them was claimed, up to 19 % too small."""

@@ -46,8 +46,7 @@ def close(found, wanted, rtol):
 
 @pytest.mark.parametrize(
     ("values", "largest"),
-    [(SMALL, None), (SMALL, 1.0), (SMALL[:4], 0.4), (SMALL[:3], 1e-3), (LARGE, None), (SMALL + LARGE, None),
-     (SMALL + LARGE, 900.0), ([0.0, 0.0], None)],
+    [(SMALL[:4], 0.4), (SMALL[:3], 1e-3), (SMALL + LARGE, None), (SMALL + LARGE, 900.0), ([0.0, 0.0], None)],
 )  # fmt: skip
 def test_moments_and_their_slopes(values, largest):
     """Of all rates, with and without a bound that is known: few roundings of the number itself."""

@@ -62,6 +62,7 @@ def test_frequencies(draw, dtype):
         chi_square_is_small(found[case == k].numpy(), number, exact)
 
 
+@pytest.mark.slow
 @together("n, p", CASES)
 def test_frequencies_of_equal_entries(n, p):
     """Every case alone: blocks take the way that suits all of their entries."""
@@ -73,7 +74,7 @@ def test_frequencies_of_equal_entries(n, p):
     chi_square_is_small(halve(counts, share, g).flatten().numpy(), n, exact)
 
 
-@pytest.mark.parametrize("p", [1e-7, 3e-6, 1e-4])
+@pytest.mark.parametrize("p", [1e-7, 1e-4])
 def test_very_rare_events(p):
     """Probabilities far below the steps of the first comparison."""
     counts = torch.full((3_000_000,), 3.0)
@@ -123,8 +124,7 @@ def test_ends_of_the_tables(n, p):
     chi_square_is_small(found.numpy(), n, float(share[0].double()))
 
 
-@pytest.mark.parametrize("size", [9_000, 50_000, 150_000], ids=["small table", "table", "two blocks"])
-@pytest.mark.parametrize("p", [1e-4, 0.02, 0.25, 0.5])
+@pytest.mark.parametrize("size, p", [(9_000, 1e-4), (9_000, 0.5), (50_000, 0.02), (150_000, 0.25)])
 def test_one_probability(size, p):
     """Rows, counts beyond the rows, and counts for torch.binomial, side by side: `thin` and `add_passing`."""
     cases = (0, 1, 100, 127, 128, 511, 512, 1500, 1501, 4000)

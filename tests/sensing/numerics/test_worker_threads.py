@@ -55,6 +55,7 @@ def _in_child(queue):
     queue.put(side_by_side(of_thread, range(2)))
 
 
+@pytest.mark.slow
 def test_forks_begin_anew(threads):
     side_by_side(of_thread, range(4))
     context = multiprocessing.get_context("fork")
@@ -82,6 +83,7 @@ def test_threads_are_in_the_mode_of_the_caller(threads):
     assert side_by_side(modes, range(4)) == [(False, True)] * 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "sensor",
     [sensing.SynchronousSPAD(50), sensing.ShotNoise(), sensing.Crosstalk(0.05), sensing.Afterpulsing(

@@ -9,7 +9,6 @@ from torchtransient.sensing import (
     Afterpulsing,
     AfterpulsingSPAD,
     CoincidencePixel,
-    FreeRunningSPAD,
     MacroPixel,
     SynchronousSPAD,
 )
@@ -52,17 +51,3 @@ def test_all_carriers_are_set_free_during_the_dead_time(tau_s):
     counts = spad.sample(x, torch.Generator().manual_seed(0))
     afterpulsing.grad = "straight_through"
     assert torch.equal(afterpulsing(counts, generator=torch.Generator().manual_seed(0)), counts)
-
-
-@pytest.mark.parametrize("p", [0.05, 0.3])
-@pytest.mark.parametrize("n", [0.001, 0.01, 0.125, 1.0])
-def test_renewal_theory_of_constant_light(p, n):
-    """Carriers set free right after the dead time find the detector armed: exact but for those that outlast another."""
-    dead, tau = 25.0, 3.0
-    afterpulsing = Afterpulsing(p, tau * 1e-9, dead * 1e-9, bin_width_s=1e-9)
-    spad = AfterpulsingSPAD(FreeRunningSPAD(1, dead * 1e-9, bin_width_s=1e-9), afterpulsing)
-    found = float(spad.expected(torch.full((1, 40, 1, 1), n, dtype=torch.float64)).mean())
-    wanted = 1 / (dead + (1 - p) / n + p / (n + 1 / tau))
-    # carriers that outlast a second dead time, exp(-25 / 3) of them, are not in the formula
-    assert found / wanted - 1 == pytest.approx(0, abs=1e-5)
-    assert found > 1 / (dead + 1 / n)

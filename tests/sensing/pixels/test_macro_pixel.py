@@ -78,10 +78,9 @@ def coincidences(events, k, window, in_step):
 
 
 @pytest.mark.parametrize("mode, dead, total", [("first", 9.5, 30.0), ("several", 9.5, 10.0), ("free", 9.5, 60.0)])
-@pytest.mark.parametrize("weights", [[1, 1, 1, 1, 1, 1], [1, 4, 4, 2]])
-def test_sums_are_those_of_events(mode, dead, total, weights):
+def test_sums_are_those_of_events(mode, dead, total):
     """Total variation within 1.5 of its noise, and not that of one SPAD with all the light."""
-    rate, found = light(total), []
+    rate, weights, found = light(total), [1, 4, 4, 2], []
     mean = MacroPixel(detector(mode, dead), len(weights), weights=weights).expected(image(rate)).numpy()
     for seed in range(4):
         events = zone(np.random.default_rng(seed), mode, dead, rate, weights, 60)
@@ -123,6 +122,7 @@ def test_draws_of_equal_spads_are_one_draw_of_more_cycles():
     assert float(error.max()) < 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("policy", ["gaussian", "straight_through"])
 def test_totals_of_free_spads_vary_as_those_of_independent_ones(policy):
     """50 photons a period on each, dead for 33.7 of 32 bins: one train of N times the periods varies N times less.
@@ -200,10 +200,10 @@ CASES = [
     ("first", 9.5, 20.0, [1] * 8, 2, 3.4),
     ("several", 9.5, 6.0, [1, 1, 2, 4], 2, 2.0),
     ("free", 9.5, 30.0, [1] * 8, 3, 4.7),
-    ("free", 41.2, 30.0, [1, 2, 3], 1, 5.3),
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode, dead, total, weights, k, window", CASES)
 def test_coincidences_are_those_of_events(mode, dead, total, weights, k, window):
     rate = light(total)
@@ -297,7 +297,7 @@ def test_the_score_of_a_learnt_dead_time_is_refused():
         sensor(image(light(1.0)))
 
 
-WINDOWS = [("first", 1.6), ("first", 0.7), ("first", 5.0), ("free", 1.6), ("free", 4.3)]
+WINDOWS = [("first", 1.6), ("first", 5.0), ("free", 0.7)]
 
 
 @pytest.mark.parametrize(
@@ -423,6 +423,7 @@ def test_no_image_at_all(make):
         assert measure(torch.ones(0, 1, BINS, 2, 2)).shape == (0, 1, BINS, 2, 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("photons", long([1e-3, 40.0, 400.0, 1e12, 1e15], [1e-3, 40.0, 400.0]))
 def test_coincidences_of_a_bin_with_any_number_of_photons(photons):
     """All light in bin 0, first photons, a window of a bin: one as soon as k of n SPADs have fired, none after that.

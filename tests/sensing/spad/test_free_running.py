@@ -33,7 +33,7 @@ def as_image(row):
     return torch.as_tensor(row, dtype=torch.float64).reshape(1, -1, 1, 1)
 
 
-@pytest.mark.parametrize("dead", [0.5, 6.8, 63.0, 64.2, 150.3])
+@pytest.mark.parametrize("dead", [6.8, 64.2, 150.3])
 def test_against_the_dense_markov_matrix(dead):
     rate = pulse(2.5)
     found = nonparalyzable_histogram(as_image(rate), dead).flatten().numpy()
@@ -43,7 +43,7 @@ def test_against_the_dense_markov_matrix(dead):
 
 
 @pytest.mark.parametrize("kind", ["non_paralyzable", "paralyzable"])
-@pytest.mark.parametrize("total, dead", [(1.5, 40.0), (1.5, 100.0), (4.0, 17.3)])
+@pytest.mark.parametrize("total, dead", [(1.5, 100.0), (4.0, 17.3)])
 def test_against_photons_one_by_one(kind, total, dead):
     rate, periods = pulse(total), 45_000 if dead == 100.0 else 30_000
     rng = np.random.default_rng(7)
@@ -143,7 +143,7 @@ def test_learnable_dead_time_is_found():
 
 @pytest.mark.parametrize("dead", long([10.5, 25.2, 80.5], [10.5]))
 def test_samples(dead):
-    rate, cycles, repeats = as_image(pulse(2.0)), 300, 3000
+    rate, cycles, repeats = as_image(pulse(2.0)), 300, 800
     spad = FreeRunningSPAD(cycles, dead * 1e-10, bin_width_s=1e-10, grad="straight_through")
     h = spad(rate.unsqueeze(0).expand(repeats, 1, BINS, 1, 1), generator=torch.Generator().manual_seed(0)).squeeze()
     mean, variance = spad.expected(rate).flatten(), spad.variance(rate).flatten()

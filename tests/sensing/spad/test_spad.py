@@ -60,7 +60,7 @@ def test_expectation_against_photons(dead_bins):
         assert chi2_per_dof(seen, raw) > 20  # pile-up is there to be seen
 
 
-@pytest.mark.parametrize("dead_bins", [None, 6.5, 11.2])
+@pytest.mark.parametrize("dead_bins", [None, 6.5])
 def test_samples_have_the_moments_of_the_model(dead_bins):
     rate, cycles, repeats = pulse(), 500, 4000
     x = as_image(rate).unsqueeze(0).expand(repeats, 1, BINS, 1, 1)
@@ -113,7 +113,7 @@ def test_multinomial_of_many_trials():
     assert single.dtype == torch.float32
 
 
-@pytest.mark.parametrize("bins", [1, 2, 5, 64, 97])
+@pytest.mark.parametrize("bins", [1, 5, 97])
 def test_first_photons_are_the_multinomial_of_their_probabilities(bins):
     """Chi-square over bins and "none", for weak light, strong light and a flood, without any running sum."""
     g, cycles = torch.Generator().manual_seed(4), 200
@@ -135,6 +135,7 @@ def test_first_photons_are_the_multinomial_of_their_probabilities(bins):
     assert float(dark.sum()) == 0
 
 
+@pytest.mark.slow
 def test_large_draws_do_not_depend_on_the_number_of_threads():
     p = torch.full((1, 64, 64, 64), 0.01)
     threads = torch.get_num_threads()
@@ -223,15 +224,13 @@ def test_the_score_has_mean_zero_and_coates_makes_it_vanish(dead_bins):
     [
         ("straight_through", "linear", 0.0),
         ("gaussian", "square", 0.0),
-        ("score", "square", 0.0),
         ("score", "step", 0.0),
         ("straight_through", "square", None),
-        ("expected", "square", None),
     ],
 )
 def test_policies_against_finite_differences(policy, f, bias):
     """Gradient in the brightness of the pulse, of a loss on the peak bin; pile-up makes it negative."""
-    rate, cycles, draws = pulse(1.0, 8), 30, 60_000
+    rate, cycles, draws = pulse(1.0, 8), 30, 20_000
     brightness = torch.full((draws, 1, 1, 1, 1), 1.6, dtype=torch.float64, requires_grad=True)
     losses = {
         "linear": lambda y: y[:, 0, 6],
@@ -315,6 +314,7 @@ def test_counts_behind_a_shut_gate_say_nothing():
     assert found.valid.flatten().tolist() == [True, False, True]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dead", [None, 2.0, 2.5])
 def test_where_counts_tell_the_rate(dead):
     """Up to a share of 1 - 1/2N of what is armed, half a cycle is none; those that come back are armed anew."""

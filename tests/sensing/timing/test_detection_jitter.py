@@ -62,6 +62,7 @@ def test_mean_is_that_of_detections_with_delays_of_their_own(boundary):
     assert (drawn.sum() == number) == (boundary == "periodic") and np.array_equal(drawn, drawn.round())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", [0.05, 3.0, 400.0, 5e4])
 @pytest.mark.parametrize("boundary", ["periodic", "zero"])
 def test_draws_have_mean_and_covariance_of_moved_counts(level, boundary):
@@ -85,6 +86,7 @@ def test_draws_have_mean_and_covariance_of_moved_counts(level, boundary):
         assert bool(((y.T.cov() - covariance).abs() < 5.5 * spread + 0.01).all())
 
 
+@pytest.mark.slow
 def test_no_count_is_lost_or_halved_in_an_image():
     """Sparse and dense blocks, both dtypes, an image of many columns and a batch."""
     for shape, level in (((1, 40, 30, 70), 0.02), ((1, 40, 60, 40), 40.0), ((3, 2, 16, 2, 2), 1e5)):
@@ -118,7 +120,7 @@ def test_means_and_rates_stay_means():
 
 
 @pytest.mark.parametrize("shape", [(0, 1, 16, 2, 2), (1, 16, 0, 2), (2, 1, 16, 3, 0), (1, 1, 2, 2)])
-@pytest.mark.parametrize("policy", ["expected", "gaussian", "straight_through", "score"])
+@pytest.mark.parametrize("policy", ["expected", "gaussian", "score"])
 def test_empty_batches_and_windows_shorter_than_the_response(shape, policy):
     x = torch.full(shape, 3.0, dtype=torch.float64)
     late = tails() if shape[-3] > 1 else GaussianResponse(50 * PS, 900 * PS)
