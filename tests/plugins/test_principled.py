@@ -242,6 +242,7 @@ def test_a_lobe_of_transmission_deep_inside_two_sides(between):
     assert float(renderer.values[key].grad) < 0
 
 
+@pytest.mark.slow
 def test_a_lobe_that_is_added_to_a_scene_that_was_rendered_refracts():
     """Of a scene of Mitsuba, where a changed weight adds the lobe."""
     description = glass_slab({"type": "principled", "eta": 1.4, "roughness": 0.3, "base_color": 0.9})

@@ -276,7 +276,8 @@ EXTRAS = {
 }
 
 
-@pytest.mark.parametrize("extra", long(EXTRAS, ["transient_prbvolpath"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("extra", EXTRAS)
 def test_an_effect_that_is_not_there_changes_nothing(extra):
     """The plan leaves out what the scene does not call for; forcing it gives the same image mean."""
     scene = tt.scenes.parallel_plates(resolution=2)
