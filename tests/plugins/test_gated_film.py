@@ -233,6 +233,7 @@ def test_cut_windows_keep_what_filters_spread_into_them(name, stddev):
     assert full.mean() > 0
 
 
+@pytest.mark.slow
 def test_cut_windows_with_a_pulse():
     scene = tt.load(mirrored(), variant=VARIANT)
     settings = {"time_axis": tt.TimeAxis(8.5, 0.1, 8), "spp": 512, "pulse": tt.Pulse.gaussian(0.8, 0.3)}

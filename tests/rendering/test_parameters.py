@@ -102,15 +102,18 @@ def test_start_value_is_the_scene_and_the_scene_is_restored(textured, key):
 # Together, since each set of keys has kernels of its own.
 TOGETHER = [
     ("wall.bsdf.reflectance.data", "box.to_world", "ball.to_world", "spot.to_world", "lamp.emitter.radiance.value"),
-    ("sensor.to_world", "sensor.x_fov", "wall.to_world", "lamp.to_world", "light.position", "light.intensity.value"),
+    ("wall.to_world", "lamp.to_world", "light.position", "light.intensity.value"),
+    ("sensor.to_world", "sensor.x_fov"),
     ("box.vertex_positions", "box.bsdf.alpha.value"),
     ("box.vertex_normals",),
 ]
 
 
 @pytest.mark.parametrize("keys", long(TOGETHER, TOGETHER[:1]), ids=" ".join)
-def test_forward_and_reverse_mode_agree_and_restore_the_scene(textured, keys):
-    renderer = tt.TransientRenderer(textured, parameters=list(keys), spp=64, grad_seed="same", temporal_filter="tent")
+def test_forward_and_reverse_mode_agree_and_restore_the_scene(textured, room_scene, keys):
+    # The plain room for the sensor: its kernels carry the adjoint of the ray and take long to compile.
+    scene = room_scene if keys[0].startswith("sensor") else textured
+    renderer = tt.TransientRenderer(scene, parameters=list(keys), spp=64, grad_seed="same", temporal_filter="tent")
     generator = torch.Generator().manual_seed(11)
     out = renderer(seed=3).transient
     weights = torch.rand(out.shape, generator=generator).cumsum(-3)
