@@ -90,9 +90,9 @@ def contexts():
 
 
 def asked(materials):
-    """The last material in every context, the others in that of paths from the sensor."""
-    *others, last = materials
-    return [*((one, mi.BSDFContext()) for one in others), *((last, ctx) for ctx in contexts())]
+    """All materials for paths from the sensor, the last one in other contexts, too."""
+    materials = list(materials)
+    return [*((one, mi.BSDFContext()) for one in materials), *((materials[-1], ctx) for ctx in [*contexts()][1::2])]
 
 
 def compare(ours, theirs, ctx, power_alone=False):

@@ -43,6 +43,7 @@ def test_poses_that_reflect_are_refused(kind, described):
         renderer({"ball.to_world": torch.tensor(REFLECTED)}, seed=0)
 
 
+@pytest.mark.slow
 def test_the_ends_of_an_irregular_spectrum_are_not_recorded():
     room = make_room()
     spectrum = {"type": "irregular", "wavelengths": "450, 550, 650", "values": ".2, .8, .4"}

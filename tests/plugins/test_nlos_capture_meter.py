@@ -94,6 +94,7 @@ def test_every_point_of_a_mesh_is_another(tmp_path):
     torch.testing.assert_close(points, expected, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_spot_of_a_mesh(tmp_path):
     found = simulate(on(wall_file(tmp_path, UPRIGHT), "single", laser_lookat_pixel=[2.5, 0.5, 0.0])).scan
     torch.testing.assert_close(found.laser_points, found.sensor_points[0, 2], rtol=0, atol=1e-6)

@@ -9,7 +9,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from support.marks import long
 from torchtransient import plugins
 from torchtransient.errors import SceneError, TorchTransientWarning
 from torchtransient.plugins.films import phasor_events
@@ -171,7 +170,8 @@ def test_sums_of_events(frequencies, spp):
     np.testing.assert_allclose(found, expected, atol=2e-6 * np.sqrt(spp * events) * np.abs(value).max())
 
 
-@pytest.mark.parametrize("tangents", long([False, True], [False]), ids=["values", "tangents"])
+@pytest.mark.slow
+@pytest.mark.parametrize("tangents", [False, True], ids=["values", "tangents"])
 def test_paths_with_more_events_than_fit(monkeypatch, tangents):
     """What exceeds the memory of a path is added event by event, with the same result."""
     film, rng = make_film(2, 1, **GRID), np.random.default_rng(1)

@@ -12,7 +12,7 @@ import torch
 
 import torchtransient as tt
 from support.gradient_cases.scenes import area_light, room
-from support.marks import long, long_rows
+from support.marks import long
 from support.surface_samples import activate, start
 from torchtransient.errors import GradientError
 
@@ -106,12 +106,8 @@ def test_polarized_plastic_is_that_of_mitsuba(settings, variant):
         np.testing.assert_allclose(np.array(other), np.array(one), rtol=1e-5, atol=1e-6)
 
 
-QUICK = [("plastic", "specular_reflectance")]
-
-
-@pytest.mark.parametrize(
-    ("kind", "lobe"), long_rows(itertools.product(["plastic", "roughplastic", "pplastic"], LOBES), QUICK)
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "lobe"), itertools.product(["plastic", "roughplastic", "pplastic"], LOBES))
 def test_a_black_lobe_has_its_slope(kind, lobe):
     scene = scene_with(kind, **black(lobe))
     key = f"wall.bsdf.{lobe}.value"

@@ -122,6 +122,7 @@ def test_wavelengths_are_drawn_where_the_curves_are():
     assert np.array(weight, dtype=float).mean() == pytest.approx(400, rel=1e-2)
 
 
+@pytest.mark.slow
 def test_less_noise_than_wavelengths_drawn_for_the_eye():
     far_red = {"far": {"type": "regular", "wavelength_min": 760, "wavelength_max": 800, "values": "0, 1, 0"}}
     ours, _ = runs(mi.load_dict(description(film(bands=far_red))))

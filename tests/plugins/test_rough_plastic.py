@@ -34,7 +34,7 @@ def pair(**settings):
     return [mi.load_dict({"type": name, "ext_ior": 1.0, **settings}) for name in ("roughplastic", "diff_rough_plastic")]
 
 
-@pytest.mark.parametrize("settings", long(CASES, CASES[1:3]), ids=lambda s: str(s["alpha"]))
+@pytest.mark.parametrize("settings", long(CASES, CASES[1:2]), ids=lambda s: str(s["alpha"]))
 def test_values_densities_and_samples_are_those_of_mitsuba(settings):
     theirs, ours = pair(diffuse_reflectance=0.6, **settings)
     count = 20000

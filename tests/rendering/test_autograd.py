@@ -112,6 +112,7 @@ def test_nn_parameter(renderer, weights):
     same_gradient(x.grad, gradient(renderer, START, weights))
 
 
+@pytest.mark.slow
 def test_optimizer_step_moves_the_image(renderer):
     target = renderer({COLOUR: torch.tensor([0.3, 0.6, 0.4])}, seed=9).steady.detach()
     optimizer = torch.optim.Adam(renderer.parameters(), lr=0.05)

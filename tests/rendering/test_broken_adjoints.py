@@ -103,6 +103,7 @@ def test_recorded_derivatives_do_the_same(renderer):
     assert torch.autograd.grad(render(renderer, x).sum(), x)[0].isfinite().all()  # nothing of it stays behind
 
 
+@pytest.mark.slow
 def test_sensors_and_path_lengths(room):
     room["second"] = dict(room["sensor"])
     renderer = tt.TransientRenderer(room, [COLOUR, WALL_POSE], spp=4, sensors="all", temporal_filter="tent")
@@ -150,6 +151,7 @@ def test_tangents_of_wrapped_functions(gathered):
     assert found[1:3].isnan().all() and found[[0, 3]].tolist() == [0, 1]
 
 
+@pytest.mark.slow
 def test_wrapped_render(room):
     with tt.rendering.variant.active_variant("llvm_ad_rgb"):
         scene = mi.load_dict(room)

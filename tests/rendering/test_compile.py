@@ -104,6 +104,7 @@ def test_scenes_made_and_read_inside(room):
     same(results(torch.compile(loss, backend="eager"), START), results(loss, START))
 
 
+@pytest.mark.slow
 def test_what_a_whole_graph_would_need(room_scene):
     renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=4)
     # The compiler of torch 2.6 takes no reason: it names the function that it was told to leave alone.

@@ -188,6 +188,7 @@ def two_views():
 # -------------------------------------------------------------------------------------------------- orders of calls
 
 
+@pytest.mark.slow
 def test_two_scenes_by_turns():
     rooms = [tt.load(make_room(), variant=VARIANT) for _ in range(2)]
     pairs = [pair(room, parameters=[COLOUR, GREY], spp=4) for room in rooms]
@@ -451,6 +452,7 @@ def test_what_changes_is_said(room_scene):
         change()
 
 
+@pytest.mark.slow
 def test_a_second_filter_leaves_the_recordings_of_the_first(room_scene):
     scene = tt.load(make_room(), variant=VARIANT)
     first = tt.TransientRenderer(scene, parameters=[COLOUR], spp=2, temporal_filter="tent")

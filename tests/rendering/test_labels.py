@@ -311,10 +311,9 @@ def test_meshes_that_renders_merge_are_told_apart():
 # ------------------------------------------------------------------------------------------------------- variants
 
 
-@pytest.mark.parametrize(
-    "variant, expected", [("llvm_ad_rgb", [0.2, 0.5, 0.7]), ("llvm_ad_spectral", [0.2, 0.5, 0.7])]
-)
-def test_albedo_of_a_colour_in_every_variant(variant, expected):
+@pytest.mark.parametrize("variant", long(["llvm_ad_rgb", "llvm_ad_spectral"], ["llvm_ad_rgb"]))
+def test_albedo_of_a_colour_in_every_variant(variant):
+    expected = [0.2, 0.5, 0.7]
     paint = {"type": "diffuse", "reflectance": {"type": "rgb", "value": expected}}
     renderer = renderer_of(camera(), variant, wall=plane(bsdf=paint))
     labels = scene_labels(renderer, names=["albedo", "depth"])
@@ -711,7 +710,7 @@ def same_recorded(make, values, names, hidden=False):
     return found
 
 
-@pytest.mark.parametrize("kind", long(["perspective", "thinlens", "orthographic"], ["perspective", "thinlens"]))
+@pytest.mark.parametrize("kind", long(["perspective", "thinlens", "orthographic"], ["perspective"]))
 def test_recorded_calls_follow_the_sensor(kind):
     more = {"aperture_radius": 0.1, "focus_distance": 3.0} if kind == "thinlens" else {}
     poses = [look_at([x, 0.2, DISTANCE - x], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]) for x in (0.0, 0.3, 0.6, 0.9, 1.2)]

@@ -52,6 +52,7 @@ def test_intensity_of_polarized_renders(bands, late):
     assert polarized.transient[1:].abs().max() == 0
 
 
+@pytest.mark.slow
 def test_gates_and_steady():
     variant = "llvm_ad_mono_polarized"
     gates = (tt.Gate.gaussian(8.0, 0.3), tt.Gate.tabulated([8, 8.5, 12], [0, 1, 0]))

@@ -64,6 +64,7 @@ def test_keys_and_states_are_those_of_another_process(merged_file):
     second.load_state_dict(first.state_dict())
 
 
+@pytest.mark.slow
 def test_a_merged_scene_renders_as_one_that_is_not(room):
     plain = make_room()
     box = plain.pop("box")

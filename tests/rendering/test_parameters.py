@@ -87,7 +87,9 @@ def test_value_has_the_effect_of_the_same_value_in_the_scene(textured, key):
     torch.testing.assert_close(given.sum(), written.transient.detach().sum(), rtol=1e-3, atol=0)
 
 
-@pytest.mark.parametrize("key", [*WRITTEN, "box.vertex_positions", "box.vertex_normals", "light.intensity.value"])
+@pytest.mark.parametrize(
+    "key", ["wall.to_world", "ball.to_world", "spot.to_world", "sensor.x_fov", "box.vertex_normals"]
+)
 def test_start_value_is_the_scene_and_the_scene_is_restored(textured, key):
     plain = tt.TransientRenderer(textured, parameters=["wall.bsdf.reflectance.data"], spp=8, temporal_filter="tent")
     expected = plain(seed=1).transient.detach()
@@ -101,15 +103,18 @@ def test_start_value_is_the_scene_and_the_scene_is_restored(textured, key):
 # Together, since each set of keys has kernels of its own.
 TOGETHER = [
     ("wall.bsdf.reflectance.data", "box.to_world", "ball.to_world", "spot.to_world", "lamp.emitter.radiance.value"),
-    ("sensor.to_world", "sensor.x_fov", "wall.to_world", "lamp.to_world", "light.position", "light.intensity.value"),
+    ("wall.to_world", "lamp.to_world", "light.position", "light.intensity.value"),
+    ("sensor.to_world", "sensor.x_fov"),
     ("box.vertex_positions", "box.bsdf.alpha.value"),
     ("box.vertex_normals",),
 ]
 
 
 @pytest.mark.parametrize("keys", long(TOGETHER, TOGETHER[:1]), ids=" ".join)
-def test_forward_and_reverse_mode_agree_and_restore_the_scene(textured, keys):
-    renderer = tt.TransientRenderer(textured, parameters=list(keys), spp=64, grad_seed="same", temporal_filter="tent")
+def test_forward_and_reverse_mode_agree_and_restore_the_scene(textured, room_scene, keys):
+    # The plain room for the sensor: its kernels carry the adjoint of the ray and take long to compile.
+    scene = room_scene if keys[0].startswith("sensor") else textured
+    renderer = tt.TransientRenderer(scene, parameters=list(keys), spp=64, grad_seed="same", temporal_filter="tent")
     generator = torch.Generator().manual_seed(11)
     out = renderer(seed=3).transient
     weights = torch.rand(out.shape, generator=generator).cumsum(-3)
@@ -255,9 +260,7 @@ def test_table_of_a_scene_with_a_parameter_that_is_not_set():
     scene = tt.load(room, variant=VARIANT)
     absorption = scene.parameters()["box.bsdf.sigma_a"]
     assert absorption.value is None and absorption.shape is None and not absorption.differentiable
-    renderer = tt.TransientRenderer(scene, parameters=["light.intensity.value"], spp=4)
-    with torch.no_grad():
-        assert renderer(seed=0).transient.sum() > 0
+    assert tt.TransientRenderer(scene, parameters=["light.intensity.value"]).values
 
 
 def test_extinction_is_told_from_albedo():

@@ -155,7 +155,6 @@ def test_gates_without_a_slope_are_refused_at_once(kind, of_scene):
     pulse = tt.Pulse.gaussian(0.2)
     pulsed = tt.plan(room, "gates", parameters=[WALL_POSE], pulse=pulse, **settings).renderer(spp=1)
     assert pulsed.has_slope_for([WALL_POSE])
-    pulsed(seed=0).gated.sum().backward()
 
 
 def test_keys_of_a_film_without_a_filter_are_looked_up():

@@ -65,6 +65,7 @@ def test_events_have_the_depth_at_which_a_render_gains_them(scene):
         assert two_sample_z_test(np.array(pilots), renders).passed
 
 
+@pytest.mark.slow
 def test_events_arrive_when_a_render_says():
     description = tt.scenes.integrating_sphere(max_depth=20)
     axis = tt.TimeAxis(0.0, 2.5, 6)
@@ -276,7 +277,8 @@ EXTRAS = {
 }
 
 
-@pytest.mark.parametrize("extra", long(EXTRAS, ["transient_prbvolpath"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("extra", EXTRAS)
 def test_an_effect_that_is_not_there_changes_nothing(extra):
     """The plan leaves out what the scene does not call for; forcing it gives the same image mean."""
     scene = tt.scenes.parallel_plates(resolution=2)
@@ -342,6 +344,7 @@ def test_stokes_outputs():
     assert plan.pilot.variant == "llvm_ad_mono"
 
 
+@pytest.mark.slow
 def test_a_medium_is_rendered_without_a_plan_too():
     """effects="auto": a steady integrator becomes the one that the scene's contents call for."""
     scene = fog_room()

@@ -182,7 +182,7 @@ LOOSE = {
 ALONE = [pytest.param([kind], id=kind, marks=pytest.mark.slow) for kind in LOOSE]
 
 
-@pytest.mark.parametrize("kinds", [pytest.param(list(LOOSE), id="all"), *ALONE])
+@pytest.mark.parametrize("kinds", [pytest.param(list(LOOSE), id="all", marks=pytest.mark.slow), *ALONE])
 def test_plugins_of_no_scene(kinds):
     """A method call is compiled for every plugin of a kind that is alive, of a scene or not."""
     import mitsuba as mi

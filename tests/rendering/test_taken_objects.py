@@ -133,7 +133,7 @@ def test_same_picture_table_and_gradient_as_the_description(make):
     torch.testing.assert_close(a[1], b[1], rtol=1e-4, atol=1e-5)
 
 
-@each(DESCRIBED, mesh)
+@each(DESCRIBED)
 def test_described_objects_travel(make):
     given, plain = make()
     taken, mono = tt.load(given), "llvm_ad_mono"

@@ -277,6 +277,7 @@ def test_what_is_done_meanwhile_is_left_out():
     assert done == ["late"]
 
 
+@pytest.mark.slow
 def test_scenes_are_put_back_in_their_variant(monkeypatch):
     """A plugin in Python computes with the types of the active variant when its parameters change."""
     renderer, active = tt.TransientRenderer(tt.load(make_room(), variant="llvm_ad_mono"), [WALL_POSE], spp=2), []

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from support.hidden_shapes import join, mannequin, mesh, plate, scene_of, wall_grid
+from support.marks import long
 from torchtransient.errors import SceneError, ShapeError, UnitError
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 
@@ -44,7 +45,7 @@ def shape_of(name):
     return mi.load_dict(description | {"to_world": turned(*description["to_world"])}), area
 
 
-@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("name", long(SHAPES, list(SHAPES)[::2]))
 def test_draws_lie_on_the_shape_with_its_normals(name):
     shape, area = shape_of(name)
     scene = scene_of(shape)

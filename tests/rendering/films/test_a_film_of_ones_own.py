@@ -120,6 +120,7 @@ def test_moments_are_those_of_a_fine_histogram():
     torch.testing.assert_close(found[:, 0], out.steady, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_derivatives_in_both_modes():
     key = WALL_POSE
     room = make_room()

@@ -66,7 +66,7 @@ def test_each_sensor_renders_as_if_it_were_alone(pair, of_integrator):
     scene = tt.load(room_of(*(FILMS[name] for name in pair), **settings), variant=VARIANT)
     for sensor, name in enumerate(pair):
         alone = tt.load(room_of(FILMS[name], **settings), variant=VARIANT)
-        for wanted in ("auto", "tent") if "histogram" in name else ("auto",):
+        for wanted in ("tent",) if "histogram" in name else ("auto",):
             arguments = {"parameters": [WALL_POSE], "temporal_filter": wanted, "spp": 4, "grad_seed": "same"}
             renderer = tt.TransientRenderer(scene, sensors=sensor, **arguments)
             before = filters_of(renderer)
