@@ -284,7 +284,6 @@ def test_captures_around_a_corner():
     with pytest.raises(SceneError, match="time_axis"):
         D.Recipe(hidden, vary, scan=scan, variant=VARIANT)
     recipe = D.Recipe(hidden, vary, scan=scan, variant=VARIANT, time_axis=tt.TimeAxis(0, 0.02, 200), spp=64)
-    recipe.check()
     sample = recipe.sample(2)
     assert sample.arrays["transient"].shape == (1, 200, 4, 4) and sample.arrays["transient"].sum() > 0
     again = D.Recipe.from_dict(json.loads(json.dumps(recipe.to_dict())))

@@ -21,6 +21,7 @@ from torchtransient.data.recipes.structures import Structure
 from torchtransient.errors import SceneError, TorchTransientError, TorchTransientWarning, UnitError
 from torchtransient.plugins.physical_ranges import PhysicalRange
 from torchtransient.rendering.physics import is_singular, level_of_user, outside_message, singular_message
+from torchtransient.rendering.progress import with_bar
 from torchtransient.rendering.variant import active_variant
 
 # Samples that are drawn, and structures among them that are built, for a look.
@@ -50,14 +51,15 @@ def check_recipe(recipe: Specification, maker: Maker) -> None:
             check_reach(built, kept, draws)
 
 
-def light_outside(recipe: Specification, maker: Maker) -> OutsideLight:
+def light_outside(recipe: Specification, maker: Maker, progress: bool = False) -> OutsideLight:
     """Light of the first samples that the time window misses; none of films without one."""
     shares: list[tuple[float, float]] = []
-    for structure, indices in structures_of(recipe, range(SAMPLES)) if maker.measures().axis is not None else ():
-        for index in indices:
-            # A sample that raises is a failed one of the data set, not a wrong recipe.
-            with contextlib.suppress(TorchTransientError):
-                shares.append(maker.kept(structure).outside(index))
+    found = structures_of(recipe, range(SAMPLES)) if maker.measures().axis is not None else []
+    pairs = [(structure, index) for structure, indices in found for index in indices]
+    for structure, index in with_bar(pairs, "check", progress):
+        # A sample that raises is a failed one of the data set, not a wrong recipe.
+        with contextlib.suppress(TorchTransientError):
+            shares.append(maker.kept(structure).outside(index))
     return OutsideLight.of(shares)
 
 

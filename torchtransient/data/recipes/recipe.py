@@ -80,7 +80,7 @@ class Recipe(Specification):
 
     # --------------------------------------------------------------------------------------- before it is used
 
-    def check(self, maker: Maker | None = None) -> OutsideLight:
+    def check(self, maker: Maker | None = None, *, progress: bool = False) -> OutsideLight:
         """Raise what is wrong with the recipe, before anything is rendered: unknown keys, distributions that do not fit
         them, numbers outside of what is physical, poses whose light leaves the window, a scene without light. Looks at
         the ends of every distribution and at the first 64 samples (of 8 structures at most). ``maker``: whose scenes
@@ -91,7 +91,7 @@ class Recipe(Specification):
         """
         maker = self._maker if maker is None else maker
         check_recipe(self, maker)
-        found = light_outside(self, maker)
+        found = light_outside(self, maker, progress)
         found.warn("recipe")
         return found
 
@@ -100,13 +100,13 @@ class Recipe(Specification):
         the window that :meth:`check` finds. Renders some ``samples`` of each structure that comes first. ``str`` of it
         is a table.
         """
-        return forecast(self, self._maker, samples, progress, self.check())
+        return forecast(self, self._maker, samples, progress, self.check(progress=progress))
 
     def preview(self, samples: int = 16, path: str | Path | None = None, *, progress: bool = False) -> Any:
         """A contact sheet of the first samples: the steady picture (or what stands for it), labels, and the light over
         time. ``path``: where to write it (.png, .pdf, .svg), else the matplotlib figure is returned. Needs matplotlib.
         """
-        self.check()
+        self.check(progress=progress)
         return contact_sheet(self, self._maker, range(count("preview: samples", samples)), path, progress)
 
     # ------------------------------------------------------------------------------------------------- as plain data
