@@ -201,7 +201,7 @@ class JsonContents:
         self.source = source
         # Python's objects take some 30 bytes for each letter at most.
         check_memory(32 * source.stat().st_size, f"{WHAT}: '{source}'")
-        data = json_data(text_of_file(source, WHAT), f"{WHAT}: '{source}'")
+        data = json_data(text_of_file(source, WHAT).removeprefix("\ufeff"), f"{WHAT}: '{source}'")
         self._frames = data if isinstance(data, list) else [data]
         if not self._frames or not all(isinstance(frame, dict) for frame in self._frames):
             raise StorageError(f"{WHAT}: '{source}': expected a JSON object or a list of objects, got something else.")

@@ -86,7 +86,8 @@ def _pose(contents: Contents, chosen: int, gaps: Gaps) -> NDArray[np.float64]:
         gaps.assumed["pose"] = np.eye(4).tolist()
         return np.eye(4)
     pose: NDArray[np.float64] = _numbers(contents, "pose", gaps, dims=3)[chosen].astype(np.float64)
-    if pose.shape != (4, 4) or not np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-3):
+    turn = pose[:3, :3]
+    if pose.shape != (4, 4) or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-3) or np.linalg.det(turn) < 0:
         raise gaps.error("expected pose as a turn and a shift (4, 4).")
     return pose
 
