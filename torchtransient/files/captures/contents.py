@@ -240,7 +240,7 @@ class JsonContents:
 
 
 def _is_json(source: Path) -> bool:
-    """Whether a file begins as an object or a list of JSON does."""
+    """Return whether a file begins as an object or a list of JSON does."""
     with source.open("rb") as file:
         return file.read(_START).lstrip(b"\xef\xbb\xbf \t\r\n")[:1] in (b"{", b"[")
 

@@ -52,7 +52,7 @@ class PhysicalModule(ScalarState):
         return self
 
     def extra_repr(self) -> str:
-        """What the module was made with, by the names of its constructors; tensors of many numbers by their size."""
+        """Arguments that the module was made with, by their names; tensors of many numbers by their size."""
         made = [cls.__init__ for cls in type(self).__mro__ if "__init__" in cls.__dict__ and issubclass(cls, nn.Module)]
         names = [name for init in made for name in inspect.signature(init).parameters]
         given = {name: _shown(self, name) for name in [*names, "bin_width_s", "num_bins"]}

@@ -34,7 +34,7 @@ class Trains:
 
 @dataclass(frozen=True)
 class Seen:
-    """What the score of trains knows: detections, and time that detectors were armed in bins, (P, T) each."""
+    """Detections of trains, and time in bins that they were armed, (P, T) each: what their score is made of."""
 
     detected: Tensor
     armed: Tensor
