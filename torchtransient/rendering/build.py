@@ -354,12 +354,9 @@ def _override_samplers(state: Any, options: BuildOptions) -> None:
             continue
         sampler = find_child(state, node, lambda child: child.type == mi.ObjectType.Sampler)
         taken = _taken_of(node, mi.Sampler)
-        if taken is not None:
-            count = node.props[taken].sample_count()
-            del node.props[taken]
-            _add_child(state, index, taken, options.sampler, mi.ObjectType.Sampler, {"sample_count": count})
-        elif sampler is None:
-            _add_child(state, index, "sampler", options.sampler, mi.ObjectType.Sampler, {})
+        if sampler is None:
+            count = {} if taken is None else {"sample_count": node.props[taken].sample_count()}
+            _add_child(state, index, taken or "sampler", options.sampler, mi.ObjectType.Sampler, count)
         else:
             _become(state, sampler, options.sampler, keep=("sample_count", "seed"))
 
