@@ -381,7 +381,7 @@ def _undefined(plugin: type, name: str) -> bool:
 
 
 class CaptureType(enum.Enum):
-    """Which laser positions belong to a scanned point: one for all, itself, each of a grid, or one of its own."""
+    """Laser positions of a scanned point: one for all, itself, each of a grid, or one of its own."""
 
     SINGLE = 1
     CONFOCAL = 2

@@ -86,6 +86,14 @@ def test_a_heavy_tail_has_no_error(index, reference_spp):
     assert report.to_dict()["points"][0]["relative_error"] is None
 
 
+def test_runs_that_are_not_finite_have_no_error():
+    """They are rare: all runs but one in thirty are fine."""
+    task = drawn_gradient(lambda rng: rng.normal() if rng.random() < 0.97 else np.nan)
+    report = measure({INDEPENDENT: task}, SPP[:1], progress=False)
+    assert np.isnan(report.points[0].squared_error)
+    assert "some are not finite" in report.table() and "nan" not in report.table()
+
+
 def test_the_standard_error_of_a_derivative_is_that_of_many_runs():
     """The square of one normal deviate scatters by sqrt(2) of its mean: two pairs know their error up to its size."""
     report = measure({INDEPENDENT: drawn_gradient(lambda rng: rng.normal())}, SPP, repeats=4, progress=False)

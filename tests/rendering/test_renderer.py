@@ -407,6 +407,22 @@ def test_statistics_tell_the_samples_that_are_drawn(room):
     assert stats.spp == 16
 
 
+def test_outputs_inside_of_vmap_are_shown(room_scene):
+    """They have no numbers: the share of light outside of a short window is left out."""
+    axis = tt.TimeAxis(start_opl=6.0, bin_width_opl=0.25, num_bins=2)
+    renderer = tt.TransientRenderer(room_scene, [GREY], time_axis=axis, spp=4, physics="ignore")
+    shown = []
+
+    def render(value):
+        out = renderer({GREY: value}, seed=0)
+        shown.append(repr(out))
+        return out.steady
+
+    torch.func.vmap(render)(torch.tensor([0.2, 0.4]))
+    assert "4 spp" in shown[0] and "outside" not in shown[0]
+    assert "outside" in repr(renderer({GREY: torch.tensor(0.2)}, seed=0))
+
+
 def test_progress_bar(room_scene, capsys):
     tt.TransientRenderer(room_scene, spp=4)(seed=0, progress=True)
     assert "100%" in capsys.readouterr().err

@@ -84,6 +84,11 @@ def sensor():
     return plain | {"sensor": mi.load_dict(plain["sensor"])}, plain
 
 
+def film():
+    plain = make_room()
+    return plain | {"sensor": plain["sensor"] | {"film": mi.load_dict(plain["sensor"]["film"])}}, plain
+
+
 def integrator():
     plain = make_room()
     return plain | {"integrator": mi.load_dict(plain["integrator"])}, plain
@@ -94,7 +99,7 @@ def scene():
 
 
 DESCRIBED = (bitmap, tensor, grid, mesh, mirrored_mesh, mesh_with_flat_faces)
-KEPT = (mesh_of_two_sides, surface, light, sensor, integrator, scene)
+KEPT = (mesh_of_two_sides, surface, light, sensor, film, integrator, scene)
 # Keys of what was taken itself; None: that of the scene's coloured box.
 KEYS = {
     bitmap: "wall.bsdf.reflectance.data", tensor: "wall.bsdf.reflectance.data",
@@ -206,6 +211,22 @@ def test_what_would_change_a_ready_scene_is_refused():
     steady["sensor"]["film"] = {"type": "hdrfilm", "width": 4, "height": 3, "rfilter": {"type": "mitchell"}}
     with pytest.raises(tt.errors.SceneError, match="no time axis"):
         tt.TransientRenderer(tt.load(mi.load_dict(steady)), time_axis=axis)
+
+
+def test_what_would_change_a_film_that_was_taken_is_refused():
+    axis = tt.TimeAxis(start_opl=6.0, bin_width_opl=0.5, num_bins=24)
+    room, _ = film()
+    with pytest.raises(tt.errors.SceneError, match="time_axis would change"):
+        tt.TransientRenderer(tt.load(room), time_axis=axis)
+    room["sensor"]["film"] = mi.load_dict(STEADY_FILM)
+    with pytest.raises(tt.errors.SceneError, match="no time axis"):
+        tt.TransientRenderer(tt.load(room), time_axis=axis)
+
+
+def test_another_sampler_takes_the_number_of_one_that_was_taken():
+    room = make_room()
+    room["sensor"]["sampler"] = mi.load_dict({"type": "independent", "sample_count": 9})
+    assert tt.TransientRenderer(tt.load(room), sampler="stratified")(seed=0).stats.spp == 9
 
 
 STEADY_FILM = {"type": "hdrfilm", "width": 6, "height": 4, "rfilter": {"type": "tent"}}

@@ -148,6 +148,11 @@ def test_a_repr_shows_the_numbers(name):
             assert re.search(rf"=\(?{re.escape(f'{float(value):g}')}[,)\n]", text), f"{argument} in {text}"
 
 
+def test_a_repr_without_memory():
+    spad = sensing.FreeRunningSPAD(10, 3e-9, bin_width_s=1e-9, learnable=True).to("meta")
+    assert "cycles=10" in repr(spad)
+
+
 def test_buffers_are_learnt_by_functional_call():
     """The way that the error names: a gate that a network has made."""
     spad = sensing.SynchronousSPAD(10, gate=torch.ones(12))

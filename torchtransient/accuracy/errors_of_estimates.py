@@ -35,7 +35,8 @@ class Tail:
     """Tail of an estimate's distribution, seen in independent runs; the distance of a run is the root of its mean
     squared deviation from the median run.
 
-    `index`: alpha where the probability of a distance above d falls as d^-alpha (Hill 1975), infinite without noise.
+    `index`: alpha where the probability of a distance above d falls as d^-alpha (Hill 1975), infinite without noise, 0
+    where most runs are alike. All are NaN of runs that are not finite.
     `largest`: share of the run that is furthest off in the sum of squared distances. `spread`: standard deviation of
     the squared distance over its mean.
     """
@@ -49,18 +50,21 @@ class Tail:
         """Of more than 8 runs, arrays of equal shape."""
         median = np.median(np.stack(runs), axis=0)
         squared = np.array([_square(run - median).mean() for run in runs])
+        if not np.isfinite(squared).all():
+            return cls(math.nan, math.nan, math.nan)
         furthest = np.sqrt(np.sort(squared)[::-1][: _FURTHEST + 1])
-        if not furthest[0] > 0:
+        if furthest[0] == 0:
             return cls(math.inf, 0.0, 0.0)
+        off = furthest[:-1][furthest[:-1] > 0]
         with np.errstate(divide="ignore"):
-            excess = float(np.log(furthest[:-1] / furthest[-1]).mean())
+            excess = float(np.log(off / furthest[-1]).mean())
         index = 1.0 / excess if excess > 0 else math.inf
         return cls(index, float(squared.max() / squared.sum()), float(squared.std(ddof=1) / squared.mean()))
 
     @property
     def heavy(self) -> bool:
-        """Whether the runs tell no variance: few of them decide about it, and more would find a larger one."""
-        return self.index < _LEAST_INDEX or self.largest > _MOST_OF_ONE
+        """Return whether the runs tell no variance: few of them decide about it, and more would find a larger one."""
+        return not (self.index >= _LEAST_INDEX and self.largest <= _MOST_OF_ONE)
 
 
 @dataclass(frozen=True)

@@ -105,10 +105,13 @@ class AccuracyReport:
             of_runs = curve[0].tail
             if of_runs is not None and of_runs.heavy:
                 lines[-1] = f"{quantity} [{choice}]  heavy tailed: no error"
-                lines += [
-                    f"  tail index {of_runs.index:.1f} (below 2 the variance is infinite), one of {TAIL_RUNS} runs has "
-                    f"{of_runs.largest:.0%} of the squared deviations; seconds of a run:"
-                ]
+                reason = (
+                    f"tail index {of_runs.index:.1f} (below 2 the variance is infinite), one of {TAIL_RUNS} runs has "
+                    f"{of_runs.largest:.0%} of the squared deviations"
+                )
+                if math.isnan(of_runs.index):
+                    reason = f"of {TAIL_RUNS} runs some are not finite"
+                lines.append(f"  {reason}; seconds of a run:")
                 lines += [f"  {p.spp:>7} spp {p.seconds:>10.4g}" for p in curve] + [""]
                 continue
             lines.append(header)

@@ -92,7 +92,7 @@ PIXELS = "data"
 
 
 def is_bump_map(bsdf: Any) -> bool:
-    """Whether a BSDF takes its normals from the slope of a texture, which jumps at each texel of a bitmap."""
+    """Return whether a BSDF takes its normals from the slope of a texture, which jumps at each texel of a bitmap."""
     return bool(bsdf.class_name() == "BumpMap")
 
 

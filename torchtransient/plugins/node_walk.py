@@ -94,7 +94,7 @@ def objects_below(node: Any, kind: type, through: bool = True) -> list[Any]:
 
 
 def has_mean(texture: Any) -> bool:
-    """Whether Mitsuba knows the mean of a texture, and those of the textures that it holds."""
+    """Return whether Mitsuba knows the mean of a texture, and those of the textures that it holds."""
     held = (texture, *objects_below(texture, mi.Texture))
     return not any(t.class_name() in TEXTURES_WITHOUT_MEAN.values() for t in held)
 

@@ -242,7 +242,7 @@ def _override_films(state: Any, options: BuildOptions) -> None:
     for index in range(len(state.nodes)):
         node = state.nodes[index]
         film = find_child(state, node, is_film)
-        if film is None and node.type == mi.ObjectType.Sensor:
+        if film is None and node.type == mi.ObjectType.Sensor and _taken_of(node, mi.Film) is None:
             _add_child(state, index, "film", "hdrfilm", mi.ObjectType.Film, {})
             film = len(state.nodes) - 1
         if film is not None:
@@ -312,8 +312,8 @@ def _override_integrator(state: Any, options: BuildOptions) -> None:
     import mitsuba as mi
 
     index = find_child(state, state.root, is_integrator)
-    if index is None and _takes_integrator(state):
-        return
+    if index is None and _taken_of(state.root, mi.Integrator) is not None:
+        return  # which is looked at when the scene is built
     if options.transient:
         if index is None:
             plugin = "transient_prbvolpath" if media_in_use(state) else "transient_path"
@@ -349,11 +349,9 @@ def _check_integrator(scene: Any, options: BuildOptions) -> None:
         )
 
 
-def _takes_integrator(state: Any) -> bool:
-    """Whether the scene holds an integrator as it was taken, which is looked at when the scene is built."""
-    import mitsuba as mi
-
-    return any(isinstance(value, mi.Integrator) for _, value in state.root.props.items())
+def _taken_of(node: Any, kind: type) -> str | None:
+    """Name of the property that holds a plugin of a kind as it was taken."""
+    return next((key for key, value in node.props.items() if isinstance(value, kind)), None)
 
 
 def _override_samplers(state: Any, options: BuildOptions) -> None:
@@ -367,8 +365,10 @@ def _override_samplers(state: Any, options: BuildOptions) -> None:
         if node.type != mi.ObjectType.Sensor:
             continue
         sampler = find_child(state, node, lambda child: child.type == mi.ObjectType.Sampler)
+        taken = _taken_of(node, mi.Sampler)
         if sampler is None:
-            _add_child(state, index, "sampler", options.sampler, mi.ObjectType.Sampler, {})
+            count = {} if taken is None else {"sample_count": node.props[taken].sample_count()}
+            _add_child(state, index, taken or "sampler", options.sampler, mi.ObjectType.Sampler, count)
         else:
             _become(state, sampler, options.sampler, keep=("sample_count", "seed"))
 

@@ -147,9 +147,11 @@ class RenderOutput(TensorRecord):
     def outside(self) -> tuple[float, float]:
         """Shares of the light before and after the time window, over all items; of polarized light of S0."""
         before, after = sum(self.stats.energy_before), sum(self.stats.energy_after)
+        if before + after <= 0:
+            return 0.0, 0.0
         steady = self.steady[..., 0, :, :, :] if self.polarized else self.steady
         total = float(steady.detach().sum(dtype=torch.float64)) / self.steady.shape[-3]
-        return (before / total, after / total) if total > 0 and before + after > 0 else (0.0, 0.0)
+        return (before / total, after / total) if total > 0 else (0.0, 0.0)
 
     @classmethod
     def merged_notes(cls, records: Sequence[RenderOutput]) -> dict[str, Any]:
@@ -159,7 +161,10 @@ class RenderOutput(TensorRecord):
         stats = self.stats
         seeds = f"seed {stats.seeds[0]}" if len(stats.seeds) == 1 else f"{len(stats.seeds)} seeds"
         made = f"{stats.spp} spp in {stats.seconds:.3g} s, {stats.integrator}, {stats.variant}, {seeds}"
-        outside = sum(self.outside)
+        try:
+            outside = sum(self.outside)
+        except RuntimeError:  # of a batch of `vmap`, which has no numbers
+            outside = 0.0
         made += f", {outside:.2%} of the light outside of the window" if outside else ""
         if stats.light_beyond is not None:
             made += f", max_depth {stats.max_depth} with {stats.light_beyond:.2g} of the light beyond"

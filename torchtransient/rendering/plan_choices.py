@@ -140,7 +140,7 @@ def choose_integrator(inventory: SceneInventory) -> tuple[Choice, list[str]]:
 
 
 def depth_in_words(depth: int) -> str:
-    """How reasons call a ``max_depth``."""
+    """A ``max_depth`` in the words of reasons."""
     return "no limit" if depth == NO_LIMIT else str(depth)
 
 

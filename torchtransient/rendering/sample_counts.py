@@ -30,7 +30,7 @@ class SampleCounts(dict[int, int]):
 
 
 def samples_taken(sampler: Any, count: int | None) -> int:
-    """What a sampler makes of a number of samples, None for its own, which it has from then on. Mitsuba's message that
+    """Set a sampler's number of samples, None for its own, and return what it has made of it. Mitsuba's message that
     it rounds is held back: it comes at every call. Under the engine lock.
     """
     with quiet():

@@ -208,6 +208,17 @@ def test_samples_whose_light_the_window_misses():
     assert low < found.cut / 64 < high and low - 0.1 < others / 64 < high + 0.1
 
 
+@pytest.mark.slow
+def test_the_check_rounds_its_own_numbers_of_samples_silently():
+    scene = tt.scenes.cornell_box(resolution=9)
+    scene["sensor"]["sampler"] = {"type": "multijitter", "sample_count": 4096}
+    recipe = small(scene, vary={"red.reflectance.value": D.Uniform(0.1, 0.9)}, spp=4096)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*is rounded to")
+        warnings.simplefilter("ignore", PhysicsWarning)
+        assert recipe.check().samples == 64
+
+
 @pytest.mark.parametrize(("cut", "samples"), [(0, 64), (8, 64), (63, 64), (16, 16)])
 def test_interval_of_the_share_of_samples(cut, samples):
     """Wilson's: its ends p are 1.96 standard deviations of a share of n samples away from k / n."""

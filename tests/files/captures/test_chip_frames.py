@@ -41,6 +41,11 @@ def test_a_frame_of_several(tmp_path):
     assert capture.metadata["not_read"] == ["joint_angles"]
 
 
+def test_a_mark_of_the_encoding(tmp_path):
+    (tmp_path / "a.json").write_text(json.dumps(frame()), encoding="utf-8-sig")
+    assert tt.nlos.Capture.read(tmp_path / "a.json").metadata["format"] == "tmf8828"
+
+
 def test_zones_meet_the_plane_before_the_chip(tmp_path):
     capture = tt.nlos.Capture.read(written(tmp_path / "a.json", frame()))
     scan = capture.scan
@@ -91,6 +96,7 @@ WRONG = {
     "flat": (frame(hists=[1, 2, 3]), "hists with 2 dimensions"),
     "huge": (frame(hists=[[10**400]]), "one shape"),
     "a pose that stretches": (frame(pose=[[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), "a turn and a"),
+    "a pose that mirrors": (frame(pose=np.diag([1, 1, -1, 1]).tolist()), "a turn and a shift"),
     "a pose of nothing": (frame(pose=[[1, 0], [0, 1]]), "a turn and a shift"),
     "another file": ({"a": 1}, "no known layout"),
     "numbers": ([1, 2], "a list of objects"),

@@ -262,6 +262,29 @@ def test_totals_of_coincidences_vary_as_those_of_events(mode, dead, kind, total,
     assert (np.abs(drawn.mean(0) - seen.mean(0)) < 5 * np.sqrt(most / number + most / len(seen)) + 1e-3).all()
 
 
+@pytest.mark.parametrize("dead", [2.0, 2.4])
+@pytest.mark.parametrize("mode", ["several", "free"])
+def test_no_spad_coincides_with_itself(mode, dead):
+    """A window of the whole dead time: the second SPAD is in the dark, then as bright; of 3e4 coincidences 3 %."""
+    bright = image(np.full(BINS, 0.3))
+    settings = {"coincidence": 2, "window_s": dead * WIDTH, "bin_width_s": WIDTH}
+    alone = CoincidencePixel(detector(mode, dead, 2000), 2, weights=[1, 1e-12], **settings)
+    assert float(alone.sample(bright, torch.Generator().manual_seed(0)).sum()) == 0
+    both = CoincidencePixel(detector(mode, dead, 20_000), 2, **settings)
+    drawn = float(both.sample(bright, torch.Generator().manual_seed(0)).sum())
+    assert drawn == pytest.approx(float(both.expected(bright).sum()), rel=0.03)
+
+
+@pytest.mark.parametrize("policy", ["expected", "gaussian", "straight_through", "score"])
+def test_coincidences_of_no_pixels(policy):
+    sensor = CoincidencePixel(
+        detector("first", 9.5), 4, coincidence=2, window_s=WIDTH, bin_width_s=WIDTH, grad=policy
+    )  # fmt: skip
+    x = torch.zeros(1, BINS, 0, 2, dtype=torch.float64, requires_grad=True)
+    with ScoreFunction():
+        assert sensor(x).shape == x.shape
+
+
 @pytest.mark.parametrize(
     ("mode", "dead"), long_rows([("first", 9.5), ("several", 4.4), ("free", 9.3)], [("first", 9.5)])
 )

@@ -46,7 +46,7 @@ class Told(Protocol):
 
 @dataclass(frozen=True)
 class Measured:
-    """What the first sample that can be made says about all: bytes before compression, facts, standard error.
+    """Figures of the first sample that can be made, for all: bytes before compression, facts, standard error.
     ``warned``: messages and classes of the warnings of the recipe's check, which the caller of ``generate`` gets.
     """
 

@@ -230,10 +230,10 @@ class Kept:
 
     def outside(self, index: int) -> tuple[float, float]:
         """Shares of the light of a sample before and after the window: those of the sample itself, or, where that
-        takes more than ``_PATHS`` camera paths, of as many.
+        takes more than ``_PATHS`` camera paths, of about as many.
         """
         rows, columns = self.measures.size[:2]
-        spp = min(self.measures.spp, max(1, _PATHS // (rows * columns)))
+        spp = self.renderer.samples_drawn(min(self.measures.spp, max(1, _PATHS // (rows * columns))))
         return self._render(self.values(self.draw(index)), self.seed(index), spp).outside
 
     def seed(self, index: int) -> int:

@@ -96,7 +96,7 @@ class Recipe(Specification):
         return found
 
     def cost(self, samples: int = 5, *, progress: bool = False) -> Cost:
-        """What a sample costs: what is built anew and what is only a value, seconds, bytes, and the light outside of
+        """Forecast the cost of a sample: entries that are built anew, values, seconds, bytes, and the light outside of
         the window that :meth:`check` finds. Renders some ``samples`` of each structure that comes first. ``str`` of it
         is a table.
         """

@@ -201,7 +201,7 @@ class JsonContents:
         self.source = source
         # Python's objects take some 30 bytes for each letter at most.
         check_memory(32 * source.stat().st_size, f"{WHAT}: '{source}'")
-        data = json_data(text_of_file(source, WHAT), f"{WHAT}: '{source}'")
+        data = json_data(text_of_file(source, WHAT).removeprefix("\ufeff"), f"{WHAT}: '{source}'")
         self._frames = data if isinstance(data, list) else [data]
         if not self._frames or not all(isinstance(frame, dict) for frame in self._frames):
             raise StorageError(f"{WHAT}: '{source}': expected a JSON object or a list of objects, got something else.")
@@ -240,7 +240,7 @@ class JsonContents:
 
 
 def _is_json(source: Path) -> bool:
-    """Whether a file begins as an object or a list of JSON does."""
+    """Return whether a file begins as an object or a list of JSON does."""
     with source.open("rb") as file:
         return file.read(_START).lstrip(b"\xef\xbb\xbf \t\r\n")[:1] in (b"{", b"[")
 

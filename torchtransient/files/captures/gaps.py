@@ -83,7 +83,7 @@ class Gaps:
         return found
 
     def frame(self, frames: int) -> int:
-        """Which of a file's frames is read: ``frame``, which a file of one needs not be told."""
+        """Number of the frame that is read: ``frame``, which a file of one needs not be told."""
         given = self.fill("frame", None, 0) if frames == 1 else self._given.get("frame")
         self._used.add("frame")
         self.assumed.pop("frame", None)

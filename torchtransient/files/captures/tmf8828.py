@@ -33,7 +33,7 @@ _KEPT = ("reference_hist", "pose", "dist_to_plane", "time_captured")
 
 
 def recognises(contents: Contents) -> bool:
-    """Whether a file holds frames of this layout."""
+    """Return whether a file holds frames of this layout."""
     return set(contents.shapes) >= {"hists", "reference_hist"}
 
 
@@ -62,7 +62,7 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
 def _points(
     contents: Contents, chosen: int, shape: tuple[int, ...], pose: NDArray[np.float64], gaps: Gaps
 ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
-    """Where the zones meet the wall (*shape, 3), and the wall's normals there."""
+    """Points where the zones meet the wall (*shape, 3), and the wall's normals there."""
     rows, columns = shape if len(shape) > 1 else (shape[0], 1)
     x, y = (half * (2 * (np.arange(n) + 0.5) / n - 1) for half, n in zip(HALF_FIELD, (rows, columns), strict=True))
     ways = np.stack(np.broadcast_arrays(x[:, None], y[None, :], 1.0), -1) @ pose[:3, :3].T
@@ -86,7 +86,8 @@ def _pose(contents: Contents, chosen: int, gaps: Gaps) -> NDArray[np.float64]:
         gaps.assumed["pose"] = np.eye(4).tolist()
         return np.eye(4)
     pose: NDArray[np.float64] = _numbers(contents, "pose", gaps, dims=3)[chosen].astype(np.float64)
-    if pose.shape != (4, 4) or not np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-3):
+    turn = pose[:3, :3]
+    if pose.shape != (4, 4) or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-3) or np.linalg.det(turn) < 0:
         raise gaps.error("expected pose as a turn and a shift (4, 4).")
     return pose
 

@@ -20,7 +20,7 @@ _KNOWN = {"hists", "pt_cloud", "cam_z"}
 
 
 def recognises(contents: Contents) -> bool:
-    """Whether a file is a frame of this layout."""
+    """Return whether a file is a frame of this layout."""
     return set(contents.shapes) >= {"hists", "pt_cloud"}
 
 

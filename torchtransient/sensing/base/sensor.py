@@ -52,7 +52,7 @@ class PhysicalModule(ScalarState):
         return self
 
     def extra_repr(self) -> str:
-        """What the module was made with, by the names of its constructors; tensors of many numbers by their size."""
+        """Arguments that the module was made with, by their names; tensors of many numbers by their size."""
         made = [cls.__init__ for cls in type(self).__mro__ if "__init__" in cls.__dict__ and issubclass(cls, nn.Module)]
         names = [name for init in made for name in inspect.signature(init).parameters]
         given = {name: _shown(self, name) for name in [*names, "bin_width_s", "num_bins"]}
@@ -73,7 +73,7 @@ def _shown(module: nn.Module, name: str) -> str:
 def _text(value: object) -> str:
     """A number, a choice or a record; nothing for None and for what torch shows itself."""
     if isinstance(value, Tensor):
-        if value.ndim > 1 or value.numel() > _FEW:
+        if value.ndim > 1 or value.numel() > _FEW or value.is_meta:
             return f"(size {'x'.join(map(str, value.shape))})"
         value = value.detach().tolist()
     if isinstance(value, (list, tuple)):

@@ -6,6 +6,7 @@ takes seconds. Source: Tachella et al., "DeepInverse: a Python package for solvi
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import torch
@@ -67,7 +68,8 @@ class LinearSensorPhysics(LinearPhysics):  # type: ignore[misc]
         Differentiable in the sensor's parameters.
         """
         if x is None:
-            x = torch.zeros(1, *self.img_size, device=next(self.sensor_module.buffers(), torch.empty(0)).device)
+            numbers = itertools.chain(self.sensor_module.parameters(), self.sensor_module.buffers())
+            x = torch.zeros(1, *self.img_size, device=next(numbers, torch.empty(0)).device)
         return self.sensor_module.expected(torch.zeros_like(x))
 
     def A(self, x: Tensor, **kwargs: Any) -> Tensor:

@@ -106,10 +106,10 @@ class CoincidencePixel(RandomSensor):
 
     The mean is exact for independent SPADs in any light: detections of each SPAD times the chance that
     `coincidence` - 1 of the others have detected within the window before. In constant light of r detections per second
-    of many SPADs it is r (r w)^(k - 1) exp(-r w) / (k - 1)!. Inside a bin the light is spread evenly; detections are
-    taken so too, except those of one per cycle, of which the first photons of a bin are the first: with a dead time,
-    use bins of at most one photon a SPAD. Integrals over a bin are right to 1e-6, however bright it is; a pixel with
-    thousands of photons in a bin takes ten times as long, for the whole image.
+    of many SPADs it is r (r w)^(k - 1) exp(-r w) / (k - 1)!. Inside a bin the light is spread evenly; so are
+    detections in the mean, except those of one per cycle, of which the first photons of a bin are the first: with a
+    dead time, use bins of at most one photon a SPAD. Integrals over a bin are right to 1e-6, however bright it is; a
+    pixel with thousands of photons in a bin takes ten times as long, for the whole image.
     Lines are down at the start of a cycle of a SynchronousSPAD, and come round the period of a FreeRunningSPAD.
 
     Samples follow every SPAD through every cycle, so that coincidences of a cycle exclude or bring one another as those
@@ -297,8 +297,6 @@ class CoincidencePixel(RandomSensor):
         """A draw, and what was `seen` of the SPADs of every share, whose pixels are rows; `weights` of coincidences."""
         with torch.no_grad():
             wide = self._check_window(check_rates(check_tensor(x, "CoincidencePixel"), "CoincidencePixel")).double()
-            if x.numel() == 0:
-                return torch.zeros_like(x)
             groups = []
             for share, number in self.groups:
                 rate, dead = self._lit(wide, share)

@@ -34,7 +34,7 @@ class Trains:
 
 @dataclass(frozen=True)
 class Seen:
-    """What the score of trains knows: detections, and time that detectors were armed in bins, (P, T) each."""
+    """Detections of trains, and time in bins that they were armed, (P, T) each: what their score is made of."""
 
     detected: Tensor
     armed: Tensor
@@ -125,8 +125,7 @@ def _detections(
         hit = fired < end
         owner, fired = owner[hit], fired[hit]
         owners.append(owner)
-        # evenly in its bin, as the mean has it, but where first photons are the first
-        times.append(fired.floor() + _uniform(fired, generator) if math.isfinite(dead) else fired)
+        times.append(fired)
         armed = fired + dead
         owner, armed = owner[armed < end], armed[armed < end]
     return torch.cat(owners), torch.cat(times)
