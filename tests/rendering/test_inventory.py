@@ -62,7 +62,6 @@ def polarizes(matrices: np.ndarray) -> bool:
     return bool((np.minimum(*errors) > 1e-4 * np.abs(matrices).max()).any())
 
 
-@pytest.mark.slow
 @together("name", [*MITSUBA, *OURS])
 def test_what_polarizes_is_listed(name):
     plugins.sync()
