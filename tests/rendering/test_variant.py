@@ -26,7 +26,6 @@ def run(script: str) -> str:
     return result.stdout.strip()
 
 
-@pytest.mark.slow
 def test_import_scenes_and_load_need_no_variant():
     """Nor is anything said of the versions that are installed here."""
     printed = run("""
