@@ -10,7 +10,6 @@ import textwrap
 
 import pytest
 
-from support.marks import long
 from torchtransient import _llvm
 
 with open(os.path.realpath(sys.executable), "rb") as _python:
@@ -219,7 +218,8 @@ def test_dr_jit_imported_first_with_an_old_library():
     assert "set DRJIT_LIBLLVM_PATH=" in result.stdout
 
 
-@pytest.mark.parametrize("first", long(["drjit", "mitsuba"], ["mitsuba"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("first", ["drjit", "mitsuba"])
 def test_dr_jit_imported_first_with_an_old_library_is_warned_of_at_the_import(tmp_path, first):
     code = f"""
         import warnings

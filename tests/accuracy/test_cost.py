@@ -83,6 +83,7 @@ def test_stratified_samples_do_better(report):
     assert stratified[-1].squared_error < 0.5 * independent[-1].squared_error
 
 
+@pytest.mark.slow
 def test_the_error_is_the_variance_of_the_renderer():
     renderer = wall_renderer(temporal_filter="tent").variation(sampler="independent")
     runs = (

@@ -51,6 +51,7 @@ def test_verify(made):
     assert result.exit_code == 0 and "6 samples in 3 shards, 0 failed" in result.stdout and "complete" in result.stdout
 
 
+@pytest.mark.slow
 def test_verify_finds_what_is_missing_and_damaged(made, tmp_path):
     for name in data_files(made / "set"):
         (tmp_path / name).write_bytes((made / "set" / name).read_bytes())
@@ -66,6 +67,7 @@ def test_verify_finds_what_is_missing_and_damaged(made, tmp_path):
     assert result.exit_code == 2 and result.stderr.startswith("error: ")
 
 
+@pytest.mark.slow
 def test_info(made):
     result = run(made, "info", "set")
     assert result.exit_code == 0, result.output
@@ -75,6 +77,7 @@ def test_info(made):
     assert run(made, "info", ".").exit_code == 2
 
 
+@pytest.mark.slow
 def test_show_and_preview(made):
     result = run(made, "show", "set", "-o", "drawn.png", "--count", 3, "--seed", 1)
     assert result.exit_code == 0 and result.stdout.startswith("drawn.png: samples "), result.output
@@ -91,6 +94,7 @@ def test_cost(made):
     assert result.exit_code == 0 and "seconds" in result.stdout and "bytes a sample" in result.stdout
 
 
+@pytest.mark.slow
 def test_export(made):
     result = run(made, "export", "set", "--out", "tars/of_mine", "--quiet")
     assert result.exit_code == 0 and "1 files" in result.stdout, result.output
@@ -112,6 +116,7 @@ def test_shares_of_machines(made, tmp_path):
     assert data_files(tmp_path / "set") == data_files(made / "set")
 
 
+@pytest.mark.slow
 def test_what_is_wrong_is_one_line(made):
     for arguments, words in (
         (("box.yaml", "--out", "set", "--n", 7, "--quiet"), "n is 6 there and 7 here"),

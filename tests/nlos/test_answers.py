@@ -289,6 +289,7 @@ def test_captures_without_light_are_said_once(dark, tiles):
     assert physics_of(lambda: simulated(TOWARDS, of=scan(kind), tiles=tiles, **settings)) == []
 
 
+@pytest.mark.slow
 def test_dark_parts_of_a_capture_are_none():
     """A square upright on the wall's middle, which looks to one side."""
     upright = [[0.0, -0.05, 0.1], [0.0, 0.05, 0.1], [0.0, 0.05, 0.4], [0.0, -0.05, 0.4]]

@@ -187,6 +187,7 @@ def test_letters_behind_foam_are_read(alphabet, letter):
     assert float(scores[own]) >= float(others.max()) + 0.1
 
 
+@pytest.mark.slow
 def test_bars_behind_foam_are_told_apart():
     picture = front_view("resolution_50")
     for row, bars in ((8, 2), (17, 3)):

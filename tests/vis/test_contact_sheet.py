@@ -71,6 +71,7 @@ def test_scales_of_what_is_finite():
     assert limits([[5.0, 5.0]]) == (5.0, 5.0 + 1e-12)
 
 
+@pytest.mark.slow
 def test_light_over_time_is_drawn_as_its_root():
     figure = tt.vis.contact_sheet(cells(2), times=TIMES)
     for number in (0, 1):

@@ -254,6 +254,7 @@ def test_endings_and_scales(tmp_path):
         assert large[row, column].tolist() == image[row // 4, column // 4].tolist()
 
 
+@pytest.mark.slow
 def test_volumes():
     values = torch.rand(2, 3, 4, generator=torch.Generator().manual_seed(5)) + 0.1
     depth = torch.arange(12.0).reshape(3, 4)

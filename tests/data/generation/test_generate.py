@@ -103,22 +103,6 @@ def test_going_on(calm, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("recipe", "changes", "words"),
-    [
-        (FakeRecipe(seed=1), {}, "recipe is another one .seed is 0 there and 1 here"),
-        (RECIPE, {"store": "rounded"}, "store is 'exact' there"),
-        (RECIPE, {"resume": False}, "resume=False"),
-    ],
-)
-def test_the_folder_of_another_data_set(calm, recipe, changes, words):
-    before = data_files(calm)
-    with pytest.raises(StorageError, match=words):
-        generate(recipe, calm, **QUICK | changes)
-    assert data_files(calm) == before
-
-
-@pytest.mark.slow
 def test_shards_without_their_recipe(calm, tmp_path):
     """What the shards say counts where recipe.json was lost."""
     folder = tmp_path / "set"

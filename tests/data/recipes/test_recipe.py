@@ -286,6 +286,7 @@ def test_devices_measure_and_vary():
     assert sums[100000.0] > 20 * sums[1000.0]
 
 
+@pytest.mark.slow
 def test_captures_around_a_corner():
     wall = tt.nlos.Wall.plane(width=1.0, height=1.0)
     scan = tt.nlos.Scan.grid(wall, (4, 4), kind="confocal")
