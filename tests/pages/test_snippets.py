@@ -19,7 +19,7 @@ VARIANT = "llvm_ad_rgb"
 # What makes scenes small.
 SMALL = {r"resolution=\d+": "resolution=6", r"spp=\d+": "spp=4"}
 # Their blocks stand for themselves: what they promise they assert, or it is tested where it is made.
-STANDING_ALONE = ["choosing", "commands", "stability", "faq", "install"]
+STANDING_ALONE = ["choosing", "commands", "stability", "faq", "install", "media"]
 SCENE = """<scene version="3.0.0">
   <default name="resx" value="8"/>
   <integrator type="transient_path"><integer name="max_depth" value="3"/></integrator>
