@@ -27,7 +27,7 @@ def test_samples_of_some_colours(monkeypatch, lit):
                    back=mi.UnpolarizedSpectrum(0), delay=mi.Float(0))  # fmt: skip
     kept = {"L": mi.UnpolarizedSpectrum(0), "before": mi.Float(0), "after": mi.Float(0), "block": {}}
     block = Local(put=lambda state, opl, value, active: (mi.Float(0), mi.Float(0)))
-    lane = Local(p=mi.Point3f(0, 0, 0), n=up, factor=mi.UnpolarizedSpectrum(3, 5, 7))
+    lane = Local(p=mi.Point3f(0, 0, 0), n=up, factor=mi.UnpolarizedSpectrum(3, 5, 7), apart=False)
     table = Local(load=lambda k: sample, lit=lit)
     third_bounce.deposit(Local(scene=None, window=None), table, lane, block, kept, mi.UInt32(0), True)
     g = 1 / 4 if lit else 1 / 16

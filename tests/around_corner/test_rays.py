@@ -203,7 +203,7 @@ def test_light_of_one_sample(monkeypatch, lit, rays, window):
     s = ends.samples()
     delay = mi.Float(ends.delay.astype(np.float32))
     table = SampleTable(s, s.front * 2, mi.Vector3f(s.n), delay) if lit else SampleTable(s)
-    lane = Local(p=mi.Point3f(ends.q.T), n=mi.Vector3f(ends.m.T), factor=spectrum(ends.value))
+    lane = Local(p=mi.Point3f(ends.q.T), n=mi.Vector3f(ends.m.T), factor=spectrum(ends.value), apart=False)
     job = Local(scene=None, window=window)
     kept = kept_before()
     third_bounce.deposit(job, table, lane, block, kept, dr.arange(mi.UInt32, COUNT), rays)

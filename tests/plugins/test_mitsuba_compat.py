@@ -18,6 +18,7 @@ from torchtransient import plugins
 from torchtransient.plugins import mitsuba_compat as compat
 from torchtransient.plugins.bsdfs.inherited import hides_lobe_probability, mirrors_matrices
 from torchtransient.plugins.node_walk import objects_below, objects_of
+from torchtransient.plugins.spectral_colours import keeps_coefficients
 from torchtransient.plugins.transport.scattering.surface import strayed
 
 RGB, POLARIZED, SPECTRAL = "llvm_ad_rgb", "llvm_ad_mono_polarized", "llvm_ad_spectral"
@@ -393,9 +394,9 @@ def test_colours_are_kept_as_coefficients_in_spectral_variants():
         texture = mi.load_dict({"type": "rgb", "value": colour})
         value = np.array(mi.traverse(texture)["value"]).ravel()
         assert np.allclose(value, colour) != kept
-        assert compat.keeps_coefficients(texture) == kept
+        assert keeps_coefficients(texture, "value") == kept
         pixels = mi.Bitmap(np.full((2, 2, 3), 0.3, dtype=np.float32))
-        assert compat.keeps_coefficients(mi.load_dict({"type": "bitmap", "bitmap": pixels, "raw": False})) == kept
+        assert keeps_coefficients(mi.load_dict({"type": "bitmap", "bitmap": pixels, "raw": False}), "data") == kept
 
 
 def test_attributes_of_meshes_do_not_say_that_they_vary():

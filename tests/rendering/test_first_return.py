@@ -7,7 +7,7 @@ import torch
 
 import torchtransient as tt
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.rendering.labels import _checked_names, _labels, first_return
+from torchtransient.rendering.labels import _checked_names, first_return
 
 AXIS = tt.TimeAxis(2.0, 0.25, 7)
 
@@ -70,14 +70,10 @@ def test_names_of_labels():
         _checked_names(["shape", "depth", "material"], True)
 
 
-@pytest.mark.parametrize("samples", [0, 4097, 2.5, True, None])
-def test_numbers_of_places_in_a_pixel(samples):
-    with pytest.raises(UnitError, match="samples: expected an integer from 1 to 4096, got"):
-        _labels(None, None, "depth", True, samples)
-
-
-@pytest.mark.parametrize("samples", [1, 4096])
-def test_numbers_of_places_at_the_ends(samples):
-    """Which are not refused: what comes next asks for the renderer, which there is none of."""
-    with pytest.raises(AttributeError, match="_collect"):
-        _labels(None, None, "depth", True, samples)
+def test_numbers_of_places_in_a_pixel():
+    scene = tt.load(tt.scenes.moving_wall(resolution=2, num_bins=8), variant="llvm_ad_mono")
+    renderer = tt.TransientRenderer(scene)
+    for samples in (0, 4097, 2.5, True, None):
+        with pytest.raises(UnitError, match="samples: expected an integer from 1 to 4096, got"):
+            tt.data.scene_labels(renderer, names=["depth"], samples=samples)
+    assert tt.data.scene_labels(renderer, names=["depth"], samples=1)["depth"].shape[-2:] == (2, 2)

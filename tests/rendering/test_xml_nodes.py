@@ -273,7 +273,7 @@ def test_maps_of_surroundings_lose_the_columns_that_are_there_twice():
 @pytest.mark.parametrize("spectrum", ["d65", "uniform"])
 def test_light_of_a_spectral_model_cannot_be_said(monkeypatch, spectrum):
     owner = SimpleNamespace(ptr=1, class_name=lambda: spectrum)
-    monkeypatch.setattr(values, "keeps_coefficients", lambda given: given is owner)
+    monkeypatch.setattr(values, "keeps_coefficients", lambda given, key: given is owner)
     built = SimpleNamespace(params=SimpleNamespace(properties={"a.value": (None, None, owner, None)}))
     slot = SimpleNamespace(key="a.value", targets=["a.value"], kind="number")
     with pytest.raises(SceneError, match=r"'a\.value' cannot be said in XML: .* a spectral model of light"):
@@ -290,7 +290,7 @@ def put_into(plugin, key, value, kind="number", held=(), keeps=False, owner=None
     built = SimpleNamespace(params=type("Params", (dict,), {"properties": {name: (None, None, owner, None)}})(params))
     state = SimpleNamespace(nodes=[None, SimpleNamespace(props=props)])
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(values, "keeps_coefficients", lambda _: keeps)
+        patch.setattr(values, "keeps_coefficients", lambda *_: keeps)
         slot = SimpleNamespace(key=name, targets=[name], kind=kind)
         values.write_value(SimpleNamespace(state=state), built, {owner.ptr: values.Place(1)}, slot, np.array(value))
     return props
