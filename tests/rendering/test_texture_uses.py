@@ -182,6 +182,15 @@ def test_attributes_of_lights_are_named(kind):
         tt.load(glowing(kind), variant=VARIANT).parameters()
 
 
+def test_textured_lights_need_texture_coordinates():
+    """Without, the kernels of all scenes that are alive with one would not be traced."""
+    corners = np.array([[-0.3, 0.0, 2.5], [0.3, 0.0, 2.5], [0.3, 0.3, 2.5]])
+    lamp = tt.scenes.triangle_mesh(corners, np.array([[0, 2, 1]]))
+    lamp["emitter"] = {"type": "area", "radiance": bitmap(1)()}
+    with pytest.raises(SceneError, match=r"'light'.*texture coordinates"):
+        tt.load(room(light=lamp), variant=VARIANT).parameters()
+
+
 def test_lights_that_stay_dark_may_have_them():
     assert tt.load(glowing("directionalarea"), variant=VARIANT).parameters()
 

@@ -162,6 +162,14 @@ def _check_radiance(emitter: Any) -> None:
                 f"{name!r} ({_named(texture)}), which Mitsuba takes for zero there: most of the light would be lost. "
                 "Give the radiance as a 'bitmap' over texture coordinates."
             )
+    shape = emitter.get_shape()
+    textured = mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
+    if textured and isinstance(shape, mi.Mesh) and not shape.has_vertex_texcoords():
+        # Mitsuba's sampling of textures raises while kernels are traced, those of other scenes too.
+        raise SceneError(
+            f"{shape.id()!r}: expected texture coordinates of a mesh that shines with a texture, got a mesh without. "
+            "Give it some, or a radiance that is the same everywhere."
+        )
 
 
 def _named(texture: Any) -> str:
