@@ -369,6 +369,6 @@ def test_findings_hold_the_window_and_the_report():
     assert found.max_depth == 1 and found.temporal_filter == "box"
     assert found.film_choice == Histogram(tt.TimeAxis(2.0, 0.5, 3))
     assert found.pilot is plan.report and found.reasons == tuple(plan.reasons)
-    assert [line.split(":")[0] for line in found.reasons] == [
+    assert {line.split(":")[0] for line in found.reasons} == {
         "first", "max_depth", "time axis", "temporal filter", "pilot",
-    ]  # fmt: skip
+    }  # fmt: skip

@@ -149,7 +149,9 @@ WINDOWS = ["furnace", "cornell_box", "glass_slab_before_wall", "moving_wall"]
 
 @pytest.mark.parametrize("name", long(WINDOWS, WINDOWS[3:]))
 def test_the_window_holds_what_it_promises(name):
-    plan = tt.plan(getattr(tt.scenes, name)(resolution=8), missed=1e-2, tail=1e-2)
+    # A wall that moves has a tent, which spreads light beyond its first bin and its last one.
+    moving = ["wall.to_world"] if name == "moving_wall" else []
+    plan = tt.plan(getattr(tt.scenes, name)(resolution=8), parameters=moving, missed=1e-2, tail=1e-2)
     output = plan.renderer()(seed=3, spp=512)
     inside = float(output.transient.sum(dtype=torch.float64)) / output.transient.shape[0]
     outside = sum(output.stats.energy_before) + sum(output.stats.energy_after)

@@ -25,6 +25,8 @@ from torchtransient.rendering.variant import active_variant
 _AROUND_CORNERS = "transient_nlos"
 # One bin for all times: far beyond the light of any scene when no pilot run says how far it goes.
 _ALL_TIMES = 1e9
+# Bins before and after an arrival that its light is spread over: by a tent, and by a Gaussian of half a bin.
+_REACH = {"tent": 0.5, "gaussian": 2.0}
 
 
 def _share(part: float, error: float) -> str:
@@ -86,8 +88,8 @@ class Finder:
             self._run()
         depth = self._depth(max_depth)
         self._note_light(depth)
-        axis = self._axis(time_axis, bins, depth)
         filter_name = self._filter(temporal_filter)
+        axis = self._axis(time_axis, bins, depth, _REACH.get(filter_name, 0.0))
         if self.report is not None:
             self.reasons.append(self._pilot_line())
         film = self.draft.film_choice if axis is None else self.draft.film.kind.from_argument(axis)
@@ -207,8 +209,9 @@ class Finder:
     # ----------------------------------------------------------------------------------------------------- window
 
     def _axis(
-        self, given: TimeAxis | str | None, bins: tuple[int | None, float | None], depth: int | None
+        self, given: TimeAxis | str | None, bins: tuple[int | None, float | None], depth: int | None, reach: float = 0.0
     ) -> TimeAxis | None:
+        """``reach``: bins over which the temporal filter spreads an arrival, to either side."""
         if not self.draft.film.kind.has_axis:
             if given is not None or bins != (None, None):
                 raise ArgumentError(
@@ -225,7 +228,7 @@ class Finder:
             return TimeAxis(0.0, last, 1)
         if given == "scene" or self.arrivals is None or self.arrivals.dark:
             return self._own_axis(given, bins)
-        return self._found_axis(self.arrivals, bins, depth)
+        return self._found_axis(self.arrivals, bins, depth, reach)
 
     def _own_axis(self, given: str | None, bins: tuple[int | None, float | None]) -> TimeAxis:
         why = "as asked for" if given == "scene" else "without a pilot run"
@@ -244,7 +247,9 @@ class Finder:
         self.reasons.append(f"time axis: {axis}, the scene's own, {why}")
         return axis
 
-    def _found_axis(self, arrivals: Arrivals, bins: tuple[int | None, float | None], depth: int | None) -> TimeAxis:
+    def _found_axis(
+        self, arrivals: Arrivals, bins: tuple[int | None, float | None], depth: int | None, reach: float = 0.0
+    ) -> TimeAxis:
         num_bins, width = bins
         first, last = arrivals.window(depth or -1, self.missed)
         how = ""
@@ -254,7 +259,11 @@ class Finder:
                 width, num_bins, how = None, MOST_BINS, f", {MOST_BINS} bins since the film's width would take more"
         if self.spread != (0.0, 0.0):
             how += f", widened by pulse and response from {self.spread[0]:g} to {self.spread[1]:+g} m"
-        axis = axis_over(first + self.spread[0], last + self.spread[1], width, num_bins)
+        first, last = first + self.spread[0], last + self.spread[1]
+        axis = axis_over(first, last, width, num_bins)
+        if reach:
+            margin = reach * axis.bin_width_opl
+            axis = axis_over(first - margin, last + margin, width, num_bins)
         kept = arrivals.depth <= depth if depth is not None and depth > 0 else arrivals.depth > 0
         part, error = arrivals.share(kept & ((arrivals.opl < axis.start_opl) | (arrivals.opl >= axis.end_opl)))
         if self.report is not None:
