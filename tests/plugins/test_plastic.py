@@ -12,7 +12,7 @@ import torch
 
 import torchtransient as tt
 from support.gradient_cases.scenes import area_light, room
-from support.marks import long
+from support.marks import long, long_rows
 from support.surface_samples import activate, start
 from torchtransient.errors import GradientError
 

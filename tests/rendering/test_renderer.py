@@ -47,7 +47,11 @@ def test_statistics(room_scene):
     outside = stats.energy_before[0] + stats.energy_after[0]
     inside = float(out.transient.mean(0).sum())
     assert outside > 0
-    assert inside + outside == pytest.approx(float(out.steady.mean(0).sum()), rel=1e-4)
+    total = float(out.steady.mean(0).sum())
+    assert inside + outside == pytest.approx(total, rel=1e-4)
+    # Of all that was rendered, whatever is kept of it.
+    assert sum(out.outside) == pytest.approx(outside / total, rel=1e-6)
+    assert out.map(lambda tensor: tensor[:1]).outside == out.outside
 
 
 def test_a_number_of_samples_that_a_sampler_rounds_is_said_once(room_scene, capfd):
@@ -60,6 +64,12 @@ def test_a_number_of_samples_that_a_sampler_rounds_is_said_once(room_scene, capf
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert renderer(seed=1, spp=7).stats.spp == 8
+        # Samples of a derivative count where there is one.
+        renderer.spp_grad = 11
+        with torch.no_grad():
+            renderer(seed=1, spp=7)
+    with pytest.warns(TorchTransientWarning, match="spp=11 is rounded to 12"):
+        renderer(seed=1, spp=7)
     assert "ounded" not in "".join(capfd.readouterr())
 
 

@@ -243,6 +243,10 @@ def test_a_forecast_in_words():
     alone = str(cost(values=(), exchanged=(), n=None)).splitlines()
     assert alone[0].endswith("none") and alone[1].endswith("nothing: one structure for all samples")
     assert len(alone) == 9
+    unseen = OutsideLight.of([], ["sample 0: bad", "sample 1: bad"])
+    assert "light outside     not looked at; 2 of 2 samples failed" in str(cost(outside=unseen))
+    with pytest.warns(TorchTransientWarning, match="recipe: 2 of 2 samples .* failed .*The first one: sample 0: bad"):
+        unseen.warn("recipe")
 
 
 @pytest.mark.parametrize(
