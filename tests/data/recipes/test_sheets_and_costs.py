@@ -20,6 +20,7 @@ from torchtransient.data.recipes.outside_light import OutsideLight
 from torchtransient.data.recipes.sample import Sample, in_order
 from torchtransient.data.recipes.structures import Structure
 from torchtransient.data.storage.shard_writing import ShardWriter
+from torchtransient.errors import TorchTransientWarning
 from torchtransient.vis.tone_mapping import tone_map
 
 RANDOM = np.random.default_rng(3)

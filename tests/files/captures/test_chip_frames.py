@@ -55,7 +55,8 @@ def test_files_that_are_of_no_known_kind(tmp_path):
     """Cut ones, too, of which the ending tells what they were."""
     np.savez(tmp_path / "whole.npz", **zone_frame())
     for name, data, hint in (
-        ("a.npz", (tmp_path / "whole.npz").read_bytes()[:-100], "NumPy"), ("a.json", b" " * 300, "JSON"), ("a", b"", ""),
+        ("a.npz", (tmp_path / "whole.npz").read_bytes()[:-100], "NumPy"),
+        ("a.json", b" " * 300, "JSON"), ("a", b"", ""),
     ):  # fmt: skip
         (tmp_path / name).write_bytes(data)
         with pytest.raises(StorageError, match=f"is no JSON, NumPy, MATLAB or HDF5 file.*{hint}"):
