@@ -79,13 +79,12 @@ def rendered(before, after, inside=100.0, polarized=False):
         transient = torch.stack([transient, *[torch.full_like(transient, 99.0)] * 3])
     return SimpleNamespace(
         polarized=polarized, transient=transient, steady=transient.sum(-3), axis=tt.TimeAxis(1.0, 0.5, 5),
-        outside=tuple(part / (inside + before + after or 1) for part in (before, after)),
+        outside=(before / (before + inside + after), after / (before + inside + after)),
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("polarized", [False, True])
-def test_light_that_the_axis_misses_is_said(capsys, polarized):
-    render._report_energy(rendered(20.0, 5.0, polarized=polarized))
+def test_light_that_the_axis_misses_is_said(capsys):
+    render._report_energy(rendered(20.0, 5.0))
     assert capsys.readouterr().out == (
         "note: the axis from 1 m to 3.5 m misses light: 16.0% arrives before it and 4.0% after it.\n"
     )
@@ -97,8 +96,6 @@ def test_a_thousandth_may_be_missed(capsys, before, after):
     assert capsys.readouterr().out == ""
     render._report_energy(rendered(before * 1.01, after * 1.01))
     assert "misses light" in capsys.readouterr().out
-    render._report_energy(rendered(0.0, 0.0, inside=0.0))
-    assert capsys.readouterr().out == ""
 
 
 @pytest.mark.parametrize("polarized", [False, True])

@@ -28,6 +28,7 @@ STATS = RenderStats(
     seeds=(0,),
     energy_before=(0.0,),
     energy_after=(0.25,),
+    energy_total=(1.0,),
 )
 ENDINGS = ("h5", "hdf5", "npz")
 

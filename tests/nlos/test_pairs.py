@@ -44,7 +44,8 @@ def test_what_a_scan_of_pairs_is():
     place = torch.tensor([0.1, 0.2, 0.7], dtype=torch.float64)
     lengths = found.legs + sum((points - place).norm(dim=-1) for points in (found.sensor_points, found.laser_points))
     axis = found.default_axis([place.tolist()] * 2, 0.01)
-    assert 0 <= float(lengths.min()) - axis.start_opl < 0.01 + 1e-9 > axis.end_opl - float(lengths.max()) >= 0
+    for spare in (float(lengths.min()) - axis.start_opl, axis.end_opl - float(lengths.max())):
+        assert -1e-9 < spare < 0.01 + 1e-9
     with pytest.raises(ShapeError, match="one for each sensor point"):
         replace(found, laser_points=found.laser_points[:3], laser_normals=None)
     with pytest.raises(ArgumentError, match=r"Scan\.points"):

@@ -296,14 +296,17 @@ def test_statistics_of_a_batch():
     """Paths over time: 10 a second for 2 s and 40 for 6 s are 260 in 8 s."""
     made = {"spp": 4, "variant": VARIANT, "integrator": "i", "temporal_filter": "box"}
     one = RenderStats(
-        seconds=2.0, samples_per_second=10.0, seeds=(1,), energy_before=(0.5,), energy_after=(3.0,), **made
+        seconds=2.0, samples_per_second=10.0, seeds=(1,), energy_before=(0.5,), energy_after=(3.0,),
+        energy_total=(7.0,), **made,
     )
     two = RenderStats(
-        seconds=6.0, samples_per_second=40.0, seeds=(2, 3), energy_before=(1.0, 2.0), energy_after=(4.0, 5.0), **made
+        seconds=6.0, samples_per_second=40.0, seeds=(2, 3), energy_before=(1.0, 2.0), energy_after=(4.0, 5.0),
+        energy_total=(8.0, 9.0), **made,
     )
     both = RenderStats.of_batch([one, two])
     assert (both.seconds, both.samples_per_second, both.seeds) == (8, 32.5, (1, 2, 3))
     assert (both.energy_before, both.energy_after) == ((0.5, 1.0, 2.0), (3.0, 4.0, 5.0))
+    assert both.energy_total == (7.0, 8.0, 9.0)
     for variant, polarized in ((VARIANT, False), ("llvm_ad_rgb_polarized", True)):
         out = RenderOutput(None, torch.zeros(1, 2, 3), None, axis=None, stats=replace(one, variant=variant))
         assert out.polarized is polarized
@@ -316,8 +319,10 @@ def test_how_a_result_shows_its_statistics():
         ((0.5, 1.0), (3.0, 0.25), (7, 8), "2 seeds, 39.58% of the light outside of the window"),
         ((0.0,), (0.0,), (7,), "seed 7"),
     ):
-        stats = RenderStats(seconds=2.5, seeds=seeds, energy_before=before, energy_after=after, **made)
-        # Two channels of 12 units each.
+        total = tuple(12.0 / len(seeds) for _ in seeds)
+        stats = RenderStats(
+            seconds=2.5, seeds=seeds, energy_before=before, energy_after=after, energy_total=total, **made
+        )
         shown = repr(RenderOutput(None, torch.ones(2, 3, 4), None, axis=None, stats=stats))
         assert f"stats=4 spp in 2.5 s, path, {VARIANT}, {said})" in shown
 

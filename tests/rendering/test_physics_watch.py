@@ -146,15 +146,8 @@ def test_smallest_and_largest():
 # ----------------------------------------------------------------------------------------------------------- windows
 
 
-def steady(total, channels=3, others=2):
-    """(H, W, C): each of the channels holds ``total``; what else a film keeps is no light."""
-    image = torch.full((2, 5, channels + others), 100.0)
-    image[..., :channels] = total / 10
-    return image
-
-
 def window(each, before, after, total=40.0):
-    return messages(each.window, steady(total), 3, before, after)
+    return messages(each.window, total, before, after)
 
 
 @pytest.mark.parametrize(("before", "after"), [(2.0, 0.0), (0.0, 2.0), (0.5, 1.5), (0.0, 0.0)])
@@ -192,7 +185,7 @@ def test_windows_are_errors_each_time():
     each.window_name = "window"
     for _ in range(2):
         with pytest.raises(PhysicsError, match=r"misses 25\.0% of the light.*With physics='warn'"):
-            each.window(steady(40.0), 3, 3.0, 7.0)
+            each.window(40.0, 3.0, 7.0)
 
 
 def test_what_a_built_scene_shows():

@@ -163,6 +163,21 @@ def test_the_window_holds_what_it_promises(name):
     assert float(profile[-some:].sum()) > 0
 
 
+def test_light_at_the_first_edge_is_inside_of_a_tent_too():
+    """Light returns to a camera with a lamp in its place from 4.02 m on: just behind an edge of bins of half a metre."""
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 2},
+        "sensor": {"type": "perspective", "fov": 10, "near_clip": 0.01,
+                   "film": {"type": "hdrfilm", "width": 4, "height": 4}},
+        "lamp": {"type": "point", "position": [0, 0, 0]},
+        "wall": {"type": "rectangle", "to_world": tt.scenes.transforms.translate([0, 0, 2.01])
+                 @ tt.scenes.transforms.rotate([0, 1, 0], 180)},
+    }  # fmt: skip
+    plan = tt.plan(tt.load(scene, variant="llvm_ad_mono"), parameters=["wall.to_world"], bin_width_opl=0.5, missed=1e-3)
+    assert sum(plan.renderer()(seed=1, spp=16).outside) < 1e-3
+
+
 def test_axes_hold_both_ends():
     generator = np.random.default_rng(5)
     for _ in range(300):

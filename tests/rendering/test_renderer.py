@@ -47,7 +47,11 @@ def test_statistics(room_scene):
     outside = stats.energy_before[0] + stats.energy_after[0]
     inside = float(out.transient.mean(0).sum())
     assert outside > 0
-    assert inside + outside == pytest.approx(float(out.steady.mean(0).sum()), rel=1e-4)
+    total = float(out.steady.mean(0).sum())
+    assert inside + outside == pytest.approx(total, rel=1e-4)
+    # Of all that was rendered, whatever is kept of it.
+    assert sum(out.outside) == pytest.approx(outside / total, rel=1e-6)
+    assert out.map(lambda tensor: tensor[:1]).outside == out.outside
 
 
 def test_a_number_of_samples_that_a_sampler_rounds_is_said_once(room_scene, capfd):
@@ -60,6 +64,12 @@ def test_a_number_of_samples_that_a_sampler_rounds_is_said_once(room_scene, capf
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert renderer(seed=1, spp=7).stats.spp == 8
+        # Samples of a derivative count where there is one.
+        renderer.spp_grad = 11
+        with torch.no_grad():
+            renderer(seed=1, spp=7)
+    with pytest.warns(TorchTransientWarning, match="spp=11 is rounded to 12"):
+        renderer(seed=1, spp=7)
     assert "ounded" not in "".join(capfd.readouterr())
 
 
@@ -408,7 +418,7 @@ def test_statistics_tell_the_samples_that_are_drawn(room):
 
 
 def test_outputs_inside_of_vmap_are_shown(room_scene):
-    """They have no numbers: the share of light outside of a short window is left out."""
+    """Their tensors have no numbers; the share of light outside of a short window is that of all entries."""
     axis = tt.TimeAxis(start_opl=6.0, bin_width_opl=0.25, num_bins=2)
     renderer = tt.TransientRenderer(room_scene, [GREY], time_axis=axis, spp=4, physics="ignore")
     shown = []
@@ -418,9 +428,10 @@ def test_outputs_inside_of_vmap_are_shown(room_scene):
         shown.append(repr(out))
         return out.steady
 
-    torch.func.vmap(render)(torch.tensor([0.2, 0.4]))
-    assert "4 spp" in shown[0] and "outside" not in shown[0]
-    assert "outside" in repr(renderer({GREY: torch.tensor(0.2)}, seed=0))
+    values = torch.tensor([0.2, 0.4])
+    torch.func.vmap(render)(values)
+    share = sum(renderer({GREY: values}, seed=[0, 0]).outside)
+    assert "4 spp" in shown[0] and f"{share:.2%} of the light outside" in shown[0]
 
 
 def test_progress_bar(room_scene, capsys):

@@ -189,6 +189,14 @@ MISSPELT = {
 }  # fmt: skip
 
 
+def test_what_asks_for_no_samples_of_silhouettes_passes():
+    node = {"type": "prb_projective", "sppp": 0, "sppi": 0, "guiding": "none", "guiding_proj": False, "max_depth": 4}
+    assert of_paths(translated(room(node)).integrator())[0] == 4
+    for stated in ({"sppc": 0}, {"guiding": "grid"}):
+        with pytest.raises(SceneError, match="expected no samples of silhouettes"):
+            translated(room({**node, **stated}))
+
+
 @pytest.mark.parametrize("name", MISSPELT)
 def test_what_mitsuba_refuses_is_refused(name, tmp_path):
     scene, options, said = MISSPELT[name]
@@ -276,6 +284,9 @@ def test_derivatives_name_their_bound():
         again, said = asked(renderer, seed=0)
     assert said == [] and again.stats.max_depth == depth
     torch.testing.assert_close(again.steady, out.steady.detach())
+    # A thousandth of the light beyond is no error, as little as that beyond a window.
+    strict = tt.TransientRenderer(tt.load(oven()), parameters=[KEY], time_axis=WINDOW, spp=16, physics="error")
+    assert [f"max_depth {depth}" in text for text in asked(strict, seed=0)[1]] == [True]
 
 
 def modes(function, value):
@@ -324,6 +335,17 @@ def test_bounds_of_bright_rooms(albedo, share):
 
 
 @pytest.mark.slow
+def test_a_bound_that_leaves_too_much_is_an_error_where_asked():
+    """Of an albedo of 0.999 more than half of the light is deeper than 512."""
+    mi.set_variant("llvm_ad_mono")
+    scene = oven()
+    scene["ball"]["bsdf"]["reflectance"]["value"] = 0.999
+    strict = tt.TransientRenderer(scene, parameters=[KEY], time_axis=WINDOW, spp=1, physics="error")
+    with pytest.raises(PhysicsError, match="give max_depth= for these"):
+        strict(seed=0)
+
+
+@pytest.mark.slow
 def test_which_calls_have_a_bound():
     """Those whose values can be differentiated by, in whichever mode."""
     mi.set_variant("llvm_ad_mono")
@@ -353,11 +375,6 @@ def test_bounds_that_are_not_found():
     dark = tt.TransientRenderer(tt.load(scene, variant="llvm_ad_mono"), parameters=[KEY], time_axis=WINDOW, spp=1)
     with pytest.raises(GradientError, match=r"a pilot run saw no light\. Set max_depth"):
         dark(seed=0)
-    strict = tt.TransientRenderer(
-        tt.load(oven(), variant="llvm_ad_mono"), parameters=[KEY], time_axis=WINDOW, spp=1, physics="error"
-    )
-    with pytest.raises(PhysicsError, match="max_depth= sets another one"):
-        strict(seed=0)
 
 
 def test_plans_say_what_has_no_limit():

@@ -22,7 +22,7 @@ def output(seed: int):
 
     stats = RenderStats(
         spp=16, seconds=0.5, samples_per_second=1e4, variant="llvm_ad_rgb", integrator="transient_path",
-        temporal_filter="box", seeds=(seed,), energy_before=(0.0,), energy_after=(0.25,),
+        temporal_filter="box", seeds=(seed,), energy_before=(0.0,), energy_after=(0.25,), energy_total=(1.0,),
     )  # fmt: skip
     film = torch.rand(32, 32, 40, 3, generator=torch.Generator().manual_seed(seed))
     cube = film.movedim((-1, -2), (-4, -3))

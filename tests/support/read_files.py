@@ -42,7 +42,7 @@ def _results(folder: Path) -> list[Path]:
     generator = torch.Generator().manual_seed(0)
     stats = RenderStats(
         spp=16, seconds=0.5, samples_per_second=1e4, variant="llvm_ad_rgb", integrator="transient_path",
-        temporal_filter="box", seeds=(0,), energy_before=(0.0,), energy_after=(0.25,),
+        temporal_filter="box", seeds=(0,), energy_before=(0.0,), energy_after=(0.25,), energy_total=(1.0,),
     )  # fmt: skip
     cube = torch.rand(3, 5, 4, 6, generator=generator)
     channels = ("r", "g", "b")

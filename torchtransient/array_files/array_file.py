@@ -235,7 +235,10 @@ def read_npz(path: Path, what: str, known: Callable[[str], bool]) -> dict[str, A
 
 
 def npz_shapes(path: Path, what: str) -> dict[str, tuple[int, ...] | None]:
-    """The shape of each array by its name, None for what is none. Raises as :func:`read_npz`."""
+    """The shape of each array by its name, None for what is none. Pickles have one too, and of names that stand twice
+    it is the last one's. Raises StorageError for arrays of a version that NumPy writes for no numbers, and what the
+    packages raise of damage.
+    """
     found: dict[str, tuple[int, ...] | None] = {}
     with zipfile.ZipFile(path) as file:
         for entry in file.infolist():

@@ -16,6 +16,7 @@ from torch.autograd import forward_ad
 
 from torchtransient.errors import GradientError
 from torchtransient.rendering.overrides import depth_limit
+from torchtransient.rendering.physics import MISSED
 from torchtransient.rendering.plan_pilot import pilot_run
 from torchtransient.rendering.translation import NO_LIMIT
 from torchtransient.rendering.variant import active_variant
@@ -43,7 +44,8 @@ def depth_bound(
     scene: Scene, options: BuildOptions, sensors: Sequence[int], film: FilmChoice, watch: PhysicsWatch
 ) -> DepthBound | None:
     """The bound for derivatives of a scene, found for its described values when it is first asked for; None where its
-    depth is stated. Raises GradientError where none can be found.
+    depth is stated. Raises GradientError where none can be found, and PhysicsError, where ``watch`` is asked for
+    it, for more light beyond the bound than a time window may miss.
     """
     # One for all samplers, so that renderers that differ by theirs alone can be compared.
     options = replace(options, sampler=None)
@@ -56,7 +58,9 @@ def depth_bound(
             f"max_depth {bound.depth}",
             "derivatives need a bound on the depth of paths, and the scene states none: value and derivative have "
             f"max_depth {bound.depth}, which leaves {bound.beyond:.2g} +- {bound.error:.1g} of the light to deeper "
-            "paths. max_depth= sets another one; renders without derivatives have none.",
+            "paths of the described values. An optimiser that reaches brighter ones keeps the bound, with more light "
+            "beyond it: give max_depth= for these then. Renders without derivatives have none.",
+            is_error=bound.beyond > MISSED,
         )
     return bound
 
@@ -91,10 +95,12 @@ def _found(scene: Scene, options: BuildOptions, sensors: Sequence[int], film: Fi
     return DepthBound(depth, *max(arrivals.share(arrivals.depth > depth) for arrivals in lit))
 
 
-def may_have_derivative(tensor: torch.Tensor) -> bool:
-    """Return whether autograd, forward mode or a transform of ``torch.func`` may differentiate by a tensor."""
+def may_have_derivative(tensor: torch.Tensor, *, graph: bool = True) -> bool:
+    """Return whether autograd, forward mode or a transform of ``torch.func`` may differentiate by a tensor; without a
+    ``graph`` (``torch.no_grad``) forward mode alone.
+    """
     transforms = torch._C._functorch
-    while not (tensor.requires_grad or _is_dual(tensor)):
+    while not ((graph and tensor.requires_grad) or _is_dual(tensor)):
         if not transforms.is_functorch_wrapped_tensor(tensor):
             return False
         tensor = transforms.get_unwrapped(tensor)

@@ -46,11 +46,13 @@ def primal(job: RenderJob, values: Sequence[torch.Tensor]) -> tuple[torch.Tensor
         check_fits(session.film(job.items[0]).cube_shape(), len(job.items), job.scene.variant)
         steady, response, before, after, said = _render_items(session, values)
         seconds, spp = time.perf_counter() - started, _drawn_samples(session)
-        integrator, depth = session.slots.built.integrator, depth_limit(session.integrator)
-        job.log.append(RunLog(job.items, seconds, integrator, spp, before, after, said, depth))
         channels = len(session.film(job.items[0]).channel_names())
+        light = steady[..., :channels].sum((-3, -2, -1), dtype=torch.float64) / channels
+        total: tuple[float, ...] = tuple(light.reshape(-1).tolist())
+        integrator, depth = session.slots.built.integrator, depth_limit(session.integrator)
+        job.log.append(RunLog(job.items, seconds, integrator, spp, before, after, total, said, depth))
     if job.watch.looks:
-        job.watch.window(steady, channels, sum(before), sum(after))
+        job.watch.window(sum(total), sum(before), sum(after))
     return steady, response
 
 

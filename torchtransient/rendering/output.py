@@ -26,12 +26,13 @@ class RenderStats:
     ``seconds`` is wall time, without loading and without the wait for other threads; ``samples_per_second``
     counts camera paths. ``energy_before`` and ``energy_after`` hold, per rendered item, the light outside the time
     axis: sum over pixels of the mean over channels; zero for films without a window (phasors, gates).
-    ``RenderOutput.outside`` has the shares.
+    ``energy_total``: likewise, all light of ``steady``. ``RenderOutput.outside`` has the shares.
     ``temporal_filter`` is empty for films without one. ``seeds`` are the items' seeds. ``recorded``: what became of
     each item's recording, "launched", "recorded", or "traced: " and why; ``derivatives_recorded``: the same of the
     derivatives that have been asked for since. ``max_depth``: of the paths, -1 for no limit, None for integrators
     without one. ``light_beyond``: share of the light in deeper paths, where a pilot run has found ``max_depth`` for
-    derivatives of a scene that states none; else None.
+    derivatives of a scene that states none; else None. It is that of the described values: brighter ones, given or
+    learnt, have the same ``max_depth`` and more light beyond it.
     """
 
     _: KW_ONLY
@@ -44,6 +45,7 @@ class RenderStats:
     seeds: tuple[int, ...]
     energy_before: tuple[float, ...]
     energy_after: tuple[float, ...]
+    energy_total: tuple[float, ...]
     recorded: tuple[str, ...] = ()
     derivatives_recorded: list[str] = field(default_factory=list, compare=False)
     max_depth: int | None = None
@@ -64,6 +66,7 @@ class RenderStats:
             seeds=tuple(item.seed for item in items),
             energy_before=tuple(energy for run in runs for energy in run.energy_before),
             energy_after=tuple(energy for run in runs for energy in run.energy_after),
+            energy_total=tuple(energy for run in runs for energy in run.energy_total),
             recorded=tuple(said for run in runs for said in run.recorded),
             derivatives_recorded=job.derivative_log,
             max_depth=runs[0].max_depth,
@@ -92,6 +95,7 @@ class RenderStats:
             seeds=tuple(seed for stats in several for seed in stats.seeds),
             energy_before=tuple(energy for stats in several for energy in stats.energy_before),
             energy_after=tuple(energy for stats in several for energy in stats.energy_after),
+            energy_total=tuple(energy for stats in several for energy in stats.energy_total),
             recorded=tuple(said for stats in several for said in stats.recorded),
             derivatives_recorded=[said for stats in several for said in stats.derivatives_recorded],
         )
@@ -145,13 +149,11 @@ class RenderOutput(TensorRecord):
 
     @property
     def outside(self) -> tuple[float, float]:
-        """Shares of the light before and after the time window, over all items; of polarized light of S0."""
-        before, after = sum(self.stats.energy_before), sum(self.stats.energy_after)
-        if before + after <= 0:
-            return 0.0, 0.0
-        steady = self.steady[..., 0, :, :, :] if self.polarized else self.steady
-        total = float(steady.detach().sum(dtype=torch.float64)) / self.steady.shape[-3]
-        return (before / total, after / total) if total > 0 else (0.0, 0.0)
+        """Shares of the light before and after the time window, over all items of the render; of polarized light of
+        S0.
+        """
+        before, after, total = map(sum, (self.stats.energy_before, self.stats.energy_after, self.stats.energy_total))
+        return (before / total, after / total) if total > 0 and before + after > 0 else (0.0, 0.0)
 
     @classmethod
     def merged_notes(cls, records: Sequence[RenderOutput]) -> dict[str, Any]:
@@ -161,10 +163,7 @@ class RenderOutput(TensorRecord):
         stats = self.stats
         seeds = f"seed {stats.seeds[0]}" if len(stats.seeds) == 1 else f"{len(stats.seeds)} seeds"
         made = f"{stats.spp} spp in {stats.seconds:.3g} s, {stats.integrator}, {stats.variant}, {seeds}"
-        try:
-            outside = sum(self.outside)
-        except RuntimeError:  # of a batch of `vmap`, which has no numbers
-            outside = 0.0
+        outside = sum(self.outside)
         made += f", {outside:.2%} of the light outside of the window" if outside else ""
         if stats.light_beyond is not None:
             made += f", max_depth {stats.max_depth} with {stats.light_beyond:.2g} of the light beyond"

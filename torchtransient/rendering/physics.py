@@ -59,9 +59,11 @@ class PhysicsWatch:
         """Whether anything is looked at."""
         return self.mode != "ignore"
 
-    def tell(self, about: str, message: str) -> None:
-        """Say a finding, in the way of the mode; those that are about the same once."""
-        if self.mode == "error":
+    def tell(self, about: str, message: str, *, is_error: bool = True) -> None:
+        """Say a finding, in the way of the mode; those that are about the same once. ``is_error``: False for one that
+        is a warning in the mode "error", too.
+        """
+        if self.mode == "error" and is_error:
             raise PhysicsError(f"{message} With physics='warn' it is computed all the same.")
         if about not in self._told:
             self._told.add(about)
@@ -103,11 +105,10 @@ class PhysicsWatch:
             for about, message in self.installed(scene, sensor).items():
                 self.tell(about, message)
 
-    def window(self, steady: torch.Tensor, channels: int, before: float, after: float) -> None:
-        """A render in the film's layout, whose first ``channels`` hold the light, and what its window missed."""
+    def window(self, total: float, before: float, after: float) -> None:
+        """Light of a render, all and what its window missed."""
         if not self.window_name or before + after <= 0 or (self.mode != "error" and self.window_name in self._told):
             return
-        total = float(steady[..., :channels].sum(dtype=torch.float64)) / channels
         if total > 0 and before + after > MISSED * total:
             self.tell(
                 self.window_name,

@@ -47,7 +47,7 @@ from torchtransient.rendering.parameters import ParameterInfo, needing_slope, un
 from torchtransient.rendering.physics import PhysicsWatch
 from torchtransient.rendering.progress import Bar
 from torchtransient.rendering.pulse_properties import checked_pulse
-from torchtransient.rendering.sample_counts import SampleCounts, samples_taken
+from torchtransient.rendering.sample_counts import rounded_count, samples_taken
 from torchtransient.rendering.scene_handle import Scene, load
 from torchtransient.rendering.seeds import Item, Seeding, drawn
 from torchtransient.rendering.session import RenderJob
@@ -99,7 +99,8 @@ class TransientRenderer(CopiesParametrized):
     ``physics``: what becomes of what no physical system has: reflectances, albedos and other shares of the light
     outside of [0, 1], described or given, transforms without an inverse, windows that miss more than 5 % of the
     light, and depths that had to be bounded. "warn" says each once for a scene, as a ``PhysicsWarning`` with the key
-    and the number; "error" raises ``PhysicsError``; "ignore" does not look.
+    and the number; "error" raises ``PhysicsError``, of bounds for those that leave out more than 5 %; "ignore" does not
+    look.
 
     ``freeze``: True records what a call launches, so that later calls need no tracing, with the same values, gradients
     and noise; ``out.stats.recorded`` says what became of it, ``docs/speed.md`` what makes a new recording.
@@ -186,7 +187,7 @@ class TransientRenderer(CopiesParametrized):
         self._cube_shape = tuple(films[0].cube_shape())
         self._channels = tuple(films[0].channel_names())
         self._scene_spp = int(found[self._sensors[0]].sampler().sample_count())
-        self._counts = SampleCounts({self._scene_spp: self._scene_spp})
+        self._counts = {self._scene_spp: self._scene_spp}
         self._pulsed = all(film.pulses for film in films)
         self._response = response_of(films)
         self._scene_filter = films[0].temporal_filter
@@ -322,7 +323,10 @@ class TransientRenderer(CopiesParametrized):
         temporal_filter = self.effective_filter
         self._check_slope(temporal_filter, tensors)
         wanted = samples("spp", spp) or self.spp or self._scene_spp
-        used, used_grad = (self._counts.of(n, self.samples_drawn) for n in (wanted, self.spp_grad or wanted))
+        used = used_grad = rounded_count(wanted, self._counts, self.samples_drawn)
+        graph = torch.is_grad_enabled()
+        if self.spp_grad is not None and any(may_have_derivative(tensor, graph=graph) for tensor in tensors):
+            used_grad = rounded_count(self.spp_grad, self._counts, self.samples_drawn)
         seeding = Seeding(self._sensors, 1 if batch is None else batch, self.grad_seed)
         number, per_entry = drawn(seed)
         bar = Bar() if progress else None

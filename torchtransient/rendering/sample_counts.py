@@ -11,22 +11,20 @@ from torchtransient.rendering.interrupts import quiet
 from torchtransient.rendering.physics import level_of_user
 
 
-class SampleCounts(dict[int, int]):
-    """Numbers that a sampler takes, by those that are asked for."""
-
-    def of(self, asked: int, taken: Callable[[int], int]) -> int:
-        """The number for one that is asked for, with a warning at the first time that it is another one. ``taken``
-        asks the sampler.
-        """
-        if asked not in self:
-            self[asked] = taken(asked)
-            if self[asked] != asked:
-                warnings.warn(
-                    f"spp={asked} is rounded to {self[asked]}, a number of samples that the scene's sampler can draw.",
-                    TorchTransientWarning,
-                    stacklevel=level_of_user(),
-                )
-        return self[asked]
+def rounded_count(asked: int, known: dict[int, int], drawn: Callable[[int], int]) -> int:
+    """Return the number of samples that a sampler draws for one that is asked for, with a warning at the first time
+    that it is another one. ``known``: numbers that were found before, to which this one is added; ``drawn`` asks the
+    sampler.
+    """
+    if asked not in known:
+        known[asked] = drawn(asked)
+        if known[asked] != asked:
+            warnings.warn(
+                f"spp={asked} is rounded to {known[asked]}, a number of samples that the scene's sampler can draw.",
+                TorchTransientWarning,
+                stacklevel=level_of_user(),
+            )
+    return known[asked]
 
 
 def samples_taken(sampler: Any, count: int | None) -> int:

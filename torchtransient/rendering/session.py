@@ -35,7 +35,8 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class RunLog:
     """What one primal run reports, item by item. ``energy_before``, ``energy_after``: outside of the window;
-    ``recorded``: what became of its recording. ``max_depth``: of the integrator, -1 for no limit.
+    ``energy_total``: all light; ``recorded``: what became of its recording. ``max_depth``: of the integrator, -1 for no
+    limit.
     """
 
     items: tuple[Item, ...]
@@ -44,6 +45,7 @@ class RunLog:
     spp: int
     energy_before: tuple[float, ...]
     energy_after: tuple[float, ...]
+    energy_total: tuple[float, ...]
     recorded: tuple[str, ...]
     max_depth: int | None = None
 

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 
 from torchtransient.errors import SceneError
-from torchtransient.interfaces import IntegratorInterface
+from torchtransient.interfaces import IntegratorInterface, is_time_resolved
 from torchtransient.plugins.dictionaries import Voxels
 from torchtransient.plugins.node_walk import objects_below, objects_of
 from torchtransient.plugins.parameter_effect import ParameterEffect, class_of
-from torchtransient.rendering.films.choices import of_film
+from torchtransient.rendering.films.choices import of_film, plugins_in_words
 from torchtransient.rendering.variant import active_variant
 
 if TYPE_CHECKING:
@@ -264,7 +264,11 @@ def _check_sensor(number: int, sensor: Any, options: BuildOptions) -> None:
     film = sensor.film()
     asked = [name for name in ("sampler", "pulse", "irf") if getattr(options, name) is not None]
     asked += [] if options.steady or not getattr(film, "keeps_steady", True) else ["steady"]
-    # Raises for a film that is not time-resolved.
+    if options.transient and not is_time_resolved(film):
+        raise SceneError(
+            f"sensor {number} was taken as it is with its film, a {class_of(film)}, which has no time axis; no other "
+            f"film is built in its place. Make the scene with one of {plugins_in_words()}. {_WAY_OUT}."
+        )
     has = of_film(film) if options.transient else None
     if options.film is not None and options.film != has:
         asked.append(options.film.argument)

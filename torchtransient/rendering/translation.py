@@ -10,8 +10,9 @@ that plugin first, so that it refuses what it would refuse in a picture: misspel
 | ``file_format``, ``component_format`` | without effect, since renders are tensors |
 | ``max_depth``, ``rr_depth``, ``hide_emitters`` | kept; of ``aov``, ``moment``, ``stokes`` those of the nested one |
 | ``use_spectral_mis`` (``volpathmis``), ``jitter``, ``strength`` (samplers) | without effect but on noise |
+| ``shading_samples``, ``emitter_samples``, ``bsdf_samples`` (``direct``) | only noise; 0 of one kind is refused |
 | ``timeout``, ``block_size``, ``samples_per_pass`` | without effect in variants that compile kernels |
-| numbers of samples of silhouettes (``prb_projective``) | refused: those are no part of the derivative here |
+| samples of silhouettes (``prb_projective``) | refused, as no part of the derivative; those that ask for none pass |
 """
 
 from __future__ import annotations
@@ -52,9 +53,11 @@ _DEPTHS = {
     **dict.fromkeys(("direct", "direct_projective"), 2),
 }
 _DEPTH_IN_PYTHON = 6
-_OF_SILHOUETTES = (
-    "sppc", "sppp", "sppi", "guiding", "guiding_proj", "guiding_rounds", "project_seed",
-)  # fmt: skip
+# Properties of silhouettes, and values of them that ask for no samples.
+_OF_SILHOUETTES = {
+    "sppc": (), "sppp": (0,), "sppi": (0,), "guiding": ("none",),
+    "guiding_proj": (False,), "guiding_rounds": (), "project_seed": (),
+}  # fmt: skip
 # What an `hdrfilm` prints for some of the values of its `pixel_format`.
 _PRINTED = {"y": "luminance", "ya": "luminance_alpha"}
 
@@ -221,7 +224,7 @@ def _check_channels(film: Any, wanted: str) -> None:
 
 
 def _check_silhouettes(props: Any) -> None:
-    found = [name for name in _OF_SILHOUETTES if name in props]
+    found = [name for name, none in _OF_SILHOUETTES.items() if name in props and props[name] not in none]
     if found:
         raise SceneError(
             f"{props.plugin_name()}: {', '.join(map(repr, found))}: expected no samples of silhouettes, which are no "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,7 +13,7 @@ from torchtransient.data.generation import shard_making
 from torchtransient.data.generation.shard_making import MOST_CHARACTERS, ShardMaker, fatal, raised, reason_of
 from torchtransient.data.recipes.sample import Sample
 from torchtransient.data.storage.shard_file import Shard
-from torchtransient.errors import SceneError, StorageError, TorchTransientError, UnitError
+from torchtransient.errors import PhysicsWarning, SceneError, StorageError, TorchTransientError, UnitError
 
 
 class Heard:
@@ -147,9 +148,18 @@ def test_the_first_sample_that_can_be_made_is_measured(making):
 
 def test_recipes_that_check_themselves(making):
     recipe = Making()
-    recipe.check = lambda maker: recipe.asked.append(maker)
-    making(recipe).measure(range(1), Heard())
+
+    def check(maker):
+        recipe.asked.append(maker)
+        for message, category in (("dark", PhysicsWarning), ("old", DeprecationWarning), ("own", UserWarning)):
+            warnings.warn(message, category, stacklevel=1)
+
+    recipe.check = check
+    with pytest.warns(UserWarning, match="own"):
+        found = making(recipe).measure(range(1), Heard())
     assert recipe.asked == [recipe, 0]
+    # Those of other packages stay where they are.
+    assert found.warned == (("dark", PhysicsWarning),)
 
 
 def test_reasons_are_the_same_everywhere():

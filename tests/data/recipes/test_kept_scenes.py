@@ -16,7 +16,6 @@ from torchtransient.data.recipes import checks, kept_scene
 from torchtransient.data.recipes.checks import _check_light, _check_names, _check_ranges, structures_of
 from torchtransient.data.recipes.distribution import NUMBERS, POSE, Place
 from torchtransient.data.recipes.kept_scene import Kept, Measures, _is_polarized, changed
-from torchtransient.data.recipes.maker import Maker
 from torchtransient.data.recipes.recipe_file import _hidden, from_dict
 from torchtransient.data.recipes.structures import OneOf, Structure, _checked_scan, _exchanged
 from torchtransient.data.recipes.written import read, read_gate, written
@@ -46,35 +45,37 @@ def recipe(scene=None, vary=None, **settings):
 # ------------------------------------------------------------------------------------------------- of what is rendered
 
 
-@pytest.mark.parametrize("polarized", [False, True])
-def test_shares_of_light_outside(polarized):
-    """Energies are sums over pixels, of the mean of the channels, over all sensors; of Stokes vectors the first."""
-    steady = torch.arange(2 * 3 * 4 * 5, dtype=torch.float32).reshape(2, 3, 4, 5) + 1
-    total = float(steady.sum()) / 3
-    if polarized:
-        steady = torch.stack([steady, 7 - steady, steady * 2, steady * 0], 1)
+def test_shares_of_light_outside():
+    """Over all items of a render, whatever became of its tensors."""
 
-    def outside(before, after, light):
+    def outside(before, after, total):
         stats = tt.rendering.output.RenderStats(
-            spp=1, seconds=1.0, samples_per_second=1.0, variant="llvm_ad_rgb" + "_polarized" * polarized, integrator="",
-            temporal_filter="", seeds=(), energy_before=before, energy_after=after,
+            spp=1, seconds=1.0, samples_per_second=1.0, variant="llvm_ad_rgb", integrator="",
+            temporal_filter="", seeds=(), energy_before=before, energy_after=after, energy_total=total,
         )  # fmt: skip
-        return tt.RenderOutput(None, light, None, axis=None, stats=stats).outside
+        return tt.RenderOutput(None, torch.ones(3, 4, 5), None, axis=None, stats=stats).outside
 
-    assert outside((10.0, 20.0), (30.0, 30.5), steady) == pytest.approx((30 / total, 60.5 / total), rel=1e-12)
-    for before, after, light in ((0.0, 0.0, steady), (1.0, 2.0, 0 * steady), (-1.0, 0.5, steady)):
-        assert outside((before,), (after,), light) == (0.0, 0.0)
+    assert outside((10.0, 20.0), (30.0, 30.5), (100.0, 200.0)) == pytest.approx((0.1, 60.5 / 300), rel=1e-12)
+    for before, after, total in ((0.0, 0.0, 9.0), (1.0, 2.0, 0.0), (-1.0, 0.5, 9.0)):
+        assert outside((before,), (after,), (total,)) == (0.0, 0.0)
 
 
-def test_samples_are_finite():
+def test_samples_are_finite(monkeypatch):
     """What is measured; labels may have NaN."""
-    check = lambda **arrays: Maker._check(None, 5, arrays, "phasor")  # noqa: E731
-    bad = np.array([1.0, np.nan])
-    check(depth=bad, phasor=np.ones(2), steady=np.ones(2))
-    for name in ("phasor", "steady", "measurement"):
-        for wrong in (bad, np.array([np.inf])):
-            with pytest.raises(UnitError, match=f"sample 5: {name} has numbers that are not finite"):
-                check(**{name: wrong})
+    found = recipe(labels=("depth",), device=DEVICE, time_axis=DEVICE.axis())
+    broken = ""
+
+    def arrays(kept, index, drawn, seed):
+        names = ("transient", "steady", "measurement", "depth")
+        return {name: np.array([1.0, np.nan if name == broken else 0.0]) for name in names}, (0.0, 0.0)
+
+    monkeypatch.setattr(Kept, "arrays", arrays)
+    for broken in ("depth", "transient", "steady", "measurement"):
+        if broken == "depth":
+            assert np.isnan(found.sample(5).arrays["depth"]).any()
+            continue
+        with pytest.raises(UnitError, match=f"sample 5: {broken} has numbers that are not finite"):
+            found.sample(5)
 
 
 def test_measures_are_the_same_for_all():
@@ -120,7 +121,7 @@ def test_polarized_light_for_a_detector(monkeypatch):
 
     kept = SimpleNamespace(
         recipe=SimpleNamespace(device=1, variant="llvm_ad_mono_polarized", seed=3),
-        _chain=SimpleNamespace(sample=sample, modules=list), device_keys=[],
+        _chain_for=lambda drawn: SimpleNamespace(sample=sample, modules=list),
     )  # fmt: skip
     for index, given in ((0, light), (0, torch.stack([light, -light])), (1, light)):
         found = Kept._measured(kept, index, {}, {"transient": given})

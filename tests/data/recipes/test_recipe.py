@@ -191,7 +191,7 @@ def test_light_outside_of_the_window():
     assert sample.outside[1] == pytest.approx(whole[40:].sum() / whole.sum(), rel=1e-2)
 
 
-def test_samples_whose_light_the_window_misses():
+def test_samples_whose_light_the_window_misses(monkeypatch):
     """They are counted before the run as they come in it; no sample is left out for it."""
     recipe = small(time_axis=tt.TimeAxis(2.0, 0.2, 45), vary={"white.reflectance.value": D.Uniform(0.1, 0.95)})
     with pytest.warns(PhysicsWarning, match=r"more than 1% in \d+ of 64 samples.* of all samples .*kept all the same"):
@@ -199,8 +199,14 @@ def test_samples_whose_light_the_window_misses():
     missed = [sum(recipe.sample(index).outside) for index in range(64)]
     assert found.samples == 64 and found.cut == sum(share > 0.01 for share in missed) and 0 < found.cut < 64
     assert found.mean == pytest.approx(np.mean(missed), rel=1e-6) and found.most == pytest.approx(max(missed), rel=1e-6)
+    # It is looked at once.
+    renders, forward = [], tt.TransientRenderer.forward
+    monkeypatch.setattr(
+        tt.TransientRenderer, "forward", lambda *given, **more: renders.append(1) or forward(*given, **more)
+    )
     with pytest.warns(PhysicsWarning, match=f"more than 1% in {found.cut} of 64 samples"):
         data = D.RecipeDataset(recipe, 64)
+    assert renders == [] and pickle.loads(pickle.dumps(recipe)) == recipe
     assert float(data[3]["outside"].sum()) == pytest.approx(missed[3], rel=1e-6)
     # As many others: their share lies within the interval, but once in 20 times.
     others = sum(sum(recipe.sample(index).outside) > 0.01 for index in range(64, 128))

@@ -20,6 +20,7 @@ from torchtransient.data.recipes.outside_light import OutsideLight
 from torchtransient.data.recipes.sample import Sample, in_order
 from torchtransient.data.recipes.structures import Structure
 from torchtransient.data.storage.shard_writing import ShardWriter
+from torchtransient.errors import TorchTransientWarning
 from torchtransient.vis.tone_mapping import tone_map
 
 RANDOM = np.random.default_rng(3)
@@ -243,6 +244,10 @@ def test_a_forecast_in_words():
     alone = str(cost(values=(), exchanged=(), n=None)).splitlines()
     assert alone[0].endswith("none") and alone[1].endswith("nothing: one structure for all samples")
     assert len(alone) == 9
+    unseen = OutsideLight.of([], ["sample 0: bad", "sample 1: bad"])
+    assert "light outside     not looked at; 2 of 2 samples failed" in str(cost(outside=unseen))
+    with pytest.warns(TorchTransientWarning, match="recipe: 2 of 2 samples .* failed .*The first one: sample 0: bad"):
+        unseen.warn("recipe")
 
 
 @pytest.mark.parametrize(

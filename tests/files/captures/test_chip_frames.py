@@ -39,11 +39,28 @@ def test_a_frame_of_several(tmp_path):
     assert capture.metadata["format"] == "tmf8828" and capture.metadata["frame"] == 1
     assert capture.metadata["reference_hist"] == chip_frames(3)[1]["reference_hist"]
     assert capture.metadata["not_read"] == ["joint_angles"]
+    # Times as texts, of the frame that was chosen.
+    dated = [one | {"time_captured": f"2025-07-0{day}"} for day, one in enumerate(chip_frames(3))]
+    assert tt.nlos.Capture.read(written(path, dated), frame=2).metadata["time_captured"] == "2025-07-02"
 
 
 def test_a_mark_of_the_encoding(tmp_path):
     (tmp_path / "a.json").write_text(json.dumps(frame()), encoding="utf-8-sig")
     assert tt.nlos.Capture.read(tmp_path / "a.json").metadata["format"] == "tmf8828"
+    written(tmp_path / "a.json", " \n" * 100 + json.dumps(frame()))
+    assert tt.nlos.Capture.read(tmp_path / "a.json").metadata["format"] == "tmf8828"
+
+
+def test_files_that_are_of_no_known_kind(tmp_path):
+    """Cut ones, too, of which the ending tells what they were."""
+    np.savez(tmp_path / "whole.npz", **zone_frame())
+    for name, data, hint in (
+        ("a.npz", (tmp_path / "whole.npz").read_bytes()[:-100], "NumPy"),
+        ("a.json", b" " * 300, "JSON"), ("a", b"", ""),
+    ):  # fmt: skip
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(StorageError, match=f"is no JSON, NumPy, MATLAB or HDF5 file.*{hint}"):
+            tt.nlos.Capture.read(tmp_path / name)
 
 
 def test_zones_meet_the_plane_before_the_chip(tmp_path):

@@ -36,6 +36,7 @@ STATS = RenderStats(
     seeds=(0,),
     energy_before=(0.0,),
     energy_after=(0.0,),
+    energy_total=(1.0,),
 )
 GIVEN = {
     "time_axis": tt.TimeAxis(3.5, 0.25, 5),

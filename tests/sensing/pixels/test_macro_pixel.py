@@ -381,6 +381,14 @@ def test_windows_of_coincidences():
     assert bool((pixel(4.0, k=3)(x) > 0).all()) and bool((pixel(4.0 * (1 + 0.9e-9)).detector(x) > 0).all())
     with pytest.raises(UnitError, match="window_s of at most the dead time"):
         pixel(4.0 * (1 + 1.1e-9))
+    learnt = CoincidencePixel(
+        detector("free", 4.0, learnable=True), 3, coincidence=2, window_s=3 * WIDTH, bin_width_s=WIDTH
+    )  # fmt: skip
+    with torch.no_grad():
+        next(learnt.parameters()).sub_(1.0)  # of its logarithm: 1.5 bins
+    for compute in (learnt, learnt.sample):
+        with pytest.raises(UnitError, match=r"window_s of at most the dead time of 1\.47"):
+            compute(x)
     with pytest.raises(UnitError, match="window_s within the 3 bins of the light, got 4 bins"):
         pixel(4.0)(x[:, :3])
     for spads, weights in ((3, None), (4, [1, 0, 2, 1])):

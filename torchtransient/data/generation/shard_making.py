@@ -17,7 +17,7 @@ from torchtransient.data.generation.settings import Settings, check_same, plain,
 from torchtransient.data.generation.told_errors import traced
 from torchtransient.data.recipes.plugin_modules import add_plugins
 from torchtransient.data.storage.file_names import shard_file_name
-from torchtransient.errors import SceneError, StorageError, TorchTransientError
+from torchtransient.errors import SceneError, StorageError, TorchTransientError, TorchTransientWarning
 
 # Words of a reason at most: it stands in the file for every sample that failed.
 MOST_CHARACTERS = 500
@@ -47,7 +47,8 @@ class Told(Protocol):
 @dataclass(frozen=True)
 class Measured:
     """Figures of the first sample that can be made, for all: bytes before compression, facts, standard error.
-    ``warned``: messages and classes of the warnings of the recipe's check, which the caller of ``generate`` gets.
+    ``warned``: messages and classes of this library's warnings of the recipe's check, which the caller of
+    ``generate`` gets.
     """
 
     sample_bytes: int
@@ -87,12 +88,17 @@ class ShardMaker:
         """Check the recipe, and make samples until one can be made. Raises what is wrong with the recipe, SceneError
         where none of the samples can be made.
         """
-        warned: list[warnings.WarningMessage] = []
+        said: list[tuple[str, type[Warning]]] = []
         check = getattr(self.settings.recipe, "check", None)
         if check is not None:
             with warnings.catch_warnings(record=True) as warned:
-                warnings.simplefilter("always")
+                warnings.simplefilter("always", TorchTransientWarning)
                 check(self._maker)
+            for one in warned:
+                if issubclass(one.category, TorchTransientWarning):
+                    said.append((str(one.message), one.category))
+                else:
+                    warnings.showwarning(one.message, one.category, one.filename, one.lineno)
         reason = ""
         for index in indices:
             reason = told.begin(-1, index) or ""
@@ -102,8 +108,7 @@ class ShardMaker:
                 if not isinstance(found, str):
                     size = sum(array.nbytes for array in found.arrays.values())
                     error = self._standard_error(index, told)
-                    said = tuple((str(one.message), one.category) for one in warned)
-                    return Measured(size, plain(self._maker.about()), error, said)
+                    return Measured(size, plain(self._maker.about()), error, tuple(said))
                 reason = found
         raise SceneError(
             f"generate: none of the samples 0 to {indices.stop - 1} of the recipe can be made. The last one: {reason}"

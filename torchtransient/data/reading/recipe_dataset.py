@@ -43,10 +43,10 @@ class RecipeDataset(Epochs, Dataset[dict[str, Any]]):
     that it has the same noise whoever reads it, that of a stored sample of this index; :meth:`set_epoch` and
     :meth:`sample` tell epochs apart. None draws from torch's, anew each time.
 
-    The recipe is checked first (:meth:`Recipe.check`). It pickles, without what it has built. ``close()`` lets go of
-    that; it is built again when a sample is read. Raises
-    UnitError for sizes, seeds and epochs, ArgumentError for what is no recipe, no function, and a seed that the
-    transform cannot take, IndexError beyond the sizes, and what the render of a sample raises.
+    The recipe is checked first (:meth:`Recipe.check`), unless it was before. It pickles, without what it has built.
+    ``close()`` lets go of that; it is built again when a sample is read. Raises UnitError for sizes, seeds and epochs,
+    ArgumentError for what is no recipe, no function, and a seed that the transform cannot take, IndexError beyond the
+    sizes, and what the render of a sample raises.
     """
 
     def __init__(

@@ -39,8 +39,8 @@ def check_recipe(recipe: Specification, maker: Maker) -> None:
         kept.check_labels()
         _check_names(named.setdefault(structure.name, kept.named()), kept)
         draws = list(_draws(recipe, kept, indices))
-        for _, drawn in draws if kept.device_keys else draws[:1]:
-            kept.check_device(drawn)
+        for number, (_, drawn) in enumerate(draws if kept.device_keys else draws[:1]):
+            kept.check_device(drawn, measures=number == 0)
         with active_variant(recipe.variant):
             built = kept.renderer.scene.built(kept.renderer._options)
             ranges = built.ranges()
@@ -52,15 +52,18 @@ def check_recipe(recipe: Specification, maker: Maker) -> None:
 
 
 def light_outside(recipe: Specification, maker: Maker, progress: bool = False) -> OutsideLight:
-    """Light of the first samples that the time window misses; none of films without one."""
+    """Light of the first samples that the time window misses; not looked at for films without one."""
     shares: list[tuple[float, float]] = []
+    failed: list[str] = []
     found = structures_of(recipe, range(SAMPLES)) if maker.measures().axis is not None else []
     pairs = [(structure, index) for structure, indices in found for index in indices]
     for structure, index in with_bar(pairs, "check", progress):
         # A sample that raises is a failed one of the data set, not a wrong recipe.
-        with contextlib.suppress(TorchTransientError):
+        try:
             shares.append(maker.kept(structure).outside(index))
-    return OutsideLight.of(shares)
+        except TorchTransientError as error:
+            failed.append(f"sample {index}: {error}")
+    return OutsideLight.of(shares, failed)
 
 
 def _tell_of_many_scenes(recipe: Specification) -> None:

@@ -83,8 +83,7 @@ class Cost:
         for store, size in self.stored_bytes.items():
             if size is not None:
                 yield f"  store={store!r:<10} {_bytes(size)}, {self.sample_bytes / size:.1f} times smaller"
-        if self.outside.samples:
-            yield f"light outside     {self.outside}"
+        yield f"light outside     {self.outside}"
         yield f"standard error    {self.standard_error:.1%} of a sample's numbers (root mean square)"
         if self.n is not None:
             sizes = [self.n * size for size in (*self.stored_bytes.values(), self.sample_bytes) if size]

@@ -271,13 +271,7 @@ class Kept:
     # ------------------------------------------------------------------------------------------------- measurements
 
     def _measured(self, index: int, drawn: Mapping[str, Any], tensors: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        device = self.recipe.device
-        assert device is not None
-        chain = self._chain
-        if chain is None:
-            for key in self.device_keys:
-                device = changed(device, key, drawn[key])
-            chain = self._chain_of(device)
+        chain = self._chain_for(drawn)
         transient = tensors["transient"]
         if stokes_components(self.recipe.variant) > 1 and not _is_polarized(chain):
             # A detector that takes no notice of polarization counts all light.
@@ -285,9 +279,24 @@ class Kept:
         generator = torch.Generator().manual_seed(Stream(self.recipe.seed, index, NOISE).seed())
         return chain.sample(transient, generator)
 
-    def check_device(self, drawn: Mapping[str, Any]) -> None:
-        """Raise what is wrong with the device, as a draw makes it: with no light, nothing is rendered."""
-        if self.recipe.device is not None:
+    def _chain_for(self, drawn: Mapping[str, Any]) -> Compose:
+        """The device's chain, as a draw makes it."""
+        device = self.recipe.device
+        assert device is not None
+        if self._chain is not None:
+            return self._chain
+        for key in self.device_keys:
+            device = changed(device, key, drawn[key])
+        return self._chain_of(device)
+
+    def check_device(self, drawn: Mapping[str, Any], *, measures: bool) -> None:
+        """Raise what is wrong with the device, as a draw makes it. ``measures``: of a whole film without light, too;
+        what that raises depends on the shape of the film, which all draws share.
+        """
+        if self.recipe.device is None:
+            return
+        self._chain_for(drawn)
+        if measures:
             renderer = self.renderer
             rows, columns, bins = renderer._cube_shape[0], renderer._cube_shape[1], renderer.film.count
             stokes = (4,) if stokes_components(self.recipe.variant) > 1 else ()

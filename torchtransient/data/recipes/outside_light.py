@@ -10,7 +10,7 @@ from typing import Self
 
 import numpy as np
 
-from torchtransient.errors import PhysicsWarning
+from torchtransient.errors import PhysicsWarning, TorchTransientWarning
 from torchtransient.rendering.physics import level_of_user
 
 # Share of a sample's light outside of the window from which on the sample counts as cut.
@@ -23,8 +23,9 @@ _Z = 1.96
 class OutsideLight:
     """Light that the time window misses, over some samples of a recipe.
 
-    ``samples``: how many were looked at. ``cut``: those of them with more than 1 % of their light outside. ``mean``,
-    ``most``: share of the light outside, over samples.
+    ``samples``: how many were looked at; none of films without a window. ``cut``: those of them with more than 1 % of
+    their light outside. ``mean``, ``most``: share of the light outside, over samples. ``failed``: how many others could
+    not be rendered; ``reason``: why the first of these could not.
     """
 
     _: KW_ONLY
@@ -32,15 +33,18 @@ class OutsideLight:
     cut: int
     mean: float
     most: float
+    failed: int = 0
+    reason: str = ""
 
     @classmethod
-    def of(cls, shares: Iterable[Sequence[float]]) -> Self:
-        """Of samples' shares (before, after) the window."""
+    def of(cls, shares: Iterable[Sequence[float]], failed: Sequence[str] = ()) -> Self:
+        """Of samples' shares (before, after) the window, and why others ``failed``."""
         missed = np.array([sum(pair) for pair in shares], dtype=np.float64)
+        reason = failed[0] if failed else ""
         if not len(missed):
-            return cls(samples=0, cut=0, mean=0.0, most=0.0)
-        cut = int((missed > CUT).sum())
-        return cls(samples=len(missed), cut=cut, mean=float(missed.mean()), most=float(missed.max()))
+            return cls(samples=0, cut=0, mean=0.0, most=0.0, failed=len(failed), reason=reason)
+        mean, most, cut = float(missed.mean()), float(missed.max()), int((missed > CUT).sum())
+        return cls(samples=len(missed), cut=cut, mean=mean, most=most, failed=len(failed), reason=reason)
 
     @property
     def expected(self) -> tuple[float, float]:
@@ -54,17 +58,30 @@ class OutsideLight:
 
     def shares(self) -> str:
         """The figures in words, of these samples alone."""
+        if not self.samples:
+            return "not looked at"
         return (
             f"more than {CUT:.0%} in {self.cut} of {self.samples} samples, {self.mean:.2%} on average, {self.most:.2%} "
             "at most"
         )
 
     def __str__(self) -> str:
-        low, high = self.expected
-        return f"{self.shares()}; more than {CUT:.0%} in {low:.1%} to {high:.1%} of all samples (95% confidence)"
+        text = self.shares()
+        if self.samples:
+            low, high = self.expected
+            text += f"; more than {CUT:.0%} in {low:.1%} to {high:.1%} of all samples (95% confidence)"
+        return text + (f"; {self.failed} of {self.failed + self.samples} samples failed" if self.failed else "")
 
     def warn(self, what: str) -> None:
-        """Give a PhysicsWarning where there are cut samples."""
+        """Give a PhysicsWarning where there are cut samples, and a TorchTransientWarning where there are failed ones.
+        """
+        if self.failed:
+            warnings.warn(
+                f"{what}: {self.failed} of {self.failed + self.samples} samples that were looked at failed and do not "
+                f"count in the light outside of the time window. The first one: {self.reason}",
+                TorchTransientWarning,
+                level_of_user(),
+            )
         if self.cut:
             warnings.warn(
                 f"{what}: light outside of the time window: {self}. Samples are kept all the same, each with its "

@@ -18,6 +18,9 @@ from torchtransient.data.recipes.sample import Sample
 from torchtransient.data.recipes.specification import Specification
 from torchtransient.quantities import count
 
+# What is no part of the description, and stays behind when a recipe is pickled or copied.
+_OF_PROCESS = ("_maker", "_parameters", "_outside")
+
 
 @own_init
 class Recipe(Specification):
@@ -62,6 +65,9 @@ class Recipe(Specification):
 
     # --------------------------------------------------------------------------------------------------- samples
 
+    # What `check` has found in this process.
+    _outside: OutsideLight | None = None
+
     @functools.cached_property
     def _maker(self) -> Maker:
         return self.maker()
@@ -87,13 +93,16 @@ class Recipe(Specification):
         are used, None for the recipe's own.
 
         Then renders these samples, with 65536 camera paths each at most, and returns how much of their light the time
-        window misses; where that is more than 1 % of some of them, it is a PhysicsWarning, too.
+        window misses; where that is more than 1 % of some of them, it is a PhysicsWarning, too, and where some of them
+        fail, a TorchTransientWarning. A recipe that has passed is not looked at again in its process: the same answer
+        comes at once, with its warnings.
         """
-        maker = self._maker if maker is None else maker
-        check_recipe(self, maker)
-        found = light_outside(self, maker, progress)
-        found.warn("recipe")
-        return found
+        if self._outside is None:
+            maker = self._maker if maker is None else maker
+            check_recipe(self, maker)
+            self._outside = light_outside(self, maker, progress)
+        self._outside.warn("recipe")
+        return self._outside
 
     def cost(self, samples: int = 5, *, progress: bool = False) -> Cost:
         """Forecast the cost of a sample: entries that are built anew, values, seconds, bytes, and the light outside of
@@ -146,7 +155,7 @@ class Recipe(Specification):
         return hash((self.seed, tuple(self.vary)))
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name not in ("_maker", "_parameters")}
+        return {name: value for name, value in self.__dict__.items() if name not in _OF_PROCESS}
 
     def __repr__(self) -> str:
         scenes = "" if self.scenes.names == [""] else f"{len(self.scenes.names)} scenes, "

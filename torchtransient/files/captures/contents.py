@@ -23,7 +23,10 @@ from torchtransient.files.captures.mat5 import HEADER_BYTES, Mat5File, Other
 from torchtransient.plain_texts import json_data, text_of_file
 
 WHAT = "capture file"
-_START = 64
+_BLOCK = 64
+_ENDINGS = {
+    ".json": "JSON", ".npz": "NumPy's files", ".mat": "MATLAB's files", ".h5": "HDF5", ".hdf5": "HDF5", ".hdf": "HDF5",
+}  # fmt: skip
 
 
 class Contents(Protocol):
@@ -52,15 +55,17 @@ def opened(path: str | Path) -> Iterator[Contents]:
     with damage_said(source, WHAT, "a capture of the layout that was read"):
         if zipfile.is_zipfile(source):
             yield NpzContents(source)
-            return
-        if _is_json(source):
+        elif _is_json(source):
             yield JsonContents(source)
-            return
-        if _is_old_mat(source):
+        elif _is_old_mat(source):
             yield MatContents(source)
-            return
-        with hdf5_package(WHAT).File(source, "r") as file:
-            yield Hdf5Contents(source, file)
+        elif (h5py := hdf5_package(WHAT)).is_hdf5(source):
+            with h5py.File(source, "r") as file:
+                yield Hdf5Contents(source, file)
+        else:
+            kind = _ENDINGS.get(source.suffix.lower())
+            hint = f"Its ending is that of {kind}: it may be damaged, or be the first part of one." if kind else ""
+            raise StorageError(f"{WHAT}: '{source}' is no JSON, NumPy, MATLAB or HDF5 file. {hint}".strip())
 
 
 class Hdf5Contents:
@@ -223,12 +228,16 @@ class JsonContents:
         return None if array.size == 0 else array[part]
 
     def text(self, name: str) -> str | None:
-        value = self._entry(self._frames[0], name)
+        value = self.entry(name)
         return value if isinstance(value, str) else None
 
     def fields(self, name: str) -> frozenset[str]:
-        value = self._entry(self._frames[0], name)
+        value = self.entry(name)
         return frozenset(value) if isinstance(value, dict) else frozenset()
+
+    def entry(self, name: str, frame: int = 0) -> Any:
+        """Plain data of one frame, None where it has none of that name."""
+        return self._entry(self._frames[frame], name)
 
     @staticmethod
     def _entry(frame: Any, name: str) -> Any:
@@ -242,7 +251,10 @@ class JsonContents:
 def _is_json(source: Path) -> bool:
     """Return whether a file begins as an object or a list of JSON does."""
     with source.open("rb") as file:
-        return file.read(_START).lstrip(b"\xef\xbb\xbf \t\r\n")[:1] in (b"{", b"[")
+        start = b""
+        while not start and (block := file.read(_BLOCK)):
+            start = block.lstrip(b"\xef\xbb\xbf \t\r\n")
+    return start[:1] in (b"{", b"[")
 
 
 def _words(value: Any) -> str:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.capture import Capture
-from torchtransient.files.captures.contents import Contents
+from torchtransient.files.captures.contents import Contents, JsonContents
 from torchtransient.files.captures.gaps import Gaps, scan_of, tensor_of, time_axis, zone_grid
 
 NAME = "tmf8828"
@@ -53,10 +53,18 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     points, normals = _points(contents, chosen, shape, pose, gaps)
     origin = pose[:3, 3]
     scan = scan_of("confocal", points, points, origin, origin, normals, normals, True)
-    kept = {name: array[chosen].tolist() for name in _KEPT if (array := contents.array(name)) is not None}
+    kept = {name: entry for name in _KEPT if (entry := _entry(contents, name, chosen)) is not None}
     left = sorted(set(contents.shapes) - {"hists", "distances", *_KEPT})
     transient = tensor_of(np.ascontiguousarray(hists[chosen].T)).reshape(1, bins, *shape)
     return Capture(transient, axis, scan, metadata=gaps.metadata(frame=chosen, **kept, not_read=left or None))
+
+
+def _entry(contents: Contents, name: str, chosen: int) -> Any:
+    """An entry of the frame as it stands in the file: numbers, or a text."""
+    if isinstance(contents, JsonContents):
+        return contents.entry(name, chosen)
+    array = contents.array(name)
+    return None if array is None else array[chosen].tolist()
 
 
 def _points(

@@ -152,13 +152,7 @@ class CoincidencePixel(RandomSensor):
         self.num_bins = common_bins([detector], where, (self.bin_width_s, given))[1]
         self.window_s = check_seconds(window_s, "window_s", where, open_low=True)
         self.periodic = isinstance(self._inner, FreeRunningSPAD)
-        dead = self._inner.dead_time_s
-        dead = float(dead.detach()) if isinstance(dead, Tensor) else dead
-        if dead is not None and self.window_s > dead * (1 + 1e-9):
-            raise UnitError(
-                f"{where}: expected window_s of at most the dead time of {dead:g} s, got {self.window_s:g} s. A "
-                "SPAD that fires twice in a window would count twice."
-            )
+        self._check_dead_time()
 
     def check_bins(self, x: object) -> None:
         super().check_bins(x)
@@ -188,7 +182,17 @@ class CoincidencePixel(RandomSensor):
                     total = total + (end - begin) * weight * self._reached(parts, at, window)
         return total.to(x.dtype)
 
+    def _check_dead_time(self) -> None:
+        dead = self._inner.dead_time_s
+        dead = float(dead.detach()) if isinstance(dead, Tensor) else dead
+        if dead is not None and self.window_s > dead * (1 + 1e-9):
+            raise UnitError(
+                f"CoincidencePixel: expected window_s of at most the dead time of {dead:g} s, got {self.window_s:g} s. "
+                "A SPAD that fires twice in a window would count twice. Keep a dead time that is learnt above it."
+            )
+
     def _check_window(self, x: Tensor) -> Tensor:
+        self._check_dead_time()  # which may have been learnt since
         bins, window = x.shape[TIME], self.window_s / self.bin_width_s
         if window > bins:
             raise UnitError(
