@@ -32,7 +32,9 @@ TAIL = 1e-3
 
 @dataclass(frozen=True)
 class DepthBound:
-    """``depth``: the bound. ``beyond``: share of a pilot run's light in deeper paths; ``error``: its standard error."""
+    """``depth``: the bound. ``beyond``: share of a pilot run's light in deeper paths, the larger one of all light and of
+    that in the time window; ``error``: its standard error.
+    """
 
     depth: int
     beyond: float
@@ -55,8 +57,9 @@ def depth_bound(
         watch.tell(
             f"max_depth {bound.depth}",
             "derivatives need a bound on the depth of paths, and the scene states none: value and derivative have "
-            f"max_depth {bound.depth}, which leaves {bound.beyond:.2g} +- {bound.error:.1g} of the light to deeper "
-            "paths. max_depth= sets another one; renders without derivatives have none.",
+            f"max_depth {bound.depth}, which leaves {bound.beyond:.2g} +- {bound.error:.1g} of the light of the "
+            "described values to deeper paths, more of brighter surfaces. max_depth= sets another one; renders without "
+            "derivatives have none.",
         )
     return bound
 
@@ -76,7 +79,7 @@ def _found(scene: Scene, options: BuildOptions, sensors: Sequence[int], film: Fi
     lit = []
     for sensor in sensors:
         _, arrivals = pilot_run(load(scene, variant=unpolarized), options, sensor, type(film), TAIL)
-        lit += [] if arrivals.dark else [arrivals]
+        lit += [part for part in film.parts(arrivals) if not part.dark]
     if not lit:
         raise GradientError(
             "gradients need a bound on the depth of paths; the scene states none, and a pilot run saw no light. Set "

@@ -30,8 +30,8 @@ class RenderStats:
     ``temporal_filter`` is empty for films without one. ``seeds`` are the items' seeds. ``recorded``: what became of
     each item's recording, "launched", "recorded", or "traced: " and why; ``derivatives_recorded``: the same of the
     derivatives that have been asked for since. ``max_depth``: of the paths, -1 for no limit, None for integrators
-    without one. ``light_beyond``: share of the light in deeper paths, where a pilot run has found ``max_depth`` for
-    derivatives of a scene that states none; else None.
+    without one. ``light_beyond``: share of the light in deeper paths at the described values, where a pilot run has
+    found ``max_depth`` for derivatives of a scene that states none; else None.
     """
 
     _: KW_ONLY
