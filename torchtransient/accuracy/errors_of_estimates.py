@@ -172,5 +172,5 @@ class ErrorEstimate:
     median_bin: float
 
 
-def _square(values: NDArray[np.float32]) -> Array:
+def _square(values: NDArray[np.float32] | Array) -> Array:
     return np.multiply(values, values, dtype=np.float64)

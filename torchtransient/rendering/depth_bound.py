@@ -32,8 +32,8 @@ TAIL = 1e-3
 
 @dataclass(frozen=True)
 class DepthBound:
-    """``depth``: the bound. ``beyond``: share of a pilot run's light in deeper paths, the larger one of all light and of
-    that in the time window; ``error``: its standard error.
+    """``depth``: the bound. ``beyond``: share of a pilot run's light in deeper paths, the larger one of
+    all light and of that in the time window; ``error``: its standard error.
     """
 
     depth: int

@@ -145,7 +145,10 @@ class RenderOutput(TensorRecord):
 
     @property
     def outside(self) -> tuple[float, float]:
-        """Shares of the light before and after the time window, over all items; of polarized light of S0."""
+        """Shares of the light before and after the time window, over all items; of polarized light of S0.
+
+        Zero where that light is not followed: without a window, and with ``steady=False``.
+        """
         before, after = sum(self.stats.energy_before), sum(self.stats.energy_after)
         steady = self.steady[..., 0, :, :, :] if self.polarized else self.steady
         total = float(steady.detach().sum(dtype=torch.float64)) / self.steady.shape[-3]
