@@ -92,6 +92,28 @@ def test_tails_of_given_runs(alpha):
     assert found.spread == pytest.approx(squared.std(ddof=1) / squared.mean(), rel=1e-4)
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("many", range(1, 9))
+def test_few_runs_that_differ_tell_no_variance(many):
+    """As a gradient that most runs do not see; the ninth run that sees it tells the index of two values."""
+    runs = np.zeros((96, 3), np.float32)
+    runs[5 : 5 + many] = 1.0
+    assert Tail.of(list(runs)).heavy
+    runs[50:60] = 1.0
+    assert not Tail.of(list(runs)).heavy
+
+
+@pytest.mark.filterwarnings("error")
+def test_runs_that_are_no_numbers_tell_no_variance_and_rounding_is_no_tail():
+    for value in (np.nan, np.inf):
+        runs = np.ones((96, 2), np.float32)
+        runs[7, 1] = value
+        assert Tail.of(list(runs)).heavy
+    runs = np.full((96, 2), 3.0, np.float32)
+    runs[:2] = np.nextafter(runs[:2], np.float32(4))
+    assert Tail.of(list(runs)) == Tail.of(list(np.full((96, 2), 3.0, np.float32)))
+
+
 def test_one_run_that_is_far_off_is_a_heavy_tail():
     runs = np.random.default_rng(0).normal(size=(96, 5)).astype(np.float32)
     assert not Tail.of(list(runs)).heavy

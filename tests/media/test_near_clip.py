@@ -107,3 +107,29 @@ def test_fog_scatters_light_before_the_clip_plane():
     values, _, _ = render(described)
     result = z_test(values, 1.0)
     assert result.passed, (str(result), values.mean())
+
+
+def test_a_batch_has_fog_before_the_clip_planes_of_its_cameras():
+    """Beside a radiance meter, which has no clip plane, in one batch."""
+    fog = {"type": "ref", "id": "fog"}
+    film = {"type": "hdrfilm", "height": 2, "rfilter": {"type": "box"}}
+    one = film | {"width": 1, "height": 1}
+    described = tt.load(
+        {
+            "type": "scene",
+            "integrator": {"type": "volpath", "max_depth": 2},
+            "fog": {"type": "homogeneous", "albedo": 0.0, "sigma_t": 1.0},
+            "sensor": {
+                "type": "batch", "medium": fog, "film": film | {"width": 4},
+                "camera": {"type": "perspective", "fov": 2.0, "near_clip": CLIP, "to_world": np.eye(4), "film": one},
+                "meter": {"type": "radiancemeter", "to_world": np.eye(4), "film": one},
+            },
+            "lamp": {"type": "rectangle", "to_world": facing(LAMP, 9.0), "emitter": {"type": "area", "radiance": 1.0}},
+        },
+        variant=VARIANT,
+    )  # fmt: skip
+    renderer = tt.TransientRenderer(described, time_axis=AXIS, spp=1024)
+    images = torch.stack([renderer(seed=seed).steady[0] for seed in range(6)]).double().numpy()
+    for columns in ((0, 1), (2, 3)):
+        result = z_test(images[..., columns].mean((1, 2)), np.exp(-LAMP), rounding=1e-3)
+        assert result.passed, str(result)

@@ -164,7 +164,7 @@ def test_the_window_holds_what_it_promises(name):
 
 
 def test_light_at_the_first_edge_is_inside_of_a_tent_too():
-    """Light returns to a camera with a lamp in its place from 4.02 m on: just behind an edge of bins of half a metre."""
+    """Light returns to a camera with a lamp in its place from 4.02 m on, just behind an edge of bins."""
     scene = {
         "type": "scene",
         "integrator": {"type": "path", "max_depth": 2},

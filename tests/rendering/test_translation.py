@@ -289,6 +289,17 @@ def test_derivatives_name_their_bound():
     assert [f"max_depth {depth}" in text for text in asked(strict, seed=0)[1]] == [True]
 
 
+@pytest.mark.slow
+def test_a_bound_keeps_the_light_of_a_late_window():
+    """The light of all times has a bound that leaves a third of what comes so late to deeper paths."""
+    mi.set_variant("llvm_ad_mono")
+    late = tt.TimeAxis(40.0, 1.0, 20)
+    common = {"parameters": [KEY], "time_axis": late, "spp": 64, "physics": "ignore"}
+    scene = tt.load(oven() | {"integrator": {"type": "path", "rr_depth": 1000}})
+    found, deep = (tt.TransientRenderer(scene, max_depth=depth, **common)(seed=0) for depth in (None, 256))
+    torch.testing.assert_close(found.transient.sum(), deep.transient.sum(), rtol=2e-2, atol=0.0)
+
+
 def modes(function, value):
     """Calls of a function of one number, by what torch differentiates them with."""
     batch = value[None]

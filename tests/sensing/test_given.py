@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import inspect
 import re
 import warnings
@@ -141,11 +142,14 @@ ANOTHER_WORD = {("FreeRunningSPAD", "period_s"), ("MeasuredDelays", "floor"), ("
 
 @together("name", MODULES)
 def test_a_repr_shows_the_numbers(name):
+    """Modules without storage, of the device "meta", have none to show."""
     numbers, rest = CALLS[name]
-    text = repr(getattr(sensing, name)(**numbers, **rest))
+    module = getattr(sensing, name)(**numbers, **rest)
+    text = repr(module)
     for argument, value in numbers.items():
         if value.ndim == 0 and (name, argument) not in ANOTHER_WORD:
             assert re.search(rf"=\(?{re.escape(f'{float(value):g}')}[,)\n]", text), f"{argument} in {text}"
+    assert repr(copy.deepcopy(module).to("meta")).startswith(name)
 
 
 def test_a_repr_without_memory():

@@ -28,6 +28,8 @@ TAIL_RUNS, _FURTHEST = 96, 8
 # Below this index the variance is infinite; above this share of the largest run it is not known. Normal runs pass
 # (999 of 1000), runs with an index of 1.1 do not (98 of 100), those with an index of 2 do in 4 of 10 cases.
 _LEAST_INDEX, _MOST_OF_ONE = 2.0, 1 / 3
+# Relative distance of runs up to which they are equal, but for the rounding of single precision.
+_ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,7 @@ class Tail:
     squared deviation from the median run.
 
     `index`: alpha where the probability of a distance above d falls as d^-alpha (Hill 1975), infinite without noise, 0
-    where most runs are alike. All are NaN of runs that are not finite.
+    where most runs are alike. All are NaN where a run is not finite.
     `largest`: share of the run that is furthest off in the sum of squared distances. `spread`: standard deviation of
     the squared distance over its mean.
     """
@@ -48,16 +50,16 @@ class Tail:
     @classmethod
     def of(cls, runs: Sequence[NDArray[np.float32]]) -> Tail:
         """Of more than 8 runs, arrays of equal shape."""
-        median = np.median(np.stack(runs), axis=0)
-        squared = np.array([_square(run - median).mean() for run in runs])
-        if not np.isfinite(squared).all():
+        wide = np.stack(runs).astype(np.float64)
+        if not np.isfinite(wide).all():
             return cls(math.nan, math.nan, math.nan)
+        median = np.median(wide, axis=0)
+        squared = np.array([_square(run - median).mean() for run in wide])
         furthest = np.sqrt(np.sort(squared)[::-1][: _FURTHEST + 1])
-        if furthest[0] == 0:
+        if furthest[0] <= _ROUNDING * math.sqrt(_square(median).mean()):
             return cls(math.inf, 0.0, 0.0)
-        off = furthest[:-1][furthest[:-1] > 0]
-        with np.errstate(divide="ignore"):
-            excess = float(np.log(off / furthest[-1]).mean())
+        # Where no more than 8 runs differ from the others, few decide about the variance: an index of 0.
+        excess = float(np.log(furthest[:-1] / furthest[-1]).mean()) if furthest[-1] > 0 else math.inf
         index = 1.0 / excess if excess > 0 else math.inf
         return cls(index, float(squared.max() / squared.sum()), float(squared.std(ddof=1) / squared.mean()))
 
@@ -171,5 +173,5 @@ class ErrorEstimate:
     median_bin: float
 
 
-def _square(values: NDArray[np.float32]) -> Array:
+def _square(values: NDArray[np.float32] | Array) -> Array:
     return np.multiply(values, values, dtype=np.float64)

@@ -33,7 +33,9 @@ TAIL = 1e-3
 
 @dataclass(frozen=True)
 class DepthBound:
-    """``depth``: the bound. ``beyond``: share of a pilot run's light in deeper paths; ``error``: its standard error."""
+    """``depth``: the bound. ``beyond``: share of a pilot run's light in deeper paths, the larger one of
+    all light and of that in the time window; ``error``: its standard error.
+    """
 
     depth: int
     beyond: float
@@ -80,7 +82,7 @@ def _found(scene: Scene, options: BuildOptions, sensors: Sequence[int], film: Fi
     lit = []
     for sensor in sensors:
         _, arrivals = pilot_run(load(scene, variant=unpolarized), options, sensor, type(film), TAIL)
-        lit += [] if arrivals.dark else [arrivals]
+        lit += [part for part in film.parts(arrivals) if not part.dark]
     if not lit:
         raise GradientError(
             "gradients need a bound on the depth of paths; the scene states none, and a pilot run saw no light. Set "

@@ -150,7 +150,7 @@ class RenderOutput(TensorRecord):
     @property
     def outside(self) -> tuple[float, float]:
         """Shares of the light before and after the time window, over all items of the render; of polarized light of
-        S0.
+        S0. Zero where that light is not followed: without a window, and with ``steady=False``.
         """
         before, after, total = map(sum, (self.stats.energy_before, self.stats.energy_after, self.stats.energy_total))
         return (before / total, after / total) if total > 0 and before + after > 0 else (0.0, 0.0)

@@ -369,6 +369,19 @@ def test_coincidences_of_three_spads_by_quadrature(windows, k):
     torch.testing.assert_close(sensor.log_prob(seen, x), logs.sum(-3), rtol=1e-9, atol=1e-9)
 
 
+def test_detectors_that_skip_periods_do_so_independently():
+    """A pulse that always fires an armed SPAD is seen every fourth time by one of 3.25 periods of dead time: two SPADs
+    out of two agree in a sixteenth of the periods, in blocks of which each has phases of its own.
+    """
+    x = torch.zeros(1, BINS, 1, 1, dtype=torch.float64)
+    x[0, 4] = 100.0
+    cycles, dead = 16384, 3.25 * BINS
+    pixel = CoincidencePixel(detector("free", dead, cycles), 2, coincidence=2, window_s=3 * WIDTH, bin_width_s=WIDTH)
+    share = float(pixel.sample(x, torch.Generator().manual_seed(0)).sum()) / cycles
+    # a quarter of the blocks, of 26 periods each, agree in a quarter of their periods
+    assert abs(share - 1 / 16) < 4 * (1 / 4) * (1 / 4 * 3 / 4 / (cycles / 26)) ** 0.5 + 1e-3
+
+
 def test_windows_of_coincidences():
     """At most the dead time, to 1e-9 of it, and at most the bins of the light; as many SPADs as there are."""
 

@@ -21,6 +21,11 @@ class View:
     def __init__(self, sensor: Any, active: Any, reference: Any = None) -> None:
         self.sensor, self.active, self.reference = sensor, active, reference
 
+    @property
+    def near(self) -> Any:
+        """Distance of the near clip plane along the axis, None for sensors that are no projective cameras."""
+        return near_clip(self.sensor)
+
     def length(self, ray: Any) -> Any:
         """Distance in metres from the sensor's origin to ``ray.o``, attached where the sensor is."""
         if is_distant(self.sensor):
@@ -28,12 +33,11 @@ class View:
             return self.reference.length(ray.o, -ray.d)
         if starts_off_itself(self.sensor):
             return mi.math.RayEpsilon * dr.norm(ray.d)
-        near = near_clip(self.sensor)
-        if near is None:
+        if self.near is None:
             return mi.Float(0)
         # The near clip plane in the world: an orthographic camera may be scaled along its axis.
         axis = self.sensor.world_transform() @ mi.Vector3f(0, 0, 1)
-        return near * dr.squared_norm(axis) / dr.dot(axis, ray.d)
+        return self.near * dr.squared_norm(axis) / dr.dot(axis, ray.d)
 
 
 class PrimaryRays:
@@ -52,9 +56,9 @@ class PrimaryRays:
 
     def length(self):
         """Optical length from the sensor's origin to where the rays start, attached."""
-        if self.clip is not None:
-            return mi.Float(0)
-        return length_to_sensor_origin(self.seen, self.ray) * self.η
+        # Where a distance to the clip plane is given, the rays of projective cameras start at the origin.
+        seen = [view for view in self.seen if self.clip is None or view.near is None]
+        return length_to_sensor_origin(seen, self.ray) * self.η
 
 
 def views(sensor: Any, position: Any, reference: Any) -> list[View]:
@@ -107,7 +111,7 @@ def sample_rays(sensor: Any, seen: list[View], time: Any, wavelength: Any, posit
 
 
 def length_to_sensor_origin(seen: list[View], ray: Any) -> Any:
-    """Distance in metres from the sensor's origin to ``ray.o``.
+    """Distance in metres from the sensor's origin to ``ray.o``, 0 for rays of none of the sensors ``seen``.
 
     Mitsuba's projective cameras start their rays on the near clip plane; their light travels on to the pinhole
     (perspective), to the sampled point of the aperture (thin lens) or to the sensor plane (orthographic). Radiance and
@@ -115,19 +119,21 @@ def length_to_sensor_origin(seen: list[View], ray: Any) -> Any:
     front leaves the sphere around the scene, as it starts there when it comes from infinity. Other sensors start rays
     where they are.
     """
-    length = seen[0].length(ray)
-    for view in seen[1:]:
+    length = mi.Float(0)
+    for view in seen:
         length = dr.select(view.active, view.length(ray), length)
     return length
 
 
 def start_at_sensor(seen: list[View], ray: Any) -> tuple[Any, Any]:
     """(``ray`` from the origin of a projective camera on, attached where it is; distance to its near clip plane,
-    detached, None for other sensors): a medium around the camera attenuates and scatters light there, too.
+    detached, 0 for rays of other sensors, None without such cameras): a medium around the camera attenuates and
+    scatters light there, too.
     """
-    if any(near_clip(view.sensor) is None for view in seen):
+    clipped = [view for view in seen if view.near is not None]
+    if not clipped:
         return ray, None
-    length = length_to_sensor_origin(seen, ray)
+    length = length_to_sensor_origin(clipped, ray)
     ray = mi.Ray3f(ray)
     ray.o = ray(-length)
     clip = dr.detach(length)

@@ -207,6 +207,10 @@ class FilmChoice(abc.ABC):
         """The arrivals of a pilot run as the film sees them."""
         return arrivals
 
+    def parts(self, arrivals: Arrivals) -> list[Arrivals]:
+        """The light of a pilot run, and parts of it of each of which a bound on depth has to keep enough."""
+        return [arrivals]
+
 
 @dataclass(frozen=True)
 class PlannedFilm:

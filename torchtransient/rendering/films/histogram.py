@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import torch
 from numpy.typing import NDArray
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ArgumentError
+from torchtransient.gates import Gate
 from torchtransient.rendering.films.choice import CommandOption, FilmChoice, PlannedFilm, measured
 from torchtransient.rendering.films.layout import cube_channels_first
+
+if TYPE_CHECKING:
+    from torchtransient.rendering.plan_pilot import Arrivals
 
 # Under a pilot run nothing is stored: the film only has to be one that integrators take.
 _ANY_AXIS = TimeAxis(0.0, 1.0, 1)
@@ -139,6 +143,10 @@ class Histogram(FilmChoice):
     def axis_in(cls, props: Any) -> TimeAxis | None:
         start, width = float(props.get("start_opl", 0.0)), float(props.get("bin_width_opl", 0.003))
         return TimeAxis(start, width, int(props.get("temporal_bins", 2048)))
+
+    def parts(self, arrivals: Arrivals) -> list[Arrivals]:
+        """All light, which the steady image holds, and that of the time window."""
+        return [arrivals, arrivals.through([Gate.rectangular(self.axis.start_opl, self.axis.end_opl)])]
 
     @classmethod
     def film_of_pilot(cls, planned: FilmChoice | None) -> FilmChoice:

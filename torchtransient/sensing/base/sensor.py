@@ -73,8 +73,10 @@ def _shown(module: nn.Module, name: str) -> str:
 def _text(value: object) -> str:
     """A number, a choice or a record; nothing for None and for what torch shows itself."""
     if isinstance(value, Tensor):
-        if value.ndim > 1 or value.numel() > _FEW or value.is_meta:
+        if value.ndim > 1 or value.numel() > _FEW or (value.is_meta and value.ndim):
             return f"(size {'x'.join(map(str, value.shape))})"
+        if value.is_meta:
+            return ""
         value = value.detach().tolist()
     if isinstance(value, (list, tuple)):
         items = [_text(item) for item in value]

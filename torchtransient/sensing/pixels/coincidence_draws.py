@@ -115,7 +115,9 @@ def _detections(
     )
     armed = torch.zeros(owner.shape, dtype=torch.float64, device=rate.device)
     if lead:
-        armed += _uniform(armed, generator) * bins - lead * bins
+        # A bright pulse keeps a detector of long dead time in step with every n-th period: all n have to be drawn.
+        turns = max(1, math.ceil(dead / bins))
+        armed += _uniform(armed, generator) * (turns * bins) - lead * bins
     owners, times = [], []
     while len(owner):
         pixel = owner.div(blocks, rounding_mode="floor")
