@@ -56,6 +56,7 @@ def test_chains_bring_what_paths_do(name, kind):
     assert equal, z
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bounces", long([4, 5, 6, 7], [4]))
 def test_each_number_of_bounces(bounces):
     """One by one, also where the walk goes by way of the relay wall: plates that do not see each other."""
@@ -151,6 +152,7 @@ def test_bins_and_what_is_outside_are_the_steady_image(corner):
     assert min(film.energy_before, film.energy_after) > 0.05 * steady.sum()
 
 
+@pytest.mark.slow
 def test_a_film_without_a_steady_image_leaves_out_what_it_cannot_see(corner):
     scene, elements, points, normals = corner
     sensors = wall_of(points, normals)
@@ -185,6 +187,7 @@ def test_groups_and_tiles_have_one_mean(corner, choices):
     assert equal, z
 
 
+@pytest.mark.slow
 def test_few_chains_and_no_light():
     """One chain, and a convex body alone, of which nothing is scattered twice."""
     points, normals = wall_grid(2, 0.4)
@@ -198,6 +201,7 @@ def test_few_chains_and_no_light():
         assert cube.sum() == 0
 
 
+@pytest.mark.slow
 def test_chains_name_their_material_points(corner):
     """Shape, primitive and barycentrics of every vertex give its place again."""
     import drjit as dr
@@ -255,6 +259,7 @@ def test_progress_goes_up_to_one():
 # ------------------------------------------------------------------------------------------------ colours
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", long(["confocal", "single"], ["single"]))
 def test_chains_are_the_same_in_every_colour(corner, kind):
     """Light of two hidden bounces goes by the square of their albedo, also where another colour is not scattered."""

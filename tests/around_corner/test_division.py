@@ -237,6 +237,7 @@ def test_fronts_in_backs_are_left_to_chance():
     assert light < 1.02 * captures(scan_scene({"a": plate(1.0)}), 2**9, 4).sum()
 
 
+@pytest.mark.slow
 def test_overlaps_are_of_the_scene_as_it_is_now():
     apart, together = ({"a": plate(1.0), "b": plate(z, name="b")} for z in (1.2, 1.0))
     once = captures(scan_scene({"a": plate(1.0)}), 2**11, 4).sum() / 4
@@ -318,6 +319,7 @@ def test_fronts_are_where_shading_normals_point(name, two_sided):
     agree(runs["paths"], runs["brute"], 0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", long(["single", "confocal"], ["single"]))
 @pytest.mark.parametrize(
     ("scale", "flip", "two_sided"),

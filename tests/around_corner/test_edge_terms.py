@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from support.marks import long_rows
 from support.nlos_scenes import transform
 from torchtransient.plugins.around_corner.occlusion import MutualOcclusion
 from torchtransient.plugins.transport.strategy import Local
@@ -30,7 +31,7 @@ EDGES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("from_spot", "x"), [(False, 0), (True, 0), (False, 8), (True, 8)])
+@pytest.mark.parametrize(("from_spot", "x"), long_rows([(False, 0), (True, 0), (False, 8), (True, 8)], [(True, 8)]))
 def test_terms_of_single_points_of_edges(from_spot, x):
     """By hand: light of the point behind, past the edge out of what hides, and how fast the outline moves; of lanes
     without a term zero, and no derivatives. (Which have one, also far from the origin, where rays that meet nothing

@@ -243,6 +243,7 @@ def test_gates_are_sums_of_bins_and_phasors_are_refused():
         runs.exhaustive()
 
 
+@pytest.mark.slow
 def test_colours():
     """Each channel is a capture in its own albedo and energy; where one is black the others are seen."""
     with mi.variant_context("llvm_ad_rgb"):

@@ -115,6 +115,7 @@ def test_legs_are_path_length(body):
     assert moved < 0.01 * cubes[0].sum()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("vertex_normals", long([False, True], [True]))
 def test_colours(vertex_normals):
     """Every channel of a single and a confocal capture is one of its own albedo and energy."""

@@ -67,6 +67,7 @@ def test_shared_samples(case, kind):
         assert abs(reverse) > 1e-3 * scale
 
 
+@pytest.mark.slow
 def test_pose_of_the_laser():
     """It moves the spot of a single capture, and the first leg of any."""
     scene = scan_scene(plate(), "single", film(3, **SMOOTH), account_first_and_last_bounces=True)
@@ -164,6 +165,7 @@ def test_films(name, kind):
     assert error < 0.15 * abs(reverse.mean())
 
 
+@pytest.mark.slow
 def test_colours():
     """Each colour has its own derivative."""
     mi.set_variant("llvm_ad_rgb")
@@ -197,7 +199,10 @@ FORWARD = {
 
 @pytest.mark.parametrize(
     ("name", "by_caller", "third_bounce"),
-    [("hidden bitmap", True, "auto"), ("wall's bitmap", False, "paths"), ("pose", False, "auto")],
+    long_rows(
+        [("hidden bitmap", True, "auto"), ("wall's bitmap", False, "paths"), ("pose", False, "auto")],
+        [("hidden bitmap", True, "auto")],
+    ),
 )
 def test_tangents_arrive_whoever_brings_them(name, by_caller, third_bounce):
     """Set on a value of the scene itself or on what it comes from, propagated by the caller or not."""
@@ -220,6 +225,7 @@ def test_tangents_arrive_whoever_brings_them(name, by_caller, third_bounce):
     assert abs(forward) > 0
 
 
+@pytest.mark.slow
 def test_a_leaf_of_the_scene_itself_carries_a_tangent():
     hidden = plate()
     hidden["a"]["bsdf"] = {"type": "diffuse", "reflectance": bitmap()}

@@ -143,6 +143,7 @@ def spectrum(rows):
     return mi.UnpolarizedSpectrum(*(mi.Float(row) for row in rows))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("smooth", [False, True])
 @pytest.mark.parametrize("channels", [1, 3])
 def test_a_table_gives_samples_back(channels, smooth):

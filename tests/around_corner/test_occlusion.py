@@ -75,6 +75,7 @@ def test_paths_have_the_same_term(kind):
     agree(capture, 2**13, spp_differences=2**14, most_error=0.05)
 
 
+@pytest.mark.slow
 def test_light_that_is_not_of_three_bounces():
     """The term is that of three bounces: it is there in all light that holds them, and in no other."""
     for settings, there in (
@@ -206,6 +207,7 @@ def test_viewpoints_with_the_same_outline():
         agree(MovedCapture(scene, "front.to_world", change), most_error=0.04)
 
 
+@pytest.mark.slow
 def test_what_hides_may_stand_still():
     """Edges of static shapes count where what is behind them moves; bodies that stand before one another at rest in
     derivatives of others do not.

@@ -50,6 +50,7 @@ def seen(scene, *x):
     return scene.ray_intersect(mi.Ray3f(mi.Point3f(mi.Float(list(x)), 0.25, 3), mi.Vector3f(0, 0, -1)))
 
 
+@pytest.mark.slow
 def test_points_that_hidden_things_are_seen_from(walls):
     """Scanned points and, but for confocal captures, spots, with normals towards the viewer; what meets nothing is
     none. Of each kind twenty-five stand for all.

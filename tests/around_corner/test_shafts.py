@@ -95,6 +95,7 @@ def hidden_lines(scene, samples, points):
     return np.array(scene.ray_test(ray) & seen).reshape(K, P)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_clear_samples_are_never_hidden(name):
     hidden, others, (least, most) = CASES[name]

@@ -187,6 +187,7 @@ def unoccluded(shape, points, normals):
     return np.array(total)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("busy", [1, 64])
 @pytest.mark.parametrize("kind", ["confocal", "single"])
 def test_the_first_samples_are_taken_without_rays(monkeypatch, kind, busy):

@@ -109,6 +109,7 @@ def test_a_capture_of_a_description(folder, kind):
     assert sorted(os.listdir(folder)) == ["own.h5", "own.yaml", "scene.xml", "tal.yaml"]
 
 
+@pytest.mark.slow
 def test_options_replace_what_the_file_says(folder):
     result = run("own.yaml", "-o", "a.npz", "--whole", "--spp", 8, "--seed", 2, "--variant", "llvm_ad_rgb", "--quiet")
     assert result.exit_code == 0, result.output

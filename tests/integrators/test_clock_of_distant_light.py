@@ -139,6 +139,7 @@ def test_scene_without_an_integrator_of_its_own():
         assert integrator.reference(scene).center[2] == pytest.approx(-1.5)
 
 
+@pytest.mark.slow
 def test_two_integrators_in_turn():
     """An integrator that meets another scene in between has not forgotten the first."""
     scenes, outside = [load(), load(LIGHTS["directional"])], mi.load_dict({"type": "transient_path", "max_depth": 2})
@@ -182,6 +183,7 @@ def test_layer_does_not_depend_on_what_it_rendered_first(light):
     assert layer_arrival(second, 3.0) == pytest.approx(expected, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_copies_of_a_layer():
     def copied(renderer):
         return pickle.loads(pickle.dumps(renderer))

@@ -144,6 +144,7 @@ def test_light_beyond_a_wall_by_its_reflectance(weight, reflectance):
     check_mean(rows, 3.0, 0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("weight", long([0.0, 1.0], [0.0]))
 def test_mirrors_and_roulette(weight):
     """A beam between two mirrors comes to the shell after five bounces, with L r^5; few of its samples live so long."""
@@ -195,6 +196,7 @@ def test_light_beyond_one_black_wall_of_two(black, weight):
     assert abs(rows.mean() - np.mean(differences)) < 4 * error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("weight", long([0.0, 1.0], [0.0]))
 def test_a_light_that_moves_leaves_the_other_derivatives_as_they_are(weight):
     """Which derivatives are asked for together does not change them. Where the shape of a light moves, its light is
@@ -272,6 +274,7 @@ def test_a_camera_that_changes_under_either_clock(unwarp, unknown):
     np.testing.assert_allclose(rows[0], (sides[0] - sides[1]) / (2 * step), rtol=5e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lamp_inside", long([True, False], [True]))
 def test_the_index_of_a_block_counts_along_the_shadow_ray(lamp_inside):
     """A beam enters a block of index n upright and meets a wall in it, which a point lights from inside of the block:
@@ -303,6 +306,7 @@ def test_the_index_of_a_block_counts_along_the_shadow_ray(lamp_inside):
     check_mean(rows, (exact(1.5 + 1e-4) - exact(1.5 - 1e-4)) / 2e-4, 5e-3)
 
 
+@pytest.mark.slow
 def test_the_index_that_the_sensor_stands_in():
     """Where all stands in one block, its index does not change what is seen, but every length: I n (d + r)."""
     lit = scene_of(
@@ -323,6 +327,7 @@ def test_the_index_that_the_sensor_stands_in():
 # ---------------------------------------------------------------------------------------------- spherical lights
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", long([0.3, 0.9], [0.9]))
 def test_a_large_sphere_over_a_wall_that_moves(ratio):
     """I = ρ L (r / d)^2: rays find a large sphere as often as connections do. Where lengths change, derivatives come by

@@ -167,9 +167,7 @@ def lit_by(light, integrator):
     return mean_of(scene.integrator().render(scene, seed=3, spp=512)[0])
 
 
-QUICK = [
-    "rectangle", "mesh of repeated texture", "mesh of equal triangles", "mesh with normals", "sky of the first row",
-]  # fmt: skip
+QUICK = ["mesh of repeated texture", "mesh of equal triangles", "sky of the first row"]
 
 
 @pytest.mark.parametrize("name", long(LIGHTS, QUICK))

@@ -98,6 +98,7 @@ def test_two_bounces_are_two_convolutions():
     assert second.sum() > 0.01 * first.sum()
 
 
+@pytest.mark.slow
 def test_measured_decay():
     pulse = Pulse.tabulated([0, 0.1, 0.4, 2.0], [0, 1, 0.3, 0])
     node = {"type": "delayed", "quantum_yield": YIELD, "nested": DIFFUSE, **DECAY}
@@ -190,6 +191,7 @@ def shifted_scene(lamp, depth=2, **extra):
     return mi.load_dict(room(bsdf=node, sensor=sensor, depth=depth, light=light))
 
 
+@pytest.mark.slow
 def test_shifted_light_has_the_photons_that_were_absorbed():
     mi.set_variant("llvm_ad_spectral")
     plugins.sync()

@@ -188,6 +188,7 @@ def test_connection_through_a_rough_interface(kind, places):
     assert measured[k - 1 : k + 2].sum() == pytest.approx(measured.sum(), rel=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("places", "key"), long_rows([(BELOW, "eta"), (ABOVE, "eta"), (ABOVE, "alpha")], [(BELOW, "eta")])
 )

@@ -72,6 +72,7 @@ def slow(*row):
     return pytest.param(*row, marks=pytest.mark.slow)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("bsdf", "key", "end"),
     [
@@ -118,6 +119,7 @@ def test_derivatives_that_are_switched_on_in_place(bsdf, key):
     assert derivative_in_place(scene_of(bsdf), key) == pytest.approx(expected, rel=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "slot", "value"),
     [

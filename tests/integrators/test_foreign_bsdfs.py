@@ -64,6 +64,7 @@ def slope(bsdf, key, value=None, spp=256):
     return float(dr.grad(x)[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("plugin", long(["tint", "mended_tint"], ["tint"]))
 def test_lobe_probabilities_that_a_nested_bsdf_hides(plugin):
     activate(MONO)

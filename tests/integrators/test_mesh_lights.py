@@ -40,6 +40,7 @@ def lit_by_mesh(face_normals, integrator="transient_path"):
     return scene
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", long(["transient_path", "transient_prbvolpath"], ["transient_path"]))
 def test_brightness_does_not_depend_on_the_normals(integrator):
     """Its radiance is the same in all directions that the normals do not turn away."""

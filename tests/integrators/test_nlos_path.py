@@ -123,6 +123,7 @@ def test_first_and_last_leg(how):
     assert times[1] - times[0] == pytest.approx(legs, abs=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("laser_sampling", long([True, False], [True]))
 def test_bounces_are_counted_as_they_are_named(laser_sampling):
     """``filter_bounces = b`` keeps light of b bounces, the laser's spot the first of them."""
@@ -152,6 +153,7 @@ def test_bounces_are_counted_as_they_are_named(laser_sampling):
     assert run(max_depth=longest, filter_depth=depth).sum() == pytest.approx(parts[-2].sum(), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_direct_paths_are_left_out():
     lamp = {"type": "spot", "intensity": 5.0, "cutoff_angle": 30.0}
     settings = {"nlos_laser_sampling": False, "nlos_hidden_geometry_sampling": False, "max_depth": 4, "laser": lamp}
@@ -234,6 +236,7 @@ def test_media_behind_the_corner(kind):
     agree(*runs, 0.04)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", long(["llvm_ad_spectral", "llvm_ad_mono_polarized"], ["llvm_ad_mono_polarized"]))
 def test_variants(variant):
     """Grey things look the same in all of them; diffuse ones leave no polarization."""

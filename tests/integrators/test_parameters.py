@@ -117,6 +117,7 @@ def test_rr_depth_out_of_range():
         load(camera(), {}, rr_depth=0)
 
 
+@pytest.mark.slow
 def test_hidden_area_lights_and_sky():
     sky = {"sky": {"type": "constant", "radiance": 0.7}}
     objects = lit_wall(**sky) | {"wall": lit_wall()["wall"] | {"to_world": T().scale([3, 0.4, 1])}}
@@ -171,6 +172,7 @@ def test_camera_unwarp_shifts_by_the_last_leg():
     assert spectra[1] == pytest.approx((4 / cosine * weight).sum() / weight.sum(), abs=noise)
 
 
+@pytest.mark.slow
 def test_discard_direct_light():
     kept, discarded = (
         runs(load(camera(), lit_wall(), discard_direct_light=flag, max_depth=3), 6, 128, 100 * flag)[0]
@@ -181,6 +183,7 @@ def test_discard_direct_light():
     check(discarded + only_emission, kept)
 
 
+@pytest.mark.slow
 def test_temporal_filter_of_the_integrator_is_handed_to_the_film():
     objects, sensor = lit_wall(), camera(fov=2, width=1, height=1, bins=8, bin_width=0.5, start=5.0, origin=(2.0, 0, 4))
     histograms = {}

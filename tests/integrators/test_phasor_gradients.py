@@ -101,6 +101,7 @@ def test_the_derivative_by_the_light_is_the_render():
     assert found == pytest.approx(terms.sum(), abs=2e-6 * np.abs(terms).sum())
 
 
+@pytest.mark.slow
 def test_arrivals_that_do_not_fit_one_read(monkeypatch):
     """Fewer at once than a path has."""
     scene = scene_of(GRID)

@@ -179,6 +179,7 @@ def test_several_launches_and_bands(monkeypatch):
     assert result.passed, str(result)
 
 
+@pytest.mark.slow
 def test_sums_of_large_jobs_in_double_precision(monkeypatch):
     monkeypatch.setattr(f"{FILMS}.base.MAX_SINGLE_PRECISION_SAMPLES", 16)
     scene = scene_of(phasor_camera())
@@ -190,6 +191,7 @@ def test_sums_of_large_jobs_in_double_precision(monkeypatch):
     np.testing.assert_allclose(double, single, atol=1e-6 * np.abs(single).max())
 
 
+@pytest.mark.slow
 def test_memory_is_that_of_the_phasors_and_events():
     """No histogram: a transient of 4096 bins would take 8 times the bound."""
     scene = scene_of(phasor_camera(64, 64, frequency_first=0.0, frequency_step=0.05, frequency_count=64))

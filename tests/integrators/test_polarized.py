@@ -174,6 +174,7 @@ def test_phasors_of_stokes_vectors():
     np.testing.assert_allclose(out.steady[:, :, 0, 0].numpy(), STATE[:, None] * brightness, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_gradient_of_a_polarization_loss():
     """Through the layer: the angle of a polarizer from the angle of polarization, S1 and S2 alone."""
     film = {"type": "transient_hdr_film", "temporal_bins": 10, "start_opl": 2.5, "bin_width_opl": 0.1}
@@ -189,6 +190,7 @@ def test_gradient_of_a_polarization_loss():
     assert float(dop.detach()) == pytest.approx(1.0, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_scenes_are_built_with_finite_derivatives():
     """``tt.load`` takes this library's elements in polarized variants."""
     film = {"type": "transient_hdr_film", "temporal_bins": 10, "start_opl": 2.5, "bin_width_opl": 0.1}

@@ -318,6 +318,7 @@ def test_wave_plates_make_the_states_of_their_names():
 # --------------------------------------------------------------------------------------------------- depolarizers
 
 
+@pytest.mark.slow
 def test_depolarising_walls_leave_nothing():
     """Inside a diffuse box light is unpolarized, bounce after bounce; through a polarizer it is so completely, at half
     the power, at every time.

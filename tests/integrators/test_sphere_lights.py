@@ -198,6 +198,7 @@ def densities(table, scene, p, u):
     return ds, weight, table.pdf(scene, ref, ds, mi.Bool(True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("inside", [False, True])
 def test_texture_coordinates_of_samples(inside):
     """Those where a ray meets the point: between 0 and 1, so that textures that do not repeat are the same ones."""
@@ -212,6 +213,7 @@ def test_texture_coordinates_of_samples(inside):
     assert np.quantile(off, 0.999) < 1e-4 and np.array(ds.uv).min() >= 0 and np.array(ds.uv).max() <= 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("ratio", "flipped"), [(1e-6, False), (0.99, False), (0.5, True), (1.5, True)])
 def test_densities_agree_and_integrate_to_the_solid_angle(ratio, flipped):
     scene = over_a_plane(lamp(ratio, flip_normals=flipped), {"type": "point", "position": [0, 0, 1], "intensity": 1})
@@ -278,6 +280,7 @@ def test_derivatives(ratio, key):
     np.testing.assert_allclose(forward, reverse, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_small_light_in_fog():
     """Attenuated along the way: the connection ends at the sphere."""
     fog = {"type": "homogeneous", "sigma_t": 0.5, "albedo": 0.0}

@@ -214,6 +214,7 @@ def test_first_photons_of_tiny_and_huge_rates(dtype):
     torch.testing.assert_close(slope.double(), -5 / torch.expm1(exact), rtol=1e-5, atol=1e-15)
 
 
+@pytest.mark.slow
 @each
 def test_gradcheck_in_the_dark(loss, exposures):
     """Where the tangent is, and beside it: forwards, backwards, and twice."""

@@ -101,6 +101,7 @@ def test_hidden_emitters(hide_emitters):
     assert result.passed, str(result)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("max_depth", long([1, 2, 3], [2]))
 def test_depth_counts_real_events(max_depth):
     objects = block(homogeneous(1.0, 0.8))

@@ -64,6 +64,7 @@ def positions_at(time, points, lengths):
     return a + fraction[:, None] * (b - a)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("g", long([0.0, 0.5, 0.8], [0.5]))
 def test_moments_of_the_random_walk(g):
     """<z> = l (1 - exp(-t/l)) and <r^2> = 2 l t - 2 l^2 (1 - exp(-t/l)), with l the transport mean free path."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from support.marks import long_rows
 from support.media_scenes import film, homogeneous, load, volume
 from support.runs import T, runs
 from torchtransient.testing.statistics import two_sample_z_test, z_test
@@ -35,7 +36,7 @@ def inside(start, sensor, block):
     return sensor, block
 
 
-@pytest.mark.parametrize(("start", "light"), [(5.0, "connected"), (2.0, "found")])
+@pytest.mark.parametrize(("start", "light"), long_rows([(5.0, "connected"), (2.0, "found")], [(2.0, "found")]))
 def test_light_through_a_grid(start, light):
     """exp(-σ l) with the length in the grid alone: by the walk of a ray to a lamp behind it, and by the shadow ray from
     a wall behind it to a lamp before it.

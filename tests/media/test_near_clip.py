@@ -67,7 +67,7 @@ def render(scene, keys=(), spp=1024, count=6):
     ("sensor", "sigma_t", "key"),
     [
         ("perspective", 1.0, "fog.sigma_t.value.value"),
-        ("thinlens", grid(1.0), "fog.sigma_t.data"),
+        pytest.param("thinlens", grid(1.0), "fog.sigma_t.data", marks=pytest.mark.slow),
         pytest.param("orthographic", grid(1.0), "fog.sigma_t.data", marks=pytest.mark.slow),
     ],
 )

@@ -78,6 +78,7 @@ def test_python_integrators_of_mitsuba_keep_their_depth():
     assert out.steady.sum() == 0, "light that is not seen directly needs a depth of two"
 
 
+@pytest.mark.slow
 def test_peer_scene_file(tmp_path):
     path = tmp_path / "volumetric.xml"
     path.write_text(XML)
@@ -222,6 +223,7 @@ def test_scenes_are_freed_at_once():
         gc.enable()
 
 
+@pytest.mark.slow
 def test_a_scene_dropped_by_another_thread_waits_for_the_trace(monkeypatch):
     from torchtransient.plugins.transport.segment import free_flight
 

@@ -226,6 +226,7 @@ CASES = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @together("case", CASES)
 def test_what_cannot_be_captured(case):
     made, kind, message = CASES[case]

@@ -83,6 +83,7 @@ def test_pairs_are_the_diagonal_of_all_pairs(third_bounce):
         assert (off < 5 * error).all() and (error < 0.05 * b.mean(0)).all() and (b.mean(0) > 0).all()
 
 
+@pytest.mark.slow
 def test_parts_and_complete_scenes_have_the_pairs_of_the_whole():
     whole = simulated(scan(), seed=3)
     parts = simulated(scan(), seed=3, tiles=2, spp=4096)

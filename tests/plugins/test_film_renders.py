@@ -76,6 +76,7 @@ def check(a, b, rounding=1e-5):
 CROP = {"crop_offset_x": 5, "crop_offset_y": 1, "crop_width": 3, "crop_height": 4}
 
 
+@pytest.mark.slow
 def test_crop_is_the_crop_of_the_full_render():
     whole, part = glowing_wall(film()), glowing_wall(film(**CROP))
     steady, transient = runs(part)
@@ -88,6 +89,7 @@ def test_crop_is_the_crop_of_the_full_render():
     assert not two_sample_z_test(steady, full_steady[:, 2:6, 5:8]).passed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rfilter", long(["gaussian", "tent", "mitchell", "catmullrom", "lanczos"], ["mitchell"]))
 def test_spatial_filters_converge_to_splatting(rfilter):
     steady, transient = runs(glowing_wall(film(rfilter=rfilter)), 8, 1024)

@@ -304,6 +304,7 @@ def _pulsed():
     return {**make_room()["sensor"]["film"], "pulse": "gaussian", "pulse_fwhm_opl": 0.2}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", long(["area light", "glass", "sky"], ["area light"]))
 def test_pruning_leaves_every_counted_event(kind):
     """Paths that cannot reach a light in time end early; what is left is the full render, path by path."""
@@ -346,6 +347,7 @@ def seen_through(index, steady, around):
     return np.array(cube, dtype=float)[0, 0, :, 0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steady", long([False, True], [False]))
 def test_glass_that_light_crosses_sooner_than_the_way_is_long(steady):
     """1 + 2 n + 0.5 m, less than the 3.5 m between camera and lamp: the straight line is no bound where a film without
@@ -357,6 +359,7 @@ def test_glass_that_light_crosses_sooner_than_the_way_is_long(steady):
         assert values.sum() == values[2] == pytest.approx(2.0 * through, rel=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steady", long([False, True], [False]))
 @pytest.mark.parametrize("lamp", [None, {"type": "point", "position": [0, 0, 30], "intensity": 1e-6}])
 def test_a_sky_over_a_wall(steady, lamp):

@@ -123,6 +123,7 @@ def test_values_of_mitsuba_differ_by_its_bessel_function(fibre):
             assert -lost - 3e-4 < low and high < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", long([RGB, "llvm_ad_spectral", "llvm_ad_mono_polarized"], [RGB]))
 def test_colours_are_those_of_mitsuba(variant):
     activate(variant)

@@ -71,6 +71,7 @@ def simulate(described):
 # -------------------------------------------------------------------------------------------------- points of a shape
 
 
+@pytest.mark.slow
 def test_a_wall_of_two_triangles_is_a_rectangle(tmp_path):
     """Its grid is that of its texture coordinates, not of samples by area, which a mesh warps triangle by triangle."""
     found = simulate(on(wall_file(tmp_path, UPRIGHT)))

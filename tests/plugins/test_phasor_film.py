@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from support.marks import long_rows
 from torchtransient import plugins
 from torchtransient.errors import SceneError, TorchTransientWarning
 from torchtransient.plugins.films import phasor_events
@@ -159,7 +160,7 @@ def summed(film, job, opl, value, active, slope=None):
 SUMS = [(GRID, 150), (LIST, 64), ({"frequencies": "0.7"}, 3)]
 
 
-@pytest.mark.parametrize(("frequencies", "spp"), SUMS, ids=["grid", "list", "single"])
+@pytest.mark.parametrize(("frequencies", "spp"), long_rows(SUMS, SUMS[:1]), ids=["grid", "list", "single"])
 def test_sums_of_events(frequencies, spp):
     """More samples than one thread sums up, rows in the middle of a film, events that do not exist."""
     film, rng = make_film(3, 4, **frequencies), np.random.default_rng(spp)
@@ -302,6 +303,7 @@ def test_events_of_any_channel_and_sign_take_room():
     assert np.array(events["count"]).tolist() == [1, 1, 1, 1, 0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("frequencies", "tangents", "block", "sizes"), [
     (GRID, False, 48, 16), (GRID, True, 48, 8), (LIST, False, 48, 5), (GRID, False, 2, 1), (GRID, False, 99, 16),
 ])  # fmt: skip

@@ -87,6 +87,7 @@ def black(name):
     return {name: {"type": "uniform", "value": 0.0}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings", [{"alpha": 0.3}, {"alpha_u": 0.1, "alpha_v": 0.4, "specular_reflectance": 0.3}], ids=str
 )

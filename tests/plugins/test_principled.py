@@ -118,6 +118,7 @@ def test_slopes_at_the_ends(kind, slot, end, others, wi, wo):
 OF_ENDS = [entry[:3] for entry in ENDS]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "slot", "end"), long_rows(OF_ENDS, OF_ENDS[2::5]))
 def test_samples_at_the_ends_fit_their_density(kind, slot, end):
     """Share of the samples in each of two times two parts of the sphere, against the integral of the density."""

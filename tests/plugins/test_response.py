@@ -75,6 +75,7 @@ def runs(scene, count=8):
     return [np.array([np.array(r[i], dtype=float) for r in results]) for i in (0, 1)]
 
 
+@pytest.mark.slow
 def test_steady_image_is_that_of_specfilm():
     scene, reference = mi.load_dict(description(film())), mi.load_dict(description(film("specfilm"), "path"))
     steady, transient = runs(scene)

@@ -136,6 +136,7 @@ def test_the_derivative_of_mitsubas_own_is_refused(key):
     params.update()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("table", "ggx"),
     long_rows(

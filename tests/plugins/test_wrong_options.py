@@ -67,6 +67,7 @@ def test_wrong_value_is_an_error_of_one_sentence(plugin, option, value):
     assert "\n" not in message and "Traceback" not in message and len(message) < 700
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("plugin", "option", "value"),
     [("transient_hdr_film", "width", "np.int64(5)"), ("independent", "sample_count", "torch.tensor(3)")],

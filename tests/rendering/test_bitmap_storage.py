@@ -35,6 +35,7 @@ def test_an_8_bit_image_is_listed_as_linear_real_numbers(textured_wall: tt.Scene
     assert info.value.min() > 0.0 and info.value.max() < (220 / 255) ** 2
 
 
+@pytest.mark.slow
 def test_gradient_of_the_image_adds_up_to_the_light_it_reflects(textured_wall: tt.Scene) -> None:
     """After one bounce the light is linear in the albedo: albedo times derivative adds up to the light (Euler). Asking
     for the derivative does not change the picture.

@@ -202,6 +202,7 @@ def test_two_scenes_by_turns():
             same(expected[1][0], got[1][0])
 
 
+@pytest.mark.slow
 def test_scenes_that_come_and_go():
     alive = []
     for number in range(3):
@@ -231,6 +232,7 @@ def test_several_renders_before_their_backward_passes(room_scene):
         same(a, b)
 
 
+@pytest.mark.slow
 def test_other_flags_of_gradients(room_scene):
     """Which values need a derivative changes from call to call; so do the adjoint's layout and what it is of."""
     traced, recorded = pair(room_scene, parameters=[COLOUR, GREY], spp=4)

@@ -328,6 +328,7 @@ def test_albedo_of_grey_has_one_channel(variant):
     close(scene_labels(renderer, names=["albedo"])["albedo"], np.full((1, H, W), 0.35))
 
 
+@pytest.mark.slow
 def test_albedo_in_the_films_own_channels():
     bands = {
         "low": {"type": "regular", "wavelength_min": 450.0, "wavelength_max": 500.0, "values": "1, 1"},
@@ -509,6 +510,7 @@ def test_phasors_and_gates_have_labels():
 # ---------------------------------------------------------------------------------------------------------- means
 
 
+@pytest.mark.slow
 def test_means_over_pixels():
     """Of a slanted plane the mean depth of an orthographic camera is that of the centre; across an edge it is not."""
     slanted = plane(to_world=rotate([0, 1, 0], 30.0) @ scale(20.0))

@@ -37,6 +37,7 @@ def render(node, variant, **settings):
     return tt.render(tt.load(node, variant=variant), seed=2, spp=64, **settings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "bands, late",
     long_rows([(True, None), (False, LATE), (True, {**LATE, **SHIFT})], [(True, {**LATE, **SHIFT})]),

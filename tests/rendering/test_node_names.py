@@ -86,6 +86,7 @@ SHARED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "named"), long_rows([("bitmap", True), ("bitmap", False), ("d65", True)], [("bitmap", True)])
 )

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.marks import long
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.testing.small_room import COLOUR, VARIANT, WALL_POSE, make_room
 
@@ -69,6 +70,7 @@ def test_frequencies_replace_the_film(scene, histogram_scene, given):
     torch.testing.assert_close(tt.render(tt.load(steady, VARIANT), seed=3, frequencies=given).phasor, expected.phasor)
 
 
+@pytest.mark.slow
 def test_frequencies_and_time_axes_replace_each_other(histogram_scene):
     given = {"wl_mean": 2.0, "wl_sigma": 4.0, "temporal_bins": 200, "bin_width_opl": 0.1}
     scene = tt.load(phasor_room(**given), variant=VARIANT)
@@ -144,7 +146,7 @@ def test_reverse_mode_against_finite_differences(scene, weights):
         assert float((above - below) / 0.2) == pytest.approx(float(gradient[c]), rel=2e-3, abs=1e-4)
 
 
-@pytest.mark.parametrize("loss", ["abs", "angle", "real", "imag", "square"])
+@pytest.mark.parametrize("loss", long(["abs", "angle", "real", "imag", "square"], ["angle"]))
 def test_losses_of_complex_numbers(scene, loss):
     """Torch's own rules meet ours at the complex output: reverse mode equals forward mode for each."""
     functions = {
@@ -201,6 +203,7 @@ def test_vmap_and_jacobians(scene):
     torch.testing.assert_close(forward, reverse, rtol=1e-3, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_copies_and_pickles_keep_the_frequencies(histogram_scene):
     renderer = tt.TransientRenderer(histogram_scene, parameters=[COLOUR], frequencies=AXIS)
     expected = renderer(seed=1).phasor

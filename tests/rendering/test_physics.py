@@ -302,6 +302,7 @@ def test_a_window_that_holds_the_light(room):
     assert said(tt.render, loaded(room), spp=16, seed=0, time_axis=short, steady=False, physics="error")[1] == []
 
 
+@pytest.mark.slow
 def test_what_a_filter_spreads_over_the_rim_of_one_bin_for_all_times_is_not_missed(room):
     everything = tt.TimeAxis(0.0, 100.0, 1)
     scene = loaded(room)
@@ -312,6 +313,7 @@ def test_what_a_filter_spreads_over_the_rim_of_one_bin_for_all_times_is_not_miss
         tt.render(scene, time_axis=tt.TimeAxis(0.0, 8.0, 1), spp=4, seed=0, physics="error")
 
 
+@pytest.mark.slow
 def test_stokes_vectors_count_by_their_first_component(room):
     scene = tt.load(room, variant="llvm_ad_spectral_polarized")
     _, messages = said(tt.render, scene, time_axis=tt.TimeAxis(9.0, 0.25, 16), spp=64, seed=0)

@@ -51,6 +51,7 @@ def fog_room():
     return plan_scenes.grey_room(ball=ball)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", long(["plates", "fog"], ["fog"]))
 def test_events_have_the_depth_at_which_a_render_gains_them(scene):
     """Renders of depth 1, 2, 3, ... differ by the events of that depth."""
@@ -93,6 +94,7 @@ def test_depth_of_a_furnace():
     assert abs(plan.pilot.tail - albedo**plan.max_depth) < 4 * plan.pilot.tail_error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bounces", long([5, 12], [12]))
 def test_a_chain_of_mirrors_is_followed_to_its_end(bounces):
     scene = plan_scenes.mirror_chain(bounces)
@@ -335,6 +337,7 @@ def test_phasor_outputs():
     assert torch.allclose(output.phasor[:, 0].real, output.steady, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_gated_outputs():
     """Light outside of the gates asks for no depth."""
     scene = tt.scenes.integrating_sphere(reflectance=0.8)
@@ -407,6 +410,7 @@ def operations(renderer) -> list[int]:
         return [entry["operation_count"] for entry in dr.kernel_history([dr.KernelType.JIT])]
 
 
+@pytest.mark.slow
 def test_a_planned_render_runs_the_plain_integrator_s_kernels():
     """Nothing is added to a scene without effects, not even by the integrator for media."""
     mi.set_variant("llvm_ad_rgb")

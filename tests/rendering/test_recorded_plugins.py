@@ -41,7 +41,7 @@ def steady(renderer, value):
 
 # One of each kind of what is walked through; what does not say that it can be recorded is told whatever it keeps.
 SAYS = [(kept, True) for kept in (
-    "float", "list", "slots", "partial", "NumPy", "torch", "generator", "array of Dr.Jit in a plain object"
+    "float", "NumPy", "array of Dr.Jit in a plain object"
 )] + [("float", False)]  # fmt: skip
 
 

@@ -89,6 +89,7 @@ def check_moments(chosen, names):
         assert interrupted > len(ends) / 20 or interrupted > 3
 
 
+@pytest.mark.slow
 def test_interrupts_where_scenes_are_put_back():
     def chosen(ends):
         last = ends[-120:]  # of the backward pass

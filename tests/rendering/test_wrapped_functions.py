@@ -100,6 +100,7 @@ def test_every_kind_of_value():
         assert dr.all(dr.ravel(params[key]) == value), key
 
 
+@pytest.mark.slow
 def test_gradients_of_a_render_by_key():
     """A path length that changes, against central differences of the same samples."""
     scene, params = load_room(without="box")

@@ -126,6 +126,7 @@ def test_light_next_to_the_surface(height):
     assert np.isfinite(gradients(scene, ["light.position", "floor.to_world", "light.intensity.value"])).all()
 
 
+@pytest.mark.slow
 def test_area_light_on_the_surface():
     lamp = {"type": "rectangle", "to_world": T().scale(0.2), "emitter": {"type": "area", "radiance": 2.0}}
     other = {

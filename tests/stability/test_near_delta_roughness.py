@@ -48,7 +48,7 @@ def hard_directions(count: int) -> np.ndarray:
     ("distribution", "alpha"),
     long_rows(
         itertools.product(["ggx", "beckmann"], ALPHAS),
-        [("ggx", 0.0), ("beckmann", 0.0), ("ggx", 1e-3), ("beckmann", 1.0)],
+        [("ggx", 0.0), ("beckmann", 1.0)],
     ),
 )
 def test_values_and_derivatives_are_finite(distribution, alpha):

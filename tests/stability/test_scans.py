@@ -121,6 +121,7 @@ def test_the_first_arrival_moves(how):
     assert np.abs(slope - difference).sum() < 0.03 * np.abs(difference).sum()
 
 
+@pytest.mark.slow
 def test_corners_and_edges_on():
     """Plates that touch the wall or stand edge-on give finite values and derivatives."""
     edge_on = {"type": "rectangle", "to_world": transform().translate([0.3, 0, 0.5]).rotate([0, 1, 0], -90).scale(0.5)}

@@ -60,6 +60,7 @@ def test_mean_at_a_millimetre(name):
     assert error < 0.05 * abs(slopes.mean())
 
 
+@pytest.mark.slow
 def test_plain_surfaces_are_no_special_case(monkeypatch):
     """Guards against a slide of flat plain surfaces that is not that of a ray which is shifted."""
     plain = problem("plates", 5e-3).reverse(1)

@@ -90,6 +90,7 @@ def test_last_polarizer_before_the_camera(theta):
     check(problem(lambda: bench(polarizer(theta)), set_color("element_0.bsdf.theta.value"), theta, step=2.0), rel=5e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delta", long([0.0, 90.0, 180.0], [0.0]))
 def test_delay_of_a_wave_plate(delta):
     plate = {"type": "diff_retarder", "theta": 45.0, "delta": delta}
@@ -171,6 +172,7 @@ def test_black_and_clear():
     check(p)
 
 
+@pytest.mark.slow
 def test_camera_rolls_before_a_polarizer():
     """The sensor's own frame turns: S1 and S2 change into each other at twice the angle. Rays along the normal of
     everything, where a rotation has no other effect.

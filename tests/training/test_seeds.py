@@ -11,6 +11,7 @@ from torchtransient.testing.small_room import VARIANT, make_room
 from torchtransient.training import Seeds
 
 
+@pytest.mark.slow
 def test_a_function_of_run_step_and_sample_alone():
     whole = Seeds(3)(7, range(10))
     assert Seeds(3)(7, torch.arange(10)) == whole

@@ -52,6 +52,7 @@ def test_strategies_need_names_of_their_own(scene, monkeypatch, names):
         integrator.world(scene, contents_of(scene))
 
 
+@pytest.mark.slow
 def test_built_once_a_scene(scene, monkeypatch):
     """Renders, backward and forward passes, in several launches and for several seeds, share one look-up."""
     built = []

@@ -160,6 +160,7 @@ def test_the_area_of_a_triangle_is_that_of_its_vertices():
     np.testing.assert_allclose(np.array(dr.grad(si.p))[:, 0], moved, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("own", [0.0, 0.6])
 def test_what_changes_where_a_point_slides_on_a_sphere(own):
     """Of the drag alone, though the ray may have a motion of its ``own``."""

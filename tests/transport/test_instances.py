@@ -132,6 +132,7 @@ def test_interactions_follow_what_moves(names):
     assert np.abs(found[0][2 if names[0] != "second" else 6]) > 0.01
 
 
+@pytest.mark.slow
 def test_points_of_a_sheet_are_carried_along():
     """With ``FollowShape`` a point keeps its place on the shape: it goes where the pose takes it, and the distance is
     that between it and the ray's origin, in lengths of the ray's direction.
@@ -185,6 +186,7 @@ def test_rays_that_meet_nothing_have_no_slope(follows):
     assert not np.array(si.is_valid())[9] and longer[9] == 0 and np.abs(longer[:9]).min() > 1e-4
 
 
+@pytest.mark.slow
 def test_idle_lanes_reach_no_pose():
     """What nothing was met by may hold what is no number, or lie at the ray's start: the poses, which all lanes share,
     and its own ray hear nothing of it.

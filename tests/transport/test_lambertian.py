@@ -39,6 +39,7 @@ def gradient(scene, key):
     return np.array(dr.grad(value)).ravel()
 
 
+@pytest.mark.slow
 def test_paths_are_those_of_any_surface(monkeypatch):
     """Same seed, same transient and gradient, whether BSDFs are asked or not."""
     scene = mi.load_dict(described())

@@ -195,6 +195,7 @@ def turning(r, radius):
     return (1 - a) / r
 
 
+@pytest.mark.slow
 def test_round_patterned_lights_that_a_path_finds():
     """Near by, where a point slides to its normal is another one, and the light that leaves it, too."""
     x, radius, d = attached_zero(), 4.0, unit(np.array([0.02, 0.1, 1.0]))

@@ -88,6 +88,7 @@ def test_phasors_do_without_a_list_of_arrivals(monkeypatch):
     torch.testing.assert_close(found(), expected, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_what_no_memory_holds_is_an_error_with_the_bound():
     for depth in (2**25, 2**32 - 2):
         with pytest.raises(GradientError, match=rf"88 bytes a bounce.*max_depth up to \d+ .*, got {depth}\. Set"):

@@ -60,8 +60,9 @@ def test_intersections_as_numbers():
     }
     again = vacuum.intersection(vacuum.intersection_numbers(pi, "entry_"), active, "entry_")
     assert np.array(again.is_valid()).tolist() == [True, True, False, False]
-    for name in ("t", "prim_uv", "prim_index"):
-        np.testing.assert_array_equal(np.array(getattr(again, name)), np.array(getattr(pi, name)))
+    np.testing.assert_array_equal(np.array(again.t), np.array(pi.t))
+    for name in ("prim_uv", "prim_index"):  # where something was hit: elsewhere they mean nothing
+        np.testing.assert_array_equal(np.array(getattr(again, name))[..., :2], np.array(getattr(pi, name))[..., :2])
     for name in ("shape", "instance"):
         assert np.array(getattr(again, name) == getattr(pi, name)).all()
     assert np.array(dr.reinterpret_array(mi.UInt32, pi.instance) != 0).tolist()[:2] == [True, False]

@@ -21,6 +21,7 @@ def mono():
     plugins.sync()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("medium", long([homogeneous, clouds], [clouds]))
 def test_light_passes_open_boundaries_in_a_group(medium):
     """A block of fog whose boundary has the BSDF ``null``: an instance of it was opaque."""

@@ -63,6 +63,7 @@ def same(a, b):
     assert all(np.array_equal(a.values[key], b.values[key]) for key in a.values)
 
 
+@pytest.mark.slow
 def test_bytes_depend_on_recipe_and_number_alone():
     recipe = small(labels=("depth", "normals", "shape", "first_return"))
     forwards = [recipe.sample(index) for index in range(6)]

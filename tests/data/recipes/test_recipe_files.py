@@ -90,6 +90,7 @@ def write(folder, mesh=OBJ):
     return D.Recipe.read(folder / "recipe.yaml")
 
 
+@pytest.mark.slow
 def test_xml_scenes_their_files_and_places(tmp_path):
     recipe = write(tmp_path / "a")
     assert recipe.exchanged == ["$albedo"]

@@ -45,7 +45,7 @@ def shape_of(name):
     return mi.load_dict(description | {"to_world": turned(*description["to_world"])}), area
 
 
-@pytest.mark.parametrize("name", long(SHAPES, list(SHAPES)[::2]))
+@pytest.mark.parametrize("name", long(SHAPES, list(SHAPES)[::5]))
 def test_draws_lie_on_the_shape_with_its_normals(name):
     shape, area = shape_of(name)
     scene = scene_of(shape)

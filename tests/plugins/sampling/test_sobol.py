@@ -15,6 +15,7 @@ def coordinates(first, count, dimension, seed=3):
     return np.array(unit_double(sobol(index, dimension, dr.opaque(mi.UInt32, seed))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dimension", range(DIMENSIONS))
 def test_blocks_have_a_point_in_every_interval(dimension):
     """Of 2^m indices from a multiple of 2^m on, and of the blocks next to each other, each interval has one."""

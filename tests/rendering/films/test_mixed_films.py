@@ -60,6 +60,7 @@ def grad_and_values(renderer):
 QUICK = [(("gated", "histogram"), "")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("pair", "of_integrator"), long_rows(itertools.product(PAIRS, ["", "gaussian"]), QUICK))
 def test_each_sensor_renders_as_if_it_were_alone(pair, of_integrator):
     settings = {"temporal_filter": of_integrator, "gaussian_stddev": 0.8} if of_integrator else {}
