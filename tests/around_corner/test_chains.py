@@ -111,6 +111,7 @@ def histogram(points, **arguments):
     return film_of(points, points, 1.2, 48, 0.05, **arguments)
 
 
+@pytest.mark.slow
 def test_the_diagonal_is_the_confocal_capture_and_a_column_a_single_one(corner):
     """The same chains: to the last digits."""
     scene, elements, points, normals = corner

@@ -112,6 +112,7 @@ def test_sides_of_surfaces_that_are_drawn():
     assert np.array(chains._probability_of_front(plan, p, n, mi.Bool([False] * 4))).tolist() == [1] * 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("two_sided", [True, False])
 def test_points_that_are_drawn_on_a_sheet_of_two_colours(two_sided):
     """Each side with its normals, its colour and its probability: light off both adds up to that of the two."""

@@ -244,6 +244,7 @@ ALONE = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ALONE)
 def test_what_hides_nothing_costs_nothing(name):
     key = "front.vertex_positions" if name == "a body" else "front.to_world"

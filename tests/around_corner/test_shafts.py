@@ -119,6 +119,7 @@ def test_clear_samples_are_never_hidden(name):
     assert dr.sum(before.weight)[0] == pytest.approx(dr.sum(samples.weight)[0], rel=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["body", "V and plate", "plates behind each other"])
 def test_numbers_do_not_change(name):
     """With rays for all of the same samples: single, confocal and exhaustive captures."""

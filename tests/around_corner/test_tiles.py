@@ -41,6 +41,7 @@ def test_tiles_are_neighbours_and_all_points_have_one(arm):
     assert ScanTiles(points[:GRID], normals[:GRID], 0.25).count == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("single", long([False, True], [False]))
 def test_less_noise_and_no_bias(arm, single):
     shapes, scene, points, normals = arm

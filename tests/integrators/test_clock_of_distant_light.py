@@ -115,6 +115,7 @@ ORDERS = [
 CASES = [(order, list(LIGHTS)[n % len(LIGHTS)]) for n, order in enumerate(ORDERS)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("order", "light"), long_rows(CASES, [CASES[n] for n in (1, 4)]))
 def test_order_of_calls(order, light):
     scene = load(light)

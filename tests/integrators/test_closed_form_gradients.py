@@ -246,6 +246,7 @@ def test_a_wall_that_moves_under_either_clock(unwarp):
     np.testing.assert_allclose(rows[0], (exact(1e-4) - exact(-1e-4)) / 2e-4, rtol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("unwarp", "unknown"),
     long_rows([(True, "field of view"), (True, "place"), (False, "place")], [(True, "field of view")]),

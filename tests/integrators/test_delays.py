@@ -246,6 +246,7 @@ def test_wavelengths_stay_where_light_is_elastic():
 # ---------------------------------------------------------------------------------------------------- torch, errors
 
 
+@pytest.mark.slow
 def test_parameters_through_torch():
     node = room(bsdf={**LATE, "elastic_fraction": 0.4}, sensor=camera())
     loaded = tt.load(node, variant=VARIANT)

@@ -164,6 +164,7 @@ def radiance_through(camera_z, lamp, eta, alpha=0.3):
 ABOVE, BELOW = (3.0, (0.4, 0.1, -2.0)), (-3.0, (0.3, -0.2, 2.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "places"),
     long_rows(

@@ -99,6 +99,7 @@ def test_no_noisier_beside_an_end_than_at_it(bsdf, key, end):
     np.testing.assert_allclose(beside, at_end, rtol=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("bsdf", "key"),
     [

@@ -80,6 +80,7 @@ def test_matrices_of_a_nested_two_sided_surface_from_behind():
     np.testing.assert_allclose(tinted, 0.5 * direct, rtol=1e-3, atol=1e-5 * direct.max())
 
 
+@pytest.mark.slow
 def test_a_surface_that_does_not_describe_itself():
     activate(MONO)
     np.testing.assert_allclose(image({"type": "nameless"}), image(DIFFUSE), rtol=1e-4, atol=1e-6)

@@ -44,7 +44,8 @@ ALIKE = {
     "lens_aperture", "glass_moves", "mirror_moves", "camera_moves_in_glass", "blend_weight", "principled_roughness",
     "smooth_plastic_index", "mirror_reflectance", "polar_polarizer_angle", "polar_albedo",
     "linear_curve_bends", "conductor_eta", "side_moves", "medium_sigma_t", "index_of_masked_thin_glass", "sky_radiance",
-    "wall_under_short_pulse",
+    "wall_under_short_pulse", "banded_albedo_spectrum", "lifetime", "gated_wall", "ellipsoid_changes", "instance_turns",
+    "mirror_normals",
 }  # fmt: skip
 
 

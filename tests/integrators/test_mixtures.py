@@ -159,6 +159,7 @@ def test_wrappers_of_parts_do_not_depend_on_what_was_rendered_first(first, flags
     np.testing.assert_allclose(*images, rtol=1e-4, atol=1e-6 * images[0].max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flags", FLAGS[1:3], ids=str)
 def test_hidden_flags_are_found(flags):
     mi.set_variant(VARIANT)

@@ -181,6 +181,7 @@ def test_every_point_is_distinct():
         assert len(np.unique(points.round(6), axis=0)) == width * height
 
 
+@pytest.mark.slow
 def test_a_projector_is_a_laser():
     """Mitsuba's projector lights its spot as mitransient says: irradiance pi / d^2 over a square metre."""
     projector = {"type": "projector", "irradiance": 2.0, "fov": 0.2}
@@ -352,6 +353,7 @@ NOT_SHARED = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NOT_SHARED)
 def test_what_cannot_be_shared_says_why(name):
     """It is an error where it was asked for; otherwise the same reason leaves it to paths."""

@@ -117,6 +117,7 @@ def test_one_bounce_in_closed_form():
     np.testing.assert_allclose(phasors[0, 0], expected, atol=2e-5 * steady.max())
 
 
+@pytest.mark.slow
 def test_crop_window():
     crop = {"crop_offset_x": 2, "crop_offset_y": 1, "crop_width": 3, "crop_height": 2}
     window, whole = scene_of(phasor_camera(crop=crop)), scene_of(phasor_camera())

@@ -79,6 +79,7 @@ def test_a_pilot_of_a_scene_whose_sensor_is_attached():
     np.testing.assert_allclose(found.energy, expected.energy, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_pilot_from_within_glass_that_is_attached():
     """Lengths there are times its index, of which nobody asks for a derivative."""
     ball = {"type": "sphere", "center": [0, 0, 4.0], "radius": 0.5, "bsdf": {"type": "dielectric", "int_ior": 1.5}}

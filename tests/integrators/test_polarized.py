@@ -116,6 +116,7 @@ def test_energy_outside_the_window_is_that_of_the_power():
     assert film.energy_before + film.energy_after == pytest.approx(missing, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_layout_of_tensors():
     """Stokes components in front of the channels, batch and sensor in front of both."""
     description = tt.scenes.moving_wall(resolution=3, num_bins=10, start_opl=0.0, bin_width_opl=1.0)

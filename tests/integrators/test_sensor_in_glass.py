@@ -103,6 +103,7 @@ def test_bodies(body):
     check(scene(at(), depth=4, **BODIES[body]()), N * 1.0 + 2.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("plugin", long(["roughdielectric", "diff_rough_dielectric"], ["diff_rough_dielectric"]))
 def test_rough_body(plugin):
     """Nearly smooth: the first light comes from a point of the wall a little nearer to the lamp."""
@@ -152,6 +153,7 @@ def test_under_an_open_surface():
     check(scene(at(z), window=small), WATER * (1.0 - z) + 2.0)
 
 
+@pytest.mark.slow
 def test_above_an_open_surface():
     """Entered and never left: air around the sensor, water below."""
     surface = {"type": "rectangle", "to_world": T().translate([0, 0, 1]).rotate([0, 1, 0], 180).scale(20.0)}
@@ -279,6 +281,7 @@ def test_distant_sensor_stands_in_nothing():
     assert first - second == pytest.approx(2 * (N - 1), abs=3 * BIN)
 
 
+@pytest.mark.slow
 def test_sensor_in_a_medium_in_glass():
     fog = {"type": "homogeneous", "sigma_t": 0.3, "albedo": 0.5}
     sensor = at() | {"medium": {"type": "ref", "id": "fog"}}

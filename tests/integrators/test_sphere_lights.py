@@ -80,6 +80,7 @@ def test_irradiance_inside_a_sphere(kind):
     close_to(steady(over_a_plane(shell), 8), RHO * RADIANCE, slack=2e-4)
 
 
+@pytest.mark.slow
 def test_lights_beside_it():
     """Choice by weights, among lights of other kinds."""
     lights = [
@@ -113,6 +114,7 @@ def stripes():
     return {"type": "bitmap", "bitmap": mi.Bitmap(data), "raw": True, "filter_type": "nearest"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", long([1e-5, 0.1], [0.1]))
 def test_texture_seen_from_the_pole(ratio):
     """From below all meridians are seen alike."""

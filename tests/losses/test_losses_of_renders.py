@@ -83,6 +83,7 @@ def test_every_loss_says_what_it_takes():
     assert {taken_by(loss) for loss in others - set(OTHER)} <= {"Volume", "DepthMap"}
 
 
+@pytest.mark.slow
 @by_name
 def test_of_two_renders(loss, renderer, shared):
     """The number of their tensors, and a gradient that goes back through the renderer."""

@@ -90,6 +90,7 @@ def drawn_from(given, lanes, stream):
     return np.array([np.array(rng.next_float32()) for _ in range(4)])
 
 
+@pytest.mark.slow
 def test_numbers_of_a_line_are_its_own():
     """The same for the same arguments, in every version; others for other lanes, numbers, orders and kinds of lines."""
     lanes = dr.arange(mi.UInt32, 4000)

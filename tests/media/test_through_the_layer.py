@@ -206,6 +206,7 @@ def integrator_of(renderer):
     return weakref.ref(built.scene.integrator())
 
 
+@pytest.mark.slow
 def test_scenes_are_freed_at_once():
     """Not only when the collector runs: data sets are rendered scene by scene."""
     key = "block.interior_medium.albedo.value.value"

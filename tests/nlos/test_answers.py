@@ -62,6 +62,7 @@ def physics_of(act):
 # ------------------------------------------------------------------------------------------------------------ settings
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parameters", long([(), [VERTICES]], [()]))
 def test_bins_that_nobody_gave(parameters):
     """Those of `simulate`: they hold all light of three bounces, but what a wider filter spreads over their rim."""

@@ -152,6 +152,7 @@ def test_films_without_a_temporal_filter():
 # ------------------------------------------------------------------------------------------------- arrays of others
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["transient_hdr_film", "phasor_hdr_film"])
 def test_films_add_to_an_array_that_was_lent(kind):
     """From its first entry on, where nothing else is touched."""

@@ -99,6 +99,7 @@ def test_spatial_filters_converge_to_splatting(rfilter):
     np.testing.assert_allclose(transient.sum(3), steady, atol=2e-6)
 
 
+@pytest.mark.slow
 def test_storage_bands(monkeypatch):
     rows = 4
     whole = glowing_wall(film())
@@ -212,6 +213,7 @@ def cornell(start, bins, filter):
     return mi.load_dict(description)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("filter", long(["box", "tent", "gaussian"], ["tent"]))
 def test_energy_outside_is_that_of_a_wider_window(filter):
     wide, narrow = cornell(0.0, 120, filter), cornell(5.0, 16, filter)

@@ -205,6 +205,7 @@ def test_gated_render_is_the_full_one_gated_afterwards():
     np.testing.assert_allclose(steady, gated.sum(2), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_histogram_without_steady_image():
     scene = tt.load(mirrored(), variant=VARIANT)
     axis = tt.TimeAxis(8.0, 0.1, 12)

@@ -143,6 +143,7 @@ def test_slopes_of_metals(variant, plugin):
         assert slope_of(plugin, slot, eta, k) == pytest.approx(right, rel=2e-4, abs=2e-5), (eta, k, slot)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", [MONO, POLARIZED])
 @pytest.mark.parametrize("plugin", METALS.values())
 def test_where_mitsubas_metals_lose_their_slopes(variant, plugin):

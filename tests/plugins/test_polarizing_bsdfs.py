@@ -110,6 +110,7 @@ def test_rough_glass_reflects_as_a_rough_metal_without_absorption():
         np.testing.assert_allclose(got, expected, atol=3e-5 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wi_z", [0.9, -0.4])
 def test_rough_glass_samples_what_it_evaluates(wi_z):
     """The weight of a sample is value over density, for all entries of the matrix."""
@@ -225,6 +226,7 @@ def reflectance(slot, value, other, cosine):
     return float(abs(s) ** 2 + abs(r) ** 2) / 2
 
 
+@pytest.mark.slow
 def test_a_described_metal_of_index_zero_is_built_anew():
     metal = {"type": "conductor", "eta": {"type": "uniform", "value": 0.0}, "k": 2.0}
     scene = tt.load(mirror_room(metal), variant="llvm_ad_mono")

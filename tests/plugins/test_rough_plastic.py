@@ -75,6 +75,7 @@ TABLES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("table", "ggx", "alpha", "eta"), TABLES)
 def test_derivatives_of_the_tables(monkeypatch, table, ggx, alpha, eta):
     """Against differences of the fourth order on a quadrature that is fine enough for them."""

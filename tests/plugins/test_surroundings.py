@@ -29,6 +29,7 @@ def around(**shapes):
     return float(found.indices(scene)[0][0]), lines[:, 1::2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("half", [0.2, 0.87, 0.95, 2.0])
 def test_more_lines_than_a_leak_has_leave_a_body(half):
     """Four of sixty-four are no more than that, five are."""
@@ -39,6 +40,7 @@ def test_more_lines_than_a_leak_has_leave_a_body(half):
     assert index == pytest.approx(1.5 if leave > 4 else 1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kept", [128, 98, 97, 64])
 def test_nine_tenths_of_the_lines_enter_what_is_inside_out(kept):
     vertices, faces = ball((0, 0, 0), 1.0, 2)

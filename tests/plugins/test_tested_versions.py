@@ -30,6 +30,7 @@ def render():
     return tt.render(tt.load(tt.scenes.cornell_box(resolution=4, num_bins=300), "llvm_ad_rgb"), {}, spp=1)
 
 
+@pytest.mark.slow
 def test_it_is_said_once_and_the_scene_is_rendered(other_mitsuba):
     with pytest.warns(VersionWarning, match=rf"mitsuba {mi.__version__} was never tested .* mitsuba==3\.9\.0"):
         assert float(render().transient.sum()) > 0

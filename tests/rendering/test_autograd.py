@@ -144,6 +144,7 @@ def test_non_contiguous_input(renderer, weights):
     same_gradient(storage.grad[:, 0], gradient(renderer, START, weights))
 
 
+@pytest.mark.slow
 def test_expanded_and_permuted_cotangents(renderer, weights):
     x = START.clone().requires_grad_()
     out = renderer({COLOUR: x}, seed=0).transient

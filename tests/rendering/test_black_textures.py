@@ -48,6 +48,7 @@ def described(kind, nested):
 QUICK = [("normalmap", "diffuse")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "name"), long_rows(itertools.product(MAPS, NESTED), QUICK))
 def test_slope_at_zero(kind, name):
     slot, nested = NESTED[name]

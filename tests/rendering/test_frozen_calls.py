@@ -144,6 +144,7 @@ def test_what_is_said(room_scene):
     assert renderer(seed=0).stats.recorded[0] == SWITCHED_OFF
 
 
+@pytest.mark.slow
 def test_batches_and_sensors(two_views):
     traced, recorded = pair(two_views, parameters=[COLOUR, GREY], spp=4, sensors="all")
     colours = torch.tensor([[0.9, 0.1, 0.3], [0.2, 0.8, 0.5], [0.4, 0.4, 0.4]])
@@ -279,6 +280,7 @@ def test_threads(room_scene):
         same(expected[seed], transient)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("stage", "kind"), [("recorded", "render"), ("launched", "backward")])
 def test_interrupts_leave_everything_as_it_was(stage, kind, monkeypatch):
     scene = tt.load(make_room(), variant=VARIANT)
@@ -321,6 +323,7 @@ def scene_integrator(renderer):
 # --------------------------------------------------------------------------------------------- what is not recorded
 
 
+@pytest.mark.slow
 def test_several_launches_are_traced(room_scene, monkeypatch):
     monkeypatch.setattr("torchtransient.plugins.integrators.launch.MAX_LANES", 20)
     traced, recorded = pair(room_scene, parameters=[COLOUR, GREY], spp=4)
@@ -399,6 +402,7 @@ def test_numbers_of_a_plugin_in_python_count(room_scene):
 # ------------------------------------------------------------------------------------------------ bounds and warning
 
 
+@pytest.mark.slow
 def test_recordings_are_bounded_and_said(monkeypatch):
     monkeypatch.setattr(recordings, "MAX_STRUCTURES", 3)
     renderer = tt.TransientRenderer(tt.load(make_room(), variant=VARIANT), parameters=[COLOUR])

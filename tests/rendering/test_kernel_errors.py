@@ -60,6 +60,7 @@ def test_forward_mode_after_an_error(unreadable):
     assert held.value is not None and slope(right) == pytest.approx(expected)
 
 
+@pytest.mark.slow
 def test_forward_mode_beside_a_scene_with_attached_values():
     """Calls are built into all objects alive: the tangent runs into values that somebody else attached."""
     key, right = "wall.bsdf.reflectance.value", tt.load(room(), variant="llvm_ad_rgb")

@@ -448,6 +448,7 @@ def test_own_parameters_and_described_values_come_back():
     assert (scene_labels(renderer)["depth"][:, 0] > before["depth"][:, 0] + 1).all()
 
 
+@pytest.mark.slow
 def test_interleaved_scenes_keys_and_renders():
     """Two scenes, two sets of keys, labels and renders in turn: each call has its own values."""
     near, far = make_room(), make_room()
@@ -596,6 +597,7 @@ def test_depth_lies_in_the_peak_bin():
     assert alike > 60
 
 
+@pytest.mark.slow
 def test_nothing_arrives_before_the_shortest_way():
     width, light = 0.1, [1.0, 2.0, 3.0]
     renderer, finer = beside({"temporal_bins": 256, "bin_width_opl": width, "start_opl": 2.0}, light, wall=plane())
@@ -712,6 +714,7 @@ def same_recorded(make, values, names, hidden=False):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", long(["perspective", "thinlens", "orthographic"], ["perspective"]))
 def test_recorded_calls_follow_the_sensor(kind):
     more = {"aperture_radius": 0.1, "focus_distance": 3.0} if kind == "thinlens" else {}

@@ -190,6 +190,7 @@ def test_batches_have_their_own_gradients(scene, weights):
         torch.testing.assert_close(together[n], alone, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_vmap_and_jacobians(scene):
     renderer = renderer_of(scene, COLOUR)
     values = torch.rand(2, 3, generator=torch.Generator().manual_seed(3))
@@ -212,6 +213,7 @@ def test_copies_and_pickles_keep_the_frequencies(histogram_scene):
     assert "frequencies=FrequencyAxis(5" in repr(renderer)
 
 
+@pytest.mark.slow
 def test_cotangents_in_any_layout(scene, weights):
     """A cotangent that is conjugated lazily, expanded or strided is read as what it is."""
     renderer = renderer_of(scene, COLOUR)

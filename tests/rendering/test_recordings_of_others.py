@@ -38,6 +38,7 @@ def scene_of(renderer):
         return renderer.scene.built(renderer._options).scene
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["render", "forward"])
 @pytest.mark.parametrize("place", ["walk", "add_steady"])
 def test_nobody_waits_for_what_an_interrupt_has_cut_off(renderers, monkeypatch, kind, place):

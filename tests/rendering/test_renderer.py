@@ -393,6 +393,7 @@ def small_launches(monkeypatch):
     monkeypatch.setattr(launch, "MAX_LANES", 64 * 12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("split", [small_bands, small_launches])
 def test_jobs_of_several_passes(room_scene, monkeypatch, split):
     renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=512, grad_seed="same")

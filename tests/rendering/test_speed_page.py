@@ -26,6 +26,7 @@ def names():
     return found
 
 
+@pytest.mark.slow
 def test_calls_are_traced_recorded_and_launched(names):
     assert names["history"] == [(said, said) for said in [*NEW, recordings.LAUNCHED]]
     assert names["difference"].item() < 1e-5 * names["out"].transient.max().item()

@@ -125,6 +125,7 @@ def test_a_thread_that_falls_asleep_while_it_is_told_to_end_is_woken(monkeypatch
         assert not [t for t in threading.enumerate() if "wakes" in t.name]
 
 
+@pytest.mark.slow
 def test_threads_are_woken_by_a_task():
     """Of the pool itself: tasks that do nothing, submitted all the time, leave it as it is."""
     assert drjit_pool._nanothread() is not None

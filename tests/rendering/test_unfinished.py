@@ -133,6 +133,7 @@ def interrupt_at_the_end(place):
     return cut_off
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", long(["render", "parameters", "wrapped", "backward"], ["backward"]))
 def test_kept_tracebacks_keep_nothing_else(name):
     """As sys.last_traceback and notebooks do: an interrupt at the beginning of a block's __exit__ leaves it unended."""

@@ -112,6 +112,7 @@ def test_gradients_of_an_empty_grid_reach_every_cell():
     assert np.isfinite(derivative).all() and (derivative != 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("albedo", long([0.0, 1e-8], [0.0]))
 def test_black_medium(albedo):
     """Black scattering is silent and its derivative is not: once-scattered light per unit of albedo."""

@@ -121,6 +121,7 @@ def test_roughness_below_the_clamp_is_said():
         logger.set_error_level(level)
 
 
+@pytest.mark.slow
 def test_index_passing_through_one():
     """Guards against 0 / 0 when an optimiser moves an index through exactly one, where the refracted lobe is a
     delta function."""

@@ -88,6 +88,7 @@ def test_edges_of_time():
         assert total == pytest.approx(whole.sum(), rel=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", long(["shared", "paths"], ["shared"]))
 def test_the_first_arrival_moves(how):
     """The edge of the first arrival moves with a plate's depth: through a tent its derivative is that of finite

@@ -40,6 +40,7 @@ def test_variance_is_bounded(name):
     assert max(widths[1e-3], widths[1e-4]) < 2.0 * widths[1e-2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", long(SCENES, ["plates"]))
 def test_a_tenth_of_the_variance_at_a_millimetre(name, monkeypatch):
     damped = damped_gradients(name, 1e-3).var(ddof=1)

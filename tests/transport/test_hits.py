@@ -283,6 +283,7 @@ def test_slopes_backwards_are_finite(kind):
     assert np.isfinite(slope).all() and slope.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", long(KEYS, ["bsplinecurve"]))
 def test_what_is_none_of_theirs_moves_as_it_did(kind):
     """The lanes of other shapes, of nothing and of what is not asked for: no infinity reaches their rays and points."""

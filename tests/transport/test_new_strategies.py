@@ -127,7 +127,6 @@ TOYS = ("transient_guided", "transient_three_emitter_samples")
 
 
 QUICK = [
-    ("transient_guided", ("histogram", "something before the panel")),
     ("transient_three_emitter_samples", ("phasors", "area light")),
 ]
 

@@ -48,6 +48,7 @@ def traced(scene, sink_of):
         return sink, kept
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", long(["plain", "fog", "glass"], ["fog"]))
 def test_adjoint_sum_is_the_product_with_the_render(kind):
     scene = scene_of(kind)

@@ -417,6 +417,7 @@ def test_what_is_wrong_is_said_before_anything_is_rendered(wrong, monkeypatch):
         make().check()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "key, words", [("red.reflectance", "'red.reflectance.value' varies as a value"), ("ball.radius", "as many as it")]
 )

@@ -122,6 +122,7 @@ def changes(recipe_of, file):
     return before != after
 
 
+@pytest.mark.slow
 def test_keys_follow_files_wherever_they_are_named(tmp_path, monkeypatch):
     folder = tmp_path / "a"
     write(folder)

@@ -239,6 +239,7 @@ def test_what_a_summary_says_of_phasors(tmp_path):
     assert drawn_sheet(tmp_path, tmp_path / "sheet.png", 1, 0) == [0]
 
 
+@pytest.mark.slow
 def test_each_capture_has_its_own_scan(tmp_path):
     scans = [
         tt.nlos.Scan.grid(tt.nlos.Wall.plane(width=width, height=width), (3, 2), kind="confocal")

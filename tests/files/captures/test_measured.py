@@ -52,6 +52,7 @@ def test_sizes_of_a_wall(size, error):
         read_capture(SCAN, wall_size=size)
 
 
+@pytest.mark.slow
 def test_a_track_seen_through_a_keyhole():
     """The direct light says when the wall is lit; the letter is 0.6 to 0.8 m away, so that its light comes later."""
     direct = read_capture(DIRECT)

@@ -50,6 +50,7 @@ def test_several_sets_are_each_a_net_of_its_own():
     assert not np.array_equal(y[:64], y[64:128])
 
 
+@pytest.mark.slow
 def test_seeds_that_follow_each_other_are_independent():
     """Kolmogorov's test of both coordinates of one point, over consecutive seeds: 1 % of all exceed 1.63."""
     count = 2048

@@ -25,6 +25,7 @@ def textured_shapes():
     return [mi.load_dict({"type": kind, **turned}) for kind in ("disk", "sphere", "cube")]
 
 
+@pytest.mark.slow
 def test_samples_are_mitsubas_surface_points():
     """Texture and normals are those that a ray finds there."""
     for shape in textured_shapes():

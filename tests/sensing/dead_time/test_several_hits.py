@@ -229,6 +229,7 @@ def test_score_of_draws_gives_the_gradient_of_the_mean():
     assert abs(float(found.mean() - one.grad)) < 4.5 * float(found.std()) / draws**0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "total, dead", [(1.0, 1.3), slow(2.0, 40.0), slow(30.0, 7.9), slow(30.0, 1.0), slow(100.0, 1.3), slow(100.0, 2.2)]
 )
