@@ -23,8 +23,8 @@ TOLERANCE = 2e-5
 
 
 def keeps_coefficients(node: Any, key: str) -> bool:
-    """Whether the numbers ``key`` of a texture, volume or mesh are coefficients of a smooth spectrum (Jakob and Hanika
-    2019) instead of a colour: those of colours, in spectral variants.
+    """Return whether the numbers ``key`` of a texture, volume or mesh are coefficients of a smooth spectrum (Jakob and
+    Hanika 2019) instead of a colour: those of colours, in spectral variants.
     """
     if not mi.is_spectral:
         return False
