@@ -42,7 +42,7 @@ class Shards:
 
     def __init__(self, recipe: Any, folder: str, count: int) -> None:
         self.recipe, self.folder, self.count = recipe, Path(folder), count
-        self.maker = ShardMaker(Settings(recipe, folder, 10**6, "exact", "blosc2", None, 0))
+        self.maker = ShardMaker(Settings(recipe, folder, 10**6, "exact", "blosc2", 0))
         measured = self.maker.measure(range(1), NoOne())
         self.megabytes = measured.sample_bytes / MB
         self.described = {"per_shard": count, "about": measured.about, "recipe": recipe.to_dict()}
