@@ -63,7 +63,7 @@ def test_every_block_runs(folder):
     for written in ("k.h5", "layout.png", "fit.pt"):
         assert (folder / written).stat().st_size > 500
     assert names["capture"].transient.shape[2:] == (4, 4) and float(names["capture"].total().sum()) > 0
-    assert names["pairs"].shape == (2, 2, 4, 4) and names["some"].shape == (2,)
+    assert names["every"].shape == (2, 2, 4, 4) and names["some"].shape == names["pairs"].shape == (2,)
     assert not torch.equal(names["leaf"], names["scan"].sensor_points)
     assert set(torch.load("fit.pt", weights_only=False)) == {"renderer", "points"}
     renderer = tt.nlos.CaptureRenderer(names["hidden"], names["scan"], ["letter.to_world"])

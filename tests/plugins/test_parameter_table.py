@@ -111,7 +111,6 @@ def test_every_plugin_of_mitsuba_is_gone_through(folder):
     assert installed - set(every_plugin(folder)) - set(LEFT_OUT) - without_parameters - others == set()
 
 
-@pytest.mark.slow
 def test_what_every_plugin_moves(folder):
     met = set()
     for name, description in every_plugin(folder).items():
