@@ -13,7 +13,6 @@ import signal
 import sys
 import threading
 import time
-import types
 
 import drjit as dr
 import mitsuba as mi
@@ -22,6 +21,7 @@ import torch
 from _pytest.faulthandler import fault_handler_stderr_fd_key
 
 from torchtransient import plugins
+from torchtransient.rendering.variant import syntax_kept
 
 # A shell lets what it starts in the background ignore interrupts: tests send some to themselves and to their children.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN and threading.current_thread() is threading.main_thread():
@@ -30,25 +30,10 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN and threading.current_threa
 # Tensors of tests are small: a second thread is no faster, and where the cores are busy all wait for it (five-fold).
 torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
 
-_syntax, _transformed = dr.syntax, {}
-
-
-def _syntax_once(f=None, **options):
-    """``dr.syntax``, which reads and rewrites the source of a function, once for each function: at every change of the
-    variant Mitsuba's integrators and the plugins are executed anew, and two thirds of the time went there.
-    """
-    if f is None:
-        return lambda g: _syntax_once(g, **options)
-    # Equal code objects have the same names, numbers and lines.
-    key = (f.__code__, f.__code__.co_filename, *sorted(options.items()))
-    if key not in _transformed:
-        _transformed[key] = _syntax(f, **options).__code__
-    found = types.FunctionType(_transformed[key], f.__globals__)
-    found.__defaults__ = f.__defaults__
-    return found
-
-
-dr.syntax = _syntax_once
+# Mitsuba's integrators and the plugins are executed anew at every change of the variant, by whatever test: two thirds
+# of the time went into rewriting their source.
+_kept = syntax_kept()  # until the process ends
+_kept.__enter__()
 
 # Processes that run tests side by side share the cores: threads that wait for work do so by spinning, which is a third
 # of what renders of small films cost. One thread alone waits for ever for Mitsuba's OpenEXR files (3.9, written or

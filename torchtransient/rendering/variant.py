@@ -171,7 +171,7 @@ def _put_back(before: str | None) -> None:
     import mitsuba as mi
 
     if before is not None and mi.variant() != before:
-        with interrupts_wait(), _syntax_kept():
+        with interrupts_wait(), syntax_kept():
             mi.set_variant(before)
 
 
@@ -180,7 +180,7 @@ _transformed: dict[Any, types.CodeType] = {}
 
 
 @contextmanager
-def _syntax_kept() -> Iterator[None]:
+def syntax_kept() -> Iterator[None]:
     """Let ``dr.syntax`` transform each function once. It reads and rewrites source, and Mitsuba executes its own
     integrators anew at every change of the variant: nine tenths of the time of a change.
     """
@@ -214,8 +214,9 @@ def _count_switch(before: str | None, variant: str) -> None:
     if _switches["count"] == MANY_SWITCHES:
         warnings.warn(
             f"a scene for {variant} is rendered again and again while {before} is active: every call switches to and "
-            f"fro, which costs some 6 ms each way. Call mitsuba.set_variant({variant!r}) once before the loop.",
-            UserWarning,
+            f"fro, which costs some 6 ms each way. Where all renders of a loop are of one variant, call "
+            f"mitsuba.set_variant({variant!r}) before it.",
+            TorchTransientWarning,
             stacklevel=level_of_user(),
         )
 
@@ -226,7 +227,7 @@ def _set_variant(variant: str) -> None:
     if variant.startswith("llvm"):
         ensure_llvm()
     try:
-        with interrupts_wait(), _syntax_kept():
+        with interrupts_wait(), syntax_kept():
             mi.set_variant(variant)
     except (ImportError, RuntimeError) as error:
         raise VariantError(
