@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.integrators.base import TransientIntegrator
+from torchtransient.plugins.transport.boundary.passes import BoundaryTerm
 from torchtransient.plugins.transport.connection.emitter_found import EmitterFound
 from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
 from torchtransient.plugins.transport.scattering.lambertian import Lambertian
@@ -26,6 +27,16 @@ class TransientPath(TransientIntegrator):
 
     Not supported: participating media (``SceneError``).
     """
+
+    # Which passes of the boundary term derivatives have, of edge samples so many for each path, of a pilot, and how
+    # many candidates an edge is chosen from.
+    boundary, boundary_share, boundary_pilot, boundary_candidates = ("primary", "vertex", "light"), 1.0, 0, 4
+
+    def beside(self, world, sensor, film, seed, samples):
+        if not (self.boundary and world.wanted.silhouettes):
+            return []
+        how = self.boundary, self.boundary_share, self.boundary_pilot, self.boundary_candidates
+        return [BoundaryTerm(self, world, sensor, film, seed, samples, *how)]
 
     def strategies(self, contents):
         scattering = Lambertian(draws_lobe=True) if Lambertian.fits(contents) else Surface()

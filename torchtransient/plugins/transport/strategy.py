@@ -164,6 +164,18 @@ class Segment(Strategy):
         """The leg of a primary ray whose PreliminaryIntersection3f is known."""
         return pi
 
+    def ends_at(self, pi: Any, medium: Any) -> Any:
+        """The leg that ends at the surface ``pi``, in the ``medium`` that :meth:`medium_towards` says."""
+        raise NotImplementedError
+
+    def medium_towards(self, d: Any, vertex: Any = None) -> Any:
+        """The medium of a ray that leaves ``vertex`` (None: the sensor) in direction ``d``, None in vacuum."""
+        raise NotImplementedError
+
+    def share_of_surface(self, leg: Any) -> Any:
+        """How much of the motion of the surface behind it the end of ``leg`` follows."""
+        raise NotImplementedError
+
     def transmittance(self, world: Any, vertex: Vertex, ds: Any, u: Any, sampler: Any, active: Any) -> tuple[Any, Any]:
         """(whether the point ``ds`` (``p, d, dist``) can be seen, factor per colour). ``u``: two uniform
         numbers that were drawn for this vertex and serve as the start of a generator.

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.polarized import product
+from torchtransient.plugins.transport.sinks.sink import Sink
 from torchtransient.plugins.transport.strategy import Local
 
 
@@ -121,7 +122,6 @@ def roulette(world, path, vertex, step, sampler, goes_on, zeros):
     return β * rr, goes_on & (~plays | survives), rr
 
 
-@dr.syntax
 def walk(world, sampler, ray, first_opl, sink, η=1, leg=None):
     """Trace the paths of one pass into ``sink``; returns (number of vertices, what the sink kept). ``η``: index of
     refraction where they start; ``leg``: PreliminaryIntersection3f at the end of their first segment, None where that
@@ -129,6 +129,26 @@ def walk(world, sampler, ray, first_opl, sink, η=1, leg=None):
     """
     path = start(world, ray, first_opl, η)
     path.leg = world.segment.first(world, ray, sampler) if leg is None else world.segment.known(leg, ray)
+    return go_on(world, sampler, path, sink)
+
+
+@dr.syntax
+def advance(world, sampler, path, target):
+    """Let paths go on to their vertex number ``target`` (UInt32), which they are then on the way to, and look for no
+    light before. Those that end before are not active.
+    """
+    kept, sink = {}, Sink()
+    going = path.active & (path.depth < target)
+    while dr.hint(going, max_iterations=world.max_depth, label="to a vertex"):
+        bounce(world, path, kept, sampler, sink, dark=True)
+        going = path.active & (path.depth < target)
+    path.active &= path.depth == target
+    return path
+
+
+@dr.syntax
+def go_on(world, sampler, path, sink):
+    """Trace paths on from wherever they are; returns as :func:`walk`."""
     kept = sink.begin(world)
     # Of the last vertex nothing is asked but its connections where no light is found: it needs no turn of the loop.
     turns = world.max_depth if world.finds_light or sink.keeps_vertices else max(world.max_depth - 2, 0)

@@ -33,6 +33,7 @@ class Wanted:
         carriers = {shape.ptr for shape in shapes_of_sensors(sensor) if shape is not None}
         self.nodes = frozenset(node.ptr for node, _, _ in effects)
         self.geometry = any(effect.moves_length for _, _, effect in effects)
+        self.silhouettes = any(effect.moves_silhouette for _, _, effect in effects)
         self.shapes = frozenset(shape.ptr for shape in moved("shape"))
         self.light, self.index = bool(moved("emitter")), bool(moved("index"))
         self.sky = next(iter(moved("sun")), None)

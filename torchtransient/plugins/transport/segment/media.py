@@ -100,6 +100,19 @@ class Media(Vacuum):
     def surface_of(self, leg):
         return leg["pi"], ~leg["scatter"]
 
+    def ends_at(self, pi, medium):
+        return {"pi": pi, "scatter": mi.Bool(False), "t": mi.Float(pi.t), "medium": medium,
+                "weight": mi.UnpolarizedSpectrum(1)} | ({"begin": medium} if self.settings.recorded else {})  # fmt: skip
+
+    def medium_towards(self, d, vertex=None):
+        if vertex is not None:
+            return medium_behind(vertex.si, d, vertex.medium, vertex.surface)
+        lanes = dr.zeros(mi.MediumPtr, dr.width(d))
+        return lanes if self.settings.at_sensor is None else mi.MediumPtr(self.settings.at_sensor)
+
+    def share_of_surface(self, leg):
+        return dr.select(leg["scatter"], leg["t"] / leg["pi"].t, 1)
+
     def transmittance(self, world, vertex, ds, u, sampler, active):
         ray = vertex.at.spawn_ray_to(ds.p)
         medium = medium_behind(vertex.si, ds.d, vertex.medium, vertex.surface)

@@ -82,6 +82,15 @@ class Vacuum(Segment):
     def surface_of(self, leg):
         return leg, mi.Bool(True)
 
+    def ends_at(self, pi, medium):
+        return pi
+
+    def medium_towards(self, d, vertex=None):
+        return None
+
+    def share_of_surface(self, leg):
+        return mi.Float(1)
+
     def found(self, leg, ray, flags, active=True):
         return leg.compute_surface_interaction(ray, flags, active)
 

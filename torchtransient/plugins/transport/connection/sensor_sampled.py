@@ -1,0 +1,57 @@
+"""The sensor as what a path is connected to: light tracing with the strategies of the walk.
+
+A path that starts at a light and scatters as paths of sensors do (values of BSDFs are symmetric; squares of indices
+cancel over a path that begins and ends in one medium) finds the pixel that sees its vertex.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins.polarized import (
+    intensity,
+    product,
+    rotate_stokes,
+    rotation_between,
+    stokes_frame_of,
+)
+from torchtransient.plugins.transport.strategy import Connection, Event, Proposal
+
+
+class SensorSampled(Connection):
+    """``aperture``: numbers that choose its point (Point2f). Events carry ``uv``, in pixels."""
+
+    name = "sensor_sampled"
+    finds_light = False
+
+    def __init__(self, sensor, aperture):
+        self.sensor, self.aperture = sensor, aperture
+
+    def propose(self, world, path, vertex, sampler):
+        active = world.deep_enough(vertex.goes_on & vertex.connectable, path.depth + 2)
+        ds, importance = self.sensor.sample_direction(vertex.at, self.aperture, active)
+        ds.dist = dr.norm(ds.p - vertex.at.p)
+        ds.d = (ds.p - vertex.at.p) / ds.dist
+        return Proposal(d=ds.d, active=active & (ds.pdf > 0), ds=ds, importance=importance, u=sampler.next_2d(),
+                        sampler=sampler)  # fmt: skip
+
+    def connect(self, world, path, vertex, proposal, answer, zeros):
+        ds = proposal.ds
+        value = first_row(product(vertex.β, answer.matrix))
+        if mi.is_polarized:  # into the frame that the sensor's own ray has
+            d = mi.Vector3f(ds.d)
+            value = rotate_stokes(value, rotation_between(d, stokes_frame_of(d), stokes_frame_of(-d)))
+        value = value * mi.unpolarized_spectrum(proposal.importance)
+        active = proposal.active & (dr.max(dr.abs(intensity(value))) > 0)
+        length = mi.Float(0) if world.camera_unwarp else ds.dist * vertex.η * answer.eta
+        opl = vertex.scattered_τ + mi.Float64(length)
+        active, T = world.segment.transmittance(world, vertex, ds, proposal.u, proposal.sampler, world.counted(active, opl))
+        return Event(value=value * T, opl=opl, active=active, depth=path.depth + 2, uv=ds.uv, d=ds.d)
+
+
+def first_row(matrix):
+    """What unpolarized light becomes that runs through a chain of matrices the other way round: U changes its sign."""
+    if not mi.is_polarized:
+        return matrix
+    return mi.SpectrumEntry(*[matrix[0, i] * (-1 if i == 2 else 1) for i in range(4)])
