@@ -233,6 +233,13 @@ def misplaces_hits(shape: Any) -> bool:
     return bool(shape.class_name() == "BSplineCurve")
 
 
+def has_no_material(shape: Any) -> bool:
+    """Whether no point of a shape can be followed: Mitsuba's interactions say where the surface goes, and not where its
+    points and areas do.
+    """
+    return bool(shape.class_name() in ("Ellipsoids", "EllipsoidsMesh", "LinearCurve", "BSplineCurve", "SDFGrid"))
+
+
 def has_vertices(shape: Any) -> bool:
     """Whether a shape is a mesh whose vertices move with its parameters. Mitsuba's rectangles are meshes too."""
     return isinstance(shape, mi.Mesh) and shape.class_name() not in _FLAT
@@ -332,6 +339,11 @@ def is_batch(sensor: Any) -> bool:
     process in forward mode, so they are asked one by one.
     """
     return bool(sensor.class_name() == "BatchSensor")
+
+
+def is_irradiance_meter(sensor: Any) -> bool:
+    """Whether a sensor collects light from all directions over a shape, without a pixel for each."""
+    return bool(sensor.class_name() == "IrradianceMeter")
 
 
 def starts_off_itself(sensor: Any) -> bool:

@@ -20,7 +20,14 @@ from torchtransient.plugins.integrators.seen_scene import SeenScene
 from torchtransient.plugins.parameter_effect import class_of
 from torchtransient.plugins.parameters import SILHOUETTES, ParameterTracker, check_slope, check_stand_ins, moving_names
 from torchtransient.plugins.properties import number, truth, whole_number
-from torchtransient.plugins.sensors.origin import PrimaryRays, index_at_sensor, sample_rays, start_at_sensor, views
+from torchtransient.plugins.sensors.origin import (
+    PrimaryRays,
+    index_at_sensor,
+    meter_normal,
+    sample_rays,
+    start_at_sensor,
+    views,
+)
 from torchtransient.plugins.sensors.stokes_frame import sensor_rotation
 from torchtransient.plugins.transport.contents import SceneContents
 from torchtransient.plugins.transport.derivative.forward import propagate_tangents
@@ -191,7 +198,9 @@ class TransientIntegrator(mi.CppADIntegrator):
         scale = dr.opaque(mi.Float, 1 / job.total)
         if weight is not None:
             scale *= weight
-        return PrimaryRays(sampler, ray, ray_weight, scale, row, column, seen, η, laser, (stratum, spp), clip)
+        rays = PrimaryRays(sampler, ray, ray_weight, scale, row, column, seen, η, laser, (stratum, spp), clip)
+        rays.meter_normal = meter_normal(sensor, rays.ray, position)
+        return rays
 
     def offset_in_pixel(self, film, sensor, sampler):
         """(offset of a sample from its pixel's centre, weight or None for one)."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.integrators.base import TransientIntegrator
-from torchtransient.plugins.transport.boundary.passes import BoundaryTerm
+from torchtransient.plugins.transport.boundary.term import BoundaryTerm
 from torchtransient.plugins.transport.connection.emitter_found import EmitterFound
 from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
 from torchtransient.plugins.transport.scattering.lambertian import Lambertian
@@ -28,15 +28,13 @@ class TransientPath(TransientIntegrator):
     Not supported: participating media (``SceneError``).
     """
 
-    # Which passes of the boundary term derivatives have, of edge samples so many for each path, of a pilot, and how
-    # many candidates an edge is chosen from.
-    boundary, boundary_share, boundary_pilot, boundary_candidates = ("primary", "vertex", "light"), 1.0, 0, 4
+    boundary, boundary_share = ("primary", "vertex", "light"), 0.5
 
     def beside(self, world, sensor, film, seed, samples):
         if not (self.boundary and world.wanted.silhouettes):
             return []
-        how = self.boundary, self.boundary_share, self.boundary_pilot, self.boundary_candidates
-        return [BoundaryTerm(self, world, sensor, film, seed, samples, *how)]
+        count = max(1, round(samples * self.boundary_share))
+        return [BoundaryTerm(self, world, sensor, film, seed, count, self.boundary)]
 
     def strategies(self, contents):
         scattering = Lambertian(draws_lobe=True) if Lambertian.fits(contents) else Surface()

@@ -125,6 +125,18 @@ class SphereLightTable:
         """The arrays that are attached where parameters are."""
         return [] if self._values is None else [self._values]
 
+    def kept_in_cone(self, emitter: Any, x: Any, y: Any, ref: Any, active: Any) -> Any:
+        """The DirectionSample3f seen from ``ref``, attached, that keeps the place which the point ``y`` of a sphere has
+        in the cone seen from ``x``.
+        """
+        with dr.suspend_grad():
+            sphere = _Sphere(self, emitter, x, active)
+            center, d = dr.normalize(sphere.to_center), dr.normalize(y - x)
+            local = mi.Frame3f(center).to_local(d)
+            φ = dr.atan2(local.y, local.x) / dr.two_pi
+            u = mi.Point2f(dr.clip((1 - dr.dot(center, d)) / sphere.versine_max, 0, 1), φ - dr.floor(φ))
+        return _Sphere(self, emitter, ref.p, active).sampled(u, ref)
+
     def lists(self, emitter: Any, active: Any = True) -> Any:
         """Which of an array of emitter pointers are spherical lights."""
         return self._marks.look_up(emitter, active) > 0

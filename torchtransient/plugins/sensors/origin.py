@@ -7,7 +7,13 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.mitsuba_compat import is_batch, is_distant, near_clip, starts_off_itself
+from torchtransient.plugins.mitsuba_compat import (
+    is_batch,
+    is_distant,
+    is_irradiance_meter,
+    near_clip,
+    starts_off_itself,
+)
 from torchtransient.plugins.node_walk import objects_of
 
 
@@ -46,13 +52,14 @@ class PrimaryRays:
     and the index of refraction ``η`` where the rays start (attached to the glass that they start in); ``laser``:
     number of the laser position in an exhaustive scan, else None; ``strata``: (number of the sample in its pixel, how
     many there are); ``leg``: how the first segment ends where that is known; ``clip``: distance from ``ray.o`` at
-    which the first surface can be, None for 0. A plain object, which Dr.Jit loops leave alone.
+    which the first surface can be, None for 0; ``meter_normal``: that of an irradiance meter at rest where each ray
+    starts, None for other sensors. A plain object, which Dr.Jit loops leave alone.
     """
 
     def __init__(self, sampler, ray, weight, scale, row, column, seen, η, laser=None, strata=None, clip=None):
         self.sampler, self.ray, self.weight, self.scale = sampler, ray, weight, scale
         self.row, self.column, self.seen, self.η, self.laser, self.leg = row, column, seen, η, laser, None
-        self.strata, self.clip = strata, clip
+        self.strata, self.clip, self.meter_normal = strata, clip, None
 
     def length(self):
         """Optical length from the sensor's origin to where the rays start, attached."""
@@ -108,6 +115,16 @@ def sample_rays(sensor: Any, seen: list[View], time: Any, wavelength: Any, posit
         rays = ray if rays is None else dr.select(view.active, ray, rays)
         weights = weight if weights is None else dr.select(view.active, weight, weights)
     return rays, weights
+
+
+def meter_normal(sensor: Any, ray: Any, position: Any) -> Any:
+    """Normal of an irradiance meter at the origins of its rays, drawn with ``position``; None for other sensors and for
+    one that is attached, whose rays carry its motion.
+    """
+    with dr.resume_grad():
+        if not is_irradiance_meter(sensor) or dr.grad_enabled(ray.o, ray.d):
+            return None
+    return mi.Normal3f(sensor.get_shape().sample_position(ray.time, position).n)
 
 
 def length_to_sensor_origin(seen: list[View], ray: Any) -> Any:

@@ -12,7 +12,13 @@ from torchtransient.plugins.bsdfs.delay_table import delays_of
 from torchtransient.plugins.bsdfs.inherited import hides_lobe_probability, mirrors_matrices
 from torchtransient.plugins.bsdfs.refraction_table import RefractiveBSDFs
 from torchtransient.plugins.films.colour import StandardObserver
-from torchtransient.plugins.mitsuba_compat import has_smooth_shape, has_vertices, is_flat, lacks_directions
+from torchtransient.plugins.mitsuba_compat import (
+    has_no_material,
+    has_smooth_shape,
+    has_vertices,
+    is_flat,
+    lacks_directions,
+)
 from torchtransient.plugins.mixtures import mixtures_of
 from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene, shapes_of_scene
 from torchtransient.plugins.pointer_table import PointerTable
@@ -26,10 +32,10 @@ from torchtransient.plugins.transport.instances import Instances
 from torchtransient.plugins.transport.media_contents import media_of
 from torchtransient.plugins.transport.patterns import emits_by_place, scatters_by_place
 
-# Derivatives let points slide along with the vertex that sees them where they are nearer than this share of the scene's
-# radius and of the path's first segment. Creases and edges so near are not followed: it is as small as the variance in
-# gaps of a millimetre allows.
-DAMPING = 0.005
+# Derivatives drag points along with the vertex that sees them where they are nearer than this share of the scene's
+# radius and of the path's first segment: in corners and gaps the motion of a direction has no bounded variance. The
+# boundary term counts what edges so near do.
+DAMPING = 0.05
 
 
 class SceneContents:
@@ -45,7 +51,7 @@ class SceneContents:
     participating media (:class:`.media_contents.MediaContents`). ``sphere_lights``: the spherical area lights
     (:class:`~..sampling.sphere_lights.SphereLights`). ``shape_lights``: the area lights that are sampled over their
     shapes (:class:`~..sampling.shape_lights.ShapeLights`). ``emitting_meshes``: those with vertices of their own;
-    ``meshes``: all of those; ``smooth_lights``: lights on meshes with normals at their vertices. Tables, instances,
+    ``meshes``: all of those, of shape groups, too; ``sliding``: the shapes without material points; ``smooth_lights``: lights on meshes with normals at their vertices. Tables, instances,
     surroundings, mixtures, media and lights are None where the scene has no such thing.
 
     ``damping_radius`` (Float): see :func:`.scattering.geometry_terms.damped_motion`. ``patterned_lights``: what leaves
@@ -75,7 +81,8 @@ class SceneContents:
         self.shape_lights = ShapeLights(scene) if self.sphere_lights is None else self.sphere_lights.others
         self.smooth_lights = PointerTable.marking([e for e in scene.emitters() if has_smooth_shape(e)])
         self.emitting_meshes = PointerTable.marking([s for s in scene.shapes() if s.is_emitter() and has_vertices(s)])
-        self.meshes = PointerTable.marking([s for s in scene.shapes() if has_vertices(s)])
+        self.meshes = PointerTable.marking([s for s in shapes_of_scene(scene) if has_vertices(s)])
+        self.sliding = PointerTable.marking([s for s in scene.shapes() if has_no_material(s)])
         self.damping_radius = dr.opaque(mi.Float, DAMPING * reference.radius)
         self.patterned_lights = any(emits_by_place(e) for e in scene.emitters())
         self.patterned = self.patterned_lights or not all(is_flat(shape) for shape in scene.shapes())

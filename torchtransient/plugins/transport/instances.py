@@ -84,6 +84,10 @@ class InstanceTable:
         row = 2 * dr.reinterpret_array(mi.UInt32, instance)
         return dr.gather(mi.Matrix4f, self.table, row), dr.gather(mi.Matrix4f, self.table, row + 1)
 
+    def to_world(self, instance: Any, v: Any) -> Any:
+        """A vector of the space of an ``instance`` (pointer) in the world, attached to both."""
+        return _vector(self._matrices(instance)[0], v)
+
     def interaction(self, pi: Any, ray: Any, flags: int, active: Any, hits: HitTable | None) -> Any:
         """As :func:`surface_interaction`."""
         with dr.suspend_grad():
@@ -130,6 +134,10 @@ class AttachedSurfaces:
         if contents.instances is None and contents.detached_hits is None:
             return None
         return AttachedSurfaces(*(part and part.read() for part in (contents.instances, contents.detached_hits)))
+
+    def to_world(self, instance: Any, v: Any) -> Any:
+        """A vector of the space of an ``instance`` in the world, attached to both."""
+        return v if self._instances is None else self._instances.to_world(instance, v)
 
     def tables(self) -> list[Any]:
         """What has been computed of parameters: attached where they are."""

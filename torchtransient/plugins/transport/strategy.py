@@ -164,6 +164,14 @@ class Segment(Strategy):
         """The leg of a primary ray whose PreliminaryIntersection3f is known."""
         return pi
 
+    def length_of(self, leg: Any) -> tuple[Any, Any]:
+        """(length of ``leg`` from the origin of its ray, whether something is there)."""
+        raise NotImplementedError
+
+    def held(self, world: Any, pi: Any, ray: Any, active: Any) -> Any:
+        """Zero with how far derivatives move the surface point ``pi``, found by ``ray``, as a point of its shape."""
+        raise NotImplementedError
+
     def ends_at(self, pi: Any, medium: Any) -> Any:
         """The leg that ends at the surface ``pi``, in the ``medium`` that :meth:`medium_towards` says."""
         raise NotImplementedError

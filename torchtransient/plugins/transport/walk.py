@@ -135,15 +135,18 @@ def walk(world, sampler, ray, first_opl, sink, η=1, leg=None):
 @dr.syntax
 def advance(world, sampler, path, target):
     """Let paths go on to their vertex number ``target`` (UInt32), which they are then on the way to, and look for no
-    light before. Those that end before are not active.
+    light before. Those that end before are not active. Returns the path, and what its last vertex was found by: (the
+    surface's PreliminaryIntersection3f, the ray).
     """
     kept, sink = {}, Sink()
+    pi, ray = mi.PreliminaryIntersection3f(world.segment.surface_of(path.leg)[0]), mi.Ray3f(path.ray)
     going = path.active & (path.depth < target)
     while dr.hint(going, max_iterations=world.max_depth, label="to a vertex"):
+        pi, ray = mi.PreliminaryIntersection3f(world.segment.surface_of(path.leg)[0]), mi.Ray3f(path.ray)
         bounce(world, path, kept, sampler, sink, dark=True)
         going = path.active & (path.depth < target)
     path.active &= path.depth == target
-    return path
+    return path, (pi, ray)
 
 
 @dr.syntax

@@ -1,10 +1,8 @@
 """Emission of what a path runs into.
 
-The point of a found light belongs to the vertex that scattered towards it. Where the light's shape moves it is attached
-there (``_ahead``) as a material point, as it is for connections: both strategies must move their samples alike, or the
-weights between them would no longer sum to one under the motion. Where the sensor or a delta lobe led to it, no other
-strategy could have: the ray decides, and it is attached at the light's own vertex (``_here``). So is light without a
-shape, from infinitely far away, but for a sun that moves and is hardly ever drawn (``_sun_ahead``).
+Light that is found moves as every vertex does (``_here``), and as the points of connections do: both strategies must
+move their samples alike, or the weights between them would no longer sum to one under the motion. A sun that moves and
+is hardly ever drawn is attached at the vertex before (``_sun_ahead``).
 """
 
 from __future__ import annotations
@@ -18,13 +16,6 @@ import mitsuba as mi
 from torchtransient.plugins.polarized import first_column, product, scatter_unpolarized
 from torchtransient.plugins.sampling.sun import MovingSun
 from torchtransient.plugins.transport.carry import slope_only
-from torchtransient.plugins.transport.scattering.geometry_terms import (
-    damped_motion,
-    displacement,
-    distance,
-    material_point,
-    slide_on_shape,
-)
 from torchtransient.plugins.transport.strategy import Connection, Event, EventTerm, Local, mis_weight
 
 
@@ -39,7 +30,7 @@ class EmitterFound(Connection):
         self.sun = sun if sun is not None and sun.rare else None
 
     def events(self, wanted):
-        return 1 if wanted is None else 1 + wanted.emitter_shape + (self.sun is not None)
+        return 1 if wanted is None else 1 + (self.sun is not None)
 
     # ------------------------------------------------------------------------------------------------- primal
 
@@ -78,8 +69,6 @@ class EmitterFound(Connection):
 
     def attached(self, world, vertex, step, wanted):
         terms = [self._here(world, vertex, wanted)]
-        if wanted.emitter_shape:
-            terms.append(self._ahead(world, vertex, step, wanted))
         if self.sun is not None:
             terms.append(self._sun_ahead(world, vertex, step))
         return terms
@@ -90,9 +79,6 @@ class EmitterFound(Connection):
         hit = v.active & (mis > 0)
         emitter = vertex.sid.emitter(world.scene)
         elsewhere = self._claimed(world, emitter, v.ray.d, wanted)
-        if wanted.emitter_shape:  # the vertex before counts what has a shape, whether it claims it or not
-            shaped = vertex.sid.is_valid()
-            elsewhere = shaped if elsewhere is None else elsewhere | shaped
         if self.sun is not None:
             shines = self.sun.shines(emitter, v.ray.d)
             elsewhere = shines if elsewhere is None else elsewhere | shines
@@ -109,35 +95,6 @@ class EmitterFound(Connection):
         claims = [c.claims(world, emitter, d, wanted) for c in world.connections if c is not self]
         claims = [c for c in claims if c is not None]
         return reduce(or_, claims) if claims else None
-
-    def _ahead(self, world, vertex, step, wanted):
-        si, following = vertex.scattered_si, vertex.v.after()
-        mis = following.of(self.name)["mis"]
-        lit = step.ahead & (mis > 0)
-        with dr.suspend_grad():
-            hit = following.pi.compute_surface_interaction(following.ray, mi.RayFlags.Minimal, lit)
-            claimed = self._claimed(world, hit.emitter(world.scene), following.ray.d, wanted)
-            if claimed is not None:
-                lit &= ~claimed
-        light, area = material_point(following.pi, following.ray, lit, world.contents.emitting_meshes)
-        fixed, out, J = dr.detach(light), mi.Vector3f(following.ray.d), mi.Float(1)
-        if wanted.geometry:
-            δ, r = displacement(si.p, lit) - displacement(light.p, lit), dr.norm(fixed.p - following.ray.o)
-            motion = damped_motion(δ, out, r, fixed.n, lit, vertex.damping_radius)
-            out, J = motion.d, motion.J * motion.of_material(light.n, dr.relative_grad(area))
-            light.p = light.p + motion.slide(fixed.n)
-            if world.contents.patterned_lights:
-                slide = slide_on_shape(following.pi, following.ray, motion.drag, lit)
-                light.uv, light.sh_frame.n = light.uv + slide.uv, light.sh_frame.n + slide.sh_n
-        light.wi = dr.select(lit, light.to_local(-out), fixed.wi)
-        towards = world.scattering.evaluate(world, vertex, out, lit)
-        Le = mi.unpolarized_spectrum(fixed.emitter(world.scene).eval(light, lit))
-        value = scatter_unpolarized(towards.value, vertex.rotation) * (step.inv_pdf * J * mis) * Le
-        end = Local(p=light.p, d=following.ray.d, far=mi.Bool(False), ahead=True)
-        T = world.segment.weight(following) * world.segment.attached_transmittance(world, vertex, end, lit)
-        value = product(vertex.carry.β, dr.select(lit, value * T, 0))
-        slope = vertex.scattered_slope + slope_only(step.carry.η * distance(si.p, light.p, lit))
-        return EventTerm(value=value, slope=slope, opl=following.τ, active=lit, arrival=following.arrival(self.name))
 
     def _sun_ahead(self, world, vertex, step):
         """Light of the sun along a path that escapes into it: the direction that was drawn turns with it."""

@@ -20,13 +20,15 @@ from torchtransient.plugins.transport.strategy import Connection, Event, Proposa
 
 
 class SensorSampled(Connection):
-    """``aperture``: numbers that choose its point (Point2f). Events carry ``uv``, in pixels."""
+    """``aperture``: numbers that choose its point (Point2f), set before a launch. ``unwarp``: the segment to the sensor
+    does not count in time. Events carry ``uv``, in pixels.
+    """
 
     name = "sensor_sampled"
     finds_light = False
 
-    def __init__(self, sensor, aperture):
-        self.sensor, self.aperture = sensor, aperture
+    def __init__(self, sensor, unwarp):
+        self.sensor, self.unwarp, self.aperture = sensor, unwarp, None
 
     def propose(self, world, path, vertex, sampler):
         active = world.deep_enough(vertex.goes_on & vertex.connectable, path.depth + 2)
@@ -44,7 +46,7 @@ class SensorSampled(Connection):
             value = rotate_stokes(value, rotation_between(d, stokes_frame_of(d), stokes_frame_of(-d)))
         value = value * mi.unpolarized_spectrum(proposal.importance)
         active = proposal.active & (dr.max(dr.abs(intensity(value))) > 0)
-        length = mi.Float(0) if world.camera_unwarp else ds.dist * vertex.η * answer.eta
+        length = mi.Float(0) if self.unwarp else ds.dist * vertex.η * answer.eta
         opl = vertex.scattered_τ + mi.Float64(length)
         active, T = world.segment.transmittance(world, vertex, ds, proposal.u, proposal.sampler, world.counted(active, opl))
         return Event(value=value * T, opl=opl, active=active, depth=path.depth + 2, uv=ds.uv, d=ds.d)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins.transport.instances import surface_interaction
 from torchtransient.plugins.transport.strategy import Local
 
 
@@ -13,20 +14,24 @@ def distance(p, q, active):
     return dr.norm(dr.select(active, q - p, mi.Vector3f(0, 0, 1)))
 
 
-def material_point(pi, ray, active, meshes=None):
+def material_point(pi, ray, active, meshes=None, surfaces=None):
     """Interaction that follows its shape, and the area element there (up to a constant).
 
-    ``meshes`` (PointerTable or None): the emitting ones. Their derivatives by texture coordinates change with these, or
-    are made up where there are none; the area is that of the triangle.
+    ``meshes`` (PointerTable or None): those that may be met. Their derivatives by texture coordinates change with
+    these, or are made up where there are none; the area is that of the triangle. ``surfaces``: as in
+    :func:`~..instances.surface_interaction`.
     """
-    si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
+    si = surface_interaction(surfaces, pi, ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
     area = dr.cross(si.dp_du, si.dp_dv)
     if meshes is not None:
         with dr.suspend_grad():
             on_mesh = active & meshes.lists(si.shape)
         mesh = mi.MeshPtr(dr.select(on_mesh, si.shape, dr.zeros(mi.ShapePtr)))
         a, b, c = (mesh.vertex_position(i, on_mesh) for i in mesh.face_indices(pi.prim_index, on_mesh))
-        area = dr.select(on_mesh, dr.cross(b - a, c - a), area)
+        sides = b - a, c - a
+        if surfaces is not None:
+            sides = (surfaces.to_world(si.instance, side) for side in sides)
+        area = dr.select(on_mesh, dr.cross(*sides), area)
     return si, dr.norm(dr.select(active, area, mi.Vector3f(0, 0, 1)))
 
 

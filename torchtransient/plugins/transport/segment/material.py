@@ -16,7 +16,7 @@ import mitsuba as mi
 
 from torchtransient.plugins.around_corner.geometry import sees
 from torchtransient.plugins.transport.carry import slope_only
-from torchtransient.plugins.transport.scattering.geometry_terms import distance, material_point
+from torchtransient.plugins.transport.scattering.geometry_terms import distance
 from torchtransient.plugins.transport.segment.triangles import AttachedTriangles
 from torchtransient.plugins.transport.segment.vacuum import Vacuum
 from torchtransient.plugins.transport.strategy import Local
@@ -28,14 +28,12 @@ class MaterialVacuum(Vacuum):
     """
 
     def prepare(self, world):
+        super().prepare(world)
         moving = frozenset() if world.wanted is None or not world.wanted.geometry else world.wanted.shapes
         self.triangles = AttachedTriangles(world.scene.shapes(), moving)
         # A point and its normal are all that Lambertian surfaces ask for: whoever has gathered a triangle's vertices to
         # go there hands them on, and each is back-propagated to once.
         self.carried = ("p", "n") if moving and self.triangles.holds_all and world.scattering.turns_freely else ()
-
-    def tables(self):
-        return [table for table in self.triangles.tables() if dr.grad_enabled(table)]
 
     def attached(self, world, v, carry, wanted):
         vertex = super().attached(world, v, carry, wanted)
@@ -63,20 +61,6 @@ class MaterialVacuum(Vacuum):
         si.sh_frame.n = dr.replace_grad(si.sh_frame.n, dr.mulsign(carry.n, dr.dot(si.sh_frame.n, si.n)))
         return si
 
-    def _place(self, world, pi, ray, n, active):
-        """(point, normal, area element) of hit points that follow their shapes, whose normals are ``n``."""
-        with dr.suspend_grad():
-            listed = active & self.triangles.lists(pi.shape)
-        point = self.triangles.point(pi, listed)
-        twice = dr.norm(point.across)
-        if self.triangles.holds_all:
-            with dr.suspend_grad():
-                si, area = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active & ~listed), 1
-        else:
-            si, area = material_point(pi, ray, active & ~listed, world.contents.meshes)
-        across = dr.mulsign(point.across / twice, dr.dot(point.across, n))
-        return dr.select(listed, point.p, si.p), dr.select(listed, across, si.n), dr.select(listed, twice, area)
-
     @staticmethod
     def _free(world, v):
         return v.active & ~v.before(world.scattering.name, "delta", at_sensor=True)
@@ -84,7 +68,7 @@ class MaterialVacuum(Vacuum):
     def motion(self, world, vertex, following, ahead):
         v, si = vertex.v, vertex.scattered_si
         after = v.after()
-        p, n, area = self._place(world, after.pi, after.ray, following.n, ahead)
+        p, n, area = self.material(world, after.pi, after.ray, following.n, ahead)
         to = dr.select(ahead, p - si.p, mi.Vector3f(following.d))
         r2 = dr.squared_norm(to)
         d = to * dr.rsqrt(r2)

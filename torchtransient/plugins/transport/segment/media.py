@@ -52,9 +52,11 @@ class Media(Vacuum):
     clip = None
 
     def prepare(self, world):
+        super().prepare(world)
         self.settings = FlightSettings(world.contents.media, world.wanted, world.hide_emitters, world.surfaces)
 
     def start(self, world, rays):
+        super().start(world, rays)
         self.clip = rays.clip
 
     # ------------------------------------------------------------------------------------------------- primal
@@ -99,6 +101,9 @@ class Media(Vacuum):
 
     def surface_of(self, leg):
         return leg["pi"], ~leg["scatter"]
+
+    def length_of(self, leg):
+        return dr.select(leg["scatter"], leg["t"], leg["pi"].t), leg["scatter"] | leg["pi"].is_valid()
 
     def ends_at(self, pi, medium):
         return {"pi": pi, "scatter": mi.Bool(False), "t": mi.Float(pi.t), "medium": medium,
@@ -161,6 +166,8 @@ class Media(Vacuum):
         return dr.all(end.n == 0)
 
     def attached(self, world, v, carry, wanted):
+        if wanted.geometry:
+            carry = self.from_meter(world, v, carry)
         ray = mi.Ray3f(v.ray)
         ray.o, ray.d = carry.o, carry.d
         si, mei, stretch = self._surface_or_medium(world, v, carry, ray, wanted)

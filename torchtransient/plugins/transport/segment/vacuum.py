@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 
@@ -10,8 +12,14 @@ from torchtransient.plugins.transport.carry import slope_only
 from torchtransient.plugins.transport.contents import DAMPING
 from torchtransient.plugins.transport.derivative.vertex import AttachedVertex, VertexEnd
 from torchtransient.plugins.transport.instances import surface_interaction
-from torchtransient.plugins.transport.scattering.geometry_terms import damped_motion, displacement, slide
-from torchtransient.plugins.transport.strategy import Segment, Vertex
+from torchtransient.plugins.transport.scattering.geometry_terms import (
+    damped_motion,
+    displacement,
+    material_point,
+    slide,
+)
+from torchtransient.plugins.transport.segment.triangles import AttachedTriangles
+from torchtransient.plugins.transport.strategy import Local, Segment, Vertex
 
 # How a preliminary intersection is kept: its shape and instance as numbers in Dr.Jit's registry.
 NUMBERS = {"t": "Float", "prim_uv": "Point2f", "prim_index": "UInt32", "shape_index": "UInt32"}
@@ -52,7 +60,25 @@ def length_to(contents, p, q, valid, d):
 
 
 class Vacuum(Segment):
-    """Nothing between surfaces. A leg is the preliminary intersection at its end."""
+    """Nothing between surfaces. A leg is the preliminary intersection at its end.
+
+    In derivatives the first vertex and those behind delta lobes slide along the rays that found them. All others are
+    points of their shapes, so that the integral over a surface that moves has no edges but where something hides it;
+    near points are dragged along with the vertex that sees them (:func:`~..scattering.geometry_terms.damped_motion`).
+    """
+
+    def prepare(self, world):
+        self.meter_normal = None
+        moving = frozenset() if world.wanted is None or not world.wanted.geometry else world.wanted.shapes
+        # Where no shape moves, every vertex stays where it is but for what it is dragged along.
+        self.triangles = AttachedTriangles(world.scene.shapes(), moving) if moving else None
+
+    def start(self, world, rays):
+        self.meter_normal = rays.meter_normal
+
+    def tables(self):
+        tables = [] if self.triangles is None else self.triangles.tables()
+        return [table for table in tables if dr.grad_enabled(table)]
 
     # ------------------------------------------------------------------------------------------------- primal
 
@@ -81,6 +107,9 @@ class Vacuum(Segment):
 
     def surface_of(self, leg):
         return leg, mi.Bool(True)
+
+    def length_of(self, leg):
+        return leg.t, leg.is_valid()
 
     def ends_at(self, pi, medium):
         return pi
@@ -123,6 +152,8 @@ class Vacuum(Segment):
         return VertexEnd(si.t, si.n, v.ray.d, si.is_valid() & v.active)
 
     def attached(self, world, v, carry, wanted):
+        if wanted.geometry:
+            carry = self.from_meter(world, v, carry)
         ray = mi.Ray3f(v.ray)
         if not wanted.plain:
             ray.o, ray.d = carry.o, carry.d
@@ -154,6 +185,65 @@ class Vacuum(Segment):
         return vertex
 
     def motion(self, world, vertex, following, ahead):
-        δ, volume = displacement(vertex.scattered_si.p, ahead), self.has_no_normal(following)
-        d, radius = mi.Vector3f(following.d), vertex.damping_radius
-        return damped_motion(δ, d, following.t, following.n, ahead, radius, volume=volume)
+        δ = displacement(vertex.scattered_si.p, ahead)
+        return self.motion_to(world, vertex.v.after(), δ, following, ahead, vertex.damping_radius)
+
+    def motion_to(self, world, after, δ, following, ahead, radius):
+        """:meth:`motion` to the vertex ``after`` from a point that moves by ``δ``."""
+        d, volume = mi.Vector3f(following.d), self.has_no_normal(following)
+        if self.triangles is None:
+            return damped_motion(δ, d, following.t, following.n, ahead, radius, volume=volume)
+        surface = ahead if volume is None else ahead & ~volume
+        p, n, area = self.material(world, after.pi, after.ray, following.n, surface)
+        moved = displacement(p, surface)
+        motion = damped_motion(δ - moved, d, following.t, following.n, ahead, radius, volume=volume)
+        J = motion.J * dr.select(surface, motion.of_material(n, dr.relative_grad(area)), 1)
+        # A ray that is shifted across with a point of a shape meets it where it went.
+        drag = motion.drag + (moved - d * dr.dot(d, moved))
+        return Local(d=motion.d, J=J, drag=drag, longer=lambda: -dr.dot(δ, d))
+
+    def material(self, world, pi, ray, n, active):
+        """(point, normal, area element) of hit points that follow their shapes, whose normals are ``n``. Points of
+        shapes without material points stay where they are.
+        """
+        with dr.suspend_grad():
+            if world.contents.sliding is not None:
+                active = active & ~world.contents.sliding.lists(pi.shape)
+            listed = active & self.triangles.lists(pi.shape)
+            at = ray(pi.t)
+        point = self.triangles.point(pi, listed)
+        twice = dr.norm(point.across)
+        across = dr.mulsign(point.across / twice, dr.dot(point.across, n))
+        if self.triangles.holds_all:
+            return dr.select(listed, point.p, at), dr.select(listed, across, n), dr.select(listed, twice, 1)
+        other = active & ~listed
+        si, area = material_point(pi, ray, other, world.contents.meshes, world.surfaces)
+        p, n = dr.select(other, si.p, at), dr.select(other, si.n, n)
+        return dr.select(listed, point.p, p), dr.select(listed, across, n), dr.select(listed, twice, area)
+
+    def held(self, world, pi, ray, active):
+        """Zero with how far derivatives move the surface point ``pi``, found by ``ray``, as a point of its shape."""
+        if self.triangles is None:
+            return mi.Vector3f(0)
+        p, _, _ = self.material(world, pi, ray, mi.Normal3f(0, 0, 1), active & pi.is_valid())
+        return displacement(p, active & pi.is_valid())
+
+    def from_meter(self, world, v, carry):
+        """The ``carry`` at the first vertex of a path that starts on an irradiance meter at rest: a point of its shape
+        like those after it, since no pixel holds the ray.
+        """
+        if self.meter_normal is None:
+            return carry
+        first = v.active & (v.k == 0)
+        with dr.suspend_grad():
+            end = self.end(world, v)
+        radius = world.contents.damping_radius
+        motion = self.motion_to(world, v, mi.Vector3f(0), end, first & end.valid, radius)
+        n = dr.select(first, self.meter_normal, mi.Normal3f(v.ray.d))
+        J = motion.J * dr.relative_grad(dr.select(first, dr.abs_dot(n, motion.d), 1))
+        return replace(
+            carry,
+            β=carry.β * dr.select(first, J, 1),
+            o=carry.o + dr.select(first, motion.drag, 0),
+            w=dr.select(first, dr.replace_grad(mi.Vector3f(carry.w), carry.w + (motion.d - end.d)), carry.w),
+        )

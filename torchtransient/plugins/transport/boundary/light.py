@@ -1,0 +1,153 @@
+"""Edges between the last vertex of a path and a light."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins.polarized import attenuated
+from torchtransient.plugins.transport.boundary.primary import can_be_sampled
+from torchtransient.plugins.transport.boundary.sides import at_point
+from torchtransient.plugins.transport.boundary.speeds import along_the_ray, dragged_share
+from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
+from torchtransient.plugins.transport.scattering.geometry_terms import displacement, material_point
+from torchtransient.plugins.transport.strategy import Local
+from torchtransient.plugins.transport.walk import go_on, start
+
+# Radii of the scene from which a light at infinity is looked at along an edge.
+_FAR = 300
+
+
+class LightPass:
+    """An edge point p is drawn, then a point y of a light, and a path goes on behind p, on its shadow, to the sensor: a
+    walk with one connection (:class:`~..connection.sensor_sampled.SensorSampled`). Its first vertex x is held on the
+    ray of the camera where it is connected at once (``direct``), and is a point of its shape where it goes on.
+    """
+
+    def __init__(self, term):
+        self.term = term
+        self.lights = EmitterSampled()
+        self.lights.prepare(term.world)
+
+    @staticmethod
+    def exists(world, sensor):
+        """Return whether there are lights and a sensor that can be connected to."""
+        return world.max_depth > 1 and len(world.scene.emitters()) > 0 and can_be_sampled(sensor)
+
+    def run(self, mode, job):
+        """Trace the samples of ``job``; returns the objective of reverse mode."""
+        term = self.term
+        world, edges, sampler, lit = term.world, term.edges, term.sampler(job), term.light_world
+        k = edges.pick(edges.by_length, sampler.next_1d(), sampler.next_1d())
+        aperture, wavelength = term.numbers_of_sensor(sampler)
+        center = mi.Point2f(mi.ScalarVector2f(term.film.crop_size())) / 2
+        middle = term.rays_at(sampler, center, wavelength, aperture, None, None, job)
+        ray = mi.Ray3f(dr.detach(middle.ray))
+        light = self._light(edges, k, ray, sampler.next_2d())
+        b, ds = light.b, light.ds
+        most = dr.max(dr.abs(light.Le))
+        active = b.valid & (most > 0) & dr.isfinite(most) & ~b.crease
+        medium = world.segment.medium_towards(b.d)
+        place = Local(at=at_point(b.beside, ray), si=dr.zeros(mi.SurfaceInteraction3f), medium=medium, surface=mi.Bool(False))
+        to_light = Local(p=dr.select(light.far, b.p + ds.d * ds.dist, ds.p), d=-b.d, dist=dr.select(light.far, ds.dist, b.dist))
+        active, T = world.segment.transmittance(world, place, to_light, sampler.next_2d(), sampler, active)
+        factor = dr.select(active, -most * b.sin * b.inv_pdf, 0)
+        factor = dr.select(dr.isfinite(factor), factor, 0)
+        ray.o, ray.d = b.beside, b.d
+        τ = mi.Float64(0)
+        if world.contents.distant is not None:
+            τ = mi.Float64(dr.select(light.far, world.contents.distant.length(b.p, -b.d), 0))
+        term.to_sensor.aperture = aperture
+        path = start(lit, ray, τ - term.film.start_opl, dr.detach(middle.η))
+        path.prev_p = dr.select(light.far, b.p, b.V)
+        β = light.Le * mi.UnpolarizedSpectrum(T) * dr.select(most > 0, dr.rcp(most), 0)
+        path.β, path.active = attenuated(mi.Spectrum(1), dr.select(active, β, 0)), active
+        path.leg = lit.segment.depart(lit, ray, place, path.β, sampler, active)
+        with dr.resume_grad():
+            speeds = self._speeds(edges, light, path, ray, wavelength, aperture, sampler, job, active)
+        u = sampler.next_2d()
+        sink, factors = mode.sink_of_pixels(middle, job, u, factor, speeds)
+        _, kept = go_on(lit, sampler, path, sink)
+        return mode.sum_of_pixels(kept, factors)
+
+    def _light(self, edges, k, ray, u):
+        """A point of a light drawn from the edge ``k``, and the outline seen from there: ``ds, b, far, Le`` (emission
+        over the density by solid angle at the edge).
+        """
+        world = self.term.world
+        near = at_point(k.near, ray)
+        ds, weight = self.lights.sample(world, near, u, mi.Bool(True))
+        far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+        y = dr.select(far, k.near + ds.d * (_FAR * self.term.radius), ds.p)
+        b = edges.seen_from(k, mi.Point3f(y), ds.pdf > 0)
+        Le = mi.unpolarized_spectrum(weight)
+        # The light was drawn from another place than a limb, which depends on the light, with another solid angle.
+        there = dr.copy(ds)
+        there.d, there.dist = -b.d, b.dist
+        ratio = dr.abs_dot(ds.n, b.d) / dr.abs_dot(ds.n, ds.d) * dr.square(ds.dist / b.dist)
+        other = mi.unpolarized_spectrum(world.scene.eval_emitter_direction(at_point(b.p, ray), there, b.valid & k.ball))
+        other *= dr.select(ds.delta, 1, dr.select(far, 1, ratio) / ds.pdf)
+        return Local(ds=ds, b=b, far=far, Le=dr.select(k.ball, other, Le), near=near, u=u)
+
+    def _speeds(self, edges, light, path, ray, wavelength, aperture, sampler, job, active):
+        """Attached speeds of the edge: where x is the first vertex of a path of the sensor, and where it is another."""
+        term, b = self.term, light.b
+        world = term.world
+        pi, on_surface = term.light_world.segment.surface_of(path.leg)
+        surface = active & on_surface & pi.is_valid()
+        with dr.suspend_grad():
+            x = term.light_world.segment.arrive(term.light_world, path)
+            seen, _ = term.importance(x.at, aperture, active)
+            behind = dr.norm(x.at.p - b.p)
+            t = dr.select(light.far, 0, behind / (behind + b.dist))
+            n = dr.select(surface, mi.Vector3f(x.si.n), 0)
+        held = world.segment.held(world, pi, ray, surface)
+        if term.is_meter and not world.wanted.sensor:
+            first = held
+        else:
+            rays = term.rays_at(sampler, seen.uv, wavelength, aperture, None, None, job)
+            if term.is_meter:
+                with dr.suspend_grad():
+                    shift = seen.p - rays.ray.o
+            else:
+                shift = mi.Vector3f(0)
+            o = rays.ray.o + shift
+            with dr.suspend_grad():
+                r = dr.norm(x.at.p - o)
+                w = (x.at.p - dr.detach(o)) / r
+            δ = displacement(rays.ray.o + rays.ray.d * r, active)
+            q, cos = dr.dot(n, along_the_ray(world, pi, ray, surface)), dr.dot(n, w)
+            first = δ + w * dr.select(surface & (cos != 0), (q - dr.dot(n, δ)) / cos, 0)
+        n_p, found = dr.dot(b.n, edges.moving(b)), []
+        for v_x in (first, held):
+            v_y = self._motion(light, x.at.p, v_x, active & ~light.far)
+            found.append(dr.select(active, n_p - (1 - t) * dr.dot(b.n, v_x) - t * dr.dot(b.n, v_y), 0))
+        return found
+
+    def _motion(self, light, x, v_x, active):
+        """Attached motion of a light's point, as interior derivatives hold it, seen from ``x``, which moves by ``v_x``:
+        points and spots move, areas are points of their shapes, dragged along where they are near, and spheres keep the
+        place in the cone that they fill.
+        """
+        world, wanted, ds, b = self.term.world, self.term.world.wanted, light.ds, light.b
+        v = mi.Vector3f(0)
+        flags = ds.emitter.flags()
+        if wanted.light:
+            at = active & mi.has_flag(flags, mi.EmitterFlags.DeltaPosition)
+            y, _ = world.scene.sample_emitter_direction(light.near, light.u, False, at)
+            v += displacement(y.p, at)
+        on_shape, cone = active & mi.has_flag(flags, mi.EmitterFlags.Surface), mi.Bool(False)
+        if wanted.sphere_lights:
+            cone = on_shape & self.lights.claims(world, ds.emitter, ds.d, wanted)
+            moving = dr.replace_grad(mi.Point3f(x), mi.Point3f(x + v_x))
+            v += displacement(self.lights.spheres.kept_in_cone(ds.emitter, x, ds.p, at_point(moving), cone).p, cone)
+        held = mi.Vector3f(0)
+        there = on_shape & ~cone
+        if wanted.emitter_shape:
+            with dr.suspend_grad():
+                ray = mi.Ray3f(b.beside, -b.d)
+                pi = world.segment.next_surface(world, ray, there)
+            y, _ = material_point(pi, ray, there & pi.is_valid(), world.contents.emitting_meshes)
+            held = displacement(y.p, there & pi.is_valid())
+        share = dragged_share(dr.norm(ds.p - x), world.contents.damping_radius)
+        return v + dr.select(there, held + share * (v_x - held), 0)

@@ -1,0 +1,59 @@
+"""Paths on both sides of an edge."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins.transport.strategy import Local
+from torchtransient.plugins.transport.walk import start
+
+
+def past_edge(world, b, ray, medium, β, sampler, active):
+    """(the ray past an outline, its leg); of a crease the other face, seen from x."""
+    place = Local(si=dr.zeros(mi.SurfaceInteraction3f), medium=medium, surface=mi.Bool(False))
+    past = mi.Ray3f(ray)
+    past.o, past.d = dr.select(b.crease, b.V, b.beside), b.d
+    leg = world.segment.depart(world, past, place, β, sampler, active & ~b.crease)
+    return past, dr.select(b.crease, world.segment.ends_at(b.facing, medium), leg)
+
+
+def both_sides(world, mode, sampler, view, b, past, first, factor, speeds, needed):
+    """Trace the two sides of the outlines ``b``.
+
+    Args:
+        past: what :func:`past_edge` says.
+        first: fields of the paths at x: ``ray`` and those of :class:`~..walk.Path`.
+        factor: detached weight of a sample; ``speeds``: attached (inner, outer).
+        needed: masks (inner, outer) of the sides that can have a speed.
+
+    Returns:
+        In reverse mode the attached objective.
+    """
+    active, ray = first["active"] & dr.isfinite(factor), first.pop("ray")
+    factor = dr.select(active, factor, 0)
+    near = mi.Ray3f(ray)
+    near.o, near.d = b.V, b.d_in
+    sides = (near, world.segment.ends_at(b.inner, first["medium"])), past
+    fields = {key: value for key, value in first.items() if key != "medium"}
+    objective = mi.Float(0)
+    for sign, (ray, leg), speed, need in zip((1, -1), sides, mode.speeds(speeds), needed, strict=True):
+        path = start(world, ray, mi.Float64(0), 1)
+        for key, value in fields.items():
+            setattr(path, key, type(getattr(path, key))(value))
+        path.leg, path.active = leg, active & need
+        # The same random numbers on both sides.
+        value = mode.traced(world, sampler.clone(), path, view, dr.select(need, sign * factor, 0), speed)
+        if value is not None:
+            with dr.resume_grad():
+                objective += value * speed
+    return objective
+
+
+def at_point(p, ray=None):
+    """An Interaction3f without a normal."""
+    it = dr.zeros(mi.Interaction3f)
+    it.p = p
+    if ray is not None:
+        it.time, it.wavelengths = ray.time, ray.wavelengths
+    return it

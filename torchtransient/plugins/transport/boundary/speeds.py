@@ -1,0 +1,72 @@
+"""Speeds of edges against the samples that interior derivatives hold.
+
+On a line of sight from x past an edge point p to y, with s = |p - x| / |y - x|, the edge moves across by
+
+    v_in = n . (v_p - v(p)),    v_out = n . (v_p - (1 - s) v_x - s v(y)),
+
+where v(y) is how the interior derivative moves a sample at y (:meth:`~..strategy.Segment.held`), which near x is dragged
+along by a share a of the motion of x: v(y) = (1 - a) v_y + a v_x. On the inner side v_p is the motion of the surface
+itself, and nothing is left of it but the drag. A point on a ray that is held, as the first one of a camera, slides along
+it, which n does not see.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins.transport.scattering.geometry_terms import displacement
+from torchtransient.plugins.transport.strategy import Local
+
+
+def dragged_share(r, radius):
+    """The share a of ``damped_motion`` at distance ``r``."""
+    return dr.select(r < radius, dr.square(1 - dr.square(r / radius)), 0)
+
+
+def sides_from(world, b, edges, v_x, y, radius, active):
+    """Attached speeds (inner, outer) of the outline ``b`` of ``edges``, seen from a point that moves by ``v_x``.
+
+    Args:
+        y: Local with ``dist`` (from x, infinite for none) and ``v`` (attached motion as held) of the point behind.
+    """
+    n_x, n_p = dr.dot(b.n, v_x), dr.dot(b.n, edges.moving(b))
+    held = n_p if world.contents.sliding is None else dr.select(slides(world, b), 0, n_p)
+    n_y = dr.select(b.crease, n_p, dr.dot(b.n, y.v))
+    s = dr.select(b.crease, 1, dr.select(dr.isfinite(y.dist), b.dist / y.dist, 0))
+    near, far = dragged_share(b.dist, radius), dragged_share(dr.select(b.crease, b.dist, y.dist), radius)
+    inner = n_p - near * n_x - (1 - near) * held
+    outer = n_p - (1 - s) * n_x - s * (far * n_x + (1 - far) * n_y)
+    return [dr.select(active, speed, 0) for speed in (inner, outer)]
+
+
+def slides(world, b):
+    """Mask of outlines of shapes without material points."""
+    table = world.contents.sliding
+    return mi.Bool(False) if table is None else table.lists(b.inner.shape)
+
+
+def behind(world, b, ray, leg, active):
+    """The point behind an outline, at the end of ``leg``, as :func:`sides_from` asks for it."""
+    t, found = world.segment.length_of(leg)
+    pi, on_surface = world.segment.surface_of(leg)
+    dist = dr.select(found, dr.norm(ray.o - b.V) + t, dr.inf)
+    return Local(dist=dist, v=world.segment.held(world, pi, ray, active & found & on_surface & ~b.crease))
+
+
+def dragged(v_x, v_before, r, d, n, radius, active):
+    """Motion of a point that moves by ``v_x`` as a point of its shape, dragged along by the vertex before it, at
+    distance ``r``, which moves by ``v_before``; ``d``: direction of the ray between them, ``n``: normal at the point.
+    """
+    δ = v_before - v_x
+    across, cos = δ - d * dr.dot(d, δ), dr.dot(n, d)
+    slid = across - d * (dr.dot(n, across) * dr.select(cos != 0, dr.rcp(cos), 0))
+    return v_x + dr.select(active, dragged_share(r, radius) * slid, 0)
+
+
+def along_the_ray(world, pi, ray, active):
+    """Attached displacement of where ``ray``, attached or not, meets the surface ``pi``."""
+    from torchtransient.plugins.transport.instances import surface_interaction
+
+    si = surface_interaction(world.surfaces, pi, ray, mi.RayFlags.All, active & pi.is_valid())
+    return displacement(si.p, active & pi.is_valid())

@@ -1,0 +1,152 @@
+r"""The boundary term of derivatives: the light that a moving edge uncovers and hides.
+
+A point p of an edge with tangent t is seen from x in direction d; n is normal to d and t and points out of the surface
+that hides; P is the density of p by length. With the adjoint A(pixel, tau) of the film,
+
+    dLoss += sum over sides  +-c [ sum over events e: A(pixel, tau_e) f_e ] (n . v_side)       + inner, - outer
+
+(Li et al. 2018, with times of flight). Each side is a path of the walk, which goes on from a segment whose end is known.
+Every edge between two vertices belongs to one of three passes:
+
+    primary   x is the sensor:           c = W sin / P                     (W: importance per area across d at p)
+    vertex    x is a vertex of a path:   c = beta f_s(x, d) sin / (r^2 P)
+    light     x is a point of a light:   c = -Le / pdf_omega sin / P, and the path goes on behind p, to the sensor
+
+The speeds v are those of the edge against the samples that interior derivatives hold, see :mod:`.speeds`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins.integrators.launch import passes_of, seed_array
+from torchtransient.plugins.mitsuba_compat import is_irradiance_meter
+from torchtransient.plugins.sensors.origin import PrimaryRays, index_at_sensor, sample_rays, views
+from torchtransient.plugins.transport.boundary.edges import Silhouettes
+from torchtransient.plugins.transport.boundary.light import LightPass
+from torchtransient.plugins.transport.boundary.primary import PrimaryPass
+from torchtransient.plugins.transport.boundary.vertex import VertexPass
+from torchtransient.plugins.transport.boundary.weigh import Forward, Reverse
+from torchtransient.plugins.transport.connection.sensor_sampled import SensorSampled
+from torchtransient.plugins.transport.world import World
+
+PASSES = {"primary": PrimaryPass, "vertex": VertexPass, "light": LightPass}
+_SEEDS = {"primary": 0x51, "vertex": 0x52, "light": 0x53}
+
+
+class BoundaryTerm:
+    """The boundary term of one job of derivatives.
+
+    Args:
+        integrator, world, sensor, film, seed: of the job.
+        samples: edge samples per pixel of each pass.
+        names: passes to run, of ``PASSES``.
+        candidates: edges that one is chosen from in the vertex pass.
+    """
+
+    def __init__(self, integrator, world, sensor, film, seed, samples, names=tuple(PASSES), candidates=4):
+        self.integrator, self.world, self.sensor, self.film = integrator, world, sensor, film
+        self.candidates = candidates
+        scene, wanted = world.scene, world.wanted
+        self.is_meter = is_irradiance_meter(sensor)
+        views_move = wanted.sensor or wanted.light
+        moving = frozenset() if views_move else wanted.shapes
+        # A sensor at rest sees the edges of what moves alone; behind an edge at rest something else may move.
+        self.seen_edges = Silhouettes(scene, moving, alone=not views_move)
+        self.edges = self.seen_edges if views_move else Silhouettes(scene, moving, alone=False)
+        self.radius = dr.opaque(mi.Float, integrator.reference(scene).radius)
+        with dr.suspend_grad():
+            self.light_world = self._light_world()
+        self.passes, self.jobs = {}, {}
+        for name in names:
+            if PASSES[name].exists(world, sensor):
+                own, _ = mi.sample_tea_32(seed_array(seed), mi.UInt32(_SEEDS[name]))
+                self.passes[name] = PASSES[name](self)
+                self.jobs[name], _ = passes_of(sensor.sampler().clone(), film, own, samples, world.most_events())
+
+    def _light_world(self):
+        """The world of paths that start at a light and are connected to the sensor."""
+        world, integrator = self.world, self.integrator
+        segment, scattering, _ = integrator.strategies(world.contents)
+        # Whether the sensor's segment counts in time is asked by its connection: here it is the last one of a path.
+        settings = replace(integrator.settings(), camera_unwarp=False)
+        self.to_sensor = SensorSampled(self.sensor, integrator.camera_unwarp)
+        return World(
+            world.scene, world.contents, settings, (segment, scattering, [self.to_sensor]), None, world.window
+        )
+
+    def tables(self):
+        """The attached ends of edges, and what the strategies of light paths have attached."""
+        ends = {id(end): end for edges in (self.seen_edges, self.edges) for end in edges.ends}
+        return [end for end in ends.values() if dr.grad_enabled(end)]
+
+    def backward(self, incoming):
+        """Back-propagate to the parameters and the tables."""
+        for name, one in self.passes.items():
+            for job in self.jobs[name]:
+                objective = one.run(Reverse(self, incoming), job)
+                with dr.resume_grad():
+                    if dr.grad_enabled(objective):
+                        dr.backward_from(objective)
+                dr.eval()
+
+    def forward(self):
+        """Add the tangent to the film."""
+        for name, one in self.passes.items():
+            for job in self.jobs[name]:
+                one.run(Forward(self, job), job)
+                dr.eval(self.film.bands[job.band][2], self.film.steady)
+
+    # ------------------------------------------------------------------------------------------------- the sensor
+
+    def sampler(self, job):
+        """A seeded sampler of independent numbers with a lane for each sample of ``job``."""
+        lanes = int(self.film.crop_size()[0]) * job.rows * job.spp
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(job.seed, lanes)
+        return sampler
+
+    def numbers_of_sensor(self, sampler):
+        """Random numbers of (aperture, wavelength), constants where the sensor has no use for them."""
+        aperture = sampler.next_2d() if self.sensor.needs_aperture_sample() or self.is_meter else mi.Point2f(0.5)
+        return aperture, sampler.next_1d() if mi.is_spectral else mi.Float(0)
+
+    def importance(self, p, aperture, active):
+        """(direction sample of the sensor seen from ``p`` (Interaction3f), its importance per area across)."""
+        ds, importance = self.sensor.sample_direction(p, aperture, active)
+        importance = mi.unpolarized_spectrum(importance)[0]
+        if self.is_meter:
+            # Mitsuba says pi, which the weight of its rays holds already.
+            area = self.sensor.get_shape().surface_area()
+            importance = dr.select(ds.pdf > 0, dr.inv_pi / (area * ds.pdf), 0)
+        return ds, importance
+
+    def pixel(self, uv, u):
+        """(row, column, weight, whether there is one) of a pixel that sees the place ``uv`` of the film, in pixels,
+        chosen by ``u`` of those that the reconstruction filter makes see it.
+        """
+        size = mi.ScalarVector2f(self.film.crop_size())
+        rfilter, weight, cell = self.film.rfilter(), mi.Float(1), dr.floor(uv)
+        if self.is_meter:
+            return mi.UInt32(0), mi.UInt32(0), weight, mi.Bool(True)
+        if not rfilter.is_box_filter():
+            _, integral = self.film._offset_distribution
+            n = int(2 * rfilter.radius()) + 1
+            cell = dr.ceil(uv - rfilter.radius() - 0.5) + dr.minimum(dr.floor(u * n), n - 1)
+            h = uv - cell - 0.5
+            weight = rfilter.eval(h.x) * rfilter.eval(h.y) * (n * n / (integral * integral))
+        inside = dr.all((cell >= 0) & (cell < size))
+        return mi.UInt32(dr.select(inside, cell.y, 0)), mi.UInt32(dr.select(inside, cell.x, 0)), weight, inside
+
+    def rays_at(self, sampler, uv, wavelength, aperture, row, column, job):
+        """Primary rays through places of the film, in pixels, attached to the sensor."""
+        world, sensor = self.world, self.sensor
+        position = uv / mi.ScalarVector2f(self.film.crop_size())
+        seen = views(sensor, position, lambda: self.integrator.reference(world.scene))
+        with dr.resume_grad():
+            ray, weight = sample_rays(sensor, seen, sensor.shutter_open(), wavelength, position, aperture)
+            η = index_at_sensor(seen, world.contents.surroundings, world.scene)
+        return PrimaryRays(sampler, ray, weight, dr.opaque(mi.Float, 1 / job.total), row, column, seen, η)

@@ -1,0 +1,121 @@
+"""Edges between two vertices of a path."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins.polarized import attenuated, product
+from torchtransient.plugins.transport.boundary.sides import both_sides, past_edge
+from torchtransient.plugins.transport.boundary.speeds import along_the_ray, behind, dragged, sides_from, slides
+from torchtransient.plugins.transport.contents import DAMPING
+from torchtransient.plugins.transport.strategy import Local, Proposal
+from torchtransient.plugins.transport.walk import advance, start
+
+
+class VertexPass:
+    """A path is traced to a vertex x, chosen uniformly of those that may have one after them; an edge point seen from
+    there is chosen of several candidates in proportion to its span over the squared distance (resampling, Talbot et al.
+    2005). Vertices behind the edge are points of their shapes, so that only outlines matter, and of them the outer side,
+    but for what is near x and dragged along.
+    """
+
+    def __init__(self, term):
+        self.term = term
+
+    @staticmethod
+    def exists(world, sensor):
+        """Return whether paths have two vertices."""
+        return world.max_depth > 2
+
+    def run(self, mode, job):
+        """Trace the samples of ``job``; returns the objective of reverse mode."""
+        term = self.term
+        world, edges = term.world, term.edges
+        vertices = world.max_depth - 2
+        rays = term.integrator.start(world.scene, world.contents, term.sensor, term.film, job)
+        world.start(rays)
+        view, sampler, ray = mode.view(rays), rays.sampler, dr.detach(rays.ray)
+        target = dr.minimum(mi.UInt32(sampler.next_1d() * vertices), vertices - 1)
+        path = start(world, ray, term.integrator.first_opl(term.film, rays), dr.detach(rays.η))
+        path.leg = world.segment.first(world, ray, sampler)
+        pi, _ = world.segment.surface_of(path.leg)
+        radius = dr.minimum(world.contents.damping_radius, pi.t * DAMPING)
+        path, before = advance(world, sampler, path, target)
+        vertex = world.segment.arrive(world, path)
+        vertex.τ, vertex.η, vertex.goes_on = path.τ + vertex.opl, path.η, path.active & vertex.valid
+        world.scattering.arrive(world, path, vertex, sampler)
+        x, n = mi.Point3f(vertex.at.p), dr.select(vertex.surface, mi.Vector3f(vertex.si.n), 0)
+
+        def worth(d, dist):
+            return dr.select(vertex.surface, dr.abs_dot(n, d), 1) / dr.maximum(dr.square(dist), 1e-12)
+
+        k = edges.choose(edges.by_length, sampler, x, vertex.goes_on, term.candidates, worth)
+        b = edges.seen_from(k, x, vertex.goes_on)
+        near = (b.dist < radius) | slides(world, b)
+        b.valid &= ~b.crease | near
+        # Asked for as a connection asks.
+        (answer,), _ = world.scattering.scatter(world, path, vertex, [Proposal(d=b.d, active=b.valid, ds=None)], sampler)
+        τ, η = vertex.delay.after(vertex.τ), vertex.η * answer.eta
+        β = product(vertex.β, dr.select(b.valid, answer.matrix, 0))
+        most = dr.max(dr.abs(mi.unpolarized_spectrum(β)))
+        end = Local(p=b.beside, d=dr.normalize(b.beside - x), dist=dr.norm(b.beside - x))
+        active = b.valid & (most > 0) & dr.isfinite(most)
+        active, T = world.segment.transmittance(world, vertex, end, sampler.next_2d(), sampler, active)
+        factor = most * vertices * b.sin * b.inv_pdf / dr.square(b.dist)
+        # A throughput that is handed to roulette is no larger than one.
+        β = attenuated(β, mi.UnpolarizedSpectrum(T) * dr.select(most > 0, dr.rcp(most), 0))
+        β = dr.select(active, β, 0)
+        medium = world.segment.medium_towards(b.d, vertex)
+        past = past_edge(world, b, path.ray, medium, β, sampler, active)
+        with dr.resume_grad():
+            v_x = self._motion(rays, path, before, target, vertex, radius, active)
+            speeds = sides_from(world, b, edges, v_x, behind(world, b, *past, active), radius, active)
+        first = {
+            "ray": path.ray, "β": β, "η": η, "τ": τ, "prev_p": x, "prev_n": vertex.at.n,
+            # Emission past the edge is found by the pass of the lights.
+            "prev_pdf": mi.Float(0), "prev_unconnected": mi.Bool(False), "depth": target + 1, "active": active,
+            "medium": medium,
+        }  # fmt: skip
+        return both_sides(world, mode, sampler, view, b, past, first, factor, speeds, (near, ~b.crease | near))
+
+    def _motion(self, rays, path, before, target, vertex, radius, active):
+        """Attached motion of x, as interior derivatives hold it."""
+        world, at_first = self.term.world, target == 0
+        pi, _ = world.segment.surface_of(path.leg)
+        surface, first = active & vertex.surface, active & at_first
+        primary = mi.Ray3f(path.ray)
+        primary.o = dr.select(at_first, rays.ray.o, path.ray.o)
+        primary.d = dr.select(at_first, rays.ray.d, path.ray.d)
+        held = world.segment.held(world, pi, path.ray, surface)
+        # Of the vertex before, its own drag is left out.
+        pi_before, ray_before = before
+        camera = mi.Ray3f(ray_before)
+        second = target == 1
+        camera.o, camera.d = dr.select(second, rays.ray.o, ray_before.o), dr.select(second, rays.ray.d, ray_before.d)
+        if rays.meter_normal is None:
+            v_before = dr.select(
+                second,
+                along_the_ray(world, pi_before, camera, active & second),
+                world.segment.held(world, pi_before, ray_before, active & (target > 1)),
+            )
+            follows = surface & ~at_first
+        else:
+            v_before = world.segment.held(world, pi_before, ray_before, active & (target > 0))
+            follows = surface
+        r = dr.norm(vertex.at.p - path.prev_p)
+        v = dragged(held, v_before, r, path.ray.d, vertex.si.n, radius, follows)
+        if rays.meter_normal is None:
+            v = dr.select(at_first, along_the_ray(world, pi, primary, first & vertex.surface), v)
+        if world.contents.media is None:
+            return dr.select(active, v, 0)
+        # A point in a medium divides the way to the surface behind it in a fixed ratio.
+        share = world.segment.share_of_surface(path.leg)
+        inside = along_the_ray(world, pi, primary, active & ~vertex.surface) * share
+        inside += displacement_of(primary.o, first) * (1 - share)
+        return dr.select(active, dr.select(vertex.surface, v, inside), 0)
+
+
+def displacement_of(p, active):
+    """Zero with the derivative of ``p`` where active."""
+    return dr.select(active, dr.replace_grad(mi.Vector3f(0), mi.Vector3f(p)), 0)

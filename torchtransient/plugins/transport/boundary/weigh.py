@@ -1,0 +1,161 @@
+"""Reverse and forward mode of boundary samples: events weighed by the film's adjoint, or put onto the film."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins.transport.carry import total_of
+from torchtransient.plugins.transport.derivative.forward import tangents_of
+from torchtransient.plugins.transport.sinks.adjoint_sum import AdjointSumSink
+from torchtransient.plugins.transport.sinks.film import FilmSink
+from torchtransient.plugins.transport.sinks.sink import Sink
+from torchtransient.plugins.transport.strategy import Local
+from torchtransient.plugins.transport.walk import go_on
+
+
+class Reverse:
+    """Sums of events times the adjoint of the film, detached, times attached speeds: the objective of a launch."""
+
+    def __init__(self, term, incoming):
+        self.term, self.incoming = term, incoming
+
+    def view(self, rays):
+        """The adjoint block of primary rays."""
+        return self.block(rays, rays)
+
+    def block(self, rays, place):
+        """The adjoint block of the pixels ``place`` (``row, column, laser``), in the channels of ``rays``."""
+        term = self.term
+        match = term.integrator.channel_match(term.world.contents, term.film, rays)
+        pixel = dr.fma(place.row, int(term.film.crop_size()[0]), place.column)
+        return self.incoming.block(place, pixel, match)
+
+    def speeds(self, attached):
+        """Speeds as :meth:`traced` takes them."""
+        return attached
+
+    def traced(self, world, sampler, path, block, factor, speed):
+        """Trace ``path``; returns what its events contribute to the loss."""
+        _, kept = go_on(world, sampler, path, AdjointSumSink(block))
+        return finite(kept["sum"] * factor)
+
+    def sink_of_pixels(self, middle, job, u, factor, speeds):
+        """(sink of events that have a pixel each, what :meth:`sum_of_pixels` takes)."""
+        return PixelSums(self, middle, u), (factor, speeds)
+
+    def sum_of_pixels(self, kept, factors):
+        """The attached objective."""
+        factor, speeds = factors
+        with dr.resume_grad():
+            return sum(finite(kept[name] * factor) * speed for name, speed in zip(PixelSums.NAMES, speeds, strict=True))
+
+
+class PixelSums(Sink):
+    """Sums over the events of the first vertex, and of all others."""
+
+    NAMES = ("direct", "rest")
+
+    def __init__(self, mode, middle, u):
+        self.mode, self.middle, self.u = mode, middle, u
+
+    def begin(self, world):
+        return {name: mi.Float(0) for name in self.NAMES}
+
+    def event(self, kept, event):
+        term = self.mode.term
+        row, column, weight, inside = term.pixel(event.uv, self.u)
+        active, place = event.active & inside, Local(row=row, column=column, laser=None)
+        A, _ = self.mode.block(seen_along(self.middle, event.d), place).read(event.opl, active)
+        value = dr.select(active, total_of(A, event.value) * weight, 0)
+        direct = event.depth == 2
+        kept["direct"] = kept["direct"] + dr.select(direct, value, 0)
+        kept["rest"] = kept["rest"] + dr.select(direct, 0, value)
+
+
+class Forward:
+    """Events onto the film, times the tangents of the speeds."""
+
+    def __init__(self, term, job):
+        self.term, self.job = term, job
+        # Samples see the whole film, of which a band of storage keeps some rows.
+        self.first, rows = term.film.band_layout()[job.band]
+        self.stop, self.scale = self.first + rows, int(term.film.crop_size()[1]) / rows
+
+    def view(self, rays):
+        """(map to channels, base and pixel) of primary rays."""
+        term = self.term
+        return term.integrator.channel_match(term.world.contents, term.film, rays), *self._indices(rays)
+
+    def _indices(self, place):
+        return self.term.integrator.pixel_indices(self.term.film, self.job, place)
+
+    def speeds(self, attached):
+        """Tangents of speeds."""
+        with dr.resume_grad():
+            if not any(dr.grad_enabled(speed) for speed in attached):
+                return [mi.Float(0)] * len(attached)
+            return tangents_of(list(attached))
+
+    def traced(self, world, sampler, path, view, factor, speed):
+        """Trace ``path`` onto the film."""
+        film, (match, base, pixel) = self.term.film, view
+        block = film.create_event_block(self.job, base, match, world.most_events())
+        _, kept = go_on(world, sampler, path, ScaledFilmSink(block, finite(factor * speed)))
+        film.add_steady(pixel, match.to_channels(kept["L"]))
+        block.finish()
+
+    def sink_of_pixels(self, middle, job, u, factor, speeds):
+        """As in reverse mode."""
+        return PixelFilmSink(self, middle, u, [finite(factor * speed) for speed in self.speeds(speeds)]), None
+
+    def sum_of_pixels(self, kept, factors):
+        """All is on the film."""
+        return mi.Float(0)
+
+
+class ScaledFilmSink(FilmSink):
+    """Events times a number for each path."""
+
+    def __init__(self, block, scale):
+        super().__init__(block)
+        self.scale = scale
+
+    def event(self, kept, event):
+        event.value = event.value * self.scale
+        super().event(kept, event)
+
+
+class PixelFilmSink(Sink):
+    """Events that have a pixel each, times one number at the first vertex and another at all others."""
+
+    def __init__(self, mode, middle, u, scales):
+        self.mode, self.middle, self.u, self.scales = mode, middle, u, scales
+
+    def event(self, kept, event):
+        mode, term = self.mode, self.mode.term
+        film = term.film
+        row, column, weight, inside = term.pixel(event.uv, self.u)
+        active = event.active & inside & (row >= mode.first) & (row < mode.stop)
+        place = Local(row=dr.select(active, row, mode.first), column=column, laser=None)
+        match = term.integrator.channel_match(term.world.contents, film, seen_along(self.middle, event.d))
+        base, pixel = mode._indices(place)
+        scale = dr.select(event.depth == 2, *self.scales) * (weight * mode.scale)
+        channels = [dr.select(active, c, 0) for c in match.to_channels(event.value * scale)]
+        film.put(mode.job.band, base, event.opl, channels, active)
+        if film.keeps_steady:
+            for c, value in enumerate(channels):
+                index = pixel * film.channel_count() + c
+                dr.scatter_reduce(dr.ReduceOp.Add, film.steady, type(film.steady)(value), index, active)
+
+
+def seen_along(rays, d):
+    """Primary rays of which each arrives against ``d``, as channels of the film ask for them."""
+    ray = mi.Ray3f(dr.detach(rays.ray))
+    ray.d = -d
+    return Local(ray=ray, weight=rays.weight, scale=rays.scale, seen=rays.seen)
+
+
+def finite(value):
+    """Zero in place of what is no number."""
+    return dr.select(dr.isfinite(value), value, 0)
