@@ -97,7 +97,7 @@ class LightPass:
         surface = active & on_surface & pi.is_valid()
         with dr.suspend_grad():
             x = term.light_world.segment.arrive(term.light_world, path)
-            seen, _ = term.importance(x.at, aperture, active)
+            seen, _ = term.to_sensor.seen_from(x.at, aperture, active)
             behind = dr.norm(x.at.p - b.p)
             t = dr.select(light.far, 0, behind / (behind + b.dist))
             n = dr.select(surface, mi.Vector3f(x.si.n), 0)

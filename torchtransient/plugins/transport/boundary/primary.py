@@ -29,18 +29,11 @@ class PrimaryPass:
         term = self.term
         world, edges, sampler = term.world, term.seen_edges, term.sampler(job)
         aperture, wavelength = term.numbers_of_sensor(sampler)
-        eye, _ = term.importance(at_point(mi.Point3f(0)), aperture, mi.Bool(True))
-
-        def worth(d, dist):
-            return term.importance(at_point(eye.p + d * dist), aperture, mi.Bool(True))[1]
-
+        k = edges.pick(edges.by_length, sampler.next_1d(), sampler.next_1d())
         # From a meter the point of view depends on what is seen.
-        candidates = 1 if term.is_meter else term.candidates
-        k = edges.choose(edges.by_length, sampler, mi.Point3f(eye.p), mi.Bool(True), candidates, worth)
-        if term.is_meter:
-            eye, _ = term.importance(at_point(k.near), aperture, mi.Bool(True))
+        eye, _ = term.to_sensor.seen_from(at_point(k.near), aperture, mi.Bool(True))
         b = edges.seen_from(k, mi.Point3f(eye.p), mi.Bool(True))
-        ds, importance = term.importance(at_point(b.p), aperture, b.valid)
+        ds, importance = term.to_sensor.seen_from(at_point(b.p), aperture, b.valid)
         row, column, weight, inside = term.pixel(ds.uv, sampler.next_2d())
         rays = term.rays_at(sampler, ds.uv, wavelength, aperture, row, column, job)
         view, ray = mode.view(rays), dr.detach(rays.ray)

@@ -47,7 +47,7 @@ class BoundaryTerm:
         candidates: edges that one is chosen from in the vertex pass.
     """
 
-    def __init__(self, integrator, world, sensor, film, seed, samples, names=tuple(PASSES), candidates=4):
+    def __init__(self, integrator, world, sensor, film, seed, samples, names=tuple(PASSES), candidates=8):
         self.integrator, self.world, self.sensor, self.film = integrator, world, sensor, film
         self.candidates = candidates
         scene, wanted = world.scene, world.wanted
@@ -113,16 +113,6 @@ class BoundaryTerm:
         """Random numbers of (aperture, wavelength), constants where the sensor has no use for them."""
         aperture = sampler.next_2d() if self.sensor.needs_aperture_sample() or self.is_meter else mi.Point2f(0.5)
         return aperture, sampler.next_1d() if mi.is_spectral else mi.Float(0)
-
-    def importance(self, p, aperture, active):
-        """(direction sample of the sensor seen from ``p`` (Interaction3f), its importance per area across)."""
-        ds, importance = self.sensor.sample_direction(p, aperture, active)
-        importance = mi.unpolarized_spectrum(importance)[0]
-        if self.is_meter:
-            # Mitsuba says pi, which the weight of its rays holds already.
-            area = self.sensor.get_shape().surface_area()
-            importance = dr.select(ds.pdf > 0, dr.inv_pi / (area * ds.pdf), 0)
-        return ds, importance
 
     def pixel(self, uv, u):
         """(row, column, weight, whether there is one) of a pixel that sees the place ``uv`` of the film, in pixels,

@@ -9,6 +9,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins.mitsuba_compat import is_irradiance_meter
 from torchtransient.plugins.polarized import (
     intensity,
     product,
@@ -30,9 +31,18 @@ class SensorSampled(Connection):
     def __init__(self, sensor, unwarp):
         self.sensor, self.unwarp, self.aperture = sensor, unwarp, None
 
+    def seen_from(self, at, aperture, active):
+        """(direction sample of the sensor seen from ``at`` (Interaction3f), its importance per area across)."""
+        ds, importance = self.sensor.sample_direction(at, aperture, active)
+        if is_irradiance_meter(self.sensor):
+            # Mitsuba says pi, which the weight of its rays holds already.
+            area = self.sensor.get_shape().surface_area()
+            return ds, dr.select(ds.pdf > 0, dr.inv_pi / (area * ds.pdf), 0)
+        return ds, mi.unpolarized_spectrum(importance)[0]
+
     def propose(self, world, path, vertex, sampler):
         active = world.deep_enough(vertex.goes_on & vertex.connectable, path.depth + 2)
-        ds, importance = self.sensor.sample_direction(vertex.at, self.aperture, active)
+        ds, importance = self.seen_from(vertex.at, self.aperture, active)
         ds.dist = dr.norm(ds.p - vertex.at.p)
         ds.d = (ds.p - vertex.at.p) / ds.dist
         return Proposal(d=ds.d, active=active & (ds.pdf > 0), ds=ds, importance=importance, u=sampler.next_2d(),
@@ -44,7 +54,7 @@ class SensorSampled(Connection):
         if mi.is_polarized:  # into the frame that the sensor's own ray has
             d = mi.Vector3f(ds.d)
             value = rotate_stokes(value, rotation_between(d, stokes_frame_of(d), stokes_frame_of(-d)))
-        value = value * mi.unpolarized_spectrum(proposal.importance)
+        value = value * proposal.importance
         active = proposal.active & (dr.max(dr.abs(intensity(value))) > 0)
         length = mi.Float(0) if self.unwarp else ds.dist * vertex.η * answer.eta
         opl = vertex.scattered_τ + mi.Float64(length)
