@@ -28,14 +28,14 @@ class TransientPath(TransientIntegrator):
     Not supported: participating media (``SceneError``).
     """
 
-    # Which passes of the boundary term derivatives have, of edge samples so many for each path, of a pilot, and how
+    # Which passes of the boundary term derivatives have, of edge samples so many for each path, and how
     # many candidates an edge is chosen from.
-    boundary, boundary_share, boundary_pilot, boundary_candidates = ("primary", "vertex", "light"), 1.0, 0, 4
+    boundary, boundary_share, boundary_candidates = ("primary", "vertex", "light"), 1.0, 4
 
     def beside(self, world, sensor, film, seed, samples):
         if not (self.boundary and world.wanted.silhouettes):
             return []
-        how = self.boundary, self.boundary_share, self.boundary_pilot, self.boundary_candidates
+        how = self.boundary, self.boundary_share, self.boundary_candidates
         return [BoundaryTerm(self, world, sensor, film, seed, samples, *how)]
 
     def strategies(self, contents):

@@ -25,12 +25,13 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins.edges.table import EdgeTable
+from torchtransient.plugins.edges.topology import Topology
 from torchtransient.plugins.integrators.launch import passes_of, seed_array
 from torchtransient.plugins.polarized import attenuated, product
 from torchtransient.plugins.sampling.sphere_lights import _Sphere
 from torchtransient.plugins.sensors.origin import PrimaryRays, index_at_sensor, sample_rays, views
 from torchtransient.plugins.sensors.stokes_frame import sensor_rotation
-from torchtransient.plugins.transport.boundary.edges import Silhouettes
 from torchtransient.plugins.transport.carry import total_of
 from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
 from torchtransient.plugins.transport.connection.sensor_sampled import SensorSampled
@@ -51,22 +52,22 @@ _FAR = 300
 
 
 class BoundaryTerm:
-    """Beside the paths of a job. ``names``: which passes; ``share``: edge samples for each path; ``pilot``: samples per
-    pixel of a run that finds out which stretches of edges matter, 0 for none.
-    """
+    """Beside the paths of a job. ``names``: which passes; ``share``: edge samples for each path."""
 
-    def __init__(self, integrator, world, sensor, film, seed, samples, names, share=1.0, pilot=0, candidates=1):
-        self.integrator, self.world, self.sensor, self.film, self.pilot = integrator, world, sensor, film, pilot
+    def __init__(self, integrator, world, sensor, film, seed, samples, names, share=1.0, candidates=1):
+        self.integrator, self.world, self.sensor, self.film = integrator, world, sensor, film
         self.candidates = candidates
         scene, wanted = world.scene, world.wanted
         self.names = [n for n in names if n != "vertex" or world.max_depth > 2]
         self.names = [n for n in self.names if n != "light" or (world.max_depth > 1 and len(scene.emitters()))]
         views_move = wanted.sensor or wanted.light
-        self.near = Silhouettes(scene, wanted.shapes, alone=not wanted.sensor)  # edges seen by the sensor
+        topology = world.contents.memory.of("edges", b"", lambda: Topology(scene))
+        self.names = self.names if topology.count else []
+        self.near = EdgeTable(topology, wanted.shapes, alone=not wanted.sensor)  # edges seen by the sensor
         # Beyond, what moves may lie behind an edge that stands still.
-        self.edges = Silhouettes(scene, wanted.shapes, alone=False) if not views_move else self.near
+        self.edges = EdgeTable(topology, wanted.shapes, alone=False) if not views_move else self.near
         if views_move:
-            self.near = self.edges = Silhouettes(scene, frozenset(), alone=False)
+            self.near = self.edges = EdgeTable(topology, frozenset(), alone=False)
         self.jobs = {}
         for name in self.names:
             own, _ = mi.sample_tea_32(seed_array(seed), mi.UInt32(_SEEDS[name]))
@@ -83,7 +84,7 @@ class BoundaryTerm:
 
     def backward(self, incoming):
         for name in self.names:
-            density = self._density(name, incoming)
+            density = self._density(name)
             for job in self.jobs[name]:
                 objective, _, _ = getattr(self, f"_{name}")(_Reverse(self, incoming), density, job)
                 with dr.resume_grad():
@@ -94,16 +95,11 @@ class BoundaryTerm:
     def forward(self):
         for name in self.names:
             for job in self.jobs[name]:
-                getattr(self, f"_{name}")(_Forward(self, job), self._density(name, None), job)
+                getattr(self, f"_{name}")(_Forward(self, job), self._density(name), job)
                 dr.eval(self.film.bands[job.band][2], self.film.steady)
 
-    def _density(self, name, incoming):
-        edges = self.near if name == "primary" else self.edges
-        if not self.pilot or incoming is None:
-            return edges.by_length
-        job = replace(self.jobs[name][0], spp=self.pilot, total=self.pilot, seed=self.jobs[name][0].seed + 77)
-        _, value, b = getattr(self, f"_{name}")(_Reverse(self, incoming), edges.by_length, job)
-        return edges.guided(value, b.k.cell)
+    def _density(self, name):
+        return (self.near if name == "primary" else self.edges).by_length
 
     # ------------------------------------------------------------------------------------------ both sides
 
@@ -226,7 +222,7 @@ class BoundaryTerm:
         pi, _ = world.segment.surface_of(path.leg)
         share = world.segment.share_of_surface(path.leg)
         past = world.scene.ray_intersect(mi.Ray3f(b.beside, b.d), active & ~b.crease)
-        y_dist = dr.select(b.crease, b.dist, dr.select(past.is_valid(), b.dist + dr.norm(past.p - b.beside), dr.inf))
+        y_dist = dr.select(b.crease, b.dist, dr.select(past.is_valid(), dr.norm(past.p - x), dr.inf))
         with dr.resume_grad():
             at_first = target == 0
             scene_ray.o = dr.select(at_first, rays.ray.o, scene_ray.o)
