@@ -9,10 +9,11 @@ import pytest
 import scipy.optimize
 
 from support.hidden_shapes import ball, join, mannequin, mesh, plate, wall_grid
-from torchtransient.plugins.around_corner import edges as edges_module
 from torchtransient.plugins.around_corner import hiding
-from torchtransient.plugins.around_corner.edges import APART, Edges, EdgeTable, Triangles
+from torchtransient.plugins.around_corner import outline_table as edges_module
 from torchtransient.plugins.around_corner.hiding import hiding_pairs, parts_of
+from torchtransient.plugins.around_corner.outline_table import Edges, OutlineTable
+from torchtransient.plugins.edges.joined import APART, Triangles
 
 VARIANT = "llvm_ad_mono"
 
@@ -184,7 +185,7 @@ def hinged():
 def table_of_edges(viewpoints, normals):
     meshes = hinged()
     triangles, edges = edges_of(*meshes)
-    return meshes, triangles, edges, EdgeTable(triangles, [edges], viewpoints, normals)
+    return meshes, triangles, edges, OutlineTable(triangles, [edges], viewpoints, normals)
 
 
 def seen_from(p, viewpoints, normals):
@@ -246,7 +247,7 @@ def test_edges_follow_the_vertices_of_their_meshes():
         one.update()
     triangles, edges = edges_of(*meshes)
     viewpoints, normals = wall_grid(2)
-    ends = EdgeTable(triangles, [edges], viewpoints - [0, 0, 2], normals).end_points(mi.UInt32(np.arange(9)))
+    ends = OutlineTable(triangles, [edges], viewpoints - [0, 0, 2], normals).end_points(mi.UInt32(np.arange(9)))
     number = mi.Float(np.arange(1.0, 10))
     dr.backward(dr.sum(number * ends[0].x + 100 * number * ends[1].z))
     order, expected = np.argsort(edges.mesh, kind="stable"), np.zeros((9, 3))

@@ -117,7 +117,7 @@ def term_of(monkeypatch, pairs, moving=(), spp=10, **facts):
     monkeypatch.setattr(outlines, "registry_number", lambda shape: shape.number)
     monkeypatch.setattr(outlines, "parts_of", lambda given: (parts, "triangles"))
     monkeypatch.setattr(outlines, "hiding_pairs", hiding_pairs)
-    monkeypatch.setattr(outlines, "EdgeTable", lambda *given: given)
+    monkeypatch.setattr(outlines, "OutlineTable", lambda *given: given)
     monkeypatch.setattr(outlines, "passes_of", lambda *given: (given, None))
     spots = Local(spots=Local(si=mi.Float(0)), confocal=False)
     world = Local(wanted=Local(geometry=facts["geometry"], sensor=facts["sensor"], light=facts["light"],

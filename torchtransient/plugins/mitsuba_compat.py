@@ -191,6 +191,14 @@ def is_instance(shape: Any) -> bool:
     return bool(shape.class_name() == "Instance")
 
 
+def group_name(instance: Any) -> str:
+    """Return the identifier of the shape group that an instance copies. Mitsuba shows it in the description alone."""
+    found = re.search(r'name = "(.*?)",\n', str(instance))
+    if found is None:
+        raise SceneError(f"{instance.class_name()}: expected the name of a shape group in its description, got {instance}.")
+    return found[1]
+
+
 def has_surface(shape: Any) -> bool:
     """Whether rays can meet a shape itself. Groups and their copies only hold others, and have a BSDF nevertheless."""
     return shape.class_name() not in ("Instance", "ShapeGroupPlugin")
@@ -251,6 +259,15 @@ def has_smooth_shape(emitter: Any) -> bool:
     """
     shape = emitter.get_shape() if mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface) else None
     return shape is not None and has_vertices(shape) and bool(shape.has_vertex_normals())
+
+
+# Meshes, and what of the others has edges or limbs in closed form.
+_OUTLINED = ("Sphere", "Disk", "Cylinder", "Ellipsoids", "Instance", "ShapeGroupPlugin")
+
+
+def lacks_edges(shape: Any) -> bool:
+    """Whether a shape has outlines that no table of edges holds: curves and grids of distances."""
+    return not (shape.is_mesh() or shape.class_name() in _OUTLINED)
 
 
 # Their normal is the same everywhere.

@@ -9,7 +9,13 @@ from typing import Any, NamedTuple
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.mitsuba_compat import TEXTURES_WITHOUT_MEAN, attribute_name, has_surface, is_instance
+from torchtransient.plugins.mitsuba_compat import (
+    TEXTURES_WITHOUT_MEAN,
+    attribute_name,
+    group_name,
+    has_surface,
+    is_instance,
+)
 
 
 class ShownValue(NamedTuple):
@@ -133,6 +139,13 @@ def shapes_of_scene(scene: Any) -> list[Any]:
         return shapes
     # Shapes of groups are not among the scene's own. Walking the whole scene finds them, at a price per parameter.
     return objects_below(scene, mi.Shape)
+
+
+def members_of(scene: Any, instance: Any) -> list[Any]:
+    """The shapes that an instance copies, in the order of their numbers in intersections (``shape_index``)."""
+    name = group_name(instance)
+    group = next(s for s in objects_below(scene, mi.Shape) if s.class_name() == "ShapeGroupPlugin" and s.id() == name)
+    return [shape for _, shape in objects_of(group) if isinstance(shape, mi.Shape)]
 
 
 def owners_of(node: Any, holders: dict[int, list[tuple[Any, str]]]) -> Iterator[tuple[Any, str]]:

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from torchtransient.plugins.around_corner.edges import Edges, Triangles
+from torchtransient.plugins.around_corner.outline_table import Edges
+from torchtransient.plugins.edges.joined import Triangles
 from torchtransient.plugins.mitsuba_compat import bounds_of
 
 # Parts of a scene that are told apart; of more, everything may hide everything.

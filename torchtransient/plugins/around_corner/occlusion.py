@@ -27,7 +27,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.around_corner.edges import EdgeTable
+from torchtransient.plugins.around_corner.outline_table import OutlineTable
 from torchtransient.plugins.integrators.launch import Pass
 from torchtransient.plugins.polarized import (
     light_type,
@@ -59,7 +59,7 @@ class MutualOcclusion:
     Light of three bounces alone; hidden surfaces scatter by their BSDF's smooth lobes.
     """
 
-    def __init__(self, integrator: Any, world: Any, sensor: Any, film: Any, edges: EdgeTable, spots: Any, jobs: Any):
+    def __init__(self, integrator: Any, world: Any, sensor: Any, film: Any, edges: OutlineTable, spots: Any, jobs: Any):
         self.integrator, self.world, self.sensor, self.film = integrator, world, sensor, film
         self.edges, self.spots, self.jobs = edges, spots, jobs
 

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient.errors import GradientError, TorchTransientWarning
-from torchtransient.plugins.around_corner.edges import EdgeTable
+from torchtransient.plugins.around_corner.outline_table import OutlineTable
 from torchtransient.plugins.around_corner.geometry import front_normal
 from torchtransient.plugins.around_corner.hiding import Part, hiding_pairs, parts_of
 from torchtransient.plugins.around_corner.occlusion import BOUNCES, MutualOcclusion
@@ -111,7 +111,7 @@ def mutual_occlusion(
     if not hiders:
         return None
     rows = viewpoints.references
-    edges = EdgeTable(triangles, [parts[i].edges for i in hiders], viewpoints.p[rows], viewpoints.n[rows])
+    edges = OutlineTable(triangles, [parts[i].edges for i in hiders], viewpoints.p[rows], viewpoints.n[rows])
     sampler = sensor.sampler().clone()
     count = spp or sampler.sample_count()
     own_seed, _ = mi.sample_tea_32(seed_array(seed), mi.UInt32(_SEED))

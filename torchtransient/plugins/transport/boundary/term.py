@@ -22,10 +22,11 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins.edges.table import EdgeTable
+from torchtransient.plugins.edges.topology import Topology
 from torchtransient.plugins.integrators.launch import passes_of, seed_array
 from torchtransient.plugins.mitsuba_compat import is_irradiance_meter
 from torchtransient.plugins.sensors.origin import PrimaryRays, index_at_sensor, sample_rays, views
-from torchtransient.plugins.transport.boundary.edges import Silhouettes
 from torchtransient.plugins.transport.boundary.light import LightPass
 from torchtransient.plugins.transport.boundary.primary import PrimaryPass
 from torchtransient.plugins.transport.boundary.vertex import VertexPass
@@ -55,13 +56,14 @@ class BoundaryTerm:
         views_move = wanted.sensor or wanted.light
         moving = frozenset() if views_move else wanted.shapes
         # A sensor at rest sees the edges of what moves alone; behind an edge at rest something else may move.
-        self.seen_edges = Silhouettes(scene, moving, alone=not views_move)
-        self.edges = self.seen_edges if views_move else Silhouettes(scene, moving, alone=False)
+        topology = world.contents.memory.of("edges", b"", lambda: Topology(scene))
+        self.seen_edges = EdgeTable(topology, moving, alone=not views_move)
+        self.edges = self.seen_edges if views_move else EdgeTable(topology, moving, alone=False)
         self.radius = dr.opaque(mi.Float, integrator.reference(scene).radius)
         with dr.suspend_grad():
             self.light_world = self._light_world()
         self.passes, self.jobs = {}, {}
-        for name in names:
+        for name in names if topology.count else ():
             if PASSES[name].exists(world, sensor):
                 own, _ = mi.sample_tea_32(seed_array(seed), mi.UInt32(_SEEDS[name]))
                 self.passes[name] = PASSES[name](self)

@@ -1,8 +1,7 @@
 """Edges of meshes at which one thing may begin to hide another: where outlines can be, seen from points of a wall.
 
-Triangles are joined by position, so that seams of texture coordinates and of separate files do not count as rims. An
-edge of one face is an outline from everywhere; one of two faces is one from where both are seen on the same side of it,
-which a flat crease never is. Laid out with numpy, outside of kernels.
+An edge of one face is an outline from everywhere; one of two faces is one from where both are seen on the same side of
+it, which a flat crease never is. Laid out with numpy, outside of kernels.
 """
 
 from __future__ import annotations
@@ -14,101 +13,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from torchtransient.plugins.host_numbers import host_numbers
+from torchtransient.plugins.edges.joined import FLAT, Triangles, edge_keys
 
-# Creases flatter than this are no outline: 1 minus the cosine of 1.4e-3 radians.
-FLAT = 1e-6
-# Rims that are nearer than this to each other, in parts of the largest coordinate, are one.
-APART = 8e-6
 # Edges that are weighed at a time.
 BLOCK = 2048
 # Share of the samples that goes by length alone: outlines that the reference points do not see are found all the same.
 DEFENSIVE = 0.1
-
-
-@dataclass
-class Triangles:
-    """The triangles of several ``meshes``, their vertices joined by position, of one mesh and of different ones.
-
-    ``vertices`` (V, 3), of all meshes in their order; ``first`` (M,), number of each one's first; ``faces`` (F, 3),
-    numbers of vertices; ``joined`` (F, 3), numbers of places; ``mesh`` (F,), number of the mesh. Faces without area are
-    left out.
-    """
-
-    meshes: list[Any]
-    vertices: np.ndarray
-    first: np.ndarray
-    faces: np.ndarray
-    joined: np.ndarray
-    mesh: np.ndarray
-
-    @staticmethod
-    def of(meshes: list[Any]) -> Triangles:
-        """Those of Mitsuba meshes, as they are now."""
-        v = [host_numbers(m.vertex_positions_buffer(), np.float32).reshape(-1, 3) for m in meshes]
-        f = [np.array(m.faces_buffer(), dtype=np.int64).reshape(-1, 3) for m in meshes]
-        first = np.cumsum([0, *(len(one) for one in v)])
-        mesh = np.repeat(np.arange(len(f)), [len(one) for one in f])
-        positions = np.concatenate([np.zeros((0, 3), np.float32), *v])
-        faces = np.concatenate(
-            [np.zeros((0, 3), np.int64), *(one + start for one, start in zip(f, first, strict=False))]
-        )
-        corners = positions.astype(np.float64)[faces]
-        some = np.any(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) != 0, axis=1)
-        faces, mesh = faces[some], mesh[some]
-        joined = _joined(positions, faces)
-        return Triangles(meshes, positions.astype(np.float64), first, faces, joined, mesh)
-
-    def parts(self) -> np.ndarray:
-        """Number of the connected part that each face belongs to, ``(F,)``."""
-        return _merged(self.joined, int(self.joined.max(initial=-1)) + 1)[self.joined[:, 0]]
-
-
-def _joined(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Places of the corners of faces. What is not the same to the bit is the same place if it lies on rims: pieces that
-    were put together by transforms are off by some roundings.
-    """
-    # Adding zero makes one of the two zeros.
-    keys = np.ascontiguousarray(positions + np.float32(0)).view("V12").ravel()
-    _, sample, place = np.unique(keys, return_index=True, return_inverse=True)
-    place = place.ravel()
-    joined = place[faces]
-    key, _ = _edge_keys(joined)
-    _, back, count = np.unique(key, return_inverse=True, return_counts=True)
-    on_rim = np.unique(joined[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)[count[back.ravel()] == 1])
-    if not len(on_rim):
-        return joined
-    p = positions[sample[on_rim]].astype(np.float64)
-    cell = p / (APART * max(float(np.abs(p).max()), 1e-30))
-    # Two points nearer than half a cell share one in some of the eight shifted grids.
-    groups = []
-    for shift in range(8):
-        of_grid = np.floor(cell + 0.5 * np.array([shift & 1, shift >> 1 & 1, shift >> 2 & 1])).astype(np.int64)
-        _, index, inverse = np.unique(of_grid, axis=0, return_index=True, return_inverse=True)
-        groups.append(np.stack([np.arange(len(p)), index[inverse.ravel()]], 1))
-    label = np.arange(len(sample))
-    label[on_rim] = on_rim[_merged(np.concatenate(groups), len(p), numbered=False)]
-    return label[joined]
-
-
-def _merged(groups: np.ndarray, count: int, numbered: bool = True) -> np.ndarray:
-    """A label for each of ``count`` things, the same for those that a row of ``groups`` (G, K) names: the least number
-    of its like, or ``numbered`` from zero on.
-    """
-    label = np.arange(count)
-    while True:
-        new = label.copy()
-        np.minimum.at(new, groups.ravel(), np.repeat(label[groups].min(1), groups.shape[1]))
-        new = new[new]
-        if np.array_equal(new, label):
-            return np.unique(label, return_inverse=True)[1].ravel() if numbered else label
-        label = new
-
-
-def _edge_keys(joined: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A number for each edge of each face, the same for the same edge, and whether it is one at all: ``(3 F,)``."""
-    low, high = joined.ravel(), joined[:, [1, 2, 0]].ravel()
-    return np.minimum(low, high) * (int(joined.max(initial=0)) + 1) + np.maximum(low, high), low != high
 
 
 @dataclass
@@ -129,7 +39,7 @@ class Edges:
     def of(all_of_them: Triangles, faces: np.ndarray) -> Edges:
         """The edges that can be outlines of some faces (F,), given by their numbers."""
         corners = all_of_them.faces[faces]
-        key, proper = _edge_keys(all_of_them.joined[faces])
+        key, proper = edge_keys(all_of_them.joined[faces])
         mesh = np.repeat(all_of_them.mesh[faces], 3)
         order = np.lexsort((mesh, key))
         order = order[proper[order]]
@@ -180,7 +90,7 @@ def _outermost(v: np.ndarray, ends: np.ndarray, around: np.ndarray) -> np.ndarra
     return around[order[[widest, (widest + 1) % len(order)]]]
 
 
-class EdgeTable:
+class OutlineTable:
     """Some edges of ``triangles`` with a density along them, and their attached ends. ``viewpoints`` and ``normals``
     ``(P, 3)``: points that see them, some of the wall.
 

@@ -1,0 +1,270 @@
+"""Which edges and limbs a scene has: corners, faces and shapes, without their numbers.
+
+Laid out with numpy once a scene. Positions are looked at to join what was put together and to order three and more
+faces around an edge; all that is computed of them later is read anew (:class:`.table.EdgeTable`).
+"""
+
+from __future__ import annotations
+
+from itertools import groupby
+from typing import Any, NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from torchtransient.plugins.edges.joined import edge_keys, joined_places, near_places
+from torchtransient.plugins.host_numbers import host_numbers
+from torchtransient.plugins.mitsuba_compat import is_instance, lacks_edges
+from torchtransient.plugins.node_walk import members_of, shapes_of_scene, shown_by
+from torchtransient.plugins.pointer_table import registry_number
+
+# Flags of a row: a second face; seen from between its faces alone; listed for the other face's vertices, too.
+TWO, GAP, TWIN = 1, 2, 4
+# What a row is: an edge; the limb of a ball; the two limbs of a tube; the rims of disks and tubes.
+EDGE, BALL, TUBE_LEFT, TUBE_RIGHT, DISK_RIM, TUBE_RIM = range(6)
+KIND = 8  # the kind's factor in the flags
+# Numbers per ellipsoid: centre, semi-axes, quaternion.
+_ELLIPSOID = 10
+
+
+class Body:
+    """A shape of the scene, or a member of an instance. ``index``: its number among the members."""
+
+    def __init__(self, shape: Any, instance: Any = None, index: int = 0xFFFFFFFF) -> None:
+        self.shape, self.instance, self.index = shape, instance, index
+        self._shown = {value.key: value for value in shown_by(shape)[0]}
+        self._placed = None if instance is None else next(v for v in shown_by(instance)[0] if v.key == "to_world")
+
+    def _value(self, key: str) -> Any:
+        return self._shown[key].read(self.shape)
+
+    def _to_world(self, p: Any) -> Any:
+        return p if self._placed is None else mi.AffineTransform4f(self._placed.read(self.instance)) @ p
+
+    def moves(self, moving: frozenset[Any]) -> bool:
+        """Return whether the address of the shape or of its instance is one of ``moving``."""
+        return self.shape.ptr in moving or (self.instance is not None and self.instance.ptr in moving)
+
+    def vertices(self) -> Any:
+        """The vertices of a mesh (Point3f), attached."""
+        return self._to_world(dr.unravel(mi.Point3f, self.shape.vertex_positions_buffer()))
+
+    def kinds(self) -> list[int]:
+        """Kinds of the rows of a shape that is no mesh; ellipsoids have one for each."""
+        name = self.shape.class_name()
+        if name == "Ellipsoids":
+            return [BALL] * (dr.width(self._value("data")) // _ELLIPSOID)
+        round_kinds = {"Sphere": [BALL], "Disk": [DISK_RIM], "Cylinder": [TUBE_LEFT, TUBE_RIGHT, TUBE_RIM, TUBE_RIM]}
+        return round_kinds[name]
+
+    def frames(self) -> list[tuple[Any, Any, Any, Any]]:
+        """Origin and axes of the space in which the shape is a unit ball, disk or tube, for each row, attached."""
+        if self.shape.class_name() == "Ellipsoids":
+            return [self._ellipsoid_frames()]
+        T = mi.AffineTransform4f(self._value("to_world"))
+        o, *axes = (
+            self._to_world(T @ v) for v in (mi.Point3f(0), mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Vector3f(0, 0, 1))
+        )
+        if self.shape.class_name() != "Cylinder":
+            return [(o, *axes)]
+        # The rims of a tube have their face along the third axis.
+        return [(o, *axes)] * 3 + [(o + axes[2], axes[0], axes[1], -axes[2])]
+
+    def _ellipsoid_frames(self) -> tuple[Any, Any, Any, Any]:
+        data = mi.Float(self._value("data"))
+        n = [dr.gather(mi.Float, data, _ELLIPSOID * dr.arange(mi.UInt32, dr.width(data) // _ELLIPSOID) + k) for k in range(_ELLIPSOID)]
+        turn = dr.quat_to_matrix(mi.Matrix3f, mi.Quaternion4f(*n[6:]))
+        axes = [mi.Vector3f(turn[0, i], turn[1, i], turn[2, i]) * n[3 + i] * self._extent() for i in range(3)]
+        return self._to_world(mi.Point3f(*n[:3])), *(self._to_world(axis) for axis in axes)
+
+    def _extent(self) -> Any:
+        if self._value("extent_adaptive_clamping"):
+            return dr.sqrt(2 * dr.log(mi.Float(self._value("opacities")) / 0.01)) * (self._value("extent") / 3)
+        return self._value("extent")
+
+
+class _Rows(NamedTuple):
+    """Edges of a mesh, numbers of vertices: ``ends`` (E, 2), ``third`` (E, 2) of both faces, ``other`` (E, 2), the ends
+    as the second face has them; ``faces`` (E, 2); ``place`` (E, 4), numbers 0 to 2 of the ends in the first face and in
+    the second; ``flags``.
+    """
+
+    ends: np.ndarray
+    third: np.ndarray
+    other: np.ndarray
+    faces: np.ndarray
+    place: np.ndarray
+    flags: np.ndarray
+
+
+def _halves(joined: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Numbers (K, 3) in ``joined.ravel()`` of start, stop and third corner of half-edges, from the lower joined place on."""
+    face, k = rows // 3 * 3, rows % 3
+    start, stop = face + k, face + (k + 1) % 3
+    turned = joined.ravel()[start] > joined.ravel()[stop]
+    return np.stack([np.where(turned, stop, start), np.where(turned, start, stop), face + (k + 2) % 3], 1)
+
+
+def _edges_of(positions: np.ndarray, faces: np.ndarray) -> _Rows:
+    """The edges of a mesh with vertices (V, 3) and faces (F, 3), flat ones included."""
+    corners = positions.astype(np.float64)[faces]
+    number = np.flatnonzero(np.any(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) != 0, axis=1))
+    faces = faces[number]
+    joined = joined_places(positions.astype(np.float32), faces)
+    key, proper = edge_keys(joined)
+    order = np.argsort(key, kind="stable")
+    order = order[proper[order]]
+    first = np.diff(key[order], prepend=-1) != 0
+    group = np.cumsum(first) - 1
+    count = np.bincount(group)[group] if len(group) else group
+    at = faces.ravel()
+    many = np.flatnonzero(count > 2)
+    if len(many):
+        # Around each edge, from its first face on.
+        angle = _angles(positions.astype(np.float64)[at[_halves(joined, order[many])]], group[many])
+        order[many] = order[many][np.lexsort((angle, group[many]))]
+    last = np.append(first[1:], True)
+    start = np.maximum.accumulate(np.where(first, np.arange(len(order)), 0))
+    following = np.where(last, start, np.arange(len(order)) + 1)
+    a, b = _halves(joined, order), _halves(joined, order[following])
+    twin = (count == 2) & np.any(at[a[:, :2]] != at[b[:, :2]], axis=1)
+    kept = first | (count > 2) | twin
+    flags = (TWO * (count > 1) + GAP * (count > 2) + TWIN * twin)[kept]
+    a, b = a[kept], b[kept]
+    return _Rows(
+        at[a[:, :2]], np.stack([at[a[:, 2]], at[b[:, 2]]], 1), at[b[:, :2]], number[np.stack([a[:, 0], b[:, 0]], 1) // 3],
+        np.concatenate([a[:, :2], b[:, :2]], 1) % 3, flags,
+    )  # fmt: skip
+
+
+def _angles(p: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """Angles of faces around their edges against the first of their ``group``; ``p`` (K, 3, 3): ends, third corner."""
+    t = p[:, 1] - p[:, 0]
+    t /= np.linalg.norm(t, axis=1, keepdims=True)
+    w = p[:, 2] - p[:, 0]
+    h = w - t * (w * t).sum(1, keepdims=True)
+    _, first, back = np.unique(group, return_index=True, return_inverse=True)
+    x = h[first][back.ravel()]
+    return np.arctan2((np.cross(t, x) * h).sum(1), (x * h).sum(1)) % (2 * np.pi)
+
+
+class Topology:
+    """The edges and limbs of ``scene``, edges first: ``count`` of them, the last ``rounds`` are limbs and rims of shapes
+    without triangles. ``without``: the shapes that have outlines, but no edges here.
+
+    A plain object of Dr.Jit arrays, to be kept with the scene and to be named as state of recorded calls.
+
+    Two meshes that touch along rims have edges there with one face of each, listed for both, with half of the light:
+    where they come apart later, each is a rim of its own. What comes together later is not joined.
+    """
+
+    def __init__(self, scene: Any) -> None:
+        self.without = [shape for shape in shapes_of_scene(scene) if lacks_edges(shape)]
+        bodies = [body for shape in scene.shapes() if not lacks_edges(shape) for body in _bodies(scene, shape)]
+        self._meshes = [body for body in bodies if body.shape.is_mesh()]
+        self._others = [body for body in bodies if not body.shape.is_mesh()]
+        self.bodies = self._meshes + self._others
+        found: dict[int, _Rows] = {}
+        for body in self._meshes:
+            if body.shape.ptr not in found:
+                positions = host_numbers(body.shape.vertex_positions_buffer(), np.float32).reshape(-1, 3)
+                found[body.shape.ptr] = _edges_of(positions, np.array(body.shape.faces_buffer(), np.int64).reshape(-1, 3))
+        parts = [found[body.shape.ptr] for body in self._meshes]
+        widths = [body.shape.vertex_count() for body in self._meshes]
+        starts = np.cumsum([0, *widths])
+        rows = _stacked(parts, starts)
+        owner = np.repeat(np.arange(len(parts)), [len(part.flags) for part in parts])
+        owners = np.stack([owner, owner], 1)
+        if len(parts) > 1:
+            with dr.suspend_grad():
+                rows, owners = _joined_rims(rows, owners, host_numbers(self.points()).T)
+        kinds = [body.kinds() for body in self._others]
+        self.rounds = sum(len(each) for each in kinds)
+        self.count = len(owners) + self.rounds
+        flags = np.concatenate([rows.flags, *(np.array(each) * KIND for each in kinds)]).astype(np.uint32)
+        rounds = np.repeat(np.arange(len(kinds)), [len(each) for each in kinds]) + len(parts)
+        owners = np.concatenate([owners, np.stack([rounds, rounds], 1)])
+        number = np.concatenate([np.arange(len(k)) if b.shape.class_name() == "Ellipsoids" else np.zeros(len(k)) for b, k in zip(self._others, kinds, strict=True)]) if kinds else []
+        faces = np.concatenate([rows.faces, np.stack([number, number], 1)]) if len(number) else rows.faces
+
+        whole = lambda x: mi.UInt32(np.ascontiguousarray(x, np.uint32))  # noqa: E731
+        self.ends, self.third, self.other = ([whole(x[:, i]) for i in (0, 1)] for x in (rows.ends, rows.third, rows.other))
+        self.faces, self.owners = ([whole(x[:, i]) for i in (0, 1)] for x in (faces, owners))
+        place = np.concatenate([rows.place, np.zeros((self.rounds, 4), int)])
+        self.place = whole(place @ [1, 4, 16, 64])
+        self.flags = whole(flags)
+        self.has_gaps, self.has_twins = bool((flags & GAP).any()), bool((flags & TWIN).any())
+        self.shape, self.instance = (
+            whole([0 if x is None else registry_number(x) for x in each])
+            for each in ([b.shape for b in self.bodies], [b.instance for b in self.bodies])
+        )
+        self.index = whole([b.index for b in self.bodies])
+        # Rows follow each other by what they belong to.
+        self._runs = [(k, len(list(run))) for k, run in groupby(owners[:, 0].tolist())]
+        dr.eval(self.ends, self.third, self.other, self.faces, self.owners, self.place, self.flags, self.shape, self.instance, self.index)
+
+    def points(self) -> Any:
+        """The vertices of all meshes, one after the other, attached where they are."""
+        return _concatenated([body.vertices() for body in self._meshes], mi.Point3f)
+
+    def frames(self) -> list[Any]:
+        """Origins and axes (four Point3f) of the limbs, attached where they are."""
+        frames = [frame for body in self._others for frame in body.frames()]
+        return [_concatenated([frame[k] for frame in frames], mi.Point3f) for k in range(4)]
+
+    def moves(self, moving: frozenset[Any]) -> Any:
+        """Ones for the rows of bodies that move, None where none does."""
+        moves = [self.bodies[k].moves(moving) for k, _ in self._runs]
+        if not any(moves):
+            return None
+        return dr.concat([dr.full(mi.Float, float(m), n) for m, (_, n) in zip(moves, self._runs, strict=True)])
+
+
+def _bodies(scene: Any, shape: Any) -> list[Body]:
+    if not is_instance(shape):
+        return [Body(shape)]
+    members = members_of(scene, shape)
+    return [Body(one, shape, k) for k, one in enumerate(members) if not lacks_edges(one)]
+
+
+def _concatenated(parts: list[Any], type_: type) -> Any:
+    return type_(*[dr.concat([mi.Float(part[k]) for part in parts]) for k in range(3)]) if parts else type_()
+
+
+def _stacked(parts: list[_Rows], starts: np.ndarray) -> _Rows:
+    """The rows of all meshes, vertices counted through."""
+    if not parts:
+        none = np.zeros((0, 2), int)
+        return _Rows(none, none, none, none, np.zeros((0, 4), int), np.zeros(0, int))
+    shifted = [
+        part._replace(ends=part.ends + n, third=part.third + n, other=part.other + n)
+        for part, n in zip(parts, starts, strict=False)
+    ]
+    return _Rows(*(np.concatenate(columns) for columns in zip(*shifted, strict=True)))
+
+
+def _joined_rims(rows: _Rows, owners: np.ndarray, positions: np.ndarray) -> tuple[_Rows, np.ndarray]:
+    """The rows with rims of two bodies that lie at the same place joined in pairs; more than two stay as they are."""
+    rims = np.flatnonzero(rows.flags & TWO == 0)
+    if not len(rims):
+        return rows, owners
+    ends = rows.ends[rims]
+    place = near_places(positions[ends].reshape(-1, 3)).reshape(-1, 2)
+    low = np.sort(place, axis=1)
+    _, group, count = np.unique(low, axis=0, return_inverse=True, return_counts=True)
+    group = group.ravel()
+    order = np.argsort(group, kind="stable")
+    order = order[count[group[order]] == 2].reshape(-1, 2)
+    order = order[owners[rims[order[:, 0]], 0] != owners[rims[order[:, 1]], 0]]
+    new = _Rows(*(each.copy() for each in rows))
+    owners = owners.copy()
+    for own, other in (order.T, order.T[::-1]):
+        a, b = rims[own], rims[other]
+        same = (place[own] == place[other])[:, :1]
+        turned = lambda x, same=same: np.where(same, x, x[:, ::-1])  # noqa: E731
+        new.other[a] = turned(rows.ends[b])
+        new.place[a, 2:] = turned(rows.place[b, :2])
+        new.third[a, 1], new.faces[a, 1], owners[a, 1] = rows.third[b, 0], rows.faces[b, 0], owners[b, 0]
+        new.flags[a] = TWO + TWIN
+    return new, owners
