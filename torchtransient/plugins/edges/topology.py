@@ -48,7 +48,8 @@ class Body:
 
     def vertices(self) -> Any:
         """The vertices of a mesh (Point3f), attached."""
-        return self._to_world(dr.unravel(mi.Point3f, self.shape.vertex_positions_buffer()))
+        buffer = self.shape.vertex_positions_buffer()
+        return self._to_world(dr.gather(mi.Point3f, buffer, dr.arange(mi.UInt32, dr.width(buffer) // 3)))
 
     def kinds(self) -> list[int]:
         """Kinds of the rows of a shape that is no mesh; ellipsoids have one for each."""
