@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins.edges.table import BESIDE
 from torchtransient.plugins.polarized import attenuated
 from torchtransient.plugins.transport.boundary.primary import can_be_sampled
 from torchtransient.plugins.transport.boundary.sides import at_point
@@ -14,6 +15,9 @@ from torchtransient.plugins.transport.scattering.geometry_terms import displacem
 from torchtransient.plugins.transport.strategy import Local
 from torchtransient.plugins.transport.walk import go_on, start
 
+# Distance past an edge, in parts of the largest coordinate, up to which a surface touches it: ten times as far as paths
+# pass beside edges.
+CONTACT = 10 * BESIDE
 # Radii of the scene from which a light at infinity is looked at along an edge.
 _FAR = 300
 
@@ -63,8 +67,12 @@ class LightPass:
         β = light.Le * mi.UnpolarizedSpectrum(T) * dr.select(most > 0, dr.rcp(most), 0)
         path.β, path.active = attenuated(mi.Spectrum(1), dr.select(active, β, 0)), active
         path.leg = lit.segment.depart(lit, ray, place, path.β, sampler, active)
+        x = lit.segment.arrive(lit, path)
+        # What touches the edge is uncovered for the light and for the vertex before at once, which counts it.
+        touches = dr.abs(dr.dot(x.at.p - b.p, b.d)) < CONTACT * (1 + dr.max(dr.abs(b.p)))
+        path.active = active = active & ~touches
         with dr.resume_grad():
-            speeds = self._speeds(edges, light, path, ray, wavelength, aperture, sampler, job, active)
+            speeds = self._speeds(edges, light, x, path, ray, wavelength, aperture, sampler, job, active)
         u = sampler.next_2d()
         sink, factors = mode.sink_of_pixels(middle, job, u, factor, speeds)
         _, kept = go_on(lit, sampler, path, sink)
@@ -89,14 +97,13 @@ class LightPass:
         other *= dr.select(ds.delta, 1, dr.select(far, 1, ratio) / ds.pdf)
         return Local(ds=ds, b=b, far=far, Le=dr.select(k.ball, other, Le), near=near, u=u)
 
-    def _speeds(self, edges, light, path, ray, wavelength, aperture, sampler, job, active):
+    def _speeds(self, edges, light, x, path, ray, wavelength, aperture, sampler, job, active):
         """Attached speeds of the edge: where x is the first vertex of a path of the sensor, and where it is another."""
         term, b = self.term, light.b
         world = term.world
         pi, on_surface = term.light_world.segment.surface_of(path.leg)
         surface = active & on_surface & pi.is_valid()
         with dr.suspend_grad():
-            x = term.light_world.segment.arrive(term.light_world, path)
             seen, _ = term.to_sensor.seen_from(x.at, aperture, active)
             behind = dr.norm(x.at.p - b.p)
             t = dr.select(light.far, 0, behind / (behind + b.dist))
