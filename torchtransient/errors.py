@@ -76,6 +76,12 @@ class PhysicsWarning(TorchTransientWarning):
     """
 
 
+class GradientWarning(TorchTransientWarning):
+    """A derivative that is computed as it is asked for, and lacks a part: what moving edges hide and uncover, where that
+    is not followed or was left out.
+    """
+
+
 class VariantWarning(TorchTransientWarning, RuntimeWarning):
     """What is loaded already cannot do what variants of this library need."""
 

@@ -51,11 +51,11 @@ _FAR = 300
 
 
 class BoundaryTerm:
-    """Beside the paths of a job. ``names``: which passes; ``share``: edge samples for each path; ``pilot``: samples per
+    """Beside the paths of a job. ``samples``: per pixel of each pass; ``names``: which passes; ``pilot``: samples per
     pixel of a run that finds out which stretches of edges matter, 0 for none.
     """
 
-    def __init__(self, integrator, world, sensor, film, seed, samples, names, share=1.0, pilot=0, candidates=1):
+    def __init__(self, integrator, world, sensor, film, seed, samples, names, pilot=0, candidates=4):
         self.integrator, self.world, self.sensor, self.film, self.pilot = integrator, world, sensor, film, pilot
         self.candidates = candidates
         scene, wanted = world.scene, world.wanted
@@ -70,8 +70,7 @@ class BoundaryTerm:
         self.jobs = {}
         for name in self.names:
             own, _ = mi.sample_tea_32(seed_array(seed), mi.UInt32(_SEEDS[name]))
-            count = max(1, round(samples * share))
-            self.jobs[name], _ = passes_of(sensor.sampler().clone(), film, own, count, world.most_events())
+            self.jobs[name], _ = passes_of(sensor.sampler().clone(), film, own, samples, world.most_events())
         self.lights = EmitterSampled()
         self.lights.prepare(world)
 
