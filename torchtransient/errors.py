@@ -77,8 +77,8 @@ class PhysicsWarning(TorchTransientWarning):
 
 
 class GradientWarning(TorchTransientWarning):
-    """A derivative that is computed as it is asked for, and lacks a part: what moving edges hide and uncover, where that
-    is not followed or was left out.
+    """A derivative that is computed and lacks a part: what moving edges hide and uncover, where they are not followed
+    or were left out.
     """
 
 

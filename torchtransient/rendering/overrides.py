@@ -61,7 +61,8 @@ def boundary_term(on: bool, spp: int | None, integrator: Any) -> Iterator[None]:
         changes = ({} if on else {"boundary": False}) | ({} if spp is None else {"spp_boundary": spp})
         for name, value in changes.items():
             if hasattr(integrator, name):
-                restore.enter_context(afterwards(functools.partial(setattr, integrator, name, getattr(integrator, name))))
+                put_back = functools.partial(setattr, integrator, name, getattr(integrator, name))
+                restore.enter_context(afterwards(put_back))
                 setattr(integrator, name, value)
         yield
 

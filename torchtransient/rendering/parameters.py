@@ -35,8 +35,9 @@ class ParameterInfo:
     ``value`` is None for more than 65536 numbers: ask for the key and read ``renderer.values[key]``.
 
     ``moves_path_length``, ``moves_silhouette``, ``moves_medium``: whether it can change an optical path length, move a
-    visibility edge, change an extinction. ``biased``: its derivative is known to be wrong somewhere, for instance where
-    edges move that are seen in a mirror. ``reason`` says why. ``substitute``: the materials built as
+    visibility edge, change an extinction. ``biased``: its derivative is known to be wrong somewhere: in whatever scene
+    (``always_biased``), or where edges move that are not followed in this one, for instance those seen in a mirror
+    (``edges_missing``, in words). ``reason`` says why. ``substitute``: the materials built as
     others when the key is asked for, by name, with the name of the texture in them ("" for a number).
     ``place``: names of the parameter and of what its plugin is in. ``checked``: whether the sweep of gradients has
     compared it with finite differences in such a place (``docs/gradients_sweep.md``); the reason says when it has not.
@@ -52,9 +53,15 @@ class ParameterInfo:
     substitute: frozenset[tuple[str, str]] = frozenset()
     moves_silhouette: bool = False
     moves_medium: bool = False
-    biased: bool = False
+    always_biased: bool = False
+    edges_missing: tuple[str, ...] = ()
     place: tuple[str, ...] = ()
     checked: bool = True
+
+    @property
+    def biased(self) -> bool:
+        """Whether the derivative is known to be wrong somewhere."""
+        return self.always_biased or bool(self.edges_missing)
 
 
 class ParameterTable(Mapping[str, ParameterInfo]):
@@ -131,7 +138,7 @@ def parameter_table(built: BuiltScene) -> ParameterTable:
 
 
 def moving_edges_of(scene: Any) -> MovingEdges:
-    """Return what derivatives of a built scene lack where edges move; a steady integrator is taken for the transient one
+    """Return what derivatives of a built scene lack where edges move; a steady integrator counts as the transient one
     that renders in its place.
     """
     integrator = scene.integrator()
@@ -158,8 +165,8 @@ def _with_gaps(info: ParameterInfo, edges: MovingEdges, tracker: ParameterTracke
     if not (info.differentiable and info.moves_silhouette):
         return info
     effect = replace(tracker.effect_of(node, info.key), reason=info.reason)
-    biased = info.biased or bool(edges.lacking(node, info.key, effect))
-    return replace(info, biased=biased, reason=edges.reason(node, info.key, effect))
+    missing = tuple(gap.where for gap in edges.lacking(node, info.key, effect))
+    return replace(info, edges_missing=missing, reason=edges.reason(node, info.key, effect))
 
 
 def _placed(info: ParameterInfo, tracker: ParameterTracker, node: Any) -> ParameterInfo:
@@ -183,7 +190,7 @@ def _info(key: str, kind: str, shape: tuple[int, ...] | None, value: Any, effect
         effect.reason,
         moves_silhouette=effect.moves_silhouette,
         moves_medium=effect.moves_medium,
-        biased=effect.biased,
+        always_biased=effect.biased,
     )
 
 

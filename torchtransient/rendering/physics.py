@@ -70,8 +70,8 @@ class PhysicsWatch:
             warnings.warn(message, PhysicsWarning, stacklevel=level_of_user())
 
     def gradient(self, about: str, message: str, *, is_error: bool = True) -> None:
-        """Warn of a derivative that lacks a part, once for each ``about``; "error" makes it a ``GradientError``, "ignore"
-        does not silence it.
+        """Warn of a derivative that lacks a part, once for each ``about``; the mode "error" makes it a
+        ``GradientError``, "ignore" does not silence it.
         """
         if self.mode == "error" and is_error:
             raise GradientError(f"{message} With physics='warn' it is computed all the same.")

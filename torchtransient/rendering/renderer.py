@@ -103,11 +103,11 @@ class TransientRenderer(CopiesParametrized):
     and the number; "error" raises ``PhysicsError``, of bounds for those that leave out more than 5 %; "ignore" does not
     look.
 
-    ``boundary``: derivatives by keys that move silhouettes hold what moving edges hide and uncover (the boundary term of
-    ``docs/gradients.md``), as the scene's integrator does by default; False leaves it out. ``spp_boundary``: samples per
-    pixel of each of its passes, None for half of those of the derivative. Where a derivative lacks a part of it,
+    ``boundary``: derivatives by keys that move silhouettes hold what moving edges hide and uncover (the boundary term,
+    see ``docs/gradients.md``), unless the scene's integrator leaves it out; False leaves it out. ``spp_boundary``:
+    samples per pixel of each of its passes, None for half of those of the derivative. Where a derivative lacks a part,
     the first call with values that can be differentiated by warns with the keys (``GradientWarning``), and with
-    ``physics="error"`` raises ``GradientError`` unless it was left out.
+    ``physics="error"`` raises ``GradientError``, unless the part was left out.
 
     ``freeze``: True records what a call launches, so that later calls need no tracing, with the same values, gradients
     and noise; ``out.stats.recorded`` says what became of it, ``docs/speed.md`` what makes a new recording.

@@ -40,7 +40,7 @@ def silhouettes(least: int, most: int, exhaustive: bool) -> MovingEdges:
         lacking = "behind shapes without triangles", "where bodies run into each other"
     if least <= BOUNCES <= most and exhaustive:
         lacking = ("where one hidden part may hide another (refused)",)
-    late = Gap("in light of more than three bounces where one part hides another", "Set filter_bounces or max_depth to 3.")
+    late = Gap("in light of more than three bounces where one part hides another", "Set max_depth to 3.")
     return MovingEdges((late,) if most > BOUNCES else (), words=lacking)
 
 

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.mitsuba_compat import attribute_name, has_surface, is_bump_map, is_instance
-from torchtransient.plugins.node_walk import bsdfs_of_scene, objects_below, shapes_of_scene
+from torchtransient.plugins.node_walk import objects_below, shapes_of_scene
 from torchtransient.plugins.parameter_effect import CORRECT, ParameterEffect
 
 # Roles of what moves edges against what is behind them, and of what bends light, which moves edges that are seen
@@ -67,9 +67,8 @@ class MovingEdges:
 
     def reason(self, node: Any, key: str, effect: ParameterEffect) -> str:
         """Return the reason of the effect with what the derivative lacks."""
-        gaps = self.lacking(node, key, effect)
-        words = [gap.where for gap in gaps]
-        words += self.words if effect.supported and moves_edges(key, effect) else ()
+        words = list(self.words) if effect.supported and moves_edges(key, effect) else []
+        words += [gap.where for gap in self.lacking(node, key, effect)]
         if not words:
             return effect.reason
         said = f"{CORRECT} except {', '.join(words)} (no boundary term)"
@@ -82,11 +81,12 @@ class MovingEdges:
             return ()
         address = 0 if shape is None else shape.ptr
         if address not in self._steps:
-            self._steps[address] = stepped_textures(shapes_of_scene(self._scene) if shape is None else [shape])
+            shapes = shapes_of_scene(self._scene) if shape is None else [shape]
+            self._steps[address] = [_name(one) for one in shapes if has_surface(one) and _is_stepped(one)]
         names = self._steps[address]
         if not names:
             return ()
-        where = f"at the steps of textures on what moves ({_listed(names)})"
+        where = f"at the steps of textures on what moves (on {_listed(names)})"
         return (Gap(where, "Take a smooth texture there, of filter_type 'bilinear'."),)
 
 
@@ -102,12 +102,12 @@ def moving_edges(scene: Any) -> MovingEdges:
     if shapes := shapes_without_edges(scene):
         names = _listed([_name(shape) for shape in shapes])
         always.append(Gap(f"at the rims of {names}, which have no edges", "Use a mesh of the same form."))
-    if rims := [emitter for emitter in scene.emitters() if _has_rim(emitter)]:
-        where = f"at the rim of the light of {_listed([_name(emitter) for emitter in rims])}"
+    if rims := [emitter.get_shape() or emitter for emitter in scene.emitters() if _has_rim(emitter)]:
+        where = f"at the rim of the light of {_listed([_name(one) for one in rims])}"
         always.append(Gap(where, "Let the light fade out, by a beam_width below the cutoff_angle for instance."))
-    bsdfs = [part for bsdf in bsdfs_of_scene(scene) for part in (bsdf, *objects_below(bsdf, mi.BSDF))]
-    if delta := [bsdf for bsdf in bsdfs if mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)]:
-        where = f"where edges are seen in mirrors, through smooth glass or through masks ({_listed([_name(bsdf) for bsdf in delta])})"
+    if smooth := [shape for shape in filter(has_surface, shapes_of_scene(scene)) if _has_delta_lobe(shape)]:
+        names = _listed([_name(shape) for shape in smooth])
+        where = f"where edges are seen in mirrors, through smooth glass or through masks ({names})"
         bent.append(Gap(where, "Take a rough surface in place of the smooth one, or keep edges out of its view."))
     return MovingEdges(always, bent, scene)
 
@@ -117,19 +117,18 @@ def shapes_without_edges(scene: Any) -> list[Any]:
     return [shape for shape in shapes_of_scene(scene) if shape.class_name() in _WITHOUT_EDGES]
 
 
-def stepped_textures(shapes: Sequence[Any]) -> list[str]:
-    """Return the names of what jumps from place to place on shapes: textures with steps, slopes of bump maps."""
-    found: dict[int, str] = {}
-    for shape in filter(has_surface, shapes):
-        holders = [part for part in (shape.bsdf(), shape.emitter()) if part is not None]
-        holders += [bsdf for holder in holders for bsdf in objects_below(holder, mi.BSDF)]
-        for bump in holders:
-            if isinstance(bump, mi.BSDF) and is_bump_map(bump):
-                found[bump.ptr] = _name(bump)
-        for texture in (t for holder in holders for t in objects_below(holder, mi.Texture)):
-            if texture.ptr not in found and _has_steps(texture):
-                found[texture.ptr] = _name(texture)
-    return list(found.values())
+def _has_delta_lobe(shape: Any) -> bool:
+    bsdf = shape.bsdf()
+    return bsdf is not None and bool(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta))
+
+
+def _is_stepped(shape: Any) -> bool:
+    """Whether something jumps from place to place on a shape: a texture with steps, the slope of a bump map."""
+    holders = [part for part in (shape.bsdf(), shape.emitter()) if part is not None]
+    nested = [bsdf for holder in holders for bsdf in (holder, *objects_below(holder, mi.BSDF))]
+    if any(isinstance(bsdf, mi.BSDF) and is_bump_map(bsdf) for bsdf in nested):
+        return True
+    return any(_has_steps(texture) for holder in holders for texture in objects_below(holder, mi.Texture))
 
 
 def _has_steps(texture: Any) -> bool:

@@ -15,8 +15,9 @@ from torchtransient.plugins.transport.boundary.moving_edges import moves_edges
 class Wanted:
     """Built once a job, outside of traced code; does not change afterwards.
 
-    ``nodes``: pointers of the plugins with attached parameters. ``geometry``: path lengths change. ``silhouettes``: edges
-    move against what is behind them. ``shapes``: pointers of the shapes that move. ``light``: an emitter without a shape moves. ``sky``: the emitter whose sun moves, or None.
+    ``nodes``: pointers of the plugins with attached parameters. ``geometry``: path lengths change. ``silhouettes``:
+    edges move against what is behind them. ``shapes``: pointers of the shapes that move. ``light``: an emitter without
+    a shape moves. ``sky``: the emitter whose sun moves, or None.
     ``emitter_shape``: the shape of a light does. ``sphere_lights``: path lengths change and some lights are spheres.
     ``sensor``: the sensor moves. ``index``: an index of refraction changes. ``ray``: the ray itself is handed on,
     behind delta lobes or a sensor that moves. ``plain``: where a point slides on its surface, nothing but its place
