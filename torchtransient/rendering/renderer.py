@@ -193,6 +193,10 @@ class TransientRenderer(CopiesParametrized):
         if not found:
             raise SceneError(f"{self.scene!r} has no sensor; add one.")
         self._sensors, self._stack_sensors = sensor_list(sensors, len(found))
+        if self.spp_boundary is not None and not hasattr(built.scene.integrator(), "spp_boundary"):
+            raise ArgumentError(
+                f"spp_boundary: {built.integrator} draws no samples of its own for moving edges; leave it out."
+            )
         self.film = engine.check_items(found, [Item(0, sensor, 0, 0) for sensor in self._sensors])
         films = [found[sensor].film() for sensor in self._sensors]
         self._cube_shape = tuple(films[0].cube_shape())
