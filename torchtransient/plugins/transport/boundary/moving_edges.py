@@ -107,7 +107,7 @@ def moving_edges(scene: Any) -> MovingEdges:
         always.append(Gap(where, "Let the light fade out, by a beam_width below the cutoff_angle for instance."))
     if smooth := [shape for shape in filter(has_surface, shapes_of_scene(scene)) if _has_delta_lobe(shape)]:
         names = _listed([_name(shape) for shape in smooth])
-        where = f"where edges are seen in mirrors, through smooth glass or through masks ({names})"
+        where = f"where edges are seen in mirrors or through smooth glass, masks and open boundaries ({names})"
         bent.append(Gap(where, "Take a rough surface in place of the smooth one, or keep edges out of its view."))
     return MovingEdges(always, bent, scene)
 
