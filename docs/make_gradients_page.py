@@ -24,18 +24,14 @@ def state_of(effect: Any) -> str:
         return "none"
     if effect.biased:
         return "biased"
-    return "right, but for silhouettes" if effect.moves_silhouette else "right"
+    return "right"
 
 
 def why(effect: Any, condition: str = "") -> str:
     """What the state does not say by itself."""
-    from torchtransient.plugins.parameter_effect import CORRECT, SILHOUETTES
+    from torchtransient.plugins.parameter_effect import CORRECT
 
-    # A biased derivative keeps the words on silhouettes: the state names the bias alone.
-    said = () if effect.biased else (SILHOUETTES, CORRECT)
-    reason = effect.reason
-    for words in said:
-        reason = reason.removeprefix(words).removeprefix("; ")
+    reason = effect.reason.removeprefix(CORRECT).removeprefix("; ")
     return "; ".join(part for part in (condition, reason) if part)
 
 

@@ -76,6 +76,12 @@ class PhysicsWarning(TorchTransientWarning):
     """
 
 
+class GradientWarning(TorchTransientWarning):
+    """A derivative that is computed and lacks a part: what moving edges hide and uncover, where they are not followed
+    or were left out.
+    """
+
+
 class VariantWarning(TorchTransientWarning, RuntimeWarning):
     """What is loaded already cannot do what variants of this library need."""
 

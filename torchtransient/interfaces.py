@@ -296,8 +296,10 @@ class IntegratorInterface(abc.ABC):
         """What the walks of one job are told (``World``); ``settings``: other than the integrator's own."""
 
     @abc.abstractmethod
-    def silhouettes(self, scene: Any) -> str:
-        """What derivatives of a scene are where silhouettes move, in the words of the table of parameters."""
+    def silhouettes(self, scene: Any) -> Any:
+        """What derivatives of a scene lack where edges move, by parameter
+        (:class:`~torchtransient.plugins.transport.boundary.moving_edges.MovingEdges`).
+        """
 
     @abc.abstractmethod
     def reference(self, scene: Any) -> Any:

@@ -11,8 +11,7 @@ from support.hidden_shapes import ball, folded_plates, join, mannequin, mesh
 from support.marks import long
 from support.moved_captures import MovedCapture, move, noted, turn
 from support.nlos_scenes import film, plane, scan_scene, transform
-from torchtransient.errors import GradientError, TorchTransientWarning
-from torchtransient.plugins.parameter_effect import SILHOUETTES
+from torchtransient.errors import ArgumentError, GradientError, GradientWarning, TorchTransientWarning
 
 VARIANT = "llvm_ad_mono"
 SIGMAS = 4.0
@@ -276,10 +275,20 @@ def test_the_table_of_parameters_says_so():
         scene = tt.load(scan_scene(plates(), kind, film(2, kind=kind, **SMOOTH), **integrator))
         return scene.parameters()["front.to_world"].reason
 
-    assert "without triangles" in reason() and "more than three" not in reason() and SILHOUETTES not in reason()
+    assert "without triangles" in reason() and "more than three" not in reason()
     assert "more than three" in reason(max_depth=5)
     assert "refused" in reason("exhaustive") and "triangles" not in reason("exhaustive")
-    assert reason(nlos_laser_sampling=False, laser={"type": "projector"}).startswith(SILHOUETTES)
+    untraced = reason(nlos_laser_sampling=False, laser={"type": "projector"})
+    assert untraced.startswith("correct except where silhouettes move")
+
+
+def test_late_light_is_said_to_lack_it():
+    """At the first call; and no samples of edges can be asked for by the pixel."""
+    scene = tt.load(scan_scene(plates(), "confocal", film(2, **SMOOTH), max_depth=5))
+    with pytest.warns(GradientWarning, match=r"'front\.to_world' .* more than three bounces"):
+        tt.TransientRenderer(scene, ["front.to_world"], spp=1)(seed=0)
+    with pytest.raises(ArgumentError, match="spp_boundary"):
+        tt.TransientRenderer(scene, ["front.to_world"], spp_boundary=4)
 
 
 # ------------------------------------------------------------------------------------------------------- bodies

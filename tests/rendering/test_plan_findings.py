@@ -11,6 +11,7 @@ from torchtransient.errors import ArgumentError, GradientError, SceneError
 from torchtransient.rendering.films import Gates, Histogram, Phasors
 from torchtransient.rendering.films.choice import PlannedFilm
 from torchtransient.rendering.inventory import SceneInventory
+from torchtransient.rendering.parameters import ParameterInfo
 from torchtransient.rendering.plan_choices import depth_by_albedo, some
 from torchtransient.rendering.plan_finder import Draft, Finder
 from torchtransient.rendering.plan_pilot import PilotReport
@@ -18,7 +19,10 @@ from torchtransient.rendering.plan_pilot import PilotReport
 VARIANT = "llvm_ad_mono"
 RECTANGULAR, SMOOTH = tt.Gate.rectangular(1.0, 2.0), tt.Gate.gaussian(5.0, 0.5)
 # What can change a path length, and what cannot.
-TABLE = {"wall.to_world": SimpleNamespace(moves_path_length=True), "colour": SimpleNamespace(moves_path_length=False)}
+TABLE = {
+    key: ParameterInfo(key, "number", (), 1.0, True, moves, "correct")
+    for key, moves in (("wall.to_world", True), ("colour", False))
+}
 
 
 def finder(found=None, film=None, tail=0.25, missed=0.25, inventory=None, **draft):

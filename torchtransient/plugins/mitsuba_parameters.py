@@ -28,7 +28,6 @@ from torchtransient.plugins.node_walk import objects_below, objects_of, shown_by
 from torchtransient.plugins.parameter_effect import (
     ANY_KEY,
     CORRECT,
-    SILHOUETTES,
     VALUE,
     ParameterEffect,
     Row,
@@ -97,12 +96,10 @@ DARK = ParameterEffect(
     supported=False,
     reason="directionalarea shines in one direction, which no path from the sensor meets: it stays dark",
 )
-# Texture coordinates move no point, and what they move is smooth but for the edges of what a texture shows.
-_EDGES = "; the edges in a texture count as such (filter nearest, checkerboard)"
-COORDINATES = ParameterEffect(moves_silhouette=True, reason=SILHOUETTES + _EDGES)
+# Texture coordinates move no point, and what they move is smooth but for the steps of what a texture shows.
+COORDINATES = ParameterEffect(moves_silhouette=True)
 PATTERN = replace(COORDINATES, role="shape")
-NORMAL_COORDINATES = replace(NORMAL, reason=SILHOUETTES + _EDGES)
-PATTERN_AND_NORMALS = replace(NORMAL_COORDINATES, role="shape")
+PATTERN_AND_NORMALS = replace(NORMAL, role="shape")
 _STEPS = "biased: the slope of a bump map jumps from texel to texel, and its coordinates change it by nothing else"
 SLOPES = replace(COORDINATES, biased=True, reason=_STEPS)
 NORMAL_SLOPES = replace(NORMAL, biased=True, reason=_STEPS)
@@ -283,7 +280,7 @@ declare_effects(
             Row(NORMAL_SLOPES, _places_delta_slopes, "a bump map over a delta lobe"),
             Row(SLOPES, _places_slopes, "another bump map"),
             Row(PATTERN_AND_NORMALS, _places_light_and_normals, "a textured light with a normal map over a delta lobe"),
-            Row(NORMAL_COORDINATES, _places_normals, "a normal map over a delta lobe"),
+            Row(NORMAL, _places_normals, "a normal map over a delta lobe"),
             Row(PATTERN, _places_light, "a light with a textured radiance"),
             Row(COORDINATES),
         ),
@@ -296,12 +293,12 @@ for _curve in ("BSplineCurve", "LinearCurve"):
 TURNED_GRID = "; Mitsuba does not draw grids that turn: put the grid into a group and turn an instance of it"
 declare_effects(
     "SDFGrid",
-    {"grid": replace(SHAPE, trusted=False), "to_world": replace(SHAPE, reason=SILHOUETTES + TURNED_GRID)},
+    {"grid": replace(SHAPE, trusted=False), "to_world": replace(SHAPE, reason=CORRECT + TURNED_GRID)},
 )
 for _blobs in ("Ellipsoids", "EllipsoidsMesh"):
     declare_effects(_blobs, {"data": replace(SHAPE, trusted=False)})
 CLAMPED = replace(
-    SHAPE, trusted=False, reason=SILHOUETTES + "; Mitsuba keeps the bounding boxes that the shape was built with"
+    SHAPE, trusted=False, reason=f"{CORRECT}; Mitsuba keeps the bounding boxes that the shape was built with"
 )
 declare_effects("Ellipsoids", {"opacities": (Row(CLAMPED, _is_clamped, "with extent_adaptive_clamping"), Row(VALUE))})
 

@@ -22,7 +22,6 @@ from typing import Any
 from torchtransient.errors import PluginRegistrationError
 
 CORRECT = "correct"
-SILHOUETTES = "correct except where silhouettes move (no boundary term)"
 ANY_KEY = "*"
 ROLES = ("shape", "normal", "emitter", "sun", "sensor", "index", "delay", "medium", "value")
 
@@ -39,9 +38,9 @@ class ParameterEffect:
     works in; "emitter": an emitter without a shape; "sun": the disk in a sky; "sensor": the sensor and its rays;
     "index": an index of refraction; "delay": a lifetime; "medium": an extinction; "value": none.
 
-    ``supported``: it has a derivative. ``biased``: that derivative is known to be wrong somewhere, besides the missing
-    boundary term of ``moves_silhouette``. ``reason``: the state in words; where a silhouette moves and there is a
-    derivative, it begins with ``SILHOUETTES``, which is put there when a row does not say it.
+    ``supported``: it has a derivative. ``biased``: that derivative is known to be wrong somewhere, in whatever scene;
+    what it lacks of moving edges in one scene is a question for the integrator (``silhouettes``). ``reason``: the state
+    in words.
 
     ``trusted``: the derivative is right although Mitsuba marks the parameter as not differentiable. ``stand_in``: name
     of the plugin that is built in place of Mitsuba's when the derivative is asked for; of a texture, in place of the
@@ -58,11 +57,6 @@ class ParameterEffect:
     trusted: bool = False
     stand_in: str = ""
     stand_in_needed: bool = True
-
-    def __post_init__(self) -> None:
-        if self.moves_silhouette and self.supported and SILHOUETTES not in self.reason:
-            more = self.reason.removeprefix(CORRECT).removeprefix("; ")
-            object.__setattr__(self, "reason", "; ".join(filter(None, (SILHOUETTES, more))))
 
     @property
     def moves(self) -> bool:

@@ -20,7 +20,6 @@ from torchtransient.plugins.black_textures import Attached, check_black, loses_b
 from torchtransient.plugins.mitsuba_compat import attribute_name, is_replaced_for
 from torchtransient.plugins.node_walk import ShownValue, objects_of, owners_of, shown_by
 from torchtransient.plugins.parameter_effect import CORRECT as CORRECT
-from torchtransient.plugins.parameter_effect import SILHOUETTES as SILHOUETTES
 from torchtransient.plugins.parameter_effect import ParameterEffect as ParameterEffect
 from torchtransient.plugins.parameter_effect import Site, class_of, matching_effect
 from torchtransient.plugins.spectral_colours import keeps_coefficients

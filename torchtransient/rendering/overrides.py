@@ -1,4 +1,4 @@
-"""Another temporal filter or depth in a built scene, for as long as a call takes."""
+"""Another temporal filter, depth or boundary term in a built scene, for as long as a call takes."""
 
 from __future__ import annotations
 
@@ -49,6 +49,21 @@ def max_depth(depth: int | None, integrator: Any) -> Iterator[None]:
 
     with afterwards(put_back):
         integrator.max_depth = depth
+        yield
+
+
+@contextmanager
+def boundary_term(on: bool, spp: int | None, integrator: Any) -> Iterator[None]:
+    """Leave the boundary term out of derivatives inside of the block, or give each of its passes ``spp`` samples per
+    pixel; True and None change nothing.
+    """
+    with ExitStack() as restore:
+        changes = ({} if on else {"boundary": False}) | ({} if spp is None else {"spp_boundary": spp})
+        for name, value in changes.items():
+            if hasattr(integrator, name):
+                put_back = functools.partial(setattr, integrator, name, getattr(integrator, name))
+                restore.enter_context(afterwards(put_back))
+                setattr(integrator, name, value)
         yield
 
 

@@ -19,8 +19,9 @@ from torchtransient.errors import SceneError, UnknownKeyError
 from torchtransient.interfaces import IntegratorInterface
 from torchtransient.plugins.mitsuba_numbers import check_pose, is_number_of_kernels, is_turned_by_reflections
 from torchtransient.plugins.node_walk import ShownValue, unshared
-from torchtransient.plugins.parameters import SILHOUETTES, ParameterEffect, ParameterTracker
+from torchtransient.plugins.parameters import ParameterEffect, ParameterTracker
 from torchtransient.plugins.swept_parameters import UNCHECKED, is_checked
+from torchtransient.plugins.transport.boundary.moving_edges import Gap, MovingEdges, moving_edges
 from torchtransient.rendering.build import BuiltScene
 from torchtransient.rendering.taken import without_stand_in
 
@@ -34,8 +35,9 @@ class ParameterInfo:
     ``value`` is None for more than 65536 numbers: ask for the key and read ``renderer.values[key]``.
 
     ``moves_path_length``, ``moves_silhouette``, ``moves_medium``: whether it can change an optical path length, move a
-    visibility edge, change an extinction. ``biased``: its derivative is known to be wrong somewhere, besides the
-    boundary term of moving silhouettes, which is missing. ``reason`` says why. ``substitute``: the materials built as
+    visibility edge, change an extinction. ``biased``: its derivative is known to be wrong somewhere: in whatever scene
+    (``always_biased``), or where edges move that are not followed in this one, for instance those seen in a mirror
+    (``edges_missing``, in words). ``reason`` says why. ``substitute``: the materials built as
     others when the key is asked for, by name, with the name of the texture in them ("" for a number).
     ``place``: names of the parameter and of what its plugin is in. ``checked``: whether the sweep of gradients has
     compared it with finite differences in such a place (``docs/gradients_sweep.md``); the reason says when it has not.
@@ -51,9 +53,15 @@ class ParameterInfo:
     substitute: frozenset[tuple[str, str]] = frozenset()
     moves_silhouette: bool = False
     moves_medium: bool = False
-    biased: bool = False
+    always_biased: bool = False
+    edges_missing: tuple[str, ...] = ()
     place: tuple[str, ...] = ()
     checked: bool = True
+
+    @property
+    def biased(self) -> bool:
+        """Whether the derivative is known to be wrong somewhere."""
+        return self.always_biased or bool(self.edges_missing)
 
 
 class ParameterTable(Mapping[str, ParameterInfo]):
@@ -118,16 +126,47 @@ def _short(value: Any) -> str:
 def parameter_table(built: BuiltScene) -> ParameterTable:
     """Read the table off a built scene (unmerged, real bitmaps, no substitutions), inside its variant."""
     tracker = ParameterTracker(built.scene)
+    edges = moving_edges_of(built.scene)
     entries = []
     for key in built.params.properties:
         node = built.params.properties[key][2]
-        entries.append(_placed(_describe(built, tracker, key, node), tracker, node))
+        found = [_describe(built, tracker, key, node)]
         if key.endswith(".vertex_positions"):
-            entries.append(_placed(_mesh_to_world(built, tracker, key, node), tracker, node))
-    # Some integrators follow some silhouettes.
-    integrator = built.scene.integrator()
-    here = integrator.silhouettes(built.scene) if isinstance(integrator, IntegratorInterface) else SILHOUETTES
-    return ParameterTable([replace(entry, reason=entry.reason.replace(SILHOUETTES, here)) for entry in entries])
+            found.append(_mesh_to_world(built, tracker, key, node))
+        entries += [_placed(_with_gaps(info, edges, tracker, node), tracker, node) for info in found]
+    return ParameterTable(entries)
+
+
+def moving_edges_of(scene: Any) -> MovingEdges:
+    """Return what derivatives of a built scene lack where edges move; a steady integrator counts as the transient one
+    that renders in its place.
+    """
+    integrator = scene.integrator()
+    if isinstance(integrator, IntegratorInterface):
+        edges: MovingEdges = integrator.silhouettes(scene)
+        return edges
+    return moving_edges(scene)
+
+
+def missing_edges(built: BuiltScene, keys: Iterable[str]) -> dict[Gap, list[str]]:
+    """Return what derivatives by ``keys`` lack of moving edges, with the keys that lack it."""
+    edges, tracker = moving_edges_of(built.scene), built.scene.integrator().parameters(built.scene)
+    found: dict[Gap, list[str]] = {}
+    for key in keys:
+        shown = key if key in built.params else f"{key.rsplit('.', 1)[0]}.vertex_positions"
+        node = built.params.properties[shown][2]
+        for gap in edges.lacking(node, key, tracker.effect_of(node, key)):
+            found.setdefault(gap, []).append(key)
+    return found
+
+
+def _with_gaps(info: ParameterInfo, edges: MovingEdges, tracker: ParameterTracker, node: Any) -> ParameterInfo:
+    """With what the derivative lacks of moving edges."""
+    if not (info.differentiable and info.moves_silhouette):
+        return info
+    effect = replace(tracker.effect_of(node, info.key), reason=info.reason)
+    missing = tuple(gap.where for gap in edges.lacking(node, info.key, effect))
+    return replace(info, edges_missing=missing, reason=edges.reason(node, info.key, effect))
 
 
 def _placed(info: ParameterInfo, tracker: ParameterTracker, node: Any) -> ParameterInfo:
@@ -151,7 +190,7 @@ def _info(key: str, kind: str, shape: tuple[int, ...] | None, value: Any, effect
         effect.reason,
         moves_silhouette=effect.moves_silhouette,
         moves_medium=effect.moves_medium,
-        biased=effect.biased,
+        always_biased=effect.biased,
     )
 
 

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchtransient.errors import ArgumentError, PhysicsError, PhysicsWarning
+from torchtransient.errors import ArgumentError, GradientError, GradientWarning, PhysicsError, PhysicsWarning
 from torchtransient.given_types import is_one_of
 from torchtransient.plugins.physical_ranges import SHARE, PhysicalRange
 from torchtransient.quantities import shown
@@ -68,6 +68,16 @@ class PhysicsWatch:
         if about not in self._told:
             self._told.add(about)
             warnings.warn(message, PhysicsWarning, stacklevel=level_of_user())
+
+    def gradient(self, about: str, message: str, *, is_error: bool = True) -> None:
+        """Warn of a derivative that lacks a part, once for each ``about``; the mode "error" makes it a
+        ``GradientError``, "ignore" does not silence it.
+        """
+        if self.mode == "error" and is_error:
+            raise GradientError(f"{message} With physics='warn' it is computed all the same.")
+        if about not in self._told:
+            self._told.add(about)
+            warnings.warn(message, GradientWarning, stacklevel=level_of_user())
 
     def scene(self, findings: Mapping[str, str]) -> None:
         """Say what is found in the description itself, by key: the first ones, where there are many."""

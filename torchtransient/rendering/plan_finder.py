@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from torchtransient.axes import TimeAxis
@@ -15,7 +16,7 @@ from torchtransient.rendering import plan_choices as choices
 from torchtransient.rendering.build_options import BuildOptions
 from torchtransient.rendering.films.choice import FilmChoice, PlannedFilm
 from torchtransient.rendering.inventory import SceneInventory
-from torchtransient.rendering.parameters import needing_slope, unknown_key
+from torchtransient.rendering.parameters import ParameterInfo, needing_slope, unknown_key
 from torchtransient.rendering.plan_pilot import MOST_BINS, Arrivals, PilotReport, axis_over, pilot_run
 from torchtransient.rendering.scene_handle import Scene, load
 from torchtransient.rendering.slope import check_filter, filter_for
@@ -274,6 +275,20 @@ class Finder:
         )
         return axis
 
+    # ------------------------------------------------------------------------------------------------- derivatives
+
+    def _note_edges(self, infos: Sequence[ParameterInfo]) -> None:
+        """Say which parameters call for the boundary term, and what it leaves out."""
+        moving = [info for info in infos if info.differentiable and info.moves_silhouette]
+        if moving:
+            named = ", ".join(info.key for info in moving)
+            self.reasons.append(f"boundary term: on, since edges move with {named}")
+        self.reasons += [
+            f"approximation: the derivative by {info.key} is wrong {', '.join(info.edges_missing)}"
+            for info in moving
+            if info.edges_missing
+        ]
+
     # --------------------------------------------------------------------------------------------- temporal filter
 
     def _filter(self, given: str | None) -> str:
@@ -284,6 +299,7 @@ class Finder:
         for key in self.draft.parameters:
             if key not in table:
                 raise SceneError(unknown_key(key, list(table)))
+        self._note_edges([table[key] for key in self.draft.parameters])
         moving = needing_slope(table, self.draft.parameters)
         pulsed = bool(self.draft.pulse or self.draft.irf or self.inventory.pulsed)
         if not kind.has_filter:

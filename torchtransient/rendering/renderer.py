@@ -43,7 +43,8 @@ from torchtransient.rendering.films.choice import FilmChoice
 from torchtransient.rendering.films.layout import steady_channels_first
 from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.output import RenderOutput, RenderStats
-from torchtransient.rendering.parameters import ParameterInfo, needing_slope, unknown_key
+from torchtransient.rendering.overrides import boundary_term
+from torchtransient.rendering.parameters import ParameterInfo, missing_edges, needing_slope, unknown_key
 from torchtransient.rendering.physics import PhysicsWatch
 from torchtransient.rendering.progress import Bar
 from torchtransient.rendering.pulse_properties import checked_pulse
@@ -102,6 +103,12 @@ class TransientRenderer(CopiesParametrized):
     and the number; "error" raises ``PhysicsError``, of bounds for those that leave out more than 5 %; "ignore" does not
     look.
 
+    ``boundary``: derivatives by keys that move silhouettes hold what moving edges hide and uncover (the boundary term,
+    see ``docs/gradients.md``), unless the scene's integrator leaves it out; False leaves it out. ``spp_boundary``:
+    samples per pixel of each of its passes, None for half of those of the derivative. Where a derivative lacks a part,
+    the first call with values that can be differentiated by warns with the keys (``GradientWarning``), and with
+    ``physics="error"`` raises ``GradientError``, unless the part was left out.
+
     ``freeze``: True records what a call launches, so that later calls need no tracing, with the same values, gradients
     and noise; ``out.stats.recorded`` says what became of it, ``docs/speed.md`` what makes a new recording.
 
@@ -130,6 +137,8 @@ class TransientRenderer(CopiesParametrized):
         steady: bool = True,
         film: FilmChoice | None = None,
         physics: str = "warn",
+        boundary: bool = True,
+        spp_boundary: int | None = None,
         freeze: bool = True,
     ):
         super().__init__()
@@ -148,6 +157,8 @@ class TransientRenderer(CopiesParametrized):
         self.temporal_filter = checked_filter(temporal_filter)
         self.grad_seed = checked_grad_seed(grad_seed)
         self.freeze = bool(freeze)
+        self.boundary, self.spp_boundary = bool(boundary), samples("spp_boundary", spp_boundary)
+        self._asked_of_edges: set[str] = set()
         self._watch = PhysicsWatch(physics, self.scene.told)
         changes: dict[str, Any] = {"pulse": checked_pulse("pulse", pulse), "irf": checked_pulse("irf", irf)}
         changes |= {"film": film, "steady": bool(steady)}
@@ -182,6 +193,10 @@ class TransientRenderer(CopiesParametrized):
         if not found:
             raise SceneError(f"{self.scene!r} has no sensor; add one.")
         self._sensors, self._stack_sensors = sensor_list(sensors, len(found))
+        if self.spp_boundary is not None and not hasattr(built.scene.integrator(), "spp_boundary"):
+            raise ArgumentError(
+                f"spp_boundary: {built.integrator} draws no samples of its own for moving edges; leave it out."
+            )
         self.film = engine.check_items(found, [Item(0, sensor, 0, 0) for sensor in self._sensors])
         films = [found[sensor].film() for sensor in self._sensors]
         self._cube_shape = tuple(films[0].cube_shape())
@@ -322,6 +337,7 @@ class TransientRenderer(CopiesParametrized):
         tensors, batched, batch = self._collect(values)
         temporal_filter = self.effective_filter
         self._check_slope(temporal_filter, tensors)
+        self._check_edges(tensors)
         wanted = samples("spp", spp) or self.spp or self._scene_spp
         used = used_grad = rounded_count(wanted, self._counts, self.samples_drawn)
         graph = torch.is_grad_enabled()
@@ -344,6 +360,8 @@ class TransientRenderer(CopiesParametrized):
             progress=bar,
             freeze=self.freeze,
             bound=self._depth_bound(values, tensors),
+            boundary=self.boundary,
+            spp_boundary=self.spp_boundary,
         )
         try:
             steady, response = rendered(job, per_entry, tensors)
@@ -386,6 +404,32 @@ class TransientRenderer(CopiesParametrized):
             moving = needing_slope(self._infos, wanted)
             check_filter(moving, temporal_filter, self._pulsed)
             check_slope(moving, *self._response)
+
+    def _check_edges(self, tensors: Sequence[torch.Tensor]) -> None:
+        """Say once of each key whose derivative a call can be asked for what that lacks of moving edges."""
+        graph = torch.is_grad_enabled()
+        new = [
+            key
+            for key, tensor in zip(self._keys, tensors, strict=True)
+            if self._infos[key].moves_silhouette
+            and key not in self._asked_of_edges
+            and may_have_derivative(tensor, graph=graph)
+        ]
+        if not new:
+            return
+        with active_variant(self.scene.variant):
+            built = self.scene.built(self._options)
+            with boundary_term(self.boundary, self.spp_boundary, built.scene.integrator()):
+                found = missing_edges(built, new)
+        for gap, keys in found.items():
+            named = ", ".join(map(repr, keys))
+            self._watch.gradient(
+                f"{gap.where} {named}",
+                f"the derivative by {named} is wrong {gap.where}: it lacks what moving edges hide and uncover there. "
+                f"{gap.remedy}",
+                is_error=self.boundary,
+            )
+        self._asked_of_edges.update(new)
 
     def _depth_bound(self, given: Mapping[str, Any] | None, tensors: Sequence[torch.Tensor]) -> DepthBound | None:
         """On the depth of a call whose values can have derivatives; None for others, and where a depth is stated."""

@@ -20,7 +20,7 @@ from torchtransient.rendering.build_options import BuildOptions
 from torchtransient.rendering.interrupts import quiet
 from torchtransient.rendering.kernel_errors import named_errors
 from torchtransient.rendering.mitsuba_words import one_line
-from torchtransient.rendering.overrides import max_depth, temporal_filter
+from torchtransient.rendering.overrides import boundary_term, max_depth, temporal_filter
 from torchtransient.rendering.physics import PhysicsWatch
 from torchtransient.rendering.scene_state import detached, put_back, values_of
 from torchtransient.rendering.seeds import Item, Seeding
@@ -56,7 +56,8 @@ class RenderJob:
 
     ``items``: the films to fill, where the seed is known; ``seeding`` makes them of a seed that is known later.
     ``batched[i]``: value i has a leading batch dimension. ``needs[i]``: value i wants a derivative. ``bound``: on the
-    depth, None for the scene's. ``watch``: says what is unphysical. ``freeze``: calls are recorded. ``log`` collects
+    depth, None for the scene's. ``boundary``: False leaves out what moving edges hide; ``spp_boundary``: samples of it,
+    None for the integrator's. ``watch``: says what is unphysical. ``freeze``: calls are recorded. ``log`` collects
     what each primal run reports (seconds, seeds, energy outside the window) and belongs to one call: under ``vmap`` a
     call is several runs. ``derivative_log``: what became of the recordings of the call's derivatives. ``at_call``: of a
     scene that is shared, its values at the call.
@@ -74,6 +75,8 @@ class RenderJob:
     watch: PhysicsWatch
     needs: tuple[bool, ...] = ()
     bound: DepthBound | None = None
+    boundary: bool = True
+    spp_boundary: int | None = None
     progress: Callable[[float], None] | None = None
     freeze: bool = True
     at_call: list[Mapping[str, Any]] = field(default_factory=list)
@@ -187,6 +190,7 @@ def session_of(job: RenderJob) -> Iterator[Session]:
                     named_errors(),
                     max_depth(depth, session.integrator),
                     temporal_filter(job.temporal_filter, session.integrator, films),
+                    boundary_term(job.boundary, job.spp_boundary, session.integrator),
                 ):
                     yield session
                 attached = any(job.needs)

@@ -12,7 +12,7 @@ that plugin first, so that it refuses what it would refuse in a picture: misspel
 | ``use_spectral_mis`` (``volpathmis``), ``jitter``, ``strength`` (samplers) | without effect but on noise |
 | ``shading_samples``, ``emitter_samples``, ``bsdf_samples`` (``direct``) | only noise; 0 of one kind is refused |
 | ``timeout``, ``block_size``, ``samples_per_pass`` | without effect in variants that compile kernels |
-| samples of silhouettes (``prb_projective``) | refused, as no part of the derivative; those that ask for none pass |
+| samples of silhouettes (``prb_projective``) | refused, see ``spp_boundary``; those that ask for none pass |
 """
 
 from __future__ import annotations
@@ -227,7 +227,7 @@ def _check_silhouettes(props: Any) -> None:
     found = [name for name, none in _OF_SILHOUETTES.items() if name in props and props[name] not in none]
     if found:
         raise SceneError(
-            f"{props.plugin_name()}: {', '.join(map(repr, found))}: expected no samples of silhouettes, which are no "
-            "part of the derivatives of a transient integrator. Leave it out; spp_grad= says the samples of a "
-            "derivative."
+            f"{props.plugin_name()}: {', '.join(map(repr, found))}: expected no samples of silhouettes in the "
+            "description. Leave it out; of a TransientRenderer spp_boundary= says them, and spp_grad= the samples of "
+            "a derivative."
         )

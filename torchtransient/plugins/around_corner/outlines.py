@@ -9,14 +9,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from torchtransient.errors import GradientError, TorchTransientWarning
-from torchtransient.plugins.around_corner.outline_table import OutlineTable
+from torchtransient.errors import GradientError, GradientWarning
 from torchtransient.plugins.around_corner.geometry import front_normal
 from torchtransient.plugins.around_corner.hiding import Part, hiding_pairs, parts_of
 from torchtransient.plugins.around_corner.occlusion import BOUNCES, MutualOcclusion
+from torchtransient.plugins.around_corner.outline_table import OutlineTable
 from torchtransient.plugins.integrators.launch import passes_of, seed_array
-from torchtransient.plugins.parameter_effect import CORRECT
 from torchtransient.plugins.pointer_table import registry_number
+from torchtransient.plugins.transport.boundary.moving_edges import Gap, MovingEdges
 from torchtransient.plugins.transport.segment.material import MaterialVacuum
 
 # Edge samples of a pixel and viewpoint, as a share of its paths.
@@ -33,18 +33,15 @@ def follows_outlines(segment: type, contents: Any) -> bool:
     return issubclass(segment, MaterialVacuum) and contents.delays is None
 
 
-def silhouettes(least: int, most: int, exhaustive: bool) -> str:
-    """What the table of parameters says of moving silhouettes where outlines are followed, for light of ``least`` to
-    ``most`` bounces.
-    """
-    lacking = []
+def silhouettes(least: int, most: int, exhaustive: bool) -> MovingEdges:
+    """Return what derivatives of light of ``least`` to ``most`` bounces lack where outlines are followed."""
+    lacking: tuple[str, ...] = ()
     if least <= BOUNCES <= most and not exhaustive:
-        lacking = ["behind shapes without triangles", "where bodies run into each other"]
+        lacking = "behind shapes without triangles", "where bodies run into each other"
     if least <= BOUNCES <= most and exhaustive:
-        lacking = ["where one hidden part may hide another (refused)"]
-    if most > BOUNCES:
-        lacking += ["in light of more than three bounces where one part hides another"]
-    return f"correct except {', '.join(lacking)} (no boundary term)" if lacking else CORRECT
+        lacking = ("where one hidden part may hide another (refused)",)
+    late = Gap("in light of more than three bounces where one part hides another", "Set max_depth to 3.")
+    return MovingEdges((late,) if most > BOUNCES else (), words=lacking)
 
 
 class Viewpoints:
@@ -148,6 +145,6 @@ def _warn_of_limbs(shapes: list[Any], parts: list[Part], pairs: list[tuple[int, 
         warnings.warn(
             "transient_nlos_path: outlines of shapes without triangles have no edges, and the derivative lacks what "
             f"changes behind them ({_names(shapes, parts, limbs)}). Use a mesh in place of the shape that hides.",
-            TorchTransientWarning,
+            GradientWarning,
             stacklevel=2,
         )

@@ -25,8 +25,8 @@ class DiffDielectric(mi.BSDF):
     the direction ``bs.wo``, the index ``bs.eta`` and the weight, which is the lobe's value divided by its detached
     probability. ``bs.pdf`` is detached, as in Mitsuba's own ``dielectric``.
 
-    ``eta`` is marked as discontinuous: moving it moves the refracted images of edges, which needs a boundary term
-    that no integrator of this library has.
+    ``eta`` is marked as discontinuous: moving it moves the refracted images of edges, which no boundary term
+    follows through smooth glass.
     """
 
     def __init__(self, props: Any) -> None:

@@ -18,7 +18,7 @@ from torchtransient.plugins.integrators.launch import Job, Pass, laser_count, pa
 from torchtransient.plugins.integrators.prepared import Prepared, state_of
 from torchtransient.plugins.integrators.seen_scene import SeenScene
 from torchtransient.plugins.parameter_effect import class_of
-from torchtransient.plugins.parameters import SILHOUETTES, ParameterTracker, check_slope, check_stand_ins, moving_names
+from torchtransient.plugins.parameters import ParameterTracker, check_slope, check_stand_ins, moving_names
 from torchtransient.plugins.properties import number, truth, whole_number
 from torchtransient.plugins.sensors.origin import (
     PrimaryRays,
@@ -29,6 +29,7 @@ from torchtransient.plugins.sensors.origin import (
     views,
 )
 from torchtransient.plugins.sensors.stokes_frame import sensor_rotation
+from torchtransient.plugins.transport.boundary.moving_edges import MovingEdges, missing
 from torchtransient.plugins.transport.contents import SceneContents
 from torchtransient.plugins.transport.derivative.forward import propagate_tangents
 from torchtransient.plugins.transport.derivative.wanted import Wanted
@@ -126,9 +127,9 @@ class TransientIntegrator(mi.CppADIntegrator):
         """The parameters of the scene, to be asked which of them carry gradients."""
         return self._seen_scene(scene).tracker(scene)
 
-    def silhouettes(self, scene):
-        """What derivatives of a scene are where silhouettes move, in the words of the table of parameters."""
-        return SILHOUETTES
+    def silhouettes(self, scene) -> MovingEdges:
+        """Return what derivatives of a scene lack where edges move."""
+        return missing(f"{class_of(self)} follows no edges", "Use transient_path or transient_prbvolpath.")
 
     def reference(self, scene):
         """The sphere around the scene as described, which light from and to infinity is timed by."""

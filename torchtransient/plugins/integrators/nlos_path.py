@@ -27,6 +27,7 @@ from torchtransient.plugins.integrators.base import UNLIMITED
 from torchtransient.plugins.integrators.launch import share_of
 from torchtransient.plugins.properties import number, truth, whole_number
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
+from torchtransient.plugins.transport.boundary.moving_edges import MovingEdges, missing
 from torchtransient.plugins.transport.connection.emitter_found import EmitterFound
 from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
 from torchtransient.plugins.transport.connection.laser_spot import LaserSpot
@@ -88,6 +89,8 @@ class TransientNLOSPath(base.TransientIntegrator):
         Light of four to seven bounces from chains that scanned points far from each other share
         (:mod:`..around_corner.late_light`), or from paths, as light of more bounces is. ``auto`` chooses as for
         ``third_bounce``; both have the same mean, and derivatives come from paths. So does late light of pairs.
+    ``boundary`` (bool, true)
+        False leaves the boundary term of what hides other hidden things out of derivatives.
     ``force_equal_illumination_scanning`` (bool, true), ``illumination_scan_fov`` (degrees, 20)
         Whether the laser positions of an exhaustive capture are the scanned points; if not, they lie on a grid of this
         horizontal field of view around the laser's axis.
@@ -125,6 +128,7 @@ class TransientNLOSPath(base.TransientIntegrator):
         self.discard_direct_paths = truth(props, "discard_direct_paths", default=False)
         self.third_bounce = _choice(props, "third_bounce", "shared")
         self.late_light = _choice(props, "late_light", "chains")
+        self.boundary = truth(props, "boundary", default=True)
         props.get("block_size", 0)
         self.min_bounces = whole_number(props, "min_bounces", 0, least=0)
         self.only_bounces = self._bounces_of(props)
@@ -341,11 +345,17 @@ class TransientNLOSPath(base.TransientIntegrator):
 
     # ----------------------------------------------------------------------------------- derivatives
 
-    def silhouettes(self, scene: Any) -> str:
+    def silhouettes(self, scene: Any) -> MovingEdges:
+        if not self.boundary:
+            return missing("boundary is false", "Leave boundary out, or set it to true.")
         sensors = scene.sensors()
         contents = self.contents(scene, sensors[0]) if sensors else None
         if contents is None or not follows_outlines(self._segment(contents), contents):
-            return super().silhouettes(scene)
+            return missing(
+                "transient_nlos_path follows them with nlos_laser_sampling, in scenes without media, instances, "
+                "ellipsoids, linear curves and surfaces that scatter late",
+                "Use a mesh, or leave out what is named.",
+            )
         settings = self.settings()
         return silhouettes(settings.min_depth, settings.max_depth, self.capture is CaptureType.EXHAUSTIVE)
 
@@ -353,6 +363,8 @@ class TransientNLOSPath(base.TransientIntegrator):
         if not self.laser_sampling:
             return []
         shared = [self._shared(world, film, seed, samples)] if world.division.third_bounce else []
+        if not self.boundary:
+            return shared
         edges = mutual_occlusion(self, world, sensor, film, seed, samples, dr.detach(self._table(world).seen()))
         return shared if edges is None else [*shared, edges]
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.integrators.base import TransientIntegrator
+from torchtransient.plugins.properties import truth, whole_number
+from torchtransient.plugins.transport.boundary.moving_edges import missing, moving_edges
 from torchtransient.plugins.transport.boundary.term import BoundaryTerm
 from torchtransient.plugins.transport.connection.emitter_found import EmitterFound
 from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
@@ -23,18 +25,37 @@ class TransientPath(TransientIntegrator):
     ``plugins/sampling/distant.py``).
 
     Gradients: reverse mode walks every path backwards over a record in thread-local memory, forward mode carries
-    tangents along; both include the time of flight. Visibility changes are not differentiated (no boundary term).
+    tangents along; both include the time of flight. Where a parameter moves edges, what they hide and uncover is part
+    of the derivative, too (the boundary term, :mod:`..transport.boundary.passes`).
+
+    Parameters beside those of :class:`TransientIntegrator`:
+
+    ``boundary`` (true)
+        False leaves the boundary term out of derivatives.
+    ``spp_boundary`` (half of the samples of the derivative)
+        Samples per pixel of each pass of the boundary term.
 
     Not supported: participating media (``SceneError``).
     """
 
-    boundary, boundary_share = ("primary", "vertex", "light"), 0.5
+    # Which passes the boundary term has: fewer for tests and benchmarks.
+    boundary_passes = ("primary", "vertex", "light")
+
+    def __init__(self, props):
+        super().__init__(props)
+        self.boundary = truth(props, "boundary", default=True)
+        self.spp_boundary = whole_number(props, "spp_boundary", 0, least=1) if "spp_boundary" in props else None
+
+    def silhouettes(self, scene):
+        if not self.boundary:
+            return missing("boundary is false", "Leave boundary out, or set it to true.")
+        return moving_edges(scene)
 
     def beside(self, world, sensor, film, seed, samples):
         if not (self.boundary and world.wanted.silhouettes):
             return []
-        count = max(1, round(samples * self.boundary_share))
-        return [BoundaryTerm(self, world, sensor, film, seed, count, self.boundary)]
+        count = self.spp_boundary or max(1, samples // 2)
+        return [BoundaryTerm(self, world, sensor, film, seed, count, self.boundary_passes)]
 
     def strategies(self, contents):
         scattering = Lambertian(draws_lobe=True) if Lambertian.fits(contents) else Surface()

@@ -8,7 +8,7 @@ from collections.abc import Container, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from torchtransient.plugins.parameter_effect import CORRECT, SILHOUETTES
+from torchtransient.plugins.parameter_effect import CORRECT
 from torchtransient.plugins.swept_parameters import FILE
 from torchtransient.testing.gradient_sweep.compare import RESOLVED, SCALE, SIGMAS, TOLERANCE, WEAK
 from torchtransient.testing.gradient_sweep.settings import all_settings
@@ -76,9 +76,7 @@ def _state(row: dict[str, Any]) -> str:
     """What the table of parameters says, in a few words."""
     if row["biased"] or row["verdict"] == "refused":
         return str(row["table"])
-    if row["table"].startswith(SILHOUETTES):
-        return "right, but for silhouettes"
-    # Some integrators follow some silhouettes.
+    # Not all edges are followed in every scene.
     partly = row["table"].startswith(f"{CORRECT} except")
     return row["table"].replace(CORRECT, "right", 1) if partly else "right" if row["table"] else ""
 

@@ -50,7 +50,8 @@ def for_setting(effort: Effort, setting: Setting) -> Effort:
 def _results_of_key(scene: Any, key: str, info: ParameterInfo, effort: Effort, both_modes: bool) -> Iterator[Result]:
     for result in _judgements(scene, key, info, effort, both_modes):
         result.table = info.reason.removesuffix(f"; {UNCHECKED}")
-        result.biased = info.biased
+        # No edge moves against another in the sweep's scenes.
+        result.biased = info.always_biased
         result.place = list(info.place)
         yield result
 

@@ -16,7 +16,7 @@ import mitsuba as mi
 from torchtransient.plugins.polarized import first_column, product, scatter_unpolarized
 from torchtransient.plugins.sampling.sun import MovingSun
 from torchtransient.plugins.transport.carry import slope_only
-from torchtransient.plugins.transport.strategy import Connection, Event, EventTerm, Local, mis_weight
+from torchtransient.plugins.transport.strategy import Connection, Event, EventTerm, mis_weight
 
 
 class EmitterFound(Connection):

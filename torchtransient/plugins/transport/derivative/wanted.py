@@ -9,13 +9,15 @@ import mitsuba as mi
 
 from torchtransient.plugins.parameter_effect import ParameterEffect
 from torchtransient.plugins.sensors.origin import sensors_of, shapes_of_sensors
+from torchtransient.plugins.transport.boundary.moving_edges import moves_edges
 
 
 class Wanted:
     """Built once a job, outside of traced code; does not change afterwards.
 
-    ``nodes``: pointers of the plugins with attached parameters. ``geometry``: path lengths change. ``shapes``: pointers
-    of the shapes that move. ``light``: an emitter without a shape moves. ``sky``: the emitter whose sun moves, or None.
+    ``nodes``: pointers of the plugins with attached parameters. ``geometry``: path lengths change. ``silhouettes``:
+    edges move against what is behind them. ``shapes``: pointers of the shapes that move. ``light``: an emitter without
+    a shape moves. ``sky``: the emitter whose sun moves, or None.
     ``emitter_shape``: the shape of a light does. ``sphere_lights``: path lengths change and some lights are spheres.
     ``sensor``: the sensor moves. ``index``: an index of refraction changes. ``ray``: the ray itself is handed on,
     behind delta lobes or a sensor that moves. ``plain``: where a point slides on its surface, nothing but its place
@@ -33,7 +35,7 @@ class Wanted:
         carriers = {shape.ptr for shape in shapes_of_sensors(sensor) if shape is not None}
         self.nodes = frozenset(node.ptr for node, _, _ in effects)
         self.geometry = any(effect.moves_length for _, _, effect in effects)
-        self.silhouettes = any(effect.moves_silhouette for _, _, effect in effects)
+        self.silhouettes = any(moves_edges(key, effect) for _, key, effect in effects)
         self.shapes = frozenset(shape.ptr for shape in moved("shape"))
         self.light, self.index = bool(moved("emitter")), bool(moved("index"))
         self.sky = next(iter(moved("sun")), None)

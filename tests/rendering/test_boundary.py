@@ -1,0 +1,212 @@
+"""The boundary term of moving edges through the layer: its value, where it is, and what is said where it is not."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+import torchtransient as tt
+from support.marks import long
+from torchtransient.errors import GradientError, GradientWarning
+from torchtransient.rendering.variant import active_variant
+from torchtransient.testing.small_room import pose
+
+VARIANT = "llvm_ad_mono"
+BODY, PAINT = "body.to_world", "body.bsdf.reflectance.value"
+CAMERA = np.diag([-1.0, 1, -1, 1]) + pose(0, 0, 4) - np.eye(4)
+PATTERN = torch.randn(1, 1, 8, 8, generator=torch.Generator().manual_seed(3))
+SIDEWAYS = torch.zeros(4, 4).index_put((torch.tensor(0), torch.tensor(3)), torch.tensor(1.0))
+
+
+def plate(**more):
+    """A plate before a wall: shifted sideways, all of the derivative is its outline and its shadow."""
+    film = {"type": "transient_hdr_film", "width": 8, "height": 8, "rfilter": {"type": "box"}, "temporal_bins": 128,
+            "start_opl": 5.5, "bin_width_opl": 0.05}  # fmt: skip
+    body = pose(0.07, -0.05, 0.8) @ np.diag([0.45, 0.35, 1, 1])
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "transient_path", "max_depth": 3},
+        "sensor": {"type": "perspective", "fov": 40, "near_clip": 1e-3, "to_world": CAMERA, "film": film},
+        "light": {"type": "point", "position": [0.7, 0.4, 3.8], "intensity": 10.0},
+        "wall": {"type": "rectangle", "to_world": pose(scale=5.0), "bsdf": {"type": "diffuse", "reflectance": 0.7}},
+        "body": {"type": "rectangle", "to_world": body, "bsdf": {"type": "diffuse", "reflectance": 0.4}},
+    }
+    return tt.load(scene | more, variant=VARIANT)
+
+
+MIRROR = {"type": "rectangle", "to_world": pose(0, 2, 1, 0.5), "bsdf": {"type": "conductor"}}
+
+
+def weighed(out):
+    """The loss: a pattern of pixels times a sine of the time, so that nothing cancels."""
+    times = torch.as_tensor(out.axis.centers_opl, dtype=torch.float32)
+    return (out.transient * PATTERN * torch.sin(3 * times)[:, None, None]).sum()
+
+
+def said(function):
+    """(result, messages of derivatives that lack a part)"""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        result = function()
+    return result, [str(one.message) for one in caught if issubclass(one.category, GradientWarning)]
+
+
+def reverse(renderer, seed=0, **settings):
+    renderer.zero_grad()
+    weighed(renderer(seed=seed, **settings)).backward()
+    return float((renderer.values[BODY].grad * SIDEWAYS).sum())
+
+
+@pytest.mark.parametrize("depth", long([2, 3], [2]))
+def test_both_modes_agree(depth):
+    """They draw the same samples."""
+    renderer = tt.TransientRenderer(plate(), [BODY], spp=16, max_depth=depth)
+    expected, base = reverse(renderer), renderer.values[BODY].detach()
+    assert abs(expected) > 1e-3
+
+    def loss(shift):
+        return weighed(renderer({BODY: base + shift * SIDEWAYS}, seed=0))
+
+    _, tangent = torch.func.jvp(loss, (torch.zeros(()),), (torch.ones(()),))
+    assert float(tangent) == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.slow
+def test_every_entry_of_a_batch_has_the_term():
+    renderer = tt.TransientRenderer(plate(), [BODY, PAINT], spp=16)
+    alone, base = reverse(renderer), renderer.values[BODY].detach()
+    shifts, paint = torch.zeros(2, 1, 1, requires_grad=True), torch.full((2,), 0.4, requires_grad=True)
+    weighed(renderer({BODY: base + shifts * SIDEWAYS, PAINT: paint}, seed=[0, 0])).backward()
+    torch.testing.assert_close(shifts.grad.flatten(), torch.full((2,), alone), rtol=1e-4, atol=0)
+
+    def loss(shift, color):
+        return weighed(renderer({BODY: base + shift * SIDEWAYS, PAINT: color}, seed=0))
+
+    each = torch.func.vmap(torch.func.grad(loss), in_dims=(0, None))(torch.zeros(2), torch.tensor(0.4))
+    torch.testing.assert_close(each, torch.full((2,), alone), rtol=1e-4, atol=0)
+
+
+def test_second_derivatives_are_refused():
+    renderer = tt.TransientRenderer(plate(), [BODY], spp=4)
+    (grad,) = torch.autograd.grad(weighed(renderer(seed=0)), [renderer.values[BODY]], create_graph=True)
+    with pytest.raises(GradientError, match="second derivatives"):
+        grad.sum().backward()
+
+
+@pytest.mark.slow
+def test_plate_against_finite_differences():
+    """Without the term the derivative is zero but for rounding. Errors are those of 8 seeds."""
+    renderer = tt.TransientRenderer(plate(), [BODY], spp=256, spp_boundary=256)
+    base, h = renderer.values[BODY].detach(), 0.005
+    found = [reverse(renderer, seed) for seed in range(8)]
+    with torch.no_grad():
+        sides = [
+            [float(weighed(renderer({BODY: base + s * h * SIDEWAYS}, seed=seed, spp=4096))) for s in (1, -1)]
+            for seed in range(8)
+        ]
+    expected = [(plus - minus) / (2 * h) for plus, minus in sides]
+    error = np.hypot(np.std(found, ddof=1), np.std(expected, ddof=1)) / np.sqrt(8)
+    assert np.mean(found) == pytest.approx(np.mean(expected), abs=4 * error)
+    assert error < 0.25 * abs(np.mean(expected))
+
+
+def test_left_out_it_is_said_once():
+    scene = plate()
+    renderer = tt.TransientRenderer(scene, [BODY, PAINT], spp=4, boundary=False)
+    _, first = said(lambda: reverse(renderer))
+    assert len(first) == 1 and repr(BODY) in first[0] and repr(PAINT) not in first[0] and "boundary" in first[0]
+    assert said(lambda: reverse(renderer, 1))[1] == []
+    # Told of as a finding of the scene: it is no error, since it was asked for.
+    strict = tt.TransientRenderer(plate(), [BODY], spp=4, boundary=False, physics="error")
+    assert len(said(lambda: reverse(strict))[1]) == 1
+    for twin in (copy.deepcopy(renderer), pickle.loads(pickle.dumps(renderer)), renderer.variation()):
+        assert twin.boundary is False and twin.spp_boundary is None
+
+
+def test_nothing_is_said_without_derivatives():
+    renderer = tt.TransientRenderer(plate(mirror=MIRROR), [BODY], spp=4)
+    with torch.no_grad():
+        assert said(lambda: renderer(seed=0))[1] == []
+    fixed = tt.TransientRenderer(plate(mirror=MIRROR), [PAINT], spp=4)
+    assert said(lambda: weighed(fixed(seed=0)).backward())[1] == []
+    complete = tt.TransientRenderer(plate(), [BODY], spp=4, physics="error")
+    assert said(lambda: reverse(complete))[1] == []
+
+
+STEPS = {"type": "bitmap", "data": np.eye(4)[..., None] * 0.6 + 0.2, "raw": True, "filter_type": "nearest"}
+STRIPED = {"type": "rectangle", "to_world": pose(scale=5.0), "bsdf": {"type": "diffuse", "reflectance": STEPS}}
+LAMP = {"type": "rectangle", "to_world": pose(0, 0, 3, 0.1) @ np.diag([1.0, -1, -1, 1]),
+        "emitter": {"type": "angulararea", "cutoff_angle": 20.0}}  # fmt: skip
+
+
+@pytest.mark.parametrize(("more", "key", "words"), [
+    ({"mirror": MIRROR}, BODY, "mirrors.*'mirror'"),
+    ({"mirror": MIRROR}, "light.position", "mirrors"),
+    ({"lamp": LAMP}, BODY, "rim of the light of 'lamp'"),
+    ({"wall": STRIPED}, "wall.to_world", "steps.*'wall'"),
+    ({"wall": STRIPED}, "sensor.to_world", "steps.*'wall'"),
+])  # fmt: skip
+def test_edges_that_are_not_followed(more, key, words):
+    scene = plate(**more)
+    info = scene.parameters()[key]
+    assert info.biased and len(info.edges_missing) == 1 and info.edges_missing[0] in info.reason
+    renderer = tt.TransientRenderer(scene, [key], spp=4)
+    message = said(lambda: renderer(seed=0))[1]
+    assert len(message) == 1 and repr(key) in message[0]
+    with pytest.raises(GradientError, match=words):
+        tt.TransientRenderer(scene, [key], spp=4, physics="error")(seed=0)
+
+
+def test_what_is_called_correct(tmp_path):
+    """Moving edges where all are followed, with a texture with steps on what stands still."""
+    table = plate(wall=STRIPED).parameters()
+    for key in (BODY, "light.position"):
+        assert table[key].reason == "correct" and table[key].moves_silhouette and not table[key].biased
+    off = plate(integrator={"type": "transient_path", "max_depth": 3, "boundary": False}).parameters()
+    assert off[BODY].biased and "boundary" in off[BODY].reason and off[PAINT].reason == "correct"
+    (tmp_path / "curve.txt").write_text("\n".join(f"{x} 0 1 0.1" for x in range(3)), encoding="utf-8")
+    curves = plate(curve={"type": "linearcurve", "filename": str(tmp_path / "curve.txt")}).parameters()
+    assert "'curve'" in curves[BODY].reason and "'curve'" in curves["curve.control_points"].reason
+
+
+def test_the_plan_says_so():
+    assert any("boundary term: on" in reason and BODY in reason for reason in planned(plate(), BODY))
+    assert any("mirrors" in reason for reason in planned(plate(mirror=MIRROR), BODY))
+    assert not any("boundary" in reason for reason in planned(plate(), PAINT))
+
+
+def planned(scene, key):
+    return tt.plan(scene, parameters=[key], pilot=False).reasons
+
+
+def test_samples_are_those_asked_for():
+    few, many = (tt.TransientRenderer(plate(), [BODY], spp=16, spp_boundary=n) for n in (1, 64))
+    assert reverse(few) != reverse(many)
+
+
+def kernels(renderer, key):
+    """Hashes of the kernels that a derivative launches, in order."""
+    weighed(renderer(seed=0)).backward()
+    with active_variant(VARIANT):
+        import drjit as dr
+
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            weighed(renderer(seed=1)).backward()
+            return [entry["hash"] for entry in dr.kernel_history((dr.KernelType.JIT,))]
+
+
+def test_derivatives_that_move_no_edge_run_the_same_kernels():
+    """Of a brightness, of texture coordinates that show no steps: as if there were no boundary term."""
+    for key in (PAINT, "light.intensity.value"):
+        with_term, without = (
+            kernels(tt.TransientRenderer(plate(), [key], spp=4, boundary=on, freeze=False), key) for on in (True, False)
+        )
+        assert with_term == without and with_term
+    moving = kernels(tt.TransientRenderer(plate(), [BODY], spp=4, freeze=False), BODY)
+    assert len(moving) > len(with_term)

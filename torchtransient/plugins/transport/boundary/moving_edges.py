@@ -1,0 +1,171 @@
+"""What derivatives lack of moving edges in a scene, in words: for the table of parameters and for warnings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins.mitsuba_compat import attribute_name, has_surface, is_bump_map, is_instance, lacks_edges
+from torchtransient.plugins.node_walk import objects_below, shapes_of_scene
+from torchtransient.plugins.parameter_effect import CORRECT, ParameterEffect
+
+# Roles of what moves edges against what is behind them, and of what bends light, which moves edges that are seen
+# through it.
+_MOVE, _BEND = ("shape", "emitter", "sensor", "sun"), ("index", "normal")
+# Of a mesh: they move no point.
+_PLACELESS = ("vertex_normals", "vertex_texcoords")
+# Places at which a texture is asked whether it is smooth, along each side.
+_PROBES = 64
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Edges that are not followed. ``where``: in words that go on from "correct except"; ``remedy``: a sentence."""
+
+    where: str
+    remedy: str
+
+
+def moves_edges(key: str, effect: ParameterEffect) -> bool:
+    """Return whether a parameter moves what hides, what is hidden, or who looks; ``key``: its name in the plugin."""
+    return effect.moves_silhouette and effect.role in _MOVE and not key.endswith(_PLACELESS)
+
+
+class MovingEdges:
+    """What derivatives of a scene lack where edges move, asked by parameter (:meth:`lacking`).
+
+    ``always``: gaps of every parameter that moves edges. ``bent``: of those, and of what bends light. ``scene``: where
+    textures are looked for, None for nowhere. ``words``: gaps that the table of parameters speaks of and that no scene
+    can be said to have.
+    """
+
+    def __init__(
+        self, always: Sequence[Gap] = (), bent: Sequence[Gap] = (), scene: Any = None, words: Sequence[str] = ()
+    ) -> None:
+        self.always, self.bent, self.words = tuple(always), tuple(bent), tuple(words)
+        self._scene = scene
+        self._steps: dict[int, list[str]] = {}
+
+    def lacking(self, node: Any, key: str, effect: ParameterEffect) -> tuple[Gap, ...]:
+        """Return the gaps of the derivative by a parameter ``key`` of the plugin ``node``."""
+        if not (effect.moves_silhouette and effect.supported):
+            return ()
+        name, moves = key.rsplit(".", 1)[-1], moves_edges(key, effect)
+        found = self.always if moves else ()
+        if moves or effect.role in _BEND or name == "vertex_normals":
+            found += self.bent
+        if (moves and effect.role in ("shape", "sensor")) or name == "vertex_texcoords":
+            # Of what an instance shows, Mitsuba says nothing; a sensor sees everything move.
+            alone = effect.role != "sensor" and isinstance(node, mi.Shape) and not is_instance(node)
+            found += self._jumps(node if alone else None)
+        return tuple(dict.fromkeys(found))
+
+    def reason(self, node: Any, key: str, effect: ParameterEffect) -> str:
+        """Return the reason of the effect with what the derivative lacks."""
+        words = list(self.words) if effect.supported and moves_edges(key, effect) else []
+        words += [gap.where for gap in self.lacking(node, key, effect)]
+        if not words:
+            return effect.reason
+        said = f"{CORRECT} except {', '.join(words)} (no boundary term)"
+        more = effect.reason.removeprefix(CORRECT).removeprefix("; ")
+        return f"{said}; {more}" if more else said
+
+    def _jumps(self, shape: Any) -> tuple[Gap, ...]:
+        """The gap of textures with steps on a shape, on any for None."""
+        if self._scene is None:
+            return ()
+        address = 0 if shape is None else shape.ptr
+        if address not in self._steps:
+            shapes = shapes_of_scene(self._scene) if shape is None else [shape]
+            self._steps[address] = [_name(one) for one in shapes if has_surface(one) and _is_stepped(one)]
+        names = self._steps[address]
+        if not names:
+            return ()
+        where = f"at the steps of textures on what moves (on {_listed(names)})"
+        return (Gap(where, "Take a smooth texture there, of filter_type 'bilinear'."),)
+
+
+def missing(reason: str, remedy: str) -> MovingEdges:
+    """Return the answer of an integrator that computes no boundary term for a ``reason``."""
+    gap = Gap(f"where silhouettes move ({reason})", remedy)
+    return MovingEdges((gap,), (gap,))
+
+
+def moving_edges(scene: Any) -> MovingEdges:
+    """Return what the passes of :mod:`.passes` leave out in a scene."""
+    always, bent = [], []
+    if shapes := shapes_without_edges(scene):
+        names = _listed([_name(shape) for shape in shapes])
+        always.append(Gap(f"at the rims of {names}, which have no edges", "Use a mesh of the same form."))
+    if rims := [emitter.get_shape() or emitter for emitter in scene.emitters() if _has_rim(emitter)]:
+        where = f"at the rim of the light of {_listed([_name(one) for one in rims])}"
+        always.append(Gap(where, "Let the light fade out, by a beam_width below the cutoff_angle for instance."))
+    if smooth := [shape for shape in filter(has_surface, shapes_of_scene(scene)) if _has_delta_lobe(shape)]:
+        names = _listed([_name(shape) for shape in smooth])
+        where = f"where edges are seen in mirrors or through smooth glass, masks and open boundaries ({names})"
+        bent.append(Gap(where, "Take a rough surface in place of the smooth one, or keep edges out of its view."))
+    return MovingEdges(always, bent, scene)
+
+
+def shapes_without_edges(scene: Any) -> list[Any]:
+    """Return the shapes of a scene with outlines that the table of edges does not hold."""
+    return [shape for shape in shapes_of_scene(scene) if lacks_edges(shape)]
+
+
+def _has_delta_lobe(shape: Any) -> bool:
+    bsdf = shape.bsdf()
+    return bsdf is not None and bool(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta))
+
+
+def _is_stepped(shape: Any) -> bool:
+    """Whether something jumps from place to place on a shape: a texture with steps, the slope of a bump map."""
+    holders = [part for part in (shape.bsdf(), shape.emitter()) if part is not None]
+    nested = [bsdf for holder in holders for bsdf in (holder, *objects_below(holder, mi.BSDF))]
+    if any(isinstance(bsdf, mi.BSDF) and is_bump_map(bsdf) for bsdf in nested):
+        return True
+    return any(_has_steps(texture) for holder in holders for texture in objects_below(holder, mi.Texture))
+
+
+def _has_steps(texture: Any) -> bool:
+    """Whether a texture is flat wherever it is asked, and not the same everywhere. Mitsuba does not show its filter."""
+    attribute = attribute_name(texture)
+    if attribute is not None:
+        return attribute.startswith("face_")
+    if not texture.is_spatially_varying():
+        return False
+    si = dr.zeros(mi.SurfaceInteraction3f, _PROBES * _PROBES)
+    si.wavelengths = dr.full(type(si.wavelengths), 550, _PROBES * _PROBES)
+    random = mi.PCG32(size=_PROBES * _PROBES)
+    si.uv = mi.Point2f(random.next_float32(), random.next_float32())
+    with dr.resume_grad():
+        dr.enable_grad(si.uv)
+        value = dr.sum(texture.eval(si), axis=0)
+        if dr.grad_enabled(value):
+            dr.backward(value)
+        slope = dr.grad(si.uv)
+    value = dr.detach(value)
+    flat = bool(dr.all((slope.x == 0) & (slope.y == 0), axis=None))
+    return flat and bool(dr.max(value)[0] > dr.min(value)[0])
+
+
+def _has_rim(emitter: Any) -> bool:
+    """Whether the light of an emitter ends at once beside its direction."""
+    if emitter.class_name() == "Projector":
+        return True
+    cutoff = getattr(emitter, "cutoff_angle", None)
+    return cutoff is not None and cutoff < 90 and cutoff == emitter.beam_width
+
+
+def _name(plugin: Any) -> str:
+    own = plugin.id()
+    return plugin.class_name() if not own or own.startswith("_") else repr(own)
+
+
+def _listed(names: Sequence[str], most: int = 3) -> str:
+    """The first few names, each once."""
+    names = list(dict.fromkeys(names))
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
