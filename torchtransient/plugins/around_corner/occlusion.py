@@ -59,6 +59,8 @@ class MutualOcclusion:
     Light of three bounces alone; hidden surfaces scatter by their BSDF's smooth lobes.
     """
 
+    can_be_recorded = False
+
     def __init__(self, integrator: Any, world: Any, sensor: Any, film: Any, edges: OutlineTable, spots: Any, jobs: Any):
         self.integrator, self.world, self.sensor, self.film = integrator, world, sensor, film
         self.edges, self.spots, self.jobs = edges, spots, jobs

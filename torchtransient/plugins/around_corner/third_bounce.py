@@ -43,6 +43,8 @@ class ThirdBounce(ScanJob):
     supported: spectral and polarized variants; derivatives.
     """
 
+    can_be_recorded = False
+
     def __init__(
         self,
         scene: Any,

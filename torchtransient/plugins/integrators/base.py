@@ -234,7 +234,7 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     def beside(self, world, sensor, film, seed, samples):
         """What derivatives of a job have beside its paths: objects with ``tables()`` (attached to the parameters),
-        ``backward(incoming)`` and ``forward()``. Raises GradientError where one is needed and cannot be computed.
+        ``backward(incoming)``, ``forward()``, and ``can_be_recorded``. Raises GradientError where one is needed and cannot be computed.
         """
         return []
 
@@ -284,7 +284,9 @@ class TransientIntegrator(mi.CppADIntegrator):
                 return f"the plugin {type(plugin).__name__} does not say that it can be (can_be_recorded)"
         if job.world.record_room is not None and job.world.record_room.in_memory:
             return "records of so many bounces lie in global memory"
-        return "derivatives beside paths read numbers of the scene" if job.beside else None
+        if not all(part.can_be_recorded for part in job.beside):
+            return "derivatives beside paths read numbers of the scene"
+        return None
 
     @staticmethod
     def state_of(jobs):

@@ -48,9 +48,12 @@ class BoundaryTerm:
         candidates: edges that one is chosen from in the vertex pass.
     """
 
+    can_be_recorded = True
+
     def __init__(self, integrator, world, sensor, film, seed, samples, names=tuple(PASSES), candidates=8):
         self.integrator, self.world, self.sensor, self.film = integrator, world, sensor, film
         self.candidates = candidates
+        self._sampler = world.contents.memory.of("sampler", b"", lambda: mi.load_dict({"type": "independent"}))
         scene, wanted = world.scene, world.wanted
         self.is_meter = is_irradiance_meter(sensor)
         views_move = wanted.sensor or wanted.light
@@ -107,7 +110,7 @@ class BoundaryTerm:
     def sampler(self, job):
         """A seeded sampler of independent numbers with a lane for each sample of ``job``."""
         lanes = int(self.film.crop_size()[0]) * job.rows * job.spp
-        sampler = mi.load_dict({"type": "independent"})
+        sampler = self._sampler.clone()
         sampler.seed(job.seed, lanes)
         return sampler
 
