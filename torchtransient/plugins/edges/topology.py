@@ -19,11 +19,12 @@ from torchtransient.plugins.mitsuba_compat import is_instance, lacks_edges
 from torchtransient.plugins.node_walk import members_of, shapes_of_scene, shown_by
 from torchtransient.plugins.pointer_table import registry_number
 
-# Flags of a row: a second face; seen from between its faces alone; listed for the other face's vertices, too.
-TWO, GAP, TWIN = 1, 2, 4
+# Flags of a row: a second face; seen from between its faces alone; listed for the other face's vertices, too; faces of
+# two bodies.
+TWO, GAP, TWIN, SEAM = 1, 2, 4, 8
 # What a row is: an edge; the limb of a ball; the two limbs of a tube; the rims of disks and tubes.
 EDGE, BALL, TUBE_LEFT, TUBE_RIGHT, DISK_RIM, TUBE_RIM = range(6)
-KIND = 8  # the kind's factor in the flags
+KIND = 16  # the kind's factor in the flags
 # Numbers per ellipsoid: centre, semi-axes, quaternion.
 _ELLIPSOID = 10
 
@@ -46,9 +47,9 @@ class Body:
         """Return whether the address of the shape or of its instance is one of ``moving``."""
         return self.shape.ptr in moving or (self.instance is not None and self.instance.ptr in moving)
 
-    def vertices(self) -> Any:
-        """The vertices of a mesh (Point3f), attached."""
-        return self._to_world(dr.unravel(mi.Point3f, self.shape.vertex_positions_buffer()))
+    def vertices(self, index: Any) -> Any:
+        """Vertices of a mesh (Point3f) by their numbers, attached."""
+        return self._to_world(dr.gather(mi.Point3f, self.shape.vertex_positions_buffer(), index))
 
     def kinds(self) -> list[int]:
         """Kinds of the rows of a shape that is no mesh; ellipsoids have one for each."""
@@ -177,8 +178,7 @@ class Topology:
         owner = np.repeat(np.arange(len(parts)), [len(part.flags) for part in parts])
         owners = np.stack([owner, owner], 1)
         if len(parts) > 1:
-            with dr.suspend_grad():
-                rows, owners = _joined_rims(rows, owners, host_numbers(self.points()).T)
+            rows, owners = _joined_rims(rows, owners, host_numbers(self.points()).T)
         kinds = [body.kinds() for body in self._others]
         self.rounds = sum(len(each) for each in kinds)
         self.count = len(owners) + self.rounds
@@ -189,7 +189,10 @@ class Topology:
         faces = np.concatenate([rows.faces, np.stack([number, number], 1)]) if len(number) else rows.faces
 
         whole = lambda x: mi.UInt32(np.ascontiguousarray(x, np.uint32))  # noqa: E731
-        self.ends, self.third, self.other = ([whole(x[:, i]) for i in (0, 1)] for x in (rows.ends, rows.third, rows.other))
+        # Ends in numbers of each mesh: gathered from what was gathered, gradients would not arrive (see `ends`).
+        own = rows.ends - starts[owner][:, None]
+        self._ends = [[whole(own[owner == k, i]) for k in range(len(parts))] for i in (0, 1)]
+        self.third, self.other = ([whole(x[:, i]) for i in (0, 1)] for x in (rows.third, rows.other))
         self.faces, self.owners = ([whole(x[:, i]) for i in (0, 1)] for x in (faces, owners))
         place = np.concatenate([rows.place, np.zeros((self.rounds, 4), int)])
         self.place = whole(place @ [1, 4, 16, 64])
@@ -202,16 +205,24 @@ class Topology:
         self.index = whole([b.index for b in self.bodies])
         # Rows follow each other by what they belong to.
         self._runs = [(k, len(list(run))) for k, run in groupby(owners[:, 0].tolist())]
-        dr.eval(self.ends, self.third, self.other, self.faces, self.owners, self.place, self.flags, self.shape, self.instance, self.index)
+        dr.eval(self._ends, self.third, self.other, self.faces, self.owners, self.place, self.flags, self.shape, self.instance, self.index)
 
     def points(self) -> Any:
-        """The vertices of all meshes, one after the other, attached where they are."""
-        return _concatenated([body.vertices() for body in self._meshes], mi.Point3f)
+        """The vertices of all meshes (Point3f), one after the other, detached."""
+        with dr.suspend_grad():
+            counts = [body.shape.vertex_count() for body in self._meshes]
+            return _concatenated([b.vertices(dr.arange(mi.UInt32, n)) for b, n in zip(self._meshes, counts, strict=True)])
 
-    def frames(self) -> list[Any]:
-        """Origins and axes (four Point3f) of the limbs, attached where they are."""
-        frames = [frame for body in self._others for frame in body.frames()]
-        return [_concatenated([frame[k] for frame in frames], mi.Point3f) for k in range(4)]
+    def ends(self) -> list[Any]:
+        """Two Point3f, attached where they are: starts and stops of all edges; behind them origins and second axes,
+        first and third axes of the limbs.
+
+        By a single gather from the scene's parameters: Dr.Jit's ``isolate_grad`` loses what arrives at gathers of
+        gathers that were made before.
+        """
+        edges = [[body.vertices(i) for body, i in zip(self._meshes, each, strict=True)] for each in self._ends]
+        o, x, y, z = zip(*(frame for body in self._others for frame in body.frames()), strict=True) if self.rounds else [()] * 4
+        return [_concatenated([*part, *first, *then]) for part, first, then in zip(edges, (o, x), (y, z), strict=True)]
 
     def moves(self, moving: frozenset[Any]) -> Any:
         """Ones for the rows of bodies that move, None where none does."""
@@ -228,8 +239,8 @@ def _bodies(scene: Any, shape: Any) -> list[Body]:
     return [Body(one, shape, k) for k, one in enumerate(members) if not lacks_edges(one)]
 
 
-def _concatenated(parts: list[Any], type_: type) -> Any:
-    return type_(*[dr.concat([mi.Float(part[k]) for part in parts]) for k in range(3)]) if parts else type_()
+def _concatenated(parts: list[Any]) -> Any:
+    return mi.Point3f(*[dr.concat([mi.Float(part[k]) for part in parts]) for k in range(3)])
 
 
 def _stacked(parts: list[_Rows], starts: np.ndarray) -> _Rows:
@@ -266,5 +277,5 @@ def _joined_rims(rows: _Rows, owners: np.ndarray, positions: np.ndarray) -> tupl
         new.other[a] = turned(rows.ends[b])
         new.place[a, 2:] = turned(rows.place[b, :2])
         new.third[a, 1], new.faces[a, 1], owners[a, 1] = rows.third[b, 0], rows.faces[b, 0], owners[b, 0]
-        new.flags[a] = TWO + TWIN
+        new.flags[a] = TWO + TWIN + SEAM
     return new, owners

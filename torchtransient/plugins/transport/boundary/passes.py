@@ -291,6 +291,10 @@ class BoundaryTerm:
         moving = active & on_surface & x.is_valid()
         x_p = light_world.segment.arrive(light_world, path).at.p
         behind = dr.norm(x_p - b.p)
+        # An edge that lies on x: shadow and outline end there together, and who looks at the edge sees both.
+        active &= ~on_surface | (dr.dot(x_p - b.p, b.d) > 0)
+        moving &= active
+        path.active = active
         t = dr.select(far, 0, behind / (behind + b.dist))
         seen, _ = sensor.sample_direction(at_point(x_p), aperture, active)
         rays = self._rays(sampler, seen.uv, wavelength, aperture, None, None, job)
