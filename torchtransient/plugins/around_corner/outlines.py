@@ -10,10 +10,10 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient.errors import GradientError, TorchTransientWarning
-from torchtransient.plugins.around_corner.outline_table import OutlineTable
 from torchtransient.plugins.around_corner.geometry import front_normal
 from torchtransient.plugins.around_corner.hiding import Part, hiding_pairs, parts_of
 from torchtransient.plugins.around_corner.occlusion import BOUNCES, MutualOcclusion
+from torchtransient.plugins.around_corner.outline_table import OutlineTable
 from torchtransient.plugins.integrators.launch import passes_of, seed_array
 from torchtransient.plugins.parameter_effect import CORRECT
 from torchtransient.plugins.pointer_table import registry_number

@@ -113,16 +113,14 @@ class EdgeTable:
         self.weight = dr.select(dr.isfinite(weight), weight, 0)
 
     def _row(self, e: Any) -> Local:
-        """Ends of rows, or origin and axes ``a, b, y, z`` of limbs, and their lengths; halves of what is listed twice."""
+        """Ends of rows, or origin and axes ``a, x, y, z`` of limbs; lengths, halves of what is listed twice."""
         k = Local(e=e, flags=dr.gather(mi.UInt32, self.flags, e))
         k.kind = k.flags // KIND
         k.a, k.b = (dr.gather(mi.Point3f, dr.detach(end), e) for end in self.ends)
         k.length = dr.norm(k.b - k.a)
         if self.topology.rounds:
-            rounds = k.kind != EDGE
-            k.y, k.z = (
-                mi.Vector3f(dr.gather(mi.Point3f, dr.detach(end), e + self.topology.rounds, rounds)) for end in self.ends
-            )
+            rounds, second = k.kind != EDGE, e + self.topology.rounds
+            k.y, k.z = (mi.Vector3f(dr.gather(mi.Point3f, dr.detach(end), second, rounds)) for end in self.ends)
             k.x = mi.Vector3f(k.b)
             # Of limbs and rims those of round ones; what they have in fact comes with the point.
             x2, y2, z2 = (dr.squared_norm(v) for v in (k.x, k.y, k.z))
@@ -169,11 +167,9 @@ class EdgeTable:
             beside = (k.flags & GAP == 0) | between
         return ha, hb, two, beside
 
-    def choose(
-        self, density: EdgeDensity, sampler: Any, V: Any, active: Any, candidates: int, worth: Any
-    ) -> Local:
-        """Of several picks, which cost no rays, the one that is seen from ``V`` in proportion to what it may be
-        ``worth(d, dist)``: an outline times its span, a crease less, the flatter it is. (Resampling, Talbot et al. 2005.)
+    def choose(self, density: EdgeDensity, sampler: Any, V: Any, active: Any, candidates: int, worth: Any) -> Local:
+        """Return one of several picks, which cost no rays, in proportion to what it may be ``worth(d, dist)`` seen from
+        ``V``: an outline times its span, a crease less, the flatter it is. (Resampling, Talbot et al. 2005.)
         """
         best, total, own = None, mi.Float(0), mi.Float(1)
         for _ in range(candidates):
@@ -297,7 +293,7 @@ class EdgeTable:
         return mi.Vector3f(*[dr.dot(c, w) / volume for c in across]), [c * dr.sign(volume) for c in across]
 
     def _limb(self, k: Any, V: Any) -> tuple[Any, Any, Any, Any]:
-        """(place in the unit space, derivative of the point by ``u``, unit normal of a limb, whether ``V`` sees one)."""
+        """(place in the unit space, derivative of the point by ``u``, normal of a limb, whether ``V`` sees one)."""
         v, across = self._to_local(k, V - k.a)
         ball, tube = k.kind == BALL, _is_tube(k.kind)
         sin, cos = dr.sincos(k.u * dr.two_pi)
