@@ -176,16 +176,16 @@ class Topology:
         place = np.concatenate([rows.place, np.zeros((len(limbs), 4), int)]) @ [1, 4, 16, 64]
         flags = np.concatenate([rows.flags, kind * KIND])
 
-        whole = lambda x: mi.UInt32(np.ascontiguousarray(x, np.uint32))  # noqa: E731
+        numbers = lambda x: mi.UInt32(np.ascontiguousarray(x, np.uint32))  # noqa: E731
         self.rounds, self.count = len(limbs), len(flags)
         self.has_gaps, self.has_twins = bool((flags & GAP).any()), bool((flags & TWIN).any())
-        self._ends = [[whole(each[:, i]) for each in own] for i in (0, 1)]
+        self._ends = [[numbers(each[:, i]) for each in own] for i in (0, 1)]
         self.third, self.other, self.faces, self.owners = (
-            [whole(x[:, i]) for i in (0, 1)] for x in (rows.third, rows.other, faces, owners)
+            [numbers(x[:, i]) for i in (0, 1)] for x in (rows.third, rows.other, faces, owners)
         )
-        self.place, self.flags, self.index = whole(place), whole(flags), whole([b.index for b in self.bodies])
+        self.place, self.flags, self.index = numbers(place), numbers(flags), numbers([b.index for b in self.bodies])
         self.shape, self.instance = (
-            whole([0 if x is None else registry_number(x) for x in each])
+            numbers([0 if x is None else registry_number(x) for x in each])
             for each in ([b.shape for b in self.bodies], [b.instance for b in self.bodies])
         )
         # Rows follow each other by what they belong to.
