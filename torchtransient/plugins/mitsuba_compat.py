@@ -195,7 +195,7 @@ def group_name(instance: Any) -> str:
     """Return the identifier of the shape group that an instance copies. Mitsuba shows it in the description alone."""
     found = re.search(r'name = "(.*?)",\n', str(instance))
     if found is None:
-        raise SceneError(f"{instance.class_name()}: expected the name of a shape group in its description, got {instance}.")
+        raise SceneError(f"Instance: expected the name of a shape group in its description, got {instance}.")
     return found[1]
 
 

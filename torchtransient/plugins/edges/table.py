@@ -18,6 +18,7 @@ from torchtransient.plugins.edges.topology import (
     EDGE,
     GAP,
     KIND,
+    SEAM,
     TUBE_LEFT,
     TUBE_RIGHT,
     TUBE_RIM,
@@ -32,7 +33,7 @@ from torchtransient.plugins.transport.strategy import Local
 BESIDE = 1e-5
 # How many times as far before the edge one begins to look, so that what the edge touches is met.
 BEFORE = 100
-# How far inside of its faces paths start at a crease, in parts of the face.
+# How far inside of its faces paths start, in parts of the face.
 INSET = 1e-3
 # How far towards the viewer paths start at a limb, in radians: at the limb itself the cosine is rounding.
 TILT = 2e-3
@@ -75,17 +76,10 @@ class EdgeTable:
             return
         self.edges = topology.count - topology.rounds
         with dr.resume_grad():
-            ends: list[list[Any]] = [[], []]
-            if self.edges:
-                points = topology.points()
-                ends = [[dr.gather(mi.Point3f, points, i)] for i in topology.ends]
-            if topology.rounds:
-                o, x, y, z = topology.frames()
-                ends = [ends[0] + [o, y], ends[1] + [x, z]]
-            self.ends = [mi.Point3f(*[dr.concat([mi.Float(p[k]) for p in e]) for k in range(3)]) for e in ends]
+            self.ends = topology.ends()
         self.flags = topology.flags
         with dr.suspend_grad():
-            self._measure(dr.detach(points) if self.edges else None)
+            self._measure()
             moves = topology.moves(moving)
             weight = self.weight
             if moves is not None:
@@ -95,38 +89,38 @@ class EdgeTable:
             self.by_length = EdgeDensity(weight)
         dr.eval(self.ends, self.third, self.flags, vars(self.by_length))
 
-    def _measure(self, points: Any) -> None:
+    def _measure(self) -> None:
         """Third corners, flags and weights of the rows."""
         t, rows = self.topology, dr.arange(mi.UInt32, self.count)
         edge = rows < self.edges
         self.third = [dr.zeros(mi.Point3f, self.count)] * 2
         if self.edges:
+            points = t.points()
             corner = lambda index: dr.gather(mi.Point3f, points, dr.gather(mi.UInt32, index, rows, edge), edge)  # noqa: E731
             self.third = [corner(index) for index in t.third]
         if t.has_twins:
             apart = 2 * APART * dr.max(dr.max(dr.abs(points)))
-            off = [dr.max(dr.abs(corner(i) - corner(j))) for i, j in zip(t.ends, t.other, strict=True)]
+            own = (dr.gather(mi.Point3f, dr.detach(end), rows) for end in self.ends)
+            off = [dr.max(dr.abs(p - corner(i))) for p, i in zip(own, t.other, strict=True)]
             lone = (self.flags & TWIN != 0) & (dr.maximum(*off) > apart)
             self.flags = dr.select(lone, self.flags & ~mi.UInt32(TWO | TWIN), self.flags)
         k = self._row(rows)
         weight = k.length
         if self.edges:
             ha, hb = (_across(third - k.a, dr.normalize(k.b - k.a)) for third in self.third)
-            bend = 0.5 * dr.norm(ha + hb)
+            bend = _bend(k, ha, hb)
             weight *= dr.select(k.flags & TWO != 0, dr.select(bend > (FLAT / 2) ** 0.5, bend, 0), 1)
         self.weight = dr.select(dr.isfinite(weight), weight, 0)
 
     def _row(self, e: Any) -> Local:
-        """Ends of rows, or origin and axes ``a, b, y, z`` of limbs, and their lengths; halves of what is listed twice."""
+        """Ends of rows, or origin and axes ``a, x, y, z`` of limbs; lengths, halves of what is listed twice."""
         k = Local(e=e, flags=dr.gather(mi.UInt32, self.flags, e))
         k.kind = k.flags // KIND
         k.a, k.b = (dr.gather(mi.Point3f, dr.detach(end), e) for end in self.ends)
         k.length = dr.norm(k.b - k.a)
         if self.topology.rounds:
-            rounds = k.kind != EDGE
-            k.y, k.z = (
-                mi.Vector3f(dr.gather(mi.Point3f, dr.detach(end), e + self.topology.rounds, rounds)) for end in self.ends
-            )
+            rounds, second = k.kind != EDGE, e + self.topology.rounds
+            k.y, k.z = (mi.Vector3f(dr.gather(mi.Point3f, dr.detach(end), second, rounds)) for end in self.ends)
             k.x = mi.Vector3f(k.b)
             # Of limbs and rims those of round ones; what they have in fact comes with the point.
             x2, y2, z2 = (dr.squared_norm(v) for v in (k.x, k.y, k.z))
@@ -173,11 +167,9 @@ class EdgeTable:
             beside = (k.flags & GAP == 0) | between
         return ha, hb, two, beside
 
-    def choose(
-        self, density: EdgeDensity, sampler: Any, V: Any, active: Any, candidates: int, worth: Any
-    ) -> Local:
-        """Of several picks, which cost no rays, the one that is seen from ``V`` in proportion to what it may be
-        ``worth(d, dist)``: an outline times its span, a crease less, the flatter it is. (Resampling, Talbot et al. 2005.)
+    def choose(self, density: EdgeDensity, sampler: Any, V: Any, active: Any, candidates: int, worth: Any) -> Local:
+        """Return one of several picks, which cost no rays, in proportion to what it may be ``worth(d, dist)`` seen from
+        ``V``: an outline times its span, a crease less, the flatter it is. (Resampling, Talbot et al. 2005.)
         """
         best, total, own = None, mi.Float(0), mi.Float(1)
         for _ in range(candidates):
@@ -191,7 +183,7 @@ class EdgeTable:
             across = dr.cross(d, t)
             ha, hb, two, beside = self._faces(k, k.near, t, d)
             same = ~two | (dr.dot(across, ha) * dr.dot(across, hb) > 0)
-            span = dr.norm(across) * dr.select(same, 1, 0.5 * dr.norm(ha + hb))
+            span = dr.norm(across) * dr.select(same, 1, _bend(k, ha, hb))
             q = dr.select(k.ball, 1, dr.select(beside, span, 0)) * worth(d, dist)
             w = dr.select(active & (k.pmf > 0) & (q > 0), q * k.length / k.pmf, 0)
             total += w
@@ -246,17 +238,18 @@ class EdgeTable:
         valid = active & (k.pmf > 0) & (s > 1e-4) & (dist > scale) & outside & between & (dr.max(dr.abs(n)) > 0)
         q = p
         if self.topology.rounds:
-            q = dr.select(k.ball, k.a + self._from_local(k, self._tilted(k, local, d)), p)
+            inwards = dr.select(k.kind == DISK_RIM, k.a - p, dr.select(k.kind == TUBE_RIM, k.z, 0))
+            q = dr.select(k.ball, k.a + self._from_local(k, self._tilted(k, local, d)), p + inwards * INSET)
         t_in = dr.norm(q - V)
         beside = p - d * dr.minimum(BEFORE * scale, 0.5 * dist) + dr.select(crease, 0, mi.Vector3f(n)) * scale
         inverse = dr.select(k.pmf > 0, length / k.pmf, 0)
         return Local(
             k=k, V=V, p=p, d=d, dist=dist, n=mi.Vector3f(n), sin=s, inv_pdf=inverse, crease=crease, valid=valid,
-            beside=beside, d_in=(q - V) / t_in, limb=local, inner=self._leg(k, other, crease, t_in, valid),
-            facing=self._leg(k, mi.Bool(True), crease, dist, valid & crease),
+            beside=beside, d_in=(q - V) / t_in, limb=local, inner=self._leg(k, other, t_in, valid),
+            facing=self._leg(k, mi.Bool(True), dist, valid & crease),
         )  # fmt: skip
 
-    def _leg(self, k: Any, other: Any, crease: Any, t: Any, valid: Any) -> Any:
+    def _leg(self, k: Any, other: Any, t: Any, valid: Any) -> Any:
         """The intersection at the point in its first face, or in the ``other`` one."""
         top = self.topology
         face, owner = (
@@ -267,8 +260,8 @@ class EdgeTable:
         place = dr.select(other, place >> 4, place)
         corner = lambda i: mi.Point2f(dr.select(i == 1, 1.0, 0.0), dr.select(i == 2, 1.0, 0.0))  # noqa: E731
         uv = dr.lerp(corner(place & 3), corner((place >> 2) & 3), k.u)
-        # Paths that start exactly on concave creases leak: start a little inside of each face.
-        uv = dr.select(crease, uv + (mi.Point2f(1 / 3) - uv) * INSET, uv)
+        # Paths that start exactly on concave creases leak, or are shaded by what the edge lies on.
+        uv += (mi.Point2f(1 / 3) - uv) * INSET
         pi = dr.zeros(mi.PreliminaryIntersection3f)
         pi.valid, pi.t, pi.prim_index, pi.prim_uv = valid, t, face, dr.select(k.kind == EDGE, uv, 0)
         pi.shape, pi.instance = (
@@ -300,7 +293,7 @@ class EdgeTable:
         return mi.Vector3f(*[dr.dot(c, w) / volume for c in across]), [c * dr.sign(volume) for c in across]
 
     def _limb(self, k: Any, V: Any) -> tuple[Any, Any, Any, Any]:
-        """(place in the unit space, derivative of the point by ``u``, unit normal of a limb, whether ``V`` sees one)."""
+        """(place in the unit space, derivative of the point by ``u``, normal of a limb, whether ``V`` sees one)."""
         v, across = self._to_local(k, V - k.a)
         ball, tube = k.kind == BALL, _is_tube(k.kind)
         sin, cos = dr.sincos(k.u * dr.two_pi)
@@ -339,3 +332,8 @@ def _is_tube(kind: Any) -> Any:
 def _across(w: Any, t: Any) -> Any:
     """Unit vectors along ``w``, across the edge with unit tangent ``t``."""
     return dr.normalize(mi.Vector3f(w - t * dr.dot(w, t)))
+
+
+def _bend(k: Any, ha: Any, hb: Any) -> Any:
+    """How much a crease counts, from 0, flat, to 1. Two bodies may differ where they are flat."""
+    return dr.select(k.flags & SEAM != 0, 1, 0.5 * dr.norm(ha + hb))

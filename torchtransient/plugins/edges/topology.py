@@ -19,11 +19,12 @@ from torchtransient.plugins.mitsuba_compat import is_instance, lacks_edges
 from torchtransient.plugins.node_walk import members_of, shapes_of_scene, shown_by
 from torchtransient.plugins.pointer_table import registry_number
 
-# Flags of a row: a second face; seen from between its faces alone; listed for the other face's vertices, too.
-TWO, GAP, TWIN = 1, 2, 4
+# Flags of a row: a second face; seen from between its faces alone; listed for the other face's vertices, too; faces of
+# two bodies.
+TWO, GAP, TWIN, SEAM = 1, 2, 4, 8
 # What a row is: an edge; the limb of a ball; the two limbs of a tube; the rims of disks and tubes.
 EDGE, BALL, TUBE_LEFT, TUBE_RIGHT, DISK_RIM, TUBE_RIM = range(6)
-KIND = 8  # the kind's factor in the flags
+KIND = 16  # the kind's factor in the flags
 # Numbers per ellipsoid: centre, semi-axes, quaternion.
 _ELLIPSOID = 10
 
@@ -46,27 +47,25 @@ class Body:
         """Return whether the address of the shape or of its instance is one of ``moving``."""
         return self.shape.ptr in moving or (self.instance is not None and self.instance.ptr in moving)
 
-    def vertices(self) -> Any:
-        """The vertices of a mesh (Point3f), attached."""
-        buffer = self.shape.vertex_positions_buffer()
-        return self._to_world(dr.gather(mi.Point3f, buffer, dr.arange(mi.UInt32, dr.width(buffer) // 3)))
+    def vertices(self, index: Any) -> Any:
+        """Vertices of a mesh (Point3f) by their numbers, attached."""
+        return self._to_world(dr.gather(mi.Point3f, self.shape.vertex_positions_buffer(), index))
 
-    def kinds(self) -> list[int]:
-        """Kinds of the rows of a shape that is no mesh; ellipsoids have one for each."""
+    def limbs(self) -> list[tuple[int, int]]:
+        """Kinds of the rows of a shape that is no mesh, and numbers of the ellipsoids that they are of."""
         name = self.shape.class_name()
         if name == "Ellipsoids":
-            return [BALL] * (dr.width(self._value("data")) // _ELLIPSOID)
-        round_kinds = {"Sphere": [BALL], "Disk": [DISK_RIM], "Cylinder": [TUBE_LEFT, TUBE_RIGHT, TUBE_RIM, TUBE_RIM]}
-        return round_kinds[name]
+            return [(BALL, i) for i in range(dr.width(self._value("data")) // _ELLIPSOID)]
+        kinds = {"Sphere": [BALL], "Disk": [DISK_RIM], "Cylinder": [TUBE_LEFT, TUBE_RIGHT, TUBE_RIM, TUBE_RIM]}
+        return [(kind, 0) for kind in kinds[name]]
 
     def frames(self) -> list[tuple[Any, Any, Any, Any]]:
         """Origin and axes of the space in which the shape is a unit ball, disk or tube, for each row, attached."""
         if self.shape.class_name() == "Ellipsoids":
             return [self._ellipsoid_frames()]
         T = mi.AffineTransform4f(self._value("to_world"))
-        o, *axes = (
-            self._to_world(T @ v) for v in (mi.Point3f(0), mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Vector3f(0, 0, 1))
-        )
+        o = self._to_world(T @ mi.Point3f(0))
+        axes = [self._to_world(T @ mi.Vector3f(*[float(i == k) for k in range(3)])) for i in range(3)]
         if self.shape.class_name() != "Cylinder":
             return [(o, *axes)]
         # The rims of a tube have their face along the third axis.
@@ -74,7 +73,8 @@ class Body:
 
     def _ellipsoid_frames(self) -> tuple[Any, Any, Any, Any]:
         data = mi.Float(self._value("data"))
-        n = [dr.gather(mi.Float, data, _ELLIPSOID * dr.arange(mi.UInt32, dr.width(data) // _ELLIPSOID) + k) for k in range(_ELLIPSOID)]
+        first = _ELLIPSOID * dr.arange(mi.UInt32, dr.width(data) // _ELLIPSOID)
+        n = [dr.gather(mi.Float, data, first + k) for k in range(_ELLIPSOID)]
         turn = dr.quat_to_matrix(mi.Matrix3f, mi.Quaternion4f(*n[6:]))
         axes = [mi.Vector3f(turn[0, i], turn[1, i], turn[2, i]) * n[3 + i] * self._extent() for i in range(3)]
         return self._to_world(mi.Point3f(*n[:3])), *(self._to_world(axis) for axis in axes)
@@ -100,7 +100,7 @@ class _Rows(NamedTuple):
 
 
 def _halves(joined: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Numbers (K, 3) in ``joined.ravel()`` of start, stop and third corner of half-edges, from the lower joined place on."""
+    """Start, stop and third corner of half-edges, numbers (K, 3) in ``joined.ravel()``; all of one edge run alike."""
     face, k = rows // 3 * 3, rows % 3
     start, stop = face + k, face + (k + 1) % 3
     turned = joined.ravel()[start] > joined.ravel()[stop]
@@ -133,10 +133,9 @@ def _edges_of(positions: np.ndarray, faces: np.ndarray) -> _Rows:
     kept = first | (count > 2) | twin
     flags = (TWO * (count > 1) + GAP * (count > 2) + TWIN * twin)[kept]
     a, b = a[kept], b[kept]
-    return _Rows(
-        at[a[:, :2]], np.stack([at[a[:, 2]], at[b[:, 2]]], 1), at[b[:, :2]], number[np.stack([a[:, 0], b[:, 0]], 1) // 3],
-        np.concatenate([a[:, :2], b[:, :2]], 1) % 3, flags,
-    )  # fmt: skip
+    third, number = np.stack([at[a[:, 2]], at[b[:, 2]]], 1), number[np.stack([a[:, 0], b[:, 0]], 1) // 3]
+    place = np.concatenate([a[:, :2], b[:, :2]], 1) % 3
+    return _Rows(at[a[:, :2]], third, at[b[:, :2]], number, place, flags)
 
 
 def _angles(p: np.ndarray, group: np.ndarray) -> np.ndarray:
@@ -151,13 +150,14 @@ def _angles(p: np.ndarray, group: np.ndarray) -> np.ndarray:
 
 
 class Topology:
-    """The edges and limbs of ``scene``, edges first: ``count`` of them, the last ``rounds`` are limbs and rims of shapes
-    without triangles. ``without``: the shapes that have outlines, but no edges here.
+    """The edges and limbs of ``scene``: ``count`` rows, of which the last ``rounds`` are limbs and rims of what has no
+    triangles. ``without``: the shapes that have outlines, but no edges here.
 
     A plain object of Dr.Jit arrays, to be kept with the scene and to be named as state of recorded calls.
 
     Two meshes that touch along rims have edges there with one face of each, listed for both, with half of the light:
-    where they come apart later, each is a rim of its own. What comes together later is not joined.
+    where they come apart later, each is a rim of its own. What comes together later is not joined, and the order of
+    three and more faces around an edge stays.
     """
 
     def __init__(self, scene: Any) -> None:
@@ -166,53 +166,63 @@ class Topology:
         self._meshes = [body for body in bodies if body.shape.is_mesh()]
         self._others = [body for body in bodies if not body.shape.is_mesh()]
         self.bodies = self._meshes + self._others
-        found: dict[int, _Rows] = {}
-        for body in self._meshes:
-            if body.shape.ptr not in found:
-                positions = host_numbers(body.shape.vertex_positions_buffer(), np.float32).reshape(-1, 3)
-                found[body.shape.ptr] = _edges_of(positions, np.array(body.shape.faces_buffer(), np.int64).reshape(-1, 3))
-        parts = [found[body.shape.ptr] for body in self._meshes]
-        widths = [body.shape.vertex_count() for body in self._meshes]
-        starts = np.cumsum([0, *widths])
-        rows = _stacked(parts, starts)
-        owner = np.repeat(np.arange(len(parts)), [len(part.flags) for part in parts])
-        owners = np.stack([owner, owner], 1)
-        if len(parts) > 1:
-            with dr.suspend_grad():
-                rows, owners = _joined_rims(rows, owners, host_numbers(self.points()).T)
-        kinds = [body.kinds() for body in self._others]
-        self.rounds = sum(len(each) for each in kinds)
-        self.count = len(owners) + self.rounds
-        flags = np.concatenate([rows.flags, *(np.array(each) * KIND for each in kinds)]).astype(np.uint32)
-        rounds = np.repeat(np.arange(len(kinds)), [len(each) for each in kinds]) + len(parts)
-        owners = np.concatenate([owners, np.stack([rounds, rounds], 1)])
-        number = np.concatenate([np.arange(len(k)) if b.shape.class_name() == "Ellipsoids" else np.zeros(len(k)) for b, k in zip(self._others, kinds, strict=True)]) if kinds else []
-        faces = np.concatenate([rows.faces, np.stack([number, number], 1)]) if len(number) else rows.faces
+        rows, owners, starts = self._edges()
+        # Ends in numbers of each mesh: gathered from what was gathered, gradients would not arrive (see `ends`).
+        own = [rows.ends[owners[:, 0] == k] - start for k, start in enumerate(starts)]
+        limbs = [(k, *limb) for k, body in enumerate(self._others, len(starts)) for limb in body.limbs()]
+        owner, kind, number = np.array(limbs, int).reshape(-1, 3).T
+        owners = np.concatenate([owners, np.stack([owner, owner], 1)])
+        faces = np.concatenate([rows.faces, np.stack([number, number], 1)])
+        place = np.concatenate([rows.place, np.zeros((len(limbs), 4), int)]) @ [1, 4, 16, 64]
+        flags = np.concatenate([rows.flags, kind * KIND])
 
-        whole = lambda x: mi.UInt32(np.ascontiguousarray(x, np.uint32))  # noqa: E731
-        self.ends, self.third, self.other = ([whole(x[:, i]) for i in (0, 1)] for x in (rows.ends, rows.third, rows.other))
-        self.faces, self.owners = ([whole(x[:, i]) for i in (0, 1)] for x in (faces, owners))
-        place = np.concatenate([rows.place, np.zeros((self.rounds, 4), int)])
-        self.place = whole(place @ [1, 4, 16, 64])
-        self.flags = whole(flags)
+        numbers = lambda x: mi.UInt32(np.ascontiguousarray(x, np.uint32))  # noqa: E731
+        self.rounds, self.count = len(limbs), len(flags)
         self.has_gaps, self.has_twins = bool((flags & GAP).any()), bool((flags & TWIN).any())
+        self._ends = [[numbers(each[:, i]) for each in own] for i in (0, 1)]
+        self.third, self.other, self.faces, self.owners = (
+            [numbers(x[:, i]) for i in (0, 1)] for x in (rows.third, rows.other, faces, owners)
+        )
+        self.place, self.flags, self.index = numbers(place), numbers(flags), numbers([b.index for b in self.bodies])
         self.shape, self.instance = (
-            whole([0 if x is None else registry_number(x) for x in each])
+            numbers([0 if x is None else registry_number(x) for x in each])
             for each in ([b.shape for b in self.bodies], [b.instance for b in self.bodies])
         )
-        self.index = whole([b.index for b in self.bodies])
         # Rows follow each other by what they belong to.
         self._runs = [(k, len(list(run))) for k, run in groupby(owners[:, 0].tolist())]
-        dr.eval(self.ends, self.third, self.other, self.faces, self.owners, self.place, self.flags, self.shape, self.instance, self.index)
+        dr.make_opaque(self._ends, self.third, self.other, self.faces, self.owners)
+        dr.make_opaque(self.place, self.flags, self.index, self.shape, self.instance)
+
+    def _edges(self) -> tuple[_Rows, np.ndarray, np.ndarray]:
+        """(edges of all meshes, vertices counted through; bodies of both faces, (E, 2); first vertices of meshes)."""
+        found: dict[int, _Rows] = {}
+        for shape in {body.shape.ptr: body.shape for body in self._meshes}.values():
+            positions = host_numbers(shape.vertex_positions_buffer(), np.float32).reshape(-1, 3)
+            found[shape.ptr] = _edges_of(positions, np.array(shape.faces_buffer(), np.int64).reshape(-1, 3))
+        parts = [found[body.shape.ptr] for body in self._meshes]
+        starts = np.cumsum([0, *(body.shape.vertex_count() for body in self._meshes)])[:-1]
+        owner = np.repeat(np.arange(len(parts)), [len(part.flags) for part in parts])
+        rows, owners = _stacked(parts, starts), np.stack([owner, owner], 1)
+        if len(parts) > 1:
+            rows, owners = _joined_rims(rows, owners, host_numbers(self.points()).T)
+        return rows, owners, starts
 
     def points(self) -> Any:
-        """The vertices of all meshes, one after the other, attached where they are."""
-        return _concatenated([body.vertices() for body in self._meshes], mi.Point3f)
+        """The vertices of all meshes (Point3f), one after the other, detached."""
+        with dr.suspend_grad():
+            return _concatenated([b.vertices(dr.arange(mi.UInt32, b.shape.vertex_count())) for b in self._meshes])
 
-    def frames(self) -> list[Any]:
-        """Origins and axes (four Point3f) of the limbs, attached where they are."""
+    def ends(self) -> list[Any]:
+        """Two Point3f, attached where they are: starts and stops of all edges; behind them origins and second axes,
+        first and third axes of the limbs.
+
+        By a single gather from the scene's parameters: Dr.Jit's ``isolate_grad`` loses what arrives at gathers of
+        gathers that were made before.
+        """
+        edges = [[body.vertices(i) for body, i in zip(self._meshes, each, strict=True)] for each in self._ends]
         frames = [frame for body in self._others for frame in body.frames()]
-        return [_concatenated([frame[k] for frame in frames], mi.Point3f) for k in range(4)]
+        o, x, y, z = ([frame[k] for frame in frames] for k in range(4))
+        return [_concatenated([*part, *first, *then]) for part, first, then in zip(edges, (o, x), (y, z), strict=True)]
 
     def moves(self, moving: frozenset[Any]) -> Any:
         """Ones for the rows of bodies that move, None where none does."""
@@ -229,8 +239,8 @@ def _bodies(scene: Any, shape: Any) -> list[Body]:
     return [Body(one, shape, k) for k, one in enumerate(members) if not lacks_edges(one)]
 
 
-def _concatenated(parts: list[Any], type_: type) -> Any:
-    return type_(*[dr.concat([mi.Float(part[k]) for part in parts]) for k in range(3)]) if parts else type_()
+def _concatenated(parts: list[Any]) -> Any:
+    return mi.Point3f(*[dr.concat([mi.Float(part[k]) for part in parts]) for k in range(3)])
 
 
 def _stacked(parts: list[_Rows], starts: np.ndarray) -> _Rows:
@@ -240,7 +250,7 @@ def _stacked(parts: list[_Rows], starts: np.ndarray) -> _Rows:
         return _Rows(none, none, none, none, np.zeros((0, 4), int), np.zeros(0, int))
     shifted = [
         part._replace(ends=part.ends + n, third=part.third + n, other=part.other + n)
-        for part, n in zip(parts, starts, strict=False)
+        for part, n in zip(parts, starts, strict=True)
     ]
     return _Rows(*(np.concatenate(columns) for columns in zip(*shifted, strict=True)))
 
@@ -267,5 +277,5 @@ def _joined_rims(rows: _Rows, owners: np.ndarray, positions: np.ndarray) -> tupl
         new.other[a] = turned(rows.ends[b])
         new.place[a, 2:] = turned(rows.place[b, :2])
         new.third[a, 1], new.faces[a, 1], owners[a, 1] = rows.third[b, 0], rows.faces[b, 0], owners[b, 0]
-        new.flags[a] = TWO + TWIN
+        new.flags[a] = TWO + TWIN + SEAM
     return new, owners

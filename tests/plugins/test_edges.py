@@ -1,0 +1,336 @@
+"""Edges and limbs of all kinds of shapes: which side hides, how they are drawn, how they move; against rays."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from support.hidden_shapes import ball, join, mesh
+from torchtransient._collection import no_collection
+from torchtransient.plugins.edges.table import EdgeTable
+from torchtransient.plugins.edges.topology import Topology
+from torchtransient.plugins.frozen_state import state_below
+from torchtransient.plugins.node_walk import members_of
+
+VARIANT = "llvm_ad_mono"
+STRETCH = (0.8, 0.5, 1.2)
+# From how far points are looked at.
+FAR = 3.0
+COUNT = 40_000
+
+
+def placed(*where, scale=0.8):
+    return mi.ScalarAffineTransform4f().translate(where).rotate([0.6, 0.8, 0], 40).scale(scale)
+
+
+def all_shapes():
+    """One of each kind, far from each other."""
+    kinds = {name: {"type": name} for name in ("rectangle", "cube", "disk", "cylinder", "sphere")}
+    shapes = {
+        **{name: kind | {"to_world": placed(6 * i, 0, 0)} for i, (name, kind) in enumerate(kinds.items())},
+        "tube": {"type": "cylinder", "to_world": placed(0, 6, 0), "flip_normals": True},
+        "ellipsoids": {
+            "type": "ellipsoids", "centers": mi.TensorXf(np.array([[6, 6, 0], [9, 6, 0.0]])), "extent": 2.0,
+            "scales": mi.TensorXf(np.array([[0.4, 0.3, 0.1], [0.2, 0.2, 0.3]])),
+            "quaternions": mi.TensorXf(np.array([[0, 0, 0.6, 0.8], [0, 0, 0, 1.0]])),
+        },
+        "star": mesh("star", join(ball([12, 6, 0], [0.7, 0.2, 0.4], 1), ball([12, 6, 0], [0.2, 0.7, 0.3], 1))),
+        "group": {"type": "shapegroup", **{
+            f"part{i}": kind | {"to_world": mi.ScalarAffineTransform4f().translate([3.5 * i, 0, 0])}
+            for i, kind in enumerate(kinds.values())
+        }},
+        "copy": {
+            "type": "instance", "to_world": placed(0, 14, 0, scale=STRETCH), "ref": {"type": "ref", "id": "group"},
+        },
+    }  # fmt: skip
+    return mi.load_dict({"type": "scene", **shapes}, optimize=False)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return all_shapes()
+
+
+def looked_at(scene, moving=frozenset(), alone=False):
+    """(table, points of it seen from around): strata of the density in order."""
+    table = EdgeTable(Topology(scene), moving, alone)
+    rng = np.random.default_rng(3)
+    x = mi.Float(((np.arange(COUNT) + rng.random(COUNT)) / COUNT).astype(np.float32))
+    k = table.pick(table.by_length, x, mi.Float(rng.random(COUNT).astype(np.float32)))
+    away = rng.normal(size=(3, COUNT))
+    V = k.near + mi.Vector3f((FAR * away / np.linalg.norm(away, axis=0)).astype(np.float32))
+    return table, table.seen_from(k, mi.Point3f(V), True)
+
+
+def seen(scene, b):
+    """Where nothing hides the points."""
+    to = b.beside - b.V
+    return b.valid & ~scene.ray_test(mi.Ray3f(b.V, dr.normalize(to), dr.norm(to) * (1 - 1e-4), 0, []))
+
+
+def beside(scene, b, off):
+    """What rays from the viewpoint meet at distance ``off`` outwards of the points."""
+    return scene.ray_intersect_preliminary(mi.Ray3f(b.V, dr.normalize(b.p + b.n * off - b.V)))
+
+
+def same(pi, told):
+    numbers = lambda p: dr.reinterpret_array(mi.UInt32, p)  # noqa: E731
+    inside = numbers(told.instance) != 0
+    found = (numbers(pi.instance) == numbers(told.instance)) & (pi.prim_index == told.prim_index)
+    return found & dr.select(inside, pi.shape_index == told.shape_index, numbers(pi.shape) == numbers(told.shape))
+
+
+def bodies_of(table, b):
+    return np.array(dr.gather(mi.UInt32, table.topology.owners[0], b.k.e))
+
+
+def share(hit, among):
+    return np.array(hit)[among].mean()
+
+
+def test_the_inner_side_hides_and_the_outer_one_does_not(scene):
+    """Of every shape. Rays so near a corner meet another face, and none where a face is seen edge-on."""
+    table, b = looked_at(scene)
+    found, off = seen(scene, b), 3e-4
+    inside, outside = (beside(scene, b, sign * off) for sign in (-1, 1))
+    near = dr.abs(inside.t - b.dist) < 0.15
+    outline = np.array(found & ~b.crease)
+    crease = np.array(found & b.crease)
+    body = bodies_of(table, b)
+    hit, met = same(inside, b.inner), same(outside, b.inner) & (dr.abs(outside.t - b.dist) < 0.02)
+    for number, one in enumerate(table.topology.bodies):
+        here = outline & (body == number) & np.array(near)
+        assert here.sum() > 200, one.shape.id()
+        assert here.sum() > 0.96 * (outline & (body == number)).sum(), one.shape.id()
+        assert share(hit, here) > 0.97 and share(met, here) < 0.01, one.shape.id()
+    assert crease.sum() > 1000 and share(hit & same(outside, b.facing), crease) > 0.95
+    # The legs lead to the points, to a thousandth of a face and 2 mrad of a limb.
+    for leg, d, where in ((b.inner, b.d_in, b.valid), (b.facing, b.d, b.valid & b.crease)):
+        si = leg.compute_surface_interaction(mi.Ray3f(b.V, d), mi.RayFlags.All, where)
+        assert np.array(dr.select(where, dr.norm(si.p - b.p), 0)).max() < 5e-3
+    lines = np.array(dr.select(b.valid, dr.abs(dr.dot(b.n, b.d)), 0))
+    assert lines.max() < 1e-4
+
+
+def rim(a, b):
+    angle = np.linspace(0, 2 * np.pi, 2000)
+    p = np.outer(np.cos(angle), a) + np.outer(np.sin(angle), b)
+    return np.linalg.norm(np.diff(p, axis=0), axis=1).sum()
+
+
+def test_lengths_are_those_of_all_edges_and_limbs(scene):
+    """One over the density, on average."""
+    table, b = looked_at(scene)
+    inverse, body = np.array(b.inv_pdf, np.float64), bodies_of(table, b)
+    found = {one.shape.id() + ("" if one.instance is None else "'"): (inverse * (body == k)).mean()
+             for k, one in enumerate(table.topology.bodies)}  # fmt: skip
+    x, y, z = (np.array(placed(0, 0, 0, scale=STRETCH).matrix)[:3, i] for i in range(3))
+    sides = [np.linalg.norm(v) for v in (x, y, z)]
+    limb = lambda R: 2 * np.pi * R * np.sqrt(1 - (R / FAR) ** 2)  # noqa: E731
+    for name, length in {
+        "rectangle": 6.4, "cube": 19.2, "disk": rim(0.8 * np.eye(3)[0], 0.8 * np.eye(3)[1]), "sphere": limb(0.8),
+        "cylinder": 4 * np.pi * 0.8 + 1.6, "tube": 4 * np.pi * 0.8 + 1.6, "part0'": 4 * (sides[0] + sides[1]),
+        "part1'": 8 * sum(sides), "part2'": rim(x, y), "part3'": 2 * rim(x, y) + 2 * sides[2],
+    }.items():  # fmt: skip
+        assert found[name] == pytest.approx(length, rel=5e-3), name
+
+
+def test_flat_creases_are_not_drawn():
+    """The diagonals of a rectangle and of the six sides of a cube; of two bodies, which may differ, they are."""
+    flat = lambda s: int((np.array(EdgeTable(Topology(s), frozenset(), False).by_length.weight) > 0).sum())  # noqa: E731
+    plates = {f"r{i}": {"type": "rectangle", "to_world": placed(0, 0, 0).translate([2.0 * i, 0, 0])} for i in (0, 1)}
+    kinds = {"rectangle": (4, {"a": {"type": "rectangle"}}), "cube": (24, {"a": {"type": "cube"}}), "two": (8, plates)}
+    for _, (count, shapes) in kinds.items():
+        assert flat(mi.load_dict({"type": "scene", **shapes}, optimize=False)) == count
+
+
+MOVED = ("rectangle", "disk", "cylinder", "sphere", "tube", "copy")
+
+
+def install(params, base, x):
+    for name, value in base.items():
+        if name.endswith("to_world"):
+            moved = mi.AffineTransform4f().translate(mi.Vector3f(1, 0.3, -0.5) * x)
+            params[name] = mi.AffineTransform4f(value) @ moved.rotate(mi.Vector3f(0, 0.6, 0.8), 3 * x).scale(
+                1 + 0.2 * x
+            )
+        else:
+            params[name] = value + x * mi.Float(np.resize([1, 0.3, -0.5], dr.width(value)).astype(np.float32))
+    params.update()
+
+
+def test_outlines_are_found_where_their_motion_puts_them():
+    """By rays past the edge at where it moves to, which meet the moved shape on one side of it only."""
+    scene, h, off = all_shapes(), 0.02, 3e-3
+    params = mi.traverse(scene)
+    base = {f"{name}.to_world": dr.copy(params[f"{name}.to_world"]) for name in MOVED}
+    base |= {name: dr.copy(params[name]) for name in ("cube.vertex_positions", "star.vertex_positions")}
+    x = mi.Float(0)
+    dr.enable_grad(x)
+    install(params, base, x)
+    table, b = looked_at(scene)
+    found = np.array(seen(scene, b) & ~b.crease)
+    speed = dr.dot(b.n, table.moving(b))
+    dr.forward_from(x)
+    dr.forward_to(speed)
+    shift = dr.grad(speed) * h
+    install(params, base, mi.Float(h))
+    inside, outside = (beside(scene, b, shift + sign * off) for sign in (-1, 1))
+    at = lambda pi: dr.abs(pi.t - b.dist) < 0.25  # noqa: E731
+    still = same(outside, b.inner) & at(outside)
+    body, moves = bodies_of(table, b), np.abs(np.array(shift)) > 2 * off
+    for number, one in enumerate(table.topology.bodies):
+        here = found & (body == number) & moves
+        if one.shape.id() != "ellipsoids":
+            assert here.sum() > 100, one.shape.id()
+            # Less than all: what is seen edge-on is thin.
+            assert share(at(inside), here) > 0.9 and share(still, here) < 0.03, one.shape.id()
+
+
+def test_gradients_of_passes_add_up_at_the_parameters():
+    """Two tables of one scene, in an isolated scope: every step arrives."""
+    scene = mi.load_dict({"type": "scene", "a": {"type": "cube"}, "b": {"type": "disk", "to_world": placed(6, 0, 0)}})
+    params = mi.traverse(scene)
+    keys = ("a.vertex_positions", "b.to_world")
+    for key in keys:
+        dr.enable_grad(params[key])
+    params.update()
+    with dr.suspend_grad():
+        topology = Topology(scene)
+        tables = [EdgeTable(topology, frozenset(), False) for _ in range(2)]
+        with dr.isolate_grad():
+            for factor, table in zip((1, 10, 100), (*tables, tables[0]), strict=True):
+                u = mi.Float((np.arange(100, dtype=np.float32) + 0.5) / 100)
+                b = table.seen_from(table.pick(table.by_length, u, u), mi.Point3f(1, 2, 9), True)
+                with dr.resume_grad():
+                    dr.backward_from(dr.sum(dr.select(b.valid, factor * table.moving(b).x, 0)))
+    valid, of_disk = np.array(b.valid), bodies_of(table, b) == 1
+    total = np.array(dr.grad(params[keys[0]])).reshape(-1, 3)[:, 0].sum()
+    assert total == pytest.approx(111 * (valid & ~of_disk).sum(), rel=1e-4)
+    moved = np.array(dr.grad(params[keys[1]].matrix)).squeeze()
+    assert moved[0, 3] == pytest.approx(111 * (valid & of_disk).sum(), rel=1e-4)
+
+
+def test_samples_go_to_what_moves():
+    """Half of them, or all."""
+    scene = mi.load_dict({"type": "scene", "a": {"type": "cube"}, "b": {"type": "sphere", "center": [6, 0, 0]}})
+    moving = frozenset(s.ptr for s in scene.shapes() if s.id() == "b")
+    for alone, expected in ((False, 0.5), (True, 1.0)):
+        _, b = looked_at(scene, moving, alone)
+        own = np.array(b.k.ball).mean()
+        length = 2 * np.pi / (24 / np.sqrt(2) + 2 * np.pi)
+        assert own == pytest.approx(expected + (0 if alone else 0.5 * length), abs=0.01)
+
+
+def test_candidates_leave_the_sum_as_it_is(scene):
+    """Of what is seen of outlines from one point, whichever are chosen."""
+    table = EdgeTable(Topology(scene), frozenset(), False)
+    totals = []
+    for candidates in (1, 4):
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(1, 4 * COUNT)
+        V = mi.Point3f(8, 5, 12)
+        worth = lambda d, dist: 1 / dr.square(dist)  # noqa: E731
+        k = table.choose(table.by_length, sampler, V, mi.Bool(True), candidates, worth)
+        b = table.seen_from(k, V, True)
+        value = np.array(dr.select(b.valid & ~b.crease, b.sin * b.inv_pdf / dr.square(b.dist), 0), np.float64)
+        totals.append((value.mean(), value.std() / len(value) ** 0.5))
+    (one, error), (many, smaller) = totals
+    assert many == pytest.approx(one, abs=4 * np.hypot(error, smaller)) and smaller < 0.8 * error
+
+
+def page(angle):
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[0, -1, 0], [0, 1, 0], [c, 0.2, s]]), np.array([[0, 1, 2]])
+
+
+def test_of_three_faces_those_next_to_each_other_are_seen():
+    """From a gap the two faces beside it, as a crease, or as an outline where it is wider than half a turn."""
+    for angles, creases in (((0, 2.0, 4.0), 1.0), ((0, 0.7, 1.4), 2 * 0.7)):
+        scene = mi.load_dict({"type": "scene", "book": mesh("book", join(*(page(a) for a in angles)))})
+        _, b = looked_at(scene)
+        spine = (np.abs(np.array(b.p)[::2]).max(0) < 1e-6) & np.array(seen(scene, b))
+        inside, outside = (beside(scene, b, sign * 1e-3) for sign in (-1, 1))
+        crease = np.array(b.crease)
+        assert share(same(inside, b.inner), spine) > 0.98
+        assert share(same(outside, b.facing), spine & crease) > 0.98
+        assert share(outside.is_valid(), spine & ~crease) < 0.02 if creases > 1 else (~crease & spine).sum() == 0
+
+
+def test_rims_of_two_meshes_are_one_until_they_part():
+    """A roof of two plates: the ridge once, with a face of each; pulled apart, two rims."""
+    turned = [mi.ScalarAffineTransform4f().rotate([0, 1, 0], 40 * s).translate([s, 0, 0]) for s in (-1, 1)]
+    halves = {f"r{i}": {"type": "rectangle", "to_world": T} for i, T in enumerate(turned)}
+    scene = mi.load_dict({"type": "scene", **halves}, optimize=False)
+    topology, params = Topology(scene), mi.traverse(scene)
+
+    def length_and_two():
+        table = EdgeTable(topology, frozenset(), False)
+        u = mi.Float((np.arange(2000, dtype=np.float32) + 0.5) / 2000)
+        b = table.seen_from(table.pick(table.by_length, u, u), mi.Point3f(0, 0.1, 9), True)
+        return np.array(b.inv_pdf).mean(), np.array(b.crease).mean()
+
+    length, crease = length_and_two()
+    assert length == pytest.approx(14, rel=1e-3) and crease == pytest.approx(1 / 7, abs=0.01)
+    params["r0.to_world"] = mi.AffineTransform4f().translate([-0.1, 0, 0]) @ params["r0.to_world"]
+    params.update()
+    length, crease = length_and_two()
+    assert length == pytest.approx(16, rel=1e-3) and not crease
+
+
+def test_what_an_edge_lies_on_is_met_beside_it():
+    """The lower edge of a plate that stands on a floor, seen from above the floor."""
+    upright = mi.ScalarAffineTransform4f().translate([0.1, 0.2, 0.5]).rotate([1, 0, 0], 90).scale(0.5)
+    scene = mi.load_dict(
+        {"type": "scene", "floor": {"type": "rectangle", "to_world": mi.ScalarAffineTransform4f().scale(9)},
+         "plate": {"type": "rectangle", "to_world": upright}}
+    )  # fmt: skip
+    plate = frozenset(s.ptr for s in scene.shapes() if s.id() == "plate")
+    _, b = looked_at(scene, plate, alone=True)
+    low = seen(scene, b) & (dr.abs(b.p.z) < 1e-6) & (b.V.z > 0.5)
+    si = scene.ray_intersect(mi.Ray3f(b.beside, b.d))
+    low = np.array(low)
+    assert low.sum() > 1000
+    assert np.array(si.is_valid())[low].all() and np.array(dr.norm(si.p - b.p))[low].max() < 2e-3
+
+
+def test_shapes_without_edges_are_named(tmp_path):
+    (tmp_path / "curve.txt").write_text("0 0 0 0.1\n1 0 0 0.1\n")
+    curve = {"type": "linearcurve", "filename": str(tmp_path / "curve.txt")}
+    grid = {"type": "sdfgrid", "grid": mi.TensorXf(np.linspace(-1, 1, 8).reshape(2, 2, 2, 1))}
+    for shapes, count in (({"curve": curve}, 0), ({"grid": grid, "ball": {"type": "sphere"}}, 1)):
+        topology = Topology(mi.load_dict({"type": "scene", **shapes}))
+        assert ([s.id() for s in topology.without], topology.count) == ([next(iter(shapes))], count)
+        assert EdgeTable(topology, frozenset(), False).count == count
+
+
+def test_members_of_an_instance(scene):
+    copy = next(s for s in scene.shapes() if s.class_name() == "Instance")
+    assert [s.id() for s in members_of(scene, copy)] == [f"part{i}" for i in range(5)]
+
+
+def test_one_recording_for_all_numbers():
+    """A table that is built within a recorded call follows the shapes."""
+    scene = mi.load_dict(
+        {"type": "scene", "cube": {"type": "cube"}, "tube": {"type": "cylinder", "to_world": placed(6, 0, 0)}}
+    )
+    params, topology = mi.traverse(scene), Topology(scene)
+    base = {key: dr.copy(params[key]) for key in ("cube.vertex_positions", "tube.to_world")}
+    moving = frozenset(s.ptr for s in scene.shapes()[:1])
+
+    def call(scene, u):
+        table = EdgeTable(topology, moving, False)
+        b = table.seen_from(table.pick(table.by_length, u, u * 0.7), mi.Point3f(1, 2, 9), True)
+        return b.p, b.n, b.inv_pdf, table.moving(b)
+
+    frozen = dr.freeze(call, state_fn=lambda *_: state_below(topology)[1])
+    for x in (0.0, 0.1, 0.2, 0.3):
+        install(params, base, dr.opaque(mi.Float, x))
+        u = mi.Float((np.arange(500, dtype=np.float32) + 0.5) / 500 * (1 - x))
+        with no_collection():
+            expected, got = call(scene, u), frozen(scene, u)
+        for a, b in zip(expected, got, strict=True):
+            np.testing.assert_allclose(np.array(b), np.array(a), rtol=1e-5, atol=1e-5)
+    assert frozen.n_recordings <= 2
