@@ -18,6 +18,8 @@ from torchtransient.testing.small_room import pose
 
 VARIANT = "llvm_ad_mono"
 BODY, PAINT = "body.to_world", "body.bsdf.reflectance.value"
+FILM = {"type": "transient_hdr_film", "width": 8, "height": 8, "rfilter": {"type": "box"}, "temporal_bins": 128,
+        "start_opl": 5.5, "bin_width_opl": 0.05}  # fmt: skip
 CAMERA = np.diag([-1.0, 1, -1, 1]) + pose(0, 0, 4) - np.eye(4)
 PATTERN = torch.randn(1, 1, 8, 8, generator=torch.Generator().manual_seed(3))
 SIDEWAYS = torch.zeros(4, 4).index_put((torch.tensor(0), torch.tensor(3)), torch.tensor(1.0))
@@ -25,13 +27,11 @@ SIDEWAYS = torch.zeros(4, 4).index_put((torch.tensor(0), torch.tensor(3)), torch
 
 def plate(**more):
     """A plate before a wall: shifted sideways, all of the derivative is its outline and its shadow."""
-    film = {"type": "transient_hdr_film", "width": 8, "height": 8, "rfilter": {"type": "box"}, "temporal_bins": 128,
-            "start_opl": 5.5, "bin_width_opl": 0.05}  # fmt: skip
     body = pose(0.07, -0.05, 0.8) @ np.diag([0.45, 0.35, 1, 1])
     scene = {
         "type": "scene",
         "integrator": {"type": "transient_path", "max_depth": 3},
-        "sensor": {"type": "perspective", "fov": 40, "near_clip": 1e-3, "to_world": CAMERA, "film": film},
+        "sensor": {"type": "perspective", "fov": 40, "near_clip": 1e-3, "to_world": CAMERA, "film": FILM},
         "light": {"type": "point", "position": [0.7, 0.4, 3.8], "intensity": 10.0},
         "wall": {"type": "rectangle", "to_world": pose(scale=5.0), "bsdf": {"type": "diffuse", "reflectance": 0.7}},
         "body": {"type": "rectangle", "to_world": body, "bsdf": {"type": "diffuse", "reflectance": 0.4}},
@@ -147,6 +147,7 @@ LAMP = {"type": "rectangle", "to_world": pose(0, 0, 3, 0.1) @ np.diag([1.0, -1, 
 @pytest.mark.parametrize(("more", "key", "words"), [
     ({"mirror": MIRROR}, BODY, "mirrors.*'mirror'"),
     ({"mirror": MIRROR}, "light.position", "mirrors"),
+    ({"sensor": {"type": "orthographic", "to_world": CAMERA, "film": FILM}}, BODY, "where 'sensor' sees"),
     ({"lamp": LAMP}, BODY, "rim of the light of 'lamp'"),
     ({"wall": STRIPED}, "wall.to_world", "steps.*'wall'"),
     ({"wall": STRIPED}, "sensor.to_world", "steps.*'wall'"),

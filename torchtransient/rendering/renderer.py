@@ -420,7 +420,7 @@ class TransientRenderer(CopiesParametrized):
         with active_variant(self.scene.variant):
             built = self.scene.built(self._options)
             with boundary_term(self.boundary, self.spp_boundary, built.scene.integrator()):
-                found = missing_edges(built, new)
+                found = missing_edges(built, new, self._sensors)
         for gap, keys in found.items():
             named = ", ".join(map(repr, keys))
             self._watch.gradient(

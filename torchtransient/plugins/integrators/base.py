@@ -120,8 +120,8 @@ class TransientIntegrator(mi.CppADIntegrator):
         """The parameters of the scene, to be asked which of them carry gradients."""
         return self._seen_scene(scene).tracker(scene)
 
-    def silhouettes(self, scene) -> MovingEdges:
-        """Return what derivatives of a scene lack where edges move."""
+    def silhouettes(self, scene, sensors=None) -> MovingEdges:
+        """Return what derivatives of a scene lack where edges move, seen by some sensors (None: all)."""
         return missing(f"{class_of(self)} follows no edges", "Use transient_path or transient_prbvolpath.")
 
     def reference(self, scene):
