@@ -30,6 +30,12 @@ class Gap:
     where: str
     remedy: str
 
+    def message(self, keys: Sequence[str]) -> str:
+        """Return the warning that names the parameters ``keys``."""
+        named = ", ".join(map(repr, keys))
+        lacking = "it lacks what moving edges hide and uncover there"
+        return f"the derivative by {named} is wrong {self.where}: {lacking}. {self.remedy}"
+
 
 def moves_edges(key: str, effect: ParameterEffect) -> bool:
     """Return whether a parameter moves what hides, what is hidden, or who looks; ``key``: its name in the plugin."""
