@@ -296,8 +296,8 @@ class IntegratorInterface(abc.ABC):
         """What the walks of one job are told (``World``); ``settings``: other than the integrator's own."""
 
     @abc.abstractmethod
-    def silhouettes(self, scene: Any) -> Any:
-        """What derivatives of a scene lack where edges move, by parameter
+    def silhouettes(self, scene: Any, sensors: Any = None) -> Any:
+        """What derivatives of a scene lack where edges move, seen by some sensors (None: all), by parameter
         (:class:`~torchtransient.plugins.transport.boundary.moving_edges.MovingEdges`).
         """
 

@@ -6,6 +6,8 @@ import copy
 import pickle
 import warnings
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 import torch
@@ -18,6 +20,8 @@ from torchtransient.testing.small_room import pose
 
 VARIANT = "llvm_ad_mono"
 BODY, PAINT = "body.to_world", "body.bsdf.reflectance.value"
+FILM = {"type": "transient_hdr_film", "width": 8, "height": 8, "rfilter": {"type": "box"}, "temporal_bins": 128,
+        "start_opl": 5.5, "bin_width_opl": 0.05}  # fmt: skip
 CAMERA = np.diag([-1.0, 1, -1, 1]) + pose(0, 0, 4) - np.eye(4)
 PATTERN = torch.randn(1, 1, 8, 8, generator=torch.Generator().manual_seed(3))
 SIDEWAYS = torch.zeros(4, 4).index_put((torch.tensor(0), torch.tensor(3)), torch.tensor(1.0))
@@ -25,18 +29,20 @@ SIDEWAYS = torch.zeros(4, 4).index_put((torch.tensor(0), torch.tensor(3)), torch
 
 def plate(**more):
     """A plate before a wall: shifted sideways, all of the derivative is its outline and its shadow."""
-    film = {"type": "transient_hdr_film", "width": 8, "height": 8, "rfilter": {"type": "box"}, "temporal_bins": 128,
-            "start_opl": 5.5, "bin_width_opl": 0.05}  # fmt: skip
+    return tt.load(described(**more), variant=VARIANT)
+
+
+def described(**more):
     body = pose(0.07, -0.05, 0.8) @ np.diag([0.45, 0.35, 1, 1])
     scene = {
         "type": "scene",
         "integrator": {"type": "transient_path", "max_depth": 3},
-        "sensor": {"type": "perspective", "fov": 40, "near_clip": 1e-3, "to_world": CAMERA, "film": film},
+        "sensor": {"type": "perspective", "fov": 40, "near_clip": 1e-3, "to_world": CAMERA, "film": FILM},
         "light": {"type": "point", "position": [0.7, 0.4, 3.8], "intensity": 10.0},
         "wall": {"type": "rectangle", "to_world": pose(scale=5.0), "bsdf": {"type": "diffuse", "reflectance": 0.7}},
         "body": {"type": "rectangle", "to_world": body, "bsdf": {"type": "diffuse", "reflectance": 0.4}},
     }
-    return tt.load(scene | more, variant=VARIANT)
+    return scene | more
 
 
 MIRROR = {"type": "rectangle", "to_world": pose(0, 2, 1, 0.5), "bsdf": {"type": "conductor"}}
@@ -138,6 +144,22 @@ def test_nothing_is_said_without_derivatives():
     assert said(lambda: reverse(complete))[1] == []
 
 
+def test_the_integrator_alone_says_it_too():
+    """For users of ``mi.render``: once a scene, too, and nothing of it inside of the layer's calls."""
+    mi.set_variant(VARIANT)
+    scene = mi.load_dict(described(mirror=MIRROR, integrator={"type": "transient_path", "temporal_filter": "tent"}))
+    params = mi.traverse(scene)
+
+    def derivative():
+        params["light.position"] = mi.Point3f(0.7, 0.4, 3.8)
+        dr.enable_grad(params["light.position"])
+        params.update()
+        scene.integrator().render_backward(scene, params, (mi.TensorXf(np.ones((8, 8, 1), np.float32)), None), spp=1)
+
+    messages = said(derivative)[1] + said(derivative)[1]
+    assert len(messages) == 1 and "'light.position'" in messages[0]
+
+
 STEPS = {"type": "bitmap", "data": np.eye(4)[..., None] * 0.6 + 0.2, "raw": True, "filter_type": "nearest"}
 STRIPED = {"type": "rectangle", "to_world": pose(scale=5.0), "bsdf": {"type": "diffuse", "reflectance": STEPS}}
 LAMP = {"type": "rectangle", "to_world": pose(0, 0, 3, 0.1) @ np.diag([1.0, -1, -1, 1]),
@@ -147,6 +169,7 @@ LAMP = {"type": "rectangle", "to_world": pose(0, 0, 3, 0.1) @ np.diag([1.0, -1, 
 @pytest.mark.parametrize(("more", "key", "words"), [
     ({"mirror": MIRROR}, BODY, "mirrors.*'mirror'"),
     ({"mirror": MIRROR}, "light.position", "mirrors"),
+    ({"sensor": {"type": "orthographic", "to_world": CAMERA, "film": FILM}}, BODY, "where 'sensor' sees"),
     ({"lamp": LAMP}, BODY, "rim of the light of 'lamp'"),
     ({"wall": STRIPED}, "wall.to_world", "steps.*'wall'"),
     ({"wall": STRIPED}, "sensor.to_world", "steps.*'wall'"),
@@ -192,13 +215,10 @@ def test_samples_are_those_asked_for():
 def kernels(renderer, key):
     """Hashes of the kernels that a derivative launches, in order."""
     weighed(renderer(seed=0)).backward()
-    with active_variant(VARIANT):
-        import drjit as dr
-
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-            dr.kernel_history_clear()
-            weighed(renderer(seed=1)).backward()
-            return [entry["hash"] for entry in dr.kernel_history((dr.KernelType.JIT,))]
+    with active_variant(VARIANT), dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        weighed(renderer(seed=1)).backward()
+        return [entry["hash"] for entry in dr.kernel_history((dr.KernelType.JIT,))]
 
 
 def test_derivatives_that_move_no_edge_run_the_same_kernels():

@@ -55,10 +55,11 @@ def max_depth(depth: int | None, integrator: Any) -> Iterator[None]:
 @contextmanager
 def boundary_term(on: bool, spp: int | None, integrator: Any) -> Iterator[None]:
     """Leave the boundary term out of derivatives inside of the block, or give each of its passes ``spp`` samples per
-    pixel; True and None change nothing.
+    pixel; True and None change nothing. What it lacks is said by the caller.
     """
     with ExitStack() as restore:
-        changes = ({} if on else {"boundary": False}) | ({} if spp is None else {"spp_boundary": spp})
+        changes: dict[str, Any] = {"warns_of_edges": False}
+        changes |= ({} if on else {"boundary": False}) | ({} if spp is None else {"spp_boundary": spp})
         for name, value in changes.items():
             if hasattr(integrator, name):
                 put_back = functools.partial(setattr, integrator, name, getattr(integrator, name))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -126,7 +126,7 @@ def _short(value: Any) -> str:
 def parameter_table(built: BuiltScene) -> ParameterTable:
     """Read the table off a built scene (unmerged, real bitmaps, no substitutions), inside its variant."""
     tracker = ParameterTracker(built.scene)
-    edges = moving_edges_of(built.scene)
+    edges = moving_edges_of(built.scene, built.scene.sensors())
     entries = []
     for key in built.params.properties:
         node = built.params.properties[key][2]
@@ -137,20 +137,22 @@ def parameter_table(built: BuiltScene) -> ParameterTable:
     return ParameterTable(entries)
 
 
-def moving_edges_of(scene: Any) -> MovingEdges:
+def moving_edges_of(scene: Any, sensors: Sequence[Any]) -> MovingEdges:
     """Return what derivatives of a built scene lack where edges move; a steady integrator counts as the transient one
     that renders in its place.
     """
     integrator = scene.integrator()
     if isinstance(integrator, IntegratorInterface):
-        edges: MovingEdges = integrator.silhouettes(scene)
+        edges: MovingEdges = integrator.silhouettes(scene, sensors)
         return edges
-    return moving_edges(scene)
+    return moving_edges(scene, sensors)
 
 
-def missing_edges(built: BuiltScene, keys: Iterable[str]) -> dict[Gap, list[str]]:
-    """Return what derivatives by ``keys`` lack of moving edges, with the keys that lack it."""
-    edges, tracker = moving_edges_of(built.scene), built.scene.integrator().parameters(built.scene)
+def missing_edges(built: BuiltScene, keys: Iterable[str], sensors: Iterable[int]) -> dict[Gap, list[str]]:
+    """Return what derivatives by ``keys`` lack of moving edges seen by some sensors, with the keys that lack it."""
+    every = built.scene.sensors()
+    edges = moving_edges_of(built.scene, [every[sensor] for sensor in sensors])
+    tracker = built.scene.integrator().parameters(built.scene)
     found: dict[Gap, list[str]] = {}
     for key in keys:
         shown = key if key in built.params else f"{key.rsplit('.', 1)[0]}.vertex_positions"

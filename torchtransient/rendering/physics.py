@@ -69,14 +69,14 @@ class PhysicsWatch:
             self._told.add(about)
             warnings.warn(message, PhysicsWarning, stacklevel=level_of_user())
 
-    def gradient(self, about: str, message: str, *, is_error: bool = True) -> None:
-        """Warn of a derivative that lacks a part, once for each ``about``; the mode "error" makes it a
-        ``GradientError``, "ignore" does not silence it.
+    def gradient(self, message: str, *, is_error: bool = True) -> None:
+        """Warn once of a derivative that lacks a part; the mode "error" makes it a ``GradientError``, "ignore" does not
+        silence it.
         """
         if self.mode == "error" and is_error:
             raise GradientError(f"{message} With physics='warn' it is computed all the same.")
-        if about not in self._told:
-            self._told.add(about)
+        if message not in self._told:
+            self._told.add(message)
             warnings.warn(message, GradientWarning, stacklevel=level_of_user())
 
     def scene(self, findings: Mapping[str, str]) -> None:

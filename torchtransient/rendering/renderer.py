@@ -420,15 +420,9 @@ class TransientRenderer(CopiesParametrized):
         with active_variant(self.scene.variant):
             built = self.scene.built(self._options)
             with boundary_term(self.boundary, self.spp_boundary, built.scene.integrator()):
-                found = missing_edges(built, new)
+                found = missing_edges(built, new, self._sensors)
         for gap, keys in found.items():
-            named = ", ".join(map(repr, keys))
-            self._watch.gradient(
-                f"{gap.where} {named}",
-                f"the derivative by {named} is wrong {gap.where}: it lacks what moving edges hide and uncover there. "
-                f"{gap.remedy}",
-                is_error=self.boundary,
-            )
+            self._watch.gradient(gap.message(keys), is_error=self.boundary)
         self._asked_of_edges.update(new)
 
     def _depth_bound(self, given: Mapping[str, Any] | None, tensors: Sequence[torch.Tensor]) -> DepthBound | None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
+
 import drjit as dr
 import mitsuba as mi
 
 from torchtransient._collection import no_collection
-from torchtransient.errors import GradientError, SceneError, VariantError
+from torchtransient.errors import GradientError, GradientWarning, SceneError, VariantError
 from torchtransient.interfaces import BACKWARD, FORWARD, JOBS, RENDER, IntegratorInterface, is_time_resolved
 from torchtransient.plugins.described_scene import note_scene
 from torchtransient.plugins.films.colour import ChannelMatch
@@ -74,6 +76,8 @@ class TransientIntegrator(mi.CppADIntegrator):
     # Whether the laser of a scan lights one position after the other, and whether beams without width are seen.
     scans_exhaustively = False
     aims_lasers = False
+    # Whether derivatives say which moving edges they do not follow: False where the caller does, who knows its keys.
+    warns_of_edges = True
 
     def traverse(self, cb):
         super().traverse(cb)
@@ -127,8 +131,8 @@ class TransientIntegrator(mi.CppADIntegrator):
         """The parameters of the scene, to be asked which of them carry gradients."""
         return self._seen_scene(scene).tracker(scene)
 
-    def silhouettes(self, scene) -> MovingEdges:
-        """Return what derivatives of a scene lack where edges move."""
+    def silhouettes(self, scene, sensors=None) -> MovingEdges:
+        """Return what derivatives of a scene lack where edges move, seen by some sensors (None: all)."""
         return missing(f"{class_of(self)} follows no edges", "Use transient_path or transient_prbvolpath.")
 
     def reference(self, scene):
@@ -380,7 +384,23 @@ class TransientIntegrator(mi.CppADIntegrator):
                 "direction, which derivatives ask all lights for. Describe it as 'diff_directionalarea', as tt.load "
                 "does, or leave it out: paths from a sensor never meet its light."
             )
+        if self.warns_of_edges:
+            self._warn_of_edges(scene, sensor, effects)
         return contents, Wanted(effects, sensor, contents)
+
+    def _warn_of_edges(self, scene, sensor, effects):
+        """Say once a scene of each attached parameter what its derivative lacks."""
+        told = self._seen_scene(scene).told_of_edges
+        new = [one for one in effects if one[2].moves_silhouette and (one[0].ptr, one[1]) not in told]
+        if not new:
+            return
+        told.update((node.ptr, key) for node, key, _ in new)
+        edges, found = self.silhouettes(scene, [sensor]), {}
+        for node, key, effect in new:
+            for gap in edges.lacking(node, key, effect):
+                found.setdefault(gap, []).append(f"{node.id()}.{key}".lstrip("."))
+        for gap, keys in found.items():
+            warnings.warn(gap.message(keys), GradientWarning, stacklevel=3)
 
     @no_collection()
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0, develop=True):

@@ -345,10 +345,10 @@ class TransientNLOSPath(base.TransientIntegrator):
 
     # ----------------------------------------------------------------------------------- derivatives
 
-    def silhouettes(self, scene: Any) -> MovingEdges:
+    def silhouettes(self, scene: Any, sensors: Any = None) -> MovingEdges:
         if not self.boundary:
             return missing("boundary is false", "Leave boundary out, or set it to true.")
-        sensors = scene.sensors()
+        sensors = scene.sensors() if sensors is None else sensors
         contents = self.contents(scene, sensors[0]) if sensors else None
         if contents is None or not follows_outlines(self._segment(contents), contents):
             return missing(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.integrators.base import TransientIntegrator
 from torchtransient.plugins.properties import truth, whole_number
-from torchtransient.plugins.transport.boundary.moving_edges import missing, moving_edges
+from torchtransient.plugins.transport.boundary.moving_edges import is_found_from_points, missing, moving_edges
 from torchtransient.plugins.transport.boundary.term import BoundaryTerm
 from torchtransient.plugins.transport.connection.emitter_found import EmitterFound
 from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
@@ -46,16 +46,19 @@ class TransientPath(TransientIntegrator):
         self.boundary = truth(props, "boundary", default=True)
         self.spp_boundary = whole_number(props, "spp_boundary", 0, least=1) if "spp_boundary" in props else None
 
-    def silhouettes(self, scene):
+    def silhouettes(self, scene, sensors=None):
         if not self.boundary:
             return missing("boundary is false", "Leave boundary out, or set it to true.")
-        return moving_edges(scene)
+        return moving_edges(scene, scene.sensors() if sensors is None else sensors)
 
     def beside(self, world, sensor, film, seed, samples):
         if not (self.boundary and world.wanted.silhouettes):
             return []
         count = self.spp_boundary or max(1, samples // 2)
-        return [BoundaryTerm(self, world, sensor, film, seed, count, self.boundary_passes)]
+        passes = self.boundary_passes
+        if not is_found_from_points(sensor):
+            passes = tuple(name for name in passes if name == "vertex")
+        return [BoundaryTerm(self, world, sensor, film, seed, count, passes)]
 
     def strategies(self, contents):
         scattering = Lambertian(draws_lobe=True) if Lambertian.fits(contents) else Surface()

@@ -41,6 +41,8 @@ class SeenScene:
         self._contents: dict[int, tuple[Any, SceneContents]] = {}
         self._tracker: ParameterTracker | None = None
         self._python: list[Any] | None = None
+        # Parameters, by plugin and key, of which it was said which moving edges derivatives do not follow.
+        self.told_of_edges: set[tuple[int, str]] = set()
 
     def is_of(self, scene: Any) -> bool:
         """Whether it is this scene."""
