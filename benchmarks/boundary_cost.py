@@ -9,9 +9,10 @@
     boundary_cost.py fit               a plate by Adam from 8 cm off
 
 `z` is a difference over its standard error. `gain`: variance x time of finite differences over that of the derivative.
-`cases` prints the figures of an earlier measurement, too, where there are some (`before`). `variance` reads
-`PACKAGE.all_cases.ALL_CASES` and `PACKAGE.problem.Problem`; with `--against FILE`, a report of another checkout with
-the same seeds, it prints ratios and flags those above 1.1. All runs in one thread.
+Times of `cases` are those of kernels alone, of the fastest of the runs; it prints the figures of an earlier measurement,
+too, where there are some (`before`). `variance` reads `PACKAGE.all_cases.ALL_CASES` and `PACKAGE.problem.Problem`; with
+`--against FILE`, a report of another checkout with the same seeds, it prints ratios and flags those above 1.1. All runs
+in one thread.
 """
 
 from __future__ import annotations
@@ -39,11 +40,13 @@ from _runner import environment
 from numpy.typing import NDArray
 
 import torchtransient as tt  # isort: skip
+import drjit as dr
 import torch
 
 from torchtransient.errors import GradientError, TorchTransientWarning
-from torchtransient.testing.edge_derivatives import PASSES, EdgeProblem
-from torchtransient.testing.moving_edges import CASES, CONCAVE, QUICK, ROOMS, MovingEdge, histograms, plain_plate
+from torchtransient.testing.closed_rooms import ROOMS
+from torchtransient.testing.edge_derivatives import PASSES, EdgeProblem, choose_passes
+from torchtransient.testing.moving_edges import CASES, CONCAVE, QUICK, MovingEdge, histograms, plain_plate
 from torchtransient.testing.moving_shapes import BODIES, CHANGES, PLACES, moving_shape
 
 Array = NDArray[np.float64]
@@ -76,26 +79,36 @@ def row(values: Array) -> Result:
 # --------------------------------------------------------------------------------------------- parts of the derivative
 
 
+def in_kernels(call: Callable[[int], float], seed: int) -> tuple[float, float]:
+    """(what a call gives, seconds that Dr.Jit gives for its kernels)."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        value = call(seed)
+        dr.sync_thread()
+        return value, 1e-3 * sum(kernel.get("execution_time", 0.0) for kernel in dr.kernel_history())
+
+
 def measure_case(name: str, options: argparse.Namespace) -> Result:
     """Interior term, each pass, their sum and finite differences of one case, and what each costs."""
     case = CASES[name]
     problem = EdgeProblem(case)
     seeds = range(options.seeds)
 
-    def part(first: int, passes: tuple[str, ...], *, interior: bool) -> tuple[Array, float]:
-        run = lambda seed: problem.reverse(seed, options.spp, passes, interior=interior, share=options.share)  # noqa: E731
-        run(first - 1)
-        found = [run(first + seed) for seed in seeds]
+    def runs(call: Callable[[int], float], first: int) -> tuple[Array, float]:
+        """(values, least seconds of kernels), after a run that compiles."""
+        call(first - 1)
+        found = [in_kernels(call, first + seed) for seed in seeds]
         return np.array([value for value, _ in found]), min(seconds for _, seconds in found)
+
+    def part(first: int, passes: tuple[str, ...], *, interior: bool) -> tuple[Array, float]:
+        settings: Result = {"interior": interior, "share": options.share}
+        return runs(lambda seed: problem.reverse(seed, options.spp, passes, **settings), first)
 
     parts = {"interior": part(100, (), interior=True)}
     parts |= {each: part(200, (each,), interior=False) for each in PASSES}
     whole = np.sum([values for values, _ in parts.values()], axis=0)
     seconds = sum(took for _, took in parts.values())
-    problem.difference(299, options.fd_spp, options.step)
-    begun = time.perf_counter()
-    differences = np.array([problem.difference(300 + seed, options.fd_spp, options.step) for seed in seeds])
-    fd_seconds = (time.perf_counter() - begun) / options.seeds
+    differences, fd_seconds = runs(lambda seed: problem.difference(seed, options.fd_spp, options.step), 300)
     inside = parts["interior"][1]
     work = whole.var(ddof=1) * seconds
     return {
@@ -105,7 +118,7 @@ def measure_case(name: str, options: argparse.Namespace) -> Result:
         "total": row(whole) | {"seconds": seconds, "cost": seconds / inside},
         "differences": row(differences) | {"seconds": fd_seconds},
         "z": z_score(whole, differences),
-        "gain": float(differences.var(ddof=1) * fd_seconds / work) if work > 0 else None,
+        "gain": float(differences.var(ddof=1) * fd_seconds / work) if work > 0 and not case.left_out else None,
         "before": {
             "interior": case.expected.interior,
             "total": case.expected.total,
@@ -125,7 +138,7 @@ def line_of_case(name: str, found: Result) -> str:
     return (
         f"{name}: {parts} | total {number(found['total'])}, differences {number(found['differences'])}, "
         f"z {found['z']:+.1f}{before_of(found)} | cost {costs}, all {found['total']['cost']:.2f} of "
-        f"{found['parts']['interior']['seconds']:.3f} s; gain {gain}"
+        f"{found['parts']['interior']['seconds']:.4f} s; gain {gain}"
         + (f" | left out: {found['left_out']}" if found["left_out"] else "")
     )
 
@@ -289,7 +302,7 @@ def ratio_of(now: Array, before: Array) -> tuple[float, float]:
 
 
 def variance(options: argparse.Namespace) -> Result:
-    """Variance of the reverse-mode derivative of every case, each at 1 / 16 of its samples."""
+    """Variance of the reverse-mode derivative of every case, each at 1 / 16 of its samples, with all of its seeds."""
     package = options.package
     every = importlib.import_module(f"{package}.all_cases").ALL_CASES
     problem_of = importlib.import_module(f"{package}.problem").Problem
@@ -301,6 +314,8 @@ def variance(options: argparse.Namespace) -> Result:
         try:
             spp = max(1, case.spp // 16)
             problem = problem_of(dataclasses.replace(case, spp=spp, fd_spp=spp))
+            if options.interior:
+                choose_passes(problem.scene.integrator(), ())
             runs = np.array([problem.reverse(100 + seed) for seed in range(options.seeds)])
         except Exception as failure:  # noqa: BLE001 - printed; the other cases are measured
             found[case.name] = {"failed": f"{type(failure).__name__}: {failure}"[:500]}
@@ -508,6 +523,7 @@ def parsed() -> argparse.Namespace:
     adders["variance"].add_argument("package", help="with all_cases.ALL_CASES and problem.Problem")
     adders["variance"].add_argument("names", nargs="*", metavar="NAMES", help="of cases; all if none is given")
     adders["variance"].add_argument("--against", type=Path, help="a report of another checkout")
+    adders["variance"].add_argument("--interior", action="store_true", help="without the boundary term")
     numbers(adders["variance"], seeds=32)
     adders["sweep"].add_argument("names", nargs="*", metavar="SHAPES", help=", ".join(BODIES))
     numbers(adders["sweep"], spp=256, fd_spp=2048, seeds=8)
@@ -520,7 +536,7 @@ def parsed() -> argparse.Namespace:
     options = parser.parse_args()
     options.quick, options.json = getattr(options, "quick", False), getattr(options, "json", None)
     if options.quick:
-        small = {"spp": 16, "fd_spp": 32, "seeds": 2, "depth": [3]}
+        small = {"spp": 16, "fd_spp": 32, "seeds": 3, "depth": [3]}
         for name in small.keys() & vars(options).keys() if options.command != "child" else ():
             setattr(options, name, small[name])
     return options

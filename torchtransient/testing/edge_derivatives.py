@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from typing import Any
 
 import drjit as dr
@@ -94,10 +93,8 @@ class EdgeProblem:
         *,
         interior: bool = True,
         share: float | None = None,
-    ) -> tuple[float, float]:
-        """(derivative by the unknown, seconds of the kernels) in reverse mode, of some ``passes`` and of the interior
-        term.
-        """
+    ) -> float:
+        """The derivative of the loss in reverse mode, of some ``passes`` and of the interior term."""
         x = mi.Float(0)
         dr.enable_grad(x)
         self.install(x)
@@ -105,16 +102,13 @@ class EdgeProblem:
         job = self.integrator.prepared(self.scene, 0, seed, spp, "backward", (None, mi.TensorXf(self.weights)))
         if not interior:
             job.launches = []
-        dr.sync_thread()
-        begun = time.perf_counter()
         self.integrator.run(job)
         if dr.grad_enabled(self.params[self.case.key]):
             dr.enqueue(dr.ADMode.Backward, self.params[self.case.key])
         dr.traverse(dr.ADMode.Backward)
         gradient = float(dr.grad(x)[0])
-        seconds = time.perf_counter() - begun
         self.install(mi.Float(0))
-        return gradient, seconds
+        return gradient
 
     def tangent(self, seed: int, spp: int, passes: tuple[str, ...] = PASSES, *, interior: bool = True) -> Array:
         """The derivative (H, W, T, C) of the transient in forward mode."""

@@ -63,7 +63,7 @@ def _rows(width: int, places: Callable[[Array], Array], others: Callable[[Array]
 
 
 def _about(points: Array) -> Array:
-    return points - points.mean(0)
+    return np.asarray(points - points.mean(0))
 
 
 def _turned_points(points: Array) -> Array:
