@@ -9,8 +9,8 @@
     boundary_cost.py fit               a plate by Adam from 8 cm off
 
 `z` is a difference over its standard error. `gain`: variance x time of finite differences over that of the derivative.
-Times of `cases` are those of kernels alone, of the fastest of the runs; it prints the figures of an earlier measurement,
-too, where there are some (`before`). `variance` reads `PACKAGE.all_cases.ALL_CASES` and `PACKAGE.problem.Problem`; with
+`cases` counts the time of kernels alone, of the fastest of the runs, and prints the figures of an earlier measurement
+where there are some (`before`). `variance` reads `PACKAGE.all_cases.ALL_CASES` and `PACKAGE.problem.Problem`; with
 `--against FILE`, a report of another checkout with the same seeds, it prints ratios and flags those above 1.1. All runs
 in one thread.
 """
@@ -247,7 +247,8 @@ def room(options: argparse.Namespace) -> Result:
             fd_cpu = (time.process_time() - begun) / options.seeds
             differences = np.array(runs)
             variance = float(reverse.var(ddof=1) * spp)
-            relative = math.sqrt(variance / 2**20) / abs(differences.mean())
+            size = abs(differences.mean())
+            relative = math.sqrt(variance / 2**20) / size if size > 0 else math.inf
             found[f"{name}, depth {depth}"] = {
                 "reverse": row(reverse) | {"median": float(np.median(reverse)), "cpu": cpu, "variance x spp": variance},
                 "differences": row(differences) | {"cpu": fd_cpu},
