@@ -527,7 +527,7 @@ def parsed() -> argparse.Namespace:
     adders["variance"].add_argument("--interior", action="store_true", help="without the boundary term")
     numbers(adders["variance"], seeds=32)
     adders["sweep"].add_argument("names", nargs="*", metavar="SHAPES", help=", ".join(BODIES))
-    numbers(adders["sweep"], spp=256, fd_spp=2048, seeds=8)
+    numbers(adders["sweep"], spp=256, fd_spp=4096, seeds=8)
     numbers(adders["step"], repeats=20)
     adders["fit"].add_argument("--starts", dest="seeds_of_fits", type=int, nargs="+", default=[0])
     numbers(adders["fit"], steps=70)

@@ -31,6 +31,8 @@ _PLACES = {"primary": ([-0.2, 0.1, 1.2], 0.45), "shadow": ([0.9, 0.35, 1.6], 0.2
 PLACES = tuple(_PLACES)
 CHANGES = ("translate", "turn", "grow")
 _PAINT = paint(0.4)
+# By a unit of x: metres, and degrees about the axes.
+_SHIFT, _TURN = (0.6, -0.5, 0.6), (60.0, 90.0, 30.0)
 
 
 @dataclass(frozen=True)
@@ -45,8 +47,8 @@ class Body:
 
 
 _POSE: dict[str, Direction] = {
-    "translate": moved(1.0, 0.3, 0.2),
-    "turn": turned(20.0, 30.0, 10.0),
+    "translate": moved(*_SHIFT),
+    "turn": turned(*_TURN),
     "grow": grown,
 }
 
@@ -67,11 +69,11 @@ def _about(points: Array) -> Array:
 
 
 def _turned_points(points: Array) -> Array:
-    return np.cross(np.radians([20.0, 30.0, 10.0]), _about(points))
+    return np.cross(np.radians(_TURN), _about(points))
 
 
 def _shifted_points(points: Array) -> Array:
-    return np.broadcast_to([1.0, 0.3, 0.2], points.shape)
+    return np.broadcast_to(_SHIFT, points.shape)
 
 
 def _points(width: int = 3, others: Callable[[Array], Array] = np.zeros_like) -> dict[str, Direction]:
@@ -153,8 +155,8 @@ def _blob_changes() -> dict[str, Direction]:
 
     shift, turn, grow = slice(0, 3), slice(6, 10), slice(3, 6)
     return {
-        "translate": at(shift, [1.0, 0.3, 0.2]),
-        "turn": at(turn, [0.3, 0.4, 0.2, 0.0]),
+        "translate": at(shift, list(_SHIFT)),
+        "turn": at(turn, [0.6, 0.8, 0.4, 0.0]),
         "grow": at(grow, [0.1, 0.08, 0.06]),
     }
 
@@ -191,5 +193,4 @@ def moving_shape(body: str, place: str, change: str, folder: Path) -> MovingEdge
             return shadow(far_area(), **parts)
         return {name: part for name, part in indirect().items() if name != "blk"} | parts
 
-    step = 0.004 if change != "turn" else 0.02
-    return MovingEdge(make, found.key, found.changes[change], step)
+    return MovingEdge(make, found.key, found.changes[change], 0.004)
