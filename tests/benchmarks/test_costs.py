@@ -143,3 +143,57 @@ def test_scenes_of_mitsuba_beside_it(tmp_path):
     assert report["scenes"]["same"]["same"] and report["settings"]["size"] == 24
     assert "labels" in report["scenes"]["refused"]["refused"] and "nowhere.ply" in report["scenes"]["absent"]["absent"]
     assert "same 1, different 0, refused 1, absent 1" in printed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("command", "names"),
+    [
+        (["cases", "plate", "shadow_area"], ["plate", "shadow_area"]),
+        (["room", "meter", "--depth", "3"], ["meter, depth 3"]),
+        (["spread", "corner"], ["corner, depth 3"]),
+        (["step"], ["wall", "cpu", "memory"]),
+        (["fit"], ["start 0"]),
+    ],
+    ids=lambda value: value[0],
+)
+def test_moving_edges(tmp_path, command, names):
+    report, printed = run("boundary_cost.py", tmp_path, *command)
+    assert list(report["results"]) == names and all(name in printed for name in names[:2])
+    for found in report["results"].values():
+        assert "failed" not in found
+
+
+@pytest.mark.slow
+def test_every_shape_that_moves(tmp_path):
+    """At toy size most differences are noise: none fails to be measured."""
+    report, printed = run("boundary_cost.py", tmp_path, "sweep", "disk", "mesh")
+    verdicts = {name: found["verdict"] for name, found in report["results"].items()}
+    assert len(verdicts) == 18 and "failed" not in verdicts.values()
+    assert "disk, shadow, turn: " in printed
+
+
+@pytest.mark.slow
+def test_variance_beside_another_checkout(tmp_path):
+    """The same checkout has the same variance."""
+    (tmp_path / "toy").mkdir()
+    (tmp_path / "toy" / "problem.py").write_text(
+        "import dataclasses, random\n"
+        "@dataclasses.dataclass\n"
+        "class Case:\n"
+        "    name: str = 'one'\n"
+        "    support: str = 'correct'\n"
+        "    spp: int = 32\n"
+        "    fd_spp: int = 32\n"
+        "class Problem:\n"
+        "    def __init__(self, case): self.case = case\n"
+        "    def reverse(self, seed): return random.Random(seed).random() / self.case.spp\n"
+    )
+    (tmp_path / "toy" / "all_cases.py").write_text("from toy.problem import Case\nALL_CASES = [Case()]\n")
+    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+    command = [sys.executable, str(ROOT / "benchmarks" / "boundary_cost.py"), "variance", "toy"]
+    for more in (["--json", "before.json"], ["--against", "before.json", "--json", "after.json"]):
+        done = subprocess.run([*command, *more], capture_output=True, text=True, cwd=tmp_path, env=environment)
+        assert done.returncode == 0, done.stderr[-3000:]
+    found = json.loads((tmp_path / "after.json").read_text(encoding="utf-8"))["results"]["one"]
+    assert found["spp"] == 2 and found["ratio"] == pytest.approx(1) and not found["more"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.integrators.base import TransientIntegrator
 from torchtransient.plugins.properties import truth, whole_number
-from torchtransient.plugins.transport.boundary.moving_edges import is_found_from_points, missing, moving_edges
+from torchtransient.plugins.transport.boundary.moving_edges import missing, moving_edges
 from torchtransient.plugins.transport.boundary.term import BoundaryTerm
 from torchtransient.plugins.transport.connection.emitter_found import EmitterFound
 from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
@@ -26,7 +26,7 @@ class TransientPath(TransientIntegrator):
 
     Gradients: reverse mode walks every path backwards over a record in thread-local memory, forward mode carries
     tangents along; both include the time of flight. Where a parameter moves edges, what they hide and uncover is part
-    of the derivative, too (the boundary term, :mod:`..transport.boundary.passes`).
+    of the derivative, too (the boundary term, :mod:`..transport.boundary.term`).
 
     Parameters beside those of :class:`TransientIntegrator`:
 
@@ -55,10 +55,7 @@ class TransientPath(TransientIntegrator):
         if not (self.boundary and world.wanted.silhouettes):
             return []
         count = self.spp_boundary or max(1, samples // 2)
-        passes = self.boundary_passes
-        if not is_found_from_points(sensor):
-            passes = tuple(name for name in passes if name == "vertex")
-        return [BoundaryTerm(self, world, sensor, film, seed, count, passes)]
+        return [BoundaryTerm(self, world, sensor, film, seed, count, self.boundary_passes)]
 
     def strategies(self, contents):
         scattering = Lambertian(draws_lobe=True) if Lambertian.fits(contents) else Surface()

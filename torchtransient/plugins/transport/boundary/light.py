@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from torchtransient.plugins.edges.table import BESIDE
 from torchtransient.plugins.polarized import attenuated
-from torchtransient.plugins.transport.boundary.primary import can_be_sampled
+from torchtransient.plugins.transport.boundary.moving_edges import is_found_from_points
 from torchtransient.plugins.transport.boundary.sides import at_point
 from torchtransient.plugins.transport.boundary.speeds import along_the_ray, dragged_share
 from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
@@ -36,7 +36,7 @@ class LightPass:
     @staticmethod
     def exists(world, sensor):
         """Return whether there are lights and a sensor that can be connected to."""
-        return world.max_depth > 1 and len(world.scene.emitters()) > 0 and can_be_sampled(sensor)
+        return world.max_depth > 1 and len(world.scene.emitters()) > 0 and is_found_from_points(sensor)
 
     def run(self, mode, job):
         """Trace the samples of ``job``; returns the objective of reverse mode."""

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.polarized import attenuated
+from torchtransient.plugins.transport.boundary.moving_edges import is_found_from_points
 from torchtransient.plugins.transport.boundary.sides import at_point, both_sides, past_edge
 from torchtransient.plugins.transport.boundary.speeds import behind, sides_from, slides
 from torchtransient.plugins.transport.strategy import Local
@@ -22,7 +23,7 @@ class PrimaryPass:
     @staticmethod
     def exists(world, sensor):
         """Return whether edges can lie there: rays that are drawn from no area meet none."""
-        return world.max_depth > 0 and can_be_sampled(sensor)
+        return world.max_depth > 0 and is_found_from_points(sensor)
 
     def run(self, mode, job):
         """Trace the samples of ``job``; returns the objective of reverse mode."""
@@ -63,12 +64,3 @@ class PrimaryPass:
             "prev_p": ray.o, "active": active, "medium": medium,
         }  # fmt: skip
         return both_sides(world, mode, sampler, view, b, past, first, factor, speeds, needed)
-
-
-def can_be_sampled(sensor):
-    """Return whether a sensor can be connected to: rays of radiance meters and scans are lines without an area."""
-    try:
-        sensor.sample_direction(dr.zeros(mi.Interaction3f), mi.Point2f(0.5), mi.Bool(False))
-    except RuntimeError:
-        return False
-    return True

@@ -1,0 +1,100 @@
+"""The boundary term of edges that move: reverse mode against finite differences, forward mode, time bin by bin.
+
+Reverse mode and finite differences are independent estimates over different seeds. The interior term alone has to be
+off by more than the bound, or a case would prove nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from torchtransient.testing.edge_derivatives import PASSES, EdgeProblem
+from torchtransient.testing.moving_edges import CASES, RGB, SPECTRAL
+
+SIGMAS = 4.0
+# Both modes add the same float32 terms in another order.
+ROUNDING = 1e-4
+SEEDS = 6
+
+
+def compare(case, spp, fd_spp, seeds=SEEDS):
+    """The mean over the seeds of a derivative agrees with central differences, and is not the interior term."""
+    problem = EdgeProblem(case)
+    found = np.array([problem.reverse(100 + seed, spp) for seed in range(seeds)])
+    expected = np.array([problem.difference(300 + seed, fd_spp) for seed in range(seeds)])
+    bound = SIGMAS * np.sqrt((found.var(ddof=1) + expected.var(ddof=1)) / seeds)
+    assert abs(found.mean() - expected.mean()) < bound
+    assert abs(problem.reverse(100, spp, ()) - expected.mean()) > bound
+
+
+@pytest.mark.parametrize("name", ["plate", "shadow_area"])
+def test_outlines_and_shadows(name):
+    compare(CASES[name], 64, 1024, seeds=4)
+
+
+# With samples per pixel of reverse mode and of differences.
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "spp", "fd_spp"),
+    [
+        ("cube", 256, 4096), ("plate4_area", 256, 4096), ("vertex4", 256, 4096), ("ball_shadow", 256, 4096),
+        ("indirect4_area", 256, 16384), ("wall_moves", 512, 4096), ("point_moves", 512, 4096),
+        ("camera_moves", 256, 4096), ("camera_zooms", 256, 4096), ("instance4", 256, 8192),
+        ("torus_shadow", 512, 4096), ("fog_shadow", 256, 8192), ("gated_plate4", 256, 4096),
+        ("phasor_shadow", 256, 4096), ("polar_plate", 256, 8192),
+    ],
+)  # fmt: skip
+def test_edges_seen_by_sensors_lights_and_surfaces(name, spp, fd_spp):
+    compare(CASES[name], spp, fd_spp)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", [RGB, SPECTRAL])
+def test_colours(variant):
+    compare(replace(CASES["indirect4_area"], variant=variant), 256, 16384)
+
+
+def both_modes(name, passes):
+    """(reverse, forward) of each pass alone at one seed."""
+    problem = EdgeProblem(CASES[name])
+    modes = problem.reverse, problem.forward
+    return np.array([[mode(5, 64, (one,), interior=False) for mode in modes] for one in passes])
+
+
+def test_forward_mode_of_every_pass():
+    found = both_modes("plate4_area", PASSES)
+    assert (abs(found[:, 0]) > 1e-3).all()
+    np.testing.assert_allclose(found[:, 1], found[:, 0], rtol=ROUNDING)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "passes"),
+    [
+        ("indirect4_wall", ("vertex", "light")), ("camera_moves4", PASSES), ("bulb_moves", ("light",)),
+        ("sphere", ("primary", "light")), ("instance4", PASSES),
+    ],
+)  # fmt: skip
+def test_forward_mode(name, passes):
+    found = both_modes(name, passes)
+    np.testing.assert_allclose(found[:, 1], found[:, 0], rtol=ROUNDING)
+
+
+@pytest.mark.slow
+def test_a_shadow_bin_by_bin():
+    """z-scores of all bins that the shadow reaches have mean zero and deviation one."""
+    problem, h = EdgeProblem(CASES["shadow_area"]), CASES["shadow_area"].step
+    found = np.array([problem.tangent(seed, 512).sum((0, 1, 3)) for seed in range(8)])
+    expected = np.array(
+        [(problem.cube(h, 50 + s, 8192) - problem.cube(-h, 50 + s, 8192)).sum((0, 1, 3)) / (2 * h) for s in range(8)]
+    )
+    error = np.sqrt((found.var(0, ddof=1) + expected.var(0, ddof=1)) / 8)
+    # Bins at the rims, which few paths reach, have errors that few runs cannot tell.
+    lit = abs(expected.mean(0)) > 0.02 * abs(expected.mean(0)).max()
+    z = (found.mean(0) - expected.mean(0))[lit] / error[lit]
+    assert lit.sum() > 20
+    assert abs(z.mean()) < SIGMAS / np.sqrt(lit.sum())
+    assert np.sqrt((z**2).mean()) < 1.5 and abs(z).max() < SIGMAS
