@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import copy
 import pickle
 import warnings
@@ -213,7 +214,8 @@ def test_samples_are_those_asked_for():
 
 
 def kernels(renderer, key):
-    """Hashes of the kernels that a derivative launches, in order."""
+    """Hashes of the kernels that a derivative launches, in order. They depend on the plugins that are alive."""
+    gc.collect()
     weighed(renderer(seed=0)).backward()
     with active_variant(VARIANT), dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()

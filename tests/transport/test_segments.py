@@ -91,52 +91,77 @@ def test_what_a_vertex_records_of_its_ray():
 # ------------------------------------------------------------------------------------------------------ material points
 
 
-class Given(MaterialVacuum):
+class Given(vacuum.Vacuum):
     """Points that are given, instead of those of shapes."""
 
     def __init__(self, place):
-        self.place = place
+        self.place, self.triangles = place, True
 
-    def _place(self, world, pi, ray, n, active):
+    def material(self, world, pi, ray, n, active):
         return self.place
 
 
-def test_segments_between_points_of_shapes():
-    """Direction, length and measure, area times the cosine over the squared distance, follow both ends."""
+class GivenMaterial(MaterialVacuum):
+    """The same around corners."""
+
+    __init__, material = Given.__init__, Given.material
+
+
+def of_two_points(kind, radius):
+    """(attached motion of a segment whose ends move, its derivatives, those of two points by differences)."""
     ahead, x = mi.Bool([True, True, False]), mi.Float(0)
     dr.enable_grad(x)
     dr.set_grad(x, 1)
     a, p, n = np.array([0.1, 0.2, 0.3]), np.array([1.2, 2.4, -0.7]), unit(0.2, -0.5, 0.8)
     da, dp, dn = np.array([[0.3, -0.2, 0.5], [-0.4, 0.7, 0.2], [0.6, 0.1, -0.3]])
+    dn -= n * (n @ dn)
     area, darea = 1.7, 0.9
 
     def vector(kind, v, dv):
         return kind(*v.tolist()) + mi.Vector3f(*dv.tolist()) * x
 
     start, end = vector(mi.Point3f, a, da), vector(mi.Point3f, p, dp)
-    segment = Given((mi.Point3f(end), mi.Normal3f(vector(mi.Vector3f, n, dn)), area + darea * x))
-    direction = unit(*(p - a))
-    following = Local(d=mi.Vector3f(*direction.tolist()), n=None)
-    vertex = Local(v=Local(after=lambda: Local(pi=None, ray=None)), scattered_si=Local(p=mi.Point3f(start)))
+    segment = kind((mi.Point3f(end), mi.Normal3f(vector(mi.Vector3f, n, dn)), area + darea * x))
+    direction, length = unit(*(p - a)), np.linalg.norm(p - a)
+    following = Local(d=mi.Vector3f(*direction.tolist()), n=mi.Normal3f(*n.tolist()), t=mi.Float(length))
+    after = Local(pi=None, ray=None)
+    vertex = Local(
+        v=Local(after=lambda: after), scattered_si=Local(p=mi.Point3f(start)), damping_radius=dr.opaque(mi.Float, radius)
+    )
     motion = segment.motion(None, vertex, following, ahead)
-    longer, turned = motion.longer(), motion.d * 1  # inner nodes keep no derivative
+    values = motion.longer(), motion.d * 1, motion.J * 1, motion.drag * 1  # inner nodes keep no derivative
     dr.enqueue(dr.ADMode.Forward, x)
     dr.traverse(dr.ADMode.Forward)
+    share = 0 if length > radius else (1 - (length / radius) ** 2) ** 2
+    δ, across = da - dp, np.eye(3) - np.outer(direction, direction)
+    drag = share * across @ δ + (across @ dp if kind is Given else 0)
+    slid = share * (across @ δ - direction * (n @ across @ δ) / (n @ direction))
 
     def at(h):
-        to = p + h * dp - a - h * da
+        to = p + h * (dp + slid) - a - h * da
         r = np.linalg.norm(to)
         return to / r, r, (area + h * darea) * abs((n + h * dn) @ to) / r**3
 
-    (d1, r1, m1), (d0, r0, m0), h = at(1e-6), at(-1e-6), 1e-6
+    h = 1e-6
+    expected = [(one - other) / (2 * h) for one, other in zip(at(h), at(-h), strict=True)]
+    return motion, [np.array(dr.grad(value)) for value in values], (*expected, drag), at(0), da @ direction
+
+
+@pytest.mark.parametrize(("kind", "radius"), [(Given, 0.5), (Given, 5.0), (GivenMaterial, 0.5)])
+def test_segments_between_points_of_shapes(kind, radius):
+    """Direction and length follow both ends, and far ends the measure, area times the cosine over the squared distance;
+    near ends slide along with the vertex that sees them.
+    """
+    motion, (longer, turned, grown, drag), (d, r, m, dragged), (direction, _, measure), own = of_two_points(kind, radius)
     there = np.array([1, 1, 0])
-    np.testing.assert_allclose(np.array(dr.grad(turned)), np.outer((d1 - d0) / (2 * h), there), rtol=1e-3, atol=1e-4)
-    np.testing.assert_allclose(np.array(dr.grad(longer)), (r1 - r0) / (2 * h) * there, rtol=1e-3)
-    slope = (m1 - m0) / (2 * h) / at(0)[2]
-    np.testing.assert_allclose(np.array(dr.grad(motion.J)), slope * there, rtol=1e-3, atol=1e-4)
-    np.testing.assert_allclose(np.array(dr.grad(motion.p)), np.outer(dp, there), rtol=1e-4, atol=1e-6)
-    np.testing.assert_allclose(np.array(dr.grad(motion.n)), np.outer(dn, there), rtol=1e-4, atol=1e-6)
-    assert not np.array(motion.drag).any() and not np.array(longer).any() and (np.array(motion.J) == 1).all()
+    np.testing.assert_allclose(turned, np.outer(d, there), rtol=1e-3, atol=1e-4)
+    # What the far end adds is counted there, where it is a vertex of a path.
+    np.testing.assert_allclose(longer, (r if kind is GivenMaterial else -own) * there, rtol=1e-3)
+    if radius < 1:
+        np.testing.assert_allclose(grown, m / measure * there, rtol=1e-3, atol=1e-4)
+    if kind is Given:
+        np.testing.assert_allclose(drag, np.outer(dragged, there), rtol=1e-3, atol=1e-4)
+    assert not np.array(motion.drag).any() and (np.array(motion.J) == 1).all()
     np.testing.assert_allclose(np.array(motion.d)[:, 0], direction, rtol=1e-6)
 
 

@@ -17,13 +17,11 @@ from torchtransient.testing.moving_edges import Array, MovingEdge
 PASSES = ("primary", "vertex", "light")
 
 
-def choose_passes(integrator: Any, passes: tuple[str, ...], share: float | None = None) -> None:
-    """Say which passes of the boundary term an integrator's derivatives have, and how many edge samples for each path;
-    ``share``: None for the integrator's own.
+def choose_passes(integrator: Any, passes: tuple[str, ...], spp: int | None = None) -> None:
+    """Set the passes of the boundary term of an integrator's derivatives, and their edge samples per pixel; ``spp``:
+    None for the integrator's own.
     """
-    integrator.boundary = tuple(passes)
-    if share is not None:
-        integrator.boundary_share = share
+    integrator.boundary, integrator.boundary_passes, integrator.spp_boundary = bool(passes), tuple(passes), spp
 
 
 class EdgeProblem:
@@ -98,7 +96,7 @@ class EdgeProblem:
         x = mi.Float(0)
         dr.enable_grad(x)
         self.install(x)
-        choose_passes(self.integrator, passes, share)
+        choose_passes(self.integrator, passes, None if share is None else max(1, round(share * spp)))
         job = self.integrator.prepared(self.scene, 0, seed, spp, "backward", (None, mi.TensorXf(self.weights)))
         if not interior:
             job.launches = []

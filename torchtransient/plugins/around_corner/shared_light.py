@@ -126,6 +126,8 @@ class SharedThirdBounce:
     ``light``: attached where the scene is; ``draw``: (seed, number of samples).
     """
 
+    can_be_recorded = False
+
     def __init__(
         self,
         world: Any,

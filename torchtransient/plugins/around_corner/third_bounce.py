@@ -43,8 +43,6 @@ class ThirdBounce(ScanJob):
     supported: spectral and polarized variants; derivatives.
     """
 
-    can_be_recorded = False
-
     def __init__(
         self,
         scene: Any,

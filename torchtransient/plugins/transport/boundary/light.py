@@ -69,7 +69,7 @@ class LightPass:
         path.leg = lit.segment.depart(lit, ray, place, path.β, sampler, active)
         x = lit.segment.arrive(lit, path)
         # What touches the edge is uncovered for the light and for the vertex before at once, which counts it.
-        touches = dr.abs(dr.dot(x.at.p - b.p, b.d)) < CONTACT * (1 + dr.max(dr.abs(b.p)))
+        touches = dr.dot(x.at.p - b.p, b.d) < CONTACT * (1 + dr.max(dr.abs(b.p)))
         path.active = active = active & ~touches
         with dr.resume_grad():
             speeds = self._speeds(edges, light, x, path, ray, wavelength, aperture, sampler, job, active)
