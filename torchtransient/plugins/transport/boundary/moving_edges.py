@@ -15,7 +15,7 @@ from torchtransient.plugins.parameter_effect import CORRECT, ParameterEffect
 
 # Roles of what moves edges against what is behind them, and of what bends light, which moves edges that are seen
 # through it.
-_MOVE, _BEND = ("shape", "emitter", "sensor", "sun"), ("index", "normal")
+_MOVE, _BEND = ("shape", "emitter", "sensor"), ("index", "normal")
 # Of a mesh: they move no point.
 _PLACELESS = ("vertex_normals", "vertex_texcoords")
 _WITHOUT_EDGES = ("BSplineCurve", "LinearCurve", "SDFGrid", "Ellipsoids", "EllipsoidsMesh")
@@ -35,6 +35,11 @@ class Gap:
         named = ", ".join(map(repr, keys))
         lacking = "it lacks what moving edges hide and uncover there"
         return f"the derivative by {named} is wrong {self.where}: {lacking}. {self.remedy}"
+
+
+_OF_THE_SUN = Gap(
+    "where shadows move with the sun", "Take an area light far away for the sun, or keep its shadows out of the picture."
+)
 
 
 def moves_edges(key: str, effect: ParameterEffect) -> bool:
@@ -62,7 +67,7 @@ class MovingEdges:
         if not (effect.moves_silhouette and effect.supported):
             return ()
         name, moves = key.rsplit(".", 1)[-1], moves_edges(key, effect)
-        found = self.always if moves else ()
+        found = self.always if moves else (_OF_THE_SUN,) if effect.role == "sun" else ()
         if moves or effect.role in _BEND or name == "vertex_normals":
             found += self.bent
         if (moves and effect.role in ("shape", "sensor")) or name == "vertex_texcoords":
@@ -182,6 +187,9 @@ def _has_rim(emitter: Any) -> bool:
     """Whether the light of an emitter ends at once beside its direction."""
     if emitter.class_name() == "Projector":
         return True
+    if emitter.class_name() == "SpotLight":
+        shown = mi.traverse(emitter)
+        return bool(dr.all(shown["beam_width"] >= shown["cutoff_angle"]))
     cutoff = getattr(emitter, "cutoff_angle", None)
     return cutoff is not None and cutoff < 90 and cutoff == emitter.beam_width
 
