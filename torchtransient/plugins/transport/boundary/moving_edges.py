@@ -38,7 +38,7 @@ class Gap:
 
 
 _OF_THE_SUN = Gap(
-    "where shadows move with the sun", "Take an area light far away for the sun, or keep its shadows out of the picture."
+    "where shadows move with the sun", "Take a far area light for the sun, or keep its shadows out of the picture."
 )
 
 
