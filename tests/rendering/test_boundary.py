@@ -171,6 +171,7 @@ LAMP = {"type": "rectangle", "to_world": pose(0, 0, 3, 0.1) @ np.diag([1.0, -1, 
     ({"mirror": MIRROR}, BODY, "mirrors.*'mirror'"),
     ({"mirror": MIRROR}, "light.position", "mirrors"),
     ({"sensor": {"type": "orthographic", "to_world": CAMERA, "film": FILM}}, BODY, "where 'sensor' sees"),
+    ({"light": {"type": "spot", "to_world": CAMERA, "cutoff_angle": 20, "beam_width": 20}}, BODY, "rim.*'light'"),
     ({"lamp": LAMP}, BODY, "rim of the light of 'lamp'"),
     ({"wall": STRIPED}, "wall.to_world", "steps.*'wall'"),
     ({"wall": STRIPED}, "sensor.to_world", "steps.*'wall'"),
@@ -194,6 +195,8 @@ def test_what_is_called_correct(tmp_path):
     off = plate(integrator={"type": "transient_path", "max_depth": 3, "boundary": False}).parameters()
     assert off[BODY].biased and "boundary" in off[BODY].reason and off[PAINT].reason == "correct"
     (tmp_path / "curve.txt").write_text("\n".join(f"{x} 0 1 0.1" for x in range(3)), encoding="utf-8")
+    sky = tt.load(described(light={"type": "sunsky", "sun_direction": [0.2, 0.1, 1.0]}), variant="llvm_ad_rgb")
+    assert "shadows" in sky.parameters()["light.sun_direction"].reason
     curves = plate(curve={"type": "linearcurve", "filename": str(tmp_path / "curve.txt")}).parameters()
     assert "'curve'" in curves[BODY].reason and "'curve'" in curves["curve.control_points"].reason
 

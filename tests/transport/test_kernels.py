@@ -62,9 +62,9 @@ def test_an_effect_is_in_the_kernel_of_its_scene_alone():
 
 def test_paths_are_traced_once_for_all_entries_of_a_pose():
     """Each entry of a pose is a sum over lanes, which are not computed anew for it."""
-    description = under("transient_path")
-    description["integrator"]["boundary"] = False
-    scene = mi.load_dict(description, optimize=False)
+    described = under("transient_path")
+    described["integrator"] |= {"boundary": False}  # the term has kernels of its own
+    scene = mi.load_dict(described, optimize=False)
     params, shape = mi.traverse(scene), scene.sensors()[0].film().cube_shape()
     pose = mi.AffineTransform4f(params["sensor.to_world"])
     dr.enable_grad(pose.matrix)

@@ -22,7 +22,7 @@ from torchtransient.plugins.parameter_effect import CORRECT, ParameterEffect
 
 # Roles of what moves edges against what is behind them, and of what bends light, which moves edges that are seen
 # through it.
-_MOVE, _BEND = ("shape", "emitter", "sensor", "sun"), ("index", "normal")
+_MOVE, _BEND = ("shape", "emitter", "sensor"), ("index", "normal")
 # Of a mesh: they move no point.
 _PLACELESS = ("vertex_normals", "vertex_texcoords")
 # Places at which a texture is asked whether it is smooth, along each side.
@@ -41,6 +41,11 @@ class Gap:
         named = ", ".join(map(repr, keys))
         lacking = "it lacks what moving edges hide and uncover there"
         return f"the derivative by {named} is wrong {self.where}: {lacking}. {self.remedy}"
+
+
+_OF_THE_SUN = Gap(
+    "where shadows move with the sun", "Take a far area light for the sun, or keep its shadows out of the picture."
+)
 
 
 def moves_edges(key: str, effect: ParameterEffect) -> bool:
@@ -68,7 +73,7 @@ class MovingEdges:
         if not (effect.moves_silhouette and effect.supported):
             return ()
         name, moves = key.rsplit(".", 1)[-1], moves_edges(key, effect)
-        found = self.always if moves else ()
+        found = self.always if moves else (_OF_THE_SUN,) if effect.role == "sun" else ()
         if moves or effect.role in _BEND or name == "vertex_normals":
             found += self.bent
         if (moves and effect.role in ("shape", "sensor")) or name == "vertex_texcoords":
@@ -174,20 +179,23 @@ def _has_steps(texture: Any) -> bool:
     random = mi.PCG32(size=_PROBES * _PROBES)
     si.uv = mi.Point2f(random.next_float32(), random.next_float32())
     with dr.resume_grad():
+        # Forwards, and from the places alone: the numbers of the texture may be attached themselves.
         dr.enable_grad(si.uv)
+        dr.set_grad(si.uv, mi.Point2f(1, 0.7))
         value = dr.sum(texture.eval(si), axis=0)
-        if dr.grad_enabled(value):
-            dr.backward(value)
-        slope = dr.grad(si.uv)
+        dr.forward_from(si.uv)
+        slope = dr.grad(value)
     value = dr.detach(value)
-    flat = bool(dr.all((slope.x == 0) & (slope.y == 0), axis=None))
-    return flat and bool(dr.max(value)[0] > dr.min(value)[0])
+    return bool(dr.all(slope == 0)) and bool(dr.max(value)[0] > dr.min(value)[0])
 
 
 def _has_rim(emitter: Any) -> bool:
     """Whether the light of an emitter ends at once beside its direction."""
     if emitter.class_name() == "Projector":
         return True
+    if emitter.class_name() == "SpotLight":
+        shown = mi.traverse(emitter)
+        return bool(dr.all(shown["beam_width"] >= shown["cutoff_angle"]))
     cutoff = getattr(emitter, "cutoff_angle", None)
     return cutoff is not None and cutoff < 90 and cutoff == emitter.beam_width
 
