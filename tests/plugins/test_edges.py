@@ -224,16 +224,24 @@ def test_samples_go_to_what_moves():
         assert own == pytest.approx(expected + (0 if alone else 0.5 * length), abs=0.01)
 
 
-def test_candidates_leave_the_sum_as_it_is(scene):
-    """Of what is seen of outlines from one point, whichever are chosen."""
+@pytest.mark.parametrize("on_mesh", [False, True])
+def test_candidates_leave_the_sum_as_it_is(scene, on_mesh):
+    """Of what is seen of outlines from one point, whichever are chosen: of a mesh, those around the face there, too."""
     table = EdgeTable(Topology(scene), frozenset(), False)
+    V = mi.Point3f(8, 5, 12)
+    pi = dr.zeros(mi.PreliminaryIntersection3f)
+    if on_mesh:
+        body = next(shape for shape in scene.shapes() if shape.is_mesh() and shape.face_count() > 4)
+        ray = mi.Ray3f(V, dr.normalize(mi.Point3f(body.bbox().center()) - V))
+        pi = scene.ray_intersect_preliminary(ray)
+        assert dr.all(pi.shape == mi.ShapePtr(body))
+        V = pi.compute_surface_interaction(ray).p
     totals = []
-    for candidates in (1, 4):
+    for candidates in (1, 8):
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(1, 4 * COUNT)
-        V = mi.Point3f(8, 5, 12)
-        worth = lambda d, dist: 1 / dr.square(dist)  # noqa: E731
-        k = table.choose(table.by_length, sampler, V, mi.Bool(True), candidates, worth)
+        worth = lambda d, dist, crease: 1 / dr.square(dist)  # noqa: E731
+        k = table.choose(table.by_length, sampler, V, (pi, mi.Bool(on_mesh)), mi.Bool(True), candidates, worth)
         b = table.seen_from(k, V, True)
         value = np.array(dr.select(b.valid & ~b.crease, b.sin * b.inv_pdf / dr.square(b.dist), 0), np.float64)
         totals.append((value.mean(), value.std() / len(value) ** 0.5))

@@ -65,7 +65,7 @@ def both_modes(name, passes):
 
 
 def test_forward_mode_of_every_pass():
-    found = both_modes("plate4_area", PASSES)
+    found = both_modes("contact4", PASSES)
     assert (abs(found[:, 0]) > 1e-3).all()
     np.testing.assert_allclose(found[:, 1], found[:, 0], rtol=ROUNDING)
 

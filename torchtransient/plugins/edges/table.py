@@ -142,12 +142,28 @@ class EdgeTable:
         e, pmf = density.sample(x)
         with dr.suspend_grad():
             k = self._row(e)
-            k.u, k.pmf, k.ball, k.near = u, pmf, mi.Bool(False), dr.lerp(k.a, k.b, u)
-            if self.topology.rounds:
-                sin, cos = dr.sincos(u * dr.two_pi)
-                k.ball = (k.kind == BALL) | _is_tube(k.kind)
-                near = k.a + dr.select(_is_tube(k.kind), k.z * u, dr.select(k.kind == BALL, 0, k.x * cos + k.y * sin))
-                k.near = dr.select(k.kind == EDGE, k.near, near)
+            k.pmf = pmf
+            self._place(k, u)
+        return k
+
+    def _place(self, k: Any, u: Any) -> None:
+        """Set the place of ``k``."""
+        k.u, k.ball, k.near = u, mi.Bool(False), dr.lerp(k.a, k.b, u)
+        if self.topology.rounds:
+            sin, cos = dr.sincos(u * dr.two_pi)
+            k.ball = (k.kind == BALL) | _is_tube(k.kind)
+            near = k.a + dr.select(_is_tube(k.kind), k.z * u, dr.select(k.kind == BALL, 0, k.x * cos + k.y * sin))
+            k.near = dr.select(k.kind == EDGE, k.near, near)
+
+    def _pick_around(self, density: EdgeDensity, around: Any, x: Any, u: Any) -> Local:
+        """As :meth:`pick`, but of the edges around a face for who is on one."""
+        spokes = self.topology.spokes
+        with dr.suspend_grad():
+            e, _ = density.sample(x)
+            own, forward = spokes.draw(around, x)
+            k = self._row(dr.select(around.active, own, e))
+            k.pmf = dr.gather(mi.Float, density.weight, k.e) / mi.Float(density.total)
+            self._place(k, dr.select(around.active, spokes.place(around, k, forward, u), u))
         return k
 
     def _faces(self, k: Any, p: Any, t: Any, d: Any) -> tuple[Any, Any, Any, Any]:
@@ -167,15 +183,28 @@ class EdgeTable:
             beside = (k.flags & GAP == 0) | between
         return ha, hb, two, beside
 
-    def choose(self, density: EdgeDensity, sampler: Any, V: Any, active: Any, candidates: int, worth: Any) -> Local:
-        """Return one of several picks, which cost no rays, in proportion to what it may be ``worth(d, dist)`` seen from
-        ``V``: an outline times its span, a crease less, the flatter it is. (Resampling, Talbot et al. 2005.)
+    def choose(
+        self, density: EdgeDensity, sampler: Any, V: Any, at: Any, active: Any, candidates: int, worth: Any
+    ) -> Local:
+        """Return one of several picks, which cost no rays, in proportion to what it may be ``worth(d, dist, crease)``
+        seen from ``V``: an outline times its span, a crease less, the flatter it is. (Resampling, Talbot et al. 2005.)
+        ``at``: (PreliminaryIntersection3f of ``V``, mask of those that lie on it); on a mesh, half of the candidates are
+        edges around the face there.
         """
+        if candidates == 1:
+            return self.pick(density, sampler.next_1d(), sampler.next_1d())
         best, total, own = None, mi.Float(0), mi.Float(1)
-        for _ in range(candidates):
-            k = self.pick(density, sampler.next_1d(), sampler.next_1d())
-            if candidates == 1:
-                return k
+        spokes = self.topology.spokes
+        around = None if spokes is None else spokes.around(at[0], V, active & at[1])
+        for i in range(candidates):
+            numbers = sampler.next_1d(), sampler.next_1d()
+            if around is None:
+                k = self.pick(density, *numbers)
+            else:
+                k = self._pick_around(density, around, *numbers) if i % 2 else self.pick(density, *numbers)
+                # Of both ways to draw it.
+                mixed = 0.5 * (k.pmf + spokes.density(around, k) * dr.norm(k.b - k.a))
+                k.pmf = dr.select(around.active, mixed, k.pmf)
             d = k.near - mi.Point3f(V)
             dist = dr.norm(d)
             d /= dist
@@ -184,7 +213,7 @@ class EdgeTable:
             ha, hb, two, beside = self._faces(k, k.near, t, d)
             same = ~two | (dr.dot(across, ha) * dr.dot(across, hb) > 0)
             span = dr.norm(across) * dr.select(same, 1, _bend(k, ha, hb))
-            q = dr.select(k.ball, 1, dr.select(beside, span, 0)) * worth(d, dist)
+            q = dr.select(k.ball, 1, dr.select(beside, span, 0)) * worth(d, dist, ~same)
             w = dr.select(active & (k.pmf > 0) & (q > 0), q * k.length / k.pmf, 0)
             total += w
             take = sampler.next_1d() * total < w

@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from torchtransient.plugins.edges.spokes import Spokes
 from torchtransient.plugins.edges.joined import edge_keys, joined_places, near_places
 from torchtransient.plugins.host_numbers import host_numbers
 from torchtransient.plugins.mitsuba_compat import is_instance, lacks_edges
@@ -88,7 +89,7 @@ class Body:
 class _Rows(NamedTuple):
     """Edges of a mesh, numbers of vertices: ``ends`` (E, 2), ``third`` (E, 2) of both faces, ``other`` (E, 2), the ends
     as the second face has them; ``faces`` (E, 2); ``place`` (E, 4), numbers 0 to 2 of the ends in the first face and in
-    the second; ``flags``.
+    the second; ``flags``; ``joined`` (E, 2), joined places of the ends.
     """
 
     ends: np.ndarray
@@ -97,6 +98,7 @@ class _Rows(NamedTuple):
     faces: np.ndarray
     place: np.ndarray
     flags: np.ndarray
+    joined: np.ndarray
 
 
 def _halves(joined: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -107,12 +109,16 @@ def _halves(joined: np.ndarray, rows: np.ndarray) -> np.ndarray:
     return np.stack([np.where(turned, stop, start), np.where(turned, start, stop), face + (k + 2) % 3], 1)
 
 
-def _edges_of(positions: np.ndarray, faces: np.ndarray) -> _Rows:
-    """The edges of a mesh with vertices (V, 3) and faces (F, 3), flat ones included."""
+def _edges_of(positions: np.ndarray, faces: np.ndarray) -> tuple[_Rows, np.ndarray]:
+    """(the edges of a mesh with vertices (V, 3) and faces (F, 3), flat ones included; joined places of the corners of its
+    faces, (F, 3), zeros where a face has no area).
+    """
+    all_places = np.zeros(faces.shape, int)
     corners = positions.astype(np.float64)[faces]
     number = np.flatnonzero(np.any(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) != 0, axis=1))
     faces = faces[number]
     joined = joined_places(positions.astype(np.float32), faces)
+    all_places[number] = joined
     key, proper = edge_keys(joined)
     order = np.argsort(key, kind="stable")
     order = order[proper[order]]
@@ -135,7 +141,7 @@ def _edges_of(positions: np.ndarray, faces: np.ndarray) -> _Rows:
     a, b = a[kept], b[kept]
     third, number = np.stack([at[a[:, 2]], at[b[:, 2]]], 1), number[np.stack([a[:, 0], b[:, 0]], 1) // 3]
     place = np.concatenate([a[:, :2], b[:, :2]], 1) % 3
-    return _Rows(at[a[:, :2]], third, at[b[:, :2]], number, place, flags)
+    return _Rows(at[a[:, :2]], third, at[b[:, :2]], number, place, flags, joined.ravel()[a[:, :2]]), all_places
 
 
 def _angles(p: np.ndarray, group: np.ndarray) -> np.ndarray:
@@ -195,11 +201,16 @@ class Topology:
 
     def _edges(self) -> tuple[_Rows, np.ndarray, np.ndarray]:
         """(edges of all meshes, vertices counted through; bodies of both faces, (E, 2); first vertices of meshes)."""
-        found: dict[int, _Rows] = {}
+        found: dict[int, tuple[_Rows, np.ndarray]] = {}
         for shape in {body.shape.ptr: body.shape for body in self._meshes}.values():
             positions = host_numbers(shape.vertex_positions_buffer(), np.float32).reshape(-1, 3)
             found[shape.ptr] = _edges_of(positions, np.array(shape.faces_buffer(), np.int64).reshape(-1, 3))
-        parts = [found[body.shape.ptr] for body in self._meshes]
+        parts = [found[body.shape.ptr][0] for body in self._meshes]
+        self.spokes = None
+        if parts:
+            faces = [found[body.shape.ptr][1] for body in self._meshes]
+            listed = [body.instance is None for body in self._meshes]
+            self.spokes = Spokes([b.shape for b in self._meshes], faces, [part.joined for part in parts], listed)
         starts = np.cumsum([0, *(body.shape.vertex_count() for body in self._meshes)])[:-1]
         owner = np.repeat(np.arange(len(parts)), [len(part.flags) for part in parts])
         rows, owners = _stacked(parts, starts), np.stack([owner, owner], 1)
@@ -247,7 +258,7 @@ def _stacked(parts: list[_Rows], starts: np.ndarray) -> _Rows:
     """The rows of all meshes, vertices counted through."""
     if not parts:
         none = np.zeros((0, 2), int)
-        return _Rows(none, none, none, none, np.zeros((0, 4), int), np.zeros(0, int))
+        return _Rows(none, none, none, none, np.zeros((0, 4), int), np.zeros(0, int), none)
     shifted = [
         part._replace(ends=part.ends + n, third=part.third + n, other=part.other + n)
         for part, n in zip(parts, starts, strict=True)

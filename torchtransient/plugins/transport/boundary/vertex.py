@@ -47,10 +47,12 @@ class VertexPass:
         world.scattering.arrive(world, path, vertex, sampler)
         x, n = mi.Point3f(vertex.at.p), dr.select(vertex.surface, mi.Vector3f(vertex.si.n), 0)
 
-        def worth(d, dist):
-            return dr.select(vertex.surface, dr.abs_dot(n, d), 1) / dr.maximum(dr.square(dist), 1e-12)
+        def worth(d, dist, crease):
+            falls = dr.select(vertex.surface, dr.abs_dot(n, d), 1) / dr.maximum(dr.square(dist), 1e-12)
+            return dr.select(~crease | (dist < radius), falls, 0)
 
-        k = edges.choose(edges.by_length, sampler, x, vertex.goes_on, term.candidates, worth)
+        at = world.segment.surface_of(path.leg)
+        k = edges.choose(edges.by_length, sampler, x, at, vertex.goes_on, term.candidates, worth)
         b = edges.seen_from(k, x, vertex.goes_on)
         near = (b.dist < radius) | slides(world, b)
         b.valid &= ~b.crease | near

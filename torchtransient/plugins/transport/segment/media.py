@@ -106,8 +106,13 @@ class Media(Vacuum):
         return dr.select(leg["scatter"], leg["t"], leg["pi"].t), leg["scatter"] | leg["pi"].is_valid()
 
     def ends_at(self, pi, medium):
-        return {"pi": pi, "scatter": mi.Bool(False), "t": mi.Float(pi.t), "medium": medium,
-                "weight": mi.UnpolarizedSpectrum(1)} | ({"begin": medium} if self.settings.recorded else {})  # fmt: skip
+        leg = {"pi": pi, "scatter": mi.Bool(False), "t": mi.Float(pi.t), "medium": medium}
+        leg["weight"] = mi.UnpolarizedSpectrum(1)
+        if self.settings.recorded:
+            leg["begin"] = medium
+        if self.settings.keeps_entry:
+            leg["entry"] = dr.zeros(mi.PreliminaryIntersection3f)
+        return leg
 
     def medium_towards(self, d, vertex=None):
         if vertex is not None:
