@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.polarized import attenuated
+from torchtransient.plugins.sensors.seen_from import can_be_connected
 from torchtransient.plugins.transport.boundary.sides import at_point, both_sides, past_edge
 from torchtransient.plugins.transport.boundary.speeds import behind, sides_from, slides
 from torchtransient.plugins.transport.strategy import Local
@@ -22,20 +23,20 @@ class PrimaryPass:
     @staticmethod
     def exists(world, sensor):
         """Return whether edges can lie there: rays that are drawn from no area meet none."""
-        return world.max_depth > 0 and can_be_sampled(sensor)
+        return world.max_depth > 0 and can_be_connected(sensor)
 
     def run(self, mode, job):
         """Trace the samples of ``job``; returns the objective of reverse mode."""
         term = self.term
         world, edges, sampler = term.world, term.seen_edges, term.sampler(job)
-        aperture, wavelength = term.numbers_of_sensor(sampler)
+        numbers = term.places.numbers(sampler)
         k = edges.pick(edges.by_length, sampler.next_1d(), sampler.next_1d())
-        # From a meter the point of view depends on what is seen.
-        eye, _ = term.to_sensor.seen_from(at_point(k.near), aperture, mi.Bool(True))
-        b = edges.seen_from(k, mi.Point3f(eye.p), mi.Bool(True))
-        ds, importance = term.to_sensor.seen_from(at_point(b.p), aperture, b.valid)
+        # Along parallel rays the point of view depends on what is seen.
+        eye, _ = term.places.seen_from(at_point(k.near), numbers, mi.Bool(True))
+        b = edges.seen_from(k, mi.Point3f(eye.eye), mi.Bool(True))
+        ds, importance = term.places.seen_from(at_point(b.p), numbers, b.valid)
         row, column, weight, inside = term.pixel(ds.uv, sampler.next_2d())
-        rays = term.rays_at(sampler, ds.uv, wavelength, aperture, row, column, job)
+        rays = term.rays_at(sampler, ds.uv, numbers, row, column, job)
         view, ray = mode.view(rays), dr.detach(rays.ray)
         if term.is_meter:
             ray.o = mi.Point3f(eye.p)
@@ -63,12 +64,3 @@ class PrimaryPass:
             "prev_p": ray.o, "active": active, "medium": medium,
         }  # fmt: skip
         return both_sides(world, mode, sampler, view, b, past, first, factor, speeds, needed)
-
-
-def can_be_sampled(sensor):
-    """Return whether a sensor can be connected to: rays of radiance meters and scans are lines without an area."""
-    try:
-        sensor.sample_direction(dr.zeros(mi.Interaction3f), mi.Point2f(0.5), mi.Bool(False))
-    except RuntimeError:
-        return False
-    return True
