@@ -32,6 +32,7 @@ from torchtransient.plugins.transport.boundary.primary import PrimaryPass
 from torchtransient.plugins.transport.boundary.vertex import VertexPass
 from torchtransient.plugins.transport.boundary.weigh import Forward, Reverse
 from torchtransient.plugins.transport.connection.sensor_sampled import SensorSampled
+from torchtransient.plugins.transport.scattering.from_light import FromLight, shades_by_other_normals
 from torchtransient.plugins.transport.world import World
 
 PASSES = {"primary": PrimaryPass, "vertex": VertexPass, "light": LightPass}
@@ -77,6 +78,8 @@ class BoundaryTerm:
         """The world of paths that start at a light and are connected to the sensor."""
         world, integrator = self.world, self.integrator
         segment, scattering, _ = integrator.strategies(world.contents)
+        if shades_by_other_normals(world.scene):
+            scattering = FromLight(scattering)
         # Whether the sensor's segment counts in time is asked by its connection: here it is the last one of a path.
         settings = replace(integrator.settings(), camera_unwarp=False)
         self.to_sensor = SensorSampled(self.places, integrator.camera_unwarp)
