@@ -6,6 +6,7 @@ faces around an edge; all that is computed of them later is read anew (:class:`.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import groupby
 from typing import Any, NamedTuple
 
@@ -152,7 +153,8 @@ def _angles(p: np.ndarray, group: np.ndarray) -> np.ndarray:
 
 class Topology:
     """The edges and limbs of ``scene``, edges first: ``count`` of them, the last ``rounds`` are limbs and rims of shapes
-    without triangles. ``without``: the shapes that have outlines, but no edges here.
+    without triangles. ``without``: the shapes that have outlines, but no edges here. ``hides``: which shapes count, None
+    for all.
 
     A plain object of Dr.Jit arrays, to be kept with the scene and to be named as state of recorded calls.
 
@@ -160,9 +162,10 @@ class Topology:
     where they come apart later, each is a rim of its own. What comes together later is not joined.
     """
 
-    def __init__(self, scene: Any) -> None:
+    def __init__(self, scene: Any, hides: Callable[[Any], bool] | None = None) -> None:
         self.without = [shape for shape in shapes_of_scene(scene) if lacks_edges(shape)]
         bodies = [body for shape in scene.shapes() if not lacks_edges(shape) for body in _bodies(scene, shape)]
+        bodies = [body for body in bodies if hides is None or hides(body.shape)]
         self._meshes = [body for body in bodies if body.shape.is_mesh()]
         self._others = [body for body in bodies if not body.shape.is_mesh()]
         self.bodies = self._meshes + self._others

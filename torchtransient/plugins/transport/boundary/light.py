@@ -8,7 +8,7 @@ import mitsuba as mi
 from torchtransient.plugins.edges.table import BESIDE
 from torchtransient.plugins.polarized import attenuated
 from torchtransient.plugins.sensors.seen_from import FAR, can_be_connected
-from torchtransient.plugins.transport.boundary.sides import at_point
+from torchtransient.plugins.transport.boundary.sides import at_point, place_at
 from torchtransient.plugins.transport.boundary.speeds import along_the_ray, dragged_share
 from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
 from torchtransient.plugins.transport.scattering.geometry_terms import displacement, material_point
@@ -48,9 +48,9 @@ class LightPass:
         b, ds = light.b, light.ds
         most = dr.max(dr.abs(light.Le))
         active = b.valid & (most > 0) & dr.isfinite(most) & ~b.crease
-        medium = world.segment.medium_towards(b.d)
-        place = Local(at=at_point(b.beside, ray), si=dr.zeros(mi.SurfaceInteraction3f), medium=medium, surface=mi.Bool(False))
-        to_light = Local(p=dr.select(light.far, b.p + ds.d * ds.dist, ds.p), d=-b.d, dist=dr.select(light.far, ds.dist, b.dist))
+        medium = world.segment.medium_at(world, b.beside, ray.o, world.segment.medium_towards(b.d), active)
+        place, far = place_at(b.beside, ray, medium), light.far
+        to_light = Local(p=dr.select(far, b.p + ds.d * ds.dist, ds.p), d=-b.d, dist=dr.select(far, ds.dist, b.dist))
         active, T = world.segment.transmittance(world, place, to_light, sampler.next_2d(), sampler, active)
         factor = dr.select(active, -most * b.sin * b.inv_pdf, 0)
         factor = dr.select(dr.isfinite(factor), factor, 0)

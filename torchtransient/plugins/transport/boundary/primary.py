@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from torchtransient.plugins.polarized import attenuated
 from torchtransient.plugins.sensors.seen_from import can_be_connected
-from torchtransient.plugins.transport.boundary.sides import at_point, both_sides, past_edge
+from torchtransient.plugins.transport.boundary.sides import at_point, both_sides, past_edge, place_at
 from torchtransient.plugins.transport.boundary.speeds import behind, sides_from, slides
 from torchtransient.plugins.transport.strategy import Local
 
@@ -40,14 +40,15 @@ class PrimaryPass:
         view, ray = mode.view(rays), dr.detach(rays.ray)
         if term.is_meter:
             ray.o = mi.Point3f(eye.p)
-        medium, way = world.segment.medium_towards(b.d), dr.norm(b.p - ray.o)
-        place = Local(at=at_point(b.beside, ray), si=dr.zeros(mi.SurfaceInteraction3f), medium=medium, surface=mi.Bool(False))
-        to_sensor = Local(p=ray.o, d=-b.d, dist=way)
-        active = b.valid & (ds.pdf > 0) & inside
-        active, T = world.segment.transmittance(world, place, to_sensor, sampler.next_2d(), sampler, active)
+        way, active = dr.norm(b.p - ray.o), b.valid & (ds.pdf > 0) & inside
+        if world.hide_emitters:
+            active &= ~b.inner.shape.is_emitter()
+        medium = world.segment.medium_at(world, b.beside, ray.o, world.segment.medium_towards(b.d), active)
+        place, to_sensor = place_at(b.beside, ray, medium), Local(p=ray.o, d=-b.d, dist=way)
+        active, T = world.segment.transmittance(world, place, to_sensor, sampler.next_2d(), sampler, active, seen=True)
         factor = importance * b.sin * b.inv_pdf * weight
         β = attenuated(mi.Spectrum(1), mi.UnpolarizedSpectrum(T))
-        past = past_edge(world, b, ray, medium, β, sampler, active)
+        past = past_edge(world, b, ray, medium, β, sampler, active, seen=True)
         held = term.is_meter and not world.wanted.sensor
         needed = mi.Bool(True), mi.Bool(True)
         with dr.resume_grad():

@@ -32,6 +32,7 @@ from torchtransient.plugins.transport.boundary.primary import PrimaryPass
 from torchtransient.plugins.transport.boundary.vertex import VertexPass
 from torchtransient.plugins.transport.boundary.weigh import Forward, Reverse
 from torchtransient.plugins.transport.connection.sensor_sampled import SensorSampled
+from torchtransient.plugins.transport.media_contents import is_open
 from torchtransient.plugins.transport.scattering.from_light import FromLight, shades_by_other_normals
 from torchtransient.plugins.transport.world import World
 
@@ -59,7 +60,10 @@ class BoundaryTerm:
         views_move = wanted.sensor or wanted.light
         moving = frozenset() if views_move else wanted.shapes
         # A sensor at rest sees the edges of what moves alone; behind an edge at rest something else may move.
-        topology = world.contents.memory.of("edges", b"", lambda: Topology(scene))
+        # Paths through media pass open boundaries, which hide nothing.
+        media = world.contents.media
+        hides = None if media is None or not media.open_boundaries else lambda shape: not is_open(shape)
+        topology = world.contents.memory.of("edges", b"", lambda: Topology(scene, hides))
         self.seen_edges = EdgeTable(topology, moving, alone=not views_move)
         self.edges = self.seen_edges if views_move else EdgeTable(topology, moving, alone=False)
         self.radius = dr.opaque(mi.Float, integrator.reference(scene).radius)

@@ -44,9 +44,12 @@ class SensorSampled(Connection):
             value = rotate_stokes(value, rotation_between(d, stokes_frame_of(d), stokes_frame_of(-d)))
         value = value * proposal.importance
         active = proposal.active & (dr.max(dr.abs(intensity(value))) > 0)
+        if world.hide_emitters:  # primary rays pass lights
+            active &= ~(vertex.surface & vertex.si.shape.is_emitter())
         length = mi.Float(0) if self.unwarp else ds.dist * vertex.η * answer.eta
         opl = vertex.scattered_τ + mi.Float64(length)
-        active, T = world.segment.transmittance(world, vertex, ds, proposal.u, proposal.sampler, world.counted(active, opl))
+        active = world.counted(active, opl)
+        active, T = world.segment.transmittance(world, vertex, ds, proposal.u, proposal.sampler, active, seen=True)
         return Event(value=value * T, opl=opl, active=active, depth=path.depth + 2, uv=ds.uv, d=ds.d)
 
 
