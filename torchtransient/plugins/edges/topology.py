@@ -6,6 +6,7 @@ faces around an edge; all that is computed of them later is read anew (:class:`.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import groupby
 from typing import Any, NamedTuple
 
@@ -13,8 +14,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from torchtransient.plugins.edges.spokes import Spokes
 from torchtransient.plugins.edges.joined import edge_keys, joined_places, near_places
+from torchtransient.plugins.edges.spokes import Spokes
 from torchtransient.plugins.host_numbers import host_numbers
 from torchtransient.plugins.mitsuba_compat import is_instance, lacks_edges
 from torchtransient.plugins.node_walk import members_of, shapes_of_scene, shown_by
@@ -157,7 +158,7 @@ def _angles(p: np.ndarray, group: np.ndarray) -> np.ndarray:
 
 class Topology:
     """The edges and limbs of ``scene``: ``count`` rows, of which the last ``rounds`` are limbs and rims of what has no
-    triangles. ``without``: the shapes that have outlines, but no edges here.
+    triangles. ``without``: the shapes that have outlines, but no edges here. ``hides``: which shapes count, None for all.
 
     A plain object of Dr.Jit arrays, to be kept with the scene and to be named as state of recorded calls.
 
@@ -166,9 +167,10 @@ class Topology:
     three and more faces around an edge stays.
     """
 
-    def __init__(self, scene: Any) -> None:
+    def __init__(self, scene: Any, hides: Callable[[Any], bool] | None = None) -> None:
         self.without = [shape for shape in shapes_of_scene(scene) if lacks_edges(shape)]
         bodies = [body for shape in scene.shapes() if not lacks_edges(shape) for body in _bodies(scene, shape)]
+        bodies = [body for body in bodies if hides is None or hides(body.shape)]
         self._meshes = [body for body in bodies if body.shape.is_mesh()]
         self._others = [body for body in bodies if not body.shape.is_mesh()]
         self.bodies = self._meshes + self._others

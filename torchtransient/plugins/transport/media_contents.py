@@ -18,20 +18,22 @@ class MediaContents:
 
     ``at_sensor``: the medium that the sensor stands in, or None. ``homogeneous``, ``heterogeneous``: whether there are
     media of that kind. ``open_boundaries``: some surface lets light through unbent (BSDF ``null``), so that straight
-    lines go through several media. ``shapes_in_groups``: there are instances. ``emitter_sampling``: every medium allows
+    lines go through several media. ``transitions``: there is more than one medium, or a place without one.
+    ``shapes_in_groups``: there are instances. ``emitter_sampling``: every medium allows
     connections to emitters. ``extent``: the size of the scene in metres. ``phase_mixtures``: blends of phase functions,
     None where there are none.
 
     A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
     """
 
-    def __init__(self, media: list[Any], at_sensor: Any, open_boundaries: bool, shapes_in_groups: bool, extent: float):
+    def __init__(self, media: list[Any], at_sensor: Any, open_boundaries: bool, shapes_in_groups: bool, extent: float, transitions: bool):
         self.media = media
         self.at_sensor = at_sensor
         self.homogeneous = any(m.is_homogeneous() for m in media)
         self.heterogeneous = any(not m.is_homogeneous() for m in media)
         self.emitter_sampling = all(m.use_emitter_sampling() for m in media)
         self.open_boundaries = open_boundaries
+        self.transitions = transitions
         self.shapes_in_groups = shapes_in_groups
         self.extent = extent
         phases = {phase.ptr: phase for phase in (medium.phase_function() for medium in media)}
@@ -79,6 +81,7 @@ class FlightSettings:
         self.at_sensor, self.emitter_sampling = contents.at_sensor, contents.emitter_sampling
         self.homogeneous, self.heterogeneous = contents.homogeneous, contents.heterogeneous
         self.open_boundaries, self.one_stretch = contents.open_boundaries, contents.one_stretch
+        self.transitions = contents.transitions
         self.shapes_in_groups = contents.shapes_in_groups
         self.hide_emitters = hide_emitters
         self.recorded = wanted is not None
@@ -103,8 +106,9 @@ def media_of(scene: Any, sensor: Any) -> MediaContents | None:
         return None
     box = scene.bbox()
     extent = float(dr.norm(box.extents())) if box.valid() else 1.0
+    transitions = len(media) > 1 or any(medium is None for medium in found)
     open_boundaries, grouped = any(is_open(shape) for shape in shapes), any(is_instance(shape) for shape in shapes)
-    return MediaContents(list(media.values()), found[0], open_boundaries, grouped, max(extent, 1e-6))
+    return MediaContents(list(media.values()), found[0], open_boundaries, grouped, max(extent, 1e-6), transitions)
 
 
 def is_open(shape: Any) -> bool:

@@ -138,8 +138,12 @@ class Segment(Strategy):
         """The leg of a primary ray."""
         raise NotImplementedError
 
-    def depart(self, world: Any, ray: Any, vertex: Vertex, β: Any, sampler: Any, active: Any) -> Any:
-        """The leg of ``ray``, which leaves ``vertex`` with throughput ``β``."""
+    def depart(
+        self, world: Any, ray: Any, vertex: Vertex, β: Any, sampler: Any, active: Any, seen: bool = False
+    ) -> Any:
+        """The leg of ``ray``, which leaves ``vertex`` with throughput ``β``. ``seen``: it is part of a primary ray,
+        which lights are hidden from where ``world.hide_emitters``.
+        """
         raise NotImplementedError
 
     def depart_guided(self, world: Any, ray: Any, vertex: Vertex, step: Step, sampler: Any, active: Any) -> Any:
@@ -180,13 +184,19 @@ class Segment(Strategy):
         """The medium of a ray that leaves ``vertex`` (None: the sensor) in direction ``d``, None in vacuum."""
         raise NotImplementedError
 
+    def medium_at(self, world: Any, p: Any, start: Any, medium: Any, active: Any) -> Any:
+        """The medium at ``p``, where that at the point ``start`` is ``medium`` on the side of ``p``; None in vacuum."""
+        raise NotImplementedError
+
     def share_of_surface(self, leg: Any) -> Any:
         """How much of the motion of the surface behind it the end of ``leg`` follows."""
         raise NotImplementedError
 
-    def transmittance(self, world: Any, vertex: Vertex, ds: Any, u: Any, sampler: Any, active: Any) -> tuple[Any, Any]:
+    def transmittance(
+        self, world: Any, vertex: Vertex, ds: Any, u: Any, sampler: Any, active: Any, seen: bool = False
+    ) -> tuple[Any, Any]:
         """(whether the point ``ds`` (``p, d, dist``) can be seen, factor per colour). ``u``: two uniform
-        numbers that were drawn for this vertex and serve as the start of a generator.
+        numbers that were drawn for this vertex and serve as the start of a generator. ``seen``: as of :meth:`depart`.
         """
         raise NotImplementedError
 

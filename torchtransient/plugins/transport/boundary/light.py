@@ -7,8 +7,8 @@ import mitsuba as mi
 
 from torchtransient.plugins.edges.table import BESIDE
 from torchtransient.plugins.polarized import attenuated
-from torchtransient.plugins.transport.boundary.moving_edges import is_found_from_points
-from torchtransient.plugins.transport.boundary.sides import at_point
+from torchtransient.plugins.sensors.seen_from import FAR, can_be_connected
+from torchtransient.plugins.transport.boundary.sides import at_point, place_at
 from torchtransient.plugins.transport.boundary.speeds import along_the_ray, dragged_share
 from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
 from torchtransient.plugins.transport.scattering.geometry_terms import displacement, material_point
@@ -18,8 +18,6 @@ from torchtransient.plugins.transport.walk import go_on, start
 # Distance past an edge, in parts of the largest coordinate, up to which a surface touches it: ten times as far as paths
 # pass beside edges.
 CONTACT = 10 * BESIDE
-# Radii of the scene from which a light at infinity is looked at along an edge.
-_FAR = 300
 
 
 class LightPass:
@@ -36,24 +34,23 @@ class LightPass:
     @staticmethod
     def exists(world, sensor):
         """Return whether there are lights and a sensor that can be connected to."""
-        return world.max_depth > 1 and len(world.scene.emitters()) > 0 and is_found_from_points(sensor)
+        return world.max_depth > 1 and len(world.scene.emitters()) > 0 and can_be_connected(sensor)
 
     def run(self, mode, job):
         """Trace the samples of ``job``; returns the objective of reverse mode."""
         term = self.term
         world, edges, sampler, lit = term.world, term.edges, term.sampler(job), term.light_world
         k = edges.pick(edges.by_length, sampler.next_1d(), sampler.next_1d())
-        aperture, wavelength = term.numbers_of_sensor(sampler)
-        center = mi.Point2f(mi.ScalarVector2f(term.film.crop_size())) / 2
-        middle = term.rays_at(sampler, center, wavelength, aperture, None, None, job)
+        numbers = term.places.numbers(sampler)
+        middle = term.rays_at(sampler, term.places.middle(numbers), numbers, None, None, job)
         ray = mi.Ray3f(dr.detach(middle.ray))
         light = self._light(edges, k, ray, sampler.next_2d())
         b, ds = light.b, light.ds
         most = dr.max(dr.abs(light.Le))
         active = b.valid & (most > 0) & dr.isfinite(most) & ~b.crease
-        medium = world.segment.medium_towards(b.d)
-        place = Local(at=at_point(b.beside, ray), si=dr.zeros(mi.SurfaceInteraction3f), medium=medium, surface=mi.Bool(False))
-        to_light = Local(p=dr.select(light.far, b.p + ds.d * ds.dist, ds.p), d=-b.d, dist=dr.select(light.far, ds.dist, b.dist))
+        medium = world.segment.medium_at(world, b.beside, ray.o, world.segment.medium_towards(b.d), active)
+        place, far = place_at(b.beside, ray, medium), light.far
+        to_light = Local(p=dr.select(far, b.p + ds.d * ds.dist, ds.p), d=-b.d, dist=dr.select(far, ds.dist, b.dist))
         active, T = world.segment.transmittance(world, place, to_light, sampler.next_2d(), sampler, active)
         factor = dr.select(active, -most * b.sin * b.inv_pdf, 0)
         factor = dr.select(dr.isfinite(factor), factor, 0)
@@ -61,7 +58,7 @@ class LightPass:
         τ = mi.Float64(0)
         if world.contents.distant is not None:
             τ = mi.Float64(dr.select(light.far, world.contents.distant.length(b.p, -b.d), 0))
-        term.to_sensor.aperture = aperture
+        term.to_sensor.numbers = numbers
         path = start(lit, ray, τ - term.film.start_opl, dr.detach(middle.η))
         path.prev_p = dr.select(light.far, b.p, b.V)
         β = light.Le * mi.UnpolarizedSpectrum(T) * dr.select(most > 0, dr.rcp(most), 0)
@@ -72,7 +69,7 @@ class LightPass:
         touches = dr.dot(x.at.p - b.p, b.d) < CONTACT * (1 + dr.max(dr.abs(b.p)))
         path.active = active = active & ~touches
         with dr.resume_grad():
-            speeds = self._speeds(edges, light, x, path, ray, wavelength, aperture, sampler, job, active)
+            speeds = self._speeds(edges, light, x, path, ray, numbers, sampler, job, active)
         u = sampler.next_2d()
         sink, factors = mode.sink_of_pixels(middle, job, u, factor, speeds)
         _, kept = go_on(lit, sampler, path, sink)
@@ -86,7 +83,7 @@ class LightPass:
         near = at_point(k.near, ray)
         ds, weight = self.lights.sample(world, near, u, mi.Bool(True))
         far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-        y = dr.select(far, k.near + ds.d * (_FAR * self.term.radius), ds.p)
+        y = dr.select(far, k.near + ds.d * (FAR * self.term.radius), ds.p)
         b = edges.seen_from(k, mi.Point3f(y), ds.pdf > 0)
         Le = mi.unpolarized_spectrum(weight)
         # The light was drawn from another place than a limb, which depends on the light, with another solid angle.
@@ -97,14 +94,14 @@ class LightPass:
         other *= dr.select(ds.delta, 1, dr.select(far, 1, ratio) / ds.pdf)
         return Local(ds=ds, b=b, far=far, Le=dr.select(k.ball, other, Le), near=near, u=u)
 
-    def _speeds(self, edges, light, x, path, ray, wavelength, aperture, sampler, job, active):
+    def _speeds(self, edges, light, x, path, ray, numbers, sampler, job, active):
         """Attached speeds of the edge: where x is the first vertex of a path of the sensor, and where it is another."""
         term, b = self.term, light.b
         world = term.world
         pi, on_surface = term.light_world.segment.surface_of(path.leg)
         surface = active & on_surface & pi.is_valid()
         with dr.suspend_grad():
-            seen, _ = term.to_sensor.seen_from(x.at, aperture, active)
+            seen, _ = term.places.seen_from(x.at, numbers, active)
             behind = dr.norm(x.at.p - b.p)
             t = dr.select(light.far, 0, behind / (behind + b.dist))
             n = dr.select(surface, mi.Vector3f(x.si.n), 0)
@@ -112,7 +109,7 @@ class LightPass:
         if term.is_meter and not world.wanted.sensor:
             first = held
         else:
-            rays = term.rays_at(sampler, seen.uv, wavelength, aperture, None, None, job)
+            rays = term.rays_at(sampler, seen.uv, numbers, None, None, job)
             if term.is_meter:
                 with dr.suspend_grad():
                     shift = seen.p - rays.ray.o

@@ -12,13 +12,13 @@ import mitsuba as mi
 from torchtransient.plugins.mitsuba_compat import (
     attribute_name,
     has_surface,
-    is_batch,
     is_bump_map,
     is_instance,
     lacks_edges,
 )
 from torchtransient.plugins.node_walk import objects_below, shapes_of_scene
 from torchtransient.plugins.parameter_effect import CORRECT, ParameterEffect
+from torchtransient.plugins.sensors.seen_from import can_be_connected
 
 # Roles of what moves edges against what is behind them, and of what bends light, which moves edges that are seen
 # through it.
@@ -116,7 +116,7 @@ def missing(reason: str, remedy: str) -> MovingEdges:
 def moving_edges(scene: Any, sensors: Sequence[Any]) -> MovingEdges:
     """Return what the passes of :mod:`.passes` leave out in a scene, seen by ``sensors``."""
     always, bent = [], []
-    if blind := [sensor for sensor in sensors if not is_found_from_points(sensor)]:
+    if blind := [sensor for sensor in sensors if not can_be_connected(sensor)]:
         where = f"where {_listed([_name(sensor) for sensor in blind])} sees an edge or its shadow"
         always.append(
             Gap(where, "Use perspective or thinlens cameras, each by itself: they tell where they see a point.")
@@ -132,20 +132,6 @@ def moving_edges(scene: Any, sensors: Sequence[Any]) -> MovingEdges:
         where = f"where edges are seen in mirrors or through smooth glass, masks and open boundaries ({names})"
         bent.append(Gap(where, "Take a rough surface in place of the smooth one, or keep edges out of its view."))
     return MovingEdges(always, bent, scene)
-
-
-def is_found_from_points(sensor: Any) -> bool:
-    """Return whether a sensor tells where it sees a point, which paths that arrive at it need. A batch answers for
-    one of its sensors, drawn anew at each question.
-    """
-    if is_batch(sensor):
-        return False
-    try:
-        with dr.suspend_grad():
-            sensor.sample_direction(dr.zeros(mi.Interaction3f), mi.Point2f(0.5))
-    except RuntimeError:  # Mitsuba's "not implemented"
-        return False
-    return True
 
 
 def shapes_without_edges(scene: Any) -> list[Any]:

@@ -6,8 +6,8 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.polarized import attenuated
-from torchtransient.plugins.transport.boundary.moving_edges import is_found_from_points
-from torchtransient.plugins.transport.boundary.sides import at_point, both_sides, past_edge
+from torchtransient.plugins.sensors.seen_from import can_be_connected
+from torchtransient.plugins.transport.boundary.sides import at_point, both_sides, past_edge, place_at
 from torchtransient.plugins.transport.boundary.speeds import behind, sides_from, slides
 from torchtransient.plugins.transport.strategy import Local
 
@@ -23,31 +23,32 @@ class PrimaryPass:
     @staticmethod
     def exists(world, sensor):
         """Return whether edges can lie there: rays that are drawn from no area meet none."""
-        return world.max_depth > 0 and is_found_from_points(sensor)
+        return world.max_depth > 0 and can_be_connected(sensor)
 
     def run(self, mode, job):
         """Trace the samples of ``job``; returns the objective of reverse mode."""
         term = self.term
         world, edges, sampler = term.world, term.seen_edges, term.sampler(job)
-        aperture, wavelength = term.numbers_of_sensor(sampler)
+        numbers = term.places.numbers(sampler)
         k = edges.pick(edges.by_length, sampler.next_1d(), sampler.next_1d())
-        # From a meter the point of view depends on what is seen.
-        eye, _ = term.to_sensor.seen_from(at_point(k.near), aperture, mi.Bool(True))
-        b = edges.seen_from(k, mi.Point3f(eye.p), mi.Bool(True))
-        ds, importance = term.to_sensor.seen_from(at_point(b.p), aperture, b.valid)
+        # Along parallel rays the point of view depends on what is seen.
+        eye, _ = term.places.seen_from(at_point(k.near), numbers, mi.Bool(True))
+        b = edges.seen_from(k, mi.Point3f(eye.eye), mi.Bool(True))
+        ds, importance = term.places.seen_from(at_point(b.p), numbers, b.valid)
         row, column, weight, inside = term.pixel(ds.uv, sampler.next_2d())
-        rays = term.rays_at(sampler, ds.uv, wavelength, aperture, row, column, job)
+        rays = term.rays_at(sampler, ds.uv, numbers, row, column, job)
         view, ray = mode.view(rays), dr.detach(rays.ray)
         if term.is_meter:
             ray.o = mi.Point3f(eye.p)
-        medium, way = world.segment.medium_towards(b.d), dr.norm(b.p - ray.o)
-        place = Local(at=at_point(b.beside, ray), si=dr.zeros(mi.SurfaceInteraction3f), medium=medium, surface=mi.Bool(False))
-        to_sensor = Local(p=ray.o, d=-b.d, dist=way)
-        active = b.valid & (ds.pdf > 0) & inside
-        active, T = world.segment.transmittance(world, place, to_sensor, sampler.next_2d(), sampler, active)
+        way, active = dr.norm(b.p - ray.o), b.valid & (ds.pdf > 0) & inside
+        if world.hide_emitters:
+            active &= ~b.inner.shape.is_emitter()
+        medium = world.segment.medium_at(world, b.beside, ray.o, world.segment.medium_towards(b.d), active)
+        place, to_sensor = place_at(b.beside, ray, medium), Local(p=ray.o, d=-b.d, dist=way)
+        active, T = world.segment.transmittance(world, place, to_sensor, sampler.next_2d(), sampler, active, seen=True)
         factor = importance * b.sin * b.inv_pdf * weight
         β = attenuated(mi.Spectrum(1), mi.UnpolarizedSpectrum(T))
-        past = past_edge(world, b, ray, medium, β, sampler, active)
+        past = past_edge(world, b, ray, medium, β, sampler, active, seen=True)
         held = term.is_meter and not world.wanted.sensor
         needed = mi.Bool(True), mi.Bool(True)
         with dr.resume_grad():

@@ -9,12 +9,12 @@ from torchtransient.plugins.transport.strategy import Local
 from torchtransient.plugins.transport.walk import start
 
 
-def past_edge(world, b, ray, medium, β, sampler, active):
-    """(the ray past an outline, its leg); of a crease the other face, seen from x."""
+def past_edge(world, b, ray, medium, β, sampler, active, seen=False):
+    """(the ray past an outline, its leg); of a crease the other face, seen from x. ``seen``: x is the sensor."""
     place = Local(si=dr.zeros(mi.SurfaceInteraction3f), medium=medium, surface=mi.Bool(False))
     past = mi.Ray3f(ray)
     past.o, past.d = dr.select(b.crease, b.V, b.beside), b.d
-    leg = world.segment.depart(world, past, place, β, sampler, active & ~b.crease)
+    leg = world.segment.depart(world, past, place, β, sampler, active & ~b.crease, seen)
     return past, dr.select(b.crease, world.segment.ends_at(b.facing, medium), leg)
 
 
@@ -57,3 +57,8 @@ def at_point(p, ray=None):
     if ray is not None:
         it.time, it.wavelengths = ray.time, ray.wavelengths
     return it
+
+
+def place_at(p, ray, medium):
+    """A place in space, of no surface, as rays of a segment depart from it."""
+    return Local(at=at_point(p, ray), si=dr.zeros(mi.SurfaceInteraction3f), medium=medium, surface=mi.Bool(False))

@@ -25,13 +25,15 @@ import mitsuba as mi
 from torchtransient.plugins.edges.table import EdgeTable
 from torchtransient.plugins.edges.topology import Topology
 from torchtransient.plugins.integrators.launch import passes_of, seed_array
-from torchtransient.plugins.mitsuba_compat import is_irradiance_meter
-from torchtransient.plugins.sensors.origin import PrimaryRays, index_at_sensor, sample_rays, views
+from torchtransient.plugins.sensors.origin import PrimaryRays, index_at_sensor, sample_rays, start_at_sensor, views
+from torchtransient.plugins.sensors.seen_from import SensorPlaces
 from torchtransient.plugins.transport.boundary.light import LightPass
 from torchtransient.plugins.transport.boundary.primary import PrimaryPass
 from torchtransient.plugins.transport.boundary.vertex import VertexPass
 from torchtransient.plugins.transport.boundary.weigh import Forward, Reverse
 from torchtransient.plugins.transport.connection.sensor_sampled import SensorSampled
+from torchtransient.plugins.transport.media_contents import is_open
+from torchtransient.plugins.transport.scattering.from_light import FromLight, shades_by_other_normals
 from torchtransient.plugins.transport.world import World
 
 PASSES = {"primary": PrimaryPass, "vertex": VertexPass, "light": LightPass}
@@ -55,14 +57,18 @@ class BoundaryTerm:
         self.candidates = candidates
         self._sampler = world.contents.memory.of("sampler", b"", lambda: mi.load_dict({"type": "independent"}))
         scene, wanted = world.scene, world.wanted
-        self.is_meter = is_irradiance_meter(sensor)
         views_move = wanted.sensor or wanted.light
         moving = frozenset() if views_move else wanted.shapes
         # A sensor at rest sees the edges of what moves alone; behind an edge at rest something else may move.
-        topology = world.contents.memory.of("edges", b"", lambda: Topology(scene))
+        # Paths through media pass open boundaries, which hide nothing.
+        media = world.contents.media
+        hides = None if media is None or not media.open_boundaries else lambda shape: not is_open(shape)
+        topology = world.contents.memory.of("edges", b"", lambda: Topology(scene, hides))
         self.seen_edges = EdgeTable(topology, moving, alone=not views_move)
         self.edges = self.seen_edges if views_move else EdgeTable(topology, moving, alone=False)
         self.radius = dr.opaque(mi.Float, integrator.reference(scene).radius)
+        self.places = SensorPlaces(sensor, film, self.radius)
+        self.is_meter = self.places.is_meter
         with dr.suspend_grad():
             self.light_world = self._light_world()
         self.passes, self.jobs = {}, {}
@@ -76,9 +82,11 @@ class BoundaryTerm:
         """The world of paths that start at a light and are connected to the sensor."""
         world, integrator = self.world, self.integrator
         segment, scattering, _ = integrator.strategies(world.contents)
+        if shades_by_other_normals(world.scene):
+            scattering = FromLight(scattering)
         # Whether the sensor's segment counts in time is asked by its connection: here it is the last one of a path.
         settings = replace(integrator.settings(), camera_unwarp=False)
-        self.to_sensor = SensorSampled(self.sensor, integrator.camera_unwarp)
+        self.to_sensor = SensorSampled(self.places, integrator.camera_unwarp)
         return World(
             world.scene, world.contents, settings, (segment, scattering, [self.to_sensor]), None, world.window
         )
@@ -114,19 +122,12 @@ class BoundaryTerm:
         sampler.seed(job.seed, lanes)
         return sampler
 
-    def numbers_of_sensor(self, sampler):
-        """Random numbers of (aperture, wavelength), constants where the sensor has no use for them."""
-        aperture = sampler.next_2d() if self.sensor.needs_aperture_sample() or self.is_meter else mi.Point2f(0.5)
-        return aperture, sampler.next_1d() if mi.is_spectral else mi.Float(0)
-
     def pixel(self, uv, u):
         """(row, column, weight, whether there is one) of a pixel that sees the place ``uv`` of the film, in pixels,
         chosen by ``u`` of those that the reconstruction filter makes see it.
         """
         size = mi.ScalarVector2f(self.film.crop_size())
         rfilter, weight, cell = self.film.rfilter(), mi.Float(1), dr.floor(uv)
-        if self.is_meter:
-            return mi.UInt32(0), mi.UInt32(0), weight, mi.Bool(True)
         if not rfilter.is_box_filter():
             _, integral = self.film._offset_distribution
             n = int(2 * rfilter.radius()) + 1
@@ -136,12 +137,17 @@ class BoundaryTerm:
         inside = dr.all((cell >= 0) & (cell < size))
         return mi.UInt32(dr.select(inside, cell.y, 0)), mi.UInt32(dr.select(inside, cell.x, 0)), weight, inside
 
-    def rays_at(self, sampler, uv, wavelength, aperture, row, column, job):
+    def rays_at(self, sampler, uv, numbers, row, column, job):
         """Primary rays through places of the film, in pixels, attached to the sensor."""
         world, sensor = self.world, self.sensor
         position = uv / mi.ScalarVector2f(self.film.crop_size())
         seen = views(sensor, position, lambda: self.integrator.reference(world.scene))
         with dr.resume_grad():
-            ray, weight = sample_rays(sensor, seen, sensor.shutter_open(), wavelength, position, aperture)
-            η = index_at_sensor(seen, world.contents.surroundings, world.scene)
-        return PrimaryRays(sampler, ray, weight, dr.opaque(mi.Float, 1 / job.total), row, column, seen, η)
+            ray, weight = sample_rays(sensor, seen, sensor.shutter_open(), numbers.wavelength, position, numbers.aperture)
+            if self.film.curves is not None:
+                ray, weight = self.film.curves.draw(sensor, ray, weight, numbers.wavelength)
+            η, clip = index_at_sensor(seen, world.contents.surroundings, world.scene), None
+            if world.contents.media is not None and world.contents.media.at_sensor is not None:
+                ray, clip = start_at_sensor(seen, ray)
+        scale = dr.opaque(mi.Float, 1 / job.total)
+        return PrimaryRays(sampler, ray, weight, scale, row, column, seen, η, clip=clip)

@@ -68,7 +68,7 @@ class VertexPass:
         # A throughput that is handed to roulette is no larger than one.
         β = attenuated(β, mi.UnpolarizedSpectrum(T) * dr.select(most > 0, dr.rcp(most), 0))
         β = dr.select(active, β, 0)
-        medium = world.segment.medium_towards(b.d, vertex)
+        medium = world.segment.medium_at(world, b.beside, x, world.segment.medium_towards(b.d, vertex), active)
         past = past_edge(world, b, path.ray, medium, β, sampler, active)
         with dr.resume_grad():
             v_x = self._motion(rays, path, before, target, vertex, radius, active)

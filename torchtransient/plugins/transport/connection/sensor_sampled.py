@@ -9,7 +9,6 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.mitsuba_compat import is_irradiance_meter
 from torchtransient.plugins.polarized import (
     intensity,
     product,
@@ -21,30 +20,19 @@ from torchtransient.plugins.transport.strategy import Connection, Event, Proposa
 
 
 class SensorSampled(Connection):
-    """``aperture``: numbers that choose its point (Point2f), set before a launch. ``unwarp``: the segment to the sensor
-    does not count in time. Events carry ``uv``, in pixels.
+    """``places``: :class:`~..sensors.seen_from.SensorPlaces`; ``numbers``: those that choose the sensor's point, set
+    before a launch. ``unwarp``: the segment to the sensor does not count in time. Events carry ``uv``, in pixels.
     """
 
     name = "sensor_sampled"
     finds_light = False
 
-    def __init__(self, sensor, unwarp):
-        self.sensor, self.unwarp, self.aperture = sensor, unwarp, None
-
-    def seen_from(self, at, aperture, active):
-        """(direction sample of the sensor seen from ``at`` (Interaction3f), its importance per area across)."""
-        ds, importance = self.sensor.sample_direction(at, aperture, active)
-        if is_irradiance_meter(self.sensor):
-            # Mitsuba says pi, which the weight of its rays holds already.
-            area = self.sensor.get_shape().surface_area()
-            return ds, dr.select(ds.pdf > 0, dr.inv_pi / (area * ds.pdf), 0)
-        return ds, mi.unpolarized_spectrum(importance)[0]
+    def __init__(self, places, unwarp):
+        self.places, self.unwarp, self.numbers = places, unwarp, None
 
     def propose(self, world, path, vertex, sampler):
         active = world.deep_enough(vertex.goes_on & vertex.connectable, path.depth + 2)
-        ds, importance = self.seen_from(vertex.at, self.aperture, active)
-        ds.dist = dr.norm(ds.p - vertex.at.p)
-        ds.d = (ds.p - vertex.at.p) / ds.dist
+        ds, importance = self.places.seen_from(vertex.at, self.numbers, active)
         return Proposal(d=ds.d, active=active & (ds.pdf > 0), ds=ds, importance=importance, u=sampler.next_2d(),
                         sampler=sampler)  # fmt: skip
 
@@ -56,9 +44,12 @@ class SensorSampled(Connection):
             value = rotate_stokes(value, rotation_between(d, stokes_frame_of(d), stokes_frame_of(-d)))
         value = value * proposal.importance
         active = proposal.active & (dr.max(dr.abs(intensity(value))) > 0)
+        if world.hide_emitters:  # primary rays pass lights
+            active &= ~(vertex.surface & vertex.si.shape.is_emitter())
         length = mi.Float(0) if self.unwarp else ds.dist * vertex.η * answer.eta
         opl = vertex.scattered_τ + mi.Float64(length)
-        active, T = world.segment.transmittance(world, vertex, ds, proposal.u, proposal.sampler, world.counted(active, opl))
+        active = world.counted(active, opl)
+        active, T = world.segment.transmittance(world, vertex, ds, proposal.u, proposal.sampler, active, seen=True)
         return Event(value=value * T, opl=opl, active=active, depth=path.depth + 2, uv=ds.uv, d=ds.d)
 
 

@@ -223,13 +223,26 @@ def sample_free_flight(scene, media, ray, medium, carried, u, lanes, active, fir
 
 
 @dr.syntax
-def transmittance(scene, media, ray, length, medium, numbers, lanes, active):
-    """Transmittance over ``length`` along ``ray``, which starts in ``medium`` and ends before ``ray.maxt``.
+def medium_along(scene, ray, medium, active):
+    """The medium at the end of ``ray``, which starts in ``medium``, whatever is in between."""
+    medium = mi.MediumPtr(medium)
+    pi = scene.ray_intersect_preliminary(ray, active=active)
+    going = active & pi.is_valid()
+    while dr.hint(going, label="through boundaries"):
+        pi, medium = cross_boundary(scene, ray, pi, medium, going)
+        going &= pi.is_valid()
+    return medium
+
+
+@dr.syntax
+def transmittance(scene, media, ray, length, medium, numbers, lanes, active, hide=False):
+    """Transmittance over ``length`` along ``ray``, which starts in ``medium`` and ends before ``ray.maxt``; with
+    ``hide`` light sources are passed, as rays from the sensor pass them.
 
     Returns (per channel, whether nothing is in the way). Analytic in homogeneous media; ratio tracking (Novak et al.
     2014) in others, with random numbers that follow from ``numbers`` of the sampler and the lane.
     """
-    if dr.hint(media.one_stretch, mode="scalar"):
+    if dr.hint(media.one_stretch and not hide, mode="scalar"):
         visible = active & ~scene.ray_test(ray, active)
         inside = visible & (medium != None)  # noqa: E711
         σ_t = medium.get_majorant(medium_interaction(ray, medium, mi.Float(0)), inside)
@@ -247,7 +260,7 @@ def transmittance(scene, media, ray, length, medium, numbers, lanes, active):
             t_end = dr.minimum(pi.t, length)
             collides, t_new, factor = ratio_tracking_step(media, medium, ray, t, t_end, rng, inside)
             T *= factor
-            blocked = pi.is_valid() & ~lets_through(media, ray, pi, False)
+            blocked = pi.is_valid() & ~lets_through(media, ray, pi, hide)
             passes = going & ~collides & pi.is_valid() & ~blocked
             visible &= ~(going & ~collides & blocked)
             t = dr.select(collides, t_new, dr.select(passes, pi.t, t))

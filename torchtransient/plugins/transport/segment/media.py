@@ -21,6 +21,7 @@ from torchtransient.plugins.transport.media_contents import FlightSettings
 from torchtransient.plugins.transport.scattering.geometry_terms import displacement
 from torchtransient.plugins.transport.segment.free_flight import (
     closed_surface,
+    medium_along,
     medium_interaction,
     sample_free_flight,
     transmittance,
@@ -65,15 +66,14 @@ class Media(Vacuum):
         medium = dr.zeros(mi.MediumPtr, dr.width(ray.d))
         if self.settings.at_sensor is not None:
             medium = mi.MediumPtr(self.settings.at_sensor)
-        return self._leg(world, ray, medium, mi.UnpolarizedSpectrum(1), sampler, mi.Bool(True), first=True)
+        return self._leg(world, ray, medium, mi.UnpolarizedSpectrum(1), sampler, mi.Bool(True), True, self.clip)
 
-    def depart(self, world, ray, vertex, β, sampler, active):
+    def depart(self, world, ray, vertex, β, sampler, active, seen=False):
         medium = medium_behind(vertex.si, ray.d, vertex.medium, vertex.surface)
-        return self._leg(world, ray, medium, mi.unpolarized_spectrum(β), sampler, active)
+        return self._leg(world, ray, medium, mi.unpolarized_spectrum(β), sampler, active, first=seen)
 
-    def _leg(self, world, ray, medium, carried, sampler, active, first=False):
+    def _leg(self, world, ray, medium, carried, sampler, active, first=False, clip=None):
         u, lanes = sampler.next_1d(), lane_numbers(sampler)
-        clip = self.clip if first else None
         end = sample_free_flight(world.scene, self.settings, ray, medium, carried, u, lanes, active, first, clip)
         t = end.t
         if self.settings.geometry:
@@ -110,8 +110,8 @@ class Media(Vacuum):
         leg["weight"] = mi.UnpolarizedSpectrum(1)
         if self.settings.recorded:
             leg["begin"] = medium
-        if self.settings.keeps_entry:
-            leg["entry"] = dr.zeros(mi.PreliminaryIntersection3f)
+        if self.settings.keeps_entry:  # not read: nothing is recorded here
+            leg["entry"] = pi
         return leg
 
     def medium_towards(self, d, vertex=None):
@@ -120,15 +120,23 @@ class Media(Vacuum):
         lanes = dr.zeros(mi.MediumPtr, dr.width(d))
         return lanes if self.settings.at_sensor is None else mi.MediumPtr(self.settings.at_sensor)
 
+    def medium_at(self, world, p, start, medium, active):
+        if not self.settings.transitions:
+            return medium
+        ray = mi.Ray3f(start, dr.normalize(p - start))
+        ray.maxt = dr.norm(p - start)
+        return medium_along(world.scene, ray, medium, active)
+
     def share_of_surface(self, leg):
         return dr.select(leg["scatter"], leg["t"] / leg["pi"].t, 1)
 
-    def transmittance(self, world, vertex, ds, u, sampler, active):
+    def transmittance(self, world, vertex, ds, u, sampler, active, seen=False):
         ray = vertex.at.spawn_ray_to(ds.p)
         medium = medium_behind(vertex.si, ds.d, vertex.medium, vertex.surface)
         lanes = lane_numbers(sampler)
-        T, seen = transmittance(world.scene, self.settings, ray, ds.dist, medium, [u.x, u.y], lanes, active)
-        return seen, T
+        hide = seen and self.settings.hide_emitters
+        T, free = transmittance(world.scene, self.settings, ray, ds.dist, medium, [u.x, u.y], lanes, active, hide)
+        return free, T
 
     def next_surface(self, world, ray, active):
         return closed_surface(world.scene, self.settings, ray, active)

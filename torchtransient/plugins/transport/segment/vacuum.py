@@ -86,8 +86,9 @@ class Vacuum(Segment):
         pi = world.scene.ray_intersect_preliminary(ray, coherent=True)
         return behind_area_lights(world.scene, ray, pi) if world.hide_emitters else pi
 
-    def depart(self, world, ray, vertex, β, sampler, active):
-        return world.scene.ray_intersect_preliminary(ray, active=active)
+    def depart(self, world, ray, vertex, β, sampler, active, seen=False):
+        pi = world.scene.ray_intersect_preliminary(ray, active=active)
+        return behind_area_lights(world.scene, ray, pi) if seen and world.hide_emitters else pi
 
     def arrive(self, world, path):
         si, (leg, _) = self.found(path.leg, path.ray, mi.RayFlags.All), self.surface_of(path.leg)
@@ -117,14 +118,21 @@ class Vacuum(Segment):
     def medium_towards(self, d, vertex=None):
         return None
 
+    def medium_at(self, world, p, start, medium, active):
+        return None
+
     def share_of_surface(self, leg):
         return mi.Float(1)
 
     def found(self, leg, ray, flags, active=True):
         return leg.compute_surface_interaction(ray, flags, active)
 
-    def transmittance(self, world, vertex, ds, u, sampler, active):
-        return active & ~world.scene.ray_test(vertex.at.spawn_ray_to(ds.p), active), 1
+    def transmittance(self, world, vertex, ds, u, sampler, active, seen=False):
+        ray = vertex.at.spawn_ray_to(ds.p)
+        if not (seen and world.hide_emitters):
+            return active & ~world.scene.ray_test(ray, active), 1
+        pi = behind_area_lights(world.scene, ray, world.scene.ray_intersect_preliminary(ray, active=active))
+        return active & ~pi.is_valid(), 1
 
     def next_surface(self, world, ray, active):
         return world.scene.ray_intersect_preliminary(ray, active=active)

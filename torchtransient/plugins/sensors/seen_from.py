@@ -1,0 +1,118 @@
+"""Where on the film of a sensor points of the scene are seen: the inverse of its primary rays."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins.mitsuba_compat import is_irradiance_meter, near_clip
+from torchtransient.plugins.sensors.origin import sensors_of
+from torchtransient.plugins.transport.strategy import Local
+
+# Radii of the scene from which what is seen along parallel rays is looked at.
+FAR = 300
+
+
+def can_be_connected(sensor: Any) -> bool:
+    """Return whether rays of a sensor fill a solid angle or a beam in which a point of the scene is found again."""
+    return all(is_irradiance_meter(one) or near_clip(one) is not None for one in sensors_of(sensor))
+
+
+class SensorPlaces:
+    """Places of the film by the points that they see.
+
+    Args:
+        sensor: projective camera, irradiance meter, or a ``batch`` of cameras.
+        film: of the sensor.
+        radius: of the scene.
+
+    Cameras are known by three rays each: on a plane across the axis, places of the film are an affine grid. This holds
+    beyond the film, from where reconstruction filters bring light to its pixels.
+    """
+
+    def __init__(self, sensor: Any, film: Any, radius: Any) -> None:
+        self.sensor, self.radius = sensor, radius
+        self.cameras = sensors_of(sensor)
+        self.is_meter = is_irradiance_meter(sensor)
+        self.size = mi.ScalarVector2f(film.crop_size())
+
+    def numbers(self, sampler: Any) -> Local:
+        """Random numbers that choose (``aperture``, ``wavelength``, ``camera``), constants where there is no choice."""
+        needs_aperture = self.is_meter or any(camera.needs_aperture_sample() for camera in self.cameras)
+        aperture = sampler.next_2d() if needs_aperture else mi.Point2f(0.5)
+        wavelength = sampler.next_1d() if mi.is_spectral else mi.Float(0)
+        camera, count = mi.UInt32(0), len(self.cameras)
+        if count > 1:
+            camera = dr.minimum(mi.UInt32(sampler.next_1d() * count), count - 1)
+        return Local(aperture=aperture, wavelength=wavelength, camera=camera)
+
+    def middle(self, numbers: Any) -> Any:
+        """The middle of the film of the chosen camera, in pixels."""
+        return mi.Point2f((mi.Float(numbers.camera) + 0.5) / len(self.cameras), 0.5) * self.size
+
+    def seen_from(self, at: Any, numbers: Any, active: Any) -> tuple[Any, Any]:
+        """Return (where the sensor sees ``at`` (Interaction3f), its importance there per area across).
+
+        The first: ``uv`` (in pixels), ``p`` (the sensor's point), ``eye`` (a point on the line of sight from which
+        everything near is seen as by the sensor), ``d, dist`` (to ``p``), ``pdf`` (zero where nothing is seen).
+        """
+        if self.is_meter:
+            return self._seen_from_meter(at, numbers, active)
+        result, count = None, len(self.cameras)
+        for number, camera in enumerate(self.cameras):
+            found = self._seen_from_camera(camera, at.p, numbers.aperture)
+            if count > 1:  # rays beyond the rim of a child's film are those of the next child
+                found.valid &= dr.all((found.uv >= 0) & (found.uv <= 1))
+                found.uv.x = (found.uv.x + number) / count
+            if result is None:
+                result = found
+                continue
+            chosen = numbers.camera == number
+            for name, value in vars(found).items():
+                setattr(result, name, dr.select(chosen, value, getattr(result, name)))
+        valid = active & result.valid & dr.isfinite(result.importance)
+        way = result.p - at.p
+        dist = dr.norm(way)
+        ds = Local(uv=result.uv * self.size, p=result.p, eye=result.eye, d=way / dist, dist=dist, pdf=dr.select(valid, 1.0, 0.0))
+        return ds, dr.select(valid, result.importance, 0)
+
+    def _seen_from_camera(self, camera: Any, p: Any, aperture: Any) -> Local:
+        axis = mi.Vector3f(camera.world_transform() @ mi.Vector3f(0, 0, 1))
+        scale = dr.norm(axis)
+        axis /= scale
+        near, far = near_clip(camera) * scale, camera.far_clip() * scale
+        starts, ways = [], []
+        for place in ((0, 0), (1, 0), (0, 1)):
+            ray, _ = camera.sample_ray_differential(camera.shutter_open(), 0.5, mi.Point2f(*place), aperture)
+            way = ray.d / dr.dot(ray.d, axis)
+            starts.append(mi.Point3f(ray.o - way * near))
+            ways.append(mi.Vector3f(way))
+        depth = dr.dot(p - starts[0], axis)
+        corner, right, up = (start + way * depth for start, way in zip(starts, ways, strict=True))
+        right, up, at = right - corner, up - corner, p - corner
+        n = dr.cross(right, up)
+        area = dr.norm(n)
+        n /= dr.square(area)
+        uv = mi.Point2f(dr.dot(dr.cross(at, up), n), dr.dot(dr.cross(right, at), n))
+        o = starts[0] + (starts[1] - starts[0]) * uv.x + (starts[2] - starts[0]) * uv.y
+        way = p - o
+        cos = dr.dot(way, axis) / dr.norm(way)
+        # Parallel rays start at different points and have no eye.
+        eye = o
+        if camera.class_name() == "OrthographicCamera":
+            eye = o - way / dr.norm(way) * (FAR * self.radius)
+        return Local(uv=uv, p=o, eye=mi.Point3f(eye), importance=dr.rcp(area * cos), valid=(depth > near) & (depth < far))
+
+    def _seen_from_meter(self, at: Any, numbers: Any, active: Any) -> tuple[Any, Any]:
+        ps = self.sensor.get_shape().sample_position(at.time, numbers.aperture, active)
+        way = ps.p - at.p
+        dist = dr.norm(way)
+        d = way / dist
+        cos = -dr.dot(ps.n, d)
+        valid = active & (cos > 0)
+        ds = Local(uv=numbers.aperture * self.size, p=mi.Point3f(ps.p), eye=mi.Point3f(ps.p), d=d, dist=dist, pdf=dr.select(valid, 1.0, 0.0))
+        ds.n = mi.Normal3f(ps.n)
+        # The weight of its rays holds a pi.
+        return ds, dr.select(valid, cos * dr.inv_pi / dr.square(dist), 0)
