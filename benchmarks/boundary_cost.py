@@ -45,7 +45,7 @@ import torch
 
 from torchtransient.errors import GradientError, TorchTransientWarning
 from torchtransient.testing.closed_rooms import ROOMS
-from torchtransient.testing.edge_derivatives import PASSES, EdgeProblem, choose_passes
+from torchtransient.testing.edge_derivatives import PASSES, EdgeProblem, choose_passes, components, pixel_weights
 from torchtransient.testing.moving_edges import CASES, CONCAVE, QUICK, MovingEdge, histograms, plain_plate
 from torchtransient.testing.moving_shapes import BODIES, CHANGES, PLACES, moving_shape
 
@@ -165,6 +165,8 @@ def cases(options: argparse.Namespace) -> Result:
         try:
             found[name] = measure_case(name, options)
             print(line_of_case(name, found[name]), flush=True)
+            if options.layer:
+                found[name]["layer"] = by_layer(CASES[name], found[name], options)
         except Exception as failure:  # noqa: BLE001 - printed; the other cases are measured
             traceback.print_exc()
             found[name] = {"failed": f"{type(failure).__name__}: {failure}"}
@@ -180,7 +182,7 @@ def cases(options: argparse.Namespace) -> Result:
 class LayerProblem:
     """A case as a function of torch tensors: its loss, derivative and differences by ``tt.TransientRenderer``."""
 
-    def __init__(self, case: MovingEdge, film: Result | None = None, **settings: Any) -> None:
+    def __init__(self, case: MovingEdge, **settings: Any) -> None:
         self.case, self.key = case, case.key
         self.renderer = tt.TransientRenderer(tt.load(case.scene(), variant=case.variant), [case.key], **settings)
         self.base = self.renderer.values[case.key].detach().clone()
@@ -204,12 +206,9 @@ class LayerProblem:
             weights = (axis - mean if self.case.weights == "arrival" else torch.sin(3 * axis)) / light
         else:
             weights = torch.sin(3 * axis)
-        self.weights = weights.float()[:, None, None]
-        if self.case.weights == "random":
-            film = self.transient(0.0, 0, 1).shape[-2:]
-            self.weights = self.weights * torch.as_tensor(
-                np.random.default_rng(1).uniform(0.3, 1.0, tuple(film)).astype(np.float32)
-            )
+        channels, _, height, width = self.transient(0.0, 0, 1).shape
+        shares = torch.as_tensor(components(channels) * pixel_weights(self.case, height, width)).permute(3, 2, 0, 1)
+        self.weights = weights.float()[:, None, None] * shares.float()
 
     def loss(self, x: Any, seed: int, spp: int) -> torch.Tensor:
         return (self.transient(x, seed, spp) * self.weights).sum()
@@ -223,6 +222,18 @@ class LayerProblem:
         h = step or self.case.step
         with torch.no_grad():
             return float(self.loss(h, seed, spp) - self.loss(-h, seed, spp)) / (2 * h)
+
+
+def by_layer(case: MovingEdge, parts: Result, options: argparse.Namespace) -> Result | None:
+    """The derivative as a user has it, beside the sum of its parts; None of films that are no histograms."""
+    if case.scene()["sensor"]["film"]["type"] != "transient_hdr_film":
+        return None
+    problem = LayerProblem(case)
+    problem.weigh()
+    found = np.array([problem.reverse(400 + seed, options.spp) for seed in range(options.seeds)])
+    z = z_score(found, np.array(parts["total"]["runs"]))
+    print(f"    by the layer: {pair(found)}, z {z:+.1f}", flush=True)
+    return row(found) | {"z": z}
 
 
 DEPTHS = {"meter": (2, 3, 8), "far": (3, 4), "near": (4,), "far_small_lamp": (3, 4), "lamp": (3,), "piston": (3,)}
@@ -511,6 +522,7 @@ def parsed() -> argparse.Namespace:
     for name in ("room", "cases", "sweep"):
         adders[name].add_argument("--step", type=float, help="of differences, the case's own if not given")
     adders["cases"].add_argument("names", nargs="*", metavar="NAMES", help=", ".join(CASES))
+    adders["cases"].add_argument("--layer", action="store_true", help="by tt.TransientRenderer as well")
     adders["cases"].add_argument("--share", type=float, help="edge samples for each path")
     numbers(adders["cases"], spp=512, fd_spp=2048, seeds=6)
     adders["room"].add_argument("names", nargs="*", metavar="NAMES", help=", ".join(ROOMS))

@@ -24,6 +24,18 @@ def choose_passes(integrator: Any, passes: tuple[str, ...], spp: int | None = No
     integrator.boundary, integrator.boundary_passes, integrator.spp_boundary = bool(passes), tuple(passes), spp
 
 
+def pixel_weights(case: MovingEdge, height: int, width: int) -> Array:
+    """Weights (H, W, 1, 1) of the pixels in a case's loss."""
+    if case.weights != "random":
+        return np.ones((height, width, 1, 1))
+    return np.random.default_rng(1).uniform(0.3, 1.0, (height, width, 1, 1))
+
+
+def components(channels: int) -> Array:
+    """Weights (C,) of the channels in a loss, which differ."""
+    return np.resize([1.0, 0.3, -0.5, 0.8, 0.2, -0.9], channels)
+
+
 class EdgeProblem:
     """A case, loaded once. The loss weighs bins by sin(3 opl) and pixels by fixed numbers between 0.3 and 1."""
 
@@ -41,12 +53,9 @@ class EdgeProblem:
         self._direction = np.asarray(case.direction(self._base), np.float64)
         height, width, *_, bins, channels = self.film.cube_shape()
         opl = self.film.start_opl + (np.arange(bins) + 0.5) * getattr(self.film, "bin_width_opl", 0.04)
-        pixels = np.ones((height, width, 1, 1))
-        if case.weights == "random":
-            pixels = np.random.default_rng(1).uniform(0.3, 1.0, (height, width, 1, 1))
-        components = np.resize([1.0, 0.3, -0.5, 0.8, 0.2, -0.9], channels)
+        shares = pixel_weights(case, height, width) * components(channels)
         # (H, W, T, C)
-        self.weights = (np.sin(3 * opl)[:, None] * pixels * components).astype(np.float32)
+        self.weights = (np.sin(3 * opl)[:, None] * shares).astype(np.float32)
         # The first look fixes the sphere around the scene, which distant lights are timed by.
         self.integrator.reference(self.scene)
 

@@ -670,14 +670,16 @@ def at_depth(description: Description, depth: int) -> Description:
     return description | {"integrator": description["integrator"] | {"max_depth": depth}}
 
 
-def _noisy(make: Callable[[], Description], key: str, direction: Direction, step: float) -> Callable[[int], MovingEdge]:
-    return lambda depth: MovingEdge(lambda: at_depth(make(), depth), key, direction, step)
+def _noisy(
+    make: Callable[[], Description], key: str, direction: Direction, step: float, **more: Any
+) -> Callable[[int], MovingEdge]:
+    return lambda depth: MovingEdge(lambda: at_depth(make(), depth), key, direction, step, **more)
 
 
 # By depth: shapes whose parts see each other from near by.
 CONCAVE: dict[str, Callable[[int], MovingEdge]] = {
-    "grooves15": _noisy(lambda: groove_field(15.0), "body.to_world", moved(0.0, 0.0, 1.0), 0.005),
-    "grooves30": _noisy(lambda: groove_field(30.0), "body.to_world", moved(0.0, 0.0, 1.0), 0.005),
+    "grooves15": _noisy(lambda: groove_field(15.0), "body.to_world", moved(0.0, 0.0, 1.0), 0.005, weights="even"),
+    "grooves30": _noisy(lambda: groove_field(30.0), "body.to_world", moved(0.0, 0.0, 1.0), 0.005, weights="even"),
     "torus": _noisy(CASES["torus4"].scene, "torus.vertex_positions", _PLATE, 0.0005),
     "star": _noisy(
         lambda: before_wall(star(), point(0.7, 0.4, 3.8), 5.0, 0.06), "body.to_world", moved(1.0, 0.0, 0.0), 0.005
