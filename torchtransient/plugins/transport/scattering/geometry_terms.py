@@ -9,6 +9,11 @@ from torchtransient.plugins.transport.instances import surface_interaction
 from torchtransient.plugins.transport.strategy import Local
 
 
+# Cosines under which a surface is seen edge-on: its points slide along a ray by one over the cosine, which is rounding
+# there. What is left out of derivatives is as rare as the cosine is small.
+EDGE_ON = 1e-4
+
+
 def distance(p, q, active):
     """Distance from ``p`` to ``q``, 1 where inactive."""
     return dr.norm(dr.select(active, q - p, mi.Vector3f(0, 0, 1)))
@@ -60,7 +65,7 @@ def slide(drag, d, n, active):
     ``drag``, across its direction.
     """
     cos = dr.dot(n, d)
-    return drag - d * (dr.dot(n, drag) * dr.select(active & (cos != 0), dr.rcp(cos), 0))
+    return drag - d * (dr.dot(n, drag) * dr.select(active & (dr.abs(cos) > EDGE_ON), dr.rcp(cos), 0))
 
 
 class DampedMotion(Local):
@@ -116,7 +121,7 @@ def damped_motion(δ, d, r, n, active, radius, nailed=None, volume=None):
         if unbound is not None:
             slope = dr.select(unbound, 0, slope)
     cos = dr.dot(n, d)
-    per_cos = dr.select(active & (cos != 0), dr.rcp(cos), 0)
+    per_cos = dr.select(active & (dr.abs(cos) > EDGE_ON), dr.rcp(cos), 0)
     along = dr.dot(δ, d)
     across = dr.select(active, δ - d * along, mi.Vector3f(0))
     J = 1 + dr.dot(δ, dr.select(active, slope * per_cos * n + (2 * W - slope) * d, mi.Vector3f(0)))

@@ -16,6 +16,7 @@ from torchtransient.plugins.polarized import (
     scatter_unpolarized,
 )
 from torchtransient.plugins.transport.carry import Carry, slope_only
+from torchtransient.plugins.transport.scattering.geometry_terms import EDGE_ON
 from torchtransient.plugins.transport.strategy import Answer, Local, Scattering, Step
 
 # Number of a triangle where any will do.
@@ -287,6 +288,9 @@ class Surface(Scattering):
             counts &= ~r["black"] | is_black(towards.value)
         inv_pdf = dr.select(counts, v.rr / pdf, 0)
         weight = rotate_mueller(towards.value, vertex.rotation, rotation_from_light(si, towards.wo, out, following.d))
+        if wanted.geometry:
+            # Of a cosine that was sampled the value changes by one over it, which is rounding edge-on.
+            weight = dr.select(dr.abs(dr.detach(towards.wo.z)) < EDGE_ON, dr.detach(weight), weight)
         weight = dr.select(smooth, weight * (inv_pdf * J), 0)
         eta = dr.select(smooth, towards.eta, 1)
         o, d, w = mi.Point3f(drag), mi.Vector3f(0), dr.select(ahead, out, 0)

@@ -13,6 +13,7 @@ from torchtransient.plugins.transport.contents import DAMPING
 from torchtransient.plugins.transport.derivative.vertex import AttachedVertex, VertexEnd
 from torchtransient.plugins.transport.instances import surface_interaction
 from torchtransient.plugins.transport.scattering.geometry_terms import (
+    EDGE_ON,
     damped_motion,
     displacement,
     material_point,
@@ -172,6 +173,10 @@ class Vacuum(Segment):
         si = surface_interaction(world.surfaces, v.pi, ray, mi.RayFlags.All, active)
         if wanted.plain:  # an attached ray would have every shape differentiated
             si.p = si.p + slide(displacement(carry.o, active), v.ray.d, dr.detach(si.n), active)
+        if wanted.geometry:
+            with dr.suspend_grad():
+                edge_on = dr.abs_dot(si.n, v.ray.d) < EDGE_ON
+            si = dr.select(edge_on, dr.detach(si), si)
         return si
 
     def arrived(self, world, v, carry, ray, si, wanted):
