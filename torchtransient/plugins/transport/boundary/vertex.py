@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.polarized import attenuated, product
+from torchtransient.plugins.sensors.seen_from import sees_one_line
 from torchtransient.plugins.transport.boundary.sides import both_sides, past_edge
 from torchtransient.plugins.transport.boundary.speeds import along_the_ray, behind, dragged, sides_from, slides
 from torchtransient.plugins.transport.contents import DAMPING
@@ -17,7 +18,8 @@ class VertexPass:
     """A path is traced to a vertex x, chosen uniformly of those that may have one after them; an edge point seen from
     there is chosen of several candidates in proportion to its span over the squared distance (resampling, Talbot et al.
     2005). Vertices behind the edge are points of their shapes, so that only outlines matter, and of them the outer side,
-    but for what is near x and dragged along.
+    but for what is near x and dragged along. Lights past edges are found by the pass of the lights, or here where paths
+    of lights do not find the sensor.
     """
 
     def __init__(self, term):
@@ -26,13 +28,14 @@ class VertexPass:
     @staticmethod
     def exists(world, sensor):
         """Return whether paths have two vertices."""
-        return world.max_depth > 2
+        return world.max_depth > (1 if sees_one_line(sensor) else 2)
 
     def run(self, mode, job):
         """Trace the samples of ``job``; returns the objective of reverse mode."""
         term = self.term
         world, edges = term.world, term.edges
-        vertices = world.max_depth - 2
+        finds_light = sees_one_line(term.sensor)
+        vertices = world.max_depth - (1 if finds_light else 2)
         rays = term.integrator.start(world.scene, world.contents, term.sensor, term.film, job)
         world.start(rays)
         view, sampler, ray = mode.view(rays), rays.sampler, dr.detach(rays.ray)
@@ -73,8 +76,8 @@ class VertexPass:
             speeds = sides_from(world, b, edges, v_x, behind(world, b, *past, active), radius, active)
         first = {
             "ray": path.ray, "β": β, "η": η, "τ": τ, "prev_p": x, "prev_n": vertex.at.n,
-            # Emission past the edge is found by the pass of the lights.
-            "prev_pdf": mi.Float(0), "prev_unconnected": mi.Bool(False), "depth": target + 1, "active": active,
+            # Without a density there is no emission past the edge.
+            "prev_pdf": mi.Float(finds_light), "prev_unconnected": mi.Bool(finds_light), "depth": target + 1, "active": active,
             "medium": medium,
         }  # fmt: skip
         return both_sides(world, mode, sampler, view, b, past, first, factor, speeds, (near, ~b.crease | near))
