@@ -20,6 +20,11 @@ def can_be_connected(sensor: Any) -> bool:
     return all(is_irradiance_meter(one) or near_clip(one) is not None for one in sensors_of(sensor))
 
 
+def sees_one_line(sensor: Any) -> bool:
+    """Return whether each sensor sees along one ray, which no edge meets but for moments."""
+    return all(one.class_name() == "RadianceMeter" for one in sensors_of(sensor))
+
+
 class SensorPlaces:
     """Places of the film by the points that they see.
 

@@ -29,7 +29,8 @@ class LightPass:
     def __init__(self, term):
         self.term = term
         self.lights = EmitterSampled()
-        self.lights.prepare(term.world)
+        with dr.resume_grad():
+            self.lights.prepare(term.world)
 
     @staticmethod
     def exists(world, sensor):
@@ -122,10 +123,13 @@ class LightPass:
             δ = displacement(rays.ray.o + rays.ray.d * r, active)
             q, cos = dr.dot(n, along_the_ray(world, pi, ray, surface)), dr.dot(n, w)
             first = δ + w * dr.select(surface & (cos != 0), (q - dr.dot(n, δ)) / cos, 0)
-        n_p, found = dr.dot(b.n, edges.moving(b)), []
+        n_p, found, turned = dr.dot(b.n, edges.moving(b)), [], mi.Float(0)
+        if self.lights.sun is not None:  # its rays turn about x
+            sun = active & light.far & self.lights.sun.shines(light.ds.emitter, light.ds.d)
+            turned = behind * dr.dot(b.n, displacement(self.lights.sun.followed(mi.Vector3f(light.ds.d), sun), sun))
         for v_x in (first, held):
             v_y = self._motion(light, x.at.p, v_x, active & ~light.far)
-            found.append(dr.select(active, n_p - (1 - t) * dr.dot(b.n, v_x) - t * dr.dot(b.n, v_y), 0))
+            found.append(dr.select(active, n_p - (1 - t) * dr.dot(b.n, v_x) - t * dr.dot(b.n, v_y) - turned, 0))
         return found
 
     def _motion(self, light, x, v_x, active):

@@ -12,13 +12,17 @@ import mitsuba as mi
 from torchtransient.plugins.mitsuba_compat import (
     attribute_name,
     has_surface,
+    has_vertices,
     is_bump_map,
     is_instance,
+    is_sphere,
     lacks_edges,
 )
-from torchtransient.plugins.node_walk import objects_below, shapes_of_scene
+from torchtransient.plugins.node_walk import bsdfs_of_scene, objects_below, shapes_of_scene
 from torchtransient.plugins.parameter_effect import CORRECT, ParameterEffect
-from torchtransient.plugins.sensors.seen_from import can_be_connected
+from torchtransient.plugins.sampling.area_elements import has_shading_normals
+from torchtransient.plugins.sensors.seen_from import can_be_connected, sees_one_line
+from torchtransient.plugins.transport.media_contents import is_open
 
 # Roles of what moves edges against what is behind them, and of what bends light, which moves edges that are seen
 # through it.
@@ -80,6 +84,8 @@ class MovingEdges:
             # Of what an instance shows, Mitsuba says nothing; a sensor sees everything move.
             alone = effect.role != "sensor" and isinstance(node, mi.Shape) and not is_instance(node)
             found += self._jumps(node if alone else None)
+            if moves:
+                found += self._horizons(node if alone else None)
         return tuple(dict.fromkeys(found))
 
     def reason(self, node: Any, key: str, effect: ParameterEffect) -> str:
@@ -107,6 +113,18 @@ class MovingEdges:
         return (Gap(where, "Take a smooth texture there, of filter_type 'bilinear'."),)
 
 
+    def _horizons(self, shape: Any) -> tuple[Gap, ...]:
+        """The gap of meshes with interpolated normals, which are black where these face away from who looks."""
+        if self._scene is None:
+            return ()
+        shapes = shapes_of_scene(self._scene) if shape is None else [shape]
+        names = [_name(one) for one in shapes if has_surface(one) and _has_horizon(one)]
+        if not names:
+            return ()
+        where = f"at the rims of meshes with normals at their vertices, where these face away ({_listed(names)})"
+        return (Gap(where, "Set face_normals to true there, or take a finer mesh."),)
+
+
 def missing(reason: str, remedy: str) -> MovingEdges:
     """Return the answer of an integrator that computes no boundary term for a ``reason``."""
     gap = Gap(f"where silhouettes move ({reason})", remedy)
@@ -127,7 +145,20 @@ def moving_edges(scene: Any, sensors: Sequence[Any]) -> MovingEdges:
     if rims := [emitter.get_shape() or emitter for emitter in scene.emitters() if _has_rim(emitter)]:
         where = f"at the rim of the light of {_listed([_name(one) for one in rims])}"
         always.append(Gap(where, "Let the light fade out, by a beam_width below the cutoff_angle for instance."))
-    if smooth := [shape for shape in filter(has_surface, shapes_of_scene(scene)) if _has_delta_lobe(shape)]:
+    for sensor in scene.sensors():
+        if sees_one_line(sensor):
+            if lights := [emitter for emitter in scene.emitters() if _is_met_by_connections_alone(emitter)]:
+                names = _listed([_name(one.get_shape() or one) for one in lights])
+                where = f"at the edges of shadows of {names} that the sensor {_name(sensor)} sees"
+                always.append(Gap(where, "Take an area light that is no sphere, or a camera of one small pixel."))
+        elif not can_be_connected(sensor):
+            where = f"what the sensor {_name(sensor)} sees of edges"
+            always.append(Gap(where, "Take a perspective, thinlens or orthographic camera, or an irradiancemeter."))
+    if delayed := [bsdf for bsdf in bsdfs_of_scene(scene) if getattr(bsdf, "shift", None) is not None]:
+        where = f"in light of other wavelengths at the edges of shadows on {_listed([_name(one) for one in delayed])}"
+        always.append(Gap(where, "Keep edges that move out of the light of what fluoresces."))
+    shapes = [shape for shape in shapes_of_scene(scene) if has_surface(shape) and not _passes_through_media(shape)]
+    if smooth := [shape for shape in shapes if _has_delta_lobe(shape)]:
         names = _listed([_name(shape) for shape in smooth])
         where = f"where edges are seen in mirrors or through smooth glass, masks and open boundaries ({names})"
         bent.append(Gap(where, "Take a rough surface in place of the smooth one, or keep edges out of its view."))
@@ -137,6 +168,23 @@ def moving_edges(scene: Any, sensors: Sequence[Any]) -> MovingEdges:
 def shapes_without_edges(scene: Any) -> list[Any]:
     """Return the shapes of a scene with outlines that the table of edges does not hold."""
     return [shape for shape in shapes_of_scene(scene) if lacks_edges(shape)]
+
+
+def _passes_through_media(shape: Any) -> bool:
+    """Whether paths pass a shape as an open boundary of a medium."""
+    return bool(shape.is_medium_transition()) and is_open(shape)
+
+
+def _is_met_by_connections_alone(emitter: Any) -> bool:
+    """Whether derivatives of light are those of connections: of points, directions and spheres."""
+    delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
+    shape = emitter.get_shape()
+    return bool(mi.has_flag(emitter.flags(), delta)) or (shape is not None and is_sphere(shape))
+
+
+def _has_horizon(shape: Any) -> bool:
+    """Whether a mesh hides places with its interpolated normals."""
+    return has_vertices(shape) and shape.has_vertex_normals() and has_shading_normals(shape)
 
 
 def _has_delta_lobe(shape: Any) -> bool:

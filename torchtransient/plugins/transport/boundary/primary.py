@@ -36,6 +36,9 @@ class PrimaryPass:
         b = edges.seen_from(k, mi.Point3f(eye.eye), mi.Bool(True))
         ds, importance = term.places.seen_from(at_point(b.p), numbers, b.valid)
         row, column, weight, inside = term.pixel(ds.uv, sampler.next_2d())
+        own, share = mode.kept(row)
+        inside &= own
+        row, column = dr.select(inside, row, job.first_row), dr.select(inside, column, 0)
         rays = term.rays_at(sampler, ds.uv, numbers, row, column, job)
         view, ray = mode.view(rays), dr.detach(rays.ray)
         if term.is_meter:
@@ -46,7 +49,7 @@ class PrimaryPass:
         medium = world.segment.medium_at(world, b.beside, ray.o, world.segment.medium_towards(b.d), active)
         place, to_sensor = place_at(b.beside, ray, medium), Local(p=ray.o, d=-b.d, dist=way)
         active, T = world.segment.transmittance(world, place, to_sensor, sampler.next_2d(), sampler, active, seen=True)
-        factor = importance * b.sin * b.inv_pdf * weight
+        factor = importance * b.sin * b.inv_pdf * weight * share
         β = attenuated(mi.Spectrum(1), mi.UnpolarizedSpectrum(T))
         past = past_edge(world, b, ray, medium, β, sampler, active, seen=True)
         held = term.is_meter and not world.wanted.sensor

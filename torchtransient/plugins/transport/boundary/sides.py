@@ -18,7 +18,7 @@ def past_edge(world, b, ray, medium, β, sampler, active, seen=False):
     return past, dr.select(b.crease, world.segment.ends_at(b.facing, medium), leg)
 
 
-def both_sides(world, mode, sampler, view, b, past, first, factor, speeds, needed):
+def both_sides(world, mode, sampler, view, b, past, first, factor, speeds, needed, lit=None):
     """Trace the two sides of the outlines ``b``.
 
     Args:
@@ -26,6 +26,7 @@ def both_sides(world, mode, sampler, view, b, past, first, factor, speeds, neede
         first: fields of the paths at x: ``ray`` and those of :class:`~..walk.Path`.
         factor: detached weight of a sample; ``speeds``: attached (inner, outer).
         needed: masks (inner, outer) of the sides that can have a speed.
+        lit: masks (inner, outer) of the sides whose own emission counts, in full; None: as ``first`` says.
 
     Returns:
         In reverse mode the attached objective.
@@ -37,11 +38,15 @@ def both_sides(world, mode, sampler, view, b, past, first, factor, speeds, neede
     sides = (near, world.segment.ends_at(b.inner, first["medium"])), past
     fields = {key: value for key, value in first.items() if key != "medium"}
     objective = mi.Float(0)
-    for sign, (ray, leg), speed, need in zip((1, -1), sides, mode.speeds(speeds), needed, strict=True):
+    for k, ((ray, leg), speed, need) in enumerate(zip(sides, mode.speeds(speeds), needed, strict=True)):
+        sign = 1 - 2 * k
         path = start(world, ray, mi.Float64(0), 1)
         for key, value in fields.items():
             setattr(path, key, type(getattr(path, key))(value))
         path.leg, path.active = leg, active & need
+        if lit is not None:
+            path.prev_unconnected = mi.Bool(lit[k])
+            path.prev_pdf = dr.select(path.prev_unconnected, mi.Float(1), 0)
         # The same random numbers on both sides.
         value = mode.traced(world, sampler.clone(), path, view, dr.select(need, sign * factor, 0), speed)
         if value is not None:

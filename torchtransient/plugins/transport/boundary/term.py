@@ -94,7 +94,8 @@ class BoundaryTerm:
     def tables(self):
         """The attached ends of edges, and what the strategies of light paths have attached."""
         ends = {id(end): end for edges in (self.seen_edges, self.edges) for end in edges.ends}
-        return [end for end in ends.values() if dr.grad_enabled(end)]
+        lights = self.passes["light"].lights.tables() if "light" in self.passes else []
+        return [table for table in (*ends.values(), *lights) if dr.grad_enabled(table)]
 
     def backward(self, incoming):
         """Back-propagate to the parameters and the tables."""

@@ -5,7 +5,9 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins.mitsuba_compat import is_sphere
 from torchtransient.plugins.polarized import attenuated, product
+from torchtransient.plugins.sensors.seen_from import sees_one_line
 from torchtransient.plugins.transport.boundary.sides import both_sides, past_edge
 from torchtransient.plugins.transport.boundary.speeds import along_the_ray, behind, dragged, sides_from, slides
 from torchtransient.plugins.transport.contents import DAMPING
@@ -13,11 +15,16 @@ from torchtransient.plugins.transport.strategy import Local, Proposal
 from torchtransient.plugins.transport.walk import advance, start
 
 
+# Probability of the last vertex, which only sees the rims of near lights.
+_SELDOM = 0.1
+
+
 class VertexPass:
     """A path is traced to a vertex x, chosen uniformly of those that may have one after them; an edge point seen from
     there is chosen of several candidates in proportion to its span over the squared distance (resampling, Talbot et al.
     2005). Vertices behind the edge are points of their shapes, so that only outlines matter, and of them the outer side,
-    but for what is near x and dragged along.
+    but for what is near x and dragged along, lights included. Lights past edges are found by the pass of the lights, or
+    here where paths of lights do not find the sensor.
     """
 
     def __init__(self, term):
@@ -26,17 +33,17 @@ class VertexPass:
     @staticmethod
     def exists(world, sensor):
         """Return whether paths have two vertices."""
-        return world.max_depth > 2
+        return world.max_depth > (1 if sees_one_line(sensor) or _has_lights_with_rims(world) else 2)
 
     def run(self, mode, job):
         """Trace the samples of ``job``; returns the objective of reverse mode."""
         term = self.term
         world, edges = term.world, term.edges
-        vertices = world.max_depth - 2
+        finds_light = sees_one_line(term.sensor)
         rays = term.integrator.start(world.scene, world.contents, term.sensor, term.film, job)
         world.start(rays)
         view, sampler, ray = mode.view(rays), rays.sampler, dr.detach(rays.ray)
-        target = dr.minimum(mi.UInt32(sampler.next_1d() * vertices), vertices - 1)
+        target, inv_pmf = self._target(sampler.next_1d(), finds_light)
         path = start(world, ray, term.integrator.first_opl(term.film, rays), dr.detach(rays.η))
         path.leg = world.segment.first(world, ray, sampler)
         pi, _ = world.segment.surface_of(path.leg)
@@ -64,7 +71,7 @@ class VertexPass:
         end = Local(p=b.beside, d=dr.normalize(b.beside - x), dist=dr.norm(b.beside - x))
         active = b.valid & (most > 0) & dr.isfinite(most)
         active, T = world.segment.transmittance(world, vertex, end, sampler.next_2d(), sampler, active)
-        factor = most * vertices * b.sin * b.inv_pdf / dr.square(b.dist)
+        factor = most * inv_pmf * b.sin * b.inv_pdf / dr.square(b.dist)
         # A throughput that is handed to roulette is no larger than one.
         β = attenuated(β, mi.UnpolarizedSpectrum(T) * dr.select(most > 0, dr.rcp(most), 0))
         β = dr.select(active, β, 0)
@@ -75,11 +82,38 @@ class VertexPass:
             speeds = sides_from(world, b, edges, v_x, behind(world, b, *past, active), radius, active)
         first = {
             "ray": path.ray, "β": β, "η": η, "τ": τ, "prev_p": x, "prev_n": vertex.at.n,
-            # Emission past the edge is found by the pass of the lights.
-            "prev_pdf": mi.Float(0), "prev_unconnected": mi.Bool(False), "depth": target + 1, "active": active,
-            "medium": medium,
+            "depth": target + 1, "active": active, "medium": medium,
         }  # fmt: skip
-        return both_sides(world, mode, sampler, view, b, past, first, factor, speeds, (near, ~b.crease | near))
+        # Elsewhere a density of zero leaves out emission.
+        dragged_along = b.dist < radius
+        lit = finds_light | (dragged_along & self._is_dragged(b.inner.shape))
+        lit = lit, finds_light | (dragged_along & b.crease & self._is_dragged(b.facing.shape))
+        return both_sides(world, mode, sampler, view, b, past, first, factor, speeds, (near, ~b.crease | near), lit)
+
+    def _target(self, u, finds_light):
+        """(number of a vertex, one over its probability). The last vertex, after which there is nothing but emission, is
+        chosen seldom where only lights with rims are of use to it.
+        """
+        world = self.term.world
+        if finds_light:
+            count = world.max_depth - 1
+            return dr.minimum(mi.UInt32(u * count), count - 1), mi.Float(count)
+        count, seldom = world.max_depth - 2, _SELDOM
+        if not _has_lights_with_rims(world):
+            return dr.minimum(mi.UInt32(u * count), count - 1), mi.Float(count)
+        if count == 0:
+            return dr.zeros(mi.UInt32, dr.width(u)), mi.Float(1)
+        last = u < seldom
+        number = dr.minimum(mi.UInt32((u - seldom) * (count / (1 - seldom))), count - 1)
+        return dr.select(last, mi.UInt32(count), number), dr.select(last, 1 / seldom, count / (1 - seldom))
+
+    def _is_dragged(self, shape):
+        """Mask of lights of which derivatives drag near points along with who sees them."""
+        world = self.term.world
+        mask = shape.is_emitter()
+        if world.wanted.sphere_lights:
+            mask &= ~world.contents.sphere_lights.lists(shape.emitter())
+        return mask
 
     def _motion(self, rays, path, before, target, vertex, radius, active):
         """Attached motion of x, as interior derivatives hold it."""
@@ -116,6 +150,14 @@ class VertexPass:
         inside = along_the_ray(world, pi, primary, active & ~vertex.surface) * share
         inside += displacement_of(primary.o, first) * (1 - share)
         return dr.select(active, dr.select(vertex.surface, v, inside), 0)
+
+
+def _has_lights_with_rims(world):
+    """Whether there are area lights other than spheres."""
+    return any(
+        mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface) and not is_sphere(emitter.get_shape())
+        for emitter in world.scene.emitters()
+    )
 
 
 def displacement_of(p, active):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins.films.block import FilmBlock
 from torchtransient.plugins.transport.carry import total_of
 from torchtransient.plugins.transport.derivative.forward import tangents_of
 from torchtransient.plugins.transport.sinks.adjoint_sum import AdjointSumSink
@@ -23,6 +24,10 @@ class Reverse:
     def view(self, rays):
         """The adjoint block of primary rays."""
         return self.block(rays, rays)
+
+    def kept(self, row):
+        """(which rows of pixels count, weight of a sample of the whole film)."""
+        return mi.Bool(True), 1
 
     def block(self, rays, place):
         """The adjoint block of the pixels ``place`` (``row, column, laser``), in the channels of ``rays``."""
@@ -83,9 +88,17 @@ class Forward:
         self.stop, self.scale = self.first + rows, int(term.film.crop_size()[1]) / rows
 
     def view(self, rays):
-        """(map to channels, base and pixel) of primary rays."""
-        term = self.term
-        return term.integrator.channel_match(term.world.contents, term.film, rays), *self._indices(rays)
+        """(film block, map to channels, pixel) of primary rays."""
+        term, film = self.term, self.term.film
+        match, (base, pixel) = term.integrator.channel_match(term.world.contents, film, rays), self._indices(rays)
+        if rays.strata is not None:
+            return film.create_event_block(self.job, base, match, term.world.most_events()), match, pixel
+        # Rays that go anywhere are not in the order of pixels, which some films count on.
+        return FilmBlock(film, self.job.band, base, match), match, pixel
+
+    def kept(self, row):
+        """As in reverse mode; here those of one band of storage."""
+        return (row >= self.first) & (row < self.stop), self.scale
 
     def _indices(self, place):
         return self.term.integrator.pixel_indices(self.term.film, self.job, place)
@@ -99,8 +112,7 @@ class Forward:
 
     def traced(self, world, sampler, path, view, factor, speed):
         """Trace ``path`` onto the film."""
-        film, (match, base, pixel) = self.term.film, view
-        block = film.create_event_block(self.job, base, match, world.most_events())
+        film, (block, match, pixel) = self.term.film, view
         _, kept = go_on(world, sampler, path, ScaledFilmSink(block, finite(factor * speed)))
         film.add_steady(pixel, match.to_channels(kept["L"]))
         block.finish()
@@ -136,11 +148,12 @@ class PixelFilmSink(Sink):
         mode, term = self.mode, self.mode.term
         film = term.film
         row, column, weight, inside = term.pixel(event.uv, self.u)
-        active = event.active & inside & (row >= mode.first) & (row < mode.stop)
+        own, share = mode.kept(row)
+        active = event.active & inside & own
         place = Local(row=dr.select(active, row, mode.first), column=column, laser=None)
         match = term.integrator.channel_match(term.world.contents, film, seen_along(self.middle, event.d))
         base, pixel = mode._indices(place)
-        scale = dr.select(event.depth == 2, *self.scales) * (weight * mode.scale)
+        scale = dr.select(event.depth == 2, *self.scales) * (weight * share)
         channels = [dr.select(active, c, 0) for c in match.to_channels(event.value * scale)]
         film.put(mode.job.band, base, event.opl, channels, active)
         if film.keeps_steady:
