@@ -26,11 +26,10 @@ class LightPass:
     ray of the camera where it is connected at once (``direct``), and is a point of its shape where it goes on.
     """
 
-    def __init__(self, term):
-        self.term = term
+    def __init__(self, world):
         self.lights = EmitterSampled()
         with dr.resume_grad():
-            self.lights.prepare(term.world)
+            self.lights.prepare(world)
 
     @staticmethod
     def exists(world, sensor):
@@ -39,13 +38,13 @@ class LightPass:
 
     def run(self, mode, job):
         """Trace the samples of ``job``; returns the objective of reverse mode."""
-        term = self.term
+        term = mode.term
         world, edges, sampler, lit = term.world, term.edges, term.sampler(job), term.light_world
         k = edges.pick(edges.by_length, sampler.next_1d(), sampler.next_1d())
         numbers = term.places.numbers(sampler)
         middle = term.rays_at(sampler, term.places.middle(numbers), numbers, None, None, job)
         ray = mi.Ray3f(dr.detach(middle.ray))
-        light = self._light(edges, k, ray, sampler.next_2d())
+        light = self._light(term, edges, k, ray, sampler.next_2d())
         b, ds = light.b, light.ds
         most = dr.max(dr.abs(light.Le))
         active = b.valid & (most > 0) & dr.isfinite(most) & ~b.crease
@@ -70,21 +69,21 @@ class LightPass:
         touches = dr.dot(x.at.p - b.p, b.d) < CONTACT * (1 + dr.max(dr.abs(b.p)))
         path.active = active = active & ~touches
         with dr.resume_grad():
-            speeds = self._speeds(edges, light, x, path, ray, numbers, sampler, job, active)
+            speeds = self._speeds(term, edges, light, x, path, ray, numbers, sampler, job, active)
         u = sampler.next_2d()
         sink, factors = mode.sink_of_pixels(middle, job, u, factor, speeds)
         _, kept = go_on(lit, sampler, path, sink)
         return mode.sum_of_pixels(kept, factors)
 
-    def _light(self, edges, k, ray, u):
+    def _light(self, term, edges, k, ray, u):
         """A point of a light drawn from the edge ``k``, and the outline seen from there: ``ds, b, far, Le`` (emission
         over the density by solid angle at the edge).
         """
-        world = self.term.world
+        world = term.world
         near = at_point(k.near, ray)
         ds, weight = self.lights.sample(world, near, u, mi.Bool(True))
         far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-        y = dr.select(far, k.near + ds.d * (FAR * self.term.radius), ds.p)
+        y = dr.select(far, k.near + ds.d * (FAR * term.radius), ds.p)
         b = edges.seen_from(k, mi.Point3f(y), ds.pdf > 0)
         Le = mi.unpolarized_spectrum(weight)
         # The light was drawn from another place than a limb, which depends on the light, with another solid angle.
@@ -95,9 +94,9 @@ class LightPass:
         other *= dr.select(ds.delta, 1, dr.select(far, 1, ratio) / ds.pdf)
         return Local(ds=ds, b=b, far=far, Le=dr.select(k.ball, other, Le), near=near, u=u)
 
-    def _speeds(self, edges, light, x, path, ray, numbers, sampler, job, active):
+    def _speeds(self, term, edges, light, x, path, ray, numbers, sampler, job, active):
         """Attached speeds of the edge: where x is the first vertex of a path of the sensor, and where it is another."""
-        term, b = self.term, light.b
+        b = light.b
         world = term.world
         pi, on_surface = term.light_world.segment.surface_of(path.leg)
         surface = active & on_surface & pi.is_valid()
@@ -128,16 +127,16 @@ class LightPass:
             sun = active & light.far & self.lights.sun.shines(light.ds.emitter, light.ds.d)
             turned = behind * dr.dot(b.n, displacement(self.lights.sun.followed(mi.Vector3f(light.ds.d), sun), sun))
         for v_x in (first, held):
-            v_y = self._motion(light, x.at.p, v_x, active & ~light.far)
+            v_y = self._motion(world, light, x.at.p, v_x, active & ~light.far)
             found.append(dr.select(active, n_p - (1 - t) * dr.dot(b.n, v_x) - t * dr.dot(b.n, v_y) - turned, 0))
         return found
 
-    def _motion(self, light, x, v_x, active):
+    def _motion(self, world, light, x, v_x, active):
         """Attached motion of a light's point, as interior derivatives hold it, seen from ``x``, which moves by ``v_x``:
         points and spots move, areas are points of their shapes, dragged along where they are near, and spheres keep the
         place in the cone that they fill.
         """
-        world, wanted, ds, b = self.term.world, self.term.world.wanted, light.ds, light.b
+        wanted, ds, b = world.wanted, light.ds, light.b
         v = mi.Vector3f(0)
         flags = ds.emitter.flags()
         if wanted.light:

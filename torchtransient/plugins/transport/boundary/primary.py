@@ -17,8 +17,8 @@ class PrimaryPass:
     the ray, and where a face ends under it the light jumps.
     """
 
-    def __init__(self, term):
-        self.term = term
+    def __init__(self, world):
+        pass
 
     @staticmethod
     def exists(world, sensor):
@@ -27,7 +27,7 @@ class PrimaryPass:
 
     def run(self, mode, job):
         """Trace the samples of ``job``; returns the objective of reverse mode."""
-        term = self.term
+        term = mode.term
         world, edges, sampler = term.world, term.seen_edges, term.sampler(job)
         numbers = term.places.numbers(sampler)
         k = edges.pick(edges.by_length, sampler.next_1d(), sampler.next_1d())

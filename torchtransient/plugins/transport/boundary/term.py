@@ -75,7 +75,7 @@ class BoundaryTerm:
         for name in names if topology.count else ():
             if PASSES[name].exists(world, sensor):
                 own, _ = mi.sample_tea_32(seed_array(seed), mi.UInt32(_SEEDS[name]))
-                self.passes[name] = PASSES[name](self)
+                self.passes[name] = PASSES[name](world)
                 self.jobs[name], _ = passes_of(sensor.sampler().clone(), film, own, samples, world.most_events())
 
     def _light_world(self):

@@ -27,8 +27,8 @@ class VertexPass:
     here where paths of lights do not find the sensor.
     """
 
-    def __init__(self, term):
-        self.term = term
+    def __init__(self, world):
+        pass
 
     @staticmethod
     def exists(world, sensor):
@@ -37,13 +37,13 @@ class VertexPass:
 
     def run(self, mode, job):
         """Trace the samples of ``job``; returns the objective of reverse mode."""
-        term = self.term
+        term = mode.term
         world, edges = term.world, term.edges
         finds_light = sees_one_line(term.sensor)
         rays = term.integrator.start(world.scene, world.contents, term.sensor, term.film, job)
         world.start(rays)
         view, sampler, ray = mode.view(rays), rays.sampler, dr.detach(rays.ray)
-        target, inv_pmf = self._target(sampler.next_1d(), finds_light)
+        target, inv_pmf = self._target(world, sampler.next_1d(), finds_light)
         path = start(world, ray, term.integrator.first_opl(term.film, rays), dr.detach(rays.η))
         path.leg = world.segment.first(world, ray, sampler)
         pi, _ = world.segment.surface_of(path.leg)
@@ -78,7 +78,7 @@ class VertexPass:
         medium = world.segment.medium_at(world, b.beside, x, world.segment.medium_towards(b.d, vertex), active)
         past = past_edge(world, b, path.ray, medium, β, sampler, active)
         with dr.resume_grad():
-            v_x = self._motion(rays, path, before, target, vertex, radius, active)
+            v_x = self._motion(world, rays, path, before, target, vertex, radius, active)
             speeds = sides_from(world, b, edges, v_x, behind(world, b, *past, active), radius, active)
         first = {
             "ray": path.ray, "β": β, "η": η, "τ": τ, "prev_p": x, "prev_n": vertex.at.n,
@@ -86,15 +86,14 @@ class VertexPass:
         }  # fmt: skip
         # Elsewhere a density of zero leaves out emission.
         dragged_along = b.dist < radius
-        lit = finds_light | (dragged_along & self._is_dragged(b.inner.shape))
-        lit = lit, finds_light | (dragged_along & b.crease & self._is_dragged(b.facing.shape))
+        lit = finds_light | (dragged_along & self._is_dragged(world, b.inner.shape))
+        lit = lit, finds_light | (dragged_along & b.crease & self._is_dragged(world, b.facing.shape))
         return both_sides(world, mode, sampler, view, b, past, first, factor, speeds, (near, ~b.crease | near), lit)
 
-    def _target(self, u, finds_light):
+    def _target(self, world, u, finds_light):
         """(number of a vertex, one over its probability). The last vertex, after which there is nothing but emission, is
         chosen seldom where only lights with rims are of use to it.
         """
-        world = self.term.world
         if finds_light:
             count = world.max_depth - 1
             return dr.minimum(mi.UInt32(u * count), count - 1), mi.Float(count)
@@ -107,17 +106,16 @@ class VertexPass:
         number = dr.minimum(mi.UInt32((u - seldom) * (count / (1 - seldom))), count - 1)
         return dr.select(last, mi.UInt32(count), number), dr.select(last, 1 / seldom, count / (1 - seldom))
 
-    def _is_dragged(self, shape):
+    def _is_dragged(self, world, shape):
         """Mask of lights of which derivatives drag near points along with who sees them."""
-        world = self.term.world
         mask = shape.is_emitter()
         if world.wanted.sphere_lights:
             mask &= ~world.contents.sphere_lights.lists(shape.emitter())
         return mask
 
-    def _motion(self, rays, path, before, target, vertex, radius, active):
+    def _motion(self, world, rays, path, before, target, vertex, radius, active):
         """Attached motion of x, as interior derivatives hold it."""
-        world, at_first = self.term.world, target == 0
+        at_first = target == 0
         pi, _ = world.segment.surface_of(path.leg)
         surface, first = active & vertex.surface, active & at_first
         primary = mi.Ray3f(path.ray)
