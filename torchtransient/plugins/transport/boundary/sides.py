@@ -48,7 +48,7 @@ def both_sides(world, mode, sampler, view, b, past, first, factor, speeds, neede
             path.prev_unconnected = mi.Bool(lit[k])
             path.prev_pdf = dr.select(path.prev_unconnected, mi.Float(1), 0)
         # The same random numbers on both sides.
-        value = mode.trace(world, sampler.clone(), path, view, dr.select(need, sign * factor, 0), speed)
+        value = mode.follow(world, sampler.clone(), path, view, dr.select(need, sign * factor, 0), speed)
         if value is not None:
             with dr.resume_grad():
                 objective += value * speed

@@ -37,10 +37,10 @@ class Reverse:
         return self.incoming.block(place, pixel, match)
 
     def speeds(self, attached):
-        """Speeds as :meth:`trace` takes them."""
+        """Speeds as :meth:`follow` takes them."""
         return attached
 
-    def trace(self, world, sampler, path, block, factor, speed):
+    def follow(self, world, sampler, path, block, factor, speed):
         """Trace ``path``; returns what its events contribute to the loss."""
         _, kept = go_on(world, sampler, path, AdjointSumSink(block))
         return finite(kept["sum"] * factor)
@@ -110,7 +110,7 @@ class Forward:
                 return [mi.Float(0)] * len(attached)
             return tangents_of(list(attached))
 
-    def trace(self, world, sampler, path, view, factor, speed):
+    def follow(self, world, sampler, path, view, factor, speed):
         """Trace ``path`` onto the film."""
         film, (block, match, pixel) = self.term.film, view
         _, kept = go_on(world, sampler, path, ScaledFilmSink(block, finite(factor * speed)))
