@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import ast
 import builtins
-import functools
 import re
 from pathlib import Path
 
@@ -396,33 +395,6 @@ def test_circles_are_found(tmp_path, first, second, closed):
     for name, text in texts.items():
         (folder / f"{name}.py").write_text(text + "\n", encoding="utf-8")
     assert bool(import_circles(tmp_path)) == closed
-
-
-def old_names():
-    """(identifiers, folder) of every row of the table of old names in docs/design.md."""
-    page = (PACKAGE.parent / "docs" / "design.md").read_text(encoding="utf-8")
-    rows = [line for line in page.split("## Old names")[1].splitlines() if line.startswith("| `")]
-    for row in rows:
-        old, _, where = (cell.strip() for cell in row.strip("|").split("|"))
-        yield {name.strip("`") for name in old.split()}, where
-
-
-@functools.cache
-def identifiers(path):
-    """Every name in a file: variables, attributes, arguments, definitions, keywords, imported modules."""
-    fields = ("id", "attr", "arg", "name", "module", "asname")
-    nodes = ast.walk(syntax_of(path))
-    values = [getattr(node, field, None) for node in nodes for field in fields]
-    return frozenset(name for value in values if isinstance(value, str) for name in value.split("."))
-
-
-def test_no_old_name_is_left():
-    rows = list(old_names())
-    assert len(rows) > 15
-    for old, where in rows:
-        for path in (PACKAGE / where).rglob("*.py"):
-            left = old & ({path.stem} | identifiers(path))
-            assert not left, f"{path.relative_to(PACKAGE)}: {', '.join(sorted(left))}"
 
 
 def test_files_of_the_structure_page_exist():
