@@ -12,7 +12,6 @@ import mitsuba as mi
 from torchtransient.plugins.mitsuba_compat import (
     attribute_name,
     has_surface,
-    has_vertices,
     is_bump_map,
     is_instance,
     is_sphere,
@@ -20,7 +19,6 @@ from torchtransient.plugins.mitsuba_compat import (
 )
 from torchtransient.plugins.node_walk import bsdfs_of_scene, objects_below, shapes_of_scene
 from torchtransient.plugins.parameter_effect import CORRECT, ParameterEffect
-from torchtransient.plugins.sampling.area_elements import has_shading_normals
 from torchtransient.plugins.sensors.seen_from import can_be_connected, sees_one_line
 from torchtransient.plugins.transport.media_contents import is_open
 
@@ -73,8 +71,6 @@ class MovingEdges:
             # Of what an instance shows, Mitsuba says nothing; a sensor sees everything move.
             alone = effect.role != "sensor" and isinstance(node, mi.Shape) and not is_instance(node)
             found += self._jumps(node if alone else None)
-            if moves:
-                found += self._horizons(node if alone else None)
         return tuple(dict.fromkeys(found))
 
     def reason(self, node: Any, key: str, effect: ParameterEffect) -> str:
@@ -100,18 +96,6 @@ class MovingEdges:
             return ()
         where = f"at the steps of textures on what moves (on {_listed(names)})"
         return (Gap(where, "Take a smooth texture there, of filter_type 'bilinear'."),)
-
-
-    def _horizons(self, shape: Any) -> tuple[Gap, ...]:
-        """The gap of meshes with interpolated normals, which are black where these face away from who looks."""
-        if self._scene is None:
-            return ()
-        shapes = shapes_of_scene(self._scene) if shape is None else [shape]
-        names = [_name(one) for one in shapes if has_surface(one) and _has_horizon(one)]
-        if not names:
-            return ()
-        where = f"at the rims of meshes with normals at their vertices, where these face away ({_listed(names)})"
-        return (Gap(where, "Set face_normals to true there, or take a finer mesh."),)
 
 
 def missing(reason: str, remedy: str) -> MovingEdges:
@@ -164,11 +148,6 @@ def _is_met_by_connections_alone(emitter: Any) -> bool:
     delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
     shape = emitter.get_shape()
     return bool(mi.has_flag(emitter.flags(), delta)) or (shape is not None and is_sphere(shape))
-
-
-def _has_horizon(shape: Any) -> bool:
-    """Whether a mesh hides places with its interpolated normals."""
-    return has_vertices(shape) and shape.has_vertex_normals() and has_shading_normals(shape)
 
 
 def _has_delta_lobe(shape: Any) -> bool:
