@@ -12,7 +12,6 @@ import pytest
 from support.gradient_cases.problem import Case, Problem, weights
 from support.gradient_cases.scenes import transform
 from support.gradient_cases.unknowns import move, move_vertices
-from torchtransient.plugins.films import base
 from torchtransient.plugins.sensors.seen_from import SensorPlaces, can_be_connected
 from torchtransient.plugins.transport.boundary.moving_edges import moving_edges
 from torchtransient.plugins.transport.strategy import Local
@@ -197,7 +196,8 @@ def test_films_of_several_bands(monkeypatch, name):
     case = next(case for case in CASES if case.name == name)
     problem = Problem(case)
     reverse = [problem.reverse(seed) for seed in range(6)]
-    monkeypatch.setattr(base, "MAX_ARRAY_ENTRIES", 3 * SIZE * problem.film.entries_per_pixel())
+    most = 3 * SIZE * problem.film.entries_per_pixel()
+    monkeypatch.setattr("torchtransient.plugins.films.base.MAX_ARRAY_ENTRIES", most)
     weight = np.broadcast_to(weights(problem.film), problem.film.cube_shape())
 
     def forward(seed):
@@ -238,7 +238,7 @@ def test_points_are_seen_where_rays_meet_them(name):
     depth = mi.Float(rng.uniform(1, 4, n))
 
     def ray(du=0, dv=0):
-        return sensor.sample_ray(0, 0.5, mi.Point2f(uv + [[du], [dv]]), aperture)[0]
+        return sensor.sample_ray(0, 0.5, mi.Point2f(uv + np.array([[du], [dv]])), aperture)[0]
 
     middle = ray()
     p = middle.o + middle.d * depth
