@@ -12,6 +12,7 @@ import pytest
 from support.gradient_cases.problem import Case, Problem, weights
 from support.gradient_cases.scenes import transform
 from support.gradient_cases.unknowns import move, move_vertices
+from torchtransient.plugins.parameter_effect import ParameterEffect
 from torchtransient.plugins.sensors.seen_from import SensorPlaces, can_be_connected
 from torchtransient.plugins.transport.boundary.moving_edges import moving_edges
 from torchtransient.plugins.transport.strategy import Local
@@ -266,7 +267,7 @@ def test_points_are_seen_where_rays_meet_them(name):
 
 def test_what_is_lacking_is_named():
     """Sensors that no path of a light finds, lights that a line cannot be connected to, faces that turn away."""
-    mi.set_variant("llvm_ad_mono")
+    mi.set_variant("llvm_ad_rgb")
 
     def words(scene):
         gaps = moving_edges(mi.load_dict(scene))
@@ -279,5 +280,12 @@ def test_what_is_lacking_is_named():
     parallel = plate(sensor=orthographic())
     for scene in (plate(), plate(sensor=batch(lens)), shadow(sensor=line(), light=lamp()), parallel):
         assert words(scene) == ""
+    # A sun in view has a rim.
+    for up, named in ((-0.2, True), (0.9, False)):
+        light = {"type": "sunsky", "sun_direction": [0.1, up, -1.0], "to_world": transform().rotate([1, 0, 0], 180)}
+        sky = mi.load_dict(plate(light=light))
+        effect = ParameterEffect(role="sun", moves_silhouette=True)
+        found = moving_edges(sky).lacking(sky.emitters()[0], "sun_direction", effect)
+        assert any("rim of the sun" in gap.where for gap in found) == named
     # Open boundaries of media are passed.
     assert words(plate(integrator="transient_prbvolpath", cloud=cloud((0, 0, 2), 0.4))) == ""

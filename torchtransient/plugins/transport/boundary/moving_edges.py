@@ -16,11 +16,14 @@ from torchtransient.plugins.mitsuba_compat import (
     is_instance,
     is_sphere,
     lacks_edges,
+    near_clip,
 )
 from torchtransient.plugins.node_walk import bsdfs_of_scene, objects_below, shapes_of_scene
 from torchtransient.plugins.parameter_effect import CORRECT, ParameterEffect
-from torchtransient.plugins.sensors.seen_from import can_be_connected, sees_one_line
+from torchtransient.plugins.sampling.sun import MovingSun
+from torchtransient.plugins.sensors.seen_from import SensorPlaces, can_be_connected, sees_one_line
 from torchtransient.plugins.transport.media_contents import is_open
+from torchtransient.plugins.transport.strategy import Local
 
 # Roles of what moves edges against what is behind them, and of what bends light, which moves edges that are seen
 # through it.
@@ -71,6 +74,8 @@ class MovingEdges:
             # Of what an instance shows, Mitsuba says nothing; a sensor sees everything move.
             alone = effect.role != "sensor" and isinstance(node, mi.Shape) and not is_instance(node)
             found += self._jumps(node if alone else None)
+        if effect.role == "sun" and self._scene is not None and _is_in_view(self._scene, node):
+            found += (Gap("at the rim of the sun where it is itself in view", "Keep it out of the picture."),)
         return tuple(dict.fromkeys(found))
 
     def reason(self, node: Any, key: str, effect: ParameterEffect) -> str:
@@ -148,6 +153,23 @@ def _is_met_by_connections_alone(emitter: Any) -> bool:
     delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
     shape = emitter.get_shape()
     return bool(mi.has_flag(emitter.flags(), delta)) or (shape is not None and is_sphere(shape))
+
+
+def _is_in_view(scene: Any, sky: Any) -> bool:
+    """Whether a sensor looks into the sun of a sky, whatever is in between."""
+    at, d = dr.zeros(mi.Interaction3f), dr.detach(MovingSun(scene, sky).direction)
+    for sensor in filter(can_be_connected, scene.sensors()):
+        places = SensorPlaces(sensor, sensor.film(), mi.Float(1))
+        for number, camera in enumerate(places.cameras):
+            carrier = camera.get_shape()
+            o = camera.world_transform() @ mi.Point3f(0) if carrier is None else carrier.bbox().center()
+            at.p = mi.Point3f(o) + d * (near_clip(camera) or 0) * 2 + d
+            numbers = Local(aperture=mi.Point2f(0.5), camera=mi.UInt32(number))
+            seen, _ = places.seen_from(at, numbers, mi.Bool(True))
+            inside = (seen.pdf > 0) & dr.all((seen.uv >= 0) & (seen.uv <= places.size))
+            if bool(dr.any(inside)):
+                return True
+    return False
 
 
 def _has_delta_lobe(shape: Any) -> bool:
