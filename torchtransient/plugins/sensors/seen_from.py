@@ -80,7 +80,8 @@ class SensorPlaces:
         valid = active & result.valid & dr.isfinite(result.importance)
         way = result.p - at.p
         dist = dr.norm(way)
-        ds = Local(uv=result.uv * self.size, p=result.p, eye=result.eye, d=way / dist, dist=dist, pdf=dr.select(valid, 1.0, 0.0))
+        uv, pdf = result.uv * self.size, dr.select(valid, mi.Float(1), 0)
+        ds = Local(uv=uv, p=result.p, eye=result.eye, d=way / dist, dist=dist, pdf=pdf)
         return ds, dr.select(valid, result.importance, 0)
 
     def _seen_from_camera(self, camera: Any, p: Any, aperture: Any) -> Local:
@@ -108,7 +109,8 @@ class SensorPlaces:
         eye = o
         if camera.class_name() == "OrthographicCamera":
             eye = o - way / dr.norm(way) * (FAR * self.radius)
-        return Local(uv=uv, p=o, eye=mi.Point3f(eye), importance=dr.rcp(area * cos), valid=(depth > near) & (depth < far))
+        valid = (depth > near) & (depth < far)
+        return Local(uv=uv, p=o, eye=mi.Point3f(eye), importance=dr.rcp(area * cos), valid=valid)
 
     def _seen_from_meter(self, at: Any, numbers: Any, active: Any) -> tuple[Any, Any]:
         ps = self.sensor.get_shape().sample_position(at.time, numbers.aperture, active)
@@ -117,7 +119,7 @@ class SensorPlaces:
         d = way / dist
         cos = -dr.dot(ps.n, d)
         valid = active & (cos > 0)
-        ds = Local(uv=numbers.aperture * self.size, p=mi.Point3f(ps.p), eye=mi.Point3f(ps.p), d=d, dist=dist, pdf=dr.select(valid, 1.0, 0.0))
-        ds.n = mi.Normal3f(ps.n)
+        uv, p, pdf = numbers.aperture * self.size, mi.Point3f(ps.p), dr.select(valid, mi.Float(1), 0)
+        ds = Local(uv=uv, p=p, eye=p, d=d, dist=dist, pdf=pdf, n=mi.Normal3f(ps.n))
         # The weight of its rays holds a pi.
         return ds, dr.select(valid, cos * dr.inv_pi / dr.square(dist), 0)

@@ -26,7 +26,10 @@ class MediaContents:
     A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
     """
 
-    def __init__(self, media: list[Any], at_sensor: Any, open_boundaries: bool, shapes_in_groups: bool, extent: float, transitions: bool):
+    def __init__(
+        self, media: list[Any], at_sensor: Any, open_boundaries: bool, shapes_in_groups: bool, extent: float,
+        transitions: bool = False,
+    ) -> None:  # fmt: skip
         self.media = media
         self.at_sensor = at_sensor
         self.homogeneous = any(m.is_homogeneous() for m in media)

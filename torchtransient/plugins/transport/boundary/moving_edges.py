@@ -12,17 +12,18 @@ import mitsuba as mi
 from torchtransient.plugins.mitsuba_compat import (
     attribute_name,
     has_surface,
-    has_vertices,
     is_bump_map,
     is_instance,
     is_sphere,
     lacks_edges,
+    near_clip,
 )
 from torchtransient.plugins.node_walk import bsdfs_of_scene, objects_below, shapes_of_scene
 from torchtransient.plugins.parameter_effect import CORRECT, ParameterEffect
-from torchtransient.plugins.sampling.area_elements import has_shading_normals
-from torchtransient.plugins.sensors.seen_from import can_be_connected, sees_one_line
+from torchtransient.plugins.sampling.sun import MovingSun
+from torchtransient.plugins.sensors.seen_from import SensorPlaces, can_be_connected, sees_one_line
 from torchtransient.plugins.transport.media_contents import is_open
+from torchtransient.plugins.transport.strategy import Local
 
 # Roles of what moves edges against what is behind them, and of what bends light, which moves edges that are seen
 # through it.
@@ -84,8 +85,8 @@ class MovingEdges:
             # Of what an instance shows, Mitsuba says nothing; a sensor sees everything move.
             alone = effect.role != "sensor" and isinstance(node, mi.Shape) and not is_instance(node)
             found += self._jumps(node if alone else None)
-            if moves:
-                found += self._horizons(node if alone else None)
+        if effect.role == "sun" and self._scene is not None and _is_in_view(self._scene, node):
+            found += (Gap("at the rim of the sun where it is itself in view", "Keep it out of the picture."),)
         return tuple(dict.fromkeys(found))
 
     def reason(self, node: Any, key: str, effect: ParameterEffect) -> str:
@@ -111,18 +112,6 @@ class MovingEdges:
             return ()
         where = f"at the steps of textures on what moves (on {_listed(names)})"
         return (Gap(where, "Take a smooth texture there, of filter_type 'bilinear'."),)
-
-
-    def _horizons(self, shape: Any) -> tuple[Gap, ...]:
-        """The gap of meshes with interpolated normals, which are black where these face away from who looks."""
-        if self._scene is None:
-            return ()
-        shapes = shapes_of_scene(self._scene) if shape is None else [shape]
-        names = [_name(one) for one in shapes if has_surface(one) and _has_horizon(one)]
-        if not names:
-            return ()
-        where = f"at the rims of meshes with normals at their vertices, where these face away ({_listed(names)})"
-        return (Gap(where, "Set face_normals to true there, or take a finer mesh."),)
 
 
 def missing(reason: str, remedy: str) -> MovingEdges:
@@ -182,9 +171,21 @@ def _is_met_by_connections_alone(emitter: Any) -> bool:
     return bool(mi.has_flag(emitter.flags(), delta)) or (shape is not None and is_sphere(shape))
 
 
-def _has_horizon(shape: Any) -> bool:
-    """Whether a mesh hides places with its interpolated normals."""
-    return has_vertices(shape) and shape.has_vertex_normals() and has_shading_normals(shape)
+def _is_in_view(scene: Any, sky: Any) -> bool:
+    """Whether a sensor looks into the sun of a sky, whatever is in between."""
+    at, d = dr.zeros(mi.Interaction3f), dr.detach(MovingSun(scene, sky).direction)
+    for sensor in filter(can_be_connected, scene.sensors()):
+        places = SensorPlaces(sensor, sensor.film(), mi.Float(1))
+        for number, camera in enumerate(places.cameras):
+            carrier = camera.get_shape()
+            o = camera.world_transform() @ mi.Point3f(0) if carrier is None else carrier.bbox().center()
+            at.p = mi.Point3f(o) + d * (near_clip(camera) or 0) * 2 + d
+            numbers = Local(aperture=mi.Point2f(0.5), camera=mi.UInt32(number))
+            seen, _ = places.seen_from(at, numbers, mi.Bool(True))
+            inside = (seen.pdf > 0) & dr.all((seen.uv >= 0) & (seen.uv <= places.size))
+            if bool(dr.any(inside)):
+                return True
+    return False
 
 
 def _has_delta_lobe(shape: Any) -> bool:

@@ -5,11 +5,15 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins.edges.topology import EDGE
 from torchtransient.plugins.polarized import attenuated
 from torchtransient.plugins.sensors.seen_from import can_be_connected
 from torchtransient.plugins.transport.boundary.sides import at_point, both_sides, past_edge, place_at
 from torchtransient.plugins.transport.boundary.speeds import behind, sides_from, slides
 from torchtransient.plugins.transport.strategy import Local
+
+# Cosine from which on an interpolated normal faces the sensor.
+FACING = 1e-3
 
 
 class PrimaryPass:
@@ -44,6 +48,8 @@ class PrimaryPass:
         if term.is_meter:
             ray.o = mi.Point3f(eye.p)
         way, active = dr.norm(b.p - ray.o), b.valid & (ds.pdf > 0) & inside
+        if term.has_vertex_normals:
+            b.inner = _where_normals_face(b)
         if world.hide_emitters:
             active &= ~b.inner.shape.is_emitter()
         medium = world.segment.medium_at(world, b.beside, ray.o, world.segment.medium_towards(b.d), active)
@@ -68,3 +74,26 @@ class PrimaryPass:
             "prev_p": ray.o, "active": active, "medium": medium,
         }  # fmt: skip
         return both_sides(world, mode, sampler, view, b, past, first, factor, speeds, needed)
+
+
+def _where_normals_face(b):
+    """The face that hides, moved from its edge to where its interpolated normal faces the sensor: between there and the
+    edge it is black, a rim that gets as narrow as the faces of the mesh and is taken to move with the edge.
+    """
+    u, v = b.inner.prim_uv
+    w, ray = 1 - u - v, mi.Ray3f(b.V, b.d_in)
+    nearest = dr.minimum(dr.minimum(dr.abs(u), dr.abs(v)), dr.abs(w))
+    third = mi.Point2f(dr.select(dr.abs(u) == nearest, 1.0, 0.0), dr.select(dr.abs(v) == nearest, 1.0, 0.0))
+    edge = b.valid & ~b.crease & (b.k.kind == EDGE)
+
+    def facing(uv):
+        pi = dr.copy(b.inner)
+        pi.prim_uv = uv
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.All, edge)
+        return dr.mulsign(dr.dot(si.sh_frame.n, b.d_in), dr.dot(si.n, b.d_in)), pi
+
+    here, _ = facing(b.inner.prim_uv)
+    there, _ = facing(third)
+    t = dr.minimum((FACING - here) / (there - here), 1)
+    moved = edge & (here < FACING) & (there > here)
+    return facing(dr.lerp(b.inner.prim_uv, third, dr.select(moved, t, 0)))[1]

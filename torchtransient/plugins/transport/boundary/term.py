@@ -82,7 +82,8 @@ class BoundaryTerm:
         """The world of paths that start at a light and are connected to the sensor."""
         world, integrator = self.world, self.integrator
         segment, scattering, _ = integrator.strategies(world.contents)
-        if shades_by_other_normals(world.scene):
+        self.has_vertex_normals = shades_by_other_normals(world.scene)
+        if self.has_vertex_normals:
             scattering = FromLight(scattering)
         # Whether the sensor's segment counts in time is asked by its connection: here it is the last one of a path.
         settings = replace(integrator.settings(), camera_unwarp=False)
@@ -144,9 +145,10 @@ class BoundaryTerm:
         position = uv / mi.ScalarVector2f(self.film.crop_size())
         seen = views(sensor, position, lambda: self.integrator.reference(world.scene))
         with dr.resume_grad():
-            ray, weight = sample_rays(sensor, seen, sensor.shutter_open(), numbers.wavelength, position, numbers.aperture)
+            u, time = numbers.wavelength, sensor.shutter_open()
+            ray, weight = sample_rays(sensor, seen, time, u, position, numbers.aperture)
             if self.film.curves is not None:
-                ray, weight = self.film.curves.draw(sensor, ray, weight, numbers.wavelength)
+                ray, weight = self.film.curves.draw(sensor, ray, weight, u)
             η, clip = index_at_sensor(seen, world.contents.surroundings, world.scene), None
             if world.contents.media is not None and world.contents.media.at_sensor is not None:
                 ray, clip = start_at_sensor(seen, ray)

@@ -14,17 +14,16 @@ from torchtransient.plugins.transport.contents import DAMPING
 from torchtransient.plugins.transport.strategy import Local, Proposal
 from torchtransient.plugins.transport.walk import advance, start
 
-
 # Probability of the last vertex, which only sees the rims of near lights.
 _SELDOM = 0.1
 
 
 class VertexPass:
     """A path is traced to a vertex x, chosen uniformly of those that may have one after them; an edge point seen from
-    there is chosen of several candidates in proportion to its span over the squared distance (resampling, Talbot et al.
-    2005). Vertices behind the edge are points of their shapes, so that only outlines matter, and of them the outer side,
-    but for what is near x and dragged along, lights included. Lights past edges are found by the pass of the lights, or
-    here where paths of lights do not find the sensor.
+    there is chosen of several candidates in proportion to its span over the squared distance (resampling, Talbot et
+    al. 2005). Vertices behind the edge are points of their shapes, so that only outlines matter, and of them the outer
+    side, but for what is near x and dragged along, lights included. Lights past edges are found by the pass of the
+    lights, or here where paths of lights do not find the sensor.
     """
 
     def __init__(self, world):
@@ -64,7 +63,8 @@ class VertexPass:
         near = (b.dist < radius) | slides(world, b)
         b.valid &= ~b.crease | near
         # Asked for as a connection asks.
-        (answer,), _ = world.scattering.scatter(world, path, vertex, [Proposal(d=b.d, active=b.valid, ds=None)], sampler)
+        asked = Proposal(d=b.d, active=b.valid, ds=None)
+        (answer,), _ = world.scattering.scatter(world, path, vertex, [asked], sampler)
         τ, η = vertex.delay.after(vertex.τ), vertex.η * answer.eta
         β = product(vertex.β, dr.select(b.valid, answer.matrix, 0))
         most = dr.max(dr.abs(mi.unpolarized_spectrum(β)))
