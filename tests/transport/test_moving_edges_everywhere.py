@@ -270,7 +270,8 @@ def test_what_is_lacking_is_named():
     mi.set_variant("llvm_ad_rgb")
 
     def words(scene):
-        gaps = moving_edges(mi.load_dict(scene))
+        loaded = mi.load_dict(scene)
+        gaps = moving_edges(loaded, loaded.sensors())
         return " ".join(gap.where for gap in (*gaps.always, *gaps.bent))
 
     far = {"type": "distant", "direction": [0.1, 0, -1], "film": film(1, 1)}

@@ -121,20 +121,15 @@ def missing(reason: str, remedy: str) -> MovingEdges:
 
 
 def moving_edges(scene: Any, sensors: Sequence[Any]) -> MovingEdges:
-    """Return what the passes of :mod:`.passes` leave out in a scene, seen by ``sensors``."""
+    """Return what the passes of the boundary term (:mod:`.term`) leave out in a scene, seen by ``sensors``."""
     always, bent = [], []
-    if blind := [sensor for sensor in sensors if not can_be_connected(sensor)]:
-        where = f"where {_listed([_name(sensor) for sensor in blind])} sees an edge or its shadow"
-        always.append(
-            Gap(where, "Use perspective or thinlens cameras, each by itself: they tell where they see a point.")
-        )
     if shapes := shapes_without_edges(scene):
         names = _listed([_name(shape) for shape in shapes])
         always.append(Gap(f"at the rims of {names}, which have no edges", "Use a mesh of the same form."))
     if rims := [emitter.get_shape() or emitter for emitter in scene.emitters() if _has_rim(emitter)]:
         where = f"at the rim of the light of {_listed([_name(one) for one in rims])}"
         always.append(Gap(where, "Let the light fade out, by a beam_width below the cutoff_angle for instance."))
-    for sensor in scene.sensors():
+    for sensor in sensors:
         if sees_one_line(sensor):
             if lights := [emitter for emitter in scene.emitters() if _is_met_by_connections_alone(emitter)]:
                 names = _listed([_name(one.get_shape() or one) for one in lights])
