@@ -55,10 +55,11 @@ def scene():
 
 def looked_at(scene, moving=frozenset(), alone=False):
     """(table, points of it seen from around): strata of the density in order."""
-    table = EdgeTable(Topology(scene), moving, alone)
+    table = EdgeTable(Topology(scene), moving)
     rng = np.random.default_rng(3)
     x = mi.Float(((np.arange(COUNT) + rng.random(COUNT)) / COUNT).astype(np.float32))
-    k = table.pick(table.by_length, x, mi.Float(rng.random(COUNT).astype(np.float32)))
+    density = table.of_moving if alone else table.by_length
+    k = table.pick(density, x, mi.Float(rng.random(COUNT).astype(np.float32)))
     away = rng.normal(size=(3, COUNT))
     V = k.near + mi.Vector3f((FAR * away / np.linalg.norm(away, axis=0)).astype(np.float32))
     return table, table.seen_from(k, mi.Point3f(V), True)
@@ -139,7 +140,7 @@ def test_lengths_are_those_of_all_edges_and_limbs(scene):
 
 def test_flat_creases_are_not_drawn():
     """The diagonals of a rectangle and of the six sides of a cube; of two bodies, which may differ, they are."""
-    flat = lambda s: int((np.array(EdgeTable(Topology(s), frozenset(), False).by_length.weight) > 0).sum())  # noqa: E731
+    flat = lambda s: int((np.array(EdgeTable(Topology(s), frozenset()).by_length.weight) > 0).sum())  # noqa: E731
     plates = {f"r{i}": {"type": "rectangle", "to_world": placed(0, 0, 0).translate([2.0 * i, 0, 0])} for i in (0, 1)}
     kinds = {"rectangle": (4, {"a": {"type": "rectangle"}}), "cube": (24, {"a": {"type": "cube"}}), "two": (8, plates)}
     for _, (count, shapes) in kinds.items():
@@ -199,7 +200,7 @@ def test_gradients_of_passes_add_up_at_the_parameters():
     params.update()
     with dr.suspend_grad():
         topology = Topology(scene)
-        tables = [EdgeTable(topology, frozenset(), False) for _ in range(2)]
+        tables = [EdgeTable(topology, frozenset()) for _ in range(2)]
         with dr.isolate_grad():
             for factor, table in zip((1, 10, 100), (*tables, tables[0]), strict=True):
                 u = mi.Float((np.arange(100, dtype=np.float32) + 0.5) / 100)
@@ -227,7 +228,7 @@ def test_samples_go_to_what_moves():
 @pytest.mark.parametrize("on_mesh", [False, True])
 def test_candidates_leave_the_sum_as_it_is(scene, on_mesh):
     """Of what is seen of outlines from one point, whichever are chosen: of a mesh, those around the face there, too."""
-    table = EdgeTable(Topology(scene), frozenset(), False)
+    table = EdgeTable(Topology(scene), frozenset())
     V = mi.Point3f(8, 5, 12)
     pi = dr.zeros(mi.PreliminaryIntersection3f)
     if on_mesh:
@@ -275,7 +276,7 @@ def test_rims_of_two_meshes_are_one_until_they_part():
     topology, params = Topology(scene), mi.traverse(scene)
 
     def length_and_two():
-        table = EdgeTable(topology, frozenset(), False)
+        table = EdgeTable(topology, frozenset())
         u = mi.Float((np.arange(2000, dtype=np.float32) + 0.5) / 2000)
         b = table.seen_from(table.pick(table.by_length, u, u), mi.Point3f(0, 0.1, 9), True)
         return np.array(b.inv_pdf).mean(), np.array(b.crease).mean()
@@ -311,7 +312,7 @@ def test_shapes_without_edges_are_named(tmp_path):
     for shapes, count in (({"curve": curve}, 0), ({"grid": grid, "ball": {"type": "sphere"}}, 1)):
         topology = Topology(mi.load_dict({"type": "scene", **shapes}))
         assert ([s.id() for s in topology.without], topology.count) == ([next(iter(shapes))], count)
-        assert EdgeTable(topology, frozenset(), False).count == count
+        assert EdgeTable(topology, frozenset()).count == count
 
 
 def test_members_of_an_instance(scene):
@@ -329,7 +330,7 @@ def test_one_recording_for_all_numbers():
     moving = frozenset(s.ptr for s in scene.shapes()[:1])
 
     def call(scene, u):
-        table = EdgeTable(topology, moving, False)
+        table = EdgeTable(topology, moving)
         b = table.seen_from(table.pick(table.by_length, u, u * 0.7), mi.Point3f(1, 2, 9), True)
         return b.p, b.n, b.inv_pdf, table.moving(b)
 

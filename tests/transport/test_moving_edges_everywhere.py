@@ -286,7 +286,7 @@ def test_what_is_lacking_is_named():
         light = {"type": "sunsky", "sun_direction": [0.1, up, -1.0], "to_world": transform().rotate([1, 0, 0], 180)}
         sky = mi.load_dict(plate(light=light))
         effect = ParameterEffect(role="sun", moves_silhouette=True)
-        found = moving_edges(sky).lacking(sky.emitters()[0], "sun_direction", effect)
+        found = moving_edges(sky, sky.sensors()).lacking(sky.emitters()[0], "sun_direction", effect)
         assert any("rim of the sun" in gap.where for gap in found) == named
     # Open boundaries of media are passed.
     assert words(plate(integrator="transient_prbvolpath", cloud=cloud((0, 0, 2), 0.4))) == ""

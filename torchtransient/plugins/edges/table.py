@@ -40,13 +40,13 @@ TILT = 2e-3
 
 
 class EdgeDensity:
-    """Density of rows of a table, in proportion to ``weight`` (Float)."""
+    """Density of rows of a table, in proportion to ``weight`` (Float), whose cumulative sum is ``cumulative`` (Float64: of
+    single precision, steps of long tables would be rounding).
+    """
 
-    def __init__(self, weight: Any) -> None:
-        self.weight = weight
-        # Of single precision, steps of long tables would be rounding.
-        self.cumulative = dr.cumsum(mi.Float64(weight))
-        self.total = dr.gather(mi.Float64, self.cumulative, dr.width(weight) - 1)
+    def __init__(self, weight: Any, cumulative: Any) -> None:
+        self.weight, self.cumulative = weight, cumulative
+        self.total = dr.gather(mi.Float64, cumulative, dr.width(weight) - 1)
 
     def sample(self, x: Any) -> tuple[Any, Any]:
         """Return (row, its probability) for uniform numbers; a probability of zero where there is nothing to draw."""
@@ -62,14 +62,14 @@ class EdgeTable:
 
     Args:
         topology: of the scene.
-        moving: addresses of the shapes that move, whose edges get half of the samples.
-        alone: only these get samples.
+        moving: addresses of the shapes that move.
 
     ``ends``: two attached Point3f: ends of edges; behind those, origins and axes of limbs. ``count``: rows.
-    ``by_length``: :class:`EdgeDensity` by length times crease angle. Nothing is drawn from a table of zero rows.
+    ``of_moving``: :class:`EdgeDensity` by length times crease angle, of the shapes that move (of all where none does);
+    ``by_length``: of all, with half of the samples for those that move. Nothing is drawn from a table of zero rows.
     """
 
-    def __init__(self, topology: Topology, moving: frozenset[Any], alone: bool) -> None:
+    def __init__(self, topology: Topology, moving: frozenset[Any]) -> None:
         self.topology, self.count = topology, topology.count
         if not self.count:
             self.ends = []
@@ -80,14 +80,16 @@ class EdgeTable:
         self.flags = topology.flags
         with dr.suspend_grad():
             self._measure()
-            moves = topology.moves(moving)
             weight = self.weight
-            if moves is not None:
-                m = weight * moves
-                share = [dr.select((s := dr.sum(w)) > 0, dr.rcp(s), 0) for w in (weight, m)]
-                weight = m if alone else weight * share[0] + m * share[1]
-            self.by_length = EdgeDensity(weight)
-        dr.eval(self.ends, self.third, self.flags, vars(self.by_length))
+            self.by_length = self.of_moving = EdgeDensity(weight, dr.cumsum(mi.Float64(weight)))
+            if (moves := topology.moves(moving)) is not None:
+                own, of_all = weight * moves, self.by_length
+                self.of_moving = EdgeDensity(own, dr.cumsum(mi.Float64(own)))
+                share = [dr.select(one.total > 0, dr.rcp(one.total), 0) for one in (of_all, self.of_moving)]
+                mixed = weight * mi.Float(share[0]) + own * mi.Float(share[1])
+                cumulative = of_all.cumulative * share[0] + self.of_moving.cumulative * share[1]
+                self.by_length = EdgeDensity(mixed, cumulative)
+        dr.eval(self.ends, self.third, self.flags, vars(self.by_length), vars(self.of_moving))
 
     def _measure(self) -> None:
         """Third corners, flags and weights of the rows."""

@@ -32,9 +32,9 @@ class PrimaryPass:
     def run(self, mode, job):
         """Trace the samples of ``job``; returns the objective of reverse mode."""
         term = mode.term
-        world, edges, sampler = term.world, term.seen_edges, term.sampler(job)
+        world, edges, sampler = term.world, term.edges, term.sampler(job)
         numbers = term.places.numbers(sampler)
-        k = edges.pick(edges.by_length, sampler.next_1d(), sampler.next_1d())
+        k = edges.pick(edges.of_moving, sampler.next_1d(), sampler.next_1d())
         # Along parallel rays the point of view depends on what is seen.
         eye, _ = term.places.seen_from(at_point(k.near), numbers, mi.Bool(True))
         b = edges.seen_from(k, mi.Point3f(eye.eye), mi.Bool(True))

@@ -58,14 +58,13 @@ class BoundaryTerm:
         self._sampler = world.contents.memory.of("sampler", b"", lambda: mi.load_dict({"type": "independent"}))
         scene, wanted = world.scene, world.wanted
         views_move = wanted.sensor or wanted.light
-        moving = frozenset() if views_move else wanted.shapes
         # A sensor at rest sees the edges of what moves alone; behind an edge at rest something else may move.
+        moving = frozenset() if views_move else wanted.shapes
         # Paths through media pass open boundaries, which hide nothing.
         media = world.contents.media
         hides = None if media is None or not media.open_boundaries else lambda shape: not is_open(shape)
         topology = world.contents.memory.of("edges", b"", lambda: Topology(scene, hides))
-        self.seen_edges = EdgeTable(topology, moving, alone=not views_move)
-        self.edges = self.seen_edges if views_move else EdgeTable(topology, moving, alone=False)
+        self.edges = EdgeTable(topology, moving)
         self.radius = dr.opaque(mi.Float, integrator.reference(scene).radius)
         self.places = SensorPlaces(sensor, film, self.radius)
         self.is_meter = self.places.is_meter
