@@ -137,6 +137,15 @@ def hidden_lamp():
     return scene
 
 
+def metered():
+    """An irradiance meter on a disk before a plate."""
+    scene = plate()
+    del scene["sensor"]
+    sensor = {"type": "irradiancemeter", "film": film(1, 1)}
+    scene["meter"] = {"type": "disk", "to_world": pose((0.3, 0.1, 3.2)).scale(0.2), "bsdf": GRAY, "sensor": sensor}
+    return scene
+
+
 def near_lamp():
     return scene_of(2, light=lamp(5.0, (0.2, 0.1, 0.1)))
 
@@ -152,6 +161,8 @@ CASES = [
     Case("crop, gaussian filter", "", lambda: plate(sensor=cropped("gaussian")), PLATE, 0, 0.004),
     Case("radiance meter", "", lambda: shadow(3, line(), lamp(30.0, (1.6, 0.7, 3.0), 205, 0.6)), HIGHER, 0, 0.004,
          spp=1 << 15, fd_spp=1 << 17),
+    Case("irradiance meter moves", "", metered, move("meter.to_world", (1, 0.2, 0.3)), 0, 0.004,
+         spp=1 << 17, fd_spp=1 << 19),
     Case("lamp near a wall", "", near_lamp, move("wall.to_world", (0.3, 0.1, 1)), 0, 0.001, spp=2048, fd_spp=8192),
     Case("shining plate, hidden", "", hidden_lamp, PLATE, 0, 0.004),
     Case("normal map", "", lambda: shadow(wall=normal_map()), HIGHER, 0, 0.004),

@@ -61,7 +61,8 @@ class SensorPlaces:
         """Return (where the sensor sees ``at`` (Interaction3f), its importance there per area across).
 
         The first: ``uv`` (in pixels), ``p`` (the sensor's point), ``eye`` (a point on the line of sight from which
-        everything near is seen as by the sensor), ``d, dist`` (to ``p``), ``pdf`` (zero where nothing is seen).
+        everything near is seen as by the sensor), ``d, dist`` (to ``p``), ``pdf`` (zero where nothing is seen),
+        ``numbers`` (those of the ray through ``uv`` that meets ``at``).
         """
         if self.is_meter:
             return self._seen_from_meter(at, numbers, active)
@@ -81,7 +82,7 @@ class SensorPlaces:
         way = result.p - at.p
         dist = dr.norm(way)
         uv, pdf = result.uv * self.size, dr.select(valid, mi.Float(1), 0)
-        ds = Local(uv=uv, p=result.p, eye=result.eye, d=way / dist, dist=dist, pdf=pdf)
+        ds = Local(uv=uv, p=result.p, eye=result.eye, d=way / dist, dist=dist, pdf=pdf, numbers=numbers)
         return ds, dr.select(valid, result.importance, 0)
 
     def _seen_from_camera(self, camera: Any, p: Any, aperture: Any) -> Local:
@@ -120,6 +121,10 @@ class SensorPlaces:
         cos = -dr.dot(ps.n, d)
         valid = active & (cos > 0)
         uv, p, pdf = numbers.aperture * self.size, mi.Point3f(ps.p), dr.select(valid, mi.Float(1), 0)
-        ds = Local(uv=uv, p=p, eye=p, d=d, dist=dist, pdf=pdf, n=mi.Normal3f(ps.n))
+        # Places are drawn by what stands for the film, directions by what stands for the aperture.
+        local = mi.Frame3f(ps.n).to_local(-d)
+        towards = mi.warp.uniform_disk_to_square_concentric(mi.Point2f(local.x, local.y))
+        asked = Local(aperture=towards, wavelength=numbers.wavelength, camera=numbers.camera)
+        ds = Local(uv=uv, p=p, eye=p, d=d, dist=dist, pdf=pdf, n=mi.Normal3f(ps.n), numbers=asked)
         # The weight of its rays holds a pi.
         return ds, dr.select(valid, cos * dr.inv_pi / dr.square(dist), 0)

@@ -43,7 +43,9 @@ class LightPass:
         k = edges.pick(edges.by_length, sampler.next_1d(), sampler.next_1d())
         numbers = term.places.numbers(sampler)
         middle = term.rays_at(sampler, term.places.middle(numbers), numbers, None, None, job)
-        ray = mi.Ray3f(dr.detach(middle.ray))
+        # Nothing attached is kept that forward mode, which follows the speeds, would run into.
+        middle.ray, middle.weight, middle.η = dr.detach((middle.ray, middle.weight, middle.η))
+        ray = mi.Ray3f(middle.ray)
         light = self._light(term, edges, k, ray, sampler.next_2d())
         b, ds = light.b, light.ds
         most = dr.max(dr.abs(light.Le))
@@ -109,7 +111,7 @@ class LightPass:
         if term.is_meter and not world.wanted.sensor:
             first = held
         else:
-            rays = term.rays_at(sampler, seen.uv, numbers, None, None, job)
+            rays = term.rays_at(sampler, seen.uv, seen.numbers, None, None, job)
             if term.is_meter:
                 with dr.suspend_grad():
                     shift = seen.p - rays.ray.o

@@ -175,7 +175,7 @@ def _is_in_view(scene: Any, sky: Any) -> bool:
             carrier = camera.get_shape()
             o = camera.world_transform() @ mi.Point3f(0) if carrier is None else carrier.bbox().center()
             at.p = mi.Point3f(o) + d * (near_clip(camera) or 0) * 2 + d
-            numbers = Local(aperture=mi.Point2f(0.5), camera=mi.UInt32(number))
+            numbers = Local(aperture=mi.Point2f(0.5), wavelength=mi.Float(0), camera=mi.UInt32(number))
             seen, _ = places.seen_from(at, numbers, mi.Bool(True))
             inside = (seen.pdf > 0) & dr.all((seen.uv >= 0) & (seen.uv <= places.size))
             if bool(dr.any(inside)):

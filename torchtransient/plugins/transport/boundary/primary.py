@@ -43,7 +43,7 @@ class PrimaryPass:
         own, share = mode.kept(row)
         inside &= own
         row, column = dr.select(inside, row, job.first_row), dr.select(inside, column, 0)
-        rays = term.rays_at(sampler, ds.uv, numbers, row, column, job)
+        rays = term.rays_at(sampler, ds.uv, ds.numbers, row, column, job)
         view, ray = mode.view(rays), dr.detach(rays.ray)
         if term.is_meter:
             ray.o = mi.Point3f(eye.p)
