@@ -38,7 +38,12 @@ def renderer(boundary: bool) -> tt.TransientRenderer:
         "plate": {"type": "rectangle", "to_world": PLATE, "bsdf": diffuse(0.4)},
     }
     return tt.TransientRenderer(
-        tt.load(scene, variant="llvm_ad_mono"), [KEY], spp=SPP, temporal_filter="tent", boundary=boundary, physics="ignore"
+        tt.load(scene, variant="llvm_ad_mono"),
+        [KEY],
+        spp=SPP,
+        temporal_filter="tent",
+        boundary=boundary,
+        physics="ignore",
     )
 
 
@@ -50,12 +55,12 @@ def derivatives() -> dict[str, Tensor]:
     def moved(which: tt.TransientRenderer, shift: Tensor, seed: int, spp: int) -> Tensor:
         return which({KEY: base + shift * SIDEWAYS}, seed=seed, spp=spp).transient[0]
 
+    def slope(which: tt.TransientRenderer, seed: int) -> Tensor:
+        return torch.func.jvp(lambda x: moved(which, x, seed, SPP), (torch.zeros(()),), (torch.ones(()),))[1]
+
     found: dict[str, list[Tensor]] = {name: [] for name in (RENDER, *KINDS)}
     for seed in tqdm(range(SEEDS), desc="seeds"):
-        with_edges, without = (
-            torch.func.jvp(lambda x, r=r: moved(r, x, seed, SPP), (torch.zeros(()),), (torch.ones(()),))[1]
-            for r in (whole, inner)
-        )
+        with_edges, without = (slope(which, seed) for which in (whole, inner))
         with torch.no_grad():
             ends = [moved(whole, torch.tensor(h), 1000 + seed, DIFFERENCE_SPP) for h in (STEP_M, -STEP_M)]
         found[RENDER].append((ends[0] + ends[1]) / 2)
@@ -95,7 +100,9 @@ def draw(found: dict[str, Tensor], axis: tt.TimeAxis, path: Path) -> None:
         curves.plot(centers, found[name].sum((2, 3)).mean(0), color=colour, linewidth=width, label=name)
     expected = found["finite differences"].sum((2, 3))
     error = expected.std(0) / SEEDS**0.5
-    curves.errorbar(centers, expected.mean(0), error, fmt=".", color="tab:red", label="finite differences", markersize=4)
+    curves.errorbar(
+        centers, expected.mean(0), error, fmt=".", color="tab:red", label="finite differences", markersize=4
+    )
     curves.axhline(0, color="0.7", linewidth=0.7, zorder=0)
     curves.set(xlim=(5.7, 8.7), xlabel="optical path length [m]", ylabel="summed over the picture,\nper metre")
     curves.legend(fontsize=9)

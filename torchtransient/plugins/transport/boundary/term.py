@@ -93,9 +93,8 @@ class BoundaryTerm:
 
     def tables(self):
         """The attached ends of edges, and what the strategies of light paths have attached."""
-        ends = {id(end): end for edges in (self.seen_edges, self.edges) for end in edges.ends}
         lights = self.passes["light"].lights.tables() if "light" in self.passes else []
-        return [table for table in (*ends.values(), *lights) if dr.grad_enabled(table)]
+        return [table for table in (*self.edges.ends, *lights) if dr.grad_enabled(table)]
 
     def backward(self, incoming):
         """Back-propagate to the parameters and the tables."""
