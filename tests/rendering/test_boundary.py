@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import gc
 import copy
+import gc
 import pickle
 import warnings
 
@@ -181,6 +181,7 @@ def test_the_integrator_alone_says_it_too():
 
 STEPS = {"type": "bitmap", "data": np.eye(4)[..., None] * 0.6 + 0.2, "raw": True, "filter_type": "nearest"}
 STRIPED = {"type": "rectangle", "to_world": pose(scale=5.0), "bsdf": {"type": "diffuse", "reflectance": STEPS}}
+DISTANT = {"type": "distant", "direction": [0.1, 0, -1], "film": FILM | {"width": 1, "height": 1}}
 LAMP = {"type": "rectangle", "to_world": pose(0, 0, 3, 0.1) @ np.diag([1.0, -1, -1, 1]),
         "emitter": {"type": "angulararea", "cutoff_angle": 20.0}}  # fmt: skip
 
@@ -188,7 +189,7 @@ LAMP = {"type": "rectangle", "to_world": pose(0, 0, 3, 0.1) @ np.diag([1.0, -1, 
 @pytest.mark.parametrize(("more", "key", "words"), [
     ({"mirror": MIRROR}, BODY, "mirrors.*'mirror'"),
     ({"mirror": MIRROR}, "light.position", "mirrors"),
-    ({"sensor": {"type": "distant", "direction": [0.1, 0, -1], "film": FILM | {"width": 1, "height": 1}}}, BODY, "'sensor'"),
+    ({"sensor": DISTANT}, BODY, "'sensor'"),
     ({"light": {"type": "spot", "to_world": CAMERA, "cutoff_angle": 20, "beam_width": 20}}, BODY, "rim.*'light'"),
     ({"lamp": LAMP}, BODY, "rim of the light of 'lamp'"),
     ({"wall": STRIPED}, "wall.to_world", "steps.*'wall'"),

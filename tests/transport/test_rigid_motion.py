@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from torchtransient.scenes import transforms
+from torchtransient.scenes.transforms import look_at, rotate, scale, translate
 
 FILM = {"type": "transient_hdr_film", "width": 6, "height": 5, "temporal_bins": 64, "start_opl": 4.0,
         "bin_width_opl": 0.1, "rfilter": {"type": "box"}}  # fmt: skip
@@ -19,13 +19,14 @@ def renderer():
         "type": "scene",
         "integrator": {"type": "transient_path", "max_depth": 4},
         "sensor": {"type": "perspective", "fov": 40, "near_clip": 1e-2, "film": FILM,
-                   "to_world": transforms.look_at(origin=[0.3, 0.2, 4], target=[0, 0, 0], up=[0, 1, 0])},
+                   "to_world": look_at(origin=[0.3, 0.2, 4], target=[0, 0, 0], up=[0, 1, 0])},
         "light": {"type": "point", "position": [0.7, 0.4, 3.0], "intensity": 10.0},
-        "lamp": {"type": "rectangle", "to_world": transforms.translate([-0.8, 0.9, 2.5]) @ transforms.rotate([1, 0, 0], 150) @ transforms.scale(0.2),
+        "lamp": {"type": "rectangle",
+                 "to_world": translate([-0.8, 0.9, 2.5]) @ rotate([1, 0, 0], 150) @ scale(0.2),
                  "emitter": {"type": "area", "radiance": 10.0}},
         "ball": {"type": "sphere", "center": [0.6, -0.5, 0.4], "radius": 0.3},
-        "wall": {"type": "rectangle", "to_world": transforms.scale([3, 3, 1]), "bsdf": {"type": "diffuse", "reflectance": 0.7}},
-        "cube": {"type": "cube", "to_world": transforms.translate([-0.3, 0.1, 0.5]) @ transforms.rotate([0, 1, 0], 30) @ transforms.scale(0.3),
+        "wall": {"type": "rectangle", "to_world": scale([3, 3, 1]), "bsdf": {"type": "diffuse", "reflectance": 0.7}},
+        "cube": {"type": "cube", "to_world": translate([-0.3, 0.1, 0.5]) @ rotate([0, 1, 0], 30) @ scale(0.3),
                  "bsdf": {"type": "roughplastic"}},
     }  # fmt: skip
     return tt.TransientRenderer(tt.load(scene, variant="llvm_ad_mono"), MOVING, spp=32)

@@ -125,9 +125,8 @@ def of_two_points(kind, radius):
     direction, length = unit(*(p - a)), np.linalg.norm(p - a)
     following = Local(d=mi.Vector3f(*direction.tolist()), n=mi.Normal3f(*n.tolist()), t=mi.Float(length))
     after = Local(pi=None, ray=None)
-    vertex = Local(
-        v=Local(after=lambda: after), scattered_si=Local(p=mi.Point3f(start)), damping_radius=dr.opaque(mi.Float, radius)
-    )
+    at = Local(p=mi.Point3f(start))
+    vertex = Local(v=Local(after=lambda: after), scattered_si=at, damping_radius=dr.opaque(mi.Float, radius))
     motion = segment.motion(None, vertex, following, ahead)
     values = motion.longer(), motion.d * 1, motion.J * 1, motion.drag * 1  # inner nodes keep no derivative
     dr.enqueue(dr.ADMode.Forward, x)
@@ -152,7 +151,8 @@ def test_segments_between_points_of_shapes(kind, radius):
     """Direction and length follow both ends, and far ends the measure, area times the cosine over the squared distance;
     near ends slide along with the vertex that sees them.
     """
-    motion, (longer, turned, grown, drag), (d, r, m, dragged), (direction, _, measure), own = of_two_points(kind, radius)
+    motion, found, (d, r, m, dragged), (direction, _, measure), own = of_two_points(kind, radius)
+    longer, turned, grown, drag = found
     there = np.array([1, 1, 0])
     np.testing.assert_allclose(turned, np.outer(d, there), rtol=1e-3, atol=1e-4)
     # What the far end adds is counted there, where it is a vertex of a path.

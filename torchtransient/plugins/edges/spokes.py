@@ -1,4 +1,4 @@
-"""The edges that start at the corners of a face: candidates for a point of a mesh, next to which edges lie that a draw by
+"""Edges that start at the corners of a face: candidates for a point of a mesh, next to which edges lie that a draw by
 length hardly ever finds.
 """
 

@@ -40,8 +40,8 @@ TILT = 2e-3
 
 
 class EdgeDensity:
-    """Density of rows of a table, in proportion to ``weight`` (Float), whose cumulative sum is ``cumulative`` (Float64: of
-    single precision, steps of long tables would be rounding).
+    """Density of rows of a table, in proportion to ``weight`` (Float), whose cumulative sum is ``cumulative`` (Float64:
+    of single precision, steps of long tables would be rounding).
     """
 
     def __init__(self, weight: Any, cumulative: Any) -> None:
@@ -190,8 +190,8 @@ class EdgeTable:
     ) -> Local:
         """Return one of several picks, which cost no rays, in proportion to what it may be ``worth(d, dist, crease)``
         seen from ``V``: an outline times its span, a crease less, the flatter it is. (Resampling, Talbot et al. 2005.)
-        ``at``: (PreliminaryIntersection3f of ``V``, mask of those that lie on it); on a mesh, half of the candidates are
-        edges around the face there.
+        ``at``: (PreliminaryIntersection3f of ``V``, mask of those that lie on it); on a mesh, half of the candidates
+        are edges around the face there.
         """
         if candidates == 1:
             return self.pick(density, sampler.next_1d(), sampler.next_1d())

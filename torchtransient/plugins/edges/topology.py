@@ -111,8 +111,8 @@ def _halves(joined: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def _edges_of(positions: np.ndarray, faces: np.ndarray) -> tuple[_Rows, np.ndarray]:
-    """(the edges of a mesh with vertices (V, 3) and faces (F, 3), flat ones included; joined places of the corners of its
-    faces, (F, 3), zeros where a face has no area).
+    """(the edges of a mesh with vertices (V, 3) and faces (F, 3), flat ones included; joined places of the corners of
+    its faces, (F, 3), zeros where a face has no area).
     """
     all_places = np.zeros(faces.shape, int)
     corners = positions.astype(np.float64)[faces]
@@ -158,7 +158,8 @@ def _angles(p: np.ndarray, group: np.ndarray) -> np.ndarray:
 
 class Topology:
     """The edges and limbs of ``scene``: ``count`` rows, of which the last ``rounds`` are limbs and rims of what has no
-    triangles. ``without``: the shapes that have outlines, but no edges here. ``hides``: which shapes count, None for all.
+    triangles. ``without``: the shapes that have outlines, but no edges here. ``hides``: which shapes count, None for
+    all.
 
     A plain object of Dr.Jit arrays, to be kept with the scene and to be named as state of recorded calls.
 

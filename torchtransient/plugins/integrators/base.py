@@ -238,7 +238,8 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     def beside(self, world, sensor, film, seed, samples):
         """What derivatives of a job have beside its paths: objects with ``tables()`` (attached to the parameters),
-        ``backward(incoming)``, ``forward()``, and ``can_be_recorded``. Raises GradientError where one is needed and cannot be computed.
+        ``backward(incoming)``, ``forward()``, and ``can_be_recorded``. Raises GradientError where one is needed and
+        cannot be computed.
         """
         return []
 

@@ -51,8 +51,9 @@ class SceneContents:
     participating media (:class:`.media_contents.MediaContents`). ``sphere_lights``: the spherical area lights
     (:class:`~..sampling.sphere_lights.SphereLights`). ``shape_lights``: the area lights that are sampled over their
     shapes (:class:`~..sampling.shape_lights.ShapeLights`). ``emitting_meshes``: those with vertices of their own;
-    ``meshes``: all of those, of shape groups, too; ``sliding``: the shapes without material points; ``smooth_lights``: lights on meshes with normals at their vertices. Tables, instances,
-    surroundings, mixtures, media and lights are None where the scene has no such thing.
+    ``meshes``: all of those, of shape groups, too; ``sliding``: the shapes without material points;
+    ``smooth_lights``: lights on meshes with normals at their vertices. Tables, instances, surroundings, mixtures, media
+    and lights are None where the scene has no such thing.
 
     ``damping_radius`` (Float): see :func:`.scattering.geometry_terms.damped_motion`. ``patterned_lights``: what leaves
     some surface differs from place to place. ``patterned``: that, or how a surface scatters does, or its normal.

@@ -11,7 +11,7 @@ from torchtransient.plugins.sensors.seen_from import FAR, can_be_connected
 from torchtransient.plugins.transport.boundary.sides import at_point, place_at
 from torchtransient.plugins.transport.boundary.speeds import along_the_ray, dragged_share
 from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
-from torchtransient.plugins.transport.scattering.geometry_terms import displacement, material_point
+from torchtransient.plugins.transport.scattering.geometry_terms import EDGE_ON, displacement, material_point
 from torchtransient.plugins.transport.strategy import Local
 from torchtransient.plugins.transport.walk import go_on, start
 
@@ -123,7 +123,7 @@ class LightPass:
                 w = (x.at.p - dr.detach(o)) / r
             δ = displacement(rays.ray.o + rays.ray.d * r, active)
             q, cos = dr.dot(n, along_the_ray(world, pi, ray, surface)), dr.dot(n, w)
-            first = δ + w * dr.select(surface & (cos != 0), (q - dr.dot(n, δ)) / cos, 0)
+            first = δ + w * dr.select(surface & (dr.abs(cos) > EDGE_ON), (q - dr.dot(n, δ)) / cos, 0)
         n_p, found, turned = dr.dot(b.n, edges.moving(b)), [], mi.Float(0)
         if self.lights.sun is not None:  # its rays turn about x
             sun = active & light.far & self.lights.sun.shines(light.ds.emitter, light.ds.d)

@@ -4,10 +4,10 @@ On a line of sight from x past an edge point p to y, with s = |p - x| / |y - x|,
 
     v_in = n . (v_p - v(p)),    v_out = n . (v_p - (1 - s) v_x - s v(y)),
 
-where v(y) is how the interior derivative moves a sample at y (:meth:`~..strategy.Segment.held`), which near x is dragged
-along by a share a of the motion of x: v(y) = (1 - a) v_y + a v_x. On the inner side v_p is the motion of the surface
-itself, and nothing is left of it but the drag. A point on a ray that is held, as the first one of a camera, slides along
-it, which n does not see.
+where v(y) is how the interior derivative moves a sample at y (:meth:`~..strategy.Segment.held`), which near x is
+dragged along by a share a of the motion of x: v(y) = (1 - a) v_y + a v_x. On the inner side v_p is the motion of the
+surface itself, and nothing is left of it but the drag. A point on a ray that is held, as the first one of a camera,
+slides along it, which n does not see.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.transport.scattering.geometry_terms import displacement
+from torchtransient.plugins.transport.instances import surface_interaction
+from torchtransient.plugins.transport.scattering.geometry_terms import displacement, slide
 from torchtransient.plugins.transport.strategy import Local
 
 
@@ -59,14 +60,10 @@ def dragged(v_x, v_before, r, d, n, radius, active):
     distance ``r``, which moves by ``v_before``; ``d``: direction of the ray between them, ``n``: normal at the point.
     """
     δ = v_before - v_x
-    across, cos = δ - d * dr.dot(d, δ), dr.dot(n, d)
-    slid = across - d * (dr.dot(n, across) * dr.select(cos != 0, dr.rcp(cos), 0))
-    return v_x + dr.select(active, dragged_share(r, radius) * slid, 0)
+    return v_x + dr.select(active, dragged_share(r, radius) * slide(δ - d * dr.dot(d, δ), d, n, active), 0)
 
 
 def along_the_ray(world, pi, ray, active):
     """Attached displacement of where ``ray``, attached or not, meets the surface ``pi``."""
-    from torchtransient.plugins.transport.instances import surface_interaction
-
     si = surface_interaction(world.surfaces, pi, ray, mi.RayFlags.All, active & pi.is_valid())
     return displacement(si.p, active & pi.is_valid())

@@ -5,8 +5,8 @@ that hides; P is the density of p by length. With the adjoint A(pixel, tau) of t
 
     dLoss += sum over sides  +-c [ sum over events e: A(pixel, tau_e) f_e ] (n . v_side)       + inner, - outer
 
-(Li et al. 2018, with times of flight). Each side is a path of the walk, which goes on from a segment whose end is known.
-Every edge between two vertices belongs to one of three passes:
+(Li et al. 2018, with times of flight). Each side is a path of the walk, which goes on from a segment whose end is
+known. Every edge between two vertices belongs to one of three passes:
 
     primary   x is the sensor:           c = W sin / P                     (W: importance per area across d at p)
     vertex    x is a vertex of a path:   c = beta f_s(x, d) sin / (r^2 P)

@@ -91,8 +91,8 @@ class VertexPass:
         return both_sides(world, mode, sampler, view, b, past, first, factor, speeds, (near, ~b.crease | near), lit)
 
     def _target(self, world, u, finds_light):
-        """(number of a vertex, one over its probability). The last vertex, after which there is nothing but emission, is
-        chosen seldom where only lights with rims are of use to it.
+        """(number of a vertex, one over its probability). The last vertex, after which there is nothing but emission,
+        is chosen seldom where only lights with rims are of use to it.
         """
         if finds_light:
             count = world.max_depth - 1

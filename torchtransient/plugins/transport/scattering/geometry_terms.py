@@ -8,7 +8,6 @@ import mitsuba as mi
 from torchtransient.plugins.transport.instances import surface_interaction
 from torchtransient.plugins.transport.strategy import Local
 
-
 # Cosines under which a surface is seen edge-on: its points slide along a ray by one over the cosine, which is rounding
 # there. What is left out of derivatives is as rare as the cosine is small.
 EDGE_ON = 1e-4
