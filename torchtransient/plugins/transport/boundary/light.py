@@ -62,6 +62,10 @@ class LightPass:
         if world.contents.distant is not None:
             τ = mi.Float64(dr.select(light.far, world.contents.distant.length(b.p, -b.d), 0))
         term.to_sensor.aperture = aperture
+        through = term.through
+        if through is not None:
+            through.chain, through.aperture = term.chains.draw(sampler.next_1d()), aperture
+            through.wavelength, through.job = wavelength, job
         path = start(lit, ray, τ - term.film.start_opl, dr.detach(middle.η))
         path.prev_p = dr.select(light.far, b.p, b.V)
         β = light.Le * mi.UnpolarizedSpectrum(T) * dr.select(most > 0, dr.rcp(most), 0)
@@ -98,7 +102,9 @@ class LightPass:
         return Local(ds=ds, b=b, far=far, Le=dr.select(k.ball, other, Le), near=near, u=u)
 
     def _speeds(self, edges, light, x, path, ray, wavelength, aperture, sampler, job, active):
-        """Attached speeds of the edge: where x is the first vertex of a path of the sensor, and where it is another."""
+        """Attached speeds of the edge: where x is the first vertex of a path of the sensor, where it is another, and where
+        the sensor sees it through a chain.
+        """
         term, b = self.term, light.b
         world = term.world
         pi, on_surface = term.light_world.segment.surface_of(path.leg)
@@ -122,14 +128,35 @@ class LightPass:
             with dr.suspend_grad():
                 r = dr.norm(x.at.p - o)
                 w = (x.at.p - dr.detach(o)) / r
-            δ = displacement(rays.ray.o + rays.ray.d * r, active)
-            q, cos = dr.dot(n, along_the_ray(world, pi, ray, surface)), dr.dot(n, w)
-            first = δ + w * dr.select(surface & (cos != 0), (q - dr.dot(n, δ)) / cos, 0)
+            q = dr.dot(n, along_the_ray(world, pi, ray, surface))
+            first = self._on_ray(displacement(rays.ray.o + rays.ray.d * r, active), w, n, q, surface)
+        motions = [first, held]
+        if term.through is not None:
+            motions.append(self._through_chain(x.at.p, n, pi, ray, surface, active))
         n_p, found = dr.dot(b.n, edges.moving(b)), []
-        for v_x in (first, held):
+        for v_x in motions:
             v_y = self._motion(light, x.at.p, v_x, active & ~light.far)
             found.append(dr.select(active, n_p - (1 - t) * dr.dot(b.n, v_x) - t * dr.dot(b.n, v_y), 0))
         return found
+
+    @staticmethod
+    def _on_ray(δ, w, n, q, surface):
+        """Motion of the point of a surface, which moves by ``q`` along its normal ``n``, on a ray in direction ``w``
+        that moves by ``δ``.
+        """
+        cos = dr.dot(n, w)
+        return δ + w * dr.select(surface & (cos != 0), (q - dr.dot(n, δ)) / cos, 0)
+
+    def _through_chain(self, x, n, pi, ray, surface, active):
+        """Motion of x on the ray of the sensor that sees it through a chain."""
+        term = self.term
+        with dr.suspend_grad():
+            seen, rays = term.through.seen_from(x, active)
+            chain = term.through.chain
+        ratios = [ratio for _, _, ratio in chain.planes]
+        last = term.chains.attached_ray(rays.ray, ratios, chain.count, active & seen.valid)
+        q = dr.dot(n, along_the_ray(term.world, pi, ray, surface))
+        return self._on_ray(displacement(last.o + last.d * seen.way, active & seen.valid), seen.d, n, q, surface)
 
     def _motion(self, light, x, v_x, active):
         """Attached motion of a light's point, as interior derivatives hold it, seen from ``x``, which moves by ``v_x``:

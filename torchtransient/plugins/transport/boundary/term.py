@@ -29,13 +29,19 @@ from torchtransient.plugins.mitsuba_compat import is_irradiance_meter
 from torchtransient.plugins.sensors.origin import PrimaryRays, index_at_sensor, sample_rays, views
 from torchtransient.plugins.transport.boundary.light import LightPass
 from torchtransient.plugins.transport.boundary.primary import PrimaryPass
+from torchtransient.plugins.transport.boundary.specular import (
+    Chains,
+    SensorThroughChain,
+    SpecularPass,
+    sees_chains,
+)
 from torchtransient.plugins.transport.boundary.vertex import VertexPass
 from torchtransient.plugins.transport.boundary.weigh import Forward, Reverse
 from torchtransient.plugins.transport.connection.sensor_sampled import SensorSampled
 from torchtransient.plugins.transport.world import World
 
-PASSES = {"primary": PrimaryPass, "vertex": VertexPass, "light": LightPass}
-_SEEDS = {"primary": 0x51, "vertex": 0x52, "light": 0x53}
+PASSES = {"primary": PrimaryPass, "vertex": VertexPass, "light": LightPass, "specular": SpecularPass}
+_SEEDS = {"primary": 0x51, "vertex": 0x52, "light": 0x53, "specular": 0x54, "chains": 0x55}
 
 
 class BoundaryTerm:
@@ -63,12 +69,19 @@ class BoundaryTerm:
         self.seen_edges = EdgeTable(topology, moving, alone=not views_move)
         self.edges = self.seen_edges if views_move else EdgeTable(topology, moving, alone=False)
         self.radius = dr.opaque(mi.Float, integrator.reference(scene).radius)
+        self.to_sensor = SensorSampled(sensor, integrator.camera_unwarp)
+        seed_of = lambda name: mi.sample_tea_32(seed_array(seed), mi.UInt32(_SEEDS[name]))[0]  # noqa: E731
+        self.chains, self.through = None, None
+        if topology.count and sees_chains(world, sensor):
+            with dr.suspend_grad():
+                self.chains = Chains(self, seed_of("chains"))
+            self.through = SensorThroughChain(self.chains)
         with dr.suspend_grad():
             self.light_world = self._light_world()
         self.passes, self.jobs = {}, {}
         for name in names if topology.count else ():
             if PASSES[name].exists(world, sensor):
-                own, _ = mi.sample_tea_32(seed_array(seed), mi.UInt32(_SEEDS[name]))
+                own = seed_of(name)
                 self.passes[name] = PASSES[name](self)
                 self.jobs[name], _ = passes_of(sensor.sampler().clone(), film, own, samples, world.most_events())
 
@@ -78,10 +91,8 @@ class BoundaryTerm:
         segment, scattering, _ = integrator.strategies(world.contents)
         # Whether the sensor's segment counts in time is asked by its connection: here it is the last one of a path.
         settings = replace(integrator.settings(), camera_unwarp=False)
-        self.to_sensor = SensorSampled(self.sensor, integrator.camera_unwarp)
-        return World(
-            world.scene, world.contents, settings, (segment, scattering, [self.to_sensor]), None, world.window
-        )
+        sensors = [self.to_sensor] if self.through is None else [self.to_sensor, self.through]
+        return World(world.scene, world.contents, settings, (segment, scattering, sensors), None, world.window)
 
     def tables(self):
         """The attached ends of edges, and what the strategies of light paths have attached."""
@@ -109,9 +120,12 @@ class BoundaryTerm:
 
     def sampler(self, job):
         """A seeded sampler of independent numbers with a lane for each sample of ``job``."""
-        lanes = int(self.film.crop_size()[0]) * job.rows * job.spp
+        return self.independent(job.seed, int(self.film.crop_size()[0]) * job.rows * job.spp)
+
+    def independent(self, seed, lanes):
+        """A seeded sampler of independent numbers."""
         sampler = self._sampler.clone()
-        sampler.seed(job.seed, lanes)
+        sampler.seed(seed, lanes)
         return sampler
 
     def numbers_of_sensor(self, sampler):

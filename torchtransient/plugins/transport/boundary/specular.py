@@ -1,0 +1,356 @@
+"""Edges and shadows that the sensor sees in plane mirrors and through plane, smooth glass.
+
+A *chain* is a sequence of planes with delta lobes that rays of the sensor run through before anything else. For a point
+p behind a chain there is one ray of the sensor that arrives there: in mirrors the straight line to the image of p, in
+glass found by Newton's method on the planes, which are taken as infinite. The walk then traces that ray and has to visit
+the same planes. The importance per area across at p is that per solid angle at the sensor over the determinant of how p
+moves across with the direction.
+
+Chains are drawn from those of a few rays of the sensor, in proportion to how often these meet them. Planes alone are
+found twice; of curved surfaces every hit has a plane of its own, and the edges seen in them are left out.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins.edges.table import EdgeDensity
+from torchtransient.plugins.mitsuba_compat import is_instance, is_irradiance_meter
+from torchtransient.plugins.node_walk import shapes_of_scene
+from torchtransient.plugins.polarized import attenuated, intensity, product
+from torchtransient.plugins.transport.boundary.primary import can_be_sampled
+from torchtransient.plugins.transport.boundary.sides import at_point, both_sides, past_edge
+from torchtransient.plugins.transport.connection.sensor_sampled import first_row, in_sensor_frame
+from torchtransient.plugins.transport.instances import surface_interaction
+from torchtransient.plugins.transport.strategy import Connection, Event, Local, Proposal
+from torchtransient.plugins.transport.walk import advance, start
+
+# Delta vertices of a chain at most: a slab of glass has two, one that is seen in a mirror three.
+LONGEST = 3
+# Rays that chains are taken from, and the share of those that end at a surface that goes on with a delta lobe.
+_RAYS, _UNFINISHED = 2**14, 0.125
+# Entries of each of two tables of counts. A chain has the lesser of its two counts: others may share one of them.
+_BUCKETS = 2**18
+_STEPS = 8
+# How far from p its ray may pass, in parts of the way; planes are told apart by a hundredth of their normals and this
+# share of the scene's radius, which is also the least distance of an edge from the last plane.
+_MISS = 1e-4
+
+
+class Chains:
+    """The chains that a sensor sees, see the module.
+
+    ``edges``: the table whose edges may move as seen through them.
+    """
+
+    def __init__(self, term, seed):
+        self.term, world = term, term.world
+        self.longest = min(LONGEST, world.max_depth - 1)
+        moved = any(
+            shape.ptr in world.wanted.shapes and (is_instance(shape) or has_delta_lobe(shape))
+            for shape in shapes_of_scene(world.scene)
+        )
+        self.edges = term.edges if moved else term.seen_edges
+        sampler = term.independent(seed, _RAYS)
+        aperture, wavelength = term.numbers_of_sensor(sampler)
+        uv = sampler.next_2d() * mi.ScalarVector2f(term.film.crop_size())
+        rays = term.rays_at(sampler, uv, wavelength, aperture, None, None, Local(total=1))
+        found = self.follow(rays, sampler, mi.UInt32(self.longest), mi.Bool(True))
+        self.planes = [mi.Vector3f(0), mi.Float(0), mi.Float(0)]
+        last = [reached & ~after for reached, after in zip(found.reached, [*found.reached[1:], mi.Bool(False)], strict=True)]
+        weights = [dr.select(r, dr.select(e, 1, _UNFINISHED), 0) for r, e in zip(found.reached, last, strict=True)]
+        self.keys = [dr.concat([key[k] for key in found.keys]) for k in (0, 1)]
+        self.normals = _concatenated([n for n, _, _ in found.planes])
+        self.offsets, self.ratios = (dr.concat([plane[k] + dr.zeros(mi.Float, _RAYS) for plane in found.planes]) for k in (1, 2))
+        self.density = EdgeDensity(dr.concat([weight + dr.zeros(mi.Float, _RAYS) for weight in weights]))
+        self.counts = [dr.zeros(mi.Float, _BUCKETS) for _ in self.keys]
+        for count, key in zip(self.counts, self.keys, strict=True):
+            dr.scatter_reduce(dr.ReduceOp.Add, count, self.density.weight, key % _BUCKETS)
+        dr.eval(self.keys, self.normals, self.offsets, self.ratios, vars(self.density), self.counts)
+
+    def draw(self, x):
+        """Draw a chain by a uniform number: ``count`` of its planes, ``planes`` (normal n, offset n . p, ratio of the
+        index behind it to that before, 0 for a mirror), ``key``, ``inverse`` (one over its probability).
+        """
+        row, p = self.density.sample(x)
+        ray, active = row % _RAYS, p > 0
+        planes = [
+            (dr.gather(mi.Vector3f, self.normals, ray + i * _RAYS, active), *(dr.gather(mi.Float, each, ray + i * _RAYS, active) for each in (self.offsets, self.ratios)))
+            for i in range(self.longest)
+        ]
+        key = [dr.gather(mi.UInt32, each, row, active) for each in self.keys]
+        counts = [dr.gather(mi.Float, count, k % _BUCKETS, active) for count, k in zip(self.counts, key, strict=True)]
+        inverse = dr.select(active, mi.Float(self.density.total) / dr.minimum(*counts), 0)
+        return Local(count=row // _RAYS + 1, planes=planes, key=key, inverse=inverse)
+
+    def follow(self, rays, sampler, count, active):
+        """Trace primary rays through up to ``count`` delta vertices.
+
+        Returns:
+            ``path``, behind the last one, active where all were delta vertices; by vertex ``reached`` (mask), ``planes``
+            and ``keys`` of the chain that ends there; ``key`` of all.
+        """
+        term, world = self.term, self.term.world
+        ray = dr.detach(rays.ray)
+        path = start(world, ray, term.integrator.first_opl(term.film, rays), dr.detach(rays.η))
+        path.active &= active
+        path.leg = world.segment.first(world, ray, sampler)
+        key, reached, planes, keys = [mi.UInt32(0), mi.UInt32(0)], [], [], []
+        for i in range(self.longest):
+            on, η = path.active & (i < count), mi.Float(path.η)
+            path, (pi, ray) = advance(world, sampler, path, dr.minimum(i + 1, count))
+            si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, on)
+            path.active &= ~on | path.prev_unconnected
+            on &= path.active
+            mirrors = dr.dot(si.n, ray.d) * dr.dot(si.n, path.ray.d) < 0
+            n, offset, ratio = mi.Vector3f(si.n), dr.dot(si.n, si.p), dr.select(mirrors, 0, path.η / η)
+            cell = dr.round(mi.Vector3f(n) * 100)
+            place = dr.round(offset / (_MISS * term.radius))
+            side = dr.select(dr.dot(n, ray.d) > 0, 2, 0) + dr.select(mirrors, 1, 0)
+            parts = [*(mi.UInt32(mi.Int32(x)) for x in (*cell, place, side)), *(dr.reinterpret_array(mi.UInt32, x) for x in (pi.shape, pi.instance))]
+            mixed = key
+            for part in parts:
+                mixed = mi.sample_tea_32(mixed[0] ^ part, mixed[1])
+            key = [dr.select(on, new, old) for new, old in zip(mixed, key, strict=True)]
+            reached.append(on)
+            planes.append((n, offset, ratio))
+            keys.append(key)
+        return Local(path=path, reached=reached, planes=planes, keys=keys, key=key)
+
+    # -------------------------------------------------------------------------------------------- rays through planes
+
+    def image_of_eye(self, chain, eye):
+        """The image of the ``eye`` in the mirrors of a chain."""
+        for i, (n, offset, ratio) in enumerate(chain.planes):
+            eye = dr.select((i < chain.count) & (ratio == 0), mirrored(eye, n, offset), eye)
+        return mi.Point3f(eye)
+
+    def look(self, chain, eye, p, aperture, active):
+        """The ray from ``eye`` through a ``chain`` to the point ``p``.
+
+        Returns:
+            ``ω`` at the eye, ``uv`` (place on the film, in pixels), ``importance`` per area across at ``p``, last vertex
+            ``o`` and direction ``d``, ``way`` between ``o`` and ``p``, ``length`` from eye to ``p``, ``valid``.
+        """
+        image = p
+        for i, (n, offset, ratio) in reversed(list(enumerate(chain.planes))):
+            image = dr.select((i < chain.count) & (ratio == 0), mirrored(image, n, offset), image)
+        end = self._sent(chain, eye, newton(self, chain, eye, p, dr.normalize(image - eye)))
+        _, missed, det = self._missed(end, p)
+        way = dr.dot(p - end.o, end.d)
+        length = end.length + way
+        valid = active & end.valid & (way > _MISS * self.term.radius) & (dr.abs(det) > 0)
+        valid &= dr.norm(missed) < _MISS * length
+        q = eye + end.ω * end.first
+        ds, importance = self.term.to_sensor.seen_from(at_point(q), aperture, valid)
+        importance *= dr.squared_norm(q - eye) / dr.abs(det)
+        valid &= (ds.pdf > 0) & dr.isfinite(importance)
+        return Local(
+            ω=end.ω, uv=ds.uv, importance=dr.select(valid, importance, 0), o=end.o, d=end.d, way=way, length=length,
+            valid=valid,
+        )  # fmt: skip
+
+    def turned(self, chain, eye, p, ω):
+        """The next direction of Newton's method."""
+        end = self._sent(chain, eye, ω)
+        a, _, _ = self._missed(end, p)
+        across = end.axes[0] * a.x + end.axes[1] * a.y
+        step = dr.norm(across)
+        across *= dr.select(step > 0.5, 0.5 / step, 1)
+        return dr.select(dr.isfinite(step), dr.normalize(ω + across), ω)
+
+    def _sent(self, chain, eye, ω):
+        """Where a ray arrives behind the chain, with the derivatives of ``o, d`` by ``ω`` along two ``axes``."""
+        o, d, length, first, valid = mi.Point3f(eye), mi.Vector3f(ω), mi.Float(0), mi.Float(0), mi.Bool(True)
+        axes = [mi.Vector3f(axis) for axis in mi.coordinate_system(ω)]
+        moves = [(mi.Vector3f(0), axis) for axis in axes]
+        for i, (n, offset, ratio) in enumerate(chain.planes):
+            on = i < chain.count
+            cos = dr.dot(n, d)
+            t = (offset - dr.dot(n, o)) / cos
+            out, slope = bent(d, n, ratio)
+            following = []
+            for δo, δd in moves:
+                δt = -(dr.dot(n, δo) + t * dr.dot(n, δd)) / cos
+                c = dr.dot(n, δd)
+                scale = dr.select(ratio == 0, 1, dr.rcp(ratio))
+                following.append((dr.select(on, δo + δd * t + d * δt, δo), dr.select(on, (δd - n * c) * scale + n * (slope * c), δd)))
+            moves = following
+            valid &= ~on | ((t > 0) & dr.isfinite(t) & dr.isfinite(slope))
+            length += dr.select(on, t, 0)
+            if i == 0:
+                first = t
+            o, d = dr.select(on, o + d * t, o), dr.select(on, out, d)
+        return Local(o=o, d=d, ω=ω, axes=axes, moves=moves, length=length, first=first, valid=valid)
+
+    @staticmethod
+    def _missed(end, p):
+        """(change of direction that brings the ray to ``p``, how far it passes ``p`` across, determinant)."""
+        t = dr.dot(p - end.o, end.d)
+        u, v = mi.coordinate_system(end.d)
+        r = p - (end.o + end.d * t)
+        (ax, ay), (bx, by) = ((dr.dot(u, δo + δd * t), dr.dot(v, δo + δd * t)) for δo, δd in end.moves)
+        rx, ry = dr.dot(u, r), dr.dot(v, r)
+        det = ax * by - bx * ay
+        return mi.Vector2f(by * rx - bx * ry, ax * ry - ay * rx) / det, mi.Vector2f(rx, ry), det
+
+    # --------------------------------------------------------------------------------------------------------- motion
+
+    def attached_ray(self, ray, ratios, count, active):
+        """The last ray (attached ``o``, ``d``) of the attached primary ``ray`` through ``count`` planes, which move."""
+        world = self.term.world
+        carried = mi.Ray3f(ray)
+        for i, ratio in enumerate(ratios):
+            on = active & (i < count)
+            with dr.suspend_grad():
+                pi = world.scene.ray_intersect_preliminary(dr.detach(carried), active=on)
+                on &= pi.is_valid()
+            si = surface_interaction(world.surfaces, pi, carried, mi.RayFlags.All, on)
+            out, _ = bent(carried.d, si.sh_frame.n, ratio)
+            with dr.suspend_grad():
+                ahead = dr.detach(si).spawn_ray(dr.detach(out))
+            carried.o = dr.select(on, dr.replace_grad(ahead.o, si.p), carried.o)
+            carried.d = dr.select(on, dr.replace_grad(ahead.d, out), carried.d)
+        return carried
+
+
+@dr.syntax
+def newton(chains, chain, eye, p, ω):
+    """The direction at ``eye`` of the ray to ``p``, from one close to it."""
+    i = mi.UInt32(0)
+    while dr.hint(i < _STEPS, max_iterations=_STEPS, label="ray through a chain"):
+        ω = chains.turned(chain, eye, p, ω)
+        i += 1
+    return ω
+
+
+def mirrored(p, n, offset):
+    """The image of ``p`` in a plane."""
+    return p - n * (2 * (dr.dot(n, p) - offset))
+
+
+def bent(d, n, ratio):
+    """(direction behind a plane, derivative of its part along ``n`` by that of ``d``)."""
+    cos = dr.dot(n, d)
+    mirrors = ratio == 0
+    inverse = dr.rcp(dr.select(mirrors, 1, ratio))
+    cos_out = dr.sqrt(dr.select(mirrors, 1, 1 - (1 - dr.square(cos)) * dr.square(inverse)))
+    through = (d - n * cos) * inverse + n * dr.mulsign(cos_out, cos)
+    slope = dr.mulsign(cos * dr.square(inverse) / cos_out, cos)
+    return dr.select(mirrors, d - n * (2 * cos), through), dr.select(mirrors, -1, slope)
+
+
+def has_delta_lobe(shape):
+    """Return whether a shape has a BSDF with a delta lobe."""
+    bsdf = shape.bsdf()
+    return bsdf is not None and bool(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta))
+
+
+def _concatenated(vectors):
+    return mi.Vector3f(*[dr.concat([mi.Float(v[k]) + dr.zeros(mi.Float, _RAYS) for v in vectors]) for k in range(3)])
+
+
+class SpecularPass:
+    """An edge point is drawn, and the pixel that sees it through a chain, as in the pass of primary edges."""
+
+    def __init__(self, term):
+        self.term = term
+
+    @staticmethod
+    def exists(world, sensor):
+        """Return whether the sensor can see edges through chains."""
+        return sees_chains(world, sensor)
+
+    def run(self, mode, job):
+        """Trace the samples of ``job``; returns the objective of reverse mode."""
+        term = self.term
+        chains = term.chains
+        world, edges, sampler = term.world, chains.edges, term.sampler(job)
+        aperture, wavelength = term.numbers_of_sensor(sampler)
+        k = edges.pick(edges.by_length, sampler.next_1d(), sampler.next_1d())
+        chain = chains.draw(sampler.next_1d())
+        at, _ = term.to_sensor.seen_from(at_point(k.near), aperture, mi.Bool(True))
+        eye = mi.Point3f(at.p)
+        b = edges.seen_from(k, chains.image_of_eye(chain, eye), chain.inverse > 0)
+        # A limb depends on where it is seen from; through glass there is no such point.
+        refracts = mi.Bool(False)
+        for i, (_, _, ratio) in enumerate(chain.planes):
+            refracts |= (i < chain.count) & (ratio != 0)
+        seen = chains.look(chain, eye, b.p, aperture, b.valid & ~(b.k.ball & refracts))
+        b = edges.seen_from(k, b.p - seen.d * seen.length, seen.valid)
+        row, column, weight, inside = term.pixel(seen.uv, sampler.next_2d())
+        rays = term.rays_at(sampler, seen.uv, wavelength, aperture, row, column, job)
+        view = mode.view(rays)
+        active, path = traced(chains, chain, seen, rays, sampler, b.valid & seen.valid & inside)
+        medium = world.segment.medium_towards(b.d)
+        place = Local(at=at_point(b.beside, path.ray), si=dr.zeros(mi.SurfaceInteraction3f), medium=medium, surface=mi.Bool(False))
+        to_last = Local(p=seen.o, d=-b.d, dist=seen.way)
+        active, T = world.segment.transmittance(world, place, to_last, sampler.next_2d(), sampler, active)
+        β = attenuated(path.β, mi.UnpolarizedSpectrum(T))
+        factor = seen.importance * chain.inverse * b.sin * b.inv_pdf * weight
+        past = past_edge(world, b, path.ray, medium, β, sampler, active)
+        with dr.resume_grad():
+            ratios = [ratio for _, _, ratio in chain.planes]
+            ray = chains.attached_ray(rays.ray, ratios, chain.count, active)
+            moves = edges.moving(b) - ray.o - ray.d * seen.way
+            speeds = [dr.select(active, dr.dot(b.n, moves), 0)] * 2
+        first = {
+            "ray": path.ray, "β": β, "η": path.η, "τ": path.τ, "prev_p": path.prev_p, "prev_n": path.prev_n,
+            "depth": chain.count, "active": active, "medium": medium,
+        }  # fmt: skip
+        return both_sides(world, mode, sampler, view, b, past, first, factor, speeds, (mi.Bool(True), mi.Bool(True)))
+
+
+def traced(chains, chain, seen, rays, sampler, active):
+    """(whether ``rays`` run through their chains to what is ``seen``, the paths behind these)."""
+    found = chains.follow(rays, sampler, chain.count, active)
+    path = found.path
+    same = (found.key[0] == chain.key[0]) & (found.key[1] == chain.key[1])
+    off = dr.norm(dr.cross(path.ray.d, seen.o + seen.d * seen.way - path.ray.o))
+    return active & path.active & same & (off < _MISS * seen.length), path
+
+
+def sees_chains(world, sensor):
+    """Return whether a sensor has a point of view from which it may see something in mirrors or through glass."""
+    contents = world.contents
+    if world.max_depth < 2 or not contents.delta or contents.media is not None:
+        return False
+    return can_be_sampled(sensor) and not is_irradiance_meter(sensor)
+
+
+class SensorThroughChain(Connection):
+    """The sensor as seen through a chain, which is one for all vertices of a path. Events are as those of
+    :class:`~..connection.sensor_sampled.SensorSampled`. ``chain``, ``aperture``, ``wavelength`` and ``job`` are set
+    before a launch.
+    """
+
+    name = "sensor_through_chain"
+    finds_light = False
+
+    def __init__(self, chains):
+        self.chains, self.term = chains, chains.term
+
+    def seen_from(self, p, active):
+        """(what :meth:`Chains.look` says of ``p``, the primary rays)."""
+        at, _ = self.term.to_sensor.seen_from(at_point(p), self.aperture, active)
+        seen = self.chains.look(self.chain, mi.Point3f(at.p), p, self.aperture, active & (self.chain.inverse > 0))
+        return seen, self.term.rays_at(None, seen.uv, self.wavelength, self.aperture, None, None, self.job)
+
+    def propose(self, world, path, vertex, sampler):
+        depth = path.depth + 2 + self.chain.count
+        active = vertex.goes_on & vertex.connectable & (depth <= world.max_depth)
+        seen, rays = self.seen_from(vertex.at.p, world.deep_enough(active, depth))
+        active, through = traced(self.chains, self.chain, seen, rays, sampler, seen.valid)
+        ds = Local(p=seen.o, n=mi.Normal3f(0), d=-seen.d, dist=seen.way, delta=mi.Bool(True), emitter=None)
+        return Proposal(d=-seen.d, active=active, ds=ds, seen=seen, through=through, depth=depth, u=sampler.next_2d(),
+                        sampler=sampler)  # fmt: skip
+
+    def connect(self, world, path, vertex, proposal, answer, zeros):
+        seen, through, ds = proposal.seen, proposal.through, proposal.ds
+        value = in_sensor_frame(first_row(product(vertex.β, answer.matrix)), mi.Vector3f(ds.d))
+        value = product(through.β, value) * (seen.importance * self.chain.inverse)
+        active = proposal.active & (dr.max(dr.abs(intensity(value))) > 0)
+        opl = vertex.scattered_τ + through.τ + self.term.film.start_opl + mi.Float64(seen.way * through.η)
+        active, T = world.segment.transmittance(world, vertex, ds, proposal.u, proposal.sampler, world.counted(active, opl))
+        return Event(value=value * T, opl=opl, active=active, depth=proposal.depth, uv=seen.uv, d=-seen.ω, first=path.depth == 0, speed=2)
