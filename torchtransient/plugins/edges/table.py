@@ -267,8 +267,12 @@ class EdgeTable:
         place = dr.select(other, place >> 4, place)
         corner = lambda i: mi.Point2f(dr.select(i == 1, 1.0, 0.0), dr.select(i == 2, 1.0, 0.0))  # noqa: E731
         uv = dr.lerp(corner(place & 3), corner((place >> 2) & 3), k.u)
-        # Paths that start exactly on concave creases leak: start a little inside of each face.
-        uv = dr.select(crease, uv + (mi.Point2f(1 / 3) - uv) * INSET, uv)
+        # Paths that start exactly on concave creases, or enter glass at its outline, leak: start a little inside of each
+        # face.
+        inset = crease
+        if top.clear is not None:
+            inset = inset | (dr.gather(mi.UInt32, top.clear, owner) != 0)
+        uv = dr.select(inset, uv + (mi.Point2f(1 / 3) - uv) * INSET, uv)
         pi = dr.zeros(mi.PreliminaryIntersection3f)
         pi.valid, pi.t, pi.prim_index, pi.prim_uv = valid, t, face, dr.select(k.kind == EDGE, uv, 0)
         pi.shape, pi.instance = (

@@ -152,7 +152,7 @@ def _angles(p: np.ndarray, group: np.ndarray) -> np.ndarray:
 
 class Topology:
     """The edges and limbs of ``scene``, edges first: ``count`` of them, the last ``rounds`` are limbs and rims of shapes
-    without triangles. ``without``: the shapes that have outlines, but no edges here.
+    without triangles. ``without``: the shapes that have outlines, but no edges here. ``clear``: by body, ones where light goes through it; None without such.
 
     A plain object of Dr.Jit arrays, to be kept with the scene and to be named as state of recorded calls.
 
@@ -201,9 +201,11 @@ class Topology:
             for each in ([b.shape for b in self.bodies], [b.instance for b in self.bodies])
         )
         self.index = whole([b.index for b in self.bodies])
+        clear = [_lets_light_through(body.shape) for body in self.bodies]
+        self.clear = whole(clear) if any(clear) else None
         # Rows follow each other by what they belong to.
         self._runs = [(k, len(list(run))) for k, run in groupby(owners[:, 0].tolist())]
-        dr.eval(self.ends, self.third, self.other, self.faces, self.owners, self.place, self.flags, self.shape, self.instance, self.index)
+        dr.eval(self.ends, self.third, self.other, self.faces, self.owners, self.place, self.flags, self.shape, self.instance, self.index, self.clear)
 
     def points(self) -> Any:
         """The vertices of all meshes, one after the other, attached where they are."""
@@ -227,6 +229,11 @@ def _bodies(scene: Any, shape: Any) -> list[Body]:
         return [Body(shape)]
     members = members_of(scene, shape)
     return [Body(one, shape, k) for k, one in enumerate(members) if not lacks_edges(one)]
+
+
+def _lets_light_through(shape: Any) -> bool:
+    bsdf = shape.bsdf()
+    return bsdf is not None and bool(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission))
 
 
 def _concatenated(parts: list[Any], type_: type) -> Any:

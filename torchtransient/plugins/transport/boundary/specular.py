@@ -23,8 +23,10 @@ from torchtransient.plugins.transport.boundary.primary import can_be_sampled
 from torchtransient.plugins.transport.boundary.sides import at_point, both_sides, past_edge
 from torchtransient.plugins.transport.connection.sensor_sampled import first_row, in_sensor_frame
 from torchtransient.plugins.transport.instances import surface_interaction
+from torchtransient.plugins.transport.scattering.surface import Surface
 from torchtransient.plugins.transport.strategy import Connection, Event, Local, Proposal
 from torchtransient.plugins.transport.walk import advance, start
+from torchtransient.plugins.transport.world import World
 
 # Delta vertices of a chain at most: a slab of glass has two, one that is seen in a mirror three.
 LONGEST = 3
@@ -36,6 +38,21 @@ _STEPS = 8
 # How far from p its ray may pass, in parts of the way; planes are told apart by a hundredth of their normals and this
 # share of the scene's radius, which is also the least distance of an edge from the last plane.
 _MISS = 1e-4
+
+
+class KnownLobes(Surface):
+    """Goes on by delta lobes alone: by reflection where ``mirrors``, else through the surface."""
+
+    mirrors = False
+
+    def sample(self, bsdf, si, u_lobe, u_dir, active):
+        found = []
+        for lobes in (mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.Null):
+            ctx = mi.BSDFContext()
+            ctx.type_mask = int(lobes)
+            found.append(bsdf.sample(ctx, si, u_lobe, u_dir, active))
+        (bs, weight), (through, its_weight) = found
+        return dr.select(self.mirrors, bs, through), dr.select(self.mirrors, weight, its_weight)
 
 
 class Chains:
@@ -52,11 +69,14 @@ class Chains:
             for shape in shapes_of_scene(world.scene)
         )
         self.edges = term.edges if moved else term.seen_edges
+        segment, _, connections = term.integrator.strategies(world.contents)
+        self.lobes = KnownLobes()
+        self.world = World(world.scene, world.contents, term.integrator.settings(), (segment, self.lobes, connections))
         sampler = term.independent(seed, _RAYS)
         aperture, wavelength = term.numbers_of_sensor(sampler)
         uv = sampler.next_2d() * mi.ScalarVector2f(term.film.crop_size())
         rays = term.rays_at(sampler, uv, wavelength, aperture, None, None, Local(total=1))
-        found = self.follow(rays, sampler, mi.UInt32(self.longest), mi.Bool(True))
+        found = self.follow(world, rays, sampler, mi.UInt32(self.longest), mi.Bool(True))
         self.planes = [mi.Vector3f(0), mi.Float(0), mi.Float(0)]
         last = [reached & ~after for reached, after in zip(found.reached, [*found.reached[1:], mi.Bool(False)], strict=True)]
         weights = [dr.select(r, dr.select(e, 1, _UNFINISHED), 0) for r, e in zip(found.reached, last, strict=True)]
@@ -84,14 +104,15 @@ class Chains:
         inverse = dr.select(active, mi.Float(self.density.total) / dr.minimum(*counts), 0)
         return Local(count=row // _RAYS + 1, planes=planes, key=key, inverse=inverse)
 
-    def follow(self, rays, sampler, count, active):
-        """Trace primary rays through up to ``count`` delta vertices.
+    def follow(self, world, rays, sampler, count, active, mirrors=None):
+        """Trace primary rays through up to ``count`` delta vertices. ``mirrors``: by vertex, the lobes that
+        :class:`KnownLobes` takes.
 
         Returns:
             ``path``, behind the last one, active where all were delta vertices; by vertex ``reached`` (mask), ``planes``
             and ``keys`` of the chain that ends there; ``key`` of all.
         """
-        term, world = self.term, self.term.world
+        term = self.term
         ray = dr.detach(rays.ray)
         path = start(world, ray, term.integrator.first_opl(term.film, rays), dr.detach(rays.η))
         path.active &= active
@@ -99,15 +120,17 @@ class Chains:
         key, reached, planes, keys = [mi.UInt32(0), mi.UInt32(0)], [], [], []
         for i in range(self.longest):
             on, η = path.active & (i < count), mi.Float(path.η)
+            if mirrors is not None:
+                self.lobes.mirrors = mirrors[i]
             path, (pi, ray) = advance(world, sampler, path, dr.minimum(i + 1, count))
             si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, on)
             path.active &= ~on | path.prev_unconnected
             on &= path.active
-            mirrors = dr.dot(si.n, ray.d) * dr.dot(si.n, path.ray.d) < 0
-            n, offset, ratio = mi.Vector3f(si.n), dr.dot(si.n, si.p), dr.select(mirrors, 0, path.η / η)
+            reflected = dr.dot(si.n, ray.d) * dr.dot(si.n, path.ray.d) < 0
+            n, offset, ratio = mi.Vector3f(si.n), dr.dot(si.n, si.p), dr.select(reflected, 0, path.η / η)
             cell = dr.round(mi.Vector3f(n) * 100)
             place = dr.round(offset / (_MISS * term.radius))
-            side = dr.select(dr.dot(n, ray.d) > 0, 2, 0) + dr.select(mirrors, 1, 0)
+            side = dr.select(dr.dot(n, ray.d) > 0, 2, 0) + dr.select(reflected, 1, 0)
             parts = [*(mi.UInt32(mi.Int32(x)) for x in (*cell, place, side)), *(dr.reinterpret_array(mi.UInt32, x) for x in (pi.shape, pi.instance))]
             mixed = key
             for part in parts:
@@ -304,7 +327,8 @@ class SpecularPass:
 
 def traced(chains, chain, seen, rays, sampler, active):
     """(whether ``rays`` run through their chains to what is ``seen``, the paths behind these)."""
-    found = chains.follow(rays, sampler, chain.count, active)
+    mirrors = [ratio == 0 for _, _, ratio in chain.planes]
+    found = chains.follow(chains.world, rays, sampler, chain.count, active, mirrors)
     path = found.path
     same = (found.key[0] == chain.key[0]) & (found.key[1] == chain.key[1])
     off = dr.norm(dr.cross(path.ray.d, seen.o + seen.d * seen.way - path.ray.o))
