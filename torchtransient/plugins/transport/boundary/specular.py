@@ -29,15 +29,16 @@ from torchtransient.plugins.transport.walk import advance, start
 from torchtransient.plugins.transport.world import World
 
 # Delta vertices of a chain at most: a slab of glass has two, one that is seen in a mirror three.
-LONGEST = 3
+LONGEST = 4
 # Rays that chains are taken from, and the share of those that end at a surface that goes on with a delta lobe.
 _RAYS, _UNFINISHED = 2**14, 0.125
 # Entries of each of two tables of counts. A chain has the lesser of its two counts: others may share one of them.
 _BUCKETS = 2**18
-_STEPS = 8
-# How far from p its ray may pass, in parts of the way; planes are told apart by a hundredth of their normals and this
-# share of the scene's radius, which is also the least distance of an edge from the last plane.
-_MISS = 1e-4
+_STEPS = 12
+# How far from p its ray may pass, in parts of the way; the walk starts its rays a little beside the planes, and may miss
+# it by more. Planes are told apart by a hundredth of their normals and the first share of the scene's radius, which is also
+# the least distance of an edge from the last plane.
+_MISS, _MISS_OF_WALK = 1e-4, 2e-3
 
 
 class KnownLobes(Surface):
@@ -81,17 +82,19 @@ class Chains:
         last = [reached & ~after for reached, after in zip(found.reached, [*found.reached[1:], mi.Bool(False)], strict=True)]
         weights = [dr.select(r, dr.select(e, 1, _UNFINISHED), 0) for r, e in zip(found.reached, last, strict=True)]
         self.keys = [dr.concat([key[k] for key in found.keys]) for k in (0, 1)]
+        self.directions = mi.Vector3f(dr.detach(rays.ray).d)
         self.normals = _concatenated([n for n, _, _ in found.planes])
         self.offsets, self.ratios = (dr.concat([plane[k] + dr.zeros(mi.Float, _RAYS) for plane in found.planes]) for k in (1, 2))
         self.density = EdgeDensity(dr.concat([weight + dr.zeros(mi.Float, _RAYS) for weight in weights]))
         self.counts = [dr.zeros(mi.Float, _BUCKETS) for _ in self.keys]
         for count, key in zip(self.counts, self.keys, strict=True):
             dr.scatter_reduce(dr.ReduceOp.Add, count, self.density.weight, key % _BUCKETS)
-        dr.eval(self.keys, self.normals, self.offsets, self.ratios, vars(self.density), self.counts)
+        dr.eval(self.keys, self.directions, self.normals, self.offsets, self.ratios, vars(self.density), self.counts)
 
     def draw(self, x):
         """Draw a chain by a uniform number: ``count`` of its planes, ``planes`` (normal n, offset n . p, ratio of the
-        index behind it to that before, 0 for a mirror), ``key``, ``inverse`` (one over its probability).
+        index behind it to that before, 0 for a mirror), ``key``, ``inverse`` (one over its probability),
+        ``ω`` (direction of a ray that runs through it).
         """
         row, p = self.density.sample(x)
         ray, active = row % _RAYS, p > 0
@@ -102,7 +105,8 @@ class Chains:
         key = [dr.gather(mi.UInt32, each, row, active) for each in self.keys]
         counts = [dr.gather(mi.Float, count, k % _BUCKETS, active) for count, k in zip(self.counts, key, strict=True)]
         inverse = dr.select(active, mi.Float(self.density.total) / dr.minimum(*counts), 0)
-        return Local(count=row // _RAYS + 1, planes=planes, key=key, inverse=inverse)
+        ω = dr.gather(mi.Vector3f, self.directions, ray, active)
+        return Local(count=row // _RAYS + 1, planes=planes, key=key, inverse=inverse, ω=ω)
 
     def follow(self, world, rays, sampler, count, active, mirrors=None):
         """Trace primary rays through up to ``count`` delta vertices. ``mirrors``: by vertex, the lobes that
@@ -159,7 +163,9 @@ class Chains:
         image = p
         for i, (n, offset, ratio) in reversed(list(enumerate(chain.planes))):
             image = dr.select((i < chain.count) & (ratio == 0), mirrored(image, n, offset), image)
-        end = self._sent(chain, eye, newton(self, chain, eye, p, dr.normalize(image - eye)))
+        straight, known = dr.normalize(image - eye), chain.ω
+        _, missed, _ = self._missed(self._sent(chain, eye, straight), p)
+        end = self._sent(chain, eye, newton(self, chain, eye, p, dr.select(dr.isfinite(dr.norm(missed)), straight, known)))
         _, missed, det = self._missed(end, p)
         way = dr.dot(p - end.o, end.d)
         length = end.length + way
@@ -174,14 +180,18 @@ class Chains:
             valid=valid,
         )  # fmt: skip
 
-    def turned(self, chain, eye, p, ω):
-        """The next direction of Newton's method."""
-        end = self._sent(chain, eye, ω)
-        a, _, _ = self._missed(end, p)
+    def turned(self, chain, eye, p, ω, step, least):
+        """One try of Newton's method at ``ω + step``: (direction, next step, how far the direction misses ``p``). What is
+        no better than the ``least`` miss so far, or no ray at all (total reflection), is tried again with half of the step.
+        """
+        tried = dr.normalize(ω + step)
+        end = self._sent(chain, eye, tried)
+        a, missed, _ = self._missed(end, p)
         across = end.axes[0] * a.x + end.axes[1] * a.y
-        step = dr.norm(across)
-        across *= dr.select(step > 0.5, 0.5 / step, 1)
-        return dr.select(dr.isfinite(step), dr.normalize(ω + across), ω)
+        miss, size = dr.norm(missed), dr.norm(across)
+        better = (miss < least) & dr.isfinite(size)
+        across *= dr.select(size > 0.5, 0.5 / size, 1)
+        return dr.select(better, tried, ω), dr.select(better, across, step * 0.5), dr.select(better, miss, least)
 
     def _sent(self, chain, eye, ω):
         """Where a ray arrives behind the chain, with the derivatives of ``o, d`` by ``ω`` along two ``axes``."""
@@ -240,10 +250,10 @@ class Chains:
 
 @dr.syntax
 def newton(chains, chain, eye, p, ω):
-    """The direction at ``eye`` of the ray to ``p``, from one close to it."""
-    i = mi.UInt32(0)
+    """The direction at ``eye`` of the ray to ``p``, from one for which there is a ray."""
+    i, step, least = mi.UInt32(0), mi.Vector3f(0), mi.Float(dr.inf)
     while dr.hint(i < _STEPS, max_iterations=_STEPS, label="ray through a chain"):
-        ω = chains.turned(chain, eye, p, ω)
+        ω, step, least = chains.turned(chain, eye, p, ω, step, least)
         i += 1
     return ω
 
@@ -332,7 +342,7 @@ def traced(chains, chain, seen, rays, sampler, active):
     path = found.path
     same = (found.key[0] == chain.key[0]) & (found.key[1] == chain.key[1])
     off = dr.norm(dr.cross(path.ray.d, seen.o + seen.d * seen.way - path.ray.o))
-    return active & path.active & same & (off < _MISS * seen.length), path
+    return active & path.active & same & (off < _MISS_OF_WALK * seen.length), path
 
 
 def sees_chains(world, sensor):
