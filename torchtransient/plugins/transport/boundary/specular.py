@@ -145,6 +145,25 @@ class Chains:
             keys.append(key)
         return Local(path=path, reached=reached, planes=planes, keys=keys, key=key)
 
+    def lead(self, path, sampler, target):
+        """Let paths go on to their vertex number ``target`` as :func:`~..walk.advance` does.
+
+        Returns:
+            ``path``, ``before`` (what advance says); ``all`` (mask: all vertices are those of a chain) and their ``ratios``.
+        """
+        world, every, ratios = self.term.world, target <= self.longest, []
+        pi, ray = mi.PreliminaryIntersection3f(world.segment.surface_of(path.leg)[0]), mi.Ray3f(path.ray)
+        for i in range(self.longest + 1):
+            on, η = path.active & (path.depth < target), mi.Float(path.η)
+            stop = target if i == self.longest else dr.minimum(i + 1, target)
+            path, (its_pi, its_ray) = advance(world, sampler, path, stop)
+            pi, ray = dr.select(on, its_pi, pi), dr.select(on, its_ray, ray)
+            if i < self.longest:
+                n = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, on).n
+                ratios.append(dr.select(dr.dot(n, ray.d) * dr.dot(n, path.ray.d) < 0, 0, path.η / η))
+                every &= ~on | path.prev_unconnected
+        return Local(path=path, before=(pi, ray), all=every, ratios=ratios)
+
     # -------------------------------------------------------------------------------------------- rays through planes
 
     def image_of_eye(self, chain, eye):

@@ -41,7 +41,12 @@ class VertexPass:
         path.leg = world.segment.first(world, ray, sampler)
         pi, _ = world.segment.surface_of(path.leg)
         radius = dr.minimum(world.contents.damping_radius, pi.t * DAMPING)
-        path, before = advance(world, sampler, path, target)
+        lead = None
+        if term.chains is None:
+            path, before = advance(world, sampler, path, target)
+        else:
+            lead = term.chains.lead(path, sampler, target)
+            path, before = lead.path, lead.before
         vertex = world.segment.arrive(world, path)
         vertex.τ, vertex.η, vertex.goes_on = path.τ + vertex.opl, path.η, path.active & vertex.valid
         world.scattering.arrive(world, path, vertex, sampler)
@@ -69,7 +74,7 @@ class VertexPass:
         medium = world.segment.medium_towards(b.d, vertex)
         past = past_edge(world, b, path.ray, medium, β, sampler, active)
         with dr.resume_grad():
-            v_x = self._motion(rays, path, before, target, vertex, radius, active)
+            v_x = self._motion(rays, path, before, lead, target, vertex, radius, active)
             speeds = sides_from(world, b, edges, v_x, behind(world, b, *past, active), radius, active)
         first = {
             "ray": path.ray, "β": β, "η": η, "τ": τ, "prev_p": x, "prev_n": vertex.at.n,
@@ -79,7 +84,7 @@ class VertexPass:
         }  # fmt: skip
         return both_sides(world, mode, sampler, view, b, past, first, factor, speeds, (near, ~b.crease | near))
 
-    def _motion(self, rays, path, before, target, vertex, radius, active):
+    def _motion(self, rays, path, before, lead, target, vertex, radius, active):
         """Attached motion of x, as interior derivatives hold it."""
         world, at_first = self.term.world, target == 0
         pi, _ = world.segment.surface_of(path.leg)
@@ -107,6 +112,15 @@ class VertexPass:
         v = dragged(held, v_before, r, path.ray.d, vertex.si.n, radius, follows)
         if rays.meter_normal is None:
             v = dr.select(at_first, along_the_ray(world, pi, primary, first & vertex.surface), v)
+        if lead is not None:
+            # Behind delta lobes a point slides along the ray that found it.
+            found = surface & path.prev_unconnected & ~at_first
+            last = mi.Ray3f(path.ray)
+            if rays.meter_normal is None:
+                bent = self.term.chains.attached_ray(rays.ray, lead.ratios, target, found & lead.all)
+                last.o = dr.select(lead.all, dr.replace_grad(last.o, bent.o), last.o)
+                last.d = dr.select(lead.all, dr.replace_grad(last.d, bent.d), last.d)
+            v = dr.select(found, along_the_ray(world, pi, last, found), v)
         if world.contents.media is None:
             return dr.select(active, v, 0)
         # A point in a medium divides the way to the surface behind it in a fixed ratio.
