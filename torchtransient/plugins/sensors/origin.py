@@ -168,3 +168,12 @@ def index_at_sensor(seen: list[View], surroundings: Any, scene: Any) -> Any:
     for view, index in zip(seen[1:], others, strict=True):
         first = dr.select(view.active, index, first)
     return first
+
+
+def can_be_sampled(sensor: Any) -> bool:
+    """Return whether a sensor can be connected to: rays of radiance meters and scans are lines without an area."""
+    try:
+        sensor.sample_direction(dr.zeros(mi.Interaction3f), mi.Point2f(0.5), mi.Bool(False))
+    except RuntimeError:
+        return False
+    return True

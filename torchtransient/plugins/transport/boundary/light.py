@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from torchtransient.plugins.edges.table import BESIDE
 from torchtransient.plugins.polarized import attenuated
-from torchtransient.plugins.transport.boundary.primary import can_be_sampled
+from torchtransient.plugins.sensors.origin import can_be_sampled
 from torchtransient.plugins.transport.boundary.sides import at_point
 from torchtransient.plugins.transport.boundary.speeds import along_the_ray, dragged_share
 from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled

@@ -8,16 +8,30 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from torchtransient.plugins.mitsuba_compat import attribute_name, has_surface, is_bump_map, is_instance, lacks_edges
+from torchtransient.plugins.mitsuba_compat import (
+    attribute_name,
+    has_limb,
+    has_surface,
+    is_bump_map,
+    is_flat,
+    is_instance,
+    is_irradiance_meter,
+    lacks_edges,
+)
 from torchtransient.plugins.node_walk import objects_below, shapes_of_scene
 from torchtransient.plugins.parameter_effect import CORRECT, ParameterEffect
+from torchtransient.plugins.sensors.origin import can_be_sampled
 
 # Roles of what moves edges against what is behind them, and of what bends light, which moves edges that are seen
 # through it.
 _MOVE, _BEND = ("shape", "emitter", "sensor", "sun"), ("index", "normal")
 # Of a mesh: they move no point.
 _PLACELESS = ("vertex_normals", "vertex_texcoords")
+# Planes of a shape up to which all chains of them are found.
+_PLANES = 32
+_TAKE_ROUGH = "Take a rough surface in place of the smooth one, or keep edges out of its view."
 # Places at which a texture is asked whether it is smooth, along each side.
 _PROBES = 64
 
@@ -38,7 +52,7 @@ def moves_edges(key: str, effect: ParameterEffect) -> bool:
 class MovingEdges:
     """What derivatives of a scene lack where edges move, asked by parameter (:meth:`lacking`).
 
-    ``always``: gaps of every parameter that moves edges. ``bent``: of those, and of what bends light. ``scene``: where
+    ``always``: gaps of every parameter that moves edges. ``bent``: of what bends light alone. ``scene``: where
     textures are looked for, None for nowhere. ``words``: gaps that the table of parameters speaks of and that no scene
     can be said to have.
     """
@@ -56,7 +70,7 @@ class MovingEdges:
             return ()
         name, moves = key.rsplit(".", 1)[-1], moves_edges(key, effect)
         found = self.always if moves else ()
-        if moves or effect.role in _BEND or name == "vertex_normals":
+        if not moves and (effect.role in _BEND or name == "vertex_normals"):
             found += self.bent
         if (moves and effect.role in ("shape", "sensor")) or name == "vertex_texcoords":
             # Of what an instance shows, Mitsuba says nothing; a sensor sees everything move.
@@ -99,16 +113,70 @@ def moving_edges(scene: Any) -> MovingEdges:
     """Return what the passes of :mod:`.passes` leave out in a scene."""
     always, bent = [], []
     if shapes := shapes_without_edges(scene):
-        names = _listed([_name(shape) for shape in shapes])
-        always.append(Gap(f"at the rims of {names}, which have no edges", "Use a mesh of the same form."))
+        always.append(Gap(f"at the rims of {_listed_shapes(shapes)}, which have no edges", "Use a mesh of the same form."))
     if rims := [emitter.get_shape() or emitter for emitter in scene.emitters() if _has_rim(emitter)]:
         where = f"at the rim of the light of {_listed([_name(one) for one in rims])}"
         always.append(Gap(where, "Let the light fade out, by a beam_width below the cutoff_angle for instance."))
-    if smooth := [shape for shape in filter(has_surface, shapes_of_scene(scene)) if _has_delta_lobe(shape)]:
-        names = _listed([_name(shape) for shape in smooth])
-        where = f"where edges are seen in mirrors or through smooth glass, masks and open boundaries ({names})"
-        bent.append(Gap(where, "Take a rough surface in place of the smooth one, or keep edges out of its view."))
+    always += _seen_through_delta_lobes(scene)
+    if smooth := _smooth_shapes(scene):
+        where = f"where edges are seen in mirrors or through smooth glass, masks and open boundaries ({_listed_shapes(smooth)})"
+        bent.append(Gap(where, _TAKE_ROUGH))
     return MovingEdges(always, bent, scene)
+
+
+def _seen_through_delta_lobes(scene: Any) -> list[Gap]:
+    """What is left out where delta lobes show edges, and send light past them."""
+    smooth = _smooth_shapes(scene)
+    if not smooth:
+        return []
+    followed = all(can_be_sampled(sensor) and not is_irradiance_meter(sensor) for sensor in scene.sensors())
+    plane = [one for one in smooth if followed and not one.is_medium_transition() and _is_plane(one)]
+    gaps = []
+    if other := [one for one in smooth if one not in plane]:
+        where = f"where edges and shadows are seen in mirrors or through smooth glass, masks and open boundaries ({_listed_shapes(other)})"
+        gaps.append(Gap(where, _TAKE_ROUGH))
+    if plane:
+        where = f"where edges are seen in mirrors or through smooth glass and masks ({_listed_shapes(plane)}) from other surfaces, or hide light that comes through them"
+        gaps.append(Gap(where, _TAKE_ROUGH))
+    refracting = [one for one in plane if mi.has_flag(one.bsdf().flags(), mi.BSDFFlags.DeltaTransmission)]
+    if refracting and (limbs := [one for one in shapes_of_scene(scene) if has_limb(one)]):
+        where = f"where outlines of {_listed_shapes(limbs)} are seen through smooth glass ({_listed_shapes(refracting)})"
+        gaps.append(Gap(where, "Use a mesh of the same form."))
+    return gaps
+
+
+def _smooth_shapes(scene: Any) -> list[Any]:
+    return [shape for shape in filter(has_surface, shapes_of_scene(scene)) if has_delta_lobe(shape)]
+
+
+def _is_plane(shape: Any) -> bool:
+    """Whether a shape consists of few planes that mirror or refract by their own normals."""
+    if not is_flat(shape):
+        return False
+    if isinstance(shape, mi.Mesh) and _number_of_planes(shape) > _PLANES:
+        return False
+    n = _PROBES * _PROBES
+    random = mi.PCG32(size=n)
+    uniform = lambda: mi.Point2f(random.next_float32(), random.next_float32())  # noqa: E731
+    si = dr.zeros(mi.SurfaceInteraction3f, n)
+    si.wavelengths, si.uv, si.t = dr.full(type(si.wavelengths), 550, n), uniform(), mi.Float(1)
+    si.n, si.sh_frame = mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Normal3f(0, 0, 1))
+    si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
+    wi = mi.warp.square_to_uniform_sphere(uniform())
+    si.wi = wi
+    bs, _ = shape.bsdf().sample(mi.BSDFContext(), si, random.next_float32(), uniform())
+    delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) & (bs.pdf > 0)
+    bent = dr.select(wi.z * bs.wo.z > 0, 1, dr.rcp(bs.eta))
+    off = dr.norm(mi.Vector2f(bs.wo.x + bent * wi.x, bs.wo.y + bent * wi.y))
+    return not bool(dr.any(delta & (off > 1e-3)))
+
+
+def _number_of_planes(mesh: Any) -> int:
+    p = np.array(mesh.vertex_positions_buffer(), np.float64).reshape(-1, 3)[np.array(mesh.faces_buffer()).reshape(-1, 3)]
+    n = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
+    n /= np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-30)
+    offset = (n * p[:, 0]).sum(1, keepdims=True) / max(np.abs(p).max(), 1e-30)
+    return len(np.unique(np.concatenate([n, offset], 1).round(3), axis=0))
 
 
 def shapes_without_edges(scene: Any) -> list[Any]:
@@ -116,7 +184,8 @@ def shapes_without_edges(scene: Any) -> list[Any]:
     return [shape for shape in shapes_of_scene(scene) if lacks_edges(shape)]
 
 
-def _has_delta_lobe(shape: Any) -> bool:
+def has_delta_lobe(shape: Any) -> bool:
+    """Return whether a shape has a BSDF with a delta lobe."""
     bsdf = shape.bsdf()
     return bsdf is not None and bool(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta))
 
@@ -158,6 +227,10 @@ def _has_rim(emitter: Any) -> bool:
         return True
     cutoff = getattr(emitter, "cutoff_angle", None)
     return cutoff is not None and cutoff < 90 and cutoff == emitter.beam_width
+
+
+def _listed_shapes(shapes: Sequence[Any]) -> str:
+    return _listed([_name(shape) for shape in shapes])
 
 
 def _name(plugin: Any) -> str:

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.polarized import attenuated
+from torchtransient.plugins.sensors.origin import can_be_sampled
 from torchtransient.plugins.transport.boundary.sides import at_point, both_sides, past_edge
 from torchtransient.plugins.transport.boundary.speeds import behind, sides_from, slides
 from torchtransient.plugins.transport.strategy import Local
@@ -63,12 +64,3 @@ class PrimaryPass:
             "prev_p": ray.o, "active": active, "medium": medium,
         }  # fmt: skip
         return both_sides(world, mode, sampler, view, b, past, first, factor, speeds, needed)
-
-
-def can_be_sampled(sensor):
-    """Return whether a sensor can be connected to: rays of radiance meters and scans are lines without an area."""
-    try:
-        sensor.sample_direction(dr.zeros(mi.Interaction3f), mi.Point2f(0.5), mi.Bool(False))
-    except RuntimeError:
-        return False
-    return True

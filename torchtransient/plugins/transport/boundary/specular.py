@@ -19,7 +19,8 @@ from torchtransient.plugins.edges.table import EdgeDensity
 from torchtransient.plugins.mitsuba_compat import is_instance, is_irradiance_meter
 from torchtransient.plugins.node_walk import shapes_of_scene
 from torchtransient.plugins.polarized import attenuated, intensity, product
-from torchtransient.plugins.transport.boundary.primary import can_be_sampled
+from torchtransient.plugins.sensors.origin import can_be_sampled
+from torchtransient.plugins.transport.boundary.moving_edges import has_delta_lobe
 from torchtransient.plugins.transport.boundary.sides import at_point, both_sides, past_edge
 from torchtransient.plugins.transport.connection.sensor_sampled import first_row, in_sensor_frame
 from torchtransient.plugins.transport.instances import surface_interaction
@@ -291,12 +292,6 @@ def bent(d, n, ratio):
     through = (d - n * cos) * inverse + n * dr.mulsign(cos_out, cos)
     slope = dr.mulsign(cos * dr.square(inverse) / cos_out, cos)
     return dr.select(mirrors, d - n * (2 * cos), through), dr.select(mirrors, -1, slope)
-
-
-def has_delta_lobe(shape):
-    """Return whether a shape has a BSDF with a delta lobe."""
-    bsdf = shape.bsdf()
-    return bsdf is not None and bool(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta))
 
 
 def _concatenated(vectors):
