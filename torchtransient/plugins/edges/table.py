@@ -267,8 +267,8 @@ class EdgeTable:
         place = dr.select(other, place >> 4, place)
         corner = lambda i: mi.Point2f(dr.select(i == 1, 1.0, 0.0), dr.select(i == 2, 1.0, 0.0))  # noqa: E731
         uv = dr.lerp(corner(place & 3), corner((place >> 2) & 3), k.u)
-        # Paths that start exactly on concave creases, or enter glass at its outline, leak: start a little inside of each
-        # face.
+        # Paths that start exactly on concave creases, or enter glass at its outline, leak: start a little inside of
+        # each face.
         inset = crease
         if top.clear is not None:
             inset = inset | (dr.gather(mi.UInt32, top.clear, owner) != 0)

@@ -152,7 +152,8 @@ def _angles(p: np.ndarray, group: np.ndarray) -> np.ndarray:
 
 class Topology:
     """The edges and limbs of ``scene``, edges first: ``count`` of them, the last ``rounds`` are limbs and rims of shapes
-    without triangles. ``without``: the shapes that have outlines, but no edges here. ``clear``: by body, ones where light goes through it; None without such.
+    without triangles. ``without``: the shapes that have outlines, but no edges here.
+    ``clear``: by body, ones where light goes through it; None without such.
 
     A plain object of Dr.Jit arrays, to be kept with the scene and to be named as state of recorded calls.
 

@@ -102,8 +102,8 @@ class LightPass:
         return Local(ds=ds, b=b, far=far, Le=dr.select(k.ball, other, Le), near=near, u=u)
 
     def _speeds(self, edges, light, x, path, ray, wavelength, aperture, sampler, job, active):
-        """Attached speeds of the edge: where x is the first vertex of a path of the sensor, where it is another, and where
-        the sensor sees it through a chain.
+        """Attached speeds of the edge: where x is the first vertex of a path of the sensor, where it is another, and
+        where the sensor sees it through a chain.
         """
         term, b = self.term, light.b
         world = term.world

@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from torchtransient.plugins.host_numbers import host_numbers
 from torchtransient.plugins.mitsuba_compat import (
     attribute_name,
     has_limb,
@@ -31,6 +32,7 @@ _MOVE, _BEND = ("shape", "emitter", "sensor", "sun"), ("index", "normal")
 _PLACELESS = ("vertex_normals", "vertex_texcoords")
 # Planes of a shape up to which all chains of them are found.
 _PLANES = 32
+_SEEN = "where edges are seen in mirrors or through smooth glass"
 _TAKE_ROUGH = "Take a rough surface in place of the smooth one, or keep edges out of its view."
 # Places at which a texture is asked whether it is smooth, along each side.
 _PROBES = 64
@@ -113,13 +115,14 @@ def moving_edges(scene: Any) -> MovingEdges:
     """Return what the passes of :mod:`.passes` leave out in a scene."""
     always, bent = [], []
     if shapes := shapes_without_edges(scene):
-        always.append(Gap(f"at the rims of {_listed_shapes(shapes)}, which have no edges", "Use a mesh of the same form."))
+        where = f"at the rims of {_listed_shapes(shapes)}, which have no edges"
+        always.append(Gap(where, "Use a mesh of the same form."))
     if rims := [emitter.get_shape() or emitter for emitter in scene.emitters() if _has_rim(emitter)]:
         where = f"at the rim of the light of {_listed([_name(one) for one in rims])}"
         always.append(Gap(where, "Let the light fade out, by a beam_width below the cutoff_angle for instance."))
     always += _seen_through_delta_lobes(scene)
     if smooth := _smooth_shapes(scene):
-        where = f"where edges are seen in mirrors or through smooth glass, masks and open boundaries ({_listed_shapes(smooth)})"
+        where = f"{_SEEN}, masks and open boundaries ({_listed_shapes(smooth)})"
         bent.append(Gap(where, _TAKE_ROUGH))
     return MovingEdges(always, bent, scene)
 
@@ -133,14 +136,16 @@ def _seen_through_delta_lobes(scene: Any) -> list[Gap]:
     plane = [one for one in smooth if followed and not one.is_medium_transition() and _is_plane(one)]
     gaps = []
     if other := [one for one in smooth if one not in plane]:
-        where = f"where edges and shadows are seen in mirrors or through smooth glass, masks and open boundaries ({_listed_shapes(other)})"
+        where = f"{_SEEN}, masks and open boundaries ({_listed_shapes(other)})"
         gaps.append(Gap(where, _TAKE_ROUGH))
     if plane:
-        where = f"where edges are seen in mirrors or through smooth glass and masks ({_listed_shapes(plane)}) from other surfaces, or hide light that comes through them"
+        names = _listed_shapes(plane)
+        where = f"{_SEEN} and masks ({names}) from other surfaces, or hide light that comes through them"
         gaps.append(Gap(where, _TAKE_ROUGH))
     refracting = [one for one in plane if mi.has_flag(one.bsdf().flags(), mi.BSDFFlags.DeltaTransmission)]
     if refracting and (limbs := [one for one in shapes_of_scene(scene) if has_limb(one)]):
-        where = f"where outlines of {_listed_shapes(limbs)} are seen through smooth glass ({_listed_shapes(refracting)})"
+        names = _listed_shapes(refracting)
+        where = f"where outlines of {_listed_shapes(limbs)} are seen through smooth glass ({names})"
         gaps.append(Gap(where, "Use a mesh of the same form."))
     return gaps
 
@@ -172,7 +177,8 @@ def _is_plane(shape: Any) -> bool:
 
 
 def _number_of_planes(mesh: Any) -> int:
-    p = np.array(mesh.vertex_positions_buffer(), np.float64).reshape(-1, 3)[np.array(mesh.faces_buffer()).reshape(-1, 3)]
+    faces = np.array(mesh.faces_buffer()).reshape(-1, 3)
+    p = host_numbers(mesh.vertex_positions_buffer(), np.float64).reshape(-1, 3)[faces]
     n = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
     n /= np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-30)
     offset = (n * p[:, 0]).sum(1, keepdims=True) / max(np.abs(p).max(), 1e-30)

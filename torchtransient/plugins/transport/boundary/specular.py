@@ -2,9 +2,9 @@
 
 A *chain* is a sequence of planes with delta lobes that rays of the sensor run through before anything else. For a point
 p behind a chain there is one ray of the sensor that arrives there: in mirrors the straight line to the image of p, in
-glass found by Newton's method on the planes, which are taken as infinite. The walk then traces that ray and has to visit
-the same planes. The importance per area across at p is that per solid angle at the sensor over the determinant of how p
-moves across with the direction.
+glass found by Newton's method on the planes, which are taken as infinite. The walk then traces that ray and has to
+visit the same planes. The importance per area across at p is that per solid angle at the sensor over the determinant of
+how p moves across with the direction.
 
 Chains are drawn from those of a few rays of the sensor, in proportion to how often these meet them. Planes alone are
 found twice; of curved surfaces every hit has a plane of its own, and the edges seen in them are left out.
@@ -37,8 +37,8 @@ _RAYS, _UNFINISHED = 2**14, 0.125
 _BUCKETS = 2**18
 _STEPS = 12
 # How far from p its ray may pass, in parts of the way; the walk starts its rays a little beside the planes, and may miss
-# it by more. Planes are told apart by a hundredth of their normals and the first share of the scene's radius, which is also
-# the least distance of an edge from the last plane.
+# it by more. Planes are told apart by a hundredth of their normals and the first share of the scene's radius, which is
+# the least distance of an edge from the last plane, too.
 _MISS, _MISS_OF_WALK = 1e-4, 2e-3
 
 
@@ -79,14 +79,16 @@ class Chains:
         uv = sampler.next_2d() * mi.ScalarVector2f(term.film.crop_size())
         rays = term.rays_at(sampler, uv, wavelength, aperture, None, None, Local(total=1))
         found = self.follow(world, rays, sampler, mi.UInt32(self.longest), mi.Bool(True))
-        self.planes = [mi.Vector3f(0), mi.Float(0), mi.Float(0)]
-        last = [reached & ~after for reached, after in zip(found.reached, [*found.reached[1:], mi.Bool(False)], strict=True)]
-        weights = [dr.select(r, dr.select(e, 1, _UNFINISHED), 0) for r, e in zip(found.reached, last, strict=True)]
+        weights = [
+            dr.select(on, dr.select(after, _UNFINISHED, 1), 0)
+            for on, after in zip(found.reached, [*found.reached[1:], mi.Bool(False)], strict=True)
+        ]
         self.keys = [dr.concat([key[k] for key in found.keys]) for k in (0, 1)]
         self.directions = mi.Vector3f(dr.detach(rays.ray).d)
-        self.normals = _concatenated([n for n, _, _ in found.planes])
-        self.offsets, self.ratios = (dr.concat([plane[k] + dr.zeros(mi.Float, _RAYS) for plane in found.planes]) for k in (1, 2))
-        self.density = EdgeDensity(dr.concat([weight + dr.zeros(mi.Float, _RAYS) for weight in weights]))
+        normals, offsets, ratios = zip(*found.planes, strict=True)
+        self.normals = mi.Vector3f(*[_concatenated([n[k] for n in normals]) for k in range(3)])
+        self.offsets, self.ratios = _concatenated(offsets), _concatenated(ratios)
+        self.density = EdgeDensity(_concatenated(weights))
         self.counts = [dr.zeros(mi.Float, _BUCKETS) for _ in self.keys]
         for count, key in zip(self.counts, self.keys, strict=True):
             dr.scatter_reduce(dr.ReduceOp.Add, count, self.density.weight, key % _BUCKETS)
@@ -99,9 +101,9 @@ class Chains:
         """
         row, p = self.density.sample(x)
         ray, active = row % _RAYS, p > 0
+        table = ((mi.Vector3f, self.normals), (mi.Float, self.offsets), (mi.Float, self.ratios))
         planes = [
-            (dr.gather(mi.Vector3f, self.normals, ray + i * _RAYS, active), *(dr.gather(mi.Float, each, ray + i * _RAYS, active) for each in (self.offsets, self.ratios)))
-            for i in range(self.longest)
+            [dr.gather(kind, each, ray + i * _RAYS, active) for kind, each in table] for i in range(self.longest)
         ]
         key = [dr.gather(mi.UInt32, each, row, active) for each in self.keys]
         counts = [dr.gather(mi.Float, count, k % _BUCKETS, active) for count, k in zip(self.counts, key, strict=True)]
@@ -114,8 +116,8 @@ class Chains:
         :class:`KnownLobes` takes.
 
         Returns:
-            ``path``, behind the last one, active where all were delta vertices; by vertex ``reached`` (mask), ``planes``
-            and ``keys`` of the chain that ends there; ``key`` of all.
+            ``path``, behind the last one, active where all were delta vertices; by vertex ``reached`` (mask),
+            ``planes`` and ``keys`` of the chain that ends there; ``key`` of all.
         """
         term = self.term
         ray = dr.detach(rays.ray)
@@ -133,10 +135,10 @@ class Chains:
             on &= path.active
             reflected = dr.dot(si.n, ray.d) * dr.dot(si.n, path.ray.d) < 0
             n, offset, ratio = mi.Vector3f(si.n), dr.dot(si.n, si.p), dr.select(reflected, 0, path.η / η)
-            cell = dr.round(mi.Vector3f(n) * 100)
-            place = dr.round(offset / (_MISS * term.radius))
             side = dr.select(dr.dot(n, ray.d) > 0, 2, 0) + dr.select(reflected, 1, 0)
-            parts = [*(mi.UInt32(mi.Int32(x)) for x in (*cell, place, side)), *(dr.reinterpret_array(mi.UInt32, x) for x in (pi.shape, pi.instance))]
+            cells = *dr.round(mi.Vector3f(n) * 100), dr.round(offset / (_MISS * term.radius)), side
+            parts = [mi.UInt32(mi.Int32(x)) for x in cells]
+            parts += [dr.reinterpret_array(mi.UInt32, x) for x in (pi.shape, pi.instance)]
             mixed = key
             for part in parts:
                 mixed = mi.sample_tea_32(mixed[0] ^ part, mixed[1])
@@ -150,7 +152,8 @@ class Chains:
         """Let paths go on to their vertex number ``target`` as :func:`~..walk.advance` does.
 
         Returns:
-            ``path``, ``before`` (what advance says); ``all`` (mask: all vertices are those of a chain) and their ``ratios``.
+            ``path``, ``before`` (what advance says); ``all`` (mask: all vertices are those of a chain) and their
+            ``ratios``.
         """
         world, every, ratios = self.term.world, target <= self.longest, []
         pi, ray = mi.PreliminaryIntersection3f(world.segment.surface_of(path.leg)[0]), mi.Ray3f(path.ray)
@@ -177,15 +180,17 @@ class Chains:
         """The ray from ``eye`` through a ``chain`` to the point ``p``.
 
         Returns:
-            ``ω`` at the eye, ``uv`` (place on the film, in pixels), ``importance`` per area across at ``p``, last vertex
-            ``o`` and direction ``d``, ``way`` between ``o`` and ``p``, ``length`` from eye to ``p``, ``valid``.
+            ``ω`` at the eye, ``uv`` (place on the film, in pixels), ``importance`` per area across at ``p``, last
+            vertex ``o`` and direction ``d``, ``way`` between ``o`` and ``p``, ``length`` from eye to ``p``, ``valid``.
         """
         image = p
         for i, (n, offset, ratio) in reversed(list(enumerate(chain.planes))):
             image = dr.select((i < chain.count) & (ratio == 0), mirrored(image, n, offset), image)
-        straight, known = dr.normalize(image - eye), chain.ω
+        straight = dr.normalize(image - eye)
         _, missed, _ = self._missed(self._sent(chain, eye, straight), p)
-        end = self._sent(chain, eye, newton(self, chain, eye, p, dr.select(dr.isfinite(dr.norm(missed)), straight, known)))
+        # Total reflection may leave the straight line without a ray.
+        begin = dr.select(dr.isfinite(dr.norm(missed)), straight, chain.ω)
+        end = self._sent(chain, eye, newton(self, chain, eye, p, begin))
         _, missed, det = self._missed(end, p)
         way = dr.dot(p - end.o, end.d)
         length = end.length + way
@@ -201,8 +206,9 @@ class Chains:
         )  # fmt: skip
 
     def turned(self, chain, eye, p, ω, step, least):
-        """One try of Newton's method at ``ω + step``: (direction, next step, how far the direction misses ``p``). What is
-        no better than the ``least`` miss so far, or no ray at all (total reflection), is tried again with half of the step.
+        """One try of Newton's method at ``ω + step``: (direction, next step, how far the direction misses ``p``). What
+        is no better than the ``least`` miss so far, or no ray at all (total reflection), is tried again with half of
+        the step.
         """
         tried = dr.normalize(ω + step)
         end = self._sent(chain, eye, tried)
@@ -224,11 +230,12 @@ class Chains:
             t = (offset - dr.dot(n, o)) / cos
             out, slope = bent(d, n, ratio)
             following = []
+            scale = dr.select(ratio == 0, 1, dr.rcp(ratio))
             for δo, δd in moves:
-                δt = -(dr.dot(n, δo) + t * dr.dot(n, δd)) / cos
                 c = dr.dot(n, δd)
-                scale = dr.select(ratio == 0, 1, dr.rcp(ratio))
-                following.append((dr.select(on, δo + δd * t + d * δt, δo), dr.select(on, (δd - n * c) * scale + n * (slope * c), δd)))
+                δt = -(dr.dot(n, δo) + t * c) / cos
+                δout = (δd - n * c) * scale + n * (slope * c)
+                following.append((dr.select(on, δo + δd * t + d * δt, δo), dr.select(on, δout, δd)))
             moves = following
             valid &= ~on | ((t > 0) & dr.isfinite(t) & dr.isfinite(slope))
             length += dr.select(on, t, 0)
@@ -294,8 +301,8 @@ def bent(d, n, ratio):
     return dr.select(mirrors, d - n * (2 * cos), through), dr.select(mirrors, -1, slope)
 
 
-def _concatenated(vectors):
-    return mi.Vector3f(*[dr.concat([mi.Float(v[k]) + dr.zeros(mi.Float, _RAYS) for v in vectors]) for k in range(3)])
+def _concatenated(parts):
+    return dr.concat([part + dr.zeros(mi.Float, _RAYS) for part in parts])
 
 
 class SpecularPass:
@@ -330,8 +337,8 @@ class SpecularPass:
         rays = term.rays_at(sampler, seen.uv, wavelength, aperture, row, column, job)
         view = mode.view(rays)
         active, path = traced(chains, chain, seen, rays, sampler, b.valid & seen.valid & inside)
-        medium = world.segment.medium_towards(b.d)
-        place = Local(at=at_point(b.beside, path.ray), si=dr.zeros(mi.SurfaceInteraction3f), medium=medium, surface=mi.Bool(False))
+        medium, nowhere = world.segment.medium_towards(b.d), dr.zeros(mi.SurfaceInteraction3f)
+        place = Local(at=at_point(b.beside, path.ray), si=nowhere, medium=medium, surface=mi.Bool(False))
         to_last = Local(p=seen.o, d=-b.d, dist=seen.way)
         active, T = world.segment.transmittance(world, place, to_last, sampler.next_2d(), sampler, active)
         β = attenuated(path.β, mi.UnpolarizedSpectrum(T))
@@ -400,5 +407,9 @@ class SensorThroughChain(Connection):
         value = product(through.β, value) * (seen.importance * self.chain.inverse)
         active = proposal.active & (dr.max(dr.abs(intensity(value))) > 0)
         opl = vertex.scattered_τ + through.τ + self.term.film.start_opl + mi.Float64(seen.way * through.η)
-        active, T = world.segment.transmittance(world, vertex, ds, proposal.u, proposal.sampler, world.counted(active, opl))
-        return Event(value=value * T, opl=opl, active=active, depth=proposal.depth, uv=seen.uv, d=-seen.ω, first=path.depth == 0, speed=2)
+        active = world.counted(active, opl)
+        active, T = world.segment.transmittance(world, vertex, ds, proposal.u, proposal.sampler, active)
+        return Event(
+            value=value * T, opl=opl, active=active, depth=proposal.depth, uv=seen.uv, d=-seen.ω,
+            first=path.depth == 0, speed=2,
+        )  # fmt: skip

@@ -48,7 +48,8 @@ class Reverse:
         """The attached objective."""
         factor, speeds = factors
         with dr.resume_grad():
-            return sum(finite(kept[name] * factor) * speed for name, speed in zip(PixelSums.NAMES, speeds, strict=False))
+            names = PixelSums.NAMES[: len(speeds)]
+            return sum(finite(kept[name] * factor) * speed for name, speed in zip(names, speeds, strict=True))
 
 
 class PixelSums(Sink):

@@ -22,8 +22,8 @@ from torchtransient.plugins.transport.strategy import Connection, Event, Proposa
 
 class SensorSampled(Connection):
     """``aperture``: numbers that choose its point (Point2f), set before a launch. ``unwarp``: the segment to the sensor
-    does not count in time. Events carry ``uv``, in pixels, ``d`` towards the sensor, ``first`` (the path's first vertex is
-    connected), and ``speed``: which of the speeds of a pass of the boundary term is theirs then.
+    does not count in time. Events carry ``uv``, in pixels, ``d`` towards the sensor, ``first`` (the path's first vertex
+    is connected), and ``speed``: which of the speeds of a pass of the boundary term is theirs then.
     """
 
     name = "sensor_sampled"
@@ -55,8 +55,12 @@ class SensorSampled(Connection):
         active = proposal.active & (dr.max(dr.abs(intensity(value))) > 0)
         length = mi.Float(0) if self.unwarp else ds.dist * vertex.η * answer.eta
         opl = vertex.scattered_τ + mi.Float64(length)
-        active, T = world.segment.transmittance(world, vertex, ds, proposal.u, proposal.sampler, world.counted(active, opl))
-        return Event(value=value * T, opl=opl, active=active, depth=path.depth + 2, uv=ds.uv, d=ds.d, first=path.depth == 0, speed=0)
+        active = world.counted(active, opl)
+        active, T = world.segment.transmittance(world, vertex, ds, proposal.u, proposal.sampler, active)
+        depth = path.depth + 2
+        return Event(
+            value=value * T, opl=opl, active=active, depth=depth, uv=ds.uv, d=ds.d, first=depth == 2, speed=0
+        )  # fmt: skip
 
 
 def first_row(matrix):
