@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.marks import long_rows
 from torchtransient.testing.small_room import pose
 
 VARIANT = "llvm_ad_mono"
@@ -43,18 +44,19 @@ def scene(fov, start, light, shapes, depth):
     )
 
 
-def in_mirror():
-    """A mirror fills the picture: it shows a plate before a wall, and the plate's shadow."""
+def in_mirror(depth=3):
+    """A mirror fills the picture: it shows a plate before a wall that shines, and the plate's shadow."""
     return scene(30, 10.0, [0.6, 0.6, 1.6], {
         "mirror": rectangle(turned(25) @ np.diag([2.0, 2, 2, 1]), {"type": "conductor"}),
-        "wall": rectangle(pose(5, 0, 4) @ turned(-120) @ np.diag([4.0, 4, 4, 1]), diffuse(0.6)),
+        "wall": rectangle(pose(5, 0, 4) @ turned(-120) @ np.diag([4.0, 4, 4, 1]), diffuse(0.6))
+        | {"emitter": {"type": "area", "radiance": 0.1}},
         "plate": rectangle(
             pose(2.4, 0.1, 2.2) @ turned(-125) @ turned(20, 2) @ np.diag([0.5, 0.35, 1, 1]), diffuse(0.3)
         ),
-    }, depth=3)  # fmt: skip
+    }, depth)  # fmt: skip
 
 
-def behind_glass():
+def behind_glass(depth=5):
     """A plate before a wall, partly behind a slab of glass, which shows its own rims."""
     return scene(50, 4.0, [1.8, 1.5, 2.5], {
         "wall": rectangle(pose(scale=3.0), diffuse(0.6)),
@@ -63,7 +65,7 @@ def behind_glass():
         ),
         "slab": {"type": "cube", "to_world": pose(0, 0, 2) @ turned(25) @ turned(10, 0) @ np.diag([0.4, 0.5, 0.12, 1]),
                  "bsdf": {"type": "dielectric", "int_ior": 1.3}},
-    }, depth=5)  # fmt: skip
+    }, depth)  # fmt: skip
 
 
 def weighed(out):
@@ -88,6 +90,7 @@ def reverse(renderer, key, shift, seed):
     return float((renderer.values[key].grad * shift).sum())
 
 
+@pytest.mark.slow
 def test_both_modes_agree():
     """They draw the same samples. The mirror shows all of the derivative."""
     renderer = tt.TransientRenderer(in_mirror(), [PLATE], spp=16)
@@ -103,25 +106,29 @@ def test_both_modes_agree():
     assert float(tangent) == pytest.approx(expected, rel=1e-4)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("make", "key", "direction"), [
-    (in_mirror, PLATE, (0.5, 0.6, -0.5)),
-    (in_mirror, MIRROR, (0.3, 0.1, 1.0)),
-    (behind_glass, PLATE, (1.0, 0.3, 0.0)),
-    (behind_glass, SLAB, (0.0, 0.0, 1.0)),
-])  # fmt: skip
-def test_against_finite_differences(make, key, direction):
+CASES = [
+    (in_mirror, 2, PLATE, (0.5, 0.6, -0.5)),
+    (in_mirror, 3, PLATE, (0.5, 0.6, -0.5)),
+    (in_mirror, 3, MIRROR, (0.3, 0.1, 1.0)),
+    (behind_glass, 5, PLATE, (1.0, 0.3, 0.0)),
+    (behind_glass, 5, SLAB, (0.0, 0.0, 1.0)),
+]
+
+
+@pytest.mark.parametrize(("make", "depth", "key", "direction"), long_rows(CASES, CASES[:1]))
+def test_against_finite_differences(make, depth, key, direction):
     """Errors are those of 8 seeds."""
-    renderer, h = tt.TransientRenderer(make(), [key], spp=1024, spp_boundary=2048), 0.01
+    spp, h = 64 if depth == 2 else 1024, 0.01
+    renderer = tt.TransientRenderer(make(depth), [key], spp=spp, spp_boundary=2 * spp)
     base = renderer.values[key].detach()
     shift = shift_of(base, direction)
     found = [reverse(renderer, key, shift, seed) for seed in range(8)]
     with torch.no_grad():
         sides = [
-            [float(weighed(renderer({key: base + s * h * shift}, seed=seed, spp=16384))) for s in (1, -1)]
+            [float(weighed(renderer({key: base + s * h * shift}, seed=seed, spp=16 * spp))) for s in (1, -1)]
             for seed in range(8)
         ]
     expected = [(plus - minus) / (2 * h) for plus, minus in sides]
     error = np.hypot(np.std(found, ddof=1), np.std(expected, ddof=1)) / np.sqrt(8)
     assert np.mean(found) == pytest.approx(np.mean(expected), abs=4 * error)
-    assert error < 0.1 * abs(np.mean(expected))
+    assert error < 0.2 * abs(np.mean(expected))

@@ -65,7 +65,7 @@ class LightPass:
         through = term.through
         if through is not None:
             through.chain, through.aperture = term.chains.draw(sampler.next_1d()), aperture
-            through.wavelength, through.job = wavelength, job
+            through.wavelength, through.job, through.η = wavelength, job, dr.detach(middle.η)
         path = start(lit, ray, τ - term.film.start_opl, dr.detach(middle.η))
         path.prev_p = dr.select(light.far, b.p, b.V)
         β = light.Le * mi.UnpolarizedSpectrum(T) * dr.select(most > 0, dr.rcp(most), 0)

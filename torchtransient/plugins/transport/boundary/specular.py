@@ -376,8 +376,8 @@ def sees_chains(world, sensor):
 
 class SensorThroughChain(Connection):
     """The sensor as seen through a chain, which is one for all vertices of a path. Events are as those of
-    :class:`~..connection.sensor_sampled.SensorSampled`. ``chain``, ``aperture``, ``wavelength`` and ``job`` are set
-    before a launch.
+    :class:`~..connection.sensor_sampled.SensorSampled`. ``chain``, ``aperture``, ``wavelength``, ``job`` and ``η``
+    (index at the sensor) are set before a launch.
     """
 
     name = "sensor_through_chain"
@@ -390,7 +390,7 @@ class SensorThroughChain(Connection):
         """(what :meth:`Chains.look` says of ``p``, the primary rays)."""
         at, _ = self.term.to_sensor.seen_from(at_point(p), self.aperture, active)
         seen = self.chains.look(self.chain, mi.Point3f(at.p), p, self.aperture, active & (self.chain.inverse > 0))
-        return seen, self.term.rays_at(None, seen.uv, self.wavelength, self.aperture, None, None, self.job)
+        return seen, self.term.rays_at(None, seen.uv, self.wavelength, self.aperture, None, None, self.job, self.η)
 
     def propose(self, world, path, vertex, sampler):
         depth = path.depth + 2 + self.chain.count

@@ -75,7 +75,8 @@ class BoundaryTerm:
         if topology.count and sees_chains(world, sensor):
             with dr.suspend_grad():
                 self.chains = Chains(self, seed_of("chains"))
-            self.through = SensorThroughChain(self.chains)
+            if world.max_depth > 2:
+                self.through = SensorThroughChain(self.chains)
         with dr.suspend_grad():
             self.light_world = self._light_world()
         self.passes, self.jobs = {}, {}
@@ -150,12 +151,14 @@ class BoundaryTerm:
         inside = dr.all((cell >= 0) & (cell < size))
         return mi.UInt32(dr.select(inside, cell.y, 0)), mi.UInt32(dr.select(inside, cell.x, 0)), weight, inside
 
-    def rays_at(self, sampler, uv, wavelength, aperture, row, column, job):
-        """Primary rays through places of the film, in pixels, attached to the sensor."""
+    def rays_at(self, sampler, uv, wavelength, aperture, row, column, job, η=None):
+        """Primary rays through places of the film, in pixels, attached to the sensor; ``η``: index where they start, None
+        to look it up, which cannot be done within loops.
+        """
         world, sensor = self.world, self.sensor
         position = uv / mi.ScalarVector2f(self.film.crop_size())
         seen = views(sensor, position, lambda: self.integrator.reference(world.scene))
         with dr.resume_grad():
             ray, weight = sample_rays(sensor, seen, sensor.shutter_open(), wavelength, position, aperture)
-            η = index_at_sensor(seen, world.contents.surroundings, world.scene)
+            η = index_at_sensor(seen, world.contents.surroundings, world.scene) if η is None else η
         return PrimaryRays(sampler, ray, weight, dr.opaque(mi.Float, 1 / job.total), row, column, seen, η)
