@@ -30,6 +30,9 @@ from torchtransient.plugins.sensors.origin import can_be_sampled
 _MOVE, _BEND = ("shape", "emitter", "sensor", "sun"), ("index", "normal")
 # Of a mesh: they move no point.
 _PLACELESS = ("vertex_normals", "vertex_texcoords")
+# Delta vertices at most between a sensor and the edges that it sees through them: a slab of glass has two, one that is
+# seen in a mirror three.
+LONGEST = 4
 # Planes of a shape up to which all chains of them are found.
 _PLANES = 32
 _SEEN = "where edges are seen in mirrors or through smooth glass"
@@ -140,7 +143,8 @@ def _seen_through_delta_lobes(scene: Any) -> list[Gap]:
         gaps.append(Gap(where, _TAKE_ROUGH))
     if plane:
         names = _listed_shapes(plane)
-        where = f"{_SEEN} and masks ({names}) from other surfaces, or hide light that comes through them"
+        unseen = f"from other surfaces or behind more than {LONGEST} planes, or hide light that comes through them"
+        where = f"{_SEEN} and masks ({names}) {unseen}"
         gaps.append(Gap(where, _TAKE_ROUGH))
     refracting = [one for one in plane if mi.has_flag(one.bsdf().flags(), mi.BSDFFlags.DeltaTransmission)]
     if refracting and (limbs := [one for one in shapes_of_scene(scene) if has_limb(one)]):

@@ -6,8 +6,9 @@ glass found by Newton's method on the planes, which are taken as infinite. The w
 visit the same planes. The importance per area across at p is that per solid angle at the sensor over the determinant of
 how p moves across with the direction.
 
-Chains are drawn from those of a few rays of the sensor, in proportion to how often these meet them. Planes alone are
-found twice; of curved surfaces every hit has a plane of its own, and the edges seen in them are left out.
+Chains are drawn from those of a few rays of the sensor, in proportion to how often these meet them; one that fills less
+than about 1e-4 of the film may be missed. Planes alone are found twice; of curved surfaces every hit has a plane of its
+own, and the edges seen in them are left out.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from torchtransient.plugins.mitsuba_compat import is_instance, is_irradiance_met
 from torchtransient.plugins.node_walk import shapes_of_scene
 from torchtransient.plugins.polarized import attenuated, intensity, product
 from torchtransient.plugins.sensors.origin import can_be_sampled
-from torchtransient.plugins.transport.boundary.moving_edges import has_delta_lobe
+from torchtransient.plugins.transport.boundary.moving_edges import LONGEST, has_delta_lobe
 from torchtransient.plugins.transport.boundary.sides import at_point, both_sides, past_edge
 from torchtransient.plugins.transport.connection.sensor_sampled import first_row, in_sensor_frame
 from torchtransient.plugins.transport.instances import surface_interaction
@@ -29,8 +30,6 @@ from torchtransient.plugins.transport.strategy import Connection, Event, Local, 
 from torchtransient.plugins.transport.walk import advance, start
 from torchtransient.plugins.transport.world import World
 
-# Delta vertices of a chain at most: a slab of glass has two, one that is seen in a mirror three.
-LONGEST = 4
 # Rays that chains are taken from, and the share of those that end at a surface that goes on with a delta lobe.
 _RAYS, _UNFINISHED = 2**14, 0.125
 # Entries of each of two tables of counts. A chain has the lesser of its two counts: others may share one of them.

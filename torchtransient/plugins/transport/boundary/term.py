@@ -6,11 +6,12 @@ that hides; P is the density of p by length. With the adjoint A(pixel, tau) of t
     dLoss += sum over sides  +-c [ sum over events e: A(pixel, tau_e) f_e ] (n . v_side)       + inner, - outer
 
 (Li et al. 2018, with times of flight). Each side is a path of the walk, which goes on from a segment whose end is known.
-Every edge between two vertices belongs to one of three passes:
+Every edge between two vertices belongs to one of these passes:
 
     primary   x is the sensor:           c = W sin / P                     (W: importance per area across d at p)
     vertex    x is a vertex of a path:   c = beta f_s(x, d) sin / (r^2 P)
     light     x is a point of a light:   c = -Le / pdf_omega sin / P, and the path goes on behind p, to the sensor
+    specular  x is the sensor, behind plane mirrors and glass (:mod:`.specular`): c as in the first pass
 
 The speeds v are those of the edge against the samples that interior derivatives hold, see :mod:`.speeds`.
 """
