@@ -153,8 +153,8 @@ class BoundaryTerm:
         return mi.UInt32(dr.select(inside, cell.y, 0)), mi.UInt32(dr.select(inside, cell.x, 0)), weight, inside
 
     def rays_at(self, sampler, uv, wavelength, aperture, row, column, job, η=None):
-        """Primary rays through places of the film, in pixels, attached to the sensor; ``η``: index where they start, None
-        to look it up, which cannot be done within loops.
+        """Primary rays through places of the film, in pixels, attached to the sensor; ``η``: index where they start,
+        None to look it up, which cannot be done within loops.
         """
         world, sensor = self.world, self.sensor
         position = uv / mi.ScalarVector2f(self.film.crop_size())
