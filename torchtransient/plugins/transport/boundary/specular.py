@@ -36,8 +36,8 @@ _RAYS, _UNFINISHED = 2**14, 0.125
 _BUCKETS = 2**18
 _STEPS = 12
 # How far from p its ray may pass, in parts of the way; the walk starts its rays a little beside the planes, and may
-# miss it by more. Planes are told apart by a hundredth of their normals and the first share of the scene's radius, which
-# is the least distance of an edge from the last plane, too.
+# miss it by more. Planes are told apart by a hundredth of their normals and the first share of the scene's radius,
+# which is the least distance of an edge from the last plane, too.
 _MISS, _MISS_OF_WALK = 1e-4, 2e-3
 
 
