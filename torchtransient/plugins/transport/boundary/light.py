@@ -8,7 +8,7 @@ import mitsuba as mi
 from torchtransient.plugins.edges.table import BESIDE
 from torchtransient.plugins.polarized import attenuated
 from torchtransient.plugins.sensors.seen_from import FAR, can_be_connected
-from torchtransient.plugins.transport.boundary.sides import at_point, place_at
+from torchtransient.plugins.transport.boundary.sides import at_point, in_memory, place_at
 from torchtransient.plugins.transport.boundary.speeds import along_the_ray, dragged_share
 from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
 from torchtransient.plugins.transport.scattering.geometry_terms import EDGE_ON, displacement, material_point
@@ -70,6 +70,8 @@ class LightPass:
         # What touches the edge is uncovered for the light and for the vertex before at once, which counts it.
         touches = dr.dot(x.at.p - b.p, b.d) < CONTACT * (1 + dr.max(dr.abs(b.p)))
         path.active = active = active & ~touches
+        of_edge = vars(b.k), b.n, b.p, b.dist
+        in_memory(world, sampler, of_edge, x.at.p, x.si.n, path.leg, path.β, path.τ, ray, active, factor, numbers.aperture)
         with dr.resume_grad():
             speeds = self._speeds(term, edges, light, x, path, ray, numbers, sampler, job, active)
         u = sampler.next_2d()
