@@ -70,8 +70,8 @@ class LightPass:
         # What touches the edge is uncovered for the light and for the vertex before at once, which counts it.
         touches = dr.dot(x.at.p - b.p, b.d) < CONTACT * (1 + dr.max(dr.abs(b.p)))
         path.active = active = active & ~touches
-        of_edge = vars(b.k), b.n, b.p, b.dist
-        in_memory(world, sampler, of_edge, x.at.p, x.si.n, path.leg, path.β, path.τ, ray, active, factor, numbers.aperture)
+        of_edge, of_path = (vars(b.k), b.n, b.p, b.dist), (x.at.p, x.si.n, path.leg, path.β, path.τ, ray)
+        in_memory(world, sampler, of_edge, of_path, active, factor, numbers.aperture)
         with dr.resume_grad():
             speeds = self._speeds(term, edges, light, x, path, ray, numbers, sampler, job, active)
         u = sampler.next_2d()
