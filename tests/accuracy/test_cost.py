@@ -131,9 +131,9 @@ def test_gradients_of_a_heavy_tailed_loss_have_no_error():
 
 
 @pytest.mark.slow
-def test_gradients_of_a_body_with_hollows_have_no_error():
-    """A bumpy sphere before a wall, moved sideways: few of its silhouettes' samples decide, and two pairs of runs say
-    5 % where 64 say 74 %.
+def test_gradients_of_a_body_with_hollows_have_an_error():
+    """A bumpy sphere before a wall, whose parts hide and light each other: the tail of its pose's gradient is that of
+    few samples, with an index of 3.6 to 4.1 over 4 seeds, where 2 is the limit.
     """
     n, m = 24, 16
     turns = np.linspace(0, 2 * np.pi, n, endpoint=False)
@@ -168,7 +168,7 @@ def test_gradients_of_a_body_with_hollows_have_no_error():
         renderer, spp=(16, 64), gradients=[pose, albedo], samplers=("independent",), progress=False
     )
     heavy = {point.quantity: point.tail.heavy for point in report.points if point.tail is not None}
-    assert heavy == {f"d loss / d {pose}": True, f"d loss / d {albedo}": False}
+    assert heavy == {f"d loss / d {pose}": False, f"d loss / d {albedo}": False}
 
 
 def test_sample_counts_are_those_that_were_drawn():

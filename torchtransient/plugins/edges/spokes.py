@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from torchtransient.plugins.host_numbers import whole_numbers
 from torchtransient.plugins.pointer_table import PointerTable
 from torchtransient.plugins.transport.strategy import Local
 
@@ -26,14 +27,13 @@ class Spokes:
     def __init__(self, shapes: list[Any], faces: list[np.ndarray], ends: list[np.ndarray], listed: list[bool]) -> None:
         places = np.cumsum([0, *(int(each.max(initial=-1)) + 1 for each in faces)])
         first = np.cumsum([0, *(len(each) for each in faces)])[:-1]
-        numbers = lambda x: mi.UInt32(np.ascontiguousarray(x, np.uint32))  # noqa: E731
         corner = np.concatenate([each + start for each, start in zip(faces, places, strict=False)])
         end = np.concatenate([each + start for each, start in zip(ends, places, strict=False)])
         kept = [(shape, 1 + start) for shape, start, some in zip(shapes, first, listed, strict=True) if some]
         self._faces = PointerTable([shape for shape, _ in kept], [int(start) for _, start in kept])
-        self._corners, self._ends = numbers(corner.ravel()), numbers(end.ravel())
-        self._rows = numbers(np.argsort(end.ravel(), kind="stable") // 2)
-        self._starts = numbers(np.cumsum([0, *np.bincount(end.ravel(), minlength=places[-1])]))
+        self._corners, self._ends = whole_numbers(corner.ravel()), whole_numbers(end.ravel())
+        self._rows = whole_numbers(np.argsort(end.ravel(), kind="stable") // 2)
+        self._starts = whole_numbers(np.cumsum([0, *np.bincount(end.ravel(), minlength=places[-1])]))
         dr.make_opaque(self._corners, self._ends, self._rows, self._starts)
 
     def around(self, pi: Any, V: Any, active: Any) -> Local:

@@ -16,7 +16,7 @@ import numpy as np
 
 from torchtransient.plugins.edges.joined import edge_keys, joined_places, near_places
 from torchtransient.plugins.edges.spokes import Spokes
-from torchtransient.plugins.host_numbers import host_numbers
+from torchtransient.plugins.host_numbers import host_numbers, whole_numbers
 from torchtransient.plugins.mitsuba_compat import is_instance, lacks_edges
 from torchtransient.plugins.node_walk import members_of, shapes_of_scene, shown_by
 from torchtransient.plugins.pointer_table import registry_number
@@ -185,16 +185,16 @@ class Topology:
         place = np.concatenate([rows.place, np.zeros((len(limbs), 4), int)]) @ [1, 4, 16, 64]
         flags = np.concatenate([rows.flags, kind * KIND])
 
-        numbers = lambda x: mi.UInt32(np.ascontiguousarray(x, np.uint32))  # noqa: E731
         self.rounds, self.count = len(limbs), len(flags)
         self.has_gaps, self.has_twins = bool((flags & GAP).any()), bool((flags & TWIN).any())
-        self._ends = [[numbers(each[:, i]) for each in own] for i in (0, 1)]
+        self._ends = [[whole_numbers(each[:, i]) for each in own] for i in (0, 1)]
         self.third, self.other, self.faces, self.owners = (
-            [numbers(x[:, i]) for i in (0, 1)] for x in (rows.third, rows.other, faces, owners)
+            [whole_numbers(x[:, i]) for i in (0, 1)] for x in (rows.third, rows.other, faces, owners)
         )
-        self.place, self.flags, self.index = numbers(place), numbers(flags), numbers([b.index for b in self.bodies])
+        index = np.array([body.index for body in self.bodies])
+        self.place, self.flags, self.index = (whole_numbers(x) for x in (place, flags, index))
         self.shape, self.instance = (
-            numbers([0 if x is None else registry_number(x) for x in each])
+            whole_numbers(np.array([0 if x is None else registry_number(x) for x in each]))
             for each in ([b.shape for b in self.bodies], [b.instance for b in self.bodies])
         )
         # Rows follow each other by what they belong to.

@@ -8,7 +8,7 @@ import mitsuba as mi
 from torchtransient.plugins.edges.table import BESIDE
 from torchtransient.plugins.polarized import attenuated
 from torchtransient.plugins.sensors.seen_from import FAR, can_be_connected
-from torchtransient.plugins.transport.boundary.sides import at_point, place_at
+from torchtransient.plugins.transport.boundary.sides import at_point, in_memory, place_at
 from torchtransient.plugins.transport.boundary.specular import attached_ray, ratios_of
 from torchtransient.plugins.transport.boundary.speeds import along_the_ray, dragged_share
 from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
@@ -74,6 +74,9 @@ class LightPass:
         # What touches the edge is uncovered for the light and for the vertex before at once, which counts it.
         touches = dr.dot(x.at.p - b.p, b.d) < CONTACT * (1 + dr.max(dr.abs(b.p)))
         path.active = active = active & ~touches
+        of_edge, of_path = (vars(b.k), b.n, b.p, b.dist), (x.at.p, x.si.n, path.leg, path.β, path.τ, ray)
+        of_chain = None if through is None else vars(through.chain)
+        in_memory(world, sampler, of_edge, of_path, of_chain, active, factor, numbers.aperture)
         with dr.resume_grad():
             speeds = self._speeds(term, edges, light, x, path, ray, numbers, sampler, active)
         u = sampler.next_2d()

@@ -8,7 +8,7 @@ import mitsuba as mi
 from torchtransient.plugins.edges.topology import EDGE
 from torchtransient.plugins.polarized import attenuated
 from torchtransient.plugins.sensors.seen_from import can_be_connected
-from torchtransient.plugins.transport.boundary.sides import at_point, both_sides, past_edge, place_at
+from torchtransient.plugins.transport.boundary.sides import at_point, both_sides, in_memory, past_edge, place_at
 from torchtransient.plugins.transport.boundary.speeds import behind, sides_from, slides
 from torchtransient.plugins.transport.strategy import Local
 
@@ -60,6 +60,7 @@ class PrimaryPass:
         past = past_edge(world, b, ray, medium, β, sampler, active, seen=True)
         held = term.is_meter and not world.wanted.sensor
         needed = mi.Bool(True), mi.Bool(True)
+        in_memory(world, sampler, vars(b.k), b.n, b.p, b.dist, way, ds.uv, numbers.aperture, active, factor, β, past)
         with dr.resume_grad():
             if held:  # the first vertex is a point of its shape, see ``Vacuum.from_meter``
                 radius = world.contents.damping_radius

@@ -50,9 +50,20 @@ def both_sides(world, mode, sampler, view, b, past, first, factor, speeds, neede
         # The same random numbers on both sides.
         value = mode.follow(world, sampler.clone(), path, view, dr.select(need, sign * factor, 0), speed)
         if value is not None:
+            in_memory(world, None, value)
             with dr.resume_grad():
                 objective += value * speed
     return objective
+
+
+def in_memory(world, sampler, *values):
+    """Evaluate what speeds are made of where the sensor moves: each entry of its pose is a sum over lanes by itself,
+    which would trace the paths once more.
+    """
+    if world.wanted.sensor:
+        if sampler is not None:
+            sampler.schedule_state()
+        dr.eval(values)
 
 
 def at_point(p, ray=None):

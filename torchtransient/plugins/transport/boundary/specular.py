@@ -23,7 +23,7 @@ from torchtransient.plugins.polarized import attenuated, intensity, product
 from torchtransient.plugins.sensors.seen_from import has_eye
 from torchtransient.plugins.transport.boundary.moving_edges import LONGEST, has_delta_lobe
 from torchtransient.plugins.transport.boundary.primary import where_normals_face
-from torchtransient.plugins.transport.boundary.sides import at_point, both_sides, past_edge, place_at
+from torchtransient.plugins.transport.boundary.sides import at_point, both_sides, in_memory, past_edge, place_at
 from torchtransient.plugins.transport.connection.sensor_sampled import first_row, in_sensor_frame
 from torchtransient.plugins.transport.instances import surface_interaction
 from torchtransient.plugins.transport.scattering.surface import Surface
@@ -351,6 +351,8 @@ class SpecularPass:
         β = attenuated(path.β, mi.UnpolarizedSpectrum(T))
         factor = seen.importance * chain.inverse * b.sin * b.inv_pdf * weight * share
         past = past_edge(world, b, path.ray, medium, β, sampler, active)
+        of_edge, of_path = (vars(b.k), b.n, b.limb, b.inner), (path, past, β)
+        in_memory(world, sampler, of_edge, of_path, vars(seen), vars(chain), vars(numbers), active, factor)
         with dr.resume_grad():
             ray = attached_ray(world, rays.ray, ratios_of(chain), chain.count, active)
             moves = edges.moving(b) - ray.o - ray.d * seen.way

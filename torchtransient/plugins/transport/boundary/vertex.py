@@ -8,7 +8,7 @@ import mitsuba as mi
 from torchtransient.plugins.mitsuba_compat import is_sphere
 from torchtransient.plugins.polarized import attenuated, product
 from torchtransient.plugins.sensors.seen_from import sees_one_line
-from torchtransient.plugins.transport.boundary.sides import both_sides, past_edge
+from torchtransient.plugins.transport.boundary.sides import both_sides, in_memory, past_edge
 from torchtransient.plugins.transport.boundary.specular import attached_ray
 from torchtransient.plugins.transport.boundary.speeds import along_the_ray, behind, dragged, sides_from, slides
 from torchtransient.plugins.transport.contents import DAMPING
@@ -83,6 +83,10 @@ class VertexPass:
         β = dr.select(active, β, 0)
         medium = world.segment.medium_at(world, b.beside, x, world.segment.medium_towards(b.d, vertex), active)
         past = past_edge(world, b, path.ray, medium, β, sampler, active)
+        of_edge = vars(b.k), b.n, b.p, b.dist, b.crease, b.inner, b.facing
+        of_path = before, path.ray, path.prev_p, at, target, radius, vertex.at.p, vertex.at.n, τ, η
+        of_lead = None if lead is None else (lead.all, lead.ratios, path.prev_unconnected)
+        in_memory(world, sampler, of_edge, of_path, of_lead, past, active, factor, β)
         with dr.resume_grad():
             v_x = self._motion(world, rays, path, before, lead, target, vertex, radius, active)
             speeds = sides_from(world, b, edges, v_x, behind(world, b, *past, active), radius, active)
@@ -116,7 +120,7 @@ class VertexPass:
         """Mask of lights of which derivatives drag near points along with who sees them."""
         mask = shape.is_emitter()
         if world.wanted.sphere_lights:
-            mask &= ~world.contents.sphere_lights.lists(shape.emitter())
+            mask &= ~world.contents.sphere_lights.marks.lists(shape.emitter())
         return mask
 
     def _motion(self, world, rays, path, before, lead, target, vertex, radius, active):

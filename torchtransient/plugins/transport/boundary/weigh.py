@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.films.block import FilmBlock
+from torchtransient.plugins.transport.boundary.sides import in_memory
 from torchtransient.plugins.transport.carry import total_of
 from torchtransient.plugins.transport.derivative.forward import tangents_of
 from torchtransient.plugins.transport.sinks.adjoint_sum import AdjointSumSink
@@ -52,6 +53,7 @@ class Reverse:
     def sum_of_pixels(self, kept, factors):
         """The attached objective."""
         factor, speeds = factors
+        in_memory(self.term.world, None, kept)
         with dr.resume_grad():
             names = PixelSums.NAMES[: len(speeds)]
             return sum(finite(kept[name] * factor) * speed for name, speed in zip(names, speeds, strict=True))
