@@ -334,7 +334,7 @@ def test_one_recording_for_all_numbers():
         b = table.seen_from(table.pick(table.by_length, u, u * 0.7), mi.Point3f(1, 2, 9), True)
         return b.p, b.n, b.inv_pdf, table.moving(b)
 
-    frozen = dr.freeze(call, state_fn=lambda *_: state_below(topology)[1])
+    frozen = dr.freeze(call, state_fn=lambda *_: state_below([topology, vars(topology.corners)])[1])
     for x in (0.0, 0.1, 0.2, 0.3):
         install(params, base, dr.opaque(mi.Float, x))
         u = mi.Float((np.arange(500, dtype=np.float32) + 0.5) / 500 * (1 - x))

@@ -77,7 +77,7 @@ class EdgeTable:
         self.edges = topology.count - topology.rounds
         with dr.resume_grad():
             self.ends = topology.ends()
-        self.flags = topology.flags
+        self.flags = topology.corners.flags | dr.opaque(mi.UInt32, 0)
         with dr.suspend_grad():
             self._measure()
             weight = self.weight
@@ -99,11 +99,11 @@ class EdgeTable:
         if self.edges:
             points = t.points()
             corner = lambda index: dr.gather(mi.Point3f, points, dr.gather(mi.UInt32, index, rows, edge), edge)  # noqa: E731
-            self.third = [corner(index) for index in t.third]
+            self.third = [corner(index) for index in t.corners.third]
         if t.has_twins:
             apart = 2 * APART * dr.max(dr.max(dr.abs(points)))
             own = (dr.gather(mi.Point3f, dr.detach(end), rows) for end in self.ends)
-            off = [dr.max(dr.abs(p - corner(i))) for p, i in zip(own, t.other, strict=True)]
+            off = [dr.max(dr.abs(p - corner(i))) for p, i in zip(own, t.corners.other, strict=True)]
             lone = (self.flags & TWIN != 0) & (dr.maximum(*off) > apart)
             self.flags = dr.select(lone, self.flags & ~mi.UInt32(TWO | TWIN), self.flags)
         k = self._row(rows)

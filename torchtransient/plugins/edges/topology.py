@@ -156,6 +156,22 @@ def _angles(p: np.ndarray, group: np.ndarray) -> np.ndarray:
     return np.arctan2((np.cross(t, x) * h).sum(1), (x * h).sum(1)) % (2 * np.pi)
 
 
+class Corners:
+    """Numbers of vertices, and flags, that tables are made from (:class:`.table.EdgeTable`): ``ends`` by mesh, ``third``
+    and ``other`` as in :class:`_Rows`.
+    """
+
+    # No state of recorded calls, which put arrays of their own in place of those that they are handed: kernels of tables
+    # would be compiled again for these.
+    only_remembers = True
+
+    def __init__(self, ends: list[np.ndarray], third: np.ndarray, other: np.ndarray, flags: np.ndarray) -> None:
+        self.ends = [[whole_numbers(each[:, i]) for each in ends] for i in (0, 1)]
+        self.third, self.other = ([whole_numbers(x[:, i]) for i in (0, 1)] for x in (third, other))
+        self.flags = whole_numbers(flags)
+        dr.make_opaque(self.ends, self.third, self.other, self.flags)
+
+
 class Topology:
     """The edges and limbs of ``scene``: ``count`` rows, of which the last ``rounds`` are limbs and rims of what has no
     triangles. ``without``: the shapes that have outlines, but no edges here. ``hides``: which shapes count, None for
@@ -187,20 +203,17 @@ class Topology:
 
         self.rounds, self.count = len(limbs), len(flags)
         self.has_gaps, self.has_twins = bool((flags & GAP).any()), bool((flags & TWIN).any())
-        self._ends = [[whole_numbers(each[:, i]) for each in own] for i in (0, 1)]
-        self.third, self.other, self.faces, self.owners = (
-            [whole_numbers(x[:, i]) for i in (0, 1)] for x in (rows.third, rows.other, faces, owners)
-        )
+        self.corners = Corners(own, rows.third, rows.other, flags)
+        self.faces, self.owners = ([whole_numbers(x[:, i]) for i in (0, 1)] for x in (faces, owners))
         index = np.array([body.index for body in self.bodies])
-        self.place, self.flags, self.index = (whole_numbers(x) for x in (place, flags, index))
+        self.place, self.index = whole_numbers(place), whole_numbers(index)
         self.shape, self.instance = (
             whole_numbers(np.array([0 if x is None else registry_number(x) for x in each]))
             for each in ([b.shape for b in self.bodies], [b.instance for b in self.bodies])
         )
         # Rows follow each other by what they belong to.
         self._runs = [(k, len(list(run))) for k, run in groupby(owners[:, 0].tolist())]
-        dr.make_opaque(self._ends, self.third, self.other, self.faces, self.owners)
-        dr.make_opaque(self.place, self.flags, self.index, self.shape, self.instance)
+        dr.make_opaque(self.faces, self.owners, self.place, self.index, self.shape, self.instance)
 
     def _edges(self) -> tuple[_Rows, np.ndarray, np.ndarray]:
         """(edges of all meshes, vertices counted through; bodies of both faces, (E, 2); first vertices of meshes)."""
@@ -233,7 +246,7 @@ class Topology:
         By a single gather from the scene's parameters: Dr.Jit's ``isolate_grad`` loses what arrives at gathers of
         gathers that were made before.
         """
-        edges = [[body.vertices(i) for body, i in zip(self._meshes, each, strict=True)] for each in self._ends]
+        edges = [[body.vertices(i) for body, i in zip(self._meshes, each, strict=True)] for each in self.corners.ends]
         frames = [frame for body in self._others for frame in body.frames()]
         o, x, y, z = ([frame[k] for frame in frames] for k in range(4))
         return [_concatenated([*part, *first, *then]) for part, first, then in zip(edges, (o, x), (y, z), strict=True)]
