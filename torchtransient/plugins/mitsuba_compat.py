@@ -270,6 +270,11 @@ def lacks_edges(shape: Any) -> bool:
     return not (shape.is_mesh() or shape.class_name() in _OUTLINED)
 
 
+def has_limb(shape: Any) -> bool:
+    """Return whether the points of a shape's outline depend on where it is seen from."""
+    return bool(shape.class_name() in ("Sphere", "Cylinder", "Ellipsoids"))
+
+
 # Their normal is the same everywhere.
 _FLAT = ("Rectangle", "Disk")
 # Meshes of more faces are not looked through.

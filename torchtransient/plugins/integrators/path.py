@@ -39,7 +39,7 @@ class TransientPath(TransientIntegrator):
     """
 
     # Which passes the boundary term has: fewer for tests and benchmarks.
-    boundary_passes = ("primary", "vertex", "light")
+    boundary_passes = ("primary", "vertex", "light", "specular")
 
     def __init__(self, props):
         super().__init__(props)

@@ -8,7 +8,14 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.mitsuba_compat import is_irradiance_meter, near_clip
-from torchtransient.plugins.sensors.origin import sensors_of
+from torchtransient.plugins.sensors.origin import (
+    PrimaryRays,
+    index_at_sensor,
+    sample_rays,
+    sensors_of,
+    start_at_sensor,
+    views,
+)
 from torchtransient.plugins.transport.strategy import Local
 
 # Radii of the scene from which what is seen along parallel rays is looked at.
@@ -18,6 +25,11 @@ FAR = 300
 def can_be_connected(sensor: Any) -> bool:
     """Return whether rays of a sensor fill a solid angle or a beam in which a point of the scene is found again."""
     return all(is_irradiance_meter(one) or near_clip(one) is not None for one in sensors_of(sensor))
+
+
+def has_eye(sensor: Any) -> bool:
+    """Return whether rays of a sensor start at a point that their random numbers choose, wherever they go."""
+    return all(near_clip(one) is not None and not _sees_in_parallel(one) for one in sensors_of(sensor))
 
 
 def sees_one_line(sensor: Any) -> bool:
@@ -38,7 +50,7 @@ class SensorPlaces:
     """
 
     def __init__(self, sensor: Any, film: Any, radius: Any) -> None:
-        self.sensor, self.radius = sensor, radius
+        self.sensor, self.film, self.radius = sensor, film, radius
         self.cameras = sensors_of(sensor)
         self.is_meter = is_irradiance_meter(sensor)
         self.size = mi.ScalarVector2f(film.crop_size())
@@ -56,6 +68,38 @@ class SensorPlaces:
     def middle(self, numbers: Any) -> Any:
         """The middle of the film of the chosen camera, in pixels."""
         return mi.Point2f((mi.Float(numbers.camera) + 0.5) / len(self.cameras), 0.5) * self.size
+
+    def eye(self, numbers: Any) -> Any:
+        """The point from which the chosen camera sees, see :func:`has_eye`."""
+        found = [self._line(camera, (0.5, 0.5), numbers.aperture)[0] for camera in self.cameras]
+        eye = found[0]
+        for number, other in enumerate(found[1:], 1):
+            eye = dr.select(numbers.camera == number, other, eye)
+        return eye
+
+    def rays_at(
+        self, world: Any, sampler: Any, uv: Any, numbers: Any, row: Any = None, column: Any = None,
+        total: int | None = None, η: Any = None,
+    ) -> PrimaryRays:
+        """Return the primary rays through places ``uv`` of the film, in pixels, attached to the sensor.
+
+        ``total``: samples of a pixel, None where the rays weigh nothing. ``η``: index of refraction where they start,
+        None to look it up, which cannot be done within loops.
+        """
+        position = uv / self.size
+        # Sensors at infinity, which ask for a sphere around the scene, cannot be connected.
+        seen = views(self.sensor, position, lambda: None)
+        with dr.resume_grad():
+            u, clip = numbers.wavelength, None
+            ray, weight = sample_rays(self.sensor, seen, self.sensor.shutter_open(), u, position, numbers.aperture)
+            if self.film.curves is not None:
+                ray, weight = self.film.curves.draw(self.sensor, ray, weight, u)
+            if η is None:
+                η = index_at_sensor(seen, world.contents.surroundings, world.scene)
+            if world.contents.media is not None and world.contents.media.at_sensor is not None:
+                ray, clip = start_at_sensor(seen, ray)
+        scale = None if total is None else dr.opaque(mi.Float, 1 / total)
+        return PrimaryRays(sampler, ray, weight, scale, row, column, seen, η, clip=clip)
 
     def seen_from(self, at: Any, numbers: Any, active: Any) -> tuple[Any, Any]:
         """Return (where the sensor sees ``at`` (Interaction3f), its importance there per area across).
@@ -85,17 +129,20 @@ class SensorPlaces:
         ds = Local(uv=uv, p=result.p, eye=result.eye, d=way / dist, dist=dist, pdf=pdf, numbers=numbers)
         return ds, dr.select(valid, result.importance, 0)
 
+    @staticmethod
+    def _line(camera: Any, place: Any, aperture: Any) -> tuple[Any, Any]:
+        """(start on the plane of the lens, direction with a unit part along the axis) of the ray through a ``place`` of
+        the film in [0, 1]^2.
+        """
+        axis, near, _ = _axis_and_clips(camera)
+        ray, _ = camera.sample_ray_differential(camera.shutter_open(), 0.5, mi.Point2f(*place), aperture)
+        way = ray.d / dr.dot(ray.d, axis)
+        return mi.Point3f(ray.o - way * near), mi.Vector3f(way)
+
     def _seen_from_camera(self, camera: Any, p: Any, aperture: Any) -> Local:
-        axis = mi.Vector3f(camera.world_transform() @ mi.Vector3f(0, 0, 1))
-        scale = dr.norm(axis)
-        axis /= scale
-        near, far = near_clip(camera) * scale, camera.far_clip() * scale
-        starts, ways = [], []
-        for place in ((0, 0), (1, 0), (0, 1)):
-            ray, _ = camera.sample_ray_differential(camera.shutter_open(), 0.5, mi.Point2f(*place), aperture)
-            way = ray.d / dr.dot(ray.d, axis)
-            starts.append(mi.Point3f(ray.o - way * near))
-            ways.append(mi.Vector3f(way))
+        axis, near, far = _axis_and_clips(camera)
+        lines = [self._line(camera, place, aperture) for place in ((0, 0), (1, 0), (0, 1))]
+        starts, ways = zip(*lines, strict=True)
         depth = dr.dot(p - starts[0], axis)
         corner, right, up = (start + way * depth for start, way in zip(starts, ways, strict=True))
         right, up, at = right - corner, up - corner, p - corner
@@ -108,7 +155,7 @@ class SensorPlaces:
         cos = dr.dot(way, axis) / dr.norm(way)
         # Parallel rays start at different points and have no eye.
         eye = o
-        if camera.class_name() == "OrthographicCamera":
+        if _sees_in_parallel(camera):
             eye = o - way / dr.norm(way) * (FAR * self.radius)
         valid = (depth > near) & (depth < far)
         return Local(uv=uv, p=o, eye=mi.Point3f(eye), importance=dr.rcp(area * cos), valid=valid)
@@ -128,3 +175,14 @@ class SensorPlaces:
         ds = Local(uv=uv, p=p, eye=p, d=d, dist=dist, pdf=pdf, n=mi.Normal3f(ps.n), numbers=asked)
         # The weight of its rays holds a pi.
         return ds, dr.select(valid, cos * dr.inv_pi / dr.square(dist), 0)
+
+
+def _axis_and_clips(camera: Any) -> tuple[Any, Any, Any]:
+    """(unit vector along the axis, distances of both clip planes) of a camera, in the world."""
+    axis = mi.Vector3f(camera.world_transform() @ mi.Vector3f(0, 0, 1))
+    scale = dr.norm(axis)
+    return axis / scale, near_clip(camera) * scale, camera.far_clip() * scale
+
+
+def _sees_in_parallel(camera: Any) -> bool:
+    return bool(camera.class_name() == "OrthographicCamera")

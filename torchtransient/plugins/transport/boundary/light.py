@@ -9,6 +9,7 @@ from torchtransient.plugins.edges.table import BESIDE
 from torchtransient.plugins.polarized import attenuated
 from torchtransient.plugins.sensors.seen_from import FAR, can_be_connected
 from torchtransient.plugins.transport.boundary.sides import at_point, in_memory, place_at
+from torchtransient.plugins.transport.boundary.specular import attached_ray, ratios_of
 from torchtransient.plugins.transport.boundary.speeds import along_the_ray, dragged_share
 from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
 from torchtransient.plugins.transport.scattering.geometry_terms import EDGE_ON, displacement, material_point
@@ -42,7 +43,7 @@ class LightPass:
         world, edges, sampler, lit = term.world, term.edges, term.sampler(job), term.light_world
         k = edges.pick(edges.by_length, sampler.next_1d(), sampler.next_1d())
         numbers = term.places.numbers(sampler)
-        middle = term.rays_at(sampler, term.places.middle(numbers), numbers, None, None, job)
+        middle = term.places.rays_at(world, sampler, term.places.middle(numbers), numbers, total=job.total)
         # Nothing attached is kept that forward mode, which follows the speeds, would run into.
         middle.ray, middle.weight, middle.η = dr.detach((middle.ray, middle.weight, middle.η))
         ray = mi.Ray3f(middle.ray)
@@ -61,6 +62,9 @@ class LightPass:
         if world.contents.distant is not None:
             τ = mi.Float64(dr.select(light.far, world.contents.distant.length(b.p, -b.d), 0))
         term.to_sensor.numbers = numbers
+        through = term.through
+        if through is not None:
+            through.set(term.chains.draw(sampler.next_1d()), numbers, dr.detach(middle.η))
         path = start(lit, ray, τ - term.film.start_opl, dr.detach(middle.η))
         path.prev_p = dr.select(light.far, b.p, b.V)
         β = light.Le * mi.UnpolarizedSpectrum(T) * dr.select(most > 0, dr.rcp(most), 0)
@@ -71,9 +75,10 @@ class LightPass:
         touches = dr.dot(x.at.p - b.p, b.d) < CONTACT * (1 + dr.max(dr.abs(b.p)))
         path.active = active = active & ~touches
         of_edge, of_path = (vars(b.k), b.n, b.p, b.dist), (x.at.p, x.si.n, path.leg, path.β, path.τ, ray)
-        in_memory(world, sampler, of_edge, of_path, active, factor, numbers.aperture)
+        of_chain = None if through is None else vars(through.chain)
+        in_memory(world, sampler, of_edge, of_path, of_chain, active, factor, numbers.aperture)
         with dr.resume_grad():
-            speeds = self._speeds(term, edges, light, x, path, ray, numbers, sampler, job, active)
+            speeds = self._speeds(term, edges, light, x, path, ray, numbers, sampler, active)
         u = sampler.next_2d()
         sink, factors = mode.sink_of_pixels(middle, job, u, factor, speeds)
         _, kept = go_on(lit, sampler, path, sink)
@@ -98,8 +103,10 @@ class LightPass:
         other *= dr.select(ds.delta, 1, dr.select(far, 1, ratio) / ds.pdf)
         return Local(ds=ds, b=b, far=far, Le=dr.select(k.ball, other, Le), near=near, u=u)
 
-    def _speeds(self, term, edges, light, x, path, ray, numbers, sampler, job, active):
-        """Attached speeds of the edge: where x is the first vertex of a path of the sensor, and where it is another."""
+    def _speeds(self, term, edges, light, x, path, ray, numbers, sampler, active):
+        """Attached speeds of the edge: where x is the first vertex of a path of the sensor, where it is another, and
+        where the sensor sees it through a chain.
+        """
         b = light.b
         world = term.world
         pi, on_surface = term.light_world.segment.surface_of(path.leg)
@@ -113,7 +120,7 @@ class LightPass:
         if term.is_meter and not world.wanted.sensor:
             first = held
         else:
-            rays = term.rays_at(sampler, seen.uv, seen.numbers, None, None, job)
+            rays = term.places.rays_at(world, sampler, seen.uv, seen.numbers)
             if term.is_meter:
                 with dr.suspend_grad():
                     shift = seen.p - rays.ray.o
@@ -123,17 +130,37 @@ class LightPass:
             with dr.suspend_grad():
                 r = dr.norm(x.at.p - o)
                 w = (x.at.p - dr.detach(o)) / r
-            δ = displacement(rays.ray.o + rays.ray.d * r, active)
-            q, cos = dr.dot(n, along_the_ray(world, pi, ray, surface)), dr.dot(n, w)
-            first = δ + w * dr.select(surface & (dr.abs(cos) > EDGE_ON), (q - dr.dot(n, δ)) / cos, 0)
+            q = dr.dot(n, along_the_ray(world, pi, ray, surface))
+            first = self._on_ray(displacement(rays.ray.o + rays.ray.d * r, active), w, n, q, surface)
+        motions = [first, held]
+        if term.through is not None:
+            motions.append(self._through_chain(term, x.at.p, n, pi, ray, surface, active))
         n_p, found, turned = dr.dot(b.n, edges.moving(b)), [], mi.Float(0)
         if self.lights.sun is not None:  # its rays turn about x
             sun = active & light.far & self.lights.sun.shines(light.ds.emitter, light.ds.d)
             turned = behind * dr.dot(b.n, displacement(self.lights.sun.followed(mi.Vector3f(light.ds.d), sun), sun))
-        for v_x in (first, held):
+        for v_x in motions:
             v_y = self._motion(world, light, x.at.p, v_x, active & ~light.far)
             found.append(dr.select(active, n_p - (1 - t) * dr.dot(b.n, v_x) - t * dr.dot(b.n, v_y) - turned, 0))
         return found
+
+    @staticmethod
+    def _on_ray(δ, w, n, q, surface):
+        """Motion of the point of a surface, which moves by ``q`` along its normal ``n``, on a ray in direction ``w``
+        that moves by ``δ``.
+        """
+        cos = dr.dot(n, w)
+        return δ + w * dr.select(surface & (dr.abs(cos) > EDGE_ON), (q - dr.dot(n, δ)) / cos, 0)
+
+    def _through_chain(self, term, x, n, pi, ray, surface, active):
+        """Motion of x on the ray of the sensor that sees it through a chain."""
+        world, through = term.world, term.through
+        with dr.suspend_grad():
+            seen, rays = through.seen_from(x, active)
+        found = active & seen.valid
+        last = attached_ray(world, rays.ray, ratios_of(through.chain), through.chain.count, found)
+        q = dr.dot(n, along_the_ray(world, pi, ray, surface))
+        return self._on_ray(displacement(last.o + last.d * seen.way, found), seen.d, n, q, surface)
 
     def _motion(self, world, light, x, v_x, active):
         """Attached motion of a light's point, as interior derivatives hold it, seen from ``x``, which moves by ``v_x``:

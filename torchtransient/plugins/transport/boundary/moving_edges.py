@@ -8,11 +8,15 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from torchtransient.plugins.host_numbers import host_numbers
 from torchtransient.plugins.mitsuba_compat import (
     attribute_name,
+    has_limb,
     has_surface,
     is_bump_map,
+    is_flat,
     is_instance,
     is_sphere,
     lacks_edges,
@@ -21,7 +25,7 @@ from torchtransient.plugins.mitsuba_compat import (
 from torchtransient.plugins.node_walk import bsdfs_of_scene, objects_below, shapes_of_scene
 from torchtransient.plugins.parameter_effect import CORRECT, ParameterEffect
 from torchtransient.plugins.sampling.sun import MovingSun
-from torchtransient.plugins.sensors.seen_from import SensorPlaces, can_be_connected, sees_one_line
+from torchtransient.plugins.sensors.seen_from import SensorPlaces, can_be_connected, has_eye, sees_one_line
 from torchtransient.plugins.transport.media_contents import is_open
 from torchtransient.plugins.transport.strategy import Local
 
@@ -30,6 +34,13 @@ from torchtransient.plugins.transport.strategy import Local
 _MOVE, _BEND = ("shape", "emitter", "sensor"), ("index", "normal")
 # Of a mesh: they move no point.
 _PLACELESS = ("vertex_normals", "vertex_texcoords")
+# Delta vertices at most between a sensor and the edges that it sees through them: a slab of glass has two, one that is
+# seen in a mirror three.
+LONGEST = 4
+# Planes of a shape up to which all chains of them are found.
+_PLANES = 32
+_SEEN = "where edges are seen in mirrors or through smooth glass and masks"
+_TAKE_ROUGH = "Take a rough surface in place of the smooth one, or keep edges out of its view."
 # Places at which a texture is asked whether it is smooth, along each side.
 _PROBES = 64
 
@@ -61,7 +72,7 @@ def moves_edges(key: str, effect: ParameterEffect) -> bool:
 class MovingEdges:
     """What derivatives of a scene lack where edges move, asked by parameter (:meth:`lacking`).
 
-    ``always``: gaps of every parameter that moves edges. ``bent``: of those, and of what bends light. ``scene``: where
+    ``always``: gaps of every parameter that moves edges. ``bent``: of what bends light alone. ``scene``: where
     textures are looked for, None for nowhere. ``words``: gaps that the table of parameters speaks of and that no scene
     can be said to have.
     """
@@ -79,7 +90,7 @@ class MovingEdges:
             return ()
         name, moves = key.rsplit(".", 1)[-1], moves_edges(key, effect)
         found = self.always if moves else (_OF_THE_SUN,) if effect.role == "sun" else ()
-        if moves or effect.role in _BEND or name == "vertex_normals":
+        if not moves and (effect.role in _BEND or name == "vertex_normals"):
             found += self.bent
         if (moves and effect.role in ("shape", "sensor")) or name == "vertex_texcoords":
             # Of what an instance shows, Mitsuba says nothing; a sensor sees everything move.
@@ -124,10 +135,10 @@ def moving_edges(scene: Any, sensors: Sequence[Any]) -> MovingEdges:
     """Return what the passes of the boundary term (:mod:`.term`) leave out in a scene, seen by ``sensors``."""
     always, bent = [], []
     if shapes := shapes_without_edges(scene):
-        names = _listed([_name(shape) for shape in shapes])
-        always.append(Gap(f"at the rims of {names}, which have no edges", "Use a mesh of the same form."))
+        where = f"at the rims of {_listed_shapes(shapes)}, which have no edges"
+        always.append(Gap(where, "Use a mesh of the same form."))
     if rims := [emitter.get_shape() or emitter for emitter in scene.emitters() if _has_rim(emitter)]:
-        where = f"at the rim of the light of {_listed([_name(one) for one in rims])}"
+        where = f"at the rim of the light of {_listed_shapes(rims)}"
         always.append(Gap(where, "Let the light fade out, by a beam_width below the cutoff_angle for instance."))
     for sensor in sensors:
         if sees_one_line(sensor):
@@ -141,22 +152,71 @@ def moving_edges(scene: Any, sensors: Sequence[Any]) -> MovingEdges:
     if delayed := [bsdf for bsdf in bsdfs_of_scene(scene) if getattr(bsdf, "shift", None) is not None]:
         where = f"in light of other wavelengths at the edges of shadows on {_listed([_name(one) for one in delayed])}"
         always.append(Gap(where, "Keep edges that move out of the light of what fluoresces."))
-    shapes = [shape for shape in shapes_of_scene(scene) if has_surface(shape) and not _passes_through_media(shape)]
-    if smooth := [shape for shape in shapes if _has_delta_lobe(shape)]:
-        names = _listed([_name(shape) for shape in smooth])
-        where = f"where edges are seen in mirrors or through smooth glass, masks and open boundaries ({names})"
-        bent.append(Gap(where, "Take a rough surface in place of the smooth one, or keep edges out of its view."))
+    if smooth := _smooth_shapes(scene):
+        always += _seen_through_delta_lobes(scene, sensors, smooth)
+        bent.append(Gap(f"{_SEEN} ({_listed_shapes(smooth)})", _TAKE_ROUGH))
     return MovingEdges(always, bent, scene)
+
+
+def _seen_through_delta_lobes(scene: Any, sensors: Sequence[Any], smooth: Sequence[Any]) -> list[Gap]:
+    """What is left out where delta lobes of the shapes ``smooth`` show edges, and send light past them."""
+    media = any(shape.is_medium_transition() for shape in shapes_of_scene(scene))
+    followed = not media and all(has_eye(sensor) and sensor.get_medium() is None for sensor in sensors)
+    plane = [one for one in smooth if followed and _is_plane(one)]
+    gaps = []
+    if other := [one for one in smooth if one not in plane]:
+        gaps.append(Gap(f"{_SEEN} ({_listed_shapes(other)})", _TAKE_ROUGH))
+    if plane:
+        unseen = f"from other surfaces or behind more than {LONGEST} planes, or hide light that comes through them"
+        gaps.append(Gap(f"{_SEEN} ({_listed_shapes(plane)}) {unseen}", _TAKE_ROUGH))
+    refracting = [one for one in plane if mi.has_flag(one.bsdf().flags(), mi.BSDFFlags.DeltaTransmission)]
+    if refracting and (limbs := [one for one in shapes_of_scene(scene) if has_limb(one)]):
+        names = _listed_shapes(refracting)
+        where = f"where outlines of {_listed_shapes(limbs)} are seen through smooth glass ({names})"
+        gaps.append(Gap(where, "Use a mesh of the same form."))
+    return gaps
+
+
+def _smooth_shapes(scene: Any) -> list[Any]:
+    """Shapes with delta lobes, but for open boundaries of media, which paths pass."""
+    shapes = [shape for shape in shapes_of_scene(scene) if has_surface(shape) and has_delta_lobe(shape)]
+    return [shape for shape in shapes if not (shape.is_medium_transition() and is_open(shape))]
+
+
+def _is_plane(shape: Any) -> bool:
+    """Whether a shape consists of few planes that mirror or refract by their own normals."""
+    if not is_flat(shape):
+        return False
+    if isinstance(shape, mi.Mesh) and _number_of_planes(shape) > _PLANES:
+        return False
+    n = _PROBES * _PROBES
+    random = mi.PCG32(size=n)
+    uniform = lambda: mi.Point2f(random.next_float32(), random.next_float32())  # noqa: E731
+    si = dr.zeros(mi.SurfaceInteraction3f, n)
+    si.wavelengths, si.uv, si.t = dr.full(type(si.wavelengths), 550, n), uniform(), mi.Float(1)
+    si.n, si.sh_frame = mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Normal3f(0, 0, 1))
+    si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
+    wi = mi.warp.square_to_uniform_sphere(uniform())
+    si.wi = wi
+    bs, _ = shape.bsdf().sample(mi.BSDFContext(), si, random.next_float32(), uniform())
+    delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) & (bs.pdf > 0)
+    bent = dr.select(wi.z * bs.wo.z > 0, 1, dr.rcp(bs.eta))
+    off = dr.norm(mi.Vector2f(bs.wo.x + bent * wi.x, bs.wo.y + bent * wi.y))
+    return not bool(dr.any(delta & (off > 1e-3)))
+
+
+def _number_of_planes(mesh: Any) -> int:
+    faces = np.array(mesh.faces_buffer()).reshape(-1, 3)
+    p = host_numbers(mesh.vertex_positions_buffer(), np.float64).reshape(-1, 3)[faces]
+    n = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
+    n /= np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-30)
+    offset = (n * p[:, 0]).sum(1, keepdims=True) / max(np.abs(p).max(), 1e-30)
+    return len(np.unique(np.concatenate([n, offset], 1).round(3), axis=0))
 
 
 def shapes_without_edges(scene: Any) -> list[Any]:
     """Return the shapes of a scene with outlines that the table of edges does not hold."""
     return [shape for shape in shapes_of_scene(scene) if lacks_edges(shape)]
-
-
-def _passes_through_media(shape: Any) -> bool:
-    """Whether paths pass a shape as an open boundary of a medium."""
-    return bool(shape.is_medium_transition()) and is_open(shape)
 
 
 def _is_met_by_connections_alone(emitter: Any) -> bool:
@@ -183,7 +243,8 @@ def _is_in_view(scene: Any, sky: Any) -> bool:
     return False
 
 
-def _has_delta_lobe(shape: Any) -> bool:
+def has_delta_lobe(shape: Any) -> bool:
+    """Return whether a shape has a BSDF with a delta lobe."""
     bsdf = shape.bsdf()
     return bsdf is not None and bool(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta))
 
@@ -228,6 +289,10 @@ def _has_rim(emitter: Any) -> bool:
         return bool(dr.all(shown["beam_width"] >= shown["cutoff_angle"]))
     cutoff = getattr(emitter, "cutoff_angle", None)
     return cutoff is not None and cutoff < 90 and cutoff == emitter.beam_width
+
+
+def _listed_shapes(shapes: Sequence[Any]) -> str:
+    return _listed([_name(shape) for shape in shapes])
 
 
 def _name(plugin: Any) -> str:

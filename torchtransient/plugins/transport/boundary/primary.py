@@ -43,13 +43,13 @@ class PrimaryPass:
         own, share = mode.kept(row)
         inside &= own
         row, column = dr.select(inside, row, job.first_row), dr.select(inside, column, 0)
-        rays = term.rays_at(sampler, ds.uv, ds.numbers, row, column, job)
+        rays = term.places.rays_at(world, sampler, ds.uv, ds.numbers, row, column, job.total)
         view, ray = mode.view(rays), dr.detach(rays.ray)
         if term.is_meter:
             ray.o = mi.Point3f(eye.p)
         way, active = dr.norm(b.p - ray.o), b.valid & (ds.pdf > 0) & inside
         if term.has_vertex_normals:
-            b.inner = _where_normals_face(b)
+            b.inner = where_normals_face(b)
         if world.hide_emitters:
             active &= ~b.inner.shape.is_emitter()
         medium = world.segment.medium_at(world, b.beside, ray.o, world.segment.medium_towards(b.d), active)
@@ -77,7 +77,7 @@ class PrimaryPass:
         return both_sides(world, mode, sampler, view, b, past, first, factor, speeds, needed)
 
 
-def _where_normals_face(b):
+def where_normals_face(b):
     """The face that hides, moved from its edge to where its interpolated normal faces the sensor: between there and the
     edge it is black, a rim that gets as narrow as the faces of the mesh and is taken to move with the edge.
     """

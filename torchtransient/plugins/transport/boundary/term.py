@@ -6,11 +6,12 @@ that hides; P is the density of p by length. With the adjoint A(pixel, tau) of t
     dLoss += sum over sides  +-c [ sum over events e: A(pixel, tau_e) f_e ] (n . v_side)       + inner, - outer
 
 (Li et al. 2018, with times of flight). Each side is a path of the walk, which goes on from a segment whose end is
-known. Every edge between two vertices belongs to one of three passes:
+known. Every edge between two vertices belongs to one of these passes:
 
     primary   x is the sensor:           c = W sin / P                     (W: importance per area across d at p)
     vertex    x is a vertex of a path:   c = beta f_s(x, d) sin / (r^2 P)
     light     x is a point of a light:   c = -Le / pdf_omega sin / P, and the path goes on behind p, to the sensor
+    specular  x is the sensor, behind plane mirrors and glass (:mod:`.specular`): c as in the first pass
 
 The speeds v are those of the edge against the samples that interior derivatives hold, see :mod:`.speeds`.
 """
@@ -25,10 +26,16 @@ import mitsuba as mi
 from torchtransient.plugins.edges.table import EdgeTable
 from torchtransient.plugins.edges.topology import Topology
 from torchtransient.plugins.integrators.launch import passes_of, seed_array
-from torchtransient.plugins.sensors.origin import PrimaryRays, index_at_sensor, sample_rays, start_at_sensor, views
 from torchtransient.plugins.sensors.seen_from import SensorPlaces
 from torchtransient.plugins.transport.boundary.light import LightPass
 from torchtransient.plugins.transport.boundary.primary import PrimaryPass
+from torchtransient.plugins.transport.boundary.specular import (
+    RAYS,
+    Chains,
+    SensorThroughChain,
+    SpecularPass,
+    sees_chains,
+)
 from torchtransient.plugins.transport.boundary.vertex import VertexPass
 from torchtransient.plugins.transport.boundary.weigh import Forward, Reverse
 from torchtransient.plugins.transport.connection.sensor_sampled import SensorSampled
@@ -36,8 +43,8 @@ from torchtransient.plugins.transport.media_contents import is_open
 from torchtransient.plugins.transport.scattering.from_light import FromLight, shades_by_other_normals
 from torchtransient.plugins.transport.world import World
 
-PASSES = {"primary": PrimaryPass, "vertex": VertexPass, "light": LightPass}
-_SEEDS = {"primary": 0x51, "vertex": 0x52, "light": 0x53}
+PASSES = {"primary": PrimaryPass, "vertex": VertexPass, "light": LightPass, "specular": SpecularPass}
+_SEEDS = {"primary": 0x51, "vertex": 0x52, "light": 0x53, "specular": 0x54, "chains": 0x55}
 
 
 class BoundaryTerm:
@@ -68,14 +75,22 @@ class BoundaryTerm:
         self.radius = dr.opaque(mi.Float, integrator.reference(scene).radius)
         self.places = SensorPlaces(sensor, film, self.radius)
         self.is_meter = self.places.is_meter
+        seeds = {name: mi.sample_tea_32(seed_array(seed), mi.UInt32(own))[0] for name, own in _SEEDS.items()}
+        self.chains, self.through = None, None
+        if topology.count and sees_chains(world, sensor):
+            with dr.suspend_grad():
+                self.chains = Chains(integrator, world, self.places, self.independent(seeds["chains"], RAYS))
+            if world.max_depth > 2:
+                self.through = SensorThroughChain(self.chains)
         with dr.suspend_grad():
             self.light_world = self._light_world()
         self.passes, self.jobs = {}, {}
         for name in names if topology.count else ():
             if PASSES[name].exists(world, sensor):
-                own, _ = mi.sample_tea_32(seed_array(seed), mi.UInt32(_SEEDS[name]))
                 self.passes[name] = PASSES[name](world)
-                self.jobs[name], _ = passes_of(sensor.sampler().clone(), film, own, samples, world.most_events())
+                self.jobs[name], _ = passes_of(
+                    sensor.sampler().clone(), film, seeds[name], samples, world.most_events()
+                )
 
     def _light_world(self):
         """The world of paths that start at a light and are connected to the sensor."""
@@ -87,9 +102,8 @@ class BoundaryTerm:
         # Whether the sensor's segment counts in time is asked by its connection: here it is the last one of a path.
         settings = replace(integrator.settings(), camera_unwarp=False)
         self.to_sensor = SensorSampled(self.places, integrator.camera_unwarp)
-        return World(
-            world.scene, world.contents, settings, (segment, scattering, [self.to_sensor]), None, world.window
-        )
+        sensors = [self.to_sensor] if self.through is None else [self.to_sensor, self.through]
+        return World(world.scene, world.contents, settings, (segment, scattering, sensors), None, world.window)
 
     def tables(self):
         """The attached ends of edges, and what the strategies of light paths have attached."""
@@ -117,9 +131,12 @@ class BoundaryTerm:
 
     def sampler(self, job):
         """A seeded sampler of independent numbers with a lane for each sample of ``job``."""
-        lanes = int(self.film.crop_size()[0]) * job.rows * job.spp
+        return self.independent(job.seed, int(self.film.crop_size()[0]) * job.rows * job.spp)
+
+    def independent(self, seed, lanes):
+        """A seeded sampler of independent numbers."""
         sampler = self._sampler.clone()
-        sampler.seed(job.seed, lanes)
+        sampler.seed(seed, lanes)
         return sampler
 
     def pixel(self, uv, u):
@@ -136,19 +153,3 @@ class BoundaryTerm:
             weight = rfilter.eval(h.x) * rfilter.eval(h.y) * (n * n / (integral * integral))
         inside = dr.all((cell >= 0) & (cell < size))
         return mi.UInt32(dr.select(inside, cell.y, 0)), mi.UInt32(dr.select(inside, cell.x, 0)), weight, inside
-
-    def rays_at(self, sampler, uv, numbers, row, column, job):
-        """Primary rays through places of the film, in pixels, attached to the sensor."""
-        world, sensor = self.world, self.sensor
-        position = uv / mi.ScalarVector2f(self.film.crop_size())
-        seen = views(sensor, position, lambda: self.integrator.reference(world.scene))
-        with dr.resume_grad():
-            u, time = numbers.wavelength, sensor.shutter_open()
-            ray, weight = sample_rays(sensor, seen, time, u, position, numbers.aperture)
-            if self.film.curves is not None:
-                ray, weight = self.film.curves.draw(sensor, ray, weight, u)
-            η, clip = index_at_sensor(seen, world.contents.surroundings, world.scene), None
-            if world.contents.media is not None and world.contents.media.at_sensor is not None:
-                ray, clip = start_at_sensor(seen, ray)
-        scale = dr.opaque(mi.Float, 1 / job.total)
-        return PrimaryRays(sampler, ray, weight, scale, row, column, seen, η, clip=clip)

@@ -9,6 +9,7 @@ from torchtransient.plugins.mitsuba_compat import is_sphere
 from torchtransient.plugins.polarized import attenuated, product
 from torchtransient.plugins.sensors.seen_from import sees_one_line
 from torchtransient.plugins.transport.boundary.sides import both_sides, in_memory, past_edge
+from torchtransient.plugins.transport.boundary.specular import attached_ray
 from torchtransient.plugins.transport.boundary.speeds import along_the_ray, behind, dragged, sides_from, slides
 from torchtransient.plugins.transport.contents import DAMPING
 from torchtransient.plugins.transport.strategy import Local, Proposal
@@ -47,7 +48,12 @@ class VertexPass:
         path.leg = world.segment.first(world, ray, sampler)
         pi, _ = world.segment.surface_of(path.leg)
         radius = dr.minimum(world.contents.damping_radius, pi.t * DAMPING)
-        path, before = advance(world, sampler, path, target)
+        lead = None
+        if term.chains is None:
+            path, before = advance(world, sampler, path, target)
+        else:
+            lead = term.chains.lead(world, path, sampler, target)
+            path, before = lead.path, lead.before
         vertex = world.segment.arrive(world, path)
         vertex.τ, vertex.η, vertex.goes_on = path.τ + vertex.opl, path.η, path.active & vertex.valid
         world.scattering.arrive(world, path, vertex, sampler)
@@ -79,9 +85,10 @@ class VertexPass:
         past = past_edge(world, b, path.ray, medium, β, sampler, active)
         of_edge = vars(b.k), b.n, b.p, b.dist, b.crease, b.inner, b.facing
         of_path = before, path.ray, path.prev_p, at, target, radius, vertex.at.p, vertex.at.n, τ, η
-        in_memory(world, sampler, of_edge, of_path, past, active, factor, β)
+        of_lead = None if lead is None else (lead.all, lead.ratios, path.prev_unconnected)
+        in_memory(world, sampler, of_edge, of_path, of_lead, past, active, factor, β)
         with dr.resume_grad():
-            v_x = self._motion(world, rays, path, before, target, vertex, radius, active)
+            v_x = self._motion(world, rays, path, before, lead, target, vertex, radius, active)
             speeds = sides_from(world, b, edges, v_x, behind(world, b, *past, active), radius, active)
         first = {
             "ray": path.ray, "β": β, "η": η, "τ": τ, "prev_p": x, "prev_n": vertex.at.n,
@@ -116,7 +123,7 @@ class VertexPass:
             mask &= ~world.contents.sphere_lights.marks.lists(shape.emitter())
         return mask
 
-    def _motion(self, world, rays, path, before, target, vertex, radius, active):
+    def _motion(self, world, rays, path, before, lead, target, vertex, radius, active):
         """Attached motion of x, as interior derivatives hold it."""
         at_first = target == 0
         pi, _ = world.segment.surface_of(path.leg)
@@ -144,6 +151,13 @@ class VertexPass:
         v = dragged(held, v_before, r, path.ray.d, vertex.si.n, radius, follows)
         if rays.meter_normal is None:
             v = dr.select(at_first, along_the_ray(world, pi, primary, first & vertex.surface), v)
+        if lead is not None:
+            # Behind delta lobes a point slides along the ray that found it.
+            found = surface & path.prev_unconnected & ~at_first
+            last, bent = mi.Ray3f(path.ray), attached_ray(world, rays.ray, lead.ratios, target, found & lead.all)
+            last.o = dr.select(lead.all, dr.replace_grad(last.o, bent.o), last.o)
+            last.d = dr.select(lead.all, dr.replace_grad(last.d, bent.d), last.d)
+            v = dr.select(found, along_the_ray(world, pi, last, found), v)
         if world.contents.media is None:
             return dr.select(active, v, 0)
         # A point in a medium divides the way to the surface behind it in a fixed ratio.

@@ -48,26 +48,29 @@ class Reverse:
 
     def sink_of_pixels(self, middle, job, u, factor, speeds):
         """(sink of events that have a pixel each, what :meth:`sum_of_pixels` takes)."""
-        return PixelSums(self, middle, u), (factor, speeds)
+        return PixelSums(self, middle, u, len(speeds)), (factor, speeds)
 
     def sum_of_pixels(self, kept, factors):
         """The attached objective."""
         factor, speeds = factors
         in_memory(self.term.world, None, kept)
         with dr.resume_grad():
-            return sum(finite(kept[name] * factor) * speed for name, speed in zip(PixelSums.NAMES, speeds, strict=True))
+            names = PixelSums.NAMES[: len(speeds)]
+            return sum(finite(kept[name] * factor) * speed for name, speed in zip(names, speeds, strict=True))
 
 
 class PixelSums(Sink):
-    """Sums over the events of the first vertex, and of all others."""
+    """Sums over the events of the first vertex, over those of all others, and where the sensor sees the first vertex
+    through a chain.
+    """
 
-    NAMES = ("direct", "rest")
+    NAMES = ("direct", "rest", "through")
 
-    def __init__(self, mode, middle, u):
-        self.mode, self.middle, self.u = mode, middle, u
+    def __init__(self, mode, middle, u, count):
+        self.mode, self.middle, self.u, self.names = mode, middle, u, self.NAMES[:count]
 
     def begin(self, world):
-        return {name: mi.Float(0) for name in self.NAMES}
+        return {name: mi.Float(0) for name in self.names}
 
     def event(self, kept, event):
         term = self.mode.term
@@ -75,9 +78,9 @@ class PixelSums(Sink):
         active, place = event.active & inside, Local(row=row, column=column, laser=None)
         A, _ = self.mode.block(seen_along(self.middle, event.d), place).read(event.opl, active)
         value = dr.select(active, total_of(A, event.value) * weight, 0)
-        direct = event.depth == 2
-        kept["direct"] = kept["direct"] + dr.select(direct, value, 0)
-        kept["rest"] = kept["rest"] + dr.select(direct, 0, value)
+        name = self.NAMES[event.speed]
+        kept[name] = kept[name] + dr.select(event.first, value, 0)
+        kept["rest"] = kept["rest"] + dr.select(event.first, 0, value)
 
 
 class Forward:
@@ -155,7 +158,7 @@ class PixelFilmSink(Sink):
         place = Local(row=dr.select(active, row, mode.first), column=column, laser=None)
         match = term.integrator.channel_match(term.world.contents, film, seen_along(self.middle, event.d))
         base, pixel = mode._indices(place)
-        scale = dr.select(event.depth == 2, *self.scales) * (weight * share)
+        scale = dr.select(event.first, self.scales[event.speed], self.scales[1]) * (weight * share)
         channels = [dr.select(active, c, 0) for c in match.to_channels(event.value * scale)]
         film.put(mode.job.band, base, event.opl, channels, active)
         if film.keeps_steady:

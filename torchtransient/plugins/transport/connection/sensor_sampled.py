@@ -21,7 +21,9 @@ from torchtransient.plugins.transport.strategy import Connection, Event, Proposa
 
 class SensorSampled(Connection):
     """``places``: :class:`~..sensors.seen_from.SensorPlaces`; ``numbers``: those that choose the sensor's point, set
-    before a launch. ``unwarp``: the segment to the sensor does not count in time. Events carry ``uv``, in pixels.
+    before a launch. ``unwarp``: the segment to the sensor does not count in time. Events carry ``uv``, in pixels, ``d``
+    towards the sensor, ``first`` (the path's first vertex is connected), and ``speed``: which of the speeds of a pass
+    of the boundary term is theirs then.
     """
 
     name = "sensor_sampled"
@@ -38,11 +40,7 @@ class SensorSampled(Connection):
 
     def connect(self, world, path, vertex, proposal, answer, zeros):
         ds = proposal.ds
-        value = first_row(product(vertex.β, answer.matrix))
-        if mi.is_polarized:  # into the frame that the sensor's own ray has
-            d = mi.Vector3f(ds.d)
-            value = rotate_stokes(value, rotation_between(d, stokes_frame_of(d), stokes_frame_of(-d)))
-        value = value * proposal.importance
+        value = in_sensor_frame(first_row(product(vertex.β, answer.matrix)), mi.Vector3f(ds.d)) * proposal.importance
         active = proposal.active & (dr.max(dr.abs(intensity(value))) > 0)
         if world.hide_emitters:  # primary rays pass lights
             active &= ~(vertex.surface & vertex.si.shape.is_emitter())
@@ -50,7 +48,10 @@ class SensorSampled(Connection):
         opl = vertex.scattered_τ + mi.Float64(length)
         active = world.counted(active, opl)
         active, T = world.segment.transmittance(world, vertex, ds, proposal.u, proposal.sampler, active, seen=True)
-        return Event(value=value * T, opl=opl, active=active, depth=path.depth + 2, uv=ds.uv, d=ds.d)
+        depth = path.depth + 2
+        return Event(
+            value=value * T, opl=opl, active=active, depth=depth, uv=ds.uv, d=ds.d, first=depth == 2, speed=0
+        )  # fmt: skip
 
 
 def first_row(matrix):
@@ -58,3 +59,10 @@ def first_row(matrix):
     if not mi.is_polarized:
         return matrix
     return mi.SpectrumEntry(*[matrix[0, i] * (-1 if i == 2 else 1) for i in range(4)])
+
+
+def in_sensor_frame(light, d):
+    """Light of a path from a light that leaves in direction ``d``, in the frame of the sensor's own ray, against it."""
+    if not mi.is_polarized:
+        return light
+    return rotate_stokes(light, rotation_between(d, stokes_frame_of(d), stokes_frame_of(-d)))

@@ -104,7 +104,7 @@ class Surface(Scattering):
                 value, pdf = bsdf.eval_pdf(ctx, si, wo, p.active)
             value = self.correct_two_sided(world, bsdf, si, wo, vertex.delay.scaled(value))
             answers.append(Answer(value=value, pdf=pdf, eta=self.relative_index(bsdf, si, wo), wo=wo))
-        bs, weight = sample or bsdf.sample(ctx, si, u_lobe, u_dir, vertex.goes_on)
+        bs, weight = sample or self.sample(bsdf, si, u_lobe, u_dir, vertex.goes_on)
         weight = self.correct_two_sided(world, bsdf, si, bs.wo, vertex.delay.scaled(weight))
         step = Step(
             out=si.to_world(bs.wo), wo=bs.wo, weight=weight, pdf=bs.pdf, eta=bs.eta, u_lobe=u_lobe, u_dir=u_dir,
@@ -127,6 +127,10 @@ class Surface(Scattering):
                 if p is not None:
                     answer.pdf = self.mixture(world, path.depth, vertex.at.p, p.ds, answer.pdf, p.active)
         return answers, step
+
+    def sample(self, bsdf, si, u_lobe, u_dir, active):
+        """A direction and its weight where nothing is connected."""
+        return bsdf.sample(mi.BSDFContext(), si, u_lobe, u_dir, active)
 
     def elsewhere(self, world, vertex, proposals, answers, step):
         """Change answers and step where the vertex is not on a surface."""
