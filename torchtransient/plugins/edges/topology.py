@@ -78,7 +78,11 @@ class Body:
         first = _ELLIPSOID * dr.arange(mi.UInt32, dr.width(data) // _ELLIPSOID)
         n = [dr.gather(mi.Float, data, first + k) for k in range(_ELLIPSOID)]
         turn = dr.quat_to_matrix(mi.Matrix3f, mi.Quaternion4f(*n[6:]))
-        axes = [mi.Vector3f(turn[0, i], turn[1, i], turn[2, i]) * n[3 + i] * self._extent() for i in range(3)]
+        # Mitsuba goes to the unit ball by the transpose, which is the inverse where quaternions have length one.
+        rows = [mi.Vector3f(turn[0, i], turn[1, i], turn[2, i]) for i in range(3)]
+        inverse = [dr.cross(rows[i - 2], rows[i - 1]) for i in range(3)]
+        det = dr.dot(rows[0], inverse[0])
+        axes = [inverse[i] / det * n[3 + i] * self._extent() for i in range(3)]
         return self._to_world(mi.Point3f(*n[:3])), *(self._to_world(axis) for axis in axes)
 
     def _extent(self) -> Any:
@@ -157,12 +161,12 @@ def _angles(p: np.ndarray, group: np.ndarray) -> np.ndarray:
 
 
 class Corners:
-    """Numbers of vertices, and flags, that tables are made from (:class:`.table.EdgeTable`): ``ends`` by mesh, ``third``
-    and ``other`` as in :class:`_Rows`.
+    """Numbers of vertices, and flags, that tables are made from (:class:`.table.EdgeTable`): ``ends`` by mesh,
+    ``third`` and ``other`` as in :class:`_Rows`.
     """
 
-    # No state of recorded calls, which put arrays of their own in place of those that they are handed: kernels of tables
-    # would be compiled again for these.
+    # No state of recorded calls, which put arrays of their own in place of those that they are handed: kernels of
+    # tables would be compiled again for these.
     only_remembers = True
 
     def __init__(self, ends: list[np.ndarray], third: np.ndarray, other: np.ndarray, flags: np.ndarray) -> None:
