@@ -65,7 +65,7 @@ class EdgeTable:
         moving: addresses of the shapes that move.
 
     ``ends``: two attached Point3f: ends of edges; behind those, origins and axes of limbs. ``count``: rows.
-    ``of_moving``: :class:`EdgeDensity` by length times crease angle, of the shapes that move (of all where none does);
+    ``of_moving``: :class:`EdgeDensity` by length times crease angle and by body, of the shapes that move (of all where none does);
     ``by_length``: of all, with half of the samples for those that move. Nothing is drawn from a table of zero rows.
     """
 
@@ -80,7 +80,7 @@ class EdgeTable:
         self.flags = topology.corners.flags | dr.opaque(mi.UInt32, 0)
         with dr.suspend_grad():
             self._measure()
-            weight = self.weight
+            weight = self._by_length_and_body()
             self.by_length = self.of_moving = EdgeDensity(weight, dr.cumsum(mi.Float64(weight)))
             if (moves := topology.moves(moving)) is not None:
                 own, of_all = weight * moves, self.by_length
@@ -90,6 +90,17 @@ class EdgeTable:
                 cumulative = of_all.cumulative * share[0] + self.of_moving.cumulative * share[1]
                 self.by_length = EdgeDensity(mixed, cumulative)
         dr.eval(self.ends, self.third, self.flags, vars(self.by_length), vars(self.of_moving))
+
+    def _by_length_and_body(self) -> Any:
+        """Weights of the density: half by length, half with an equal share for each body, since the longest edges are
+        often those of a floor, behind which there is nothing.
+        """
+        owner, bodies = self.topology.owners[0], len(self.topology.bodies)
+        sums = dr.zeros(mi.Float, bodies)
+        dr.scatter_add(sums, self.weight, owner)
+        own, total = dr.gather(mi.Float, sums, owner), dr.sum(sums)
+        alike = dr.select(own > 0, total / (bodies * own), 0)
+        return self.weight * (0.5 + 0.5 * alike)
 
     def _measure(self) -> None:
         """Third corners, flags and weights of the rows."""
