@@ -263,6 +263,12 @@ class Topology:
         return dr.concat([dr.full(mi.Float, float(m), n) for m, (_, n) in zip(moves, self._runs, strict=True)])
 
 
+def sizes_of_meshes(scene: Any) -> bytes:
+    """Numbers of vertices and faces, by which a topology of other meshes is told."""
+    meshes = [shape for shape in shapes_of_scene(scene) if shape.is_mesh()]
+    return np.array([(mesh.vertex_count(), mesh.face_count()) for mesh in meshes], np.int64).tobytes()
+
+
 def _bodies(scene: Any, shape: Any) -> list[Body]:
     if not is_instance(shape):
         return [Body(shape)]
