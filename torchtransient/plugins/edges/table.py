@@ -65,7 +65,8 @@ class EdgeTable:
         moving: addresses of the shapes that move.
 
     ``ends``: two attached Point3f: ends of edges; behind those, origins and axes of limbs. ``count``: rows.
-    ``of_moving``: :class:`EdgeDensity` by length times crease angle and by body, of the shapes that move (of all where none does);
+    ``of_moving``: :class:`EdgeDensity` by length times crease angle and by body, of the shapes that move (of all where
+    none does);
     ``by_length``: of all, with half of the samples for those that move. Nothing is drawn from a table of zero rows.
     """
 
