@@ -187,7 +187,7 @@ def test_outlines_are_found_where_their_motion_puts_them():
         if one.shape.id() != "ellipsoids":
             assert here.sum() > 100, one.shape.id()
             # Less than all: what is seen edge-on is thin.
-            assert share(at(inside), here) > 0.9 and share(still, here) < 0.03, one.shape.id()
+            assert share(at(inside), here) > 0.9 and share(still, here) < 0.05, one.shape.id()
 
 
 def test_gradients_of_passes_add_up_at_the_parameters():
@@ -215,14 +215,14 @@ def test_gradients_of_passes_add_up_at_the_parameters():
 
 
 def test_samples_go_to_what_moves():
-    """Half of them, or all."""
+    """Half of them, or all; of the others half go by length, and half to every body alike."""
     scene = mi.load_dict({"type": "scene", "a": {"type": "cube"}, "b": {"type": "sphere", "center": [6, 0, 0]}})
     moving = frozenset(s.ptr for s in scene.shapes() if s.id() == "b")
     for alone, expected in ((False, 0.5), (True, 1.0)):
         _, b = looked_at(scene, moving, alone)
         own = np.array(b.k.ball).mean()
         length = 2 * np.pi / (24 / np.sqrt(2) + 2 * np.pi)
-        assert own == pytest.approx(expected + (0 if alone else 0.5 * length), abs=0.01)
+        assert own == pytest.approx(expected + (0 if alone else 0.5 * (0.5 * length + 0.25)), abs=0.01)
 
 
 @pytest.mark.parametrize("on_mesh", [False, True])
@@ -334,7 +334,7 @@ def test_one_recording_for_all_numbers():
         b = table.seen_from(table.pick(table.by_length, u, u * 0.7), mi.Point3f(1, 2, 9), True)
         return b.p, b.n, b.inv_pdf, table.moving(b)
 
-    frozen = dr.freeze(call, state_fn=lambda *_: state_below(topology)[1])
+    frozen = dr.freeze(call, state_fn=lambda *_: state_below([topology, vars(topology.corners)])[1])
     for x in (0.0, 0.1, 0.2, 0.3):
         install(params, base, dr.opaque(mi.Float, x))
         u = mi.Float((np.arange(500, dtype=np.float32) + 0.5) / 500 * (1 - x))

@@ -108,12 +108,13 @@ def test_memory_is_flat_over_200_steps(training):
         assert "scatter" not in dr.whos_ad(as_string=True)
 
 
-def test_nothing_is_compiled_after_two_steps(training):
+def test_nothing_is_compiled_after_three_steps(training):
+    """They are traced, recorded and launched; small kernels beside a recording differ where it is launched."""
     with active_variant(VARIANT):
         import drjit as dr
 
-        training(0)
-        training(1)
+        for seed in range(10, 13):
+            training(seed)
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
             for seed in range(2, 8):

@@ -24,4 +24,4 @@ def whole_numbers(values: np.ndarray) -> Any:
     kernels differ by how their arrays are aligned.
     """
     shared = mi.UInt32(np.ascontiguousarray(values, np.uint32))
-    return shared + dr.opaque(mi.UInt32, 0)
+    return shared | dr.opaque(mi.UInt32, 0) if len(values) else shared

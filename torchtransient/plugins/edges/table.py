@@ -65,7 +65,8 @@ class EdgeTable:
         moving: addresses of the shapes that move.
 
     ``ends``: two attached Point3f: ends of edges; behind those, origins and axes of limbs. ``count``: rows.
-    ``of_moving``: :class:`EdgeDensity` by length times crease angle, of the shapes that move (of all where none does);
+    ``of_moving``: :class:`EdgeDensity` by length times crease angle and by body, of the shapes that move (of all where
+    none does);
     ``by_length``: of all, with half of the samples for those that move. Nothing is drawn from a table of zero rows.
     """
 
@@ -77,10 +78,10 @@ class EdgeTable:
         self.edges = topology.count - topology.rounds
         with dr.resume_grad():
             self.ends = topology.ends()
-        self.flags = topology.flags
+        self.flags = topology.corners.flags | dr.opaque(mi.UInt32, 0)
         with dr.suspend_grad():
             self._measure()
-            weight = self.weight
+            weight = self._by_length_and_body()
             self.by_length = self.of_moving = EdgeDensity(weight, dr.cumsum(mi.Float64(weight)))
             if (moves := topology.moves(moving)) is not None:
                 own, of_all = weight * moves, self.by_length
@@ -91,6 +92,17 @@ class EdgeTable:
                 self.by_length = EdgeDensity(mixed, cumulative)
         dr.eval(self.ends, self.third, self.flags, vars(self.by_length), vars(self.of_moving))
 
+    def _by_length_and_body(self) -> Any:
+        """Weights of the density: half by length, half with an equal share for each body, since the longest edges are
+        often those of a floor, behind which there is nothing.
+        """
+        owner, bodies = self.topology.owners[0], len(self.topology.bodies)
+        sums = dr.zeros(mi.Float, bodies)
+        dr.scatter_add(sums, self.weight, owner)
+        own, total = dr.gather(mi.Float, sums, owner), dr.sum(sums)
+        alike = dr.select(own > 0, total / (bodies * own), 0)
+        return self.weight * (0.5 + 0.5 * alike)
+
     def _measure(self) -> None:
         """Third corners, flags and weights of the rows."""
         t, rows = self.topology, dr.arange(mi.UInt32, self.count)
@@ -99,11 +111,11 @@ class EdgeTable:
         if self.edges:
             points = t.points()
             corner = lambda index: dr.gather(mi.Point3f, points, dr.gather(mi.UInt32, index, rows, edge), edge)  # noqa: E731
-            self.third = [corner(index) for index in t.third]
+            self.third = [corner(index) for index in t.corners.third]
         if t.has_twins:
             apart = 2 * APART * dr.max(dr.max(dr.abs(points)))
             own = (dr.gather(mi.Point3f, dr.detach(end), rows) for end in self.ends)
-            off = [dr.max(dr.abs(p - corner(i))) for p, i in zip(own, t.other, strict=True)]
+            off = [dr.max(dr.abs(p - corner(i))) for p, i in zip(own, t.corners.other, strict=True)]
             lone = (self.flags & TWIN != 0) & (dr.maximum(*off) > apart)
             self.flags = dr.select(lone, self.flags & ~mi.UInt32(TWO | TWIN), self.flags)
         k = self._row(rows)

@@ -78,7 +78,11 @@ class Body:
         first = _ELLIPSOID * dr.arange(mi.UInt32, dr.width(data) // _ELLIPSOID)
         n = [dr.gather(mi.Float, data, first + k) for k in range(_ELLIPSOID)]
         turn = dr.quat_to_matrix(mi.Matrix3f, mi.Quaternion4f(*n[6:]))
-        axes = [mi.Vector3f(turn[0, i], turn[1, i], turn[2, i]) * n[3 + i] * self._extent() for i in range(3)]
+        # Mitsuba goes to the unit ball by the transpose, which is the inverse where quaternions have length one.
+        rows = [mi.Vector3f(turn[0, i], turn[1, i], turn[2, i]) for i in range(3)]
+        inverse = [dr.cross(rows[i - 2], rows[i - 1]) for i in range(3)]
+        det = dr.dot(rows[0], inverse[0])
+        axes = [inverse[i] / det * n[3 + i] * self._extent() for i in range(3)]
         return self._to_world(mi.Point3f(*n[:3])), *(self._to_world(axis) for axis in axes)
 
     def _extent(self) -> Any:
@@ -156,6 +160,22 @@ def _angles(p: np.ndarray, group: np.ndarray) -> np.ndarray:
     return np.arctan2((np.cross(t, x) * h).sum(1), (x * h).sum(1)) % (2 * np.pi)
 
 
+class Corners:
+    """Numbers of vertices, and flags, that tables are made from (:class:`.table.EdgeTable`): ``ends`` by mesh,
+    ``third`` and ``other`` as in :class:`_Rows`.
+    """
+
+    # No state of recorded calls, which put arrays of their own in place of those that they are handed: kernels of
+    # tables would be compiled again for these.
+    only_remembers = True
+
+    def __init__(self, ends: list[np.ndarray], third: np.ndarray, other: np.ndarray, flags: np.ndarray) -> None:
+        self.ends = [[whole_numbers(each[:, i]) for each in ends] for i in (0, 1)]
+        self.third, self.other = ([whole_numbers(x[:, i]) for i in (0, 1)] for x in (third, other))
+        self.flags = whole_numbers(flags)
+        dr.make_opaque(self.ends, self.third, self.other, self.flags)
+
+
 class Topology:
     """The edges and limbs of ``scene``: ``count`` rows, of which the last ``rounds`` are limbs and rims of what has no
     triangles. ``without``: the shapes that have outlines, but no edges here. ``hides``: which shapes count, None for
@@ -187,20 +207,17 @@ class Topology:
 
         self.rounds, self.count = len(limbs), len(flags)
         self.has_gaps, self.has_twins = bool((flags & GAP).any()), bool((flags & TWIN).any())
-        self._ends = [[whole_numbers(each[:, i]) for each in own] for i in (0, 1)]
-        self.third, self.other, self.faces, self.owners = (
-            [whole_numbers(x[:, i]) for i in (0, 1)] for x in (rows.third, rows.other, faces, owners)
-        )
+        self.corners = Corners(own, rows.third, rows.other, flags)
+        self.faces, self.owners = ([whole_numbers(x[:, i]) for i in (0, 1)] for x in (faces, owners))
         index = np.array([body.index for body in self.bodies])
-        self.place, self.flags, self.index = (whole_numbers(x) for x in (place, flags, index))
+        self.place, self.index = whole_numbers(place), whole_numbers(index)
         self.shape, self.instance = (
             whole_numbers(np.array([0 if x is None else registry_number(x) for x in each]))
             for each in ([b.shape for b in self.bodies], [b.instance for b in self.bodies])
         )
         # Rows follow each other by what they belong to.
         self._runs = [(k, len(list(run))) for k, run in groupby(owners[:, 0].tolist())]
-        dr.make_opaque(self._ends, self.third, self.other, self.faces, self.owners)
-        dr.make_opaque(self.place, self.flags, self.index, self.shape, self.instance)
+        dr.make_opaque(self.faces, self.owners, self.place, self.index, self.shape, self.instance)
 
     def _edges(self) -> tuple[_Rows, np.ndarray, np.ndarray]:
         """(edges of all meshes, vertices counted through; bodies of both faces, (E, 2); first vertices of meshes)."""
@@ -233,7 +250,7 @@ class Topology:
         By a single gather from the scene's parameters: Dr.Jit's ``isolate_grad`` loses what arrives at gathers of
         gathers that were made before.
         """
-        edges = [[body.vertices(i) for body, i in zip(self._meshes, each, strict=True)] for each in self._ends]
+        edges = [[body.vertices(i) for body, i in zip(self._meshes, each, strict=True)] for each in self.corners.ends]
         frames = [frame for body in self._others for frame in body.frames()]
         o, x, y, z = ([frame[k] for frame in frames] for k in range(4))
         return [_concatenated([*part, *first, *then]) for part, first, then in zip(edges, (o, x), (y, z), strict=True)]
@@ -244,6 +261,12 @@ class Topology:
         if not any(moves):
             return None
         return dr.concat([dr.full(mi.Float, float(m), n) for m, (_, n) in zip(moves, self._runs, strict=True)])
+
+
+def sizes_of_meshes(scene: Any) -> bytes:
+    """Numbers of vertices and faces, by which a topology of other meshes is told."""
+    meshes = [shape for shape in shapes_of_scene(scene) if shape.is_mesh()]
+    return np.array([(mesh.vertex_count(), mesh.face_count()) for mesh in meshes], np.int64).tobytes()
 
 
 def _bodies(scene: Any, shape: Any) -> list[Body]:

@@ -67,3 +67,14 @@ def along_the_ray(world, pi, ray, active):
     """Attached displacement of where ``ray``, attached or not, meets the surface ``pi``."""
     si = surface_interaction(world.surfaces, pi, ray, mi.RayFlags.All, active & pi.is_valid())
     return displacement(si.p, active & pi.is_valid())
+
+
+def as_held(world, pi, ray, active):
+    """Attached motion of a vertex that ``ray`` found, as a point of its shape, or along the ray where the
+    shape has none.
+    """
+    v = world.segment.held(world, pi, ray, active)
+    if world.contents.sliding is None:
+        return v
+    slid = active & world.contents.sliding.lists(pi.shape)
+    return dr.select(slid, along_the_ray(world, pi, ray, slid), v)

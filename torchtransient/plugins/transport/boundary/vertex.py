@@ -10,7 +10,7 @@ from torchtransient.plugins.polarized import attenuated, product
 from torchtransient.plugins.sensors.seen_from import sees_one_line
 from torchtransient.plugins.transport.boundary.sides import both_sides, in_memory, past_edge
 from torchtransient.plugins.transport.boundary.specular import attached_ray
-from torchtransient.plugins.transport.boundary.speeds import along_the_ray, behind, dragged, sides_from, slides
+from torchtransient.plugins.transport.boundary.speeds import along_the_ray, as_held, behind, dragged, sides_from, slides
 from torchtransient.plugins.transport.contents import DAMPING
 from torchtransient.plugins.transport.strategy import Local, Proposal
 from torchtransient.plugins.transport.walk import advance, start
@@ -131,7 +131,7 @@ class VertexPass:
         primary = mi.Ray3f(path.ray)
         primary.o = dr.select(at_first, rays.ray.o, path.ray.o)
         primary.d = dr.select(at_first, rays.ray.d, path.ray.d)
-        held = world.segment.held(world, pi, path.ray, surface)
+        held = as_held(world, pi, path.ray, surface)
         # Of the vertex before, its own drag is left out.
         pi_before, ray_before = before
         camera = mi.Ray3f(ray_before)
@@ -141,11 +141,11 @@ class VertexPass:
             v_before = dr.select(
                 second,
                 along_the_ray(world, pi_before, camera, active & second),
-                world.segment.held(world, pi_before, ray_before, active & (target > 1)),
+                as_held(world, pi_before, ray_before, active & (target > 1)),
             )
             follows = surface & ~at_first
         else:
-            v_before = world.segment.held(world, pi_before, ray_before, active & (target > 0))
+            v_before = as_held(world, pi_before, ray_before, active & (target > 0))
             follows = surface
         r = dr.norm(vertex.at.p - path.prev_p)
         v = dragged(held, v_before, r, path.ray.d, vertex.si.n, radius, follows)

@@ -1,9 +1,8 @@
 """One recorded vertex as a function ``Carry -> (EventTerms, Carry)``, put together from what the strategies say.
 
-The sampled path is held fixed in this sense: a vertex slides along the ray that found it when its surface moves, and
-against the next vertex it moves as if that one were nailed down, with the change of solid angle counted. Points on
-light sources whose shape moves are material points: they follow the shape. Where a delta lobe determines the next ray,
-that ray itself is attached.
+The sampled path is held fixed in this sense: vertices are points of their shapes, dragged along with the vertex before
+where they are near; the first vertex of a camera's path slides along its ray. Where a delta lobe determines the next
+ray, that ray itself is attached.
 """
 
 from __future__ import annotations

@@ -93,10 +93,11 @@ class DampedMotion(Local):
 
 
 def damped_motion(δ, d, r, n, active, radius, nailed=None, volume=None):
-    """The direction ``d`` to a point at distance ``r`` on a surface of normal ``n``, when its vertex moves by ``δ``.
+    """The direction ``d`` to a point at distance ``r`` on a surface of normal ``n``, when its vertex moves by ``δ``
+    against it.
 
-    Far away the point is nailed down: the direction moves by ``-δ_perp / r``. In corners and gaps that has no bounded
-    variance. Nearer than ``radius`` the point slides along with the vertex by a share ``a``, and the direction moves by
+    Far away the direction moves by ``-δ_perp / r``. In corners and gaps that has no bounded variance. Nearer than
+    ``radius`` the point is dragged along with the vertex by a share ``a``, and the direction moves by
 
         -W δ_perp,    W = (1 - a) / r,    a = (1 - s^2)^2,    s = r / radius,
 

@@ -1,12 +1,7 @@
-"""Segments through vacuum whose ends follow their shapes in derivatives: vertices are material points.
+"""Segments of captures around a corner: material points in derivatives, as in :mod:`.vacuum`, that are never dragged.
 
-Where a scene is lit through one point and seen through another, as around a corner, its outlines are what changes most
-when a body moves. Vertices that slide along the rays that found them leave the outlines to a boundary term. Material
-points carry them along: with the density held fixed per material area, the integral over the area of a body,
-
-    I = int  f G  dA(theta),   G = cos cos' / r^2,
-
-has no boundary that moves, and what is left are the edges of bodies that hide each other.
+Where a scene is lit through one point and seen through another, as around a corner, hidden bodies keep their distance
+from the wall, so that damping buys nothing; ends that a guide has drawn are handed on with their normals.
 """
 
 from __future__ import annotations
@@ -23,9 +18,7 @@ from torchtransient.plugins.transport.strategy import Local
 
 
 class MaterialVacuum(Vacuum):
-    """In renders as :class:`.vacuum.Vacuum`. In derivatives the ray decides over the first vertex alone, and over those
-    behind delta lobes: all others are points of their shapes.
-    """
+    """As :class:`.vacuum.Vacuum`, without a damping radius."""
 
     def prepare(self, world):
         super().prepare(world)
