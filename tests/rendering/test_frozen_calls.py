@@ -20,6 +20,7 @@ from torchtransient.rendering.recordings import FIRST, LAUNCHED, NO_FREEZING, PR
 from torchtransient.rendering.variant import active_variant
 from torchtransient.testing.gradient_sweep.measure import quiet
 from torchtransient.testing.gradient_sweep.settings import Setting, all_settings
+from torchtransient.testing.moving_edges import CASES
 from torchtransient.testing.small_room import COLOUR, GREY, VARIANT, WALL_POSE, make_room
 
 # The same kernels but for the order of atomic sums: the last digits of single precision.
@@ -61,6 +62,15 @@ def check(setting, folder, most):
 def test_numbers_of_traced_calls(setting, tmp_path):
     for key, outcome in check(setting, tmp_path, 1).items():
         assert outcome.launched, (key, outcome.said)
+
+
+@pytest.mark.slow
+def test_edges_in_mirrors():
+    """The sequences of planes that a camera sees are told from rays, with other seeds in every call."""
+    with active_variant(VARIANT), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        outcome = Runs(tt.load(CASES["mirror_shadow"].scene(), variant=VARIANT), "plate.to_world").outcome()
+    assert max(outcome.differences.values()) < TOLERANCE and outcome.launched, (outcome.differences, outcome.said)
 
 
 def marked(found):

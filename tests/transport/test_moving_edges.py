@@ -44,7 +44,9 @@ def test_outlines_and_shadows(name):
         ("indirect4_area", 256, 16384), ("wall_moves", 512, 4096), ("point_moves", 512, 4096),
         ("camera_moves", 256, 4096), ("camera_zooms", 256, 4096), ("instance4", 256, 8192),
         ("torus_shadow", 512, 4096), ("fog_shadow", 256, 8192), ("gated_plate4", 256, 4096),
-        ("phasor_shadow", 256, 4096), ("polar_plate", 256, 8192),
+        ("phasor_shadow", 256, 4096), ("polar_plate", 256, 8192), ("mirror", 256, 8192),
+        ("mirror_shadow", 512, 8192), ("mirror_moves", 1024, 4096), ("mirror_camera", 4096, 32768),
+        ("glass_rims", 512, 8192), ("glass_moves", 1024, 8192),
     ],
 )  # fmt: skip
 def test_edges_seen_by_sensors_lights_and_surfaces(name, spp, fd_spp):
@@ -64,8 +66,9 @@ def both_modes(name, passes):
     return np.array([[mode(5, 64, (one,), interior=False) for mode in modes] for one in passes])
 
 
-def test_forward_mode_of_every_pass():
-    found = both_modes("contact4", PASSES)
+@pytest.mark.parametrize(("name", "passes"), [("contact4", ("primary", "vertex", "light")), ("mirror", ("specular",))])
+def test_forward_mode_of_every_pass(name, passes):
+    found = both_modes(name, passes)
     assert (abs(found[:, 0]) > 1e-3).all()
     np.testing.assert_allclose(found[:, 1], found[:, 0], rtol=ROUNDING)
 
@@ -74,6 +77,7 @@ def test_forward_mode_of_every_pass():
 @pytest.mark.parametrize(
     ("name", "passes"),
     [
+        ("mirror_camera", ("light", "specular")), ("glass_moves", ("primary", "light", "specular")),
         ("indirect4_wall", ("vertex", "light")), ("camera_moves4", PASSES), ("bulb_moves", ("light",)),
         ("sphere", ("primary", "light")), ("instance4", PASSES),
     ],

@@ -301,3 +301,26 @@ def test_what_is_lacking_is_named():
         assert any("rim of the sun" in gap.where for gap in found) == named
     # Open boundaries of media are passed.
     assert words(plate(integrator="transient_prbvolpath", cloud=cloud((0, 0, 2), 0.4))) == ""
+
+
+def test_what_mirrors_and_glass_lack_is_named_once():
+    """Edges in plane ones are followed where a camera sees them; nothing of curved ones, nor before other sensors."""
+    mi.set_variant("llvm_ad_mono")
+    pane = {"type": "dielectric"}
+    mirror = {"type": "rectangle", "to_world": transform().translate([0, 0, 3]), "bsdf": {"type": "conductor"}}
+    ball = {"type": "sphere", "center": [1, 0, 1], "radius": 0.2, "bsdf": GRAY}
+    foggy = {"integrator": "transient_prbvolpath", "cloud": cloud((0, 0, 2), 0.4)}
+    followed, not_followed = ["from other surfaces"], [")"]
+    for more, ends in (
+        ({"mirror": mirror}, followed),
+        ({"mirror": mirror, "sensor": batch(camera)}, followed),
+        ({"mirror": mirror, "sensor": orthographic()}, not_followed),
+        ({"mirror": mirror} | foggy, not_followed),
+        ({"mirror": ball | {"bsdf": pane}}, not_followed),
+        ({"mirror": mirror | {"bsdf": pane}, "ball": ball}, [*followed, "through smooth glass ('mirror')"]),
+    ):
+        loaded = mi.load_dict(plate(**more))
+        gaps = moving_edges(loaded, loaded.sensors()).always
+        assert len(gaps) == len(ends)
+        for gap, end in zip(gaps, ends, strict=True):
+            assert "'mirror'" in gap.where and end in gap.where and (end != ")" or gap.where.endswith(end))

@@ -14,7 +14,7 @@ from torchtransient.rendering.scene_handle import load
 from torchtransient.rendering.variant import active_variant
 from torchtransient.testing.moving_edges import Array, MovingEdge
 
-PASSES = ("primary", "vertex", "light")
+PASSES = ("primary", "vertex", "light", "specular")
 
 
 def choose_passes(integrator: Any, passes: tuple[str, ...], spp: int | None = None) -> None:

@@ -52,6 +52,9 @@ class MovingEdge:
     left_out: str = ""
 
 
+_GLASS: Description = {"type": "dielectric", "int_ior": 1.3}
+_MIRROR: Description = {"type": "twosided", "b": {"type": "conductor", "material": "none"}}
+
 # --------------------------------------------------------------------------------------------------- the unknown
 
 
@@ -394,11 +397,33 @@ def in_mirror(surface: Description) -> Description:
     )
 
 
+def shadow_in_mirror(depth: int = 3) -> Description:
+    """A mirror fills the picture: it shows a plate before a wall that shines, and the plate's shadow."""
+    wall = rectangle(translate([5.0, 0, 4.0]) @ rotate([0, 1, 0], -120) @ scale([4.0, 4.0, 1]), paint(0.6))
+    wall |= {"emitter": {"type": "area", "radiance": 0.1}}
+    pose = translate([2.4, 0.1, 2.2]) @ rotate([0, 1, 0], -125) @ rotate([0, 0, 1], 20) @ scale([0.5, 0.35, 1])
+    return scene(
+        depth,
+        point(0.6, 0.6, 1.6),
+        sensor=camera(30, histograms(9.5)),
+        mirror=rectangle(rotate([0, 1, 0], 25) @ scale(2.0), _MIRROR),
+        wall=wall,
+        plate=rectangle(pose, paint(0.3)),
+    )
+
+
 def through(surface: Description) -> Description:
     """A plate before the wall, behind a slab of glass."""
     pose = translate([0, 0, 2.3]) @ rotate([0, 1, 0], 15) @ scale([0.8, 0.8, 0.08])
     slab = {"type": "cube", "to_world": pose, "bsdf": surface}
     return scene(6, point(1.8, 1.5, 2.5), 24.0, plate=plate(), slab=slab)
+
+
+def slab_in_view(depth: int = 5) -> Description:
+    """A plate before a wall, partly behind a slab of glass, which shows its own rims."""
+    pose = translate([0, 0, 2]) @ rotate([0, 1, 0], 25) @ rotate([1, 0, 0], 10) @ scale([0.4, 0.5, 0.12])
+    slab = {"type": "cube", "to_world": pose, "bsdf": _GLASS}
+    return scene(depth, point(1.8, 1.5, 2.5), sensor=camera(50, histograms(4.0)), plate=plate(), slab=slab)
 
 
 def shining_torus() -> Description:
@@ -425,9 +450,7 @@ def side_panel() -> Description:
 
 
 _C, _H, _B, _L = (1.0, 0.3, 0.0), (1.0, 0.2, 0.0), (0.2, 0.5, 1.0), (1.0, 0.2, 0.3)
-_PLATE, _HID, _BLK = moved(*_C), moved(*_H), moved(*_B)
-_MIRROR: Description = {"type": "twosided", "b": {"type": "conductor", "material": "none"}}
-_DELTA = "edges seen through delta lobes"
+_PLATE, _HID, _BLK, _IN_MIRROR = moved(*_C), moved(*_H), moved(*_B), moved(0.5, 0.6, -0.5)
 _JUMPS = "jumps of a texture on what moves"
 
 
@@ -619,19 +642,35 @@ CASES: dict[str, MovingEdge] = {
         0.003, (-3.239, 0.029), (-3.230, 0.028), variant=POLARIZED,
     ),
     "mirror_rough": _edge(
-        lambda: in_mirror({"type": "twosided", "b": metal(0.15)}), "plate.to_world", moved(0.5, 0.6, -0.5), 0.004,
+        lambda: in_mirror({"type": "twosided", "b": metal(0.15)}), "plate.to_world", _IN_MIRROR, 0.004,
         0.005, (-0.0812, 0.0018), (-0.0808, 0.0013),
     ),
     "mirror": _edge(
-        lambda: in_mirror(_MIRROR), "plate.to_world", moved(0.5, 0.6, -0.5), 0.004,
-        0.0, (0.0, None), (-0.1933, 0.0021), left_out=_DELTA,
+        lambda: in_mirror(_MIRROR), "plate.to_world", _IN_MIRROR, 0.01, 0.0, (-0.1880, 0.0005), (-0.1883, 0.0009)
+    ),
+    "mirror_shadow": _edge(
+        shadow_in_mirror, "plate.to_world", _IN_MIRROR, 0.01, -0.0003, (-0.2104, 0.0023), (-0.2123, 0.0015)
+    ),
+    "mirror_moves": _edge(
+        lambda: shadow_in_mirror(2), "mirror.to_world", moved(0.3, 0.1, 1.0), 0.01,
+        -10.173, (-10.071, 0.007), (-10.067, 0.002),
+    ),
+    "mirror_camera": _edge(
+        shadow_in_mirror, "sensor.to_world", moved(*_L), 0.01, 0.466, (0.4259, 0.0014), (0.4246, 0.0005)
     ),
     "glass_rough": _of_plate(
         lambda: through({"type": "roughdielectric", "int_ior": 1.3, "alpha": 0.1}),
         1.307, (-2.10, 0.45), (-2.059, 0.035),
     ),
-    "glass": _of_plate(
-        lambda: through({"type": "dielectric", "int_ior": 1.3}), 1.325, (1.328, None), (-2.342, 0.014), left_out=_DELTA
+    "glass": _edge(
+        lambda: through(_GLASS), "plate.to_world", _PLATE, 0.01, 1.333, (-2.301, 0.006), (-2.296, 0.006)
+    ),
+    "glass_rims": _edge(slab_in_view, "plate.to_world", _PLATE, 0.01, -0.017, (-0.542, 0.005), (-0.537, 0.006)),
+    "glass_moves": _edge(
+        slab_in_view, "slab.vertex_positions", moved(0.0, 0.0, 1.0), 0.01, 0.019, (-0.274, 0.011), (-0.279, 0.005)
+    ),
+    "glass_camera": _edge(
+        slab_in_view, "sensor.to_world", moved(*_L), 0.01, -0.083, (0.799, 0.050), (0.795, 0.008)
     ),
 }  # fmt: skip
 # What a short look takes.
