@@ -107,6 +107,7 @@ audit: $(READY)
 # page's rows of the others: make sweep ONLY=retroreflector
 sweep: $(READY)
 	$(BIN)/python -m torchtransient.testing.gradient_sweep --write docs $(if $(ONLY),--only '$(ONLY)')
+	$(if $(ONLY),,$(BIN)/python benchmarks/boundary_cost.py sweep --page docs/moving_shapes.md)
 
 # ROOM: a name in tests/mutation/rooms.py. A run that was stopped goes on; its record is build/mutants/ROOM-SEED.jsonl.
 mutants: $(READY)

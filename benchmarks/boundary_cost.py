@@ -397,7 +397,33 @@ def sweep(options: argparse.Namespace) -> Result:
     counts = {verdict: sum(r["verdict"] == verdict for r in found.values()) for verdict in
               ("agrees", "contradicts", "warned", "refused", "failed")}  # fmt: skip
     print(", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count))
+    if options.page is not None:
+        options.page.write_text(page_of(found, options), encoding="utf-8")
     return found
+
+
+def page_of(found: Result, options: argparse.Namespace) -> str:
+    """The sweep as a page of the documentation."""
+    lines = [
+        "# Every shape that moves",
+        "The derivative of a loss (random pixel weights, times a sine of the path length) by one number that moves a "
+        "shape before a background (*primary*), that throws a shadow into the picture (*shadow*), and that another "
+        "surface sees (*surface*): translated, turned, and grown or with moved vertices. Reverse mode with the "
+        "[boundary term](gradients.md#edges-that-move) against central differences with common random numbers, each "
+        f"+- its standard error over {options.seeds} seeds; `make sweep` writes this page.",
+        "",
+        "*agrees*: within 4 standard errors; *warned*: off, and a `GradientWarning` said so at the first call.",
+        "",
+        "| shape | seen | moved | reverse mode | differences | |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name, result in found.items():
+        body, place, change = name.split(", ")
+        numbers = ["", ""]
+        if "z" in result:
+            numbers = [f"{result[s]['mean']:.4f} +- {result[s]['error']:.4f}" for s in ("reverse", "differences")]
+        lines.append(f"| {body} | {place} | {change} | {numbers[0]} | {numbers[1]} | {result['verdict']} |")
+    return "\n".join(lines) + "\n"
 
 
 # ----------------------------------------------------------------------------------------------- training steps, a fit
@@ -539,6 +565,7 @@ def parsed() -> argparse.Namespace:
     adders["variance"].add_argument("--interior", action="store_true", help="without the boundary term")
     numbers(adders["variance"], seeds=32)
     adders["sweep"].add_argument("names", nargs="*", metavar="SHAPES", help=", ".join(BODIES))
+    adders["sweep"].add_argument("--page", type=Path, help="write the result as a page of the documentation")
     numbers(adders["sweep"], spp=256, fd_spp=4096, seeds=8)
     numbers(adders["step"], repeats=20)
     adders["fit"].add_argument("--starts", dest="seeds_of_fits", type=int, nargs="+", default=[0])
