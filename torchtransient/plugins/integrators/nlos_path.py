@@ -14,7 +14,12 @@ from torchtransient.interfaces import CaptureType
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.around_corner.division import BOUNCES, Division
 from torchtransient.plugins.around_corner.late_light import FIRST, MOST
-from torchtransient.plugins.around_corner.outlines import follows_outlines, mutual_occlusion, silhouettes
+from torchtransient.plugins.around_corner.outlines import (
+    follows_outlines,
+    late_outlines,
+    mutual_occlusion,
+    silhouettes,
+)
 from torchtransient.plugins.around_corner.scan_table import ScanTable, capture_type, laser_of, scan_rays
 from torchtransient.plugins.around_corner.shared_light import (
     SharedThirdBounce,
@@ -366,7 +371,8 @@ class TransientNLOSPath(base.TransientIntegrator):
         if not self.boundary:
             return shared
         edges = mutual_occlusion(self, world, sensor, film, seed, samples, dr.detach(self._table(world).seen()))
-        return shared if edges is None else [*shared, edges]
+        late = late_outlines(self, world, sensor, film, seed, samples)
+        return shared + [term for term in (edges, late) if term is not None]
 
     @staticmethod
     def _table(world: Any) -> ScanTable:

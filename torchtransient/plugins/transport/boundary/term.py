@@ -37,7 +37,7 @@ from torchtransient.plugins.transport.scattering.from_light import FromLight, sh
 from torchtransient.plugins.transport.world import World
 
 PASSES = {"primary": PrimaryPass, "vertex": VertexPass, "light": LightPass}
-_SEEDS = {"primary": 0x51, "vertex": 0x52, "light": 0x53}
+_SEEDS = {"primary": 0x51, "vertex": 0x52, "light": 0x53, "spot": 0x54}
 
 
 class BoundaryTerm:
@@ -46,11 +46,12 @@ class BoundaryTerm:
     Args:
         integrator, world, sensor, film, seed: of the job.
         samples: edge samples per pixel of each pass.
-        names: passes to run, of ``PASSES``.
+        names: passes to run, of ``kinds``.
         candidates: edges that one is chosen from in the vertex pass.
     """
 
     can_be_recorded = True
+    kinds = PASSES
 
     def __init__(self, integrator, world, sensor, film, seed, samples, names=tuple(PASSES), candidates=8):
         self.integrator, self.world, self.sensor, self.film = integrator, world, sensor, film
@@ -66,22 +67,22 @@ class BoundaryTerm:
         topology = world.contents.memory.of("edges", b"", lambda: Topology(scene, hides))
         self.edges = EdgeTable(topology, moving)
         self.radius = dr.opaque(mi.Float, integrator.reference(scene).radius)
-        self.places = SensorPlaces(sensor, film, self.radius)
-        self.is_meter = self.places.is_meter
+        self.has_vertex_normals = shades_by_other_normals(scene)
         with dr.suspend_grad():
             self.light_world = self._light_world()
         self.passes, self.jobs = {}, {}
         for name in names if topology.count else ():
-            if PASSES[name].exists(world, sensor):
+            if self.kinds[name].exists(world, sensor):
                 own, _ = mi.sample_tea_32(seed_array(seed), mi.UInt32(_SEEDS[name]))
-                self.passes[name] = PASSES[name](world)
+                self.passes[name] = self.kinds[name](world)
                 self.jobs[name], _ = passes_of(sensor.sampler().clone(), film, own, samples, world.most_events())
 
     def _light_world(self):
         """The world of paths that start at a light and are connected to the sensor."""
         world, integrator = self.world, self.integrator
+        self.places = SensorPlaces(self.sensor, self.film, self.radius)
+        self.is_meter = self.places.is_meter
         segment, scattering, _ = integrator.strategies(world.contents)
-        self.has_vertex_normals = shades_by_other_normals(world.scene)
         if self.has_vertex_normals:
             scattering = FromLight(scattering)
         # Whether the sensor's segment counts in time is asked by its connection: here it is the last one of a path.

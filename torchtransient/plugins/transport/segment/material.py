@@ -27,6 +27,8 @@ class MaterialVacuum(Vacuum):
     behind delta lobes: all others are points of their shapes.
     """
 
+    drags = False
+
     def prepare(self, world):
         super().prepare(world)
         moving = frozenset() if world.wanted is None or not world.wanted.geometry else world.wanted.shapes
