@@ -17,7 +17,12 @@ from torchtransient.plugins.around_corner.occlusion import BOUNCES, MutualOcclus
 from torchtransient.plugins.around_corner.outline_table import OutlineTable
 from torchtransient.plugins.integrators.launch import passes_of, seed_array
 from torchtransient.plugins.pointer_table import registry_number
-from torchtransient.plugins.transport.boundary.moving_edges import Gap, MovingEdges
+from torchtransient.plugins.transport.boundary.moving_edges import (
+    Gap,
+    MovingEdges,
+    edges_in_mirrors,
+    rims_without_edges,
+)
 from torchtransient.plugins.transport.segment.material import MaterialVacuum
 
 # Edge samples of a pixel and viewpoint, as a share of its paths.
@@ -34,15 +39,20 @@ def follows_outlines(segment: type, contents: Any) -> bool:
     return issubclass(segment, MaterialVacuum) and contents.delays is None
 
 
-def silhouettes(least: int, most: int, exhaustive: bool) -> MovingEdges:
+def silhouettes(scene: Any, least: int, most: int) -> MovingEdges:
     """Return what derivatives of light of ``least`` to ``most`` bounces lack where outlines are followed."""
-    lacking: tuple[str, ...] = ()
-    if least <= BOUNCES <= most and not exhaustive:
-        lacking = "behind shapes without triangles", "where bodies run into each other"
-    if least <= BOUNCES <= most and exhaustive:
-        lacking = ("where one hidden part may hide another (refused)",)
-    late = Gap("in light of more than three bounces where one part hides another", "Set max_depth to 3.")
-    return MovingEdges((late,) if most > BOUNCES else (), words=lacking)
+    words, always, bent = [], [], []
+    if least <= BOUNCES <= most:
+        alone = "" if most == BOUNCES else "in light of three bounces "
+        words.append(f"{alone}behind shapes without triangles")
+    if most >= BOUNCES:
+        words.append("where bodies run into each other")
+    if most >= FIRST:
+        always, bent = rims_without_edges(scene), edges_in_mirrors(scene)
+        if mi.is_polarized:
+            where = "in polarized light of more than three bounces where one part hides another"
+            always.append(Gap(where, "Set max_depth to 3."))
+    return MovingEdges(always, bent, words=words)
 
 
 class Viewpoints:

@@ -122,10 +122,7 @@ def missing(reason: str, remedy: str) -> MovingEdges:
 
 def moving_edges(scene: Any, sensors: Sequence[Any]) -> MovingEdges:
     """Return what the passes of the boundary term (:mod:`.term`) leave out in a scene, seen by ``sensors``."""
-    always, bent = [], []
-    if shapes := shapes_without_edges(scene):
-        names = _listed([_name(shape) for shape in shapes])
-        always.append(Gap(f"at the rims of {names}, which have no edges", "Use a mesh of the same form."))
+    always = rims_without_edges(scene)
     if rims := [emitter.get_shape() or emitter for emitter in scene.emitters() if _has_rim(emitter)]:
         where = f"at the rim of the light of {_listed([_name(one) for one in rims])}"
         always.append(Gap(where, "Let the light fade out, by a beam_width below the cutoff_angle for instance."))
@@ -141,12 +138,25 @@ def moving_edges(scene: Any, sensors: Sequence[Any]) -> MovingEdges:
     if delayed := [bsdf for bsdf in bsdfs_of_scene(scene) if getattr(bsdf, "shift", None) is not None]:
         where = f"in light of other wavelengths at the edges of shadows on {_listed([_name(one) for one in delayed])}"
         always.append(Gap(where, "Keep edges that move out of the light of what fluoresces."))
+    return MovingEdges(always, edges_in_mirrors(scene), scene)
+
+
+def rims_without_edges(scene: Any) -> list[Gap]:
+    """Return the gap of shapes with outlines that the table of edges does not hold, if there are some."""
+    if not (shapes := shapes_without_edges(scene)):
+        return []
+    names = _listed([_name(shape) for shape in shapes])
+    return [Gap(f"at the rims of {names}, which have no edges", "Use a mesh of the same form.")]
+
+
+def edges_in_mirrors(scene: Any) -> list[Gap]:
+    """Return the gap of edges that are seen by way of delta lobes, if some surface has one."""
     shapes = [shape for shape in shapes_of_scene(scene) if has_surface(shape) and not _passes_through_media(shape)]
-    if smooth := [shape for shape in shapes if _has_delta_lobe(shape)]:
-        names = _listed([_name(shape) for shape in smooth])
-        where = f"where edges are seen in mirrors or through smooth glass, masks and open boundaries ({names})"
-        bent.append(Gap(where, "Take a rough surface in place of the smooth one, or keep edges out of its view."))
-    return MovingEdges(always, bent, scene)
+    if not (smooth := [shape for shape in shapes if _has_delta_lobe(shape)]):
+        return []
+    names = _listed([_name(shape) for shape in smooth])
+    where = f"where edges are seen in mirrors or through smooth glass, masks and open boundaries ({names})"
+    return [Gap(where, "Take a rough surface in place of the smooth one, or keep edges out of its view.")]
 
 
 def shapes_without_edges(scene: Any) -> list[Any]:
