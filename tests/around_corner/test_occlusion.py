@@ -9,28 +9,13 @@ import pytest
 import torchtransient as tt
 from support.hidden_shapes import ball, folded_plates, join, mannequin, mesh
 from support.marks import long
-from support.moved_captures import MovedCapture, move, noted, turn
+from support.moved_captures import MovedCapture, agree, move, turn
 from support.nlos_scenes import film, plane, scan_scene, transform
 from torchtransient.errors import ArgumentError, GradientWarning, TorchTransientWarning
 
 VARIANT = "llvm_ad_mono"
 SIGMAS = 4.0
-# The parameter of differences: of the third derivative a share of (h / 0.3 m)^2 is left. No shadow of a plate may pass
-# a rim meanwhile, where the capture has a kink.
-STEP = 4e-3
 SMOOTH = {"start": 1.0, "width": 0.05, "bins": 100, "temporal_filter": "tent"}
-
-
-def agree(capture, spp=2**12, seeds=6, spp_differences=2**16, seeds_differences=10, step=STEP, most_error=0.02):
-    """Both modes are the same derivative, which is that of finite differences; returns what paths alone say of it."""
-    found = np.array([capture.reverse(seed, spp) for seed in range(seeds)])
-    assert capture.forward(0, spp) == pytest.approx(found[0], rel=2e-4)
-    expected = np.array([capture.difference(step, 100 + seed, spp_differences) for seed in range(seeds_differences)])
-    error = np.hypot(*(x.std(ddof=1) / len(x) ** 0.5 for x in (found, expected)))
-    assert abs(found.mean() - expected.mean()) < SIGMAS * error
-    assert error < most_error * abs(found.mean())
-    with noted():
-        return capture.reverse(0, spp), found.mean(), error
 
 
 def plates(**changes):
@@ -73,7 +58,7 @@ EXHAUSTIVE = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", long(EXHAUSTIVE, ["wall, sideways", "back, depth"]))
+@pytest.mark.parametrize("case", long(EXHAUSTIVE, ["front, sideways"]))
 def test_every_pair_of_an_exhaustive_capture(case):
     """Spots are the scanned points, so that many pairs have outlines in common, which count once."""
     points, spp, spp_differences, most_error = EXHAUSTIVE[case]

@@ -12,7 +12,7 @@ one are found the other way round (:class:`SpotPass`): a path begins at L, past 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -129,12 +129,14 @@ class ScanSampled(Connection):
 
 
 class LateOutlines(BoundaryTerm):
-    """The boundary term of one job in light of ``FIRST`` and more bounces; arguments as of :class:`BoundaryTerm`, ``world``
-    that of the job.
+    """The boundary term of one job in light of ``FIRST`` and more bounces.
+
+    Args:
+        integrator, world, sensor, film, seed, samples: as of :class:`BoundaryTerm`; ``world`` is that of the job.
     """
 
     can_be_recorded = False
-    kinds = {"vertex": VertexPass, "spot": SpotPass}
+    kinds: ClassVar[dict[str, Any]] = {"vertex": VertexPass, "spot": SpotPass}
 
     def __init__(self, integrator: Any, world: Any, sensor: Any, film: Any, seed: Any, samples: int) -> None:
         (spots,) = world.connections
