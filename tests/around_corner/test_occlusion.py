@@ -9,28 +9,13 @@ import pytest
 import torchtransient as tt
 from support.hidden_shapes import ball, folded_plates, join, mannequin, mesh
 from support.marks import long
-from support.moved_captures import MovedCapture, move, noted, turn
+from support.moved_captures import MovedCapture, agree, move, turn
 from support.nlos_scenes import film, plane, scan_scene, transform
-from torchtransient.errors import ArgumentError, GradientError, GradientWarning, TorchTransientWarning
+from torchtransient.errors import ArgumentError, GradientWarning, TorchTransientWarning
 
 VARIANT = "llvm_ad_mono"
 SIGMAS = 4.0
-# The parameter of differences: of the third derivative a share of (h / 0.3 m)^2 is left. No shadow of a plate may pass
-# a rim meanwhile, where the capture has a kink.
-STEP = 4e-3
 SMOOTH = {"start": 1.0, "width": 0.05, "bins": 100, "temporal_filter": "tent"}
-
-
-def agree(capture, spp=2**12, seeds=6, spp_differences=2**16, seeds_differences=10, step=STEP, most_error=0.02):
-    """Both modes are the same derivative, which is that of finite differences; returns what paths alone say of it."""
-    found = np.array([capture.reverse(seed, spp) for seed in range(seeds)])
-    assert capture.forward(0, spp) == pytest.approx(found[0], rel=2e-4)
-    expected = np.array([capture.difference(step, 100 + seed, spp_differences) for seed in range(seeds_differences)])
-    error = np.hypot(*(x.std(ddof=1) / len(x) ** 0.5 for x in (found, expected)))
-    assert abs(found.mean() - expected.mean()) < SIGMAS * error
-    assert error < most_error * abs(found.mean())
-    with noted():
-        return capture.reverse(0, spp), found.mean(), error
 
 
 def plates(**changes):
@@ -65,6 +50,22 @@ def test_a_plate_before_a_plate(case, kind):
     interior, whole, error = agree(capture_of(plates(), *MOVED[case], kind), most_error=0.05)
     if "sideways" in case:
         assert abs(interior - whole) > 10 * error
+
+
+EXHAUSTIVE = {
+    "front, sideways": (2, 2**12, 2**14, 0.05), "wall, sideways": (3, 2**13, 2**17, 0.01),
+    "back, depth": (3, 2**13, 2**17, 0.01),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", long(EXHAUSTIVE, ["front, sideways"]))
+def test_every_pair_of_an_exhaustive_capture(case):
+    """Spots are the scanned points, so that many pairs have outlines in common, which count once."""
+    points, spp, spp_differences, most_error = EXHAUSTIVE[case]
+    capture = capture_of(plates(), *MOVED[case], "exhaustive", response=film(points, kind="exhaustive", **SMOOTH))
+    interior, whole, error = agree(capture, spp, 4, spp_differences, 8, most_error=most_error)
+    if "sideways" in case:
+        assert abs(interior - whole) > 5 * error
 
 
 @pytest.mark.slow
@@ -250,20 +251,6 @@ def test_what_hides_nothing_costs_nothing(name):
     assert capture_of(ALONE[name](), key, move(1, 0, 0)).boundary() is None
 
 
-def test_exhaustive_captures():
-    """They have no boundary term: derivatives are refused where it is not known to be zero."""
-    response = film(2, kind="exhaustive", **SMOOTH)
-    with pytest.raises(GradientError, match=r"exhaustive capture.*'front' hides 'back'"):
-        capture_of(plates(), "front.to_world", move(1, 0, 0), "exhaustive", response=response).reverse(0, 16)
-    with pytest.raises(GradientError, match="exhaustive capture"):
-        capture_of(plates(), "front.to_world", move(1, 0, 0), "exhaustive", response=response).forward(0, 16)
-    alone = capture_of(ALONE["plates side by side"](), "front.to_world", move(1, 0, 0), "exhaustive", response=response)
-    assert alone.reverse(0, 16) != 0
-    value = capture_of(plates(), "front.bsdf.reflectance.value", lambda start, θ: start + θ, "exhaustive",
-                       response=response)  # fmt: skip
-    assert value.reverse(0, 16) != 0
-
-
 def test_outlines_without_edges_are_told():
     hidden = {"ball": {"type": "sphere", "center": [0, 0, 0.7], "radius": 0.1}, "back": plane(1.2)}
     with pytest.warns(TorchTransientWarning, match="'ball' hides 'back'"):
@@ -275,18 +262,20 @@ def test_the_table_of_parameters_says_so():
         scene = tt.load(scan_scene(plates(), kind, film(2, kind=kind, **SMOOTH), **integrator))
         return scene.parameters()["front.to_world"].reason
 
-    assert "without triangles" in reason() and "more than three" not in reason()
-    assert "more than three" in reason(max_depth=5)
-    assert "refused" in reason("exhaustive") and "triangles" not in reason("exhaustive")
+    for kind in ("confocal", "exhaustive"):
+        assert "without triangles" in reason(kind) and "more than three" not in reason(kind, max_depth=5)
     untraced = reason(nlos_laser_sampling=False, laser={"type": "projector"})
     assert untraced.startswith("correct except where silhouettes move")
 
 
-def test_late_light_is_said_to_lack_it():
+def test_polarized_late_light_is_said_to_lack_it():
     """At the first call; and no samples of edges can be asked for by the pixel."""
-    scene = tt.load(scan_scene(plates(), "confocal", film(2, **SMOOTH), max_depth=5))
-    with pytest.warns(GradientWarning, match=r"'front\.to_world' .* more than three bounces"):
-        tt.TransientRenderer(scene, ["front.to_world"], spp=1)(seed=0)
+    scene = tt.load(scan_scene(plates(), "confocal", film(2, **SMOOTH), max_depth=5), variant="llvm_ad_mono_polarized")
+    try:
+        with pytest.warns(GradientWarning, match=r"'front\.to_world' .* more than three bounces"):
+            tt.TransientRenderer(scene, ["front.to_world"], spp=1)(seed=0)
+    finally:
+        mi.set_variant(VARIANT)
     with pytest.raises(ArgumentError, match="spp_boundary"):
         tt.TransientRenderer(scene, ["front.to_world"], spp_boundary=4)
 

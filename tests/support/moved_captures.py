@@ -8,8 +8,15 @@ from unittest.mock import patch
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import pytest
 
+from torchtransient.plugins.around_corner.late_outlines import LateOutlines
 from torchtransient.plugins.around_corner.occlusion import MutualOcclusion
+
+SIGMAS = 4.0
+# The parameter of differences: of the third derivative a share of (h / 0.3 m)^2 is left. No shadow of a plate may pass
+# a rim meanwhile, where the capture has a kink.
+STEP = 4e-3
 
 
 def move(*v):
@@ -112,6 +119,18 @@ class MovedCapture:
 @contextmanager
 def noted():
     """The boundary terms that are computed meanwhile, which are left out."""
-    found = []
-    with patch.object(MutualOcclusion, "backward", lambda self, incoming: found.append(self)):
+    found, kept = [], lambda self, incoming: found.append(self)
+    with patch.object(MutualOcclusion, "backward", kept), patch.object(LateOutlines, "backward", kept):
         yield found
+
+
+def agree(capture, spp=2**12, seeds=6, spp_differences=2**16, seeds_differences=10, step=STEP, most_error=0.02):
+    """Both modes are the same derivative, which is that of finite differences; returns what paths alone say of it."""
+    found = np.array([capture.reverse(seed, spp) for seed in range(seeds)])
+    assert capture.forward(0, spp) == pytest.approx(found[0], rel=2e-4)
+    expected = np.array([capture.difference(step, 100 + seed, spp_differences) for seed in range(seeds_differences)])
+    error = np.hypot(*(x.std(ddof=1) / len(x) ** 0.5 for x in (found, expected)))
+    assert abs(found.mean() - expected.mean()) < SIGMAS * error
+    assert error < most_error * abs(found.mean())
+    with noted():
+        return capture.reverse(0, spp), found.mean(), error

@@ -80,7 +80,7 @@ class MutualOcclusion:
             block = incoming.block(rays, pixel, match)
             with dr.resume_grad():
                 objective = mi.Float(0)
-                for term in self._terms(rays, pixel, job):
+                for term in self._terms(rays, self._array(rays, pixel), job):
                     A, _ = block.read(term.opl, term.active)
                     objective += total_of(A, term.value) * term.outwards
                 if dr.grad_enabled(objective):
@@ -96,7 +96,7 @@ class MutualOcclusion:
             base, pixel = self.integrator.pixel_indices(film, job, rays)
             block = film.create_event_block(job, base, match, 2, tangents=True)
             with dr.resume_grad():
-                terms = self._terms(rays, pixel, job)
+                terms = self._terms(rays, self._array(rays, pixel), job)
                 tangents = tangents_of([term.outwards for term in terms])
             events, total = block.begin(), light_type()(0)
             for term, outwards in zip(terms, tangents, strict=True):
@@ -107,6 +107,10 @@ class MutualOcclusion:
             film.add_steady(pixel, match.to_channels(total))
             block.finish()
             dr.eval(film.bands[job.band][2], film.steady)
+
+    def _array(self, rays: Any, pixel: Any) -> Any:
+        """Number of the array of the film that each sample belongs to: of a pixel, or of a pixel and a laser spot."""
+        return pixel if rays.laser is None else pixel * self.film.laser_count() + rays.laser
 
     def _start(self, job: Pass) -> Any:
         world = self.world

@@ -9,14 +9,20 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from torchtransient.errors import GradientError, GradientWarning
+from torchtransient.errors import GradientWarning
 from torchtransient.plugins.around_corner.geometry import front_normal
 from torchtransient.plugins.around_corner.hiding import Part, hiding_pairs, parts_of
+from torchtransient.plugins.around_corner.late_outlines import FIRST, LateOutlines
 from torchtransient.plugins.around_corner.occlusion import BOUNCES, MutualOcclusion
 from torchtransient.plugins.around_corner.outline_table import OutlineTable
 from torchtransient.plugins.integrators.launch import passes_of, seed_array
 from torchtransient.plugins.pointer_table import registry_number
-from torchtransient.plugins.transport.boundary.moving_edges import Gap, MovingEdges
+from torchtransient.plugins.transport.boundary.moving_edges import (
+    Gap,
+    MovingEdges,
+    edges_in_mirrors,
+    rims_without_edges,
+)
 from torchtransient.plugins.transport.segment.material import MaterialVacuum
 
 # Edge samples of a pixel and viewpoint, as a share of its paths.
@@ -33,15 +39,20 @@ def follows_outlines(segment: type, contents: Any) -> bool:
     return issubclass(segment, MaterialVacuum) and contents.delays is None
 
 
-def silhouettes(least: int, most: int, exhaustive: bool) -> MovingEdges:
+def silhouettes(scene: Any, least: int, most: int) -> MovingEdges:
     """Return what derivatives of light of ``least`` to ``most`` bounces lack where outlines are followed."""
-    lacking: tuple[str, ...] = ()
-    if least <= BOUNCES <= most and not exhaustive:
-        lacking = "behind shapes without triangles", "where bodies run into each other"
-    if least <= BOUNCES <= most and exhaustive:
-        lacking = ("where one hidden part may hide another (refused)",)
-    late = Gap("in light of more than three bounces where one part hides another", "Set max_depth to 3.")
-    return MovingEdges((late,) if most > BOUNCES else (), words=lacking)
+    words, always, bent = [], [], []
+    if least <= BOUNCES <= most:
+        alone = "" if most == BOUNCES else "in light of three bounces "
+        words.append(f"{alone}behind shapes without triangles")
+    if most >= BOUNCES:
+        words.append("where bodies run into each other")
+    if most >= FIRST:
+        always, bent = rims_without_edges(scene), edges_in_mirrors(scene)
+        if mi.is_polarized:
+            where = "in polarized light of more than three bounces where one part hides another"
+            always.append(Gap(where, "Set max_depth to 3."))
+    return MovingEdges(always, bent, words=words)
 
 
 class Viewpoints:
@@ -77,8 +88,7 @@ def mutual_occlusion(
     followed.
 
     ``scanned``: preliminary intersections of the scanned points. ``spp``: of the job, 0 for the sampler's own; there
-    is an edge sample for every ``SHARE`` paths. Raises GradientError in exhaustive captures, where every pair of
-    positions would have outlines of its own; warns where something that has no edges may hide another thing.
+    is an edge sample for every ``SHARE`` paths. Warns where something that has no edges may hide another thing.
     """
     wanted = world.wanted
     if not (wanted.geometry and follows_outlines(type(world.segment), world.contents)):
@@ -101,8 +111,6 @@ def mutual_occlusion(
     pairs = hiding_pairs(parts, viewpoints.p, of_interest)
     if not pairs:
         return None
-    if film.exhaustive_scan:
-        raise GradientError(_refusal(shapes, parts, pairs))
     _warn_of_limbs(shapes, parts, pairs)
     hiders = sorted({i for i, _ in pairs if parts[i].edges is not None and len(parts[i].edges.ends)})
     if not hiders:
@@ -114,6 +122,26 @@ def mutual_occlusion(
     own_seed, _ = mi.sample_tea_32(seed_array(seed), mi.UInt32(_SEED))
     jobs, _ = passes_of(sampler, film, own_seed, max(1, count // SHARE), 2)
     return MutualOcclusion(integrator, world, sensor, film, edges, spots, jobs)
+
+
+def late_outlines(integrator: Any, world: Any, sensor: Any, film: Any, seed: Any, spp: int) -> LateOutlines | None:
+    """The boundary term of light of more than three bounces; arguments as of :func:`mutual_occlusion`. None where there
+    is no such light, where nothing moves, or where what is hidden is one body that cannot hide a part of itself.
+    """
+    wanted = world.wanted
+    if not (wanted.geometry and follows_outlines(type(world.segment), world.contents)) or mi.is_polarized:
+        return None
+    if world.max_depth < FIRST or not (wanted.sensor or wanted.light or wanted.shapes):
+        return None
+    (spots,) = world.connections
+    wall = {shape.ptr for shape in spots.table.wall or ()}
+    hidden = [shape for shape in world.scene.shapes() if shape.ptr not in wall]
+    if wall and len(hidden) < 2:
+        parts, _ = parts_of(hidden)
+        if len(parts) < 2 and not any(part.hides_itself for part in parts):
+            return None
+    count = spp or sensor.sampler().sample_count()
+    return LateOutlines(integrator, world, sensor, film, seed, max(1, count // SHARE))
 
 
 def _names(shapes: list[Any], parts: list[Part], pairs: list[tuple[int, int]]) -> str:
@@ -129,14 +157,6 @@ def _names(shapes: list[Any], parts: list[Part], pairs: list[tuple[int, int]]) -
     ]  # fmt: skip
     words = list(dict.fromkeys(words))
     return ", ".join(words[:3]) + (f", and {len(words) - 3} more" if len(words) > 3 else "")
-
-
-def _refusal(shapes: list[Any], parts: list[Part], pairs: list[tuple[int, int]]) -> str:
-    return (
-        "transient_nlos_path: the derivative by geometry of an exhaustive capture lacks the boundary term of outlines, "
-        f"and some may move over what they hide ({_names(shapes, parts, pairs)}). Take the derivative of a single or "
-        "confocal capture, or of a scene in which nothing can hide another thing from the relay wall."
-    )
 
 
 def _warn_of_limbs(shapes: list[Any], parts: list[Part], pairs: list[tuple[int, int]]) -> None:

@@ -14,7 +14,12 @@ from torchtransient.interfaces import CaptureType
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.around_corner.division import BOUNCES, Division
 from torchtransient.plugins.around_corner.late_light import FIRST, MOST
-from torchtransient.plugins.around_corner.outlines import follows_outlines, mutual_occlusion, silhouettes
+from torchtransient.plugins.around_corner.outlines import (
+    follows_outlines,
+    late_outlines,
+    mutual_occlusion,
+    silhouettes,
+)
 from torchtransient.plugins.around_corner.scan_table import ScanTable, capture_type, laser_of, scan_rays
 from torchtransient.plugins.around_corner.shared_light import (
     SharedThirdBounce,
@@ -90,7 +95,8 @@ class TransientNLOSPath(base.TransientIntegrator):
         (:mod:`..around_corner.late_light`), or from paths, as light of more bounces is. ``auto`` chooses as for
         ``third_bounce``; both have the same mean, and derivatives come from paths. So does late light of pairs.
     ``boundary`` (bool, true)
-        False leaves the boundary term of what hides other hidden things out of derivatives.
+        False leaves the boundary term of what hides other hidden things out of derivatives. Samples of edges are a
+        quarter of the paths, for light of three bounces and twice for that of more.
     ``force_equal_illumination_scanning`` (bool, true), ``illumination_scan_fov`` (degrees, 20)
         Whether the laser positions of an exhaustive capture are the scanned points; if not, they lie on a grid of this
         horizontal field of view around the laser's axis.
@@ -357,7 +363,7 @@ class TransientNLOSPath(base.TransientIntegrator):
                 "Use a mesh, or leave out what is named.",
             )
         settings = self.settings()
-        return silhouettes(settings.min_depth, settings.max_depth, self.capture is CaptureType.EXHAUSTIVE)
+        return silhouettes(scene, settings.min_depth, settings.max_depth)
 
     def beside(self, world: Any, sensor: Any, film: Any, seed: Any, samples: int) -> list[Any]:
         if not self.laser_sampling:
@@ -366,7 +372,8 @@ class TransientNLOSPath(base.TransientIntegrator):
         if not self.boundary:
             return shared
         edges = mutual_occlusion(self, world, sensor, film, seed, samples, dr.detach(self._table(world).seen()))
-        return shared if edges is None else [*shared, edges]
+        late = late_outlines(self, world, sensor, film, seed, samples)
+        return shared + [term for term in (edges, late) if term is not None]
 
     @staticmethod
     def _table(world: Any) -> ScanTable:

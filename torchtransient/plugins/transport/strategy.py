@@ -131,6 +131,8 @@ class Segment(Strategy):
     """
 
     name = "segment"
+    # Whether near points are dragged along with the vertex that sees them (``damped_motion``).
+    drags = True
     # Fields of the Carry that derivatives go through for its sake.
     carried: tuple[str, ...] = ()
 

@@ -128,8 +128,13 @@ def walk(world, sampler, ray, first_opl, sink, η=1, leg=None):
     is not known.
     """
     path = start(world, ray, first_opl, η)
-    path.leg = world.segment.first(world, ray, sampler) if leg is None else world.segment.known(leg, ray)
+    path.leg = first_leg(world, sampler, ray, leg)
     return go_on(world, sampler, path, sink)
+
+
+def first_leg(world, sampler, ray, leg):
+    """The leg of a primary ray; ``leg``: as of :func:`walk`."""
+    return world.segment.first(world, ray, sampler) if leg is None else world.segment.known(leg, ray)
 
 
 @dr.syntax

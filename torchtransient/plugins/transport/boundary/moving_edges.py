@@ -133,10 +133,7 @@ def missing(reason: str, remedy: str) -> MovingEdges:
 
 def moving_edges(scene: Any, sensors: Sequence[Any]) -> MovingEdges:
     """Return what the passes of the boundary term (:mod:`.term`) leave out in a scene, seen by ``sensors``."""
-    always, bent = [], []
-    if shapes := shapes_without_edges(scene):
-        where = f"at the rims of {_listed_shapes(shapes)}, which have no edges"
-        always.append(Gap(where, "Use a mesh of the same form."))
+    always, bent = rims_without_edges(scene), []
     if rims := [emitter.get_shape() or emitter for emitter in scene.emitters() if _has_rim(emitter)]:
         where = f"at the rim of the light of {_listed_shapes(rims)}"
         always.append(Gap(where, "Let the light fade out, by a beam_width below the cutoff_angle for instance."))
@@ -154,8 +151,22 @@ def moving_edges(scene: Any, sensors: Sequence[Any]) -> MovingEdges:
         always.append(Gap(where, "Keep edges that move out of the light of what fluoresces."))
     if smooth := _smooth_shapes(scene):
         always += _seen_through_delta_lobes(scene, sensors, smooth)
-        bent.append(Gap(f"{_SEEN} ({_listed_shapes(smooth)})", _TAKE_ROUGH))
+        bent = edges_in_mirrors(scene)
     return MovingEdges(always, bent, scene)
+
+
+def rims_without_edges(scene: Any) -> list[Gap]:
+    """Return the gap of shapes with outlines that the table of edges does not hold, if there are some."""
+    if not (shapes := shapes_without_edges(scene)):
+        return []
+    where = f"at the rims of {_listed_shapes(shapes)}, which have no edges"
+    return [Gap(where, "Use a mesh of the same form.")]
+
+
+def edges_in_mirrors(scene: Any) -> list[Gap]:
+    """Return the gap of edges that are seen by way of delta lobes, if some surface has one."""
+    smooth = _smooth_shapes(scene)
+    return [Gap(f"{_SEEN} ({_listed_shapes(smooth)})", _TAKE_ROUGH)] if smooth else []
 
 
 def _seen_through_delta_lobes(scene: Any, sensors: Sequence[Any], smooth: Sequence[Any]) -> list[Gap]:

@@ -25,7 +25,7 @@ def both_sides(world, mode, sampler, view, b, past, first, factor, speeds, neede
         past: what :func:`past_edge` says.
         first: fields of the paths at x: ``ray`` and those of :class:`~..walk.Path`.
         factor: detached weight of a sample; ``speeds``: attached (inner, outer).
-        needed: masks (inner, outer) of the sides that can have a speed.
+        needed: masks (inner, outer) of the sides that can have a speed; None where a side has none.
         lit: masks (inner, outer) of the sides whose own emission counts, in full; None: as ``first`` says.
 
     Returns:
@@ -39,6 +39,8 @@ def both_sides(world, mode, sampler, view, b, past, first, factor, speeds, neede
     fields = {key: value for key, value in first.items() if key != "medium"}
     objective = mi.Float(0)
     for k, ((ray, leg), speed, need) in enumerate(zip(sides, mode.speeds(speeds), needed, strict=True)):
+        if need is None:
+            continue
         sign = 1 - 2 * k
         path = start(world, ray, mi.Float64(0), 1)
         for key, value in fields.items():

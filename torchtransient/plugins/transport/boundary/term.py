@@ -44,7 +44,7 @@ from torchtransient.plugins.transport.scattering.from_light import FromLight, sh
 from torchtransient.plugins.transport.world import World
 
 PASSES = {"primary": PrimaryPass, "vertex": VertexPass, "light": LightPass, "specular": SpecularPass}
-_SEEDS = {"primary": 0x51, "vertex": 0x52, "light": 0x53, "specular": 0x54, "chains": 0x55}
+_SEEDS = {"primary": 0x51, "vertex": 0x52, "light": 0x53, "specular": 0x54, "chains": 0x55, "spot": 0x56}
 
 
 class BoundaryTerm:
@@ -53,11 +53,12 @@ class BoundaryTerm:
     Args:
         integrator, world, sensor, film, seed: of the job.
         samples: edge samples per pixel of each pass.
-        names: passes to run, of ``PASSES``.
+        names: passes to run, of ``kinds``.
         candidates: edges that one is chosen from in the vertex pass.
     """
 
     can_be_recorded = True
+    kinds = PASSES
 
     def __init__(self, integrator, world, sensor, film, seed, samples, names=tuple(PASSES), candidates=8):
         self.integrator, self.world, self.sensor, self.film = integrator, world, sensor, film
@@ -73,30 +74,27 @@ class BoundaryTerm:
         topology = world.contents.memory.of("edges", sizes_of_meshes(scene), lambda: Topology(scene, hides))
         self.edges = EdgeTable(topology, moving)
         self.radius = dr.opaque(mi.Float, integrator.reference(scene).radius)
-        self.places = SensorPlaces(sensor, film, self.radius)
-        self.is_meter = self.places.is_meter
+        self.has_vertex_normals = shades_by_other_normals(scene)
         seeds = {name: mi.sample_tea_32(seed_array(seed), mi.UInt32(own))[0] for name, own in _SEEDS.items()}
-        self.chains, self.through = None, None
-        if topology.count and sees_chains(world, sensor):
-            with dr.suspend_grad():
-                self.chains = Chains(integrator, world, self.places, self.independent(seeds["chains"], RAYS))
-            if world.max_depth > 2:
-                self.through = SensorThroughChain(self.chains)
+        self.chains, self.through, self._seed_of_chains = None, None, seeds["chains"]
         with dr.suspend_grad():
             self.light_world = self._light_world()
         self.passes, self.jobs = {}, {}
         for name in names if topology.count else ():
-            if PASSES[name].exists(world, sensor):
-                self.passes[name] = PASSES[name](world)
-                self.jobs[name], _ = passes_of(
-                    sensor.sampler().clone(), film, seeds[name], samples, world.most_events()
-                )
+            if self.kinds[name].exists(world, sensor):
+                self.passes[name] = self.kinds[name](world)
+                own = sensor.sampler().clone()
+                self.jobs[name], _ = passes_of(own, film, seeds[name], samples, world.most_events())
 
     def _light_world(self):
         """The world of paths that start at a light and are connected to the sensor."""
         world, integrator = self.world, self.integrator
+        self.places = SensorPlaces(self.sensor, self.film, self.radius)
+        self.is_meter = self.places.is_meter
+        if sees_chains(world, self.sensor):
+            self.chains = Chains(integrator, world, self.places, self.independent(self._seed_of_chains, RAYS))
+            self.through = SensorThroughChain(self.chains) if world.max_depth > 2 else None
         segment, scattering, _ = integrator.strategies(world.contents)
-        self.has_vertex_normals = shades_by_other_normals(world.scene)
         if self.has_vertex_normals:
             scattering = FromLight(scattering)
         # Whether the sensor's segment counts in time is asked by its connection: here it is the last one of a path.

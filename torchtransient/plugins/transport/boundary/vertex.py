@@ -13,7 +13,7 @@ from torchtransient.plugins.transport.boundary.specular import attached_ray
 from torchtransient.plugins.transport.boundary.speeds import along_the_ray, as_held, behind, dragged, sides_from, slides
 from torchtransient.plugins.transport.contents import DAMPING
 from torchtransient.plugins.transport.strategy import Local, Proposal
-from torchtransient.plugins.transport.walk import advance, start
+from torchtransient.plugins.transport.walk import advance, first_leg, start
 
 # Probability of the last vertex, which only sees the rims of near lights.
 _SELDOM = 0.1
@@ -33,21 +33,22 @@ class VertexPass:
     @staticmethod
     def exists(world, sensor):
         """Return whether paths have two vertices."""
-        return world.max_depth > (1 if sees_one_line(sensor) or _has_lights_with_rims(world) else 2)
+        at_last = world.finds_light and (sees_one_line(sensor) or _has_lights_with_rims(world))
+        return world.max_depth > (1 if at_last else 2)
 
     def run(self, mode, job):
         """Trace the samples of ``job``; returns the objective of reverse mode."""
         term = mode.term
         world, edges = term.world, term.edges
-        finds_light = sees_one_line(term.sensor)
+        finds_light = world.finds_light and sees_one_line(term.sensor)
         rays = term.integrator.start(world.scene, world.contents, term.sensor, term.film, job)
         world.start(rays)
         view, sampler, ray = mode.view(rays), rays.sampler, dr.detach(rays.ray)
         target, inv_pmf = self._target(world, sampler.next_1d(), finds_light)
         path = start(world, ray, term.integrator.first_opl(term.film, rays), dr.detach(rays.η))
-        path.leg = world.segment.first(world, ray, sampler)
+        path.leg = first_leg(world, sampler, ray, rays.leg)
         pi, _ = world.segment.surface_of(path.leg)
-        radius = dr.minimum(world.contents.damping_radius, pi.t * DAMPING)
+        radius = dr.minimum(world.contents.damping_radius, pi.t * DAMPING) if world.segment.drags else mi.Float(0)
         lead = None
         if term.chains is None:
             path, before = advance(world, sampler, path, target)
@@ -69,7 +70,7 @@ class VertexPass:
         near = (b.dist < radius) | slides(world, b)
         b.valid &= ~b.crease | near
         # Asked for as a connection asks.
-        asked = Proposal(d=b.d, active=b.valid, ds=None)
+        asked = Proposal(d=b.d, active=b.valid, ds=Local(emitter=None))
         (answer,), _ = world.scattering.scatter(world, path, vertex, [asked], sampler)
         τ, η = vertex.delay.after(vertex.τ), vertex.η * answer.eta
         β = product(vertex.β, dr.select(b.valid, answer.matrix, 0))
@@ -94,11 +95,14 @@ class VertexPass:
             "ray": path.ray, "β": β, "η": η, "τ": τ, "prev_p": x, "prev_n": vertex.at.n,
             "depth": target + 1, "active": active, "medium": medium,
         }  # fmt: skip
-        # Elsewhere a density of zero leaves out emission.
-        dragged_along = b.dist < radius
-        lit = finds_light | (dragged_along & self._is_dragged(world, b.inner.shape))
-        lit = lit, finds_light | (dragged_along & b.crease & self._is_dragged(world, b.facing.shape))
-        return both_sides(world, mode, sampler, view, b, past, first, factor, speeds, (near, ~b.crease | near), lit)
+        lit = None
+        if world.finds_light:  # Elsewhere a density of zero leaves out emission.
+            dragged_along = b.dist < radius
+            lit = finds_light | (dragged_along & self._is_dragged(world, b.inner.shape))
+            lit = lit, finds_light | (dragged_along & b.crease & self._is_dragged(world, b.facing.shape))
+        stays = not world.segment.drags and world.contents.sliding is None
+        needed = (None, mi.Bool(True)) if stays else (near, ~b.crease | near)
+        return both_sides(world, mode, sampler, view, b, past, first, factor, speeds, needed, lit)
 
     def _target(self, world, u, finds_light):
         """(number of a vertex, one over its probability). The last vertex, after which there is nothing but emission,
@@ -168,8 +172,8 @@ class VertexPass:
 
 
 def _has_lights_with_rims(world):
-    """Whether there are area lights other than spheres."""
-    return any(
+    """Whether paths find area lights other than spheres."""
+    return world.finds_light and any(
         mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface) and not is_sphere(emitter.get_shape())
         for emitter in world.scene.emitters()
     )

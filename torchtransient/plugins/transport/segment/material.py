@@ -20,6 +20,8 @@ from torchtransient.plugins.transport.strategy import Local
 class MaterialVacuum(Vacuum):
     """As :class:`.vacuum.Vacuum`, without a damping radius."""
 
+    drags = False
+
     def prepare(self, world):
         super().prepare(world)
         moving = frozenset() if world.wanted is None or not world.wanted.geometry else world.wanted.shapes
