@@ -52,7 +52,7 @@ def both_sides(world, mode, sampler, view, b, past, first, factor, speeds, neede
         # The same random numbers on both sides.
         value = mode.follow(world, sampler.clone(), path, view, dr.select(need, sign * factor, 0), speed)
         if value is not None:
-            in_memory(world, None, value)
+            in_memory(mode.term.world, None, value)
             with dr.resume_grad():
                 objective += value * speed
     return objective
