@@ -179,11 +179,21 @@ def test_the_integrator_alone_says_it_too():
     assert len(messages) == 1 and "'light.position'" in messages[0]
 
 
+UPRIGHT = np.eye(4)
+# A rotation by 60 degrees about an axis that lies in no plane of two axes.
+OBLIQUE = np.array([[7, -4, 4, 0], [1, 8, 4, 0], [-8, -4, 1, 0], [0, 0, 0, 9]]) / 9
 STEPS = {"type": "bitmap", "data": np.eye(4)[..., None] * 0.6 + 0.2, "raw": True, "filter_type": "nearest"}
 STRIPED = {"type": "rectangle", "to_world": pose(scale=5.0), "bsdf": {"type": "diffuse", "reflectance": STEPS}}
 DISTANT = {"type": "distant", "direction": [0.1, 0, -1], "film": FILM | {"width": 1, "height": 1}}
 LAMP = {"type": "rectangle", "to_world": pose(0, 0, 3, 0.1) @ np.diag([1.0, -1, -1, 1]),
         "emitter": {"type": "angulararea", "cutoff_angle": 20.0}}  # fmt: skip
+
+
+def box(z, tilt=UPRIGHT):
+    """A cube with sides of 0.8 m, beside the plate."""
+    turn = np.diag([0.4, 0.4, 0.4, 1])
+    turn[:2, :2] = [[0.32, -0.24], [0.24, 0.32]]
+    return {"type": "cube", "to_world": tilt @ pose(2, 0, z) @ turn}
 
 
 @pytest.mark.parametrize(("more", "key", "words"), [
@@ -194,6 +204,7 @@ LAMP = {"type": "rectangle", "to_world": pose(0, 0, 3, 0.1) @ np.diag([1.0, -1, 
     ({"lamp": LAMP}, BODY, "rim of the light of 'lamp'"),
     ({"wall": STRIPED}, "wall.to_world", "steps.*'wall'"),
     ({"wall": STRIPED}, "sensor.to_world", "steps.*'wall'"),
+    ({"box": box(0.1)}, "box.vertex_positions", "where 'wall' and 'box' run into each other"),
 ])  # fmt: skip
 def test_edges_that_are_not_followed(more, key, words):
     scene = plate(**more)
@@ -218,6 +229,86 @@ def test_what_is_called_correct(tmp_path):
     assert "shadows" in sky.parameters()["light.sun_direction"].reason
     curves = plate(curve={"type": "linearcurve", "filename": str(tmp_path / "curve.txt")}).parameters()
     assert "'curve'" in curves[BODY].reason and "'curve'" in curves["curve.control_points"].reason
+
+
+def crossing(moved="wall.to_world", **parts):
+    """What the derivative by a pose lacks of bodies that run into each other."""
+    return [words for words in plate(**parts).parameters()[moved].edges_missing if "run into each other" in words]
+
+
+def wall(tilt=UPRIGHT):
+    return {"type": "rectangle", "to_world": tilt @ pose(scale=5.0)}
+
+
+def ball(z, radius=0.5):
+    return {"type": "sphere", "center": [2.0, 0.2, z], "radius": radius}
+
+
+def tube(low, high):
+    return {"type": "cylinder", "p0": [2.0, 0.2, low], "p1": [2.0, 0.2, high], "radius": 0.3}
+
+
+def several(*poses):
+    """A group of a cube in several places."""
+    copies = {f"copy{i}": {"type": "instance", "to_world": p, "g": {"type": "ref", "id": "group"}}
+              for i, p in enumerate(poses)}  # fmt: skip
+    return {"group": {"type": "shapegroup", "one": box(0.0)}} | copies
+
+
+NEAR = pose(0, 0, 2.0)
+
+
+@pytest.mark.parametrize(("parts", "names"), [
+    ({"a": box(0.1)}, "'wall' and 'a'"),
+    ({"a": box(0.399)}, "'wall' and 'a'"),
+    ({"wall": wall(OBLIQUE), "a": box(0.2, OBLIQUE)}, "'wall' and 'a'"),
+    ({"a": ball(0.0)}, "'wall' and 'a'"),
+    ({"a": ball(0.49)}, "'wall' and 'a'"),
+    ({"a": tube(-0.1, 0.5)}, "'wall' and 'a'"),
+    ({"a": {"type": "disk", "to_world": pose(2) @ OBLIQUE}}, "'wall' and 'a'"),
+    (several(pose(0, 0, 0.2), NEAR), "'wall' and 'copy0'"),
+])  # fmt: skip
+def test_bodies_that_run_into_each_other(parts, names):
+    """Named for what moves either one, and for the camera, which sees the line in which they meet."""
+    for moved in ("wall.to_world", "sensor.to_world"):
+        (words,) = crossing(moved, **parts)
+        assert names in words
+    for moved in (BODY, "light.position"):
+        assert crossing(moved, **parts) == []
+
+
+@pytest.mark.parametrize("parts", [
+    {"a": box(0.4)},
+    {"wall": wall(OBLIQUE), "a": box(0.4, OBLIQUE)},
+    {"a": ball(0.5), "b": tube(1.0, 1.3)},
+    {"a": ball(2.0), "dome": ball(2.0, 50.0)},
+    {"a": box(2.0), "room": ball(2.0, 0.9)},
+    several(pose(0, 0, 0.4), NEAR),
+    {"cloud": box(0.1) | {"bsdf": {"type": "null"}, "interior": {"type": "homogeneous", "albedo": 0.5}}},
+])  # fmt: skip
+def test_bodies_that_touch_do_not_run_into_each_other(parts):
+    assert crossing("sensor.to_world", **parts) == []
+
+
+def test_bricks_side_by_side():
+    """The edges of the upper one run along the faces in which the lower ones touch."""
+    bricks = {name: {"type": "cube", "to_world": OBLIQUE @ pose(x, 0, z) @ np.diag([0.4, 0.4, 0.4, 1])}
+              for name, x, z in (("a", 2.6, 2.0), ("b", 3.4, 2.0), ("c", 3.1, 2.8))}  # fmt: skip
+    bricks["wall"] = {"type": "rectangle", "to_world": pose(0, 0, -9)}
+    assert crossing("sensor.to_world", **bricks) == []
+    bricks["c"]["to_world"] = OBLIQUE @ pose(3.1, 0, 2.7) @ np.diag([0.4, 0.4, 0.4, 1])
+    (words,) = crossing("sensor.to_world", **bricks)
+    assert "'c'" in words
+
+
+def test_one_mesh_of_plates_that_cross():
+    """Joined without an edge where they meet."""
+    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    mesh = {"type": "mesh_arrays", "vertices": np.concatenate([corners, corners[:, [0, 2, 1]]]) * 0.3 + [0, 0, 2],
+            "faces": np.concatenate([faces, faces + 4])}  # fmt: skip
+    (words,) = crossing("sensor.to_world", mesh=mesh)
+    assert "parts of 'mesh'" in words
 
 
 def test_the_plan_says_so():

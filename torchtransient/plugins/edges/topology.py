@@ -190,8 +190,7 @@ class Topology:
 
     def __init__(self, scene: Any, hides: Callable[[Any], bool] | None = None) -> None:
         self.without = [shape for shape in shapes_of_scene(scene) if lacks_edges(shape)]
-        bodies = [body for shape in scene.shapes() if not lacks_edges(shape) for body in _bodies(scene, shape)]
-        bodies = [body for body in bodies if hides is None or hides(body.shape)]
+        bodies = [body for body in bodies_of(scene) if hides is None or hides(body.shape)]
         self._meshes = [body for body in bodies if body.shape.is_mesh()]
         self._others = [body for body in bodies if not body.shape.is_mesh()]
         self.bodies = self._meshes + self._others
@@ -269,11 +268,15 @@ def sizes_of_meshes(scene: Any) -> bytes:
     return np.array([(mesh.vertex_count(), mesh.face_count()) for mesh in meshes], np.int64).tobytes()
 
 
-def _bodies(scene: Any, shape: Any) -> list[Body]:
-    if not is_instance(shape):
-        return [Body(shape)]
-    members = members_of(scene, shape)
-    return [Body(one, shape, k) for k, one in enumerate(members) if not lacks_edges(one)]
+def bodies_of(scene: Any) -> list[Body]:
+    """Return the bodies of a scene that have edges or limbs."""
+    bodies = []
+    for shape in scene.shapes():
+        if is_instance(shape):
+            bodies += [Body(member, shape, k) for k, member in enumerate(members_of(scene, shape))]
+        else:
+            bodies.append(Body(shape))
+    return [body for body in bodies if not lacks_edges(body.shape)]
 
 
 def _concatenated(parts: list[Any]) -> Any:

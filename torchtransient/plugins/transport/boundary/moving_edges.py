@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from torchtransient.plugins.edges.topology import Body
 from torchtransient.plugins.host_numbers import host_numbers
 from torchtransient.plugins.mitsuba_compat import (
     attribute_name,
@@ -26,6 +28,7 @@ from torchtransient.plugins.node_walk import bsdfs_of_scene, objects_below, shap
 from torchtransient.plugins.parameter_effect import CORRECT, ParameterEffect
 from torchtransient.plugins.sampling.sun import MovingSun
 from torchtransient.plugins.sensors.seen_from import SensorPlaces, can_be_connected, has_eye, sees_one_line
+from torchtransient.plugins.transport.boundary.crossings import crossing_bodies
 from torchtransient.plugins.transport.media_contents import is_open
 from torchtransient.plugins.transport.strategy import Local
 
@@ -73,8 +76,8 @@ class MovingEdges:
     """What derivatives of a scene lack where edges move, asked by parameter (:meth:`lacking`).
 
     ``always``: gaps of every parameter that moves edges. ``bent``: of what bends light alone. ``scene``: where
-    textures are looked for, None for nowhere. ``words``: gaps that the table of parameters speaks of and that no scene
-    can be said to have.
+    textures and bodies that run into each other are looked for, None for nowhere. ``words``: gaps that the table of
+    parameters speaks of and that no scene can be said to have.
     """
 
     def __init__(
@@ -96,6 +99,8 @@ class MovingEdges:
             # Of what an instance shows, Mitsuba says nothing; a sensor sees everything move.
             alone = effect.role != "sensor" and isinstance(node, mi.Shape) and not is_instance(node)
             found += self._jumps(node if alone else None)
+        if moves and (effect.role == "sensor" or isinstance(node, mi.Shape)):
+            found += self._crossings(None if effect.role == "sensor" else node)
         if effect.role == "sun" and self._scene is not None and _is_in_view(self._scene, node):
             found += (Gap("at the rim of the sun where it is itself in view", "Keep it out of the picture."),)
         return tuple(dict.fromkeys(found))
@@ -123,6 +128,22 @@ class MovingEdges:
             return ()
         where = f"at the steps of textures on what moves (on {_listed(names)})"
         return (Gap(where, "Take a smooth texture there, of filter_type 'bilinear'."),)
+
+
+    @cached_property
+    def _crossing(self) -> list[tuple[Body, Body]]:
+        return [] if self._scene is None else crossing_bodies(self._scene)
+
+    def _crossings(self, shape: Any) -> tuple[Gap, ...]:
+        """The gap of bodies that run into each other, one of which moves with a shape; a sensor, None, sees any."""
+        pairs = self._crossing
+        if shape is not None:
+            moving = frozenset([shape.ptr])
+            pairs = [pair for pair in pairs if any(body.moves(moving) for body in pair)]
+        if not pairs:
+            return ()
+        where = f"where {_listed([_named_pair(*pair) for pair in pairs])} run into each other"
+        return (Gap(where, "Keep a gap between them, or join them to one mesh that has an edge there."),)
 
 
 def missing(reason: str, remedy: str) -> MovingEdges:
@@ -304,6 +325,14 @@ def _has_rim(emitter: Any) -> bool:
 
 def _listed_shapes(shapes: Sequence[Any]) -> str:
     return _listed([_name(shape) for shape in shapes])
+
+
+def _named_pair(one: Body, two: Body) -> str:
+    """Names of two bodies: of instances, where these differ."""
+    if one is two:
+        return f"parts of {_name(one.shape)}"
+    within = one.instance is not None and two.instance is not None and one.instance.ptr == two.instance.ptr
+    return " and ".join(_name(body.shape if within or body.instance is None else body.instance) for body in (one, two))
 
 
 def _name(plugin: Any) -> str:
