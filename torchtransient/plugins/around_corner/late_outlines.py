@@ -18,7 +18,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.polarized import product
-from torchtransient.plugins.transport.boundary.sides import both_sides, past_edge
+from torchtransient.plugins.transport.boundary.sides import BoundaryPass, both_sides, past_edge
 from torchtransient.plugins.transport.boundary.speeds import behind, sides_from
 from torchtransient.plugins.transport.boundary.term import BoundaryTerm
 from torchtransient.plugins.transport.boundary.vertex import VertexPass, displacement_of
@@ -35,13 +35,10 @@ from torchtransient.plugins.transport.world import World
 FIRST = 4
 
 
-class SpotPass:
+class SpotPass(BoundaryPass):
     """An edge point seen from the laser's spot is drawn as :class:`VertexPass` does, and a path goes on behind it, to
     the scanned point.
     """
-
-    def __init__(self, world: Any) -> None:
-        pass
 
     @staticmethod
     def exists(world: Any, sensor: Any) -> bool:
@@ -49,7 +46,6 @@ class SpotPass:
         return bool(world.max_depth >= FIRST)
 
     def run(self, mode: Any, job: Any) -> Any:
-        """Trace the samples of ``job``; returns the objective of reverse mode."""
         term = mode.term
         world, edges, (spots,) = term.world, term.edges, term.world.connections
         rays = term.integrator.start(world.scene, world.contents, term.sensor, term.film, job)

@@ -8,7 +8,7 @@ import mitsuba as mi
 from torchtransient.plugins.edges.table import BESIDE
 from torchtransient.plugins.polarized import attenuated
 from torchtransient.plugins.sensors.seen_from import FAR, can_be_connected
-from torchtransient.plugins.transport.boundary.sides import at_point, in_memory, place_at
+from torchtransient.plugins.transport.boundary.sides import BoundaryPass, at_point, in_memory, place_at
 from torchtransient.plugins.transport.boundary.specular import attached_ray, ratios_of
 from torchtransient.plugins.transport.boundary.speeds import along_the_ray, dragged_share
 from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
@@ -21,7 +21,7 @@ from torchtransient.plugins.transport.walk import go_on, start
 CONTACT = 10 * BESIDE
 
 
-class LightPass:
+class LightPass(BoundaryPass):
     """An edge point p is drawn, then a point y of a light, and a path goes on behind p, on its shadow, to the sensor: a
     walk with one connection (:class:`~..connection.sensor_sampled.SensorSampled`). Its first vertex x is held on the
     ray of the camera where it is connected at once (``direct``), and is a point of its shape where it goes on.
@@ -38,7 +38,6 @@ class LightPass:
         return world.max_depth > 1 and len(world.scene.emitters()) > 0 and can_be_connected(sensor)
 
     def run(self, mode, job):
-        """Trace the samples of ``job``; returns the objective of reverse mode."""
         term = mode.term
         world, edges, sampler, lit = term.world, term.edges, term.sampler(job), term.light_world
         k = edges.pick(edges.by_length, sampler.next_1d(), sampler.next_1d())

@@ -8,7 +8,14 @@ import mitsuba as mi
 from torchtransient.plugins.edges.topology import EDGE
 from torchtransient.plugins.polarized import attenuated
 from torchtransient.plugins.sensors.seen_from import can_be_connected
-from torchtransient.plugins.transport.boundary.sides import at_point, both_sides, in_memory, past_edge, place_at
+from torchtransient.plugins.transport.boundary.sides import (
+    BoundaryPass,
+    at_point,
+    both_sides,
+    in_memory,
+    past_edge,
+    place_at,
+)
 from torchtransient.plugins.transport.boundary.speeds import behind, sides_from, slides
 from torchtransient.plugins.transport.strategy import Local
 
@@ -16,13 +23,10 @@ from torchtransient.plugins.transport.strategy import Local
 FACING = 1e-3
 
 
-class PrimaryPass:
+class PrimaryPass(BoundaryPass):
     """An edge point is drawn, and the pixel that sees it. Creases count, too: a point on a camera's ray slides along
     the ray, and where a face ends under it the light jumps.
     """
-
-    def __init__(self, world):
-        pass
 
     @staticmethod
     def exists(world, sensor):
@@ -30,7 +34,6 @@ class PrimaryPass:
         return world.max_depth > 0 and can_be_connected(sensor)
 
     def run(self, mode, job):
-        """Trace the samples of ``job``; returns the objective of reverse mode."""
         term = mode.term
         world, edges, sampler = term.world, term.edges, term.sampler(job)
         numbers = term.places.numbers(sampler)

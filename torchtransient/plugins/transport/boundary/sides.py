@@ -9,6 +9,31 @@ from torchtransient.plugins.transport.strategy import Local
 from torchtransient.plugins.transport.walk import start
 
 
+class BoundaryPass:
+    """Edges between two kinds of points of a path. Built once a job (a :class:`.term.BoundaryTerm`, which it does not
+    hold: its derivatives would outlive the job).
+    """
+
+    def __init__(self, world):
+        """Prepare what launches share."""
+
+    @staticmethod
+    def exists(world, sensor):
+        """Return whether a job has such edges."""
+        raise NotImplementedError
+
+    def run(self, mode, job):
+        """Trace the edge samples of the launch ``job`` (:class:`~...integrators.launch.Pass`).
+
+        Args:
+            mode: :class:`.weigh.Reverse` or :class:`.weigh.Forward`; ``mode.term`` is the job's term.
+
+        Returns:
+            In reverse mode the attached objective: sums of events times the film's adjoint, times speeds of edges.
+        """
+        raise NotImplementedError
+
+
 def past_edge(world, b, ray, medium, β, sampler, active, seen=False):
     """(the ray past an outline, its leg); of a crease the other face, seen from x. ``seen``: x is the sensor."""
     place = Local(si=dr.zeros(mi.SurfaceInteraction3f), medium=medium, surface=mi.Bool(False))

@@ -23,7 +23,14 @@ from torchtransient.plugins.polarized import attenuated, intensity, product
 from torchtransient.plugins.sensors.seen_from import has_eye
 from torchtransient.plugins.transport.boundary.moving_edges import LONGEST, has_delta_lobe
 from torchtransient.plugins.transport.boundary.primary import where_normals_face
-from torchtransient.plugins.transport.boundary.sides import at_point, both_sides, in_memory, past_edge, place_at
+from torchtransient.plugins.transport.boundary.sides import (
+    BoundaryPass,
+    at_point,
+    both_sides,
+    in_memory,
+    past_edge,
+    place_at,
+)
 from torchtransient.plugins.transport.connection.sensor_sampled import first_row, in_sensor_frame
 from torchtransient.plugins.transport.instances import surface_interaction
 from torchtransient.plugins.transport.scattering.surface import Surface
@@ -311,11 +318,8 @@ def _concatenated(parts):
     return dr.concat([part + dr.zeros(mi.Float, RAYS) for part in parts])
 
 
-class SpecularPass:
+class SpecularPass(BoundaryPass):
     """An edge point is drawn, and the pixel that sees it through a chain, as in the pass of primary edges."""
-
-    def __init__(self, world):
-        pass
 
     @staticmethod
     def exists(world, sensor):
@@ -323,7 +327,6 @@ class SpecularPass:
         return sees_chains(world, sensor)
 
     def run(self, mode, job):
-        """Trace the samples of ``job``; returns the objective of reverse mode."""
         term = mode.term
         world, edges, chains, sampler = term.world, term.edges, term.chains, term.sampler(job)
         numbers = term.places.numbers(sampler)

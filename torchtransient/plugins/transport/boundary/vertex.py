@@ -8,7 +8,7 @@ import mitsuba as mi
 from torchtransient.plugins.mitsuba_compat import is_sphere
 from torchtransient.plugins.polarized import attenuated, product
 from torchtransient.plugins.sensors.seen_from import sees_one_line
-from torchtransient.plugins.transport.boundary.sides import both_sides, in_memory, past_edge
+from torchtransient.plugins.transport.boundary.sides import BoundaryPass, both_sides, in_memory, past_edge
 from torchtransient.plugins.transport.boundary.specular import attached_ray
 from torchtransient.plugins.transport.boundary.speeds import along_the_ray, as_held, behind, dragged, sides_from, slides
 from torchtransient.plugins.transport.contents import DAMPING
@@ -19,16 +19,13 @@ from torchtransient.plugins.transport.walk import advance, first_leg, start
 _SELDOM = 0.1
 
 
-class VertexPass:
+class VertexPass(BoundaryPass):
     """A path is traced to a vertex x, chosen uniformly of those that may have one after them; an edge point seen from
     there is chosen of several candidates in proportion to its span over the squared distance (resampling, Talbot et
     al. 2005). Vertices behind the edge are points of their shapes, so that only outlines matter, and of them the outer
     side, but for what is near x and dragged along, lights included. Lights past edges are found by the pass of the
     lights, or here where paths of lights do not find the sensor.
     """
-
-    def __init__(self, world):
-        pass
 
     @staticmethod
     def exists(world, sensor):
@@ -37,7 +34,6 @@ class VertexPass:
         return world.max_depth > (1 if at_last else 2)
 
     def run(self, mode, job):
-        """Trace the samples of ``job``; returns the objective of reverse mode."""
         term = mode.term
         world, edges = term.world, term.edges
         finds_light = world.finds_light and sees_one_line(term.sensor)
