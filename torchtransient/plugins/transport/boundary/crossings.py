@@ -138,8 +138,8 @@ def _parts(shape: Any) -> list[np.ndarray | None]:
     faces = np.array(shape.faces_buffer(), np.int64).reshape(-1, 3)
     joined = joined_places(host_numbers(shape.vertex_positions_buffer(), np.float32).reshape(-1, 3), faces)
     label = merged(joined, int(joined.max()) + 1)[joined[:, 0]]
-    number = int(label.max()) + 1
-    return [np.flatnonzero(label == k) for k in range(number)] if 1 < number <= _MOST_PARTS else [None]
+    numbers = np.unique(label)
+    return [np.flatnonzero(label == k) for k in numbers] if 1 < len(numbers) <= _MOST_PARTS else [None]
 
 
 def _box(body: Body, rows: np.ndarray | None, triangles: Callable[[Body], Any]) -> np.ndarray:

@@ -129,14 +129,13 @@ class MovingEdges:
         where = f"at the steps of textures on what moves (on {_listed(names)})"
         return (Gap(where, "Take a smooth texture there, of filter_type 'bilinear'."),)
 
-
     @cached_property
-    def _crossing(self) -> list[tuple[Body, Body]]:
+    def _crossing_pairs(self) -> list[tuple[Body, Body]]:
         return [] if self._scene is None else crossing_bodies(self._scene)
 
     def _crossings(self, shape: Any) -> tuple[Gap, ...]:
         """The gap of bodies that run into each other, one of which moves with a shape; a sensor, None, sees any."""
-        pairs = self._crossing
+        pairs = self._crossing_pairs
         if shape is not None:
             moving = frozenset([shape.ptr])
             pairs = [pair for pair in pairs if any(body.moves(moving) for body in pair)]
