@@ -8,6 +8,7 @@ wall, both albedos. 8 x 8 pixels, 64 bins of 8 cm of path, about 100 counts of t
 from __future__ import annotations
 
 import math
+import warnings
 from typing import Any, NamedTuple
 
 import torch
@@ -31,6 +32,8 @@ KEYS = ("wall.to_world", "side.to_world", "wall.bsdf.reflectance.value", "side.b
 BOUNDS = Bounded(LOW - 0.15 * SPAN, HIGH + 0.13 * SPAN, margin=1e-4)  # a little beyond the ranges
 # Both walls before they are moved: squares of 12 m, which have no silhouette in the picture.
 WALL, SIDE = (torch.tensor(m).float() for m in (scale(SIZE), rotate([0, 1, 0], -90) @ scale(SIZE)))
+# The corner in which they meet is out of the picture, and each wall sees it at a grazing angle, without light.
+warnings.filterwarnings("ignore", "the derivative by .* run into each other", tt.errors.GradientWarning)
 
 
 def values_of(unknowns: Tensor) -> dict[str, Tensor]:

@@ -28,7 +28,8 @@ def cornell_box(
     """The standard Cornell box as Mitsuba ships it, with a transient film and integrator. Lengths in metres.
 
     The room is the cube [-1, 1]^3 without its front face, the camera sits at z = 3.90 and looks along -z. Keys of
-    interest: `white`, `red`, `green` (BSDFs), `light`, `small-box`, `large-box`. `large-box` stands on the left;
+    interest: `white`, `red`, `green` (BSDFs), `light`, `small-box`, `large-box`. `large-box` stands on the left, a
+    centimetre deep in the floor (derivatives by its pose lack the line in which they meet, and warn of it);
     `mirror=True` makes it an ideal mirror, `glass=True` a smooth dielectric of refractive index `index` (not both,
     ArgumentError).
 

@@ -89,7 +89,10 @@ def _triangles(body: Body) -> tuple[np.ndarray, np.ndarray]:
     shape = body.shape
     if not shape.is_mesh():
         return _grid(body)
-    points = host_numbers(body.vertices(dr.arange(mi.UInt32, shape.vertex_count()))).T
+    if body.instance is None:
+        points = host_numbers(shape.vertex_positions_buffer()).reshape(-1, 3)
+    else:
+        points = host_numbers(body.vertices(dr.arange(mi.UInt32, shape.vertex_count()))).T
     return points, np.array(shape.faces_buffer(), np.int64).reshape(-1, 3)
 
 
