@@ -7,12 +7,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from support.hidden_shapes import ball, join, mesh
+from support.hidden_shapes import ball, disc, join, mesh
 from torchtransient._collection import no_collection
 from torchtransient.plugins.edges.table import EdgeTable
-from torchtransient.plugins.edges.topology import Topology
+from torchtransient.plugins.edges.topology import Topology, topology_of
 from torchtransient.plugins.frozen_state import state_below
 from torchtransient.plugins.node_walk import members_of
+from torchtransient.plugins.remembered import Remembered
 
 VARIANT = "llvm_ad_mono"
 STRETCH = (0.8, 0.5, 1.2)
@@ -287,6 +288,50 @@ def test_rims_of_two_meshes_are_one_until_they_part():
     params.update()
     length, crease = length_and_two()
     assert length == pytest.approx(16, rel=1e-3) and not crease
+
+
+def total_length(scene, V=(0, 0.1, 9)):
+    """Of all outlines and creases, seen from ``V``."""
+    table = EdgeTable(topology_of(scene, Remembered()), frozenset())
+    u = mi.Float((np.arange(4000, dtype=np.float32) + 0.5) / 4000)
+    b = table.seen_from(table.pick(table.by_length, u, u), mi.Point3f(*V), True)
+    return np.array(dr.select(b.valid, b.inv_pdf, 0), np.float64).mean()
+
+
+@pytest.mark.parametrize("corners", [1500, 4000])
+def test_short_rims_far_from_the_origin(corners):
+    """Ten micrometres are what a coordinate of a hundred metres is rounded to."""
+    v, f = disc(0.3, 1.2, corners)
+    scene = mi.load_dict({"type": "scene", "fan": mesh("fan", (v + [100, 0, 0], f))})
+    assert total_length(scene, (100, 0.1, 9)) == pytest.approx(0.6 * np.pi, rel=0.02)
+
+
+def test_how_near_rims_are_one_does_not_follow_from_other_bodies():
+    plates = {f"r{i}": {"type": "rectangle", "to_world": mi.ScalarAffineTransform4f().translate([0, 0, 0.003 * i])}
+              for i in (0, 1)}  # fmt: skip
+    ground = mi.ScalarAffineTransform4f().translate([0, 0, -5]).scale(1e4)
+    for more in ({}, {"ground": {"type": "rectangle", "to_world": ground}}):
+        topology = Topology(mi.load_dict({"type": "scene", **plates, **more}, optimize=False))
+        assert not topology.has_twins
+
+
+def test_faces_that_get_an_area():
+    """A mesh of none, which has no edges; then it has three, and none again."""
+    flat = mesh("flat", (np.zeros((3, 3)), np.array([[0, 1, 2]])))
+    scene = mi.load_dict({"type": "scene", "r": {"type": "rectangle"}, "flat": flat}, optimize=False)
+    params, memory = mi.traverse(scene), Remembered()
+    for area in (0, 1, 2, 0):
+        params["flat.vertex_positions"] = mi.Float(3, 0, 0, 3, area, 0, 3, 0, area)
+        params.update()
+        topology = topology_of(scene, memory)
+        assert (len(topology.bodies), topology.count - 5) == ((2, 3) if area else (1, 0))
+        EdgeTable(topology, frozenset())
+
+
+def test_an_open_face_seen_edge_on_has_no_outline():
+    scene = mi.load_dict({"type": "scene", "r": {"type": "rectangle"}})
+    assert total_length(scene, (5, 0.3, 0)) == 0
+    assert total_length(scene, (5, 0.3, 1e-3)) == pytest.approx(8, rel=1e-3)
 
 
 def test_what_an_edge_lies_on_is_met_beside_it():

@@ -30,7 +30,7 @@ def compare(case, spp, fd_spp, seeds=SEEDS):
     assert abs(problem.reverse(100, spp, ()) - expected.mean()) > bound
 
 
-@pytest.mark.parametrize("name", ["plate", "shadow_area"])
+@pytest.mark.parametrize("name", ["plate", "shadow_area", "flash"])
 def test_outlines_and_shadows(name):
     compare(CASES[name], 64, 1024, seeds=4)
 
@@ -46,6 +46,7 @@ def test_outlines_and_shadows(name):
         ("torus_shadow", 512, 4096), ("fog_shadow", 256, 8192), ("gated_plate4", 256, 4096),
         ("phasor_shadow", 256, 4096), ("polar_plate", 256, 8192), ("mirror", 256, 8192),
         ("mirror_shadow", 512, 8192), ("mirror_moves", 1024, 4096), ("mirror_camera", 4096, 32768),
+        ("sun_turns4", 256, 4096), ("flash_parallel", 256, 8192), ("in_line", 256, 4096),
         ("glass_rims", 512, 8192), ("glass_moves", 1024, 8192),
     ],
 )  # fmt: skip

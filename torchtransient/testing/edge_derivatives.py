@@ -72,8 +72,8 @@ class EdgeProblem:
         if base.shape == (4, 4):
             rows = [[float(base[i, j]) + x * float(direction[i, j]) for j in range(4)] for i in range(4)]
             value = self._type(mi.Matrix4f(rows))
-        elif self._type is mi.Point3f:
-            value = mi.Point3f(*base.tolist()) + mi.Vector3f(*direction.tolist()) * x
+        elif self._type in (mi.Point3f, mi.Vector3f):
+            value = self._type(*base.tolist()) + mi.Vector3f(*direction.tolist()) * x
         else:
             value = mi.Float(base.ravel()) + mi.Float(direction.ravel()) * x
         self.params[self.case.key] = value

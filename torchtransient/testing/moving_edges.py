@@ -129,6 +129,11 @@ def lens() -> Description:
     return camera() | {"type": "thinlens", "aperture_radius": 0.12, "focus_distance": 2.6}
 
 
+def parallel() -> Description:
+    more: Description = {"type": "orthographic", "to_world": look_at([0, 0, 4], [0, 0, 0]) @ scale([1.4, 1.4, 1])}
+    return {key: value for key, value in camera().items() if key != "fov"} | more
+
+
 def paint(reflectance: float | Description) -> Description:
     return {"type": "twosided", "b": {"type": "diffuse", "reflectance": reflectance}}
 
@@ -199,6 +204,10 @@ def spot() -> Description:
 
 def sun() -> Description:
     return {"type": "directional", "direction": [-0.5, -0.15, -1.0], "irradiance": 3.0}
+
+
+def sunny_sky() -> Description:
+    return {"type": "sunsky", "sun_direction": [0.5, 0.15, 1.0], "sun_scale": 0.1, "sky_scale": 0.1}
 
 
 def even_sky() -> Description:
@@ -336,6 +345,14 @@ def indirect(light: Description | None = None) -> Description:
 
 def plate_and_side(light: Description | None = None, /, **parts: Description) -> Description:
     return scene(4, light, **{"plate": plate(), "side": side(), **parts})
+
+
+def plates_in_line() -> Description:
+    """One as large as the other as the camera sees them."""
+    front, back = ([0.0, 0.0, z] for z in (1.2, 0.2))
+    k = (4 - back[2]) / (4 - front[2])
+    near = rectangle(translate(front) @ scale([0.4, 0.3, 1]), paint(0.2))
+    return scene(2, front=near, back=rectangle(translate(back) @ scale([0.4 * k, 0.3 * k, 1]), paint(0.9)))
 
 
 def coloured(description: Description) -> Description:
@@ -507,6 +524,16 @@ CASES: dict[str, MovingEdge] = {
         None, (-1.201, 0.053), (-1.194, 0.023),
     ),
     "instance4": _edge(instances, "copy.to_world", _PLATE, 0.001, -1.731, (-2.697, 0.011), (-2.691, 0.021)),
+    # ---- in line with each other
+    "flash": _of_plate(lambda: scene(2, point(0.0, 0.0, 4.0), plate=plate())),
+    "flash_ball": _edge(
+        lambda: scene(2, point(0.0, 0.0, 4.0), ball=sphere()), "ball.to_world", _PLATE, 0.004
+    ),
+    "flash_fog": _of_plate(lambda: fog(scene(3, point(0.0, 0.0, 4.0), plate=plate()))),
+    "flash_parallel": _of_plate(
+        lambda: scene(2, {"type": "directional", "direction": [0.0, 0.0, -1.0]}, sensor=parallel(), plate=plate())
+    ),
+    "in_line": _edge(plates_in_line, "sensor.x_fov", widened, 0.2),
     # ---- shadows
     "shadow_point": _of_shadow(lambda: shadow(far_point()), 0.0, (-7.226, 0.026), (-7.186, 0.028)),
     "shadow_area": _of_shadow(lambda: shadow(far_area()), 0.0, (-3.115, 0.012), (-3.110, 0.023)),
@@ -548,6 +575,14 @@ CASES: dict[str, MovingEdge] = {
     ),
     "bulb_moves": _of_light(lambda: shadow(bulb()), -2.798, (-0.587, 0.047), (-0.554, 0.033)),
     "spot_moves": _of_light(lambda: shadow(spot()), -1.206, (1.856, 0.061), (1.783, 0.022)),
+    "sun_turns": _edge(
+        lambda: shadow(sunny_sky()), "light.sun_direction", moved(*_L), 0.004,
+        -0.1349, (-0.0275, 0.0056), (-0.0378, 0.0097), variant=RGB,
+    ),
+    "sun_turns4": _edge(
+        lambda: scene(4, sunny_sky(), cube=cube(), side=side()), "light.sun_direction", moved(*_L), 0.004,
+        0.5318, (0.1292, 0.0049), (0.1290, 0.0062), variant=RGB,
+    ),
     "camera_moves": _edge(
         lambda: scene(2, plate=plate()), "sensor.to_world", moved(*_L), 0.004, -4.793, (-2.797, 0.011), (-2.788, 0.012)
     ),

@@ -11,7 +11,7 @@ from torchtransient.plugins.host_numbers import host_numbers
 
 # Creases flatter than this are no outline: 1 minus the cosine of 1.4e-3 radians.
 FLAT = 1e-6
-# Rims that are nearer than this to each other, in parts of the largest coordinate, are one.
+# Points of rims that are nearer than this to each other, in parts of their largest coordinate, are one.
 APART = 8e-6
 
 
@@ -55,7 +55,8 @@ class Triangles:
 
 def joined_places(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Places of the corners of faces. What is not the same to the bit is the same place if it lies on rims: pieces that
-    were put together by transforms are off by some roundings.
+    were put together by transforms are off by some roundings. No face loses an edge by it: far from the origin, edges
+    may be as short as roundings are long.
     """
     # Adding zero makes one of the two zeros.
     keys = np.ascontiguousarray(positions + np.float32(0)).view("V12").ravel()
@@ -69,19 +70,27 @@ def joined_places(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
         return joined
     label = np.arange(len(sample))
     label[on_rim] = on_rim[near_places(positions[sample[on_rim]])]
+    near = label[joined]
+    lost = (near == near[:, [1, 2, 0]]) & (joined != joined[:, [1, 2, 0]])
+    apart = np.isin(label, near[lost])
+    label[apart] = np.flatnonzero(apart)
     return label[joined]
 
 
 def near_places(positions: np.ndarray) -> np.ndarray:
     """The first of those points that lie at the same place as each of ``positions`` (K, 3), to some roundings."""
     p = positions.astype(np.float64)
-    cell = p / (APART * max(float(np.abs(p).max(initial=0)), 1e-30))
-    # Two points nearer than half a cell share one in some of the eight shifted grids.
+    _, size = np.frexp(np.abs(p).max(axis=1, initial=0))
     groups = []
-    for shift in range(8):
-        of_grid = np.floor(cell + 0.5 * np.array([shift & 1, shift >> 1 & 1, shift >> 2 & 1])).astype(np.int64)
-        _, index, inverse = np.unique(of_grid, axis=0, return_index=True, return_inverse=True)
-        groups.append(np.stack([np.arange(len(p)), index[inverse.ravel()]], 1))
+    # Cells as large as the coordinates ask for; two points on both sides of a power of two have one size in common.
+    for sizes in (size, size + 1):
+        cell = p / np.ldexp(APART, sizes)[:, None]
+        # Two points nearer than half a cell share one in some of the eight shifted grids.
+        for shift in range(8):
+            of_grid = np.floor(cell + 0.5 * np.array([shift & 1, shift >> 1 & 1, shift >> 2 & 1])).astype(np.int64)
+            keys = np.column_stack([of_grid, sizes])
+            _, index, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+            groups.append(np.stack([np.arange(len(p)), index[inverse.ravel()]], 1))
     return merged(np.concatenate(groups), len(p), numbered=False)
 
 

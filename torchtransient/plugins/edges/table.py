@@ -31,8 +31,15 @@ from torchtransient.plugins.transport.strategy import Local
 # How far beside an edge one looks past it, in parts of the largest coordinate. Ten times as far, what a fine mesh hides
 # of its own outlines is missed: 5 % of the shadow of a torus of 2304 triangles.
 BESIDE = 1e-5
+# Ends of a rim of two bodies that are farther apart than this, in parts of their largest coordinate, have come apart.
+_ASTRAY = 4 * APART
 # How many times as far before the edge one begins to look, so that what the edge touches is met.
 BEFORE = 100
+# How far before it, in parts of the distance, one begins to look along the inside of an edge: spheres are taken to hide
+# their own outlines from there only where their radii are more than a hundred times the distance.
+WELL_BEFORE = 0.05
+# Sines of the angle with the line of sight below which a face is seen edge-on: a few roundings.
+_ON_EDGE = 1e-6
 # How far inside of its faces paths start, in parts of the face.
 INSET = 1e-3
 # How far towards the viewer paths start at a limb, in radians: at the limb itself the cosine is rounding.
@@ -113,10 +120,12 @@ class EdgeTable:
             corner = lambda index: dr.gather(mi.Point3f, points, dr.gather(mi.UInt32, index, rows, edge), edge)  # noqa: E731
             self.third = [corner(index) for index in t.corners.third]
         if t.has_twins:
-            apart = 2 * APART * dr.max(dr.max(dr.abs(points)))
             own = (dr.gather(mi.Point3f, dr.detach(end), rows) for end in self.ends)
-            off = [dr.max(dr.abs(p - corner(i))) for p, i in zip(own, t.corners.other, strict=True)]
-            lone = (self.flags & TWIN != 0) & (dr.maximum(*off) > apart)
+            off = [
+                dr.max(dr.abs(p - corner(i))) > _ASTRAY * dr.max(dr.abs(p))
+                for p, i in zip(own, t.corners.other, strict=True)
+            ]
+            lone = (self.flags & TWIN != 0) & (off[0] | off[1])
             self.flags = dr.select(lone, self.flags & ~mi.UInt32(TWO | TWIN), self.flags)
         k = self._row(rows)
         weight = k.length
@@ -256,7 +265,7 @@ class EdgeTable:
             ``p, d, dist``: the point, direction and distance of it; ``n``: out of what hides, across edge and line of
             sight; ``sin`` between these two; ``inv_pdf``: one over the density by length; ``crease``: a face begins
             where another one ends; ``valid``: there is an outline or a crease; ``beside``: where to look past the edge
-            from, a little before it; ``inner``: the face that hides, as intersection of the ray along ``d_in``;
+            from, a little before it; ``within``: the same on the inside, along what hides; ``inner``: the face that hides, as intersection of the ray along ``d_in``;
             ``facing``: the other face of a crease, along ``d``; ``limb``: the place in the space of a limb.
         """
         t, p, length, outside = self._tangent(k), k.near, k.length, mi.Bool(True)
@@ -272,23 +281,28 @@ class EdgeTable:
         s = dr.norm(across)
         ha, hb, two, between = self._faces(k, p, t, d)
         n = across / s
+        # An open face has no outline where it is seen edge-on.
+        shows = two | k.ball | (dr.abs(dr.dot(n, ha)) > _ON_EDGE * (1 + dr.max(dr.abs(p)) / dist))
         n = dr.select(k.ball, limb_n, dr.select(dr.dot(n, ha) > 0, -n, n))
         a_in, b_in = -dr.dot(n, ha), -dr.dot(n, hb)
         crease = two & (b_in < 0)
         # Across the edge, since third corners lie anywhere along it: the nearer face hides.
         other = two & ~crease & (dr.dot(hb, d) * a_in < dr.dot(ha, d) * b_in)
         scale = BESIDE * (1 + dr.max(dr.abs(p)))
-        valid = active & (k.pmf > 0) & (s > 1e-4) & (dist > scale) & outside & between & (dr.max(dr.abs(n)) > 0)
+        valid = active & (k.pmf > 0) & (s > 1e-4) & (dist > scale) & outside & between & shows
+        valid &= dr.max(dr.abs(n)) > 0
         q = p
         if self.topology.rounds:
             inwards = dr.select(k.kind == DISK_RIM, k.a - p, dr.select(k.kind == TUBE_RIM, k.z, 0))
             q = dr.select(k.ball, k.a + self._from_local(k, self._tilted(k, local, d)), p + inwards * INSET)
         t_in = dr.norm(q - V)
-        beside = p - d * dr.minimum(BEFORE * scale, 0.5 * dist) + dr.select(crease, 0, mi.Vector3f(n)) * scale
+        off = dr.select(crease, 0, mi.Vector3f(n)) * scale
+        beside = p - d * dr.minimum(BEFORE * scale, 0.5 * dist) + off
+        within = p - d * dr.clip(BEFORE * scale, WELL_BEFORE * dist, 0.5 * dist) - off
         inverse = dr.select(k.pmf > 0, length / k.pmf, 0)
         return Local(
             k=k, V=V, p=p, d=d, dist=dist, n=mi.Vector3f(n), sin=s, inv_pdf=inverse, crease=crease, valid=valid,
-            beside=beside, d_in=(q - V) / t_in, limb=local, inner=self._leg(k, other, t_in, valid),
+            beside=beside, within=within, d_in=(q - V) / t_in, limb=local, inner=self._leg(k, other, t_in, valid),
             facing=self._leg(k, mi.Bool(True), dist, valid & crease),
         )  # fmt: skip
 

@@ -20,6 +20,7 @@ from torchtransient.plugins.host_numbers import host_numbers, whole_numbers
 from torchtransient.plugins.mitsuba_compat import is_instance, lacks_edges
 from torchtransient.plugins.node_walk import members_of, shapes_of_scene, shown_by
 from torchtransient.plugins.pointer_table import registry_number
+from torchtransient.plugins.remembered import Remembered
 
 # Flags of a row: a second face; seen from between its faces alone; listed for the other face's vertices, too; faces of
 # two bodies.
@@ -114,13 +115,21 @@ def _halves(joined: np.ndarray, rows: np.ndarray) -> np.ndarray:
     return np.stack([np.where(turned, stop, start), np.where(turned, start, stop), face + (k + 2) % 3], 1)
 
 
-def _edges_of(positions: np.ndarray, faces: np.ndarray) -> tuple[_Rows, np.ndarray]:
+def _numbers_of(mesh: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices (V, 3) and faces (F, 3) of a mesh as they are now, and which faces have an area (F,)."""
+    positions = host_numbers(mesh.vertex_positions_buffer(), np.float32).reshape(-1, 3)
+    faces = np.array(mesh.faces_buffer(), np.int64).reshape(-1, 3)
+    corners = positions.astype(np.float64)[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return positions, faces, np.any(normals != 0, axis=1)
+
+
+def _edges_of(positions: np.ndarray, faces: np.ndarray, solid: np.ndarray) -> tuple[_Rows, np.ndarray]:
     """(the edges of a mesh with vertices (V, 3) and faces (F, 3), flat ones included; joined places of the corners of
-    its faces, (F, 3), zeros where a face has no area).
+    its faces, (F, 3), zeros where a face is not ``solid`` (F,): has no area).
     """
     all_places = np.zeros(faces.shape, int)
-    corners = positions.astype(np.float64)[faces]
-    number = np.flatnonzero(np.any(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) != 0, axis=1))
+    number = np.flatnonzero(solid)
     faces = faces[number]
     joined = joined_places(positions.astype(np.float32), faces)
     all_places[number] = joined
@@ -191,10 +200,12 @@ class Topology:
     def __init__(self, scene: Any, hides: Callable[[Any], bool] | None = None) -> None:
         self.without = [shape for shape in shapes_of_scene(scene) if lacks_edges(shape)]
         bodies = [body for body in bodies_of(scene) if hides is None or hides(body.shape)]
-        self._meshes = [body for body in bodies if body.shape.is_mesh()]
+        found = self._found([body.shape for body in bodies if body.shape.is_mesh()])
+        self._meshes = [body for body in bodies if body.shape.ptr in found]
         self._others = [body for body in bodies if not body.shape.is_mesh()]
         self.bodies = self._meshes + self._others
-        rows, owners, starts = self._edges()
+        self.areas_at_first = self.areas()
+        rows, owners, starts = self._edges(found)
         # Ends in numbers of each mesh: gathered from what was gathered, gradients would not arrive (see `ends`).
         own = [rows.ends[owners[:, 0] == k] - start for k, start in enumerate(starts)]
         limbs = [(k, *limb) for k, body in enumerate(self._others, len(starts)) for limb in body.limbs()]
@@ -218,12 +229,23 @@ class Topology:
         self._runs = [(k, len(list(run))) for k, run in groupby(owners[:, 0].tolist())]
         dr.make_opaque(self.faces, self.owners, self.place, self.index, self.shape, self.instance)
 
-    def _edges(self) -> tuple[_Rows, np.ndarray, np.ndarray]:
+    def _found(self, meshes: list[Any]) -> dict[int, tuple[_Rows, np.ndarray]]:
+        """What :func:`_edges_of` says of each mesh that has edges."""
+        self._flat, found = [], {}
+        for mesh in {mesh.ptr: mesh for mesh in meshes}.values():
+            positions, faces, solid = _numbers_of(mesh)
+            if not solid.all():
+                self._flat.append(mesh)
+            if solid.any():
+                found[mesh.ptr] = _edges_of(positions, faces, solid)
+        return found
+
+    def areas(self) -> bytes:
+        """Which faces have an area now, of the meshes in which some had none; empty where there are none."""
+        return b"".join(np.packbits(_numbers_of(mesh)[2]).tobytes() for mesh in self._flat)
+
+    def _edges(self, found: dict[int, tuple[_Rows, np.ndarray]]) -> tuple[_Rows, np.ndarray, np.ndarray]:
         """(edges of all meshes, vertices counted through; bodies of both faces, (E, 2); first vertices of meshes)."""
-        found: dict[int, tuple[_Rows, np.ndarray]] = {}
-        for shape in {body.shape.ptr: body.shape for body in self._meshes}.values():
-            positions = host_numbers(shape.vertex_positions_buffer(), np.float32).reshape(-1, 3)
-            found[shape.ptr] = _edges_of(positions, np.array(shape.faces_buffer(), np.int64).reshape(-1, 3))
         parts = [found[body.shape.ptr][0] for body in self._meshes]
         self.spokes = None
         if parts:
@@ -262,10 +284,14 @@ class Topology:
         return dr.concat([dr.full(mi.Float, float(m), n) for m, (_, n) in zip(moves, self._runs, strict=True)])
 
 
-def sizes_of_meshes(scene: Any) -> bytes:
-    """Numbers of vertices and faces, by which a topology of other meshes is told."""
+def topology_of(scene: Any, memory: Remembered, hides: Callable[[Any], bool] | None = None) -> Topology:
+    """Return the :class:`Topology` of a scene as it is now, kept in ``memory``."""
     meshes = [shape for shape in shapes_of_scene(scene) if shape.is_mesh()]
-    return np.array([(mesh.vertex_count(), mesh.face_count()) for mesh in meshes], np.int64).tobytes()
+    sizes = np.array([(mesh.vertex_count(), mesh.face_count()) for mesh in meshes], np.int64).tobytes()
+    found = memory.of("edges", sizes, lambda: Topology(scene, hides))
+    if (areas := found.areas()) == found.areas_at_first:
+        return found
+    return memory.of("edges", sizes + areas, lambda: Topology(scene, hides))
 
 
 def bodies_of(scene: Any) -> list[Body]:
@@ -302,6 +328,7 @@ def _joined_rims(rows: _Rows, owners: np.ndarray, positions: np.ndarray) -> tupl
         return rows, owners
     ends = rows.ends[rims]
     place = near_places(positions[ends].reshape(-1, 3)).reshape(-1, 2)
+    rims, place = (each[place[:, 0] != place[:, 1]] for each in (rims, place))
     low = np.sort(place, axis=1)
     _, group, count = np.unique(low, axis=0, return_inverse=True, return_counts=True)
     group = group.ravel()

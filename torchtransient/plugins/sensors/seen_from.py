@@ -54,11 +54,12 @@ class SensorPlaces:
         self.cameras = sensors_of(sensor)
         self.is_meter = is_irradiance_meter(sensor)
         self.size = mi.ScalarVector2f(film.crop_size())
+        # Whether each place of the film sees along one ray: edges may be in line with others or with lights then.
+        self.is_sharp = not (self.is_meter or any(camera.needs_aperture_sample() for camera in self.cameras))
 
     def numbers(self, sampler: Any) -> Local:
         """Random numbers that choose (``aperture``, ``wavelength``, ``camera``), constants where there is no choice."""
-        needs_aperture = self.is_meter or any(camera.needs_aperture_sample() for camera in self.cameras)
-        aperture = sampler.next_2d() if needs_aperture else mi.Point2f(0.5)
+        aperture = mi.Point2f(0.5) if self.is_sharp else sampler.next_2d()
         wavelength = sampler.next_1d() if mi.is_spectral else mi.Float(0)
         camera, count = mi.UInt32(0), len(self.cameras)
         if count > 1:

@@ -8,7 +8,7 @@ import mitsuba as mi
 from torchtransient.plugins.edges.table import BESIDE
 from torchtransient.plugins.polarized import attenuated
 from torchtransient.plugins.sensors.seen_from import FAR, can_be_connected
-from torchtransient.plugins.transport.boundary.sides import BoundaryPass, at_point, in_memory, place_at
+from torchtransient.plugins.transport.boundary.sides import BoundaryPass, at_point, in_memory, is_seen_within, place_at
 from torchtransient.plugins.transport.boundary.specular import attached_ray, ratios_of
 from torchtransient.plugins.transport.boundary.speeds import along_the_ray, dragged_share
 from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
@@ -19,6 +19,10 @@ from torchtransient.plugins.transport.walk import go_on, start
 # Distance past an edge, in parts of the largest coordinate, up to which a surface touches it: ten times as far as paths
 # pass beside edges.
 CONTACT = 10 * BESIDE
+# Distance between an edge and a line of sight, in the same unit, up to which they are taken to touch: rays leave
+# surfaces at ten times BESIDE.
+_IN_LINE = 20
+_STEEP = 10.0
 
 
 class LightPass(BoundaryPass):
@@ -31,6 +35,8 @@ class LightPass(BoundaryPass):
         self.lights = EmitterSampled()
         with dr.resume_grad():
             self.lights.prepare(world)
+        delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
+        self.is_sharp = any(mi.has_flag(emitter.flags(), delta) for emitter in world.scene.emitters())
 
     @staticmethod
     def exists(world, sensor):
@@ -54,6 +60,8 @@ class LightPass(BoundaryPass):
         place, far = place_at(b.beside, ray, medium), light.far
         to_light = Local(p=dr.select(far, b.p + ds.d * ds.dist, ds.p), d=-b.d, dist=dr.select(far, ds.dist, b.dist))
         active, T = world.segment.transmittance(world, place, to_light, sampler.next_2d(), sampler, active)
+        if self.is_sharp:  # what is in line with the edge may hide its inside alone
+            active &= is_seen_within(world, b, ray, to_light, medium, sampler, active, seen=False)
         factor = dr.select(active, -most * b.sin * b.inv_pdf, 0)
         factor = dr.select(dr.isfinite(factor), factor, 0)
         ray.o, ray.d = b.beside, b.d
@@ -73,6 +81,9 @@ class LightPass(BoundaryPass):
         # What touches the edge is uncovered for the light and for the vertex before at once, which counts it.
         touches = dr.dot(x.at.p - b.p, b.d) < CONTACT * (1 + dr.max(dr.abs(b.p)))
         path.active = active = active & ~touches
+        term.to_sensor.in_line = None
+        if self.is_sharp and term.places.is_sharp:
+            term.to_sensor.in_line = self._in_line(term, edges, light, x, ray, medium, numbers, sampler, active)
         of_edge, of_path = (vars(b.k), b.n, b.p, b.dist), (x.at.p, x.si.n, path.leg, path.β, path.τ, ray)
         of_chain = None if through is None else vars(through.chain)
         in_memory(world, sampler, of_edge, of_path, of_chain, active, factor, numbers.aperture)
@@ -82,6 +93,33 @@ class LightPass(BoundaryPass):
         sink, factors = mode.sink_of_pixels(middle, job, u, factor, speeds)
         _, kept = go_on(lit, sampler, path, sink)
         return mode.sum_of_pixels(kept, factors)
+
+    def _in_line(self, term, edges, light, x, ray, medium, numbers, sampler, active):
+        """Where the sensor looks along the edge to the shadow at ``x``, as where it is at the light: whether the shadow
+        is ``shown``, as :class:`~..connection.sensor_sampled.SensorSampled` asks for it. Rounding would say so; the pass
+        of the sensor says it here: beside the edge, as the sensor sees it, there is the light or there is the shadow.
+        """
+        world, b, ds = term.world, light.b, light.ds
+        scale = BESIDE * (1 + dr.max(dr.abs(b.p)))
+        seen, _ = term.places.seen_from(x.at, numbers, active)
+        off = dr.norm(dr.cross(b.p - seen.p, mi.Vector3f(seen.d)))
+        near = active & x.surface & (seen.pdf > 0) & (off < _IN_LINE * scale) & (dr.norm(x.at.p - b.p) < seen.dist)
+        outline = edges.seen_from(b.k, mi.Point3f(seen.eye), near)
+        near &= outline.valid & ~outline.crease
+        to_sensor = Local(p=seen.p, d=-outline.d, dist=dr.norm(outline.p - seen.p))
+        place = place_at(outline.beside, ray, medium)
+        free, _ = world.segment.transmittance(world, place, to_sensor, sampler.next_2d(), sampler, near, seen=True)
+        past = mi.Ray3f(ray)
+        past.o, past.d = outline.beside, outline.d
+        si = world.segment.next_surface(world, past, near).compute_surface_interaction(past, mi.RayFlags.All, near)
+        behind = Local(at=si, si=si, medium=medium, surface=mi.Bool(True))
+        to_light = Local(p=dr.select(light.far, si.p + ds.d * ds.dist, ds.p), d=ds.d, dist=ds.dist)
+        lit, _ = world.segment.transmittance(world, behind, to_light, sampler.next_2d(), sampler, near & si.is_valid())
+        # Across the line of the light, on the surface.
+        n, N = mi.Vector3f(b.n), mi.Vector3f(x.si.n)
+        along = dr.clip(dr.dot(n, N) / dr.dot(b.d, N), -_STEEP, _STEEP)
+        step = dr.select(near, (n - b.d * along) * (2 * _IN_LINE * scale), 0)
+        return Local(near=near, shown=free & ~lit, step=step)
 
     def _light(self, term, edges, k, ray, u):
         """A point of a light drawn from the edge ``k``, and the outline seen from there: ``ds, b, far, Le`` (emission

@@ -34,7 +34,7 @@ from torchtransient.plugins.transport.strategy import Local
 
 # Roles of what moves edges against what is behind them, and of what bends light, which moves edges that are seen
 # through it.
-_MOVE, _BEND = ("shape", "emitter", "sensor"), ("index", "normal")
+_MOVE, _BEND = ("shape", "emitter", "sun", "sensor"), ("index", "normal")
 # Of a mesh: they move no point.
 _PLACELESS = ("vertex_normals", "vertex_texcoords")
 # Delta vertices at most between a sensor and the edges that it sees through them: a slab of glass has two, one that is
@@ -62,11 +62,6 @@ class Gap:
         return f"the derivative by {named} is wrong {self.where}: {lacking}. {self.remedy}"
 
 
-_OF_THE_SUN = Gap(
-    "where shadows move with the sun", "Take a far area light for the sun, or keep its shadows out of the picture."
-)
-
-
 def moves_edges(key: str, effect: ParameterEffect) -> bool:
     """Return whether a parameter moves what hides, what is hidden, or who looks; ``key``: its name in the plugin."""
     return effect.moves_silhouette and effect.role in _MOVE and not key.endswith(_PLACELESS)
@@ -92,7 +87,7 @@ class MovingEdges:
         if not (effect.moves_silhouette and effect.supported):
             return ()
         name, moves = key.rsplit(".", 1)[-1], moves_edges(key, effect)
-        found = self.always if moves else (_OF_THE_SUN,) if effect.role == "sun" else ()
+        found = self.always if moves else ()
         if not moves and (effect.role in _BEND or name == "vertex_normals"):
             found += self.bent
         if (moves and effect.role in ("shape", "sensor")) or name == "vertex_texcoords":

@@ -13,6 +13,7 @@ from torchtransient.plugins.transport.boundary.sides import (
     at_point,
     both_sides,
     in_memory,
+    is_seen_within,
     past_edge,
     place_at,
 )
@@ -58,6 +59,8 @@ class PrimaryPass(BoundaryPass):
         medium = world.segment.medium_at(world, b.beside, ray.o, world.segment.medium_towards(b.d), active)
         place, to_sensor = place_at(b.beside, ray, medium), Local(p=ray.o, d=-b.d, dist=way)
         active, T = world.segment.transmittance(world, place, to_sensor, sampler.next_2d(), sampler, active, seen=True)
+        if term.places.is_sharp:  # what is in line with the edge may hide its inside alone
+            active &= is_seen_within(world, b, ray, to_sensor, medium, sampler, active)
         factor = importance * b.sin * b.inv_pdf * weight * share
         β = attenuated(mi.Spectrum(1), mi.UnpolarizedSpectrum(T))
         past = past_edge(world, b, ray, medium, β, sampler, active, seen=True)

@@ -93,6 +93,14 @@ def in_memory(world, sampler, *values):
         dr.eval(values)
 
 
+def is_seen_within(world, b, ray, end, medium, sampler, active, seen=True):
+    """Mask of outlines of which the inner side is seen, too, from the point ``end`` (Local). It is hidden where what is
+    in front ends in line with them: there is but one edge then, that of what is in front.
+    """
+    place = place_at(b.within, ray, medium)
+    return world.segment.transmittance(world, place, end, sampler.next_2d(), sampler, active, seen)[0]
+
+
 def at_point(p, ray=None):
     """An Interaction3f without a normal."""
     it = dr.zeros(mi.Interaction3f)

@@ -24,7 +24,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.edges.table import EdgeTable
-from torchtransient.plugins.edges.topology import Topology, sizes_of_meshes
+from torchtransient.plugins.edges.topology import topology_of
 from torchtransient.plugins.integrators.launch import passes_of, seed_array
 from torchtransient.plugins.sensors.seen_from import SensorPlaces
 from torchtransient.plugins.transport.boundary.light import LightPass
@@ -71,7 +71,7 @@ class BoundaryTerm:
         # Paths through media pass open boundaries, which hide nothing.
         media = world.contents.media
         hides = None if media is None or not media.open_boundaries else lambda shape: not is_open(shape)
-        topology = world.contents.memory.of("edges", sizes_of_meshes(scene), lambda: Topology(scene, hides))
+        topology = topology_of(scene, world.contents.memory, hides)
         self.edges = EdgeTable(topology, moving)
         self.radius = dr.opaque(mi.Float, integrator.reference(scene).radius)
         self.has_vertex_normals = shades_by_other_normals(scene)

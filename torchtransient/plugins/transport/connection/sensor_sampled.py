@@ -23,14 +23,15 @@ class SensorSampled(Connection):
     """``places``: :class:`~..sensors.seen_from.SensorPlaces`; ``numbers``: those that choose the sensor's point, set
     before a launch. ``unwarp``: the segment to the sensor does not count in time. Events carry ``uv``, in pixels, ``d``
     towards the sensor, ``first`` (the path's first vertex is connected), and ``speed``: which of the speeds of a pass
-    of the boundary term is theirs then.
+    of the boundary term is theirs then. ``in_line``: None, or Local with masks ``near`` of paths of which it is known
+    whether the first vertex is ``shown``, and a ``step`` from it to where nothing is in the way then.
     """
 
     name = "sensor_sampled"
     finds_light = False
 
     def __init__(self, places, unwarp):
-        self.places, self.unwarp, self.numbers = places, unwarp, None
+        self.places, self.unwarp, self.numbers, self.in_line = places, unwarp, None, None
 
     def propose(self, world, path, vertex, sampler):
         active = world.deep_enough(vertex.goes_on & vertex.connectable, path.depth + 2)
@@ -47,11 +48,15 @@ class SensorSampled(Connection):
         length = mi.Float(0) if self.unwarp else ds.dist * vertex.η * answer.eta
         opl = vertex.scattered_τ + mi.Float64(length)
         active = world.counted(active, opl)
-        active, T = world.segment.transmittance(world, vertex, ds, proposal.u, proposal.sampler, active, seen=True)
         depth = path.depth + 2
-        return Event(
-            value=value * T, opl=opl, active=active, depth=depth, uv=ds.uv, d=ds.d, first=depth == 2, speed=0
-        )  # fmt: skip
+        first, at, known = depth == 2, vertex, self.in_line
+        if known is not None:
+            at = dr.copy(vertex)
+            at.at = dr.copy(vertex.at)
+            at.at.p += dr.select(first & known.near, known.step, 0)
+        seen, T = world.segment.transmittance(world, at, ds, proposal.u, proposal.sampler, active, seen=True)
+        active = seen if known is None else dr.select(first & known.near, active & known.shown, seen)
+        return Event(value=value * T, opl=opl, active=active, depth=depth, uv=ds.uv, d=ds.d, first=first, speed=0)
 
 
 def first_row(matrix):
