@@ -333,7 +333,7 @@ def variance(options: argparse.Namespace) -> Result:
             found[case.name] = {"failed": f"{type(failure).__name__}: {failure}"[:500]}
             print(f"{case.name}: FAILED {found[case.name]['failed'][:200]}", flush=True)
             continue
-        found[case.name] = row(runs) | {"spp": spp, "variance": float(runs.var(ddof=1)), "support": case.support}
+        found[case.name] = row(runs) | {"spp": spp, "variance": float(runs.var(ddof=1))}
         words = f"{case.name}: {runs.mean():.6g} +- {error(runs):.2g}, variance x spp {runs.var(ddof=1) * spp:.4g}"
         other = before.get(case.name, {})
         if "runs" in other and len(other["runs"]) == len(runs) and other["spp"] == spp and np.var(other["runs"]) > 0:

@@ -64,16 +64,11 @@ def marked(cases):
 
 @pytest.mark.parametrize("case", marked(ALL_CASES))
 def test_modes_and_finite_differences_agree(case):
-    """The modes of every case; finite differences of those that are correct, which are in the same test since a scene
-    is loaded and its kernels are traced once for both.
-    """
+    """In one test, since a scene is loaded and its kernels are traced once."""
     problem = Problem(case)
-    seeds = case.seeds if case.support == "correct" else 1
-    reverse = np.array([problem.reverse(100 + s) for s in range(seeds)])
+    reverse = np.array([problem.reverse(100 + s) for s in range(case.seeds)])
     assert np.isfinite(reverse).all() and reverse[0] != 0
     assert problem.forward(100) == pytest.approx(reverse[0], rel=ROUNDING)
-    if case.support != "correct":
-        return
     differences = np.array([problem.difference(s) for s in range(case.seeds)])
     error = np.sqrt((reverse.var(ddof=1) + differences.var(ddof=1)) / case.seeds)
     assert abs(reverse.mean() - differences.mean()) < SIGMAS * error

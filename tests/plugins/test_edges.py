@@ -302,7 +302,7 @@ def total_length(scene, V=(0, 0.1, 9)):
 def test_short_rims_far_from_the_origin(corners):
     """Ten micrometres are what a coordinate of a hundred metres is rounded to."""
     v, f = disc(0.3, 1.2, corners)
-    scene = mi.load_dict({"type": "scene", "fan": mesh("fan", (v + [100, 0, 0], f))})
+    scene = mi.load_dict({"type": "scene", "fan": mesh("fan", (v + np.array([100, 0, 0]), f))})
     assert total_length(scene, (100, 0.1, 9)) == pytest.approx(0.6 * np.pi, rel=0.02)
 
 

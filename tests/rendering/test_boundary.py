@@ -15,7 +15,7 @@ import torch
 
 import torchtransient as tt
 from support.marks import long
-from torchtransient.errors import GradientError, GradientWarning
+from torchtransient.errors import ArgumentError, GradientError, GradientWarning
 from torchtransient.rendering.variant import active_variant
 from torchtransient.testing.small_room import pose
 
@@ -151,6 +151,33 @@ def test_left_out_it_is_said_once():
     assert len(said(lambda: reverse(strict))[1]) == 1
     for twin in (copy.deepcopy(renderer), pickle.loads(pickle.dumps(renderer)), renderer.variation()):
         assert twin.boundary is False and twin.spp_boundary is None
+
+
+def test_left_out_by_the_scene_it_is_no_error_either():
+    integrator = {"type": "transient_path", "max_depth": 3, "boundary": False}
+    renderer = tt.TransientRenderer(plate(integrator=integrator), [BODY], spp=4, physics="error")
+    _, messages = said(lambda: reverse(renderer))
+    assert len(messages) == 1 and "integrator" in messages[0]
+
+
+@pytest.mark.parametrize("settings", [{"boundary": "no"}, {"boundary": None}, {"boundary": False, "spp_boundary": 8}])
+def test_settings_that_are_none(settings):
+    with pytest.raises(ArgumentError, match=next(reversed(settings))):
+        tt.TransientRenderer(plate(), [BODY], **settings)
+
+
+def test_a_plan_says_which_derivatives_have_the_term():
+    def said_of(key, **parts):
+        reasons = tt.plan(plate(**parts), parameters=[key]).reasons
+        return [reason for reason in reasons if "boundary" in reason or "edges" in reason]
+
+    off = {"integrator": {"type": "transient_path", "max_depth": 3, "boundary": False}}
+    pane = {"pane": MIRROR | {"bsdf": {"type": "dielectric"}}}
+    (on,), (lost,) = said_of(BODY), said_of(BODY, **off)
+    assert BODY in on and "on" in on and "boundary is false" in lost
+    assert said_of(PAINT) == []
+    (bent,) = said_of("pane.bsdf.eta", **pane)
+    assert bent.startswith("approximation")
 
 
 def test_nothing_is_said_without_derivatives():

@@ -310,7 +310,7 @@ def test_what_mirrors_and_glass_lack_is_named_once():
     mirror = {"type": "rectangle", "to_world": transform().translate([0, 0, 3]), "bsdf": {"type": "conductor"}}
     ball = {"type": "sphere", "center": [1, 0, 1], "radius": 0.2, "bsdf": GRAY}
     foggy = {"integrator": "transient_prbvolpath", "cloud": cloud((0, 0, 2), 0.4)}
-    followed, not_followed = ["from other surfaces"], [")"]
+    followed, not_followed = ["but for a camera"], [")"]
     for more, ends in (
         ({"mirror": mirror}, followed),
         ({"mirror": mirror, "sensor": batch(camera)}, followed),

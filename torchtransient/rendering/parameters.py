@@ -21,7 +21,7 @@ from torchtransient.plugins.mitsuba_numbers import check_pose, is_number_of_kern
 from torchtransient.plugins.node_walk import ShownValue, unshared
 from torchtransient.plugins.parameters import ParameterEffect, ParameterTracker
 from torchtransient.plugins.swept_parameters import UNCHECKED, is_checked
-from torchtransient.plugins.transport.boundary.moving_edges import Gap, MovingEdges, moving_edges
+from torchtransient.plugins.transport.boundary.moving_edges import Gap, MovingEdges, moves_edges, moving_edges
 from torchtransient.rendering.build import BuiltScene
 from torchtransient.rendering.taken import without_stand_in
 
@@ -37,8 +37,9 @@ class ParameterInfo:
     ``moves_path_length``, ``moves_silhouette``, ``moves_medium``: whether it can change an optical path length, move a
     visibility edge, change an extinction. ``biased``: its derivative is known to be wrong somewhere: in whatever scene
     (``always_biased``), or where edges move that are not followed in this one, for instance those seen in a mirror
-    (``edges_missing``, in words). ``reason`` says why. ``substitute``: the materials built as
-    others when the key is asked for, by name, with the name of the texture in them ("" for a number).
+    (``edges_missing``, in words). ``has_boundary_term``: it moves edges, and the derivative follows them. ``reason``
+    says why it has none, or where it is wrong. ``substitute``: the materials built as others when the key is asked for,
+    by name, with the name of the texture in them ("" for a number).
     ``place``: names of the parameter and of what its plugin is in. ``checked``: whether the sweep of gradients has
     compared it with finite differences in such a place (``docs/gradients_sweep.md``); the reason says when it has not.
     """
@@ -55,6 +56,7 @@ class ParameterInfo:
     moves_medium: bool = False
     always_biased: bool = False
     edges_missing: tuple[str, ...] = ()
+    has_boundary_term: bool = False
     place: tuple[str, ...] = ()
     checked: bool = True
 
@@ -168,7 +170,9 @@ def _with_gaps(info: ParameterInfo, edges: MovingEdges, tracker: ParameterTracke
         return info
     effect = replace(tracker.effect_of(node, info.key), reason=info.reason)
     missing = tuple(gap.where for gap in edges.lacking(node, info.key, effect))
-    return replace(info, edges_missing=missing, reason=edges.reason(node, info.key, effect))
+    followed = edges.has_term and moves_edges(info.key, effect)
+    reason = edges.reason(node, info.key, effect)
+    return replace(info, edges_missing=missing, has_boundary_term=followed, reason=reason)
 
 
 def _placed(info: ParameterInfo, tracker: ParameterTracker, node: Any) -> ParameterInfo:

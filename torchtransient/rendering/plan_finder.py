@@ -279,13 +279,11 @@ class Finder:
 
     def _note_edges(self, infos: Sequence[ParameterInfo]) -> None:
         """Say which parameters call for the boundary term, and what it leaves out."""
-        moving = [info for info in infos if info.differentiable and info.moves_silhouette]
-        if moving:
-            named = ", ".join(info.key for info in moving)
-            self.reasons.append(f"boundary term: on, since edges move with {named}")
+        if followed := [info.key for info in infos if info.has_boundary_term]:
+            self.reasons.append(f"boundary term: on, since edges move with {', '.join(followed)}")
         self.reasons += [
             f"approximation: the derivative by {info.key} is wrong {', '.join(info.edges_missing)}"
-            for info in moving
+            for info in infos
             if info.edges_missing
         ]
 

@@ -18,7 +18,7 @@ from torchtransient.parametrize.copies import CopiesParametrized
 from torchtransient.plugins.parameters import check_slope
 from torchtransient.plugins.physical_ranges import sun_axes
 from torchtransient.pulses import Pulse
-from torchtransient.quantities import Numbers, shown
+from torchtransient.quantities import Numbers, flag, shown
 from torchtransient.rendering import engine
 from torchtransient.rendering.arguments import (
     Values,
@@ -157,7 +157,12 @@ class TransientRenderer(CopiesParametrized):
         self.temporal_filter = checked_filter(temporal_filter)
         self.grad_seed = checked_grad_seed(grad_seed)
         self.freeze = bool(freeze)
-        self.boundary, self.spp_boundary = bool(boundary), samples("spp_boundary", spp_boundary)
+        self.boundary, self.spp_boundary = flag("boundary", boundary), samples("spp_boundary", spp_boundary)
+        if not self.boundary and self.spp_boundary is not None:
+            raise ArgumentError(
+                "spp_boundary: expected none with boundary=False, which leaves out what they are samples of; leave one "
+                "of both out."
+            )
         self._asked_of_edges: set[str] = set()
         self._watch = PhysicsWatch(physics, self.scene.told)
         changes: dict[str, Any] = {"pulse": checked_pulse("pulse", pulse), "irf": checked_pulse("irf", irf)}
@@ -422,7 +427,7 @@ class TransientRenderer(CopiesParametrized):
             with boundary_term(self.boundary, self.spp_boundary, built.scene.integrator()):
                 found = missing_edges(built, new, self._sensors)
         for gap, keys in found.items():
-            self._watch.gradient(gap.message(keys), is_error=self.boundary)
+            self._watch.gradient(gap.message(keys), is_error=not gap.is_asked_for)
         self._asked_of_edges.update(new)
 
     def _depth_bound(self, given: Mapping[str, Any] | None, tensors: Sequence[torch.Tensor]) -> DepthBound | None:

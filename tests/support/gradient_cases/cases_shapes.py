@@ -11,14 +11,13 @@ CASES = [
     Case("wall_tilt", "shape to_world", room, rotate("wall.to_world", (0, 1, 0)), 0.0, 0.1, spp=4096, fd_spp=32768),
     Case(
         "side_moves",
-        "shape to_world, silhouette seen from a vertex",
+        "shape to_world",
         room,
         move("side.to_world", (-1, 0, 0.4)),
         0.0,
         2e-2,
         spp=4096,
         fd_spp=16384,
-        support="biased where silhouettes move",
     ),
     Case(
         "mesh_vertices",

@@ -1,7 +1,6 @@
 """A gradient case and its problem: one scalar unknown of a scene, the loss, its gradient in both modes.
 
-A case builds a scene and says how the unknown enters the scene's parameters. ``support`` is what the table of
-docs/gradients_table.md prints: ``correct`` or ``biased where silhouettes move``.
+A case builds a scene and says how the unknown enters the scene's parameters.
 """
 
 from __future__ import annotations
@@ -34,7 +33,6 @@ class Case:
     seeds: int = 6
     fd_spp: int = 0
     side: int = 0
-    support: str = "correct"
     tags: tuple[str, ...] = field(default=())
 
     def __post_init__(self):

@@ -32,7 +32,7 @@ from torchtransient.plugins.integrators.base import UNLIMITED
 from torchtransient.plugins.integrators.launch import share_of
 from torchtransient.plugins.properties import number, truth, whole_number
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
-from torchtransient.plugins.transport.boundary.moving_edges import MovingEdges, missing
+from torchtransient.plugins.transport.boundary.moving_edges import MovingEdges, missing, switched_off
 from torchtransient.plugins.transport.connection.emitter_found import EmitterFound
 from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
 from torchtransient.plugins.transport.connection.laser_spot import LaserSpot
@@ -353,7 +353,7 @@ class TransientNLOSPath(base.TransientIntegrator):
 
     def silhouettes(self, scene: Any, sensors: Any = None) -> MovingEdges:
         if not self.boundary:
-            return missing("boundary is false", "Leave boundary out, or set it to true.")
+            return switched_off()
         sensors = scene.sensors() if sensors is None else sensors
         contents = self.contents(scene, sensors[0]) if sensors else None
         if contents is None or not follows_outlines(self._segment(contents), contents):

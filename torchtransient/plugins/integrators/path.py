@@ -5,7 +5,7 @@ from __future__ import annotations
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.integrators.base import TransientIntegrator
 from torchtransient.plugins.properties import truth, whole_number
-from torchtransient.plugins.transport.boundary.moving_edges import missing, moving_edges
+from torchtransient.plugins.transport.boundary.moving_edges import moving_edges, switched_off
 from torchtransient.plugins.transport.boundary.term import BoundaryTerm
 from torchtransient.plugins.transport.connection.emitter_found import EmitterFound
 from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
@@ -48,8 +48,8 @@ class TransientPath(TransientIntegrator):
 
     def silhouettes(self, scene, sensors=None):
         if not self.boundary:
-            return missing("boundary is false", "Leave boundary out, or set it to true.")
-        return moving_edges(scene, scene.sensors() if sensors is None else sensors)
+            return switched_off()
+        return moving_edges(scene, scene.sensors() if sensors is None else sensors, self.max_depth)
 
     def beside(self, world, sensor, film, seed, samples):
         if not (self.boundary and world.wanted.silhouettes):

@@ -95,9 +95,10 @@ class LightPass(BoundaryPass):
         return mode.sum_of_pixels(kept, factors)
 
     def _in_line(self, term, edges, light, x, ray, medium, numbers, sampler, active):
-        """Where the sensor looks along the edge to the shadow at ``x``, as where it is at the light: whether the shadow
-        is ``shown``, as :class:`~..connection.sensor_sampled.SensorSampled` asks for it. Rounding would say so; the pass
-        of the sensor says it here: beside the edge, as the sensor sees it, there is the light or there is the shadow.
+        """Where the sensor sees the shadow at ``x`` past the edge itself, as from a place at the light: whether the
+        shadow is ``shown``, as :class:`~..connection.sensor_sampled.SensorSampled` asks for it. A ray to the sensor
+        would let rounding decide, once more than in the pass of the sensor. That one sees past the edge either what the
+        light reaches, or the shadow: where it is not lit, the edge of the shadow is in view.
         """
         world, b, ds = term.world, light.b, light.ds
         scale = BESIDE * (1 + dr.max(dr.abs(b.p)))

@@ -42,7 +42,7 @@ _PLACELESS = ("vertex_normals", "vertex_texcoords")
 LONGEST = 4
 # Planes of a shape up to which all chains of them are found.
 _PLANES = 32
-_SEEN = "where edges are seen in mirrors or through smooth glass and masks"
+_SEEN = "where edges are seen in mirrors, or through smooth glass or masks"
 _TAKE_ROUGH = "Take a rough surface in place of the smooth one, or keep edges out of its view."
 # Places at which a texture is asked whether it is smooth, along each side.
 _PROBES = 64
@@ -50,10 +50,13 @@ _PROBES = 64
 
 @dataclass(frozen=True)
 class Gap:
-    """Edges that are not followed. ``where``: in words that go on from "correct except"; ``remedy``: a sentence."""
+    """Edges that are not followed. ``where``: in words that go on from "correct except"; ``remedy``: a sentence;
+    ``is_asked_for``: the boundary term was switched off.
+    """
 
     where: str
     remedy: str
+    is_asked_for: bool = False
 
     def message(self, keys: Sequence[str]) -> str:
         """Return the warning that names the parameters ``keys``."""
@@ -72,13 +75,19 @@ class MovingEdges:
 
     ``always``: gaps of every parameter that moves edges. ``bent``: of what bends light alone. ``scene``: where
     textures and bodies that run into each other are looked for, None for nowhere. ``words``: gaps that the table of
-    parameters speaks of and that no scene can be said to have.
+    parameters speaks of and that no scene can be said to have. ``has_term``: whether there is a boundary term at all.
     """
 
     def __init__(
-        self, always: Sequence[Gap] = (), bent: Sequence[Gap] = (), scene: Any = None, words: Sequence[str] = ()
+        self,
+        always: Sequence[Gap] = (),
+        bent: Sequence[Gap] = (),
+        scene: Any = None,
+        words: Sequence[str] = (),
+        has_term: bool = True,
     ) -> None:
         self.always, self.bent, self.words = tuple(always), tuple(bent), tuple(words)
+        self.has_term = has_term
         self._scene = scene
         self._steps: dict[int, list[str]] = {}
 
@@ -140,14 +149,22 @@ class MovingEdges:
         return (Gap(where, "Keep a gap between them, or join them to one mesh that has an edge there."),)
 
 
-def missing(reason: str, remedy: str) -> MovingEdges:
+def missing(reason: str, remedy: str, *, is_asked_for: bool = False) -> MovingEdges:
     """Return the answer of an integrator that computes no boundary term for a ``reason``."""
-    gap = Gap(f"where silhouettes move ({reason})", remedy)
-    return MovingEdges((gap,), (gap,))
+    gap = Gap(f"where silhouettes move, since {reason}", remedy, is_asked_for)
+    return MovingEdges((gap,), (gap,), has_term=False)
 
 
-def moving_edges(scene: Any, sensors: Sequence[Any]) -> MovingEdges:
-    """Return what the passes of the boundary term (:mod:`.term`) leave out in a scene, seen by ``sensors``."""
+def switched_off() -> MovingEdges:
+    """Return the answer of an integrator whose ``boundary`` is false."""
+    remedy = "Take out boundary=False, of the renderer or of the scene's integrator."
+    return missing("boundary is false", remedy, is_asked_for=True)
+
+
+def moving_edges(scene: Any, sensors: Sequence[Any], max_depth: int | None = None) -> MovingEdges:
+    """Return what the passes of the boundary term (:mod:`.term`) leave out in a scene, seen by ``sensors``, of paths
+    with at most ``max_depth`` segments, None for any number.
+    """
     always, bent = rims_without_edges(scene), []
     if rims := [emitter.get_shape() or emitter for emitter in scene.emitters() if _has_rim(emitter)]:
         where = f"at the rim of the light of {_listed_shapes(rims)}"
@@ -165,7 +182,7 @@ def moving_edges(scene: Any, sensors: Sequence[Any]) -> MovingEdges:
         where = f"in light of other wavelengths at the edges of shadows on {_listed([_name(one) for one in delayed])}"
         always.append(Gap(where, "Keep edges that move out of the light of what fluoresces."))
     if smooth := _smooth_shapes(scene):
-        always += _seen_through_delta_lobes(scene, sensors, smooth)
+        always += _seen_through_delta_lobes(scene, sensors, smooth, max_depth)
         bent = edges_in_mirrors(scene)
     return MovingEdges(always, bent, scene)
 
@@ -184,7 +201,9 @@ def edges_in_mirrors(scene: Any) -> list[Gap]:
     return [Gap(f"{_SEEN} ({_listed_shapes(smooth)})", _TAKE_ROUGH)] if smooth else []
 
 
-def _seen_through_delta_lobes(scene: Any, sensors: Sequence[Any], smooth: Sequence[Any]) -> list[Gap]:
+def _seen_through_delta_lobes(
+    scene: Any, sensors: Sequence[Any], smooth: Sequence[Any], max_depth: int | None
+) -> list[Gap]:
     """What is left out where delta lobes of the shapes ``smooth`` show edges, and send light past them."""
     media = any(shape.is_medium_transition() for shape in shapes_of_scene(scene))
     followed = not media and all(has_eye(sensor) and sensor.get_medium() is None for sensor in sensors)
@@ -192,9 +211,9 @@ def _seen_through_delta_lobes(scene: Any, sensors: Sequence[Any], smooth: Sequen
     gaps = []
     if other := [one for one in smooth if one not in plane]:
         gaps.append(Gap(f"{_SEEN} ({_listed_shapes(other)})", _TAKE_ROUGH))
-    if plane:
-        unseen = f"from other surfaces or behind more than {LONGEST} planes, or hide light that comes through them"
-        gaps.append(Gap(f"{_SEEN} ({_listed_shapes(plane)}) {unseen}", _TAKE_ROUGH))
+    if plane and (max_depth is None or max_depth > 2):
+        seen = f"{_SEEN} ({_listed_shapes(plane)}), but for a camera behind at most {LONGEST} planes"
+        gaps.append(Gap(f"{seen}, and where they cast shadows in light from there", _TAKE_ROUGH))
     refracting = [one for one in plane if mi.has_flag(one.bsdf().flags(), mi.BSDFFlags.DeltaTransmission)]
     if refracting and (limbs := [one for one in shapes_of_scene(scene) if has_limb(one)]):
         names = _listed_shapes(refracting)
