@@ -91,6 +91,14 @@ def test_polarization(folder):
 
 
 @pytest.mark.slow
+def test_gradients(folder):
+    """The box that is fitted: from 0.2 radians and 7 cm to what the page says."""
+    found = Page("docs/gradients.md").names()
+    turn, x, z = found["x"].detach()[[1, 3, 5]].tolist()
+    assert abs(turn) < 0.003 and max(abs(x), abs(z)) < 0.004
+
+
+@pytest.mark.slow
 def test_accuracy(folder, capsys):
     found = Page("docs/accuracy.md").names({"resolution=16": "resolution=4"})
     assert set(found["report"].quantities()) and "red.reflectance.value" in capsys.readouterr().out
