@@ -21,9 +21,10 @@ from torchtransient.plugins.polarized import product
 from torchtransient.plugins.transport.boundary.sides import BoundaryPass, both_sides, past_edge
 from torchtransient.plugins.transport.boundary.speeds import behind, sides_from
 from torchtransient.plugins.transport.boundary.term import BoundaryTerm
-from torchtransient.plugins.transport.boundary.vertex import VertexPass, displacement_of
+from torchtransient.plugins.transport.boundary.vertex import CANDIDATES, VertexPass
 from torchtransient.plugins.transport.connection.laser_spot import LaserSpot
 from torchtransient.plugins.transport.scattering.from_light import FromLight
+from torchtransient.plugins.transport.scattering.geometry_terms import displacement
 from torchtransient.plugins.transport.scattering.lambertian import Lambertian
 from torchtransient.plugins.transport.scattering.surface import Surface
 from torchtransient.plugins.transport.segment.material import MaterialVacuum
@@ -61,7 +62,7 @@ class SpotPass(BoundaryPass):
             return dr.select(crease, 0, dr.abs_dot(spot.n, d) / dr.maximum(dr.square(dist), 1e-12))
 
         nowhere = dr.zeros(mi.PreliminaryIntersection3f, dr.width(ray)), mi.Bool(False)
-        k = edges.choose(edges.by_length, sampler, L, nowhere, active, term.candidates, worth)
+        k = edges.choose(edges.by_length, sampler, L, nowhere, active, CANDIDATES, worth)
         b = edges.seen_from(k, L, active)
         b.valid &= ~b.crease
         light = dr.select(b.valid, spot.light(-b.d, b.valid), 0)
@@ -75,7 +76,7 @@ class SpotPass(BoundaryPass):
         factor = most * b.sin * b.inv_pdf / dr.square(b.dist)
         past = past_edge(world, b, ray, None, β, sampler, active)
         with dr.resume_grad():
-            v_L = displacement_of(dr.gather(mi.Point3f, spots.spots.si.p, spots.index, active), active)
+            v_L = displacement(dr.gather(mi.Point3f, spots.spots.si.p, spots.index, active), active)
             speeds = sides_from(world, b, edges, v_L, behind(world, b, *past, active), mi.Float(0), active)
         τ = term.integrator.first_opl(term.film, rays) + mi.Float64(spot.leg)
         if not world.camera_unwarp:

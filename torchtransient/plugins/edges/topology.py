@@ -187,18 +187,16 @@ class Corners:
 
 class Topology:
     """The edges and limbs of ``scene``: ``count`` rows, of which the last ``rounds`` are limbs and rims of what has no
-    triangles. ``without``: the shapes that have outlines, but no edges here. ``hides``: which shapes count, None for
-    all.
+    triangles. ``hides``: which shapes count, None for all.
 
     A plain object of Dr.Jit arrays, to be kept with the scene and to be named as state of recorded calls.
 
     Two meshes that touch along rims have edges there with one face of each, listed for both, with half of the light:
     where they come apart later, each is a rim of its own. What comes together later is not joined, and the order of
-    three and more faces around an edge stays.
+    three and more faces around an edge stays. Faces without area are left out (:func:`topology_of` looks again).
     """
 
     def __init__(self, scene: Any, hides: Callable[[Any], bool] | None = None) -> None:
-        self.without = [shape for shape in shapes_of_scene(scene) if lacks_edges(shape)]
         bodies = [body for body in bodies_of(scene) if hides is None or hides(body.shape)]
         found = self._found([body.shape for body in bodies if body.shape.is_mesh()])
         self._meshes = [body for body in bodies if body.shape.ptr in found]

@@ -54,15 +54,13 @@ class BoundaryTerm:
         integrator, world, sensor, film, seed: of the job.
         samples: edge samples per pixel of each pass.
         names: passes to run, of ``kinds``.
-        candidates: edges that one is chosen from in the vertex pass.
     """
 
     can_be_recorded = True
     kinds = PASSES
 
-    def __init__(self, integrator, world, sensor, film, seed, samples, names=tuple(PASSES), candidates=8):
+    def __init__(self, integrator, world, sensor, film, seed, samples, names=tuple(PASSES)):
         self.integrator, self.world, self.sensor, self.film = integrator, world, sensor, film
-        self.candidates = candidates
         self._sampler = world.contents.memory.of("sampler", b"", lambda: mi.load_dict({"type": "independent"}))
         scene, wanted = world.scene, world.wanted
         views_move = wanted.sensor or wanted.light

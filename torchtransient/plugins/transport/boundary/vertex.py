@@ -12,9 +12,12 @@ from torchtransient.plugins.transport.boundary.sides import BoundaryPass, both_s
 from torchtransient.plugins.transport.boundary.specular import attached_ray
 from torchtransient.plugins.transport.boundary.speeds import along_the_ray, as_held, behind, dragged, sides_from, slides
 from torchtransient.plugins.transport.contents import DAMPING
+from torchtransient.plugins.transport.scattering.geometry_terms import displacement
 from torchtransient.plugins.transport.strategy import Local, Proposal
 from torchtransient.plugins.transport.walk import advance, first_leg, start
 
+# Edges that one is chosen from, which costs no rays.
+CANDIDATES = 8
 # Probability of the last vertex, which only sees the rims of near lights.
 _SELDOM = 0.1
 
@@ -61,7 +64,7 @@ class VertexPass(BoundaryPass):
             return dr.select(~crease | (dist < radius), falls, 0)
 
         at = world.segment.surface_of(path.leg)
-        k = edges.choose(edges.by_length, sampler, x, at, vertex.goes_on, term.candidates, worth)
+        k = edges.choose(edges.by_length, sampler, x, at, vertex.goes_on, CANDIDATES, worth)
         b = edges.seen_from(k, x, vertex.goes_on)
         near = (b.dist < radius) | slides(world, b)
         b.valid &= ~b.crease | near
@@ -163,7 +166,7 @@ class VertexPass(BoundaryPass):
         # A point in a medium divides the way to the surface behind it in a fixed ratio.
         share = world.segment.share_of_surface(path.leg)
         inside = along_the_ray(world, pi, primary, active & ~vertex.surface) * share
-        inside += displacement_of(primary.o, first) * (1 - share)
+        inside += displacement(primary.o, first) * (1 - share)
         return dr.select(active, dr.select(vertex.surface, v, inside), 0)
 
 
@@ -173,8 +176,3 @@ def _has_lights_with_rims(world):
         mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface) and not is_sphere(emitter.get_shape())
         for emitter in world.scene.emitters()
     )
-
-
-def displacement_of(p, active):
-    """Zero with the derivative of ``p`` where active."""
-    return dr.select(active, dr.replace_grad(mi.Vector3f(0), mi.Vector3f(p)), 0)
