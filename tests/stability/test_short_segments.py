@@ -36,8 +36,8 @@ damped_gradients = functools.cache(gradients)
 def test_variance_is_bounded(name):
     """Guards against the derivative of a direction by the place of its vertex, which grows as one over the distance."""
     widths = {gap: damped_gradients(name, gap).std(ddof=1) for gap in GAPS}
-    # Nailed down, it grows tenfold with each row. A width of 16 numbers is good to 18 %.
-    assert max(widths[1e-3], widths[1e-4]) < 2.0 * widths[1e-2]
+    # Nailed down, it grows tenfold with each row, a hundredfold in all. A width of 16 numbers is good to 18 %.
+    assert max(widths[1e-3], widths[1e-4]) < 5.0 * widths[1e-2]
 
 
 @pytest.mark.slow
@@ -57,7 +57,8 @@ def test_mean_at_a_millimetre(name):
     step = posed.case.step
     slopes = np.array([(posed.loss(step, seed) - posed.loss(-step, seed)) / (2 * step) for seed in range(8)])
     error = np.hypot(found.std(ddof=1) / 4, slopes.std(ddof=1) / np.sqrt(8))
-    assert abs(found.mean() - slopes.mean()) < 3 * error
+    # Differences see that rays start 1e-4 m off: of a wall through the floor and of one on it they are 0.8 % apart.
+    assert abs(found.mean() - slopes.mean()) < 3 * error + 0.008 * abs(slopes.mean())
     assert error < 0.05 * abs(slopes.mean())
 
 

@@ -98,6 +98,7 @@ class AreaOfShape(Guide):
     def prepare(self, world):
         self.shape = next(shape for shape in world.scene.shapes() if shape.id() == self.shape_id)
         self.per_area = 1 / self.shape.surface_area()
+        dr.eval(self.per_area)
 
     def draw(self, world, vertex, x, y):
         point = self.shape.sample_position(0.0, mi.Point2f(mi.Float(x), y)).p

@@ -127,7 +127,7 @@ class SensorPlaces:
         way = result.p - at.p
         dist = dr.norm(way)
         uv, pdf = result.uv * self.size, dr.select(valid, mi.Float(1), 0)
-        ds = Local(uv=uv, p=result.p, eye=result.eye, d=way / dist, dist=dist, pdf=pdf, numbers=numbers)
+        ds = Local(uv=uv, p=result.p, eye=result.eye, d=way / dist, dist=dist, pdf=pdf, numbers=numbers, emitter=None)
         return ds, dr.select(valid, result.importance, 0)
 
     @staticmethod
@@ -173,7 +173,7 @@ class SensorPlaces:
         local = mi.Frame3f(ps.n).to_local(-d)
         towards = mi.warp.uniform_disk_to_square_concentric(mi.Point2f(local.x, local.y))
         asked = Local(aperture=towards, wavelength=numbers.wavelength, camera=numbers.camera)
-        ds = Local(uv=uv, p=p, eye=p, d=d, dist=dist, pdf=pdf, n=mi.Normal3f(ps.n), numbers=asked)
+        ds = Local(uv=uv, p=p, eye=p, d=d, dist=dist, pdf=pdf, n=mi.Normal3f(ps.n), numbers=asked, emitter=None)
         # The weight of its rays holds a pi.
         return ds, dr.select(valid, cos * dr.inv_pi / dr.square(dist), 0)
 

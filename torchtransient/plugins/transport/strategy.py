@@ -106,7 +106,10 @@ class Strategy:
     name = ""
 
     def prepare(self, world: Any) -> None:
-        """Once a job, outside of traced code, with gradients enabled: what all lanes share."""
+        """Once a job, outside of traced code, with gradients enabled: what all lanes share. Arrays that are kept are
+        evaluated (``dr.eval``): launches of a job differ in width, and the first one that reads others may widen
+        them to its own.
+        """
 
     def start(self, world: Any, rays: Any) -> None:
         """Before every launch, outside of traced code: what is told by the lane (``rays``: its primary rays)."""

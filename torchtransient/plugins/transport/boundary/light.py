@@ -49,6 +49,7 @@ class LightPass(BoundaryPass):
         k = edges.pick(edges.by_length, sampler.next_1d(), sampler.next_1d())
         numbers = term.places.numbers(sampler)
         middle = term.places.rays_at(world, sampler, term.places.middle(numbers), numbers, total=job.total)
+        lit.start(middle)
         # Nothing attached is kept that forward mode, which follows the speeds, would run into.
         middle.ray, middle.weight, middle.η = dr.detach((middle.ray, middle.weight, middle.η))
         ray = mi.Ray3f(middle.ray)

@@ -48,6 +48,7 @@ class PrimaryPass(BoundaryPass):
         inside &= own
         row, column = dr.select(inside, row, job.first_row), dr.select(inside, column, 0)
         rays = term.places.rays_at(world, sampler, ds.uv, ds.numbers, row, column, job.total)
+        world.start(rays)
         view, ray = mode.view(rays), dr.detach(rays.ray)
         if term.is_meter:
             ray.o = mi.Point3f(eye.p)

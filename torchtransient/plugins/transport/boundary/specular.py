@@ -344,6 +344,7 @@ class SpecularPass(BoundaryPass):
         inside &= own
         row, column = dr.select(inside, row, job.first_row), dr.select(inside, column, 0)
         rays = term.places.rays_at(world, sampler, seen.uv, numbers, row, column, job.total)
+        world.start(rays)
         view = mode.view(rays)
         if term.has_vertex_normals:
             b.inner = where_normals_face(b)

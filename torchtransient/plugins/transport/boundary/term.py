@@ -90,7 +90,8 @@ class BoundaryTerm:
         self.places = SensorPlaces(self.sensor, self.film, self.radius)
         self.is_meter = self.places.is_meter
         if sees_chains(world, self.sensor):
-            self.chains = Chains(integrator, world, self.places, self.independent(self._seed_of_chains, RAYS))
+            with world.contents.hidden_from_mitsuba():
+                self.chains = Chains(integrator, world, self.places, self.independent(self._seed_of_chains, RAYS))
             self.through = SensorThroughChain(self.chains) if world.max_depth > 2 else None
         segment, scattering, _ = integrator.strategies(world.contents)
         if self.has_vertex_normals:

@@ -144,8 +144,10 @@ class Surface(Scattering):
         At the first vertex the samples of a pixel share out among them who draws, and what: they vary less, and lanes
         beside each other look at places beside each other, where their rays find the same boxes and triangles.
         """
-        u, (number, count) = mi.Float64(sampler.next_1d()), self.strata
-        u = dr.select(path.depth == 0, (mi.Float64(number) + u) / mi.Float64(count), u)
+        u = mi.Float64(sampler.next_1d())
+        if self.strata is not None:
+            number, count = self.strata
+            u = dr.select(path.depth == 0, (mi.Float64(number) + u) / mi.Float64(count), u)
         below, own = 0.0, self.own_share(path.depth)
         step.guided, step.point = u < 1 - own, mi.Point3f(vertex.at.p)
         step.shape, step.primitive = dr.zeros(mi.ShapePtr), mi.UInt32(_ANY)
