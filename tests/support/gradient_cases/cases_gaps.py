@@ -133,14 +133,14 @@ CASES = [
     near("polarized", lambda: plates(PLASTIC), variant="llvm_ad_mono_polarized"),
     near("lamp", lamp),
     near("lamp_with_stripes", lambda: lamp(radiance=stripes())),
-    near("lamp_with_a_cone", lambda: lamp(**CONE), spp=65536),
+    near("lamp_with_a_cone", lambda: lamp(**CONE), spp=8192),
     near("tube_with_a_cone", lambda: tube(**CONE)),
     near("lamp_moves", lamp, LAMP, LIGHT),
     near("lamp_with_stripes_moves", lambda: lamp(radiance=stripes()), LAMP, LIGHT),
     near("lamp_tilts", lamp, rotate("light.to_world", (0, 1, 0)), LIGHT, step=0.1),
     near("tube_moves", tube, LAMP, LIGHT),
     near(
-        "lamp_with_a_cone_tilts", lambda: lamp(**CONE), rotate("light.to_world", (0, 1, 0)), LIGHT, step=0.1, spp=65536
+        "lamp_with_a_cone_tilts", lambda: lamp(**CONE), rotate("light.to_world", (0, 1, 0)), LIGHT, step=0.1, spp=8192
     ),
     near("tube_with_a_cone_moves", lambda: tube(**CONE), LAMP, LIGHT),
 ]
