@@ -19,7 +19,7 @@ class Case:
     """One unknown: ``scene()`` is a Mitsuba dictionary, ``apply(params, x)`` writes the attached unknown into it.
 
     ``fd_spp``: samples of the renders for finite differences, as many as ``spp`` when it is not given. ``side``: 1 or
-    -1 for differences on that side of the value alone, where it ends.
+    -1 for differences on that side of the value alone, where it ends. ``off``: by which share of it differences are off.
     """
 
     name: str
@@ -33,6 +33,7 @@ class Case:
     seeds: int = 6
     fd_spp: int = 0
     side: int = 0
+    off: float = 0.0
     tags: tuple[str, ...] = field(default=())
 
     def __post_init__(self):
