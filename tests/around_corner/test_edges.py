@@ -147,19 +147,18 @@ def test_creases_that_are_almost_flat_are_none(angle, edge):
 
 @pytest.mark.parametrize(("apart", "rims"), [(3e-7, 4), (3e-5, 6)])
 def test_rims_that_are_apart(apart, rims):
-    """By more than a hundred thousandth of the largest coordinate they are two."""
+    """By more than a hundred thousandth of their length they are two."""
     _, edges = edges_of(mesh("one", page_at(0)), mesh("other", page_at(np.pi, apart)))
     assert edges.share.sum() == pytest.approx(rims)
 
 
 def test_rims_that_are_near_are_one_wherever_they_lie():
-    """Nearer than half of that along every axis."""
+    """Nearer than half of that, or of their distance from the origin, along every axis."""
     rng = np.random.default_rng(6)
     place = rng.uniform(-0.4, 0.4, (60, 1, 3)) + np.linspace(0, 99, 60)[:, None, None] * [1, 0, 0]
     rim, third = place + rng.normal(size=(60, 2, 3)) * 0.2, rng.normal(size=(60, 1, 3)) * 0.2
     v = np.concatenate([rim, place + third], 1)
-    # Single precision rounds by a tenth of the step from rim to rim.
-    cell = APART * np.abs(v).max()
+    cell = APART * np.abs(rim).max(2).min(1)[:, None, None]
     w = np.concatenate([rim + 0.38 * cell * rng.choice([-1, 1], (60, 1, 3)), place - third], 1)
     faces = np.arange(180).reshape(60, 3)
     _, edges = edges_of(mesh("one", (v.reshape(-1, 3), faces)), mesh("other", (w.reshape(-1, 3), faces)))

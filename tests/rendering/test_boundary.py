@@ -231,7 +231,7 @@ def box(z, tilt=UPRIGHT):
     ({"lamp": LAMP}, BODY, "rim of the light of 'lamp'"),
     ({"wall": STRIPED}, "wall.to_world", "steps.*'wall'"),
     ({"wall": STRIPED}, "sensor.to_world", "steps.*'wall'"),
-    ({"box": box(0.1)}, "box.vertex_positions", "where 'wall' and 'box' run into each other"),
+    ({"box": box(0.1)}, "box.vertex_positions", "where 'box' and 'wall' run into each other"),
 ])  # fmt: skip
 def test_edges_that_are_not_followed(more, key, words):
     scene = plate(**more)
@@ -286,14 +286,14 @@ NEAR = pose(0, 0, 2.0)
 
 
 @pytest.mark.parametrize(("parts", "names"), [
-    ({"a": box(0.1)}, "'wall' and 'a'"),
-    ({"a": box(0.399)}, "'wall' and 'a'"),
-    ({"wall": wall(OBLIQUE), "a": box(0.2, OBLIQUE)}, "'wall' and 'a'"),
-    ({"a": ball(0.0)}, "'wall' and 'a'"),
-    ({"a": ball(0.49)}, "'wall' and 'a'"),
-    ({"a": tube(-0.1, 0.5)}, "'wall' and 'a'"),
-    ({"a": {"type": "disk", "to_world": pose(2) @ OBLIQUE}}, "'wall' and 'a'"),
-    (several(pose(0, 0, 0.2), NEAR), "'wall' and 'copy0'"),
+    ({"a": box(0.1)}, "'a' and 'wall'"),
+    ({"a": box(0.399)}, "'a' and 'wall'"),
+    ({"wall": wall(OBLIQUE), "a": box(0.2, OBLIQUE)}, "'a' and 'wall'"),
+    ({"a": ball(0.0)}, "'a' and 'wall'"),
+    ({"a": ball(0.49)}, "'a' and 'wall'"),
+    ({"a": tube(-0.1, 0.5)}, "'a' and 'wall'"),
+    ({"a": {"type": "disk", "to_world": pose(2) @ OBLIQUE}}, "'a' and 'wall'"),
+    (several(pose(0, 0, 0.2), NEAR), "'copy0' and 'wall'"),
 ])  # fmt: skip
 def test_bodies_that_run_into_each_other(parts, names):
     """Named for what moves either one, and for the camera, which sees the line in which they meet."""

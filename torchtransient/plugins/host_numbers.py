@@ -9,6 +9,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import DTypeLike
 
+# Bytes: the widest packet of Dr.Jit's LLVM.
+_ALIGNMENT = 64
+
 
 def host_numbers(value: Any, dtype: DTypeLike = np.float64) -> np.ndarray:
     """A copy of an array's numbers.
@@ -20,8 +23,22 @@ def host_numbers(value: Any, dtype: DTypeLike = np.float64) -> np.ndarray:
 
 
 def whole_numbers(values: np.ndarray) -> Any:
-    """An array of numpy's as a ``mi.UInt32`` in memory of Dr.Jit's own: what it shares with numpy may lie anywhere, and
-    kernels differ by how their arrays are aligned.
+    """A copy of an array of numpy's as a ``mi.UInt32``."""
+    return mi.UInt32(_aligned(values, np.uint32))
+
+
+def floats(values: np.ndarray) -> Any:
+    """A copy of an array of numpy's as a ``mi.Float``."""
+    return mi.Float(_aligned(values, np.float32))
+
+
+def _aligned(values: np.ndarray, dtype: DTypeLike) -> np.ndarray:
+    """A copy (N,) where Dr.Jit's own arrays would lie: it shares memory with numpy, and kernels differ by how their
+    arrays are aligned, so that others would be compiled in every process.
     """
-    shared = mi.UInt32(np.ascontiguousarray(values, np.uint32))
-    return shared | dr.opaque(mi.UInt32, 0) if len(values) else shared
+    values = np.asarray(values, dtype).ravel()
+    room = np.empty(values.nbytes + _ALIGNMENT, np.uint8)
+    first = -room.ctypes.data % _ALIGNMENT
+    copy = room[first : first + values.nbytes].view(dtype)
+    copy[:] = values
+    return copy

@@ -27,6 +27,11 @@ _POINTERS = {
 _MORE_POINTERS = ("MeshPtr", "TexturePtr")
 
 
+# Entries of tables come in steps: the length is part of kernels, and which plugin has which number depends on the order
+# in which Mitsuba's threads load them.
+_STEP = 64
+
+
 def registry_number(plugin: Any) -> int:
     """The number of a plugin in Dr.Jit's registry. Numbers start at one, each kind of plugin has its own. Raises
     ``SceneError`` for what kernels cannot point to.
@@ -54,7 +59,7 @@ class PointerTable:
 
     def __init__(self, plugins: Sequence[Any], values: Sequence[Any], default: float = 0) -> None:
         numbers = [registry_number(plugin) for plugin in plugins]
-        size = 1 + max(numbers, default=0)
+        size = -(-(1 + max(numbers, default=0)) // _STEP) * _STEP
         self.default = default
         if values and dr.is_array_v(values[0]):
             self.values = dr.full(type(values[0]), default, size)

@@ -113,7 +113,7 @@ AWAY = move("wall.to_world", (0, 0, 1))
 LAMP = move("light.to_world", (0.3, 0.1, 1))
 ROW, LIGHT = "shape to_world", "area light shape"
 STEP = GAP / 10
-# Rays start 1e-4 m beside surfaces: differences of a corner that is built in two ways are so far apart, at a gap of 1 mm.
+# Rays start 1e-4 m beside surfaces: differences of a corner built in two ways are so far apart, at a gap of 1 mm.
 OFF = 0.008
 
 

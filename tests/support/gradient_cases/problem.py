@@ -19,7 +19,7 @@ class Case:
     """One unknown: ``scene()`` is a Mitsuba dictionary, ``apply(params, x)`` writes the attached unknown into it.
 
     ``fd_spp``: samples of the renders for finite differences, as many as ``spp`` when it is not given. ``side``: 1 or
-    -1 for differences on that side of the value alone, where it ends. ``off``: by which share of it differences are off.
+    -1 for differences on that side of the value alone, where it ends. ``off``: the share by which they are off.
     """
 
     name: str

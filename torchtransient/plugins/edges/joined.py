@@ -11,8 +11,10 @@ from torchtransient.plugins.host_numbers import host_numbers
 
 # Creases flatter than this are no outline: 1 minus the cosine of 1.4e-3 radians.
 FLAT = 1e-6
-# Points of rims that are nearer than this to each other, in parts of their largest coordinate, are one.
+# Points of rims that are nearer than this to each other, in parts of their coordinates and rims, are one.
 APART = 8e-6
+# Binary ones of single precision.
+_DIGITS = 24
 
 
 @dataclass
@@ -65,11 +67,16 @@ def joined_places(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
     joined = place[faces]
     key, _ = edge_keys(joined)
     _, back, count = np.unique(key, return_inverse=True, return_counts=True)
-    on_rim = np.unique(joined[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)[count[back.ravel()] == 1])
-    if not len(on_rim):
+    rims = joined[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)[count[back.ravel()] == 1]
+    if not len(rims):
         return joined
+    on_rim, back = np.unique(rims, return_inverse=True)
+    p = positions[sample[on_rim]]
+    ends = back.reshape(-1, 2)
+    reach = np.zeros(len(on_rim))
+    np.maximum.at(reach, ends, np.abs(p[ends[:, 0]] - p[ends[:, 1]]).max(1, keepdims=True))
     label = np.arange(len(sample))
-    label[on_rim] = on_rim[near_places(positions[sample[on_rim]])]
+    label[on_rim] = on_rim[near_places(p, reach)]
     near = label[joined]
     lost = (near == near[:, [1, 2, 0]]) & (joined != joined[:, [1, 2, 0]])
     apart = np.isin(label, near[lost])
@@ -77,20 +84,26 @@ def joined_places(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return label[joined]
 
 
-def near_places(positions: np.ndarray) -> np.ndarray:
-    """The first of those points that lie at the same place as each of ``positions`` (K, 3), to some roundings."""
+def near_places(positions: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """The first of those points that lie at the same place as each of ``positions`` (K, 3), to some roundings.
+
+    ``reach`` (K,): length of the longest rim at each, which a rotation may have rounded by.
+    """
     p = positions.astype(np.float64)
-    _, size = np.frexp(np.abs(p).max(axis=1, initial=0))
-    groups = []
-    # Cells as large as the coordinates ask for; two points on both sides of a power of two have one size in common.
-    for sizes in (size, size + 1):
-        cell = p / np.ldexp(APART, sizes)[:, None]
+    low = np.frexp(np.abs(p).max(axis=1, initial=0))[1] - 1
+    high = np.maximum(low, np.frexp(reach)[1] - 1)
+    # Of smaller coordinates nothing is left.
+    low = np.maximum(low, high - _DIGITS)
+    groups = [np.zeros((0, 2), np.int64)]
+    # Cells for each power of two; points on both sides of one have one in common.
+    for size in range(int(low.min(initial=0)), int(high.max(initial=-1)) + 2):
+        some = np.flatnonzero((low <= size) & (size <= high + 1))
+        cell = p[some] / np.ldexp(APART, size)
         # Two points nearer than half a cell share one in some of the eight shifted grids.
-        for shift in range(8):
+        for shift in range(8 if len(some) else 0):
             of_grid = np.floor(cell + 0.5 * np.array([shift & 1, shift >> 1 & 1, shift >> 2 & 1])).astype(np.int64)
-            keys = np.column_stack([of_grid, sizes])
-            _, index, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-            groups.append(np.stack([np.arange(len(p)), index[inverse.ravel()]], 1))
+            _, index, inverse = np.unique(of_grid, axis=0, return_index=True, return_inverse=True)
+            groups.append(np.stack([some, some[index[inverse.ravel()]]], 1))
     return merged(np.concatenate(groups), len(p), numbered=False)
 
 

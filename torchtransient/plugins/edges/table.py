@@ -31,7 +31,7 @@ from torchtransient.plugins.transport.strategy import Local
 # How far beside an edge one looks past it, in parts of the largest coordinate. Ten times as far, what a fine mesh hides
 # of its own outlines is missed: 5 % of the shadow of a torus of 2304 triangles.
 BESIDE = 1e-5
-# Ends of a rim of two bodies that are farther apart than this, in parts of their largest coordinate, have come apart.
+# Ends of a rim of two bodies that are farther apart than this, in parts of its coordinates and length, have come apart.
 _ASTRAY = 4 * APART
 # How many times as far before the edge one begins to look, so that what the edge touches is met.
 BEFORE = 100
@@ -120,12 +120,10 @@ class EdgeTable:
             corner = lambda index: dr.gather(mi.Point3f, points, dr.gather(mi.UInt32, index, rows, edge), edge)  # noqa: E731
             self.third = [corner(index) for index in t.corners.third]
         if t.has_twins:
-            own = (dr.gather(mi.Point3f, dr.detach(end), rows) for end in self.ends)
-            off = [
-                dr.max(dr.abs(p - corner(i))) > _ASTRAY * dr.max(dr.abs(p))
-                for p, i in zip(own, t.corners.other, strict=True)
-            ]
-            lone = (self.flags & TWIN != 0) & (off[0] | off[1])
+            own = [dr.gather(mi.Point3f, dr.detach(end), rows) for end in self.ends]
+            off = [dr.max(dr.abs(p - corner(i))) for p, i in zip(own, t.corners.other, strict=True)]
+            reach = dr.maximum(dr.norm(own[1] - own[0]), dr.max(dr.maximum(dr.abs(own[0]), dr.abs(own[1]))))
+            lone = (self.flags & TWIN != 0) & (dr.maximum(*off) > _ASTRAY * reach)
             self.flags = dr.select(lone, self.flags & ~mi.UInt32(TWO | TWIN), self.flags)
         k = self._row(rows)
         weight = k.length

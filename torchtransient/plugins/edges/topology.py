@@ -293,9 +293,11 @@ def topology_of(scene: Any, memory: Remembered, hides: Callable[[Any], bool] | N
 
 
 def bodies_of(scene: Any) -> list[Body]:
-    """Return the bodies of a scene that have edges or limbs."""
+    """Return the bodies of a scene that have edges or limbs, by name: Mitsuba orders what it merges by addresses, and
+    kernels would differ from process to process.
+    """
     bodies = []
-    for shape in scene.shapes():
+    for shape in sorted(scene.shapes(), key=lambda shape: str(shape.id())):
         if is_instance(shape):
             bodies += [Body(member, shape, k) for k, member in enumerate(members_of(scene, shape))]
         else:
@@ -325,7 +327,8 @@ def _joined_rims(rows: _Rows, owners: np.ndarray, positions: np.ndarray) -> tupl
     if not len(rims):
         return rows, owners
     ends = rows.ends[rims]
-    place = near_places(positions[ends].reshape(-1, 3)).reshape(-1, 2)
+    lengths = np.abs(positions[ends[:, 0]] - positions[ends[:, 1]]).max(1)
+    place = near_places(positions[ends].reshape(-1, 3), np.repeat(lengths, 2)).reshape(-1, 2)
     rims, place = (each[place[:, 0] != place[:, 1]] for each in (rims, place))
     low = np.sort(place, axis=1)
     _, group, count = np.unique(low, axis=0, return_inverse=True, return_counts=True)

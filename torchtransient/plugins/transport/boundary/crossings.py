@@ -17,7 +17,7 @@ import numpy as np
 from torchtransient.plugins.edges.joined import joined_places, merged
 from torchtransient.plugins.edges.table import BESIDE
 from torchtransient.plugins.edges.topology import BALL, DISK_RIM, Body, bodies_of
-from torchtransient.plugins.host_numbers import host_numbers
+from torchtransient.plugins.host_numbers import floats, host_numbers
 from torchtransient.plugins.mitsuba_compat import bounds_of
 from torchtransient.plugins.pointer_table import registry_number
 from torchtransient.plugins.transport.media_contents import is_open
@@ -232,8 +232,8 @@ def _next_face(
         Distances (N,), infinite for none; registry numbers of shapes and instances and numbers of faces (3, N); cosines
         to normals; whether the place is inside of a triangle and not at its rim.
     """
-    ray = mi.Ray3f(mi.Point3f(o.T), mi.Vector3f(d.T))
-    ray.maxt = mi.Float(length)
+    ray = mi.Ray3f(mi.Point3f(*map(floats, o.T)), mi.Vector3f(*map(floats, d.T)))
+    ray.maxt = floats(length)
     pi = scene.ray_intersect_preliminary(ray, coherent=False)
     si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal)
     u, v = pi.prim_uv

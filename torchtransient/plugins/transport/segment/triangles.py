@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from torchtransient.plugins.host_numbers import whole_numbers
 from torchtransient.plugins.mitsuba_compat import has_vertices
 from torchtransient.plugins.pointer_table import PointerTable
 from torchtransient.plugins.sampling.area_elements import has_shading_normals
@@ -35,7 +36,7 @@ class AttachedTriangles:
             vertices, faces = vertices + mesh.vertex_count(), faces + mesh.face_count()
         # Shapes that are not listed begin at 0.
         self.starts = PointerTable(meshes, starts) if meshes else None
-        self.corners = mi.UInt32(np.concatenate(corners).astype(np.uint32)) if meshes else None
+        self.corners = whole_numbers(np.concatenate(corners)) if meshes else None
         self.vertices = _joined([mesh.vertex_positions_buffer() for mesh in meshes])
 
     def tables(self) -> list[Any]:
