@@ -29,7 +29,7 @@ LEVEL = {
     "plugins": 1, "sensing": 1, "reconstruction": 1, "losses": 1, "metrics": 1, "vis": 1,
     "parametrize": 1, "geometry": 1,
     "scenes": 2,
-    "rendering": 3,
+    "scene": 3, "rendering": 3,
     "files": 4, "nlos": 4, "data": 4, "accuracy": 4, "testing": 4, "training": 4,
     "cli": 5,
     "__main__": 6,
@@ -180,6 +180,7 @@ def is_below(other, room):
         ("array_files", "quantities"), ("array_files", "plain_texts"), ("array_files", "free_memory"),
         ("units", "quantities"), ("stokes", "quantities"), ("given_types", "quantities"), ("pulses", "given_types"),
         ("array_files", "file_places"), ("plain_texts", "file_places"), ("file_places", "quantities"),
+        ("rendering", "scene"), ("scene", "rendering"),
     }  # fmt: skip
     return other in {"errors", "units"} or (room, other) in within
 
@@ -432,7 +433,7 @@ BARE = {
     "plugins/transport/contents.py": {"AttributeError"},  # the protocol of objects
     "plugins/transport/world.py": {"AttributeError"},
     "rendering/films/choices.py": {"KeyError"},  # caught by its callers
-    "rendering/translation.py": {"RuntimeError"},  # what Mitsuba says, told by its caller with the place
+    "scene/edits.py": {"RuntimeError"},  # what Mitsuba says, told by its caller with the place
     "sensing/base/given.py": {"TypeError"},  # a wrong keyword argument, as Python says it
     "sensing/itof/itof_reading.py": {"AttributeError"},  # the protocol of objects
     "sensing/dead_time/free_running_ring.py": {"AssertionError"},  # what its own calls rule out

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from torchtransient.errors import SceneError
 from torchtransient.files.content_key import contents_of
-from torchtransient.rendering.scene_handle import Scene
-from torchtransient.rendering.taken import ReadyScene
 from torchtransient.rendering.variant import active_variant
+from torchtransient.scene.load import Scene
+from torchtransient.scene.objects import ReadyScene
 
 
 def files_of(scene: Scene) -> dict[str, str]:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torchtransient.rendering.plan import inventory_of
-from torchtransient.rendering.plan_choices import some
-from torchtransient.rendering.scene_handle import Scene, load
 from torchtransient.rendering.variant import is_differentiable, resolve_variant
+from torchtransient.scene.inventory import inventory_of
+from torchtransient.scene.load import Scene, load
+from torchtransient.scene.plan import some
 
 
 @dataclass(frozen=True)

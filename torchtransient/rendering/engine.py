@@ -26,12 +26,13 @@ from torchtransient.rendering.films.choice import FilmChoice
 from torchtransient.rendering.films.choices import of_film
 from torchtransient.rendering.interrupts import ends_frames
 from torchtransient.rendering.memory import check_fits
-from torchtransient.rendering.overrides import depth_limit
-from torchtransient.rendering.parameters import needing_slope
-from torchtransient.rendering.physics import are_finite, smallest_and_largest
 from torchtransient.rendering.sample_counts import samples_taken
 from torchtransient.rendering.seeds import Item
-from torchtransient.rendering.session import RenderJob, RunLog, Session, own_array, session_of, wait_for_torch
+from torchtransient.rendering.session import RenderJob, RunLog, Session, session_of
+from torchtransient.scene.edits import depth_limit
+from torchtransient.scene.parameters import needing_slope
+from torchtransient.scene.physics import are_finite, smallest_and_largest
+from torchtransient.scene.values import own_array, wait_for_torch
 
 # ---------------------------------------------------------------------------------------------------------- primal
 

@@ -22,10 +22,10 @@ from torchtransient.rendering.engine import check_values
 from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.recordings import NotRecordedError
 from torchtransient.rendering.renderer import TransientRenderer
-from torchtransient.rendering.scene_handle import Scene
 from torchtransient.rendering.seeds import Seeding
 from torchtransient.rendering.session import RenderJob, Session, session_of
 from torchtransient.rendering.variant import active_variant
+from torchtransient.scene.load import Scene
 
 LABELS = ("depth", "z_depth", "position", "normals", "uv", "albedo", "shape", "primitive", "material")
 # Numbers of things, of which there is no mean.

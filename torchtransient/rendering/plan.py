@@ -13,27 +13,23 @@ from typing import Any
 from torchtransient import plugins
 from torchtransient.argument_names import arguments_of
 from torchtransient.axes import FrequencyAxis, TimeAxis
-from torchtransient.errors import ArgumentError, SceneError, TorchTransientError, UnitError
+from torchtransient.errors import ArgumentError, SceneError, UnitError
 from torchtransient.gates import Gate
 from torchtransient.given_types import text
 from torchtransient.pulses import Pulse
 from torchtransient.quantities import Numbers, as_whole, count, shown
-from torchtransient.rendering import plan_choices as choices
 from torchtransient.rendering.arguments import checked_depth, checked_filter, checked_keys, film_asked_for
-from torchtransient.rendering.effects import Effects
 from torchtransient.rendering.films.choice import FilmChoice
 from torchtransient.rendering.films.choices import all_films, planned
-from torchtransient.rendering.inventory import SceneInventory, take_inventory
-from torchtransient.rendering.mitsuba_words import one_line
-from torchtransient.rendering.node_checks import check_nodes
 from torchtransient.rendering.opaque import opaque
-from torchtransient.rendering.plan_finder import Draft, Finder
-from torchtransient.rendering.plan_pilot import PilotReport
 from torchtransient.rendering.pulse_properties import checked_pulse
 from torchtransient.rendering.renderer import TransientRenderer
-from torchtransient.rendering.scene_handle import Scene, load
-from torchtransient.rendering.taken import ReadyScene
-from torchtransient.rendering.variant import active_variant, resolve_variant
+from torchtransient.rendering.variant import resolve_variant
+from torchtransient.scene import plan as choices
+from torchtransient.scene.inventory import inventory_of
+from torchtransient.scene.load import load
+from torchtransient.scene.pilot import PilotReport
+from torchtransient.scene.plan import Draft, Effects, Finder
 
 # Decisions of a draft that a plan takes over as they are.
 _OF_THE_DRAFT = ("scene", "variant", "integrator", "pulse", "irf", "parameters", "sensor")
@@ -208,37 +204,6 @@ def plan(
     found = finder.settle(pilot, max_depth, time_axis, (num_bins, bin_width_opl), temporal_filter)
     kept = {name: getattr(draft, name) for name in _OF_THE_DRAFT}
     return Plan(outputs=asked, film=kind.name, filter_is_given=temporal_filter is not None, **kept, **vars(found))
-
-
-def inventory_of(scene: Scene, sensor: int = 0) -> SceneInventory:
-    """What the description of a scene contains, and the film of one of its sensors. Raises ``SceneError`` for one that
-    Mitsuba cannot parse.
-    """
-    import mitsuba as mi
-
-    description = scene._description
-    description.check_described("tt.plan")
-    assert not isinstance(description, ReadyScene)  # refused above
-    with active_variant(scene.variant):
-        config = mi.parser.ParserConfig(scene.variant)
-        try:
-            with description.resolved_files(), plugins.plugin_errors():
-                state = description.parse(config)
-                check_nodes(state)
-                mi.parser.transform_upgrade(config, state)
-                return take_inventory(state, _lookup, sensor)
-        except TorchTransientError as error:
-            raise type(error)(f"{description.name}: {error}") from error
-        except (RuntimeError, ValueError, TypeError) as error:
-            raise SceneError(f"{description.name}: Mitsuba could not read the scene. {one_line(error)}") from error
-
-
-def _lookup(name: str) -> Any:
-    from pathlib import Path
-
-    import mitsuba as mi
-
-    return Path(str(mi.file_resolver().resolve(name)))
 
 
 def _taken(name: str, given: str | None, best: choices.Choice) -> str:

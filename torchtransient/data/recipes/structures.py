@@ -21,9 +21,9 @@ from torchtransient.data.recipes.distributions import checked_choices
 from torchtransient.errors import SceneError
 from torchtransient.files.content_key import content_key
 from torchtransient.quantities import Numbers, shown
-from torchtransient.rendering.description import DictDescription, Plain, XmlDescription, describe_dict
-from torchtransient.rendering.scene_handle import Scene, load
-from torchtransient.rendering.taken import ReadyScene
+from torchtransient.scene.description import DictDescription, Plain, XmlDescription, describe_dict
+from torchtransient.scene.load import Scene, load
+from torchtransient.scene.objects import ReadyScene
 
 # The key that stands for the scan of a capture.
 SCAN = "scan"

@@ -19,7 +19,7 @@ from torchtransient.errors import ArgumentError
 
 if TYPE_CHECKING:
     from torchtransient.interfaces import FilmInterface
-    from torchtransient.rendering.plan_pilot import Arrivals
+    from torchtransient.scene.pilot import Arrivals
 
 
 @dataclass(frozen=True)
