@@ -155,7 +155,7 @@ def test_spectra_are_looked_at_in_the_active_variant(monkeypatch, active, loaded
     asked = []
     grey = SimpleNamespace(colours=[], measured=[], bands=[])
     monkeypatch.setattr(variant_choice, "load", lambda scene, variant: asked.append(variant))
-    monkeypatch.setattr(variant_choice, "inventory_of", lambda scene: grey)
+    monkeypatch.setattr(variant_choice, "scene_inventory", lambda scene: grey)
     with mi.variant_context(active):
         found = variant_choice.choose_variant(None, None)
     assert asked == [loaded] and found.name == "llvm_ad_mono"

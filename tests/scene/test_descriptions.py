@@ -19,7 +19,7 @@ from torchtransient.scene.description import (
     describe_dict,
     describe_xml,
 )
-from torchtransient.scene.objects import described_for_time
+from torchtransient.scene.objects import transient_dictionary
 from torchtransient.testing.small_room import GREY, make_room
 
 VARIANT = "llvm_ad_rgb"
@@ -206,7 +206,7 @@ def test_cameras_and_integrators_of_ready_scenes():
         "near_clip": 0.5, "far_clip": 50.0, "shutter_open": 1.5, "shutter_close": 4.0, "film": film,
         "sampler": {"type": "stratified", "sample_count": 9, "jitter": False},
     }  # fmt: skip
-    tree = described_for_time(mi.load_dict(room, optimize=False))
+    tree = transient_dictionary(mi.load_dict(room, optimize=False))
     (integrator,) = (entry for entry in tree.values() if isinstance(entry, dict) and entry["type"] == "volpath")
     assert (integrator["max_depth"], integrator["rr_depth"], integrator["hide_emitters"]) == (-1, 7, True)
     (camera,) = (entry for entry in tree.values() if isinstance(entry, dict) and entry["type"] == "thinlens")
@@ -232,7 +232,7 @@ def test_cameras_and_integrators_of_ready_scenes():
 def test_filters_of_ready_scenes(given, described):
     room = make_room() | {"integrator": {"type": "path", "max_depth": 5}}
     room["sensor"]["film"] = {"type": "hdrfilm", "width": 3, "height": 2, "rfilter": given}
-    tree = described_for_time(mi.load_dict(room, optimize=False))
+    tree = transient_dictionary(mi.load_dict(room, optimize=False))
     films = [entry["film"] for entry in tree.values() if isinstance(entry, dict) and "film" in entry]
     assert [film["rfilter"] for film in films] == [described]
     assert [entry["max_depth"] for entry in tree.values() if isinstance(entry, dict) and "max_depth" in entry] == [5]
@@ -243,7 +243,7 @@ def test_filters_of_ready_scenes(given, described):
 
 
 def test_ready_scenes_that_stay_as_they_are():
-    assert described_for_time(mi.load_dict(make_room(), optimize=False)) is None
+    assert transient_dictionary(mi.load_dict(make_room(), optimize=False)) is None
 
 
 # ------------------------------------------------------------------------------------------------ tried with less

@@ -13,7 +13,7 @@ import torch
 import torchtransient as tt
 from support.sweeps import together
 from support.text_files import SCENE
-from torchtransient.errors import ArgumentError
+from torchtransient.errors import ArgumentError, SceneError
 from torchtransient.rendering.variant import active_variant
 from torchtransient.testing.small_room import CAMERA, COLOUR, VARIANT, make_room, pose
 
@@ -403,3 +403,14 @@ def test_many_settings_of_one_scene():
     for depth in range(3, 12):
         tt.TransientRenderer(scene, spp=1, max_depth=depth)
     torch.testing.assert_close(first(seed=0).steady, expected, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("name", ["to_world", "to_uv"])
+def test_transforms_that_are_numbers(name):
+    room = make_room()
+    if name == "to_world":
+        room["box"]["to_world"] = 2.0
+    else:
+        room["wall"]["bsdf"] = {"type": "diffuse", "reflectance": {"type": "checkerboard", "to_uv": 2.0}}
+    with pytest.raises(SceneError, match=name):
+        tt.load(room, variant=VARIANT).parameters()

@@ -8,7 +8,8 @@ import pytest
 
 from torchtransient.errors import SceneError
 from torchtransient.scene.checks import check_nesting, check_nodes
-from torchtransient.scene.inventory import name_of, take_inventory
+from torchtransient.scene.inventory import take_inventory
+from torchtransient.scene.nodes import node_label
 
 VARIANT = "llvm_ad_rgb"
 DIFFUSE = '<bsdf type="diffuse"><float name="reflectance" value="0.3"/></bsdf>'
@@ -167,12 +168,12 @@ def test_nodes_are_called_by_plugin_name_and_place(tmp_path):
     (folder / "room.xml").write_text("<scene version='3.0.0'>\n" + "\n".join(lines) + "\n</scene>")
     config = mi.parser.ParserConfig(mi.variant())
     state = mi.parser.parse_file(config, str(folder / "room.xml"))
-    assert name_of(state, 0) == "scene, room.xml (line 1, col 2)"
-    assert [name_of(state, index) for index in (1, 2)] == [
+    assert node_label(state, 0) == "scene, room.xml (line 1, col 2)"
+    assert [node_label(state, index) for index in (1, 2)] == [
         "sphere, room.xml (line 2, col 2)", "cube 'box', room.xml (line 3, col 2)"]  # fmt: skip
     described = {"type": "scene", "box": {"type": "cube"}, "wall": {"type": "rectangle", "id": "front"}}
     state = mi.parser.parse_dict(config, described)
-    names = {name_of(state, index) for index in (1, 2)}
+    names = {node_label(state, index) for index in (1, 2)}
     assert names == {"cube 'box' at 'box'", "rectangle 'front' at 'wall'"}
 
 
@@ -242,10 +243,3 @@ def test_strength_of_orthogonal_samples():
     assert refused(mi.ObjectType.Sampler, "orthogonal", strength=2) is None
     assert "strength: expected a whole number from 2" in refused(mi.ObjectType.Sampler, "orthogonal", strength=1)
     assert refused(mi.ObjectType.Sampler, "independent", strength=1) is None
-
-
-@pytest.mark.parametrize(("name", "size"), [("to_world", "(4, 4)"), ("to_uv", "(3, 3)")])
-def test_transforms_are_transforms(name, size):
-    assert f"{name}: expected a transform, a {size} array" in refused(mi.ObjectType.Shape, "sphere", **{name: 2.0})
-    assert refused(mi.ObjectType.Shape, "sphere", to_world=mi.ScalarTransform4f()) is None
-    assert refused(mi.ObjectType.Shape, "sphere", radius=2.0) is None

@@ -211,7 +211,7 @@ def test_many_findings_are_a_few_words(room):
     for n in range(9):
         room[f"cube_{n}"] = {"type": "cube", "bsdf": bad, "to_world": pose(0.0, 0.0, 0.1 * n, 0.01)}
     _, messages = said(tt.TransientRenderer, loaded(room), spp=1)
-    assert len(messages) == 4 and messages[-1].endswith("So are 5 more.") and "cube_3.bsdf" in messages[-1]
+    assert len(messages) == 4 and messages[-1].endswith(" 5 more of such values.") and "cube_3.bsdf" in messages[-1]
 
 
 # --------------------------------------------------------------------------------------------------------------- given

@@ -7,13 +7,11 @@ import pytest
 import torch
 
 from torchtransient.errors import PhysicsError, PhysicsWarning
-from torchtransient.plugins.physical_ranges import ANGLE, INDEX, ROUGHNESS, SHARE
+from torchtransient.plugins.physical_ranges import SHARE
 from torchtransient.scene.physics import (
     PhysicsWatch,
     are_finite,
     is_singular,
-    outside_message,
-    scene_findings,
     smallest_and_largest,
 )
 
@@ -26,49 +24,19 @@ def messages(function, *arguments):
     return [str(one.message) for one in caught]
 
 
-def watch(mode="warn", told=None):
-    return PhysicsWatch(mode, set() if told is None else told)
+def watch(mode="warn"):
+    return PhysicsWatch(mode, set())
 
 
 # ------------------------------------------------------------------------------------------------------------ ranges
 
 
-def test_shares_say_which_end_they_left():
-    assert "reaches 1.5, more than all:" in outside_message("k", SHARE, -0.5, 1.5)
-    assert "reaches -0.5, less than nothing:" in outside_message("k", SHARE, -0.5, 0.9)
 
 
-@pytest.mark.parametrize(
-    ("limits", "low", "high", "said"),
-    [
-        (ANGLE, -3.0, 20.0, "reaches -3: expected more than 0 and less than 180."),
-        (ANGLE, 20.0, 200.0, "reaches 200: expected more than 0 and less than 180."),
-        (INDEX, 0.0, 2.0, "reaches 0: expected more than 0."),
-        (ROUGHNESS, -0.25, 0.5, "reaches -0.25: expected at least 0."),
-    ],
-)
-def test_other_ranges_say_what_was_expected(limits, low, high, said):
-    assert said in outside_message("k", limits, low, high)
 
 
-def test_findings_of_a_description():
-    found = scene_findings(
-        [("a", SHARE, 0.0, 1.0), ("b", SHARE, -0.5, 0.5), ("c", SHARE, 0.5, 1.5), ("d", ANGLE, 1.0, 179.0)],
-        {"e": np.diag([1.0, 0.0, 1.0, 1.0]), "f": np.eye(4)},
-        ["beam"],
-    )
-    assert list(found) == ["beam", "b", "c", "e"]
-    assert found["beam"].startswith("'beam' is black here") and "no inverse" in found["e"]
 
 
-@pytest.mark.parametrize(
-    ("count", "end"), [(3, None), (4, None), (5, " So is 1 more."), (6, " So are 2 more."), (9, " So are 5 more.")]
-)
-def test_four_findings_are_said_and_the_others_counted(count, end):
-    said = messages(watch().scene, {f"key {n}": f"message {n}." for n in range(count)})
-    assert [one[:10] for one in said] == [f"message {n}." for n in range(min(count, 4))]
-    assert all(len(one) == 10 for one in said[:3])
-    assert end is None or said[3][10:] == end
 
 
 def test_both_ends_of_a_range_are_said_once_each():
@@ -188,25 +156,12 @@ def test_windows_are_errors_each_time():
             each.window(40.0, 3.0, 7.0)
 
 
-def test_what_a_built_scene_shows():
-    """It is asked for each sensor, unless nothing is to be looked at."""
-    asked = []
-    each = watch()
-    each.placed("scene", 3)
-    each.installed = lambda scene, sensor: asked.append((scene, sensor)) or {"about": "It is so."}
-    assert messages(each.placed, "scene", 3) == ["It is so."]
-    assert messages(each.placed, "scene", 4) == []
-    assert asked == [("scene", 3), ("scene", 4)]
-    silent = watch("ignore")
-    silent.installed = each.installed
-    assert messages(silent.placed, "scene", 5) == [] and len(asked) == 2
-    assert each.looks and not silent.looks
 
 
 def test_warnings_point_at_the_line_outside():
     """Of the library and of torch, however many calls of theirs are in between."""
     calls = (
-        lambda: watch().tell("a", "b"),
+        lambda: watch().warn("a", "b"),
         lambda: watch().scene({"a": "b"}),
         lambda: torch.func.vmap(lambda x: (watch().scene({"a": "b"}), x)[1])(torch.ones(2)),
     )

@@ -11,7 +11,7 @@ import torchtransient as tt
 from support import plan_scenes
 from torchtransient.errors import ArgumentError, GradientError, SceneError, UnitError, VariantError
 from torchtransient.rendering.films import Gates
-from torchtransient.scene.inventory import inventory_of
+from torchtransient.scene.inventory import scene_inventory
 
 VARIANT = "llvm_ad_rgb"
 
@@ -364,6 +364,6 @@ def test_reading_a_scene_is_quick():
     seconds = []
     for _ in range(7):
         begin = time.perf_counter()
-        inventory_of(scene)
+        scene_inventory(scene)
         seconds.append(time.perf_counter() - begin)
     assert min(seconds) < 0.05

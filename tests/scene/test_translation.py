@@ -15,7 +15,7 @@ import torch
 import torchtransient as tt
 from torchtransient.errors import GradientError, PhysicsError, PhysicsWarning, SceneError
 from torchtransient.rendering.films import Gates, Histogram, Phasors
-from torchtransient.scene.edits import BuildOptions, shown_properties
+from torchtransient.scene.edits import BuildOptions, printed_properties
 from torchtransient.scene.values import may_have_derivative
 
 VARIANT = "llvm_ad_rgb"
@@ -60,7 +60,7 @@ def translated(scene, **options):
 
 def of_paths(integrator):
     """max_depth (-1: no limit), rr_depth, hide_emitters"""
-    shown = {**shown_properties(integrator), **getattr(integrator, "__dict__", {})}
+    shown = {**printed_properties(integrator), **getattr(integrator, "__dict__", {})}
     depth, first = int(shown["max_depth"]), int(shown["rr_depth"])
     return -1 if depth == 2**32 - 1 else depth, first, bool(integrator.hide_emitters)
 

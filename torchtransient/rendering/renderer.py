@@ -163,7 +163,7 @@ class TransientRenderer(CopiesParametrized):
                 "of both out."
             )
         self._asked_of_edges: set[str] = set()
-        self._watch = PhysicsWatch(physics, self.scene.told)
+        self._watch = PhysicsWatch(physics, self.scene.warned)
         changes: dict[str, Any] = {"pulse": checked_pulse("pulse", pulse), "irf": checked_pulse("irf", irf)}
         changes |= {"film": film, "steady": bool(steady)}
         changes["integrator"] = effects.integrator if isinstance(effects, Effects) else None
@@ -226,7 +226,7 @@ class TransientRenderer(CopiesParametrized):
             )
 
     def _look_at_scene(self) -> None:
-        if self._watch.looks:
+        if self._watch.enabled:
             built = self.scene.built(self._options)
             slots = self.scene.slots(self._keys, self._options).slots
             if self.film.count > 1 or self.effective_filter in ("", "box"):
@@ -426,7 +426,7 @@ class TransientRenderer(CopiesParametrized):
             with boundary_term(self.boundary, self.spp_boundary, built.scene.integrator()):
                 found = missing_edges(built, new, self._sensors)
         for gap, keys in found.items():
-            self._watch.gradient(gap.message(keys), is_error=not gap.is_asked_for)
+            self._watch.warn_of_gradient(gap.message(keys), is_error=not gap.is_asked_for)
         self._asked_of_edges.update(new)
 
     def _depth_bound(self, given: Mapping[str, Any] | None, tensors: Sequence[torch.Tensor]) -> DepthBound | None:

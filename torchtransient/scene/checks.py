@@ -1,4 +1,4 @@
-"""What of a parsed scene Mitsuba would not refuse, and die of, never end with, or fail at much later."""
+"""Checks of a parsed scene: mistakes that Mitsuba crashes of, never ends with, or renders wrongly without a word."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from torchtransient.errors import SceneError
 from torchtransient.file_places import check_special
 from torchtransient.plugins.finite_values import count_bad, numbers_of, refuse
 from torchtransient.quantities import shown
-from torchtransient.scene.nodes import children, is_film, kind_of_node
-from torchtransient.scene.objects import ReadyScene
+from torchtransient.scene.nodes import children, is_film, node_kind
+from torchtransient.scene.objects import LoadedScene
 
 # Nodes inside of nodes, references counted. Kernels hold a call inside of a call for each, and the time to build them
 # grows with a power of their number: 16 take seconds.
@@ -29,14 +29,14 @@ _MOST = 2**31 - 1
 _SIZES = ("width", "height", "crop_width", "crop_height")
 
 
+# --------------------------------------------------------------------------------------------------------------- nodes
+
+
 def check_nodes(state: Any) -> None:
-    """Raise ``SceneError`` for a scene that is nested too deeply, for numbers of samples and sizes of films below one,
-    and for transforms that are none.
-    """
+    """Raise ``SceneError`` for nodes nested too deeply, and for numbers of samples and sizes of films below one."""
     check_nesting(state)
     for node in state.nodes:
-        _check_transforms(node)
-        if kind_of_node(node) == "Sampler":
+        if node_kind(node) == "Sampler":
             _check_whole(node, "sample_count")
             if node.props.plugin_name() == "orthogonal":
                 _check_whole(node, "strength", least=2)
@@ -56,24 +56,16 @@ def _check_whole(node: Any, name: str, least: int = 1) -> None:
         )
 
 
-def _check_transforms(node: Any) -> None:
-    for name in ("to_world", "to_uv"):
-        given = node.props.get(name, None)
-        if given is not None and not hasattr(given, "matrix"):
-            size = "(3, 3)" if name == "to_uv" else "(4, 4)"
-            raise SceneError(
-                f"{_name(node)}: {name}: expected a transform, a {size} array or one of Mitsuba's, got {shown(given)}."
-            )
-
-
 def _name(node: Any) -> str:
     name, plugin = node.props.id(), node.props.plugin_name()
     return f"{name!r} ({plugin})" if name else plugin
 
 
 def check_nesting(state: Any) -> None:
-    """Raise ``SceneError`` where nodes stand in nodes more than 32 deep, or a surface holds more than 256 nodes, each
-    counted as often as it is reached. Circles of references are left to Mitsuba, which names them.
+    """Raise ``SceneError`` for nodes inside of nodes more than 32 deep, and for surfaces of more than 256 nodes.
+
+    Each node of a surface counts as often as it is reached. Circles of references are left to Mitsuba, which names
+    them.
     """
     levels: dict[int, int] = {}
     sizes: dict[int, int] = {}
@@ -97,23 +89,42 @@ def check_nesting(state: Any) -> None:
             if levels[index] > MOST_LEVELS:
                 raise SceneError(
                     f"{_name(state.nodes[index])}: expected nodes inside of nodes at most {MOST_LEVELS} deep, got "
-                    "more. Kernels are not built of deeper ones in a time that anybody waits for."
+                    "more. Kernels of deeper ones take hours to build."
                 )
 
 
 def _size(node: Any, inside: int) -> int:
-    if kind_of_node(node) not in _EXPANDED:
+    if node_kind(node) not in _EXPANDED:
         return 1
     size = 1 + (2 if node.props.plugin_name() in _REACHED_TWICE else 1) * inside
     if size > MOST_EXPANDED:
         raise SceneError(
             f"{_name(node)}: expected at most {MOST_EXPANDED} nodes in one surface, medium or light, each counted as "
-            f"often as it is reached, got {size}. Kernels are not built of more in a time that anybody waits for."
+            f"often as it is reached, got {size}. Kernels of more take hours to build."
         )
     return size
 
 
-# Plugins that hand on what a file says; Mitsuba checks the faces of an 'obj' itself.
+def check_finite(state: Any) -> None:
+    """Raise ``SceneError`` with the keys of all numbers of a parsed scene that are NaN or infinite."""
+    bad: dict[str, str] = {}
+    waiting, seen, by_id = [(state.root, "")], set(), state.id_to_index
+    while waiting:
+        node, path = waiting.pop()
+        for key, value in node.props.items():
+            array = numbers_of(value)
+            if array is not None:
+                count_bad(bad, f"{path}{key}", array)
+        for key, index in children(state, node, by_id):
+            if index not in seen:
+                seen.add(index)
+                waiting.append((state.nodes[index], f"{path}{key}."))
+    refuse(bad)
+
+
+# --------------------------------------------------------------------------------------------------------- mesh files
+
+# Plugins that hand on the faces of a file unchecked; Mitsuba checks those of an 'obj' itself.
 _UNCHECKED = ("ply", "serialized")
 _READ = ("filename", "shape_index", "shape_name")
 # Files that were found to be right, by name, time and size: a scene is built several times.
@@ -122,9 +133,10 @@ _MOST_REMEMBERED = 4096
 
 
 def check_mesh_files(state: Any) -> None:
-    """Raise ``SceneError`` where a face of a mesh file is made of vertices that the file does not have, and where any
-    file is a device or a pipe, which may have no end. Must be called where Mitsuba finds the files, before the scene is
-    built; what cannot be read is left to Mitsuba to say.
+    """Raise ``SceneError`` for faces of vertices that a mesh file does not have, and for files that are devices.
+
+    Mitsuba reads memory beyond the vertices for such faces, and a pipe without an end. Called where Mitsuba finds the
+    files; files that cannot be read are left to Mitsuba.
     """
     import mitsuba as mi
 
@@ -133,65 +145,34 @@ def check_mesh_files(state: Any) -> None:
             if isinstance(node.props[name], str):
                 place = str(mi.file_resolver().resolve(node.props[name]))
                 check_special(place, f"{name} of {node.props.plugin_name()}", SceneError)
-        if node.props.plugin_name() not in _UNCHECKED or not isinstance(node.props.get("filename", None), str):
-            continue
-        given = {name: node.props[name] for name in _READ if name in node.props}
-        key = _state_of(str(mi.file_resolver().resolve(given["filename"])), node.props.plugin_name(), given)
-        if key is None or key in _right:
-            continue
-        try:
-            # Without normals of vertices a file is no more than read.
-            mesh = mi.load_dict({"type": node.props.plugin_name(), "face_normals": True, **given})
-        except (RuntimeError, TypeError, ValueError):
-            continue
-        name = f"{given['filename']} ({node.props.plugin_name()})"
-        check_faces(mesh, name)
-        if node.props.plugin_name() == "ply" and (least := _smallest(key[0])) < 0:
-            raise SceneError(_wrong(name, mesh.vertex_count(), least))
-        _right[key] = None
-        while len(_right) > _MOST_REMEMBERED:
-            del _right[next(iter(_right))]
+        if node.props.plugin_name() in _UNCHECKED and isinstance(node.props.get("filename", None), str):
+            _check_mesh_file(node)
 
 
-def check_faces(mesh: Any, name: str) -> None:
-    """Raise ``SceneError`` where a mesh has faces of vertices that are not there."""
+def _check_mesh_file(node: Any) -> None:
     import mitsuba as mi
 
-    params = mi.traverse(mesh)
-    if "faces" not in params:  # a rectangle of Mitsuba is a mesh by its class
+    plugin, given = node.props.plugin_name(), {name: node.props[name] for name in _READ if name in node.props}
+    path = str(mi.file_resolver().resolve(given["filename"]))
+    key = _file_state(path, plugin, given)
+    if key is None or key in _right:
         return
-    count, faces = mesh.vertex_count(), np.array(params["faces"])
-    if faces.size and int(faces.max()) >= count:
-        raise SceneError(_wrong(name, count, int(faces.max())))
-
-
-def _smallest(path: str) -> int:
     try:
-        return smallest_vertex(path)
-    except (ValueError, LookupError):  # a form of header that Mitsuba reads and this library does not
-        return 0
+        # Without normals of vertices Mitsuba does no more than read the file.
+        mesh = mi.load_dict({"type": plugin, "face_normals": True, **given})
+    except (RuntimeError, TypeError, ValueError):
+        return
+    name = f"{given['filename']} ({plugin})"
+    _check_faces(mesh, name)
+    if plugin == "ply" and (least := _smallest(path)) < 0:
+        raise SceneError(_wrong_faces(name, mesh.vertex_count(), least))
+    _right[key] = None
+    while len(_right) > _MOST_REMEMBERED:
+        del _right[next(iter(_right))]
 
 
-def _wrong(name: str, count: int, number: int) -> str:
-    return (
-        f"{name}: expected faces of vertices from 0 to {count - 1}, got the number {number}. Mend the file, or write "
-        "it anew with the program that it comes from."
-    )
-
-
-def check_taken_meshes(taken: Any) -> None:
-    """The same of the meshes that were taken as they are, and of those of scenes that were."""
-    import mitsuba as mi
-
-    for one in taken:
-        held = one.scene.shapes() if isinstance(one, ReadyScene) else [one.value]
-        for shape in held:
-            if isinstance(shape, mi.Mesh):
-                check_faces(shape, f"the mesh {shape.id()!r}")
-
-
-def _state_of(path: str, plugin: str, given: dict[str, Any]) -> tuple[Any, ...] | None:
-    """What tells a file, as it is now, from others; None where it is not there."""
+def _file_state(path: str, plugin: str, given: dict[str, Any]) -> tuple[Any, ...] | None:
+    """Return a key that tells a file, as it is now, from others; None without a file."""
     try:
         found = os.stat(path)
     except (OSError, ValueError):
@@ -199,6 +180,37 @@ def _state_of(path: str, plugin: str, given: dict[str, Any]) -> tuple[Any, ...] 
     rest = tuple(sorted((key, str(value)) for key, value in given.items() if key != "filename"))
     return (path, plugin, rest, found.st_mtime_ns, found.st_size, found.st_ino)
 
+
+def check_meshes(objects: Any) -> None:
+    """Raise ``SceneError`` for faces without vertices of loaded meshes, those of loaded scenes included."""
+    import mitsuba as mi
+
+    for one in objects:
+        held = one.scene.shapes() if isinstance(one, LoadedScene) else [one.value]
+        for shape in held:
+            if isinstance(shape, mi.Mesh):
+                _check_faces(shape, f"the mesh {shape.id()!r}")
+
+
+def _check_faces(mesh: Any, name: str) -> None:
+    import mitsuba as mi
+
+    params = mi.traverse(mesh)
+    if "faces" not in params:  # a rectangle of Mitsuba is a mesh by its class
+        return
+    count, faces = mesh.vertex_count(), np.array(params["faces"])
+    if faces.size and int(faces.max()) >= count:
+        raise SceneError(_wrong_faces(name, count, int(faces.max())))
+
+
+def _wrong_faces(name: str, count: int, number: int) -> str:
+    return (
+        f"{name}: expected faces of vertices from 0 to {count - 1}, got the number {number}. Mend the file, or write "
+        "it anew with the program that it comes from."
+    )
+
+
+# ---------------------------------------------------------------------------------------------- headers of PLY files
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
@@ -215,8 +227,9 @@ Element = tuple[str, int, list[tuple[str, str, bool]]]
 
 
 def smallest_vertex(path: str) -> int:
-    """The smallest number of a vertex that a face of a PLY file has, of a file that Mitsuba has read: its faces are
-    triangles. 0 where none is negative, or numbers have no sign.
+    """Return the smallest vertex number of the faces of a PLY file; 0 where none is negative.
+
+    Mitsuba reads negative numbers as 0. It has read the file before: all faces are triangles.
     """
     data = Path(path).read_bytes()
     end = _END.search(data)
@@ -237,7 +250,7 @@ def smallest_vertex(path: str) -> int:
 
 
 def _header(text: str) -> tuple[str, list[Element]]:
-    """(order of bytes, "" for text; elements)."""
+    """Return the order of bytes, "" for text, and the elements."""
     order, elements = "", list[Element]()
     for line in text.splitlines():
         words = line.split()
@@ -254,7 +267,7 @@ def _header(text: str) -> tuple[str, list[Element]]:
 
 
 def _width(properties: list[tuple[str, str, bool]], order: str) -> int:
-    """Bytes, or words of text, of a row."""
+    """Return the bytes, or words of text, of a row."""
     return sum((3 if listed else 1) * (np.dtype(kind).itemsize if order else 1) for _, kind, listed in properties)
 
 
@@ -273,18 +286,8 @@ def _rows(
     return rows
 
 
-def check_finite(state: Any) -> None:
-    """Raise ``SceneError`` with the keys of all numbers of a parsed scene that are NaN or infinite."""
-    bad: dict[str, str] = {}
-    waiting, seen, by_id = [(state.root, "")], set(), state.id_to_index
-    while waiting:
-        node, path = waiting.pop()
-        for key, value in node.props.items():
-            array = numbers_of(value)
-            if array is not None:
-                count_bad(bad, f"{path}{key}", array)
-        for key, index in children(state, node, by_id):
-            if index not in seen:
-                seen.add(index)
-                waiting.append((state.nodes[index], f"{path}{key}."))
-    refuse(bad)
+def _smallest(path: str) -> int:
+    try:
+        return smallest_vertex(path)
+    except (ValueError, LookupError):  # a form of header that Mitsuba reads and this library does not
+        return 0

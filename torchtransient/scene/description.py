@@ -1,8 +1,7 @@
-"""What a scene is described by: an XML file or a dictionary, reduced to plain data that can be pickled.
+"""Scenes as plain data that can be pickled: an XML file, or a dictionary of numbers, texts and arrays.
 
-A description is parsed into Mitsuba's intermediate representation (``mitsuba.parser.ParserState``) whenever a scene
-is built. Mitsuba objects belong to one variant of one process: what is not plain data stands in it as it was taken
-(:mod:`.taken`), and then it is no more than that object itself.
+A description is parsed into Mitsuba's list of nodes (``mitsuba.parser.ParserState``) whenever a scene is built. Objects
+of Mitsuba, which belong to one variant of one process, become data where that is possible (:mod:`.objects`).
 """
 
 from __future__ import annotations
@@ -24,14 +23,14 @@ from torchtransient.plugins.dictionaries import NUMBERS_IN_TEXT, Pixels, Voxels,
 from torchtransient.plugins.unfinished import afterwards
 from torchtransient.quantities import shown
 from torchtransient.scene.checks import MOST_LEVELS
-from torchtransient.scene.objects import ReadyScene, Taken, check_variant, describe_object, refuse, taken_below
+from torchtransient.scene.objects import Description, LoadedObject, LoadedScene, describe_object, objects_inside
 
 # Files in files: Mitsuba takes fewer.
 _MOST_INCLUDES = 16
 
 
 @dataclass(frozen=True)
-class XmlDescription:
+class XmlDescription(Description):
     """An XML file: its path, its text at the time of loading, and the values for its ``$parameters``."""
 
     path: str
@@ -40,24 +39,11 @@ class XmlDescription:
 
     @property
     def name(self) -> str:
-        """How messages call this scene."""
+        """Path of the file."""
         return self.path
 
-    @property
-    def taken(self) -> tuple[Any, ...]:
-        """What is not described: nothing."""
-        return ()
-
-    def check_described(self, what: str) -> None:
-        """Nothing: all of it is."""
-
-    def check_variant(self, variant: str | None) -> None:
-        """Nothing: it can be built in every variant."""
-
     def parse(self, config: Any) -> Any:
-        """Mitsuba's parser state. The text of the time of loading counts, even if the file has changed or gone
-        since.
-        """
+        """Return Mitsuba's parser state of the text at the time of loading; the file may have changed since."""
         import mitsuba as mi
 
         path = Path(self.path)
@@ -68,13 +54,13 @@ class XmlDescription:
 
     @contextmanager
     def resolved_files(self) -> Iterator[None]:
-        """Relative file names are looked up beside the XML file first."""
+        """Look relative file names up beside the XML file first."""
         with _search_path(str(Path(self.path).parent)):
             yield
 
 
 @dataclass(frozen=True)
-class DictDescription:
+class DictDescription(Description):
     """A scene dictionary: strings, numbers, lists, and numpy arrays for transforms and pixels."""
 
     tree: dict[str, Any]
@@ -82,24 +68,16 @@ class DictDescription:
 
     @property
     def name(self) -> str:
-        """How messages call this scene."""
+        """Name of the scene in messages."""
         return "scene dictionary"
 
     @property
-    def taken(self) -> tuple[Any, ...]:
-        """The Mitsuba objects that are not described."""
-        return taken_below(self.tree)
-
-    def check_described(self, what: str) -> None:
-        """Raise ``SceneError`` where something is not: ``what`` needs a description."""
-        refuse(what, self.taken)
-
-    def check_variant(self, variant: str | None) -> None:
-        """Raise ``SceneError`` where an object inside is of another variant."""
-        check_variant(self.taken, variant)
+    def objects(self) -> tuple[Any, ...]:
+        """Loaded objects of Mitsuba in the dictionary, which have no description."""
+        return objects_inside(self.tree)
 
     def parse(self, config: Any) -> Any:
-        """Mitsuba's parser state."""
+        """Return Mitsuba's parser state."""
         import mitsuba as mi
 
         state = parsed(config, self.tree)
@@ -111,18 +89,39 @@ class DictDescription:
 
     @contextmanager
     def resolved_files(self) -> Iterator[None]:
-        """Relative file names are looked up in the folder that was current when the scene was loaded."""
+        """Look relative file names up in the folder that was current when the scene was loaded."""
         with _search_path(self.folder):
             yield
 
 
+# Descriptions that can be parsed, and all of them.
 Plain = XmlDescription | DictDescription
-Description = Plain | ReadyScene
+SceneDescription = Plain | LoadedScene
 
 
-def same_description(a: Description, b: Description) -> bool:
-    """Whether two descriptions are of one scene: equal values throughout, and files looked up in the same places."""
-    if isinstance(a, ReadyScene) and isinstance(b, ReadyScene):
+@contextmanager
+def _search_path(folder: str) -> Iterator[None]:
+    import mitsuba as mi
+
+    before = mi.file_resolver()
+    resolver = mi.FileResolver(before)
+    resolver.prepend(folder)
+
+    def put_back() -> None:
+        if mi.file_resolver() is resolver:  # which another call may have replaced meanwhile
+            mi.set_file_resolver(before)
+
+    with afterwards(put_back):
+        mi.set_file_resolver(resolver)
+        yield
+
+
+# ------------------------------------------------------------------------------------------------------------ equality
+
+
+def same_description(a: SceneDescription, b: SceneDescription) -> bool:
+    """Return whether two descriptions are of one scene: equal values, and files looked up in the same places."""
+    if isinstance(a, LoadedScene) and isinstance(b, LoadedScene):
         return a.scene is b.scene
     if not isinstance(a, DictDescription) or not isinstance(b, DictDescription):
         return a == b
@@ -135,7 +134,7 @@ def _same(a: Any, b: Any) -> bool:
     if isinstance(a, Mapping) and isinstance(b, Mapping):
         # The order counts: it numbers the nameless children.
         return list(a) == list(b) and all(_same(a[key], b[key]) for key in a)
-    if isinstance(a, Taken) and isinstance(b, Taken):
+    if isinstance(a, LoadedObject) and isinstance(b, LoadedObject):
         return a.value is b.value
     if isinstance(a, Pixels) and isinstance(b, Pixels):
         return (a.srgb_gamma, a.pixel_format) == (b.srgb_gamma, b.pixel_format) and _same(a.values, b.values)
@@ -146,28 +145,14 @@ def _same(a: Any, b: Any) -> bool:
 
 
 def _names_files(tree: Mapping[str, Any]) -> bool:
-    """Whether a relative file name may stand anywhere in a scene dictionary."""
+    """Return whether a relative file name may stand anywhere in a scene dictionary."""
     return any(
         _names_files(value) if isinstance(value, Mapping) else isinstance(value, str) and "file" in key
         for key, value in tree.items()
     )
 
 
-@contextmanager
-def _search_path(folder: str) -> Iterator[None]:
-    import mitsuba as mi
-
-    before = mi.file_resolver()
-    resolver = mi.FileResolver(before)
-    resolver.prepend(folder)
-
-    def put_back() -> None:
-        if mi.file_resolver() is resolver:  # which nobody has changed meanwhile
-            mi.set_file_resolver(before)
-
-    with afterwards(put_back):
-        mi.set_file_resolver(resolver)
-        yield
+# ----------------------------------------------------------------------------------------------------------- XML files
 
 
 def describe_xml(path: str | os.PathLike[str], parameters: Mapping[str, Any]) -> XmlDescription:
@@ -183,7 +168,7 @@ def describe_xml(path: str | os.PathLike[str], parameters: Mapping[str, Any]) ->
         )
     try:
         text = file.read_text(encoding="utf-8")
-        _look_at(text, _Levels(file, parameters))
+        _check_levels(text, _Levels(file, parameters))
     except (OSError, UnicodeDecodeError) as error:
         raise SceneError(f"tt.load: {file} cannot be read as text: {error}.") from error
     except ElementTree.ParseError as error:
@@ -196,39 +181,40 @@ def describe_xml(path: str | os.PathLike[str], parameters: Mapping[str, Any]) ->
 
 
 class _Levels:
-    """What the parser tells of an XML file: Mitsuba takes one level after the other on its stack."""
+    """Target of an XML parser that counts levels, through included files: Mitsuba recurses into each on its stack."""
 
     def __init__(self, file: Path, given: Mapping[str, Any], level: int = 0, includes: int = 0):
         self.file, self.given, self.level, self.includes = file, dict(given), level, includes
 
     def start(self, tag: str, attributes: Mapping[str, str]) -> None:
-        """An element begins."""
+        """Count the element, and look into a file that it includes."""
         self.level += 1
         if tag == "default":
             self.given.setdefault(attributes.get("name", ""), attributes.get("value", ""))
         if tag == "include":
-            self._look_into(attributes.get("filename", ""))
+            self._check_include(attributes.get("filename", ""))
         if self.level > 2 * MOST_LEVELS:  # a node of the last level may hold a transform of several parts
             raise SceneError(
                 f"tt.load: {self.file}: expected elements at most {2 * MOST_LEVELS} levels deep, got more at <{tag}>."
             )
 
     def end(self, tag: str) -> None:
-        """An element ends."""
+        """Leave the element."""
         self.level -= 1
 
-    def _look_into(self, name: str) -> None:
-        """A file that is included: Mitsuba opens what is there, and would wait for the other end of a pipe."""
+    def _check_include(self, name: str) -> None:
+        """Check an included file: Mitsuba opens devices too, and waits for the other end of a pipe."""
         for parameter in sorted(self.given, key=len, reverse=True):
             name = name.replace(f"${parameter}", str(self.given[parameter]))
         path = self.file.parent / name
         check_special(path, f"tt.load: {self.file}: <include>", SceneError)
         if self.includes < _MOST_INCLUDES:
-            with suppress(OSError, UnicodeDecodeError, ElementTree.ParseError):  # which Mitsuba says, with the line
-                _look_at(path.read_text(encoding="utf-8"), _Levels(path, self.given, self.level, self.includes + 1))
+            inner = _Levels(path, self.given, self.level, self.includes + 1)
+            with suppress(OSError, UnicodeDecodeError, ElementTree.ParseError):  # which Mitsuba names, with the line
+                _check_levels(path.read_text(encoding="utf-8"), inner)
 
 
-def _look_at(text: str, levels: _Levels) -> None:
+def _check_levels(text: str, levels: _Levels) -> None:
     parser = ElementTree.XMLParser(target=levels)
     parser.feed(text)
     parser.close()
@@ -244,6 +230,9 @@ def _xml_value(key: str, value: Any) -> str:
     raise SceneError(f"tt.load: XML parameter {key!r} must be a string or a number, got {type(value).__name__}.")
 
 
+# -------------------------------------------------------------------------------------------------------- dictionaries
+
+
 def describe_dict(scene: Mapping[str, Any]) -> DictDescription:
     """Reduce a scene dictionary to plain data. Raises ``SceneError`` for entries that cannot be described."""
     tree = _to_plain(scene, "", MOST_LEVELS)
@@ -253,7 +242,7 @@ def describe_dict(scene: Mapping[str, Any]) -> DictDescription:
 
 
 def _to_plain(value: Any, path: str, levels: int) -> Any:
-    """Plain data for ``value``: dictionaries ``levels`` deep, strings, numbers, lists of numbers, numpy arrays."""
+    """Return plain data for a value: dictionaries ``levels`` deep, strings, numbers, lists of numbers, numpy arrays."""
     where = path or "the top level"
     if isinstance(value, Mapping):
         if levels == 0:
@@ -270,7 +259,7 @@ def _to_plain(value: Any, path: str, levels: int) -> Any:
             listed = key in NUMBERS_IN_TEXT and isinstance(entry, (list, np.ndarray))
             plain[key] = numbers_in_text(entry, below) if listed and is_ours(value) else entry
         return plain
-    if isinstance(value, (bool, int, float, str, Pixels, Voxels, Taken)):
+    if isinstance(value, (bool, int, float, str, Pixels, Voxels, LoadedObject)):
         return value
     if isinstance(value, np.generic):
         return value.item()
@@ -299,9 +288,7 @@ def _plain_sequence(value: list[Any] | tuple[Any, ...], where: str) -> Any:
 
 
 def _plain_mitsuba(value: Any, where: str) -> Any:
-    """Values of Mitsuba and Dr.Jit: transforms, colours, vectors, tensors, bitmaps, grids, meshes; objects that have
-    no description, as they are.
-    """
+    """Return plain data for a value of Mitsuba or Dr.Jit; objects without a description stay as they are."""
     import drjit as dr
     import mitsuba as mi
 

@@ -1,7 +1,7 @@
-"""What a scene's description contains, read off its list of nodes without building anything.
+"""Contents of a scene's description, read off its list of nodes without building anything.
 
 Only nodes that a render can meet count: those reachable from the shapes, emitters, sensors and the integrator of the
-scene, through references, groups and nested plugins. What is declared and never used costs nothing.
+scene, through references, groups and nested plugins. Declarations that nothing uses cost nothing.
 """
 
 from __future__ import annotations
@@ -15,18 +15,24 @@ from typing import Any
 import numpy as np
 
 from torchtransient import plugins
-from torchtransient.axes import TimeAxis
 from torchtransient.errors import SceneError, TorchTransientError
 from torchtransient.plain_texts import one_line
 from torchtransient.plugins.drjit_pool import threads_for_files
-from torchtransient.rendering.films.choice import FilmChoice
-from torchtransient.rendering.films.choices import of_plugin
 from torchtransient.rendering.variant import active_variant
 from torchtransient.scene.checks import check_nodes
-from torchtransient.scene.edits import NO_LIMIT, depth_of
+from torchtransient.scene.edits import NO_LIMIT, described_depth
 from torchtransient.scene.load import Scene
-from torchtransient.scene.nodes import children, find_child, is_film, is_integrator, kind_of_node, reachable, roots
-from torchtransient.scene.objects import ReadyScene
+from torchtransient.scene.nodes import (
+    children,
+    find_child,
+    is_film,
+    is_integrator,
+    node_kind,
+    node_label,
+    reachable,
+    rendered_children,
+)
+from torchtransient.scene.objects import LoadedScene
 
 # Optical elements whose only purpose is polarization: without it even a single one is drawn wrongly.
 POLARIZING_ELEMENTS = ("polarizer", "retarder", "circular", "pplastic", "measured_polarized")
@@ -42,7 +48,7 @@ _FLAT_SHAPES = ("rectangle", "disk")
 
 @dataclass(frozen=True)
 class Finding:
-    """Something in a scene, and where: what the user calls the node, with its place in the file if it has one."""
+    """Content of a scene, and the node that has it, by its name and place in the file."""
 
     what: str
     where: str
@@ -53,11 +59,20 @@ class Finding:
 
 @dataclass
 class SceneInventory:
-    """What was found. Lists are in the order of the description.
+    """Contents of a scene. Lists are in the order of the description.
 
-    ``albedo``: no surface or medium scatters more than this share of the light, 1 when that is not known, with the
-    node that sets it in ``brightest``. ``integrator`` and ``film`` are plugin names, with the properties that a plan
-    reads; ``max_depth`` is -1 for no limit. ``pulsed``: the film spreads arrivals by a pulse or an impulse response.
+    Attributes:
+        media, colours, measured, bands, elements, interfaces: participating media; colours that three numbers carry;
+            data over wavelength; response curves of films; polarizing elements; polarizing surfaces.
+        interfaces_in_a_row: light can meet two polarizing surfaces in a row.
+        declared_only: media and polarizing elements that nothing refers to.
+        albedo, brightest: no surface or medium scatters more than this share of the light, 1 when that is not known,
+            and the node that sets it.
+        integrator, max_depth: plugin name, and its bound on the depth, -1 for no limit.
+        film, film_props: plugin name and properties of the film of the sensor.
+        temporal_filter: described temporal filter, of the integrator or else of the film.
+        pulsed: the film spreads arrivals by a pulse or an impulse response.
+        plugins: names of all plugins.
     """
 
     media: list[Finding] = field(default_factory=list)
@@ -73,19 +88,47 @@ class SceneInventory:
     integrator: str | None = None
     max_depth: int = NO_LIMIT
     film: str | None = None
-    film_axis: TimeAxis | None = None
+    film_props: Any = None
     temporal_filter: str | None = None
-    film_settings: FilmChoice | None = None
     pulsed: bool = False
     plugins: set[str] = field(default_factory=set)
 
 
-def take_inventory(state: Any, folder_lookup: Any, sensor: int = 0) -> SceneInventory:
-    """Read a parser state. ``folder_lookup`` finds a file by the name that a scene uses, as Mitsuba would; the film of
-    ``sensor`` counts.
+def scene_inventory(scene: Scene, sensor: int = 0) -> SceneInventory:
+    """Return the contents of a scene, with the film of one of its sensors.
+
+    Raises:
+        SceneError: for a scene that Mitsuba cannot parse, and for one with loaded objects.
     """
+    import mitsuba as mi
+
+    description = scene._description
+    description.check_described("tt.plan")
+    assert not isinstance(description, LoadedScene)  # refused above
+    with active_variant(scene.variant):
+        config = mi.parser.ParserConfig(scene.variant)
+        try:
+            with description.resolved_files(), plugins.plugin_errors():
+                state = description.parse(config)
+                check_nodes(state)
+                mi.parser.transform_upgrade(config, state)
+                return take_inventory(state, _resolved, sensor)
+        except TorchTransientError as error:
+            raise type(error)(f"{description.name}: {error}") from error
+        except (RuntimeError, ValueError, TypeError) as error:
+            raise SceneError(f"{description.name}: Mitsuba could not read the scene. {one_line(error)}") from error
+
+
+def _resolved(name: str) -> Path:
+    import mitsuba as mi
+
+    return Path(str(mi.file_resolver().resolve(name)))
+
+
+def take_inventory(state: Any, lookup: Callable[[str], Path], sensor: int = 0) -> SceneInventory:
+    """Return the contents of a parsed scene. ``lookup`` finds files as Mitsuba does."""
     inventory = SceneInventory()
-    order = reachable(state, roots(state))
+    order = reachable(state, rendered_children(state))
     _note_unused(inventory, state, set(order))
     surfaces_of_interfaces: list[int] = []
     for index in order:
@@ -94,7 +137,7 @@ def take_inventory(state: Any, folder_lookup: Any, sensor: int = 0) -> SceneInve
         inventory.plugins.add(plugin)
         _note_physics(inventory, state, index, surfaces_of_interfaces)
         if index != 0 and not is_film(node):
-            _note_colours(inventory, state, index, folder_lookup)
+            _note_colours(inventory, state, index, lookup)
         _note_bands(inventory, state, node)
     _note_film(inventory, state, order, sensor)
     _note_integrator(inventory, state)
@@ -104,31 +147,18 @@ def take_inventory(state: Any, folder_lookup: Any, sensor: int = 0) -> SceneInve
 
 
 def like_mitsuba(plugin: str) -> str:
-    """The plugin of Mitsuba that one of this library stands in for, ``dielectric`` for ``diff_dielectric``."""
+    """Return the plugin of Mitsuba that one of this library stands in for: ``dielectric`` for ``diff_dielectric``."""
     name = plugin.removeprefix(_TWIN)
     return name.replace("rough_", "rough")
-
-
-def name_of(state: Any, index: int) -> str:
-    """How a message calls a node."""
-    import mitsuba as mi
-
-    node = state.nodes[index]
-    plugin, given = node.props.plugin_name(), node.props.id()
-    label = f"{plugin} {given!r}" if given and not given.startswith("_unnamed") else plugin
-    if len(state.node_paths) > index and state.node_paths[index]:
-        return f"{label} at {state.node_paths[index]!r}"
-    where = mi.parser.file_location(state, node).rsplit("/", 1)[-1].rsplit("\\", 1)[-1]
-    return f"{label}, {where}" if where else label
 
 
 def _note_unused(inventory: SceneInventory, state: Any, used: set[int]) -> None:
     for _, index in children(state, state.root):
         node = state.nodes[index]
         if index not in used and (
-            kind_of_node(node) == "Medium" or like_mitsuba(node.props.plugin_name()) in POLARIZING_ELEMENTS
+            node_kind(node) == "Medium" or like_mitsuba(node.props.plugin_name()) in POLARIZING_ELEMENTS
         ):
-            inventory.declared_only.append(Finding(node.props.plugin_name(), name_of(state, index)))
+            inventory.declared_only.append(Finding(node.props.plugin_name(), node_label(state, index)))
 
 
 # --------------------------------------------------------------------------------------------------------- findings
@@ -137,20 +167,20 @@ def _note_unused(inventory: SceneInventory, state: Any, used: set[int]) -> None:
 def _note_physics(inventory: SceneInventory, state: Any, index: int, interfaces: list[int]) -> None:
     node = state.nodes[index]
     plugin = node.props.plugin_name()
-    if kind_of_node(node) == "Medium":
-        inventory.media.append(Finding("participating medium", name_of(state, index)))
+    if node_kind(node) == "Medium":
+        inventory.media.append(Finding("participating medium", node_label(state, index)))
     if like_mitsuba(plugin) in POLARIZING_ELEMENTS:
-        inventory.elements.append(Finding(plugin, name_of(state, index)))
+        inventory.elements.append(Finding(plugin, node_label(state, index)))
     elif like_mitsuba(plugin) in POLARIZING_INTERFACES:
-        inventory.interfaces.append(Finding(plugin, name_of(state, index)))
+        inventory.interfaces.append(Finding(plugin, node_label(state, index)))
         interfaces.append(index)
 
 
-def _note_colours(inventory: SceneInventory, state: Any, index: int, folder_lookup: Any) -> None:
+def _note_colours(inventory: SceneInventory, state: Any, index: int, lookup: Callable[[str], Path]) -> None:
     node = state.nodes[index]
-    where = name_of(state, index)
-    found = [colour_of_node(node, folder_lookup)]
-    found += [colour_of_value(node, key, value) for key, value in node.props.items()]
+    where = node_label(state, index)
+    found = [_node_colour(node, lookup)]
+    found += [_value_colour(node, key, value) for key, value in node.props.items()]
     for verdict in found:
         if verdict is not None and verdict.kind == COLOUR:
             inventory.colours.append(Finding(verdict.why, where))
@@ -166,26 +196,25 @@ def _note_bands(inventory: SceneInventory, state: Any, node: Any) -> None:
     props = node.props
     for key, value in props.items():
         nested = isinstance(value, mi.Properties.ResolvedReference)
-        curve = nested and kind_of_node(state.nodes[value.index()]) == "Texture"
+        curve = nested and node_kind(state.nodes[value.index()]) == "Texture"
         if curve or props.type(key) == mi.Properties.Type.Spectrum:
             inventory.bands.append(Finding(f"response curve {key!r}", props.plugin_name()))
 
 
 def _note_film(inventory: SceneInventory, state: Any, order: list[int], sensor: int) -> None:
-    sensors = [state.nodes[index] for index in roots(state) if kind_of_node(state.nodes[index]) == "Sensor"]
+    import mitsuba as mi
+
+    sensors = [state.nodes[index] for index in rendered_children(state) if node_kind(state.nodes[index]) == "Sensor"]
     films: list[int | None] = [find_child(state, node, is_film) for node in sensors[sensor : sensor + 1]]
-    # A sensor whose kind is not known here, or that is not there, which the render will say.
+    # A sensor of unknown kind, or one that is missing, which the render will report.
     films = films or [next((index for index in order if is_film(state.nodes[index])), None)]
     if films[0] is None:
         return
     props = state.nodes[films[0]].props
-    inventory.film = props.plugin_name()
+    inventory.film, inventory.film_props = props.plugin_name(), mi.Properties(props)
     inventory.pulsed = any(name in props for name in ("pulse", "irf"))
     if "temporal_filter" in props:
         inventory.temporal_filter = str(props["temporal_filter"])
-    kind = of_plugin(inventory.film)
-    inventory.film_axis = None if kind is None else kind.axis_in(props)
-    inventory.film_settings = None if kind is None else kind.settings_in(props)
 
 
 def _note_integrator(inventory: SceneInventory, state: Any) -> None:
@@ -193,7 +222,7 @@ def _note_integrator(inventory: SceneInventory, state: Any) -> None:
         props = state.nodes[index].props
         if is_integrator(state.nodes[index]):
             inventory.integrator = props.plugin_name()
-            inventory.max_depth = int(depth_of(state, index))
+            inventory.max_depth = int(described_depth(state, index))
             if props.get("temporal_filter", ""):
                 inventory.temporal_filter = str(props["temporal_filter"])
 
@@ -209,29 +238,29 @@ def _note_albedo(inventory: SceneInventory, state: Any, order: list[int]) -> Non
         shapes = node.type == mi.ObjectType.Shape and node.props.plugin_name() not in ("instance", "shapegroup")
         bound = None
         if shapes:
-            surface = [child for _, child in children(state, node) if kind_of_node(state.nodes[child]) == "BSDF"]
+            surface = [child for _, child in children(state, node) if node_kind(state.nodes[child]) == "BSDF"]
             # A shape without a BSDF is diffuse with an albedo of one half.
             bound = max((_reflectance(state, child) for child in surface), default=0.5)
-        elif kind_of_node(node) == "Medium":
+        elif node_kind(node) == "Medium":
             bound = _largest(state, node, "albedo", 0.75)
         if bound is not None and bound > inventory.albedo:
-            inventory.albedo, inventory.brightest = bound, name_of(state, index)
+            inventory.albedo, inventory.brightest = bound, node_label(state, index)
 
 
 def _reflectance(state: Any, index: int) -> float:
-    """No more than this share of the light leaves a surface; 1 where that is all that is known."""
+    """Return a bound on the share of the light that leaves a surface, 1 where none is known."""
     node = state.nodes[index]
     plugin = node.props.plugin_name()
     if plugin == "diffuse":
         return _largest(state, node, "reflectance", 0.5)
     if plugin in ("twosided", "blendbsdf", "bumpmap", "normalmap"):
-        nested = [child for _, child in children(state, node) if kind_of_node(state.nodes[child]) == "BSDF"]
+        nested = [child for _, child in children(state, node) if node_kind(state.nodes[child]) == "BSDF"]
         return max((_reflectance(state, child) for child in nested), default=1.0)
     return 1.0
 
 
 def _largest(state: Any, node: Any, key: str, default: float) -> float:
-    """The largest value of a colour or number; 1 for what is nested (textures, grids)."""
+    """Return the largest value of a colour or number; 1 for nested plugins (textures, grids)."""
     import mitsuba as mi
 
     if key not in node.props:
@@ -251,7 +280,7 @@ def _largest(state: Any, node: Any, key: str, default: float) -> float:
 
 
 def _in_a_row(state: Any, order: list[int], interfaces: list[int]) -> bool:
-    """Whether light can meet two polarizing surfaces in a row: not on a single flat one among depolarizing walls."""
+    """Return whether light can meet two polarizing surfaces in a row: not on a single flat one alone."""
     import mitsuba as mi
 
     wanted, carriers = set(interfaces), []
@@ -259,10 +288,15 @@ def _in_a_row(state: Any, order: list[int], interfaces: list[int]) -> bool:
         node = state.nodes[index]
         if node.type == mi.ObjectType.Shape and wanted & set(reachable(state, [index])):
             carriers.append(node.props.plugin_name())
-        elif kind_of_node(node) == "Medium" and wanted & set(reachable(state, [index])):
+        elif node_kind(node) == "Medium" and wanted & set(reachable(state, [index])):
             return True
     return len(carriers) > 1 or any(plugin not in _FLAT_SHAPES for plugin in carriers)
 
+
+# ------------------------------------------------------------------------------------------------------------- colours
+# Spectra are grey, a colour that three numbers carry, or data over wavelength that they do not. Grey means the same in
+# monochromatic, RGB and spectral variants. Measured data keep their meaning in spectral variants only: others reduce
+# them to three numbers before light is reflected twice.
 
 COLOUR, MEASURED = "colour", "measured"
 # Wavelengths (nm) that a constant table has to cover to be grey.
@@ -311,14 +345,14 @@ _COLOURED_PLUGINS = {
 
 @dataclass(frozen=True)
 class Verdict:
-    """``kind``: COLOUR or MEASURED. ``why``: what was found."""
+    """``kind``: COLOUR or MEASURED. ``why``: the property or plugin that has it."""
 
     kind: str
     why: str
 
 
-def colour_of_value(node: Any, key: str, value: Any) -> Verdict | None:
-    """What one property says; None for grey and for what is no spectrum."""
+def _value_colour(node: Any, key: str, value: Any) -> Verdict | None:
+    """Return the colour of one property; None for grey and for values that are no spectrum."""
     import mitsuba as mi
 
     kind = node.props.type(key)
@@ -333,7 +367,7 @@ def colour_of_value(node: Any, key: str, value: Any) -> Verdict | None:
 
 
 def _constant(spectrum: Any) -> bool:
-    """Constant over what is visible: a table of equal values may still end inside it."""
+    """Return whether a spectrum is constant over the visible: a table of equal values may end inside it."""
     if spectrum.is_uniform():
         return True
     values, wavelengths = list(spectrum.values), list(spectrum.wavelengths)
@@ -341,8 +375,8 @@ def _constant(spectrum: Any) -> bool:
     return covers and min(values) == max(values)
 
 
-def colour_of_node(node: Any, lookup: Callable[[str], Path]) -> Verdict | None:
-    """What the plugin itself says: tables of materials, pictures, grids, plugins with colours of their own."""
+def _node_colour(node: Any, lookup: Callable[[str], Path]) -> Verdict | None:
+    """Return the colour of a plugin itself: tables of materials, pictures, grids, plugins with colours of their own."""
     import mitsuba as mi
 
     props, plugin = node.props, node.props.plugin_name()
@@ -400,38 +434,7 @@ def _grid(props: Any, lookup: Callable[[str], Path]) -> Verdict | None:
 
 
 def _grey(pixels: np.ndarray) -> bool:
-    """Whether the colour channels of (..., C) agree. One channel, or one and alpha, is grey."""
+    """Return whether the colour channels of (..., C) agree. One channel, or one and alpha, is grey."""
     if pixels.ndim < 3 or pixels.shape[-1] < 3:
         return True
     return bool(np.all(pixels[..., 0] == pixels[..., 1]) and np.all(pixels[..., 0] == pixels[..., 2]))
-
-
-def inventory_of(scene: Scene, sensor: int = 0) -> SceneInventory:
-    """What the description of a scene contains, and the film of one of its sensors. Raises ``SceneError`` for one that
-    Mitsuba cannot parse.
-    """
-    import mitsuba as mi
-
-    description = scene._description
-    description.check_described("tt.plan")
-    assert not isinstance(description, ReadyScene)  # refused above
-    with active_variant(scene.variant):
-        config = mi.parser.ParserConfig(scene.variant)
-        try:
-            with description.resolved_files(), plugins.plugin_errors():
-                state = description.parse(config)
-                check_nodes(state)
-                mi.parser.transform_upgrade(config, state)
-                return take_inventory(state, _lookup, sensor)
-        except TorchTransientError as error:
-            raise type(error)(f"{description.name}: {error}") from error
-        except (RuntimeError, ValueError, TypeError) as error:
-            raise SceneError(f"{description.name}: Mitsuba could not read the scene. {one_line(error)}") from error
-
-
-def _lookup(name: str) -> Any:
-    from pathlib import Path
-
-    import mitsuba as mi
-
-    return Path(str(mi.file_resolver().resolve(name)))

@@ -1,12 +1,13 @@
-"""Objects and scenes of Mitsuba that are loaded already: described where that is possible, otherwise taken as they are.
+"""Objects and scenes of Mitsuba that are loaded already: described where that is possible, otherwise used as they are.
 
-What is described is plain data again: it can be pickled, and built in any variant. An object holds no description: what
-it was made of is gone. One that is taken as it is belongs to its variant and its process, is shared with whoever made
-it, and keeps its plugins: nothing is built in their place. What that rules out is refused in words.
+A description is plain data: it can be pickled, and built in any variant. A loaded object has lost what it was made of.
+It belongs to its variant and its process, is shared with its owner, and keeps its plugins: no other plugin is built in
+its place. Calls that need one are refused.
 """
 
 from __future__ import annotations
 
+import abc
 from dataclasses import dataclass, replace
 from typing import Any, NoReturn
 
@@ -17,15 +18,47 @@ from torchtransient.plugins.dictionaries import Voxels
 from torchtransient.plugins.node_walk import objects_below, objects_of
 from torchtransient.plugins.parameter_effect import ParameterEffect, class_of
 from torchtransient.rendering.variant import active_variant
-from torchtransient.scene.edits import pixels_of, shown_properties
+from torchtransient.scene.edits import pixel_format, printed_properties
 
 # Meshes that are nothing but their buffers and what their base class holds.
 _PLAIN_MESHES = ("Mesh", "PLYMesh", "OBJMesh", "SerializedMesh", "Cube", "MergeShape")
 WAY_OUT = "Give the scene as a dictionary or an XML file instead"
 
 
+class Description(abc.ABC):
+    """Source of a scene: an XML file, a dictionary, or a loaded scene of Mitsuba."""
+
+    @property
+    @abc.abstractmethod
+    def name(self) -> str:
+        """Name of the scene in messages."""
+
+    @property
+    def objects(self) -> tuple[Any, ...]:
+        """Loaded objects of Mitsuba in the scene, which have no description."""
+        return ()
+
+    def check_described(self, caller: str) -> None:
+        """Raise ``SceneError`` for loaded objects in the scene: ``caller`` needs a description."""
+        if self.objects:
+            raise SceneError(
+                f"{caller} needs a scene that is described; {self.objects[0]} is a Mitsuba object that was taken as it "
+                f"is. {WAY_OUT}."
+            )
+
+    def check_variant(self, variant: str | None) -> None:
+        """Raise ``SceneError`` for loaded objects of another variant than the scene's."""
+        for entry in self.objects:
+            wanted = variant or self.objects[0].variant
+            if entry.variant != wanted:
+                raise SceneError(
+                    f"tt.load: {entry} is a Mitsuba object of {entry.variant} and was taken as it is, so that it "
+                    f"cannot be rendered in {wanted}. {WAY_OUT}, or leave variant out."
+                )
+
+
 @dataclass(frozen=True, eq=False)
-class Taken:
+class LoadedObject:
     """An object of Mitsuba inside a scene dictionary; ``where``: its place there."""
 
     value: Any
@@ -33,101 +66,107 @@ class Taken:
 
     @property
     def variant(self) -> str:
-        """The variant that the object belongs to."""
+        """Variant of the object."""
         return str(self.value.variant_name())
 
     def to_mitsuba(self) -> Any:
-        """The object."""
+        """Return the object, for the parser of dictionaries."""
         return self.value
 
     def __str__(self) -> str:
         return f"the {class_of(self.value)} at {self.where}"
 
     def __reduce__(self) -> NoReturn:
-        raise SceneError(_cannot_travel(str(self), self.variant))
-
-
-def _cannot_travel(what: str, variant: str) -> str:
-    return (
-        f"tt.Scene: {what} is a Mitsuba object that was taken as it is; it lives in this process and in {variant} "
-        f"alone, and cannot be pickled or described. {WAY_OUT}."
-    )
+        _refuse_pickling(self)
 
 
 @dataclass(frozen=True, eq=False)
-class ReadyScene:
+class LoadedScene(Description):
     """A ``mitsuba.Scene`` that is rendered as it is, in place of a description."""
 
     scene: Any
 
-    name = "ready mi.Scene"
+    @property
+    def name(self) -> str:
+        """Name of the scene in messages."""
+        return "ready mi.Scene"
 
     @property
     def variant(self) -> str:
-        """The variant that the scene belongs to."""
+        """Variant of the scene."""
         return str(self.scene.variant_name())
 
     @property
-    def taken(self) -> tuple[Any, ...]:
-        """What is not described."""
+    def objects(self) -> tuple[Any, ...]:
+        """The scene as a whole."""
         return (self,)
-
-    def check_described(self, what: str) -> None:
-        """Raise ``SceneError``: ``what`` needs a description."""
-        refuse(what, (self,))
-
-    def check_variant(self, variant: str | None) -> None:
-        """Raise ``SceneError`` for another variant."""
-        check_variant((self,), variant)
 
     def __str__(self) -> str:
         return "the mi.Scene"
 
     def __reduce__(self) -> NoReturn:
-        raise SceneError(_cannot_travel(str(self), self.variant))
+        _refuse_pickling(self)
 
 
-def refuse(what: str, taken: tuple[Any, ...]) -> None:
-    """Raise ``SceneError`` where something is not described."""
-    if taken:
-        raise SceneError(
-            f"{what} needs a scene that is described; {taken[0]} is a Mitsuba object that was taken as it is. "
-            f"{WAY_OUT}."
-        )
+def _refuse_pickling(loaded: Any) -> NoReturn:
+    raise SceneError(
+        f"tt.Scene: {loaded} is a Mitsuba object that was taken as it is; it lives in this process and in "
+        f"{loaded.variant} alone, and cannot be pickled or described. {WAY_OUT}."
+    )
 
 
-def check_variant(taken: tuple[Any, ...], variant: str | None) -> None:
-    """Raise ``SceneError`` where an object belongs to another variant than the scene is for."""
-    for entry in taken:
-        wanted = variant or taken[0].variant
-        if entry.variant != wanted:
-            raise SceneError(
-                f"tt.load: {entry} is a Mitsuba object of {entry.variant} and was taken as it is, so that it cannot be "
-                f"rendered in {wanted}. {WAY_OUT}, or leave variant out."
-            )
-
-
-def taken_below(tree: Any) -> tuple[Taken, ...]:
-    """The objects that are not described in a tree of plain data."""
-    if isinstance(tree, Taken):
+def objects_inside(tree: Any) -> tuple[LoadedObject, ...]:
+    """Return the loaded objects in a scene dictionary."""
+    if isinstance(tree, LoadedObject):
         return (tree,)
-    return tuple(found for entry in tree.values() for found in taken_below(entry)) if isinstance(tree, dict) else ()
+    return tuple(found for entry in tree.values() for found in objects_inside(entry)) if isinstance(tree, dict) else ()
+
+
+def pointers(objects: tuple[Any, ...]) -> frozenset[int]:
+    """Return the addresses of loaded objects and of all plugins inside them."""
+    import mitsuba as mi
+
+    starts = [entry.scene if isinstance(entry, LoadedScene) else entry.value for entry in objects]
+    found: set[int] = set()
+    for start in starts:
+        found |= {start.ptr, *(value.ptr for value in objects_below(start, mi.Object))}
+        if isinstance(start, mi.Sensor):
+            found.add(start.film().ptr)
+        for sensor in start.sensors() if isinstance(start, mi.Scene) else ():
+            found |= {sensor.ptr, sensor.film().ptr}
+        if isinstance(start, mi.Scene) and start.integrator() is not None:
+            found.add(start.integrator().ptr)
+    return frozenset(found)
+
+
+def without_stand_in(effect: ParameterEffect, plugin: Any) -> ParameterEffect:
+    """Return the effect of a parameter of a loaded plugin: no other plugin can be built in its place."""
+    if not effect.stand_in_needed:
+        return replace(effect, stand_in="")
+    reason = (
+        f"{class_of(plugin)} {plugin.id()!r} was taken as it is, and its derivative needs {effect.stand_in!r} in "
+        "its place: make it one, or give the scene as a dictionary or an XML file"
+    )
+    return replace(effect, supported=False, reason=reason, stand_in="")
+
+
+# ------------------------------------------------------------------------------------------------------ descriptions
 
 
 def describe_object(value: Any, where: str) -> Any:
-    """Plain data for an object of Mitsuba, or the object as it is. Raises ``SceneError`` for a scene inside another."""
+    """Return plain data for an object of Mitsuba, or the object itself. Raises ``SceneError`` for a whole scene."""
     if value.class_name() == "VolumeGrid":
         return Voxels.of(value)
     if value.class_name() == "Scene":
         raise SceneError(f"tt.load: {where} is a whole mi.Scene; load that alone, tt.load(scene).")
     if class_of(value) in _PLAIN_MESHES:
         with active_variant(value.variant_name()):
-            return _described_mesh(value) or Taken(value, where)
-    return Taken(value, where)
+            return _described_mesh(value) or LoadedObject(value, where)
+    return LoadedObject(value, where)
 
 
 def _described_mesh(mesh: Any) -> dict[str, Any] | None:
-    """A mesh as arrays, None where it has more than these: attributes, light, media, a surface of other kinds."""
+    """Return a mesh as arrays; None for one with attributes, light, media or a surface of another kind."""
     import mitsuba as mi
 
     surface = _described_surface(mesh.bsdf())
@@ -153,7 +192,7 @@ def _described_mesh(mesh: Any) -> dict[str, Any] | None:
 
 
 def _described_surface(bsdf: Any) -> dict[str, Any] | None:
-    """A diffuse surface of one colour, where its variant has kept the colour; None for others."""
+    """Return a diffuse surface of one colour, where its variant has kept the colour; None for others."""
     import mitsuba as mi
 
     if bsdf is None or bsdf.class_name() != "SmoothDiffuse" or mi.is_monochromatic:
@@ -168,36 +207,7 @@ def _described_surface(bsdf: Any) -> dict[str, Any] | None:
     return None
 
 
-# ------------------------------------------------------------------------------------------------------ when built
-
-
-def pointers(taken: tuple[Any, ...]) -> frozenset[int]:
-    """Which plugins of a built scene were taken as they are, with everything inside them."""
-    import mitsuba as mi
-
-    starts = [entry.scene if isinstance(entry, ReadyScene) else entry.value for entry in taken]
-    found: set[int] = set()
-    for start in starts:
-        found |= {start.ptr, *(value.ptr for value in objects_below(start, mi.Object))}
-        if isinstance(start, mi.Sensor):
-            found.add(start.film().ptr)
-        for sensor in start.sensors() if isinstance(start, mi.Scene) else ():
-            found |= {sensor.ptr, sensor.film().ptr}
-        if isinstance(start, mi.Scene) and start.integrator() is not None:
-            found.add(start.integrator().ptr)
-    return frozenset(found)
-
-
-def without_stand_in(effect: ParameterEffect, plugin: Any) -> ParameterEffect:
-    """Of a plugin that was taken as it is: another cannot be built in its place."""
-    if not effect.stand_in_needed:
-        return replace(effect, stand_in="")
-    reason = (
-        f"{class_of(plugin)} {plugin.id()!r} was taken as it is, and its derivative needs {effect.stand_in!r} in "
-        "its place: make it one, or give the scene as a dictionary or an XML file"
-    )
-    return replace(effect, supported=False, reason=reason, stand_in="")
-
+# ----------------------------------------------------------------------------------------- scenes for steady pictures
 
 _INTEGRATORS = {
     "PathIntegrator": "path", "VolumetricPathIntegrator": "volpath", "VolpathMisIntegratorImpl": "volpathmis",
@@ -214,8 +224,13 @@ _SAMPLERS = {
 }  # fmt: skip
 
 
-def described_for_time(scene: Any) -> dict[str, Any] | None:
-    """Return a scene dictionary for a ``mi.Scene`` with a steady integrator or film; None for one without."""
+def transient_dictionary(scene: Any) -> dict[str, Any] | None:
+    """Return a dictionary of a ``mi.Scene`` with a steady integrator or film; None for one without.
+
+    A film belongs to its sensor and an integrator to its scene; neither can be exchanged in a loaded scene. Cameras
+    with a steady film and steady path tracers are described by the parameters that they show, without the seeds of
+    their samplers; all else is taken as it is.
+    """
     import mitsuba as mi
 
     tree: dict[str, Any] = {"type": "scene"}
@@ -226,22 +241,22 @@ def described_for_time(scene: Any) -> dict[str, Any] | None:
                 found = _integrator(value)
             elif isinstance(value, mi.Sensor):
                 found = _sensor(value)
-            tree[value.id() or f"{name}_{number}"] = found or Taken(value, value.id() or name)
+            tree[value.id() or f"{name}_{number}"] = found or LoadedObject(value, value.id() or name)
     return tree if any(isinstance(entry, dict) for entry in tree.values()) else None
 
 
 def _integrator(value: Any) -> dict[str, Any] | None:
-    plugin, said = _INTEGRATORS.get(value.class_name()), shown_properties(value)
-    if plugin is None or not {"max_depth", "rr_depth"} <= said.keys():
+    plugin, printed = _INTEGRATORS.get(value.class_name()), printed_properties(value)
+    if plugin is None or not {"max_depth", "rr_depth"} <= printed.keys():
         return None
     # Without a bound it is -1, as a number without sign.
-    depths = {name: int(said[name]) for name in ("max_depth", "rr_depth")}
+    depths = {name: int(printed[name]) for name in ("max_depth", "rr_depth")}
     depths = {name: -1 if depth >= 2**31 else depth for name, depth in depths.items()}
     return {"type": plugin, **depths, "hide_emitters": bool(value.hide_emitters)}
 
 
 def _sensor(value: Any) -> dict[str, Any] | None:
-    """A camera in vacuum with a steady film; None for other sensors."""
+    """Return a camera in vacuum with a steady film; None for other sensors."""
     import mitsuba as mi
 
     known, film, sampler = _CAMERAS.get(value.class_name()), _film(value.film()), _sampler(value.sampler())
@@ -278,7 +293,7 @@ def _film(film: Any) -> dict[str, Any] | None:
         "crop_offset_x": int(left),
         "crop_offset_y": int(top),
         "sample_border": bool(film.sample_border()),
-        "pixel_format": pixels_of(film),
+        "pixel_format": pixel_format(film),
         "rfilter": rfilter,
     }
 
@@ -296,10 +311,10 @@ def _rfilter(rfilter: Any) -> dict[str, Any] | None:
 
 
 def _sampler(sampler: Any) -> dict[str, Any] | None:
-    plugin, said = _SAMPLERS.get(sampler.class_name()), shown_properties(sampler)
+    plugin, printed = _SAMPLERS.get(sampler.class_name()), printed_properties(sampler)
     if plugin is None:
         return None
     found: dict[str, Any] = {"type": plugin, "sample_count": int(sampler.sample_count())}
-    if "jitter" in said:
-        found["jitter"] = said["jitter"].strip() in ("1", "true")
+    if "jitter" in printed:
+        found["jitter"] = printed["jitter"].strip() in ("1", "true")
     return found

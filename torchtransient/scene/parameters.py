@@ -1,4 +1,4 @@
-"""The parameters of a scene: what they are, which of them have derivatives, and how torch values enter the scene.
+"""The table of a scene's parameters: shapes, values, and which of them have derivatives.
 
 Keys are those of ``mitsuba.traverse``. Meshes apply ``to_world`` while loading and forget it; a key
 ``<mesh>.to_world`` is offered for them all the same: the matrix replaces the one of the description, and vertices
@@ -30,17 +30,26 @@ _MAX_LISTED = 65536  # larger values are not copied: textures of a real scene wo
 
 @dataclass(frozen=True)
 class ParameterInfo:
-    """One parameter. ``shape`` is that of the torch value without a batch dimension, None for what is not numeric.
-    ``value`` is None for more than 65536 numbers: ask for the key and read ``renderer.values[key]``.
+    """One parameter of a scene.
 
-    ``moves_path_length``, ``moves_silhouette``, ``moves_medium``: whether it can change an optical path length, move a
-    visibility edge, change an extinction. ``biased``: its derivative is known to be wrong somewhere: in whatever scene
-    (``always_biased``), or where edges move that are not followed in this one, for instance those seen in a mirror
-    (``edges_missing``, in words). ``has_boundary_term``: it moves edges, and the derivative follows them. ``reason``
-    says why it has none, or where it is wrong. ``substitute``: the materials built as others when the key is asked for,
-    by name, with the name of the texture in them ("" for a number).
-    ``place``: names of the parameter and of what its plugin is in. ``checked``: whether the sweep of gradients has
-    compared it with finite differences in such a place (``docs/gradients_sweep.md``); the reason says when it has not.
+    Attributes:
+        key: name in ``mitsuba.traverse``, and in ``TransientRenderer(parameters=...)``.
+        kind: form of Mitsuba's value: number, list, vector, points, vertices, tensor, transform, mesh_transform,
+            integer, plain.
+        shape: shape of the torch value without a batch dimension, None for values that are not numeric.
+        value: current value as numpy, None for more than 65536 numbers (``renderer.values[key]`` has them).
+        differentiable: a derivative exists.
+        moves_path_length, moves_silhouette, moves_medium: it can change an optical path length, move a visibility
+            edge, change an extinction.
+        reason: why there is no derivative, or where it is wrong.
+        substitute: materials that are built as others when the key is asked for: name, and the name of the texture
+            in it ("" for a number).
+        always_biased: the derivative is known to be wrong in every scene.
+        edges_missing: moving edges that the derivative does not follow in this scene, in words.
+        has_boundary_term: it moves edges, and the derivative follows them.
+        place: names of the parameter and of the plugins around it.
+        checked: the sweep of gradients has compared it with finite differences in such a place
+            (``docs/gradients_sweep.md``).
     """
 
     key: str
@@ -61,7 +70,7 @@ class ParameterInfo:
 
     @property
     def biased(self) -> bool:
-        """Whether the derivative is known to be wrong somewhere."""
+        """The derivative is known to be wrong somewhere: everywhere, or where edges are not followed."""
         return self.always_biased or bool(self.edges_missing)
 
 
@@ -83,7 +92,7 @@ class ParameterTable(Mapping[str, ParameterInfo]):
         return len(self._entries)
 
     def differentiable(self) -> list[str]:
-        """The keys that have a derivative."""
+        """Return the keys that have a derivative."""
         return [key for key, entry in self.items() if entry.differentiable]
 
     def __str__(self) -> str:
@@ -104,7 +113,7 @@ class ParameterTable(Mapping[str, ParameterInfo]):
 
 
 def unknown_key(key: str, known: list[str], owner: str = "the scene") -> str:
-    """The message for a parameter key that a scene, or another ``owner``, does not have."""
+    """Return the message for a key that a scene, or another ``owner``, does not have."""
     inside = [other for other in known if f".{key}." in f".{other}."]
     close = inside[:3] or difflib.get_close_matches(str(key), known, n=3, cutoff=0.5)
     hint = f"Did you mean {', '.join(repr(c) for c in close)}? " if close else ""
@@ -125,7 +134,7 @@ def _short(value: Any) -> str:
 
 
 def parameter_table(built: BuiltScene) -> ParameterTable:
-    """Read the table off a built scene (unmerged, real bitmaps, no substitutions), inside its variant."""
+    """Return the table of a built scene (unmerged, real bitmaps, no substitutions). Called inside its variant."""
     tracker = ParameterTracker(built.scene)
     edges = moving_edges_of(built.scene, built.scene.sensors())
     entries = []
@@ -139,9 +148,7 @@ def parameter_table(built: BuiltScene) -> ParameterTable:
 
 
 def moving_edges_of(scene: Any, sensors: Sequence[Any]) -> MovingEdges:
-    """Return what derivatives of a built scene lack where edges move; a steady integrator counts as the transient one
-    that renders in its place.
-    """
+    """Return the gaps of derivatives where edges move, for the transient integrator that renders the scene."""
     integrator = scene.integrator()
     if isinstance(integrator, IntegratorInterface):
         edges: MovingEdges = integrator.silhouettes(scene, sensors)
@@ -150,7 +157,7 @@ def moving_edges_of(scene: Any, sensors: Sequence[Any]) -> MovingEdges:
 
 
 def missing_edges(built: BuiltScene, keys: Iterable[str], sensors: Iterable[int]) -> dict[Gap, list[str]]:
-    """Return what derivatives by ``keys`` lack of moving edges seen by some sensors, with the keys that lack it."""
+    """Return the gaps of derivatives by ``keys`` at moving edges that some sensors see, with their keys."""
     every = built.scene.sensors()
     edges = moving_edges_of(built.scene, [every[sensor] for sensor in sensors])
     tracker = built.scene.integrator().parameters(built.scene)
@@ -164,7 +171,7 @@ def missing_edges(built: BuiltScene, keys: Iterable[str], sensors: Iterable[int]
 
 
 def _with_gaps(info: ParameterInfo, edges: MovingEdges, tracker: ParameterTracker, node: Any) -> ParameterInfo:
-    """With what the derivative lacks of moving edges."""
+    """Return the parameter with the gaps of its derivative at moving edges."""
     if not (info.differentiable and info.moves_silhouette):
         return info
     effect = replace(tracker.effect_of(node, info.key), reason=info.reason)
@@ -175,7 +182,7 @@ def _with_gaps(info: ParameterInfo, edges: MovingEdges, tracker: ParameterTracke
 
 
 def _placed(info: ParameterInfo, tracker: ParameterTracker, node: Any) -> ParameterInfo:
-    """With the place of the parameter, and whether the sweep of gradients has been there."""
+    """Return the parameter with its place, and whether the sweep of gradients covers that."""
     if not info.differentiable:
         return info
     place = tracker.location_of(node, info.key)
@@ -216,10 +223,10 @@ def _describe(built: BuiltScene, tracker: ParameterTracker, key: str, node: Any)
     effect = tracker.effect_of(node, name, built.params.flags(key))
     if effect.stand_in:
         holders = tracker.stood_in_for(node, name)
-        if built.taken.intersection(plugin.ptr for plugin, _ in holders):
+        if built.loaded.intersection(plugin.ptr for plugin, _ in holders):
             return _info(key, kind, shape, value, without_stand_in(effect, holders[0][0]))
         if isinstance(node, mi.BSDF):
-            # What stands in for the plugin has a number there, whatever Mitsuba's has.
+            # The plugin that is built in its place has a number there, whatever Mitsuba's has.
             kind, shape, value = "number", (), float(np.reshape(np.asarray(value), ()))
             effect = tracker.effect_of(node, name)
         exchanged = frozenset((plugin.id(), slot) for plugin, slot in holders)
@@ -235,19 +242,20 @@ def _describe(built: BuiltScene, tracker: ParameterTracker, key: str, node: Any)
 
 
 def needing_slope(infos: Mapping[str, ParameterInfo], keys: Iterable[str]) -> list[str]:
-    """Those of ``keys`` that can change a path length: their derivatives need a response over time with a slope."""
+    """Return the ``keys`` that can change a path length: their derivatives need a response in time with a slope."""
     return [key for key in keys if infos[key].moves_path_length]
 
 
 def is_transform(value: Any) -> bool:
-    """Whether a value is one of Mitsuba's transforms. By name: Dr.Jit arrays answer to any attribute made of
-    component letters.
+    """Return whether a value is a transform of Mitsuba.
+
+    By name of its class: Dr.Jit arrays answer to any attribute made of component letters.
     """
     return "Transform" in type(value).__name__
 
 
 def classify(key: str, current: Any) -> tuple[str, tuple[int, ...] | None]:
-    """(kind, shape of the torch value) of a Mitsuba value; the shape is None for what is not numeric."""
+    """Return kind and shape of the torch value of a Mitsuba value; the shape is None for one that is not numeric."""
     import drjit as dr
 
     if current is None:
@@ -275,7 +283,7 @@ def classify(key: str, current: Any) -> tuple[str, tuple[int, ...] | None]:
 
 
 def read_value(current: Any, shape: tuple[int, ...] | None) -> Any:
-    """A Mitsuba value as numpy in the shape of its torch value; plain Python values as they are."""
+    """Return a Mitsuba value as numpy in the shape of its torch value, plain Python values unchanged."""
     import drjit as dr
 
     if is_transform(current):

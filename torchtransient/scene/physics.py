@@ -1,8 +1,8 @@
-"""What can be rendered and cannot be: more light scattered than arrives, numbers out of their range, transforms without
-an inverse, windows that miss the light, depths that had to be bounded.
+"""Warnings of scenes and values that can be rendered, and that no physical system has.
 
-Nothing of it stops a computation by itself: an optimiser steps over the edge of [0, 1] and comes back, and a window may
-be meant to be short. So it is said once, and where it would be a mistake, it can be made an error.
+More light scattered than arrives, numbers out of their range, transforms without an inverse, windows that miss the
+light, depths that had to be bounded. None stops a computation: an optimiser steps over the edge of [0, 1] and comes
+back, and a window may be short on purpose. Each is a warning, given once, or an error where that is asked for.
 """
 
 from __future__ import annotations
@@ -28,26 +28,27 @@ from torchtransient.plugins.physical_ranges import SHARE, PhysicalRange
 from torchtransient.quantities import shown
 
 MODES = ("warn", "error", "ignore")
-# Light outside of the window, as a share of all light, from which on it is said.
+# Largest share of the light outside of the window without a warning.
 MISSED = 0.05
-# Findings about a description that are said one by one.
-_SAID_OF_A_SCENE = 4
-# What single precision makes of a matrix that has an inverse.
+# Findings about a description that have a warning of their own.
+_MOST_WARNINGS = 4
+# Ratio of singular values below which single precision has no inverse.
 _SINGULAR = 1e-7
 
 
 class PhysicsWatch:
-    """Says each finding about one renderer once. ``mode``: "warn" gives ``PhysicsWarning``, "error" raises
-    ``PhysicsError``, "ignore" looks at nothing.
+    """Checks of the physics of one renderer, each with one warning.
 
-    ``told``: what was said before, of the same scene: ``tt.render`` in a loop makes a renderer each time.
-    ``window_name``: what tells its window from others, empty where none is looked at. ``ranges``: those that the
-    renderer's keys have; ``transforms``: which are transforms; ``directions``: which are those of a sun, with the axis
-    of its sky. ``installed``: looks at a built scene that holds the values of a call, for the sensor of a number, and
-    returns what it finds by what it is about; None looks at nothing.
+    Attributes:
+        mode: "warn" gives ``PhysicsWarning``, "error" raises ``PhysicsError``, "ignore" checks nothing.
+        window_name: identity of the renderer's time window, empty for none to be checked.
+        ranges: physical ranges of the renderer's keys.
+        transforms: keys of transforms.
+        directions: keys of directions of a sun, with the axis of its sky.
+        installed: check of a built scene that holds the values of a call, for a sensor; returns messages by subject.
     """
 
-    def __init__(self, mode: str, told: set[str]):
+    def __init__(self, mode: str, warned: set[str]):
         if not is_one_of(mode, MODES):
             raise ArgumentError(f"physics: expected one of {', '.join(map(repr, MODES))}, got {shown(mode)}.")
         self.mode = mode
@@ -56,75 +57,72 @@ class PhysicsWatch:
         self.transforms: frozenset[str] = frozenset()
         self.directions: dict[str, np.ndarray] = {}
         self.installed: Callable[[Any, int], Mapping[str, str]] | None = None
-        self._told = told
+        # Shared by the renderers of a scene: ``tt.render`` in a loop makes one each time.
+        self._warned = warned
 
     @property
-    def looks(self) -> bool:
-        """Whether anything is looked at."""
+    def enabled(self) -> bool:
+        """Whether anything is checked."""
         return self.mode != "ignore"
 
-    def tell(self, about: str, message: str, *, is_error: bool = True) -> None:
-        """Say a finding, in the way of the mode; those that are about the same once. ``is_error``: False for one that
-        is a warning in the mode "error", too.
-        """
+    def warn(self, about: str, message: str, *, is_error: bool = True) -> None:
+        """Warn of one subject once, or raise in the mode "error" unless ``is_error`` is False."""
         if self.mode == "error" and is_error:
             raise PhysicsError(f"{message} With physics='warn' it is computed all the same.")
-        if about not in self._told:
-            self._told.add(about)
+        if about not in self._warned:
+            self._warned.add(about)
             warnings.warn(message, PhysicsWarning, stacklevel=level_of_user())
 
-    def gradient(self, message: str, *, is_error: bool = True) -> None:
-        """Warn once of a derivative that lacks a part; the mode "error" makes it a ``GradientError``, "ignore" does not
-        silence it.
-        """
+    def warn_of_gradient(self, message: str, *, is_error: bool = True) -> None:
+        """Warn once of a derivative that lacks a part, in the mode "ignore" too; "error" raises ``GradientError``."""
         if self.mode == "error" and is_error:
             raise GradientError(f"{message} With physics='warn' it is computed all the same.")
-        if message not in self._told:
-            self._told.add(message)
+        if message not in self._warned:
+            self._warned.add(message)
             warnings.warn(message, GradientWarning, stacklevel=level_of_user())
 
     def scene(self, findings: Mapping[str, str]) -> None:
-        """Say what is found in the description itself, by key: the first ones, where there are many."""
+        """Warn of findings in the description, by key: of the first ones, where there are many."""
         for number, (key, message) in enumerate(findings.items()):
-            if number < _SAID_OF_A_SCENE:
-                more = len(findings) - _SAID_OF_A_SCENE if number == _SAID_OF_A_SCENE - 1 else 0
-                self.tell(key, message + (f" So {'is' if more == 1 else 'are'} {more} more." if more > 0 else ""))
+            if number < _MOST_WARNINGS:
+                more = len(findings) - _MOST_WARNINGS if number == _MOST_WARNINGS - 1 else 0
+                self.warn(key, message + (f" {more} more of such values." if more > 0 else ""))
 
     def value(self, key: str, value: torch.Tensor, low: float, high: float) -> None:
-        """A value of a call, with its smallest and largest number."""
+        """Check a value of a call, with its smallest and largest number."""
         limits = self.ranges.get(key)
         if limits is not None:
             if limits.above(high):
-                self.tell(key, outside_message(key, limits, low, high))
+                self.warn(key, outside_message(key, limits, low, high))
             elif limits.below(low):
-                self.tell(f"{key} too small", outside_message(key, limits, low, high))
+                self.warn(f"{key} too small", outside_message(key, limits, low, high))
         elif key in self.directions:
             given = value.detach().cpu().double().numpy()
             if (given == 0).all(-1).any():
-                self.tell(key, f"{key!r} is a direction and has no length. Give it one.")
+                self.warn(key, f"{key!r} is a direction and has no length. Give it one.")
             elif value.requires_grad and (np.cross(given, self.directions[key]) == 0).all(-1).any():
-                self.tell(
+                self.warn(
                     f"{key} at the pole",
                     f"{key!r} points along the axis of its sky, where Mitsuba's derivative by it is NaN. Tilt it by a "
                     "thousandth.",
                 )
-        elif key in self.transforms and (self.mode == "error" or key not in self._told):
+        elif key in self.transforms and (self.mode == "error" or key not in self._warned):
             matrices = value.detach().cpu().numpy().reshape(-1, *value.shape[-2:])
             if any(is_singular(matrix) for matrix in matrices):
-                self.tell(key, singular_message(key))
+                self.warn(key, singular_message(key))
 
     def placed(self, scene: Any, sensor: int) -> None:
-        """A built scene that holds the values of a call, before it is rendered."""
-        if self.looks and self.installed is not None:
+        """Check a built scene that holds the values of a call, before it is rendered."""
+        if self.enabled and self.installed is not None:
             for about, message in self.installed(scene, sensor).items():
-                self.tell(about, message)
+                self.warn(about, message)
 
     def window(self, total: float, before: float, after: float) -> None:
-        """Light of a render, all and what its window missed."""
-        if not self.window_name or before + after <= 0 or (self.mode != "error" and self.window_name in self._told):
+        """Check the light that a render's window missed, before and after it, against the total."""
+        if not self.window_name or before + after <= 0 or (self.mode != "error" and self.window_name in self._warned):
             return
         if total > 0 and before + after > MISSED * total:
-            self.tell(
+            self.warn(
                 self.window_name,
                 f"the window misses {(before + after) / total:.1%} of the light: {before / total:.1%} arrives before "
                 f"it, {after / total:.1%} after it. tt.plan(scene) finds a window; a start_opl that is earlier, more "
@@ -137,8 +135,12 @@ def scene_findings(
     transforms: Mapping[str, np.ndarray],
     dark: Iterable[str] = (),
 ) -> dict[str, str]:
-    """What is unphysical in a description, by key. ``ranges``: (key, its range, smallest, largest). ``dark``: names of
-    the lights that no path meets.
+    """Return messages about unphysical values of a description, by key.
+
+    Args:
+        ranges: (key, physical range, smallest value, largest value).
+        transforms: matrices (4, 4) by key.
+        dark: names of lights that no path meets.
     """
     found = {name: dark_message(name) for name in dark}
     for key, limits, low, high in ranges:
@@ -151,7 +153,7 @@ def scene_findings(
 
 
 def dark_message(name: str) -> str:
-    """The message for a light that paths from a sensor never meet."""
+    """Return the message for a light that paths from a sensor never meet."""
     return (
         f"{name!r} is black here: a directionalarea shines in one direction alone, which no path from a sensor ever "
         "meets. Describe it as an 'angulararea' with a small cutoff_angle, or as a 'directional' light."
@@ -159,7 +161,7 @@ def dark_message(name: str) -> str:
 
 
 def outside_message(key: str, limits: PhysicalRange, low: float, high: float) -> str:
-    """The message for a number outside of its range."""
+    """Return the message for numbers from ``low`` to ``high`` that leave a range."""
     if limits == SHARE:
         number = f"{high:.6g}, more than all" if limits.above(high) else f"{low:.6g}, less than nothing"
         message = (
@@ -178,7 +180,7 @@ def outside_message(key: str, limits: PhysicalRange, low: float, high: float) ->
 
 
 def singular_message(key: str) -> str:
-    """The message for a transform without an inverse."""
+    """Return the message for a transform without an inverse."""
     return (
         f"{key!r} has no inverse: it flattens space, and what it is applied to has no normals and is not hit. Scale by "
         "numbers other than 0, flat shapes too."
@@ -186,8 +188,9 @@ def singular_message(key: str) -> str:
 
 
 def is_singular(matrix: np.ndarray) -> bool:
-    """Whether a transform (4, 4) or (3, 3) flattens space, up to single precision; not for numbers that are not finite,
-    of which others speak.
+    """Return whether a transform (4, 4) or (3, 3) flattens space, up to single precision.
+
+    False for numbers that are not finite, which other checks refuse.
     """
     linear = np.asarray(matrix, dtype=np.float64)
     linear = linear[:-1, :-1]
@@ -198,7 +201,7 @@ def is_singular(matrix: np.ndarray) -> bool:
 
 
 def smallest_and_largest(value: torch.Tensor) -> tuple[float, float]:
-    """Of a tensor; NaN for both where it holds one, 0 for an empty one. One wait for the device."""
+    """Return both numbers of a tensor, NaN where it holds one, 0 for an empty one. Waits once for the device."""
     if value.numel() == 0:
         return 0.0, 0.0
     low, high = torch.stack(torch.aminmax(value.detach())).tolist()
@@ -206,5 +209,5 @@ def smallest_and_largest(value: torch.Tensor) -> tuple[float, float]:
 
 
 def are_finite(low: float, high: float) -> bool:
-    """Whether numbers between these are all finite, as :func:`smallest_and_largest` tells."""
+    """Return whether all numbers of a tensor with this smallest and largest one are finite."""
     return math.isfinite(low) and math.isfinite(high)

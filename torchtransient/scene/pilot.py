@@ -1,14 +1,15 @@
-"""What a pilot run says about a scene: how deep its paths have to be, and when its light arrives.
+"""Pilot runs: how deep the paths of a scene have to be, and when its light arrives.
 
-Both answers are read off a list of events (:class:`torchtransient.plugins.integrators.pilot.PilotEvents`), for the
-image as a whole and for its blocks, since light that matters to a corner of the picture may not matter to its mean.
+A run lists arrivals one by one (:class:`torchtransient.plugins.integrators.pilot.PilotEvents`). Depth and window are
+read off the list for the image as a whole and for its blocks, since light that matters to a corner of the picture may
+not matter to its mean.
 """
 
 from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,10 +18,9 @@ import numpy as np
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ArgumentError, GradientError
 from torchtransient.gates import Gate
-from torchtransient.rendering.films.choice import FilmChoice
 from torchtransient.rendering.variant import active_variant
-from torchtransient.scene.edits import NO_LIMIT, BuildOptions, depth_limit
-from torchtransient.scene.load import Scene
+from torchtransient.scene.edits import NO_LIMIT, BuildOptions, built_depth
+from torchtransient.scene.load import Scene, load
 from torchtransient.scene.physics import MISSED, PhysicsWatch
 
 PILOT_PATHS = 32768
@@ -31,19 +31,23 @@ DEEP = 48
 # The image is divided into so many blocks along each side; a block may lose so many times the image's share.
 BLOCKS = 8
 BLOCK_ALLOWANCE = 10.0
-# Bins of an axis whose bin width nobody has said, and the most that an axis gets without being asked.
+# Bins of an axis without a given bin width, and the most that an axis gets without being asked.
 DEFAULT_BINS = 300
 MOST_BINS = 4096
 
 
 @dataclass(frozen=True)
 class PilotReport:
-    """What a pilot run found.
+    """Results of a pilot run.
 
-    ``paths``, ``events``: how many were traced and listed; ``seconds``: wall time with building and compiling.
-    ``relative_error``: standard error of the image's mean over that mean. ``tail``, ``tail_error``: share of the light
-    in paths deeper than the depth that was chosen, and its standard error. ``missed``, ``missed_error``: the same for
-    light outside the chosen window, None without one. ``first_opl``, ``last_opl``: earliest and latest arrival, metres.
+    Attributes:
+        variant: variant of the run.
+        paths, events: number of traced paths and of listed arrivals.
+        seconds: wall time with building and compiling.
+        relative_error: standard error of the image's mean over that mean.
+        tail, tail_error: share of the light in paths deeper than the chosen depth, and its standard error.
+        first_opl, last_opl: earliest and latest arrival, metres.
+        missed, missed_error: share of the light outside of the chosen window, and its error; None without a window.
     """
 
     variant: str
@@ -60,7 +64,13 @@ class PilotReport:
 
 
 class Arrivals:
-    """Events of a pilot run, ready for questions about parts of their energy."""
+    """Arrivals of a pilot run, with the shares of light in parts of them.
+
+    Attributes:
+        opl, energy, depth, path: optical path length (metres), energy, depth and number of the path, all (N,).
+        paths: number of traced paths.
+        total: energy of all arrivals.
+    """
 
     def __init__(self, events: Any):
         self.opl, self.energy, self.depth, self.path = events.opl, events.energy, events.depth, events.path
@@ -74,7 +84,7 @@ class Arrivals:
         self.block_total = np.bincount(self.block, self.energy, self.blocks)
 
     def through(self, gates: Sequence[Gate]) -> Arrivals:
-        """The same arrivals as some gates see them: energy times the sum of their sensitivities."""
+        """Return the arrivals as some gates see them: energy times the sum of their sensitivities."""
         seen = copy.copy(self)
         seen.energy = self.energy * sum(gate.value(self.opl) for gate in gates)
         seen.total = float(seen.energy.sum())
@@ -83,11 +93,11 @@ class Arrivals:
 
     @property
     def dark(self) -> bool:
-        """Whether no light was met at all."""
+        """No light was met at all."""
         return not self.total > 0
 
     def share(self, chosen: np.ndarray) -> tuple[float, float]:
-        """Share of the energy in the chosen events, and its standard error over paths."""
+        """Return the share of the energy in the chosen arrivals, a mask (N,), and its standard error over paths."""
         return self._share(chosen, slice(None), self.paths, self.total)
 
     def _share(self, chosen: np.ndarray, part: Any, paths: int, total: float) -> tuple[float, float]:
@@ -97,12 +107,13 @@ class Arrivals:
         return mean / total, math.sqrt(max(spread, 0.0)) / total
 
     def relative_error(self) -> float:
-        """Standard error of the mean energy over the mean."""
+        """Return the standard error of the mean energy over the mean."""
         return self.share(np.ones(len(self.energy), dtype=bool))[1]
 
     def negligible(self, chosen: np.ndarray, share: float) -> bool:
-        """Whether the chosen events hold at most ``share`` of the light, with two standard errors to spare, and no
-        block of the image loses more than ten times that, beyond two standard errors.
+        """Return whether the chosen arrivals hold at most ``share`` of the light, with two standard errors to spare.
+
+        No block of the image may lose more than ten times that, beyond two standard errors.
         """
         part, error = self.share(chosen)
         if part + 2 * error > share:
@@ -120,7 +131,7 @@ class Arrivals:
     # ------------------------------------------------------------------------------------------------------ depth
 
     def enough_depth(self, tail: float) -> int:
-        """The smallest depth beyond which light is negligible; the deepest that was seen when none is."""
+        """Return the smallest depth beyond which light is negligible, or else the largest depth of all arrivals."""
         low, high = 1, int(self.depth.max())
         while low < high:
             middle = (low + high) // 2
@@ -131,8 +142,9 @@ class Arrivals:
         return low
 
     def beyond(self, deepest: int) -> tuple[float, float]:
-        """Share of the light in paths deeper than the run's ``deepest``, and its standard error: light that has fallen
-        to a share by the middle falls by that once more.
+        """Return the share of the light in paths deeper than the run's ``deepest``, and its standard error.
+
+        Light that has fallen to a share by the middle falls by that once more.
         """
         part, error = self.share(self.depth > deepest // 2)
         return part * part, 2 * part * error
@@ -140,7 +152,7 @@ class Arrivals:
     # ----------------------------------------------------------------------------------------------------- window
 
     def window(self, depth: int, missed: float) -> tuple[float, float]:
-        """From the earliest arrival to the time after which light is negligible, among paths up to ``depth``."""
+        """Return the earliest arrival and the one after which light is negligible, of paths up to ``depth``, metres."""
         kept = self.depth <= depth if depth > 0 else np.ones(len(self.depth), dtype=bool)
         times = np.sort(self.opl[kept & (self.energy > 0)])
         low, high = 0, len(times) - 1
@@ -154,11 +166,29 @@ class Arrivals:
 
 
 def pilot_run(
-    scene: Scene, options: BuildOptions, sensor: int, kind: type[FilmChoice], tail: float, seed: int = 0
+    scene: Scene,
+    options: BuildOptions,
+    sensor: int,
+    weigh: Callable[[Any, Arrivals], Arrivals],
+    tail: float,
+    seed: int = 0,
 ) -> tuple[Any, Arrivals]:
-    """(film, arrivals) of a pilot run of a scene in a variant without polarization, which costs most of the time and
-    changes neither depth nor time. ``kind``: what the film measures; ``tail``: the share of light that will be left to
-    deeper paths. Raises ``ArgumentError`` for unknown sensors.
+    """Trace a few thousand paths of a scene and list their arrivals.
+
+    Args:
+        scene: a scene in an unpolarized variant: polarization takes most of the time and changes neither depth nor
+            arrival.
+        options: options of the build.
+        sensor: index of the sensor.
+        weigh: function of (film, arrivals) that returns the arrivals as the film sees them.
+        tail: share of light that will be left to deeper paths.
+        seed: seed of the run.
+
+    Returns:
+        The film of the sensor, and the arrivals.
+
+    Raises:
+        ArgumentError: for an unknown sensor.
     """
     with active_variant(scene.variant):
         from torchtransient.plugins.integrators.pilot import pilot_events
@@ -169,18 +199,18 @@ def pilot_run(
             raise ArgumentError(f"sensor: the scene has {len(sensors)}, numbered from 0; got {sensor}. Give an index.")
         film = sensors[sensor].film()
         size = {"seed": seed, "pixels": PILOT_PIXELS, "paths": PILOT_PATHS}
-        found = kind.seen(film, Arrivals(pilot_events(built, built.integrator(), sensor, **size)))
+        found = weigh(film, Arrivals(pilot_events(built, built.integrator(), sensor, **size)))
         if not found.dark and found.enough_depth(tail) >= DEEP:
             events = pilot_events(built, built.integrator(), sensor, **size, roulette=False)
-            found = kind.seen(film, Arrivals(events))
+            found = weigh(film, Arrivals(events))
     return film, found
 
 
 def axis_over(first: float, last: float, bin_width_opl: float | None, num_bins: int | None) -> TimeAxis:
-    """A time axis from ``first`` to ``last``, both inside, in metres.
+    """Return a time axis that holds ``first`` and ``last``, in metres.
 
-    The bin width is ``bin_width_opl``, or else what divides the window into ``num_bins`` bins (300 when None), rounded
-    up to three digits. Bins start at a multiple of the width, except for a single one.
+    The bin width is ``bin_width_opl``, or else the window over ``num_bins`` bins (300 when None), rounded up to three
+    digits. Bins start at a multiple of the width, except for a single one.
     """
     count = num_bins or DEFAULT_BINS
     if num_bins == 1 and bin_width_opl is None:
@@ -206,14 +236,20 @@ def _round_up(length: float) -> float:
     return math.ceil(length / unit - 1e-9) * unit
 
 
+# ------------------------------------------------------------------------------------------ depth for derivatives
+
 # Largest share of the light that a bound leaves to deeper paths, as that of `tt.plan`.
 TAIL = 1e-3
 
 
 @dataclass(frozen=True)
 class DepthBound:
-    """``depth``: the bound. ``beyond``: share of a pilot run's light in deeper paths, the larger one of
-    all light and of that in the time window; ``error``: its standard error.
+    """Bound on the depth of paths for derivatives of a scene that states none.
+
+    Attributes:
+        depth: the bound.
+        beyond, error: share of a pilot run's light in deeper paths, the larger one of all light and of that in the time
+            window, and its standard error.
     """
 
     depth: int
@@ -222,20 +258,30 @@ class DepthBound:
 
 
 def depth_bound(
-    scene: Scene, options: BuildOptions, sensors: Sequence[int], film: FilmChoice, watch: PhysicsWatch
+    scene: Scene, options: BuildOptions, sensors: Sequence[int], film: Any, watch: PhysicsWatch
 ) -> DepthBound | None:
-    """The bound for derivatives of a scene, found for its described values when it is first asked for; None where its
-    depth is stated. Raises GradientError where none can be found, and PhysicsError, where ``watch`` is asked for
-    it, for more light beyond the bound than a time window may miss.
+    """Return the bound on the depth for derivatives of a scene, found at the first request; None for a stated depth.
+
+    A derivative keeps a record of every bounce and needs to know how many there are at most. The bound holds for a call
+    whose values can have derivatives, for its value too. Other renders have none: Russian roulette ends their paths.
+
+    Args:
+        scene, options, sensors: the scene, its build, and the sensors that are rendered.
+        film: film of the sensors, with ``seen`` (arrivals as it sees them) and ``parts`` (parts of its light).
+        watch: warns of the bound.
+
+    Raises:
+        GradientError: for a scene without light, and for a loaded polarized one.
+        PhysicsError: with ``physics="error"``, for more light beyond the bound than a time window may miss.
     """
     # One for all samplers, so that renderers that differ by theirs alone can be compared.
     options = replace(options, sampler=None)
     key = options, tuple(sensors)
     if key not in scene.depth_bounds:
-        scene.depth_bounds[key] = _found(scene, options, sensors, film)
+        scene.depth_bounds[key] = _found_bound(scene, options, sensors, film)
     bound: DepthBound | None = scene.depth_bounds[key]
-    if bound is not None and watch.looks:
-        watch.tell(
+    if bound is not None and watch.enabled:
+        watch.warn(
             f"max_depth {bound.depth}",
             "derivatives need a bound on the depth of paths, and the scene states none: value and derivative have "
             f"max_depth {bound.depth}, which leaves {bound.beyond:.2g} +- {bound.error:.1g} of the light to deeper "
@@ -246,11 +292,9 @@ def depth_bound(
     return bound
 
 
-def _found(scene: Scene, options: BuildOptions, sensors: Sequence[int], film: FilmChoice) -> DepthBound | None:
-    from torchtransient.scene.load import load
-
+def _found_bound(scene: Scene, options: BuildOptions, sensors: Sequence[int], film: Any) -> DepthBound | None:
     with active_variant(scene.variant):
-        if depth_limit(scene.built(options).scene.integrator()) != NO_LIMIT:
+        if built_depth(scene.built(options).scene.integrator()) != NO_LIMIT:
             return None
     unpolarized = scene.variant.removesuffix("_polarized")
     if scene.is_shared and unpolarized != scene.variant:
@@ -260,7 +304,7 @@ def _found(scene: Scene, options: BuildOptions, sensors: Sequence[int], film: Fi
         )
     lit = []
     for sensor in sensors:
-        _, arrivals = pilot_run(load(scene, variant=unpolarized), options, sensor, type(film), TAIL)
+        _, arrivals = pilot_run(load(scene, variant=unpolarized), options, sensor, film.seen, TAIL)
         lit += [part for part in film.parts(arrivals) if not part.dark]
     if not lit:
         raise GradientError(

@@ -1,4 +1,8 @@
-"""The decisions of a plan that may need a pilot run: depth, time axis, temporal filter."""
+"""Decisions of ``tt.plan``, each with the line that explains it.
+
+Variant, integrator and a depth by albedo follow from the description; depth, time window and temporal filter may need a
+pilot run (:mod:`.pilot`).
+"""
 
 from __future__ import annotations
 
@@ -11,12 +15,10 @@ from typing import Any
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ArgumentError, SceneError
-from torchtransient.given_types import is_one_of, several
+from torchtransient.given_types import is_one_of
 from torchtransient.plugins.parameters import check_slope
 from torchtransient.pulses import Pulse
 from torchtransient.quantities import shown
-from torchtransient.rendering.films.choice import FilmChoice, PlannedFilm
-from torchtransient.rendering.films.choices import all_films
 from torchtransient.rendering.slope import check_filter, filter_for
 from torchtransient.rendering.variant import active_variant
 from torchtransient.scene.edits import NO_LIMIT, BuildOptions
@@ -26,310 +28,76 @@ from torchtransient.scene.nodes import is_transient_integrator
 from torchtransient.scene.parameters import ParameterInfo, needing_slope, unknown_key
 from torchtransient.scene.pilot import MOST_BINS, Arrivals, PilotReport, axis_over, pilot_run
 
+_SURFACES, _VOLUMES = "transient_path", "transient_prbvolpath"
+_ALIASES = {"transient_volpath": _VOLUMES}
 _AROUND_CORNERS = "transient_nlos"
-# One bin for all times: far beyond the light of any scene when no pilot run says how far it goes.
+# Integrators that add pictures to those of a nested one.
+_WITH_PICTURES = ("aov", "moment")
+# One bin for all times without a pilot run: far beyond the light of any scene, metres.
 _ALL_TIMES = 1e9
 # Bins before and after an arrival that its light is spread over: by a tent, and by a Gaussian of half a bin.
 _REACH = {"tent": 0.5, "gaussian": 2.0}
 
 
-def _share(part: float, error: float) -> str:
-    return f"{part:.2g} +- {error:.1g} of the light" if part > 0 else "no light of the pilot run"
+@dataclass(frozen=True, kw_only=True)
+class Effects(abc.ABC):
+    """Decisions about one scene that a renderer takes over where its own arguments leave them open.
 
-
-@dataclass(frozen=True)
-class Draft:
-    """What is decided before a pilot run: the arguments of a :class:`~torchtransient.rendering.plan.Plan` but ``film``,
-    which is the plan's word and class of the film, while ``film_choice`` holds its settings, None to keep or find them.
+    Attributes:
+        scene: the scene, in the variant of the plan.
+        variant, integrator: names.
+        film_choice, max_depth, pulse, irf: None keeps those of the scene.
+        temporal_filter: empty for films without one.
+        filter_is_given: the filter was asked for, and no other one may take its place.
+        sensor: index of the sensor whose light the decisions are about.
     """
 
-    scene: Scene
+    scene: Scene = field(repr=False)
     variant: str
     integrator: str
-    film: PlannedFilm
-    film_choice: FilmChoice | None
+    film_choice: Any
+    max_depth: int | None
     pulse: Pulse | None
     irf: Pulse | None
-    parameters: tuple[str, ...]
-    sensor: int
-
-
-@dataclass(frozen=True)
-class Findings:
-    """What is decided with a pilot run, or without one."""
-
-    max_depth: int | None
-    film_choice: FilmChoice | None
     temporal_filter: str
-    reasons: tuple[str, ...]
-    pilot: PilotReport | None
+    filter_is_given: bool = False
+    sensor: int = 0
 
+    @abc.abstractmethod
+    def __str__(self) -> str:
+        """Return the reasons of the decisions, a line each."""
 
-class Finder:
-    """The decisions that may need a render: depth, window, temporal filter."""
-
-    def __init__(
-        self, draft: Draft, reasons: tuple[str, ...], inventory: SceneInventory, tail: float, missed: float, seed: int
-    ):
-        self.draft, self.inventory, self.tail, self.missed = draft, inventory, tail, missed
-        self.seed = seed
-        self.arrivals: Arrivals | None = None
-        self.report: PilotReport | None = None
-        self.reasons: list[str] = list(reasons)
-        # How far before and after its arrival a pulse or an impulse response spreads light.
-        self.spread = (0.0, 0.0)
-
-    def settle(
-        self,
-        pilot: bool,
-        max_depth: int | str | None,
-        time_axis: TimeAxis | str | None,
-        bins: tuple[int | None, float | None],
-        temporal_filter: str | None,
-    ) -> Findings:
-        wants_axis = self.draft.film.kind.has_axis and not self.draft.film.all_times and time_axis is None
-        if pilot and (max_depth is None or wants_axis):
-            self._run()
-        depth = self._depth(max_depth)
-        self._note_light(depth)
-        filter_name = self._filter(temporal_filter)
-        axis = self._axis(time_axis, bins, depth, _REACH.get(filter_name, 0.0))
-        if self.report is not None:
-            self.reasons.append(self._pilot_line())
-        film = self.draft.film_choice if axis is None else self.draft.film.kind.from_argument(axis)
-        return Findings(depth, film, filter_name, tuple(self.reasons), self.report)
-
-    def _run(self) -> None:
-        """The pilot run."""
-        started = time.perf_counter()
-        variant = self.draft.variant.removesuffix("_polarized")
-        scene = load(self.draft.scene, variant=variant)
-        kind = self.draft.film.kind
-        options = BuildOptions(
-            film=kind.film_of_pilot(self.draft.film_choice),
-            merge=True,
-            transient=True,
-            integrator=self.draft.integrator,
-            pulse=self.draft.pulse,
-            irf=self.draft.irf,
-        )
-        film, found = pilot_run(scene, options, self.draft.sensor, kind, self.tail, self.seed)
-        early, late = (sum(p.support_opl[side] for p in film.pulses) for side in (0, 1))
-        self.spread = (early, late)
-        scene.drop(options)
-        self.arrivals = found
-        dark = found.dark
-        self.report = PilotReport(
-            variant=variant,
-            paths=found.paths,
-            events=len(found.opl),
-            seconds=time.perf_counter() - started,
-            relative_error=float("nan") if dark else found.relative_error(),
-            tail=0.0,
-            tail_error=0.0,
-            first_opl=float("nan") if dark else float(found.opl.min()),
-            last_opl=float("nan") if dark else float(found.opl.max()),
-        )
-
-    def _pilot_line(self) -> str:
-        report = self.report
-        if report is None:
-            raise SceneError("tt.plan: no pilot run was made.")
-        dark = self.arrivals is None or self.arrivals.dark
-        error = "no light at all" if dark else f"image mean within {report.relative_error:.1%}"
-        return (
-            f"pilot: {report.paths} paths in {report.variant}, {report.events} arrivals, {error}; light that fewer "
-            f"than one path in {max(report.paths // 3, 1)} meets may have been overlooked"
-        )
-
-    # ------------------------------------------------------------------------------------------------------ depth
-
-    def _depth(self, given: int | str | None) -> int | None:
-        own = self.inventory.max_depth
-        if isinstance(given, str) and given != "scene":
-            raise ArgumentError(f"max_depth: expected a number, 'scene' or None, got {given!r}.")
-        if given is not None:
-            asked = own if given == "scene" else int(given)
-            self._note_tail(asked)
-            self.reasons.append(f"max_depth: {self._in_words(asked)}, as asked for{self._beyond(asked)}")
-            return asked
-        if self.arrivals is None and self._around_a_corner:
-            self.reasons.append(
-                f"max_depth: {self._in_words(own)}, kept; what albedos leave of emitted power says little about light "
-                "around corners"
-            )
-            return None
-        if self.arrivals is None:
-            depth, reason = depth_by_albedo(self.inventory, self.tail)
-            self.reasons.append(reason)
-            return depth
-        if self.arrivals.dark:
-            self.reasons.append(f"max_depth: {self._in_words(own)}, kept, since the pilot run saw no light")
-            return None
-        from torchtransient.plugins.integrators.pilot import PILOT_DEPTH
-
-        depth = self.arrivals.enough_depth(self.tail)
-        self._note_tail(depth)
-        reason = f"max_depth: {depth}{self._beyond(depth)}, asked for was {self.tail:g}"
-        if depth >= PILOT_DEPTH:
-            reason += f"; the pilot run went no deeper than {PILOT_DEPTH}, so light beyond it is not bounded"
-        if own != -1 and own < depth:
-            reason += f"; at the scene's own {own} it would be {self.arrivals.share(self.arrivals.depth > own)[0]:.2g}"
-        self.reasons.append(reason)
-        return depth
-
-    def _in_words(self, depth: int) -> str:
-        unbounded = depth == NO_LIMIT and self.draft.parameters
-        return depth_in_words(depth) + (" (derivatives: a bound that renderers find)" if unbounded else "")
-
-    def _note_tail(self, depth: int) -> None:
-        if self.arrivals is not None and self.report is not None and not self.arrivals.dark and depth >= 0:
-            part, error = self.arrivals.share(self.arrivals.depth > depth)
-            self.report = replace(self.report, tail=part, tail_error=error)
-
-    def _beyond(self, depth: int) -> str:
-        if self.arrivals is None or self.report is None or self.arrivals.dark or depth < 0:
-            return ""
-        return f"; {_share(self.report.tail, self.report.tail_error)} in deeper paths"
-
-    @property
-    def _around_a_corner(self) -> bool:
-        return self.draft.integrator.startswith(_AROUND_CORNERS) and self.inventory.integrator == self.draft.integrator
-
-    def _note_light(self, depth: int | None) -> None:
-        """How an integrator that has several ways finds which light."""
-        if not self._around_a_corner:
-            return
-        options = BuildOptions(max_depth=depth, merge=True, transient=True, integrator=self.draft.integrator)
-        with active_variant(self.draft.variant):
-            from torchtransient.plugins.around_corner.explanation import explanation
-
-            built = self.draft.scene.built(options).scene
-            integrator, sensors = built.integrator(), built.sensors()
-            contents = integrator.contents(built, sensors[self.draft.sensor])
-            self.reasons.append(f"light: {explanation(integrator, built, contents)}")
-            self.draft.scene.drop(options)
-
-    # ----------------------------------------------------------------------------------------------------- window
-
-    def _axis(
-        self, given: TimeAxis | str | None, bins: tuple[int | None, float | None], depth: int | None, reach: float = 0.0
-    ) -> TimeAxis | None:
-        """``reach``: bins over which the temporal filter spreads an arrival, to either side."""
-        if not self.draft.film.kind.has_axis:
-            if given is not None or bins != (None, None):
-                raise ArgumentError(
-                    f"tt.plan: a {self.draft.film.name} film has no time axis; leave time_axis and bins out."
-                )
-            return None
-        if isinstance(given, TimeAxis):
-            self.reasons.append(f"time axis: {given}, as asked for")
-            return given
-        if given is not None and not is_one_of(given, ("scene",)):
-            raise ArgumentError(f"time_axis: expected a tt.TimeAxis, 'scene' or None, got {shown(given)}.")
-        if self.draft.film.all_times:
-            last = _ALL_TIMES if self.arrivals is None or self.arrivals.dark else 4 * float(self.arrivals.opl.max())
-            return TimeAxis(0.0, last, 1)
-        if given == "scene" or self.arrivals is None or self.arrivals.dark:
-            return self._own_axis(given, bins)
-        return self._found_axis(self.arrivals, bins, depth, reach)
-
-    def _own_axis(self, given: str | None, bins: tuple[int | None, float | None]) -> TimeAxis:
-        why = "as asked for" if given == "scene" else "without a pilot run"
-        if given is None and self.arrivals is not None:
-            why = "since the pilot run saw no light"
-        if bins != (None, None):
-            raise ArgumentError(
-                f"tt.plan: num_bins and bin_width_opl have no effect on the scene's own axis, taken {why}."
-            )
-        if self.inventory.film_axis is None:
+    def planned_scene(self, scene: Any) -> Scene:
+        """Return a scene in the variant of the plan. Raises ``SceneError`` for another scene."""
+        given = load(scene)
+        if not given.same_description(self.scene):
             raise SceneError(
-                f"tt.plan: the scene's film has no time axis, which would be taken {why}. Give "
-                "time_axis=tt.TimeAxis(start_opl=..., bin_width_opl=..., num_bins=...), or let a pilot run find one."
+                f"effects: the plan was made for {self.scene!r}, got {given!r}, which is another scene: its depth, "
+                "window and variant would be those of the other. Make a plan of this one with tt.plan(scene, ...), or "
+                "take plan.renderer()."
             )
-        axis = self.inventory.film_axis
-        self.reasons.append(f"time axis: {axis}, the scene's own, {why}")
-        return axis
+        return load(given, variant=self.variant)
 
-    def _found_axis(
-        self, arrivals: Arrivals, bins: tuple[int | None, float | None], depth: int | None, reach: float = 0.0
-    ) -> TimeAxis:
-        num_bins, width = bins
-        first, last = arrivals.window(depth or -1, self.missed)
-        how = ""
-        if width is None and num_bins is None and self.inventory.film_axis is not None:
-            width, how = self.inventory.film_axis.bin_width_opl, ", bin width of the scene's film"
-            if (last - first) / width > MOST_BINS:
-                width, num_bins, how = None, MOST_BINS, f", {MOST_BINS} bins since the film's width would take more"
-        if self.spread != (0.0, 0.0):
-            how += f", widened by pulse and response from {self.spread[0]:g} to {self.spread[1]:+g} m"
-        first, last = first + self.spread[0], last + self.spread[1]
-        axis = axis_over(first, last, width, num_bins)
-        if reach:
-            margin = reach * axis.bin_width_opl
-            axis = axis_over(first - margin, last + margin, width, num_bins)
-        kept = arrivals.depth <= depth if depth is not None and depth > 0 else arrivals.depth > 0
-        part, error = arrivals.share(kept & ((arrivals.opl < axis.start_opl) | (arrivals.opl >= axis.end_opl)))
-        if self.report is not None:
-            self.report = replace(self.report, missed=part, missed_error=error)
-        self.reasons.append(
-            f"time axis: {axis}{how}; {_share(part, error)} outside, asked for was {self.missed:g}; the pilot run's "
-            f"last arrival came at {float(arrivals.opl.max()):.4g} m"
-        )
-        return axis
+    def film_settings(self, film: Any, temporal_filter: str) -> tuple[Any, str]:
+        """Return film and temporal filter of a renderer: its own where it has some, else the plan's."""
+        film = self.film_choice if film is None else film
+        # A box of the plan's own choice stays "auto": parameters that were not planned for may call for a slope.
+        decided = self.temporal_filter if self.filter_is_given or self.temporal_filter != "box" else ""
+        if temporal_filter == "auto" and decided and (film is None or film.has_filter):
+            temporal_filter = decided
+        return film, temporal_filter
 
-    # ------------------------------------------------------------------------------------------------- derivatives
-
-    def _note_edges(self, infos: Sequence[ParameterInfo]) -> None:
-        """Say which parameters call for the boundary term, and what it leaves out."""
-        if followed := [info.key for info in infos if info.has_boundary_term]:
-            self.reasons.append(f"boundary term: on, since edges move with {', '.join(followed)}")
-        self.reasons += [
-            f"approximation: the derivative by {info.key} is wrong {', '.join(info.edges_missing)}"
-            for info in infos
-            if info.edges_missing
-        ]
-
-    # --------------------------------------------------------------------------------------------- temporal filter
-
-    def _filter(self, given: str | None) -> str:
-        kind = self.draft.film.kind
-        if not kind.has_filter and given is not None:
-            raise ArgumentError(f"tt.plan: a {self.draft.film.name} film takes no temporal filter; leave it out.")
-        table = self.draft.scene.parameters() if self.draft.parameters else {}
-        for key in self.draft.parameters:
-            if key not in table:
-                raise SceneError(unknown_key(key, list(table)))
-        self._note_edges([table[key] for key in self.draft.parameters])
-        moving = needing_slope(table, self.draft.parameters)
-        pulsed = bool(self.draft.pulse or self.draft.irf or self.inventory.pulsed)
-        if not kind.has_filter:
-            film = self.draft.film_choice or self.inventory.film_settings
-            jump = "" if film is None or pulsed else film.jump()
-            check_slope(moving, not jump, jump, kind.slope_remedy)
-            return ""
-        own = self.inventory.temporal_filter or "box"
-        if given is not None:
-            check_filter(moving, given, pulsed)
-            self.reasons.append(f"temporal filter: {given}, as asked for")
-            return given
-        chosen = filter_for(moving, own, pulsed)
-        if chosen != own:
-            self.reasons.append(
-                f"temporal filter: {chosen}, since {moving[0]} changes path lengths and a {own} has no slope"
+    def check_sensors(self, sensors: Sequence[int]) -> None:
+        """Raise ``SceneError`` for sensors without a plan."""
+        others = sorted(set(sensors) - {self.sensor})
+        if others:
+            raise SceneError(
+                f"effects: the plan was made for sensor {self.sensor}, got sensors={list(sensors)}: another one sees "
+                f"light of other depths and times. Leave sensors out, or plan with tt.plan(scene, sensor={others[0]})."
             )
-        elif not self.draft.film.all_times:
-            why = "the scene's own" if self.inventory.temporal_filter else "since no parameter changes a path length"
-            self.reasons.append(f"temporal filter: {own}, {why}")
-        return chosen
 
 
-# What every film can show beside its own measurement.
-_OF_ANY_FILM = ("steady", "stokes", "bands")
-SURFACES, VOLUMES = "transient_path", "transient_prbvolpath"
-_ALIASES = {"transient_volpath": VOLUMES}
-# They add pictures to what a nested integrator traces.
-_WITH_PICTURES = ("aov", "moment")
+# ------------------------------------------------------------------------------------------- decisions by the contents
 
 
 @dataclass(frozen=True)
@@ -341,51 +109,25 @@ class Choice:
 
 
 def some(findings: Sequence[Finding], most: int = 3) -> str:
-    """The first few findings as text."""
+    """Return the first few findings as text."""
     named = "; ".join(str(finding) for finding in findings[:most])
     return named if len(findings) <= most else f"{named}; and {len(findings) - most} more"
-
-
-def known_outputs() -> tuple[str, ...]:
-    """What a plan can be asked for."""
-    return (*(kind.output for kind in all_films()), *_OF_ANY_FILM)
-
-
-def checked_outputs(outputs: Sequence[str] | str) -> tuple[str, ...]:
-    """The outputs as a tuple. Raises ``ArgumentError`` for unknown ones, and for two that need different films."""
-    asked = (outputs,) if isinstance(outputs, str) else tuple(several("tt.plan: outputs", outputs, "names"))
-    of_films, known = tuple(kind.output for kind in all_films()), known_outputs()
-    if not asked or not all(is_one_of(name, known) for name in asked):
-        raise ArgumentError(f"tt.plan: outputs are some of {', '.join(known)}; got {shown(list(asked))}.")
-    films = [name for name in asked if name in of_films]
-    if len(set(films)) > 1:
-        raise ArgumentError(
-            f"tt.plan: a film measures one of {', '.join(of_films)}, got {' and '.join(films)}; make a plan for each."
-        )
-    return asked
-
-
-def film_settings(
-    film: PlannedFilm, given: FilmChoice | None, plugin: str | None, outputs: Sequence[str]
-) -> FilmChoice | None:
-    """The settings of the plan's film: those ``given`` by the call; None to keep those of the scene's film, which is a
-    ``plugin``, or to find them. ``outputs``: what is asked for, from which ``film`` follows. Raises ``ArgumentError``.
-    """
-    if given is not None and type(given) is not film.kind:
-        of_any_film = (name for name in outputs if name in _OF_ANY_FILM)
-        raise ArgumentError(
-            f"tt.plan: outputs={tuple(outputs)} call for a {film.name} film, on which {given.argument} have no effect; "
-            f"ask for outputs={(given.output, *of_any_film)}."
-        )
-    if given is None and plugin != film.kind.plugin and film.kind.needed():
-        raise SceneError(film.kind.needed())
-    return given
 
 
 def choose_variant(
     inventory: SceneInventory, outputs: Sequence[str], device: str, strict: bool
 ) -> tuple[Choice, list[str]]:
-    """The cheapest variant in which nothing of the scene that was asked for is lost, and what is approximated."""
+    """Return the cheapest variant that can show the outputs, and notes on approximations.
+
+    Args:
+        inventory: contents of the scene.
+        outputs: outputs of the plan.
+        device: "llvm" or "cuda".
+        strict: carry polarization where it only changes the light between smooth surfaces, too.
+
+    Raises:
+        SceneError: for bands of a film without response curves.
+    """
     spectral = bool(inventory.measured or inventory.bands or "bands" in outputs)
     if "bands" in outputs and not inventory.bands:
         raise SceneError(
@@ -431,7 +173,7 @@ def _polarization(inventory: SceneInventory, outputs: Sequence[str], strict: boo
 
 
 def choose_integrator(inventory: SceneInventory) -> tuple[Choice, list[str]]:
-    """Surface or volume; a transient integrator of the scene that is neither is kept."""
+    """Return the integrator for surfaces or for volumes, or another transient one of the scene, and notes."""
     notes = [
         f"not used: {some(inventory.declared_only)}, declared and referred to by nothing"
     ] if inventory.declared_only else []  # fmt: skip
@@ -439,25 +181,25 @@ def choose_integrator(inventory: SceneInventory) -> tuple[Choice, list[str]]:
     if own in _WITH_PICTURES:
         notes.append(
             f"not rendered: the pictures that {own!r} adds to those of its nested integrator; "
-            "torchtransient.rendering.labels has depth, normals, shapes and albedos"
+            "tt.data.scene_labels has depth, normals, shapes and albedos"
         )
-    if is_transient_integrator(own) and _ALIASES.get(own, own) not in (SURFACES, VOLUMES):
+    if is_transient_integrator(own) and _ALIASES.get(own, own) not in (_SURFACES, _VOLUMES):
         return Choice(own, f"integrator: {own}, the scene's own"), notes
     if inventory.media:
-        return Choice(VOLUMES, f"integrator: {VOLUMES}, since the scene has {some(inventory.media)}"), notes
-    return Choice(SURFACES, f"integrator: {SURFACES}, since no medium can be reached from the scene"), notes
+        return Choice(_VOLUMES, f"integrator: {_VOLUMES}, since the scene has {some(inventory.media)}"), notes
+    return Choice(_SURFACES, f"integrator: {_SURFACES}, since no medium can be reached from the scene"), notes
 
 
-def depth_in_words(depth: int) -> str:
-    """A ``max_depth`` in the words of reasons."""
+def _depth_text(depth: int) -> str:
+    """Return a ``max_depth`` as text."""
     return "no limit" if depth == NO_LIMIT else str(depth)
 
 
 def depth_by_albedo(inventory: SceneInventory, tail: float) -> tuple[int | None, str]:
-    """The depth at which at most ``tail`` of the emitted power is still on its way, if the albedos bound it."""
+    """Return the depth at which at most ``tail`` of the emitted power is left, if the albedos bound it, and why."""
     if inventory.albedo >= 1:
         return None, (
-            f"max_depth: {depth_in_words(inventory.max_depth)}, kept; not bounded, since {inventory.brightest} may "
+            f"max_depth: {_depth_text(inventory.max_depth)}, kept; not bounded, since {inventory.brightest} may "
             "reflect everything and no pilot run was asked for"
         )
     bounces = 1 if inventory.albedo == 0 else max(1, math.ceil(math.log(tail) / math.log(inventory.albedo)))
@@ -469,55 +211,323 @@ def depth_by_albedo(inventory: SceneInventory, tail: float) -> tuple[int | None,
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Effects(abc.ABC):
-    """The decisions about one scene that a renderer takes over where its own arguments do not say otherwise.
+# ------------------------------------------------------------------------------------------ decisions by a pilot run
 
-    ``film_choice``, ``max_depth``, ``pulse`` and ``irf`` None keep what the scene has; ``temporal_filter`` is empty for
-    films without one, and ``filter_is_given`` says that it was asked for, so that no other one may take its place.
-    ``sensor``: the one whose light the decisions are about.
+
+def _share(part: float, error: float) -> str:
+    return f"{part:.2g} +- {error:.1g} of the light" if part > 0 else "no light of the pilot run"
+
+
+@dataclass(frozen=True)
+class Draft:
+    """Decisions before a pilot run.
+
+    Attributes:
+        film: kind of film (``PlannedFilm``).
+        film_choice: settings of the film that were asked for, None to keep or find them.
+        described_film: settings of the scene's own film, None where they are not known before it is built.
+        described_axis: time axis of the scene's own film, None without one.
+        scene, variant, integrator, pulse, irf, parameters, sensor: as those of the plan.
     """
 
-    scene: Scene = field(repr=False)
+    scene: Scene
     variant: str
     integrator: str
-    film_choice: FilmChoice | None
-    max_depth: int | None
+    film: Any
+    film_choice: Any
+    described_film: Any
+    described_axis: TimeAxis | None
     pulse: Pulse | None
     irf: Pulse | None
+    parameters: tuple[str, ...]
+    sensor: int
+
+
+@dataclass(frozen=True)
+class Findings:
+    """Decisions by a pilot run, or without one; attributes are those of the plan."""
+
+    max_depth: int | None
+    film_choice: Any
     temporal_filter: str
-    filter_is_given: bool = False
-    sensor: int = 0
+    reasons: tuple[str, ...]
+    pilot: PilotReport | None
 
-    @abc.abstractmethod
-    def __str__(self) -> str:
-        """The reasons of the decisions."""
 
-    def planned_scene(self, scene: Any) -> Scene:
-        """A scene in the variant of the plan. Raises ``SceneError`` for one that was not planned for."""
-        given = load(scene)
-        if not given.same_description(self.scene):
-            raise SceneError(
-                f"effects: the plan was made for {self.scene!r}, got {given!r}, which is another scene: its depth, "
-                "window and variant would be those of the other. Make a plan of this one with tt.plan(scene, ...), or "
-                "take plan.renderer()."
+class Finder:
+    """Search for depth, window and temporal filter, by a pilot run where it is needed."""
+
+    def __init__(
+        self, draft: Draft, reasons: tuple[str, ...], inventory: SceneInventory, tail: float, missed: float, seed: int
+    ):
+        self.draft, self.inventory, self.tail, self.missed = draft, inventory, tail, missed
+        self.seed = seed
+        self.arrivals: Arrivals | None = None
+        self.report: PilotReport | None = None
+        self.reasons: list[str] = list(reasons)
+        # Reach of pulse and impulse response before and after an arrival, metres.
+        self.spread = (0.0, 0.0)
+
+    def settle(
+        self,
+        pilot: bool,
+        max_depth: int | str | None,
+        time_axis: TimeAxis | str | None,
+        bins: tuple[int | None, float | None],
+        temporal_filter: str | None,
+    ) -> Findings:
+        """Return the decisions.
+
+        Args:
+            pilot: a pilot run may be made.
+            max_depth: a depth, "scene" for the scene's own, or None.
+            time_axis: an axis, "scene" for the scene's own, or None.
+            bins: number and width of bins of an axis to be found.
+            temporal_filter: name of a filter, or None.
+
+        Raises:
+            ArgumentError: for settings that have no effect.
+            SceneError: for an axis that cannot be found, and for unknown parameters.
+            GradientError: for a filter without a slope, with parameters that change path lengths.
+        """
+        wants_axis = self.draft.film.kind.has_axis and not self.draft.film.all_times and time_axis is None
+        if pilot and (max_depth is None or wants_axis):
+            self._run()
+        depth = self._depth(max_depth)
+        self._note_light(depth)
+        filter_name = self._filter(temporal_filter)
+        axis = self._axis(time_axis, bins, depth, _REACH.get(filter_name, 0.0))
+        if self.report is not None:
+            self.reasons.append(self._pilot_line())
+        film = self.draft.film_choice if axis is None else self.draft.film.kind.from_argument(axis)
+        return Findings(depth, film, filter_name, tuple(self.reasons), self.report)
+
+    def _run(self) -> None:
+        started = time.perf_counter()
+        variant = self.draft.variant.removesuffix("_polarized")
+        scene = load(self.draft.scene, variant=variant)
+        kind = self.draft.film.kind
+        options = BuildOptions(
+            film=kind.film_of_pilot(self.draft.film_choice),
+            merge=True,
+            transient=True,
+            integrator=self.draft.integrator,
+            pulse=self.draft.pulse,
+            irf=self.draft.irf,
+        )
+        film, found = pilot_run(scene, options, self.draft.sensor, kind.seen, self.tail, self.seed)
+        early, late = (sum(p.support_opl[side] for p in film.pulses) for side in (0, 1))
+        self.spread = (early, late)
+        scene.drop(options)
+        self.arrivals = found
+        dark = found.dark
+        self.report = PilotReport(
+            variant=variant,
+            paths=found.paths,
+            events=len(found.opl),
+            seconds=time.perf_counter() - started,
+            relative_error=float("nan") if dark else found.relative_error(),
+            tail=0.0,
+            tail_error=0.0,
+            first_opl=float("nan") if dark else float(found.opl.min()),
+            last_opl=float("nan") if dark else float(found.opl.max()),
+        )
+
+    def _pilot_line(self) -> str:
+        report = self.report
+        assert report is not None
+        dark = self.arrivals is None or self.arrivals.dark
+        error = "no light at all" if dark else f"image mean within {report.relative_error:.1%}"
+        return (
+            f"pilot: {report.paths} paths in {report.variant}, {report.events} arrivals, {error}; light that fewer "
+            f"than one path in {max(report.paths // 3, 1)} meets may have been overlooked"
+        )
+
+    # ------------------------------------------------------------------------------------------------------ depth
+
+    def _depth(self, given: int | str | None) -> int | None:
+        own = self.inventory.max_depth
+        if isinstance(given, str) and given != "scene":
+            raise ArgumentError(f"max_depth: expected a number, 'scene' or None, got {given!r}.")
+        if given is not None:
+            asked = own if given == "scene" else int(given)
+            self._note_tail(asked)
+            self.reasons.append(f"max_depth: {self._depth_words(asked)}, as asked for{self._beyond(asked)}")
+            return asked
+        if self.arrivals is None and self._around_a_corner:
+            self.reasons.append(
+                f"max_depth: {self._depth_words(own)}, kept; what albedos leave of emitted power says little about "
+                "light around corners"
             )
-        return load(given, variant=self.variant)
+            return None
+        if self.arrivals is None:
+            depth, reason = depth_by_albedo(self.inventory, self.tail)
+            self.reasons.append(reason)
+            return depth
+        if self.arrivals.dark:
+            self.reasons.append(f"max_depth: {self._depth_words(own)}, kept, since the pilot run saw no light")
+            return None
+        from torchtransient.plugins.integrators.pilot import PILOT_DEPTH
 
-    def film_settings(self, film: FilmChoice | None, temporal_filter: str) -> tuple[FilmChoice | None, str]:
-        """Film and temporal filter of a renderer: its own where it has some, else the plan's."""
-        film = self.film_choice if film is None else film
-        # A box of the plan's own choice stays "auto": parameters that were not planned for may call for a slope.
-        decided = self.temporal_filter if self.filter_is_given or self.temporal_filter != "box" else ""
-        if temporal_filter == "auto" and decided and (film is None or film.has_filter):
-            temporal_filter = decided
-        return film, temporal_filter
+        depth = self.arrivals.enough_depth(self.tail)
+        self._note_tail(depth)
+        reason = f"max_depth: {depth}{self._beyond(depth)}, asked for was {self.tail:g}"
+        if depth >= PILOT_DEPTH:
+            reason += f"; the pilot run went no deeper than {PILOT_DEPTH}, so light beyond it is not bounded"
+        if own != -1 and own < depth:
+            reason += f"; at the scene's own {own} it would be {self.arrivals.share(self.arrivals.depth > own)[0]:.2g}"
+        self.reasons.append(reason)
+        return depth
 
-    def check_sensors(self, sensors: Sequence[int]) -> None:
-        """Raise ``SceneError`` for a sensor that was not planned for."""
-        others = sorted(set(sensors) - {self.sensor})
-        if others:
-            raise SceneError(
-                f"effects: the plan was made for sensor {self.sensor}, got sensors={list(sensors)}: another one sees "
-                f"light of other depths and times. Leave sensors out, or plan with tt.plan(scene, sensor={others[0]})."
+    def _depth_words(self, depth: int) -> str:
+        unbounded = depth == NO_LIMIT and self.draft.parameters
+        return _depth_text(depth) + (" (derivatives: a bound that renderers find)" if unbounded else "")
+
+    def _note_tail(self, depth: int) -> None:
+        if self.arrivals is not None and self.report is not None and not self.arrivals.dark and depth >= 0:
+            part, error = self.arrivals.share(self.arrivals.depth > depth)
+            self.report = replace(self.report, tail=part, tail_error=error)
+
+    def _beyond(self, depth: int) -> str:
+        if self.arrivals is None or self.report is None or self.arrivals.dark or depth < 0:
+            return ""
+        return f"; {_share(self.report.tail, self.report.tail_error)} in deeper paths"
+
+    @property
+    def _around_a_corner(self) -> bool:
+        return self.draft.integrator.startswith(_AROUND_CORNERS) and self.inventory.integrator == self.draft.integrator
+
+    def _note_light(self, depth: int | None) -> None:
+        """Add the reason which light an integrator for corners finds in which way."""
+        if not self._around_a_corner:
+            return
+        options = BuildOptions(max_depth=depth, merge=True, transient=True, integrator=self.draft.integrator)
+        with active_variant(self.draft.variant):
+            from torchtransient.plugins.around_corner.explanation import explanation
+
+            built = self.draft.scene.built(options).scene
+            integrator, sensors = built.integrator(), built.sensors()
+            contents = integrator.contents(built, sensors[self.draft.sensor])
+            self.reasons.append(f"light: {explanation(integrator, built, contents)}")
+            self.draft.scene.drop(options)
+
+    # ----------------------------------------------------------------------------------------------------- window
+
+    def _axis(
+        self, given: TimeAxis | str | None, bins: tuple[int | None, float | None], depth: int | None, reach: float = 0.0
+    ) -> TimeAxis | None:
+        """Return the time axis. ``reach``: bins over which the temporal filter spreads an arrival, to either side."""
+        if not self.draft.film.kind.has_axis:
+            if given is not None or bins != (None, None):
+                raise ArgumentError(
+                    f"tt.plan: a {self.draft.film.name} film has no time axis; leave time_axis and bins out."
+                )
+            return None
+        if isinstance(given, TimeAxis):
+            self.reasons.append(f"time axis: {given}, as asked for")
+            return given
+        if given is not None and not is_one_of(given, ("scene",)):
+            raise ArgumentError(f"time_axis: expected a tt.TimeAxis, 'scene' or None, got {shown(given)}.")
+        if self.draft.film.all_times:
+            last = _ALL_TIMES if self.arrivals is None or self.arrivals.dark else 4 * float(self.arrivals.opl.max())
+            return TimeAxis(0.0, last, 1)
+        if given == "scene" or self.arrivals is None or self.arrivals.dark:
+            return self._own_axis(given, bins)
+        return self._found_axis(self.arrivals, bins, depth, reach)
+
+    def _own_axis(self, given: str | None, bins: tuple[int | None, float | None]) -> TimeAxis:
+        why = "as asked for" if given == "scene" else "without a pilot run"
+        if given is None and self.arrivals is not None:
+            why = "since the pilot run saw no light"
+        if bins != (None, None):
+            raise ArgumentError(
+                f"tt.plan: num_bins and bin_width_opl have no effect on the scene's own axis, taken {why}."
             )
+        if self.draft.described_axis is None:
+            raise SceneError(
+                f"tt.plan: the scene's film has no time axis, which would be taken {why}. Give "
+                "time_axis=tt.TimeAxis(start_opl=..., bin_width_opl=..., num_bins=...), or let a pilot run find one."
+            )
+        axis = self.draft.described_axis
+        self.reasons.append(f"time axis: {axis}, the scene's own, {why}")
+        return axis
+
+    def _found_axis(
+        self, arrivals: Arrivals, bins: tuple[int | None, float | None], depth: int | None, reach: float = 0.0
+    ) -> TimeAxis:
+        num_bins, width = bins
+        first, last = arrivals.window(depth or -1, self.missed)
+        how = ""
+        if width is None and num_bins is None and self.draft.described_axis is not None:
+            width, how = self.draft.described_axis.bin_width_opl, ", bin width of the scene's film"
+            if (last - first) / width > MOST_BINS:
+                width, num_bins, how = None, MOST_BINS, f", {MOST_BINS} bins since the film's width would take more"
+        if self.spread != (0.0, 0.0):
+            how += f", widened by pulse and response from {self.spread[0]:g} to {self.spread[1]:+g} m"
+        first, last = first + self.spread[0], last + self.spread[1]
+        axis = axis_over(first, last, width, num_bins)
+        if reach:
+            margin = reach * axis.bin_width_opl
+            axis = axis_over(first - margin, last + margin, width, num_bins)
+        kept = arrivals.depth <= depth if depth is not None and depth > 0 else arrivals.depth > 0
+        part, error = arrivals.share(kept & ((arrivals.opl < axis.start_opl) | (arrivals.opl >= axis.end_opl)))
+        if self.report is not None:
+            self.report = replace(self.report, missed=part, missed_error=error)
+        self.reasons.append(
+            f"time axis: {axis}{how}; {_share(part, error)} outside, asked for was {self.missed:g}; the pilot run's "
+            f"last arrival came at {float(arrivals.opl.max()):.4g} m"
+        )
+        return axis
+
+    # ------------------------------------------------------------------------------------------------- derivatives
+
+    def _note_edges(self, infos: Sequence[ParameterInfo]) -> None:
+        """Add the reasons of the boundary term, and the edges that it leaves out."""
+        if followed := [info.key for info in infos if info.has_boundary_term]:
+            self.reasons.append(f"boundary term: on, since edges move with {', '.join(followed)}")
+        self.reasons += [
+            f"approximation: the derivative by {info.key} is wrong {', '.join(info.edges_missing)}"
+            for info in infos
+            if info.edges_missing
+        ]
+
+    # --------------------------------------------------------------------------------------------- temporal filter
+
+    def _filter(self, given: str | None) -> str:
+        kind = self.draft.film.kind
+        if not kind.has_filter and given is not None:
+            raise ArgumentError(f"tt.plan: a {self.draft.film.name} film takes no temporal filter; leave it out.")
+        table = self.draft.scene.parameters() if self.draft.parameters else {}
+        for key in self.draft.parameters:
+            if key not in table:
+                raise SceneError(unknown_key(key, list(table)))
+        self._note_edges([table[key] for key in self.draft.parameters])
+        moving = needing_slope(table, self.draft.parameters)
+        pulsed = bool(self.draft.pulse or self.draft.irf or self.inventory.pulsed)
+        if not kind.has_filter:
+            film = self.draft.film_choice or self.draft.described_film
+            jump = "" if film is None or pulsed else film.jump()
+            check_slope(moving, not jump, jump, kind.slope_remedy)
+            return ""
+        own = self.inventory.temporal_filter or "box"
+        if given is not None:
+            check_filter(moving, given, pulsed)
+            self.reasons.append(f"temporal filter: {given}, as asked for")
+            return given
+        chosen = filter_for(moving, own, pulsed)
+        if chosen != own:
+            self.reasons.append(
+                f"temporal filter: {chosen}, since {moving[0]} changes path lengths and a {own} has no slope"
+            )
+        elif not self.draft.film.all_times:
+            why = "the scene's own" if self.inventory.temporal_filter else "since no parameter changes a path length"
+            self.reasons.append(f"temporal filter: {own}, {why}")
+        return chosen
+
+
+# What every film can show beside its own measurement.
+_OF_ANY_FILM = ("steady", "stokes", "bands")
+SURFACES, VOLUMES = "transient_path", "transient_prbvolpath"
+_ALIASES = {"transient_volpath": VOLUMES}
+# They add pictures to what a nested integrator traces.
+_WITH_PICTURES = ("aov", "moment")

@@ -1,4 +1,4 @@
-"""``scene.save``: a scene with its values as an XML file that loads again, and the check that it does."""
+"""``scene.save``: a scene with values as an XML file, written, read back and compared."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import os
 import shutil
 import tempfile
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,22 +24,21 @@ from torchtransient.plugins.drjit_pool import threads_for_files
 from torchtransient.plugins.mitsuba_compat import DIFFERENTIABLE_PLUGINS, POLARIZED_PLUGINS
 from torchtransient.plugins.node_walk import ShownValue, objects_below, objects_of
 from torchtransient.plugins.spectral_colours import as_colours, keeps_coefficients, same_spectra
-from torchtransient.plugins.unfinished import afterwards
-from torchtransient.rendering.variant import active_variant, device_type, in_variant
-from torchtransient.scene.edits import BuildOptions
-from torchtransient.scene.nodes import children, kind_of_node, name_nodes, take_merged_apart
-from torchtransient.scene.objects import ReadyScene
+from torchtransient.rendering.variant import device_type
+from torchtransient.scene.build import BuiltScene
+from torchtransient.scene.description import Plain
+from torchtransient.scene.nodes import children, name_children, node_kind, split_merged_shapes
 from torchtransient.scene.parameters import read_value
-from torchtransient.scene.values import Slot, as_float, fit_shape, own_array
+from torchtransient.scene.values import Slot, SlotTable, as_float, fit_shape, own_array
 
 # Numbers that went through a file differ by the rounding of single precision.
 _RTOL, _ATOL = 1e-5, 1e-6
-_WAY_OUT = "Leave such keys out of values, or keep the values and the description: pickle.dumps(scene)."
+WAY_OUT = "Leave such keys out of values, or keep the values and the description: pickle.dumps(scene)."
 
 
-def save_scene(scene: Any, path: str | os.PathLike[str], values: Mapping[str, Any], load: Callable[..., Any]) -> Path:
-    """Write a scene with ``values``, load it, and compare. ``load``: ``tt.load``."""
-    scene._description.check_described("scene.save")
+@contextmanager
+def replaced_files(path: str | os.PathLike[str]) -> Iterator[tuple[Path, Path, Path]]:
+    """Yield the path of a scene, and a draft of the file and of its folder that take their place without an error."""
     target = path_of(path, "scene.save")
     if target.suffix != ".xml":
         raise SceneError(f"scene.save: expected the name of an XML file, such as scene.xml, got {str(target)!r}.")
@@ -47,62 +47,74 @@ def save_scene(scene: Any, path: str | os.PathLike[str], values: Mapping[str, An
     check_folder(target, "scene.save")
     files = f"{target.stem}_files"
     with writing_said(target, "scene.save"), tempfile.TemporaryDirectory(dir=target.parent) as place:
-        draft = Path(place) / target.name
-        with active_variant(scene.variant):
-            wanted = _write(scene, draft, Path(place) / files, values)
-            try:
-                _compare(load(draft, variant=scene.variant), wanted, tuple(values))
-            except SceneError as error:
-                # The folder that it was tried in is gone.
-                raise SceneError(str(error).replace(f"{place}{os.sep}", "")) from error
+        draft, folder = Path(place) / target.name, Path(place) / files
+        try:
+            yield target, draft, folder
+        except SceneError as error:
+            # The folder of the draft is gone.
+            raise SceneError(str(error).replace(f"{place}{os.sep}", "")) from error
         if (target.parent / files).is_dir():
             shutil.rmtree(target.parent / files)
-        if (Path(place) / files).is_dir():
-            shutil.move(str(Path(place) / files), str(target.parent / files))
+        if folder.is_dir():
+            shutil.move(str(folder), str(target.parent / files))
         os.replace(draft, target)
-    return target
 
 
-def _write(scene: Any, draft: Path, folder: Path, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Write the files; the numbers that they should bring back, by key."""
+def write_scene(
+    description: Plain, variant: str, slots: SlotTable, values: Mapping[str, Any], draft: Path, folder: Path
+) -> dict[str, np.ndarray]:
+    """Write a scene with values, which are installed in its built scene, and return all its numbers by key.
+
+    Args:
+        description, variant: the scene.
+        slots: slots of the values.
+        values: values by key.
+        draft, folder: the XML file, and the folder of arrays and files beside it.
+    """
     import mitsuba as mi
 
-    description = scene._description
-    assert not isinstance(description, ReadyScene)
-    keys = tuple(values)
-    options = _options(scene, keys)
-    slots = scene.slots(keys, options)
     built = slots.built
     try:
-        with afterwards(in_variant(scene.variant, lambda: scene.leave(options, slots, attached=True))):
-            slots.install([_leaf(slot, values[slot.key], scene.variant) for slot in slots.slots])
-            with description.resolved_files(), plugins.plugin_errors():
-                state = _parsed(description, scene.variant)
-                writer = XmlWriter(state, folder)
-                places = places_of(built.scene, state)
-                for slot in slots.slots:
-                    shape = slot.shape if slot.kind != "mesh_transform" else (4, 4)
-                    given = values[slot.key]
-                    given = given.detach().cpu() if isinstance(given, torch.Tensor) else given
-                    write_value(writer, built, places, slot, np.asarray(given, dtype=np.float64).reshape(shape))
-                for value in objects_below(built.scene, mi.Object):
-                    place = places.get(value.ptr)
-                    if place is None or place.names:
-                        continue
-                    writer.note_kind(place.node, value)
-                    if isinstance(value, mi.Mesh) and state.nodes[place.node].props.plugin_name() == "mesh_arrays":
-                        mesh_as_file(writer, place.node, value)
-                draft.write_text(writer.text(), encoding="utf-8")
-            return _numbers(built)
+        slots.install([_leaf(slot, values[slot.key], variant) for slot in slots.slots])
+        with description.resolved_files(), plugins.plugin_errors():
+            state = _parsed(description, variant)
+            writer = XmlWriter(state, folder)
+            places = _places(built.scene, state)
+            for slot in slots.slots:
+                shape = slot.shape if slot.kind != "mesh_transform" else (4, 4)
+                given = values[slot.key]
+                given = given.detach().cpu() if isinstance(given, torch.Tensor) else given
+                _write_value(writer, built, places, slot, np.asarray(given, dtype=np.float64).reshape(shape))
+            for value in objects_below(built.scene, mi.Object):
+                place = places.get(value.ptr)
+                if place is None or place.names:
+                    continue
+                writer.note_kind(place.node, value)
+                if isinstance(value, mi.Mesh) and state.nodes[place.node].props.plugin_name() == "mesh_arrays":
+                    _save_mesh(writer, place.node, value)
+            draft.write_text(writer.text(), encoding="utf-8")
+        return _numbers(built)
     except (RuntimeError, ValueError, TypeError) as error:
         if isinstance(error, TorchTransientError):
             raise
         raise SceneError(f"scene.save: {description.name} cannot be written: {error}") from error
 
 
-def _options(scene: Any, keys: tuple[str, ...]) -> BuildOptions:
-    plain = BuildOptions(real_bitmaps=True)
-    return scene.options_for(keys, plain) if keys else plain
+def check_same(built: BuiltScene, wanted: Mapping[str, np.ndarray]) -> None:
+    """Raise ``SceneError`` where the numbers of a scene that was read back are not the wanted ones."""
+    found = _numbers(built)
+    other = sorted(found.keys() ^ wanted.keys())
+    params = built.params.properties
+    for key, value in wanted.items():
+        if key in found and not _same(value, found[key]):
+            spectral = keeps_coefficients(params[key][2], key.rsplit(".", 1)[-1])
+            if not (spectral and same_spectra(value, found[key])):
+                other.append(key)
+    if other:
+        raise SceneError(
+            f"scene.save: {', '.join(other[:5])}{' ...' if len(other) > 5 else ''} cannot be said in XML: what was "
+            f"read back is different. {WAY_OUT}"
+        )
 
 
 def _leaf(slot: Any, value: Any, variant: str) -> Any:
@@ -118,47 +130,24 @@ def _leaf(slot: Any, value: Any, variant: str) -> Any:
     return own_array(tensor)
 
 
-def _parsed(description: Any, variant: str) -> Any:
+def _parsed(description: Plain, variant: str) -> Any:
     import mitsuba as mi
 
     config = mi.parser.ParserConfig(variant)
     state = description.parse(config)
     mi.parser.transform_upgrade(config, state)
     mi.parser.transform_resolve(config, state)
-    name_nodes(state)
-    take_merged_apart(state)
+    name_children(state)
+    split_merged_shapes(state)
     return state
 
 
-def _numbers(built: Any) -> dict[str, Any]:
+def _numbers(built: BuiltScene) -> dict[str, np.ndarray]:
     found = {}
     for key, (handle, cpptype, node, _) in built.params.properties.items():
         current = ShownValue(key, handle, 0, cpptype).read(node)  # type: ignore[call-arg]
         found[key] = np.array(read_value(current, None) if np.ndim(current) == 0 else current)
     return found
-
-
-def _compare(again: Any, wanted: dict[str, Any], keys: tuple[str, ...]) -> None:
-    """Raise ``SceneError`` where a scene that was read back is another one. It is built as the one of ``wanted``, with
-    the plugins that ``keys`` ask for.
-    """
-    try:
-        built = again.built(_options(again, keys))
-        found = _numbers(built)
-    except TorchTransientError as error:
-        raise SceneError(f"scene.save: what was written does not load. {_WAY_OUT} {error}") from error
-    other = sorted(found.keys() ^ wanted.keys())
-    params = built.params.properties
-    for key, value in wanted.items():
-        if key in found and not _same(value, found[key]):
-            spectral = keeps_coefficients(params[key][2], key.rsplit(".", 1)[-1])
-            if not (spectral and same_spectra(value, found[key])):
-                other.append(key)
-    if other:
-        raise SceneError(
-            f"scene.save: {', '.join(other[:5])}{' ...' if len(other) > 5 else ''} cannot be said in XML: what was "
-            f"read back is different. {_WAY_OUT}"
-        )
 
 
 def _same(a: np.ndarray, b: np.ndarray) -> bool:
@@ -167,13 +156,15 @@ def _same(a: np.ndarray, b: np.ndarray) -> bool:
     return bool(np.allclose(a, b, rtol=_RTOL, atol=_ATOL * max(1.0, float(np.abs(a).max(initial=0)))))
 
 
+# ------------------------------------------------------------------------------------- values as properties of nodes
+
 _VERTICES = ("vertex_positions", "vertex_normals", "vertex_texcoords")
 # Properties of three numbers that are no colour.
 _VECTORS = ("position", "direction", "sensor_origin", "laser_origin", "sun_direction", "target")
-# What a mesh file says itself.
-_SAID_BY_FILE = ("filename", "to_world", "vertices", "faces", "normals", "texcoords", "shape_index")
-# What a property takes the place of: files, names of glasses and metals, other ways to say an angle.
-_STANDS_FOR = {
+# Properties that a mesh file holds itself.
+_IN_MESH_FILE = ("filename", "to_world", "vertices", "faces", "normals", "texcoords", "shape_index")
+# Properties that another one replaces: files, names of glasses and metals, other forms of an angle.
+_REPLACES = {
     "data": ("filename", "bitmap", "grid"),
     "bitmap": ("filename", "data"),
     "fov": ("focal_length",),
@@ -187,13 +178,15 @@ _TWINS = {**DIFFERENTIABLE_PLUGINS, **POLARIZED_PLUGINS}
 _RATIOS = (*_GLASSES, *(_TWINS[plugin] for plugin in _GLASSES if plugin in _TWINS))
 # Lists of numbers in a text.
 _TEXTS = ("values", "wavelengths")
-# Numbers that Mitsuba makes of another one where they are not described.
-_MADE_OF = {("spot", "cutoff_angle"): ("beam_width",)}
+# Numbers that Mitsuba derives from another one where they are not described.
+_DERIVED = {("spot", "cutoff_angle"): ("beam_width",)}
 
 
 class Place(NamedTuple):
-    """Where an object of a built scene is described: a node, and where Mitsuba has made it of a number, of a colour or
-    of nothing, the names that lead to it from there, and the first object on that way.
+    """Place of a built object in the description.
+
+    ``node``: index of a node. For objects that Mitsuba has made of a number, of a colour or of a default: ``names``
+    that lead to the object from there, and the first object ``made`` on that way.
     """
 
     node: int
@@ -201,8 +194,8 @@ class Place(NamedTuple):
     made: Any = None
 
 
-def places_of(scene: Any, state: Any) -> dict[int, Place]:
-    """The places of the objects of a built scene in the list of nodes, by address."""
+def _places(scene: Any, state: Any) -> dict[int, Place]:
+    """Return the places of the objects of a built scene in the list of nodes, by address."""
     found: dict[int, Place] = {}
     waiting = [(scene, Place(0))]
     while waiting:
@@ -215,7 +208,7 @@ def places_of(scene: Any, state: Any) -> dict[int, Place]:
 
 
 def _places_in(value: Any, place: Place, state: Any) -> list[tuple[Any, Place]]:
-    """The places of what an object holds."""
+    """Return the objects inside an object with their places."""
     index = place.node
     if place.names:
         return [(inner, place._replace(names=(*place.names, name))) for name, inner in objects_of(value)]
@@ -223,15 +216,15 @@ def _places_in(value: Any, place: Place, state: Any) -> list[tuple[Any, Place]]:
     free = dict.fromkeys(child for _, child in held)
     found, unmatched = [], []
     for name, inner in objects_of(value):
-        said = name if index else inner.id()
-        match = next((c for key, c in held if (key if index else state.nodes[c].props.id()) == said), None)
+        wanted = name if index else inner.id()
+        match = next((c for key, c in held if (key if index else state.nodes[c].props.id()) == wanted), None)
         if match is None:
             unmatched.append((name, inner))
         else:
             free.pop(match, None)
             found.append((inner, Place(match)))
     for name, inner in unmatched:
-        match = next((c for c in free if _is_of_kind(inner, state.nodes[c])), None)
+        match = next((c for c in free if _may_be(inner, state.nodes[c])), None)
         if name in state.nodes[index].props or match is None:
             found.append((inner, Place(index, (name,), inner)))
         else:
@@ -240,18 +233,16 @@ def _places_in(value: Any, place: Place, state: Any) -> list[tuple[Any, Place]]:
     return found
 
 
-def _is_of_kind(value: Any, node: Any) -> bool:
-    """Whether a node may be what an object was made of."""
+def _may_be(value: Any, node: Any) -> bool:
+    """Return whether an object may have been made of a node."""
     import mitsuba as mi
 
-    kind = getattr(mi, kind_of_node(node), None)
+    kind = getattr(mi, node_kind(node), None)
     return kind is not None and isinstance(value, kind)
 
 
-def write_value(writer: XmlWriter, built: Any, places: dict[int, Place], slot: Slot, value: np.ndarray) -> None:
-    """Put a value, which is installed in the built scene, into its node. Raises ``SceneError`` where that has no
-    property for it.
-    """
+def _write_value(writer: XmlWriter, built: Any, places: dict[int, Place], slot: Slot, value: np.ndarray) -> None:
+    """Write an installed value into its node. Raises ``SceneError`` for a node without a property for it."""
     import mitsuba as mi
 
     state = writer.state
@@ -272,39 +263,40 @@ def write_value(writer: XmlWriter, built: Any, places: dict[int, Place], slot: S
     if slot.kind == "mesh_transform" and props.plugin_name() != "mesh_arrays":
         props["to_world"] = double_transform()(value.astype(np.float64))
     elif slot.kind == "mesh_transform" or (isinstance(owner, mi.Mesh) and name in _VERTICES):
-        mesh_as_file(writer, index, owner)
+        _save_mesh(writer, index, owner)
     elif slot.kind == "transform":
         matrix = value.astype(np.float64)
         props[name] = double_transform()(matrix) if len(matrix) == 4 else mi.ScalarTransform3f(matrix)
-        _leave_only(props, name)
+        _drop_replaced(props, name)
     elif slot.kind == "tensor" and not place.names:
-        name, value = _array_of(owner, name, value)
+        name, value = _array_property(owner, name, value)
         props[name] = mi.TensorXf(np.ascontiguousarray(value, dtype=np.float32))
-        _leave_only(props, name)
+        _drop_replaced(props, name)
     elif place.names:
-        of_metal = "material" in props and place.names in (("eta",), ("k",))
-        _put_into_made(state, place, owner, value, slot.key)
-        if of_metal:
-            # Its name stood for both.
+        is_metal = "material" in props and place.names in (("eta",), ("k",))
+        _write_made(state, place, owner, value, slot.key)
+        if is_metal:
+            # The name of the metal gave both.
             (other,) = {"eta", "k"} - set(place.names)
             there = f"{slot.key.removesuffix(f'{place.names[0]}.{name}')}{other}.{name}"
-            _put_numbers(props, other, np.array(built.params[there]), slot.key)
+            _write_numbers(props, other, np.array(built.params[there]), slot.key)
     else:
-        for other in _MADE_OF.get((props.plugin_name(), name), ()):
+        for other in _DERIVED.get((props.plugin_name(), name), ()):
             if other not in props:
                 props[other] = float(np.ravel(built.params[f"{target.rpartition('.')[0]}.{other}"])[0])
-        _put_numbers(props, *_property_of(props, name, value), slot.key)
+        _write_numbers(props, *_number_property(props, name, value), slot.key)
 
 
-def _array_of(owner: Any, name: str, value: np.ndarray) -> tuple[str, np.ndarray]:
-    """The property of a plugin that its array is read from. Maps of surroundings repeat a column at either end, which
-    files do not have.
+def _array_property(owner: Any, name: str, value: np.ndarray) -> tuple[str, np.ndarray]:
+    """Return the property and the numbers of an array.
+
+    Maps of surroundings repeat a column at either end, which files do not have.
     """
     return ("bitmap", value[:, 1:-1]) if owner.class_name() == "EnvironmentMapEmitter" else (name, value)
 
 
-def _property_of(props: Any, name: str, value: np.ndarray) -> tuple[str, np.ndarray]:
-    """The property that a number of a plugin is said by, and what else that fixes."""
+def _number_property(props: Any, name: str, value: np.ndarray) -> tuple[str, np.ndarray]:
+    """Return the property of a number, and set the properties that it depends on."""
     plugin = props.plugin_name()
     if name == "eta" and plugin in _RATIOS:
         # The ratio alone counts, and what it was made of may have been names of glasses.
@@ -316,29 +308,29 @@ def _property_of(props: Any, name: str, value: np.ndarray) -> tuple[str, np.ndar
     return ("scale", value) if plugin == "d65" and name == "value" else (name, value)
 
 
-def _put_into_made(state: Any, place: Place, owner: Any, value: np.ndarray, key: str) -> None:
-    """Into what Mitsuba makes of a number or of nothing."""
+def _write_made(state: Any, place: Place, owner: Any, value: np.ndarray, key: str) -> None:
+    """Write a value of an object that Mitsuba has made of a number or of a default."""
     import mitsuba as mi
 
     node, (first, *rest) = state.nodes[place.node], place.names
     surface = isinstance(place.made, mi.BSDF) and place.made.class_name() == "SmoothDiffuse" and len(rest) == 1
     if surface:
-        _put_numbers(_child_of(state, place.node, first, "diffuse", mi.ObjectType.BSDF), rest[0], value, key)
+        _write_numbers(_child(state, place.node, first, "diffuse", mi.ObjectType.BSDF), rest[0], value, key)
     elif not rest and first not in node.props and isinstance(owner, mi.Texture) and _is_emitter(node):
         # Light that is not described is that of daylight.
-        _put_numbers(_child_of(state, place.node, first, "d65", mi.ObjectType.Texture), "scale", value, key)
+        _write_numbers(_child(state, place.node, first, "d65", mi.ObjectType.Texture), "scale", value, key)
     elif not rest or (isinstance(place.made, mi.Volume) and len(rest) == 1):
-        _put_numbers(node.props, first, value, key)
+        _write_numbers(node.props, first, value, key)
     else:
         raise SceneError(f"scene.save: {key!r} has no place in the description, and cannot be said in XML.")
 
 
 def _is_emitter(node: Any) -> bool:
-    return kind_of_node(node) == "Emitter" or kind_of(node.props.plugin_name()) == "emitter"
+    return node_kind(node) == "Emitter" or kind_of(node.props.plugin_name()) == "emitter"
 
 
-def _child_of(state: Any, index: int, name: str, plugin: str, kind: Any) -> Any:
-    """The properties of a child, which is made where there is none."""
+def _child(state: Any, index: int, name: str, plugin: str, kind: Any) -> Any:
+    """Return the properties of a child, which is added where there is none."""
     import mitsuba as mi
 
     there = dict(children(state, state.nodes[index])).get(name)
@@ -352,13 +344,13 @@ def _child_of(state: Any, index: int, name: str, plugin: str, kind: Any) -> Any:
     return state.nodes[there].props
 
 
-def _leave_only(props: Any, name: str) -> None:
-    for other in _STANDS_FOR.get(name, ()):
+def _drop_replaced(props: Any, name: str) -> None:
+    for other in _REPLACES.get(name, ()):
         if other in props:
             del props[other]
 
 
-def _put_numbers(props: Any, name: str, value: np.ndarray, key: str) -> None:
+def _write_numbers(props: Any, name: str, value: np.ndarray, key: str) -> None:
     import mitsuba as mi
 
     numbers, types = np.ravel(value).astype(np.float64), mi.Properties.Type
@@ -378,11 +370,11 @@ def _put_numbers(props: Any, name: str, value: np.ndarray, key: str) -> None:
             f"scene.save: a value of shape {np.shape(value)} for {key!r} cannot be said in XML: the description has no "
             f"property {name!r} of that kind. Leave the key out of values, or keep the values themselves."
         )
-    _leave_only(props, name)
+    _drop_replaced(props, name)
 
 
-def mesh_as_file(writer: XmlWriter, index: int, mesh: Any) -> None:
-    """Make a mesh's node one that reads a file, which is written from the mesh as it is now."""
+def _save_mesh(writer: XmlWriter, index: int, mesh: Any) -> None:
+    """Turn the node of a mesh into one that reads a file, and write that."""
     import mitsuba as mi
 
     node = writer.state.nodes[index]
@@ -394,10 +386,12 @@ def mesh_as_file(writer: XmlWriter, index: int, mesh: Any) -> None:
     new["filename"] = str(path)
     new["face_normals"] = not mesh.has_vertex_normals()
     for key in list(old.keys()):
-        if key not in (*_SAID_BY_FILE, "face_normals"):
+        if key not in (*_IN_MESH_FILE, "face_normals"):
             new[key] = old[key]
     node.props = new
 
+
+# ----------------------------------------------------------------------------------------------------- nodes as XML
 
 # Mitsuba's kinds, as its classes are called.
 _KINDS = (
@@ -414,7 +408,11 @@ _POINTS = {"nlos_capture_meter": ("points", "laser_points")}
 
 
 class XmlWriter:
-    """Writes the nodes of ``state`` with files into ``folder``, which the XML calls by the name of the folder."""
+    """Writer of parsed nodes as XML, with arrays and files of the scene in ``folder`` beside it.
+
+    Mitsuba's own writer (``mi.parser.write_file``) drops the names of most nodes, and with them the keys of parameters,
+    and decomposes transforms with errors of 1e-6.
+    """
 
     def __init__(self, state: Any, folder: Path) -> None:
         self.state, self.folder = state, folder
@@ -425,14 +423,14 @@ class XmlWriter:
         self._count = 0
 
     def note_kind(self, index: int, built: Any) -> None:
-        """Tell the kind of a node by the object that was built of it: the parser knows that of no plugin in Python."""
+        """Note the kind of a node by its built object: the parser does not know that of plugins in Python."""
         import mitsuba as mi
 
         kinds = (kind for kind in _KINDS if isinstance(built, getattr(mi, kind)))
         self._kinds[index] = next(kinds, "Unknown")
 
     def text(self) -> str:
-        """The scene as XML."""
+        """Return the scene as XML."""
         import mitsuba as mi
 
         root = ElementTree.Element("scene", version=mi.__version__)
@@ -441,7 +439,7 @@ class XmlWriter:
         return ElementTree.tostring(root, encoding="unicode") + "\n"
 
     def file(self, name: str, ending: str) -> Path:
-        """A new file beside the scene, called after what is in it."""
+        """Return the path of a new file in the folder."""
         self.folder.mkdir(parents=True, exist_ok=True)
         safe = "".join(c if c.isalnum() or c in "-_" else "_" for c in name) or "data"
         path = self.folder / f"{safe}{ending}"
@@ -451,7 +449,7 @@ class XmlWriter:
         return path
 
     def name_of(self, path: Path) -> str:
-        """What the scene calls a file beside it."""
+        """Return the name of a file in the folder, as the scene refers to it."""
         return f"{self.folder.name}/{path.name}"
 
     # ------------------------------------------------------------------------------------------------------- nodes
@@ -477,13 +475,13 @@ class XmlWriter:
 
     def _child(self, parent: ElementTree.Element, name: str, index: int, direct: bool) -> None:
         node = self.state.nodes[index]
-        said = "" if name.startswith("_arg") else name
+        label = "" if name.startswith("_arg") else name
         if index in self._written or (index in self._direct and not direct):
             reference = node.props.id()
             if index not in self._direct:
                 reference = self._written[index].get("id") or f"node_{index}"
                 self._written[index].set("id", reference)
-            _named(ElementTree.SubElement(parent, "ref", id=reference), said)
+            _named(ElementTree.SubElement(parent, "ref", id=reference), label)
             return
         plugin, kind = node.props.plugin_name(), str(node.type).rsplit(".", 1)[-1]
         kind = self._kinds.get(index, kind) if kind == "Unknown" else kind
@@ -491,8 +489,8 @@ class XmlWriter:
         if tag == "unknown":
             raise SceneError(f"scene.save: the kind of plugin {plugin!r} is not known, so that XML has no tag for it.")
         element = ElementTree.SubElement(parent, tag, type=plugin)
-        _named(element, said)
-        # Parameters of shapes in groups and of sensors in batches are called after them, too.
+        _named(element, label)
+        # Keys of shapes in groups and of sensors in batches have their names too.
         named = direct or (kind in ("Shape", "Sensor") and self._names.count(node.props.id()) == 1)
         if named and node.props.id():
             element.set("id", node.props.id())
@@ -531,7 +529,7 @@ class XmlWriter:
             )
 
     def _text(self, key: str, value: str, where: str) -> str:
-        """A text; files that it names come along."""
+        """Return a text; files that it names are copied into the folder."""
         import mitsuba as mi
 
         if "$" in value:

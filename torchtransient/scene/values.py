@@ -20,8 +20,16 @@ FEW = 64
 
 
 def as_float(key: str, value: Any, device: str) -> torch.Tensor:
-    """The value as float32, by an operation that gradients pass. Numbers, lists and arrays come to ``device``, tensors
-    must be there. Raises ``ShapeError`` for what is not real numbers, ``DeviceError`` for another device.
+    """Return a value as a float32 tensor, by an operation that gradients pass.
+
+    Args:
+        key: key of the parameter, for messages.
+        value: number, list, array, or tensor; all but tensors are copied to ``device``.
+        device: torch device type of the scene's variant.
+
+    Raises:
+        ShapeError: for values that are not dense and real.
+        DeviceError: for a tensor on another device.
     """
     if value is None:  # which numpy takes for a number that is none
         raise ShapeError(f"value of {key!r}: expected numbers, got None. Leave the key out to keep the current value.")
@@ -42,7 +50,7 @@ def as_float(key: str, value: Any, device: str) -> torch.Tensor:
 
 
 def _tensor_of(key: str, value: Any) -> torch.Tensor:
-    """A tensor of a number, of lists of them, also with tensors inside, or of an array of any library."""
+    """Return a tensor of a number, of nested lists of numbers and tensors, or of an array of any library."""
     try:
         if _holds_tensors(value):
             return torch.stack([e if isinstance(e, torch.Tensor) else _tensor_of(key, e) for e in value])
@@ -58,13 +66,22 @@ def _tensor_of(key: str, value: Any) -> torch.Tensor:
 
 
 def _holds_tensors(value: Any) -> bool:
-    """Whether there are tensors in a list, or in one of its lists."""
+    """Return whether a nested list holds tensors."""
     listed = isinstance(value, (list, tuple))
     return listed and any(isinstance(entry, torch.Tensor) or _holds_tensors(entry) for entry in value)
 
 
 def fit_shape(key: str, value: torch.Tensor, shape: tuple[int, ...]) -> tuple[torch.Tensor, bool]:
-    """The value in its own shape, and whether it has a leading batch dimension. Flat vertex lists are taken too."""
+    """Return a value in the shape of its parameter, and whether it has a leading batch dimension.
+
+    Args:
+        key: key of the parameter, for messages.
+        value: tensor of ``shape``, (B, *shape), or flat for ``shape`` (N, D).
+        shape: shape of the parameter.
+
+    Raises:
+        ShapeError: for other shapes.
+    """
     got = tuple(value.shape)
     if got == shape:
         return value, False
@@ -83,8 +100,9 @@ def fit_shape(key: str, value: torch.Tensor, shape: tuple[int, ...]) -> tuple[to
 
 
 def may_have_derivative(tensor: torch.Tensor, *, graph: bool = True) -> bool:
-    """Return whether autograd, forward mode or a transform of ``torch.func`` may differentiate by a tensor; without a
-    ``graph`` (``torch.no_grad``) forward mode alone.
+    """Return whether autograd, forward mode or a transform of ``torch.func`` may differentiate by a tensor.
+
+    Without a ``graph`` (``torch.no_grad``) forward mode alone can.
     """
     transforms = torch._C._functorch
     while not ((graph and tensor.requires_grad) or _is_dual(tensor)):
@@ -103,8 +121,10 @@ def _is_dual(tensor: torch.Tensor) -> bool:
 
 
 def own_array(tensor: torch.Tensor) -> Any:
-    """A flat Dr.Jit copy in Dr.Jit's own memory: the scene must not alias memory that belongs to the caller, and a
-    recorded kernel would go on reading memory that is not Dr.Jit's where the first call had it.
+    """Return a flat Dr.Jit copy of a tensor in Dr.Jit's own memory.
+
+    The scene must not alias memory of the caller, and a recorded kernel would go on reading other memory where the
+    first call had it.
     """
     import drjit as dr
     import mitsuba as mi
@@ -125,13 +145,13 @@ def own_array(tensor: torch.Tensor) -> Any:
 
 
 def wait_for_torch(tensor: torch.Tensor) -> None:
-    """Dr.Jit works on a stream of its own: what torch has queued must be done before Dr.Jit reads or reuses memory."""
+    """Wait for torch's queue: Dr.Jit reads and reuses memory on a stream of its own."""
     if tensor.is_cuda:
         torch.cuda.current_stream(tensor.device).synchronize()
 
 
 class Slot:
-    """Where one torch value goes: its shape, and the Mitsuba parameters that are written from it."""
+    """Place of one torch value in a built scene: its shape, and the parameters of Mitsuba that it sets."""
 
     def __init__(self, built: BuiltScene, key: str):
         self.key = key
@@ -152,7 +172,7 @@ class Slot:
         self.shape: tuple[int, ...] = shape
 
     def loses_black(self) -> bool:
-        """Whether derivatives are lost where the value is exactly zero."""
+        """Return whether derivatives are lost where the value is exactly zero."""
         if self.kind == "mesh_transform":
             return False
         scene = self._built.scene
@@ -160,11 +180,11 @@ class Slot:
         return bool(scene.integrator().parameters(scene).loses_black(node, self.key.rsplit(".", 1)[-1]))
 
     def is_number_of_kernels(self) -> bool:
-        """Whether Mitsuba reads numbers of the value while it is installed, and keeps them as plain ones."""
+        """Return whether Mitsuba reads the value as plain numbers, which become part of kernels."""
         return is_number_of_kernels(*self._class_and_name())
 
     def check(self, value: Any) -> None:
-        """Raise SceneError for a value that Mitsuba would keep wrongly."""
+        """Raise ``SceneError`` for a pose that Mitsuba would store wrongly."""
         if is_turned_by_reflections(*self._class_and_name()):
             check_pose(self.key, self.initial, value)
 
@@ -173,20 +193,15 @@ class Slot:
             return "", "to_world"
         return self._built.params.properties[self.key][2].class_name(), self.key.rsplit(".", 1)[-1]
 
-    @property
-    def size(self) -> int:
-        """Number of entries."""
-        return int(np.prod(self.shape, dtype=np.int64))
-
     def write(self, leaf: Any, originals: Mapping[str, Any]) -> None:
-        """Set the Mitsuba parameters from the flat array ``leaf`` by operations that Dr.Jit can differentiate."""
+        """Set the parameters of Mitsuba from the flat array ``leaf``, by operations that Dr.Jit differentiates."""
         if self.kind == "mesh_transform":
             self._write_mesh(leaf, originals)
             return
         self._built.params[self.key] = as_mitsuba_value(self.kind, self.shape, originals[self.key], leaf)
 
     def _write_mesh(self, leaf: Any, originals: Mapping[str, Any]) -> None:
-        """New vertices ``T inv(T0) v0``, normals by the inverse transpose; T0 is the transform of the description."""
+        """Set vertices ``T inv(T0) v0``, normals by the inverse transpose; T0 is the described transform."""
         import drjit as dr
         import mitsuba as mi
 
@@ -203,7 +218,7 @@ class Slot:
 
 
 def as_mitsuba_value(kind: str, shape: tuple[int, ...], current: Any, leaf: Any) -> Any:
-    """The flat array ``leaf`` as a value like ``current``, by operations that Dr.Jit can differentiate."""
+    """Return the flat array ``leaf`` as a value like ``current``, by operations that Dr.Jit differentiates."""
     import drjit as dr
     import mitsuba as mi
 
@@ -220,7 +235,7 @@ def as_mitsuba_value(kind: str, shape: tuple[int, ...], current: Any, leaf: Any)
 
 
 def changed_with(keys: Iterable[str], params: Any) -> list[str]:
-    """The parameters that Mitsuba has to be told have changed beside ``keys``.
+    """Return the parameters to mark as changed beside ``keys``.
 
     A light with a texture is sampled by a map from texture coordinates to points, which Mitsuba keeps until positions
     change; where those do and normals do not, it makes up new normals.
@@ -232,7 +247,7 @@ def changed_with(keys: Iterable[str], params: Any) -> list[str]:
 
 
 class SlotTable:
-    """The slots of some keys in one built scene, with the values that the scene goes back to."""
+    """Slots of some keys in one built scene, with the described values."""
 
     def __init__(self, built: BuiltScene, keys: tuple[str, ...]):
         self.built = built

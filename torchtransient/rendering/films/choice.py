@@ -126,6 +126,10 @@ class FilmChoice(abc.ABC):
     def write(self, props: Any) -> None:
         """Write the settings into the properties of a film node of this plugin."""
 
+    def describes(self, film: FilmInterface) -> bool:
+        """Return whether a built film has these settings."""
+        return film.measures == self.measures and self.from_film(film) == self
+
     @classmethod
     def fits(cls, plugin: str) -> bool:
         """Whether a film plugin takes the properties that :meth:`write` writes."""

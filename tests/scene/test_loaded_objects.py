@@ -209,7 +209,7 @@ def test_what_would_change_a_ready_scene_is_refused():
         tt.TransientRenderer(tt.load(mi.load_dict(steady)))
     steady = make_room()
     steady["sensor"]["film"] = {"type": "hdrfilm", "width": 4, "height": 3, "rfilter": {"type": "mitchell"}}
-    with pytest.raises(tt.errors.SceneError, match=r"taken as it is .* no time axis.*Make the scene with one of trans"):
+    with pytest.raises(tt.errors.SceneError, match=r"taken as it is .* no time axis.*Make the scene with a trans"):
         tt.TransientRenderer(tt.load(mi.load_dict(steady)), time_axis=axis)
 
 
