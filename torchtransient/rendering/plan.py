@@ -1,7 +1,7 @@
-"""``tt.plan``: the cheapest variant, integrator, film, depth and time window that show what is asked for.
+"""``tt.plan``: cheapest variant, integrator, film, depth and time window that show the outputs.
 
 Nothing is guessed: a decision follows from what the description contains, from a pilot run (a few thousand paths whose
-arrivals are listed one by one), or from the caller, and ``plan.reasons`` says from which.
+arrivals are listed one by one), or from the caller; ``plan.reasons`` names the source.
 """
 
 from __future__ import annotations
@@ -164,7 +164,7 @@ def plan(
             spare.
         missed: the same for light outside of the time window.
         strict: carry polarization also where it only changes the light between smooth surfaces. Without it such a
-            scene is planned unpolarized, as is usual, and ``reasons`` says so.
+            scene is planned unpolarized, as is usual, with a line in ``reasons``.
         pilot: False for no pilot run: the depth then follows from the albedos where they bound it, and the time axis
             is the scene's.
         sensor: index of the sensor that is planned for, and rendered.

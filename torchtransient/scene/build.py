@@ -1,6 +1,6 @@
 """A Mitsuba scene from a description: parsed, checked, edited by the options of a renderer, instantiated.
 
-The same edits of Mitsuba's list of nodes serve XML files and dictionaries. Errors are told in terms of the description.
+The same edits of Mitsuba's list of nodes serve XML files and dictionaries. Errors name places of the description.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class BuiltScene:
         let_go(contents)
 
 
-# Errors of constructors, Mitsuba's and those of plugins in Python.
+# Errors of constructors, of Mitsuba and of plugins in Python.
 _PLUGIN_ERRORS = (RuntimeError, ValueError, TypeError, ArithmeticError, AttributeError, LookupError, MemoryError)
 
 # Mitsuba merges meshes of one surface, and stops where their normals are made in different ways.

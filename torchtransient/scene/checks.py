@@ -219,7 +219,7 @@ _TYPES = {
 }  # fmt: skip
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 _LISTS = ("vertex_index", "vertex_indices")
-# A line of its own: comments may say it, too.
+# A line of its own: comments may hold it, too.
 _END = re.compile(rb"^end_header\s*?\n", re.MULTILINE)
 
 # (name of an element, how many, its properties as (name, type, whether it is a list))

@@ -12,7 +12,7 @@ builds that plugin first, so that it refuses misspelt properties and wrong value
 | ``use_spectral_mis`` (``volpathmis``), ``jitter``, ``strength`` (samplers) | without effect but on noise |
 | ``shading_samples``, ``emitter_samples``, ``bsdf_samples`` (``direct``) | only noise; 0 of one kind is refused |
 | ``timeout``, ``block_size``, ``samples_per_pass`` | without effect in variants that compile kernels |
-| samples of silhouettes (``prb_projective``) | refused, see ``spp_boundary``; those that ask for none pass |
+| samples of silhouettes (``prb_projective``) | refused, see ``spp_boundary``; values that ask for none pass |
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ class FilmRequest(Protocol):
 
     @property
     def takes_pulse(self) -> bool:
-        """Whether the film spreads arrivals by a pulse."""
+        """The film spreads arrivals by a pulse."""
 
     def describes(self, film: Any) -> bool:
         """Return whether a built film has the properties."""
@@ -124,7 +124,7 @@ class BuildOptions:
         merge: let Mitsuba merge meshes and equal materials, which is faster to trace but takes parameters away.
         transient: turn a steady film and integrator into transient ones.
         sampler: plugin name of a sampler that replaces those of the sensors, with the same number of samples.
-        pulse, irf: shape of the pulse and impulse response of every film, None to keep those of the films.
+        pulse, irf: shape of the pulse and impulse response of every film, None to keep their own.
         steady: False takes the steady image from the histograms.
         integrator: plugin name of a transient integrator that replaces the scene's, with the parameters of both.
     """
@@ -414,7 +414,7 @@ def _substitute_twins(state: Any, options: BuildOptions) -> None:
 
 
 def _lacks_mean(state: Any, node: Any) -> bool:
-    """Return whether one of a plugin's textures, or of those that they hold, has no mean."""
+    """Return whether a texture of a plugin, or one inside it, has no mean."""
     import mitsuba as mi
 
     described = any(inner.props.plugin_name() in TEXTURES_WITHOUT_MEAN for inner in descendants(state, node))

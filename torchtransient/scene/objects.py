@@ -98,7 +98,7 @@ class LoadedScene(Description):
 
     @property
     def objects(self) -> tuple[Any, ...]:
-        """The scene as a whole."""
+        """All of the scene."""
         return (self,)
 
     def __str__(self) -> str:
@@ -229,7 +229,7 @@ def transient_dictionary(scene: Any) -> dict[str, Any] | None:
 
     A film belongs to its sensor and an integrator to its scene; neither can be exchanged in a loaded scene. Cameras
     with a steady film and steady path tracers are described by the parameters that they show, without the seeds of
-    their samplers; all else is taken as it is.
+    their samplers; all else is used as it is.
     """
     import mitsuba as mi
 

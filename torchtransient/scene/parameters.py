@@ -1,4 +1,4 @@
-"""The table of a scene's parameters: shapes, values, and which of them have derivatives.
+"""Table of a scene's parameters: shapes, values, and which of them have derivatives.
 
 Keys are those of ``mitsuba.traverse``. Meshes apply ``to_world`` while loading and forget it; a key
 ``<mesh>.to_world`` is offered for them all the same: the matrix replaces the one of the description, and vertices
@@ -70,12 +70,12 @@ class ParameterInfo:
 
     @property
     def biased(self) -> bool:
-        """The derivative is known to be wrong somewhere: everywhere, or where edges are not followed."""
+        """Derivative that is known to be wrong: everywhere, or where edges are not followed."""
         return self.always_biased or bool(self.edges_missing)
 
 
 class ParameterTable(Mapping[str, ParameterInfo]):
-    """The parameters of a scene by key. ``str(table)`` is a readable table."""
+    """Parameters of a scene by key. ``str(table)`` is a readable table."""
 
     def __init__(self, entries: list[ParameterInfo]):
         self._entries = {entry.key: entry for entry in entries}

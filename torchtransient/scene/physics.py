@@ -62,7 +62,7 @@ class PhysicsWatch:
 
     @property
     def enabled(self) -> bool:
-        """Whether anything is checked."""
+        """Checks are made."""
         return self.mode != "ignore"
 
     def warn(self, about: str, message: str, *, is_error: bool = True) -> None:

@@ -46,7 +46,7 @@ class Effects(abc.ABC):
     Attributes:
         scene: the scene, in the variant of the plan.
         variant, integrator: names.
-        film_choice, max_depth, pulse, irf: None keeps those of the scene.
+        film_choice, max_depth, pulse, irf: None keeps the scene's.
         temporal_filter: empty for films without one.
         filter_is_given: the filter was asked for, and no other one may take its place.
         sensor: index of the sensor whose light the decisions are about.
@@ -227,7 +227,7 @@ class Draft:
         film_choice: settings of the film that were asked for, None to keep or find them.
         described_film: settings of the scene's own film, None where they are not known before it is built.
         described_axis: time axis of the scene's own film, None without one.
-        scene, variant, integrator, pulse, irf, parameters, sensor: as those of the plan.
+        scene, variant, integrator, pulse, irf, parameters, sensor: as in the plan.
     """
 
     scene: Scene
@@ -245,7 +245,7 @@ class Draft:
 
 @dataclass(frozen=True)
 class Findings:
-    """Decisions by a pilot run, or without one; attributes are those of the plan."""
+    """Decisions by a pilot run, or without one; attributes as in the plan."""
 
     max_depth: int | None
     film_choice: Any

@@ -15,7 +15,7 @@ from torchtransient.quantities import real_array, shown
 from torchtransient.scene.build import BuiltScene
 from torchtransient.scene.parameters import classify, read_value
 
-# Of so few entries a list is taken over sooner than a kernel is launched.
+# Up to so many entries a list is copied faster than a kernel is launched.
 FEW = 64
 
 
@@ -167,8 +167,7 @@ class Slot:
             node = params.properties[f"{prefix}.vertex_positions"][2]
             self.initial = built.mesh_to_world.get(node.id(), np.eye(4))
             self.targets = [f"{prefix}.vertex_positions", f"{prefix}.vertex_normals"]
-        if shape is None:
-            raise SceneError(f"parameter {key!r} is not numeric.")
+        assert shape is not None, key  # keys without a derivative, such as texts, are refused before
         self.shape: tuple[int, ...] = shape
 
     def loses_black(self) -> bool:
