@@ -10,7 +10,7 @@ import abc
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 from torchtransient.axes import TimeAxis
@@ -262,9 +262,13 @@ class Finder:
     ):
         self.draft, self.inventory, self.tail, self.missed = draft, inventory, tail, missed
         self.seed = seed
-        self.arrivals: Arrivals | None = None
-        self.report: PilotReport | None = None
         self.reasons: list[str] = list(reasons)
+        # Of the pilot run: its arrivals, None without one, and its wall time.
+        self.arrivals: Arrivals | None = None
+        self.seconds = 0.0
+        # Share of light in paths deeper than the depth, and outside of the window, with standard errors.
+        self.tail_found: tuple[float, float] = (0.0, 0.0)
+        self.missed_found: tuple[float, float] | tuple[None, None] = (None, None)
         # Reach of pulse and impulse response before and after an arrival, metres.
         self.spread = (0.0, 0.0)
 
@@ -297,15 +301,13 @@ class Finder:
         self._note_light(depth)
         filter_name = self._filter(temporal_filter)
         axis = self._axis(time_axis, bins, depth, _REACH.get(filter_name, 0.0))
-        if self.report is not None:
-            self.reasons.append(self._pilot_line())
+        report = None if self.arrivals is None else self._report(self.arrivals)
         film = self.draft.film_choice if axis is None else self.draft.film.kind.from_argument(axis)
-        return Findings(depth, film, filter_name, tuple(self.reasons), self.report)
+        return Findings(depth, film, filter_name, tuple(self.reasons), report)
 
     def _run(self) -> None:
         started = time.perf_counter()
-        variant = self.draft.variant.removesuffix("_polarized")
-        scene = load(self.draft.scene, variant=variant)
+        scene = load(self.draft.scene, variant=self._pilot_variant)
         kind = self.draft.film.kind
         options = BuildOptions(
             film=kind.film_of_pilot(self.draft.film_choice),
@@ -315,33 +317,38 @@ class Finder:
             pulse=self.draft.pulse,
             irf=self.draft.irf,
         )
-        film, found = pilot_run(scene, options, self.draft.sensor, kind.seen, self.tail, self.seed)
+        film, self.arrivals = pilot_run(scene, options, self.draft.sensor, kind.seen, self.tail, self.seed)
         early, late = (sum(p.support_opl[side] for p in film.pulses) for side in (0, 1))
         self.spread = (early, late)
         scene.drop(options)
-        self.arrivals = found
-        dark = found.dark
-        self.report = PilotReport(
-            variant=variant,
-            paths=found.paths,
-            events=len(found.opl),
-            seconds=time.perf_counter() - started,
-            relative_error=float("nan") if dark else found.relative_error(),
-            tail=0.0,
-            tail_error=0.0,
-            first_opl=float("nan") if dark else float(found.opl.min()),
-            last_opl=float("nan") if dark else float(found.opl.max()),
-        )
+        self.seconds = time.perf_counter() - started
 
-    def _pilot_line(self) -> str:
-        report = self.report
-        assert report is not None
-        dark = self.arrivals is None or self.arrivals.dark
-        error = "no light at all" if dark else f"image mean within {report.relative_error:.1%}"
-        return (
+    @property
+    def _pilot_variant(self) -> str:
+        return self.draft.variant.removesuffix("_polarized")
+
+    def _report(self, arrivals: Arrivals) -> PilotReport:
+        """Return the report of the pilot run, and add its line to the reasons."""
+        nan = float("nan")
+        report = PilotReport(
+            variant=self._pilot_variant,
+            paths=arrivals.paths,
+            events=len(arrivals.opl),
+            seconds=self.seconds,
+            relative_error=nan if arrivals.dark else arrivals.relative_error(),
+            tail=self.tail_found[0],
+            tail_error=self.tail_found[1],
+            first_opl=nan if arrivals.dark else float(arrivals.opl.min()),
+            last_opl=nan if arrivals.dark else float(arrivals.opl.max()),
+            missed=self.missed_found[0],
+            missed_error=self.missed_found[1],
+        )
+        error = "no light at all" if arrivals.dark else f"image mean within {report.relative_error:.1%}"
+        self.reasons.append(
             f"pilot: {report.paths} paths in {report.variant}, {report.events} arrivals, {error}; light that fewer "
             f"than one path in {max(report.paths // 3, 1)} meets may have been overlooked"
         )
+        return report
 
     # ------------------------------------------------------------------------------------------------------ depth
 
@@ -350,10 +357,9 @@ class Finder:
         if isinstance(given, str) and given != "scene":
             raise ArgumentError(f"max_depth: expected a number, 'scene' or None, got {given!r}.")
         if given is not None:
-            asked = own if given == "scene" else int(given)
-            self._note_tail(asked)
-            self.reasons.append(f"max_depth: {self._depth_words(asked)}, as asked for{self._beyond(asked)}")
-            return asked
+            depth = own if given == "scene" else int(given)
+            self.reasons.append(f"max_depth: {self._depth_words(depth)}, as asked for{self._deeper(depth)}")
+            return depth
         if self.arrivals is None and self._around_a_corner:
             self.reasons.append(
                 f"max_depth: {self._depth_words(own)}, kept; what albedos leave of emitted power says little about "
@@ -361,20 +367,19 @@ class Finder:
             )
             return None
         if self.arrivals is None:
-            depth, reason = depth_by_albedo(self.inventory, self.tail)
+            bound, reason = depth_by_albedo(self.inventory, self.tail)
             self.reasons.append(reason)
-            return depth
+            return bound
         if self.arrivals.dark:
             self.reasons.append(f"max_depth: {self._depth_words(own)}, kept, since the pilot run saw no light")
             return None
         from torchtransient.plugins.integrators.pilot import PILOT_DEPTH
 
         depth = self.arrivals.enough_depth(self.tail)
-        self._note_tail(depth)
-        reason = f"max_depth: {depth}{self._beyond(depth)}, asked for was {self.tail:g}"
+        reason = f"max_depth: {depth}{self._deeper(depth)}, asked for was {self.tail:g}"
         if depth >= PILOT_DEPTH:
             reason += f"; the pilot run went no deeper than {PILOT_DEPTH}, so light beyond it is not bounded"
-        if own != -1 and own < depth:
+        if own != NO_LIMIT and own < depth:
             reason += f"; at the scene's own {own} it would be {self.arrivals.share(self.arrivals.depth > own)[0]:.2g}"
         self.reasons.append(reason)
         return depth
@@ -383,15 +388,12 @@ class Finder:
         unbounded = depth == NO_LIMIT and self.draft.parameters
         return _depth_text(depth) + (" (derivatives: a bound that renderers find)" if unbounded else "")
 
-    def _note_tail(self, depth: int) -> None:
-        if self.arrivals is not None and self.report is not None and not self.arrivals.dark and depth >= 0:
-            part, error = self.arrivals.share(self.arrivals.depth > depth)
-            self.report = replace(self.report, tail=part, tail_error=error)
-
-    def _beyond(self, depth: int) -> str:
-        if self.arrivals is None or self.report is None or self.arrivals.dark or depth < 0:
+    def _deeper(self, depth: int) -> str:
+        """Measure the light in paths deeper than ``depth``, and return it as text."""
+        if self.arrivals is None or self.arrivals.dark or depth < 0:
             return ""
-        return f"; {_share(self.report.tail, self.report.tail_error)} in deeper paths"
+        self.tail_found = self.arrivals.share(self.arrivals.depth > depth)
+        return f"; {_share(*self.tail_found)} in deeper paths"
 
     @property
     def _around_a_corner(self) -> bool:
@@ -471,8 +473,7 @@ class Finder:
             axis = axis_over(first - margin, last + margin, width, num_bins)
         kept = arrivals.depth <= depth if depth is not None and depth > 0 else arrivals.depth > 0
         part, error = arrivals.share(kept & ((arrivals.opl < axis.start_opl) | (arrivals.opl >= axis.end_opl)))
-        if self.report is not None:
-            self.report = replace(self.report, missed=part, missed_error=error)
+        self.missed_found = (part, error)
         self.reasons.append(
             f"time axis: {axis}{how}; {_share(part, error)} outside, asked for was {self.missed:g}; the pilot run's "
             f"last arrival came at {float(arrivals.opl.max()):.4g} m"
