@@ -144,11 +144,11 @@ class BuildOptions:
 
 def edit(config: Any, state: Any, options: BuildOptions) -> None:
     """Edit a parsed scene by the options. Raises ``SceneError`` for edits that would lose something of the scene."""
-    before = _copies(state)
+    described = _replaceable(state)
     _edit_films(state, options)
     _edit_integrator(state, options)
     _edit_samplers(state, options)
-    _check_replaced(config, state, before)
+    _check_replaced(config, state, described)
     _substitute_twins(state, options)
 
 
@@ -268,10 +268,9 @@ def _edit_integrator(state: Any, options: BuildOptions) -> None:
         return  # a loaded one is checked in the built scene
     if options.transient:
         if index is None:
+            # Mitsuba renders a scene without an integrator by `path`, which has no limit.
             plugin = "transient_prbvolpath" if has_media(state) else "transient_path"
-            _add_child(
-                state, 0, "integrator", plugin, mi.ObjectType.Integrator, {"max_depth": described_depth(state, None)}
-            )
+            _add_child(state, 0, "integrator", plugin, mi.ObjectType.Integrator, {"max_depth": NO_LIMIT})
             index = len(state.nodes) - 1
         index = _path_tracer(state, index, replaced=options.integrator is not None)
         plugin, depth = state.nodes[index].props.plugin_name(), described_depth(state, index)
@@ -301,13 +300,8 @@ def _traced(state: Any, index: int) -> int:
     return index if nested is None else _traced(state, nested)
 
 
-def described_depth(state: Any, index: int | None) -> Any:
-    """Return ``max_depth`` of an integrator node or its default, -1 for no limit.
-
-    Without an integrator (None) Mitsuba renders by ``path``.
-    """
-    if index is None:
-        return NO_LIMIT
+def described_depth(state: Any, index: int) -> Any:
+    """Return ``max_depth`` of an integrator node or its default, -1 for no limit."""
     props = state.nodes[_traced(state, index)].props
     return props.get("max_depth", _DEPTHS.get(props.plugin_name(), _DEPTH_IN_PYTHON))
 
@@ -424,7 +418,7 @@ def _lacks_mean(state: Any, node: Any) -> bool:
 def _has_index_of_one(props: Any) -> bool:
     """Return whether a node is a principled surface without a dielectric.
 
-    Mitsuba's loses its mirror lobe there, that of its metal too; its twin has the limit, as it does for derivatives.
+    Mitsuba's plugin loses its mirror lobe there, that of its metal too; the twin renders the limit.
     """
     if props.plugin_name() != "principled":
         return False
@@ -435,7 +429,7 @@ def _has_index_of_one(props: Any) -> bool:
 # ------------------------------------------------------------------------------------------------ replaced plugins
 
 
-def _copies(state: Any) -> dict[int, Any]:
+def _replaceable(state: Any) -> dict[int, Any]:
     """Return copies of the films, integrators and samplers of a parsed scene, by index."""
     import mitsuba as mi
 
@@ -446,8 +440,8 @@ def _copies(state: Any) -> dict[int, Any]:
     }
 
 
-def _check_replaced(config: Any, state: Any, stated: Mapping[int, Any]) -> None:
-    """Build every node that has become another plugin as it was ``stated``, so that Mitsuba refuses its mistakes.
+def _check_replaced(config: Any, state: Any, described: Mapping[int, Any]) -> None:
+    """Build every node that has become another plugin as it was described, so that Mitsuba refuses its mistakes.
 
     Raises ``SceneError`` for channels and samples of silhouettes, which the other plugin does not have.
     """
@@ -455,7 +449,7 @@ def _check_replaced(config: Any, state: Any, stated: Mapping[int, Any]) -> None:
 
     changed = {
         index: node
-        for index, node in stated.items()
+        for index, node in described.items()
         if node.props.plugin_name() != state.nodes[index].props.plugin_name() and _is_built(node.props.plugin_name())
     }
     if not changed:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -34,7 +35,7 @@ def as_float(key: str, value: Any, device: str) -> torch.Tensor:
     if value is None:  # which numpy takes for a number that is none
         raise ShapeError(f"value of {key!r}: expected numbers, got None. Leave the key out to keep the current value.")
     if not isinstance(value, torch.Tensor):
-        value = _tensor_of(key, value).to(device)
+        value = _as_tensor(key, value).to(device)
     if value.is_complex() or value.dtype == torch.bool:
         raise ShapeError(f"value of {key!r}: expected real numbers, got dtype {value.dtype}.")
     if value.layout != torch.strided or value.is_nested or value.is_quantized:
@@ -49,11 +50,11 @@ def as_float(key: str, value: Any, device: str) -> torch.Tensor:
     return found
 
 
-def _tensor_of(key: str, value: Any) -> torch.Tensor:
+def _as_tensor(key: str, value: Any) -> torch.Tensor:
     """Return a tensor of a number, of nested lists of numbers and tensors, or of an array of any library."""
     try:
         if _holds_tensors(value):
-            return torch.stack([e if isinstance(e, torch.Tensor) else _tensor_of(key, e) for e in value])
+            return torch.stack([e if isinstance(e, torch.Tensor) else _as_tensor(key, e) for e in value])
     except (TypeError, RuntimeError) as error:  # of different shapes or devices
         raise ShapeError(f"value of {key!r}: expected tensors that can be stacked, got others: {error}.") from error
     array = real_array(value)
@@ -87,9 +88,7 @@ def fit_shape(key: str, value: torch.Tensor, shape: tuple[int, ...]) -> tuple[to
         return value, False
     if len(got) == len(shape) + 1 and got[1:] == shape:
         return value, True
-    flat = 1
-    for n in shape:
-        flat *= n
+    flat = math.prod(shape)
     if len(shape) == 2 and got == (flat,):
         return value.reshape(shape), False
     if len(shape) == 2 and len(got) == 2 and got[1] == flat:
