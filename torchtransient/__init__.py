@@ -43,10 +43,10 @@ if TYPE_CHECKING:
     from torchtransient.rendering.plan import Plan as Plan
     from torchtransient.rendering.plan import plan as plan
     from torchtransient.rendering.renderer import TransientRenderer as TransientRenderer
-    from torchtransient.rendering.scene_handle import Scene as Scene
-    from torchtransient.rendering.scene_handle import load as load
     from torchtransient.rendering.threads import threads as threads
     from torchtransient.rendering.wrap import wrap as wrap
+    from torchtransient.scene.load import Scene as Scene
+    from torchtransient.scene.load import load as load
 
 __version__ = "0.1.0.dev0"
 
@@ -57,7 +57,7 @@ _LAZY = {
     "Pulse": "torchtransient.pulses",
     "RenderOutput": "torchtransient.rendering.output",
     "RenderStats": "torchtransient.rendering.output",
-    "Scene": "torchtransient.rendering.scene_handle",
+    "Scene": "torchtransient.scene.load",
     "TimeAxis": "torchtransient.axes",
     "TransientRenderer": "torchtransient.rendering.renderer",
     "accuracy": "torchtransient.accuracy",
@@ -65,7 +65,7 @@ _LAZY = {
     "data": "torchtransient.data",
     "errors": "torchtransient.errors",
     "geometry": "torchtransient.geometry",
-    "load": "torchtransient.rendering.scene_handle",
+    "load": "torchtransient.scene.load",
     "losses": "torchtransient.losses",
     "metrics": "torchtransient.metrics",
     "nlos": "torchtransient.nlos",

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
+
+# Packages whose lines a warning passes over on its way to the user's.
+_INSIDE = ("torchtransient", "torch", "contextlib")
 
 
 class _InOneLine(Exception):  # noqa: N818 - no error of its own
@@ -88,3 +92,11 @@ class VariantWarning(TorchTransientWarning, RuntimeWarning):
 
 class VersionWarning(TorchTransientWarning):
     """Mitsuba or Dr.Jit is of a version that this library was never tested with."""
+
+
+def level_of_user() -> int:
+    """Return the ``stacklevel`` of the first line outside of this library and torch, for a warning of the caller."""
+    level, frame = 1, sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in _INSIDE:
+        level, frame = level + 1, frame.f_back
+    return level

@@ -21,6 +21,10 @@ _LETTERS = 160
 # Of a message that repeats what a file says: all of it, or its beginning and its end.
 _MOST, _BEGINNING, _END = 360, 220, 120
 _WITHOUT_POINT = re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+")
+# Of a message of Mitsuba: what Python's tracebacks and places in C++ look like, and the longest that is repeated.
+_TRACEBACK = re.compile(r"Traceback \(most recent call last\):\n(?:[ \t].*\n)*")
+_PLACE_IN_SOURCE = re.compile(r"\[\w+\.(?:cpp|h):\d+\] ")
+_LONGEST = 600
 # What PyYAML's constructors and Python's own parsers raise of texts that are something else.
 _WRONG = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, RecursionError, MemoryError)
 
@@ -148,3 +152,9 @@ def _check_events(yaml: Any, text: str, what: str, most: int) -> None:
                 anchors[name] = size
         if len(sizes) > MOST_LEVELS or sizes[-1] > most:
             raise StorageError(f"{what}: expected YAML of at most {most:,} nodes and {MOST_LEVELS} levels, got more.")
+
+
+def one_line(error: BaseException) -> str:
+    """Return the message of an error of Mitsuba as one line, without tracebacks and places in its sources."""
+    words = " ".join(_PLACE_IN_SOURCE.sub("", _TRACEBACK.sub("", str(error))).split())
+    return words if len(words) <= _LONGEST else f"{words[: _LONGEST - 3]}..."

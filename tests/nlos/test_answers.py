@@ -308,7 +308,7 @@ def test_layers_without_light_say_it_once():
     assert physics_of(lambda: renderer(hidden=TOWARDS)(seed=0)) == []
     # What was said of something else does not explain it.
     other = renderer(hidden=AWAY)
-    other.renderer.scene.told.add("window of a film")
+    other.renderer.scene.warned.add("window of a film")
     assert len(physics_of(lambda: other(seed=0))) == 1
     assert physics_of(lambda: renderer(hidden=AWAY, physics="ignore")(seed=0)) == []
     strict = renderer(hidden=AWAY, physics="error")

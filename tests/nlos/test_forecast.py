@@ -52,7 +52,7 @@ class Clocked:
         return (0, math.prod(SCAN.sensor_shape)) if self.sums or self.count == 1 else (0, 12 // self.count)
 
     def renderer(self, number):
-        return SimpleNamespace(scene=SimpleNamespace(told=self.told))
+        return SimpleNamespace(scene=SimpleNamespace(warned=self.told))
 
     def render(self, number, seed, *, spp):
         warnings.warn("few samples see little", PhysicsWarning, stacklevel=2)

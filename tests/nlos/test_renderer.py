@@ -187,8 +187,8 @@ def test_values_that_hide_the_scan_are_said_once(z, batch):
     found = [warning for warning in caught if "window" not in str(warning.message)]
     assert len(found) == 1 and issubclass(found[0].category, PhysicsWarning)
     assert re.search(SAID[z], str(found[0].message))
-    assert (SENSOR_RAYS in layer.renderer.scene.told) == (z == BETWEEN)
-    assert (HIDDEN in layer.renderer.scene.told) == (z == BEHIND) and LASER_RAYS not in layer.renderer.scene.told
+    assert (SENSOR_RAYS in layer.renderer.scene.warned) == (z == BETWEEN)
+    assert (HIDDEN in layer.renderer.scene.warned) == (z == BEHIND) and LASER_RAYS not in layer.renderer.scene.warned
 
 
 @pytest.mark.parametrize("z", long(SAID, [*SAID][:1]))
@@ -225,7 +225,7 @@ def test_lasers_of_confocal_scans_stand_elsewhere():
     beyond = torch.tensor([0.0, -0.4, 4.0])
     with pytest.warns(PhysicsWarning, match="rays of the laser do not end at their points"):
         layer({LASER_ORIGIN: beyond}, seed=0)
-    assert LASER_RAYS in layer.renderer.scene.told and SENSOR_RAYS not in layer.renderer.scene.told
+    assert LASER_RAYS in layer.renderer.scene.warned and SENSOR_RAYS not in layer.renderer.scene.warned
 
 
 def test_rays_end_within_the_tolerance():

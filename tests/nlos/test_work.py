@@ -155,7 +155,7 @@ def test_spectra_are_looked_at_in_the_active_variant(monkeypatch, active, loaded
     asked = []
     grey = SimpleNamespace(colours=[], measured=[], bands=[])
     monkeypatch.setattr(variant_choice, "load", lambda scene, variant: asked.append(variant))
-    monkeypatch.setattr(variant_choice, "inventory_of", lambda scene: grey)
+    monkeypatch.setattr(variant_choice, "scene_inventory", lambda scene: grey)
     with mi.variant_context(active):
         found = variant_choice.choose_variant(None, None)
     assert asked == [loaded] and found.name == "llvm_ad_mono"
@@ -206,7 +206,7 @@ def test_spots_around_the_axis_of_a_laser(kind):
     look = mi.ScalarTransform4f().look_at([0, 0, 0.5], [0, 0, 0], [0, 1, 0])
     description["laser"] |= {"to_world": look}
     scene = tt.load(description, variant=VARIANT)
-    found = work.scan_of_scene(scene.built(tt.rendering.build_options.BuildOptions(transient=True)).scene)
+    found = work.scan_of_scene(scene.built(tt.scene.edits.BuildOptions(transient=True)).scene)
     assert found.kind == kind and found.laser_origin.tolist() == [0.0, 0.0, 0.5]
     if kind == "confocal":  # whose laser goes along, whatever the integrator says
         assert torch.equal(found.laser_points, found.sensor_points)

@@ -291,7 +291,7 @@ def test_arguments():
         tt.TransientRenderer(scene, gates=GATES, time_axis=FINE)
     with pytest.raises(ArgumentError, match=r"tt\.Gate objects"):
         tt.TransientRenderer(scene, gates=[3.0])
-    with pytest.raises(ArgumentError, match="steady=False"):
+    with pytest.raises(SceneError, match="does not read .steady."):
         tt.TransientRenderer(scene, gates=GATES, steady=False)
     with pytest.raises(ArgumentError, match="gated film has none"):
         tt.TransientRenderer(scene, gates=GATES, temporal_filter="tent")

@@ -15,7 +15,7 @@ from support.gradient_cases.cases_curves import file_of
 from torchtransient import plugins
 from torchtransient.errors import PhysicsWarning, SceneError, UnitError
 from torchtransient.plugins.sensors.places_on_mesh import PlacesOnMesh
-from torchtransient.rendering.build_options import BuildOptions
+from torchtransient.scene.edits import BuildOptions
 
 VARIANT = "llvm_ad_mono"
 AXIS = tt.TimeAxis(1.5, 0.05, 40)

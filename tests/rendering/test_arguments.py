@@ -11,18 +11,17 @@ import torchtransient as tt
 from torchtransient.errors import ArgumentError, DeviceError, ShapeError, UnitError, UnknownKeyError
 from torchtransient.rendering.arguments import (
     Values,
-    as_float,
     checked_depth,
     checked_filter,
     checked_grad_seed,
     film_asked_for,
-    fit_shape,
     given_values,
     mangle,
     samples,
     sensor_list,
 )
 from torchtransient.rendering.films import Histogram
+from torchtransient.scene.values import as_float, fit_shape
 
 NO_NUMBERS = "expected a torch tensor, an array, a list of numbers or a number, all of them real, got "
 

@@ -424,7 +424,7 @@ def test_recordings_are_bounded_and_said(monkeypatch):
 
     with torch.no_grad(), pytest.warns(UserWarning, match="more than 3 kinds of calls take turns"):
         take_turns()
-    kept = renderer.scene.recordings((COLOUR,), renderer._options)
+    kept = renderer.scene.recordings[renderer._options][(COLOUR,)]
     assert len(kept) == 3
     with warnings.catch_warnings(), torch.no_grad():  # once
         warnings.simplefilter("error")

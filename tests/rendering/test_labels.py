@@ -793,7 +793,7 @@ def test_built_scenes_are_freed():
     del built
     renderer.scene._builds.clear()
     renderer.scene._slots.clear()
-    renderer.scene._recordings.clear()
+    renderer.scene.recordings.clear()
     renderer.scene._unsettled.clear()
     renderer.scene._table = None
     gc.collect()

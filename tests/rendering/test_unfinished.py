@@ -21,10 +21,10 @@ from torchtransient.plugins import unfinished
 from torchtransient.plugins.drjit_pool import engine_lock
 from torchtransient.plugins.interrupted import interrupts_wait
 from torchtransient.plugins.unfinished import afterwards, make_good
-from torchtransient.rendering.description import _search_path
 from torchtransient.rendering.interrupts import quiet
-from torchtransient.rendering.scene_handle import Scene
 from torchtransient.rendering.variant import active_variant
+from torchtransient.scene.description import _search_path
+from torchtransient.scene.load import Scene
 from torchtransient.testing.small_room import COLOUR, VARIANT, WALL_POSE, make_room
 
 # What ends calls: the moments in these functions are the ones that leave something behind.
@@ -110,8 +110,8 @@ def test_another_scene_after_an_interrupt(monkeypatch):
     expected = pushed(renderer)
     for name in ("backward", "wrapped"):
         with monkeypatch.context() as patched:
-            for place in ("scene_handle.Scene._settle", "replay.put_back"):
-                patched.setattr(f"torchtransient.rendering.{place}", interrupt_at_the_end(place))
+            for place in ("scene.load.Scene._settle", "rendering.replay.put_back"):
+                patched.setattr(f"torchtransient.{place}", interrupt_at_the_end(place))
             with pytest.raises(KeyboardInterrupt):
                 jobs[name]()
         for one, other in zip(pushed(renderer), expected, strict=True):
@@ -120,9 +120,9 @@ def test_another_scene_after_an_interrupt(monkeypatch):
 
 def interrupt_at_the_end(place):
     """In place of what puts back: an interrupt, once there is something attached."""
-    from torchtransient.rendering import replay, scene_handle
+    from torchtransient.rendering import replay
 
-    own = scene_handle.Scene._settle if place.startswith("scene") else replay.put_back
+    own = Scene._settle if place.startswith("scene") else replay.put_back
 
     def cut_off(*args):
         is_end = bool(args[0]._unsettled) if place.startswith("scene") else len(args) == 2

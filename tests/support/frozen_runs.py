@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from torchtransient.rendering.build_options import BuildOptions
 from torchtransient.rendering.engine import jvp, primal, vjp
-from torchtransient.rendering.physics import PhysicsWatch
 from torchtransient.rendering.recordings import LAUNCHED
-from torchtransient.rendering.scene_handle import Scene
 from torchtransient.rendering.seeds import Item, Seeding
 from torchtransient.rendering.session import RenderJob
+from torchtransient.scene.edits import BuildOptions
+from torchtransient.scene.load import Scene
+from torchtransient.scene.physics import PhysicsWatch
 from torchtransient.testing.gradient_sweep.measure import Subject
 
 SPP = 2

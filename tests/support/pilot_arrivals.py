@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from torchtransient.rendering.plan_pilot import Arrivals
+from torchtransient.scene.pilot import Arrivals
 
 
 def arrivals(opl, energy, depth=None, path=None, pixel=None, paths=None, size=(1, 1)):

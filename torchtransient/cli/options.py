@@ -15,7 +15,7 @@ from torchtransient.rendering.films.choices import all_films
 if TYPE_CHECKING:
     import torch
 
-    from torchtransient.rendering.scene_handle import Scene
+    from torchtransient.scene.load import Scene
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 

@@ -10,7 +10,7 @@ import click
 
 from torchtransient.cli.options import load_scene, scene_options
 from torchtransient.rendering.films.choices import from_options
-from torchtransient.rendering.plan_choices import known_outputs
+from torchtransient.rendering.plan import known_outputs
 
 
 class Names(click.ParamType):  # type: ignore[type-arg]  # a parameter of newer versions

@@ -85,7 +85,7 @@ def _seconds(work: Work) -> float:
     few, some = max(LEAST, of_part // FEW), max(LEAST, of_part // SOME)
     few, some = (few, some) if some > few else (of_part, of_part)
     times = {}
-    told = work.renderer(0).scene.told
+    told = work.renderer(0).scene.warned
     before = set(told)
     with torch.no_grad(), warnings.catch_warnings():
         # What few samples see of a window is no warning yet.

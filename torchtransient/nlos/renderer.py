@@ -17,13 +17,13 @@ from torchtransient.nlos.arguments import check_is_scan, check_seeds, check_sens
 from torchtransient.nlos.scan_watch import HIDDEN, LASER_RAYS, SENSOR_RAYS, ScanWatch
 from torchtransient.nlos.scene import SENSOR, WALL, capture_scene, film_size, hidden_bounds, laser_size
 from torchtransient.nlos.scene_scan import check_scan_is_seen, tolerance_of
-from torchtransient.rendering.build_options import BuildOptions
 from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.output import RenderOutput
-from torchtransient.rendering.parameters import needing_slope
 from torchtransient.rendering.renderer import TransientRenderer
-from torchtransient.rendering.scene_handle import Scene, load
 from torchtransient.rendering.variant import active_variant
+from torchtransient.scene.edits import BuildOptions
+from torchtransient.scene.load import Scene, load
+from torchtransient.scene.parameters import needing_slope
 from torchtransient.sensing import Device
 
 # Where the points of a scan stand in the scene.
@@ -148,11 +148,11 @@ class CaptureRenderer(nn.Module):
 
     def _say_black(self, out: RenderOutput) -> None:
         """Of a capture without light, unless what was said of its scan explains it."""
-        watch, told = self.renderer._watch, self.renderer.scene.told
-        if not self.says_black or not watch.looks or told & {SENSOR_RAYS, LASER_RAYS, HIDDEN}:
+        watch, told = self.renderer._watch, self.renderer.scene.warned
+        if not self.says_black or not watch.enabled or told & {SENSOR_RAYS, LASER_RAYS, HIDDEN}:
             return
         if (watch.mode == "error" or _BLACK not in told) and is_readable(out.steady) and not bool(out.steady.any()):
-            watch.tell(_BLACK, black_message("CaptureRenderer"))
+            watch.warn(_BLACK, black_message("CaptureRenderer"))
 
     def _scan_of(self, given: Mapping[str, Any]) -> Scan:
         """The scan with the points of this call, which later steps do not change. Points that differ in a batch, or
@@ -172,8 +172,8 @@ class CaptureRenderer(nn.Module):
         try:
             return replace(self.scan, **changed, **_lasting(self.scan))
         except TorchTransientError as error:
-            if self.renderer._watch.looks:
-                self.renderer._watch.tell(
+            if self.renderer._watch.enabled:
+                self.renderer._watch.warn(
                     "points of a scan",
                     f"CaptureRenderer: points of a call are no scan, capture.scan is the constructor's: {error}",
                 )

@@ -16,9 +16,9 @@ from torchtransient.nlos import defaults
 from torchtransient.nlos.arguments import check_is_scan
 from torchtransient.nlos.mesh_file import mesh_file
 from torchtransient.quantities import MOST, as_number, as_whole, shown
-from torchtransient.rendering.build_options import BuildOptions
-from torchtransient.rendering.scene_handle import load
 from torchtransient.rendering.variant import active_variant
+from torchtransient.scene.edits import BuildOptions
+from torchtransient.scene.load import load
 
 # Names of a capture's own nodes: those of hidden things must be others.
 WALL, SENSOR, LASER = "wall", "sensor", "laser"

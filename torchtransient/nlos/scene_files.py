@@ -6,9 +6,9 @@ from pathlib import Path
 
 from torchtransient.errors import SceneError
 from torchtransient.files.content_key import contents_of
-from torchtransient.rendering.scene_handle import Scene
-from torchtransient.rendering.taken import ReadyScene
 from torchtransient.rendering.variant import active_variant
+from torchtransient.scene.load import Scene
+from torchtransient.scene.objects import LoadedScene
 
 
 def files_of(scene: Scene) -> dict[str, str]:
@@ -19,7 +19,7 @@ def files_of(scene: Scene) -> dict[str, str]:
 
     description, found = scene._description, {}
     description.check_described("tt.nlos: a simulation that is kept in files")
-    assert not isinstance(description, ReadyScene)  # refused above
+    assert not isinstance(description, LoadedScene)  # refused above
     with active_variant(scene.variant), description.resolved_files():
         try:
             nodes = description.parse(mi.parser.ParserConfig(scene.variant)).nodes

@@ -13,7 +13,7 @@ from torchtransient.nlos.description import read_description
 from torchtransient.nlos.scene import ALL_BOUNCES
 from torchtransient.nlos.tal_yaml import TalSettings, read_tal_yaml
 from torchtransient.plain_texts import told_shortly
-from torchtransient.rendering.scene_handle import load
+from torchtransient.scene.load import load
 
 # Bounces of light that goes from spot to scan point, and around one corner.
 _WALL_TO_WALL, _AROUND_A_CORNER = 2, 3

@@ -35,8 +35,8 @@ from torchtransient.nlos.scene import capture_scene, hidden_bounds
 from torchtransient.nlos.variant_choice import choose_variant
 from torchtransient.nlos.work import Film, HiddenWork, SceneWork, Work, seed_of
 from torchtransient.quantities import Numbers
-from torchtransient.rendering.scene_handle import Scene, load
 from torchtransient.rendering.variant import active_variant
+from torchtransient.scene.load import Scene, load
 from torchtransient.sensing import Device
 
 

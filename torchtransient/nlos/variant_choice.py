@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torchtransient.rendering.plan import inventory_of
-from torchtransient.rendering.plan_choices import some
-from torchtransient.rendering.scene_handle import Scene, load
 from torchtransient.rendering.variant import is_differentiable, resolve_variant
+from torchtransient.scene.inventory import scene_inventory
+from torchtransient.scene.load import Scene, load
+from torchtransient.scene.plan import some
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ def choose_variant(scene: Scene, requested: str | None) -> VariantChoice:
     if name.endswith("_polarized"):
         return VariantChoice(name, "the active one, which is polarized")
     # In the variant that is active, or becomes so: a switch takes time.
-    found = inventory_of(load(scene, variant=name if is_differentiable(active) else f"{name.split('_')[0]}_ad_mono"))
+    found = scene_inventory(load(scene, variant=name if is_differentiable(active) else f"{name.split('_')[0]}_ad_mono"))
     coloured = [*found.colours, *found.measured, *found.bands]
     if not coloured:
         device = name.split("_")[0]

@@ -10,12 +10,13 @@ import torch
 from torch import nn
 from torch.nn.utils import parametrize
 
-from torchtransient.errors import ArgumentError, DeviceError, ShapeError, UnitError, UnknownKeyError
+from torchtransient.errors import ArgumentError, ShapeError, UnitError, UnknownKeyError
 from torchtransient.given_types import is_one_of, text
-from torchtransient.quantities import as_whole, real_array, shown
+from torchtransient.quantities import as_whole, shown
 from torchtransient.rendering.films.choice import FilmChoice
 from torchtransient.rendering.films.choices import chosen
-from torchtransient.rendering.parameters import unknown_key
+from torchtransient.scene.parameters import unknown_key
+from torchtransient.scene.values import as_float, fit_shape
 
 # What samplers count with has 32 bits, and a depth of all ones stands for no limit.
 MOST_SAMPLES, MOST_DEPTH = 2**32 - 1, 2**32 - 2
@@ -111,69 +112,6 @@ def mangle(keys: Sequence[str]) -> dict[str, str]:
             f"parameters: every key once, and no two keys that differ only in '.' and '/', got {list(keys)}."
         )
     return names
-
-
-def as_float(key: str, value: Any, device: str) -> torch.Tensor:
-    """The value as float32, by an operation that gradients pass. Numbers, lists and arrays come to ``device``, tensors
-    must be there. Raises ``ShapeError`` for what is not real numbers, ``DeviceError`` for another device.
-    """
-    if value is None:  # which numpy takes for a number that is none
-        raise ShapeError(f"value of {key!r}: expected numbers, got None. Leave the key out to keep the current value.")
-    if not isinstance(value, torch.Tensor):
-        value = _tensor_of(key, value).to(device)
-    if value.is_complex() or value.dtype == torch.bool:
-        raise ShapeError(f"value of {key!r}: expected real numbers, got dtype {value.dtype}.")
-    if value.layout != torch.strided or value.is_nested or value.is_quantized:
-        kind = "a nested one" if value.is_nested else f"layout {value.layout} and dtype {value.dtype}"
-        raise ShapeError(f"value of {key!r}: expected a dense tensor, got {kind}.")
-    if value.device.type != device:
-        raise DeviceError(
-            f"value of {key!r}: expected a tensor on {device!r}, where the scene's variant computes, got "
-            f"{str(value.device)!r}. Move it with .to({device!r}), or load the scene with a variant of the other kind."
-        )
-    found: torch.Tensor = value.to(torch.float32)
-    return found
-
-
-def _tensor_of(key: str, value: Any) -> torch.Tensor:
-    """A tensor of a number, of lists of them, also with tensors inside, or of an array of any library."""
-    try:
-        if _holds_tensors(value):
-            return torch.stack([e if isinstance(e, torch.Tensor) else _tensor_of(key, e) for e in value])
-    except (TypeError, RuntimeError) as error:  # of different shapes or devices
-        raise ShapeError(f"value of {key!r}: expected tensors that can be stacked, got others: {error}.") from error
-    array = real_array(value)
-    if array is None:
-        raise ShapeError(
-            f"value of {key!r}: expected a torch tensor, an array, a list of numbers or a number, all of them real, "
-            f"got {shown(value)}."
-        )
-    return torch.from_numpy(array)
-
-
-def _holds_tensors(value: Any) -> bool:
-    """Whether there are tensors in a list, or in one of its lists."""
-    listed = isinstance(value, (list, tuple))
-    return listed and any(isinstance(entry, torch.Tensor) or _holds_tensors(entry) for entry in value)
-
-
-def fit_shape(key: str, value: torch.Tensor, shape: tuple[int, ...]) -> tuple[torch.Tensor, bool]:
-    """The value in its own shape, and whether it has a leading batch dimension. Flat vertex lists are taken too."""
-    got = tuple(value.shape)
-    if got == shape:
-        return value, False
-    if len(got) == len(shape) + 1 and got[1:] == shape:
-        return value, True
-    flat = 1
-    for n in shape:
-        flat *= n
-    if len(shape) == 2 and got == (flat,):
-        return value.reshape(shape), False
-    if len(shape) == 2 and len(got) == 2 and got[1] == flat:
-        return value.reshape(got[0], *shape), True
-    batch = ("B", *shape)
-    with_batch = f"({', '.join(str(n) for n in batch)}{',' if len(batch) == 1 else ''})"
-    raise ShapeError(f"value of {key!r}: expected shape {shape}, or {with_batch} with a batch, got {got}.")
 
 
 def film_asked_for(film: Any, named: Mapping[str, Any]) -> FilmChoice | None:

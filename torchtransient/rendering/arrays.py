@@ -11,8 +11,8 @@ import numpy as np
 import torch
 
 from torchtransient.errors import DeviceError, ShapeError
-from torchtransient.rendering.session import FEW, wait_for_torch
 from torchtransient.rendering.surroundings import is_array_or_structure
+from torchtransient.scene.values import FEW, wait_for_torch
 
 _NAMES = {
     torch.float16: "TensorXf16",

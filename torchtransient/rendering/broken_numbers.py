@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 import torch
 
-from torchtransient.rendering.physics import are_finite, smallest_and_largest
+from torchtransient.scene.physics import are_finite, smallest_and_largest
 
 Tensors = tuple[torch.Tensor, ...]
 

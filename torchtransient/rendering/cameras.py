@@ -1,4 +1,4 @@
-"""The pinhole camera of a renderer's sensor, with the values that it renders with."""
+"""Pinhole camera of a renderer's sensor, with the values of a call."""
 
 from __future__ import annotations
 
@@ -19,8 +19,12 @@ from torchtransient.rendering.variant import active_variant
 
 @dataclass(frozen=True)
 class Camera:
-    """`intrinsics` (3, 3) in pixels of the image, its `size` (height, width), and the sensor's `to_world` (4, 4): what
-    the functions of `tt.geometry` take. With gradients to values of the call.
+    """A pinhole camera, for the functions of ``tt.geometry``, with gradients to values of the call.
+
+    Attributes:
+        intrinsics: (3, 3), in pixels of the image.
+        to_world: pose of the sensor, (4, 4).
+        size: height and width of the image.
     """
 
     intrinsics: torch.Tensor
@@ -28,7 +32,7 @@ class Camera:
     size: tuple[int, int]
 
 
-# What Mitsuba's cameras say of their optics, by class.
+# Parameters of the optics of Mitsuba's cameras, by class.
 _OPTICS = {
     "PerspectiveCamera": ("x_fov", "principal_point_offset_x", "principal_point_offset_y"),
     "ThinLensCamera": ("x_fov",),
@@ -39,11 +43,18 @@ _OPTICS = {
 def camera_of(
     renderer: TransientRenderer, values: Mapping[str, Any] | None = None, sensor: int | None = None
 ) -> Camera:
-    """The camera of a renderer's sensor (`perspective`, `thinlens`), of a film with a crop window that of the window.
+    """Return the camera of a renderer's sensor (``perspective``, ``thinlens``), that of the crop window of its film.
 
-    `values` as in a call of the renderer, without a batch: those of the sensor's own keys count, `x_fov`,
-    `principal_point_offset_x`, `_y` and `to_world`, with their gradients. `sensor`: its index in the scene, the
-    renderer's first by default. Raises SceneError for sensors without a pinhole, and as the renderer for values.
+    Args:
+        renderer: the renderer.
+        values: values by key as in a call of the renderer, without a batch. Those of the sensor count (``x_fov``,
+            ``principal_point_offset_x``, ``_y`` and ``to_world``), with their gradients.
+        sensor: index of the sensor in the scene, None for the renderer's first.
+
+    Raises:
+        SceneError: for sensors without a pinhole.
+        ArgumentError: for batches and unknown sensors.
+        ShapeError, UnitError, DeviceError: for values, as the renderer raises them.
     """
     index = renderer._sensors[0] if sensor is None else sensor
     tensors, _, batch = renderer._collect(values)

@@ -1,7 +1,7 @@
 """Runs of a Mitsuba scene on torch tensors: primal, reverse and forward mode, without any torch graph.
 
 Every run installs its values in the scene, renders and reads the result, under one lock. The described values are put
-back before anybody else looks at the scene (:meth:`.scene_handle.Scene.leave`), and no Dr.Jit graph outlives a run.
+back before anybody else looks at the scene (:meth:`.load.Scene.leave`), and no Dr.Jit graph outlives a run.
 
 Tensors are real and in the film's layout here: steady (H, W, C) and the film's response, which is the transient (H, W,
 T, C) or the phasors (H, W, F, 2 C) with real and imaginary parts in turn; with a leading dimension of items when there
@@ -26,12 +26,13 @@ from torchtransient.rendering.films.choice import FilmChoice
 from torchtransient.rendering.films.choices import of_film
 from torchtransient.rendering.interrupts import ends_frames
 from torchtransient.rendering.memory import check_fits
-from torchtransient.rendering.overrides import depth_limit
-from torchtransient.rendering.parameters import needing_slope
-from torchtransient.rendering.physics import are_finite, smallest_and_largest
 from torchtransient.rendering.sample_counts import samples_taken
 from torchtransient.rendering.seeds import Item
-from torchtransient.rendering.session import RenderJob, RunLog, Session, own_array, session_of, wait_for_torch
+from torchtransient.rendering.session import RenderJob, RunLog, Session, session_of
+from torchtransient.scene.edits import built_depth
+from torchtransient.scene.parameters import needing_slope
+from torchtransient.scene.physics import are_finite, smallest_and_largest
+from torchtransient.scene.values import own_array, wait_for_torch
 
 # ---------------------------------------------------------------------------------------------------------- primal
 
@@ -49,9 +50,9 @@ def primal(job: RenderJob, values: Sequence[torch.Tensor]) -> tuple[torch.Tensor
         channels = len(session.film(job.items[0]).channel_names())
         light = steady[..., :channels].sum((-3, -2, -1), dtype=torch.float64) / channels
         total: tuple[float, ...] = tuple(light.reshape(-1).tolist())
-        integrator, depth = session.slots.built.integrator, depth_limit(session.integrator)
+        integrator, depth = session.slots.built.integrator, built_depth(session.integrator)
         job.log.append(RunLog(job.items, seconds, integrator, spp, before, after, total, said, depth))
-    if job.watch.looks:
+    if job.watch.enabled:
         job.watch.window(sum(total), sum(before), sum(after))
     return steady, response
 
@@ -121,7 +122,7 @@ def check_values(job: RenderJob, values: Sequence[torch.Tensor]) -> None:
             raise UnitError(
                 f"value of {key!r}: expected finite numbers, got {bad} of {value.numel()} that are NaN or infinite."
             )
-        if job.watch.looks:
+        if job.watch.enabled:
             job.watch.value(key, value, low, high)
 
 

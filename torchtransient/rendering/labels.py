@@ -1,7 +1,7 @@
-"""Labels of a scene: what each pixel of a renderer's sensors looks at, for the values that a render gets.
+"""Labels: depth, normals, shapes and materials at each pixel of a renderer's sensors, for the values of a call.
 
-Depth, normals, shapes and the like come from one intersection at each pixel's centre, in the built scene and with the
-values that the render uses. They have no derivatives.
+They come from one intersection at each pixel's centre, in the built scene and with the values that a render uses. They
+have no derivatives.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from torchtransient.rendering.engine import check_values
 from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.recordings import NotRecordedError
 from torchtransient.rendering.renderer import TransientRenderer
-from torchtransient.rendering.scene_handle import Scene
 from torchtransient.rendering.seeds import Seeding
 from torchtransient.rendering.session import RenderJob, Session, session_of
 from torchtransient.rendering.variant import active_variant
+from torchtransient.scene.load import Scene
 
 LABELS = ("depth", "z_depth", "position", "normals", "uv", "albedo", "shape", "primitive", "material")
-# Numbers of things, of which there is no mean.
+# Labels that are indices, which have no mean.
 NUMBERED = ("shape", "primitive", "material")
 _SCALARS = ("depth", "z_depth", *NUMBERED)
 
@@ -42,11 +42,10 @@ def scene_labels(
     average: bool = False,
     samples: int = 16,
 ) -> dict[str, torch.Tensor]:
-    """What the pixels of a renderer's sensors look at, by name. ``values`` as in a call of the renderer, which uses its
-    own parameters for those that are not given.
+    """Return labels of the pixels of a renderer's sensors, by name.
 
     ========= =============== ==========================================================================================
-    name      shape, dtype    what
+    name      shape, dtype    content
     ========= =============== ==========================================================================================
     depth     (H, W) float32  metres from the sensor's origin (the pinhole, the middle of a lens, the sensor plane of an
                               orthographic camera) to the surface along the pixel's ray: not along the axis, and not
@@ -69,42 +68,62 @@ def scene_labels(
     most, and through area lights under an integrator that hides emitters; a
     glass that bends light is a surface, and so is a mirror. ``camera_unwarp`` changes nothing.
 
-    ``average``: the mean over ``samples`` places in each pixel (the same in all, spread evenly; of a thin lens over the
-    aperture, too) that meet something, instead of its centre. Normals become shorter than one where they differ, depths
-    of an edge lie between those of its sides. Not for numbers.
+    Calls are recorded as renders are, unless the renderer was made with ``freeze=False``. Not supported:
+    ``torch.func.vmap``.
 
-    Tensors have the leading dimensions of the render: the batch of the values, the sensors of a list. They are on the
-    scene's device, without gradients, and belong to the caller. Calls are recorded as renders are, unless the renderer
-    was made with ``freeze=False``. Not supported: ``torch.func.vmap``.
+    Args:
+        renderer: the renderer; its own parameters count for keys without a value.
+        values: values by key, as in a call of the renderer.
+        names: labels of the table.
+        average: the mean over places in each pixel (the same in all, spread evenly; of a thin lens over the aperture,
+            too) that meet something, instead of the pixel's centre. Normals become shorter than one where they differ,
+            depths of an edge lie between those of its sides. Not for indices.
+        samples: number of places, 1 to 4096.
 
-    Raises ArgumentError for unknown names, SceneError for unknown keys, for sensors whose pixels have no direction
-    (``irradiancemeter``, ``distant``), for ``z_depth`` of a sensor without an axis (``nlos_capture_meter``) and for
-    means of numbers; ShapeError, UnitError and DeviceError for values as the renderer does.
+    Returns:
+        Tensors by name, with the leading dimensions of the render: the batch of the values, the sensors of a list. On
+        the scene's device, without gradients, owned by the caller.
+
+    Raises:
+        ArgumentError: for unknown names, and for means of indices.
+        SceneError: for unknown keys, for sensors whose pixels have no direction (``irradiancemeter``, ``distant``), and
+            for ``z_depth`` of a sensor without an axis (``nlos_capture_meter``).
+        ShapeError, UnitError, DeviceError: for values, as the renderer raises them.
     """
     return _labels(renderer, values, names, average, samples)[0]
 
 
 @opaque
 def label_names(renderer: TransientRenderer) -> tuple[str, ...]:
-    """Names of the shapes that the label "shape" counts, in the order of the scene's description."""
+    """Return the names of the shapes that the label "shape" counts, in the order of the scene's description."""
     return tuple(_tables(renderer).shape_names)
 
 
 @opaque
 def material_names(renderer: TransientRenderer) -> tuple[str, ...]:
-    """Names of the materials that the label "material" counts, in the order of the shapes that have them."""
+    """Return the names of the materials that the label "material" counts, in the order of their shapes."""
     return tuple(_tables(renderer).material_names)
 
 
 def first_return(
     transient: torch.Tensor, axis: TimeAxis, *, polarized: bool = False, threshold: float = 0.0
 ) -> torch.Tensor:
-    """Optical path (metres) at the start of the first bin with light, in any channel; NaN without light.
+    """Return the optical path length at the start of the first bin with light in any channel.
 
-    ``transient`` (..., C, T, H, W) with the T bins of ``axis``; ``polarized``: (..., 4, C, T, H, W), of which S0 is
-    looked at. Light is more than ``threshold``, in the units of the transient. Returns float32 (..., H, W), without
-    gradients. Filters wider than a bin bring light to the bins before. Raises ShapeError, UnitError. Not supported:
-    exhaustive scans.
+    Filters wider than a bin bring light to the bins before. Not supported: exhaustive scans.
+
+    Args:
+        transient: (..., C, T, H, W), or (..., 4, C, T, H, W) with ``polarized``.
+        axis: its time axis, of T bins.
+        polarized: the transient has Stokes components, of which S0 counts.
+        threshold: largest value of a dark bin, in units of the transient.
+
+    Returns:
+        Metres, float32 (..., H, W), without gradients; NaN without light.
+
+    Raises:
+        ShapeError: for other shapes, and complex numbers.
+        UnitError: for a negative threshold.
     """
     of_class("first_return: transient", transient, torch.Tensor)
     of_class("first_return: axis", axis, TimeAxis)
@@ -136,7 +155,7 @@ def first_return(
 def _labels(
     renderer: TransientRenderer, values: Mapping[str, Any] | None, names: Sequence[str], average: bool, samples: int
 ) -> tuple[dict[str, torch.Tensor], list[str]]:
-    """(labels, what became of the recording of each item)."""
+    """Return the labels, and how the call of each item was made (recorded, launched or traced)."""
     _renderer(renderer)
     wanted = _checked_names(names, average)
     number = as_whole(samples)
@@ -162,19 +181,19 @@ def _labels(
     )
     check_values(job, tensors)
     found: list[list[torch.Tensor]] = []
-    said: list[str] = []
+    calls: list[str] = []
     with session_of(job) as session:
         for group in groups_of(session):
             session.install(group[0][1], tensors, job.needs)
-            how, of_group = _of_group(session, group, wanted, samples if average else 0)
-            said += how
-            found += of_group
+            how, per_item = _group_labels(session, group, wanted, samples if average else 0)
+            calls += how
+            found += per_item
     leading = (*(() if batch is None else (batch,)), *((len(renderer._sensors),) if renderer._stack_sensors else ()))
     labels = {}
     for n, name in enumerate(wanted):
-        together = torch.stack([of_item[n] for of_item in found])
+        together = torch.stack([item[n] for item in found])
         labels[name] = together.reshape(*leading, *together.shape[1:])
-    return labels, said
+    return labels, calls
 
 
 def _renderer(given: Any) -> TransientRenderer:
@@ -189,26 +208,24 @@ def _checked_names(names: Sequence[str], average: bool) -> tuple[str, ...]:
     numbered = [name for name in wanted if name in NUMBERED]
     if average and numbered:
         raise ArgumentError(
-            f"average: numbers of things have no mean ({', '.join(numbered)}); ask for them in a call without it."
+            f"average: indices have no mean ({', '.join(numbered)}); ask for them in a call without it."
         )
     return wanted
 
 
 def _options(renderer: TransientRenderer) -> Any:
-    """Shapes that Mitsuba has merged cannot be told apart: labels are those of a build that leaves them as described,
-    which renders with parameters use as well.
-    """
+    """Return the options of a build with the described shapes: merged ones cannot be told apart."""
     return replace(renderer._options, merge=False)
 
 
 def _tables(renderer: TransientRenderer) -> Any:
     scene: Scene = _renderer(renderer).scene
     with active_variant(scene.variant):
-        return tables_of(scene.built(_options(renderer)))
+        return label_tables(scene.built(_options(renderer)))
 
 
-def tables_of(built: Any) -> Any:
-    """What labels look up once of a built scene. Must be called inside its variant."""
+def label_tables(built: Any) -> Any:
+    """Return the tables of a built scene. Called inside its variant."""
     from torchtransient.plugins.labels import LabelTables
 
     if built.label_tables is None:
@@ -216,13 +233,13 @@ def tables_of(built: Any) -> Any:
     return built.label_tables
 
 
-def _of_group(
+def _group_labels(
     session: Session, group: Sequence[Numbered], names: tuple[str, ...], samples: int
 ) -> tuple[list[str], list[list[torch.Tensor]]]:
-    """Labels of items with the same values: how they were computed, and the tensors of each by name."""
+    """Return how the calls of items with the same values were made, and the labels of each item."""
     from torchtransient.plugins.labels import LabelJob
 
-    tables = tables_of(session.slots.built)
+    tables = label_tables(session.slots.built)
     jobs = [
         LabelJob(session.scene, session.sensors[item.sensor], names, tables, samples).prepare() for _, item in group
     ]

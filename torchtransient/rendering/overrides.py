@@ -9,7 +9,6 @@ from typing import Any
 
 from torchtransient.interfaces import is_time_resolved
 from torchtransient.plugins.unfinished import afterwards
-from torchtransient.rendering.translation import NO_LIMIT
 
 
 @contextmanager
@@ -66,9 +65,3 @@ def boundary_term(on: bool, spp: int | None, integrator: Any) -> Iterator[None]:
                 restore.enter_context(afterwards(put_back))
                 setattr(integrator, name, value)
         yield
-
-
-def depth_limit(integrator: Any) -> int | None:
-    """``max_depth`` of a built integrator, -1 for no limit; None for one without."""
-    depth = getattr(integrator, "max_depth", None)
-    return None if depth is None else NO_LIMIT if int(depth) % 2**32 == 2**32 - 1 else int(depth)

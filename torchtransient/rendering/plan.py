@@ -1,7 +1,7 @@
-"""``tt.plan``: the cheapest variant, integrator, film, depth and time window that show what is asked for.
+"""``tt.plan``: cheapest variant, integrator, film, depth and time window that show the outputs.
 
 Nothing is guessed: a decision follows from what the description contains, from a pilot run (a few thousand paths whose
-arrivals are listed one by one), or from the caller, and ``plan.reasons`` says from which.
+arrivals are listed one by one), or from the caller; ``plan.reasons`` names the source.
 """
 
 from __future__ import annotations
@@ -13,41 +13,46 @@ from typing import Any
 from torchtransient import plugins
 from torchtransient.argument_names import arguments_of
 from torchtransient.axes import FrequencyAxis, TimeAxis
-from torchtransient.errors import ArgumentError, SceneError, TorchTransientError, UnitError
+from torchtransient.errors import ArgumentError, SceneError, UnitError
 from torchtransient.gates import Gate
-from torchtransient.given_types import text
+from torchtransient.given_types import is_one_of, several, text
 from torchtransient.pulses import Pulse
 from torchtransient.quantities import Numbers, as_whole, count, shown
-from torchtransient.rendering import plan_choices as choices
 from torchtransient.rendering.arguments import checked_depth, checked_filter, checked_keys, film_asked_for
-from torchtransient.rendering.effects import Effects
-from torchtransient.rendering.films.choice import FilmChoice
-from torchtransient.rendering.films.choices import all_films, planned
-from torchtransient.rendering.inventory import SceneInventory, take_inventory
-from torchtransient.rendering.mitsuba_words import one_line
-from torchtransient.rendering.node_checks import check_nodes
+from torchtransient.rendering.films.choice import FilmChoice, PlannedFilm
+from torchtransient.rendering.films.choices import all_films, of_plugin, planned
 from torchtransient.rendering.opaque import opaque
-from torchtransient.rendering.plan_finder import Draft, Finder
-from torchtransient.rendering.plan_pilot import PilotReport
 from torchtransient.rendering.pulse_properties import checked_pulse
 from torchtransient.rendering.renderer import TransientRenderer
-from torchtransient.rendering.scene_handle import Scene, load
-from torchtransient.rendering.taken import ReadyScene
-from torchtransient.rendering.variant import active_variant, resolve_variant
+from torchtransient.rendering.variant import resolve_variant
+from torchtransient.scene.inventory import scene_inventory
+from torchtransient.scene.load import load
+from torchtransient.scene.pilot import PilotReport
+from torchtransient.scene.plan import Choice, Draft, Effects, Finder, choose_integrator, choose_variant
 
+# Outputs that every film can show beside its own measurement.
+_ANY_FILM = ("steady", "stokes", "bands")
 # Decisions of a draft that a plan takes over as they are.
-_OF_THE_DRAFT = ("scene", "variant", "integrator", "pulse", "irf", "parameters", "sensor")
+_FROM_DRAFT = ("scene", "variant", "integrator", "pulse", "irf", "parameters", "sensor")
 _PLAIN = ("outputs", "variant", "integrator", "film", "max_depth", "temporal_filter", "parameters", "sensor", "reasons")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Plan(Effects):
-    """What :func:`plan` decided. Use it with :meth:`renderer` or ``tt.TransientRenderer(scene, effects=plan)``.
+    """Decisions of :func:`plan`, for :meth:`renderer` or ``tt.TransientRenderer(scene, effects=plan)``.
 
-    ``film`` is "transient", "steady" (one bin), "phasor" or "gated". ``max_depth`` None keeps the scene's; so do
-    ``time_axis``, ``frequencies`` and ``gates``. ``temporal_filter`` is empty for phasor and gated films.
-    ``reasons``: one line per decision. ``pilot``: what the pilot run found, None without one. ``sensor``: the one
-    that was planned for, which the renderer takes; another one is refused. ``str(plan)`` prints the reasons.
+    ``str(plan)`` prints the reasons.
+
+    Attributes:
+        outputs: outputs of the plan.
+        film: "transient", "steady" (one bin), "phasor" or "gated".
+        parameters: keys that gradients will be asked for.
+        reasons: one line per decision.
+        pilot: results of the pilot run, None without one.
+        scene, variant, integrator, temporal_filter: as the renderer uses them; the filter is empty for phasor and
+            gated films.
+        max_depth: bound on the depth, None for the scene's.
+        sensor: sensor of the plan, which the renderer takes; another one is refused.
     """
 
     outputs: tuple[str, ...]
@@ -58,19 +63,19 @@ class Plan(Effects):
 
     @property
     def time_axis(self) -> TimeAxis | None:
-        """The time axis of the film, None to keep the scene's or for a film without one."""
+        """Time axis of the film, None to keep the scene's or for a film without one."""
         axis: TimeAxis | None = self._setting("axis")
         return axis
 
     @property
     def frequencies(self) -> FrequencyAxis | None:
-        """The frequencies of a phasor film, None to keep the scene's."""
+        """Frequencies of a phasor film, None to keep the scene's."""
         frequencies: FrequencyAxis | None = self._setting("frequencies")
         return frequencies
 
     @property
     def gates(self) -> tuple[Gate, ...] | None:
-        """The gates of a gated film, None to keep the scene's."""
+        """Gates of a gated film, None to keep the scene's."""
         gates: tuple[Gate, ...] | None = self._setting("gates")
         return gates
 
@@ -78,15 +83,17 @@ class Plan(Effects):
         return None if self.film_choice is None else self.film_choice.attributes().get(name)
 
     def renderer(self, **settings: Any) -> TransientRenderer:
-        """A :class:`TransientRenderer` of the planned scene; ``settings`` are its other arguments and go before the
-        plan's.
+        """Return a :class:`TransientRenderer` of the planned scene.
+
+        Args:
+            settings: its other arguments, which go before the plan's.
         """
         settings.setdefault("parameters", self.parameters)
         with arguments_of("Plan.renderer", TransientRenderer.__init__, ("scene", "effects")):
             return TransientRenderer(self.scene, effects=self, **settings)
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything but the scene, as plain data for JSON."""
+        """Return all decisions but the scene as plain data for JSON."""
         plain: dict[str, Any] = {name: getattr(self, name) for name in _PLAIN}
         for kind in all_films():
             plain[kind.argument] = self.film_choice.plain() if isinstance(self.film_choice, kind) else None
@@ -101,7 +108,7 @@ class Plan(Effects):
         return "\n".join(self.reasons)
 
     def __eq__(self, other: object) -> bool:
-        """The same decisions about one scene, in whichever process they were made."""
+        """Return whether both are the same decisions about one scene."""
         if not isinstance(other, Plan):
             return NotImplemented
         rest = [field.name for field in fields(self) if field.name != "scene"]
@@ -137,32 +144,43 @@ def plan(
     seed: int = 0,
     film: FilmChoice | None = None,
 ) -> Plan:
-    """Choose how to render ``scene``, what :func:`load` takes.
+    """Choose the cheapest way to render a scene that shows what is asked for.
 
-    ``outputs``: some of "transient", "steady", "phasor", "stokes", "gates", "bands". ``parameters``: keys that
-    gradients will be asked for.
+    Depths and times hold for the described values: parameters that change brightness or geometry very much call for
+    another plan.
 
-    ``tail``: the largest share of the image's light that may be left to deeper paths; no block of the image (an 8 x
-    8 grid) may lose more than ten times that. ``missed``: the same for light outside the time window. Both are
-    bounds on what the pilot run saw, with two standard errors to spare. ``pilot=False`` does without that run: the
-    depth then follows from the albedos where they bound it, and the time axis is the scene's.
+    Args:
+        scene: scene, as for :func:`load`. The variant that it was loaded with only sets the device.
+        outputs: some of "transient", "steady", "phasor", "stokes", "gates", "bands".
+        parameters: keys that gradients will be asked for.
+        time_axis: axis of the film, "scene" for the scene's own, None to find one.
+        frequencies, gates: settings of a phasor or gated film.
+        pulse, irf: shapes of pulse and impulse response, which the renderer uses; they widen the axis.
+        num_bins, bin_width_opl: bins of an axis to be found; a width (metres) of the scene's film is kept.
+        max_depth: bound on the depth, "scene" for the scene's own, None to find one.
+        variant, integrator, temporal_filter: names, None to choose.
+        tail: largest share of the image's light that may be left to deeper paths; no block of the image (an 8 x 8
+            grid) may lose more than ten times that. A bound on the light of the pilot run, with two standard errors to
+            spare.
+        missed: the same for light outside of the time window.
+        strict: carry polarization also where it only changes the light between smooth surfaces. Without it such a
+            scene is planned unpolarized, as is usual, with a line in ``reasons``.
+        pilot: False for no pilot run: the depth then follows from the albedos where they bound it, and the time axis
+            is the scene's.
+        sensor: index of the sensor that is planned for, and rendered.
+        seed: seed of the pilot run.
+        film: film and its settings, in place of ``frequencies`` and ``gates``.
 
-    ``strict``: carry polarization also where it only changes the light between smooth surfaces. Without it such a
-    scene is planned unpolarized, as is usual, and ``reasons`` says so.
+    Returns:
+        The plan.
 
-    Every choice can be taken over: ``variant``, ``integrator``, ``max_depth`` (a number, or "scene" for the scene's
-    own), ``time_axis`` (an axis, or "scene"), ``num_bins`` and ``bin_width_opl`` of the axis to be found,
-    ``temporal_filter``, ``frequencies``, ``gates``, or ``film``, an object that says the same. ``pulse`` and ``irf``
-    are handed to the renderer, and widen the axis. A bin width that the scene's film has is kept. ``sensor``: the one
-    that is planned for, and rendered.
-
-    The variant with which a scene was loaded only says on which device to compute. Depths and times hold for the
-    description's values: parameters that change brightness or geometry very much call for another plan.
-
-    Raises ``ArgumentError`` for unknown outputs, ``SceneError`` for unknown parameters, for outputs that need different
-    films, for scenes that cannot be read or rendered, and when the pilot run sees no light and no time axis is given;
-    ``UnitError`` for shares outside (0, 1); ``VariantError`` for unknown variants; ``GradientError`` for a box filter,
-    or gates that open or close at once, with parameters that change path lengths.
+    Raises:
+        ArgumentError: for unknown outputs, and settings that have no effect.
+        SceneError: for unknown parameters, outputs that need different films, scenes that cannot be read or rendered,
+            and when the pilot run sees no light and no time axis is given.
+        UnitError: for shares outside (0, 1).
+        VariantError: for unknown variants.
+        GradientError: for a box filter, or gates that open or close at once, with parameters that change path lengths.
     """
     for name, share in (("tail", tail), ("missed", missed)):
         if not 0 < share < 1:
@@ -180,75 +198,84 @@ def plan(
     if temporal_filter is not None:
         checked_filter(temporal_filter)
     loaded = load(scene)
-    asked = choices.checked_outputs(outputs)
-    inventory = inventory_of(loaded, sensor)
-    device = loaded.variant.split("_")[0]
+    wanted = _checked_outputs(outputs)
+    inventory = scene_inventory(loaded, sensor)
     given = film_asked_for(film, {"frequencies": frequencies, "gates": gates})
     if given is not None and given.has_axis:
         if time_axis is not None:
             raise ArgumentError("tt.plan: film and time_axis both give a time axis; leave out one of them.")
         time_axis = given.argument_value()
-    kind = planned(asked)
-    best, notes = choices.choose_variant(inventory, asked, device, strict)
-    tracer, more = choices.choose_integrator(inventory)
-    reasons = (_taken("variant", variant, best), *notes, _taken("integrator", integrator, tracer), *more, kind.reason)
+    planned_film = planned(wanted)
+    best, notes = choose_variant(inventory, wanted, loaded.variant.split("_")[0], strict)
+    tracer, more = choose_integrator(inventory)
+    reasons = (
+        _reason("variant", variant, best), *notes, _reason("integrator", integrator, tracer), *more,
+        planned_film.reason,
+    )  # fmt: skip
+    own_film = of_plugin(inventory.film or "")
     draft = Draft(
         scene=load(loaded, variant=best.value if variant is None else variant),
         variant=best.value if variant is None else variant,
         integrator=tracer.value if integrator is None else integrator,
-        film=kind,
-        film_choice=choices.film_settings(kind, given, inventory.film, asked),
+        film=planned_film,
+        film_choice=_film_settings(planned_film, given, inventory.film, wanted),
+        described_film=None if own_film is None else own_film.settings_in(inventory.film_props),
+        described_axis=None if own_film is None else own_film.axis_in(inventory.film_props),
         pulse=checked_pulse("pulse", pulse),
         irf=checked_pulse("irf", irf),
         parameters=checked_keys(parameters),
         sensor=sensor,
     )
-    _check_known(draft, reasons)
+    _check_registered(draft, reasons)
     finder = Finder(draft, reasons, inventory, tail, missed, seed)
     found = finder.settle(pilot, max_depth, time_axis, (num_bins, bin_width_opl), temporal_filter)
-    kept = {name: getattr(draft, name) for name in _OF_THE_DRAFT}
-    return Plan(outputs=asked, film=kind.name, filter_is_given=temporal_filter is not None, **kept, **vars(found))
+    kept = {name: getattr(draft, name) for name in _FROM_DRAFT}
+    return Plan(
+        outputs=wanted, film=planned_film.name, filter_is_given=temporal_filter is not None, **kept, **vars(found)
+    )
 
 
-def inventory_of(scene: Scene, sensor: int = 0) -> SceneInventory:
-    """What the description of a scene contains, and the film of one of its sensors. Raises ``SceneError`` for one that
-    Mitsuba cannot parse.
-    """
-    import mitsuba as mi
-
-    description = scene._description
-    description.check_described("tt.plan")
-    assert not isinstance(description, ReadyScene)  # refused above
-    with active_variant(scene.variant):
-        config = mi.parser.ParserConfig(scene.variant)
-        try:
-            with description.resolved_files(), plugins.plugin_errors():
-                state = description.parse(config)
-                check_nodes(state)
-                mi.parser.transform_upgrade(config, state)
-                return take_inventory(state, _lookup, sensor)
-        except TorchTransientError as error:
-            raise type(error)(f"{description.name}: {error}") from error
-        except (RuntimeError, ValueError, TypeError) as error:
-            raise SceneError(f"{description.name}: Mitsuba could not read the scene. {one_line(error)}") from error
+def known_outputs() -> tuple[str, ...]:
+    """Return the outputs that a plan can be asked for."""
+    return (*(kind.output for kind in all_films()), *_ANY_FILM)
 
 
-def _lookup(name: str) -> Any:
-    from pathlib import Path
+def _checked_outputs(outputs: Sequence[str] | str) -> tuple[str, ...]:
+    wanted = (outputs,) if isinstance(outputs, str) else tuple(several("tt.plan: outputs", outputs, "names"))
+    films, known = tuple(kind.output for kind in all_films()), known_outputs()
+    if not wanted or not all(is_one_of(name, known) for name in wanted):
+        raise ArgumentError(f"tt.plan: outputs are some of {', '.join(known)}; got {shown(list(wanted))}.")
+    measured = [name for name in wanted if name in films]
+    if len(set(measured)) > 1:
+        raise ArgumentError(
+            f"tt.plan: a film measures one of {', '.join(films)}, got {' and '.join(measured)}; make a plan for each."
+        )
+    return wanted
 
-    import mitsuba as mi
 
-    return Path(str(mi.file_resolver().resolve(name)))
+def _film_settings(
+    film: PlannedFilm, given: FilmChoice | None, plugin: str | None, outputs: Sequence[str]
+) -> FilmChoice | None:
+    """Return the settings that a call gives, None to keep those of the scene's film, a ``plugin``, or to find them."""
+    if given is not None and type(given) is not film.kind:
+        others = (name for name in outputs if name in _ANY_FILM)
+        raise ArgumentError(
+            f"tt.plan: outputs={tuple(outputs)} call for a {film.name} film, on which {given.argument} have no effect; "
+            f"ask for outputs={(given.output, *others)}."
+        )
+    if given is None and plugin != film.kind.plugin and film.kind.needed():
+        raise SceneError(film.kind.needed())
+    return given
 
 
-def _taken(name: str, given: str | None, best: choices.Choice) -> str:
+def _reason(name: str, given: str | None, best: Choice) -> str:
     if given is None:
         return best.reason
     return f"{name}: {given}, as asked for; the plan's own would have been {best.reason.removeprefix(f'{name}: ')}"
 
 
-def _check_known(draft: Draft, reasons: Sequence[str]) -> None:
-    """What the plan calls for has to be part of this installation."""
+def _check_registered(draft: Draft, reasons: Sequence[str]) -> None:
+    """Raise ``SceneError`` for plugins of a plan that this installation does not have."""
     for kind, plugin in (("integrator", draft.integrator), ("film", draft.film.kind.plugin)):
         if plugins.kind_of(plugin) != kind:
             raise SceneError(

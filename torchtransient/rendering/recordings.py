@@ -15,9 +15,9 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from typing import Any
 
+from torchtransient.errors import level_of_user
 from torchtransient.interfaces import BACKWARD
 from torchtransient.plugins.frozen_state import WAITS, NotComparableError, not_recordable
-from torchtransient.rendering.physics import level_of_user
 
 # Structures of one built scene and set of keys, and recordings of each of them for other sizes and flags of arrays.
 MAX_STRUCTURES, MAX_RECORDINGS = 64, 8

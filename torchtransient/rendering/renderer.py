@@ -22,38 +22,37 @@ from torchtransient.quantities import Numbers, flag, shown
 from torchtransient.rendering import engine
 from torchtransient.rendering.arguments import (
     Values,
-    as_float,
     checked_depth,
     checked_filter,
     checked_grad_seed,
     checked_keys,
     checked_sampler,
     film_asked_for,
-    fit_shape,
     given_values,
     mangle,
     samples,
     sensor_list,
 )
 from torchtransient.rendering.autograd import rendered
-from torchtransient.rendering.build_options import BuildOptions
-from torchtransient.rendering.depth_bound import DepthBound, depth_bound, may_have_derivative
-from torchtransient.rendering.effects import Effects
 from torchtransient.rendering.films.choice import FilmChoice
 from torchtransient.rendering.films.layout import steady_channels_first
 from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.output import RenderOutput, RenderStats
 from torchtransient.rendering.overrides import boundary_term
-from torchtransient.rendering.parameters import ParameterInfo, missing_edges, needing_slope, unknown_key
-from torchtransient.rendering.physics import PhysicsWatch
 from torchtransient.rendering.progress import Bar
 from torchtransient.rendering.pulse_properties import checked_pulse
 from torchtransient.rendering.sample_counts import rounded_count, samples_taken
-from torchtransient.rendering.scene_handle import Scene, load
 from torchtransient.rendering.seeds import Item, Seeding, drawn
 from torchtransient.rendering.session import RenderJob
 from torchtransient.rendering.slope import check_filter, filter_for, has_slope, response_of
 from torchtransient.rendering.variant import active_variant, device_type, stokes_components
+from torchtransient.scene.edits import BuildOptions
+from torchtransient.scene.load import Scene, load
+from torchtransient.scene.parameters import ParameterInfo, missing_edges, needing_slope, unknown_key
+from torchtransient.scene.physics import PhysicsWatch
+from torchtransient.scene.pilot import DepthBound, depth_bound
+from torchtransient.scene.plan import Effects
+from torchtransient.scene.values import as_float, fit_shape, may_have_derivative
 
 
 class TransientRenderer(CopiesParametrized):
@@ -164,7 +163,7 @@ class TransientRenderer(CopiesParametrized):
                 "of both out."
             )
         self._asked_of_edges: set[str] = set()
-        self._watch = PhysicsWatch(physics, self.scene.told)
+        self._watch = PhysicsWatch(physics, self.scene.warned)
         changes: dict[str, Any] = {"pulse": checked_pulse("pulse", pulse), "irf": checked_pulse("irf", irf)}
         changes |= {"film": film, "steady": bool(steady)}
         changes["integrator"] = effects.integrator if isinstance(effects, Effects) else None
@@ -227,7 +226,7 @@ class TransientRenderer(CopiesParametrized):
             )
 
     def _look_at_scene(self) -> None:
-        if self._watch.looks:
+        if self._watch.enabled:
             built = self.scene.built(self._options)
             slots = self.scene.slots(self._keys, self._options).slots
             if self.film.count > 1 or self.effective_filter in ("", "box"):
@@ -427,7 +426,7 @@ class TransientRenderer(CopiesParametrized):
             with boundary_term(self.boundary, self.spp_boundary, built.scene.integrator()):
                 found = missing_edges(built, new, self._sensors)
         for gap, keys in found.items():
-            self._watch.gradient(gap.message(keys), is_error=not gap.is_asked_for)
+            self._watch.warn_of_gradient(gap.message(keys), is_error=not gap.is_asked_for)
         self._asked_of_edges.update(new)
 
     def _depth_bound(self, given: Mapping[str, Any] | None, tensors: Sequence[torch.Tensor]) -> DepthBound | None:

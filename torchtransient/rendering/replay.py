@@ -23,13 +23,13 @@ from torchtransient.rendering.broken_numbers import carried_on
 from torchtransient.rendering.derivatives import Asked
 from torchtransient.rendering.generators import Generators
 from torchtransient.rendering.interrupts import ends_frames
-from torchtransient.rendering.parameters import is_transform
-from torchtransient.rendering.physics import are_finite, smallest_and_largest
 from torchtransient.rendering.scene_state import put_back, values_of, write
 from torchtransient.rendering.seeds import mix_seed
 from torchtransient.rendering.surroundings import is_typed_structure
 from torchtransient.rendering.trees import Tree, taken_apart
 from torchtransient.rendering.variant import active_variant, at_work, in_variant, is_differentiable, take_over
+from torchtransient.scene.parameters import is_transform
+from torchtransient.scene.physics import are_finite, smallest_and_largest
 
 Tensors = tuple[torch.Tensor, ...]
 

@@ -6,9 +6,8 @@ import warnings
 from collections.abc import Callable
 from typing import Any
 
-from torchtransient.errors import TorchTransientWarning
+from torchtransient.errors import TorchTransientWarning, level_of_user
 from torchtransient.rendering.interrupts import quiet
-from torchtransient.rendering.physics import level_of_user
 
 
 def rounded_count(asked: int, known: dict[int, int], drawn: Callable[[int], int]) -> int:

@@ -8,18 +8,12 @@ from typing import Any
 import numpy as np
 
 from torchtransient.errors import SceneError, TorchTransientError, UnknownKeyError
+from torchtransient.plain_texts import one_line
 from torchtransient.plugins.mitsuba_numbers import check_pose, is_turned_by_reflections
 from torchtransient.plugins.node_walk import ShownValue
 from torchtransient.rendering.interrupts import quiet
-from torchtransient.rendering.mitsuba_words import one_line
-from torchtransient.rendering.parameters import (
-    as_mitsuba_value,
-    changed_with,
-    classify,
-    is_transform,
-    read_value,
-    unknown_key,
-)
+from torchtransient.scene.parameters import classify, is_transform, read_value, unknown_key
+from torchtransient.scene.values import as_mitsuba_value, changed_with
 
 
 def variant_of(params: Any) -> str | None:

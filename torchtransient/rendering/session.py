@@ -14,22 +14,24 @@ import torch
 
 from torchtransient._collection import no_collection
 from torchtransient.errors import SceneError, TorchTransientError, VariantError
+from torchtransient.plain_texts import one_line
 from torchtransient.plugins.black_textures import lifted
 from torchtransient.plugins.unfinished import afterwards
-from torchtransient.rendering.build_options import BuildOptions
 from torchtransient.rendering.interrupts import quiet
 from torchtransient.rendering.kernel_errors import named_errors
-from torchtransient.rendering.mitsuba_words import one_line
 from torchtransient.rendering.overrides import boundary_term, max_depth, temporal_filter
-from torchtransient.rendering.physics import PhysicsWatch
+from torchtransient.rendering.recordings import Recordings
 from torchtransient.rendering.scene_state import detached, put_back, values_of
 from torchtransient.rendering.seeds import Item, Seeding
 from torchtransient.rendering.variant import active_variant, in_variant
+from torchtransient.scene.edits import BuildOptions
+from torchtransient.scene.physics import PhysicsWatch
+from torchtransient.scene.values import own_array
 
 if TYPE_CHECKING:
-    from torchtransient.rendering.depth_bound import DepthBound
-    from torchtransient.rendering.parameters import SlotTable
-    from torchtransient.rendering.scene_handle import Scene
+    from torchtransient.scene.load import Scene
+    from torchtransient.scene.pilot import DepthBound
+    from torchtransient.scene.values import SlotTable
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,7 @@ class Session:
         self.scene = slots.built.scene
         self.params = slots.built.params
         self.integrator = self.scene.integrator()
-        self.recordings = job.scene.recordings(job.keys, job.options)
+        self.recordings = job.scene.recordings.setdefault(job.options, {}).setdefault(job.keys, Recordings())
         self.sensors = self.scene.sensors()
 
     def film(self, item: Item) -> Any:
@@ -130,38 +132,6 @@ class Session:
             keys = ", ".join(self.job.keys)
             raise SceneError(f"values of {keys}: Mitsuba refuses them: {one_line(error)}") from error
         return leaves
-
-
-# Of so few entries a list is taken over sooner than a kernel is launched.
-FEW = 64
-
-
-def own_array(tensor: torch.Tensor) -> Any:
-    """A flat Dr.Jit copy in Dr.Jit's own memory: the scene must not alias memory that belongs to the caller, and a
-    recorded kernel would go on reading memory that is not Dr.Jit's where the first call had it.
-    """
-    import drjit as dr
-    import mitsuba as mi
-
-    flat = tensor.resolve_neg().reshape(-1)
-    if flat.numel() <= FEW:
-        few = mi.Float(flat.tolist())
-        # A single number would be a literal of the kernels, and that of the first call for ever where a plugin does not
-        # show it to Dr.Jit.
-        dr.make_opaque(few)
-        return few
-    flat = flat.contiguous()
-    wait_for_torch(flat)
-    copy = mi.Float(flat) * dr.opaque(mi.Float, 1)
-    dr.eval(copy)
-    dr.sync_thread()
-    return copy
-
-
-def wait_for_torch(tensor: torch.Tensor) -> None:
-    """Dr.Jit works on a stream of its own: what torch has queued must be done before Dr.Jit reads or reuses memory."""
-    if tensor.is_cuda:
-        torch.cuda.current_stream(tensor.device).synchronize()
 
 
 def _check_flags() -> None:

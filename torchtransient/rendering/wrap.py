@@ -14,7 +14,6 @@ import torch
 from torchtransient.errors import ArgumentError, GradientError, ShapeError, UnitError
 from torchtransient.given_types import is_one_of
 from torchtransient.quantities import as_whole, shown
-from torchtransient.rendering.arguments import as_float
 from torchtransient.rendering.arrays import computable, handle
 from torchtransient.rendering.derivatives import run
 from torchtransient.rendering.generators import Generators
@@ -25,6 +24,7 @@ from torchtransient.rendering.scene_state import detached, shapes_of, values_of,
 from torchtransient.rendering.surroundings import entries_of, is_typed_structure, wants_derivative
 from torchtransient.rendering.trees import taken_apart
 from torchtransient.rendering.variant import at_work, device_type
+from torchtransient.scene.values import as_float
 
 
 def wrap(

@@ -9,9 +9,9 @@ import mitsuba as mi
 import numpy as np
 
 import torchtransient.plugins
-from torchtransient.rendering.build_options import BuildOptions
-from torchtransient.rendering.scene_handle import load
 from torchtransient.rendering.variant import active_variant
+from torchtransient.scene.edits import BuildOptions
+from torchtransient.scene.load import load
 from torchtransient.testing.moving_edges import Array, MovingEdge
 
 PASSES = ("primary", "vertex", "light", "specular")

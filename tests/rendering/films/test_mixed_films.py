@@ -80,9 +80,9 @@ def test_each_sensor_renders_as_if_it_were_alone(pair, of_integrator):
 
 
 def test_steady_gates_beside_a_window_that_cuts():
-    """`steady=False` speaks of histograms: a gated film beside one says so."""
+    """`steady=False` is for histograms: a gated film beside one is refused."""
     scene = tt.load(room_of(HISTOGRAM, FILMS["gated"]), variant=VARIANT)
-    with pytest.raises(ArgumentError, match="gated_hdr_film"):
+    with pytest.raises(SceneError, match="'gated_hdr_film' does not read 'steady'"):
         tt.TransientRenderer(scene, steady=False)
 
 

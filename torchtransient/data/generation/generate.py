@@ -29,10 +29,9 @@ from torchtransient.data.generation.settings import (
 )
 from torchtransient.data.recipes.plugin_modules import plugins_here
 from torchtransient.data.storage.file_names import MANIFEST_FILE, RECIPE_FILE, SHARD_FILES, shard_file_name
-from torchtransient.errors import ArgumentError, SceneError, StorageError, TorchTransientError, UnitError
+from torchtransient.errors import ArgumentError, SceneError, StorageError, TorchTransientError, UnitError, level_of_user
 from torchtransient.given_types import a_recipe, is_one_of
 from torchtransient.quantities import as_number, count, shown
-from torchtransient.rendering.physics import level_of_user
 
 ENGINES = ("local", "ray")
 # Samples that are tried until one tells how large all are.

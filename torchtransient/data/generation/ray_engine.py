@@ -16,8 +16,7 @@ from torchtransient.data.generation.ledger import Ledger
 from torchtransient.data.generation.settings import Settings
 from torchtransient.data.generation.shard_making import ShardMaker, fatal
 from torchtransient.data.generation.telling import Telling
-from torchtransient.errors import MissingPackageError, TorchTransientError, TorchTransientWarning
-from torchtransient.rendering.physics import level_of_user
+from torchtransient.errors import MissingPackageError, TorchTransientError, TorchTransientWarning, level_of_user
 
 
 class Board:

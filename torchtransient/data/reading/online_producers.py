@@ -28,8 +28,7 @@ from torchtransient.data.reading.online_worker import Layout, empty_ring, produc
 from torchtransient.data.reading.sample_draws import outside_tensor
 from torchtransient.data.recipes.outside_light import OutsideLight
 from torchtransient.data.recipes.plugin_modules import plugins_here
-from torchtransient.errors import ShapeError, StorageError, TorchTransientError, TorchTransientWarning
-from torchtransient.rendering.physics import level_of_user
+from torchtransient.errors import ShapeError, StorageError, TorchTransientError, TorchTransientWarning, level_of_user
 
 WHAT = "OnlineDataset"
 _SHARED = Path("/dev/shm")

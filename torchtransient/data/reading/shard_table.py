@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 
 from torchtransient.data.storage.manifest import named_shards, shards_of
 from torchtransient.data.storage.shard_file import Shard
-from torchtransient.errors import StorageError, TorchTransientWarning
+from torchtransient.errors import StorageError, TorchTransientWarning, level_of_user
 from torchtransient.file_places import path_of
 from torchtransient.given_types import several
 from torchtransient.quantities import shown
-from torchtransient.rendering.physics import level_of_user
 
 WHAT = "data set"
 _OPEN = 32

@@ -18,11 +18,11 @@ from torchtransient.data.recipes.reach import check_reach
 from torchtransient.data.recipes.specification import Specification
 from torchtransient.data.recipes.streams import Draw, Extreme, Fixed, Stream
 from torchtransient.data.recipes.structures import Structure
-from torchtransient.errors import SceneError, TorchTransientError, TorchTransientWarning, UnitError
+from torchtransient.errors import SceneError, TorchTransientError, TorchTransientWarning, UnitError, level_of_user
 from torchtransient.plugins.physical_ranges import PhysicalRange
-from torchtransient.rendering.physics import is_singular, level_of_user, outside_message, singular_message
 from torchtransient.rendering.progress import with_bar
 from torchtransient.rendering.variant import active_variant
+from torchtransient.scene.physics import is_singular, outside_message, singular_message
 
 # Samples that are drawn, and structures among them that are built, for a look.
 SAMPLES, STRUCTURES = 64, 8

@@ -27,10 +27,10 @@ from torchtransient.files.scan_data import scan_data
 from torchtransient.plugins import versions_of_others
 from torchtransient.quantities import shown
 from torchtransient.rendering.labels import LABELS, first_return, label_names, material_names, scene_labels
-from torchtransient.rendering.parameters import ParameterTable, unknown_key
 from torchtransient.rendering.renderer import TransientRenderer
-from torchtransient.rendering.scene_handle import Scene, load
 from torchtransient.rendering.variant import active_variant, stokes_components
+from torchtransient.scene.load import Scene, load
+from torchtransient.scene.parameters import ParameterTable, unknown_key
 from torchtransient.sensing import Analyzers, Compose, Device, PolarizationMosaic
 
 if TYPE_CHECKING:

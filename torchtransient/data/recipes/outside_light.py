@@ -10,8 +10,7 @@ from typing import Self
 
 import numpy as np
 
-from torchtransient.errors import PhysicsWarning, TorchTransientWarning
-from torchtransient.rendering.physics import level_of_user
+from torchtransient.errors import PhysicsWarning, TorchTransientWarning, level_of_user
 
 # Share of a sample's light outside of the window from which on the sample counts as cut.
 CUT = 0.01

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from torchtransient.files.content_key import contents_of
-from torchtransient.rendering.description import Plain, XmlDescription
+from torchtransient.scene.description import Plain, XmlDescription
 
 # Longer texts name no file.
 _MOST_LETTERS = 1024

@@ -39,8 +39,8 @@ from torchtransient.files.scan_data import scan_data, scan_from_data
 from torchtransient.files.yaml_files import Section, read_yaml
 from torchtransient.plain_texts import json_data, said_in_short, text_of_file, told_shortly
 from torchtransient.quantities import shown
-from torchtransient.rendering.description import DictDescription, XmlDescription, describe_dict
-from torchtransient.rendering.scene_handle import Scene
+from torchtransient.scene.description import DictDescription, XmlDescription, describe_dict
+from torchtransient.scene.load import Scene
 
 FORMAT = "torchtransient recipe 1"
 # Entries that are the constructor's arguments as they are.
@@ -248,7 +248,7 @@ def _hidden(given: Any) -> Any:
 
 
 def _xml(given: Mapping[str, Any], folder: Path) -> Any:
-    from torchtransient.rendering.scene_handle import load
+    from torchtransient.scene.load import load
 
     path = Path(given["xml"])
     path = path if path.is_absolute() else folder / path

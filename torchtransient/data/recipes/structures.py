@@ -21,9 +21,9 @@ from torchtransient.data.recipes.distributions import checked_choices
 from torchtransient.errors import SceneError
 from torchtransient.files.content_key import content_key
 from torchtransient.quantities import Numbers, shown
-from torchtransient.rendering.description import DictDescription, Plain, XmlDescription, describe_dict
-from torchtransient.rendering.scene_handle import Scene, load
-from torchtransient.rendering.taken import ReadyScene
+from torchtransient.scene.description import DictDescription, Plain, XmlDescription, describe_dict
+from torchtransient.scene.load import Scene, load
+from torchtransient.scene.objects import LoadedScene
 
 # The key that stands for the scan of a capture.
 SCAN = "scan"
@@ -112,7 +112,7 @@ def _description(given: Any, scan: Scan | None, parameters: Mapping[str, Any]) -
         if parameters and not isinstance(scene._description, XmlDescription):
             raise SceneError("recipe: parameters fill the $names of XML files; a dictionary has none. Leave them out.")
         scene._description.check_described("recipe")
-        assert not isinstance(scene._description, ReadyScene)
+        assert not isinstance(scene._description, LoadedScene)
         return scene._description
     if parameters:
         raise SceneError("recipe: parameters fill the $names of XML files; a capture has none. Leave them out.")

@@ -19,7 +19,7 @@ from torchtransient.errors import ArgumentError
 
 if TYPE_CHECKING:
     from torchtransient.interfaces import FilmInterface
-    from torchtransient.rendering.plan_pilot import Arrivals
+    from torchtransient.scene.pilot import Arrivals
 
 
 @dataclass(frozen=True)
@@ -125,6 +125,10 @@ class FilmChoice(abc.ABC):
     @abc.abstractmethod
     def write(self, props: Any) -> None:
         """Write the settings into the properties of a film node of this plugin."""
+
+    def describes(self, film: FilmInterface) -> bool:
+        """Return whether a built film has these settings."""
+        return film.measures == self.measures and self.from_film(film) == self
 
     @classmethod
     def fits(cls, plugin: str) -> bool:

@@ -14,7 +14,7 @@ from torchtransient.rendering.films.choice import CommandOption, FilmChoice, mea
 from torchtransient.rendering.films.layout import cube_channels_first
 
 if TYPE_CHECKING:
-    from torchtransient.rendering.plan_pilot import Arrivals
+    from torchtransient.scene.pilot import Arrivals
 
 
 @dataclass(frozen=True)

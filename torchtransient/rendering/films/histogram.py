@@ -16,7 +16,7 @@ from torchtransient.rendering.films.choice import CommandOption, FilmChoice, Pla
 from torchtransient.rendering.films.layout import cube_channels_first
 
 if TYPE_CHECKING:
-    from torchtransient.rendering.plan_pilot import Arrivals
+    from torchtransient.scene.pilot import Arrivals
 
 # Under a pilot run nothing is stored: the film only has to be one that integrators take.
 _ANY_AXIS = TimeAxis(0.0, 1.0, 1)

@@ -16,15 +16,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchtransient.rendering.build_options import BuildOptions
 from torchtransient.rendering.engine import jvp, primal, vjp
-from torchtransient.rendering.physics import PhysicsWatch
 from torchtransient.rendering.seeds import Item, Seeding
 from torchtransient.rendering.session import RenderJob
 from torchtransient.rendering.variant import active_variant
+from torchtransient.scene.edits import BuildOptions
+from torchtransient.scene.physics import PhysicsWatch
 
 if TYPE_CHECKING:
-    from torchtransient.rendering.scene_handle import Scene
+    from torchtransient.scene.load import Scene
 
 Array = NDArray[np.float64]
 # Of the loss weights, per metre.

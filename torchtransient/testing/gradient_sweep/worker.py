@@ -12,8 +12,8 @@ from typing import Any
 
 from torchtransient.errors import TorchTransientError
 from torchtransient.plugins.swept_parameters import UNCHECKED
-from torchtransient.rendering.parameters import ParameterInfo
-from torchtransient.rendering.scene_handle import load
+from torchtransient.scene.load import load
+from torchtransient.scene.parameters import ParameterInfo
 from torchtransient.testing.gradient_sweep.compare import Effort, Result, judge
 from torchtransient.testing.gradient_sweep.measure import Subject, quiet
 from torchtransient.testing.gradient_sweep.settings import Setting

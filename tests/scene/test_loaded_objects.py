@@ -1,0 +1,339 @@
+"""Mitsuba objects and scenes that are loaded already: every kind is rendered, listed, differentiated, pickled, taken to
+another variant and planned, or refused in words.
+"""
+
+from __future__ import annotations
+
+import pickle
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+
+import torchtransient as tt
+from torchtransient.testing.small_room import COLOUR, make_room, pose
+
+VARIANT = "llvm_ad_rgb"
+PIXELS = np.linspace(0.1, 0.9, 48, dtype=np.float32).reshape(4, 4, 3)
+
+
+def with_surface(entry):
+    room = make_room()
+    room["wall"]["bsdf"]["reflectance"] = entry
+    return room
+
+
+def bitmap():
+    plain = {"type": "bitmap", "raw": True}
+    return with_surface(plain | {"bitmap": mi.Bitmap(PIXELS)}), with_surface(plain | {"data": PIXELS})
+
+
+def tensor():
+    plain = {"type": "bitmap", "raw": True, "data": PIXELS}
+    return with_surface(plain | {"data": mi.TensorXf(PIXELS)}), with_surface(plain)
+
+
+def grid():
+    """A medium in the cube, whose extinction is a grid."""
+    values = np.linspace(0.5, 2.0, 24, dtype=np.float32).reshape(2, 3, 4, 1)
+
+    def room(volume):
+        found = make_room()
+        found["integrator"]["type"] = "transient_prbvolpath"
+        sigma = {"type": "gridvolume", "grid": volume, "to_world": pose(0.1, -0.3, 0.2, 0.6)}
+        medium = {"type": "heterogeneous", "sigma_t": sigma, "albedo": 0.7}
+        found["box"] |= {"bsdf": {"type": "null"}, "interior": medium}
+        return found
+
+    return room(mi.VolumeGrid(values)), room(values)
+
+
+def mesh(**more):
+    plain = make_room()
+    plain["box"] |= more
+    given = make_room()
+    given["box"] = mi.load_dict(plain["box"])
+    return given, plain
+
+
+def mirrored_mesh():
+    return mesh(to_world=pose(0.4, 0.0, 0.5, 0.3) @ np.diag([1.0, -1.0, 1.0, 1.0]))
+
+
+def mesh_with_flat_faces():
+    return mesh(face_normals=True)
+
+
+def mesh_of_two_sides():
+    return mesh(bsdf={"type": "twosided", "nested": {"type": "diffuse"}}, flip_normals=True)
+
+
+def surface():
+    plain = make_room()
+    return plain | {"wall": plain["wall"] | {"bsdf": mi.load_dict(plain["wall"]["bsdf"])}}, plain
+
+
+def light():
+    plain = make_room()
+    return plain | {"light": mi.load_dict(plain["light"])}, plain
+
+
+def sensor():
+    plain = make_room()
+    return plain | {"sensor": mi.load_dict(plain["sensor"])}, plain
+
+
+def film():
+    plain = make_room()
+    return plain | {"sensor": plain["sensor"] | {"film": mi.load_dict(plain["sensor"]["film"])}}, plain
+
+
+def integrator():
+    plain = make_room()
+    return plain | {"integrator": mi.load_dict(plain["integrator"])}, plain
+
+
+def scene():
+    return mi.load_dict(make_room(), optimize=False), make_room()
+
+
+DESCRIBED = (bitmap, tensor, grid, mesh, mirrored_mesh, mesh_with_flat_faces)
+KEPT = (mesh_of_two_sides, surface, light, sensor, film, integrator, scene)
+# Keys of what was taken itself; None: that of the scene's coloured box.
+KEYS = {
+    bitmap: "wall.bsdf.reflectance.data", tensor: "wall.bsdf.reflectance.data",
+    grid: "box.interior_medium.sigma_t.data",
+    mesh: "box.vertex_positions", mesh_of_two_sides: "box.vertex_positions", surface: "wall.bsdf.reflectance.value",
+    light: "light.position", scene: "light.position",
+}  # fmt: skip
+
+
+def render(loaded, key=None):
+    renderer = tt.TransientRenderer(loaded, parameters=[key] if key else [], spp=8, physics="ignore")
+    out = renderer(seed=0).transient
+    if key:
+        weights = torch.linspace(0.5, 1.5, out.shape[1])[None, :, None, None]
+        (out * weights).sum().backward()
+    return out.detach(), renderer.values[key].grad if key else None
+
+
+def each(makers, *quick):
+    """All kinds, the others than ``quick`` among the slow tests."""
+    marks = {make: () if make in quick else pytest.mark.slow for make in makers}
+    return pytest.mark.parametrize("make", [pytest.param(m, marks=marks[m], id=m.__name__) for m in makers])
+
+
+@each([*DESCRIBED, *KEPT], scene)
+def test_same_picture_table_and_gradient_as_the_description(make):
+    given, plain = make()
+    taken, described = tt.load(given), tt.load(plain, variant=VARIANT)
+    names = {k: v.differentiable for k, v in taken.parameters().items()}
+    # A mesh that keeps no transform is placed by its vertices alone.
+    assert names == {k: v.differentiable for k, v in described.parameters().items()}
+    key = KEYS.get(make, COLOUR)
+    a, b = render(taken, key), render(described, key)
+    assert a[0].sum() > 0 and a[1].abs().max() > 0
+    torch.testing.assert_close(a[0], b[0], rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(a[1], b[1], rtol=1e-4, atol=1e-5)
+
+
+@each(DESCRIBED)
+def test_described_objects_travel(make):
+    given, plain = make()
+    taken, mono = tt.load(given), "llvm_ad_mono"
+    again = pickle.loads(pickle.dumps(taken))
+    assert again.same_description(taken) and taken.same_description(tt.load(given))
+    assert torch.equal(render(again)[0], render(taken)[0])
+    if make is not mesh_with_flat_faces:
+        torch.testing.assert_close(
+            render(tt.load(taken, variant=mono))[0], render(tt.load(plain, variant=mono))[0], rtol=1e-5, atol=1e-6
+        )
+        assert tt.plan(taken, pilot=False).variant
+
+
+def test_flags_of_a_described_mesh():
+    room = make_room()
+    flags = {"face_normals": True, "flip_normals": True, "silhouette_sampling_weight": 0.25}
+    room["box"] = mi.load_dict(room["box"] | flags)
+    described = tt.load(room)._description.tree["box"]
+    assert flags.items() <= described.items() and described["type"] == "mesh_arrays"
+
+
+@each(KEPT, scene)
+def test_objects_that_are_taken_as_they_are_stay(make):
+    given, _ = make()
+    taken = tt.load(given)
+    assert taken.variant == VARIANT and taken.same_description(tt.load(given))
+    for refused in (
+        lambda: pickle.dumps(taken),
+        lambda: pickle.dumps(tt.TransientRenderer(taken)),
+        lambda: tt.load(taken, variant="llvm_ad_mono"),
+        lambda: tt.load(given, variant="llvm_ad_mono"),
+        lambda: tt.plan(taken, pilot=False),
+        lambda: tt.data.Recipe(taken),
+    ):
+        with pytest.raises(tt.errors.SceneError, match=r"taken as it( is|)(.|\n)*dictionary or an XML file"):
+            refused()
+
+
+def test_values_do_not_leak_between_renderers_that_share_an_object():
+    """One object stands in all that is built of a scene: what one renderer has installed no other sees."""
+    ready = mi.load_dict(make_room(), optimize=False)
+    loaded = tt.load(ready)
+    first = render(loaded)[0]
+    dark = tt.TransientRenderer(loaded, parameters=[COLOUR], spp=8)
+    out = dark({COLOUR: torch.zeros(3)}, seed=0).transient
+    assert out.sum() < first.sum()
+    assert torch.equal(render(loaded)[0], first)
+    assert np.allclose(np.array(mi.traverse(ready)[COLOUR]).ravel(), [0.8, 0.5, 0.2])
+    # Later changes of what is shared count.
+    params = mi.traverse(ready)
+    params["light.intensity.value"] = mi.Float(20.0)
+    params.update()
+    torch.testing.assert_close(render(loaded)[0], 2 * first, rtol=1e-5, atol=1e-6)
+
+
+def test_what_would_change_a_ready_scene_is_refused():
+    loaded = tt.load(mi.load_dict(make_room(), optimize=False))
+    axis = tt.TimeAxis(start_opl=6.0, bin_width_opl=0.25, num_bins=24)
+    for options in ({"max_depth": 2}, {"sampler": "stratified"}, {"steady": False}, {"pulse": tt.Pulse.gaussian(0.5)}):
+        with pytest.raises(tt.errors.SceneError, match="was taken as it is"):
+            tt.TransientRenderer(loaded, **options)
+    with pytest.raises(tt.errors.SceneError, match="time_axis would change"):
+        tt.TransientRenderer(loaded, time_axis=tt.TimeAxis(start_opl=6.0, bin_width_opl=0.5, num_bins=24))
+    assert tt.TransientRenderer(loaded, time_axis=axis, max_depth=3).axis == axis
+    steady = make_room()
+    steady["integrator"] = {"type": "direct"}
+    with pytest.raises(tt.errors.SceneError, match="DirectIntegrator was taken as it is"):
+        tt.TransientRenderer(tt.load(mi.load_dict(steady)))
+    steady = make_room()
+    steady["sensor"]["film"] = {"type": "hdrfilm", "width": 4, "height": 3, "rfilter": {"type": "mitchell"}}
+    with pytest.raises(tt.errors.SceneError, match=r"taken as it is .* no time axis.*Make the scene with a trans"):
+        tt.TransientRenderer(tt.load(mi.load_dict(steady)), time_axis=axis)
+
+
+def test_what_would_change_a_film_that_was_taken_is_refused():
+    axis = tt.TimeAxis(start_opl=6.0, bin_width_opl=0.5, num_bins=24)
+    room, _ = film()
+    with pytest.raises(tt.errors.SceneError, match="time_axis would change"):
+        tt.TransientRenderer(tt.load(room), time_axis=axis)
+    room["sensor"]["film"] = mi.load_dict(STEADY_FILM)
+    with pytest.raises(tt.errors.SceneError, match="no time axis"):
+        tt.TransientRenderer(tt.load(room), time_axis=axis)
+
+
+def test_another_sampler_takes_the_number_of_one_that_was_taken():
+    room = make_room()
+    room["sensor"]["sampler"] = mi.load_dict({"type": "independent", "sample_count": 9})
+    assert tt.TransientRenderer(tt.load(room), sampler="stratified")(seed=0).stats.spp == 9
+
+
+STEADY_FILM = {"type": "hdrfilm", "width": 6, "height": 4, "rfilter": {"type": "tent"}}
+STEADY = {
+    "crop": ({}, {"crop_width": 3, "crop_height": 2, "crop_offset_x": 1, "crop_offset_y": 1}, {}),
+    "lens": ({"type": "thinlens", "aperture_radius": 0.05, "focus_distance": 3.0}, {}, {"max_depth": 2}),
+    "parallel": ({"type": "orthographic"}, {"rfilter": {"type": "gaussian", "stddev": 0.4}}, {"rr_depth": 2}),
+    "angle": ({"fov_axis": "y", "principal_point_offset_x": 0.1}, {"rfilter": {"type": "box"}}, {"max_depth": -1}),
+    "sampler": ({"sampler": {"type": "stratified", "sample_count": 9, "jitter": False}}, {}, {"type": "volpath"}),
+}
+
+
+def steady_room(name):
+    sensor, film, integrator = STEADY[name]
+    room = make_room()
+    room["integrator"] = {"type": "path", "max_depth": 3, **integrator}
+    room["sensor"] |= {**sensor, "film": STEADY_FILM | film}
+    if sensor.get("type") == "orthographic":
+        del room["sensor"]["fov"]
+    return room
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name == "crop" else pytest.mark.slow) for name in STEADY]
+)
+def test_a_ready_scene_for_steady_pictures_takes_a_time_axis(name):
+    """As its description does: the same light in the same bins; the slow ones have derivatives too."""
+    keys = [] if name == "crop" else ["light.position"]
+    room = steady_room(name)
+    axis = tt.TimeAxis(start_opl=6.0, bin_width_opl=0.25, num_bins=24)
+    found = []
+    for scene in (tt.load(mi.load_dict(room, optimize=False)), tt.load(room, variant=VARIANT)):
+        options = {"time_axis": axis, "spp": 9, "physics": "ignore", "max_depth": 4 if name == "angle" else None}
+        renderer = tt.TransientRenderer(scene, parameters=keys, temporal_filter="tent", **options)
+        out = renderer(seed=0)
+        found.append([out.transient.detach(), out.steady.detach()])
+        for key in keys:
+            out.transient.square().sum().backward()
+            found[-1].append(renderer.values[key].grad)
+    assert all(one.abs().max() > 0 for one in found[1])
+    for a, b in zip(*found, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5 * float(b.abs().max()))
+
+
+def test_derivatives_that_need_another_plugin_are_refused():
+    """The index of Mitsuba's dielectric has no derivative, and nothing is built in the place of what was taken."""
+    room = make_room()
+    room["box"]["bsdf"] = {"type": "dielectric"}
+    described, taken = tt.load(room, variant=VARIANT), tt.load(room | {"box": mi.load_dict(room["box"])})
+    key = next(key for key in described.parameters() if key.endswith(".eta"))
+    assert described.parameters()[key].differentiable
+    entry = taken.parameters()[key]
+    assert not entry.differentiable and "diff_dielectric" in entry.reason and "taken as it is" in entry.reason
+    with pytest.raises(tt.errors.GradientError, match="taken as it is"):
+        tt.TransientRenderer(taken, parameters=[key])
+
+
+def test_plugins_that_are_wrong_in_a_variant_are_refused():
+    room = make_room()
+    room["box"]["bsdf"] = {"type": "dielectric"}
+    lamp = make_room()
+    lamp["wall"]["emitter"] = {"type": "directionalarea"}
+    with pytest.raises(tt.errors.SceneError, match="diff_directionalarea"):
+        tt.TransientRenderer(tt.load(mi.load_dict(lamp)))
+    mi.set_variant("llvm_ad_mono_polarized")
+    with pytest.raises(tt.errors.SceneError, match="diff_dielectric"):
+        tt.TransientRenderer(tt.load(mi.load_dict(room)))
+
+
+def test_plugins_in_python_are_called_by_their_own_names():
+    """Mitsuba calls them by the class that they derive from."""
+    ready = tt.load(mi.load_dict(make_room(), optimize=False))
+    with pytest.raises(tt.errors.SceneError, match="the integrator TransientPath was taken as it is"):
+        tt.TransientRenderer(ready, max_depth=2)
+    assert tt.TransientRenderer(ready, spp=1, physics="ignore")(seed=0).stats.integrator == "TransientPath"
+
+
+def test_meshes_of_a_class_of_ones_own_are_no_plain_meshes():
+    """They may do more than their buffers say."""
+
+    class Sail(mi.Mesh):
+        def __init__(self):
+            props = mi.Properties()
+            props["bsdf"] = mi.load_dict({"type": "diffuse"})
+            mi.Mesh.__init__(self, "sail", 3, 1, props=props)
+            params = mi.traverse(self)
+            params["vertex_positions"] = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0]
+            params["faces"] = [0, 1, 2]
+            params.update()
+
+    scene = tt.load(make_room() | {"sail": Sail()})
+    assert "sail.vertex_positions" in scene.parameters()
+    with pytest.raises(tt.errors.SceneError, match="the Sail at"):
+        pickle.dumps(scene)
+
+
+def test_other_things_are_refused():
+    with pytest.raises(tt.errors.ArgumentError, match="got the SceneParameters of one"):
+        tt.load(mi.traverse(mi.load_dict(make_room())))
+    with pytest.raises(tt.errors.ArgumentError, match="inside a dictionary"):
+        tt.load(mi.load_dict({"type": "sphere"}))
+    with pytest.raises(tt.errors.SceneError, match=r"inner is a whole mi\.Scene"):
+        tt.load({"type": "scene", "inner": mi.load_dict(make_room())})
+    scalar = mi.scalar_rgb.load_dict if hasattr(mi.scalar_rgb, "load_dict") else None
+    assert scalar is None
+    mi.set_variant("scalar_rgb")
+    thing = mi.load_dict({"type": "point"})
+    mi.set_variant(VARIANT)
+    with pytest.raises(tt.errors.VariantError, match="scalar_rgb"):
+        tt.load(make_room() | {"light": thing}).parameters()

@@ -1,0 +1,78 @@
+"""Films and integrators that a render would have to change, and cannot without losing something."""
+
+from __future__ import annotations
+
+import pytest
+
+import torchtransient as tt
+from torchtransient.errors import SceneError
+from torchtransient.rendering.films.choices import of_entries
+from torchtransient.testing.small_room import VARIANT, make_room
+
+GATES = [tt.Gate.gaussian(8.0, 0.5)]
+
+
+def rendered(room, **settings):
+    return tt.TransientRenderer(tt.load(room, variant=VARIANT), spp=1, physics="ignore", **settings)
+
+
+@pytest.mark.parametrize("prefix", ["pulse", "irf"])
+def test_a_pulse_that_phasors_would_lose(room, prefix):
+    """Films of gates take one, films of frequencies do not."""
+    room["sensor"]["film"] |= {prefix: "gaussian", f"{prefix}_fwhm_opl": 0.3}
+    rendered(room, gates=GATES)
+    with pytest.raises(SceneError, match="has a pulse or an irf, which a phasor_hdr_film would lose; take it out"):
+        rendered(room, frequencies=[0.0, 0.5])
+
+
+def test_films_that_are_steady(room):
+    room["sensor"]["film"] = {"type": "hdrfilm", "width": 3, "height": 2}
+    with pytest.raises(SceneError, match=r"is a steady 'hdrfilm', which has no time axis\. Give Transient"):
+        rendered(room)
+    for settings in ({"frequencies": [0.5]}, {"gates": GATES}, {"time_axis": tt.TimeAxis(6.0, 0.5, 8)}):
+        rendered(room, **settings)
+    with pytest.raises(SceneError, match="'phasor_hdr_film' does not read 'steady'"):
+        rendered(room, frequencies=[0.5], steady=False)
+    del room["sensor"]["film"]
+    with pytest.raises(SceneError, match="has no time axis"):
+        rendered(room)
+    assert rendered(room, time_axis=tt.TimeAxis(6.0, 0.5, 8)).axis.num_bins == 8
+
+
+def test_plugins_that_nobody_knows(room):
+    room["sensor"]["film"]["type"] = "transient_hdr_flim"
+    with pytest.raises(SceneError, match="transient_hdr_flim"):
+        rendered(room)
+    room = make_room() | {"integrator": {"type": "transient_pth"}}
+    with pytest.raises(SceneError, match="transient_pth"):
+        rendered(room)
+
+
+def test_integrators_without_a_transient_counterpart(room):
+    room["integrator"] = {"type": "depth"}
+    with pytest.raises(SceneError, match=r"integrator 'depth' has no transient counterpart. Expected transient_path"):
+        rendered(room)
+    room["integrator"] = {"type": "path", "max_depth": 4}
+    assert rendered(room)(seed=0).stats.integrator == "transient_path"
+    del room["integrator"]
+    assert rendered(room)(seed=0).stats.integrator == "transient_path"
+
+
+def test_files_of_something_else(tmp_path):
+    file = tmp_path / "cube.xml"
+    file.write_text('<shape version="3.0.0" type="cube"/>', encoding="utf-8")
+    with pytest.raises(SceneError, match=r"cube\.xml: expected a <scene> at the top, got <cube>"):
+        tt.load(file, variant=VARIANT).parameters()
+
+
+def test_scenes_without_a_sensor(room):
+    del room["sensor"]
+    with pytest.raises(SceneError, match="has no sensor; add one"):
+        rendered(room)
+
+
+def test_files_without_a_film():
+    with pytest.raises(KeyError, match="transient or phasor or gated"):
+        of_entries({"steady": 1})
+
+

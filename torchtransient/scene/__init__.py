@@ -1,0 +1,1 @@
+"""Scenes of the layer: loaded, described, checked, edited, built, planned and saved."""

@@ -1,0 +1,469 @@
+"""``tt.load`` and ``tt.Scene``: a scene that can be pickled, copied and built in any differentiable variant."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import signal
+import subprocess
+import sys
+from collections import OrderedDict
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from torchtransient.errors import ArgumentError, GradientError, SceneError, TorchTransientError
+from torchtransient.plugins import kind_of, modules_of_others, register_module
+from torchtransient.plugins.unfinished import afterwards
+from torchtransient.quantities import flag, shown
+from torchtransient.rendering.kernel_errors import named_errors
+from torchtransient.rendering.opaque import opaque
+from torchtransient.rendering.variant import active_variant, in_variant, resolve_variant
+from torchtransient.scene.build import BuiltScene, build
+from torchtransient.scene.description import SceneDescription, describe_dict, describe_xml, same_description
+from torchtransient.scene.edits import BuildOptions
+from torchtransient.scene.nodes import children, is_film
+from torchtransient.scene.objects import LoadedScene, transient_dictionary
+from torchtransient.scene.parameters import ParameterTable, parameter_table, unknown_key
+from torchtransient.scene.save import WAY_OUT, check_same, replaced_files, write_scene
+from torchtransient.scene.values import SlotTable
+
+# Built scenes kept per description: one for every combination of time axis, depth and substituted plugins in use.
+_MAX_BUILDS = 8
+
+
+class Scene:
+    """A scene's description, and the Mitsuba scenes built from it when they are needed.
+
+    Made by :func:`load`. Pickling and copying take the description alone; the Mitsuba scene is built on first use,
+    under the scene's variant. Instances are immutable, so copies share everything. A scene that holds loaded Mitsuba
+    objects (:func:`load`) stays in their variant and process.
+    """
+
+    def __init__(self, description: SceneDescription, variant: str | None):
+        self._description = description
+        # Loaded objects fix the variant, and are shared with their owners.
+        self.is_shared = bool(description.objects)
+        description.check_variant(variant)
+        self._requested_variant = description.objects[0].variant if self.is_shared else variant
+        self._variant: str | None = None
+        self._builds: OrderedDict[BuildOptions, BuiltScene] = OrderedDict()
+        # Not in the built scenes: objects that refer to themselves are freed late.
+        self._slots: dict[BuildOptions, dict[tuple[str, ...], SlotTable]] = {}
+        # Built scenes that still hold the values of the last run: the next one most likely brings its own.
+        self._unsettled: dict[BuildOptions, SlotTable] = {}
+        self._table: ParameterTable | None = None
+        # Options of the table: a shared scene may be built with some alone.
+        self._table_options = BuildOptions(real_bitmaps=True)
+        # Recorded calls by options and keys. The engine fills them; they go with the built scene.
+        self.recordings: dict[BuildOptions, dict[tuple[str, ...], Any]] = {}
+        # Bounds on the depth for derivatives by options and sensors. `depth_bound` fills them.
+        self.depth_bounds: dict[tuple[BuildOptions, tuple[int, ...]], Any] = {}
+        # Subjects of warnings that were given: each is given once for a scene.
+        self.warned: set[str] = set()
+
+    @property
+    def variant(self) -> str:
+        """Variant that this scene is built in; settled at the first use."""
+        if self._variant is None:
+            self._variant = resolve_variant(self._requested_variant)
+        return self._variant
+
+    @opaque
+    def parameters(self) -> ParameterTable:
+        """Return every parameter with its value, shape, and whether and why it is differentiable.
+
+        Returns:
+            A mapping from keys to :class:`ParameterInfo`; printed, it is a table.
+
+        Raises:
+            SceneError: for a scene that cannot be built.
+        """
+        if self.is_shared:  # values may have changed
+            self._table = None
+            return self._parameters(self._table_options)
+        return self.known_parameters()
+
+    def known_parameters(self) -> ParameterTable:
+        """Return the table with the values at the first request."""
+        return self._parameters(BuildOptions(real_bitmaps=True))
+
+    def _parameters(self, options: BuildOptions) -> ParameterTable:
+        found = self._table
+        if found is None:
+            with active_variant(self.variant):
+                found = self._table = parameter_table(self.built(options))
+                self._table_options = options
+        return found
+
+    @opaque
+    def save(self, path: str | os.PathLike[str], values: Mapping[str, Any] | None = None) -> Path:
+        """Write the scene as an XML file, with ``values`` in place of the described ones.
+
+        Meshes, bitmaps and volumes that the XML cannot hold, and files that the scene names, are written to the folder
+        ``NAME_files`` beside it, which is replaced. ``tt.load`` and, after ``import torchtransient``, ``mi.load_file``
+        read the file. It is read back in the scene's variant before it takes its place, and every parameter is
+        compared.
+
+        Args:
+            path: name of an XML file in an existing folder.
+            values: values by key, in the shapes that :meth:`parameters` lists, such as ``renderer.values``.
+
+        Returns:
+            The path.
+
+        Raises:
+            SceneError: for numbers of a spectral model, arrays of plugins that read no file and loaded objects, which
+                XML cannot hold, for unknown keys and for other paths. Nothing is written then.
+            ShapeError, UnitError, GradientError: for values, as a renderer raises them.
+        """
+        if values is not None and not isinstance(values, Mapping):
+            raise ArgumentError(f"scene.save: expected values by key, got {shown(values)}.")
+        description, given = self._description, dict(values or {})
+        description.check_described("scene.save")
+        assert not isinstance(description, LoadedScene)  # refused above
+        with replaced_files(path) as (target, draft, folder), active_variant(self.variant):
+            options = self._save_options(given)
+            slots = self.slots(given, options)
+            with afterwards(in_variant(self.variant, lambda: self.leave(options, slots, attached=True))):
+                written = write_scene(description, self.variant, slots, given, draft, folder)
+            again = load(draft, variant=self.variant)
+            try:
+                built = again.built(again._save_options(given))
+            except TorchTransientError as error:
+                raise SceneError(f"scene.save: what was written does not load. {WAY_OUT} {error}") from error
+            check_same(built, written)
+        return target
+
+    def _save_options(self, keys: Iterable[str]) -> BuildOptions:
+        options, keys = BuildOptions(real_bitmaps=True), tuple(keys)
+        return self.options_for(keys, options) if keys else options
+
+    def same_description(self, other: Scene) -> bool:
+        """Return whether both describe one scene, in any variants."""
+        return same_description(self._description, other._description)
+
+    # ------------------------------------------------------------------------------------------------- built scenes
+
+    def built(self, options: BuildOptions) -> BuiltScene:
+        """Return the Mitsuba scene for some options, with the described values.
+
+        Called inside ``active_variant(scene.variant)``.
+        """
+        self._settle(options)
+        return self._build(options)
+
+    def _build(self, options: BuildOptions) -> BuiltScene:
+        found = self._builds.get(options)
+        if found is None:
+            found = build(self._description, self.variant, options)
+            self._builds[options] = found
+            while len(self._builds) > _MAX_BUILDS:
+                self.drop(next(iter(self._builds)))
+        self._builds.move_to_end(options)
+        return found
+
+    def drop(self, options: BuildOptions) -> None:
+        """Forget one built scene; the next use builds it anew."""
+        self._builds.pop(options, None)
+        self._unsettled.pop(options, None)
+        self._slots.pop(options, None)
+        self.recordings.pop(options, None)
+
+    def findings(self, options: BuildOptions) -> dict[str, str]:
+        """Return messages about unphysical values of the description, by key.
+
+        Called inside ``active_variant(scene.variant)``.
+        """
+        found = self.built(options).findings()
+        if found and options.merge:
+            # Merged shapes have lost their names: those of the build that `parameters()` reads.
+            found = self.built(BuildOptions(real_bitmaps=True)).findings()
+        return found
+
+    def options_for(self, keys: Iterable[str], options: BuildOptions) -> BuildOptions:
+        """Return the options under which every one of ``keys`` is an independent, differentiable parameter.
+
+        Raises:
+            SceneError: for unknown keys.
+            GradientError: for keys without a derivative.
+        """
+        keys = tuple(keys)
+        if not keys:
+            return replace(options, merge=True)
+        # The build that most keys need anyway, so that looking them up costs nothing.
+        table = self._parameters(replace(options, real_bitmaps=True, merge=False))
+        substitute = set(options.substitute)
+        for key in keys:
+            info = table.get(key)
+            if info is None:
+                raise SceneError(unknown_key(key, list(table)))
+            if not info.differentiable:
+                raise GradientError(f"parameter {key!r} has no derivative: {info.reason}.")
+            substitute |= info.substitute
+        return replace(options, substitute=frozenset(substitute), real_bitmaps=True, merge=False)
+
+    def slots(self, keys: Iterable[str], options: BuildOptions) -> SlotTable:
+        """Return the slots of ``keys`` in the built scene, which holds described values or those of the last run.
+
+        Called inside ``active_variant(scene.variant)``.
+        """
+        wanted = tuple(keys)
+        if self.is_shared:  # the scene goes back to the values that it holds now
+            return SlotTable(self.built(options), wanted)
+        found = self._slots.setdefault(options, {}).get(wanted)
+        if found is not None and self._unsettled.get(options) is found:
+            del self._unsettled[options]
+            self._builds.move_to_end(options)
+            return found
+        built = self.built(options)
+        # Building may have dropped other scenes, or the tables of this one.
+        tables = self._slots.setdefault(options, {})
+        if wanted not in tables:
+            tables[wanted] = SlotTable(built, wanted)
+        return tables[wanted]
+
+    def leave(self, options: BuildOptions, slots: SlotTable, attached: bool) -> None:
+        """End a run: described values are put back before anything but a run with the same keys uses the scene.
+
+        ``attached``: values have derivatives and are put back at once, so that no graph outlives a run.
+        """
+        if not slots.originals:
+            return
+        if self._builds.get(options) is not slots.built:
+            if attached:  # its restoring was cut off by an interrupt (`_settle`); others may hold it still
+                slots.restore()
+            return
+        self._unsettled[options] = slots
+        if attached or self.is_shared:
+            self._settle(options)
+
+    def _settle(self, options: BuildOptions) -> None:
+        slots = self._unsettled.pop(options, None)
+        if slots is not None:
+            try:
+                slots.restore()
+            except BaseException:
+                self.drop(options)
+                raise
+
+    # --------------------------------------------------------------------------------------------- pickles and copies
+
+    def __getstate__(self) -> dict[str, Any]:
+        self._description.check_described("tt.Scene: pickling")
+        return {"description": self._description, "variant": self._requested_variant, "settled": self._variant}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(state["description"], state["variant"])  # type: ignore[misc]
+        self._variant = state["settled"]
+
+    def __copy__(self) -> Scene:
+        return self
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Scene:
+        return self
+
+    def __repr__(self) -> str:
+        return f"tt.Scene({self._description.name!r}, variant={self._variant or self._requested_variant!r})"
+
+
+@opaque
+def load(
+    scene: str | os.PathLike[str] | Mapping[str, Any] | Scene | Any,
+    variant: str | None = None,
+    *,
+    trusted: bool = True,
+    **xml_parameters: Any,
+) -> Scene:
+    """Describe a scene: the path of a Mitsuba XML file, a scene dictionary, another :class:`Scene` or a ``mi.Scene``.
+
+    Nothing is built yet and no variant is switched: that happens at the first use, inside the call, and the variant
+    that was active before is put back (when none was active, the scene's variant stays active). Scenes written for
+    mitransient 1.x load unchanged. Children of an XML scene without an id are named after their kind: ``sensor``,
+    ``shape_0``, ``shape_1``.
+
+    Dictionaries hold transforms as (4, 4) arrays or nested lists, or as Mitsuba transforms. Colours, vectors, bitmaps
+    and tensors of Mitsuba, volume grids and loaded meshes (positions, normals, texture coordinates, a diffuse surface
+    of one colour) are accepted too, and described. Other objects of Mitsuba inside a dictionary, and a whole
+    ``mi.Scene``, are used as they are: they keep their plugins, film, integrator and variant, later changes of them
+    count, and pickling, plans and other variants are refused. Of a ``mi.Scene`` for steady pictures, cameras with an
+    ``hdrfilm``, and ``path``, ``volpath`` and ``volpathmis``, are described as they are now, so that they can have a
+    time axis.
+
+    Args:
+        scene: the scene.
+        variant: a differentiable variant such as ``llvm_ad_rgb``, ``llvm_ad_mono``, ``cuda_ad_spectral``; None for the
+            active one if it is differentiable and ``llvm_ad_rgb`` otherwise, settled at the first use.
+        trusted: False for scenes of strangers. They are built, and a few pixels of each sensor are rendered with one
+            sample, in a process of its own first (some seconds; 120 s at most), so that a damaged or malicious file
+            ends that process and not this one. Files that change afterwards, gradients, and other samples are not
+            covered, and the process is no sandbox: what the scene reads it may read. See ``docs/stability.md``.
+        xml_parameters: values of the ``$name`` parameters of an XML file.
+
+    Returns:
+        The scene, not built yet.
+
+    Raises:
+        SceneError: for a missing or malformed file, for entries that cannot be described, and, with ``trusted=False``,
+            for a scene that cannot be rendered, with the name of the signal that ended its process. Faults inside the
+            scene (unknown plugins, unknown or unused parameters) are reported when the scene is built, with file and
+            line where Mitsuba knows them.
+        VariantError: for a variant that cannot be used.
+        ArgumentError: for other objects.
+    """
+    if variant is not None:
+        resolve_variant(variant)
+    loaded = _described(scene, variant, xml_parameters)
+    if not flag("tt.load: trusted", trusted):
+        _probe(loaded)
+    return loaded
+
+
+def _described(scene: Any, variant: str | None, xml_parameters: Mapping[str, Any]) -> Scene:
+    if isinstance(scene, (str, os.PathLike)):
+        return Scene(describe_xml(scene, xml_parameters), variant)
+    if xml_parameters:
+        names = ", ".join(sorted(xml_parameters))
+        raise ArgumentError(
+            f"tt.load: $parameters of XML files ({names}) are for these alone, got {type(scene).__name__}."
+            " Options of a render belong to TransientRenderer and tt.render, max_depth to the scene's integrator too."
+        )
+    if isinstance(scene, Scene):
+        return scene if variant is None or variant == scene.variant else Scene(scene._description, variant)
+    if isinstance(scene, Mapping) and hasattr(scene, "hierarchy"):
+        raise ArgumentError(
+            "tt.load: expected a path, a dictionary, a tt.Scene or a mi.Scene, got the SceneParameters of one. Pass "
+            "the scene itself; tt.wrap takes its parameters."
+        )
+    if isinstance(scene, Mapping):
+        return Scene(describe_dict(scene), variant)
+    if getattr(scene, "class_name", str)() == "Scene":
+        tree = transient_dictionary(scene)
+        return Scene(LoadedScene(scene) if tree is None else describe_dict(tree), variant)
+    raise ArgumentError(
+        f"tt.load: expected a path, a dictionary, a tt.Scene or a mi.Scene, got {type(scene).__name__}. Other objects "
+        "of Mitsuba are taken inside a dictionary: {'type': 'scene', 'shape': mesh, ...}."
+    )
+
+
+# ---------------------------------------------------------------------------------------------- scenes of strangers
+
+# Longest time for a scene to be loaded, compiled and rendered, a few pixels of it, the start of the process included.
+SECONDS = 120.0
+# Rows and columns of a film that are rendered, around its middle.
+PIXELS = 4
+_MARK = "torchtransient probe: "
+# By its name: a module that is run is another one than the same module imported.
+_CHILD = "from torchtransient.scene.load import probe_child; probe_child()"
+
+
+def _probe(scene: Scene) -> None:
+    """Build ``scene`` and render a few pixels of each of its sensors in a process of its own.
+
+    Raises ``SceneError`` for an error there, for a process that is ended by a signal, and for one that takes too long.
+    """
+    scene._description.check_described("tt.load(..., trusted=False)")
+    name = scene._description.name
+    others = [(entry.module, entry.plugins) for entry in modules_of_others()]
+    sent = pickle.dumps((scene, scene.variant, others))
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
+    process = subprocess.Popen(
+        [sys.executable, "-c", _CHILD], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+        env=environment, start_new_session=True,
+    )  # fmt: skip
+    try:
+        out, _ = process.communicate(sent, timeout=SECONDS)
+    except subprocess.TimeoutExpired:
+        raise SceneError(
+            f"{name}: expected a scene that is loaded and rendered, a few pixels of it, within {SECONDS:g} s, got no "
+            "answer in a process of its own. It was not loaded here."
+        ) from None
+    finally:
+        if process.poll() is None:
+            process.kill()
+            process.communicate()
+    if process.returncode < 0:
+        raise SceneError(
+            f"{name}: expected a scene that can be rendered, got {_signal(-process.returncode)}, which ended the "
+            "process in which it was tried. It was not loaded here; a file of it is damaged, or made to do this."
+        )
+    answers = [line for line in out.decode("utf-8", "replace").splitlines() if line.startswith(_MARK)]
+    if not answers:
+        raise SceneError(f"{name}: the process in which the scene was tried ended with code {process.returncode}.")
+    error = json.loads(answers[-1].removeprefix(_MARK))
+    if error is not None:
+        raise SceneError(error)
+
+
+def _signal(number: int) -> str:
+    try:
+        return f"the signal {signal.Signals(number).name}"
+    except ValueError:
+        return f"the signal {number}"
+
+
+def probe_child() -> None:
+    """Render the scene on standard input, print its error as JSON, null for none, and end the process."""
+    error: str | None = None
+    try:
+        scene, variant, others = pickle.load(sys.stdin.buffer)
+        for module, registered in others:
+            register_module(module, registered)
+        _render_pixels(scene, variant)
+    except TorchTransientError as raised:
+        error = str(raised)
+    except Exception as raised:  # noqa: BLE001  any error is the answer
+        text = " ".join(str(raised).split())[:400]
+        error = f"the scene cannot be rendered, {type(raised).__name__}: {text}"
+    sys.stdout.write(f"\n{_MARK}{json.dumps(error)}\n")
+    sys.stdout.flush()
+    os._exit(0)
+
+
+def _render_pixels(scene: Scene, variant: str) -> None:
+    import drjit as dr
+    import mitsuba as mi
+
+    with active_variant(variant), named_errors():
+        built = build(_Cropped(scene._description), variant, BuildOptions()).scene  # type: ignore[arg-type]
+        if not built.sensors():
+            raise SceneError(f"{scene!r} has no sensor; add one.")
+        for number in range(len(built.sensors())):
+            dr.eval(mi.render(built, sensor=number, spp=1, seed=0))
+        dr.sync_thread()
+
+
+class _Cropped:
+    """A description with films of a few pixels."""
+
+    def __init__(self, description: Any):
+        self._whole = description
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._whole, name)
+
+    def parse(self, config: Any) -> Any:
+        """Return Mitsuba's parser state, with cropped films but for sensors that place each pixel themselves."""
+        state = self._whole.parse(config)
+        by_id = state.id_to_index
+        for node in state.nodes:
+            below = [state.nodes[index] for _, index in children(state, node, by_id)]
+            if kind_of(node.props.plugin_name()) != "sensor":
+                for film in below:
+                    if is_film(film):
+                        _crop(film.props)
+        return state
+
+
+def _crop(props: Any) -> None:
+    if props.get("exhaustive_scan", False) is not False:
+        return
+    for side, along in (("width", "x"), ("height", "y")):
+        whole = props.get(side, 768 if side == "width" else 576)
+        there, first = props.get(f"crop_{side}", whole), props.get(f"crop_offset_{along}", 0)
+        numbers = [value for value in (whole, there, first) if isinstance(value, int) and value is not True]
+        if len(numbers) == 3 and first >= 0 and PIXELS < there <= whole - first:  # others are refused as they are
+            props[side] = whole
+            props[f"crop_{side}"], props[f"crop_offset_{along}"] = PIXELS, first + (there - PIXELS) // 2
