@@ -13,8 +13,7 @@ from torchtransient import plugins
 from torchtransient.errors import PluginRegistrationError, SceneError, StorageError
 from torchtransient.interfaces import FilmInterface, is_time_resolved, missing_members
 from torchtransient.plugins import _registry
-from torchtransient.plugins.films import pulsed_filter
-from torchtransient.plugins.films.plain_image import bitmap_of, plain_image
+from torchtransient.plugins.films import temporal_filters
 from torchtransient.rendering.films import choices
 
 FILMS = {
@@ -100,13 +99,13 @@ def test_a_film_without_a_member_is_refused():
 @pytest.fixture
 def made(monkeypatch):
     """The settings for which the kernel table of a pulse was made."""
-    calls, original = [], pulsed_filter.cumulative_of_sum
+    calls, original = [], temporal_filters.cumulative_of_sum
 
     def counting(pulses, step):
         calls.append((len(pulses), step))
         return original(pulses, step)
 
-    monkeypatch.setattr(pulsed_filter, "cumulative_of_sum", counting)
+    monkeypatch.setattr(temporal_filters, "cumulative_of_sum", counting)
     return calls
 
 
@@ -241,6 +240,8 @@ def test_the_image_of_integrators_that_know_nothing_of_time(variant, pixels):
     mi.set_variant(variant)
     size = {"width": 7, "height": 6, "crop_width": 4, "crop_height": 3, "crop_offset_x": 2, "crop_offset_y": 1}
     node = {"type": "transient_hdr_film", "sample_border": True, "rfilter": {"type": "tent", "radius": 1.5}}
+    from torchtransient.plugins.films.base import plain_image
+
     image = plain_image(mi.load_dict(node | size))
     assert [list(part) for part in (image.size(), image.crop_size(), image.crop_offset())] == [[7, 6], [4, 3], [2, 1]]
     assert image.rfilter().radius() == 1.5 and image.sample_border()
@@ -255,6 +256,8 @@ def test_the_image_of_integrators_that_know_nothing_of_time(variant, pixels):
 ])  # fmt: skip
 def test_names_of_a_picture_s_channels(names, channels, pixels):
     values = np.arange(6.0 * len(channels), dtype=np.float32).reshape(2, 3, -1)
+    from torchtransient.plugins.films.base import bitmap_of
+
     bitmap = bitmap_of(mi.TensorXf(values), names)
     assert bitmap.pixel_format().name == pixels
     assert [field.name for field in bitmap.struct_()] == channels

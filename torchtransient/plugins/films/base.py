@@ -1,4 +1,4 @@
-"""What every time-resolved film shares: storage in bands of rows, the steady image, sampling of the spatial filter."""
+"""Base of time-resolved films: storage in bands of rows, the steady image, sampling of the spatial filter."""
 
 from __future__ import annotations
 
@@ -11,11 +11,39 @@ from torchtransient.interfaces import FilmInterface
 from torchtransient.plugins.described_scene import note_scene
 from torchtransient.plugins.drjit_pool import threads_for_files
 from torchtransient.plugins.films.block import AdjointBlock, FilmBlock
-from torchtransient.plugins.films.plain_image import bitmap_of, plain_image
-from torchtransient.plugins.films.response import SensorResponse
+from torchtransient.plugins.films.colour import SensorResponse
 from torchtransient.plugins.frozen_state import says_it_can_be_recorded
 from torchtransient.plugins.parameter_effect import ANY_KEY, VALUE, declare_effects
 from torchtransient.plugins.properties import number, truth, whole_number
+
+
+def plain_image(film):
+    """An ``hdrfilm`` like ``film``, in single precision: RGB, or luminance in monochromatic variants."""
+    size, crop, offset = film.size(), film.crop_size(), film.crop_offset()
+    return mi.load_dict(
+        {
+            "type": "hdrfilm",
+            "width": int(size[0]),
+            "height": int(size[1]),
+            "crop_width": int(crop[0]),
+            "crop_height": int(crop[1]),
+            "crop_offset_x": int(offset[0]),
+            "crop_offset_y": int(offset[1]),
+            "pixel_format": "luminance" if mi.is_monochromatic else "rgb",
+            "component_format": "float32",
+            "sample_border": film.sample_border(),
+            "rfilter": film.rfilter(),
+        }
+    )
+
+
+def bitmap_of(steady, names):
+    """The steady image ``(H, W, C)`` as a bitmap; ``names`` of its channels."""
+    if tuple(names) in (("L",), ("R", "G", "B")) and steady.shape[2] == len(names):
+        return mi.Bitmap(steady)
+    stokes = [f"{name}.S{s}" for s in range(4) for name in names] if steady.shape[2] > len(names) else list(names)
+    return mi.Bitmap(steady, mi.Bitmap.PixelFormat.MultiChannel, channel_names=stokes)
+
 
 # Dr.Jit arrays are indexed with 32 bits; a larger cube is stored in bands of whole rows.
 MAX_ARRAY_ENTRIES = 2**32 - 1
@@ -52,7 +80,8 @@ class TimeResolvedFilm(mi.Film):
     that array (``cube_shape``, ``entries_per_array``), and how an arrival meets it: ``put``, its derivative
     ``put_slope`` and its adjoint ``read``. A class that lacks one of them is refused where it is registered.
 
-    Children that are spectra are the response curves of the film's channels (``curves``), see :mod:`.response`.
+    Children that are spectra are the response curves of the film's channels (``curves``,
+    :class:`.colour.SensorResponse`).
 
     Integrators that know nothing of time (``path``, ``aov``, ``prb``, those of users) render an image to it, as to an
     ``hdrfilm``: RGB whatever the response curves, luminance in monochromatic variants, then what ``aov`` adds.
