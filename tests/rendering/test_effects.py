@@ -14,7 +14,7 @@ class Decided(Effects):
         return "decided"
 
 
-FILTERED, GATED = SimpleNamespace(has_filter=True), SimpleNamespace(has_filter=False)
+FILTERED, GATED = SimpleNamespace(has_bins=True), SimpleNamespace(has_bins=False)
 PLAN = Decided(
     scene=None, variant="llvm_ad_mono", integrator="transient_path", film_choice=None, max_depth=3, pulse=None,
     irf=None, temporal_filter="tent", sensor=1,

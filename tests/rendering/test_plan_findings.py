@@ -9,12 +9,12 @@ import torchtransient as tt
 from support.pilot_arrivals import arrivals
 from torchtransient.errors import ArgumentError, GradientError, SceneError
 from torchtransient.rendering.films import Gates, Histogram, Phasors
-from torchtransient.rendering.films.choice import PlannedFilm
 from torchtransient.rendering.inventory import SceneInventory
 from torchtransient.rendering.parameters import ParameterInfo
 from torchtransient.rendering.plan_choices import depth_by_albedo, some
 from torchtransient.rendering.plan_finder import Draft, Finder
 from torchtransient.rendering.plan_pilot import PilotReport
+from torchtransient.rendering.planned_film import PlannedFilm
 
 VARIANT = "llvm_ad_mono"
 RECTANGULAR, SMOOTH = tt.Gate.rectangular(1.0, 2.0), tt.Gate.gaussian(5.0, 0.5)

@@ -9,7 +9,7 @@ import pytest
 
 import torchtransient as tt
 from torchtransient.errors import ArgumentError, SceneError
-from torchtransient.rendering.films.choices import of_entries
+from torchtransient.rendering.films import layout_of_entries
 from torchtransient.rendering.saving import values
 from torchtransient.testing.small_room import VARIANT, make_room
 
@@ -77,7 +77,7 @@ def test_scenes_without_a_sensor(room):
 
 def test_files_without_a_film():
     with pytest.raises(KeyError, match="transient or phasor or gated"):
-        of_entries({"steady": 1})
+        layout_of_entries({"steady": 1})
 
 
 def test_values_without_a_place_in_a_file(room):

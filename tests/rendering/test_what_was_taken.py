@@ -46,7 +46,7 @@ def test_films_that_were_taken(monkeypatch):
     """With the sampler, pulses and steady image that they have."""
     one, other = (tt.TimeAxis(0.0, 1.0, n) for n in (3, 5))
     own, pulse = Histogram(one), tt.Pulse.gaussian(0.5)
-    monkeypatch.setattr(taken, "of_film", lambda film: own)
+    monkeypatch.setattr(taken, "layout_of_film", lambda film: own)
     monkeypatch.setattr(taken, "is_time_resolved", lambda film: True)
 
     def said(keeps_steady=True, **options):

@@ -34,7 +34,7 @@ from torchtransient.plugins.parameter_effect import class_of
 from torchtransient.plugins.physical_ranges import PhysicalRange, described_ranges, ranges_of
 from torchtransient.rendering.build_options import BuildOptions
 from torchtransient.rendering.description import Description
-from torchtransient.rendering.films.choices import all_films, of_plugin, plugins_in_words
+from torchtransient.rendering.films import FILMS, film_plugins, layout_of_plugin
 from torchtransient.rendering.mesh_files import check_mesh_files, check_taken_meshes
 from torchtransient.rendering.mitsuba_words import one_line
 from torchtransient.rendering.node_checks import check_nodes
@@ -57,7 +57,6 @@ from torchtransient.rendering.nodes import (
 )
 from torchtransient.rendering.physics import scene_findings
 from torchtransient.rendering.placements import mesh_transforms, placements
-from torchtransient.rendering.pulse_properties import PREFIXES, PROPERTIES, write_pulse
 from torchtransient.rendering.taken import ReadyScene, check_taken, pointers
 from torchtransient.rendering.translation import (
     ADVICE,
@@ -73,6 +72,7 @@ from torchtransient.rendering.translation import (
     tracing,
 )
 from torchtransient.rendering.unread_properties import unread_properties
+from torchtransient.scene.pulses import PREFIXES, PROPERTIES, write_pulse
 
 _TRANSIENT_PROPERTIES = (
     *PATH_PROPERTIES, "camera_unwarp", "discard_direct_light", "temporal_filter", "gaussian_stddev",
@@ -255,8 +255,8 @@ def _override_films(state: Any, options: BuildOptions) -> None:
 
 
 def _leave_out_steady(props: Any) -> None:
-    kind = of_plugin(props.plugin_name())
-    if kind is None or not kind.spares_steady:
+    kind = layout_of_plugin(props.plugin_name())
+    if kind is None or not kind.has_bins:
         raise ArgumentError(
             f"steady=False spares a histogram the light outside of its window; the film is a {props.plugin_name()!r}. "
             "Leave it out."
@@ -269,15 +269,15 @@ def _override_film(state: Any, index: int, options: BuildOptions) -> None:
     plugin = props.plugin_name()
     if film is None:
         if options.transient and plugin in STEADY_FILMS:
-            ways = " or ".join(f"TransientRenderer(..., {kind.example})" for kind in all_films())
+            ways = " or ".join(f"TransientRenderer(..., {kind.example})" for kind in FILMS)
             raise SceneError(
                 f"the film is a steady {plugin!r}, which has no time axis. Give one: {ways}, or make the film one of "
-                f"{plugins_in_words()}."
+                f"{film_plugins()}."
             )
         return
     if plugin in STEADY_FILMS and not options.transient:
         return
-    if plugin != film.plugin and (plugin in STEADY_FILMS or of_plugin(plugin) is not None):
+    if plugin != film.plugin and (plugin in STEADY_FILMS or layout_of_plugin(plugin) is not None):
         if not film.takes_pulse and any(prefix in props for prefix in PREFIXES):
             raise SceneError(
                 f"the film {plugin!r} has a pulse or an irf, which a {film.plugin} would lose; take it out."
@@ -285,7 +285,7 @@ def _override_film(state: Any, index: int, options: BuildOptions) -> None:
         _become(state, index, film.plugin, keep=FILM_PROPERTIES + PROPERTIES)
         props = state.nodes[index].props
     if not film.fits(props.plugin_name()):
-        raise SceneError(f"the film {plugin!r} cannot become a {film.plugin}; make it one of {plugins_in_words()}.")
+        raise SceneError(f"the film {plugin!r} cannot become a {film.plugin}; make it one of {film_plugins()}.")
     film.write(props)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from torchtransient.pulses import Pulse
-from torchtransient.rendering.films.choice import FilmChoice
+from torchtransient.rendering.films import FilmLayout
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class BuildOptions:
     histograms.
     """
 
-    film: FilmChoice | None = None
+    film: FilmLayout | None = None
     max_depth: int | None = None
     substitute: frozenset[tuple[str, str]] = frozenset()
     real_bitmaps: bool = False

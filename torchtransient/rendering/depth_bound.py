@@ -23,7 +23,7 @@ from torchtransient.rendering.variant import active_variant
 
 if TYPE_CHECKING:
     from torchtransient.rendering.build_options import BuildOptions
-    from torchtransient.rendering.films.choice import FilmChoice
+    from torchtransient.rendering.films import FilmLayout
     from torchtransient.rendering.physics import PhysicsWatch
     from torchtransient.rendering.scene_handle import Scene
 
@@ -43,7 +43,7 @@ class DepthBound:
 
 
 def depth_bound(
-    scene: Scene, options: BuildOptions, sensors: Sequence[int], film: FilmChoice, watch: PhysicsWatch
+    scene: Scene, options: BuildOptions, sensors: Sequence[int], film: FilmLayout, watch: PhysicsWatch
 ) -> DepthBound | None:
     """The bound for derivatives of a scene, found for its described values when it is first asked for; None where its
     depth is stated. Raises GradientError where none can be found, and PhysicsError, where ``watch`` is asked for
@@ -67,7 +67,7 @@ def depth_bound(
     return bound
 
 
-def _found(scene: Scene, options: BuildOptions, sensors: Sequence[int], film: FilmChoice) -> DepthBound | None:
+def _found(scene: Scene, options: BuildOptions, sensors: Sequence[int], film: FilmLayout) -> DepthBound | None:
     from torchtransient.rendering.scene_handle import load
 
     with active_variant(scene.variant):

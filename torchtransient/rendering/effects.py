@@ -9,7 +9,7 @@ from typing import Any
 
 from torchtransient.errors import SceneError
 from torchtransient.pulses import Pulse
-from torchtransient.rendering.films.choice import FilmChoice
+from torchtransient.rendering.films import FilmLayout
 from torchtransient.rendering.scene_handle import Scene, load
 
 
@@ -25,7 +25,7 @@ class Effects(abc.ABC):
     scene: Scene = field(repr=False)
     variant: str
     integrator: str
-    film_choice: FilmChoice | None
+    film_choice: FilmLayout | None
     max_depth: int | None
     pulse: Pulse | None
     irf: Pulse | None
@@ -48,12 +48,12 @@ class Effects(abc.ABC):
             )
         return load(given, variant=self.variant)
 
-    def film_settings(self, film: FilmChoice | None, temporal_filter: str) -> tuple[FilmChoice | None, str]:
+    def film_settings(self, film: FilmLayout | None, temporal_filter: str) -> tuple[FilmLayout | None, str]:
         """Film and temporal filter of a renderer: its own where it has some, else the plan's."""
         film = self.film_choice if film is None else film
         # A box of the plan's own choice stays "auto": parameters that were not planned for may call for a slope.
         decided = self.temporal_filter if self.filter_is_given or self.temporal_filter != "box" else ""
-        if temporal_filter == "auto" and decided and (film is None or film.has_filter):
+        if temporal_filter == "auto" and decided and (film is None or film.has_bins):
             temporal_filter = decided
         return film, temporal_filter
 

@@ -10,8 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from torchtransient.axes import TimeAxis
-from torchtransient.rendering.films.choice import FilmChoice
-from torchtransient.rendering.films.choices import of_plugin
+from torchtransient.rendering.films import FilmLayout, layout_of_plugin
 from torchtransient.rendering.inventory_colour import COLOUR, MEASURED, colour_of_node, colour_of_value
 from torchtransient.rendering.nodes import children, find_child, is_film, is_integrator, kind_of_node, reachable, roots
 from torchtransient.rendering.translation import NO_LIMIT, depth_of
@@ -63,7 +62,7 @@ class SceneInventory:
     film: str | None = None
     film_axis: TimeAxis | None = None
     temporal_filter: str | None = None
-    film_settings: FilmChoice | None = None
+    film_settings: FilmLayout | None = None
     pulsed: bool = False
     plugins: set[str] = field(default_factory=set)
 
@@ -171,9 +170,10 @@ def _note_film(inventory: SceneInventory, state: Any, order: list[int], sensor: 
     inventory.pulsed = any(name in props for name in ("pulse", "irf"))
     if "temporal_filter" in props:
         inventory.temporal_filter = str(props["temporal_filter"])
-    kind = of_plugin(inventory.film)
-    inventory.film_axis = None if kind is None else kind.axis_in(props)
-    inventory.film_settings = None if kind is None else kind.settings_in(props)
+    kind = layout_of_plugin(inventory.film)
+    settings = None if kind is None else kind.from_properties(props)
+    inventory.film_settings = settings
+    inventory.film_axis = None if settings is None else settings.attributes().get("axis")
 
 
 def _note_integrator(inventory: SceneInventory, state: Any) -> None:

@@ -21,19 +21,19 @@ from torchtransient.quantities import Numbers, as_whole, count, shown
 from torchtransient.rendering import plan_choices as choices
 from torchtransient.rendering.arguments import checked_depth, checked_filter, checked_keys, film_asked_for
 from torchtransient.rendering.effects import Effects
-from torchtransient.rendering.films.choice import FilmChoice
-from torchtransient.rendering.films.choices import all_films, planned
+from torchtransient.rendering.films import FILMS, FilmLayout
 from torchtransient.rendering.inventory import SceneInventory, take_inventory
 from torchtransient.rendering.mitsuba_words import one_line
 from torchtransient.rendering.node_checks import check_nodes
 from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.plan_finder import Draft, Finder
 from torchtransient.rendering.plan_pilot import PilotReport
-from torchtransient.rendering.pulse_properties import checked_pulse
+from torchtransient.rendering.planned_film import planned
 from torchtransient.rendering.renderer import TransientRenderer
 from torchtransient.rendering.scene_handle import Scene, load
 from torchtransient.rendering.taken import ReadyScene
 from torchtransient.rendering.variant import active_variant, resolve_variant
+from torchtransient.scene.pulses import checked_pulse
 
 # Decisions of a draft that a plan takes over as they are.
 _OF_THE_DRAFT = ("scene", "variant", "integrator", "pulse", "irf", "parameters", "sensor")
@@ -88,7 +88,7 @@ class Plan(Effects):
     def to_dict(self) -> dict[str, Any]:
         """Everything but the scene, as plain data for JSON."""
         plain: dict[str, Any] = {name: getattr(self, name) for name in _PLAIN}
-        for kind in all_films():
+        for kind in FILMS:
             plain[kind.argument] = self.film_choice.plain() if isinstance(self.film_choice, kind) else None
         for name in ("pulse", "irf"):
             plain[name] = None if getattr(self, name) is None else asdict(getattr(self, name))
@@ -135,7 +135,7 @@ def plan(
     pilot: bool = True,
     sensor: int = 0,
     seed: int = 0,
-    film: FilmChoice | None = None,
+    film: FilmLayout | None = None,
 ) -> Plan:
     """Choose how to render ``scene``, what :func:`load` takes.
 
@@ -184,10 +184,10 @@ def plan(
     inventory = inventory_of(loaded, sensor)
     device = loaded.variant.split("_")[0]
     given = film_asked_for(film, {"frequencies": frequencies, "gates": gates})
-    if given is not None and given.has_axis:
+    if given is not None and given.has_bins:
         if time_axis is not None:
             raise ArgumentError("tt.plan: film and time_axis both give a time axis; leave out one of them.")
-        time_axis = given.argument_value()
+        time_axis = given.settings
     kind = planned(asked)
     best, notes = choices.choose_variant(inventory, asked, device, strict)
     tracer, more = choices.choose_integrator(inventory)

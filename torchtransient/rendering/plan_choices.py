@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from torchtransient.errors import ArgumentError, SceneError
 from torchtransient.given_types import is_one_of, several
 from torchtransient.quantities import shown
-from torchtransient.rendering.films.choice import FilmChoice, PlannedFilm
-from torchtransient.rendering.films.choices import all_films
+from torchtransient.rendering.films import FILMS, FilmLayout
 from torchtransient.rendering.inventory import Finding, SceneInventory
 from torchtransient.rendering.nodes import is_transient_integrator
+from torchtransient.rendering.planned_film import PlannedFilm
 from torchtransient.rendering.translation import NO_LIMIT
 
 # What every film can show beside its own measurement.
@@ -39,13 +39,13 @@ def some(findings: Sequence[Finding], most: int = 3) -> str:
 
 def known_outputs() -> tuple[str, ...]:
     """What a plan can be asked for."""
-    return (*(kind.output for kind in all_films()), *_OF_ANY_FILM)
+    return (*(kind.output for kind in FILMS), *_OF_ANY_FILM)
 
 
 def checked_outputs(outputs: Sequence[str] | str) -> tuple[str, ...]:
     """The outputs as a tuple. Raises ``ArgumentError`` for unknown ones, and for two that need different films."""
     asked = (outputs,) if isinstance(outputs, str) else tuple(several("tt.plan: outputs", outputs, "names"))
-    of_films, known = tuple(kind.output for kind in all_films()), known_outputs()
+    of_films, known = tuple(kind.output for kind in FILMS), known_outputs()
     if not asked or not all(is_one_of(name, known) for name in asked):
         raise ArgumentError(f"tt.plan: outputs are some of {', '.join(known)}; got {shown(list(asked))}.")
     films = [name for name in asked if name in of_films]
@@ -57,8 +57,8 @@ def checked_outputs(outputs: Sequence[str] | str) -> tuple[str, ...]:
 
 
 def film_settings(
-    film: PlannedFilm, given: FilmChoice | None, plugin: str | None, outputs: Sequence[str]
-) -> FilmChoice | None:
+    film: PlannedFilm, given: FilmLayout | None, plugin: str | None, outputs: Sequence[str]
+) -> FilmLayout | None:
     """The settings of the plan's film: those ``given`` by the call; None to keep those of the scene's film, which is a
     ``plugin``, or to find them. ``outputs``: what is asked for, from which ``film`` follows. Raises ``ArgumentError``.
     """
@@ -68,8 +68,8 @@ def film_settings(
             f"tt.plan: outputs={tuple(outputs)} call for a {film.name} film, on which {given.argument} have no effect; "
             f"ask for outputs={(given.output, *of_any_film)}."
         )
-    if given is None and plugin != film.kind.plugin and film.kind.needed():
-        raise SceneError(film.kind.needed())
+    if given is None and plugin != film.kind.plugin and film.missing_settings():
+        raise SceneError(film.missing_settings())
     return given
 
 

@@ -14,10 +14,11 @@ from torchtransient.pulses import Pulse
 from torchtransient.quantities import shown
 from torchtransient.rendering import plan_choices as choices
 from torchtransient.rendering.build_options import BuildOptions
-from torchtransient.rendering.films.choice import FilmChoice, PlannedFilm
+from torchtransient.rendering.films import FilmLayout
 from torchtransient.rendering.inventory import SceneInventory
 from torchtransient.rendering.parameters import ParameterInfo, needing_slope, unknown_key
 from torchtransient.rendering.plan_pilot import MOST_BINS, Arrivals, PilotReport, axis_over, pilot_run
+from torchtransient.rendering.planned_film import PlannedFilm
 from torchtransient.rendering.scene_handle import Scene, load
 from torchtransient.rendering.slope import check_filter, filter_for
 from torchtransient.rendering.translation import NO_LIMIT
@@ -44,7 +45,7 @@ class Draft:
     variant: str
     integrator: str
     film: PlannedFilm
-    film_choice: FilmChoice | None
+    film_choice: FilmLayout | None
     pulse: Pulse | None
     irf: Pulse | None
     parameters: tuple[str, ...]
@@ -56,7 +57,7 @@ class Findings:
     """What is decided with a pilot run, or without one."""
 
     max_depth: int | None
-    film_choice: FilmChoice | None
+    film_choice: FilmLayout | None
     temporal_filter: str
     reasons: tuple[str, ...]
     pilot: PilotReport | None
@@ -84,7 +85,7 @@ class Finder:
         bins: tuple[int | None, float | None],
         temporal_filter: str | None,
     ) -> Findings:
-        wants_axis = self.draft.film.kind.has_axis and not self.draft.film.all_times and time_axis is None
+        wants_axis = self.draft.film.kind.has_bins and not self.draft.film.all_times and time_axis is None
         if pilot and (max_depth is None or wants_axis):
             self._run()
         depth = self._depth(max_depth)
@@ -93,7 +94,7 @@ class Finder:
         axis = self._axis(time_axis, bins, depth, _REACH.get(filter_name, 0.0))
         if self.report is not None:
             self.reasons.append(self._pilot_line())
-        film = self.draft.film_choice if axis is None else self.draft.film.kind.from_argument(axis)
+        film = self.draft.film_choice if axis is None else self.draft.film.kind(axis)
         return Findings(depth, film, filter_name, tuple(self.reasons), self.report)
 
     def _run(self) -> None:
@@ -103,7 +104,7 @@ class Finder:
         scene = load(self.draft.scene, variant=variant)
         kind = self.draft.film.kind
         options = BuildOptions(
-            film=kind.film_of_pilot(self.draft.film_choice),
+            film=self.draft.film.pilot_film(self.draft.film_choice),
             merge=True,
             transient=True,
             integrator=self.draft.integrator,
@@ -213,7 +214,7 @@ class Finder:
         self, given: TimeAxis | str | None, bins: tuple[int | None, float | None], depth: int | None, reach: float = 0.0
     ) -> TimeAxis | None:
         """``reach``: bins over which the temporal filter spreads an arrival, to either side."""
-        if not self.draft.film.kind.has_axis:
+        if not self.draft.film.kind.has_bins:
             if given is not None or bins != (None, None):
                 raise ArgumentError(
                     f"tt.plan: a {self.draft.film.name} film has no time axis; leave time_axis and bins out."
@@ -291,7 +292,7 @@ class Finder:
 
     def _filter(self, given: str | None) -> str:
         kind = self.draft.film.kind
-        if not kind.has_filter and given is not None:
+        if not kind.has_bins and given is not None:
             raise ArgumentError(f"tt.plan: a {self.draft.film.name} film takes no temporal filter; leave it out.")
         table = self.draft.scene.parameters() if self.draft.parameters else {}
         for key in self.draft.parameters:
@@ -300,7 +301,7 @@ class Finder:
         self._note_edges([table[key] for key in self.draft.parameters])
         moving = needing_slope(table, self.draft.parameters)
         pulsed = bool(self.draft.pulse or self.draft.irf or self.inventory.pulsed)
-        if not kind.has_filter:
+        if not kind.has_bins:
             film = self.draft.film_choice or self.inventory.film_settings
             jump = "" if film is None or pulsed else film.jump()
             check_slope(moving, not jump, jump, kind.slope_remedy)

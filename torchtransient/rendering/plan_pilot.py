@@ -21,7 +21,7 @@ from torchtransient.rendering.variant import active_variant
 
 if TYPE_CHECKING:
     from torchtransient.rendering.build_options import BuildOptions
-    from torchtransient.rendering.films.choice import FilmChoice
+    from torchtransient.rendering.films import FilmLayout
     from torchtransient.rendering.scene_handle import Scene
 
 PILOT_PATHS = 32768
@@ -155,7 +155,7 @@ class Arrivals:
 
 
 def pilot_run(
-    scene: Scene, options: BuildOptions, sensor: int, kind: type[FilmChoice], tail: float, seed: int = 0
+    scene: Scene, options: BuildOptions, sensor: int, kind: type[FilmLayout], tail: float, seed: int = 0
 ) -> tuple[Any, Arrivals]:
     """(film, arrivals) of a pilot run of a scene in a variant without polarization, which costs most of the time and
     changes neither depth nor time. ``kind``: what the film measures; ``tail``: the share of light that will be left to

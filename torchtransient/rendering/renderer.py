@@ -39,21 +39,20 @@ from torchtransient.rendering.autograd import rendered
 from torchtransient.rendering.build_options import BuildOptions
 from torchtransient.rendering.depth_bound import DepthBound, depth_bound, may_have_derivative
 from torchtransient.rendering.effects import Effects
-from torchtransient.rendering.films.choice import FilmChoice
-from torchtransient.rendering.films.layout import steady_channels_first
+from torchtransient.rendering.films import FilmLayout, steady_channels_first
 from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.output import RenderOutput, RenderStats
 from torchtransient.rendering.overrides import boundary_term
 from torchtransient.rendering.parameters import ParameterInfo, missing_edges, needing_slope, unknown_key
 from torchtransient.rendering.physics import PhysicsWatch
 from torchtransient.rendering.progress import Bar
-from torchtransient.rendering.pulse_properties import checked_pulse
 from torchtransient.rendering.sample_counts import rounded_count, samples_taken
 from torchtransient.rendering.scene_handle import Scene, load
 from torchtransient.rendering.seeds import Item, Seeding, drawn
 from torchtransient.rendering.session import RenderJob
 from torchtransient.rendering.slope import check_filter, filter_for, has_slope, response_of
 from torchtransient.rendering.variant import active_variant, device_type, stokes_components
+from torchtransient.scene.pulses import checked_pulse
 
 
 class TransientRenderer(CopiesParametrized):
@@ -135,7 +134,7 @@ class TransientRenderer(CopiesParametrized):
         irf: Pulse | None = None,
         gates: Sequence[Gate] | None = None,
         steady: bool = True,
-        film: FilmChoice | None = None,
+        film: FilmLayout | None = None,
         physics: str = "warn",
         boundary: bool = True,
         spp_boundary: int | None = None,
@@ -211,10 +210,11 @@ class TransientRenderer(CopiesParametrized):
         self._pulsed = all(film.pulses for film in films)
         self._response = response_of(films)
         self._scene_filter = films[0].temporal_filter
-        if not self.film.has_filter:
+        if not self.film.has_bins:
             if self.temporal_filter != "auto":
                 raise ArgumentError(
-                    f"temporal_filter: a {self.film.noun} has none, expected 'auto', got {self.temporal_filter!r}."
+                    f"temporal_filter: a {self.film.measures} film has none, expected 'auto', "
+                    f"got {self.temporal_filter!r}."
                 )
             return
         of_integrator = getattr(built.scene.integrator(), "temporal_filter", "")
@@ -293,7 +293,7 @@ class TransientRenderer(CopiesParametrized):
         """A copy with the same values and another sampler or temporal filter; None keeps what this one has."""
         if temporal_filter is not None:
             checked_filter(temporal_filter)
-        if not self.film.has_filter and temporal_filter not in (None, "auto"):
+        if not self.film.has_bins and temporal_filter not in (None, "auto"):
             raise ArgumentError(f"temporal_filter: the film has none, expected 'auto', got {temporal_filter!r}.")
         twin = copy.deepcopy(self)
         if sampler is not None:

@@ -17,7 +17,7 @@ from torchtransient.interfaces import IntegratorInterface, is_time_resolved
 from torchtransient.plugins.dictionaries import Voxels
 from torchtransient.plugins.node_walk import objects_below, objects_of
 from torchtransient.plugins.parameter_effect import ParameterEffect, class_of
-from torchtransient.rendering.films.choices import of_film, plugins_in_words
+from torchtransient.rendering.films import film_plugins, layout_of_film
 from torchtransient.rendering.variant import active_variant
 
 if TYPE_CHECKING:
@@ -267,9 +267,9 @@ def _check_sensor(number: int, sensor: Any, options: BuildOptions) -> None:
     if options.transient and not is_time_resolved(film):
         raise SceneError(
             f"sensor {number} was taken as it is with its film, a {class_of(film)}, which has no time axis; no other "
-            f"film is built in its place. Make the scene with one of {plugins_in_words()}. {_WAY_OUT}."
+            f"film is built in its place. Make the scene with one of {film_plugins()}. {_WAY_OUT}."
         )
-    has = of_film(film) if options.transient else None
+    has = layout_of_film(film) if options.transient else None
     if options.film is not None and options.film != has:
         asked.append(options.film.argument)
     if asked:

@@ -150,7 +150,7 @@ class Kept:
     def _settle_filter(self) -> None:
         """Not another filter because a pose varies: nobody asks for derivatives here."""
         renderer = self.renderer
-        if renderer.film.has_filter and renderer.temporal_filter == "auto":
+        if renderer.film.has_bins and renderer.temporal_filter == "auto":
             renderer.temporal_filter = renderer._scene_filter
 
     def _places(self) -> dict[str, Place]:

@@ -148,6 +148,7 @@ class GatedHDRFilm(TimeResolvedFilm):
     measures = "gated"
     has_window = False
     keeps_steady = False
+    slope_remedy = SLOPE_REMEDY
 
     def __init__(self, props):
         super().__init__(props)
@@ -176,10 +177,6 @@ class GatedHDRFilm(TimeResolvedFilm):
     def response_name(self) -> str:
         return jump_in(self.gates) or "gate"
 
-    @property
-    def slope_remedy(self) -> str:
-        return SLOPE_REMEDY
-
     def arrivals(self):
         """What can count: arrivals while some gate is open."""
         return self._window
@@ -194,10 +191,6 @@ class GatedHDRFilm(TimeResolvedFilm):
         """Shape of the gated images: (H, W, G, C) or (H, W, Lh, Lw, G, C)."""
         size = self.crop_size()
         return (int(size[1]), int(size[0]), *self.laser_shape(), self.gate_count(), self.channel_count())
-
-    def entries_per_array(self) -> int:
-        """Floats of the gates of one pixel and laser position."""
-        return self.gate_count() * self.channel_count()
 
     # ----------------------------------------------------------------------------------- splat and read
 

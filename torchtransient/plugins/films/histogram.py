@@ -193,10 +193,6 @@ class TransientHDRFilm(TimeResolvedFilm):
         size = self.crop_size()
         return (int(size[1]), int(size[0]), *self.laser_shape(), self.temporal_bins, self.channel_count())
 
-    def entries_per_array(self) -> int:
-        """Floats of one histogram."""
-        return self.temporal_bins * self.channel_count()
-
     # ----------------------------------------------------------------------------------- splat and read
 
     def bin_position(self, opl_from_start):

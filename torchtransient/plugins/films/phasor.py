@@ -204,10 +204,6 @@ class PhasorHDRFilm(TimeResolvedFilm):
         entries = (self.frequency_count(), 2 * self.channel_count())
         return (int(size[1]), int(size[0]), *self.laser_shape(), *entries)
 
-    def entries_per_array(self) -> int:
-        """Floats of the phasors of one pixel and laser position."""
-        return self.frequency_count() * 2 * self.channel_count()
-
     def lanes_at_most(self, most_events: int) -> int | None:
         per_path = slots_for(most_events) * (EVENT_BYTES + 4 * self.channel_count())
         return max(1, MAX_EVENT_BYTES // per_path)
