@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeGuard
 RENDER, BACKWARD, FORWARD = JOBS = ("render", "backward", "forward")
 
 
-class FilmInterface(abc.ABC):
+class FilmInterface(abc.ABC):  # noqa: B024  # a marker
     """Films that keep an array behind every pixel beside the steady image.
 
     ``torchtransient.plugins.films.base.TimeResolvedFilm`` documents the members.
