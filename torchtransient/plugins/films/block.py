@@ -26,7 +26,7 @@ class FilmBlock:
         self.exclusive, self.origin = exclusive, origin
 
     def begin(self):
-        """What the film carries along a path: loop state, handed back at every event."""
+        """Return the state that the film carries along a path: loop state, handed back at every event."""
         return {}
 
     def put(self, events, opl, value, active, crowded=False):
@@ -83,8 +83,9 @@ class AdjointBlock:
         return self.match.to_spectrum(A), None if slope is None else self.match.to_spectrum(slope)
 
     def together(self, most, with_slope):
-        """How many arrivals of a path, which has ``most``, are read at once and ahead, 0 where each is read when it is
-        asked for: of films where reading costs more than to keep what was read.
+        """Return the number of arrivals, out of ``most`` of a path, that are read at once and ahead.
+
+        0 where each is read by itself; more in films where reading costs more than keeping.
         """
         return 0
 
@@ -104,11 +105,11 @@ class ArrivalWindow:
         self.first, self.last = float(first), float(last)
 
     def counts(self, opl):
-        """Whether an arrival at ``opl`` (``Float64``) can count."""
+        """Return a mask of arrivals at ``opl`` (``Float64``) that can count."""
         return (opl >= self.first) & (opl < self.last)
 
     def over(self, opl):
-        """Whether nothing that arrives at ``opl`` or later can count."""
+        """Return a mask of lengths ``opl`` after which nothing can count."""
         return opl >= self.last
 
 
@@ -128,7 +129,7 @@ class GappedWindow(ArrivalWindow):
 
 
 class BinLayout:
-    """Where one event meets the film: arrays, index of the histogram's first value, strides, bins and channels."""
+    """Place of one event in a film: arrays, index of the histogram's first value, strides, bins and channels."""
 
     def __init__(self, flat, base, bin_stride, channel_stride, bins, channels, exclusive=False):
         self.flat, self.base = flat, base
@@ -138,7 +139,7 @@ class BinLayout:
 
 
 def reduce_mode(exclusive, direct=False):
-    """How lanes add that share their target with others (``Auto``: atomically, lanes with the same address together),
+    """Return the mode of lanes that share their target with others (``Auto``: atomically, equal addresses together),
     or that have one of their own. ``direct``: each lane by itself.
     """
     if exclusive:

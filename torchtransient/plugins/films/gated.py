@@ -170,7 +170,7 @@ class GatedHDRFilm(TimeResolvedFilm):
 
     @property
     def has_slope(self) -> bool:
-        """Whether all gates are continuous."""
+        """All gates are continuous."""
         return self._has_slope
 
     @property
@@ -178,7 +178,7 @@ class GatedHDRFilm(TimeResolvedFilm):
         return jump_in(self.gates) or "gate"
 
     def arrivals(self):
-        """What can count: arrivals while some gate is open."""
+        """Return the window of arrivals while some gate is open."""
         return self._window
 
     # ---------------------------------------------------------------------------------------- storage

@@ -172,7 +172,7 @@ class TransientHDRFilm(TimeResolvedFilm):
 
     @property
     def has_slope(self) -> bool:
-        """Whether the temporal filter has a slope."""
+        """The temporal filter has a slope."""
         return self.filter.has_slope
 
     def arrivals(self):
@@ -205,9 +205,9 @@ class TransientHDRFilm(TimeResolvedFilm):
         return HistogramBlock(self, job.band, base, match, exclusive, origin)
 
     def reduce_mode(self, cube, exclusive, crowded):
-        """How lanes add to ``cube``. A processor takes them one by one: where many add, it costs more to look for those
-        that share a bin than to add each. Of a small array Dr.Jit gives every thread its own.
-        """
+        """Return the mode of lanes that add to ``cube``."""
+        # A processor takes lanes one by one: where many add, it costs more to look for those that share a bin than to
+        # add each. Of a small array Dr.Jit gives every thread its own.
         looks = dr.backend_v(cube) is dr.JitBackend.LLVM and dr.width(cube) > dr.expand_threshold()
         return reduce_mode(exclusive, crowded and looks and self.temporal_bins >= MANY_BINS)
 

@@ -214,7 +214,7 @@ MOST_ARRIVALS = 8
 
 
 class Phases:
-    """Which frequencies there are, and the phases of some arrivals. A plain object: constant in loops."""
+    """Frequencies of a film, and the phases of some arrivals. A plain object: constant in loops."""
 
     def __init__(self, film, opls):
         self.frequencies, self.count, self.opls = film.frequency_array, film.frequency_total, opls
@@ -226,7 +226,7 @@ class Phases:
         return [rotation(ν * opl) for opl in self.opls]
 
     def next(self, phases):
-        """Those at the next frequency of a grid."""
+        """Return the phases at the next frequency of a grid."""
         if self.step is None:
             return phases
         return [
