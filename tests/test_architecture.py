@@ -436,7 +436,7 @@ BARE = {
     "losses/results.py": {"TypeError"},  # a wrong keyword argument, as Python says it
     "plugins/transport/contents.py": {"AttributeError"},  # the protocol of objects
     "plugins/transport/world.py": {"AttributeError"},
-    "rendering/films/choices.py": {"KeyError"},  # caught by its callers
+    "rendering/films.py": {"KeyError"},  # caught by its callers
     "scene/edits.py": {"RuntimeError"},  # what Mitsuba says, told by its caller with the place
     "sensing/base/given.py": {"TypeError"},  # a wrong keyword argument, as Python says it
     "sensing/itof/itof_reading.py": {"AttributeError"},  # the protocol of objects

@@ -10,7 +10,7 @@ import pytest
 from support.plain_scenes import camera, load
 from support.runs import T
 from torchtransient import plugins
-from torchtransient.plugins.films import phasor_adjoint
+from torchtransient.plugins.films import phasor_sums
 
 VARIANT = "llvm_ad_rgb"
 GRID = {"frequency_first": -0.6, "frequency_step": 0.2, "frequency_count": 40}
@@ -64,7 +64,7 @@ def gradient(scene, moves):
 
 
 def one_by_one(monkeypatch):
-    monkeypatch.setattr(phasor_adjoint.PhasorAdjointBlock, "together", lambda self, most, with_slope: 0)
+    monkeypatch.setattr(phasor_sums.PhasorAdjointBlock, "together", lambda self, most, with_slope: 0)
 
 
 @pytest.mark.slow
@@ -106,8 +106,8 @@ def test_arrivals_that_do_not_fit_one_read(monkeypatch):
     """Fewer at once than a path has."""
     scene = scene_of(GRID)
     expected = gradient(scene, True)
-    monkeypatch.setattr(phasor_adjoint, "MOST_ARRIVALS", 3)
-    monkeypatch.setattr(phasor_adjoint, "SUMS", 600)
+    monkeypatch.setattr(phasor_sums, "MOST_ARRIVALS", 3)
+    monkeypatch.setattr(phasor_sums, "SUMS", 600)
     np.testing.assert_allclose(gradient(scene, True), expected, rtol=1e-5)
 
 

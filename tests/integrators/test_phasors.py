@@ -8,7 +8,7 @@ import pytest
 
 from support.plain_scenes import camera, load
 from support.runs import T
-from torchtransient.plugins.films import phasor_events
+from torchtransient.plugins.films import phasor_sums
 from torchtransient.testing.statistics import two_sample_z_test, z_test
 
 GRID = {"frequency_first": -0.6, "frequency_step": 0.2, "frequency_count": 10}
@@ -140,15 +140,15 @@ def test_light_is_not_lost():
 def test_deep_paths_and_no_limit():
     """More bounces than a path's memory has room for: equal to enough room, and right without any limit."""
     scene = scene_of(phasor_camera(), max_depth=20, rr_depth=50)
-    assert phasor_events.slots_for(2 * 20) == phasor_events.MAX_EVENTS < 40
+    assert phasor_sums.slots_for(2 * 20) == phasor_sums.MAX_EVENTS < 40
     steady, a = render(scene)
-    before = phasor_events.MAX_EVENTS
+    before = phasor_sums.MAX_EVENTS
     try:
-        for phasor_events.MAX_EVENTS in (2, 40):
+        for phasor_sums.MAX_EVENTS in (2, 40):
             _, b = render(scene)
             np.testing.assert_allclose(a, b, atol=ROUNDING * steady.max())
     finally:
-        phasor_events.MAX_EVENTS = before
+        phasor_sums.MAX_EVENTS = before
     unlimited, limited = scene_of(phasor_camera(), max_depth=-1), scene_of(phasor_camera(), max_depth=40)
     np.testing.assert_allclose(render(unlimited)[1], render(limited)[1], rtol=1e-3, atol=1e-4 * np.abs(a).max())
 
@@ -158,7 +158,7 @@ def test_several_launches_and_bands(monkeypatch):
     """Jobs that are split by samples, by rows and into storage bands add up."""
     scene = scene_of(phasor_camera())
     one = np.array([render(scene, seed)[1] for seed in range(12)])
-    per_path = 8 * (phasor_events.EVENT_BYTES + 12)
+    per_path = 8 * (phasor_sums.EVENT_BYTES + 12)
     for limit in (24 * 10 * per_path, 7 * 16 * per_path):
         monkeypatch.setattr(f"{FILMS}.phasor.MAX_EVENT_BYTES", limit)
         film = scene.sensors()[0].film()

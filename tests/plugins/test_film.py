@@ -13,8 +13,8 @@ from scipy.special import erf
 from support.marks import long_rows
 from torchtransient import plugins
 from torchtransient.errors import SceneError, StorageError
-from torchtransient.plugins.films.long_kernel import BinLayout, reduce_mode
-from torchtransient.plugins.films.temporal_filter import make_temporal_filter
+from torchtransient.plugins.films.block import BinLayout, reduce_mode
+from torchtransient.plugins.films.temporal_filters import make_temporal_filter
 from torchtransient.plugins.transport.strategy import Local
 from torchtransient.testing.film_storage import storage
 

@@ -14,10 +14,8 @@ from scipy.special import erf
 
 from torchtransient import plugins
 from torchtransient.errors import SceneError, StorageError
-from torchtransient.plugins.films.block import AdjointBlock, FilmBlock
-from torchtransient.plugins.films.pulsed_filter import PulsedFilter
-from torchtransient.plugins.films.temporal_filter import BoxFilter, GaussianFilter
-from torchtransient.plugins.films.window import GappedWindow
+from torchtransient.plugins.films.block import AdjointBlock, FilmBlock, GappedWindow
+from torchtransient.plugins.films.temporal_filters import BoxFilter, GaussianFilter, PulsedFilter
 from torchtransient.pulses import Pulse
 
 KINDS = {
@@ -122,7 +120,7 @@ def test_paths_of_a_phasor_film_fit_the_memory_of_their_events(most):
         plugins.sync()
         # of the variant
         from torchtransient.plugins.films.phasor import MAX_EVENT_BYTES
-        from torchtransient.plugins.films.phasor_events import slots_for
+        from torchtransient.plugins.films.phasor_sums import slots_for
 
         lanes = make("phasor_hdr_film").lanes_at_most(most)
         path = slots_for(most) * (8 + 4 * channels)

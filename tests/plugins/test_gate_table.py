@@ -9,8 +9,14 @@ import pytest
 
 from torchtransient import plugins
 from torchtransient.gates import Gate
-from torchtransient.plugins.films.gate_table import CELLS, GateTable, put_gates, read_gates
-from torchtransient.plugins.films.long_kernel import BinLayout
+from torchtransient.plugins.films.block import BinLayout
+
+
+def gated():
+    """The plugin module, as it was executed for the active variant."""
+    from torchtransient.plugins.films import gated as module
+
+    return module
 
 
 @pytest.fixture(autouse=True)
@@ -29,11 +35,11 @@ def test_every_open_gate_is_a_candidate():
     rng = np.random.default_rng(8)
     starts, lengths = rng.uniform(3, 90, 40), rng.uniform(1e-4, 5, 40)
     gates = [Gate.rectangular(a, a + w) for a, w in zip(starts, lengths, strict=True)]
-    table = GateTable(gates, 1.25)
+    table = gated().GateTable(gates, 1.25)
     edges = np.array([(gate.start_opl, gate.end_opl) for gate in gates]) - 1.25
     opl = np.concatenate([edges.ravel(), np.nextafter(edges, 0).ravel(), rng.uniform(1, 95, 2000)])
     low, high = candidates(table, opl)
-    cell = (table.last - table.first) / CELLS
+    cell = (table.last - table.first) / gated().CELLS
     for k, (a, b) in enumerate(edges):
         listed = (low <= k) & (k < high)
         assert listed[(opl >= a) & (opl < b)].all()
@@ -48,15 +54,15 @@ def test_the_last_gate_is_met_until_before_its_end():
     rounded = 0
     for last in np.linspace(0.11, 3.7, 60):
         opl = np.nextafter(last, 0)
-        rounded += opl * (CELLS / last) >= CELLS
+        rounded += opl * (gated().CELLS / last) >= gated().CELLS
         gates = [Gate.rectangular(0, last / 2), Gate.rectangular(last / 2, last)]
-        low, high = candidates(GateTable(gates, 0.0), [opl])
+        low, high = candidates(gated().GateTable(gates, 0.0), [opl])
         assert (low[0], high[0]) == (1, 2)
     assert rounded > 3
 
 
 def test_cells_of_gates_are_those_that_they_reach_into():
-    table = GateTable([Gate.rectangular(2.0, 2.125), Gate.rectangular(2.5, 3.0)], 2.0)
+    table = gated().GateTable([Gate.rectangular(2.0, 2.125), Gate.rectangular(2.5, 3.0)], 2.0)
     # cells of 1 / 4096: the first 512, and one that begins at the end of the gate
     assert np.flatnonzero(table.open_cells).tolist() == [*range(513), *range(2048, 4096)]
 
@@ -83,26 +89,26 @@ def test_candidates_alone_are_asked():
     opl, active = mi.Float64([0.5, 0.25]), mi.Bool([True, False])
     for slope_value, share in ((None, 0), ([mi.Float(11), mi.Float(13)], 5)):
         layout = layout_of(np.zeros(12))
-        put_gates(layout, Between(), opl, [mi.Float(3), mi.Float(7)], slope_value, active)
+        gated().put_gates(layout, Between(), opl, [mi.Float(3), mi.Float(7)], slope_value, active)
         expected = np.zeros((2, 3, 2))
         expected[0, 1] = 3 * 0.5 * 3 + share * 11, 3 * 0.5 * 7 + share * 13
         assert np.array(layout.flat).tolist() == expected.ravel().tolist()
     numbers = np.arange(1.0, 13.0) ** 2
     for steady, more in ((None, 0), ([mi.Float(100), mi.Float(200)], 100)):
-        A, slope = read_gates(layout_of(numbers), Between(), opl, steady, active)
+        A, slope = gated().read_gates(layout_of(numbers), Between(), opl, steady, active)
         for c in range(2):
             value = numbers[2 + c] + more * (c + 1)
             assert list(A[c]) == [value * 1.5, 0] and list(slope[c]) == [value * 5, 0]
     layout = layout_of(np.zeros(12))
-    put_gates(layout, Between(1), opl, [mi.Float(3)] * 2, [mi.Float(3)] * 2, active)
-    A, slope = read_gates(layout_of(numbers), Between(1), opl, None, active)
+    gated().put_gates(layout, Between(1), opl, [mi.Float(3)] * 2, [mi.Float(3)] * 2, active)
+    A, slope = gated().read_gates(layout_of(numbers), Between(1), opl, None, active)
     assert not np.array(layout.flat).any() and not np.any([np.array(part) for part in A + slope])
 
 
 def test_a_gate_that_begins_to_open_has_a_slope_and_no_weight():
-    table = GateTable([Gate.tabulated([2.0, 4.0, 5.0], [0.0, 3.0, 0.0])], 0.0)
+    table = gated().GateTable([Gate.tabulated([2.0, 4.0, 5.0], [0.0, 3.0, 0.0])], 0.0)
     layout = BinLayout(dr.zeros(mi.Float, 2), mi.UInt32(0), 2, 1, 1, 2)
-    put_gates(layout, table, mi.Float64(2.0), [mi.Float(1)] * 2, [mi.Float(4), mi.Float(6)], mi.Bool(True))
+    gated().put_gates(layout, table, mi.Float64(2.0), [mi.Float(1)] * 2, [mi.Float(4), mi.Float(6)], mi.Bool(True))
     assert np.array(layout.flat).tolist() == [6, 9]
 
 

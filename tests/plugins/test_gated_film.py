@@ -14,8 +14,7 @@ from torchtransient import plugins
 from torchtransient.errors import ArgumentError, GradientError, SceneError
 from torchtransient.files.result_file import read_result, write_result
 from torchtransient.gates import Gate
-from torchtransient.plugins.films.gate_table import GateTable
-from torchtransient.plugins.films.window import ArrivalWindow, GappedWindow
+from torchtransient.plugins.films.block import ArrivalWindow, GappedWindow
 from torchtransient.plugins.sampling.light_box import LightBox
 from torchtransient.testing.film_storage import storage
 from torchtransient.testing.small_room import GREY, WALL_POSE, make_room
@@ -117,6 +116,8 @@ def test_slopes():
 def test_gates_see_nothing_before_and_behind_them():
     """From its start on, until before its end; nor what never arrives. No gate is asked where none is open."""
     ramp = Gate.tabulated([3.0, 5.0, 9.0], [2.0, 4.0, 8.0])
+    from torchtransient.plugins.films.gated import GateTable
+
     table = GateTable([ramp, Gate.rectangular(12.0, 13.0)], 1.0)
     at = np.array([3.0, np.nextafter(3.0, 0), 4.0, 7.0, np.nextafter(9.0, 0), 9.0, np.inf, -np.inf])
     value, slope = table.value(mi.UInt32(0), mi.Float64(at - 1.0), mi.Bool([True] * 8))
@@ -291,7 +292,7 @@ def test_arguments():
         tt.TransientRenderer(scene, gates=GATES, time_axis=FINE)
     with pytest.raises(ArgumentError, match=r"tt\.Gate objects"):
         tt.TransientRenderer(scene, gates=[3.0])
-    with pytest.raises(SceneError, match="does not read .steady."):
+    with pytest.raises(SceneError, match=r"does not read .steady."):
         tt.TransientRenderer(scene, gates=GATES, steady=False)
     with pytest.raises(ArgumentError, match="gated film has none"):
         tt.TransientRenderer(scene, gates=GATES, temporal_filter="tent")

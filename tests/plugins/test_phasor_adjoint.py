@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from torchtransient import plugins
-from torchtransient.plugins.films import phasor_adjoint
+from torchtransient.plugins.films import phasor_sums
 from torchtransient.plugins.films.colour import ChannelMatch
 
 LENGTHS = [0.0, 0.37, 12.125, 731.0625, 1000.0 + 1 / 3, 4.1e4]
@@ -80,7 +80,7 @@ def test_a_grid_on_both_sides_of_zero():
 def test_phases_that_are_never_set_anew_drift_away(monkeypatch):
     """Without a phase in double precision every 16 frequencies the bound above does not hold."""
     film = make_film(frequency_first=0.1, frequency_step=99.9 / 1024, frequency_count=1025)
-    monkeypatch.setattr(phasor_adjoint, "STEPS", 2000)
+    monkeypatch.setattr(phasor_sums, "STEPS", 2000)
     assert worst(film) > 5 * CYCLES
 
 
@@ -137,10 +137,10 @@ def test_how_many_are_read_together():
     """As many as there is room for sums, one at least; none ahead where nothing is to be read."""
     film, rng = make_film(**GRID), np.random.default_rng(2)
     block, _ = adjoint_block(film, 1, rng)
-    assert block.together(100, False) == phasor_adjoint.MOST_ARRIVALS and block.together(3, False) == 3
+    assert block.together(100, False) == phasor_sums.MOST_ARRIVALS and block.together(3, False) == 3
     film.channel_count = lambda: 12
-    assert block.together(100, False) * 12 <= phasor_adjoint.SUMS < (block.together(100, False) + 1) * 12
-    assert block.together(100, True) * 24 <= phasor_adjoint.SUMS < (block.together(100, True) + 1) * 24
+    assert block.together(100, False) * 12 <= phasor_sums.SUMS < (block.together(100, False) + 1) * 12
+    assert block.together(100, True) * 24 <= phasor_sums.SUMS < (block.together(100, True) + 1) * 24
     film.channel_count = lambda: 100
     assert block.together(100, True) == 1
     block.response = None

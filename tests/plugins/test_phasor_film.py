@@ -12,8 +12,7 @@ import pytest
 from support.marks import long_rows
 from torchtransient import plugins
 from torchtransient.errors import SceneError, TorchTransientWarning
-from torchtransient.plugins.films import phasor_events
-from torchtransient.plugins.films.phasor_grid import step_of
+from torchtransient.plugins.films import phasor_sums
 from torchtransient.testing.film_storage import storage
 
 START = 2.0
@@ -179,7 +178,7 @@ def test_paths_with_more_events_than_fit(monkeypatch, tangents):
     opl, value, active = random_events(10, 9, 3, rng)
     slope = rng.normal(size=value.shape) if tangents else None
     roomy = summed(film, Job(0, 1, 5), opl, value, active, slope)
-    monkeypatch.setattr(phasor_events, "MAX_EVENTS", 4)
+    monkeypatch.setattr(phasor_sums, "MAX_EVENTS", 4)
     block = film.create_event_block(Job(0, 1, 5), mi.UInt32(0), Copies(), 9, tangents)
     assert block.slots == 4 and block.overflows
     tight = summed(film, Job(0, 1, 5), opl, value, active, slope)
@@ -270,6 +269,8 @@ def test_defaults_that_nobody_asked_for_are_said():
 @pytest.mark.parametrize("side", [1, -1])
 def test_deviations_of_a_grid(scale, side):
     """Up to 1e-14 of the highest frequency are rounding, whichever way they point."""
+    from torchtransient.plugins.films.phasor import step_of
+
     for share, step in ((0.95e-14, scale / 2), (1.1e-14, None)):
         frequencies = np.array([0, 0.5, 1.0]) * scale
         frequencies[1] += side * share * 4
@@ -309,14 +310,14 @@ def test_events_of_any_channel_and_sign_take_room():
 ])  # fmt: skip
 def test_frequencies_of_one_thread(monkeypatch, frequencies, tangents, block, sizes):
     """As many as there is room for sums, 16 at most, one at least, and no more than there are."""
-    made, original = [], phasor_events.FrequencyBlock
+    made, original = [], phasor_sums.FrequencyBlock
 
     def noting(film, start, size):
         made.append(size)
         return original(film, start, size)
 
-    monkeypatch.setattr(phasor_events, "FrequencyBlock", noting)
-    monkeypatch.setattr(phasor_events, "BLOCK", block)
+    monkeypatch.setattr(phasor_sums, "FrequencyBlock", noting)
+    monkeypatch.setattr(phasor_sums, "BLOCK", block)
     film, rng = make_film(**frequencies), np.random.default_rng(3)
     opl, value, active = random_events(2, 2, 3, rng)
     slope = rng.normal(size=value.shape) if tangents else None

@@ -12,8 +12,7 @@ import pytest
 from support.marks import long, long_pairs, long_rows
 from torchtransient import plugins
 from torchtransient.errors import SceneError
-from torchtransient.plugins.films.pulsed_filter import PulsedFilter
-from torchtransient.plugins.films.temporal_filter import BoxFilter
+from torchtransient.plugins.films.temporal_filters import BoxFilter, PulsedFilter
 from torchtransient.pulses import Pulse
 from torchtransient.testing.film_storage import storage
 

@@ -10,7 +10,7 @@ import pytest
 from torchtransient.errors import ArgumentError, SceneError
 from torchtransient.interfaces import BACKWARD, FORWARD, RENDER
 from torchtransient.rendering import carry_out, engine
-from torchtransient.rendering.films import choices
+from torchtransient.rendering import films as choices
 from torchtransient.rendering.recordings import (
     LARGE,
     LAUNCHED,
@@ -217,9 +217,9 @@ def sensors_of(*films):
 
 
 def test_films_of_one_call_measure_the_same(monkeypatch):
-    monkeypatch.setattr(engine, "of_film", lambda film: film.choice)
+    monkeypatch.setattr(engine, "layout_of_film", lambda film: film.choice)
     one = ("histogram", (2, 3, 5, 1), ("R", "G"))
-    assert choices.of_film is not engine.of_film
+    assert choices.layout_of_film is not engine.layout_of_film
     assert engine.check_items(sensors_of(one, one), items(0, 1, sensors=2)) == "histogram"
     for other in (("phasors", *one[1:]), ("histogram", (2, 3, 4, 1), one[2]), (*one[:2], ("R", "B"))):
         with pytest.raises(SceneError, match=r"sensors: films rendered in one call .* sensor 0: histogram of shape"):

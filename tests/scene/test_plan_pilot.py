@@ -14,7 +14,7 @@ from support import plan_scenes
 from support.marks import long
 from torchtransient.cli.main import main
 from torchtransient.errors import ArgumentError, SceneError
-from torchtransient.rendering.films.histogram import Histogram
+from torchtransient.rendering.films import Histogram
 from torchtransient.rendering.variant import active_variant
 from torchtransient.scene.edits import BuildOptions
 from torchtransient.scene.pilot import Arrivals, axis_over

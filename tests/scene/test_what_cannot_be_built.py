@@ -6,7 +6,7 @@ import pytest
 
 import torchtransient as tt
 from torchtransient.errors import SceneError
-from torchtransient.rendering.films.choices import of_entries
+from torchtransient.rendering.films import layout_of_entries
 from torchtransient.testing.small_room import VARIANT, make_room
 
 GATES = [tt.Gate.gaussian(8.0, 0.5)]
@@ -73,6 +73,6 @@ def test_scenes_without_a_sensor(room):
 
 def test_files_without_a_film():
     with pytest.raises(KeyError, match="transient or phasor or gated"):
-        of_entries({"steady": 1})
+        layout_of_entries({"steady": 1})
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from support.plain_scenes import camera, load
-from torchtransient.plugins.films.window import ArrivalWindow
+from torchtransient.plugins.films.block import ArrivalWindow
 from torchtransient.plugins.transport.sinks.sink import Sink
 from torchtransient.plugins.transport.strategy import Connection, Event, Local, Step, Vertex
 from torchtransient.plugins.transport.walk import roulette, start, walk

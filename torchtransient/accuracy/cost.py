@@ -13,7 +13,7 @@ from torchtransient.accuracy.measure import Candidate, Estimates, Task, checked_
 from torchtransient.accuracy.report import AccuracyReport, Choice
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.quantities import as_whole, shown
-from torchtransient.rendering.films.choices import of_output
+from torchtransient.rendering.films import layout_of_output
 from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.output import RenderOutput
 from torchtransient.rendering.renderer import TransientRenderer
@@ -39,7 +39,7 @@ def cosine_over_the_window(out: RenderOutput) -> torch.Tensor:
 
 def _response(out: RenderOutput) -> torch.Tensor:
     """What the film of a render measured."""
-    film = of_output(out)
+    film = layout_of_output(out)
     response = None if film is None else film.tensor(out)
     if response is None:
         raise ShapeError("cost_of_accuracy: expected a render with what its film measured, got a steady image alone.")
@@ -124,7 +124,7 @@ def cost_of_accuracy(
         "spp": counts,
         "gradients": list(gradients),
         "loss": getattr(loss, "__name__", type(loss).__name__),
-        "measured": repr(renderer.film.argument_value()),
+        "measured": repr(renderer.film.settings),
         "time_axis": axis and [axis.start_opl, axis.bin_width_opl, axis.num_bins],
         "without_gradients": without,
     }

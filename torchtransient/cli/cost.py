@@ -7,8 +7,8 @@ from typing import Any
 
 import click
 
+from torchtransient.cli.films import film_of_options
 from torchtransient.cli.options import load_scene, scene_options
-from torchtransient.rendering.films.choices import from_options
 
 
 class Counts(click.ParamType):  # type: ignore[type-arg]  # a parameter of newer versions
@@ -45,7 +45,7 @@ def command(scene: Path, **options: Any) -> None:
     from torchtransient.files.result_file import check_folder
     from torchtransient.vis.overview import check_picture
 
-    film = from_options(options)
+    film = film_of_options(options)
     if options["plot"]:
         check_picture(options["plot"])
     if options["json_path"]:

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from torchtransient.rendering.films.choice import CommandOption
-from torchtransient.rendering.films.choices import all_films
+from torchtransient.cli.films import film_options
 
 if TYPE_CHECKING:
     import torch
@@ -28,16 +27,11 @@ def scene_options(command: Command) -> Command:
         click.option("--param", "params", multiple=True, metavar="NAME=VALUE", help="Fill $NAME of the scene file."),
         click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Same seed, same image."),
         click.option("--max-depth", type=int, help="Longest path, in segments; -1 for no limit."),
-        *(_film_option(option) for kind in all_films() for option in kind.options),
+        film_options,
     )
     for option in reversed(options):
         command = option(command)
     return command
-
-
-def _film_option(option: CommandOption) -> Callable[[Command], Command]:
-    flag = f"--{option.name.replace('_', '-')}"
-    return click.option(flag, type=option.kind, metavar=option.metavar, help=option.help)
 
 
 def assignments(given: Sequence[str], option: str) -> dict[str, str]:

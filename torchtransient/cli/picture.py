@@ -40,13 +40,13 @@ def command(result: Path, target: Path, kind: str, **options: Any) -> None:
 def _draw(kind: str, result: Path, target: Path, options: dict[str, Any]) -> None:
     import torchtransient as tt
     from torchtransient.files.result_file import read_result
-    from torchtransient.rendering.films.choices import of_output
+    from torchtransient.rendering.films import layout_of_output
 
     def overview() -> None:
         from torchtransient.vis.sources import steady_of, transient_of
 
         held = read_result(result)
-        film = of_output(held)
+        film = layout_of_output(held)
         if held.axis is None:
             what = "something else" if film is None else film.plural
             raise click.UsageError(f"--kind overview shows a histogram over time, and this file holds {what}.")

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from torchtransient.cli.films import pictures_of, write_film_video
+
 if TYPE_CHECKING:
-    from torchtransient.rendering.films.choice import FilmChoice
+    from torchtransient.rendering.films import FilmLayout
 
 PICTURES = ("overview", "peak_time", "rainbow", "video")
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -45,7 +47,7 @@ def picture_options(command: Command) -> Command:
     return command
 
 
-def check_pictures(options: dict[str, Any], film: FilmChoice | None) -> None:
+def check_pictures(options: dict[str, Any], film: FilmLayout | None) -> None:
     """Raise StorageError when one of the pictures of `picture_options` could not be written, UsageError when it does
     not show what the film measures. None: it is not known yet.
     """
@@ -56,7 +58,7 @@ def check_pictures(options: dict[str, Any], film: FilmChoice | None) -> None:
         if not options[name]:
             continue
         flag = f"--{name.replace('_', '-')}"
-        if film is not None and name not in film.pictures:
+        if film is not None and name not in pictures_of(film):
             raise click.UsageError(f"{flag} shows a histogram over time; leave it out for {film.plural}.")
         if name == "video":
             check_video(options[name])
@@ -64,7 +66,7 @@ def check_pictures(options: dict[str, Any], film: FilmChoice | None) -> None:
             check_picture(options[name], flag)
 
 
-def write_pictures(output: Any, film: FilmChoice, options: dict[str, Any], title: str) -> None:
+def write_pictures(output: Any, film: FilmLayout, options: dict[str, Any], title: str) -> None:
     """Write the pictures of `picture_options` that are asked for, and say so."""
     import torchtransient as tt
 
@@ -79,5 +81,5 @@ def write_pictures(output: Any, film: FilmChoice, options: dict[str, Any], title
         tt.vis.rainbow(output, options["rainbow"])
         click.echo(f"{options['rainbow']}: hue by arrival")
     if options["video"]:
-        shown = film.write_video(output, options["video"], progress=not options["quiet"])
+        shown = write_film_video(film, output, options["video"], progress=not options["quiet"])
         click.echo(f"{options['video']}: {shown}")

@@ -8,8 +8,8 @@ from typing import Any
 
 import click
 
+from torchtransient.cli.films import film_of_options
 from torchtransient.cli.options import load_scene, scene_options
-from torchtransient.rendering.films.choices import from_options
 from torchtransient.rendering.plan import known_outputs
 
 
@@ -48,7 +48,7 @@ def command(scene: Path, **options: Any) -> None:
 
     # Without a start, bins and their width are wishes for the axis that the plan finds.
     wishes = ("num_bins", "bin_width_opl") if options["start_opl"] is None else ()
-    film = from_options({name: value for name, value in options.items() if name not in wishes})
+    film = film_of_options({name: value for name, value in options.items() if name not in wishes})
     found = tt.plan(
         load_scene(scene, None, options["params"]),
         options["outputs"],

@@ -8,10 +8,11 @@ from typing import Any
 
 import click
 
+from torchtransient.cli.films import film_of_options, summary
 from torchtransient.cli.options import assignments, load_scene, scene_options, scene_values
 from torchtransient.cli.pictures import check_pictures, picture_options, write_pictures
 from torchtransient.errors import PhysicsWarning
-from torchtransient.rendering.films.choices import from_options, of_output
+from torchtransient.rendering.films import layout_of_output
 
 
 @click.command()
@@ -36,7 +37,7 @@ def command(scene: Path, **options: Any) -> None:
     from torchtransient.files.result_file import check_target, write_result
 
     assignments(options["params"], "--param")
-    film = from_options(options)
+    film = film_of_options(options)
     values = scene_values(options["values"], "--set")
     # What is wrong with the places to write to is said before the render, not after it.
     target = check_target(options["output"] or scene.with_suffix(".h5"))
@@ -47,20 +48,14 @@ def command(scene: Path, **options: Any) -> None:
         return
     output = _render(described, values, film, options)
     write_result(target, output, {"scene": scene.name, "parameters": options["params"], "set": options["values"]})
-    stats, film = output.stats, of_output(output)
+    stats, film = output.stats, layout_of_output(output)
     assert film is not None  # a steady film was refused before the render
-    what, how = film.summary(
-        _sizes(film.tensor(output)), "Stokes x " if output.polarized else "", stats.temporal_filter
-    )
+    what, how = summary(film, output)
     click.echo(f"{target}: {what}, {stats.spp} samples per pixel, {stats.seconds:.1f} s, {stats.variant}{how}")
     if output.axis is not None:
         _report_energy(output)
     check_pictures(options, film)
     write_pictures(output, film, options, scene.name)
-
-
-def _sizes(tensor: Any) -> str:
-    return " x ".join(map(str, tensor.shape))
 
 
 def _render(described: Any, values: dict[str, Any], film: Any, options: dict[str, Any]) -> Any:

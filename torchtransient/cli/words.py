@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from torchtransient.rendering.films.choices import all_films
+from torchtransient.cli.films import OPTIONS
 
 _WORDS = {
     "print(scene.parameters()) lists all keys": "`torchtransient render SCENE --list-parameters` lists all keys",
@@ -23,10 +23,8 @@ _WORDS = {
 
 def in_options(message: str) -> str:
     """The message without Python in it."""
-    for kind in all_films():
-        if kind.options:
-            flags = ", ".join(f"--{option.name.replace('_', '-')}" for option in kind.options)
-            message = message.replace(f"Give {kind.example}", f"Give {flags}")
+    for kind, flags in OPTIONS.items():
+        message = message.replace(f"Give {kind.example}", f"Give {', '.join(flags)}")
     for python, option in _WORDS.items():
         message = message.replace(python, option)
     return message

@@ -18,6 +18,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 
 from torchtransient.array_files import array_file
@@ -27,7 +28,7 @@ from torchtransient.capture.metadata import metadata_text
 from torchtransient.errors import ArgumentError, StorageError
 from torchtransient.files.entries import names_of, notes_of, number_of, text_of, whole_of
 from torchtransient.gates import Gate
-from torchtransient.rendering.films.choices import all_films, of_entries, of_output
+from torchtransient.rendering.films import FILMS, layout_of_entries, layout_of_output
 from torchtransient.rendering.output import RenderOutput, named_fields
 from torchtransient.tensor_record import TensorRecord
 
@@ -94,16 +95,22 @@ def write_result(path: str | Path, output: RenderOutput | Result, metadata: Mapp
         )
     own = {"stats": asdict(output.stats)} if isinstance(output, RenderOutput) else output.metadata
     note = metadata_text({**(metadata or {}), **own}, _WHAT)
-    film = of_output(output)
+    film = layout_of_output(output)
     tensor = None if film is None else film.tensor(output)
     if film is None or tensor is None:
         raise StorageError(
             "result file: expected an output with what its film measured, transient and axis for instance, got neither."
         )
+    settings = film.entries()
+    values = {name: value for name, value in settings.items() if not isinstance(value, np.ndarray)}
     entries: dict[str, Any] = {
-        "format": FORMAT, **film.numbers(), "channels": json.dumps(output.channels), "metadata": note,
+        "format": FORMAT, **values, "channels": json.dumps(output.channels), "metadata": note,
     }  # fmt: skip
-    arrays = {"steady": array_of(output.steady, _WHAT), film.measures: array_of(tensor, _WHAT), **film.arrays()}
+    arrays = {
+        "steady": array_of(output.steady, _WHAT),
+        film.measures: array_of(tensor, _WHAT),
+        **{name: value for name, value in settings.items() if name not in values},
+    }
     write_arrays(target, arrays, entries, _WHAT)
     return target
 
@@ -122,7 +129,7 @@ def read_result(path: str | Path) -> Result:
 
 def _is_known(name: str) -> bool:
     # Films of others know alone what their settings are called.
-    return name in _KNOWN or any(name == film.measures or not _is_ours(film) for film in all_films())
+    return name in _KNOWN or any(name == film.measures or not _is_ours(film) for film in FILMS)
 
 
 def _is_ours(film: type) -> bool:
@@ -133,14 +140,15 @@ def _result(values: Mapping[str, Any], source: Path) -> Result:
     metadata, steady = notes_of(values, "metadata"), tensor_in(values["steady"])
     # Files of earlier versions have no names of channels.
     channels = names_of(values, "channels") if "channels" in values else ()
-    film = of_entries({**values, **{name: read(values, name) for name, read in _READ.items() if name in values}})
-    response = tensor_in(film.tensor_in(values))
+    film = layout_of_entries({**values, **{name: read(values, name) for name, read in _READ.items() if name in values}})
+    # Files of earlier versions call gated images a transient.
+    response = tensor_in(values[film.measures if film.measures in values else "transient"])
     if response.ndim < 4 or response.shape[-3] != film.count:
         raise StorageError(
             f"result file: '{source}' holds a {film.measures} of shape {tuple(response.shape)}; expected "
             f"(..., C, {film.letter}, H, W) with {film.letter} = {film.count}."
         )
-    if response.is_complex() != (film.measures == "phasor") or steady.is_complex() or torch.bool in (
+    if response.is_complex() != film.is_complex or steady.is_complex() or torch.bool in (
         response.dtype, steady.dtype
     ):  # fmt: skip
         raise ValueError(f"{film.measures} is of {response.dtype}, steady of {steady.dtype}")

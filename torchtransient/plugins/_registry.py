@@ -141,7 +141,7 @@ def register(kind: str, name: str, constructor: Callable[..., object]) -> None:
     if missing:
         raise PluginRegistrationError(
             f"register: {kind} plugin '{name}' ({constructor.__name__}) was expected to have {', '.join(missing)} and "
-            "does not. What is asked of it is written in torchtransient/interfaces.py."
+            "does not. Its base class documents them."
         )
     key = (kind, name)
     module = _state.loading or getattr(constructor, "__module__", "?")

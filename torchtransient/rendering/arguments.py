@@ -13,8 +13,7 @@ from torch.nn.utils import parametrize
 from torchtransient.errors import ArgumentError, ShapeError, UnitError, UnknownKeyError
 from torchtransient.given_types import is_one_of, text
 from torchtransient.quantities import as_whole, shown
-from torchtransient.rendering.films.choice import FilmChoice
-from torchtransient.rendering.films.choices import chosen
+from torchtransient.rendering.films import FilmLayout, film_of_arguments
 from torchtransient.scene.parameters import unknown_key
 from torchtransient.scene.values import as_float, fit_shape
 
@@ -114,14 +113,14 @@ def mangle(keys: Sequence[str]) -> dict[str, str]:
     return names
 
 
-def film_asked_for(film: Any, named: Mapping[str, Any]) -> FilmChoice | None:
+def film_asked_for(film: Any, named: Mapping[str, Any]) -> FilmLayout | None:
     """The film of a call: an object, or one of the ``named`` arguments. Raises ``ArgumentError``."""
-    found = chosen(named)
+    found = film_of_arguments(named)
     if film is None:
         return found
     if found is not None:
         raise ArgumentError(f"film, {', '.join(named)}: a film measures one thing; give one of them.")
-    if not isinstance(film, FilmChoice):
+    if not isinstance(film, FilmLayout):
         raise ArgumentError(
             f"film: expected a film such as Histogram(axis) of torchtransient.rendering.films, got {film!r}."
         )

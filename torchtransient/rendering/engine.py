@@ -22,8 +22,7 @@ from torchtransient.plugins.parameters import check_slope
 from torchtransient.rendering.batch import Batch, take
 from torchtransient.rendering.broken_numbers import all_finite, broken_entries, fill_broken
 from torchtransient.rendering.carry_out import Numbered, carry_out, groups_of
-from torchtransient.rendering.films.choice import FilmChoice
-from torchtransient.rendering.films.choices import of_film
+from torchtransient.rendering.films import FilmLayout, layout_of_film
 from torchtransient.rendering.interrupts import ends_frames
 from torchtransient.rendering.memory import check_fits
 from torchtransient.rendering.sample_counts import samples_taken
@@ -93,14 +92,14 @@ def _fraction(job: RenderJob, n: int) -> Callable[[float], None] | None:
     return None if report is None else lambda fraction: report((n + fraction) / count)
 
 
-def check_items(sensors: Sequence[Any], items: Sequence[Item]) -> FilmChoice:
+def check_items(sensors: Sequence[Any], items: Sequence[Item]) -> FilmLayout:
     """What the films of a call measure, which has to be the same in one shape. Raises ``SceneError``."""
-    found: dict[int, tuple[FilmChoice, tuple[int, ...], tuple[str, ...]]] = {}
+    found: dict[int, tuple[FilmLayout, tuple[int, ...], tuple[str, ...]]] = {}
     for item in items:
         if not 0 <= item.sensor < len(sensors):
             raise ArgumentError(f"sensors: the scene has {len(sensors)}, numbered from 0; got {item.sensor}.")
         film = sensors[item.sensor].film()
-        found[item.sensor] = of_film(film), tuple(film.cube_shape()), tuple(film.channel_names())
+        found[item.sensor] = layout_of_film(film), tuple(film.cube_shape()), tuple(film.channel_names())
     if len(set(found.values())) > 1:
         said = "; ".join(
             f"sensor {sensor}: {choice} of shape {shape} and channels {'/'.join(channels)}"

@@ -11,7 +11,7 @@ import torch
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import ShapeError
 from torchtransient.gates import Gate
-from torchtransient.rendering.films.choice import FilmChoice
+from torchtransient.rendering.films import FilmLayout
 from torchtransient.rendering.variant import stokes_components
 from torchtransient.tensor_record import TensorRecord
 
@@ -172,7 +172,7 @@ class RenderOutput(TensorRecord):
     @classmethod
     def of(
         cls,
-        film: FilmChoice,
+        film: FilmLayout,
         steady: torch.Tensor,
         response: torch.Tensor,
         *,
@@ -183,7 +183,7 @@ class RenderOutput(TensorRecord):
         return cls(steady=steady, stats=stats, channels=tuple(channels), **named_fields(film, response))
 
 
-def named_fields(film: FilmChoice, response: torch.Tensor) -> dict[str, Any]:
+def named_fields(film: FilmLayout, response: torch.Tensor) -> dict[str, Any]:
     """What a film measured as arguments of a dataclass like ``RenderOutput``; what has no field goes to ``others``."""
     found = {film.measures: response, **film.attributes()}
     named = {name: found.pop(name, None) for name in _OF_FILMS}

@@ -19,16 +19,16 @@ from torchtransient.given_types import is_one_of, several, text
 from torchtransient.pulses import Pulse
 from torchtransient.quantities import Numbers, as_whole, count, shown
 from torchtransient.rendering.arguments import checked_depth, checked_filter, checked_keys, film_asked_for
-from torchtransient.rendering.films.choice import FilmChoice, PlannedFilm
-from torchtransient.rendering.films.choices import all_films, of_plugin, planned
+from torchtransient.rendering.films import FILMS, FilmLayout, layout_of_plugin
 from torchtransient.rendering.opaque import opaque
-from torchtransient.rendering.pulse_properties import checked_pulse
+from torchtransient.rendering.planned_film import PlannedFilm, planned
 from torchtransient.rendering.renderer import TransientRenderer
 from torchtransient.rendering.variant import resolve_variant
 from torchtransient.scene.inventory import scene_inventory
 from torchtransient.scene.load import load
 from torchtransient.scene.pilot import PilotReport
 from torchtransient.scene.plan import Choice, Draft, Effects, Finder, choose_integrator, choose_variant
+from torchtransient.scene.pulses import checked_pulse
 
 # Outputs that every film can show beside its own measurement.
 _ANY_FILM = ("steady", "stokes", "bands")
@@ -95,7 +95,7 @@ class Plan(Effects):
     def to_dict(self) -> dict[str, Any]:
         """Return all decisions but the scene as plain data for JSON."""
         plain: dict[str, Any] = {name: getattr(self, name) for name in _PLAIN}
-        for kind in all_films():
+        for kind in FILMS:
             plain[kind.argument] = self.film_choice.plain() if isinstance(self.film_choice, kind) else None
         for name in ("pulse", "irf"):
             plain[name] = None if getattr(self, name) is None else asdict(getattr(self, name))
@@ -142,7 +142,7 @@ def plan(
     pilot: bool = True,
     sensor: int = 0,
     seed: int = 0,
-    film: FilmChoice | None = None,
+    film: FilmLayout | None = None,
 ) -> Plan:
     """Choose the cheapest way to render a scene that shows what is asked for.
 
@@ -201,10 +201,10 @@ def plan(
     wanted = _checked_outputs(outputs)
     inventory = scene_inventory(loaded, sensor)
     given = film_asked_for(film, {"frequencies": frequencies, "gates": gates})
-    if given is not None and given.has_axis:
+    if given is not None and given.has_bins:
         if time_axis is not None:
             raise ArgumentError("tt.plan: film and time_axis both give a time axis; leave out one of them.")
-        time_axis = given.argument_value()
+        time_axis = given.settings
     planned_film = planned(wanted)
     best, notes = choose_variant(inventory, wanted, loaded.variant.split("_")[0], strict)
     tracer, more = choose_integrator(inventory)
@@ -212,15 +212,16 @@ def plan(
         _reason("variant", variant, best), *notes, _reason("integrator", integrator, tracer), *more,
         planned_film.reason,
     )  # fmt: skip
-    own_film = of_plugin(inventory.film or "")
+    own_film = layout_of_plugin(inventory.film or "")
+    described = None if own_film is None else own_film.from_properties(inventory.film_props)
     draft = Draft(
         scene=load(loaded, variant=best.value if variant is None else variant),
         variant=best.value if variant is None else variant,
         integrator=tracer.value if integrator is None else integrator,
         film=planned_film,
         film_choice=_film_settings(planned_film, given, inventory.film, wanted),
-        described_film=None if own_film is None else own_film.settings_in(inventory.film_props),
-        described_axis=None if own_film is None else own_film.axis_in(inventory.film_props),
+        described_film=described,
+        described_axis=None if described is None else described.attributes().get("axis"),
         pulse=checked_pulse("pulse", pulse),
         irf=checked_pulse("irf", irf),
         parameters=checked_keys(parameters),
@@ -237,12 +238,12 @@ def plan(
 
 def known_outputs() -> tuple[str, ...]:
     """Return the outputs that a plan can be asked for."""
-    return (*(kind.output for kind in all_films()), *_ANY_FILM)
+    return (*(kind.output for kind in FILMS), *_ANY_FILM)
 
 
 def _checked_outputs(outputs: Sequence[str] | str) -> tuple[str, ...]:
     wanted = (outputs,) if isinstance(outputs, str) else tuple(several("tt.plan: outputs", outputs, "names"))
-    films, known = tuple(kind.output for kind in all_films()), known_outputs()
+    films, known = tuple(kind.output for kind in FILMS), known_outputs()
     if not wanted or not all(is_one_of(name, known) for name in wanted):
         raise ArgumentError(f"tt.plan: outputs are some of {', '.join(known)}; got {shown(list(wanted))}.")
     measured = [name for name in wanted if name in films]
@@ -254,8 +255,8 @@ def _checked_outputs(outputs: Sequence[str] | str) -> tuple[str, ...]:
 
 
 def _film_settings(
-    film: PlannedFilm, given: FilmChoice | None, plugin: str | None, outputs: Sequence[str]
-) -> FilmChoice | None:
+    film: PlannedFilm, given: FilmLayout | None, plugin: str | None, outputs: Sequence[str]
+) -> FilmLayout | None:
     """Return the settings that a call gives, None to keep those of the scene's film, a ``plugin``, or to find them."""
     if given is not None and type(given) is not film.kind:
         others = (name for name in outputs if name in _ANY_FILM)
@@ -263,8 +264,8 @@ def _film_settings(
             f"tt.plan: outputs={tuple(outputs)} call for a {film.name} film, on which {given.argument} have no effect; "
             f"ask for outputs={(given.output, *others)}."
         )
-    if given is None and plugin != film.kind.plugin and film.kind.needed():
-        raise SceneError(film.kind.needed())
+    if given is None and plugin != film.kind.plugin and film.missing_settings():
+        raise SceneError(film.missing_settings())
     return given
 
 

@@ -34,13 +34,11 @@ from torchtransient.rendering.arguments import (
     sensor_list,
 )
 from torchtransient.rendering.autograd import rendered
-from torchtransient.rendering.films.choice import FilmChoice
-from torchtransient.rendering.films.layout import steady_channels_first
+from torchtransient.rendering.films import FilmLayout, steady_channels_first
 from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.output import RenderOutput, RenderStats
 from torchtransient.rendering.overrides import boundary_term
 from torchtransient.rendering.progress import Bar
-from torchtransient.rendering.pulse_properties import checked_pulse
 from torchtransient.rendering.sample_counts import rounded_count, samples_taken
 from torchtransient.rendering.seeds import Item, Seeding, drawn
 from torchtransient.rendering.session import RenderJob
@@ -52,6 +50,7 @@ from torchtransient.scene.parameters import ParameterInfo, missing_edges, needin
 from torchtransient.scene.physics import PhysicsWatch
 from torchtransient.scene.pilot import DepthBound, depth_bound
 from torchtransient.scene.plan import Effects
+from torchtransient.scene.pulses import checked_pulse
 from torchtransient.scene.values import as_float, fit_shape, may_have_derivative
 
 
@@ -134,7 +133,7 @@ class TransientRenderer(CopiesParametrized):
         irf: Pulse | None = None,
         gates: Sequence[Gate] | None = None,
         steady: bool = True,
-        film: FilmChoice | None = None,
+        film: FilmLayout | None = None,
         physics: str = "warn",
         boundary: bool = True,
         spp_boundary: int | None = None,
@@ -210,10 +209,11 @@ class TransientRenderer(CopiesParametrized):
         self._pulsed = all(film.pulses for film in films)
         self._response = response_of(films)
         self._scene_filter = films[0].temporal_filter
-        if not self.film.has_filter:
+        if not self.film.has_bins:
             if self.temporal_filter != "auto":
                 raise ArgumentError(
-                    f"temporal_filter: a {self.film.noun} has none, expected 'auto', got {self.temporal_filter!r}."
+                    f"temporal_filter: a {self.film.measures} film has none, expected 'auto', "
+                    f"got {self.temporal_filter!r}."
                 )
             return
         of_integrator = getattr(built.scene.integrator(), "temporal_filter", "")
@@ -292,7 +292,7 @@ class TransientRenderer(CopiesParametrized):
         """A copy with the same values and another sampler or temporal filter; None keeps what this one has."""
         if temporal_filter is not None:
             checked_filter(temporal_filter)
-        if not self.film.has_filter and temporal_filter not in (None, "auto"):
+        if not self.film.has_bins and temporal_filter not in (None, "auto"):
             raise ArgumentError(f"temporal_filter: the film has none, expected 'auto', got {temporal_filter!r}.")
         twin = copy.deepcopy(self)
         if sampler is not None:

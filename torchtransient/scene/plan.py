@@ -83,7 +83,7 @@ class Effects(abc.ABC):
         film = self.film_choice if film is None else film
         # A box of the plan's own choice stays "auto": parameters that were not planned for may call for a slope.
         decided = self.temporal_filter if self.filter_is_given or self.temporal_filter != "box" else ""
-        if temporal_filter == "auto" and decided and (film is None or film.has_filter):
+        if temporal_filter == "auto" and decided and (film is None or film.has_bins):
             temporal_filter = decided
         return film, temporal_filter
 
@@ -294,7 +294,7 @@ class Finder:
             SceneError: for an axis that cannot be found, and for unknown parameters.
             GradientError: for a filter without a slope, with parameters that change path lengths.
         """
-        wants_axis = self.draft.film.kind.has_axis and not self.draft.film.all_times and time_axis is None
+        wants_axis = self.draft.film.kind.has_bins and not self.draft.film.all_times and time_axis is None
         if pilot and (max_depth is None or wants_axis):
             self._run()
         depth = self._depth(max_depth)
@@ -302,7 +302,7 @@ class Finder:
         filter_name = self._filter(temporal_filter)
         axis = self._axis(time_axis, bins, depth, _REACH.get(filter_name, 0.0))
         report = None if self.arrivals is None else self._report(self.arrivals)
-        film = self.draft.film_choice if axis is None else self.draft.film.kind.from_argument(axis)
+        film = self.draft.film_choice if axis is None else self.draft.film.kind(axis)
         return Findings(depth, film, filter_name, tuple(self.reasons), report)
 
     def _run(self) -> None:
@@ -310,7 +310,7 @@ class Finder:
         scene = load(self.draft.scene, variant=self._pilot_variant)
         kind = self.draft.film.kind
         options = BuildOptions(
-            film=kind.film_of_pilot(self.draft.film_choice),
+            film=self.draft.film.pilot_film(self.draft.film_choice),
             merge=True,
             transient=True,
             integrator=self.draft.integrator,
@@ -419,7 +419,7 @@ class Finder:
         self, given: TimeAxis | str | None, bins: tuple[int | None, float | None], depth: int | None, reach: float = 0.0
     ) -> TimeAxis | None:
         """Return the time axis. ``reach``: bins over which the temporal filter spreads an arrival, to either side."""
-        if not self.draft.film.kind.has_axis:
+        if not self.draft.film.kind.has_bins:
             if given is not None or bins != (None, None):
                 raise ArgumentError(
                     f"tt.plan: a {self.draft.film.name} film has no time axis; leave time_axis and bins out."
@@ -496,7 +496,7 @@ class Finder:
 
     def _filter(self, given: str | None) -> str:
         kind = self.draft.film.kind
-        if not kind.has_filter and given is not None:
+        if not kind.has_bins and given is not None:
             raise ArgumentError(f"tt.plan: a {self.draft.film.name} film takes no temporal filter; leave it out.")
         table = self.draft.scene.parameters() if self.draft.parameters else {}
         for key in self.draft.parameters:
@@ -505,7 +505,7 @@ class Finder:
         self._note_edges([table[key] for key in self.draft.parameters])
         moving = needing_slope(table, self.draft.parameters)
         pulsed = bool(self.draft.pulse or self.draft.irf or self.inventory.pulsed)
-        if not kind.has_filter:
+        if not kind.has_bins:
             film = self.draft.film_choice or self.draft.described_film
             jump = "" if film is None or pulsed else film.jump()
             check_slope(moving, not jump, jump, kind.slope_remedy)

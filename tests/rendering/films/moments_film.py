@@ -21,9 +21,6 @@ class MomentsFilm(TimeResolvedFilm):
         size = self.crop_size()
         return int(size[1]), int(size[0]), self.moments, self.channel_count()
 
-    def entries_per_pixel(self):
-        return self.moments * self.channel_count()
-
     def put(self, band, base, opl_from_start, value, active):
         self._add(band, base, [[v * opl_from_start**k for v in value] for k in range(self.moments)], active)
         return mi.Float(0), mi.Float(0)

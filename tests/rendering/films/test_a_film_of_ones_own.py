@@ -1,108 +1,68 @@
-"""A new film is one plugin (`moments_film.py`), one class (`Moments`) and an entry in the list of films: renderer,
-gradients, plan, result files and command line follow.
+"""A new film is one plugin (`moments_film.py`) and one layout (`Moments`), which is listed: renderer, gradients, plan
+and result files follow.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
-import click
 import mitsuba as mi
 import pytest
 import torch
-from click.testing import CliRunner
 
 import torchtransient as tt
 from torchtransient import plugins
-from torchtransient.cli.options import scene_options
 from torchtransient.errors import ArgumentError, SceneError
 from torchtransient.files.result_file import read_result, write_result
 from torchtransient.plugins import _registry
-from torchtransient.rendering.films import choices
-from torchtransient.rendering.films.choice import CommandOption, FilmChoice, measured
-from torchtransient.rendering.films.histogram import Histogram
-from torchtransient.rendering.films.layout import cube_channels_first
+from torchtransient.rendering.films import FILMS, FilmLayout
 from torchtransient.testing.small_room import WALL_POSE, make_room
 
 VARIANT = "llvm_ad_rgb"
 
 
 @dataclass(frozen=True)
-class Moments(FilmChoice):
+class Moments(FilmLayout):
     measures: ClassVar[str] = "moments"
     plugin: ClassVar[str] = "moments_hdr_film"
     letter: ClassVar[str] = "K"
     argument: ClassVar[str] = "moments"
     example: ClassVar[str] = "film=Moments(3)"
-    output: ClassVar[str] = "moments"
-    plan_name: ClassVar[str] = "moments"
-    noun: ClassVar[str] = "moments film"
     plural: ClassVar[str] = "moments"
-    options: ClassVar[tuple[CommandOption, ...]] = (CommandOption("moments", int, "So many moments of the time."),)
+    output: ClassVar[str] = "moments"
 
-    number: int
+    number_of_moments: int
 
-    @classmethod
-    def from_argument(cls, value: Any):
-        return cls(int(value))
+    @property
+    def count(self):
+        return self.number_of_moments
 
     @classmethod
     def from_film(cls, film):
         return cls(film.moments)
 
-    @classmethod
-    def from_output(cls, output):
-        number = measured(output, "number_of_moments")
-        return None if number is None else cls(number)
+    def write(self, props):
+        props["moments"] = self.number_of_moments
+
+    def entries(self):
+        return self.attributes()
 
     @classmethod
     def from_entries(cls, values):
         return cls(int(values["number_of_moments"])) if "number_of_moments" in values else None
 
-    @classmethod
-    def from_options(cls, options):
-        return None if options.get("moments") is None else cls(options["moments"])
-
-    @property
-    def count(self):
-        return self.number
-
-    def attributes(self):
-        return {"number_of_moments": self.number}
-
-    def numbers(self):
-        return self.attributes()
-
-    def argument_value(self):
-        return self.number
-
-    def plain(self):
-        return self.number
-
-    def describe(self, temporal_filter):
-        return f"moments={self.number}"
-
-    def write(self, props):
-        props["moments"] = self.number
-
-    def channels_first(self, cube, leading, components=1):
-        return cube_channels_first(cube, leading, components)
-
-    @classmethod
-    def film_of_pilot(cls, planned):
-        return Histogram.film_of_pilot(None)
-
 
 @pytest.fixture(autouse=True)
 def _listed(monkeypatch):
-    """As if the plugin stood in `PLUGIN_MODULES` and the class in `CHOICES`."""
+    """As if the plugin stood in `PLUGIN_MODULES` and the class in `FILMS`."""
     monkeypatch.syspath_prepend(str(Path(__file__).parent))
-    monkeypatch.setattr(choices, "CHOICES", (*choices.CHOICES, Moments))
+    FILMS.append(Moments)
     mi.set_variant(VARIANT)
     plugins.register_module("moments_film", (("film", "moments_hdr_film"),))
     yield
+    FILMS.remove(Moments)
     _registry._state.third_party = []
     _registry._state.variant = None
     plugins.sync()
@@ -169,19 +129,6 @@ def test_result_files(tmp_path, ending):
     back = read_result(write_result(tmp_path / f"a.{ending}", out))
     assert torch.equal(back.others["moments"], out.others["moments"]) and back.others["number_of_moments"] == 2
     assert back.transient is None and back.channels == out.channels
-
-
-def test_command_line():
-    @click.command()
-    @scene_options
-    def command(**options):
-        click.echo(repr(choices.from_options(options)))
-
-    # the options of this list of films; the commands of the package were made before it
-    result = CliRunner().invoke(command, ["scene.xml", "--moments", "4"])
-    assert result.output.strip() == repr(Moments(4)), result.output
-    result = CliRunner().invoke(command, ["scene.xml", "--moments", "4", "--frequencies", "1"])
-    assert "--frequencies and --moments" in str(result.exception)
 
 
 def test_accuracy():

@@ -18,12 +18,9 @@ from torchtransient import plugins
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, StorageError, TorchTransientError
 from torchtransient.files.result_file import read_result, write_result
 from torchtransient.rendering import films
-from torchtransient.rendering.films import choices, layout
-from torchtransient.rendering.films.choice import FilmChoice, measured
-from torchtransient.rendering.films.gates import Gates
-from torchtransient.rendering.films.histogram import Histogram
-from torchtransient.rendering.films.phasors import Phasors
+from torchtransient.rendering.films import Gates, Histogram, Phasors, measured
 from torchtransient.rendering.output import RenderOutput, RenderStats
+from torchtransient.rendering.planned_film import planned
 
 VARIANT = "llvm_ad_rgb"
 STATS = RenderStats(
@@ -47,7 +44,7 @@ each = pytest.mark.parametrize("argument", GIVEN)
 
 
 def choice_for(argument):
-    return choices.chosen({argument: GIVEN[argument]})
+    return films.film_of_arguments({argument: GIVEN[argument]})
 
 
 def film_node(choice):
@@ -67,11 +64,11 @@ def output_of(choice, leading=(), components=1):
 
 
 def test_the_list():
-    assert list(choices.all_films()) == [Histogram, Phasors, Gates]
-    assert [type(choice_for(argument)) for argument in GIVEN] == list(choices.all_films())
+    assert list(films.FILMS) == [Histogram, Phasors, Gates]
+    assert [type(choice_for(argument)) for argument in GIVEN] == list(films.FILMS)
     for name in ("measures", "plugin", "argument", "output", "letter"):
-        assert len({getattr(kind, name) for kind in choices.all_films()}) == 3, name
-    assert all(plugins.kind_of(kind.plugin) == "film" for kind in choices.all_films())
+        assert len({getattr(kind, name) for kind in films.FILMS}) == 3, name
+    assert all(plugins.kind_of(kind.plugin) == "film" for kind in films.FILMS)
 
 
 @each
@@ -81,8 +78,8 @@ def test_plugin_and_back(argument):
     choice = choice_for(argument)
     film = mi.load_dict(film_node(choice))
     assert film.plugin == choice.plugin and film.measures == choice.measures
-    assert choices.of_film(film) == choice and choices.of_plugin(choice.plugin) is type(choice)
-    assert bool(film.temporal_filter) == choice.has_filter
+    assert films.layout_of_film(film) == choice and films.layout_of_plugin(choice.plugin) is type(choice)
+    assert bool(film.temporal_filter) == choice.has_bins
     assert film.cube_shape()[2] == choice.count
 
 
@@ -91,7 +88,7 @@ def test_values_that_compare_travel_and_print(argument):
     choice = choice_for(argument)
     assert choice == choice_for(argument) and hash(choice) == hash(choice_for(argument))
     assert pickle.loads(pickle.dumps(choice)) == copy.deepcopy(choice) == choice
-    assert choice.argument_value() == GIVEN[argument]
+    assert choice.settings == GIVEN[argument]
     assert json.loads(json.dumps(choice.plain())) is not None
     assert argument in repr(choice) or "axis" in repr(choice)
 
@@ -102,11 +99,11 @@ def test_values_that_compare_travel_and_print(argument):
 def test_output_and_file(tmp_path, argument, ending, leading, components):
     choice = choice_for(argument)
     out = output_of(choice, leading, components)
-    assert choices.of_output(out) == choice and not out.others
+    assert films.layout_of_output(out) == choice and not out.others
     for name in ("transient", "phasor", "gated"):
         assert (getattr(out, name) is None) == (name != choice.measures)
     back = read_result(write_result(tmp_path / f"a.{ending}", out))
-    assert choices.of_output(back) == choice
+    assert films.layout_of_output(back) == choice
     assert torch.equal(choice.tensor(back), choice.tensor(out)) and torch.equal(back.steady, out.steady)
 
 
@@ -157,9 +154,9 @@ def test_files_that_do_not_fit_together(tmp_path):
 
 
 def test_one_film_is_asked_for():
-    assert choices.chosen({}) is None and choices.chosen({"gates": None}) is None
-    with pytest.raises(ArgumentError, match="a histogram, a phasor film or a gated film; give one of them"):
-        choices.chosen({"time_axis": GIVEN["time_axis"], "gates": GIVEN["gates"]})
+    assert films.film_of_arguments({}) is None and films.film_of_arguments({"gates": None}) is None
+    with pytest.raises(ArgumentError, match="a transient film, a phasor film or a gated film; give one of them"):
+        films.film_of_arguments({"time_axis": GIVEN["time_axis"], "gates": GIVEN["gates"]})
     room = tt.scenes.cornell_box(4)
     with pytest.raises(ArgumentError, match="film, time_axis"):
         tt.TransientRenderer(room, film=choice_for("gates"), time_axis=GIVEN["time_axis"])
@@ -168,11 +165,6 @@ def test_one_film_is_asked_for():
     for wrong in ({"time_axis": 3.0}, {"gates": ["rectangular 1 2"]}, {"frequencies": [float("nan")]}):
         with pytest.raises(TorchTransientError):
             tt.TransientRenderer(room, **wrong)
-
-
-def test_where_the_pages_say_that_they_are():
-    for kind in choices.all_films():
-        assert getattr(films, kind.__name__) is kind
 
 
 @pytest.mark.parametrize(
@@ -190,9 +182,10 @@ def test_objects_take_what_their_keywords_take(given, argument):
 
 def test_a_single_setting():
     gate = GIVEN["gates"][0]
-    assert Gates(gate) == Gates([gate]) == choices.chosen({"gates": gate}) and Gates(gate).count == 1
+    assert Gates(gate) == Gates([gate]) == films.film_of_arguments({"gates": gate}) and Gates(gate).count == 1
     for numbers in ([0.5], (0.5,), 0.5, torch.tensor([0.5]), np.array([0.5])):
-        assert Phasors(numbers) == Phasors(tt.FrequencyAxis((0.5,))) == choices.chosen({"frequencies": numbers})
+        found = films.film_of_arguments({"frequencies": numbers})
+        assert Phasors(numbers) == Phasors(tt.FrequencyAxis((0.5,))) == found
     axis = GIVEN["time_axis"]
     assert tt.TransientRenderer(tt.scenes.cornell_box(4), film=Gates([gate])).gates == (gate,)
     assert Histogram(axis).axis == axis
@@ -222,62 +215,25 @@ def test_an_object_says_the_same_as_the_argument(argument):
     assert named.film == plain.film == choice_for(argument) and repr(named) == repr(plain)
 
 
-@pytest.mark.parametrize(
-    "options, expected",
-    [
-        ({"start_opl": 3.5, "bin_width_opl": 0.25, "num_bins": 5}, "time_axis"),
-        ({"frequencies": "0, 0.5,-2", "gates": None}, Phasors(tt.FrequencyAxis((0.0, 0.5, -2.0)))),
-        ({"gates": "rectangular 3 4; gaussian 7.0 0.5; tabulated 1:0 2:1 4:0"}, "gates"),
-        ({"start_opl": None, "frequencies": None}, None),
-    ],
-)
-def test_command_line(options, expected):
-    assert choices.from_options(options) == (choice_for(expected) if isinstance(expected, str) else expected)
-
-
-@pytest.mark.parametrize(
-    "options, message",
-    [
-        ({"num_bins": 5}, "give all"),
-        ({"start_opl": 0.0, "bin_width_opl": 1.0}, "give all"),
-        ({"start_opl": 0.0, "num_bins": 5}, "give all"),
-        ({"bin_width_opl": 1.0, "num_bins": 5}, "give all"),
-        ({"frequencies": "1, two"}, r"--frequencies: expected numbers with commas, got '1, two'"),
-        ({"frequencies": "1", "gates": "rectangular 1 2"}, "--frequencies and --gates ask for different films"),
-        ({"gates": "round 1 2"}, "kind out of"),
-    ],
-)
-def test_command_lines_that_ask_for_nothing(options, message):
-    with pytest.raises(TorchTransientError, match=message):
-        choices.from_options(options)
-
-
 def test_films_that_are_not_ours(monkeypatch):
     mi.set_variant(VARIANT)
     ours = mi.load_dict(film_node(choice_for("gates")))
     with monkeypatch.context() as patch:
         patch.setattr(type(ours), "measures", "colour of time", raising=False)
         with pytest.raises(SceneError, match=r"'gated_hdr_film' measures 'colour of time', expected one of transient"):
-            choices.of_film(ours)
+            films.layout_of_film(ours)
     with pytest.raises(SceneError, match=r"transient_hdr_film, phasor_hdr_film, gated_hdr_film.*time_axis="):
-        choices.of_film(mi.load_dict({"type": "hdrfilm"}))
-
-
-def test_what_a_film_has_no_video_of():
-    class Still(Histogram):
-        write_video = FilmChoice.write_video
-
-    with pytest.raises(ArgumentError, match="--video shows nothing of transients"):
-        Still(GIVEN["time_axis"]).write_video(None, "a.mp4", False)
+        films.layout_of_film(mi.load_dict({"type": "hdrfilm"}))
 
 
 def test_settings_in_a_scene():
-    assert Gates.settings_in({}) is None
-    assert Gates.settings_in({"gates": "rectangular 3 4"}) == Gates(GIVEN["gates"][0])
+    assert Gates.from_properties({}) is None and Phasors.from_properties({"frequencies": "1"}) is None
+    assert Gates.from_properties({"gates": "rectangular 3 4"}) == Gates(GIVEN["gates"][0])
     with pytest.raises(SceneError, match=r"gated_hdr_film: .*kind out of"):
-        Gates.settings_in({"gates": "round 1 2"})
-    assert Histogram.axis_in({}) == tt.TimeAxis(0.0, 0.003, 2048)
-    assert Histogram.axis_in({"start_opl": 2, "bin_width_opl": 0.5, "temporal_bins": 7}) == tt.TimeAxis(2.0, 0.5, 7)
+        Gates.from_properties({"gates": "round 1 2"})
+    assert Histogram.from_properties({}) == Histogram(tt.TimeAxis(0.0, 0.003, 2048))
+    found = Histogram.from_properties({"start_opl": 2, "bin_width_opl": 0.5, "temporal_bins": 7})
+    assert found == Histogram(tt.TimeAxis(2.0, 0.5, 7))
 
 
 @each
@@ -287,7 +243,7 @@ def test_outputs_and_files_without_the_film(argument):
     kind, output = type(choice), output_of(choice)
     assert kind.from_output(output) == choice
     without = replace(output, **{kind.measures: None})
-    assert kind.from_output(without) is None and choices.of_output(without) is None
+    assert kind.from_output(without) is None and films.layout_of_output(without) is None
     assert kind.from_output(replace(output, **dict.fromkeys(choice.attributes()))) is None
     for other in GIVEN:
         if other != argument:
@@ -317,15 +273,15 @@ def test_layouts_of_torch(leading, components):
 
     steady, cube, pairs = drawn("hwsc"), drawn("hwtsc"), drawn("hwlmtsc")
     layouts = (
-        (layout.steady_channels_first, steady, "hwsc", "schw"),
-        (layout.cube_channels_first, cube, "hwtsc", "scthw"),
-        (layout.cube_channels_first, pairs, "hwlmtsc", "sctlmhw"),
+        (films.steady_channels_first, steady, "hwsc", "schw"),
+        (films.cube_channels_first, cube, "hwtsc", "scthw"),
+        (films.cube_channels_first, pairs, "hwlmtsc", "sctlmhw"),
     )
     for function, values, letters, order in layouts:
         found = function(joined(values), leading, components).numpy()
         np.testing.assert_array_equal(found, expected(values, letters, order))
     waves = cube[..., None] * np.array([2.0, -3.0])
-    found = layout.phasor_channels_first(torch.from_numpy(waves.reshape(*items, 2, 3, 4, -1)), leading, components)
+    found = films.phasor_channels_first(torch.from_numpy(waves.reshape(*items, 2, 3, 4, -1)), leading, components)
     np.testing.assert_allclose(found.numpy(), expected(cube * (2 - 3j), "hwtsc", "scthw"), rtol=1e-12)
 
 
@@ -337,24 +293,11 @@ def test_what_is_planned_for_outputs():
         (("steady", "transient"), "transient", "transients are asked for", False),
         (("peak_time",), "transient", "peak_time over time is asked for", False),
     ):
-        found = Histogram.planned(outputs)
+        found = planned(outputs)
         assert (found.name, found.all_times) == (name, all_times) and words in found.reason
     asked = {"peak_time": Histogram, "phasor": Phasors, "gates": Gates, "transient": Histogram}
-    assert [choices.planned(["steady", name]).kind for name in asked] == list(asked.values())
-    assert choices.planned(["phasor"]).reason == "film: phasor, since phasors are asked for; no time axis is stored"
-
-
-@pytest.mark.parametrize("given", [{"start_opl": 0.0}, {"bin_width_opl": 1.0}, {"num_bins": 5}])
-def test_no_part_of_an_axis_is_given_alone(given):
-    with pytest.raises(ArgumentError, match="replace the scene's axis together: give all"):
-        Histogram.from_options(given)
-    assert Histogram.from_options({"start_opl": None, "frequencies": "1"}) is None
-
-
-def test_options_of_two_films_are_named_by_their_first():
-    axis = {"start_opl": 3.5, "bin_width_opl": 0.25, "num_bins": 5}
-    with pytest.raises(ArgumentError, match=r"^--start-opl and --gates ask for different films"):
-        choices.from_options({**axis, "gates": "rectangular 1 2"})
+    assert [planned(["steady", name]).kind for name in asked] == list(asked.values())
+    assert planned(["phasor"]).reason == "film: phasor, since phasors are asked for; no time axis is stored"
 
 
 def test_histograms_of_files_have_an_axis_and_an_array():
@@ -362,7 +305,6 @@ def test_histograms_of_files_have_an_axis_and_an_array():
     assert Histogram.from_entries({**axis, "transient": 0}) == choice_for("time_axis")
     assert Histogram.from_entries(axis) is None
     assert Histogram.from_entries({"start_opl": 3.5, "bin_width_opl": 0.25, "transient": 0}) is None
-    assert Gates.tensor_in({"transient": 3}) == 3 and Gates.tensor_in({"transient": 3, "gated": 4}) == 4
 
 
 def test_what_an_object_holds_under_a_name():
@@ -372,9 +314,9 @@ def test_what_an_object_holds_under_a_name():
 
 
 def test_plugins_in_words():
-    assert choices.plugins_in_words() == "transient_hdr_film, phasor_hdr_film, gated_hdr_film"
-    assert choices.plugins_in_words([Gates, Histogram]) == "gated_hdr_film, transient_hdr_film"
-    assert choices.of_plugin("hdrfilm") is None
+    assert films.film_plugins() == "transient_hdr_film, phasor_hdr_film, gated_hdr_film"
+    assert films.film_plugins([Gates, Histogram]) == "gated_hdr_film, transient_hdr_film"
+    assert films.layout_of_plugin("hdrfilm") is None
     assert Histogram.fits("streak_hdr_film") and not Gates.fits("transient_hdr_film") and Gates.fits("gated_hdr_film")
 
 

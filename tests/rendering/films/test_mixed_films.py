@@ -13,7 +13,7 @@ import torchtransient as tt
 from support.marks import long_rows
 from torchtransient import plugins
 from torchtransient.errors import ArgumentError, GradientError, SceneError
-from torchtransient.plugins.films import pulsed_filter
+from torchtransient.plugins.films import temporal_filters
 from torchtransient.rendering.overrides import temporal_filter
 from torchtransient.testing.small_room import GREY, WALL_POSE, make_room
 
@@ -211,13 +211,13 @@ def test_every_film_of_a_call_needs_a_slope():
 
 def test_a_render_makes_no_table_twice(monkeypatch):
     """The kernel table of a pulse is made with the film and for every filter that is used, not for every render."""
-    calls, original = [], pulsed_filter.cumulative_of_sum
+    calls, original = [], temporal_filters.cumulative_of_sum
 
     def counting(*arguments):
         calls.append(arguments)
         return original(*arguments)
 
-    monkeypatch.setattr(pulsed_filter, "cumulative_of_sum", counting)
+    monkeypatch.setattr(temporal_filters, "cumulative_of_sum", counting)
     pulsed = {**HISTOGRAM, "pulse": "gaussian", "pulse_fwhm_opl": 0.5}
     scene = tt.load(room_of(pulsed, gaussian_stddev=0.5), variant=VARIANT)
     renderer = tt.TransientRenderer(scene, parameters=[GREY], spp=2)

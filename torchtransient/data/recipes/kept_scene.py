@@ -115,8 +115,9 @@ class Kept:
         bounces, energy, scan = settings.bounces, settings.energy, self.scan
         # What stands in the way of laser or sensor is no capture.
         common |= {"bounces": bounces, "energy": energy, "variant": self.recipe.variant, "physics": "error"}
-        with self._keys_told(lambda: load(capture_scene(given, scan, bounces=bounces, energy=energy),
-            variant=self.recipe.variant)):
+        with self._keys_told(
+            lambda: load(capture_scene(given, scan, bounces=bounces, energy=energy), variant=self.recipe.variant)
+        ):
             renderer = CaptureRenderer(given, scan, parameters=self.keys, **common).renderer
         if settings.physics == "ignore":
             # Of light outside of the window the share is told.
@@ -150,7 +151,7 @@ class Kept:
     def _settle_filter(self) -> None:
         """Not another filter because a pose varies: nobody asks for derivatives here."""
         renderer = self.renderer
-        if renderer.film.has_filter and renderer.temporal_filter == "auto":
+        if renderer.film.has_bins and renderer.temporal_filter == "auto":
             renderer.temporal_filter = renderer._scene_filter
 
     def _places(self) -> dict[str, Place]:

@@ -14,7 +14,7 @@ from torchtransient.plugins._registry import register
 from torchtransient.plugins.bsdfs import delay_table
 from torchtransient.plugins.bsdfs.delay_table import SpectralShift
 from torchtransient.plugins.bsdfs.ior import opaque
-from torchtransient.plugins.films.pulsed_filter import numbers_of
+from torchtransient.plugins.films.temporal_filters import numbers_of
 from torchtransient.plugins.parameter_effect import VALUE, ParameterEffect, declare_effects
 from torchtransient.plugins.properties import number
 from torchtransient.pulses import Pulse

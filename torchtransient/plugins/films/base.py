@@ -1,6 +1,9 @@
-"""What every time-resolved film shares: storage in bands of rows, the steady image, sampling of the spatial filter."""
+"""Base of time-resolved films: storage in bands of rows, the steady image, sampling of the spatial filter."""
 
 from __future__ import annotations
+
+import abc
+import math
 
 import drjit as dr
 import mitsuba as mi
@@ -11,11 +14,39 @@ from torchtransient.interfaces import FilmInterface
 from torchtransient.plugins.described_scene import note_scene
 from torchtransient.plugins.drjit_pool import threads_for_files
 from torchtransient.plugins.films.block import AdjointBlock, FilmBlock
-from torchtransient.plugins.films.plain_image import bitmap_of, plain_image
-from torchtransient.plugins.films.response import SensorResponse
+from torchtransient.plugins.films.colour import SensorResponse
 from torchtransient.plugins.frozen_state import says_it_can_be_recorded
 from torchtransient.plugins.parameter_effect import ANY_KEY, VALUE, declare_effects
 from torchtransient.plugins.properties import number, truth, whole_number
+
+
+def plain_image(film):
+    """An ``hdrfilm`` like ``film``, in single precision: RGB, or luminance in monochromatic variants."""
+    size, crop, offset = film.size(), film.crop_size(), film.crop_offset()
+    return mi.load_dict(
+        {
+            "type": "hdrfilm",
+            "width": int(size[0]),
+            "height": int(size[1]),
+            "crop_width": int(crop[0]),
+            "crop_height": int(crop[1]),
+            "crop_offset_x": int(offset[0]),
+            "crop_offset_y": int(offset[1]),
+            "pixel_format": "luminance" if mi.is_monochromatic else "rgb",
+            "component_format": "float32",
+            "sample_border": film.sample_border(),
+            "rfilter": film.rfilter(),
+        }
+    )
+
+
+def bitmap_of(steady, names):
+    """The steady image ``(H, W, C)`` as a bitmap; ``names`` of its channels."""
+    if tuple(names) in (("L",), ("R", "G", "B")) and steady.shape[2] == len(names):
+        return mi.Bitmap(steady)
+    stokes = [f"{name}.S{s}" for s in range(4) for name in names] if steady.shape[2] > len(names) else list(names)
+    return mi.Bitmap(steady, mi.Bitmap.PixelFormat.MultiChannel, channel_names=stokes)
+
 
 # Dr.Jit arrays are indexed with 32 bits; a larger cube is stored in bands of whole rows.
 MAX_ARRAY_ENTRIES = 2**32 - 1
@@ -47,27 +78,94 @@ class TimeResolvedFilm(mi.Film):
     ``exhaustive_scan`` (bool, false), ``laser_scan_width``, ``laser_scan_height`` (int, 0): one array for every pair of
     sensor and laser position, ``(H, W, Lh, Lw, ...)``; the steady image is the sum over the laser's positions.
 
-    What it has to offer is declared in :class:`torchtransient.interfaces.FilmInterface`. A subclass adds ``plugin``
-    (its name in messages) and ``measures`` (``transient``, ``phasor``, ``gated``, ...: what its array is), the shape of
-    that array (``cube_shape``, ``entries_per_array``), and how an arrival meets it: ``put``, its derivative
-    ``put_slope`` and its adjoint ``read``. A class that lacks one of them is refused where it is registered.
+    A subclass owes the abstract members: ``plugin``, ``measures``, ``cube_shape``, and ``put``, which adds an arrival
+    to the array, with its derivative ``put_slope`` and its adjoint ``read``. A class that lacks one of them is refused
+    where it is registered. Everything else has a default; integrators and the renderer use no member beyond these.
 
-    Children that are spectra are the response curves of the film's channels (``curves``), see :mod:`.response`.
+    Path lengths are handed over as ``opl - start_opl`` in double precision. The array is stored in bands of whole
+    rows, since Dr.Jit's indices have 32 bits; a *band* is given by its number, a *base* is the index of a pixel's first
+    value in it. While a film holds a render, it has ``bands`` ((first row, rows, flat array) each), ``steady`` and
+    ``outside`` (light before and after the window by pixel, None for films without a window).
+
+    Children that are spectra are the response curves of the film's channels (``curves``,
+    :class:`.colour.SensorResponse`).
 
     Integrators that know nothing of time (``path``, ``aov``, ``prb``, those of users) render an image to it, as to an
     ``hdrfilm``: RGB whatever the response curves, luminance in monochromatic variants, then what ``aov`` adds.
     """
 
+    # One array for every pair of sensor and laser position.
     exhaustive_scan = False
+    # There is a steady image beside the array, of light at any time; otherwise it is the sum over the array.
     keeps_steady = True
+    # There is a window that light can miss, which is then counted in `outside`.
     has_window = True
-    # Whether ``put`` takes the word that every lane has an array of its own.
+    # `put` takes `exclusive`: every lane has an array of its own, so that sums need not be atomic.
     knows_exclusive_lanes = False
-    # Whether ``put`` takes the word that most lanes add something at once.
+    # `put` takes `crowded`: most lanes add something at once.
     knows_crowds = False
-    slope_remedy = "Set temporal_filter to 'tent' or 'gaussian'."
+    # The array changes smoothly with path lengths; otherwise the end of an error message that says what to do.
     has_slope = True
+    slope_remedy = "Set temporal_filter to 'tent' or 'gaussian'."
+    # Pulse of the light and impulse response of the sensor that spread every arrival.
     pulses = ()
+
+    # ------------------------------------------------------------------------------------------ what a film owes
+
+    @property
+    @abc.abstractmethod
+    def plugin(self) -> str:
+        """Name of the plugin, for messages."""
+
+    @property
+    @abc.abstractmethod
+    def measures(self) -> str:
+        """Name of the measurement: ``transient``, ``phasor``, ``gated``, or the word of a film of one's own."""
+
+    @abc.abstractmethod
+    def cube_shape(self) -> tuple[int, ...]:
+        """Return the shape of the array of the crop window: (H, W, entries, channels).
+
+        In an exhaustive scan it is (H, W, Lh, Lw, entries, channels).
+        """
+
+    @abc.abstractmethod
+    def put(self, band, base, opl_from_start, value, active, exclusive=False):
+        """Add a contribution to the array.
+
+        Args:
+            band: number of the band.
+            base: index of the pixel's first value in the band.
+            opl_from_start: ``opl - start_opl`` of the arrival, ``Float64``.
+            value: contribution by channel.
+            active: mask of lanes.
+            exclusive: no two lanes have the same base; for films with ``knows_exclusive_lanes`` alone. Films with
+                ``knows_crowds`` take ``crowded`` too.
+
+        Returns:
+            The fractions of the contribution before and after the window, which are not stored.
+        """
+
+    @abc.abstractmethod
+    def put_slope(self, band, base, opl_from_start, d_value, value_d_opl, active):
+        """Add ``k df + f k' dtau`` in forward mode, with ``df`` and ``f dtau`` by channel; arguments as in ``put``."""
+
+    @abc.abstractmethod
+    def read(self, adjoint, base, opl_from_start, active, steady=None):
+        """Adjoint of ``put`` at an arrival.
+
+        Args:
+            adjoint: (flat array, stride of entries, stride of channels), or None.
+            base: index of the pixel's first value in the array.
+            opl_from_start: ``opl - start_opl`` of the arrival, ``Float64``.
+            active: mask of lanes.
+            steady: adjoint of the sum over the array by channel, for films without a steady image of their own.
+
+        Returns:
+            ``A`` and its slope ``dA / d opl``, lists over channels.
+        """
+
+    # ------------------------------------------------------------------------------------------------ parameters
 
     def __init__(self, props):
         super().__init__(props)
@@ -152,33 +250,57 @@ class TimeResolvedFilm(mi.Film):
 
     @property
     def temporal_filter(self) -> str:
-        """A film without a filter answers so."""
+        """Name of the temporal filter, empty for films without one."""
         return ""
 
     @property
     def response_name(self) -> str:
+        """Name of the response over time in messages."""
         return self.temporal_filter
 
     def take_filter(self, name: str, stddev: float | None):
-        pass
+        """Replace the temporal filter; an empty name and None leave it, and films without one ignore the call."""
 
     def arrivals(self):
-        return None
+        """Return the :class:`~.block.ArrivalWindow` of a film without a steady image, None where all light counts."""
+        return
 
     def lanes_at_most(self, most_events: int) -> int | None:
+        """Return the largest number of paths of up to ``most_events`` events in a launch, None for no limit."""
         return None
 
     def create_event_block(
         self, job, base, match, most_events: int, tangents=False, exclusive=False, origin=None
     ) -> FilmBlock:
+        """Return the block that samples of a launch write to.
+
+        Args:
+            job: launch, with the number of its band.
+            base: index of each sample's first entry in the band.
+            match: :class:`~.colour.ChannelMatch` of the samples.
+            most_events: events of a path at most.
+            tangents: events are derivatives (``put_slope``) instead of contributions (``put``).
+            exclusive: every sample has a base of its own.
+            origin: path length (``Float64``, by sample) that those of the events are counted from, which may come in
+                single precision then; None for zero.
+        """
         return FilmBlock(self, job.band, base, match, exclusive and self.knows_exclusive_lanes, origin)
 
     def create_adjoint_block(self, response, base, steady, match) -> AdjointBlock:
+        """Return the block that samples of a launch read the adjoint from.
+
+        Args:
+            response: adjoint of the array as (flat array, stride of entries, stride of channels), or None.
+            base: index of each sample's first entry in it.
+            steady: adjoint of the steady image by channel.
+            match: :class:`~.colour.ChannelMatch` of the samples.
+        """
         return AdjointBlock(self, response, base, steady, match)
 
     # ---------------------------------------------------------------------------------------- storage
 
     def channel_count(self) -> int:
+        """Return the number of channels, times four in polarized variants: all of S0, then S1, S2, S3."""
         return len(self.channel_names()) * (4 if mi.is_polarized else 1)
 
     def channel_names(self) -> tuple[str, ...]:
@@ -197,8 +319,12 @@ class TimeResolvedFilm(mi.Film):
         """The dimensions of an array that belong to the laser: (Lh, Lw), or none."""
         return (self.laser_scan_height, self.laser_scan_width) if self.exhaustive_scan else ()
 
+    def entries_per_array(self) -> int:
+        """Return the number of floats of one pixel and laser position."""
+        return math.prod(self.cube_shape()[-2:])
+
     def entries_per_pixel(self) -> int:
-        """Floats behind one pixel."""
+        """Return the number of floats behind one pixel."""
         return self.laser_count() * self.entries_per_array()
 
     def pixel_base(self, base, laser):
@@ -220,10 +346,12 @@ class TimeResolvedFilm(mi.Film):
         return min(rows, int(self.crop_size()[1]))
 
     def band_layout(self) -> list[tuple[int, int]]:
+        """Return first row and number of rows of every band."""
         height, rows = self.cube_shape()[0], self.band_rows()
         return [(first, min(rows, height - first)) for first in range(0, height, rows)]
 
     def start_render(self, samples: int = 0):
+        """Allocate zeroed storage for a render of ``samples`` per pixel."""
         height, width = self.cube_shape()[:2]
         real = mi.Float64 if samples > MAX_SINGLE_PRECISION_SAMPLES else mi.Float
         per_row = width * self.entries_per_pixel()
@@ -256,6 +384,7 @@ class TimeResolvedFilm(mi.Film):
                 dr.scatter_reduce(dr.ReduceOp.Add, self.outside, type(self.outside)(value), pixel * 2 + side)
 
     def finish_render(self):
+        """Round sums to single precision, and sum up the steady image of a film that keeps none."""
         if dr.type_v(self.steady) != dr.type_v(mi.Float):
             self.bands = [(first, rows, mi.Float(flat)) for first, rows, flat in self.bands]
             self.steady = mi.Float(self.steady)
@@ -273,32 +402,42 @@ class TimeResolvedFilm(mi.Film):
             dr.scatter(self.steady, total.array, index)
 
     def clear(self):
+        """Drop the storage; tensors that were developed before keep their memory."""
         self.bands, self.steady, self.outside = [], None, None
         if self._image is not None:
             self._image.clear()
 
     def can_borrow(self, samples):
+        """Return whether renders of ``samples`` per pixel can add to an array that is lent (:meth:`lend`)."""
         # Samplers may round up; a sum over the array needs one that starts with the film; classes made out of this one
         # may have storage of their own.
         in_single = 4 * samples <= MAX_SINGLE_PRECISION_SAMPLES and says_it_can_be_recorded(self)
         return in_single and len(self.band_layout()) == 1 and self.keeps_steady
 
     def lend(self, storage):
+        """Let renders add to ``(flat array of zeros, first entry)`` instead of an array of their own, until None."""
         self._lent = storage
 
     def first_entry(self):
+        """Return the index of the film's first value in its band (``UInt32``), which is added to a base; None for 0."""
         return None if self._lent is None else dr.opaque(mi.UInt32, self._lent[1])
 
     def taken(self):
+        """Return the arrays of a finished render as :meth:`hold` takes them; the film keeps none of them.
+
+        Other arrays of the film stay: Dr.Jit writes attributes of plugins back after a recorded call.
+        """
         arrays = [self.steady, self.outside, *(band[2] for band in self.bands)]
         self.clear()
         return arrays
 
     def hold(self, arrays):
+        """Take arrays of :meth:`taken` as those of a render."""
         self.steady, self.outside, *stored = arrays
         self.bands = [(first, rows, flat) for (first, rows), flat in zip(self.band_layout(), stored, strict=True)]
 
     def transient_bands(self):
+        """Return the storage as (first row, rows, flat array) for each band."""
         return self.bands
 
     def band_array(self, band: int):
@@ -306,6 +445,7 @@ class TimeResolvedFilm(mi.Film):
         return self.bands[band][2]
 
     def check_one_band(self):
+        """Raise ``StorageError`` where the array does not fit into one tensor."""
         if self.band_rows() < int(self.crop_size()[1]):
             raise StorageError(
                 f"{self.plugin}: the cube {self.cube_shape()} exceeds the 2^32 values of one tensor; render with "
@@ -328,6 +468,7 @@ class TimeResolvedFilm(mi.Film):
         return steady, mi.TensorXf(self.bands[0][2], shape)
 
     def energies_outside(self):
+        """Return light before and after the window: sums over pixels, means over channels (of S0)."""
         if self.outside is None:
             return 0.0, 0.0
         before, after = np.array(self.outside).reshape(-1, 2).sum(0, dtype=np.float64)
@@ -335,16 +476,18 @@ class TimeResolvedFilm(mi.Film):
 
     @property
     def energy_before(self) -> float:
+        """Light before the window."""
         return self.energies_outside()[0]
 
     @property
     def energy_after(self) -> float:
+        """Light after the window."""
         return self.energies_outside()[1]
 
     # ----------------------------------------------------------------------------------- pixel sampling
 
     def tabulate_filter(self):
-        """Make the density that offsets are drawn from, where there is none yet: outside of recorded code."""
+        """Tabulate the density of :meth:`sample_offset` once; called before anything is recorded."""
         rfilter = self.rfilter()
         if rfilter.is_box_filter() or self._offset_distribution is not None:
             return
@@ -368,6 +511,7 @@ class TimeResolvedFilm(mi.Film):
         )
 
     def sample_offset(self, sample):
+        """Return an offset from the pixel's centre drawn from the spatial filter, and its weight (None for one)."""
         rfilter = self.rfilter()
         if rfilter.is_box_filter():
             return sample - 0.5, None

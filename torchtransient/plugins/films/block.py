@@ -1,7 +1,7 @@
-"""The film's side of the samples in flight, as the integrators' loops see it.
+"""Samples in flight as a film sees them: blocks that write events and read adjoints, and windows of arrivals.
 
 Plain objects, which Dr.Jit loops leave alone: the arrays in them are targets of scatters, not loop state. What a film
-has to carry along a path is in ``events``, which belongs to the loop.
+carries along a path is in ``events``, which belongs to the loop.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class FilmBlock:
         self.exclusive, self.origin = exclusive, origin
 
     def begin(self):
-        """What the film carries along a path: loop state, handed back at every event."""
+        """Return the state that the film carries along a path: loop state, handed back at every event."""
         return {}
 
     def put(self, events, opl, value, active, crowded=False):
@@ -83,11 +83,65 @@ class AdjointBlock:
         return self.match.to_spectrum(A), None if slope is None else self.match.to_spectrum(slope)
 
     def together(self, most, with_slope):
-        """How many arrivals of a path, which has ``most``, are read at once and ahead, 0 where each is read when it is
-        asked for: of films where reading costs more than to keep what was read.
+        """Return the number of arrivals, out of ``most`` of a path, that are read at once and ahead.
+
+        0 where each is read by itself; more in films where reading costs more than keeping.
         """
         return 0
 
     def read_together(self, opls, with_slope, active):
         """(A, its slope or None) by channel, for each of several arrivals."""
         raise NotImplementedError
+
+
+class ArrivalWindow:
+    """Arrivals between ``first`` and ``last`` (metres after the film's ``start_opl``) count, others do not.
+
+    No later event of a path can count once the path itself is longer than ``last``. A plain object, which Dr.Jit loops
+    leave alone.
+    """
+
+    def __init__(self, first: float, last: float):
+        self.first, self.last = float(first), float(last)
+
+    def counts(self, opl):
+        """Return a mask of arrivals at ``opl`` (``Float64``) that can count."""
+        return (opl >= self.first) & (opl < self.last)
+
+    def over(self, opl):
+        """Return a mask of lengths ``opl`` after which nothing can count."""
+        return opl >= self.last
+
+
+class GappedWindow(ArrivalWindow):
+    """A window in which equal cells of time count or not, for gates with gaps in between."""
+
+    def __init__(self, first: float, last: float, cells):
+        super().__init__(first, last)
+        self._cells = mi.UInt32(cells)
+        self._scale = len(cells) / (self.last - self.first)
+
+    def counts(self, opl):
+        inside = super().counts(opl)
+        cell = mi.UInt32(dr.select(inside, (opl - self.first) * self._scale, 0))
+        cell = dr.minimum(cell, dr.width(self._cells) - 1)
+        return dr.gather(mi.UInt32, self._cells, cell, inside) == 1
+
+
+class BinLayout:
+    """Place of one event in a film: arrays, index of the histogram's first value, strides, bins and channels."""
+
+    def __init__(self, flat, base, bin_stride, channel_stride, bins, channels, exclusive=False):
+        self.flat, self.base = flat, base
+        self.bin_stride, self.channel_stride = bin_stride, channel_stride
+        self.bins, self.channels = bins, channels
+        self.mode = reduce_mode(exclusive)
+
+
+def reduce_mode(exclusive, direct=False):
+    """Return the mode of lanes that share their target with others (``Auto``: atomically, equal addresses together),
+    or that have one of their own. ``direct``: each lane by itself.
+    """
+    if exclusive:
+        return dr.ReduceMode.NoConflicts
+    return dr.ReduceMode.Direct if direct else dr.ReduceMode.Auto

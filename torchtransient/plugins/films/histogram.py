@@ -8,13 +8,16 @@ import mitsuba as mi
 from torchtransient.errors import SceneError
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.films.base import TimeResolvedFilm
-from torchtransient.plugins.films.block import FilmBlock
-from torchtransient.plugins.films.long_kernel import BinLayout, reduce_mode
-from torchtransient.plugins.films.long_kernel import put as put_long
-from torchtransient.plugins.films.long_kernel import read as read_long
-from torchtransient.plugins.films.pulsed_filter import PulsedFilter, pulse_of
-from torchtransient.plugins.films.temporal_filter import check_name, check_stddev, make_temporal_filter
-from torchtransient.plugins.films.window import ArrivalWindow
+from torchtransient.plugins.films.block import ArrivalWindow, BinLayout, FilmBlock, reduce_mode
+from torchtransient.plugins.films.temporal_filters import (
+    PulsedFilter,
+    check_name,
+    check_stddev,
+    make_temporal_filter,
+    pulse_of,
+    put_long,
+    read_long,
+)
 from torchtransient.plugins.properties import number, truth, whole_number
 
 # Kernels of more bins are looped over instead of written out.
@@ -63,7 +66,7 @@ class TransientHDRFilm(TimeResolvedFilm):
     ``temporal_bins`` (int, 2048), ``bin_width_opl`` (float, 0.003), ``start_opl`` (float, 0)
         Bins ``[start_opl + k bin_width_opl, start_opl + (k + 1) bin_width_opl)`` over optical path length in metres.
     ``temporal_filter`` (``box`` | ``tent`` | ``gaussian``; box), ``gaussian_stddev`` (float, 0.5 bins)
-        How an arrival spreads over the bins, see :mod:`.temporal_filter`.
+        How an arrival spreads over the bins, see :mod:`.temporal_filters`.
     ``exhaustive_scan`` (bool, false), ``laser_scan_width``, ``laser_scan_height`` (int, 0)
         One histogram for every pair of sensor and laser position; layout ``(H, W, Lh, Lw, T, C)``.
 
@@ -71,14 +74,14 @@ class TransientHDRFilm(TimeResolvedFilm):
         Shape of the light's pulse and impulse response of the sensor, densities over optical path length: every arrival
         is spread by both. ``pulse_fwhm_opl``; ``pulse_width_opl``; ``pulse_opl`` and ``pulse_values`` (numbers between
         spaces or commas) give the shape, ``pulse_center_opl`` (0) shifts it; the same for ``irf``. See
-        :mod:`.pulsed_filter`. With one of them every temporal filter has a slope.
+        :class:`.temporal_filters.PulsedFilter`. With one of them every temporal filter has a slope.
     ``steady`` (bool, true)
         False: no steady image is asked for. Paths end where they are longer than the window, no shadow ray is traced
         for light that would arrive outside of it, and ``steady`` is the sum over the bins. No bin's expected value
         changes; light outside the window is not counted then.
     nested spectra (spectral variants)
         Response curves of the sensor's channels, as in ``specfilm``: the name of a spectrum is that of its channel,
-        which holds the integral over wavelength (nm) of radiance times curve. See :mod:`.response`.
+        which holds the integral over wavelength (nm) of radiance times curve. See :class:`.colour.SensorResponse`.
 
     A bin holds radiance integrated over the bin: the sum over all bins is the steady image. Storage is ``(H, W, T,
     C)`` of the crop window with C = 1 in monochromatic variants, the number of response curves where there are
@@ -169,7 +172,7 @@ class TransientHDRFilm(TimeResolvedFilm):
 
     @property
     def has_slope(self) -> bool:
-        """Whether the temporal filter has a slope."""
+        """The temporal filter has a slope."""
         return self.filter.has_slope
 
     def arrivals(self):
@@ -190,10 +193,6 @@ class TransientHDRFilm(TimeResolvedFilm):
         size = self.crop_size()
         return (int(size[1]), int(size[0]), *self.laser_shape(), self.temporal_bins, self.channel_count())
 
-    def entries_per_array(self) -> int:
-        """Floats of one histogram."""
-        return self.temporal_bins * self.channel_count()
-
     # ----------------------------------------------------------------------------------- splat and read
 
     def bin_position(self, opl_from_start):
@@ -206,9 +205,9 @@ class TransientHDRFilm(TimeResolvedFilm):
         return HistogramBlock(self, job.band, base, match, exclusive, origin)
 
     def reduce_mode(self, cube, exclusive, crowded):
-        """How lanes add to ``cube``. A processor takes them one by one: where many add, it costs more to look for those
-        that share a bin than to add each. Of a small array Dr.Jit gives every thread its own.
-        """
+        """Return the mode of lanes that add to ``cube``."""
+        # A processor takes lanes one by one: where many add, it costs more to look for those that share a bin than to
+        # add each. Of a small array Dr.Jit gives every thread its own.
         looks = dr.backend_v(cube) is dr.JitBackend.LLVM and dr.width(cube) > dr.expand_threshold()
         return reduce_mode(exclusive, crowded and looks and self.temporal_bins >= MANY_BINS)
 

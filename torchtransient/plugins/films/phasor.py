@@ -3,16 +3,99 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from torchtransient.errors import SceneError, TorchTransientWarning
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.films.base import TimeResolvedFilm
-from torchtransient.plugins.films.long_kernel import reduce_mode
-from torchtransient.plugins.films.phasor_adjoint import AdjointRows, Phases, PhasorAdjointBlock, read_arrivals
-from torchtransient.plugins.films.phasor_events import EVENT_BYTES, EventBlock, rotation, slots_for
-from torchtransient.plugins.films.phasor_grid import frequencies_of, step_of
+from torchtransient.plugins.films.block import reduce_mode
+from torchtransient.plugins.films.phasor_sums import (
+    EVENT_BYTES,
+    AdjointRows,
+    EventBlock,
+    Phases,
+    PhasorAdjointBlock,
+    read_arrivals,
+    rotation,
+    slots_for,
+)
+from torchtransient.plugins.properties import number, whole_number
+from torchtransient.transform_bins import transform_bins
+
+_LIST = ("frequencies",)
+_GRID = ("frequency_first", "frequency_step", "frequency_count")
+_WAVELENGTHS = ("wl_mean", "wl_sigma", "temporal_bins", "bin_width_opl")
+
+
+def frequencies_of(props) -> np.ndarray:
+    """The frequencies that a film's properties ask for: float64, cycles per metre. Raises ``SceneError``."""
+    given = [names for names in (_LIST, _GRID, _WAVELENGTHS) if any(name in props for name in names)]
+    if len(given) > 1:
+        sets = " and ".join(", ".join(name for name in names if name in props) for names in given)
+        raise SceneError(f"phasor_hdr_film: {sets} exclude each other; give one of the sets.")
+    if given == [_LIST]:
+        return _parsed(props["frequencies"])
+    if given == [_GRID]:
+        missing = [name for name in _GRID if name not in props]
+        if missing:
+            raise SceneError(
+                f"phasor_hdr_film: a uniform grid needs {', '.join(_GRID)}; {', '.join(missing)} is missing."
+            )
+        count = whole_number(props, "frequency_count", 0)
+        if count < 1:
+            raise SceneError(f"phasor_hdr_film: frequency_count must be at least 1, got {count}.")
+        return _checked(number(props, "frequency_first") + np.arange(count) * number(props, "frequency_step"))
+    found = transform_bins(
+        number(props, "wl_mean", 100.0),
+        number(props, "wl_sigma", 1000.0),
+        whole_number(props, "temporal_bins", 4096),
+        number(props, "bin_width_opl", 0.003),
+    )
+    if not given:
+        numbers = ", ".join(f"{number:.4g}" for number in found)
+        warnings.warn(
+            f"phasor_hdr_film: no frequencies are given, so the film keeps those of mitransient's defaults, {numbers} "
+            "cycles per metre. Give 'frequencies': '...', numbers with commas in cycles per metre, or wl_mean and "
+            "wl_sigma to mean these.",
+            TorchTransientWarning,
+            stacklevel=2,
+        )
+    return found
+
+
+def _parsed(given) -> np.ndarray:
+    """Numbers from a string with commas or spaces, or from an array of any kind."""
+    try:
+        if isinstance(given, str):
+            values = [float(word) for word in given.replace(",", " ").split()]
+        else:
+            values = np.array(given, dtype=np.float64).ravel()
+    except (TypeError, ValueError):
+        raise SceneError(f"phasor_hdr_film: frequencies: expected numbers, got {given!r}.") from None
+    return _checked(values)
+
+
+def _checked(values) -> np.ndarray:
+    """Finite, and at least one."""
+    values = np.asarray(values, dtype=np.float64)
+    if values.size < 1:
+        raise SceneError("phasor_hdr_film: frequencies: expected at least one, got none.")
+    if not np.isfinite(values).all():
+        raise SceneError(f"phasor_hdr_film: frequencies: expected finite numbers, got {values.tolist()}.")
+    return values
+
+
+def step_of(frequencies: np.ndarray) -> float | None:
+    """The step of a uniform grid, None for other lists. Deviations that no phase could show are taken as rounding."""
+    count = len(frequencies)
+    step = (frequencies[-1] - frequencies[0]) / (count - 1) if count > 1 else 0.0
+    deviation = np.abs(frequencies - (frequencies[0] + np.arange(count) * step)).max()
+    return float(step) if deviation <= 1e-14 * np.abs(frequencies).max() else None
+
 
 # The events of one kernel launch wait in memory until the next kernel sums them up; larger jobs take several launches.
 MAX_EVENT_BYTES = 2**28
@@ -70,7 +153,7 @@ class PhasorHDRFilm(TimeResolvedFilm):
     A uniform grid, however it is given, is faster than other lists: one complex multiplication for each step.
 
     nested spectra (spectral variants)
-        Response curves of the sensor's channels, see :mod:`.response`.
+        Response curves of the sensor's channels, see :class:`.colour.SensorResponse`.
 
     A phasor is integrated over time: its value at frequency zero is the steady image, and nothing is lost outside a
     window. It is what a histogram's transform would be with infinitely narrow bins. ``develop()`` returns steady
@@ -120,10 +203,6 @@ class PhasorHDRFilm(TimeResolvedFilm):
         size = self.crop_size()
         entries = (self.frequency_count(), 2 * self.channel_count())
         return (int(size[1]), int(size[0]), *self.laser_shape(), *entries)
-
-    def entries_per_array(self) -> int:
-        """Floats of the phasors of one pixel and laser position."""
-        return self.frequency_count() * 2 * self.channel_count()
 
     def lanes_at_most(self, most_events: int) -> int | None:
         per_path = slots_for(most_events) * (EVENT_BYTES + 4 * self.channel_count())

@@ -12,7 +12,7 @@ from torchtransient.errors import GradientError, GradientWarning, SceneError, Va
 from torchtransient.interfaces import BACKWARD, FORWARD, JOBS, RENDER, IntegratorInterface, is_time_resolved
 from torchtransient.plugins.described_scene import note_scene
 from torchtransient.plugins.films.colour import ChannelMatch
-from torchtransient.plugins.films.temporal_filter import check_name, check_stddev
+from torchtransient.plugins.films.temporal_filters import check_name, check_stddev
 from torchtransient.plugins.frozen_state import arrays_below, says_it_can_be_recorded
 from torchtransient.plugins.integrators.derivative_passes import backward, forward
 from torchtransient.plugins.integrators.incoming_adjoint import IncomingAdjoint

@@ -1,4 +1,4 @@
-"""How a :class:`~torchtransient.pulses.Pulse` is written into the properties of a film."""
+"""Pulses and impulse responses as properties of films."""
 
 from __future__ import annotations
 
@@ -6,16 +6,21 @@ from typing import Any
 
 from torchtransient.errors import ArgumentError, SceneError
 from torchtransient.pulses import Pulse
-from torchtransient.rendering.films.choices import all_films, of_plugin, plugins_in_words
 
 _NAMES = ("fwhm_opl", "width_opl", "center_opl", "opl", "values")
 PREFIXES = ("pulse", "irf")
-# Every property that a pulse can have in a film.
+# Films that spread every arrival by a pulse.
+_SPREADING = ("transient_hdr_film", "gated_hdr_film")
+# Properties of pulses in films.
 PROPERTIES = tuple(prefix + suffix for prefix in PREFIXES for suffix in ("", *(f"_{name}" for name in _NAMES)))
 
 
 def checked_pulse(name: str, value: Any) -> Pulse | None:
-    """None or a Pulse. Raises ``ArgumentError``."""
+    """Return a pulse of a call, or None.
+
+    Raises:
+        ArgumentError: for anything else.
+    """
     if value is None or isinstance(value, Pulse):
         return value
     raise ArgumentError(
@@ -24,14 +29,22 @@ def checked_pulse(name: str, value: Any) -> Pulse | None:
 
 
 def write_pulse(props: Any, prefix: str, pulse: Pulse | None) -> None:
-    """Replace the pulse of a film node; None leaves the film its own. Raises ``SceneError`` for films without one."""
+    """Replace the pulse of a film node; None leaves the film its own.
+
+    Args:
+        props: properties of the node.
+        prefix: "pulse" or "irf".
+        pulse: pulse over optical path length, metres.
+
+    Raises:
+        SceneError: for films that spread no arrivals.
+    """
     if pulse is None:
         return
-    kind = of_plugin(props.plugin_name())
-    if kind is None or not kind.takes_pulse:
-        spread = plugins_in_words([kind for kind in all_films() if kind.takes_pulse])
+    if props.plugin_name() not in _SPREADING:
         raise SceneError(
-            f"{prefix}: the film {props.plugin_name()!r} does not spread arrivals over time, {spread} does. "
+            f"{prefix}: the film {props.plugin_name()!r} does not spread arrivals over time, "
+            f"{' and '.join(_SPREADING)} do. "
             "Multiply a phasor by torchtransient.pulses.transform(pulse, frequencies) instead, or leave it out."
         )
     for name in _NAMES:

@@ -1,0 +1,507 @@
+"""Films on the side of torch: the settings of each, the layout of its tensor, its entries of a result file.
+
+A film is a plugin (``plugins/films``), which measures, and a :class:`FilmLayout` here, listed in :data:`FILMS`.
+Renderer, plan and result files ask the layout and name no film.
+"""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from typing import TYPE_CHECKING, Any, ClassVar, Self
+
+import torch
+
+from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.errors import ArgumentError, SceneError, TorchTransientError
+from torchtransient.gates import SLOPE_REMEDY, Gate, gates_from_text, gates_to_text, jump_in
+from torchtransient.interfaces import FilmInterface, is_time_resolved
+
+if TYPE_CHECKING:
+    from torchtransient.scene.pilot import Arrivals
+
+
+@dataclass(frozen=True)
+class FilmLayout(abc.ABC):
+    """Settings of a film, and where its measurements lie in a tensor.
+
+    A subclass is a frozen dataclass with one field, the settings; outputs have them under the name of the field. It
+    owes the names from ``measures`` to ``output`` and the abstract methods; the rest has defaults. Layouts with equal
+    settings are equal.
+    """
+
+    # Word of the plugin's `measures`: the attribute of a RenderOutput, and the name in a result file.
+    measures: ClassVar[str]
+    plugin: ClassVar[str]
+    # Letter of the dimension between channels and rows.
+    letter: ClassVar[str]
+    # Name of the settings: the keyword of TransientRenderer and tt.plan, of films that have one. A call that asks for
+    # the film, written out for messages ("film=..." of films without a keyword).
+    argument: ClassVar[str]
+    example: ClassVar[str]
+    # Name of the measurements in messages.
+    plural: ClassVar[str]
+    # Name in tt.plan(outputs=...).
+    output: ClassVar[str]
+    # The film has bins of time: a temporal filter, an axis that a plan can find, a steady image that can be left out.
+    has_bins: ClassVar[bool] = False
+    is_complex: ClassVar[bool] = False
+    # The film spreads arrivals by a pulse and an impulse response.
+    takes_pulse: ClassVar[bool] = False
+    # Remedy for a response over time without a slope (`jump`): the end of an error message.
+    slope_remedy: ClassVar[str] = ""
+
+    if TYPE_CHECKING:
+
+        def __init__(self, settings: Any, /) -> None: ...
+
+    # ----------------------------------------------------------------------------------------------------- settings
+
+    @property
+    @abc.abstractmethod
+    def count(self) -> int:
+        """Number of entries along the film's own dimension."""
+
+    @property
+    def settings(self) -> Any:
+        """Value of the keyword ``argument``: the field of the dataclass."""
+        return getattr(self, fields(self)[0].name)
+
+    def attributes(self) -> dict[str, Any]:
+        """Return the settings by the name that renderers and outputs give them."""
+        return {fields(self)[0].name: self.settings}
+
+    def plain(self) -> Any:
+        """Return the settings as plain data for JSON."""
+        return self.settings
+
+    def describe(self, temporal_filter: str) -> str:
+        """Return the part of ``print(renderer)`` that tells of the film."""
+        return f"{self.argument}={self.settings}"
+
+    def jump(self) -> str:
+        """Return the name of a response over time that jumps and has no slope without a pulse; empty without one, and
+        for films with bins, whose temporal filter decides.
+        """
+        return ""
+
+    # ----------------------------------------------------------------------------------------------- scene and film
+
+    @classmethod
+    @abc.abstractmethod
+    def from_film(cls, film: Any) -> Self:
+        """Return the settings of a film plugin that ``measures`` this."""
+
+    @classmethod
+    def from_properties(cls, props: Any) -> Self | None:
+        """Return the settings of a described film node, None where a plan needs none before the scene is built.
+
+        Raises:
+            SceneError: for properties that the plugin refuses.
+        """
+        return None
+
+    @abc.abstractmethod
+    def write(self, props: Any) -> None:
+        """Write the settings into the properties of a film node of this plugin."""
+
+    @classmethod
+    def fits(cls, plugin: str) -> bool:
+        """Return whether a film plugin takes the properties that :meth:`write` writes."""
+        return plugin == cls.plugin
+
+    def describes(self, film: FilmInterface) -> bool:
+        """Return whether a built film has these settings."""
+        return bool(film.measures == self.measures) and self.from_film(film) == self
+
+    # ------------------------------------------------------------------------------------------------------ tensors
+
+    def channels_first(self, cube: torch.Tensor, leading: tuple[int, ...], components: int = 1) -> torch.Tensor:
+        """Return the array of a film in the order of torch.
+
+        Args:
+            cube: (H, W, ..., C) of a film, with or without one dimension of items.
+            leading: sizes of the dimensions of items.
+            components: Stokes components that the film's channels are made of; more than one come before C.
+
+        Returns:
+            (C, ..., H, W) behind ``leading``.
+        """
+        return cube_channels_first(cube, leading, components)
+
+    def tensor(self, output: Any) -> torch.Tensor | None:
+        """Return the film's tensor in an output or a result."""
+        tensor: torch.Tensor | None = measured(output, self.measures)
+        return tensor
+
+    @classmethod
+    def from_output(cls, output: Any) -> Self | None:
+        """Return the settings that an output or a result has, None where it holds nothing of this film."""
+        settings = measured(output, fields(cls)[0].name)
+        return None if settings is None or measured(output, cls.measures) is None else cls(settings)
+
+    # ------------------------------------------------------------------------------------------------- result files
+
+    @abc.abstractmethod
+    def entries(self) -> dict[str, Any]:
+        """Return the arrays, numbers and texts of a result file that hold the settings."""
+
+    @classmethod
+    @abc.abstractmethod
+    def from_entries(cls, values: Mapping[str, Any]) -> Self | None:
+        """Return the settings that a result file holds, None for a file of another film."""
+
+    # --------------------------------------------------------------------------------------------------- pilot runs
+
+    @classmethod
+    def seen(cls, film: FilmInterface, arrivals: Arrivals) -> Arrivals:
+        """Return the arrivals of a pilot run as the film sees them."""
+        return arrivals
+
+    def parts(self, arrivals: Arrivals) -> list[Arrivals]:
+        """Return parts of the light of a pilot run; a bound on depth has to keep enough of each."""
+        return [arrivals]
+
+
+@dataclass(frozen=True)
+class Histogram(FilmLayout):
+    """Radiance integrated over each bin of ``axis``: float32 (C, T, H, W).
+
+    Raises:
+        ArgumentError: for anything but a :class:`~torchtransient.axes.TimeAxis`.
+    """
+
+    measures: ClassVar[str] = "transient"
+    plugin: ClassVar[str] = "transient_hdr_film"
+    letter: ClassVar[str] = "T"
+    argument: ClassVar[str] = "time_axis"
+    example: ClassVar[str] = "time_axis=tt.TimeAxis(start_opl=..., bin_width_opl=..., num_bins=...)"
+    plural: ClassVar[str] = "transients"
+    output: ClassVar[str] = "transient"
+    has_bins: ClassVar[bool] = True
+    takes_pulse: ClassVar[bool] = True
+
+    axis: TimeAxis
+
+    def __post_init__(self) -> None:
+        given: Any = self.axis
+        if not isinstance(given, TimeAxis):
+            raise ArgumentError(f"time_axis: expected a tt.TimeAxis, got {type(given).__name__}; write {self.example}.")
+
+    @property
+    def count(self) -> int:
+        return self.axis.num_bins
+
+    def plain(self) -> dict[str, Any]:
+        axis = self.axis
+        return {"start_opl": axis.start_opl, "bin_width_opl": axis.bin_width_opl, "num_bins": axis.num_bins}
+
+    def describe(self, temporal_filter: str) -> str:
+        return f"axis={self.axis}, temporal_filter={temporal_filter!r}"
+
+    @classmethod
+    def from_film(cls, film: Any) -> Self:
+        return cls(TimeAxis(film.start_opl, film.bin_width_opl, film.temporal_bins))
+
+    @classmethod
+    def from_properties(cls, props: Any) -> Self | None:
+        start, width = float(props.get("start_opl", 0.0)), float(props.get("bin_width_opl", 0.003))
+        return cls(TimeAxis(start, width, int(props.get("temporal_bins", 2048))))
+
+    def write(self, props: Any) -> None:
+        props["start_opl"], props["bin_width_opl"] = self.axis.start_opl, self.axis.bin_width_opl
+        props["temporal_bins"] = self.axis.num_bins
+
+    @classmethod
+    def fits(cls, plugin: str) -> bool:
+        """Return True: histograms of other packages take the same properties; one that does not says so when built."""
+        return True
+
+    def entries(self) -> dict[str, Any]:
+        return {"edges_opl": self.axis.edges_opl.numpy(), **self.plain()}
+
+    @classmethod
+    def from_entries(cls, values: Mapping[str, Any]) -> Self | None:
+        if cls.measures not in values or "num_bins" not in values:
+            return None
+        return cls(TimeAxis(float(values["start_opl"]), float(values["bin_width_opl"]), int(values["num_bins"])))
+
+    def parts(self, arrivals: Arrivals) -> list[Arrivals]:
+        """Return all light, which the steady image holds, and that of the time window."""
+        return [arrivals, arrivals.through([Gate.rectangular(self.axis.start_opl, self.axis.end_opl)])]
+
+
+# Properties of a phasor film that choose its frequencies; explicit frequencies replace them.
+_FREQUENCY_PROPERTIES = (
+    "wl_mean", "wl_sigma", "temporal_bins", "bin_width_opl", "frequency_first", "frequency_step", "frequency_count",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Phasors(FilmLayout):
+    """Radiance times ``exp(-2 pi i nu (opl - start_opl))`` for each of ``frequencies``: complex64 (C, F, H, W).
+
+    A :class:`~torchtransient.axes.FrequencyAxis`, or numbers in cycles per metre.
+
+    Raises:
+        UnitError, ShapeError: for anything else.
+    """
+
+    measures: ClassVar[str] = "phasor"
+    plugin: ClassVar[str] = "phasor_hdr_film"
+    letter: ClassVar[str] = "F"
+    argument: ClassVar[str] = "frequencies"
+    example: ClassVar[str] = "frequencies=tt.FrequencyAxis(...)"
+    plural: ClassVar[str] = "phasors"
+    output: ClassVar[str] = "phasor"
+    is_complex: ClassVar[bool] = True
+
+    frequencies: FrequencyAxis
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.frequencies, FrequencyAxis):
+            object.__setattr__(self, "frequencies", FrequencyAxis(self.frequencies))
+
+    @property
+    def count(self) -> int:
+        return self.frequencies.num_frequencies
+
+    def plain(self) -> list[float]:
+        return list(self.frequencies.frequencies)
+
+    @classmethod
+    def from_film(cls, film: Any) -> Self:
+        return cls(FrequencyAxis(tuple(film.frequencies.tolist()), film.start_opl))
+
+    def write(self, props: Any) -> None:
+        for name in _FREQUENCY_PROPERTIES:
+            if name in props:
+                del props[name]
+        props["frequencies"] = ", ".join(repr(f) for f in self.frequencies.frequencies)
+        props["start_opl"] = self.frequencies.start_opl
+
+    def channels_first(self, cube: torch.Tensor, leading: tuple[int, ...], components: int = 1) -> torch.Tensor:
+        return phasor_channels_first(cube, leading, components)
+
+    def entries(self) -> dict[str, Any]:
+        return {"frequencies_per_metre": self.frequencies.per_metre.numpy(), "start_opl": self.frequencies.start_opl}
+
+    @classmethod
+    def from_entries(cls, values: Mapping[str, Any]) -> Self | None:
+        if cls.measures not in values:
+            return None
+        return cls(FrequencyAxis(tuple(values["frequencies_per_metre"].tolist()), float(values["start_opl"])))
+
+
+@dataclass(frozen=True)
+class Gates(FilmLayout):
+    """The light as each of ``gates`` sees it: float32 (C, G, H, W). The steady image is the sum over the gates.
+
+    One :class:`~torchtransient.gates.Gate` or several.
+
+    Raises:
+        ArgumentError: for anything else.
+    """
+
+    measures: ClassVar[str] = "gated"
+    plugin: ClassVar[str] = "gated_hdr_film"
+    letter: ClassVar[str] = "G"
+    argument: ClassVar[str] = "gates"
+    example: ClassVar[str] = "gates=[tt.Gate.gaussian(...)]"
+    plural: ClassVar[str] = "gates"
+    output: ClassVar[str] = "gates"
+    takes_pulse: ClassVar[bool] = True
+    slope_remedy: ClassVar[str] = SLOPE_REMEDY
+
+    gates: tuple[Gate, ...]
+
+    def __post_init__(self) -> None:
+        given: Any = self.gates
+        gates = tuple(given) if isinstance(given, Iterable) else (given,)
+        if not gates or not all(isinstance(gate, Gate) for gate in gates):
+            raise ArgumentError(
+                "gates: expected one or more tt.Gate objects, for instance [tt.Gate.gaussian(6.0, 0.2)], got "
+                f"{given!r}."
+            )
+        object.__setattr__(self, "gates", gates)
+
+    @property
+    def count(self) -> int:
+        return len(self.gates)
+
+    def plain(self) -> list[dict[str, Any]]:
+        return [asdict(gate) for gate in self.gates]
+
+    def describe(self, temporal_filter: str) -> str:
+        return f"gates={self.count}"
+
+    def jump(self) -> str:
+        return jump_in(self.gates)
+
+    @classmethod
+    def from_film(cls, film: Any) -> Self:
+        return cls(tuple(film.gates))
+
+    @classmethod
+    def from_properties(cls, props: Any) -> Self | None:
+        try:
+            return cls(gates_from_text(str(props["gates"]))) if "gates" in props else None
+        except TorchTransientError as error:
+            raise SceneError(f"{cls.plugin}: {error}") from error
+
+    def write(self, props: Any) -> None:
+        props["gates"] = gates_to_text(self.gates)
+
+    def entries(self) -> dict[str, Any]:
+        return {"gates": gates_to_text(self.gates)}
+
+    @classmethod
+    def from_entries(cls, values: Mapping[str, Any]) -> Self | None:
+        return cls(gates_from_text(str(values["gates"]))) if "gates" in values else None
+
+    @classmethod
+    def seen(cls, film: Any, arrivals: Arrivals) -> Arrivals:
+        seen: tuple[Gate, ...] = tuple(film.gates)
+        for pulse in film.pulses:
+            seen = tuple(gate.spread(pulse) for gate in seen)
+        return arrivals.through(seen)
+
+
+# ------------------------------------------------------------------------------------------------------ list of films
+
+# A new film is added here, one of a user's own too. The first one is that of a plan that is asked for no other.
+FILMS: list[type[FilmLayout]] = [Histogram, Phasors, Gates]
+
+
+def film_of_arguments(arguments: Mapping[str, Any]) -> FilmLayout | None:
+    """Return the film that keyword arguments ask for, None without one.
+
+    Args:
+        arguments: ``time_axis``, ``frequencies``, ``gates``: at most one that is not None.
+
+    Raises:
+        ArgumentError: for several, and for wrong settings, as the layouts raise it.
+    """
+    given = [(kind, arguments.get(kind.argument)) for kind in FILMS]
+    given = [(kind, value) for kind, value in given if value is not None]
+    if len(given) > 1:
+        names, films = ", ".join(kind.argument for kind in FILMS), [f"a {kind.measures} film" for kind in FILMS]
+        raise ArgumentError(f"{names}: a film is {', '.join(films[:-1])} or {films[-1]}; give one of them.")
+    return given[0][0](given[0][1]) if given else None
+
+
+def layout_of_film(film: Any) -> FilmLayout:
+    """Return the layout of a built film.
+
+    Raises:
+        SceneError: for films that are not time-resolved, or not listed.
+    """
+    if not is_time_resolved(film):
+        raise SceneError(
+            f"the sensor's film has no time axis; use one of {film_plugins()}, or give "
+            f"{' or '.join(kind.example for kind in FILMS)}."
+        )
+    for kind in FILMS:
+        if kind.measures == film.measures:
+            return kind.from_film(film)
+    known = ", ".join(kind.measures for kind in FILMS)
+    raise SceneError(
+        f"the film {film.plugin!r} measures {film.measures!r}, expected one of {known}; see "
+        "torchtransient.rendering.films.FilmLayout."
+    )
+
+
+def layout_of_output(output: Any) -> FilmLayout | None:
+    """Return the layout of a ``RenderOutput`` or a ``Result``, None where it holds a steady image alone."""
+    return next((found for kind in FILMS if (found := kind.from_output(output)) is not None), None)
+
+
+def layout_of_entries(values: Mapping[str, Any]) -> FilmLayout:
+    """Return the layout of the arrays and numbers of a result file.
+
+    Raises:
+        KeyError: for a file of none of the films.
+    """
+    for kind in FILMS:
+        found = kind.from_entries(values)
+        if found is not None:
+            return found
+    raise KeyError(" or ".join(kind.measures for kind in FILMS))
+
+
+def layout_of_plugin(plugin: str) -> type[FilmLayout] | None:
+    """Return the class for a film plugin, None for plugins that are not listed."""
+    return next((kind for kind in FILMS if kind.plugin == plugin), None)
+
+
+def film_plugins(kinds: Sequence[type[FilmLayout]] | None = None) -> str:
+    """Return the names of film plugins, for messages."""
+    return ", ".join(kind.plugin for kind in (FILMS if kinds is None else kinds))
+
+
+def measured(output: Any, name: str) -> Any:
+    """Return an attribute of an output or a result, or one of its ``others``; None where it has neither."""
+    found = getattr(output, name, None)
+    return getattr(output, "others", {}).get(name) if found is None else found
+
+
+# ------------------------------------------------------------------------------------------- from memory order to torch
+
+# Dimensions of the film of an exhaustive scan, without those of items.
+_EXHAUSTIVE = 6
+
+
+def steady_channels_first(steady: torch.Tensor, leading: tuple[int, ...], components: int = 1) -> torch.Tensor:
+    """Return a steady image in the order of torch.
+
+    Args:
+        steady: (H, W, C) of a film, with or without one dimension of items.
+        leading: sizes of the dimensions of items.
+        components: Stokes components that the film's channels are made of; more than one come before C.
+
+    Returns:
+        (C, H, W) behind ``leading``.
+    """
+    steady = steady.reshape(*leading, *steady.shape[-3:])
+    return _stokes_first(steady.movedim(-1, -3), -3, components)
+
+
+def cube_channels_first(cube: torch.Tensor, leading: tuple[int, ...], components: int = 1) -> torch.Tensor:
+    """Return an array over time in the order of torch.
+
+    Args:
+        cube: (H, W, T, C) of a film, (H, W, Lh, Lw, T, C) of an exhaustive scan, with or without a dimension of items.
+        leading: sizes of the dimensions of items.
+        components: Stokes components that the film's channels are made of; more than one come before C.
+
+    Returns:
+        (C, T, H, W) behind ``leading``; (C, T, Lh, Lw, H, W) of an exhaustive scan.
+    """
+    if cube.ndim >= _EXHAUSTIVE:
+        cube = cube.reshape(*leading, *cube.shape[-_EXHAUSTIVE:])
+        return _stokes_first(cube.movedim((-1, -2, -4, -3), (-6, -5, -4, -3)), -6, components)
+    cube = cube.reshape(*leading, *cube.shape[-4:])
+    return _stokes_first(cube.movedim((-1, -2), (-4, -3)), -4, components)
+
+
+def phasor_channels_first(cube: torch.Tensor, leading: tuple[int, ...], components: int = 1) -> torch.Tensor:
+    """Return phasors in the order of torch, as :func:`cube_channels_first`.
+
+    Args:
+        cube: (H, W, F, 2 C) of real and imaginary parts in turn.
+        leading: sizes of the dimensions of items.
+        components: Stokes components that the film's channels are made of; more than one come before C.
+
+    Returns:
+        Complex (C, F, H, W) behind ``leading``.
+    """
+    pairs = torch.view_as_complex(cube.reshape(*cube.shape[:-1], -1, 2))
+    return cube_channels_first(pairs, leading, components)
+
+
+def _stokes_first(tensor: torch.Tensor, channel_dim: int, components: int) -> torch.Tensor:
+    if components == 1:
+        return tensor
+    split: torch.Tensor = tensor.unflatten(channel_dim, (components, -1))  # type: ignore[no-untyped-call]
+    return split
