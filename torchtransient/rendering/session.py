@@ -22,8 +22,8 @@ from torchtransient.rendering.kernel_errors import named_errors
 from torchtransient.rendering.mitsuba_words import one_line
 from torchtransient.rendering.overrides import boundary_term, max_depth, temporal_filter
 from torchtransient.rendering.physics import PhysicsWatch
-from torchtransient.rendering.scene_state import detached, put_back, values_of
 from torchtransient.rendering.seeds import Item, Seeding
+from torchtransient.rendering.values import detached, put_back, values_of
 from torchtransient.rendering.variant import active_variant, in_variant
 
 if TYPE_CHECKING:
