@@ -3,9 +3,9 @@
 A call keeps no graph of Dr.Jit. Its derivatives are *replays*: they call the function again with the saved arguments,
 attached, and with the scenes as they were at the call. Every run takes the engine's lock and puts the scenes back.
 
-The scenes are found by a walk over the variables of the function. Asking for them alone would be no safer: plugins
-written in C++ read a scene without a trace in Python, so that only such a walk can tell that one was not named, and a
-scene that it finds needs no naming. ``state`` names those that it does not find.
+Scenes are found by a walk over the variables of the function. To ask for all of them would be no safer: plugins in C++
+read a scene without a trace in Python, so that a scene that was not named could be told by such a walk alone, and one
+that it finds needs no name. ``state`` names those that it does not find.
 """
 
 from __future__ import annotations
@@ -380,8 +380,8 @@ class Call:
         if any(dr.grad_enabled(array) for array in arrays):
             raise GradientError(
                 f"{self.name}: the result depends on arrays of Dr.Jit that want a gradient, and would get none: those "
-                "of the torch tensors among the arguments are computed alone. Pass it as a torch tensor, or detach it, "
-                "dr.detach(array); parameters of a scene that is not found are named by tt.wrap(..., state=params)."
+                "of the torch tensors among the arguments are computed alone. Pass them as torch tensors, or detach "
+                "them, dr.detach(array). If they are parameters of a scene: tt.wrap(..., state=params)."
             )
         if self.returned:
             first, values = self.returned[0]
@@ -570,10 +570,8 @@ def _without_autocast() -> Iterator[None]:
         yield
 
 
-# Generators that a function may draw from without an argument, for instance the seed of a render.
-
-
 def _generator_states() -> tuple[Any, ...]:
+    """Return the states of the generators that functions draw from without an argument, a seed for instance."""
     return torch.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002
 
 
@@ -636,7 +634,7 @@ def _equal(a: Any, b: Any) -> bool:
 
 # ------------------------------------------------------------------------------------- the surroundings of a function
 
-# Entries and attributes are followed so deep below a variable; of long lists, only the entries themselves: data.
+# Entries and attributes are followed so deep below a variable; of long lists only the entries: they hold data.
 _DEPTH = 4
 _LONG = 1000
 _DATA = (str, bytes, int, float, complex, type(None), torch.Tensor, np.ndarray, np.generic, range, slice)
