@@ -10,86 +10,10 @@ import pytest
 import torch
 
 import torchtransient as tt
-from torchtransient.errors import SceneError, ShapeError, UnknownKeyError
-from torchtransient.rendering import scene_state, session
+from torchtransient.errors import SceneError, ShapeError
+from torchtransient.rendering import session
 from torchtransient.rendering.variant import active_variant
 from torchtransient.testing.small_room import VARIANT, make_room
-
-# -------------------------------------------------------------------------------------------------- values of scenes
-
-
-@pytest.fixture(scope="module")
-def params():
-    """A mesh with texture coordinates, and a colour."""
-    mi.set_variant(VARIANT)
-    return mi.traverse(mi.load_dict({"type": "cube", "bsdf": {"type": "diffuse", "reflectance": {
-        "type": "rgb", "value": [0.1, 0.2, 0.7]}}}))  # fmt: skip
-
-
-def test_values_are_the_same_memory_or_equal():
-    same = scene_state._same
-    one, two = mi.Float(1, 2), mi.Float(1, 2)
-    assert same(one, mi.Float(one)) and not same(one, two) and not same(one, mi.UInt32(1, 2))
-    assert same(1.5, 1.5) and not same(1.5, 2.5) and not same(1, 1.0) and same("a", "a")
-    pose = mi.ScalarTransform4f().translate([1, 2, 3])
-    assert same(pose, pose)
-
-
-def test_parameters_that_are_not_set_are_no_values():
-    """As the absorption of hair that has pigments: functions that reached it were a TypeError. Nor what is fixed."""
-    fixed = mi.ParamFlags.ReadOnly.value
-
-    def unset(*_):
-        raise RuntimeError("not set")
-
-    shown = {"a": (None, None, None, 0), "b": (2.5, None, None, 0), "c": (3.5, None, None, fixed),
-             "d": (4.5, None, None, 2), "e": (5.5, None, None, 2 + fixed), "f": (unset, unset, unset, 0)}  # fmt: skip
-    assert scene_state.values_of(SimpleNamespace(properties=shown)) == {"b": 2.5, "d": 4.5}
-    hair = mi.load_dict({"type": "hair", "eumelanin": 0.25, "pheomelanin": 0.5})
-    assert torch.equal(tt.wrap(lambda x: x * len((hair,)))(torch.ones(2)), torch.ones(2))
-
-
-def test_only_what_has_changed_is_put_back(params, monkeypatch):
-    written = []
-    monkeypatch.setattr(scene_state, "_follow", lambda params, keys: written.append(list(keys)))
-    before = scene_state.values_of(params)
-    assert {"vertex_positions", "vertex_normals", "vertex_texcoords", "faces"} <= set(before)
-    scene_state.put_back(params, before)
-    scene_state.put_back(params, {}, {})
-    assert written == []
-
-    class Kept(dict):
-        properties = params.properties
-
-    target = Kept()
-    now = dict(before) | {"vertex_texcoords": mi.Float([0.0] * 48)}
-    scene_state.put_back(target, before, now)
-    assert written == [["vertex_texcoords"]] and list(target) == ["vertex_texcoords"]
-    # Normals go back with positions; what is not there any more, too.
-    before = {f"a.{key}": value for key, value in before.items()}
-    now = dict(before) | {"a.vertex_positions": mi.Float([0.0] * 72)}
-    scene_state.put_back(target, before, now)
-    del now["a.vertex_positions"]
-    scene_state.put_back(target, before, now)
-    assert written[1:] == [["a.vertex_positions", "a.vertex_normals"]] * 2
-    assert target["a.vertex_normals"] is before["a.vertex_normals"]
-
-
-def test_shapes_of_values(params):
-    keys = ["vertex_positions", "bsdf.reflectance.value"]
-    assert scene_state.shapes_of(params, keys, "f") == {keys[0]: (24, 3), keys[1]: (3,)}
-    with pytest.raises(UnknownKeyError, match=r"f: `parameters` has no parameter 'colour'.*print\(params\) lists all"):
-        scene_state.shapes_of(params, ["colour"], "f")
-    with pytest.raises(SceneError, match="f: the parameter 'faces' is not an array of real numbers"):
-        scene_state.shapes_of(params, ["faces"], "f")
-    assert scene_state.variant_of(params) == VARIANT
-    assert scene_state.variant_of(SimpleNamespace(properties={})) is None
-
-
-def test_values_that_mitsuba_refuses(params):
-    with pytest.raises(SceneError, match=r"f: values of bsdf\.reflectance\.value: Mitsuba refuses them: "):
-        scene_state.write(params, {"bsdf.reflectance.value": "text"}, "f")
-
 
 # ------------------------------------------------------------------------------------------------------ scenes in use
 

@@ -108,27 +108,24 @@ def test_another_scene_after_an_interrupt(monkeypatch):
     """Forward mode refuses where any object alive is attached: the interrupted scene is none any more."""
     jobs, renderer = ready()
     expected = pushed(renderer)
-    for name in ("backward", "wrapped"):
-        with monkeypatch.context() as patched:
-            for place in ("scene.load.Scene._settle", "rendering.replay.put_back"):
-                patched.setattr(f"torchtransient.{place}", interrupt_at_the_end(place))
-            with pytest.raises(KeyboardInterrupt):
-                jobs[name]()
-        for one, other in zip(pushed(renderer), expected, strict=True):
-            torch.testing.assert_close(one, other)
+    with monkeypatch.context() as patched:
+        patched.setattr("torchtransient.scene.load.Scene._settle", interrupt_at_the_end())
+        with pytest.raises(KeyboardInterrupt):
+            jobs["backward"]()
+    for one, other in zip(pushed(renderer), expected, strict=True):
+        torch.testing.assert_close(one, other)
 
 
-def interrupt_at_the_end(place):
+def interrupt_at_the_end():
     """In place of what puts back: an interrupt, once there is something attached."""
-    from torchtransient.rendering import replay
+    from torchtransient.rendering import scene_handle
 
-    own = Scene._settle if place.startswith("scene") else replay.put_back
+    own = scene_handle.Scene._settle
 
-    def cut_off(*args):
-        is_end = bool(args[0]._unsettled) if place.startswith("scene") else len(args) == 2
-        if is_end:
+    def cut_off(scene, *args):
+        if scene._unsettled:
             raise KeyboardInterrupt
-        return own(*args)
+        return own(scene, *args)
 
     return cut_off
 

@@ -21,8 +21,8 @@ from torchtransient.rendering.interrupts import quiet
 from torchtransient.rendering.kernel_errors import named_errors
 from torchtransient.rendering.overrides import boundary_term, max_depth, temporal_filter
 from torchtransient.rendering.recordings import Recordings
-from torchtransient.rendering.scene_state import detached, put_back, values_of
 from torchtransient.rendering.seeds import Item, Seeding
+from torchtransient.rendering.values import detached, put_back, values_of
 from torchtransient.rendering.variant import active_variant, in_variant
 from torchtransient.scene.edits import BuildOptions
 from torchtransient.scene.physics import PhysicsWatch

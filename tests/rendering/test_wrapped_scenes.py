@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import collections
-import contextvars
 import functools
 import threading
 import types
-import weakref
-from typing import ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -17,8 +14,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from torchtransient.errors import GradientError
-from torchtransient.rendering.reached import Reached
+from torchtransient.errors import ArgumentError, GradientError
 from torchtransient.testing.small_room import VARIANT as VARIANT
 
 KEY = "data"
@@ -65,16 +61,6 @@ class Slots:
         return write(self.params, x)
 
 
-class Weak:
-    """An object that another one knows without keeping it."""
-
-    kept: ClassVar = []
-
-    def __init__(self, params):
-        self.params = params
-        self.kept.append(self)
-
-
 def ways(scene, params):
     """Functions that reach a scene, by how they do."""
     holder, module = Holder(params), types.ModuleType("setup_of_mine")
@@ -118,9 +104,8 @@ def ways(scene, params):
         def of_class(cls, x):
             return write(cls.shared, x)
 
-    computed, weak, local = Computed(), weakref.ref(Weak(params)), threading.local()
-    local.params, context = params, contextvars.ContextVar("params")
-    context.set(params)
+    computed, local = Computed(), threading.local()
+    local.params = params
     row, view = collections.deque([params]), types.MappingProxyType({"params": params})
     return {
         "slots": Slots(params),
@@ -129,9 +114,7 @@ def ways(scene, params):
         "an attribute of the object's class": lambda x: write(computed.shared, x),
         "a static method": lambda x: computed.alone(x),
         "a method of the class": lambda x: computed.of_class(x),
-        "a weak reference": lambda x: write(weak().params, x),
         "what is the thread's own": lambda x: write(local.params, x),
-        "what is the context's own": lambda x: write(context.get(), x),
         "a deque": lambda x: write(row[0], x),
         "a view of a dictionary": lambda x: write(view["params"], x),
         "a function that it calls": lambda x: helper(x),
@@ -173,8 +156,6 @@ def test_parameters_are_not_looked_for_twice(scene, monkeypatch):
     """Where a function names parameters of a scene beside it, the scene is not traversed."""
     params = mi.traverse(scene)
     params.keep([KEY])
-    reached = Reached(lambda: (scene, params, [params]))
-    assert reached.parameters == [params] and reached.objects == [scene]
     wrapped, alone = tt.wrap(lambda x: x * len((scene, params))), tt.wrap(lambda x: x * len((scene,)))
     traversed = []
     monkeypatch.setattr(mi, "traverse", lambda node, traverse=mi.traverse: traversed.append(node) or traverse(node))
@@ -184,24 +165,87 @@ def test_parameters_are_not_looked_for_twice(scene, monkeypatch):
     assert traversed == [scene], "once for all calls"
 
 
-def test_what_is_not_followed():
-    """Code of libraries, entries of long lists that are no objects of Mitsuba, and scenes of this library."""
-    own = tt.load({"type": "scene"})
-    long = [[mi.Float(1)] for _ in range(2000)]
-    reached = Reached(lambda: (np.mean, torch.relu, mi.render, dr.sum, own, long))
-    assert not reached.parameters and not reached.objects
-    assert {name for name, _ in reached.named} == {"np", "torch", "mi", "dr", "own", "long"}
+def held(value, levels):
+    for _ in range(levels):
+        value = [value]
+    return value
 
 
-def test_circles_end():
-    a, b, module = [], [], types.ModuleType("ring")
-    a.append(b), b.append(a)
+def left_behind(scene, function):
+    """Whether a function that is wrapped leaves its value in the scene."""
+    tt.wrap(function)(torch.full((2, 2, 3), 2.0))
+    params = mi.traverse(scene)
+    found = np.any(np.array(params[KEY]) != 0.5)
+    params[KEY] = mi.TensorXf(np.full((2, 2, 3), 0.5, np.float32))
+    params.update()
+    return found
+
+
+@pytest.mark.parametrize("levels", [0, 1, 4, 5])
+def test_entries_of_entries_are_followed_four_deep(scene, levels):
+    params = mi.traverse(scene)
+    entries = held(params, levels)
+
+    def first(x):
+        found = entries
+        while isinstance(found, list):
+            found = found[0]
+        return write(found, x)
+
+    assert left_behind(scene, first) == (levels > 4)
+    # Nearer by another name.
+    near = held(params, 3)
+    a_way = held(near, 3)
+    assert not left_behind(scene, lambda x: (write(near[0][0][0], x), a_way)[0])
+
+
+def test_many_entries_are_data(scene):
+    """More than a thousand are looked at for themselves alone."""
+    params = mi.traverse(scene)
+    for rows, expected in (([[0]] * 999 + [[params]], False), ([[0]] * 1000 + [[params]], True)):
+        assert left_behind(scene, lambda x, rows=rows: write(rows[-1][0], x)) == expected
+    row = [[0]] * 1000 + [params]
+    assert not left_behind(scene, lambda x: write(row[-1], x))
+
+
+def test_comprehensions_and_circles(scene):
+    """Functions that call one another, lists that hold themselves, and variables of a comprehension alone."""
+    params, ring, module = mi.traverse(scene), [], types.ModuleType("ring")
+    ring.append(ring)
     module.itself = module
 
-    def f():
-        return a, b, module.itself, f
+    def even(x, n):
+        return odd(x, n - 1) if n else x
 
-    assert ("module.itself", module) not in Reached(f).named and ("ring.itself", module) in Reached(f).named
+    def odd(x, n):
+        found = [write(params, x) for _ in range(1 - n)]
+        return even(x, n - 1) if n else (ring, module.itself, *found)[2]
+
+    assert not left_behind(scene, lambda x: even(x, 3))
+
+
+def test_code_of_libraries_is_not_followed():
+    """Nor are scenes of this library, which look after themselves."""
+    own = tt.load({"type": "scene"})
+    f = tt.wrap(lambda x: (np.mean, torch.relu, mi.render, own, torch.nn.Module, x)[-1] * dr.pi)
+    torch.testing.assert_close(f(torch.ones(2)), torch.full((2,), torch.pi))
+
+
+def test_scenes_of_two_variants_are_refused(scene):
+    mi.set_variant("llvm_ad_mono")
+    other = mi.traverse(mi.load_dict({"type": "uniform", "value": 2.0}))
+    mi.set_variant(VARIANT)
+    with pytest.raises(ArgumentError, match="parameters of scenes of one variant, got llvm_ad_mono, llvm_ad_rgb"):
+        tt.wrap(lambda x: (scene, other, x)[-1])(torch.ones(1))
+
+
+def test_parameters_that_are_not_set():
+    """As the absorption of hair that has pigments."""
+    hair = mi.load_dict({"type": "hair", "eumelanin": 0.25, "pheomelanin": 0.5})
+    assert torch.equal(tt.wrap(lambda x: x * len((hair,)))(torch.ones(2)), torch.ones(2))
+
+
+# ----------------------------------------------------------------------------------------- gradients that would be lost
 
 
 def test_gradients_that_helpers_would_swallow_are_refused():
@@ -210,15 +254,54 @@ def test_gradients_that_helpers_would_swallow_are_refused():
     def helper(x):
         return x * mi.TensorXf(weight)
 
-    with pytest.raises(GradientError, match="variable 'weight', which is no argument"):
-        tt.wrap(lambda x: helper(x))(torch.ones(2))
+    all_of_them = [helper]
+    for calls in (lambda x: helper(x), lambda x: (all_of_them, helper(x))[1], functools.partial(helper)):
+        with pytest.raises(GradientError, match="variable 'weight', which is no argument"):
+            tt.wrap(calls)(torch.ones(2))
 
-    @dr.freeze
-    def frozen(x):
-        return x * x
+    def scaled(x, factor, *, by=weight):
+        return x * factor
 
-    def calls_it(x):
-        return frozen(x)
+    with pytest.raises(GradientError, match="variable 'by', which is no argument"):
+        tt.wrap(scaled)(torch.ones(2), 2.0)
+    with pytest.raises(GradientError, match="variable 'argument 0', which is no argument"):
+        tt.wrap(functools.partial(lambda factor, x: x, weight))(torch.ones(2))
 
-    with pytest.raises(GradientError, match="variable 'frozen' is frozen"):
-        tt.wrap(lambda x: calls_it(x))(torch.ones(2, requires_grad=True)).sum().backward()
+
+@pytest.mark.parametrize("way", ["variable", "entry", "attribute", "attribute of an attribute"])
+def test_attached_arrays_are_refused_wherever_they_are(way):
+    """A result that depends on one: those beside it that it does not need do no harm."""
+    weight = mi.Float(2.0)
+    dr.enable_grad(weight)
+    place = types.SimpleNamespace(inner=types.SimpleNamespace(weight=weight), weight=weight)
+    ways = {
+        "variable": lambda x: x * weight,
+        "entry": lambda x, row=(weight,): x * row[0],
+        "attribute": lambda x: x * place.weight,
+        "attribute of an attribute": lambda x: x * place.inner.weight,
+    }
+    with pytest.raises(GradientError, match=r"depends on arrays of Dr\.Jit that want a gradient"):
+        tt.wrap(ways[way])(torch.ones(2))
+    assert torch.equal(tt.wrap(lambda x: (x, place)[0] * dr.detach(weight))(torch.ones(2)), torch.full((2,), 2.0))
+
+
+def test_a_scene_that_is_attached_and_not_found_is_refused(scene):
+    """As after a step of ``mi.ad.Adam``, in a place too deep to be found: its derivative would be lost."""
+    params = mi.traverse(scene)
+    attached = mi.TensorXf(params[KEY])
+    dr.enable_grad(attached)
+    params[KEY] = attached
+    params.update()
+    hidden = held(params, 6)
+
+    def read(x):
+        found = hidden
+        while isinstance(found, list):
+            found = found[0]
+        return found[KEY] * x
+
+    x = torch.ones((2, 2, 3), requires_grad=True)
+    with pytest.raises(GradientError, match=r"tt\.wrap\(\.\.\., state=params\)"):
+        tt.wrap(read)(x)
+    tt.wrap(read, state=params)(x).sum().backward()
+    assert torch.equal(x.grad, torch.full((2, 2, 3), 0.5))
