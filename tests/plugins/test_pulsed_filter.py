@@ -9,13 +9,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from support.film_storage import storage
 from support.marks import long, long_pairs, long_rows
 from torchtransient import plugins
 from torchtransient.errors import SceneError
 from torchtransient.plugins.films.pulsed_filter import PulsedFilter
 from torchtransient.plugins.films.temporal_filter import BoxFilter
 from torchtransient.pulses import Pulse
-from torchtransient.testing.film_storage import storage
 
 VARIANT = "llvm_ad_rgb"
 BINS, WIDTH, START = 60, 0.25, 2.0

@@ -10,12 +10,12 @@ import pytest
 import torch
 
 import torchtransient as tt
+from tools.small_room import COLOUR, GREY, VARIANT, make_room
 from torchtransient.errors import ArgumentError, GradientError, SceneError, ShapeError, UnknownKeyError
 from torchtransient.rendering import scene_handle, scene_state, session
 from torchtransient.rendering.build_options import BuildOptions
 from torchtransient.rendering.taken import ReadyScene
 from torchtransient.rendering.variant import active_variant
-from torchtransient.testing.small_room import COLOUR, GREY, VARIANT, make_room
 
 
 @pytest.fixture

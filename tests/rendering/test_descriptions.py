@@ -13,6 +13,7 @@ import torch
 
 import torchtransient as tt
 from support.sweeps import together
+from tools.small_room import GREY, make_room
 from torchtransient.errors import SceneError
 from torchtransient.plugins.dictionaries import Pixels
 from torchtransient.rendering import description, ready_scenes
@@ -29,7 +30,6 @@ from torchtransient.rendering.description import (
 from torchtransient.rendering.node_checks import MOST_LEVELS
 from torchtransient.rendering.probe import PIXELS, _crop
 from torchtransient.rendering.ready_scenes import described_for_time
-from torchtransient.testing.small_room import GREY, make_room
 
 VARIANT = "llvm_ad_rgb"
 

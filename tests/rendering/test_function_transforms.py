@@ -7,8 +7,8 @@ import torch
 from torch.autograd import functional
 
 import torchtransient as tt
-from torchtransient.testing.small_room import COLOUR
-from torchtransient.testing.small_room import VARIANT as VARIANT
+from tools.small_room import COLOUR
+from tools.small_room import VARIANT as VARIANT
 
 START = torch.tensor([0.8, 0.5, 0.2])
 XS = torch.stack([START, START * 0.5])

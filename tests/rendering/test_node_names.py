@@ -12,9 +12,9 @@ import torch
 
 import torchtransient as tt
 from support.marks import long_rows
+from tools.small_room import VARIANT, make_room
 from torchtransient.rendering.node_names import _free_name, name_nested, name_nodes, take_merged_apart
 from torchtransient.rendering.nodes import children
-from torchtransient.testing.small_room import VARIANT, make_room
 
 MERGED = """<scene version="3.0.0">
 <integrator type="transient_path"/>

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from torchtransient.testing.small_room import COLOUR, VARIANT, make_room
+from tools.small_room import COLOUR, VARIANT, make_room
 
 
 @pytest.fixture(scope="module")

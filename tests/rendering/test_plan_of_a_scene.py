@@ -12,11 +12,11 @@ import torch
 
 import torchtransient as tt
 from support.marks import long_rows
+from tools.small_room import WALL_POSE, make_room
 from torchtransient.errors import GradientError, SceneError
 from torchtransient.gates import gates_to_text
 from torchtransient.rendering.plan import _check_known, _taken
 from torchtransient.rendering.plan_choices import Choice
-from torchtransient.testing.small_room import WALL_POSE, make_room
 
 VARIANT = "llvm_ad_rgb"
 XML = """<scene version="3.0.0"><default name="fov" value="20"/>

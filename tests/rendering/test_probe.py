@@ -14,10 +14,10 @@ import mitsuba as mi
 import pytest
 
 import torchtransient as tt
+from tools.small_room import VARIANT, make_room
 from torchtransient import plugins
 from torchtransient.errors import SceneError
 from torchtransient.rendering import probe
-from torchtransient.testing.small_room import VARIANT, make_room
 
 
 class Described:

@@ -17,9 +17,9 @@ import pytest
 import torch
 
 import torchtransient as tt
+from tools.small_room import VARIANT as VARIANT
 from torchtransient.errors import GradientError
 from torchtransient.rendering.reached import Reached
-from torchtransient.testing.small_room import VARIANT as VARIANT
 
 KEY = "data"
 

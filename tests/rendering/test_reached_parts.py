@@ -16,9 +16,9 @@ import pytest
 import torch
 
 import torchtransient as tt
+from tools.small_room import VARIANT as VARIANT
 from torchtransient.errors import GradientError
 from torchtransient.rendering.reached import Reached, _is_of_library, _is_private, _parts_of
-from torchtransient.testing.small_room import VARIANT as VARIANT
 
 
 @pytest.fixture

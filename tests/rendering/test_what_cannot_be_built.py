@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import torchtransient as tt
+from tools.small_room import VARIANT, make_room
 from torchtransient.errors import ArgumentError, SceneError
 from torchtransient.rendering.films.choices import of_entries
 from torchtransient.rendering.saving import values
-from torchtransient.testing.small_room import VARIANT, make_room
 
 GATES = [tt.Gate.gaussian(8.0, 0.5)]
 

@@ -14,9 +14,9 @@ from torch.autograd import forward_ad
 import torchtransient as tt
 from support.mitsuba_room import load_room
 from support.sweeps import together
+from tools.small_room import COLOUR
+from tools.small_room import VARIANT as VARIANT
 from torchtransient.errors import GradientError
-from torchtransient.testing.small_room import COLOUR
-from torchtransient.testing.small_room import VARIANT as VARIANT
 
 START = torch.tensor([0.8, 0.5, 0.2])
 TANGENT = torch.tensor([1.0, -0.5, 2.0])

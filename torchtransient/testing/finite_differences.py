@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from torchtransient.accuracy.statistics import ZTest, standard_error, two_sample_z_test
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.testing.statistics import ZTest, standard_error, two_sample_z_test
 
 Array = NDArray[np.float64]
 Render = Callable[[float, int], ArrayLike]

@@ -15,6 +15,7 @@ import torch
 from click.testing import CliRunner
 
 import torchtransient as tt
+from tools.small_room import WALL_POSE, make_room
 from torchtransient import plugins
 from torchtransient.cli.options import scene_options
 from torchtransient.errors import ArgumentError, SceneError
@@ -24,7 +25,6 @@ from torchtransient.rendering.films import choices
 from torchtransient.rendering.films.choice import CommandOption, FilmChoice, measured
 from torchtransient.rendering.films.histogram import Histogram
 from torchtransient.rendering.films.layout import cube_channels_first
-from torchtransient.testing.small_room import WALL_POSE, make_room
 
 VARIANT = "llvm_ad_rgb"
 

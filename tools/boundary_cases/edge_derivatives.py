@@ -9,10 +9,10 @@ import mitsuba as mi
 import numpy as np
 
 import torchtransient.plugins
+from tools.boundary_cases.moving_edges import Array, MovingEdge
 from torchtransient.rendering.build_options import BuildOptions
 from torchtransient.rendering.scene_handle import load
 from torchtransient.rendering.variant import active_variant
-from torchtransient.testing.moving_edges import Array, MovingEdge
 
 PASSES = ("primary", "vertex", "light", "specular")
 

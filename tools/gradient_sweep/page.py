@@ -8,10 +8,10 @@ from collections.abc import Container, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from tools.gradient_sweep.compare import RESOLVED, SCALE, SIGMAS, TOLERANCE, WEAK
+from tools.gradient_sweep.settings import all_settings
 from torchtransient.plugins.parameter_effect import CORRECT
 from torchtransient.plugins.swept_parameters import FILE
-from torchtransient.testing.gradient_sweep.compare import RESOLVED, SCALE, SIGMAS, TOLERANCE, WEAK
-from torchtransient.testing.gradient_sweep.settings import all_settings
 
 PAGE, DATA = "gradients_sweep.md", "gradients_sweep.json"
 # Columns of the JSON file, one row for a comparison.
@@ -34,7 +34,7 @@ HEAD = f"""# The sweep of gradients
 Every parameter that `scene.parameters()` offers for every plugin, bare and inside others, against central finite
 differences, in scenes in which no silhouette moves but in captures around a corner, where derivatives follow the
 outline of what is hidden. Written by `make sweep`
-(`torchtransient/testing/gradient_sweep`); the numbers are in [{DATA}]({DATA}) too.
+(`tools/gradient_sweep`); the numbers are in [{DATA}]({DATA}) too.
 
 - The loss is the transient of 4 x 4 pixels (exhaustive captures: 2 x 2, with 2 x 2 laser positions) weighed by a sine
   of the optical path length. What is differentiated is the loss along one fixed direction in the entries of a

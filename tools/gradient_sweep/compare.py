@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from tools.gradient_sweep.measure import Array, Subject, Tangent
 from torchtransient.errors import GradientError
-from torchtransient.testing.gradient_sweep.measure import Array, Subject, Tangent
 
 # The scale beside which an error is small: a part of the loss with absolute weights, for a change of the parameter by
 # its own size (a pose: by a metre or a fifth of a radian).

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchtransient.testing.gradient_sweep.bsdfs import METAL, normals, picture, rgb
-from torchtransient.testing.gradient_sweep.stages import Description, matte, move, stretch
+from tools.gradient_sweep.bsdfs import METAL, normals, picture, rgb
+from tools.gradient_sweep.stages import Description, matte, move, stretch
 
 Number = Callable[[float, float, int], Description]
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from tools.gradient_sweep.stages import Description, matte
 from torchtransient.plugins.mitsuba_compat import DIFFERENTIABLE_PLUGINS, POLARIZED_PLUGINS
-from torchtransient.testing.gradient_sweep.stages import Description, matte
 
 # Pitch of a texel on the plate, whose texture spans it once: what the camera sees lies within one patch, since the
 # slope of a bilinear texture jumps from patch to patch.

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from torchtransient.testing.gradient_sweep.bsdfs import METAL, picture, rgb
-from torchtransient.testing.gradient_sweep.shapes import grid_mesh
-from torchtransient.testing.gradient_sweep.stages import Description, Matrix, film, look, matte, move, stretch, turn
+from tools.gradient_sweep.bsdfs import METAL, picture, rgb
+from tools.gradient_sweep.shapes import grid_mesh
+from tools.gradient_sweep.stages import Description, Matrix, film, look, matte, move, stretch, turn
 
 KINDS = ("single", "confocal", "exhaustive")
 # Scanned points along each side of the wall; of an exhaustive scan laser positions, too.

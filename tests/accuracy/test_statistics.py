@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
+from torchtransient.accuracy import statistics as st
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.testing import statistics as st
 from torchtransient.testing.finite_differences import central_difference
 
 

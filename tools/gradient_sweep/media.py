@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from torchtransient.testing.gradient_sweep.bsdfs import rgb
-from torchtransient.testing.gradient_sweep.stages import Description, move, stretch
+from tools.gradient_sweep.bsdfs import rgb
+from tools.gradient_sweep.stages import Description, move, stretch
 
 # Where the slab of fog is: the view is narrower.
 _LOW, _SIZE = (-2.0, -2.0, 0.5), (4.0, 4.0, 1.5)

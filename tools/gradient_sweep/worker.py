@@ -10,13 +10,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from tools.gradient_sweep.compare import Effort, Result, judge
+from tools.gradient_sweep.measure import Subject, quiet
+from tools.gradient_sweep.settings import Setting
 from torchtransient.errors import TorchTransientError
 from torchtransient.plugins.swept_parameters import UNCHECKED
 from torchtransient.rendering.parameters import ParameterInfo
 from torchtransient.rendering.scene_handle import load
-from torchtransient.testing.gradient_sweep.compare import Effort, Result, judge
-from torchtransient.testing.gradient_sweep.measure import Subject, quiet
-from torchtransient.testing.gradient_sweep.settings import Setting
 
 
 def results_of(setting: Setting, folder: Path, effort: Effort) -> Iterator[Result]:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
+from tools.diffusion import extrapolation_length, internal_reflection, slab_transmittance
 from torchtransient.errors import UnitError
-from torchtransient.testing.diffusion import extrapolation_length, internal_reflection, slab_transmittance
 
 FOAM = {"reduced_scattering": 262.0, "absorption": 0.53, "index": 1.12}
 

@@ -15,19 +15,19 @@ import pytest
 import torch
 
 import torchtransient as tt
+from tools.every_plugin import every_plugin
+from tools.gradient_sweep import compare, runner
+from tools.gradient_sweep.bsdfs import HOLDERS
+from tools.gradient_sweep.compare import QUICK, Runs, judge
+from tools.gradient_sweep.measure import Subject, Tangent, tangents_of
+from tools.gradient_sweep.page import PAGE, page, read_rows, swept, with_rows_of_the_page
+from tools.gradient_sweep.runner import ResultFile
+from tools.gradient_sweep.settings import all_settings
+from tools.gradient_sweep.stages import between_lights, matte
+from tools.gradient_sweep.worker import for_setting
 from torchtransient.plugins import _registry
 from torchtransient.plugins.mitsuba_compat import COMPLETED_PLUGINS
 from torchtransient.plugins.swept_parameters import FILE, is_checked
-from torchtransient.testing.every_plugin import every_plugin
-from torchtransient.testing.gradient_sweep import compare, runner
-from torchtransient.testing.gradient_sweep.bsdfs import HOLDERS
-from torchtransient.testing.gradient_sweep.compare import QUICK, Runs, judge
-from torchtransient.testing.gradient_sweep.measure import Subject, Tangent, tangents_of
-from torchtransient.testing.gradient_sweep.page import PAGE, page, read_rows, swept, with_rows_of_the_page
-from torchtransient.testing.gradient_sweep.runner import ResultFile
-from torchtransient.testing.gradient_sweep.settings import all_settings
-from torchtransient.testing.gradient_sweep.stages import between_lights, matte
-from torchtransient.testing.gradient_sweep.worker import for_setting
 
 DOCS = Path(__file__).parents[2] / "docs"
 SETTINGS = {setting.name: setting for setting in all_settings()}
@@ -311,8 +311,8 @@ def test_a_process_has_one_variant():
 def test_from_the_command_line(tmp_path):
     """Processes, file and page, for one scene."""
     results, name = tmp_path / "results.jsonl", "sensor orthographic"
-    command = [sys.executable, "-m", "torchtransient.testing.gradient_sweep", "--results", str(results)]
-    subprocess.run([*command, "--only", f"^{name}$", "--quick"], check=True)
+    command = [sys.executable, "-m", "tools.gradient_sweep", "--results", str(results)]
+    subprocess.run([*command, "--only", f"^{name}$", "--quick"], check=True, cwd=runner.ROOT)
     assert {line["key"] for line in ResultFile(results).results()} == {"sensor.to_world"}
 
 

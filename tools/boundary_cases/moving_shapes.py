@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torchtransient.scenes.transforms import rotate, scale, translate
-from torchtransient.testing.moving_edges import (
+from tools.boundary_cases.moving_edges import (
     Array,
     Description,
     Direction,
@@ -24,6 +23,7 @@ from torchtransient.testing.moving_edges import (
     shadow,
     turned,
 )
+from torchtransient.scenes.transforms import rotate, scale, translate
 
 Parts = dict[str, Description]
 # Where the body is, and half its size, in metres.

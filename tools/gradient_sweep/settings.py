@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from torchtransient.testing.gradient_sweep import bsdfs, lights, media, scans, shapes, textures
-from torchtransient.testing.gradient_sweep.shapes import Maker
-from torchtransient.testing.gradient_sweep.stages import (
+from tools.gradient_sweep import bsdfs, lights, media, scans, shapes, textures
+from tools.gradient_sweep.shapes import Maker
+from tools.gradient_sweep.stages import (
     Description,
     between_lights,
     filled,

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from torchtransient.testing.gradient_sweep.bsdfs import picture, rgb
-from torchtransient.testing.gradient_sweep.stages import Description, camera, film, look, move, stretch, turn
+from tools.gradient_sweep.bsdfs import picture, rgb
+from tools.gradient_sweep.stages import Description, camera, film, look, move, stretch, turn
 
 # Their light departs from the sphere around the scene.
 DISTANT = ("directional", "constant", "envmap", "sunsky", "sunsky (by date)", "timed_sunsky")

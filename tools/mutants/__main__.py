@@ -1,7 +1,7 @@
 """Sixty changes of a room's sources, one after the other, and whether its tests notice: the default ones, then the slow
 ones that execute what has changed.
 
-    make mutants ROOM=losses SEED=1        (or, from tests/: python -m mutation losses 1 [--count 60])
+    make mutants ROOM=losses SEED=1        (or, from tools/: python -m mutants losses 1 [--count 60])
 
 The package is changed in a copy. Results are appended to build/mutants/ROOM-SEED.jsonl, a line each, and a run that was
 stopped goes on behind the last of them; ``--again`` repeats the survivors of an earlier run, for tests that were
@@ -28,10 +28,10 @@ from pathlib import Path
 
 import pytest
 
-from . import changes, equivalent, executed, rooms
+from . import changes, executed, rooms
 
 ROOT = Path(__file__).resolve().parents[2]
-COPIED = ("torchtransient", "tests", "docs", "training_examples", "benchmarks", "pyproject.toml", "README.md",
+COPIED = ("torchtransient", "tests", "tools", "docs", "training_examples", "benchmarks", "pyproject.toml", "README.md",
           "CHANGELOG.md", "LICENSE", "Makefile", "constraints.txt", "constraints-lowest.txt",
           "hatch_build.py")  # fmt: skip
 # A change that makes a loop endless is noticed, too: the tests would not end.
@@ -230,20 +230,15 @@ def try_change(
 
 def tell(results: list[dict[str, object]]) -> None:
     """Score and survivors."""
-    proofs = equivalent.proofs()
     survivors = [result for result in results if result["outcome"] == "survived"]
-    unnoticed = [result for result in survivors if (result["path"], result["diff"]) not in proofs]
-    for result in unnoticed:
+    for result in survivors:
         print(f"\n{result['path']}:{result['line']} ({result['operator']})\n{result['diff']}")
-    same = len(survivors) - len(unnoticed)
-    counted = len(results) - same
-    caught = counted - len(unnoticed)
-    share = 100 * caught / max(1, counted)
-    print(f"\n{caught} of {counted} changes were noticed ({share:.0f} %), {same} more change nothing.")
+    caught = len(results) - len(survivors)
+    print(f"\n{caught} of {len(results)} changes were noticed ({100 * caught / max(1, len(results)):.0f} %).")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="mutation", description=__doc__)
+    parser = argparse.ArgumentParser(prog="mutants", description=__doc__)
     parser.add_argument("room", choices=sorted(rooms.ROOMS))
     parser.add_argument("seed", type=int)
     parser.add_argument("--count", type=int, default=60)
@@ -294,7 +289,7 @@ def _seconds_unchanged(folder: Path, test: str, data: Path, marked: tuple[str, .
     begun = time.monotonic()
     outcome, by = run_tests(folder, [test], 3600.0, data, marked)
     if outcome != "survived":
-        sys.exit(f"mutation: the tests have to pass before anything is changed, failed: {by}.")
+        sys.exit(f"mutants: the tests have to pass before anything is changed, failed: {by}.")
     return time.monotonic() - begun
 
 

@@ -1,4 +1,4 @@
-"""``python -m torchtransient.testing.gradient_sweep``: run the sweep, write the page."""
+"""``python -m tools.gradient_sweep``: run the sweep, write the page."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ import argparse
 import re
 from pathlib import Path
 
-import torchtransient  # noqa: F401  finds an LLVM before Dr.Jit does
-from torchtransient.testing.gradient_sweep.page import with_rows_of_the_page, write_files
-from torchtransient.testing.gradient_sweep.runner import ResultFile, sweep, work
-from torchtransient.testing.gradient_sweep.settings import all_settings
+from tools.gradient_sweep.page import with_rows_of_the_page, write_files
+from tools.gradient_sweep.runner import ResultFile, sweep, work
+from tools.gradient_sweep.settings import all_settings
 
 
 def main() -> None:

@@ -18,10 +18,11 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from torchtransient.testing.gradient_sweep.compare import QUICK, Effort, Result
-from torchtransient.testing.gradient_sweep.settings import Setting, all_settings
-from torchtransient.testing.gradient_sweep.worker import results_of
+from tools.gradient_sweep.compare import QUICK, Effort, Result
+from tools.gradient_sweep.settings import Setting, all_settings
+from tools.gradient_sweep.worker import results_of
 
+ROOT = Path(__file__).parents[2]
 BATCH = 24
 # A scene has a few dozen parameters of a few seconds each.
 SILENCE = 1800.0
@@ -104,12 +105,12 @@ def _run_process(
     names: list[str], results: ResultFile, quick: bool, progress: Callable[[str], None]
 ) -> tuple[list[str], str]:
     """The settings that a process has finished, and its last words."""
-    module = "torchtransient.testing.gradient_sweep"
+    module = "tools.gradient_sweep"
     command = [sys.executable, "-m", module, "--worker", *(["--quick"] if quick else [])]
     finished: list[str] = []
     with tempfile.TemporaryFile("w+", encoding="utf-8") as said:
         process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=said, text=True, encoding="utf-8"
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=said, text=True, encoding="utf-8", cwd=ROOT
         )
         guard = threading.Timer(SILENCE * len(names), process.kill)
         guard.start()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torchtransient.testing.gradient_sweep.stages import Description, move, stretch, turn
+from tools.gradient_sweep.stages import Description, move, stretch, turn
 
 # Half the size of plates, in metres: their rims are out of reach.
 _HALF = 30.0
