@@ -53,7 +53,7 @@ def public_classes():
 def test_an_unknown_argument_is_said_of_the_class_that_was_called(name, kind):
     """Or of the base class whose ``__init__`` it has."""
     names = "|".join(base.__name__ for base in kind.__mro__ if base is not object)
-    with pytest.raises(TypeError, match=rf"^({names})\..*no_such_argument"):
+    with pytest.raises(TypeError, match=rf"^({names})\."):
         kind(no_such_argument=1)
 
 
