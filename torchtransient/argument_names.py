@@ -1,4 +1,4 @@
-"""Python's errors about arguments, said of what was called rather than of what it calls."""
+"""Python's errors about arguments under the name of the function that the user called."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from typing import Any
 
 @contextmanager
 def arguments_of(name: str, function: Callable[..., Any], given: Collection[str] = ()) -> Iterator[None]:
-    """A TypeError of calling ``function`` with wrong arguments is said of ``name``, with the arguments there are, those
-    aside that ``name`` itself has ``given``. For functions that hand their ``**options`` on.
+    """Raise a TypeError about the arguments of ``function`` under another name, with the names of its arguments.
+
+    For functions that hand their ``**options`` on; ``given``: arguments that such a function passes itself.
     """
     try:
         yield

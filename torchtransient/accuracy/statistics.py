@@ -42,7 +42,7 @@ class ZTest:
 
     @property
     def passed(self) -> bool:
-        """Whether no single entry stands out. Look at `chi2_z` for a small shift of all of them."""
+        """True if no single entry stands out. Look at `chi2_z` for a small shift of all of them."""
         return self.worst <= self.limit
 
     def __str__(self) -> str:
@@ -55,7 +55,7 @@ class ZTest:
 
 
 def standard_error(runs: ArrayLike) -> Array:
-    """Standard error of the mean over independent runs (K, ...), K >= 2; shape (...)."""
+    """Return the standard error of the mean over independent runs (K, ...), K >= 2, in the shape (...) of one."""
     data = _runs("runs", runs)
     return np.asarray(data.std(axis=0, ddof=1) / math.sqrt(data.shape[0]), dtype=np.float64)
 
@@ -63,10 +63,15 @@ def standard_error(runs: ArrayLike) -> Array:
 def z_test(runs: ArrayLike, expected: ArrayLike, alpha: float = 1e-3, rounding: float = 0.0) -> ZTest:
     """Test that independent runs (K, ...) have the mean `expected` (...), which is known exactly.
 
-    `rounding` is an absolute error that the comparison forgives, for float32 results with hardly any noise. The limit
-    on
-    |z| is set so that a correct result fails with probability `alpha` over all entries together (Sidak). Raises
-    ShapeError when the shapes differ or K < 2.
+    Args:
+        runs: independent runs, (K, ...), K >= 2.
+        expected: the mean, (...) or one number.
+        alpha: probability that a correct result fails, over all entries together (Sidak).
+        rounding: absolute error that is forgiven, for float32 results with hardly any noise.
+
+    Raises:
+        ShapeError: if the shapes differ or K < 2.
+        UnitError: if `alpha` is not between 0 and 1.
     """
     data = _runs("runs", runs)
     target = np.asarray(expected, dtype=np.float64)
@@ -76,7 +81,17 @@ def z_test(runs: ArrayLike, expected: ArrayLike, alpha: float = 1e-3, rounding: 
 
 
 def two_sample_z_test(runs_a: ArrayLike, runs_b: ArrayLike, alpha: float = 1e-3, rounding: float = 0.0) -> ZTest:
-    """Test that two sets of independent runs, (K, ...) and (M, ...), have the same mean (Welch's test per entry)."""
+    """Test that two sets of independent runs have the same mean (Welch's test per entry).
+
+    Args:
+        runs_a: runs of one set, (K, ...), K >= 2.
+        runs_b: runs of the other set, (M, ...), M >= 2.
+        alpha: probability that equal means fail, over all entries together.
+        rounding: absolute difference that is forgiven.
+
+    Raises:
+        ShapeError: if the shapes of one run differ, or a set has fewer than two.
+    """
     a, b = _runs("runs_a", runs_a), _runs("runs_b", runs_b)
     if a.shape[1:] != b.shape[1:]:
         raise ShapeError(f"expected runs of equal shape, got {a.shape[1:]} and {b.shape[1:]}")
@@ -88,7 +103,7 @@ def two_sample_z_test(runs_a: ArrayLike, runs_b: ArrayLike, alpha: float = 1e-3,
 
 
 def pool_small_bins(expected: ArrayLike, minimum: float) -> NDArray[np.intp]:
-    """First indices of groups of neighbouring bins that each hold at least `minimum` of `expected` (T,).
+    """Return the first indices of groups of neighbouring bins that each hold at least `minimum` of `expected` (T,).
 
     Few events in a bin are not normally distributed; pool both sides of a test with `np.add.reduceat(values, starts,
     axis=-1)`. What is left at the end joins the last group. Raises UnitError when all bins together hold less than
@@ -138,7 +153,7 @@ def log_log_slope(x: ArrayLike, y: ArrayLike) -> Slope:
 
 
 def student_t_deviate(t: float, dof: float) -> float:
-    """The normal deviate with the same tail probability as Student's `t` with `dof` degrees of freedom."""
+    """Return the normal deviate with the same tail probability as Student's `t` with `dof` degrees of freedom."""
     if math.isinf(t):
         return t
     tail = 0.5 * _incomplete_beta(dof / 2.0, 0.5, dof / (dof + t * t))
