@@ -48,7 +48,7 @@ def point_capture(
 
 
 def _distances(scan: Scan, point: Tensor) -> tuple[Tensor, Tensor]:
-    """Of every pair (P,): the distances of a point from spot and sensor point."""
+    """Distances of a point from spot and sensor point of every pair, (P,)."""
     spots, sensors = (
         torch.linalg.vector_norm(tensor.detach().cpu().reshape(-1, 3) - point, dim=-1)
         for tensor in (scan.laser_points, scan.sensor_points)

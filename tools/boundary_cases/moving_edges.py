@@ -333,12 +333,12 @@ def grooves(angle: float = 30.0) -> Description:
 
 
 def shadow(light: Description, depth: int = 2, /, **parts: Description) -> Description:
-    """What casts the shadow is out of view."""
+    """Shadow of a plate that is out of view."""
     return scene(depth, light, 22.0, **(parts or {"hid": hidden_plate()}))
 
 
 def indirect(light: Description | None = None) -> Description:
-    """What hides the panel from the wall is out of view."""
+    """Panel hidden from the wall by a part that is out of view."""
     panel = rectangle(translate([1.9, 0, 1.0]) @ rotate([0, 1, 0], -80), paint(0.9))
     return scene(4, light or side_area(), 22.0, blk=blocker(), side=panel)
 

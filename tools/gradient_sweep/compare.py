@@ -33,7 +33,7 @@ LONGER_STEPS = 4.0
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is done for one parameter: seconds of a processor for one direction, seeds and samples per pixel to
+    """Effort for one parameter: seconds of a processor for one direction, seeds and samples per pixel to
     begin with, at most so many directions from which one on, at most so many paths a seed, seeds to confirm a
     contradiction with. Of so many parameters, one is differentiated in forward mode too. What calls for so many times
     as many paths is given up.
@@ -50,12 +50,12 @@ class Effort:
     patience: float = float("inf")
 
     def chosen(self, tangents: list[Tangent]) -> list[Tangent]:
-        """Of the directions in a parameter those that are looked at."""
+        """Select directions in a parameter."""
         first = self.first_direction if self.first_direction < len(tangents) else 0
         return tangents[first : first + self.directions]
 
     def in_both_modes(self, name: str) -> bool:
-        """Whether the parameter of that name is differentiated in forward mode too."""
+        """True if the parameter of that name is differentiated in forward mode too."""
         return zlib.crc32(name.encode()) % self.forward_of == 0
 
 
@@ -66,7 +66,7 @@ QUICK = Effort(seconds=60.0, seeds=4, spp=256, directions=1, paths=2**16, confir
 
 @dataclass
 class Result:
-    """What the sweep found for one parameter of one scene along one direction."""
+    """Result for one parameter of one scene along one direction."""
 
     setting: str
     key: str
@@ -126,7 +126,7 @@ class Runs:
 
     @property
     def is_nothing(self) -> bool:
-        """Whether there is no effect, up to a small part of the scale."""
+        """True if there is no effect, up to a small part of the scale."""
         error = self.error_of(self.differences)
         small = max(abs(float(self.reverse.mean())), error) <= RESOLVED * self.scale
         return small and abs(float(self.differences.mean())) <= 3 * error + ROUNDING * RESOLVED * self.scale

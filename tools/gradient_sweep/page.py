@@ -1,4 +1,4 @@
-"""What the sweep writes: ``docs/gradients_sweep.md``, the same as JSON, and what the table of parameters reads."""
+"""Files of the sweep: ``docs/gradients_sweep.md``, the same as JSON, and the data of the table of parameters."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def _cells(row: dict[str, Any]) -> list[str]:
 
 
 def _state(row: dict[str, Any]) -> str:
-    """What the table of parameters says, in a few words."""
+    """Entry of the table of parameters, in a few words."""
     if row["biased"] or row["verdict"] == "refused":
         return str(row["table"])
     # Not all edges are followed in every scene.
@@ -111,7 +111,7 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> str:
-    """How many comparisons there are of each outcome."""
+    """Number of comparisons of each outcome."""
     counts = Counter(row["verdict"] for row in rows)
     compared = sum(counts[v] for v in (*DECIDED, *UNDECIDED, "not finite"))
     said = ", ".join(f"{counts[verdict]} {verdict}" for verdict in sorted(counts, key=lambda v: -counts[v]))
@@ -129,7 +129,7 @@ def place_without_shapes(place: Sequence[str]) -> list[str]:
 
 
 def swept(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """What the table of parameters reads: names that took part in a decided comparison, places of undecided ones.
+    """Data of the table of parameters: names that took part in a decided comparison, places of undecided ones.
 
     A parameter is decided in a place when it is along one direction in one scene.
     """

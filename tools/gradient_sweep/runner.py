@@ -41,7 +41,7 @@ class ResultFile:
             file.write(json.dumps(line) + "\n")
 
     def lines(self) -> list[dict[str, Any]]:
-        """What is there; a last line that was cut off is not."""
+        """Read all lines; a last line that was cut off is dropped."""
         found = []
         for line in self.path.read_text(encoding="utf-8").splitlines() if self.path.exists() else ():
             try:
@@ -130,7 +130,7 @@ def _run_process(
 
 
 def work(quick: bool) -> None:
-    """What a worker process does: names of settings from the standard input, JSON lines to the standard output."""
+    """Run a worker process: names of settings from the standard input, JSON lines to the standard output."""
     by_name = {setting.name: setting for setting in all_settings()}
     output = sys.stdout
     sys.stdout = sys.stderr  # what others print must not come between the lines

@@ -146,7 +146,7 @@ def captures() -> Iterator[Capture]:
 
 
 def _other_light() -> Iterator[Capture]:
-    """What does not depend on the type of the capture."""
+    """Parts that do not depend on the type of the capture."""
     painted = _of("confocal", lambda: plate({"type": "diffuse", "reflectance": picture(3)}), legs=False)
     yield Capture("confocal", "texture", painted, without=("wall.sensor.", "laser."))
     metal = _of("single", lambda: plate(ROUGH_METAL), legs=False)

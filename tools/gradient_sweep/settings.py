@@ -57,19 +57,19 @@ class Setting:
 
     @property
     def name(self) -> str:
-        """What messages and results call it."""
+        """Name in messages and results."""
         words = f"{self.kind} {self.plugin}" + (f" in {self.inside}" if self.inside else "")
         return words if self.variant == RGB else f"{words}, {self.variant.removeprefix('llvm_ad_')}"
 
     @property
     def is_bare(self) -> bool:
-        """Whether it stands for its plugin alone, in the simplest place that it can be in."""
+        """True if it stands for its plugin alone, in the simplest place."""
         if self.inside not in BARE or self.plugin in AGAIN:
             return False
         return bool(self.variant == RGB or self.kind == "spectrum" or self.plugin in FILTERS)
 
     def takes(self, key: str) -> bool:
-        """Whether a parameter is to be looked at."""
+        """True if a parameter is measured."""
         return key.startswith(self.keys) and not key.startswith(self.without)
 
 
@@ -111,7 +111,7 @@ def _between_lights(bsdf: Description, grazing: bool = False) -> Maker:
 
 
 def _before_a_filter(bsdf: Description, grazing: bool = False) -> Maker:
-    """What is behind the plate is polarized."""
+    """Polarized light from behind the plate."""
     return lambda _: between_lights(bsdf, grazing) | {"sheet": polarizing_sheet()}
 
 

@@ -45,7 +45,7 @@ def textures() -> dict[str, Number]:
 
 
 def spectra() -> dict[str, Number]:
-    """What has a shape over the wavelength."""
+    """Spectra that vary with the wavelength."""
     return {
         "rgb": lambda low, high, _: rgb(low, (low + high) / 2, high),
         "regular": lambda low, high, _: _spectrum("regular", low, high),
@@ -69,7 +69,7 @@ class Slot:
     sloping: bool = False
 
     def takes(self, texture: str) -> bool:
-        """Whether a texture matters there. Of Mitsuba's, others have no slope, or none that is not zero."""
+        """True if a texture matters there. Of Mitsuba's, others have no slope, or none that is not zero."""
         return not self.sloping or texture == "bitmap"
 
 

@@ -47,7 +47,7 @@ ADOPTS_ORPHANS = 36  # PR_SET_CHILD_SUBREAPER
 
 
 def copied(folder: Path) -> None:
-    """What tests read, beside the package."""
+    """Copy the package and all that tests read."""
     for name in COPIED:
         source = ROOT / name
         if source.is_dir():
@@ -57,7 +57,7 @@ def copied(folder: Path) -> None:
 
 
 def preload() -> None:
-    """What every run imports and no change touches: each is a fork of this process. Dr.Jit would start a thread."""
+    """Import modules that no change touches: each run is a fork of this process. Dr.Jit would start a thread."""
     import numpy as np
     import scipy.signal
     import scipy.stats
@@ -74,7 +74,7 @@ def adopt_orphans() -> None:
 
 
 def end_children() -> None:
-    """Every process that runs of tests have left, those with a session of their own included."""
+    """End every process that runs of tests have left, those with a session of their own included."""
     file = Path(f"/proc/self/task/{os.getpid()}/children")
     while children := [int(word) for word in file.read_text().split()] if file.exists() else []:
         for child in children:
@@ -152,7 +152,7 @@ def ordered(folder: Path, known: executed.Executed, names: Iterable[str], change
 def rounds(
     folder: Path, known: executed.Executed, change: changes.Change, source: bytes
 ) -> Iterator[tuple[list[str], executed.Chosen, float]]:
-    """What is asked one after the other: test files, which tests of them, seconds that they take without the change."""
+    """Rounds of tests, one after the other: test files, their tests, seconds that they take without the change."""
     asked = known.tests(change.path, executed.range_of(source, change.line))
     files = ordered(folder, known, asked, change)
     for names in (files[:FIRST], files[FIRST:]):

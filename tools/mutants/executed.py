@@ -1,4 +1,4 @@
-"""Which tests execute a line of the package: the others cannot notice that it has changed.
+"""Tests that execute a line of the package: the others cannot notice that it has changed.
 
 Every test file runs in a process of its own, since what a first file has left in a cache no second one executes. What a
 fixture of several tests executes counts for each of them. Lines that are executed when a module is imported count for
@@ -52,7 +52,7 @@ class Executed:
 
 
 def measured(folder: Path, tests: list[str], record: Path, run: Callable[[str, Path], float]) -> Executed:
-    """What ``run(test file, data file)`` executes, which returns seconds; kept in ``record`` for the same texts."""
+    """Measure the lines that ``run(test file, data file)`` executes, which returns seconds; cached in ``record``."""
     state = _digest(folder)
     kept = json.loads(record.read_text()) if record.exists() else {}
     if kept.get("state") != state:
@@ -103,7 +103,7 @@ class Recorder:
         self.coverage.start()
 
     def pytest_collection_finish(self, session: pytest.Session) -> None:
-        """Which tests use a fixture."""
+        """Collect the tests that use a fixture."""
         for item in session.items:
             self.seconds[item.nodeid] = 0.0
             for name in getattr(item, "fixturenames", ()):
@@ -165,7 +165,7 @@ class Chosen:
 
     @pytest.hookimpl(trylast=True)
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
-        """What is collected becomes what is asked for."""
+        """Keep the chosen tests alone."""
         items[:] = [
             item
             for item in items
