@@ -132,8 +132,8 @@ def test_gradients_of_a_heavy_tailed_loss_have_no_error():
 
 @pytest.mark.slow
 def test_gradients_of_a_body_with_hollows_have_an_error():
-    """A bumpy sphere before a wall, whose parts hide and light each other: the tail of its pose's gradient is that of
-    few samples, with an index of 3.6 to 4.1 over 4 seeds, where 2 is the limit.
+    """A bumpy sphere before a wall, whose parts hide and light each other: the root of the mean square of its pose's
+    gradient is at most twice the median of 200 runs (1.6 of 300).
     """
     n, m = 24, 16
     turns = np.linspace(0, 2 * np.pi, n, endpoint=False)
@@ -164,11 +164,16 @@ def test_gradients_of_a_body_with_hollows_have_an_error():
     }  # fmt: skip
     pose, albedo = "body.to_world", "wall.bsdf.reflectance.value"
     renderer = tt.TransientRenderer(tt.load(scene, variant=VARIANT), [pose, albedo])
-    report = tt.cost_of_accuracy(
-        renderer, spp=(16, 64), gradients=[pose, albedo], samplers=("independent",), progress=False
-    )
-    heavy = {point.quantity: point.tail.heavy for point in report.points if point.tail is not None}
-    assert heavy == {f"d loss / d {pose}": False, f"d loss / d {albedo}": False}
+    report = tt.cost_of_accuracy(renderer, spp=(16, 64), gradients=[albedo], samplers=("independent",), progress=False)
+    assert not any(point.tail.heavy for point in report.points if point.tail is not None)
+    gradients = []
+    for seed in range(200):
+        value = renderer.values[pose].detach().requires_grad_()
+        loss = cosine_over_the_window(renderer({pose: value}, seed=seed, spp=16))
+        gradients.append(torch.autograd.grad(loss, value)[0])
+    found = torch.stack(gradients).flatten(1)
+    off = (found - found.median(0).values).norm(dim=1)
+    assert off.square().mean().sqrt() < 2 * off.median()
 
 
 def test_sample_counts_are_those_that_were_drawn():
