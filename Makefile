@@ -106,12 +106,12 @@ audit: $(READY)
 # Goes on where an earlier run has stopped: remove build/gradient_sweep.jsonl to begin anew. One plugin alone, with the
 # page's rows of the others: make sweep ONLY=retroreflector
 sweep: $(READY)
-	$(BIN)/python -m torchtransient.testing.gradient_sweep --write docs $(if $(ONLY),--only '$(ONLY)')
+	$(BIN)/python -m tools.gradient_sweep --write docs $(if $(ONLY),--only '$(ONLY)')
 	$(if $(ONLY),,$(BIN)/python benchmarks/boundary_cost.py sweep --page docs/moving_shapes.md)
 
-# ROOM: a name in tests/mutation/rooms.py. A run that was stopped goes on; its record is build/mutants/ROOM-SEED.jsonl.
+# ROOM: a name in tools/mutants/rooms.py. A run that was stopped goes on; its record is build/mutants/ROOM-SEED.jsonl.
 mutants: $(READY)
-	cd tests && OMP_NUM_THREADS=1 $(abspath $(BIN))/python -m mutation $(ROOM) $(SEED)
+	cd tools && OMP_NUM_THREADS=1 $(abspath $(BIN))/python -m mutants $(ROOM) $(SEED)
 
 lint: $(READY)
 	$(BIN)/ruff check .

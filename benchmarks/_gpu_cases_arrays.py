@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from _gpu_cases_registry import Found, Side, case
 
-from torchtransient.testing.small_room import make_room
+from tools.small_room import make_room
 
 FLOATS = (torch.float32, torch.float64, torch.float16, torch.bfloat16)
 

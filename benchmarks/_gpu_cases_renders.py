@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from _gpu_cases_registry import Found, Side, case
 
+from tools.small_room import COLOUR, WALL_POSE, make_room
 from torchtransient.rendering.labels import scene_labels
-from torchtransient.testing.small_room import COLOUR, WALL_POSE, make_room
 
 
 def several_calls(side: Side, renderer: tt.TransientRenderer, calls: int = 4) -> Found:

@@ -12,7 +12,7 @@ from _gpu_cases_registry import Found, Side, case
 from _gpu_cases_renders import several_calls
 
 import torchtransient as tt
-from torchtransient.testing.small_room import make_room
+from tools.small_room import make_room
 
 
 @case()

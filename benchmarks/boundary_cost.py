@@ -43,11 +43,11 @@ import torchtransient as tt  # isort: skip
 import drjit as dr
 import torch
 
+from tools.boundary_cases.closed_rooms import ROOMS
+from tools.boundary_cases.edge_derivatives import PASSES, EdgeProblem, choose_passes, components, pixel_weights
+from tools.boundary_cases.moving_edges import CASES, CONCAVE, QUICK, MovingEdge, histograms, plain_plate
+from tools.boundary_cases.moving_shapes import BODIES, CHANGES, PLACES, moving_shape
 from torchtransient.errors import GradientError, TorchTransientWarning
-from torchtransient.testing.closed_rooms import ROOMS
-from torchtransient.testing.edge_derivatives import PASSES, EdgeProblem, choose_passes, components, pixel_weights
-from torchtransient.testing.moving_edges import CASES, CONCAVE, QUICK, MovingEdge, histograms, plain_plate
-from torchtransient.testing.moving_shapes import BODIES, CHANGES, PLACES, moving_shape
 
 Array = NDArray[np.float64]
 Result = dict[str, Any]

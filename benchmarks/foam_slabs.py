@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 import torchtransient as tt
+from tools.diffusion import slab_transmittance
 from torchtransient.scenes.transforms import look_at, rotate, scale, translate
-from torchtransient.testing.diffusion import slab_transmittance
 from torchtransient.units import SPEED_OF_LIGHT
 
 HERE = Path(__file__).resolve().parent

@@ -27,6 +27,7 @@ from _runner import arguments, environment, ratio, report, summary
 from _tal import Tal
 
 import torchtransient as tt
+from tools.point_captures import point_capture
 from torchtransient.reconstruction import (
     Backprojection,
     FilteredBackprojection,
@@ -35,7 +36,6 @@ from torchtransient.reconstruction import (
     TransientCamera,
     VoxelGrid,
 )
-from torchtransient.testing.point_captures import point_capture
 
 BINS, WIDTH = 512, 0.0096
 PLANES = [0.8 + 0.025 * k for k in range(16)]

@@ -24,9 +24,9 @@ import torch
 from _runner import arguments, environment, summary
 
 import torchtransient as tt
+from tools.point_captures import point_capture
 from torchtransient.nlos import VoxelGrid
 from torchtransient.nlos.methods import default_wavelength
-from torchtransient.testing.point_captures import point_capture
 
 RESULTS = Path(__file__).parent / "results" / "nlos_reconstruction_cost.json"
 DEPTHS, DISTANCE, PHOTONS = (0.3, 0.9), 0.6, 50

@@ -20,7 +20,7 @@ import drjit as dr
 import mitsuba as mi
 import torch
 
-from torchtransient.testing.small_room import COLOUR, make_room
+from tools.small_room import COLOUR, make_room
 
 START = [0.8, 0.5, 0.2]
 

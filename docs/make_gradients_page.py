@@ -39,9 +39,9 @@ def seen_parameters() -> dict[str, dict[tuple[str, str], Any]]:
     """By kind of plugin, what every real-valued parameter of every plugin does: (class, key) -> effect."""
     import mitsuba as mi
 
+    from tools.every_plugin import every_plugin
     from torchtransient.plugins.parameter_effect import lineage
     from torchtransient.plugins.parameters import can_carry_gradients, effect_of
-    from torchtransient.testing.every_plugin import every_plugin
 
     found: dict[str, dict[tuple[str, str], Any]] = {kind: {} for kind in KINDS}
     with tempfile.TemporaryDirectory() as folder:

@@ -2,7 +2,7 @@
 the library's own for what users do; bare ones of Python only where they stay inside.
 
 Every import of every file is read with `ast`, the ones inside functions too. Tests share through `tests/support`, and
-benchmarks do without tests.
+benchmarks and `tools` do without tests.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from support.syntax import statements, syntax_of
 PACKAGE = Path(torchtransient.__file__).parent
 TESTS = Path(__file__).parent
 BENCHMARKS = sorted((TESTS.parent / "benchmarks").glob("*.py"))
+TOOLS = sorted(p for p in (TESTS.parent / "tools").rglob("*.py") if p.parent.name != "mutants")  # which runs tests
 LEVEL = {
     "errors": 0, "_llvm": 0, "_collection": 0, "units": 0, "axes": 0, "capture": 0, "interfaces": 0, "pulses": 0,
     "gates": 0, "stokes": 0, "tensor_record": 0, "quantities": 0, "volume_methods": 0,
@@ -173,11 +174,11 @@ def violations(path, package=PACKAGE):
 def is_below(other, room):
     if LEVEL[other] != LEVEL[room]:
         return LEVEL[other] < LEVEL[room]
-    # Within a level: `accuracy` quotes the statistics of `testing`, and everything may know errors and units;
+    # Within a level: `testing` judges by the statistics of `accuracy`, and everything may know errors and units;
     # likelihoods are those of the sensors; metrics read results as losses do, and volumes; captures are records with
     # axes; simulated ones have files, data sets both; rows of numbers are given alike.
     within = {
-        ("accuracy", "testing"), ("gates", "pulses"), ("losses", "sensing"), ("capture", "axes"),
+        ("testing", "accuracy"), ("gates", "pulses"), ("losses", "sensing"), ("capture", "axes"),
         ("capture", "tensor_record"), ("capture", "quantities"), ("nlos", "files"), ("data", "files"), ("data", "nlos"),
         ("floating", "quantities"), ("metrics", "losses"), ("metrics", "reconstruction"), ("axes", "quantities"),
         ("gates", "quantities"), ("pulses", "quantities"), ("capture", "argument_names"),
@@ -286,8 +287,8 @@ def from_tests(path):
             yield from (f"the path {node.value}" for part in re.split(r"[/\\\\]", node.value) if part == "tests")
 
 
-@together("path", BENCHMARKS, lambda p: p.stem)
-def test_benchmarks_do_without_tests(path):
+@together("path", BENCHMARKS + TOOLS, lambda p: p.relative_to(TESTS.parent).as_posix())
+def test_benchmarks_and_tools_do_without_tests(path):
     assert list(from_tests(path)) == []
 
 
@@ -336,7 +337,7 @@ def test_every_package_has_a_level():
         ("plugins", "from .. import rendering", "imports 'rendering'"),
         ("plugins", "from torchtransient import vis", "imports 'vis'"),
         ("scenes", "from torchtransient.accuracy import measure", "imports 'accuracy'"),
-        ("testing", "from torchtransient.accuracy import measure", "imports 'accuracy'"),
+        ("accuracy", "from torchtransient.testing import closed_forms", "imports 'testing'"),
         ("capture", "def f():\n    import mitsuba as mi", "must not know mitsuba"),
         ("capture", "from torchtransient.reconstruction import fk", "imports 'reconstruction'"),
         ("reconstruction", "import mitsuba as mi", "must not know mitsuba"),

@@ -8,9 +8,9 @@ from torch import nn
 
 import torchtransient as tt
 from support.sweeps import together
+from tools.small_room import VARIANT, make_room
 from torchtransient import scalar_state
 from torchtransient.parametrize import Bounded, register
-from torchtransient.testing.small_room import VARIANT, make_room
 
 
 def glossy():

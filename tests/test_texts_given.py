@@ -16,8 +16,8 @@ from support.number_cases import CASES, SLOW
 from support.refused import complaint
 from support.sweeps import together
 from test_public_names import found, members_of, public_names, signature_of
+from tools.small_room import COLOUR, VARIANT, make_room
 from torchtransient.errors import TorchTransientError
-from torchtransient.testing.small_room import COLOUR, VARIANT, make_room
 
 NO_TEXT = [[], {}, np.array(["x", "y"]), np.array([1.0, 2.0]), torch.ones(2), object(), b"x", ["box"],
            np.array("box"), ("a",), 1.5, [None]]  # fmt: skip

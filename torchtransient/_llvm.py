@@ -1,10 +1,10 @@
-"""Finds an LLVM that Dr.Jit can use, before Dr.Jit is imported.
+"""Find an LLVM that Dr.Jit can use, before Dr.Jit is imported.
 
 Dr.Jit compiles kernels for the CPU with an LLVM shared library that it looks for once, during `import drjit`. LLVM 15
 and 16 are accepted there and then abort the whole process at the first larger kernel on x86-64; 14 and older are
 refused. So the search happens here, first: `bind()` points `DRJIT_LIBLLVM_PATH` to a good library and imports Dr.Jit.
-No library is loaded to learn its version: it stands in the library's own name (its soname), and where it does not, a
-process of its own asks.
+No library is loaded to learn its version: the name of its file has it (`libLLVM.so.19.1`), and another process asks
+where it does not, which takes 30 ms.
 
 Importing the package never fails for want of an LLVM, since CUDA and scalar variants do without. `ensure_llvm()`
 raises the error, and is called wherever an `llvm_*` variant is about to be used. Users who render with Mitsuba alone
@@ -16,7 +16,6 @@ from __future__ import annotations
 import glob
 import os
 import re
-import struct
 import subprocess
 import sys
 import warnings
@@ -59,7 +58,7 @@ class LLVMLibrary:
 
     @property
     def is_good(self) -> bool:
-        """Whether Dr.Jit can work with it."""
+        """True if Dr.Jit can work with it."""
         return bool(self.version) and self.version[0] >= MIN_MAJOR
 
     def __str__(self) -> str:
@@ -68,7 +67,7 @@ class LLVMLibrary:
 
 @dataclass
 class _Outcome:
-    """What `bind()` found."""
+    """Result of `bind()`."""
 
     chosen: LLVMLibrary | None = None
     refused: tuple[LLVMLibrary, ...] = ()
@@ -126,7 +125,7 @@ def _bound_version() -> tuple[int, ...]:
 
 
 def users_choice() -> str | None:
-    """What the user had set `DRJIT_LIBLLVM_PATH` to before the package was imported, None when nothing."""
+    """Return the user's own `DRJIT_LIBLLVM_PATH` from before the package was imported, None if unset."""
     return _outcome.own or None
 
 
@@ -207,22 +206,9 @@ def candidates() -> Iterator[str]:
         for path in sorted(found, key=_age):
             # The real path: a library finds those it depends on beside itself, and not beside a link to it.
             real = os.path.realpath(path)
-            if real not in seen and os.path.isfile(real) and not _is_foreign(real):
+            if real not in seen and os.path.isfile(real):
                 seen.add(real)
                 yield real
-
-
-def _is_foreign(path: str) -> bool:
-    """Whether an ELF library was built for another processor than this Python (machines with cross compilers)."""
-    machines = []
-    for file in (path, "/proc/self/exe"):
-        try:
-            with open(file, "rb") as opened:
-                header = opened.read(20)
-        except OSError:
-            return False
-        machines.append(header[18:20] if header[:4] == b"\x7fELF" else None)
-    return None not in machines and machines[0] != machines[1]
 
 
 def _age(path: str) -> tuple[list[int], str]:
@@ -251,7 +237,7 @@ def _folders() -> Iterator[str]:
         yield "/usr/lib/llvm-*/lib"
         yield "/usr/lib/llvm*/lib"
         yield "/usr/lib/llvm/*/lib*"
-        yield "/usr/lib/*-linux-gnu"
+        yield f"/usr/lib/{os.uname().machine}-linux-gnu"  # not those of cross compilers
         yield "/usr/lib64"
         yield "/usr/lib64/llvm*/lib*"
         yield "/usr/lib"
@@ -259,13 +245,9 @@ def _folders() -> Iterator[str]:
 
 
 def library_version(path: str) -> tuple[int, ...]:
-    """Version of an LLVM shared library, read without loading it into this process; empty when it cannot be told."""
+    """Return the version of an LLVM shared library without loading it into this process; empty if unknown."""
     real = os.path.realpath(path)
-    return (
-        _version_in_name(_soname(real) or "")
-        or _version_in_name(os.path.basename(real))
-        or _version_by_subprocess(real)
-    )
+    return _version_in_name(os.path.basename(real)) or _version_by_subprocess(real)
 
 
 def _version_in_name(name: str) -> tuple[int, ...]:
@@ -281,36 +263,6 @@ def _version_in_name(name: str) -> tuple[int, ...]:
 def _version_in_folder(path: str) -> tuple[int, ...]:
     match = re.search(r"llvm[-@/]?(\d+(?:\.\d+)*)", os.path.realpath(path))
     return tuple(int(n) for n in match[1].split(".")) if match else ()
-
-
-def _soname(path: str) -> str | None:
-    """The name that an ELF shared library gives itself (DT_SONAME); None for other files."""
-    try:
-        with open(path, "rb") as file:
-            header = file.read(64)
-            if len(header) < 64 or header[:5] != b"\x7fELF\x02":
-                return None
-            order = "<" if header[5] == 1 else ">"
-            table, entry_size, entries = struct.unpack_from(order + "Q14xHH", header, 32)
-            file.seek(table)
-            headers = file.read(entry_size * entries)
-            segments = [struct.unpack_from(order + "IIQQQQ", headers, i * entry_size) for i in range(entries)]
-            dynamic = next((s for s in segments if s[0] == 2), None)  # PT_DYNAMIC
-            if dynamic is None:
-                return None
-            file.seek(dynamic[2])
-            raw = file.read(dynamic[5])
-            tags = dict(struct.unpack_from(order + "QQ", raw, i) for i in range(0, len(raw) - 15, 16))
-            if 14 not in tags or 5 not in tags:  # DT_SONAME, DT_STRTAB
-                return None
-            # The string table is given by its address in memory; find the segment that maps it from the file.
-            for kind, _flags, offset, address, _physical, size in segments:
-                if kind == 1 and address <= tags[5] < address + size:  # PT_LOAD
-                    file.seek(offset + tags[5] - address + tags[14])
-                    return file.read(256).split(b"\0")[0].decode("utf-8", "replace")
-    except (OSError, OverflowError, ValueError, struct.error):  # not what it claims to be
-        return None
-    return None
 
 
 def _version_by_subprocess(path: str) -> tuple[int, ...]:

@@ -14,11 +14,11 @@ import torchtransient as tt
 from torchtransient import sensing
 from torchtransient.scenes.parts import perspective, transient_film
 from torchtransient.scenes.transforms import look_at, scale, translate
-from torchtransient.testing.diffusion import extrapolation_length
 
 SIGMA_T, ALBEDO = (f"block.interior_medium.{name}.value.value" for name in ("sigma_t", "albedo"))
 HEIGHT, LIT, PIXEL, PIXELS = 1.0, 0.2, 0.005, 8  # metres; six pixels in the dark, two in the light
 AXIS = tt.TimeAxis(1.9, 0.01, 50)
+EXTRAPOLATION = 2 / 3  # free paths from a boundary without a step of the index to where the fluence vanishes
 RESPONSE = sensing.GaussianResponse(fwhm_s=100e-12)
 
 
@@ -76,7 +76,7 @@ def diffused(scattering: Tensor, absorption: Tensor) -> Tensor:
     path = inside.clamp_min(1e-4)
     spread = 4 * path / (3 * (scattering + absorption))
     deep = 1 / scattering
-    image = deep + 2 * deep * extrapolation_length(1.0, 1.0)
+    image = deep + 2 * EXTRAPOLATION * deep
     flux = deep * (-deep.square() / spread).exp() + image * (-image.square() / spread).exp()
     flux = flux / (path * spread.sqrt()) * (-absorption * path).exp() * torch.erfc(-x / spread.sqrt())
     light = torch.where(inside > 0, flux, 0).reshape(AXIS.num_bins, parts, PIXELS, parts).mean((1, 3))

@@ -12,8 +12,8 @@ from click.testing import CliRunner
 
 import torchtransient as tt
 from support.marks import long_rows
+from tools.point_captures import point_capture
 from torchtransient.cli.main import main
-from torchtransient.testing.point_captures import point_capture
 
 POINT = (0.15, -0.1, 0.7)
 AXIS = tt.TimeAxis(0.0, 0.02, 128)

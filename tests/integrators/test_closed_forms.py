@@ -6,8 +6,8 @@ import pytest
 
 from support.marks import long, long_rows
 from torchtransient import plugins, scenes
+from torchtransient.accuracy.statistics import pool_small_bins, z_test
 from torchtransient.testing import closed_forms as cf
-from torchtransient.testing.statistics import pool_small_bins, z_test
 
 VARIANT = "llvm_ad_mono"
 RUNS = 12

@@ -30,7 +30,7 @@ from support.marks import long, long_rows
 from support.runs import T
 from torchtransient import plugins
 from torchtransient._collection import no_collection
-from torchtransient.testing.statistics import two_sample_z_test
+from torchtransient.accuracy.statistics import two_sample_z_test
 
 VARIANT = "llvm_ad_rgb"  # the sky of Mitsuba knows no monochromatic variant
 # Half a bin, and what float32 makes of lengths of ten metres.

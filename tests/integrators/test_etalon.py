@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 
+from support.dielectric_reference import fresnel_reflectance, rough_dielectric
 from support.marks import long_rows
-from torchtransient.testing.dielectric_reference import fresnel_reflectance, rough_dielectric
-from torchtransient.testing.statistics import z_test
+from torchtransient.accuracy.statistics import z_test
 
 VARIANT = "llvm_ad_mono"
 RUNS = 8

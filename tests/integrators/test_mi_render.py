@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from support.mitsuba_room import as_mitsuba
-from torchtransient.testing.small_room import COLOUR, GREY, make_room
-from torchtransient.testing.small_room import VARIANT as VARIANT
+from tools.small_room import COLOUR, GREY, make_room
+from tools.small_room import VARIANT as VARIANT
 
 FILM = {"width": 4, "height": 3, "rfilter": {"type": "box"}}
 POSITION = "light.position"

@@ -8,8 +8,8 @@ import pytest
 
 from support.plain_scenes import camera, load
 from support.runs import T
+from torchtransient.accuracy.statistics import two_sample_z_test, z_test
 from torchtransient.plugins.films import phasor_sums
-from torchtransient.testing.statistics import two_sample_z_test, z_test
 
 GRID = {"frequency_first": -0.6, "frequency_step": 0.2, "frequency_count": 10}
 FILMS = "torchtransient.plugins.films"

@@ -11,10 +11,10 @@ import pytest
 
 import torchtransient as tt
 from support.mitsuba_room import as_mitsuba
+from tools.small_room import GREY, make_room
+from tools.small_room import VARIANT as VARIANT
 from torchtransient import plugins
 from torchtransient.errors import SceneError
-from torchtransient.testing.small_room import GREY, make_room
-from torchtransient.testing.small_room import VARIANT as VARIANT
 
 SLOW = pytest.mark.slow
 SIZE = {"width": 6, "height": 5, "crop_width": 4, "crop_height": 3, "crop_offset_x": 1, "crop_offset_y": 2}

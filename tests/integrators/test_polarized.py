@@ -9,7 +9,7 @@ import pytest
 import torchtransient as tt
 from support.marks import long
 from torchtransient._collection import no_collection
-from torchtransient.testing.statistics import two_sample_z_test
+from torchtransient.accuracy.statistics import two_sample_z_test
 
 VARIANT = "llvm_ad_mono_polarized"
 SPP = 1024

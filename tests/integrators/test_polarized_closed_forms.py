@@ -13,8 +13,8 @@ import torch
 from support.marks import long_rows
 from torchtransient import plugins
 from torchtransient import stokes as st
+from torchtransient.accuracy.statistics import two_sample_z_test, z_test
 from torchtransient.testing.closed_forms import fresnel_reflectances
-from torchtransient.testing.statistics import two_sample_z_test, z_test
 
 RUNS, BIN, INDEX = 8, 0.02, 1.5
 # Products of some ten numbers in single precision, of light of power one

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 import torchtransient as tt
+from tools.small_room import GREY, WALL_POSE, make_room
 from torchtransient import plugins
 from torchtransient.plugins.sampling.sphere_lights import SphereLights
 from torchtransient.plugins.sampling.sun import MovingSun
-from torchtransient.testing.small_room import GREY, WALL_POSE, make_room
 
 VARIANT = "llvm_ad_mono"
 SUN, SUN_VARIANT = "light.sun_direction", "llvm_ad_rgb"

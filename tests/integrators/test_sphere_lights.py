@@ -12,8 +12,8 @@ import pytest
 from support.marks import long, long_rows
 from support.runs import T, runs
 from support.surface_samples import start
+from torchtransient.accuracy.statistics import two_sample_z_test
 from torchtransient.plugins.sampling.sphere_lights import SphereLights
-from torchtransient.testing.statistics import two_sample_z_test
 
 RHO, DISTANCE, RADIANCE = 0.5, 3.0, 2.0
 RATIOS = [1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 0.5, 0.9, 0.99]

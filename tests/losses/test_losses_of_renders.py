@@ -10,9 +10,9 @@ import torch
 
 import torchtransient as tt
 from support.loss_cases import CASES
+from tools.small_room import VARIANT, make_room
 from torchtransient import losses
 from torchtransient.errors import GradientError, UnitError
-from torchtransient.testing.small_room import VARIANT, make_room
 
 GREY = "wall.bsdf.reflectance.value"
 BAND = tt.FrequencyAxis.uniform(0.2, 0.2, 5)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import torchtransient as tt
-from torchtransient.testing.diffusion import slab_transmittance
+from tools.diffusion import slab_transmittance
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 VARIANT = "llvm_ad_mono"

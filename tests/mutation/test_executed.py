@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from mutation import executed
+from tools.mutants import executed
 
 SOURCE = b"""\
 FLOOR = 1
@@ -83,7 +83,7 @@ RUN = """\
 import sys
 from pathlib import Path
 import pytest
-from mutation import executed
+from mutants import executed
 folder = Path.cwd()
 recorder = executed.Recorder(folder / "data", folder, folder / "package")
 sys.path.insert(0, str(folder))
@@ -102,8 +102,7 @@ def test_what_tests_and_their_fixtures_execute(tmp_path):
     (tmp_path / "test_x.py").write_text(TESTS)
 
     def run(name, data):
-        tests = str(Path(executed.__file__).parents[1])
-        environment = {**os.environ, "PYTHONPATH": tests}
+        environment = {**os.environ, "PYTHONPATH": str(Path(executed.__file__).parents[1])}
         subprocess.run([sys.executable, "-c", RUN], cwd=tmp_path, env=environment, check=True)
         (tmp_path / "data").rename(data)
         return 1.5

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from mutation import executed
+from tools.mutants import executed
 
 TESTS = """\
 import pytest
@@ -30,7 +30,7 @@ def test_other():
 RUN = """\
 import functools, json, os, sys
 from pathlib import Path
-from mutation import __main__ as run, changes, executed
+from mutants import __main__ as run, changes, executed
 folder, files = Path.cwd(), ["tests/test_x.py"]
 known = executed.measured(folder, files, folder / "a", lambda *a: run._seconds_unchanged(folder, *a))
 slow = functools.cache(

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 import torchtransient as tt
+from tools.point_captures import point_capture
 from torchtransient.errors import ArgumentError, SceneError, ShapeError
-from torchtransient.testing.point_captures import point_capture
 
 N = tt.nlos
 VARIANT = "llvm_ad_mono"

@@ -13,12 +13,12 @@ from click.testing import CliRunner
 import torchtransient as tt
 from support.marks import long_rows
 from support.pages import Page
+from tools.point_captures import point_capture
 from torchtransient.capture import Wall
 from torchtransient.cli.main import main
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, StorageError, UnitError
 from torchtransient.nlos.methods import METHODS, default_wavelength
 from torchtransient.nlos.reconstruct import camera_of
-from torchtransient.testing.point_captures import point_capture
 
 RECONSTRUCTION = Page("docs/nlos_reconstruction.md")
 PAGE, TEXT = RECONSTRUCTION.path, RECONSTRUCTION.text

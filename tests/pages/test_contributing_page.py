@@ -62,7 +62,8 @@ def test_places_are_there(recipe):
 
 def test_everything_else_that_is_named_is_there():
     made = {step.file for recipe in RECIPES for step in recipe.steps}
-    for place in set(re.findall(r"`((?:tests|torchtransient|docs|benchmarks)/[\w/.*]+)(?:::\w+)?`", PAGE.text)) - made:
+    folders = "tests|tools|torchtransient|docs|benchmarks"
+    for place in set(re.findall(rf"`((?:{folders})/[\w/.*]+)(?:::\w+)?`", PAGE.text)) - made:
         assert any(True for _ in ROOT.glob(place)), place
     for file, name in re.findall(r"(tests/[\w/.]+\.py)::(\w+)", PAGE.text):
         assert name in names_in(file), f"{file}::{name}"
@@ -100,7 +101,7 @@ def plain(tmp_path_factory):
     """What is copied: package, tests and pages."""
     folder = tmp_path_factory.mktemp("plain")
     left_out = shutil.ignore_patterns("__pycache__", "images", "measured", "site")
-    for name in ("torchtransient", "tests", "docs"):
+    for name in ("torchtransient", "tests", "tools", "docs"):
         shutil.copytree(ROOT / name, folder / name, ignore=left_out)
     for name in ("pyproject.toml", "README.md", "CHANGELOG.md"):
         shutil.copy(ROOT / name, folder / name)

@@ -12,6 +12,7 @@ from torch import nn
 from torch.nn.utils import parametrize as torch_parametrize
 
 import torchtransient as tt
+from tools.small_room import COLOUR, VARIANT, WALL_POSE, make_room
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError, UnknownKeyError
 from torchtransient.parametrize import (
     Albedo,
@@ -22,7 +23,6 @@ from torchtransient.parametrize import (
     register,
     remove,
 )
-from torchtransient.testing.small_room import COLOUR, VARIANT, WALL_POSE, make_room
 
 KEYS = [COLOUR, WALL_POSE]
 

@@ -128,7 +128,7 @@ def test_states_that_do_not_fit(tmp_path):
 
 def test_a_renderer_whose_pose_began_elsewhere():
     """The pose of the state, not the state's step from where this one began."""
-    from torchtransient.testing.small_room import COLOUR, VARIANT, WALL_POSE, make_room
+    from tools.small_room import COLOUR, VARIANT, WALL_POSE, make_room
 
     def made(shift, bounds):
         room = make_room()

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from tools.point_captures import point_capture
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Scan, Wall
 from torchtransient.reconstruction import (
@@ -20,7 +21,6 @@ from torchtransient.reconstruction import (
     TransientCamera,
     VoxelGrid,
 )
-from torchtransient.testing.point_captures import point_capture
 
 pytestmark = pytest.mark.peer
 

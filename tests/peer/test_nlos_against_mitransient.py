@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from torchtransient import plugins
+from torchtransient.accuracy.statistics import two_sample_z_test
 from torchtransient.scenes.transforms import look_at, rotate, scale, translate
-from torchtransient.testing.statistics import two_sample_z_test
 
 pytestmark = pytest.mark.peer
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import torchtransient as tt
+from tools.gradient_sweep.bsdfs import METAL, ROUGH_GLASS, blend
+from tools.gradient_sweep.measure import Subject
+from tools.gradient_sweep.stages import between_lights, matte
 from torchtransient import plugins
 from torchtransient.plugins.mixtures import needs_choice
-from torchtransient.testing.gradient_sweep.bsdfs import METAL, ROUGH_GLASS, blend
-from torchtransient.testing.gradient_sweep.measure import Subject
-from torchtransient.testing.gradient_sweep.stages import between_lights, matte
 
 PAINT = {"type": "diffuse", "reflectance": 0.5}
 GLASS = {"type": "roughdielectric", **ROUGH_GLASS}

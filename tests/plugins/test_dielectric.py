@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import torch
 
+from support.dielectric_reference import fresnel_reflectance, refracted_direction, rough_dielectric
 from support.marks import long, long_rows
-from torchtransient.testing.dielectric_reference import fresnel_reflectance, refracted_direction, rough_dielectric
 
 LANES = 4000
 

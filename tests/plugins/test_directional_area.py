@@ -10,12 +10,12 @@ import torch
 
 import torchtransient as tt
 from support.plain_scenes import as_mitsuba
+from tools.gradient_sweep.lights import area_emitters
+from tools.gradient_sweep.shapes import lamp_shapes
+from tools.gradient_sweep.stages import lit_by, matte, move, stretch, turn
 from torchtransient import plugins
 from torchtransient.errors import GradientError
 from torchtransient.plugins.mitsuba_compat import COMPLETED_PLUGINS
-from torchtransient.testing.gradient_sweep.lights import area_emitters
-from torchtransient.testing.gradient_sweep.shapes import lamp_shapes
-from torchtransient.testing.gradient_sweep.stages import lit_by, matte, move, stretch, turn
 
 VARIANT = "llvm_ad_rgb"
 REFLECTANCE = "plate.bsdf.reflectance.value"

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
+from support.film_storage import storage
 from support.marks import long_rows
 from torchtransient import plugins
 from torchtransient.errors import SceneError, StorageError
 from torchtransient.plugins.films.block import BinLayout, reduce_mode
 from torchtransient.plugins.films.temporal_filters import make_temporal_filter
 from torchtransient.plugins.transport.strategy import Local
-from torchtransient.testing.film_storage import storage
 
 SLOPED = [("tent", 0.5), ("gaussian", 0.5), ("gaussian", 0.2), ("gaussian", 3.0)]
 FILTERS = long_rows([("box", 0.5), *SLOPED], [("box", 0.5), *SLOPED[:2]])

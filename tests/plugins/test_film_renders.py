@@ -11,8 +11,8 @@ import pytest
 
 from support.marks import long
 from torchtransient import plugins
+from torchtransient.accuracy.statistics import two_sample_z_test
 from torchtransient.errors import SceneError, StorageError
-from torchtransient.testing.statistics import two_sample_z_test
 
 LANES = "torchtransient.plugins.integrators.launch.MAX_LANES"
 ENTRIES = "torchtransient.plugins.films.base.MAX_ARRAY_ENTRIES"

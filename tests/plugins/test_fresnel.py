@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from support.dielectric_reference import fresnel_reflectance, refracted_direction
 from torchtransient.plugins.bsdfs.fresnel import fresnel, refract
-from torchtransient.testing.dielectric_reference import fresnel_reflectance, refracted_direction
 
 VARIANT = "llvm_ad_mono"
 INDICES = [0.5, 1 / 1.5, 0.9, 1.1, 1.33, 1.5, 2.4]

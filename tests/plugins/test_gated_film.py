@@ -9,16 +9,16 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.film_storage import storage
 from support.marks import long
+from tools.small_room import GREY, WALL_POSE, make_room
 from torchtransient import plugins
+from torchtransient.accuracy.statistics import two_sample_z_test
 from torchtransient.errors import ArgumentError, GradientError, SceneError
 from torchtransient.files.result_file import read_result, write_result
 from torchtransient.gates import Gate
 from torchtransient.plugins.films.block import ArrivalWindow, GappedWindow
 from torchtransient.plugins.sampling.light_box import LightBox
-from torchtransient.testing.film_storage import storage
-from torchtransient.testing.small_room import GREY, WALL_POSE, make_room
-from torchtransient.testing.statistics import two_sample_z_test
 
 VARIANT = "llvm_ad_rgb"
 START = 2.0

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from torchtransient.testing.small_room import make_room
+from tools.small_room import make_room
 
 VARIANT = "llvm_ad_rgb"
 UPRIGHT, REFLECTED = np.diag([0.3, 0.3, 0.3, 1.0]), np.diag([-0.3, 0.3, 0.3, 1.0])

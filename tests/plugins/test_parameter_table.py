@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tools.every_plugin import LEFT_OUT, every_plugin
 from torchtransient import plugins
 from torchtransient.errors import GradientError, PluginRegistrationError
 from torchtransient.plugins import parameter_effect
@@ -25,7 +26,6 @@ from torchtransient.plugins.parameters import (
     effect_of,
     moving_names,
 )
-from torchtransient.testing.every_plugin import LEFT_OUT, every_plugin
 
 NON_DIFFERENTIABLE, READ_ONLY = 0x1, 0x4
 

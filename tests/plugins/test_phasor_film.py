@@ -9,11 +9,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from support.film_storage import storage
 from support.marks import long_rows
 from torchtransient import plugins
 from torchtransient.errors import SceneError, TorchTransientWarning
 from torchtransient.plugins.films import phasor_sums
-from torchtransient.testing.film_storage import storage
 
 START = 2.0
 GRID = {"frequency_first": -0.4, "frequency_step": 0.11, "frequency_count": 37}

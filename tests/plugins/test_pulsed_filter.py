@@ -9,12 +9,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from support.film_storage import storage
 from support.marks import long, long_pairs, long_rows
 from torchtransient import plugins
 from torchtransient.errors import SceneError
 from torchtransient.plugins.films.temporal_filters import BoxFilter, PulsedFilter
 from torchtransient.pulses import Pulse
-from torchtransient.testing.film_storage import storage
 
 VARIANT = "llvm_ad_rgb"
 BINS, WIDTH, START = 60, 0.25, 2.0

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from torchtransient.testing.small_room import make_room, pose
+from tools.small_room import make_room, pose
 
 VARIANT = "llvm_ad_mono"
 

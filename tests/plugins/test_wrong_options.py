@@ -9,8 +9,8 @@ import torch
 import torchtransient as tt
 from support.option_cases import OPTIONS, VALUES, cases, with_option
 from support.sweeps import together
+from tools.small_room import VARIANT, make_room
 from torchtransient.errors import SceneError
-from torchtransient.testing.small_room import VARIANT, make_room
 
 # What ended the process, never answered, or was an error of Python's before: (kind of node, option, value).
 DIED = [

@@ -8,6 +8,7 @@ import torch
 
 from support.scan_operators import AXIS, DEPTHS, SCANS, WALL, bent_scan, listed_scan, paired_scan, points_anywhere
 from support.sweeps import together
+from tools.point_captures import point_capture
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
@@ -23,7 +24,6 @@ from torchtransient.reconstruction import (
     filtered_backproject,
 )
 from torchtransient.reconstruction.filters import sample_places
-from torchtransient.testing.point_captures import point_capture
 
 F64 = torch.float64
 POINTS = points_anywhere()

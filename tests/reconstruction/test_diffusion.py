@@ -11,12 +11,12 @@ import torch
 
 from support.grid_operators import SCAN as SMALL
 from support.grid_operators import confocal_points
+from tools import diffusion
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Scan, Wall
 from torchtransient.errors import UnitError
 from torchtransient.reconstruction import FK, DiffusionDeconvolution
 from torchtransient.reconstruction.diffusion import FOAM, slab_transmittance
-from torchtransient.testing import diffusion
 
 F64 = torch.float64
 MEASURED = Path(__file__).parents[2] / "benchmarks" / "data" / "foam_captures.npz"

@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from support.grid_operators import confocal_points
+from tools.point_captures import point_capture
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.reconstruction import LCT, DirectionalLCT, directional_lct, lct
-from torchtransient.testing.point_captures import point_capture
 
 F64 = torch.float64
 AXIS = TimeAxis(0.0, 0.0192, 192)

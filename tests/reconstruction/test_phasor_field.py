@@ -7,6 +7,7 @@ import torch
 
 from support.marks import long
 from support.scan_operators import AXIS, DEPTHS, PULSE, SCANS, WALL, bent_scan
+from tools.point_captures import point_capture
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Scan
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
@@ -20,7 +21,6 @@ from torchtransient.reconstruction import (
     phasor_field,
     phasor_image,
 )
-from torchtransient.testing.point_captures import point_capture
 
 F64 = torch.float64
 

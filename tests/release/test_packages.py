@@ -130,7 +130,7 @@ def test_the_wheel_has_the_package_and_nothing_else(packages):
 
 @pytest.mark.slow
 def test_the_sdist_has_what_tests_need(unpacked):
-    for folder in ("torchtransient", "tests", "docs", "benchmarks", "training_examples"):
+    for folder in ("torchtransient", "tests", "tools", "docs", "benchmarks", "training_examples"):
         assert kept(unpacked / folder) == kept(ROOT / folder)
     beside = ("README.md", "CHANGELOG.md", "LICENSE", "Makefile", "constraints.txt", "constraints-lowest.txt")
     for name in (*beside, "hatch_build.py"):

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from torchtransient.testing.small_room import VARIANT, make_room
+from tools.small_room import VARIANT, make_room
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from torch import nn
 from torch.autograd import forward_ad
 
 import torchtransient as tt
-from torchtransient.testing.small_room import COLOUR, GREY, WALL_POSE
+from tools.small_room import COLOUR, GREY, WALL_POSE
 
 START = torch.tensor([0.8, 0.5, 0.2])
 

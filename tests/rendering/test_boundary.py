@@ -15,9 +15,9 @@ import torch
 
 import torchtransient as tt
 from support.marks import long
+from tools.small_room import pose
 from torchtransient.errors import ArgumentError, GradientError, GradientWarning
 from torchtransient.rendering.variant import active_variant
-from torchtransient.testing.small_room import pose
 
 VARIANT = "llvm_ad_mono"
 BODY, PAINT = "body.to_world", "body.bsdf.reflectance.value"

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from torchtransient.testing.small_room import COLOUR, GREY, WALL_POSE
+from tools.small_room import COLOUR, GREY, WALL_POSE
 
 START = torch.tensor([0.8, 0.5, 0.2])
 NAN, INF = math.nan, math.inf

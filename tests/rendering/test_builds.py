@@ -10,10 +10,10 @@ import pytest
 import torch
 
 import torchtransient as tt
+from tools.small_room import VARIANT, make_room
 from torchtransient.errors import SceneError, ShapeError
 from torchtransient.rendering import session
 from torchtransient.rendering.variant import active_variant
-from torchtransient.testing.small_room import VARIANT, make_room
 
 # ------------------------------------------------------------------------------------------------------ scenes in use
 

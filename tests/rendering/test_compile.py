@@ -15,9 +15,9 @@ from torch import nn
 import torchtransient as tt
 from support.marks import long
 from support.sensing.all_entries import ENTRIES
+from tools.small_room import COLOUR
+from tools.small_room import VARIANT as VARIANT
 from torchtransient.rendering.opaque import opaque
-from torchtransient.testing.small_room import COLOUR
-from torchtransient.testing.small_room import VARIANT as VARIANT
 
 START = torch.tensor([0.8, 0.5, 0.2])
 
@@ -120,7 +120,7 @@ def test_what_a_whole_graph_would_need(room_scene):
 def test_a_render_does_not_import_the_compiler():
     code = (
         "import torchtransient as tt, sys, torch\n"
-        "from torchtransient.testing.small_room import make_room\n"
+        "from tools.small_room import make_room\n"
         "before = 'torch._dynamo' in sys.modules\n"
         "out = tt.render(make_room(), spp=1, seed=0)\n"
         "print(before, 'torch._dynamo' in sys.modules)\n"

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from torchtransient.testing.small_room import COLOUR, WALL_POSE, make_room
+from tools.small_room import COLOUR, WALL_POSE, make_room
 
 pytestmark = pytest.mark.gpu
 

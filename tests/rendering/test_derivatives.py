@@ -185,26 +185,6 @@ def test_gradients_that_nobody_gives(given):
     assert x.grad is None and y.grad is None and job.asked == ["primal"]
 
 
-@pytest.mark.filterwarnings("ignore:Please use `torch.vmap`")
-def test_batches_of_batches_as_torch_maps_its_own_backward(given):
-    """Some of whose cotangents belong to the outer batch alone, which is of another size than the inner one."""
-    from torch._vmap_internals import _vmap
-
-    x, y, n = given
-    job = Job()
-    first, second, _ = run(job, x, y, n)
-    inner = torch.arange(6.0, dtype=torch.float64).view(3, 2) - 1.5
-    outer = torch.arange(15.0, dtype=torch.float64).view(5, 3) ** 2
-
-    def pulled(both, a):
-        return torch.autograd.grad((first, second), x, (a, both), retain_graph=True)[0]
-
-    found = _vmap(lambda both: _vmap(lambda a: pulled(both, a))(inner))(outer)
-    wanted = torch.stack([torch.stack([pulled(b, a) for a in inner]) for b in outer])
-    assert found.shape == (5, 3, 3)
-    torch.testing.assert_close(found, wanted)
-
-
 def test_nothing_is_run_where_nothing_is_asked_for(given):
     x, y, n = given
     job = Job()

@@ -16,8 +16,8 @@ from torch import nn
 from torch.autograd import forward_ad
 
 from support.mitsuba_room import load_room
-from torchtransient.testing.small_room import COLOUR
-from torchtransient.testing.small_room import VARIANT as VARIANT
+from tools.small_room import COLOUR
+from tools.small_room import VARIANT as VARIANT
 
 START = torch.tensor([0.8, 0.5, 0.2])
 NONE = torch.zeros(3)

@@ -15,13 +15,13 @@ import torch
 import torchtransient as tt
 from support.frozen_runs import Runs
 from support.marks import long
+from tools.boundary_cases.moving_edges import CASES
+from tools.gradient_sweep.measure import quiet
+from tools.gradient_sweep.settings import Setting, all_settings
+from tools.small_room import COLOUR, GREY, VARIANT, WALL_POSE, make_room
 from torchtransient.rendering import recordings
 from torchtransient.rendering.recordings import FIRST, LAUNCHED, NO_FREEZING, PROGRESS, RECORDED, SEVERAL, SWITCHED_OFF
 from torchtransient.rendering.variant import active_variant
-from torchtransient.testing.gradient_sweep.measure import quiet
-from torchtransient.testing.gradient_sweep.settings import Setting, all_settings
-from torchtransient.testing.moving_edges import CASES
-from torchtransient.testing.small_room import COLOUR, GREY, VARIANT, WALL_POSE, make_room
 
 # The same kernels but for the order of atomic sums: the last digits of single precision.
 TOLERANCE = 2e-5

@@ -13,12 +13,12 @@ import pytest
 import torch
 
 import torchtransient as tt
+from tools.small_room import COLOUR, VARIANT, WALL_POSE, make_room
 from torchtransient._collection import no_collection
 from torchtransient.plugins import _registry
 from torchtransient.rendering import interrupts
 from torchtransient.rendering.interrupts import quiet
 from torchtransient.rendering.variant import active_variant
-from torchtransient.testing.small_room import COLOUR, VARIANT, WALL_POSE, make_room
 
 
 def interrupt(*args, **kwargs):

@@ -13,6 +13,7 @@ import torch
 
 import torchtransient as tt
 from support.marks import long
+from tools.small_room import COLOUR, GREY, VARIANT, WALL_POSE, make_room
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.rendering.labels import (
     LABELS,
@@ -25,7 +26,6 @@ from torchtransient.rendering.labels import (
 )  # fmt: skip
 from torchtransient.rendering.recordings import FIRST, LAUNCHED, RECORDED, SWITCHED_OFF
 from torchtransient.scenes.transforms import look_at, rotate, scale, translate
-from torchtransient.testing.small_room import COLOUR, GREY, VARIANT, WALL_POSE, make_room
 
 FLOATS = [name for name in LABELS if name not in NUMBERED]
 DISTANCE, RADIUS = 5.0, 1.25

@@ -6,7 +6,7 @@ import drjit as dr
 import pytest
 
 from support.pages import Page
-from torchtransient.testing.small_room import VARIANT as VARIANT
+from tools.small_room import VARIANT as VARIANT
 
 
 @pytest.mark.slow

@@ -11,8 +11,8 @@ from torch.utils import _pytree
 from torch.utils.data import DataLoader, Dataset, default_collate
 
 import torchtransient as tt
+from tools.small_room import COLOUR, VARIANT, make_room
 from torchtransient.files.result_file import read_result, write_result
-from torchtransient.testing.small_room import COLOUR, VARIANT, make_room
 
 
 @pytest.fixture(scope="module")

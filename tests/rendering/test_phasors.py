@@ -10,8 +10,8 @@ import torch
 
 import torchtransient as tt
 from support.marks import long
+from tools.small_room import COLOUR, VARIANT, WALL_POSE, make_room
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.testing.small_room import COLOUR, VARIANT, WALL_POSE, make_room
 
 AXIS = tt.FrequencyAxis.uniform(0.0, 0.15, 5)
 LIST = (0.3, 1.7, -0.4)

@@ -11,11 +11,11 @@ import torch
 
 import torchtransient as tt
 from support.mitsuba_room import FILM, as_mitsuba
+from tools.small_room import VARIANT as VARIANT
+from tools.small_room import make_room
 from torchtransient import plugins
 from torchtransient.errors import SceneError
 from torchtransient.plugins import _registry
-from torchtransient.testing.small_room import VARIANT as VARIANT
-from torchtransient.testing.small_room import make_room
 
 MODULE = "support.plugins_of_ones_own"
 KEYS = ("light.power", "wall.bsdf.colour.level")

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from torchtransient.testing.small_room import COLOUR, VARIANT, make_room
+from tools.small_room import COLOUR, VARIANT, make_room
 
 
 def run(script: str, *arguments: str) -> str:
@@ -37,7 +37,7 @@ def test_a_fresh_process_gives_the_same_tensor_and_takes_a_pickle(tmp_path, room
     torch.save(renderer(seed=2).transient.detach().contiguous(), tmp_path / "expected.pt")
     total, squares, *printed = run(f"""
         import torchtransient as tt
-        from torchtransient.testing.small_room import make_room
+        from tools.small_room import make_room
         out = tt.render(make_room(), spp=16, seed=1).transient
         print(repr(out.double().sum().item()), repr(out.double().square().sum().item()))
         import pickle, torch
@@ -63,7 +63,7 @@ def test_spawned_data_loader(tmp_path):
         import torch
         import torchtransient as tt
         from torch.utils.data import DataLoader, Dataset
-        from torchtransient.testing.small_room import COLOUR, make_room
+        from tools.small_room import COLOUR, make_room
 
         class Rooms(Dataset):
             def __init__(self):
@@ -102,7 +102,7 @@ def test_distributed_data_parallel_on_two_ranks(tmp_path):
         import torch.multiprocessing as mp
         import torchtransient as tt
         from torch.nn.parallel import DistributedDataParallel
-        from torchtransient.testing.small_room import COLOUR, make_room
+        from tools.small_room import COLOUR, make_room
 
         def gradient(renderer, seed, wrap):
             module = DistributedDataParallel(renderer) if wrap else renderer

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 import torchtransient as tt
+from tools.small_room import COLOUR, VARIANT, WALL_POSE, make_room
 from torchtransient.rendering import batch
 from torchtransient.rendering.variant import active_variant
-from torchtransient.testing.small_room import COLOUR, VARIANT, WALL_POSE, make_room
 
 
 def resident_bytes(field: str = "VmRSS") -> int:

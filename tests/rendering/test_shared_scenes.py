@@ -9,8 +9,8 @@ import pytest
 import torch
 
 import torchtransient as tt
-from torchtransient.testing.small_room import COLOUR, GREY, make_room
-from torchtransient.testing.small_room import VARIANT as VARIANT
+from tools.small_room import COLOUR, GREY, make_room
+from tools.small_room import VARIANT as VARIANT
 
 RED = torch.tensor([0.9, 0.1, 0.2])
 

@@ -14,6 +14,7 @@ import torch
 import torchtransient as tt
 from support.interrupts import moments_of
 from support.marks import long
+from tools.small_room import COLOUR, VARIANT, WALL_POSE, make_room
 from torchtransient import _collection
 from torchtransient._collection import no_collection
 from torchtransient.errors import SceneError, ShapeError, TorchTransientWarning
@@ -25,7 +26,6 @@ from torchtransient.rendering.interrupts import quiet
 from torchtransient.rendering.variant import active_variant
 from torchtransient.scene.description import _search_path
 from torchtransient.scene.load import Scene
-from torchtransient.testing.small_room import COLOUR, VARIANT, WALL_POSE, make_room
 
 # What ends calls: the moments in these functions are the ones that leave something behind.
 ENDS = {

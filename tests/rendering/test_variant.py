@@ -13,8 +13,8 @@ import torchtransient as tt  # isort: skip
 import drjit as dr
 import mitsuba as mi
 
+from tools.small_room import COLOUR, VARIANT, make_room
 from torchtransient.rendering.variant import active_variant, is_differentiable, resolve_variant
-from torchtransient.testing.small_room import COLOUR, VARIANT, make_room
 
 
 def run(script: str) -> str:
@@ -32,7 +32,7 @@ def test_import_scenes_and_load_need_no_variant():
         import warnings
         import torchtransient as tt
         from torchtransient.errors import VersionWarning
-        from torchtransient.testing.small_room import make_room
+        from tools.small_room import make_room
         warnings.simplefilter("error", VersionWarning)
         import mitsuba as mi
         assert mi.variant() is None
@@ -79,7 +79,7 @@ def test_differentiable_active_variant_is_taken_and_scalar_one_is_not():
         import mitsuba as mi
         mi.set_variant("llvm_ad_mono")
         import torchtransient as tt
-        from torchtransient.testing.small_room import make_room
+        from tools.small_room import make_room
         first = tt.TransientRenderer(make_room(), spp=4)
         mi.set_variant("scalar_rgb")
         second = tt.TransientRenderer(make_room(), spp=4)
@@ -145,7 +145,7 @@ def test_unusable_variants():
 def test_fork_before_rendering_is_fine_and_after_it_is_refused():
     printed = run("""
         import os, torchtransient as tt
-        from torchtransient.testing.small_room import make_room
+        from tools.small_room import make_room
         scene = tt.load(make_room())
         child = os.fork()
         if child == 0:

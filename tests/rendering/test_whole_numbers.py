@@ -11,12 +11,12 @@ import torch
 
 import torchtransient as tt
 from support.sweeps import together
+from tools.small_room import COLOUR, VARIANT, make_room
 from torchtransient.errors import ArgumentError, ShapeError, TorchTransientError, TorchTransientWarning, UnitError
 from torchtransient.nlos.scene import _range as bounces_of
 from torchtransient.rendering.cameras import camera_of
 from torchtransient.rendering.labels import scene_labels
 from torchtransient.sensing.itof.itof_codes import phase_steps
-from torchtransient.testing.small_room import COLOUR, VARIANT, make_room
 
 WHOLE = [np.int64(3), np.array(3), torch.tensor(3, dtype=torch.uint8)]
 NONE = [1.5, float("nan"), "x", "3", True, torch.tensor(True), 1j, [], {}, torch.tensor(3.0)]

@@ -19,6 +19,8 @@ import torch
 
 import torchtransient as tt
 from support.mitsuba_room import load_room
+from tools.small_room import CAMERA, COLOUR, GREY
+from tools.small_room import VARIANT as VARIANT
 from torchtransient.errors import (
     ArgumentError,
     DeviceError,
@@ -29,8 +31,6 @@ from torchtransient.errors import (
     UnknownKeyError,
     VariantError,
 )
-from torchtransient.testing.small_room import CAMERA, COLOUR, GREY
-from torchtransient.testing.small_room import VARIANT as VARIANT
 
 START = torch.tensor([0.8, 0.5, 0.2])
 POSITION, POSE = "light.position", "sensor.to_world"

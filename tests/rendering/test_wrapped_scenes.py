@@ -14,8 +14,8 @@ import pytest
 import torch
 
 import torchtransient as tt
+from tools.small_room import VARIANT as VARIANT
 from torchtransient.errors import ArgumentError, GradientError
-from torchtransient.testing.small_room import VARIANT as VARIANT
 
 KEY = "data"
 

@@ -18,8 +18,8 @@ from torch import nn
 from torch.autograd import forward_ad
 
 import torchtransient as tt
+from tools.small_room import VARIANT as VARIANT
 from torchtransient.errors import GradientError, ShapeError
-from torchtransient.testing.small_room import VARIANT as VARIANT
 
 squares = tt.wrap(lambda x: x * x)
 

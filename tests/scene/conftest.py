@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 import torchtransient as tt
-from torchtransient.testing.small_room import VARIANT, make_room
+from tools.small_room import VARIANT, make_room
 
 
 @pytest.fixture

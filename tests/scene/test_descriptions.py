@@ -12,6 +12,7 @@ import pytest
 import torch
 
 import torchtransient as tt
+from tools.small_room import GREY, make_room
 from torchtransient.errors import SceneError
 from torchtransient.plugins.dictionaries import Pixels
 from torchtransient.scene.checks import MOST_LEVELS
@@ -20,7 +21,6 @@ from torchtransient.scene.description import (
     describe_xml,
 )
 from torchtransient.scene.objects import transient_dictionary
-from torchtransient.testing.small_room import GREY, make_room
 
 VARIANT = "llvm_ad_rgb"
 

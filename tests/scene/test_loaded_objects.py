@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from torchtransient.testing.small_room import COLOUR, make_room, pose
+from tools.small_room import COLOUR, make_room, pose
 
 VARIANT = "llvm_ad_rgb"
 PIXELS = np.linspace(0.1, 0.9, 48, dtype=np.float32).reshape(4, 4, 3)

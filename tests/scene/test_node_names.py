@@ -11,7 +11,7 @@ import torch
 
 import torchtransient as tt
 from support.marks import long_rows
-from torchtransient.testing.small_room import VARIANT, make_room
+from tools.small_room import VARIANT, make_room
 
 MERGED = """<scene version="3.0.0">
 <integrator type="transient_path"/>

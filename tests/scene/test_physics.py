@@ -13,8 +13,8 @@ import torch
 
 import torchtransient as tt
 from support.marks import long_rows
+from tools.small_room import COLOUR, GREY, VARIANT, WALL_POSE, pose
 from torchtransient.errors import PhysicsError, PhysicsWarning
-from torchtransient.testing.small_room import COLOUR, GREY, VARIANT, WALL_POSE, pose
 
 
 def said(function, *arguments, **keywords):

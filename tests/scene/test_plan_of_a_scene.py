@@ -11,9 +11,9 @@ import torch
 
 import torchtransient as tt
 from support.marks import long_rows
+from tools.small_room import WALL_POSE, make_room
 from torchtransient.errors import GradientError, SceneError
 from torchtransient.gates import gates_to_text
-from torchtransient.testing.small_room import WALL_POSE, make_room
 
 VARIANT = "llvm_ad_rgb"
 XML = """<scene version="3.0.0"><default name="fov" value="20"/>

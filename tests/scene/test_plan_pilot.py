@@ -12,13 +12,13 @@ from click.testing import CliRunner
 import torchtransient as tt
 from support import plan_scenes
 from support.marks import long
+from torchtransient.accuracy.statistics import two_sample_z_test
 from torchtransient.cli.main import main
 from torchtransient.errors import ArgumentError, SceneError
 from torchtransient.rendering.films import Histogram
 from torchtransient.rendering.variant import active_variant
 from torchtransient.scene.edits import BuildOptions
 from torchtransient.scene.pilot import Arrivals, axis_over
-from torchtransient.testing.statistics import two_sample_z_test
 
 VARIANT = "llvm_ad_mono"
 

@@ -12,11 +12,11 @@ import torch
 
 import torchtransient as tt
 from support import deadly_plugins
+from tools.small_room import VARIANT, make_room
 from torchtransient import plugins
 from torchtransient.errors import ArgumentError, SceneError
 from torchtransient.plugins import _registry
 from torchtransient.scene import load as module
-from torchtransient.testing.small_room import VARIANT, make_room
 
 VERTICES = np.array([(0, 0, 1), (1, 0, 1), (0, 1, 1)], np.float32)
 FORMATS = ("ascii", "binary_little_endian", "binary_big_endian", "serialized")

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 import torchtransient as tt
+from tools.small_room import VARIANT, make_room
 from torchtransient.errors import SceneError
 from torchtransient.rendering.films import layout_of_entries
-from torchtransient.testing.small_room import VARIANT, make_room
 
 GATES = [tt.Gate.gaussian(8.0, 0.5)]
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 
+from support.dielectric_reference import rough_dielectric
 from support.marks import long_rows
 from torchtransient.plugins.bsdfs.microfacet import ALPHA_MIN
-from torchtransient.testing.dielectric_reference import rough_dielectric
 
 VARIANT = "llvm_ad_mono"
 ALPHAS = [0.0, 1e-4, 1e-3, 1e-2, 0.1, 1.0]

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from torchtransient.testing.film_storage import storage
+from support.film_storage import storage
 
 VARIANT = "llvm_ad_mono"
 WAVELENGTHS = [0.1, 0.01, 0.0015]

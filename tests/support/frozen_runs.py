@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from tools.gradient_sweep.measure import Subject
 from torchtransient.rendering.engine import jvp, primal, vjp
 from torchtransient.rendering.recordings import LAUNCHED
 from torchtransient.rendering.seeds import Item, Seeding
@@ -15,7 +16,6 @@ from torchtransient.rendering.session import RenderJob
 from torchtransient.scene.edits import BuildOptions
 from torchtransient.scene.load import Scene
 from torchtransient.scene.physics import PhysicsWatch
-from torchtransient.testing.gradient_sweep.measure import Subject
 
 SPP = 2
 # Calls of a kind: traced, recorded, launched with other values and seeds. What is found to change may be recorded once

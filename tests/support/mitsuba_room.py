@@ -6,7 +6,7 @@ from typing import Any
 
 import mitsuba as mi
 
-from torchtransient.testing.small_room import make_room
+from tools.small_room import make_room
 
 # Of a film that has a slope in time and few bins.
 FILM = {"temporal_filter": "tent", "temporal_bins": 6, "start_opl": 6.0, "bin_width_opl": 1.0}

@@ -15,8 +15,8 @@ import torch
 
 import torchtransient as tt
 from support.capture_files import grids, made
+from tools.small_room import make_room
 from torchtransient.errors import TorchTransientError
-from torchtransient.testing.small_room import make_room
 
 # Right numbers of options that are None by default.
 OPTIONS = {

@@ -22,8 +22,8 @@ from support.number_case import (
     recipe,
     until,
 )
+from tools.small_room import make_room
 from torchtransient.errors import TorchTransientError
-from torchtransient.testing.small_room import make_room
 
 AXIS, LIGHT = tt.TimeAxis(1.0, 0.05, 8), 0.1 + torch.rand(1, 8, 16, 16, generator=torch.Generator().manual_seed(0))
 PICTURE, STOKES = LIGHT[:, :3], torch.tensor([2.0, 0.3, 0.4, 0.5]).view(4, 1, 1, 1, 1).expand(4, 1, 8, 16, 16)

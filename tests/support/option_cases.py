@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchtransient.testing.small_room import make_room, pose
+from tools.small_room import make_room, pose
 
 NAN, INF = math.nan, math.inf
 # What people write, and what arithmetic leaves behind.

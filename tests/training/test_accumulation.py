@@ -8,8 +8,8 @@ from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
 import torchtransient as tt
+from tools.small_room import COLOUR, VARIANT, make_room
 from torchtransient.errors import ArgumentError, GradientError, ShapeError, UnitError
-from torchtransient.testing.small_room import COLOUR, VARIANT, make_room
 from torchtransient.training import Seeds, accumulate
 
 EPS = torch.finfo(torch.float32).eps

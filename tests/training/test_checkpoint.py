@@ -12,8 +12,8 @@ import torch
 from torch import nn
 
 import torchtransient as tt
+from tools.small_room import COLOUR, VARIANT, make_room
 from torchtransient.errors import ArgumentError, ShapeError, StorageError, TorchTransientWarning, UnitError
-from torchtransient.testing.small_room import COLOUR, VARIANT, make_room
 from torchtransient.training import Batches, Seeds, checkpoint, load_checkpoint, save_checkpoint
 
 

@@ -16,7 +16,7 @@ SCRIPT = """
     from torch import nn
     from torch.nn.parallel import DistributedDataParallel
     import torchtransient as tt
-    from torchtransient.testing.small_room import COLOUR, GREY, VARIANT, make_room
+    from tools.small_room import COLOUR, GREY, VARIANT, make_room
 
     class Proposer(nn.Module):
         def __init__(self):

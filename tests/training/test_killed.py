@@ -23,7 +23,7 @@ SCRIPT = """
     from torch import nn
     import torchtransient as tt
     from torchtransient import training
-    from torchtransient.testing.small_room import COLOUR, GREY, VARIANT, make_room
+    from tools.small_room import COLOUR, GREY, VARIANT, make_room
     from torchtransient.training import checkpoint
 
     name, data, kill_step, kill_where, workers = sys.argv[1:]

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 import torchtransient as tt
+from tools.small_room import VARIANT, make_room
 from torchtransient.errors import ArgumentError, UnitError
-from torchtransient.testing.small_room import VARIANT, make_room
 from torchtransient.training import Seeds
 
 

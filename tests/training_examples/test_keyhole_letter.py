@@ -9,8 +9,8 @@ import pytest
 import torch
 
 import torchtransient as tt
+from tools.point_captures import point_capture
 from torchtransient.capture import Scan
-from torchtransient.testing.point_captures import point_capture
 
 SCRIPT = Path(__file__).parents[2] / "training_examples" / "keyhole_letter.py"
 

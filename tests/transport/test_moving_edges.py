@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from torchtransient.testing.edge_derivatives import PASSES, EdgeProblem
-from torchtransient.testing.moving_edges import CASES, RGB, SPECTRAL
+from tools.boundary_cases.edge_derivatives import PASSES, EdgeProblem
+from tools.boundary_cases.moving_edges import CASES, RGB, SPECTRAL
 
 SIGMAS = 4.0
 # Both modes add the same float32 terms in another order.

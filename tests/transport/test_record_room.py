@@ -15,9 +15,9 @@ import pytest
 import torch
 
 import torchtransient as tt
+from tools.small_room import COLOUR, VARIANT, WALL_POSE, make_room, pose
 from torchtransient.errors import GradientError
 from torchtransient.plugins.transport.sinks import record_room
-from torchtransient.testing.small_room import COLOUR, VARIANT, WALL_POSE, make_room, pose
 
 TESTS = Path(__file__).parents[1]
 ADJOINT = torch.linspace(0, 1, 24)[None, :, None, None]

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from torchtransient.accuracy.errors_of_estimates import TAIL_RUNS, Tail
+from torchtransient.accuracy.statistics import Slope, log_log_slope
 from torchtransient.array_files.part_files import write_text
-from torchtransient.testing.statistics import Slope, log_log_slope
 
 
 @dataclass(frozen=True)

@@ -15,25 +15,22 @@ from typing import Any
 import drjit as dr
 
 from torchtransient.errors import VariantError
-from torchtransient.plugins.unfinished import afterwards
 
 # One lock for everything that touches Mitsuba: the variant, the scenes' parameters and Dr.Jit's graph are shared state.
-# Calls take it through `rendering.variant.at_work`, which makes good what interrupts have left; where it is taken
-# alone, calls inside do not.
 engine_lock = threading.RLock()
 
 _process = {"parent_was_rendering": False}
 
-# Id of the process that has set the size of Dr.Jit's pool, 0 for none: the threads do not come along in a fork, and
-# waiting for them never ends.
-_pool = {"of": 0}
+# Process id of the last change of the pool's size, 0 for none: threads do not come along in a fork, and waiting for
+# them never ends.
+_pool = {"process": 0}
 
 # Seconds between two attempts to wake threads that were told to end, and how many attempts are made.
 WAKE_S, MOST_WAKES = 0.1, 600
 
 
 def _mark_fork() -> None:
-    """Runs in the child of a fork: Dr.Jit's threads did not come along, and waiting for them would never end."""
+    """Mark the child of a fork whose parent rendered: it lacks Dr.Jit's threads, and would wait for them for ever."""
     mitsuba = sys.modules.get("mitsuba")
     active = None if mitsuba is None else mitsuba.variant()
     if active is not None and not active.startswith("scalar"):
@@ -55,25 +52,26 @@ def check_process() -> None:
 
 
 def set_drjit_threads(count: int) -> None:
-    """Let Dr.Jit compute with so many threads; the engine lock is held. Raises ``VariantError`` in a forked child."""
+    """Set the number of Dr.Jit's threads, under the engine lock. Raises ``VariantError`` in a forked child."""
     check_process()
-    if _pool["of"] not in (0, os.getpid()):
+    if _pool["process"] not in (0, os.getpid()):
         raise VariantError(
             "threads: this process was forked from one that had set Dr.Jit's threads, which did not come along. "
             "Expected a fresh process: use multiprocessing.get_context('spawn'), or set them in the child alone."
         )
-    _pool["of"] = os.getpid()
+    _pool["process"] = os.getpid()
     dr.sync_thread()
     resize_pool(count)
 
 
 def resize_pool(count: int) -> None:
-    """Set the number of Dr.Jit's threads without the hang of ``dr.set_thread_count``. The engine lock is held, and
-    nothing of Dr.Jit's is running.
+    """Set the number of Dr.Jit's threads without the hang of ``dr.set_thread_count``, under the engine lock, while no
+    kernel runs.
 
-    Where a worker falls asleep just as it is told to end, nanothread (of Dr.Jit 1.5) waits for it for ever: once in
-    some 250,000 changes. A task that is submitted meanwhile wakes it. ``dr.set_thread_count`` holds the interpreter's
-    lock, which would stop the thread that submits: so the pool is shrunk through ctypes.
+    If a worker falls asleep just as the pool shrinks, nanothread (of Dr.Jit 1.5) waits for it for ever: once in some
+    250,000 changes, and a process of one thread shrinks its pool after every file (:func:`threads_for_files`). A task
+    that is submitted meanwhile wakes the worker. ``dr.set_thread_count`` holds the interpreter's lock, which would stop
+    the thread that submits: so the pool is shrunk through ctypes.
     """
     library = _nanothread()
     # At the interpreter's end no thread begins any more, and its start would be waited for.
@@ -99,9 +97,7 @@ def resize_pool(count: int) -> None:
 
 
 def _wake(library: Any, ended: threading.Lock) -> None:
-    """Submit a task that does nothing, again and again until ``ended`` is let go; not for ever, since an interrupt may
-    prevent that it is.
-    """
+    """Submit empty tasks until ``ended`` is released, at most ``MOST_WAKES``: an interrupt may prevent the release."""
     for _ in range(MOST_WAKES):
         if ended.acquire(timeout=WAKE_S):
             return
@@ -112,9 +108,7 @@ def _wake(library: Any, ended: threading.Lock) -> None:
 
 @functools.cache
 def _nanothread() -> Any:
-    """Dr.Jit's pool of threads, which Python does not offer whole; None where it is not found, and where its functions
-    may be others than those of Dr.Jit 1.5: look at nanothread.h again then.
-    """
+    """Library of Dr.Jit's pool; None if not found, or of another Dr.Jit than 1.5, whose nanothread.h may differ."""
     if not dr.__version__.startswith("1.5."):
         return None
     path = next(Path(dr.__file__).parent.glob("*nanothread*"), None)
@@ -140,8 +134,7 @@ def threads_for_files() -> Iterator[None]:
     """Hold the engine lock with at least two threads of Dr.Jit: for blocks in which Mitsuba may read or write pictures.
 
     Mitsuba (3.9 at least) submits the blocks of an OpenEXR file to Dr.Jit's pool and waits on a semaphore, without
-    taking part: a pool that is the calling thread alone never gets to them. Also on machines of one core. An interrupt
-    may leave two threads until the next call.
+    taking part: a pool that is the calling thread alone never gets to them, on machines of one core too.
     """
     with engine_lock:
         before = dr.thread_count()
@@ -149,10 +142,9 @@ def threads_for_files() -> Iterator[None]:
             yield
             return
 
-        def as_before() -> None:
-            if dr.thread_count() == 2:  # and nobody has set others meanwhile
-                set_drjit_threads(before)
-
-        with afterwards(as_before):
+        try:
             set_drjit_threads(2)
             yield
+        finally:
+            if dr.thread_count() == 2:  # the block has set no other number
+                set_drjit_threads(before)

@@ -16,7 +16,6 @@ from typing import Any, NoReturn, Protocol
 import torch
 
 from torchtransient.errors import GradientError, ShapeError
-from torchtransient.rendering.older_vmap import each_of_older_vmap
 
 Tensors = tuple[torch.Tensor, ...]
 
@@ -94,7 +93,15 @@ def _once(job: Replayable, tensors: Sequence[torch.Tensor]) -> list[torch.Tensor
 
 
 def _check_runs(job: Replayable, tensors: Sequence[torch.Tensor]) -> None:
-    """Raise ``GradientError`` where a run would become a constant of a graph that torch is tracing."""
+    """Raise ``GradientError`` where a run would become a constant of a graph that torch is tracing, and for the batches
+    of ``torch.autograd``, which reach ``forward`` as one tensor without memory.
+    """
+    if any(torch._C._functorch.is_legacy_batchedtensor(tensor) for tensor in tensors):
+        raise GradientError(
+            f"{job.what} has no rule for the batches of torch.autograd (jacobian and hessian with vectorize=True, grad "
+            "with is_grads_batched=True). Expected torch.func.jacrev, torch.func.jacfwd or torch.func.vmap, or "
+            "vectorize=False."
+        )
     modes: Any = torch._ops
     key = torch._C._TorchDispatchModeKey.PROXY
     tracing = torch._C._get_dispatch_mode(key) or modes._get_dispatch_mode_pre_dispatch(key)
@@ -180,11 +187,7 @@ class Pullback(torch.autograd.Function):
     def forward(job: Replayable, asked: Asked, *tensors: torch.Tensor) -> Tensors:
         _check_runs(job, tensors)
         count = sum(asked.given)
-
-        def run(*cotangents: torch.Tensor) -> Tensors:
-            return job.pullback(asked, tensors[count:], cotangents)
-
-        return each_of_older_vmap(run, *tensors[:count])
+        return job.pullback(asked, tensors[count:], tensors[:count])
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
@@ -228,11 +231,7 @@ class Pushforward(torch.autograd.Function):
     def forward(job: Replayable, asked: Asked, *tensors: torch.Tensor) -> Tensors:
         _check_runs(job, tensors)
         count = sum(asked.needs)
-
-        def run(*tangents: torch.Tensor) -> Tensors:
-            return job.pushforward(asked, tensors[count:], tangents)
-
-        return each_of_older_vmap(run, *tensors[:count])
+        return job.pushforward(asked, tensors[count:], tensors[:count])
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:

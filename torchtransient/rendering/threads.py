@@ -20,7 +20,7 @@ MOST_THREADS = 1024
 class Threads:
     """Numbers of threads in use, the calling one included: ``torch``'s for one operation, ``drjit``'s for one kernel.
 
-    As a context manager it puts back what was in use before the call of :func:`threads` that made it.
+    As a context manager it puts back the counts from before its call of :func:`threads`.
     """
 
     torch: int
@@ -38,16 +38,27 @@ class Threads:
 
 
 def threads(n: int | None = None) -> Threads:
-    """Let torch and Dr.Jit, which has a pool of its own, compute with ``n`` threads each; None only asks.
+    """Set the number of threads that torch and Dr.Jit, which has a pool of its own, compute with.
 
-    Returns the counts in use. As a context manager it puts back what was there before::
+    The result is a context manager that puts back the counts from before::
 
         with tt.threads(1):
             out = renderer(seed=0)
 
-    ``n``: 1 to 1024, the calling thread included; 1 leaves no other one at work. More threads than cores are taken and
-    take turns, which is slower. Pools grow and shrink at any time; a call waits until renders of other threads are
-    done. Numbers of a render do not depend on the count but for the order of sums.
+    Pools grow and shrink at any time; a call waits until renders of other threads are done. Numbers of a render depend
+    on the count through the order of sums alone.
+
+    Args:
+        n: 1 to 1024, the calling thread included; 1 leaves no other thread at work. More threads than cores take turns,
+            which is slower. None changes nothing.
+
+    Returns:
+        The counts in use.
+
+    Raises:
+        UnitError: if ``n`` is no such number.
+        DeviceError: if the system or torch refuses so many threads; the counts stay as they were.
+        VariantError: in a process that was forked from one whose threads of Dr.Jit were at work.
 
     Dr.Jit's count is the process's. Torch's is that of the calling thread, and what threads begin with that compute
     for the first time later; those that have computed before keep theirs. Neither reaches spawned processes: call it
@@ -56,10 +67,6 @@ def threads(n: int | None = None) -> Threads:
     Mitsuba hands OpenEXR files to Dr.Jit's threads and waits for them, for ever where there is but one. What this
     library loads gets a second one meanwhile; for Mitsuba's own calls on such files (``mi.Bitmap``, ``mi.load_dict``)
     write ``with tt.threads(2):`` around them.
-
-    Raises ``UnitError`` for anything but such a number, ``DeviceError`` where the system or torch refuses so many
-    threads (the counts stay what they were), ``VariantError`` in a process that was forked from one whose threads of
-    Dr.Jit were at work.
     """
     n = _checked(n)
     # What an interrupted call has left may be a number of threads.

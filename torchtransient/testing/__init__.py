@@ -1,4 +1,6 @@
-"""Helpers for testing renderers and gradients: closed forms, finite differences, statistics.
+"""Closed forms and finite differences, for tests of renderers, plugins and gradients of your own.
 
-Numpy only, but for captures, which are tensors.
+`closed_forms` has transients of the scenes of `tt.scenes`, `closed_forms_nlos` captures around a corner, and
+`finite_differences` central differences with common random numbers. All take and return numpy arrays; tests of
+independent runs are in `torchtransient.accuracy.statistics`.
 """

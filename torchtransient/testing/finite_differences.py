@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from torchtransient.accuracy.statistics import ZTest, standard_error, two_sample_z_test
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.testing.statistics import ZTest, standard_error, two_sample_z_test
 
 Array = NDArray[np.float64]
 Render = Callable[[float, int], ArrayLike]
@@ -22,8 +22,12 @@ Render = Callable[[float, int], ArrayLike]
 
 @dataclass(frozen=True)
 class Derivative:
-    """A derivative by finite differences: `per_seed` (K, ...) in the shape of what was rendered, and the `step` that
-    was used."""
+    """Derivative by finite differences.
+
+    Attributes:
+        per_seed: derivative of each seed, (K, ...), in the shape of one render.
+        step: half the distance of the two renders, in units of the parameter.
+    """
 
     per_seed: Array
     step: float
@@ -39,20 +43,37 @@ class Derivative:
         return standard_error(self.per_seed)
 
     def compare(self, gradients: ArrayLike, alpha: float = 1e-3, rounding: float = 0.0) -> ZTest:
-        """Welch's test of gradients from independent runs (M, ...), M >= 2, against these differences."""
+        """Compare gradients of independent runs with these differences by Welch's test.
+
+        Args:
+            gradients: gradients of independent runs, (M, ...), M >= 2.
+            alpha: probability that right gradients fail.
+            rounding: absolute error that is forgiven.
+
+        Raises:
+            ShapeError: if the shapes of one run differ, or M < 2.
+        """
         return two_sample_z_test(gradients, self.per_seed, alpha, rounding)
 
 
 def central_difference(
     render: Render, value: float, step: float, seeds: Sequence[int], richardson: bool = False
 ) -> Derivative:
-    """d render(value, seed) / d value at `value`, from render(value + step, seed) - render(value - step, seed), per
-    seed.
+    """Differentiate a render by one number: (render(value + step, seed) - render(value - step, seed)) / (2 step).
 
-    `render(x, seed)` returns a number or an array of any fixed shape. `richardson=True` renders twice as often, at
-    `step` and `step / 2`, and cancels the error of second order: (4 D(step / 2) - D(step)) / 3. At least two different
-    seeds (UnitError otherwise, since no error can be told). For the derivative with respect to a direction in many
-    parameters, let `value` be the coordinate along it.
+    Args:
+        render: `render(x, seed)` returns a number or an array of one shape.
+        value: number at which the derivative is taken; the coordinate along a direction in many parameters.
+        step: half the distance of the two renders, in units of `value`.
+        seeds: two or more different seeds; both renders of a difference use the same one.
+        richardson: render at `step / 2` too, and cancel the error of second order, (4 D(step / 2) - D(step)) / 3.
+
+    Returns:
+        The derivative of each seed.
+
+    Raises:
+        UnitError: if `step` is not positive, or there are fewer than two different seeds, which leave no error.
+        ShapeError: if the shape of a render depends on `x`.
     """
     if not step > 0.0:
         raise UnitError(f"step: expected a number greater than zero, got {step!r}")

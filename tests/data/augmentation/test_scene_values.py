@@ -11,6 +11,7 @@ import torch
 from kornia.augmentation import RandomAffine, RandomRotation
 
 from support.sweeps import together
+from tools.every_plugin import every_plugin
 from torchtransient import plugins
 from torchtransient.data import Affine, Augment, Crop, Flip, QuarterTurn
 from torchtransient.data.augmentation.pixel_map import PixelMap
@@ -19,7 +20,6 @@ from torchtransient.errors import SceneError
 from torchtransient.plugins.parameter_effect import ANY_KEY, all_rows
 from torchtransient.plugins.parameters import ParameterTracker, can_carry_gradients
 from torchtransient.sensing.devices.devices import KINDS
-from torchtransient.testing.every_plugin import every_plugin
 
 N = 6
 OPERATIONS = {

@@ -11,8 +11,8 @@ import torch
 from torch.utils.data import DataLoader
 
 import torchtransient as tt
+from tools.small_room import COLOUR, VARIANT, make_room
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.testing.small_room import COLOUR, VARIANT, make_room
 from torchtransient.training import Batches, worker_init
 
 

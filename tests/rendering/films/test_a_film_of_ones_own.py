@@ -13,12 +13,12 @@ import pytest
 import torch
 
 import torchtransient as tt
+from tools.small_room import WALL_POSE, make_room
 from torchtransient import plugins
 from torchtransient.errors import ArgumentError, SceneError
 from torchtransient.files.result_file import read_result, write_result
 from torchtransient.plugins import _registry
 from torchtransient.rendering.films import FILMS, FilmLayout
-from torchtransient.testing.small_room import WALL_POSE, make_room
 
 VARIANT = "llvm_ad_rgb"
 

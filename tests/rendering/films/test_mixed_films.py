@@ -11,11 +11,11 @@ import torch
 
 import torchtransient as tt
 from support.marks import long_rows
+from tools.small_room import GREY, WALL_POSE, make_room
 from torchtransient import plugins
 from torchtransient.errors import ArgumentError, GradientError, SceneError
 from torchtransient.plugins.films import temporal_filters
 from torchtransient.rendering.overrides import temporal_filter
-from torchtransient.testing.small_room import GREY, WALL_POSE, make_room
 
 VARIANT = "llvm_ad_rgb"
 SIZE = {"width": 4, "height": 3, "rfilter": {"type": "box"}}

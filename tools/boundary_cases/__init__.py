@@ -1,0 +1,1 @@
+"""Scenes in which edges move, and the parts of their derivatives."""
