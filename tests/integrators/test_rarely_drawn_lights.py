@@ -10,8 +10,8 @@ import torch
 
 import torchtransient as tt
 from torchtransient import plugins
+from torchtransient.plugins.sampling.lights import MovingSun
 from torchtransient.plugins.sampling.sphere_lights import SphereLights
-from torchtransient.plugins.sampling.sun import MovingSun
 from torchtransient.testing.small_room import GREY, WALL_POSE, make_room
 
 VARIANT = "llvm_ad_mono"

@@ -9,7 +9,7 @@ import pytest
 
 import torchtransient as tt
 from torchtransient import plugins
-from torchtransient.plugins.mixtures import needs_choice
+from torchtransient.plugins.bsdfs.mixtures import needs_choice
 from torchtransient.testing.gradient_sweep.bsdfs import METAL, ROUGH_GLASS, blend
 from torchtransient.testing.gradient_sweep.measure import Subject
 from torchtransient.testing.gradient_sweep.stages import between_lights, matte

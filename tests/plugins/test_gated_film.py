@@ -16,7 +16,7 @@ from torchtransient.files.result_file import read_result, write_result
 from torchtransient.gates import Gate
 from torchtransient.plugins.films.gate_table import GateTable
 from torchtransient.plugins.films.window import ArrivalWindow, GappedWindow
-from torchtransient.plugins.sampling.light_box import LightBox
+from torchtransient.plugins.sampling.lights import LightBox
 from torchtransient.testing.film_storage import storage
 from torchtransient.testing.small_room import GREY, WALL_POSE, make_room
 from torchtransient.testing.statistics import two_sample_z_test

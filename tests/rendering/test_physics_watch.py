@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchtransient.errors import PhysicsError, PhysicsWarning
-from torchtransient.plugins.physical_ranges import ANGLE, INDEX, ROUGHNESS, SHARE
+from torchtransient.plugins.parameters import ANGLE, INDEX, ROUGHNESS, SHARE
 from torchtransient.rendering.physics import (
     PhysicsWatch,
     are_finite,

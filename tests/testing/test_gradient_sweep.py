@@ -17,7 +17,7 @@ import torch
 import torchtransient as tt
 from torchtransient.plugins import _registry
 from torchtransient.plugins.mitsuba_compat import COMPLETED_PLUGINS
-from torchtransient.plugins.swept_parameters import FILE, is_checked
+from torchtransient.plugins.parameter_effect import FILE, is_checked
 from torchtransient.testing.every_plugin import every_plugin
 from torchtransient.testing.gradient_sweep import compare, runner
 from torchtransient.testing.gradient_sweep.bsdfs import HOLDERS

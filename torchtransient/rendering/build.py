@@ -31,7 +31,7 @@ from torchtransient.plugins.mitsuba_compat import (
 )
 from torchtransient.plugins.node_walk import has_mean
 from torchtransient.plugins.parameter_effect import class_of
-from torchtransient.plugins.physical_ranges import PhysicalRange, described_ranges, ranges_of
+from torchtransient.plugins.parameters import PhysicalRange, described_ranges, ranges_of
 from torchtransient.rendering.build_options import BuildOptions
 from torchtransient.rendering.description import Description
 from torchtransient.rendering.films.choices import all_films, of_plugin, plugins_in_words

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from torchtransient.plugins import kind_of
-from torchtransient.plugins.finite_values import count_bad, numbers_of, refuse
+from torchtransient.plugins.properties import count_bad, numbers_of, refuse
 
 # Direct children of the scene that matter only where something refers to them.
 _DECLARATIONS = ("BSDF", "Medium", "Texture", "Volume", "PhaseFunction", "ReconstructionFilter", "Film", "Sampler")

@@ -17,10 +17,10 @@ import numpy as np
 
 from torchtransient.errors import SceneError, UnknownKeyError
 from torchtransient.interfaces import IntegratorInterface
-from torchtransient.plugins.mitsuba_numbers import check_pose, is_number_of_kernels, is_turned_by_reflections
+from torchtransient.plugins.mitsuba_compat import check_pose, is_number_of_kernels, is_turned_by_reflections
 from torchtransient.plugins.node_walk import ShownValue, unshared
+from torchtransient.plugins.parameter_effect import UNCHECKED, is_checked
 from torchtransient.plugins.parameters import ParameterEffect, ParameterTracker
-from torchtransient.plugins.swept_parameters import UNCHECKED, is_checked
 from torchtransient.plugins.transport.boundary.moving_edges import Gap, MovingEdges, moves_edges, moving_edges
 from torchtransient.rendering.build import BuiltScene
 from torchtransient.rendering.taken import without_stand_in

@@ -20,7 +20,7 @@ import torch
 
 from torchtransient.errors import ArgumentError, GradientError, GradientWarning, PhysicsError, PhysicsWarning
 from torchtransient.given_types import is_one_of
-from torchtransient.plugins.physical_ranges import SHARE, PhysicalRange
+from torchtransient.plugins.parameters import SHARE, PhysicalRange
 from torchtransient.quantities import shown
 
 MODES = ("warn", "error", "ignore")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from torchtransient.errors import SceneError, TorchTransientError, UnknownKeyError
-from torchtransient.plugins.mitsuba_numbers import check_pose, is_turned_by_reflections
+from torchtransient.plugins.mitsuba_compat import check_pose, is_turned_by_reflections
 from torchtransient.plugins.node_walk import ShownValue
 from torchtransient.rendering.interrupts import quiet
 from torchtransient.rendering.mitsuba_words import one_line

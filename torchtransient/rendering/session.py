@@ -14,7 +14,7 @@ import torch
 
 from torchtransient._collection import no_collection
 from torchtransient.errors import SceneError, TorchTransientError, VariantError
-from torchtransient.plugins.black_textures import lifted
+from torchtransient.plugins.parameters import lifted
 from torchtransient.plugins.unfinished import afterwards
 from torchtransient.rendering.build_options import BuildOptions
 from torchtransient.rendering.interrupts import quiet

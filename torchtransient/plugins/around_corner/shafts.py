@@ -18,7 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from torchtransient.plugins.host_numbers import host_numbers
+from torchtransient.plugins.kernel_arrays import host_numbers
 from torchtransient.plugins.sampling.area_elements import TRIANGLE, AreaElements, morton_order
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from torchtransient.plugins.host_numbers import host_numbers
+from torchtransient.plugins.kernel_arrays import host_numbers
 
 # Creases flatter than this are no outline: 1 minus the cosine of 1.4e-3 radians.
 FLAT = 1e-6

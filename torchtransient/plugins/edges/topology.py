@@ -14,13 +14,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from torchtransient.plugins.cache import Cache
 from torchtransient.plugins.edges.joined import edge_keys, joined_places, near_places
 from torchtransient.plugins.edges.spokes import Spokes
-from torchtransient.plugins.host_numbers import host_numbers, whole_numbers
+from torchtransient.plugins.kernel_arrays import host_numbers, registry_number, whole_numbers
 from torchtransient.plugins.mitsuba_compat import is_instance, lacks_edges
 from torchtransient.plugins.node_walk import members_of, shapes_of_scene, shown_by
-from torchtransient.plugins.pointer_table import registry_number
-from torchtransient.plugins.remembered import Remembered
 
 # Flags of a row: a second face; seen from between its faces alone; listed for the other face's vertices, too; faces of
 # two bodies.
@@ -282,14 +281,14 @@ class Topology:
         return dr.concat([dr.full(mi.Float, float(m), n) for m, (_, n) in zip(moves, self._runs, strict=True)])
 
 
-def topology_of(scene: Any, memory: Remembered, hides: Callable[[Any], bool] | None = None) -> Topology:
+def topology_of(scene: Any, memory: Cache, hides: Callable[[Any], bool] | None = None) -> Topology:
     """Return the :class:`Topology` of a scene as it is now, kept in ``memory``."""
     meshes = [shape for shape in shapes_of_scene(scene) if shape.is_mesh()]
     sizes = np.array([(mesh.vertex_count(), mesh.face_count()) for mesh in meshes], np.int64).tobytes()
-    found = memory.of("edges", sizes, lambda: Topology(scene, hides))
+    found = memory.get("edges", sizes, lambda: Topology(scene, hides))
     if (areas := found.areas()) == found.areas_at_first:
         return found
-    return memory.of("edges", sizes + areas, lambda: Topology(scene, hides))
+    return memory.get("edges", sizes + areas, lambda: Topology(scene, hides))
 
 
 def bodies_of(scene: Any) -> list[Body]:

@@ -27,7 +27,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from torchtransient.plugins.host_numbers import host_numbers
+from torchtransient.plugins.kernel_arrays import host_numbers
 from torchtransient.plugins.mitsuba_compat import has_surface
 from torchtransient.plugins.node_walk import shown_by
 from torchtransient.plugins.parameter_effect import class_of

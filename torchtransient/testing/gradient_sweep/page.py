@@ -8,8 +8,7 @@ from collections.abc import Container, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from torchtransient.plugins.parameter_effect import CORRECT
-from torchtransient.plugins.swept_parameters import FILE
+from torchtransient.plugins.parameter_effect import CORRECT, FILE
 from torchtransient.testing.gradient_sweep.compare import RESOLVED, SCALE, SIGMAS, TOLERANCE, WEAK
 from torchtransient.testing.gradient_sweep.settings import all_settings
 

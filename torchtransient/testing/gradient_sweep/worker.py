@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from torchtransient.errors import TorchTransientError
-from torchtransient.plugins.swept_parameters import UNCHECKED
+from torchtransient.plugins.parameter_effect import UNCHECKED
 from torchtransient.rendering.parameters import ParameterInfo
 from torchtransient.rendering.scene_handle import load
 from torchtransient.testing.gradient_sweep.compare import Effort, Result, judge

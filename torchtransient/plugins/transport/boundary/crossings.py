@@ -17,9 +17,8 @@ import numpy as np
 from torchtransient.plugins.edges.joined import joined_places, merged
 from torchtransient.plugins.edges.table import BESIDE
 from torchtransient.plugins.edges.topology import BALL, DISK_RIM, Body, bodies_of
-from torchtransient.plugins.host_numbers import floats, host_numbers
+from torchtransient.plugins.kernel_arrays import floats, host_numbers, registry_number
 from torchtransient.plugins.mitsuba_compat import bounds_of
-from torchtransient.plugins.pointer_table import registry_number
 from torchtransient.plugins.transport.media_contents import is_open
 
 # How deep an edge reaches through a face at least, in parts of the largest coordinate of both bodies: edges that lie

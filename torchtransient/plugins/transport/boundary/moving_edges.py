@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient.plugins.edges.topology import Body
-from torchtransient.plugins.host_numbers import host_numbers
+from torchtransient.plugins.kernel_arrays import host_numbers
 from torchtransient.plugins.mitsuba_compat import (
     attribute_name,
     has_limb,
@@ -26,7 +26,7 @@ from torchtransient.plugins.mitsuba_compat import (
 )
 from torchtransient.plugins.node_walk import bsdfs_of_scene, objects_below, shapes_of_scene
 from torchtransient.plugins.parameter_effect import CORRECT, ParameterEffect
-from torchtransient.plugins.sampling.sun import MovingSun
+from torchtransient.plugins.sampling.lights import MovingSun
 from torchtransient.plugins.sensors.seen_from import SensorPlaces, can_be_connected, has_eye, sees_one_line
 from torchtransient.plugins.transport.boundary.crossings import crossing_bodies
 from torchtransient.plugins.transport.media_contents import is_open

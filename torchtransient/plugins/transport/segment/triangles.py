@@ -12,9 +12,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from torchtransient.plugins.host_numbers import whole_numbers
+from torchtransient.plugins.kernel_arrays import PointerTable, whole_numbers
 from torchtransient.plugins.mitsuba_compat import has_vertices
-from torchtransient.plugins.pointer_table import PointerTable
 from torchtransient.plugins.sampling.area_elements import has_shading_normals
 from torchtransient.plugins.transport.strategy import Local
 
