@@ -23,6 +23,7 @@ import mitsuba as mi
 from torchtransient.errors import SceneError
 from torchtransient.interfaces import IntegratorInterface, is_time_resolved
 from torchtransient.plugins.mitsuba_compat import (
+    VERTEX_COLUMNS,
     attribute_name,
     attribute_sizes,
     has_surface,
@@ -31,7 +32,6 @@ from torchtransient.plugins.mitsuba_compat import (
     normal_texture,
     read_as,
 )
-from torchtransient.plugins.mitsuba_parameters import VERTICES
 from torchtransient.plugins.node_walk import objects_below, objects_of, shown_by
 from torchtransient.plugins.parameter_effect import class_of
 from torchtransient.plugins.properties import check_parameters
@@ -154,7 +154,7 @@ def attributes_of(shape: Any) -> dict[str, float | None]:
     found: dict[str, float | None] = {name: None for name, part, _ in objects if isinstance(part, mi.Texture)}
     for shown in values if isinstance(shape, mi.Mesh) else ():
         count = {"vertex": shape.vertex_count, "face": shape.face_count}.get(shown.key.partition("_")[0])
-        if count is not None and shown.key not in VERTICES and dr.is_array_v(shown.read(shape)):
+        if count is not None and shown.key not in VERTEX_COLUMNS and dr.is_array_v(shown.read(shape)):
             found[shown.key] = dr.width(shown.read(shape)) / max(count(), 1)
     return found
 

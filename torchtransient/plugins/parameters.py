@@ -20,6 +20,7 @@ from torchtransient.plugins import mitsuba_parameters as mitsuba_parameters
 from torchtransient.plugins.mitsuba_compat import (
     NUMBERS,
     PIXELS,
+    VERTEX_COLUMNS,
     attribute_name,
     attribute_scale,
     forgets_black_samples,
@@ -277,7 +278,7 @@ def can_carry_gradients(value: Any) -> bool:
 
 def is_attribute(node: Any, key: str) -> bool:
     """Whether it is an attribute of a mesh, whose memory moves when another one is added."""
-    return isinstance(node, mi.Mesh) and key.startswith(("vertex_", "face_")) and key not in mitsuba_parameters.VERTICES
+    return isinstance(node, mi.Mesh) and key.startswith(("vertex_", "face_")) and key not in VERTEX_COLUMNS
 
 
 # --------------------------------------------------------------------------------------- what has to be there for them

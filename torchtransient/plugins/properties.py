@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient.errors import SceneError
+from torchtransient.plugins.mitsuba_compat import mesh_faces
 from torchtransient.plugins.node_walk import ShownValue
 from torchtransient.quantities import shown
 
@@ -121,6 +122,6 @@ def _components(value: Any) -> np.ndarray:
 
 def _at_faces(mesh: Any, array: np.ndarray) -> np.ndarray:
     """The entries of a vertex attribute that faces refer to."""
-    faces = np.array(mi.traverse(mesh)["faces"])
+    faces = np.array(mesh_faces(mesh))
     count = mesh.vertex_count()
     return array.reshape(count, -1)[np.unique(faces[faces < count])]

@@ -17,7 +17,12 @@ import numpy as np
 
 from torchtransient.errors import SceneError, UnknownKeyError
 from torchtransient.interfaces import IntegratorInterface
-from torchtransient.plugins.mitsuba_compat import check_pose, is_number_of_kernels, is_turned_by_reflections
+from torchtransient.plugins.mitsuba_compat import (
+    VERTEX_COLUMNS,
+    check_pose,
+    is_number_of_kernels,
+    is_turned_by_reflections,
+)
 from torchtransient.plugins.node_walk import ShownValue, unshared
 from torchtransient.plugins.parameter_effect import UNCHECKED, is_checked
 from torchtransient.plugins.parameters import ParameterEffect, ParameterTracker
@@ -25,7 +30,6 @@ from torchtransient.plugins.transport.boundary.moving_edges import Gap, MovingEd
 from torchtransient.rendering.build import BuiltScene
 from torchtransient.rendering.taken import without_stand_in
 
-_VERTEX_COLUMNS = {"vertex_positions": 3, "vertex_normals": 3, "vertex_texcoords": 2}
 _MAX_LISTED = 65536  # larger values are not copied: textures of a real scene would fill the memory once more
 
 
@@ -269,7 +273,7 @@ def classify(key: str, current: Any) -> tuple[str, tuple[int, ...] | None]:
         several = width > 1 or key.rsplit(".", 1)[-1] == "points"
         return ("points", (width, len(current))) if several else ("vector", (len(current),))
     size = dr.width(current)
-    columns = _VERTEX_COLUMNS.get(key.rsplit(".", 1)[-1])
+    columns = VERTEX_COLUMNS.get(key.rsplit(".", 1)[-1])
     if columns is not None:
         return "vertices", (size // columns, columns)
     return ("number", ()) if size == 1 else ("list", (size,))

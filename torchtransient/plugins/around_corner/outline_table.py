@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient.plugins.edges.joined import FLAT, Triangles, edge_keys
-from torchtransient.plugins.mitsuba_compat import bounds_of
+from torchtransient.plugins.mitsuba_compat import bounds_of, mesh_positions
 
 # Edges that are weighed at a time.
 BLOCK = 2048
@@ -138,7 +138,7 @@ def _attached(triangles: Triangles, mesh: np.ndarray, vertices: np.ndarray) -> A
     points = []
     for number in np.unique(mesh):
         rows = (vertices[mesh == number] - triangles.first[number]).astype(np.uint32)
-        points.append(dr.gather(mi.Point3f, triangles.meshes[number].vertex_positions_buffer(), mi.UInt32(rows)))
+        points.append(dr.gather(mi.Point3f, mesh_positions(triangles.meshes[number]), mi.UInt32(rows)))
     return mi.Point3f(*[dr.concat([point[axis] for point in points]) for axis in range(3)])
 
 

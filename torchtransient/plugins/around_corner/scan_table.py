@@ -14,7 +14,7 @@ from torchtransient.interfaces import CaptureType
 from torchtransient.plugins.around_corner.geometry import OFFSET, WallPoints, front_normal, points_of, sees
 from torchtransient.plugins.bsdfs.lambertian import is_lambertian
 from torchtransient.plugins.kernel_arrays import host_numbers, registry_number
-from torchtransient.plugins.mitsuba_compat import is_flat_shape
+from torchtransient.plugins.mitsuba_compat import is_flat_shape, mesh_positions
 from torchtransient.plugins.node_walk import shown_by
 from torchtransient.plugins.sampling.area_elements import TRIANGLE, has_shading_normals
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
@@ -209,7 +209,7 @@ def _in_one_plane(shapes: list[Any]) -> bool:
 def _corners(shape: Any) -> np.ndarray | None:
     """Points that span a shape (N, 3), None for one that is curved."""
     if shape.is_mesh():
-        return host_numbers(shape.vertex_positions_buffer()).reshape(-1, 3)
+        return host_numbers(mesh_positions(shape)).reshape(-1, 3)
     if not is_flat_shape(shape):
         return None
     shown = next(v for v in shown_by(shape)[0] if v.key == "to_world")

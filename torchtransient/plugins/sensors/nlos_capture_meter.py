@@ -11,6 +11,7 @@ import numpy as np
 from torchtransient.capture.triangles import first_hits
 from torchtransient.errors import SceneError
 from torchtransient.plugins._registry import register
+from torchtransient.plugins.mitsuba_compat import mesh_faces, mesh_texcoords
 from torchtransient.plugins.parameter_effect import ParameterEffect, class_of, declare_effects
 from torchtransient.quantities import real_array, shown
 
@@ -27,10 +28,9 @@ class PlacesOnMesh:
     """
 
     def __init__(self, mesh: Any, places: np.ndarray) -> None:
-        shown = mi.traverse(mesh)
-        faces = np.array(shown["faces"]).reshape(-1, 3)
+        faces = np.array(mesh_faces(mesh)).reshape(-1, 3)
         corners = np.zeros((len(faces), 3, 3))
-        corners[:, :, :2] = np.array(shown["vertex_texcoords"], dtype=np.float64).reshape(-1, 2)[faces]
+        corners[:, :, :2] = np.array(mesh_texcoords(mesh), dtype=np.float64).reshape(-1, 2)[faces]
         origins = np.column_stack([places, np.full(len(places), -1.0)])
         _, triangle = first_hits(origins, np.array([0.0, 0.0, 1.0]), corners)
         missed = int((triangle < 0).sum())

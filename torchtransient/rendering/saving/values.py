@@ -9,7 +9,7 @@ import numpy as np
 from torchtransient.errors import SceneError
 from torchtransient.plugins import kind_of
 from torchtransient.plugins.dictionaries import double_transform
-from torchtransient.plugins.mitsuba_compat import DIFFERENTIABLE_PLUGINS, POLARIZED_PLUGINS
+from torchtransient.plugins.mitsuba_compat import DIFFERENTIABLE_PLUGINS, POLARIZED_PLUGINS, VERTEX_COLUMNS
 from torchtransient.plugins.node_walk import objects_of
 from torchtransient.plugins.spectral_colours import as_colours, keeps_coefficients
 from torchtransient.rendering.nodes import children, kind_of_node
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from torchtransient.rendering.parameters import Slot
     from torchtransient.rendering.saving.xml_nodes import XmlWriter
 
-_VERTICES = ("vertex_positions", "vertex_normals", "vertex_texcoords")
 # Properties of three numbers that are no colour.
 _VECTORS = ("position", "direction", "sensor_origin", "laser_origin", "sun_direction", "target")
 # What a mesh file says itself.
@@ -122,7 +121,7 @@ def write_value(writer: XmlWriter, built: Any, places: dict[int, Place], slot: S
     props = state.nodes[index].props
     if slot.kind == "mesh_transform" and props.plugin_name() != "mesh_arrays":
         props["to_world"] = double_transform()(value.astype(np.float64))
-    elif slot.kind == "mesh_transform" or (isinstance(owner, mi.Mesh) and name in _VERTICES):
+    elif slot.kind == "mesh_transform" or (isinstance(owner, mi.Mesh) and name in VERTEX_COLUMNS):
         mesh_as_file(writer, index, owner)
     elif slot.kind == "transform":
         matrix = value.astype(np.float64)
