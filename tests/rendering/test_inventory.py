@@ -14,8 +14,6 @@ from torchtransient import plugins
 from torchtransient.plugins._registry import PLUGIN_MODULES
 from torchtransient.rendering.inventory import POLARIZING_ELEMENTS, POLARIZING_INTERFACES, like_mitsuba
 from torchtransient.rendering.inventory_colour import (
-    _COLOURED_PLUGINS,
-    _TRANSPARENT,
     _constant,
     colour_of_node,
     colour_of_value,
@@ -69,11 +67,6 @@ def test_what_polarizes_is_listed(name):
     listed = like_mitsuba(name) in (*POLARIZING_ELEMENTS, *POLARIZING_INTERFACES)
     # Mitsuba's rough dielectric depolarizes; polarized renders replace it by one that does not.
     assert listed == (found or name == "roughdielectric")
-
-
-@pytest.mark.parametrize("name", OURS)
-def test_colours_of_our_plugins_are_known(name):
-    assert {name, like_mitsuba(name)} & {*_TRANSPARENT, *_COLOURED_PLUGINS}
 
 
 def verdict(plugin, lookup=Path, **properties):

@@ -179,6 +179,10 @@ PLUGIN_MODULES: tuple[PluginModule, ...] = (
 )
 
 
+# Surfaces of this library, by the names of their plugins.
+OWN_BSDFS = tuple(name for module in PLUGIN_MODULES for kind, name in module.plugins if kind == "bsdf")
+
+
 @dataclass
 class _State:
     """What is registered. Guarded by `lock`, since scenes are loaded from several threads; but for `listeners`, which

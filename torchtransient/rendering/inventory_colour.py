@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from torchtransient.plugins._registry import OWN_BSDFS
 from torchtransient.plugins.drjit_pool import threads_for_files
 from torchtransient.rendering.nodes import is_integrator
 
@@ -112,7 +113,7 @@ def colour_of_node(node: Any, lookup: Callable[[str], Path]) -> Verdict | None:
         return _picture(props, lookup)
     if plugin == "gridvolume":
         return _grid(props, lookup)
-    if plugin in _TRANSPARENT or node.type in (mi.ObjectType.Integrator, mi.ObjectType.Sampler):
+    if plugin in (*_TRANSPARENT, *OWN_BSDFS) or node.type in (mi.ObjectType.Integrator, mi.ObjectType.Sampler):
         return None
     return None if is_integrator(node) else Verdict(COLOUR, f"{plugin!r}, whose colours are not known here")
 
