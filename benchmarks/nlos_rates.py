@@ -69,7 +69,8 @@ class Case:
 
     def __init__(self, arrays: Mesh, scan: int, pairs: int, samples: int, rays_too: bool = True) -> None:
         # Plugins know their variant: their modules are imported when one is active.
-        from torchtransient.plugins.around_corner import exhaustive, shafts, third_bounce, wall_points
+        from torchtransient.plugins.around_corner import exhaustive, shafts, third_bounce
+        from torchtransient.plugins.around_corner import geometry as wall_points
         from torchtransient.plugins.sampling import hidden_elements, shared_samples
 
         v, f = plate(2, 2, (0, 0, 0))

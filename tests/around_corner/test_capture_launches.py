@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 
 from torchtransient.plugins.around_corner import late_light, launches, third_bounce_gradients
-from torchtransient.plugins.around_corner.attached import Ends
-from torchtransient.plugins.around_corner.chains import ChainPlan
-from torchtransient.plugins.around_corner.late_light import Tiles, divmod_by
+from torchtransient.plugins.around_corner.late_light import ChainPlan, Tiles, divmod_by
 from torchtransient.plugins.around_corner.occlusion import MutualOcclusion
-from torchtransient.plugins.around_corner.third_bounce_gradients import AdjointReader, Split
+from torchtransient.plugins.around_corner.third_bounce_gradients import AdjointReader, Ends, Split
 from torchtransient.plugins.transport.strategy import Local
 
 VARIANT = "llvm_ad_mono"

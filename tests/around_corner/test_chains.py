@@ -207,7 +207,7 @@ def test_chains_name_their_material_points(corner):
     """Shape, primitive and barycentrics of every vertex give its place again."""
     import drjit as dr
 
-    from torchtransient.plugins.around_corner.chains import ChainPlan, trace_chains
+    from torchtransient.plugins.around_corner.late_light import ChainPlan, trace_chains
 
     scene, elements, points, _ = corner
     center, seed = mi.Point3f(*np.mean(points, 0).tolist()), dr.opaque(mi.UInt32, 5)

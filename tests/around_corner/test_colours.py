@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from support.hidden_shapes import folded_plates, mesh, plate, scene_of, wall_grid
-from torchtransient.plugins.around_corner import chains, late_density, third_bounce
+from torchtransient.plugins.around_corner import late_light as chains
+from torchtransient.plugins.around_corner import shared_light as late_density
+from torchtransient.plugins.around_corner import third_bounce
+from torchtransient.plugins.around_corner.geometry import WallPoints
 from torchtransient.plugins.around_corner.third_bounce import lit_by
-from torchtransient.plugins.around_corner.wall_points import WallPoints
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 from torchtransient.plugins.transport.strategy import Local
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from support.hidden_shapes import mesh, plate, scene_of
-from torchtransient.plugins.around_corner import chains, occlusion
+from torchtransient.plugins.around_corner import late_light as chains
+from torchtransient.plugins.around_corner import occlusion
 from torchtransient.plugins.around_corner.occlusion import MutualOcclusion
 from torchtransient.plugins.transport.strategy import Local
 

@@ -9,10 +9,9 @@ import pytest
 import scipy.optimize
 
 from support.hidden_shapes import ball, join, mannequin, mesh, plate, wall_grid
-from torchtransient.plugins.around_corner import hiding
 from torchtransient.plugins.around_corner import outline_table as edges_module
-from torchtransient.plugins.around_corner.hiding import hiding_pairs, parts_of
-from torchtransient.plugins.around_corner.outline_table import Edges, OutlineTable
+from torchtransient.plugins.around_corner import outline_table as hiding
+from torchtransient.plugins.around_corner.outline_table import Edges, OutlineTable, hiding_pairs, parts_of
 from torchtransient.plugins.edges.joined import APART, Triangles
 
 VARIANT = "llvm_ad_mono"

@@ -11,7 +11,7 @@ from support.third_bounce_runs import captured, film_of, table_of, wall_of
 from torchtransient.errors import SceneError, ShapeError
 from torchtransient.interfaces import CaptureType
 from torchtransient.plugins.around_corner.late_light import LateLight
-from torchtransient.plugins.around_corner.scan_job import ScanJob
+from torchtransient.plugins.around_corner.launches import ScanJob
 from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
 from torchtransient.plugins.sampling.shared_samples import draw_samples
 from torchtransient.plugins.transport.strategy import Local

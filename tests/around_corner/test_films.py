@@ -9,8 +9,8 @@ from support.hidden_shapes import mannequin, mesh, scene_of, wall_grid
 from support.marks import long
 from support.third_bounce_runs import captured, film_of, table_of, wall_of
 from torchtransient.errors import SceneError, ShapeError, VariantError
+from torchtransient.plugins.around_corner.geometry import WallPoints
 from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
-from torchtransient.plugins.around_corner.wall_points import WallPoints
 from torchtransient.plugins.sampling.shared_samples import draw_samples
 
 VARIANT = "llvm_ad_mono"

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from support.hidden_shapes import join, mesh, plate, wall_grid
-from torchtransient.plugins.around_corner import hiding
 from torchtransient.plugins.around_corner import outline_table as edges_module
-from torchtransient.plugins.around_corner.hiding import parts_of
-from torchtransient.plugins.around_corner.outline_table import Edges
+from torchtransient.plugins.around_corner import outline_table as hiding
+from torchtransient.plugins.around_corner.outline_table import Edges, parts_of
 from torchtransient.plugins.edges.joined import Triangles
 from torchtransient.plugins.transport.strategy import Local
 

@@ -7,7 +7,7 @@ import pytest
 
 from support.moved_captures import MovedCapture, agree, move, noted
 from support.nlos_scenes import film, plane, scan_scene, side
-from torchtransient.plugins.around_corner.late_outlines import LateOutlines
+from torchtransient.plugins.around_corner.occlusion import LateOutlines
 
 VARIANT = "llvm_ad_mono"
 SMOOTH = {"start": 1.0, "width": 0.05, "bins": 100, "temporal_filter": "tent"}

@@ -9,11 +9,12 @@ import pytest
 
 from support.hidden_shapes import folded_plates, mesh, plate, scene_of, wall_grid
 from torchtransient.errors import ShapeError
-from torchtransient.plugins.around_corner import geometry, late_density
-from torchtransient.plugins.around_corner.attached import Ends, ends_of_points, ends_of_samples, leaves
-from torchtransient.plugins.around_corner.sample_table import SampleTable
-from torchtransient.plugins.around_corner.wall_points import WallPoints, points_of
-from torchtransient.plugins.remembered import Remembered
+from torchtransient.plugins.around_corner import geometry
+from torchtransient.plugins.around_corner import shared_light as late_density
+from torchtransient.plugins.around_corner.geometry import WallPoints, points_of
+from torchtransient.plugins.around_corner.third_bounce import SampleTable
+from torchtransient.plugins.around_corner.third_bounce_gradients import Ends, ends_of_points, ends_of_samples, leaves
+from torchtransient.plugins.cache import Cache
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 from torchtransient.plugins.sampling.shared_samples import draw_samples
 from torchtransient.plugins.transport.strategy import Local
@@ -342,8 +343,8 @@ def test_weights_of_elements_from_samples_of_neighbours(monkeypatch):
 def test_densities_of_one_scene_are_made_once():
     """As long as what scatters light is the same, and the elements are those that were kept."""
     shapes = [mesh("a", plate(1, 1, (0, 0, 1)))]
-    scene, memory, wall = scene_of(*shapes), Remembered(), wall_grid(2)
-    kept = HiddenElements.remembered(memory, shapes, *wall)
+    scene, memory, wall = scene_of(*shapes), Cache(), wall_grid(2)
+    kept = HiddenElements.cached(memory, shapes, *wall)
     first = late_density.late_density(scene, kept, *wall, memory)
     assert late_density.late_density(scene, kept, *wall, memory) is first
     assert late_density.late_density(scene, kept, *wall) is not first

@@ -10,7 +10,8 @@ import pytest
 from support.hidden_shapes import mesh, plate, scene_of, wall_grid
 from torchtransient.errors import SceneError
 from torchtransient.interfaces import CaptureType
-from torchtransient.plugins.around_corner import chains, late_light
+from torchtransient.plugins.around_corner import late_light
+from torchtransient.plugins.around_corner import late_light as chains
 from torchtransient.plugins.around_corner.late_light import LateLanes, LateLaunch, LateLight, Tiles
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 from torchtransient.plugins.transport.strategy import Local

@@ -9,9 +9,9 @@ import pytest
 from support.nlos_scenes import transform
 from torchtransient.errors import TorchTransientWarning
 from torchtransient.plugins.around_corner import outlines, shared_light
+from torchtransient.plugins.kernel_arrays import registry_number
 from torchtransient.plugins.parameter_effect import CORRECT
 from torchtransient.plugins.parameters import effect_of
-from torchtransient.plugins.pointer_table import registry_number
 from torchtransient.plugins.transport.segment.material import FoundVacuum, MaterialVacuum
 from torchtransient.plugins.transport.segment.vacuum import Vacuum
 from torchtransient.plugins.transport.strategy import Local

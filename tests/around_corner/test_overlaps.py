@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from support.hidden_shapes import mesh, plate, wall_grid
-from torchtransient.plugins.around_corner import geometry, overlaps
+from torchtransient.plugins.around_corner import geometry
+from torchtransient.plugins.around_corner import scan_table as overlaps
 from torchtransient.plugins.sampling.area_elements import TRIANGLE
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 from torchtransient.plugins.transport.strategy import Local

@@ -7,10 +7,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from torchtransient.plugins.around_corner import attached, chains, exhaustive, late_light, third_bounce
+from torchtransient.plugins.around_corner import exhaustive, late_light, third_bounce
+from torchtransient.plugins.around_corner import late_light as chains
+from torchtransient.plugins.around_corner import third_bounce_gradients as attached
 from torchtransient.plugins.around_corner import third_bounce_gradients as gradients
-from torchtransient.plugins.around_corner.sample_table import SampleTable
-from torchtransient.plugins.around_corner.wall_points import WallPoints
+from torchtransient.plugins.around_corner.geometry import WallPoints
+from torchtransient.plugins.around_corner.third_bounce import SampleTable
 from torchtransient.plugins.transport.strategy import Local
 
 VARIANT = "llvm_ad_mono"

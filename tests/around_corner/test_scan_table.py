@@ -12,8 +12,7 @@ from support.plain_scenes import camera
 from torchtransient.errors import SceneError, TorchTransientWarning
 from torchtransient.interfaces import CaptureType
 from torchtransient.plugins.around_corner import scan_table
-from torchtransient.plugins.around_corner.division import Division
-from torchtransient.plugins.around_corner.explanation import explanation
+from torchtransient.plugins.around_corner.division import Division, explanation
 from torchtransient.plugins.transport.strategy import Local
 
 VARIANT = "llvm_ad_mono"

@@ -10,8 +10,8 @@ from support.marks import long
 from support.nlos_scenes import captures, film, plane, ratio, scan_scene, side
 from support.third_bounce_runs import table_of, wall_of
 from torchtransient.plugins.around_corner.shared_light import SharedThirdBounce
-from torchtransient.plugins.remembered import Remembered
-from torchtransient.plugins.sampling.scan_tiles import ScanTiles
+from torchtransient.plugins.cache import Cache
+from torchtransient.plugins.sampling.shared_samples import ScanTiles
 from torchtransient.plugins.transport.strategy import Local
 
 VARIANT = "llvm_ad_mono"
@@ -116,7 +116,7 @@ def test_scans_of_what_is_near_have_tiles(monkeypatch):
     monkeypatch.setattr(shared_light, "distance_to", lambda v, p: looked.append(p) or found_distance(v, p))
     for z, tiled in ((0.2, True), (0.9, False)):
         job = Local(light=Local(sensors=wall_of(points, normals)), tile=None,
-                    world=Local(contents=Local(memory=Remembered())))  # fmt: skip
+                    world=Local(contents=Local(memory=Cache())))  # fmt: skip
         elements = table_of([mesh("a", ball((0.1, 0, z), 0.05, 1))])
         found = SharedThirdBounce._near(job, elements)
         assert (found is not elements) == tiled == (job.tile is not None)

@@ -11,8 +11,7 @@ from torchtransient.plugins.around_corner.exhaustive import add_exhaustive
 from torchtransient.plugins.around_corner.shafts import spare_rays
 from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
-from torchtransient.plugins.sampling.scan_tiles import ScanTiles, distance_to
-from torchtransient.plugins.sampling.shared_samples import draw_samples
+from torchtransient.plugins.sampling.shared_samples import ScanTiles, distance_to, draw_samples
 
 VARIANT = "llvm_ad_mono"
 GRID = 8

@@ -27,7 +27,7 @@ from tools.gradient_sweep.stages import between_lights, matte
 from tools.gradient_sweep.worker import for_setting
 from torchtransient.plugins import _registry
 from torchtransient.plugins.mitsuba_compat import COMPLETED_PLUGINS
-from torchtransient.plugins.swept_parameters import FILE, is_checked
+from torchtransient.plugins.parameter_effect import FILE, is_checked
 
 DOCS = Path(__file__).parents[2] / "docs"
 SETTINGS = {setting.name: setting for setting in all_settings()}

@@ -204,7 +204,7 @@ def test_derivatives_by_brightness(name, key):
 
 
 def test_mitsuba_draws_one_of_two_points_of_a_texture():
-    """Fails when Mitsuba mends it: then ``sampling/shape_lights.py`` can go."""
+    """Fails when Mitsuba mends it: then ``sampling/sphere_lights.py`` can go."""
     shape = mi.load_dict(area(mesh([PIECE] * 4), bitmap(), to_world=T()))
     light = shape.emitter()
     ref = mi.Interaction3f(0.0, 0.0, [], mi.Point3f(0, 0, 2))

@@ -28,7 +28,7 @@ from support.gradient_cases.cases_mixtures import (
 )
 from support.marks import long
 from torchtransient.errors import SceneError
-from torchtransient.plugins.bsdfs.wrapper_copy import flags_of
+from torchtransient.plugins.bsdfs.mixtures import flags_of
 
 VARIANT = "llvm_ad_mono"
 SEEDS = 6

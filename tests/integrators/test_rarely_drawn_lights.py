@@ -11,8 +11,8 @@ import torch
 import torchtransient as tt
 from tools.small_room import GREY, WALL_POSE, make_room
 from torchtransient import plugins
+from torchtransient.plugins.sampling.lights import MovingSun
 from torchtransient.plugins.sampling.sphere_lights import SphereLights
-from torchtransient.plugins.sampling.sun import MovingSun
 
 VARIANT = "llvm_ad_mono"
 SUN, SUN_VARIANT = "light.sun_direction", "llvm_ad_rgb"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from support.media_scenes import rgb, volume
-from torchtransient.plugins.pointer_table import registry_number
+from torchtransient.plugins.kernel_arrays import registry_number
 from torchtransient.plugins.transport import media_contents
 from torchtransient.plugins.transport.segment import free_flight, optical_depth
 from torchtransient.plugins.transport.strategy import Local

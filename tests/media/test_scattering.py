@@ -9,8 +9,8 @@ import pytest
 
 from support.marks import long
 from support.media_scenes import rgb
-from torchtransient.plugins.mixtures import mixtures_of
-from torchtransient.plugins.pointer_table import registry_number
+from torchtransient.plugins.bsdfs.mixtures import mixtures_of
+from torchtransient.plugins.kernel_arrays import registry_number
 from torchtransient.plugins.transport.scattering import medium as scattering
 from torchtransient.plugins.transport.scattering.surface import Surface
 from torchtransient.plugins.transport.strategy import Local

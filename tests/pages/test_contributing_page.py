@@ -31,7 +31,7 @@ def names_in(file):
 
 def test_every_recipe_is_there():
     assert [str(recipe) for recipe in RECIPES] == [
-        "A loss", "A sensor effect", "A reconstruction operator", "A BSDF", "A parameter with a gradient", "A film",
+        "A loss", "A sensor effect", "A reconstruction operator", "A BSDF", "A parameter with a gradient",
         "A connection strategy",
     ]  # fmt: skip
     assert len(re.findall(r"^## .*files?$", PAGE.text, re.MULTILINE)) == len(RECIPES)

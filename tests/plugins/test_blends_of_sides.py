@@ -12,7 +12,7 @@ from tools.gradient_sweep.bsdfs import METAL, ROUGH_GLASS, blend
 from tools.gradient_sweep.measure import Subject
 from tools.gradient_sweep.stages import between_lights, matte
 from torchtransient import plugins
-from torchtransient.plugins.mixtures import needs_choice
+from torchtransient.plugins.bsdfs.mixtures import needs_choice
 
 PAINT = {"type": "diffuse", "reflectance": 0.5}
 GLASS = {"type": "roughdielectric", **ROUGH_GLASS}

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from support.surface_samples import start
-from torchtransient.plugins.mixtures import LEAST_PROBABILITY, Choice, Leaf, Sides, _descend
+from torchtransient.plugins.bsdfs.mixtures import LEAST_PROBABILITY, Choice, Leaf, Sides, _descend
 
 COUNT = 2000
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from support.surface_samples import directions, interaction, start
+from torchtransient.plugins.bsdfs.mixtures import _random
 from torchtransient.plugins.bsdfs.rough_coating import external_transmittance, internal_reflectance
-from torchtransient.plugins.bsdfs.wrapper_copy import _random
 from torchtransient.plugins.mitsuba_compat import DIFFERENTIABLE_PLUGINS
 
 

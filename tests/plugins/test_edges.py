@@ -9,11 +9,11 @@ import pytest
 
 from support.hidden_shapes import ball, disc, join, mesh
 from torchtransient._collection import no_collection
+from torchtransient.plugins.cache import Cache
 from torchtransient.plugins.edges.table import EdgeTable
 from torchtransient.plugins.edges.topology import Topology, topology_of
 from torchtransient.plugins.frozen_state import state_below
 from torchtransient.plugins.node_walk import members_of
-from torchtransient.plugins.remembered import Remembered
 
 VARIANT = "llvm_ad_mono"
 STRETCH = (0.8, 0.5, 1.2)
@@ -292,7 +292,7 @@ def test_rims_of_two_meshes_are_one_until_they_part():
 
 def total_length(scene, V=(0, 0.1, 9)):
     """Of all outlines and creases, seen from ``V``."""
-    table = EdgeTable(topology_of(scene, Remembered()), frozenset())
+    table = EdgeTable(topology_of(scene, Cache()), frozenset())
     u = mi.Float((np.arange(4000, dtype=np.float32) + 0.5) / 4000)
     b = table.seen_from(table.pick(table.by_length, u, u), mi.Point3f(*V), True)
     return np.array(dr.select(b.valid, b.inv_pdf, 0), np.float64).mean()
@@ -319,7 +319,7 @@ def test_faces_that_get_an_area():
     """A mesh of none, which has no edges; then it has three, and none again."""
     flat = mesh("flat", (np.zeros((3, 3)), np.array([[0, 1, 2]])))
     scene = mi.load_dict({"type": "scene", "r": {"type": "rectangle"}, "flat": flat}, optimize=False)
-    params, memory = mi.traverse(scene), Remembered()
+    params, memory = mi.traverse(scene), Cache()
     for area in (0, 1, 2, 0):
         params["flat.vertex_positions"] = mi.Float(3, 0, 0, 3, area, 0, 3, 0, area)
         params.update()

@@ -18,7 +18,7 @@ from torchtransient.errors import ArgumentError, GradientError, SceneError
 from torchtransient.files.result_file import read_result, write_result
 from torchtransient.gates import Gate
 from torchtransient.plugins.films.block import ArrivalWindow, GappedWindow
-from torchtransient.plugins.sampling.light_box import LightBox
+from torchtransient.plugins.sampling.lights import LightBox
 
 VARIANT = "llvm_ad_rgb"
 START = 2.0

@@ -16,7 +16,7 @@ import pytest
 from support.hair_model import scattered
 from torchtransient import plugins
 from torchtransient.plugins import mitsuba_compat as compat
-from torchtransient.plugins.bsdfs.inherited import hides_lobe_probability, mirrors_matrices
+from torchtransient.plugins.bsdfs.mixtures import hides_lobe_probability, mirrors_matrices
 from torchtransient.plugins.node_walk import objects_below, objects_of
 from torchtransient.plugins.spectral_colours import keeps_coefficients
 from torchtransient.plugins.transport.scattering.surface import strayed

@@ -11,7 +11,7 @@ import pytest
 
 from torchtransient import plugins
 from torchtransient.plugins import polarized
-from torchtransient.plugins.bsdfs.mueller import Interface, across_plane, metal_reflection, two_by_two
+from torchtransient.plugins.bsdfs.fresnel import Interface, across_plane, metal_reflection, two_by_two
 from torchtransient.plugins.transport.scattering.surface import Surface
 from torchtransient.plugins.transport.strategy import Local
 

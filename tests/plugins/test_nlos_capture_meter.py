@@ -14,7 +14,6 @@ import torchtransient as tt
 from support.gradient_cases.cases_curves import file_of
 from torchtransient import plugins
 from torchtransient.errors import PhysicsWarning, SceneError, UnitError
-from torchtransient.plugins.sensors.places_on_mesh import PlacesOnMesh
 from torchtransient.scene.edits import BuildOptions
 
 VARIANT = "llvm_ad_mono"
@@ -312,6 +311,8 @@ def test_what_mitsuba_itself_is_refused(meter, more, message):
 
 def test_places_of_a_texture_on_a_mesh():
     """Of the triangles that have their coordinates, as their vertices are now."""
+    from torchtransient.plugins.sensors.nlos_capture_meter import PlacesOnMesh  # of a variant
+
     node = {"type": "obj", "filename": file_of("places.obj", SHEET), "id": "sheet", "flip_tex_coords": False}
     mesh = mi.load_dict(node)
     places = np.array([[0.5, 0.25], [0.25, 0.75], [0.9, 0.2]])

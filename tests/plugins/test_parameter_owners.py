@@ -11,8 +11,7 @@ import torch
 import torchtransient as tt
 from support.gradient_cases.scenes import area_light, room
 from torchtransient.errors import GradientError
-from torchtransient.plugins.black_textures import ALMOST_BLACK
-from torchtransient.plugins.parameters import ParameterTracker, attached_effects
+from torchtransient.plugins.parameters import ALMOST_BLACK, ParameterTracker, attached_effects
 
 VARIANT = "llvm_ad_mono"
 NAME = "vertex_numbers"

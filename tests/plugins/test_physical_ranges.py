@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from torchtransient import plugins
-from torchtransient.plugins import physical_ranges as ranges
-from torchtransient.plugins.physical_ranges import described_ranges, ranges_of
+from torchtransient.plugins import parameters as ranges
+from torchtransient.plugins.parameters import described_ranges, ranges_of
 
 VARIANT = "llvm_ad_mono"
 VALUE = {"type": "uniform", "value": 0.25}

@@ -7,7 +7,7 @@ import mitsuba as mi
 import pytest
 
 from torchtransient.errors import SceneError
-from torchtransient.plugins.pointer_table import PointerTable, registry_number
+from torchtransient.plugins.kernel_arrays import PointerTable, registry_number
 
 
 @pytest.fixture(autouse=True)

@@ -14,7 +14,7 @@ from packaging.requirements import Requirement
 import torchtransient as tt
 from torchtransient.cli import doctor
 from torchtransient.errors import VersionWarning
-from torchtransient.plugins import tested_versions
+from torchtransient.plugins import _registry as tested_versions
 
 ROOT = Path(__file__).parents[2]
 

@@ -4,14 +4,11 @@
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-import pytest
 
 from support.sweeps import together
 from torchtransient import plugins
 from torchtransient.plugins._registry import PLUGIN_MODULES
 from torchtransient.scene.inventory import (
-    _COLOURED_PLUGINS,
-    _TRANSPARENT,
     POLARIZING_ELEMENTS,
     POLARIZING_INTERFACES,
     like_mitsuba,
@@ -65,24 +62,3 @@ def test_what_polarizes_is_listed(name):
     listed = like_mitsuba(name) in (*POLARIZING_ELEMENTS, *POLARIZING_INTERFACES)
     # Mitsuba's rough dielectric depolarizes; polarized renders replace it by one that does not.
     assert listed == (found or name == "roughdielectric")
-
-
-@pytest.mark.parametrize("name", OURS)
-def test_colours_of_our_plugins_are_known(name):
-    assert {name, like_mitsuba(name)} & {*_TRANSPARENT, *_COLOURED_PLUGINS}
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-
-

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchtransient.errors import PhysicsError, PhysicsWarning
-from torchtransient.plugins.physical_ranges import SHARE
+from torchtransient.plugins.parameters import SHARE
 from torchtransient.scene.physics import (
     PhysicsWatch,
     are_finite,

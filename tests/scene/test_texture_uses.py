@@ -10,7 +10,7 @@ import torchtransient as tt
 from support.gradient_cases.scenes import area_light, room
 from support.marks import long
 from torchtransient.errors import SceneError
-from torchtransient.plugins.texture_uses import check_textures, numbers_below
+from torchtransient.plugins.described_scene import check_textures, numbers_below
 
 VARIANT = "llvm_ad_rgb"
 HEIGHTS = {"type": "constvolume", "value": 0.5}

@@ -9,9 +9,9 @@ from scipy.stats import t as student
 
 from support.third_bounce_runs import captured
 from torchtransient.interfaces import CaptureType
-from torchtransient.plugins.around_corner.late_density import late_density
 from torchtransient.plugins.around_corner.late_light import LateLight
-from torchtransient.plugins.around_corner.scan_job import ScanJob
+from torchtransient.plugins.around_corner.launches import ScanJob
+from torchtransient.plugins.around_corner.shared_light import late_density
 
 ORIGIN = [-0.5, 0.0, 0.25]
 

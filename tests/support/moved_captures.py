@@ -10,8 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from torchtransient.plugins.around_corner.late_outlines import LateOutlines
-from torchtransient.plugins.around_corner.occlusion import MutualOcclusion
+from torchtransient.plugins.around_corner.occlusion import LateOutlines, MutualOcclusion
 
 SIGMAS = 4.0
 # The parameter of differences: of the third derivative a share of (h / 0.3 m)^2 is left. No shadow of a plate may pass

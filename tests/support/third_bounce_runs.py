@@ -7,8 +7,8 @@ import mitsuba as mi
 import numpy as np
 
 from support.hidden_shapes import scene_of, wall_grid
+from torchtransient.plugins.around_corner.geometry import WallPoints
 from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
-from torchtransient.plugins.around_corner.wall_points import WallPoints
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 from torchtransient.plugins.sampling.shared_samples import draw_samples
 

@@ -7,8 +7,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from torchtransient.plugins.around_corner.wall_points import WallPoints
-from torchtransient.plugins.sampling.distant import DistantReference
+from torchtransient.plugins.around_corner.geometry import WallPoints
+from torchtransient.plugins.sampling.lights import DistantReference
 from torchtransient.plugins.transport.connection.emitter_found import EmitterFound
 from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled, is_light
 from torchtransient.plugins.transport.connection.laser_spot import DiffuseSpot, LaserSpot, PackedSpots

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from support.gradient_cases.cases_curves import file_of
-from torchtransient.plugins.pointer_table import PointerTable
+from torchtransient.plugins.kernel_arrays import PointerTable
 from torchtransient.plugins.transport.scattering import geometry_terms as terms
 
 VARIANT = "llvm_ad_mono"

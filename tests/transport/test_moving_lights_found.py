@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from support.moving_points import MOVE, PLACE, attached_zero, difference, slopes, unit, vector
-from torchtransient.plugins.sampling.distant import DistantReference
+from torchtransient.plugins.sampling.lights import DistantReference
 from torchtransient.plugins.transport.connection.emitter_found import EmitterFound
 from torchtransient.plugins.transport.strategy import Local
 

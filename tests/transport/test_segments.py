@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from torchtransient.plugins.sampling.distant import DistantReference
+from torchtransient.plugins.sampling.lights import DistantReference
 from torchtransient.plugins.transport.scattering.surface import Surface, is_black, strayed
 from torchtransient.plugins.transport.segment import vacuum
 from torchtransient.plugins.transport.segment.material import MaterialVacuum

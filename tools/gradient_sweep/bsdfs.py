@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from tools.every_plugin import bsdfs
 from tools.gradient_sweep.stages import Description, matte
+from torchtransient.plugins._registry import OWN_BSDFS
 from torchtransient.plugins.mitsuba_compat import DIFFERENTIABLE_PLUGINS, POLARIZED_PLUGINS
 
 # Pitch of a texel on the plate, whose texture spans it once: what the camera sees lies within one patch, since the
@@ -124,7 +126,9 @@ def surfaces() -> dict[str, Surface]:
         ),
         **at_the_ends(),
     }  # fmt: skip
-    return {**found, **{twin: _twin(found[plugin], twin) for plugin, twin in TWINS.items()}}
+    found |= {twin: _twin(found[plugin], twin) for plugin, twin in TWINS.items()}
+    # Others of this library are measured as they are described for all tests.
+    return {**found, **{name: Surface(lambda name=name: bsdfs()[name]) for name in OWN_BSDFS if name not in found}}
 
 
 def _twin(surface: Surface, plugin: str) -> Surface:

@@ -10,8 +10,7 @@ from typing import Any
 
 from tools.gradient_sweep.compare import RESOLVED, SCALE, SIGMAS, TOLERANCE, WEAK
 from tools.gradient_sweep.settings import all_settings
-from torchtransient.plugins.parameter_effect import CORRECT
-from torchtransient.plugins.swept_parameters import FILE
+from torchtransient.plugins.parameter_effect import CORRECT, FILE
 
 PAGE, DATA = "gradients_sweep.md", "gradients_sweep.json"
 # Columns of the JSON file, one row for a comparison.

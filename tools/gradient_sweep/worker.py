@@ -14,7 +14,7 @@ from tools.gradient_sweep.compare import Effort, Result, judge
 from tools.gradient_sweep.measure import Subject, quiet
 from tools.gradient_sweep.settings import Setting
 from torchtransient.errors import TorchTransientError
-from torchtransient.plugins.swept_parameters import UNCHECKED
+from torchtransient.plugins.parameter_effect import UNCHECKED
 from torchtransient.scene.load import load
 from torchtransient.scene.parameters import ParameterInfo
 

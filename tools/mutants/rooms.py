@@ -63,9 +63,8 @@ ROOMS = {
     "plugins": Room(
         ("plugins/bsdfs", "plugins/emitters", "plugins/sensors", "plugins/shapes", "plugins/sampling",
          *(f"plugins/{name}.py" for name in (
-             "black_textures", "finite_values", "mitsuba_compat", "mitsuba_numbers", "mitsuba_parameters", "mixtures",
-             "parameter_effect", "parameters", "physical_ranges", "pointer_table", "polarized", "properties",
-             "spectral_colours", "swept_parameters", "texture_uses"))),
+             "cache", "described_scene", "kernel_arrays", "mitsuba_compat", "mitsuba_parameters", "parameter_effect",
+             "parameters", "polarized", "properties", "spectral_colours"))),
         ("plugins", "stability", "integrators", "scene/test_black_textures.py", "scene/test_finite_numbers.py",
          "scene/test_texture_uses.py", "transport/test_lambertian.py", "transport/test_triangles.py"),
     ),

@@ -58,7 +58,7 @@ def versions() -> list[Finding]:
 def _judged(name: str, version: str) -> Finding:
     """A tested version of a package that is there, or any of one whose internals nothing here follows."""
     try:
-        from torchtransient.plugins.tested_versions import untested
+        from torchtransient.plugins._registry import untested
     except ImportError as error:  # what the package needs is missing, and stands in a line of its own
         return Finding("ok", name, f"{version} (not compared with the tested versions: {error})")
     message = untested(name, version)

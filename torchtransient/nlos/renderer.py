@@ -190,7 +190,7 @@ def _lasting(scan: Scan) -> dict[str, Any]:
 def light_of(renderer: TransientRenderer) -> str:
     """How a capture's scene, as it is built, finds which light."""
     with active_variant(renderer.scene.variant):
-        from torchtransient.plugins.around_corner.explanation import explanation
+        from torchtransient.plugins.around_corner.division import explanation
 
         built = renderer.scene.built(renderer._options).scene
         integrator, sensor = built.integrator(), built.sensors()[0]

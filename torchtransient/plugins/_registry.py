@@ -47,11 +47,82 @@ from pathlib import Path
 import mitsuba as mi
 
 from torchtransient._llvm import ensure_llvm
-from torchtransient.errors import PluginRegistrationError, TorchTransientError
+from torchtransient.errors import PluginRegistrationError, TorchTransientError, VariantError, VersionWarning
 from torchtransient.interfaces import missing_members
-from torchtransient.plugins._compat import active_variant, is_jit, require_jit_variant
 from torchtransient.plugins.interrupted import interrupts_wait
-from torchtransient.plugins.tested_versions import warn_of_untested
+
+# ---------------------------------------------------------------- what the plugins ask about the active Mitsuba variant
+# Nothing here is bound to one variant: every function looks at the variant that is active when it is called.
+
+_JIT_PREFIXES = ("llvm_", "cuda_", "metal_")
+
+
+def active_variant() -> str | None:
+    """Name of the active Mitsuba variant, or None when none has been set yet."""
+    variant: str | None = mi.variant()
+    return variant
+
+
+def is_jit(variant: str | None) -> bool:
+    """Whether a variant compiles its kernels with Dr.Jit (`llvm_*`, `cuda_*`, `metal_*`)."""
+    return variant is not None and variant.startswith(_JIT_PREFIXES)
+
+
+def require_jit_variant(what: str) -> str:
+    """Return the active variant, or raise VariantError when `what` cannot work in it (none set, or a scalar one)."""
+    variant = active_variant()
+    if variant is None:
+        raise VariantError(
+            f"{what} needs an active Mitsuba variant and none is set. Call mi.set_variant('llvm_ad_rgb') first."
+        )
+    if not is_jit(variant):
+        raise VariantError(
+            f"{what} works on whole arrays and needs a Dr.Jit variant (llvm_ad_*, cuda_ad_*); the active variant is "
+            f"'{variant}'. Call mi.set_variant('llvm_ad_rgb') before the scene is loaded."
+        )
+    return variant
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The versions of Mitsuba and Dr.Jit that the tests have run with. Another one is warned of, once in a process.
+# The integrators follow internals of Mitsuba that no interface promises, and several of its errors are worked around: a
+# patch release can change a number without a message. `torchtransient doctor` shows the same.
+
+# A version comes in here when the whole test set, slow tests included, has passed with it.
+TESTED: dict[str, tuple[str, ...]] = {"mitsuba": ("3.9.1",), "drjit": ("1.5.0",)}
+_said: set[str] = set()
+
+
+def untested(name: str, version: str) -> str | None:
+    """What to say of `version` of the package `name`; None of a tested one, and of a package that is not listed.
+
+    Builds of a tested version, such as "1.5.0+local", are tested ones.
+    """
+    tested = TESTED.get(name)
+    if tested is None or version.partition("+")[0] in tested:
+        return None
+    return (
+        f"{name} {version} was never tested with this version of torchtransient; tested: {', '.join(tested)}. Numbers "
+        f"may differ without an error: run the tests, or pip install {name}=={tested[-1]}."
+    )
+
+
+def warn_of_untested() -> None:
+    """Give a `VersionWarning` that names each of the two packages whose version is not a tested one: once in a process,
+    also where the warning is raised as an error.
+    """
+    import drjit
+    import mitsuba
+
+    found = {"mitsuba": mitsuba.__version__, "drjit": drjit.__version__}
+    messages = [message for name, version in found.items() if (message := untested(name, version)) is not None]
+    text = " ".join(messages)
+    if text and text not in _said:
+        _said.add(text)
+        warnings.warn(text, VersionWarning, stacklevel=4)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
 
 KINDS = (
     "bsdf", "emitter", "film", "integrator", "medium", "phase", "rfilter", "sampler", "sensor", "shape", "texture",
@@ -98,13 +169,18 @@ PLUGIN_MODULES: tuple[PluginModule, ...] = (
     ),
     PluginModule("torchtransient.plugins.bsdfs.polarized_plastic", (("bsdf", "diff_pplastic"),)),
     PluginModule("torchtransient.plugins.bsdfs.hair", (("bsdf", "diff_hair"),)),
-    PluginModule("torchtransient.plugins.bsdfs.conductor", (("bsdf", "diff_conductor"),)),
-    PluginModule("torchtransient.plugins.bsdfs.rough_conductor", (("bsdf", "diff_rough_conductor"),)),
+    PluginModule(
+        "torchtransient.plugins.bsdfs.conductor", (("bsdf", "diff_conductor"), ("bsdf", "diff_rough_conductor"))
+    ),
     PluginModule(
         "torchtransient.plugins.bsdfs.thin_elements",
         (("bsdf", "diff_polarizer"), ("bsdf", "diff_retarder"), ("bsdf", "diff_circular")),
     ),
 )
+
+
+# Surfaces of this library, by the names of their plugins.
+OWN_BSDFS = tuple(name for module in PLUGIN_MODULES for kind, name in module.plugins if kind == "bsdf")
 
 
 @dataclass

@@ -13,15 +13,186 @@ the first render.
 
 from __future__ import annotations
 
-from typing import Any
+import re
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.errors import SceneError
 from torchtransient.interfaces import IntegratorInterface, is_time_resolved
-from torchtransient.plugins.finite_values import check_parameters
-from torchtransient.plugins.sampling.distant import distant_reference
-from torchtransient.plugins.texture_uses import check_textures
+from torchtransient.plugins.mitsuba_compat import (
+    VERTEX_COLUMNS,
+    attribute_name,
+    attribute_sizes,
+    has_surface,
+    is_bump_map,
+    is_dark,
+    normal_texture,
+    read_as,
+)
+from torchtransient.plugins.node_walk import objects_below, objects_of, shown_by
+from torchtransient.plugins.parameter_effect import class_of
+from torchtransient.plugins.properties import check_parameters
+from torchtransient.plugins.sampling.lights import distant_reference
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What textures read, and textures in places where they cannot be read: found before anything is rendered, not inside
+# a kernel or never.
+#
+# A bump map asks for the slope of its texture: of Mitsuba's, bitmaps have one, and what is the same everywhere.
+# Attributes that a shape does not have, or of another number of values than a surface asks for, read as zero; so do all
+# of them where a point is sampled on a light, which knows neither its shape nor its face.
+
+
+def numbers_below(node: Any, shapes: Sequence[Any]) -> Iterator[Any]:
+    """The numbers of a plugin and of what it holds, attached where they are; ``shapes``: those whose attributes its
+    textures read. Attributes belong to the shapes.
+    """
+    below = (node, *objects_below(node, mi.Object))
+    for part in below:
+        yield from (shown.read(part) for shown in shown_by(part)[0])
+    names = {attribute_name(part) for part in below if isinstance(part, mi.Texture)} - {None}
+    for shape in shapes if names else ():
+        values, objects = shown_by(shape)
+        yield from (shown.read(shape) for shown in values if shown.key in names)
+        for name, texture, _ in objects:
+            if name in names:
+                yield from numbers_below(texture, ())
+
+
+def check_textures(params: Any) -> None:
+    """Raise ``SceneError`` where a built scene (``mi.traverse``) has a texture in a place where it cannot be read."""
+    somewhere = dr.zeros(mi.SurfaceInteraction3f)
+    for node in params.hierarchy:
+        if isinstance(node, mi.BSDF) and is_bump_map(node):
+            _check_heights(node, somewhere)
+        elif isinstance(node, mi.Emitter) and not is_dark(node):
+            _check_radiance(node)
+        if isinstance(node, mi.BSDF | mi.Emitter):
+            _check_channels(node, somewhere)
+    shown = {node.ptr for node in params.hierarchy}
+    has_readers = any(isinstance(node, mi.Texture) and attribute_name(node) is not None for node in params.hierarchy)
+    read: dict[int, list[Read]] = {}
+    for node in params.hierarchy:
+        surface = node.bsdf() if isinstance(node, mi.Shape) and has_surface(node) else None
+        # Some shapes (ellipsoids) do not show their surface.
+        if surface is not None and (has_readers or surface.ptr not in shown):
+            _check_attributes(node, surface, read)
+
+
+def _check_channels(node: Any, somewhere: Any) -> None:
+    """A texture that cannot be read ends the kernels of all scenes that are alive with it."""
+    for slot, texture in objects_of(node):
+        how = read_as(node, slot) if isinstance(texture, mi.Texture) else ""
+        reason = _refusal(texture, how, somewhere) if how else ""
+        if reason:
+            raise SceneError(
+                f"{node.id()!r}: expected a texture for {slot!r} that can be read as "
+                f"{_READ[how]}, got {_named(texture)}, of which Mitsuba says: {reason}. Give one with that many "
+                "channels, colours in spectral variants without raw=True."
+            )
+
+
+_READ = {"eval_1": "one number", "eval_3": "three numbers", "eval": "a colour"}
+
+
+def _refusal(texture: Any, how: str, somewhere: Any) -> str:
+    """Why a method of a texture fails, in Mitsuba's words without its pictures of objects; empty where it does not."""
+    try:
+        with dr.suspend_grad():
+            getattr(texture, how)(somewhere)
+    except (RuntimeError, TypeError, AttributeError) as error:
+        words = re.sub(r"\w+\[\n.*\n\]", "", str(error), flags=re.DOTALL)
+        return " ".join(words.split()).rstrip("!.")
+    return ""
+
+
+class Read(NamedTuple):
+    """An attribute that a surface reads: its name, the texture, the slot that this is for, numbers it may have."""
+
+    name: str
+    texture: Any
+    slot: str
+    sizes: tuple[int, ...]
+
+
+def _check_attributes(shape: Any, surface: Any, known: dict[int, list[Read]]) -> None:
+    """``known``: what is read by surfaces that were looked at before, by their address."""
+    if surface.ptr not in known:
+        known[surface.ptr] = list(_attributes_of(surface))
+    for read in known[surface.ptr]:
+        sizes = attributes_of(shape)
+        said = f"{shape.id()!r}: expected an attribute {read.name!r} for {read.slot!r} of its surface"
+        if read.name not in sizes:
+            has = ", ".join(map(repr, sizes)) or "none"
+            raise SceneError(
+                f"{said} ({_named(read.texture)}), got a shape that has {has}; Mitsuba would take it for zero. Give "
+                "the shape the attribute, or the surface another texture."
+            )
+        size = sizes[read.name]
+        if size is not None and size not in read.sizes:
+            raise SceneError(
+                f"{said} of size {' or '.join(map(str, read.sizes))} at each place, got one of size {size:g}, which "
+                "Mitsuba would take for zero. Add an attribute of that size (mesh.add_attribute) or give a 'bitmap'."
+            )
+
+
+def _attributes_of(surface: Any) -> Iterator[Read]:
+    for bsdf in (surface, *objects_below(surface, mi.BSDF)):
+        for slot, texture in objects_of(bsdf):
+            for part in (texture, *objects_below(texture, mi.Texture)) if isinstance(texture, mi.Texture) else ():
+                name = attribute_name(part)
+                if name is not None:
+                    yield Read(name, part, slot, attribute_sizes(bsdf, slot))
+
+
+def attributes_of(shape: Any) -> dict[str, float | None]:
+    """The attributes of a shape, by name: how many numbers they have at each place, None where a texture says so."""
+    values, objects = shown_by(shape)
+    found: dict[str, float | None] = {name: None for name, part, _ in objects if isinstance(part, mi.Texture)}
+    for shown in values if isinstance(shape, mi.Mesh) else ():
+        count = {"vertex": shape.vertex_count, "face": shape.face_count}.get(shown.key.partition("_")[0])
+        if count is not None and shown.key not in VERTEX_COLUMNS and dr.is_array_v(shown.read(shape)):
+            found[shown.key] = dr.width(shown.read(shape)) / max(count(), 1)
+    return found
+
+
+def _check_heights(bump_map: Any, somewhere: Any) -> None:
+    texture = dict(objects_of(bump_map))[normal_texture(bump_map)]
+    reason = _refusal(texture, "eval_1_grad", somewhere)
+    if reason:
+        raise SceneError(
+            f"{bump_map.id()!r}: expected a texture of heights with a slope in a bumpmap, got {_named(texture)}, of "
+            f"which Mitsuba says: {reason}. Give the heights as a raw 'bitmap'."
+        )
+
+
+def _check_radiance(emitter: Any) -> None:
+    for texture in objects_below(emitter, mi.Texture):
+        name = attribute_name(texture)
+        if name is not None:
+            raise SceneError(
+                f"{emitter.id()!r}: expected a texture that can be read where a light is sampled, got the attribute "
+                f"{name!r} ({_named(texture)}), which Mitsuba takes for zero there: most of the light would be lost. "
+                "Give the radiance as a 'bitmap' over texture coordinates."
+            )
+    shape = emitter.get_shape()
+    textured = mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
+    if textured and isinstance(shape, mi.Mesh) and not shape.has_vertex_texcoords():
+        # Mitsuba's sampling of textures raises while kernels are traced, those of other scenes too.
+        raise SceneError(
+            f"{shape.id()!r}: expected texture coordinates of a mesh that shines with a texture, got a mesh without. "
+            "Give it some, or a radiance that is the same everywhere."
+        )
+
+
+def _named(texture: Any) -> str:
+    return f"{class_of(texture)} {texture.id()!r}" if texture.id() else class_of(texture)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
 
 
 class DescribedScene:

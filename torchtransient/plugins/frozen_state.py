@@ -24,7 +24,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from torchtransient.plugins.remembered import digest
+from torchtransient.plugins.cache import digest
 
 # Their objects are known one by one below, or not comparable.
 _OTHERS = ("builtins", "drjit", "mitsuba", "numpy", "torch")

@@ -18,10 +18,10 @@ from torchtransient.errors import SceneError
 from torchtransient.plugins.films.colour import StandardObserver
 from torchtransient.plugins.frozen_state import says_it_can_be_recorded, state_below
 from torchtransient.plugins.integrators.seen_scene import SeenScene
+from torchtransient.plugins.kernel_arrays import PointerTable
 from torchtransient.plugins.mitsuba_compat import has_surface, is_distant, is_instance, near_clip
 from torchtransient.plugins.node_walk import shapes_of_scene
 from torchtransient.plugins.parameter_effect import class_of
-from torchtransient.plugins.pointer_table import PointerTable
 from torchtransient.plugins.sensors.origin import length_to_sensor_origin, sensors_of, views
 
 # Numbers by pixel of each label; None: the channels of the film.

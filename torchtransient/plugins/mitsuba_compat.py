@@ -183,6 +183,84 @@ COMPLETED_PLUGINS = {"directionalarea": "diff_directionalarea", "hair": "diff_ha
 # Textures that know no mean, which Mitsuba's plastics ask for: with one of these their twins are built.
 TEXTURES_WITHOUT_MEAN = {"mesh_attribute": "MeshAttribute", "volume": "VolumeAdapter"}
 
+# -------------------------------------------------------------------------------------------------------------- meshes
+
+# Users' keys of the arrays of a mesh, which are those of this library with every version of Mitsuba.
+POSITIONS, NORMALS, TEXCOORDS, FACES = "vertex_positions", "vertex_normals", "vertex_texcoords", "faces"
+# Columns of the arrays that a user can replace.
+VERTEX_COLUMNS = {POSITIONS: 3, NORMALS: 3, TEXCOORDS: 2}
+# Mitsuba 3.10 (pull request 1933) renames these, shows all arrays as tensors of rows, makes meshes of arrays that are
+# given to the constructor, and has no buffers. What a mesh lets vertices share (`position_index`) is not read here.
+_NEW_NAMES = {POSITIONS: "positions", NORMALS: "normals", TEXCOORDS: "texcoords"}
+_USERS_NAMES = {new: name for name, new in _NEW_NAMES.items()}
+_WEIGHT = "silhouette_sampling_weight"
+MESH_PARAMETERS = frozenset((*VERTEX_COLUMNS, FACES, _WEIGHT))
+
+
+def shows_rows() -> bool:
+    """Return whether Mitsuba shows the arrays of meshes as rows, under the names of version 3.10."""
+    major, minor, *_ = mi.__version__.split(".")
+    return (int(major), int(minor)) >= (3, 10)
+
+
+def users_name(node: Any, name: str) -> str:
+    """Return users' key of the parameter that Mitsuba shows as ``name`` of a plugin."""
+    return _USERS_NAMES.get(name, name) if shows_rows() and isinstance(node, mi.Mesh) else name
+
+
+def mesh_positions(mesh: Any) -> Any:
+    """Return the places of the vertices of a mesh in the world, (3 V,) in a row, attached where they are."""
+    return _mesh_array(mesh, POSITIONS)
+
+
+def mesh_normals(mesh: Any) -> Any:
+    """Return the normals at the vertices of a mesh, (3 V,) in a row, empty for meshes without."""
+    return _mesh_array(mesh, NORMALS)
+
+
+def mesh_texcoords(mesh: Any) -> Any:
+    """Return the texture coordinates of the vertices of a mesh, (2 V,) in a row, empty for meshes without."""
+    return _mesh_array(mesh, TEXCOORDS)
+
+
+def mesh_faces(mesh: Any) -> Any:
+    """Return the numbers of the vertices of the faces of a mesh, (3 F,) in a row."""
+    return _mesh_array(mesh, FACES)
+
+
+def _mesh_array(mesh: Any, name: str) -> Any:
+    if shows_rows():
+        return mi.traverse(mesh)[_NEW_NAMES.get(name, name)].array
+    return getattr(mesh, f"{name}_buffer")()
+
+
+def silhouette_weight(mesh: Any) -> dict[str, float]:
+    """Return the weight of a mesh among silhouettes by its name in scene files, where it is not that of all meshes."""
+    weight = float(mesh.silhouette_sampling_weight())
+    return {} if weight == 1 else {_WEIGHT: weight}
+
+
+def mesh_of_arrays(
+    props: Any, positions: np.ndarray, faces: np.ndarray, normals: np.ndarray | None, texcoords: np.ndarray | None
+) -> Any:
+    """Return a mesh of arrays with a row for each vertex or face, positions and normals in the world."""
+    arrays = {POSITIONS: positions, FACES: faces, TEXCOORDS: texcoords, NORMALS: normals}
+    given = {name: array for name, array in arrays.items() if array is not None}
+    if shows_rows():
+        rows = {
+            _NEW_NAMES.get(name, name): (mi.TensorXu if name == FACES else mi.TensorXf)(np.ascontiguousarray(array))
+            for name, array in given.items()
+        }
+        return mi.Mesh(props.id(), props=props, **rows)
+    mesh = mi.Mesh(props.id(), len(positions), len(faces), props, normals is not None, texcoords is not None)
+    params = mi.traverse(mesh)
+    for name, array in given.items():
+        kind, dtype = (mi.UInt32, np.uint32) if name == FACES else (mi.Float, np.float32)
+        params[name] = kind(np.ravel(array).astype(dtype))
+    params.update()
+    return mesh
+
+
 # ------------------------------------------------------------------------------------------------------ shapes, lights
 
 
@@ -296,8 +374,8 @@ def is_flat(shape: Any) -> bool:
         return True
     if shape.face_count() > _LARGE_MESH:
         return False
-    corners = np.array(shape.faces_buffer()).reshape(-1, 3)
-    normals = np.array(shape.vertex_normals_buffer()).reshape(-1, 3)[corners]
+    corners = np.array(mesh_faces(shape)).reshape(-1, 3)
+    normals = np.array(mesh_normals(shape)).reshape(-1, 3)[corners]
     return bool(np.ptp(normals, axis=1).max(initial=0) < 1e-5)
 
 
@@ -431,3 +509,34 @@ def varies(texture: Any) -> bool:
 
 # Of a texture or volume the numbers, not where they lie.
 NUMBERS = ("value", "values", "data", "color0", "color1")
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What Mitsuba 3.9.1 makes of installed values in plain numbers, outside of Dr.Jit's sight.
+# ``tests/plugins/test_mitsuba_numbers.py`` shows each on Mitsuba alone.
+
+# By class and name. The ends of an irregular spectrum are read when it is installed, and become part of the kernels: a
+# recorded call would keep those of its own.
+_READ_WHEN_INSTALLED = frozenset({("IrregularSpectrum", "wavelengths")})
+# These flip their normals at every update with a pose that reflects, instead of once.
+_TURNED_BY_REFLECTIONS = frozenset({("Sphere", "to_world"), ("Cylinder", "to_world")})
+
+
+def is_number_of_kernels(class_name: str, name: str) -> bool:
+    """Whether a value becomes plain numbers of kernels, other ones with each value."""
+    return (class_name, name) in _READ_WHEN_INSTALLED
+
+
+def is_turned_by_reflections(class_name: str, name: str) -> bool:
+    """Whether a pose that reflects turns the shape inside out once more at every installation."""
+    return (class_name, name) in _TURNED_BY_REFLECTIONS
+
+
+def check_pose(key: str, *poses: Any) -> None:
+    """Raise SceneError for poses (4, 4) that reflect, of a shape that they would turn inside out."""
+    if any(np.linalg.det(np.asarray(pose, dtype=np.float64).reshape(4, 4)[:3, :3]) < 0 for pose in poses):
+        raise SceneError(
+            f"value of {key!r}: expected poses without a reflection, got one whose determinant is negative: Mitsuba "
+            "turns such a shape inside out once more at every change. Turn it by a rotation, use flip_normals, or "
+            "describe it as a mesh."
+        )

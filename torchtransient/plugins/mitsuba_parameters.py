@@ -15,8 +15,11 @@ from torchtransient.plugins.mitsuba_compat import (
     LOSING,
     LOST_AT,
     METALS,
+    NORMALS,
     NUMBERS,
     PLASTICS,
+    POSITIONS,
+    TEXCOORDS,
     is_absorption_of_hair,
     is_bump_map,
     is_dark,
@@ -36,7 +39,6 @@ from torchtransient.plugins.parameter_effect import (
 )
 from torchtransient.plugins.spectral_colours import keeps_coefficients
 
-VERTICES = ("vertex_positions", "vertex_normals", "vertex_texcoords")
 # What moves the rays of a sensor.
 SENSOR_KEYS = (
     "to_world",
@@ -274,9 +276,9 @@ declare_effects(
     "Mesh",
     {
         "to_world": SHAPE,
-        "vertex_positions": SHAPE,
-        "vertex_normals": SHAPE,
-        "vertex_texcoords": (
+        POSITIONS: SHAPE,
+        NORMALS: SHAPE,
+        TEXCOORDS: (
             Row(NORMAL_SLOPES, _places_delta_slopes, "a bump map over a delta lobe"),
             Row(SLOPES, _places_slopes, "another bump map"),
             Row(PATTERN_AND_NORMALS, _places_light_and_normals, "a textured light with a normal map over a delta lobe"),

@@ -15,6 +15,8 @@ from torchtransient.plugins.mitsuba_compat import (
     group_name,
     has_surface,
     is_instance,
+    shows_rows,
+    users_name,
 )
 
 
@@ -72,6 +74,8 @@ def shown_by(node: Any) -> tuple[list[ShownValue], list[tuple[str, Any, int]]]:
     """(parameters, objects) of one plugin, objects as (name, object, flags)."""
     collector = _collector(mi.TraversalCallback)()
     node.traverse(collector)
+    if shows_rows() and isinstance(node, mi.Mesh):
+        collector.values = [value._replace(key=users_name(node, value.key)) for value in collector.values]
     return collector.values, collector.objects
 
 

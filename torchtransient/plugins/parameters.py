@@ -7,23 +7,108 @@ taken, ``scene.parameters()``, the plan, the page of gradients. How rows are ent
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from torchtransient.errors import GradientError
 from torchtransient.plugins import mitsuba_parameters as mitsuba_parameters
-from torchtransient.plugins.black_textures import Attached, check_black, loses_black
-from torchtransient.plugins.mitsuba_compat import attribute_name, is_replaced_for
-from torchtransient.plugins.node_walk import ShownValue, objects_of, owners_of, shown_by
+from torchtransient.plugins.mitsuba_compat import (
+    NUMBERS,
+    PIXELS,
+    VERTEX_COLUMNS,
+    attribute_name,
+    attribute_scale,
+    forgets_black_samples,
+    is_replaced_for,
+    normal_texture,
+    weight_slot,
+)
+from torchtransient.plugins.node_walk import ShownValue, objects_of, owners_of, shown_by, unshared
 from torchtransient.plugins.parameter_effect import CORRECT as CORRECT
 from torchtransient.plugins.parameter_effect import ParameterEffect as ParameterEffect
-from torchtransient.plugins.parameter_effect import Site, class_of, matching_effect
+from torchtransient.plugins.parameter_effect import Site, class_of, location_of, matching_effect
 from torchtransient.plugins.spectral_colours import keeps_coefficients
-from torchtransient.plugins.swept_parameters import location_of
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Textures that are exactly zero where Mitsuba then loses the derivative: inside normal and bump maps, and in lights
+# that are sampled by their own brightness.
+#
+# Mitsuba's maps drop samples whose weight is zero (:func:`.mitsuba_compat.forgets_black_samples`), and a light of which
+# all texels are black has no density to sample it by: the derivative by what is black, as far as it is due to the light
+# beyond, is lost. A number that leaves no weight to speak of, but is not zero, keeps both.
+
+# Far above the least number of single precision, far below anything that can be seen.
+ALMOST_BLACK = 1e-30
+
+
+class Attached(NamedTuple):
+    """A number of a plugin that carries gradients: the plugin, its key, the value, all that holds it and of that what
+    holds it directly.
+    """
+
+    node: Any
+    key: str
+    value: Any
+    owners: Sequence[tuple[Any, str]]
+    holders: Sequence[tuple[Any, str]]
+
+
+def loses_black(node: Any, key: str, owners: Sequence[tuple[Any, str]]) -> bool:
+    """Whether the derivative by a plugin's numbers is lost where they are zero; ``owners``: all that holds it. Of a
+    mesh, its attributes are numbers that textures hold, and shapes themselves are in no map.
+    """
+    return _is_in_a_map(node, owners) or _is_light(node, key, owners)
+
+
+def _is_in_a_map(node: Any, owners: Sequence[tuple[Any, str]]) -> bool:
+    if not isinstance(node, mi.Texture | mi.Volume | mi.Mesh):
+        return False
+    return any(forgets_black_samples(holder) and normal_texture(holder) != name for holder, name in owners)
+
+
+def _is_light(node: Any, key: str, owners: Sequence[tuple[Any, str]]) -> bool:
+    if isinstance(node, mi.Emitter):
+        return key == PIXELS
+    return isinstance(node, mi.Texture) and any(isinstance(holder, mi.Emitter) for holder, _ in owners)
+
+
+def lifted(value: Any) -> Any:
+    """An array of numbers, of which none is exactly zero."""
+    return dr.select(value == 0, ALMOST_BLACK, value)
+
+
+def check_black(attached: Iterable[Attached]) -> None:
+    """Raise ``GradientError`` where a derivative would be lost."""
+    for one in attached:
+        # Paths are handed a part of a mixture: its weight is none of what maps drop.
+        only_weighs = bool(one.holders) and all(weight_slot(holder) == name for holder, name in one.holders)
+        if _is_in_a_map(one.node, one.owners) and not only_weighs and _zeros(one.value, dr.any):
+            where = "inside a normalmap or bumpmap, which drops samples of weight zero and with them the derivative"
+        elif _is_light(one.node, one.key, one.owners) and _zeros(one.value, dr.all):
+            where = "everywhere in a light, which then has no density to sample it by"
+        else:
+            continue
+        raise GradientError(
+            f"{f'{one.node.id()}.{one.key}'.lstrip('.')!r} is zero {where}. Set it to {ALMOST_BLACK:g}, as "
+            "tt.TransientRenderer does."
+        )
+
+
+def _zeros(value: Any, how: Any) -> bool:
+    """Whether ``how`` many (``dr.any`` or ``dr.all``) of the numbers of a value are zero."""
+    if not (dr.is_array_v(value) and dr.is_float_v(value)):
+        return False
+    with dr.suspend_grad():
+        flat = dr.ravel(value)
+        return bool(dr.width(flat) and how(flat == 0)[0])
+
+
+# ----------------------------------------------------------------------------------------------------------------------
 
 
 def effect_of(node: Any, key: str, flags: int = 0, owners: Sequence[tuple[Any, str]] = ()) -> ParameterEffect:
@@ -193,7 +278,7 @@ def can_carry_gradients(value: Any) -> bool:
 
 def is_attribute(node: Any, key: str) -> bool:
     """Whether it is an attribute of a mesh, whose memory moves when another one is added."""
-    return isinstance(node, mi.Mesh) and key.startswith(("vertex_", "face_")) and key not in mitsuba_parameters.VERTICES
+    return isinstance(node, mi.Mesh) and key.startswith(("vertex_", "face_")) and key not in VERTEX_COLUMNS
 
 
 # --------------------------------------------------------------------------------------- what has to be there for them
@@ -232,3 +317,126 @@ def check_slope(moving: Sequence[str], has_slope: bool, response: str, remedy: s
             f"{', '.join(repr(name) for name in moving)} can change path lengths, and the film's {response!r} has no "
             f"slope: the derivative through the time of flight would be lost. {remedy}"
         )
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Parameters that have a range outside of which no physical surface, medium, light or sensor has them.
+#
+
+# What single precision makes of the ends of a range.
+_SLACK = 1e-5
+
+
+@dataclass(frozen=True)
+class PhysicalRange:
+    """From ``low`` to ``high``. ``meaning``: what a parameter is, in words. ``is_open``: the ends are outside."""
+
+    meaning: str
+    low: float
+    high: float = float("inf")
+    is_open: bool = False
+
+    def above(self, number: float) -> bool:
+        """Whether a number is beyond the upper end."""
+        return number >= self.high if self.is_open else number > self.high + _SLACK
+
+    def below(self, number: float) -> bool:
+        """Whether a number is beyond the lower end."""
+        return number <= self.low if self.is_open else number < self.low - _SLACK
+
+
+SHARE = PhysicalRange("a share of the light", 0, 1)
+WEIGHT = PhysicalRange("a weight", 0, 1)
+ROUGHNESS = PhysicalRange("a roughness", 0)
+OPTICAL = PhysicalRange("an optical constant of a metal", 0)
+INDEX = PhysicalRange("an index of refraction", 0, is_open=True)
+EXTINCTION = PhysicalRange("an extinction coefficient", 0)
+ANISOTROPY = PhysicalRange("the mean cosine of a phase function", -1, 1, is_open=True)
+LIGHT = PhysicalRange("the light of an emitter", 0)
+ANGLE = PhysicalRange("an angle of view in degrees", 0, 180, is_open=True)
+LENGTH = PhysicalRange("a length", 0)
+
+# Names under which plugins keep such a number, or the texture or volume of them.
+_OF_BSDFS = {
+    **dict.fromkeys(
+        (
+            "reflectance", "transmittance", "diffuse_reflectance", "specular_reflectance", "specular_transmittance",
+            "base_color", "opacity", "weight", "quantum_yield", "elastic_fraction",
+        ),
+        SHARE,
+    ),
+    **dict.fromkeys(
+        (
+            "metallic", "spec_trans", "spec_tint", "sheen_tint", "clearcoat", "clearcoat_gloss", "anisotropic",
+            "flatness", "share",
+        ),
+        WEIGHT,
+    ),
+    **dict.fromkeys(("alpha", "alpha_u", "alpha_v", "roughness"), ROUGHNESS),
+    "eta": INDEX,
+    "k": OPTICAL,
+}  # fmt: skip
+_OF_MEDIA = {"albedo": SHARE, "sigma_t": EXTINCTION}
+_OF_EMITTERS = dict.fromkeys(("radiance", "intensity", "irradiance", "energy"), LIGHT)
+_OF_SENSORS = {"x_fov": ANGLE, "aperture_radius": LENGTH, "focus_distance": LENGTH}
+
+def ranges_of(params: Any) -> dict[str, PhysicalRange]:
+    """The ranges of the parameters that have one, by key of ``mi.traverse``.
+
+    The numbers of textures, volumes and attributes of meshes have the range of what they supply, through whatever
+    textures they are read. Coefficients of spectral models have none.
+    """
+    tracker, found = ParameterTracker.of(params), {}
+    for key in params.properties:
+        limits = list(_ranges_at(tracker, params.properties[key][2], key.rsplit(".", 1)[-1]))
+        if limits:  # one that serves for several things: the one with the least room
+            found[key] = min(limits, key=lambda one: one.high)
+    return found
+
+
+def _ranges_at(tracker: ParameterTracker, node: Any, name: str) -> Iterator[PhysicalRange]:
+    """The ranges of a parameter of a plugin."""
+    if isinstance(node, mi.Texture | mi.Volume):
+        supplies = name in NUMBERS and not keeps_coefficients(node, name)
+    else:
+        own = _range_in(node, name)
+        if own is not None:
+            yield own
+        supplies = is_attribute(node, name) and not keeps_coefficients(node, name)
+    waiting = [(node, name, 1.0)] if supplies else []
+    while waiting:
+        supplier, attribute, scale = waiting.pop()
+        for holder, slot in tracker.holders_of(supplier, attribute):
+            if isinstance(holder, mi.Texture | mi.Volume):
+                factor = attribute_scale(holder)
+                if factor > 0:
+                    waiting.append((holder, "", scale * factor))
+            elif (limits := _range_in(holder, slot)) is not None:
+                yield limits if scale == 1 else replace(limits, low=limits.low / scale, high=limits.high / scale)
+
+
+def _range_in(node: Any, name: str) -> PhysicalRange | None:
+    if isinstance(node, mi.BSDF):
+        is_metal = "Conductor" in node.class_name() + type(node).__name__
+        return OPTICAL if name == "eta" and is_metal else _OF_BSDFS.get(name)
+    if isinstance(node, mi.PhaseFunction):
+        return {"g": ANISOTROPY, "weight": SHARE}.get(name)
+    for kind, ranges in ((mi.Medium, _OF_MEDIA), (mi.Emitter, _OF_EMITTERS), (mi.Sensor, _OF_SENSORS)):
+        if isinstance(node, kind):
+            return ranges.get(name)
+    return None
+
+
+def described_ranges(params: Any) -> Iterator[tuple[str, PhysicalRange, float, float]]:
+    """(key, range, smallest, largest) of what has a range in a scene, as it is now."""
+    for key, limits in ranges_of(params).items():
+        numbers = np.array(unshared(params[key]))
+        if numbers.size:
+            yield key, limits, float(numbers.min()), float(numbers.max())
+
+
+def sun_axes(params: Any, keys: Iterable[str]) -> dict[str, np.ndarray]:
+    """Of the keys that are directions of a sun, where its sky's third axis points."""
+    suns = [key for key in keys if key.endswith(".sun_direction")]
+    matrices = {key: params[f"{key.removesuffix('sun_direction')}to_world"].matrix for key in suns}
+    return {key: np.array(unshared(matrix), dtype=float).reshape(4, 4)[:3, 2] for key, matrix in matrices.items()}

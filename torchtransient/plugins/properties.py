@@ -1,12 +1,23 @@
-"""Numbers and truth values of a plugin's properties, checked where Python would take others for them."""
+"""Numbers of plugins, checked: properties by type and range, parameters of built scenes for NaN and infinity."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
 from torchtransient.errors import SceneError
+from torchtransient.plugins.mitsuba_compat import mesh_faces
+from torchtransient.plugins.node_walk import ShownValue
 from torchtransient.quantities import shown
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Numbers and truth values of a plugin's properties, checked where Python would take others for them.
+#
 
 # Kernels count in 32 bits.
 MOST = 2**32 - 2
@@ -42,3 +53,75 @@ def truth(props: Any, name: str, default: bool) -> bool:
     if not isinstance(given, (bool, int, float)) or given not in (0, 1):
         raise SceneError(f"{props.plugin_name()}: {name}: expected true or false, got {shown(given)}.")
     return bool(given)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Whether the numbers of a scene are numbers: NaN and infinity are found before anything is rendered.
+# A texture with a NaN in it takes light away without a word, an infinite light fills every bin. No parameter of
+# Mitsuba's plugins or of ours has a meaning for either.
+
+
+def check_parameters(params: Any) -> None:
+    """Raise ``SceneError`` with the keys of the parameters of a built scene (``mi.traverse``) that are not finite.
+
+    Vertices of a mesh count where a face has them: files come with others that no ray can meet.
+    """
+    bad = {}
+    for key, (handle, cpptype, node, _) in params.properties.items():
+        array = numbers_of(ShownValue(key, handle, 0, cpptype).read(node))
+        if array is not None and not np.isfinite(array).all():
+            if isinstance(node, mi.Mesh) and ".vertex_" in f".{key}":
+                array = _at_faces(node, array)
+            count_bad(bad, key, array)
+    refuse(bad)
+
+
+def count_bad(bad: dict[str, str], key: str, array: np.ndarray) -> None:
+    """Note under ``key`` how many numbers of an array are not finite, if any are not."""
+    wrong = int(array.size - np.isfinite(array).sum())
+    if wrong:
+        bad[key] = f"{wrong} of {array.size}" if array.size > 1 else str(float(array.reshape(-1)[0]))
+
+
+def refuse(bad: Mapping[str, str]) -> None:
+    """Raise ``SceneError`` where :func:`count_bad` has noted something."""
+    if not bad:
+        return
+    listed = "; ".join(f"{key!r} ({count})" for key, count in bad.items())
+    raise SceneError(
+        f"expected finite numbers, got NaN or infinity in {listed}. Mend the value or the file that it comes from."
+    )
+
+
+def numbers_of(value: Any) -> np.ndarray | None:
+    """The real numbers of a value of Mitsuba, detached; None for what has none."""
+    if isinstance(value, (bool, int, str)) or value is None:
+        return None
+    if isinstance(value, float):
+        return np.array(value)
+    if "Transform" in type(value).__name__:  # by name: Dr.Jit arrays answer to any attribute of component letters
+        value = value.matrix
+    if hasattr(value, "wavelengths") and hasattr(value, "values"):  # a spectrum as a property of a plugin
+        return np.array([*value.wavelengths, *value.values])
+    if isinstance(value, (mi.Bitmap, mi.VolumeGrid, np.ndarray)):
+        array = np.asarray(value)
+    elif dr.is_array_v(value) and dr.is_float_v(value):
+        # of a copy: to read a literal evaluates it, and shows the scene another array
+        array = _components(dr.detach(value))
+    else:
+        return None
+    return array if array.dtype.kind == "f" else None
+
+
+def _components(value: Any) -> np.ndarray:
+    """All numbers, read one component at a time: to put them into one array would take a kernel."""
+    if dr.depth_v(value) > 1 and not dr.is_tensor_v(value):
+        return np.concatenate([_components(entry).reshape(-1) for entry in value])
+    return np.array(value)
+
+
+def _at_faces(mesh: Any, array: np.ndarray) -> np.ndarray:
+    """The entries of a vertex attribute that faces refer to."""
+    faces = np.array(mesh_faces(mesh))
+    count = mesh.vertex_count()
+    return array.reshape(count, -1)[np.unique(faces[faces < count])]

@@ -61,7 +61,7 @@ class Recordings:
         """
         import drjit as dr
 
-        from torchtransient.plugins.pointer_table import null_pointers
+        from torchtransient.plugins.kernel_arrays import null_pointers
 
         for job in jobs:
             if job.refusal is not None or len(job.launches) > 1:

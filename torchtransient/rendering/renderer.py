@@ -15,8 +15,7 @@ from torchtransient.errors import ArgumentError, SceneError, ShapeError
 from torchtransient.gates import Gate
 from torchtransient.given_types import is_one_of
 from torchtransient.parametrize.copies import CopiesParametrized
-from torchtransient.plugins.parameters import check_slope
-from torchtransient.plugins.physical_ranges import sun_axes
+from torchtransient.plugins.parameters import check_slope, sun_axes
 from torchtransient.pulses import Pulse
 from torchtransient.quantities import Numbers, flag, shown
 from torchtransient.rendering import engine

@@ -15,7 +15,7 @@ import torch
 from torchtransient._collection import no_collection
 from torchtransient.errors import SceneError, TorchTransientError, VariantError
 from torchtransient.plain_texts import one_line
-from torchtransient.plugins.black_textures import lifted
+from torchtransient.plugins.parameters import lifted
 from torchtransient.plugins.unfinished import afterwards
 from torchtransient.rendering.interrupts import quiet
 from torchtransient.rendering.kernel_errors import named_errors

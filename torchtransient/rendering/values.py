@@ -14,7 +14,7 @@ import torch
 
 from torchtransient.errors import DeviceError, SceneError, ShapeError, TorchTransientError, UnknownKeyError
 from torchtransient.plain_texts import one_line
-from torchtransient.plugins.mitsuba_numbers import check_pose, is_turned_by_reflections
+from torchtransient.plugins.mitsuba_compat import check_pose, is_turned_by_reflections
 from torchtransient.plugins.node_walk import ShownValue
 from torchtransient.rendering.interrupts import quiet
 from torchtransient.scene.parameters import classify, is_transform, read_value, unknown_key

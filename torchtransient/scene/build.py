@@ -21,7 +21,7 @@ from torchtransient.plugins.drjit_pool import threads_for_files
 from torchtransient.plugins.mitsuba_compat import is_dark
 from torchtransient.plugins.node_walk import objects_below
 from torchtransient.plugins.parameter_effect import class_of
-from torchtransient.plugins.physical_ranges import PhysicalRange, described_ranges, ranges_of
+from torchtransient.plugins.parameters import PhysicalRange, described_ranges, ranges_of
 from torchtransient.scene.checks import check_finite, check_mesh_files, check_meshes, check_nodes
 from torchtransient.scene.description import Plain, SceneDescription
 from torchtransient.scene.edits import BuildOptions, edit, forget_queries

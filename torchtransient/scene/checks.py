@@ -11,7 +11,7 @@ import numpy as np
 
 from torchtransient.errors import SceneError
 from torchtransient.file_places import check_special
-from torchtransient.plugins.finite_values import count_bad, numbers_of, refuse
+from torchtransient.plugins.properties import count_bad, numbers_of, refuse
 from torchtransient.quantities import shown
 from torchtransient.scene.nodes import children, is_film, node_kind
 from torchtransient.scene.objects import LoadedScene

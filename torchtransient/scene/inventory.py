@@ -17,6 +17,7 @@ import numpy as np
 from torchtransient import plugins
 from torchtransient.errors import SceneError, TorchTransientError
 from torchtransient.plain_texts import one_line
+from torchtransient.plugins._registry import OWN_BSDFS
 from torchtransient.plugins.drjit_pool import threads_for_files
 from torchtransient.rendering.variant import active_variant
 from torchtransient.scene.checks import check_nodes
@@ -393,7 +394,7 @@ def _node_colour(node: Any, lookup: Callable[[str], Path]) -> Verdict | None:
         return _picture(props, lookup)
     if plugin == "gridvolume":
         return _grid(props, lookup)
-    if plugin in _TRANSPARENT or node.type in (mi.ObjectType.Integrator, mi.ObjectType.Sampler):
+    if plugin in (*_TRANSPARENT, *OWN_BSDFS) or node.type in (mi.ObjectType.Integrator, mi.ObjectType.Sampler):
         return None
     return None if is_integrator(node) else Verdict(COLOUR, f"{plugin!r}, whose colours are not known here")
 

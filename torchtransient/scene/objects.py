@@ -15,6 +15,15 @@ import numpy as np
 
 from torchtransient.errors import SceneError
 from torchtransient.plugins.dictionaries import Voxels
+from torchtransient.plugins.mitsuba_compat import (
+    MESH_PARAMETERS,
+    mesh_faces,
+    mesh_normals,
+    mesh_positions,
+    mesh_texcoords,
+    silhouette_weight,
+    users_name,
+)
 from torchtransient.plugins.node_walk import objects_below, objects_of
 from torchtransient.plugins.parameter_effect import ParameterEffect, class_of
 from torchtransient.rendering.variant import active_variant
@@ -171,22 +180,20 @@ def _described_mesh(mesh: Any) -> dict[str, Any] | None:
 
     surface = _described_surface(mesh.bsdf())
     held = [value for _, value in objects_of(mesh) if not isinstance(value, mi.BSDF)]
-    numbers = {name for name in mi.traverse(mesh).properties if "." not in name}
-    known = {"vertex_positions", "vertex_normals", "vertex_texcoords", "faces", "silhouette_sampling_weight"}
-    if surface is None or held or mesh.is_emitter() or mesh.is_sensor() or numbers - known or not mesh.face_count():
+    numbers = {users_name(mesh, name) for name in mi.traverse(mesh).properties if "." not in name} - MESH_PARAMETERS
+    if surface is None or held or mesh.is_emitter() or mesh.is_sensor() or numbers or not mesh.face_count():
         return None
     described: dict[str, Any] = {
         "type": "mesh_arrays",
-        "vertices": np.array(mesh.vertex_positions_buffer(), dtype=np.float64).reshape(-1, 3),
-        "faces": np.array(mesh.faces_buffer(), dtype=np.int64).reshape(-1, 3),
+        "vertices": np.array(mesh_positions(mesh), dtype=np.float64).reshape(-1, 3),
+        "faces": np.array(mesh_faces(mesh), dtype=np.int64).reshape(-1, 3),
         "bsdf": surface,
     }
     if mesh.has_vertex_normals():
-        described["normals"] = np.array(mesh.vertex_normals_buffer(), dtype=np.float64).reshape(-1, 3)
+        described["normals"] = np.array(mesh_normals(mesh), dtype=np.float64).reshape(-1, 3)
     if mesh.has_vertex_texcoords():
-        described["texcoords"] = np.array(mesh.vertex_texcoords_buffer(), dtype=np.float64).reshape(-1, 2)
-    weight = float(mesh.silhouette_sampling_weight())
-    described |= {} if weight == 1 else {"silhouette_sampling_weight": weight}
+        described["texcoords"] = np.array(mesh_texcoords(mesh), dtype=np.float64).reshape(-1, 2)
+    described |= silhouette_weight(mesh)
     flags = {"face_normals": mesh.has_face_normals(), "flip_normals": mesh.has_flipped_normals()}
     return described | {name: True for name, is_set in flags.items() if is_set}
 

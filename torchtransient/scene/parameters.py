@@ -17,14 +17,14 @@ import numpy as np
 
 from torchtransient.errors import UnknownKeyError
 from torchtransient.interfaces import IntegratorInterface
+from torchtransient.plugins.mitsuba_compat import VERTEX_COLUMNS
 from torchtransient.plugins.node_walk import ShownValue, unshared
+from torchtransient.plugins.parameter_effect import UNCHECKED, is_checked
 from torchtransient.plugins.parameters import ParameterEffect, ParameterTracker
-from torchtransient.plugins.swept_parameters import UNCHECKED, is_checked
 from torchtransient.plugins.transport.boundary.moving_edges import Gap, MovingEdges, moves_edges, moving_edges
 from torchtransient.scene.build import BuiltScene
 from torchtransient.scene.objects import without_stand_in
 
-_VERTEX_COLUMNS = {"vertex_positions": 3, "vertex_normals": 3, "vertex_texcoords": 2}
 _MAX_LISTED = 65536  # larger values are not copied: textures of a real scene would fill the memory once more
 
 
@@ -276,7 +276,7 @@ def classify(key: str, current: Any) -> tuple[str, tuple[int, ...] | None]:
         several = width > 1 or key.rsplit(".", 1)[-1] == "points"
         return ("points", (width, len(current))) if several else ("vector", (len(current),))
     size = dr.width(current)
-    columns = _VERTEX_COLUMNS.get(key.rsplit(".", 1)[-1])
+    columns = VERTEX_COLUMNS.get(key.rsplit(".", 1)[-1])
     if columns is not None:
         return "vertices", (size // columns, columns)
     return ("number", ()) if size == 1 else ("list", (size,))

@@ -24,7 +24,7 @@ from torchtransient.errors import (
     level_of_user,
 )
 from torchtransient.given_types import is_one_of
-from torchtransient.plugins.physical_ranges import SHARE, PhysicalRange
+from torchtransient.plugins.parameters import SHARE, PhysicalRange
 from torchtransient.quantities import shown
 
 MODES = ("warn", "error", "ignore")

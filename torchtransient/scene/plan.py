@@ -405,7 +405,7 @@ class Finder:
             return
         options = BuildOptions(max_depth=depth, merge=True, transient=True, integrator=self.draft.integrator)
         with active_variant(self.draft.variant):
-            from torchtransient.plugins.around_corner.explanation import explanation
+            from torchtransient.plugins.around_corner.division import explanation
 
             built = self.draft.scene.built(options).scene
             integrator, sensors = built.integrator(), built.sensors()

@@ -21,7 +21,7 @@ from torchtransient.file_places import check_folder, path_of
 from torchtransient.plugins import kind_of
 from torchtransient.plugins.dictionaries import double_transform
 from torchtransient.plugins.drjit_pool import threads_for_files
-from torchtransient.plugins.mitsuba_compat import DIFFERENTIABLE_PLUGINS, POLARIZED_PLUGINS
+from torchtransient.plugins.mitsuba_compat import DIFFERENTIABLE_PLUGINS, POLARIZED_PLUGINS, VERTEX_COLUMNS
 from torchtransient.plugins.node_walk import ShownValue, objects_below, objects_of
 from torchtransient.plugins.spectral_colours import as_colours, keeps_coefficients, same_spectra
 from torchtransient.rendering.variant import device_type
@@ -158,7 +158,6 @@ def _same(a: np.ndarray, b: np.ndarray) -> bool:
 
 # ------------------------------------------------------------------------------------- values as properties of nodes
 
-_VERTICES = ("vertex_positions", "vertex_normals", "vertex_texcoords")
 # Properties of three numbers that are no colour.
 _VECTORS = ("position", "direction", "sensor_origin", "laser_origin", "sun_direction", "target")
 # Properties that a mesh file holds itself.
@@ -262,7 +261,7 @@ def _write_value(writer: XmlWriter, built: Any, places: dict[int, Place], slot: 
     props = state.nodes[index].props
     if slot.kind == "mesh_transform" and props.plugin_name() != "mesh_arrays":
         props["to_world"] = double_transform()(value.astype(np.float64))
-    elif slot.kind == "mesh_transform" or (isinstance(owner, mi.Mesh) and name in _VERTICES):
+    elif slot.kind == "mesh_transform" or (isinstance(owner, mi.Mesh) and name in VERTEX_COLUMNS):
         _save_mesh(writer, index, owner)
     elif slot.kind == "transform":
         matrix = value.astype(np.float64)

@@ -177,7 +177,7 @@ def test_ranges_at_their_ends():
 def lit(monkeypatch, described, drawn, lights=("lamp",), emitters=("lamp",)):
     """The check of lights that are described with these radiances, of which some are drawn."""
     monkeypatch.setattr(checks, "_emitter_of", lambda params, key, kind: key.split(".")[0])
-    from torchtransient.plugins import physical_ranges
+    from torchtransient.plugins import parameters as physical_ranges
 
     told = [(f"{name}.radiance.value", physical_ranges.LIGHT, 0.0, high) for name, high in described.items()]
     told.append(("wall.reflectance.value", "no light", 0.0, 9.0))

@@ -22,7 +22,7 @@ from torchtransient.plugins.sampling.area_elements import (
     local_point,
     morton_order,
 )
-from torchtransient.plugins.sampling.scan_tiles import ScanTiles, distance_to
+from torchtransient.plugins.sampling.shared_samples import ScanTiles, distance_to
 
 VARIANT = "llvm_ad_mono"
 SHEET = np.array([[0.1, 0.2, 1.3], [0.9, 0.3, 1.1], [0.2, 1.4, 1.6], [2.1, 0.7, 0.8]]), np.array([[0, 2, 1], [1, 2, 3]])

@@ -4,7 +4,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from torchtransient.plugins.sampling.ray_offsets import past, shortest
+from torchtransient.plugins.sampling.rays import past, shortest
 
 VARIANT = "llvm_ad_mono"
 

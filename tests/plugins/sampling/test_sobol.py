@@ -5,7 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from torchtransient.plugins.sampling.sobol import DIMENSIONS, _directions, sobol, unit_double, unit_float
+from torchtransient.plugins.sampling.point_sets import DIMENSIONS, _directions, sobol, unit_double, unit_float
 
 VARIANT = "llvm_ad_mono"
 

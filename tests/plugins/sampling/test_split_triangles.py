@@ -9,7 +9,7 @@ import pytest
 
 from support.gradient_cases.cases_curves import file_of
 from torchtransient.plugins.sampling.area_elements import AreaElements
-from torchtransient.plugins.sampling.split_triangles import PrimitiveDensity, cut, cuts_of
+from torchtransient.plugins.sampling.hidden_elements import PrimitiveDensity, cut, cuts_of
 
 VARIANT = "llvm_ad_mono"
 # Three triangles of a kind each: wide, slender, small.

@@ -12,10 +12,14 @@ import pytest
 from torchtransient import plugins
 from torchtransient.errors import SceneError
 from torchtransient.plugins import mitsuba_compat as compat
-from torchtransient.plugins.sampling.distant import DistantReference, distant_reference
-from torchtransient.plugins.sampling.light_box import LightBox
-from torchtransient.plugins.sampling.rare_lights import is_rare, least_probability
-from torchtransient.plugins.sampling.sun import MovingSun
+from torchtransient.plugins.sampling.lights import (
+    DistantReference,
+    LightBox,
+    MovingSun,
+    distant_reference,
+    is_rare,
+    least_probability,
+)
 
 VARIANT = "llvm_ad_rgb"
 

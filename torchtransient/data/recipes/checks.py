@@ -19,7 +19,7 @@ from torchtransient.data.recipes.specification import Specification
 from torchtransient.data.recipes.streams import Draw, Extreme, Fixed, Stream
 from torchtransient.data.recipes.structures import Structure
 from torchtransient.errors import SceneError, TorchTransientError, TorchTransientWarning, UnitError, level_of_user
-from torchtransient.plugins.physical_ranges import PhysicalRange
+from torchtransient.plugins.parameters import PhysicalRange
 from torchtransient.rendering.progress import with_bar
 from torchtransient.rendering.variant import active_variant
 from torchtransient.scene.physics import is_singular, outside_message, singular_message
@@ -146,7 +146,7 @@ def _check_light(built: Any, kept: Kept, draws: Sequence[Mapping[str, Any]]) -> 
     """Raise SceneError for a scene without an emitter, and where none of them ever shines."""
     import mitsuba as mi
 
-    from torchtransient.plugins.physical_ranges import LIGHT, described_ranges
+    from torchtransient.plugins.parameters import LIGHT, described_ranges
 
     emitters = list(built.scene.emitters())
     where = f"structure '{kept.structure.text}': " if kept.structure.text else ""

@@ -14,10 +14,9 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.errors import SceneError, ShapeError
-from torchtransient.plugins.around_corner.geometry import occluded, span
+from torchtransient.plugins.around_corner.geometry import WallPoints, occluded, span
 from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
-from torchtransient.plugins.around_corner.wall_points import WallPoints
-from torchtransient.plugins.sampling.packed import packed_columns
+from torchtransient.plugins.sampling.hidden_elements import packed_columns
 from torchtransient.plugins.transport.strategy import Local
 
 # Bytes of the pairs of numbers that are kept at a time, for scan points and laser spots together.

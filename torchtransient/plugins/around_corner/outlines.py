@@ -11,12 +11,10 @@ import numpy as np
 
 from torchtransient.errors import GradientWarning
 from torchtransient.plugins.around_corner.geometry import front_normal
-from torchtransient.plugins.around_corner.hiding import Part, hiding_pairs, parts_of
-from torchtransient.plugins.around_corner.late_outlines import FIRST, LateOutlines
-from torchtransient.plugins.around_corner.occlusion import BOUNCES, MutualOcclusion
-from torchtransient.plugins.around_corner.outline_table import OutlineTable
+from torchtransient.plugins.around_corner.occlusion import BOUNCES, FIRST, LateOutlines, MutualOcclusion
+from torchtransient.plugins.around_corner.outline_table import OutlineTable, Part, hiding_pairs, parts_of
 from torchtransient.plugins.integrators.launch import passes_of, seed_array
-from torchtransient.plugins.pointer_table import registry_number
+from torchtransient.plugins.kernel_arrays import registry_number
 from torchtransient.plugins.transport.boundary.moving_edges import (
     Gap,
     MovingEdges,

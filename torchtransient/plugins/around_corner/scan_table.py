@@ -11,16 +11,91 @@ import numpy as np
 
 from torchtransient.errors import SceneError, TorchTransientWarning
 from torchtransient.interfaces import CaptureType
-from torchtransient.plugins.around_corner.geometry import front_normal
-from torchtransient.plugins.around_corner.overlaps import overlaps
-from torchtransient.plugins.around_corner.wall_points import WallPoints, points_of
+from torchtransient.plugins.around_corner.geometry import OFFSET, WallPoints, front_normal, points_of, sees
 from torchtransient.plugins.bsdfs.lambertian import is_lambertian
-from torchtransient.plugins.host_numbers import host_numbers
-from torchtransient.plugins.mitsuba_compat import is_flat_shape
+from torchtransient.plugins.kernel_arrays import host_numbers, registry_number
+from torchtransient.plugins.mitsuba_compat import is_flat_shape, mesh_positions
 from torchtransient.plugins.node_walk import shown_by
-from torchtransient.plugins.pointer_table import registry_number
-from torchtransient.plugins.sampling.area_elements import has_shading_normals
+from torchtransient.plugins.sampling.area_elements import TRIANGLE, has_shading_normals
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
+from torchtransient.plugins.sampling.point_sets import plane_points
+from torchtransient.plugins.transport.strategy import Local
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Surfaces that lie in each other: what a ray meets there is chance, and a sum over areas counts both.
+# Lines to drawn points end just before them (:func:`.geometry.occluded`), so nothing that lies nearer than that can
+# hide a point: of two surfaces at one place both are seen. Whether there are such places is asked of drawn points
+# themselves, of shapes of all kinds: what is free to see, has a ray that is sent there met it?
+
+# Points that are looked at from the wall, and as many from those that are seen.
+POINTS = 2**13
+# So many of them have to lie in something else. Where surfaces cross, rounding finds one in a hundred thousand.
+FEWEST = 3
+# Heights over each other, in offsets, at which lines see both of two surfaces.
+_HEIGHT = 4.0
+# Share of a triangle's barycentric coordinates that belongs to its edges, where a ray may meet the neighbour.
+_EDGE = 0.01
+_SEEDS = (0x51ED270B, 0x7FEB352D)
+
+
+def overlaps(scene: Any, elements: HiddenElements, points: np.ndarray, normals: np.ndarray) -> list[str]:
+    """Names of the shapes that lie in others, or whose own triangles lie in each other, where light finds them: seen
+    from wall points ``(P, 3)``, or from what those see. Overlaps of less than one in two thousand of the density of
+    ``elements`` may stay unnoticed.
+    """
+    with dr.suspend_grad():
+        index = dr.arange(mi.UInt32, POINTS) % dr.opaque(mi.UInt32, len(points))
+        p, n = mi.Point3f(points.T), mi.Vector3f(normals.T)
+        dr.make_opaque(p, n)
+        viewer = Local(p=dr.gather(mi.Point3f, p, index), geometric_n=dr.gather(mi.Vector3f, n, index))
+        found, active = np.zeros(0, dtype=np.uint32), mi.Mask(True)
+        for seed in _SEEDS:
+            target, active, contested = _look(scene, elements, viewer, dr.opaque(mi.UInt32, seed), active)
+            numbers = dr.reinterpret_array(mi.UInt32, target.shape)
+            dr.eval(target.p, target.geometric_n, active, contested, numbers)
+            found = np.concatenate([found, np.array(numbers)[np.array(contested)]])
+            viewer = target
+    if len(found) < FEWEST:
+        return []
+    met = {int(number) for number in np.unique(found)}
+    return [shape.id() or shape.class_name() for shape in elements.shapes if registry_number(shape) in met]
+
+
+def _look(scene: Any, elements: HiddenElements, viewer: Local, seed: Any, active: Any) -> tuple[Local, Any, Any]:
+    """(drawn points with the normals of the sides that are seen, which of them are seen, and of these the ones that
+    something else lies in).
+    """
+    x, y = plane_points(POINTS, seed)
+    # Points in another order than those that see them.
+    turn = dr.opaque(mi.UInt32, 0x9E3779B1 % POINTS | 1)
+    order = dr.arange(mi.UInt32, POINTS) * turn % dr.opaque(mi.UInt32, POINTS)
+    x, y = dr.gather(mi.Float64, x, order), dr.gather(mi.Float, y, order)
+    element, a = elements.select_element(x)
+    p, n = elements.point(element, a, y)
+    shape, primitive = elements.surface(element)
+    to = mi.Vector3f(p - viewer.p)
+    target = Local(p=p, geometric_n=dr.mulsign(mi.Vector3f(n), -dr.dot(n, to)), shape=shape)
+    # From behind, too: what turns its back to the viewer may be what the ray meets of two surfaces.
+    seen = sees(scene, viewer, p, target.geometric_n, active)
+    # A ray that starts where the line does, and goes on.
+    length = dr.norm(to)
+    offset = OFFSET * (dr.max(dr.abs(p)) + length)
+    o = mi.Point3f(viewer.p + viewer.geometric_n * dr.mulsign(offset, dr.dot(viewer.geometric_n, to)))
+    ray = mi.Ray3f(o, dr.normalize(p - o))
+    pi = scene.ray_intersect_preliminary(ray, coherent=False, active=seen)
+    height = dr.abs(dr.dot(target.geometric_n, o + ray.d * pi.t - p))
+    other = seen & pi.is_valid() & ((pi.shape != shape) | (pi.prim_index != primitive))
+    return target, seen, other & (height <= _HEIGHT * offset) & _is_inside(elements, element, a, y)
+
+
+def _is_inside(elements: HiddenElements, element: Any, a: Any, y: Any) -> Any:
+    """Whether points are off the edges of their triangles."""
+    uv = elements.coordinates(element, a, y)
+    least = dr.minimum(dr.minimum(uv.x, uv.y), 1 - uv.x - uv.y)
+    return (elements.kind(element) != TRIANGLE) | (least > _EDGE)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
 
 # Wall points along each side of a scan that stand for all of it in densities.
 ACROSS = 5
@@ -63,7 +138,7 @@ class ScanTable:
         if left_out not in self._elements:
             every = self.scene.shapes()
             shapes, beside = ([s for s in every if (s.ptr in left_out) == other] for other in (False, True))
-            made = HiddenElements.remembered(self.memory, shapes, *self.reference_points(), beside)
+            made = HiddenElements.cached(self.memory, shapes, *self.reference_points(), beside)
             self._elements[left_out] = made
         return self._elements[left_out]
 
@@ -74,7 +149,7 @@ class ScanTable:
         def found() -> list[str]:
             return overlaps(self.scene, elements, *self.reference_points())
 
-        return self.memory.of("overlaps", elements.key, found) if elements.key else found()
+        return self.memory.get("overlaps", elements.key, found) if elements.key else found()
 
     def lambertian_spots(self, legs: bool) -> WallPoints | None:
         """The spots as points of a flat diffuse wall, None where they are more than that: on curved walls, with
@@ -134,7 +209,7 @@ def _in_one_plane(shapes: list[Any]) -> bool:
 def _corners(shape: Any) -> np.ndarray | None:
     """Points that span a shape (N, 3), None for one that is curved."""
     if shape.is_mesh():
-        return host_numbers(shape.vertex_positions_buffer()).reshape(-1, 3)
+        return host_numbers(mesh_positions(shape)).reshape(-1, 3)
     if not is_flat_shape(shape):
         return None
     shown = next(v for v in shown_by(shape)[0] if v.key == "to_world")

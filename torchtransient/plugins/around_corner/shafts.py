@@ -18,7 +18,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from torchtransient.plugins.host_numbers import host_numbers
+from torchtransient.plugins.kernel_arrays import host_numbers
+from torchtransient.plugins.mitsuba_compat import mesh_faces, mesh_positions
 from torchtransient.plugins.sampling.area_elements import TRIANGLE, AreaElements, morton_order
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 
@@ -165,8 +166,8 @@ def _obstacles(shapes: list[Any], frame: np.ndarray) -> tuple[np.ndarray, np.nda
     triangles, boxes = [np.zeros((0, 3, 3))], [np.zeros((0, 2, 3))]
     for shape in shapes:
         if shape.is_mesh() and not shape.is_ellipsoids():
-            v = host_numbers(shape.vertex_positions_buffer()).reshape(-1, 3) @ frame.T
-            triangles.append(v[np.array(shape.faces_buffer(), dtype=np.int64).reshape(-1, 3)])
+            v = host_numbers(mesh_positions(shape)).reshape(-1, 3) @ frame.T
+            triangles.append(v[np.array(mesh_faces(shape), dtype=np.int64).reshape(-1, 3)])
         elif shape.bbox().valid():
             ends = [np.array(end, dtype=np.float64) for end in (shape.bbox().min, shape.bbox().max)]
             box = np.stack(np.meshgrid(*zip(*ends, strict=True), indexing="ij"), -1).reshape(-1, 3) @ frame.T

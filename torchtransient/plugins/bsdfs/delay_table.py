@@ -14,9 +14,9 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient.errors import SceneError
+from torchtransient.plugins.kernel_arrays import PointerTable, registry_number
 from torchtransient.plugins.node_walk import objects_below
 from torchtransient.plugins.parameter_effect import class_of
-from torchtransient.plugins.pointer_table import PointerTable, registry_number
 from torchtransient.plugins.polarized import attenuated
 
 DECAY_NODES = 4097

@@ -8,11 +8,9 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins._registry import register
+from torchtransient.plugins.bsdfs.fresnel import Interface, across_plane, fresnel, refract
+from torchtransient.plugins.bsdfs.ior import opaque, optional_texture, relative_index, textured
 from torchtransient.plugins.parameter_effect import ParameterEffect, declare_effects
-
-from .fresnel import fresnel, refract
-from .ior import opaque, optional_texture, relative_index, textured
-from .mueller import Interface, across_plane
 
 
 class DiffDielectric(mi.BSDF):

@@ -8,12 +8,11 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins._registry import register
+from torchtransient.plugins.bsdfs.fresnel import fresnel
+from torchtransient.plugins.bsdfs.ior import opaque, optional_texture, relative_index, specular_share, textured
 from torchtransient.plugins.node_walk import carries_derivatives
 from torchtransient.plugins.parameter_effect import VALUE, declare_effects
 from torchtransient.plugins.properties import truth
-
-from .fresnel import fresnel
-from .ior import opaque, optional_texture, relative_index, specular_share, textured
 
 
 class DiffPlastic(mi.BSDF):

@@ -7,9 +7,8 @@ from typing import Any
 import mitsuba as mi
 
 from torchtransient.plugins._registry import register
+from torchtransient.plugins.bsdfs.ior import optional_texture, specular_share
 from torchtransient.plugins.node_walk import carries_derivatives, shown_by
-
-from .ior import optional_texture, specular_share
 
 _OTHERS = ("eta", "int_ior", "ext_ior", "distribution", "sample_visible", "alpha", "alpha_u", "alpha_v")
 _DIFFUSE, _SPECULAR = "diffuse_reflectance", "specular_reflectance"

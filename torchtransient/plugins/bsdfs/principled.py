@@ -10,13 +10,12 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins._registry import register
+from torchtransient.plugins.bsdfs.ior import opaque
 from torchtransient.plugins.mitsuba_compat import LOST_AT
 from torchtransient.plugins.mitsuba_parameters import PRINCIPLED_INDEX
 from torchtransient.plugins.node_walk import attached_as, carries_derivatives
 from torchtransient.plugins.parameter_effect import declare_effects
 from torchtransient.plugins.properties import number
-
-from .ior import opaque
 
 # How a weight is read by the BSDF of Mitsuba that is asked.
 AS_IT_IS, BESIDE_ITS_END, AWAY_FROM_ITS_END = "as it is", "beside its end", "away from its end"

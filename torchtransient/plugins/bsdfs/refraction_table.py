@@ -13,11 +13,11 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.errors import SceneError
+from torchtransient.plugins.kernel_arrays import PointerTable
 from torchtransient.plugins.mitsuba_compat import has_equal_sides
 from torchtransient.plugins.node_walk import bsdfs_below as bsdfs_below
 from torchtransient.plugins.node_walk import bsdfs_of_scene as bsdfs_of_scene
 from torchtransient.plugins.parameter_effect import class_of
-from torchtransient.plugins.pointer_table import PointerTable
 
 
 class RefractiveBSDFs:

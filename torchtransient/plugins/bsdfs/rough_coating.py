@@ -11,8 +11,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .fresnel import fresnel, refract
-from .microfacet import normal_density, smith_g1_over_cos
+from torchtransient.plugins.bsdfs.fresnel import fresnel, refract
+from torchtransient.plugins.bsdfs.microfacet import normal_density, smith_g1_over_cos
 
 ENTRIES = 64
 """Entries of a table, equally spaced in the cosine of the angle of incidence from 0 to 1."""

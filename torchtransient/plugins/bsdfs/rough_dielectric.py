@@ -9,13 +9,11 @@ import mitsuba as mi
 
 from torchtransient.errors import SceneError
 from torchtransient.plugins._registry import register
+from torchtransient.plugins.bsdfs.fresnel import Interface, across_plane, fresnel, refract
+from torchtransient.plugins.bsdfs.ior import opaque, optional_texture, relative_index, textured
+from torchtransient.plugins.bsdfs.microfacet import ALPHA_MIN, half_vector, normal_density, smith_g1_over_cos
 from torchtransient.plugins.parameter_effect import ParameterEffect, declare_effects
 from torchtransient.plugins.properties import truth
-
-from .fresnel import fresnel, refract
-from .ior import opaque, optional_texture, relative_index, textured
-from .microfacet import ALPHA_MIN, half_vector, normal_density, smith_g1_over_cos
-from .mueller import Interface, across_plane
 
 _DISTRIBUTIONS = {"ggx": True, "beckmann": False}
 

@@ -9,14 +9,13 @@ import mitsuba as mi
 
 from torchtransient.errors import SceneError
 from torchtransient.plugins._registry import register
+from torchtransient.plugins.bsdfs.fresnel import fresnel
+from torchtransient.plugins.bsdfs.ior import opaque, optional_texture, relative_index, specular_share, textured
+from torchtransient.plugins.bsdfs.microfacet import half_vector, normal_density, smith_g1_over_cos
+from torchtransient.plugins.bsdfs.rough_coating import external_transmittance, internal_reflectance, look_up
 from torchtransient.plugins.node_walk import attached_as, carries_derivatives
 from torchtransient.plugins.parameter_effect import VALUE, declare_effects
 from torchtransient.plugins.properties import number, truth
-
-from .fresnel import fresnel
-from .ior import opaque, optional_texture, relative_index, specular_share, textured
-from .microfacet import half_vector, normal_density, smith_g1_over_cos
-from .rough_coating import external_transmittance, internal_reflectance, look_up
 
 _DISTRIBUTIONS = {"ggx": True, "beckmann": False}
 _ALPHA_MIN = 1e-4  # Mitsuba's

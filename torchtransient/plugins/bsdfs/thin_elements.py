@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins._registry import register
-from torchtransient.plugins.bsdfs.mueller import two_by_two
+from torchtransient.plugins.bsdfs.fresnel import two_by_two
 from torchtransient.plugins.polarized import rotate_mueller, rotation_along
 from torchtransient.plugins.properties import truth
 

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from torchtransient.plugins.host_numbers import host_numbers
+from torchtransient.plugins.kernel_arrays import host_numbers
+from torchtransient.plugins.mitsuba_compat import mesh_faces, mesh_positions
 
 # Creases flatter than this are no outline: 1 minus the cosine of 1.4e-3 radians.
 FLAT = 1e-6
@@ -36,8 +37,8 @@ class Triangles:
     @staticmethod
     def of(meshes: list[Any]) -> Triangles:
         """Those of Mitsuba meshes, as they are now."""
-        v = [host_numbers(m.vertex_positions_buffer(), np.float32).reshape(-1, 3) for m in meshes]
-        f = [np.array(m.faces_buffer(), dtype=np.int64).reshape(-1, 3) for m in meshes]
+        v = [host_numbers(mesh_positions(m), np.float32).reshape(-1, 3) for m in meshes]
+        f = [np.array(mesh_faces(m), dtype=np.int64).reshape(-1, 3) for m in meshes]
         first = np.cumsum([0, *(len(one) for one in v)])
         mesh = np.repeat(np.arange(len(f)), [len(one) for one in f])
         positions = np.concatenate([np.zeros((0, 3), np.float32), *v])

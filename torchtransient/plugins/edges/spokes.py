@@ -10,8 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from torchtransient.plugins.host_numbers import whole_numbers
-from torchtransient.plugins.pointer_table import PointerTable
+from torchtransient.plugins.kernel_arrays import PointerTable, whole_numbers
 from torchtransient.plugins.transport.strategy import Local
 
 

@@ -14,13 +14,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from torchtransient.plugins.cache import Cache
 from torchtransient.plugins.edges.joined import edge_keys, joined_places, near_places
 from torchtransient.plugins.edges.spokes import Spokes
-from torchtransient.plugins.host_numbers import host_numbers, whole_numbers
-from torchtransient.plugins.mitsuba_compat import is_instance, lacks_edges
+from torchtransient.plugins.kernel_arrays import host_numbers, registry_number, whole_numbers
+from torchtransient.plugins.mitsuba_compat import is_instance, lacks_edges, mesh_faces, mesh_positions
 from torchtransient.plugins.node_walk import members_of, shapes_of_scene, shown_by
-from torchtransient.plugins.pointer_table import registry_number
-from torchtransient.plugins.remembered import Remembered
 
 # Flags of a row: a second face; seen from between its faces alone; listed for the other face's vertices, too; faces of
 # two bodies.
@@ -52,7 +51,7 @@ class Body:
 
     def vertices(self, index: Any) -> Any:
         """Vertices of a mesh (Point3f) by their numbers, attached."""
-        return self._to_world(dr.gather(mi.Point3f, self.shape.vertex_positions_buffer(), index))
+        return self._to_world(dr.gather(mi.Point3f, mesh_positions(self.shape), index))
 
     def limbs(self) -> list[tuple[int, int]]:
         """Kinds of the rows of a shape that is no mesh, and numbers of the ellipsoids that they are of."""
@@ -117,8 +116,8 @@ def _halves(joined: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 def _numbers_of(mesh: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Vertices (V, 3) and faces (F, 3) of a mesh as they are now, and which faces have an area (F,)."""
-    positions = host_numbers(mesh.vertex_positions_buffer(), np.float32).reshape(-1, 3)
-    faces = np.array(mesh.faces_buffer(), np.int64).reshape(-1, 3)
+    positions = host_numbers(mesh_positions(mesh), np.float32).reshape(-1, 3)
+    faces = np.array(mesh_faces(mesh), np.int64).reshape(-1, 3)
     corners = positions.astype(np.float64)[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return positions, faces, np.any(normals != 0, axis=1)
@@ -282,14 +281,14 @@ class Topology:
         return dr.concat([dr.full(mi.Float, float(m), n) for m, (_, n) in zip(moves, self._runs, strict=True)])
 
 
-def topology_of(scene: Any, memory: Remembered, hides: Callable[[Any], bool] | None = None) -> Topology:
+def topology_of(scene: Any, memory: Cache, hides: Callable[[Any], bool] | None = None) -> Topology:
     """Return the :class:`Topology` of a scene as it is now, kept in ``memory``."""
     meshes = [shape for shape in shapes_of_scene(scene) if shape.is_mesh()]
     sizes = np.array([(mesh.vertex_count(), mesh.face_count()) for mesh in meshes], np.int64).tobytes()
-    found = memory.of("edges", sizes, lambda: Topology(scene, hides))
+    found = memory.get("edges", sizes, lambda: Topology(scene, hides))
     if (areas := found.areas()) == found.areas_at_first:
         return found
-    return memory.of("edges", sizes + areas, lambda: Topology(scene, hides))
+    return memory.get("edges", sizes + areas, lambda: Topology(scene, hides))
 
 
 def bodies_of(scene: Any) -> list[Body]:

@@ -10,10 +10,10 @@ import numpy as np
 
 from torchtransient.errors import UnitError
 from torchtransient.plugins._registry import register
-from torchtransient.plugins.finite_values import numbers_of
 from torchtransient.plugins.mitsuba_compat import NUMBERS
 from torchtransient.plugins.node_walk import shown_by
 from torchtransient.plugins.parameter_effect import ANY_KEY, VALUE, ParameterEffect, declare_effects
+from torchtransient.plugins.properties import numbers_of
 from torchtransient.plugins.spectral_colours import keeps_coefficients
 
 

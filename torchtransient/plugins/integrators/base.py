@@ -27,10 +27,10 @@ from torchtransient.plugins.sensors.origin import (
     index_at_sensor,
     meter_normal,
     sample_rays,
+    sensor_rotation,
     start_at_sensor,
     views,
 )
-from torchtransient.plugins.sensors.stokes_frame import sensor_rotation
 from torchtransient.plugins.transport.boundary.moving_edges import MovingEdges, missing
 from torchtransient.plugins.transport.contents import SceneContents
 from torchtransient.plugins.transport.derivative.forward import propagate_tangents

@@ -22,7 +22,7 @@ class TransientPath(TransientIntegrator):
     Parameters as in :class:`TransientIntegrator`. The optical path length is counted from the sensor's origin, segment
     by segment between hit points, each times the index of refraction it runs through; light from environment and
     directional emitters arrives as plane waves that leave the sphere around the scene at t = 0 (see
-    ``plugins/sampling/distant.py``).
+    ``plugins/sampling/lights.py``).
 
     Gradients: reverse mode walks every path backwards over a record in thread-local memory, forward mode carries
     tangents along; both include the time of flight. Where a parameter moves edges, what they hide and uncover is part

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.polarized import rotation_tangent
-from torchtransient.plugins.sensors.stokes_frame import sensor_rotation
+from torchtransient.plugins.sensors.origin import sensor_rotation
 from torchtransient.plugins.transport.carry import Carry
 from torchtransient.plugins.transport.derivative.forward import tangents_of
 

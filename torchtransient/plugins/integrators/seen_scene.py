@@ -10,7 +10,7 @@ import mitsuba as mi
 from torchtransient.plugins.described_scene import check_scene, described
 from torchtransient.plugins.node_walk import objects_below, shapes_of_scene
 from torchtransient.plugins.parameters import ParameterTracker
-from torchtransient.plugins.sampling.distant import DistantReference
+from torchtransient.plugins.sampling.lights import DistantReference
 from torchtransient.plugins.transport.contents import SceneContents
 
 

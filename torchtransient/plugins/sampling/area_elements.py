@@ -27,8 +27,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from torchtransient.plugins.host_numbers import host_numbers
-from torchtransient.plugins.mitsuba_compat import has_surface
+from torchtransient.plugins.kernel_arrays import host_numbers
+from torchtransient.plugins.mitsuba_compat import has_surface, mesh_faces, mesh_normals, mesh_positions
 from torchtransient.plugins.node_walk import shown_by
 from torchtransient.plugins.parameter_effect import class_of
 
@@ -172,8 +172,8 @@ def _rows_of(shape: Any) -> tuple[np.ndarray, int, np.ndarray, np.ndarray] | Non
 
 
 def _triangles(mesh: Any) -> tuple[np.ndarray, int, np.ndarray, np.ndarray]:
-    v = host_numbers(mesh.vertex_positions_buffer()).reshape(-1, 3)
-    f = np.array(mesh.faces_buffer(), dtype=np.int64).reshape(-1, 3)
+    v = host_numbers(mesh_positions(mesh)).reshape(-1, 3)
+    f = np.array(mesh_faces(mesh), dtype=np.int64).reshape(-1, 3)
     o, e1, e2 = v[f[:, 0]], v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]]
     n = np.cross(e1, e2)
     twice = np.linalg.norm(n, axis=1)
@@ -192,14 +192,14 @@ def _corner_normals(mesh: Any, faces: np.ndarray) -> np.ndarray | None:
     """The normals at the corners of the triangles (F, 3, 3), None where there are none but those of their planes."""
     if mesh.has_face_normals() or not mesh.has_vertex_normals():
         return None
-    return host_numbers(mesh.vertex_normals_buffer()).reshape(-1, 3)[faces]
+    return host_numbers(mesh_normals(mesh)).reshape(-1, 3)[faces]
 
 
 def has_shading_normals(shape: Any) -> bool:
     """Whether the normals at the corners of some triangle are not those of one side of its plane."""
     if not shape.is_mesh():
         return False
-    at_corners = _corner_normals(shape, np.array(shape.faces_buffer(), dtype=np.int64).reshape(-1, 3))
+    at_corners = _corner_normals(shape, np.array(mesh_faces(shape), dtype=np.int64).reshape(-1, 3))
     if at_corners is None:
         return False
     _, _, area, n = _triangles(shape)

@@ -20,10 +20,10 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient.plugins.bsdfs.refraction_table import boundaries_of, index_of
-from torchtransient.plugins.kept import Kept
+from torchtransient.plugins.cache import Cache
+from torchtransient.plugins.kernel_arrays import PointerTable
 from torchtransient.plugins.mitsuba_compat import has_surface, is_distant, is_instance
 from torchtransient.plugins.node_walk import shapes_of_scene
-from torchtransient.plugins.pointer_table import PointerTable
 from torchtransient.plugins.sensors.origin import sensors_of
 
 # Lines per sensor: half of them along its rays.
@@ -60,7 +60,7 @@ class Surroundings:
         self._film, self._aperture = (mi.Point2f(*map(mi.Float, rng.random((2, LINES)))) for _ in range(2))
         around = rng.normal(size=(3, LINES))
         self._around = mi.Vector3f(*map(mi.Float, around / np.linalg.norm(around, axis=0)))
-        self._kept_levels = Kept(_bodies(shapes, bsdfs) + _with_shapes(self._sensors))
+        self._cache = Cache(_bodies(shapes, bsdfs) + _with_shapes(self._sensors))
 
     @staticmethod
     def of(scene: Any, sensor: Any, bsdfs: list[Any]) -> Surroundings | None:
@@ -73,7 +73,7 @@ class Surroundings:
         of loops, with gradients enabled.
         """
         count = len(self._leaves)
-        levels = self._kept_levels.get(lambda: self._levels(scene), also=self._crops())
+        levels = self._cache.get("levels", self._crops(), lambda: self._levels(scene))
         found = []
         for number in range(len(self._sensors)):
             pairs = zip(self._leaves, levels[number * count : (number + 1) * count], strict=True)
@@ -86,10 +86,10 @@ class Surroundings:
             found.append(index)
         return found
 
-    def _crops(self) -> list[Any]:
-        """Which part of its film each sensor looks through."""
+    def _crops(self) -> tuple[tuple[int, ...], ...]:
+        """Return the part of its film that each sensor looks through."""
         films = (sensor.film() for sensor in self._sensors)
-        return [[*film.size(), *film.crop_size(), *film.crop_offset()] for film in films]
+        return tuple((*film.size(), *film.crop_size(), *film.crop_offset()) for film in films)
 
     def _levels(self, scene: Any) -> list[Any]:
         """For each sensor and material how many bodies around each other the sensor is in, -1 for outside of one that

@@ -10,6 +10,7 @@ import numpy as np
 
 from torchtransient.errors import SceneError
 from torchtransient.plugins._registry import register
+from torchtransient.plugins.mitsuba_compat import mesh_of_arrays
 
 
 def mesh_arrays(props: Any) -> Any:
@@ -35,19 +36,10 @@ def mesh_arrays(props: Any) -> Any:
     # As Mitsuba's own meshes: vertices are kept in world space, and a transform that mirrors turns the normals around.
     transform = np.array(props.get("to_world", mi.ScalarTransform4f()).matrix, dtype=np.float64)
     placed = vertices @ transform[:3, :3].T + transform[:3, 3]
-    mesh = mi.Mesh(props.id(), len(placed), len(faces), props, normals is not None, texcoords is not None)
-    params = mi.traverse(mesh)
-    params["vertex_positions"] = mi.Float(np.ravel(placed).astype(np.float32))
-    params["faces"] = mi.UInt32(np.ravel(faces).astype(np.uint32))
-    if texcoords is not None:
-        params["vertex_texcoords"] = mi.Float(np.ravel(texcoords).astype(np.float32))
-    if normals is not None:
-        if "to_world" in props:
-            normals = normals @ np.linalg.inv(transform[:3, :3])
-            normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(np.float64).tiny)
-        params["vertex_normals"] = mi.Float(np.ravel(normals).astype(np.float32))
-    params.update()
-    return mesh
+    if normals is not None and "to_world" in props:
+        normals = normals @ np.linalg.inv(transform[:3, :3])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    return mesh_of_arrays(props, placed, faces, normals, texcoords)
 
 
 # Arrays of a mesh have rows of so many numbers.

@@ -9,9 +9,11 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.bsdfs.delay_table import delays_of
-from torchtransient.plugins.bsdfs.inherited import hides_lobe_probability, mirrors_matrices
+from torchtransient.plugins.bsdfs.mixtures import hides_lobe_probability, mirrors_matrices, mixtures_of
 from torchtransient.plugins.bsdfs.refraction_table import RefractiveBSDFs
+from torchtransient.plugins.cache import Cache
 from torchtransient.plugins.films.colour import StandardObserver
+from torchtransient.plugins.kernel_arrays import PointerTable
 from torchtransient.plugins.mitsuba_compat import (
     has_no_material,
     has_smooth_shape,
@@ -19,13 +21,9 @@ from torchtransient.plugins.mitsuba_compat import (
     is_flat,
     lacks_directions,
 )
-from torchtransient.plugins.mixtures import mixtures_of
 from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene, shapes_of_scene
-from torchtransient.plugins.pointer_table import PointerTable
-from torchtransient.plugins.remembered import Remembered
-from torchtransient.plugins.sampling.distant import DistantReference
-from torchtransient.plugins.sampling.shape_lights import ShapeLights
-from torchtransient.plugins.sampling.sphere_lights import SphereLights
+from torchtransient.plugins.sampling.lights import DistantReference
+from torchtransient.plugins.sampling.sphere_lights import ShapeLights, SphereLights
 from torchtransient.plugins.sensors.surroundings import Surroundings
 from torchtransient.plugins.transport.hits import DetachedHits
 from torchtransient.plugins.transport.instances import Instances
@@ -91,7 +89,7 @@ class SceneContents:
         self.untraceable = [emitter.id() for emitter in scene.emitters() if lacks_directions(emitter)]
         self.observer = StandardObserver.of_variant()
         # What was computed of the scene as it was: renders of one that stays as it is begin sooner.
-        self.memory = Remembered()
+        self.memory = Cache()
         self._built = True
 
     def hidden_from_mitsuba(self) -> AbstractContextManager[None]:

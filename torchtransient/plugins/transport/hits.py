@@ -14,9 +14,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins.kernel_arrays import PointerTable
 from torchtransient.plugins.mitsuba_compat import leaves_hits_detached, misplaces_hits
 from torchtransient.plugins.node_walk import shapes_of_scene, shown_by
-from torchtransient.plugins.pointer_table import PointerTable
 
 # Numbers per ellipsoid: centre, semi-axes, quaternion. Per control point of a curve: place, radius.
 _ELLIPSOID, _POINT = 10, 4

@@ -15,9 +15,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from torchtransient.plugins.kernel_arrays import registry_number
 from torchtransient.plugins.mitsuba_compat import attached_distance, is_instance
 from torchtransient.plugins.node_walk import shown_by
-from torchtransient.plugins.pointer_table import registry_number
 from torchtransient.plugins.transport.hits import HitTable
 
 # Entries of a matrix; the table holds it and its inverse, so that no lane inverts matrices.

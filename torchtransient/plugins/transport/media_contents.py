@@ -8,8 +8,8 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.errors import GradientError
+from torchtransient.plugins.bsdfs.mixtures import mixtures_of
 from torchtransient.plugins.mitsuba_compat import is_instance
-from torchtransient.plugins.mixtures import mixtures_of
 from torchtransient.plugins.node_walk import shapes_of_scene
 
 

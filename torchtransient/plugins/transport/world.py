@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.errors import SceneError
-from torchtransient.plugins.sampling.light_box import LightBox
+from torchtransient.plugins.sampling.lights import LightBox
 from torchtransient.plugins.transport.instances import AttachedSurfaces
 from torchtransient.plugins.transport.sinks.record import record_room
 

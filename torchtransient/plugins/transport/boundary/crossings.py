@@ -17,9 +17,8 @@ import numpy as np
 from torchtransient.plugins.edges.joined import joined_places, merged
 from torchtransient.plugins.edges.table import BESIDE
 from torchtransient.plugins.edges.topology import BALL, DISK_RIM, Body, bodies_of
-from torchtransient.plugins.host_numbers import floats, host_numbers
-from torchtransient.plugins.mitsuba_compat import bounds_of
-from torchtransient.plugins.pointer_table import registry_number
+from torchtransient.plugins.kernel_arrays import floats, host_numbers, registry_number
+from torchtransient.plugins.mitsuba_compat import bounds_of, mesh_faces, mesh_positions
 from torchtransient.plugins.transport.media_contents import is_open
 
 # How deep an edge reaches through a face at least, in parts of the largest coordinate of both bodies: edges that lie
@@ -90,10 +89,10 @@ def _triangles(body: Body) -> tuple[np.ndarray, np.ndarray]:
     if not shape.is_mesh():
         return _grid(body)
     if body.instance is None:
-        points = host_numbers(shape.vertex_positions_buffer()).reshape(-1, 3)
+        points = host_numbers(mesh_positions(shape)).reshape(-1, 3)
     else:
         points = host_numbers(body.vertices(dr.arange(mi.UInt32, shape.vertex_count()))).T
-    return points, np.array(shape.faces_buffer(), np.int64).reshape(-1, 3)
+    return points, np.array(mesh_faces(shape), np.int64).reshape(-1, 3)
 
 
 def _grid(body: Body) -> tuple[np.ndarray, np.ndarray]:
@@ -138,8 +137,8 @@ def _parts(shape: Any) -> list[np.ndarray | None]:
     """Faces of the connected parts of a mesh, None for all: Mitsuba merges rectangles of one material."""
     if not shape.is_mesh() or not 0 < shape.face_count() <= _MOST_SPLIT:
         return [None]
-    faces = np.array(shape.faces_buffer(), np.int64).reshape(-1, 3)
-    joined = joined_places(host_numbers(shape.vertex_positions_buffer(), np.float32).reshape(-1, 3), faces)
+    faces = np.array(mesh_faces(shape), np.int64).reshape(-1, 3)
+    joined = joined_places(host_numbers(mesh_positions(shape), np.float32).reshape(-1, 3), faces)
     label = merged(joined, int(joined.max()) + 1)[joined[:, 0]]
     numbers = np.unique(label)
     return [np.flatnonzero(label == k) for k in numbers] if 1 < len(numbers) <= _MOST_PARTS else [None]

@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient.plugins.edges.topology import Body
-from torchtransient.plugins.host_numbers import host_numbers
+from torchtransient.plugins.kernel_arrays import host_numbers
 from torchtransient.plugins.mitsuba_compat import (
     attribute_name,
     has_limb,
@@ -22,11 +22,13 @@ from torchtransient.plugins.mitsuba_compat import (
     is_instance,
     is_sphere,
     lacks_edges,
+    mesh_faces,
+    mesh_positions,
     near_clip,
 )
 from torchtransient.plugins.node_walk import bsdfs_of_scene, objects_below, shapes_of_scene
 from torchtransient.plugins.parameter_effect import CORRECT, ParameterEffect
-from torchtransient.plugins.sampling.sun import MovingSun
+from torchtransient.plugins.sampling.lights import MovingSun
 from torchtransient.plugins.sensors.seen_from import SensorPlaces, can_be_connected, has_eye, sees_one_line
 from torchtransient.plugins.transport.boundary.crossings import crossing_bodies
 from torchtransient.plugins.transport.media_contents import is_open
@@ -251,8 +253,8 @@ def _is_plane(shape: Any) -> bool:
 
 
 def _number_of_planes(mesh: Any) -> int:
-    faces = np.array(mesh.faces_buffer()).reshape(-1, 3)
-    p = host_numbers(mesh.vertex_positions_buffer(), np.float64).reshape(-1, 3)[faces]
+    faces = np.array(mesh_faces(mesh)).reshape(-1, 3)
+    p = host_numbers(mesh_positions(mesh), np.float64).reshape(-1, 3)[faces]
     n = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
     n /= np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-30)
     offset = (n * p[:, 0]).sum(1, keepdims=True) / max(np.abs(p).max(), 1e-30)

@@ -61,7 +61,7 @@ class BoundaryTerm:
 
     def __init__(self, integrator, world, sensor, film, seed, samples, names=tuple(PASSES)):
         self.integrator, self.world, self.sensor, self.film = integrator, world, sensor, film
-        self._sampler = world.contents.memory.of("sampler", b"", lambda: mi.load_dict({"type": "independent"}))
+        self._sampler = world.contents.memory.get("sampler", b"", lambda: mi.load_dict({"type": "independent"}))
         scene, wanted = world.scene, world.wanted
         views_move = wanted.sensor or wanted.light
         # A sensor at rest sees the edges of what moves alone; behind an edge at rest something else may move.

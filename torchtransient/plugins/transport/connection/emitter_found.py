@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.polarized import first_column, product, scatter_unpolarized
-from torchtransient.plugins.sampling.sun import MovingSun
+from torchtransient.plugins.sampling.lights import MovingSun
 from torchtransient.plugins.transport.carry import slope_only
 from torchtransient.plugins.transport.strategy import Connection, Event, EventTerm, mis_weight
 

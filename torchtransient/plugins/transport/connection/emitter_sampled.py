@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from torchtransient.plugins.node_walk import carries_derivatives
 from torchtransient.plugins.polarized import intensity, product, scatter_unpolarized
-from torchtransient.plugins.sampling.sun import MovingSun
+from torchtransient.plugins.sampling.lights import MovingSun
 from torchtransient.plugins.transport.carry import slope_only
 from torchtransient.plugins.transport.scattering.geometry_terms import (
     damped_motion,

@@ -19,7 +19,7 @@ from torchtransient.plugins.polarized import (
     rotation_from_light,
     rotation_to_sensor,
 )
-from torchtransient.plugins.sampling.packed import packed_columns
+from torchtransient.plugins.sampling.hidden_elements import packed_columns
 from torchtransient.plugins.transport.carry import slope_only
 from torchtransient.plugins.transport.strategy import Connection, Event, EventTerm, Local, Proposal
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.sampling.ray_offsets import past
+from torchtransient.plugins.sampling.rays import past
 from torchtransient.plugins.transport.media_contents import is_open
 
 # Streams of random numbers that start from the same number must differ.

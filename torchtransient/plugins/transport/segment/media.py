@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.polarized import attenuated
-from torchtransient.plugins.sampling.ray_offsets import shortest
+from torchtransient.plugins.sampling.rays import shortest
 from torchtransient.plugins.transport.derivative.vertex import VertexEnd
 from torchtransient.plugins.transport.instances import distance_to, surface_interaction
 from torchtransient.plugins.transport.media_contents import FlightSettings

@@ -12,9 +12,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from torchtransient.plugins.host_numbers import whole_numbers
-from torchtransient.plugins.mitsuba_compat import has_vertices
-from torchtransient.plugins.pointer_table import PointerTable
+from torchtransient.plugins.kernel_arrays import PointerTable, whole_numbers
+from torchtransient.plugins.mitsuba_compat import has_vertices, mesh_faces, mesh_positions
 from torchtransient.plugins.sampling.area_elements import has_shading_normals
 from torchtransient.plugins.transport.strategy import Local
 
@@ -31,13 +30,13 @@ class AttachedTriangles:
         self.holds_all = moving <= {mesh.ptr for mesh in meshes}
         corners, starts, vertices, faces = [], [], 0, 1
         for mesh in meshes:
-            corners.append(np.array(mesh.faces_buffer(), dtype=np.int64) + vertices)
+            corners.append(np.array(mesh_faces(mesh), dtype=np.int64) + vertices)
             starts.append(faces)
             vertices, faces = vertices + mesh.vertex_count(), faces + mesh.face_count()
         # Shapes that are not listed begin at 0.
         self.starts = PointerTable(meshes, starts) if meshes else None
         self.corners = whole_numbers(np.concatenate(corners)) if meshes else None
-        self.vertices = _joined([mesh.vertex_positions_buffer() for mesh in meshes])
+        self.vertices = _joined([mesh_positions(mesh) for mesh in meshes])
 
     def tables(self) -> list[Any]:
         """What is attached."""
@@ -63,7 +62,7 @@ class AttachedTriangles:
 
 
 def _is_listed(shape: Any) -> bool:
-    return has_vertices(shape) and dr.grad_enabled(shape.vertex_positions_buffer()) and not has_shading_normals(shape)
+    return has_vertices(shape) and dr.grad_enabled(mesh_positions(shape)) and not has_shading_normals(shape)
 
 
 def _joined(buffers: list[Any]) -> Any:

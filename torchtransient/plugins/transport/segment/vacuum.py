@@ -7,7 +7,7 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.sampling.visible_lights import behind_area_lights
+from torchtransient.plugins.sampling.rays import behind_area_lights
 from torchtransient.plugins.transport.carry import slope_only
 from torchtransient.plugins.transport.contents import DAMPING
 from torchtransient.plugins.transport.derivative.vertex import AttachedVertex, VertexEnd

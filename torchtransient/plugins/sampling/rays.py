@@ -1,11 +1,31 @@
-"""Light sources that the sensor must not see (``hide_emitters``)."""
+"""Rays to lights: how far they start from a surface, and what they meet."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.sampling.ray_offsets import past
+# -------------------------------------------------------- distances along rays that single precision can tell from none
+
+# Of the largest coordinate: a few ulp.
+SHORTEST = 1e-6
+
+
+def past(p: Any) -> Any:
+    """How far behind a hit ``p`` a ray goes on, so that it does not meet the same surface again. Mitsuba's own rays
+    start as far off a surface.
+    """
+    return (1 + dr.max(dr.abs(p))) * mi.math.RayEpsilon
+
+
+def shortest(o: Any) -> Any:
+    """The shortest distance from ``o`` to a point that has a direction seen from there."""
+    return (1 + dr.max(dr.abs(o))) * SHORTEST
+
+
+# ------------------------------------------------------- light sources that the sensor must not see (``hide_emitters``)
 
 
 @dr.syntax

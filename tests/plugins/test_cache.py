@@ -8,8 +8,8 @@ import pytest
 
 from support.plain_scenes import as_mitsuba
 from torchtransient import plugins
+from torchtransient.plugins.cache import Cache
 from torchtransient.plugins.frozen_state import arrays_below
-from torchtransient.plugins.kept import Kept
 from torchtransient.scenes import cornell_box
 
 
@@ -45,74 +45,74 @@ def moved(params, key):
 @pytest.mark.parametrize("key", ["red-wall.to_world", "small-box.vertex_positions", "sensor.x_fov"])
 def test_replaced_numbers(key):
     scene, compute = box(), Counted()
-    kept, params = Kept([*scene.shapes(), *scene.sensors()]), mi.traverse(scene)
-    assert [kept.get(compute) for _ in range(3)] == [1, 1, 1]
+    cache, params = Cache([*scene.shapes(), *scene.sensors()]), mi.traverse(scene)
+    assert [cache.get("", None, compute) for _ in range(3)] == [1, 1, 1]
     params[key] = moved(params, key)
     params.update()
-    assert [kept.get(compute) for _ in range(3)] == [2, 2, 2]
+    assert [cache.get("", None, compute) for _ in range(3)] == [2, 2, 2]
     # Others have nothing to do with it.
     scene.integrator().render(scene, spp=1)
     params["red.reflectance.value"] = params["red.reflectance.value"] * 0.5
     params.update()
-    assert kept.get(compute) == 2
+    assert cache.get("", None, compute) == 2
 
 
 def test_array_that_is_written_in_place():
     scene, compute = box(), Counted()
-    kept, params = Kept(scene.shapes()), mi.traverse(scene)
-    kept.get(compute)
+    cache, params = Cache(scene.shapes()), mi.traverse(scene)
+    cache.get("", None, compute)
     positions = params["small-box.vertex_positions"]
     dr.scatter(positions, mi.Float(3), mi.UInt32(0))
     params["small-box.vertex_positions"] = positions
     params.update()
-    assert kept.get(compute) == 2
+    assert cache.get("", None, compute) == 2
 
 
 def test_attached_numbers_are_the_same_numbers():
     """Where derivatives are asked for is no other state of the scene; the value is detached."""
     scene, compute = box(), Counted()
-    kept, params = Kept(scene.shapes()), mi.traverse(scene)
-    kept.get(compute)
+    cache, params = Cache(scene.shapes()), mi.traverse(scene)
+    cache.get("", None, compute)
     dr.enable_grad(params["small-box.vertex_positions"])
-    assert kept.get(compute) == 1
+    assert cache.get("", None, compute) == 1
 
 
 def test_plugins_written_in_python_show_their_numbers_anew():
     """A film's layout is a plain number of its own."""
     scene, compute = box(), Counted()
     film = scene.sensors()[0].film()
-    kept = Kept([film])
-    kept.get(compute)
-    assert kept.get(compute) == 1
+    cache = Cache([film])
+    cache.get("", None, compute)
+    assert cache.get("", None, compute) == 1
     film.start_opl = 0.5
-    assert kept.get(compute) == 2
+    assert cache.get("", None, compute) == 2
 
 
 def test_plain_numbers_that_count_too():
-    compute, kept = Counted(), Kept([])
-    assert [kept.get(compute, also=also) for also in ([1, 2], [1, 2], [1, 3])] == [1, 1, 2]
+    compute, cache = Counted(), Cache([])
+    assert [cache.get("", also, compute) for also in ((1, 2), (1, 2), (1, 3))] == [1, 1, 2]
 
 
 def test_nothing_is_kept_of_a_computation_that_failed():
     def fail():
         raise ValueError("no")
 
-    compute, kept = Counted(), Kept([])
+    compute, cache = Counted(), Cache([])
     with pytest.raises(ValueError, match="no"):
-        kept.get(fail)
-    assert kept.get(compute) == 1
+        cache.get("", None, fail)
+    assert cache.get("", None, compute) == 1
 
 
 def test_recordings_compute_for_themselves():
-    compute, kept = Counted(), Kept([])
-    kept.get(compute)
+    compute, cache = Counted(), Cache([])
+    cache.get("", None, compute)
     with dr.scoped_set_flag(dr.JitFlag.FreezingScope, True):
-        assert [kept.get(compute), kept.get(compute)] == [2, 3]
-    assert kept.get(compute) == 1
+        assert [cache.get("", None, compute), cache.get("", None, compute)] == [2, 3]
+    assert cache.get("", None, compute) == 1
 
 
 def test_what_is_held_is_no_state_of_kernels():
     scene = box()
-    kept = Kept(scene.shapes())
-    kept.get(lambda: mi.Float(1, 2))
-    assert arrays_below([kept]) == []
+    cache = Cache(scene.shapes())
+    cache.get("", None, lambda: mi.Float(1, 2))
+    assert arrays_below([cache]) == []
