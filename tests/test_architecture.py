@@ -22,10 +22,9 @@ PACKAGE = Path(torchtransient.__file__).parent
 TESTS = Path(__file__).parent
 BENCHMARKS = sorted((TESTS.parent / "benchmarks").glob("*.py"))
 LEVEL = {
-    "errors": 0, "_llvm": 0, "_collection": 0, "units": 0, "axes": 0, "capture": 0, "interfaces": 0, "pulses": 0,
-    "gates": 0, "stokes": 0, "tensor_record": 0, "quantities": 0, "volume_methods": 0,
-    "transform_bins": 0, "plain_texts": 0, "file_places": 0, "free_memory": 0, "array_files": 0,
-    "floating": 0, "scalar_state": 0, "given_types": 0, "argument_names": 0,
+    "errors": 0, "_llvm": 0, "_collection": 0, "checks": 0, "units": 0, "axes": 0, "capture": 0, "interfaces": 0,
+    "pulses": 0, "gates": 0, "stokes": 0, "tensor_record": 0, "floating": 0, "volume_methods": 0, "transform_bins": 0,
+    "plain_texts": 0, "array_files": 0,
     "plugins": 1, "sensing": 1, "reconstruction": 1, "losses": 1, "metrics": 1, "vis": 1,
     "parametrize": 1, "geometry": 1,
     "scenes": 2,
@@ -41,16 +40,12 @@ FORBIDDEN = {
     "plugins": {"torch", "kornia"},
     "scenes": {"torch", "kornia", *MITSUBA},
     "errors": {"torch", *MITSUBA},
-    "argument_names": {"torch", *MITSUBA},
-    "given_types": {"torch", *MITSUBA},
+    "checks": {"torch", *MITSUBA},
     "volume_methods": {"torch", *MITSUBA},
     "transform_bins": {"torch", *MITSUBA},
     "plain_texts": {"torch", *MITSUBA},
-    "free_memory": {"torch", *MITSUBA},
-    "file_places": {"torch", *MITSUBA},
     "array_files": MITSUBA,
     "floating": MITSUBA,
-    "scalar_state": MITSUBA,
     "units": MITSUBA,
     "axes": MITSUBA,
     "capture": MITSUBA,
@@ -169,19 +164,15 @@ def violations(path, package=PACKAGE):
 def is_below(other, room):
     if LEVEL[other] != LEVEL[room]:
         return LEVEL[other] < LEVEL[room]
-    # Within a level: `accuracy` quotes the statistics of `testing`, and everything may know errors and units;
+    # Within a level: `accuracy` quotes the statistics of `testing`, and everything may know errors, checks and units;
     # likelihoods are those of the sensors; metrics read results as losses do, and volumes; captures are records with
-    # axes; simulated ones have files, data sets both; rows of numbers are given alike.
+    # axes; simulated ones have files, data sets both.
     within = {
         ("accuracy", "testing"), ("gates", "pulses"), ("losses", "sensing"), ("capture", "axes"),
-        ("capture", "tensor_record"), ("capture", "quantities"), ("nlos", "files"), ("data", "files"), ("data", "nlos"),
-        ("floating", "quantities"), ("metrics", "losses"), ("metrics", "reconstruction"), ("axes", "quantities"),
-        ("gates", "quantities"), ("pulses", "quantities"), ("capture", "argument_names"),
-        ("array_files", "quantities"), ("array_files", "plain_texts"), ("array_files", "free_memory"),
-        ("units", "quantities"), ("stokes", "quantities"), ("given_types", "quantities"), ("pulses", "given_types"),
-        ("array_files", "file_places"), ("plain_texts", "file_places"), ("file_places", "quantities"),
+        ("capture", "tensor_record"), ("nlos", "files"), ("data", "files"), ("data", "nlos"), ("metrics", "losses"),
+        ("metrics", "reconstruction"), ("array_files", "plain_texts"),
     }  # fmt: skip
-    return other in {"errors", "units"} or (room, other) in within
+    return other in {"errors", "checks", "units"} or (room, other) in within
 
 
 @together("path", FILES, dotted)
@@ -417,7 +408,7 @@ PYTHONS = {
 # Bare errors of Python that are raised on purpose, by file, and who takes them.
 BARE = {
     "__init__.py": {"AttributeError"},  # the protocol of modules
-    "argument_names.py": {"TypeError"},  # a wrong keyword argument, as Python says it
+    "checks.py": {"TypeError"},  # a wrong keyword argument, as Python says it
     "capture/capture.py": {"TypeError"},  # caught where tensors are made, and told
     "capture/metadata.py": {"TypeError"},  # caught by its callers, who know the file
     "data/augmentation/augmented.py": {"AttributeError"},  # the protocol of objects

@@ -15,8 +15,8 @@ from torchtransient.axes import TimeAxis
 from torchtransient.capture.distances import bounds_of, longest, shortest
 from torchtransient.capture.scan_checks import check_shapes, check_sides, float64_points, unit_normals
 from torchtransient.capture.wall import Wall, grid_size, triple
+from torchtransient.checks import Numbers, as_whole, flag, positive, real_array, shown
 from torchtransient.errors import ArgumentError, SceneError, ShapeError
-from torchtransient.quantities import Numbers, as_whole, flag, positive, real_array, shown
 from torchtransient.tensor_record import same
 
 # Kinds of a regular grid; "pairs" are given point by point.

@@ -15,9 +15,8 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from torchtransient.checks import MOST, finite, flag, is_one_of, shown
 from torchtransient.errors import ArgumentError, DeviceError, ShapeError, TorchTransientError, UnitError
-from torchtransient.given_types import is_one_of
-from torchtransient.quantities import MOST, finite, flag, shown
 from torchtransient.units import SHORTEST_OPL
 
 Reduction = Literal["none", "sum", "mean"]

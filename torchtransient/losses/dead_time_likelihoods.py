@@ -12,6 +12,7 @@ import math
 import torch
 from torch import Tensor, nn
 
+from torchtransient.checks import positive
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.losses.comparison import (
     Reduction,
@@ -36,7 +37,6 @@ from torchtransient.losses.likelihoods import (
     floored,
 )
 from torchtransient.losses.results import TRANSIENT, Transient, reads
-from torchtransient.quantities import positive
 from torchtransient.sensing.dead_time.dead_time_cycle import check_dead_bins
 from torchtransient.sensing.spad.spad import exposed_cycles, first_photon_log_prob
 

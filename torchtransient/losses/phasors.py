@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.checks import shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.losses.comparison import (
     Reduction,
@@ -32,7 +33,6 @@ from torchtransient.losses.comparison import (
 )
 from torchtransient.losses.layouts import bins_dim, check_held, item_dims
 from torchtransient.losses.results import PHASOR, TRANSIENT, Phasors, Transient, reads
-from torchtransient.quantities import shown
 
 # The phasors of dark pixels are noise: relative to the mean modulus of an item, below what has a phase.
 _PHASE_FLOOR = 1e-3

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from torchtransient.checks import Numbers, shown
 from torchtransient.errors import ShapeError
 from torchtransient.losses.comparison import (
     Reduction,
@@ -22,7 +23,6 @@ from torchtransient.losses.comparison import (
     working_dtype,
 )
 from torchtransient.losses.results import VALUES, Volume, reads
-from torchtransient.quantities import Numbers, shown
 
 _DIMS = (-3, -2, -1)
 _SMOOTHING = 1e-3

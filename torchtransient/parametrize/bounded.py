@@ -7,11 +7,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchtransient.argument_names import own_init
+from torchtransient.checks import as_number, shown
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import floating, holds, number_tensor, without_autocast
 from torchtransient.parametrize.settings import Settings
-from torchtransient.quantities import as_number, shown
 
 Bound = float | Tensor
 # What single precision makes of the ends of a range, as a share of it.
@@ -117,7 +116,6 @@ class Bounded(Settings):
         return f"{_said(self.low)} to {_said(self.high)}"
 
 
-@own_init
 class Albedo(Bounded):
     """Shares of the light, 0 to 1: reflectances, transmittances, albedos of media, opacities, weights of lobes."""
 

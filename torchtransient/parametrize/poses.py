@@ -15,11 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchtransient.argument_names import own_init
+from torchtransient.checks import positive, real_array, shown
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.floating import floating, holds, number_tensor, single, without_autocast
 from torchtransient.parametrize.settings import Settings, choice_code, choice_of
-from torchtransient.quantities import positive, real_array, shown
 
 Frame = Literal["world", "local"]
 _FRAMES: tuple[str, ...] = get_args(Frame)
@@ -165,7 +164,6 @@ class _RigidPose(Settings):
         return f"frame={self.frame!r}, length_scale={self.length_scale.item():g}"
 
 
-@own_init
 class AxisAnglePose(_RigidPose):
     """Six numbers to `to_world` (..., 4, 4): `base`, turned about a point by an axis-angle vector, then moved.
 
@@ -186,7 +184,6 @@ class AxisAnglePose(_RigidPose):
     _from_matrix = staticmethod(_axis_angle_of)
 
 
-@own_init
 class SE3Pose(_RigidPose):
     """As `AxisAnglePose`, by the exponential of SE(3): turn and move at once along a screw. To first order the same;
     the six numbers are then coordinates of one motion, for Lie-algebra optimisers and interpolation of poses.

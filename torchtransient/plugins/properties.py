@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from torchtransient.checks import shown
 from torchtransient.errors import SceneError
-from torchtransient.quantities import shown
 
 # Kernels count in 32 bits.
 MOST = 2**32 - 2

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from torchtransient.capture.metadata import metadata_text
+from torchtransient.checks import shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.quantities import shown
 from torchtransient.reconstruction.voxels import VoxelGrid
 
 

@@ -10,9 +10,8 @@ import torch
 from torch import nn
 from torch.nn.utils import parametrize
 
+from torchtransient.checks import as_whole, is_one_of, real_array, shown, text
 from torchtransient.errors import ArgumentError, DeviceError, ShapeError, UnitError, UnknownKeyError
-from torchtransient.given_types import is_one_of, text
-from torchtransient.quantities import as_whole, real_array, shown
 from torchtransient.rendering.films.choice import FilmChoice
 from torchtransient.rendering.films.choices import chosen
 from torchtransient.rendering.parameters import unknown_key

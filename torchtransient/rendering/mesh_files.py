@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from torchtransient.checks import check_special
 from torchtransient.errors import SceneError
-from torchtransient.file_places import check_special
 from torchtransient.rendering.ply_faces import smallest_vertex
 from torchtransient.rendering.taken import ReadyScene
 

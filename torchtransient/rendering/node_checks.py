@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from torchtransient.checks import shown
 from torchtransient.errors import SceneError
-from torchtransient.quantities import shown
 from torchtransient.rendering.nodes import children, is_film, kind_of_node
 
 # Nodes inside of nodes, references counted. Kernels hold a call inside of a call for each, and the time to build them

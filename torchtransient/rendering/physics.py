@@ -18,10 +18,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from torchtransient.checks import is_one_of, shown
 from torchtransient.errors import ArgumentError, GradientError, GradientWarning, PhysicsError, PhysicsWarning
-from torchtransient.given_types import is_one_of
 from torchtransient.plugins.physical_ranges import SHARE, PhysicalRange
-from torchtransient.quantities import shown
 
 MODES = ("warn", "error", "ignore")
 # Light outside of the window, as a share of all light, from which on it is said.

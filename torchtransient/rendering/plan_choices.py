@@ -6,9 +6,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from torchtransient.checks import is_one_of, several, shown
 from torchtransient.errors import ArgumentError, SceneError
-from torchtransient.given_types import is_one_of, several
-from torchtransient.quantities import shown
 from torchtransient.rendering.films.choice import FilmChoice, PlannedFilm
 from torchtransient.rendering.films.choices import all_films
 from torchtransient.rendering.inventory import Finding, SceneInventory

@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from torchtransient.axes import TimeAxis
+from torchtransient.checks import is_one_of, shown
 from torchtransient.errors import ArgumentError, SceneError
-from torchtransient.given_types import is_one_of
 from torchtransient.plugins.parameters import check_slope
 from torchtransient.pulses import Pulse
-from torchtransient.quantities import shown
 from torchtransient.rendering import plan_choices as choices
 from torchtransient.rendering.build_options import BuildOptions
 from torchtransient.rendering.films.choice import FilmChoice, PlannedFilm

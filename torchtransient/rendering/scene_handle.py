@@ -9,8 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from torchtransient.checks import flag, shown
 from torchtransient.errors import ArgumentError, GradientError, SceneError
-from torchtransient.quantities import flag, shown
 from torchtransient.rendering.build import BuiltScene, build
 from torchtransient.rendering.build_options import BuildOptions
 from torchtransient.rendering.description import Description, describe_dict, describe_xml, same_description

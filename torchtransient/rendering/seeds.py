@@ -9,8 +9,8 @@ from typing import Any
 
 import torch
 
+from torchtransient.checks import as_whole, shown
 from torchtransient.errors import ShapeError, TorchTransientWarning, UnitError
-from torchtransient.quantities import as_whole, shown
 from torchtransient.rendering.physics import level_of_user
 
 SEED_RANGE = 2**32

@@ -11,9 +11,8 @@ from typing import Any
 
 import torch
 
+from torchtransient.checks import as_whole, is_one_of, shown
 from torchtransient.errors import ArgumentError, GradientError, ShapeError, UnitError
-from torchtransient.given_types import is_one_of
-from torchtransient.quantities import as_whole, shown
 from torchtransient.rendering.arguments import as_float
 from torchtransient.rendering.arrays import computable, handle
 from torchtransient.rendering.derivatives import run

@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 
 from torchtransient.capture import Scan
+from torchtransient.checks import Numbers, shown
 from torchtransient.data.recipes.distributions import checked_choices
 from torchtransient.errors import SceneError
 from torchtransient.files.content_key import content_key
-from torchtransient.quantities import Numbers, shown
 from torchtransient.rendering.description import DictDescription, Plain, XmlDescription, describe_dict
 from torchtransient.rendering.scene_handle import Scene, load
 from torchtransient.rendering.taken import ReadyScene

@@ -8,11 +8,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from torchtransient.checks import real_array, shown
 from torchtransient.errors import SceneError
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.parameter_effect import ParameterEffect, class_of, declare_effects
 from torchtransient.plugins.sensors.places_on_mesh import PlacesOnMesh
-from torchtransient.quantities import real_array, shown
 
 
 class NLOSCaptureMeter(mi.Sensor):

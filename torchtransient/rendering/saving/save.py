@@ -14,8 +14,8 @@ import torch
 
 from torchtransient import plugins
 from torchtransient.array_files.part_files import writing_said
+from torchtransient.checks import check_folder, path_of
 from torchtransient.errors import SceneError, ShapeError, TorchTransientError, UnitError
-from torchtransient.file_places import check_folder, path_of
 from torchtransient.plugins.node_walk import ShownValue, objects_below
 from torchtransient.plugins.spectral_colours import keeps_coefficients, same_spectra
 from torchtransient.plugins.unfinished import afterwards

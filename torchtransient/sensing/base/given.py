@@ -12,8 +12,8 @@ import torch
 from torch import Tensor, nn
 from torch.autograd import forward_ad
 
+from torchtransient.checks import shown
 from torchtransient.errors import GradientError, ShapeError, UnitError
-from torchtransient.quantities import shown
 
 
 def tensor_of(array: np.ndarray[Any, Any], where: str) -> Tensor:

@@ -12,8 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.errors import GradientError, ShapeError, TorchTransientError
-from torchtransient.floating import in_single
-from torchtransient.scalar_state import ScalarState
+from torchtransient.floating import ScalarState, in_single
 from torchtransient.sensing.base.given import careful_init
 from torchtransient.sensing.base.layout import TIME, check_generator
 from torchtransient.sensing.base.policies import (

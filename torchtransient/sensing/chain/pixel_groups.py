@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
+from torchtransient.checks import several
 from torchtransient.errors import ArgumentError, GradientError, ShapeError, UnitError
-from torchtransient.given_types import several
 from torchtransient.sensing.base.layout import check_transient
 from torchtransient.sensing.base.own_bins import common_bins
 from torchtransient.sensing.base.policies import GradPolicy, ScoreFunction, check_policy, record_score

@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
+from torchtransient.checks import Numbers
 from torchtransient.errors import GradientError, UnitError
 from torchtransient.floating import in_single
-from torchtransient.quantities import Numbers
 from torchtransient.sensing.base.layout import (
     TIME,
     bin_width_of,
