@@ -40,7 +40,7 @@ FORBIDDEN = {
     "plugins": {"torch", "kornia"},
     "scenes": {"torch", "kornia", *MITSUBA},
     "errors": {"torch", *MITSUBA},
-    "checks": {"torch", *MITSUBA},
+    "checks": MITSUBA,
     "volume_methods": {"torch", *MITSUBA},
     "transform_bins": {"torch", *MITSUBA},
     "plain_texts": {"torch", *MITSUBA},
@@ -424,7 +424,6 @@ BARE = {
     "plugins/transport/world.py": {"AttributeError"},
     "rendering/films/choices.py": {"KeyError"},  # caught by its callers
     "rendering/translation.py": {"RuntimeError"},  # what Mitsuba says, told by its caller with the place
-    "sensing/base/given.py": {"TypeError"},  # a wrong keyword argument, as Python says it
     "sensing/itof/itof_reading.py": {"AttributeError"},  # the protocol of objects
     "sensing/dead_time/free_running_ring.py": {"AssertionError"},  # what its own calls rule out
     "tensor_record.py": {"AttributeError"},  # the protocol of objects

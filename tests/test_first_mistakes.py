@@ -50,8 +50,8 @@ def public_classes():
 
 
 @together("name, kind", public_classes(), lambda row: row[0])
-def test_an_unknown_argument_is_said_of_the_class_that_was_called(name, kind):
-    with pytest.raises(TypeError, match=rf"^{kind.__name__}\."):
+def test_an_unknown_argument_is_a_type_error_that_names_it(name, kind):
+    with pytest.raises(TypeError, match="'no_such_argument'"):
         kind(no_such_argument=1)
 
 

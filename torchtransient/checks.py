@@ -121,7 +121,11 @@ def as_whole(value: Any) -> int | None:
         return None
     try:
         return operator.index(value)
-    except (TypeError, RuntimeError):  # torch's own, for a number without a value, as on "meta"
+    except TypeError:
+        return None
+    except RuntimeError:  # torch: uint64 has no index; tensors on "meta" and in vmap have no number
+        with contextlib.suppress(RuntimeError):
+            return int(value.item())
         return None
 
 

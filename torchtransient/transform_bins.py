@@ -1,4 +1,4 @@
-"""Discrete Fourier transforms: lengths they are fast at, and the lines that a phasor film of mitransient keeps."""
+"""Frequencies that a phasor film of mitransient keeps of a discrete Fourier transform."""
 
 from __future__ import annotations
 
