@@ -41,20 +41,6 @@ def capture():
     return tt.nlos.Capture(LIGHT.clone(), AXIS, scan)
 
 
-def public_classes():
-    for room in ("data", "losses", "metrics", "nlos", "parametrize", "sensing", "training"):
-        for name, value in vars(getattr(tt, room)).items():
-            own = inspect.isclass(value) and value.__module__.startswith("torchtransient.")
-            if own and not inspect.isabstract(value) and not getattr(value, "_is_protocol", False):
-                yield f"{room}.{name}", value
-
-
-@together("name, kind", public_classes(), lambda row: row[0])
-def test_an_unknown_argument_is_a_type_error_that_names_it(name, kind):
-    with pytest.raises(TypeError, match="'no_such_argument'"):
-        kind(no_such_argument=1)
-
-
 def test_functions_that_hand_arguments_on_say_what_was_called(scene, capture):
     reconstructions = {name: getattr(tt.nlos, name) for name in ("fk", "lct", "directional_lct", "midpoint_fk")}
     for name, function in reconstructions.items():

@@ -288,25 +288,17 @@ def function(name: str, value: Any, what: str, error: type[TorchTransientError] 
     return called
 
 
-def with_methods(name: str, value: Any, what: str, *methods: str) -> Any:
-    """Return an object that has ``methods``. Raises ArgumentError that names the first missing one."""
-    lacking = [method for method in methods if isinstance(value, type) or not callable(getattr(value, method, None))]
-    if lacking:
-        raise ArgumentError(f"{name}: expected {what}, with {lacking[0]}(), got {shown(value)}.")
-    return value
-
-
 def a_recipe(name: str, value: Any, *methods: str) -> Any:
     """Return a recipe with ``methods``. Raises ArgumentError, which names the function that reads files of recipes."""
+    missing = [method for method in methods if isinstance(value, type) or not callable(getattr(value, method, None))]
+    if not missing:
+        return value
     hint = ""
     if isinstance(value, (str, os.PathLike)):
         hint = " tt.data.Recipe.read reads files."
     elif isinstance(value, Mapping):
         hint = " tt.data.Recipe.from_dict reads dictionaries."
-    try:
-        return with_methods(name, value, "a recipe", *methods)
-    except ArgumentError as error:
-        raise ArgumentError(f"{error}{hint}") from None
+    raise ArgumentError(f"{name}: expected a recipe, with {missing[0]}(), got {shown(value)}.{hint}")
 
 
 def by_number(name: str, value: Any) -> Any:
