@@ -13,7 +13,7 @@ import torch
 
 import torchtransient as tt
 from support.sweeps import together
-from torchtransient.argument_names import arguments_of
+from torchtransient.checks import arguments_of
 from torchtransient.errors import (
     ArgumentError,
     SceneError,

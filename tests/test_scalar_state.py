@@ -9,7 +9,7 @@ from torch import nn
 import torchtransient as tt
 from support.sweeps import together
 from tools.small_room import VARIANT, make_room
-from torchtransient import scalar_state
+from torchtransient import floating
 from torchtransient.parametrize import Bounded, register
 
 
@@ -70,9 +70,9 @@ def test_where_torch_takes_the_first(monkeypatch):
                     own.copy_(given[0] if own.ndim == 0 and given.ndim == 1 else given)
 
     monkeypatch.setattr(nn.Module, "_load_from_state_dict", lenient)
-    scalar_state._first_is_taken.cache_clear()
+    floating._first_is_taken.cache_clear()
     try:
-        assert scalar_state._first_is_taken()
+        assert floating._first_is_taken()
         assert all(load_several(make) > 0 for make in MODULES.values())
     finally:
-        scalar_state._first_is_taken.cache_clear()
+        floating._first_is_taken.cache_clear()

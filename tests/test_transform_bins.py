@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from support.sweeps import together
+from torchtransient.axes import fast_length
 from torchtransient.errors import SceneError
-from torchtransient.transform_bins import fast_length, transform_bins
+from torchtransient.transform_bins import transform_bins
 
 SMOOTH = sorted(2**a * 3**b * 5**c for a, b, c in itertools.product(range(13), range(8), range(6)))
 

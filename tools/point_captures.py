@@ -9,8 +9,8 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
+from torchtransient.checks import finite, positive, real_array, shown
 from torchtransient.errors import ShapeError
-from torchtransient.quantities import finite, positive, real_array, shown
 
 
 def point_capture(

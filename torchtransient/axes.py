@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torchtransient import quantities
+from torchtransient import checks
+from torchtransient.checks import Numbers, as_number, as_whole, numbers, shown
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.quantities import Numbers, as_number, as_whole, numbers, shown
 from torchtransient.units import LATEST_S, SHORTEST_OPL, SPEED_OF_LIGHT, near_seconds, opl_to_seconds, seconds_to_opl
 
 # What a number in another unit looks like. The bins of real records are 1 ps to 1 us wide: in nanoseconds, picoseconds
@@ -162,7 +162,7 @@ class FrequencyAxis:
     def uniform(cls, first: float, step: float, count: int, *, start_opl: float = 0.0) -> FrequencyAxis:
         """`count` frequencies `first + k step`, in cycles per metre. Equal steps render faster than arbitrary ones."""
         low, width = _finite(first, "first", "FrequencyAxis.uniform"), _finite(step, "step", "FrequencyAxis.uniform")
-        number = quantities.count("FrequencyAxis.uniform: count", count, 1, ShapeError, quantities.MOST_MADE)
+        number = checks.count("FrequencyAxis.uniform: count", count, 1, ShapeError, checks.MOST_MADE)
         return cls(tuple(low + k * width for k in range(number)), start_opl)
 
     @classmethod
@@ -220,3 +220,18 @@ def _finite(value: float, name: str, owner: str = "TimeAxis") -> float:
     if not math.isfinite(number):
         raise UnitError(f"{owner}: expected {name} to be finite, got {number!r}.")
     return number
+
+
+def fast_length(least: int, multiple: int = 1) -> int:
+    """The smallest length from ``least`` on, both positive, that is ``multiple`` times 2^a 3^b 5^c: transforms are fast
+    at such lengths, and real ones halve even ones.
+    """
+    units = -(-least // multiple)
+    while True:
+        rest = units
+        for prime in (2, 3, 5):
+            while rest % prime == 0:
+                rest //= prime
+        if rest == 1:
+            return units * multiple
+        units += 1

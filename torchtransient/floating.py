@@ -1,25 +1,27 @@
-"""Tensors of floating numbers as people give them, in a precision of their own: half ones are computed in single, and
-autocast does not reach in.
+"""Precision of tensors in functions and modules: half precision is computed in single, and autocast is switched off.
+
+Modules with single numbers in their state, loaded from single numbers alone, are :class:`ScalarState`.
 """
 
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from torchtransient.checks import real_array, shown
 from torchtransient.errors import ShapeError, TorchTransientError
-from torchtransient.quantities import real_array, shown
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
 
 def without_autocast(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """A function or method, in the dtype of its tensors inside `torch.autocast` too.
+    """Run a function or method in the dtype of its tensors, inside `torch.autocast` as well.
 
     Autocast makes bfloat16 or float16 of the operands of matrix products and convolutions. A network bears that; a
     measurement loses 3e-3 of its value by it, phases their millimetres, and poses their centimetres.
@@ -84,7 +86,7 @@ def product(matrix: Tensor, x: Tensor) -> Tensor:
 
 
 def floating(x: Any, where: str) -> Tensor:
-    """The tensor. Raises ShapeError for what is none of floating numbers."""
+    """Return a tensor of floating numbers. Raises ShapeError for anything else."""
     if not isinstance(x, Tensor) or not x.is_floating_point():
         got = str(x.dtype) if isinstance(x, Tensor) else type(x).__name__
         raise ShapeError(f"{where}: expected a floating tensor, got {got}. Convert it with .float().")
@@ -92,9 +94,7 @@ def floating(x: Any, where: str) -> Tensor:
 
 
 def number_tensor(given: Any, expected: str, error: type[TorchTransientError] = ShapeError) -> Tensor:
-    """A floating tensor as it is, with its gradient; float64 of other numbers. Raises `error`, which says what was
-    `expected`.
-    """
+    """Return a floating tensor with its gradient, or float64 of other numbers. Raises `error` with `expected`."""
     if isinstance(given, Tensor) and given.is_floating_point():
         return given
     array = real_array(given)
@@ -104,12 +104,12 @@ def number_tensor(given: Any, expected: str, error: type[TorchTransientError] = 
 
 
 def single(x: Tensor) -> Tensor:
-    """In float32 or better: half precision has no linear algebra on the CPU, and products of it lose digits."""
+    """Return a tensor in float32 or better: half precision has no linear algebra on the CPU, and loses digits."""
     return x.float() if x.is_floating_point() and x.element_size() < 4 else x
 
 
 def in_single(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """A function or method that is given its half-precision tensors in float32, and answers in float32 for them.
+    """Run a function or method with its half-precision tensors in float32; the result is float32.
 
     Counts are whole in bfloat16 up to 256 and in float16 up to 2048, which ends at 65504; positions in bins and rates
     per cycle fare no better. Gradients arrive in the precision of the tensors that were given.
@@ -125,8 +125,10 @@ def in_single(function: Callable[Arguments, Result]) -> Callable[Arguments, Resu
 
 
 def holds(condition: Tensor) -> bool:
-    """Whether it is true everywhere. True where nobody can look, which leaves checks of values out: inside of
-    `torch.func.vmap`, in `torch.compile` (whose graph would break), and of tensors without values.
+    """Return True if a condition is true everywhere, or its values cannot be read.
+
+    Checks of values are left out inside `torch.func.vmap`, in `torch.compile` (the graph would break), and for
+    tensors on "meta".
     """
     if torch.compiler.is_compiling() or condition.device.type == "meta":
         return True
@@ -136,3 +138,32 @@ def holds(condition: Tensor) -> bool:
         if "vmap" not in str(error):
             raise
         return True
+
+
+class ScalarState(nn.Module):
+    """Base of modules with numbers in their state. Torch 2.6 takes the first number of several for one number, in
+    silence; later versions report it. Loading reports it here, of the numbers of modules inside too.
+    """
+
+    def _load_from_state_dict(self, state: Any, prefix: str, *rest: Any) -> None:
+        super()._load_from_state_dict(state, prefix, *rest)
+        errors = rest[-1]
+        if not _first_is_taken():
+            return
+        for name, own in itertools.chain(self.named_parameters(), self.named_buffers()):
+            given, key = state.get(prefix + name), prefix + name
+            several = isinstance(given, Tensor) and given.ndim == 1 and len(given) != 1
+            if own.ndim == 0 and several and not any(key in error for error in errors):
+                errors.append(f"size mismatch for {key}: {tuple(given.shape)} in the state, expected one number.")
+
+
+@functools.cache
+def _first_is_taken() -> bool:
+    """Whether this version of torch loads a number from several."""
+    module = nn.Module()
+    module.register_buffer("number", torch.zeros(()))
+    try:
+        module.load_state_dict({"number": torch.zeros(2)})
+    except RuntimeError:
+        return False
+    return True

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient import quantities
+from torchtransient import checks
+from torchtransient.checks import Numbers, finite, numbers, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.pulses import CUT_STDDEVS, FWHM_PER_STDDEV, Pulse
-from torchtransient.quantities import Numbers, finite, numbers, shown
 from torchtransient.units import SHORTEST_OPL, near_seconds, seconds_to_opl
 
 Array = NDArray[np.float64]
@@ -121,7 +121,7 @@ class Gate:
     def sequence(self, step_opl: float, count: int) -> tuple[Gate, ...]:
         """``count`` gates of this shape, each ``step_opl`` metres after the one before."""
         step = finite("Gate.sequence: step_opl", step_opl)
-        number = quantities.count("Gate.sequence: count", count, 0, ShapeError, quantities.MOST_MADE)
+        number = checks.count("Gate.sequence: count", count, 0, ShapeError, checks.MOST_MADE)
         return tuple(self.shifted(k * step) for k in range(number))
 
     # ------------------------------------------------------------------------------------------------ the profile

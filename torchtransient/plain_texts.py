@@ -11,8 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from torchtransient.checks import check_special, path_of
 from torchtransient.errors import StorageError, TorchTransientError
-from torchtransient.file_places import check_special, path_of
 
 MOST_LEVELS = 100
 # Of a text with fewer characters, which aliases may repeat.

@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchtransient.checks import Numbers, as_number, finite, is_one_of, numbers, of_class, positive, several, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.given_types import is_one_of, of_class, several
-from torchtransient.quantities import Numbers, as_number, finite, numbers, positive, shown
 from torchtransient.units import LONGEST_PULSE_S, SHORTEST_OPL, near_seconds, seconds_to_opl
 
 Array = NDArray[np.float64]

@@ -22,8 +22,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchtransient.checks import as_number, as_whole, index, numbers, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.quantities import as_number, as_whole, index, numbers, shown
 
 TRANSIENT_DIM = -5
 STEADY_DIM = -4

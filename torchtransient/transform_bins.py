@@ -1,4 +1,4 @@
-"""Discrete Fourier transforms: lengths they are fast at, and the lines that a phasor film of mitransient keeps."""
+"""Frequencies that a phasor film of mitransient keeps of a discrete Fourier transform."""
 
 from __future__ import annotations
 
@@ -8,21 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.errors import SceneError
-
-
-def fast_length(least: int, multiple: int = 1) -> int:
-    """The smallest length from ``least`` on, both positive, that is ``multiple`` times 2^a 3^b 5^c: transforms are fast
-    at such lengths, and real ones halve even ones.
-    """
-    units = -(-least // multiple)
-    while True:
-        rest = units
-        for prime in (2, 3, 5):
-            while rest % prime == 0:
-                rest //= prime
-        if rest == 1:
-            return units * multiple
-        units += 1
 
 
 def transform_bins(wl_mean: float, wl_sigma: float, bins: int, width: float) -> NDArray[np.float64]:

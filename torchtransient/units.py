@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from torchtransient.checks import as_number, shown
 from torchtransient.errors import UnitError
-from torchtransient.quantities import as_number, shown
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

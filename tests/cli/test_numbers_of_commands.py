@@ -13,6 +13,7 @@ from click.testing import CliRunner
 
 import torchtransient as tt
 from torchtransient import _llvm
+from torchtransient.checks import positive
 from torchtransient.cli import demo, doctor, reconstruct, render
 from torchtransient.cli.cost import Counts
 from torchtransient.cli.dataset import _share
@@ -21,7 +22,6 @@ from torchtransient.cli.main import main
 from torchtransient.cli.options import assignments, scene_values
 from torchtransient.cli.pictures import write_pictures
 from torchtransient.cli.reconstruct import Numbers, _as_words, _check_together, _draw, _grid, _wall_size
-from torchtransient.quantities import positive
 from torchtransient.rendering.variant import active_variant
 
 # ----------------------------------------------------------------------------------------------------------- options

@@ -6,12 +6,11 @@ import math
 import pytest
 import torch
 
-from torchtransient.axes import TimeAxis
+from torchtransient.axes import TimeAxis, fast_length
 from torchtransient.capture import Scan, Wall
 from torchtransient.errors import ShapeError
 from torchtransient.reconstruction import LCT, DiffusionDeconvolution, DirectionalLCT
 from torchtransient.reconstruction.cone_operator import ConeOperator
-from torchtransient.transform_bins import fast_length
 
 F64 = torch.float64
 # v = r^2 from 0 to 4 m^2 in bins of 0.25 m^2; steps of 0.5 m along x are one of them, of 1 m along y four.

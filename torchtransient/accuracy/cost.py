@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from torchtransient.accuracy.measure import Candidate, Estimates, Task, checked_counts, measure
 from torchtransient.accuracy.report import AccuracyReport, Choice
+from torchtransient.checks import as_whole, shown
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
-from torchtransient.quantities import as_whole, shown
 from torchtransient.rendering.films import layout_of_output
 from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.output import RenderOutput

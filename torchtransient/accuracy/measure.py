@@ -14,8 +14,8 @@ from tqdm import tqdm
 
 from torchtransient.accuracy.errors_of_estimates import TAIL_RUNS, ErrorTally, Reference, Tail
 from torchtransient.accuracy.report import AccuracyReport, Choice, CostPoint
+from torchtransient.checks import as_whole, shown
 from torchtransient.errors import UnitError
-from torchtransient.quantities import as_whole, shown
 
 
 @dataclass(frozen=True)

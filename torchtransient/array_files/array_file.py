@@ -25,12 +25,12 @@ from torchtransient.array_files.checksums import CHECKSUMS, Digest, array_digest
 from torchtransient.array_files.hdf5_limits import check_size, read_attributes, read_dataset
 from torchtransient.array_files.hdf5_writing import hdf5_package, new_hdf5
 from torchtransient.array_files.part_files import replacing as replacing
+from torchtransient.checks import check_folder as check_folder
+from torchtransient.checks import check_source as check_source
+from torchtransient.checks import path_of as path_of
+from torchtransient.checks import shown
 from torchtransient.errors import StorageError, TorchTransientError
-from torchtransient.file_places import check_folder as check_folder
-from torchtransient.file_places import check_source as check_source
-from torchtransient.file_places import path_of as path_of
 from torchtransient.plain_texts import said_in_short
-from torchtransient.quantities import shown
 
 HDF5 = (".h5", ".hdf5")
 ENDINGS = (*HDF5, ".npz")

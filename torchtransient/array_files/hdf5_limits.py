@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchtransient.array_files.free_memory import available_memory
 from torchtransient.errors import StorageError
-from torchtransient.free_memory import available_memory
 
 # Deflate, the filter that all of these files use, makes at most 1032 bytes of one.
 MOST_BYTES_OF_ONE = 1032

@@ -15,8 +15,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from torchtransient.checks import check_folder
 from torchtransient.errors import StorageError
-from torchtransient.file_places import check_folder
 
 _SUFFIX = ".part"
 # Names that this module gives.

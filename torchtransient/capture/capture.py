@@ -12,14 +12,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchtransient.argument_names import arguments_of
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture.arithmetic import summed
 from torchtransient.capture.files import reader, writer
 from torchtransient.capture.metadata import metadata_text
 from torchtransient.capture.scan import Scan, laser_index
+from torchtransient.checks import arguments_of, finite, flag, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.quantities import finite, flag, shown
 from torchtransient.tensor_record import TensorRecord
 
 _CHANNEL_AND_TIME = 2

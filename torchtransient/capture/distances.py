@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from torchtransient.checks import real_array, shown
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.quantities import real_array, shown
 
 if TYPE_CHECKING:
     from torchtransient.capture.scan import Scan

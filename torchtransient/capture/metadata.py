@@ -6,8 +6,8 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
+from torchtransient.checks import shown
 from torchtransient.errors import StorageError
-from torchtransient.quantities import shown
 
 
 def metadata_text(metadata: Any, who: str) -> str:

@@ -13,10 +13,9 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture.distances import bounds_of, longest, shortest
-from torchtransient.capture.scan_checks import check_shapes, check_sides, float64_points, unit_normals
 from torchtransient.capture.wall import Wall, grid_size, triple
-from torchtransient.errors import ArgumentError, SceneError, ShapeError
-from torchtransient.quantities import Numbers, as_whole, flag, positive, real_array, shown
+from torchtransient.checks import Numbers, as_whole, flag, positive, real_array, shown
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.tensor_record import same
 
 # Kinds of a regular grid; "pairs" are given point by point.
@@ -60,15 +59,15 @@ class Scan:
         _check_kind(self.kind)
         device = self.sensor_points.device if isinstance(self.sensor_points, Tensor) else torch.device("cpu")
         for name in ("sensor_points", "laser_points", "sensor_origin", "laser_origin"):
-            object.__setattr__(self, name, float64_points(name, getattr(self, name), device))
+            object.__setattr__(self, name, _float64_points(name, getattr(self, name), device))
         for name in ("sensor_normals", "laser_normals"):
             if getattr(self, name) is not None:
-                object.__setattr__(self, name, unit_normals(name, float64_points(name, getattr(self, name), device)))
+                object.__setattr__(self, name, _unit_normals(name, _float64_points(name, getattr(self, name), device)))
         if self.wall is not None and not isinstance(self.wall, Mapping):
             raise ArgumentError(f"Scan: expected wall as a Mitsuba dictionary or None, got {type(self.wall).__name__}.")
         flag("Scan: first_and_last_leg", self.first_and_last_leg)
-        check_shapes(self)
-        check_sides(self)
+        _check_shapes(self)
+        _check_sides(self)
 
     @classmethod
     def grid(
@@ -128,8 +127,8 @@ class Scan:
             kind=kind,
             sensor_points=torch.from_numpy(points),
             laser_points=spots if isinstance(spots, Tensor) else torch.from_numpy(spots),
-            sensor_origin=float64_points("sensor_origin", aside if sensor_origin is None else sensor_origin),
-            laser_origin=float64_points("laser_origin", aside if laser_origin is None else laser_origin),
+            sensor_origin=_float64_points("sensor_origin", aside if sensor_origin is None else sensor_origin),
+            laser_origin=_float64_points("laser_origin", aside if laser_origin is None else laser_origin),
             sensor_normals=torch.from_numpy(normals),
             laser_normals=torch.from_numpy(spot_normals),
             first_and_last_leg=first_and_last_leg,
@@ -158,7 +157,7 @@ class Scan:
         shapes, where no wall says them; spots of confocal scans have those of the sensor points. Errors as the class.
         """
         _check_kind(kind)
-        sensor = float64_points("sensor_points", sensor_points)
+        sensor = _float64_points("sensor_points", sensor_points)
         if wall is not None:
             for name, given in (("normals", normals), ("laser_normals", laser_normals)):
                 if given is not None:
@@ -170,12 +169,12 @@ class Scan:
         elif laser_points is None:
             raise SceneError(f"Scan.points: expected laser_points for kind={kind!r}, got None. Give the laser's spots.")
         else:
-            laser = float64_points("laser_points", laser_points, sensor.device)
-        sensor_normals = None if normals is None else float64_points("normals", normals, sensor.device)
+            laser = _float64_points("laser_points", laser_points, sensor.device)
+        sensor_normals = None if normals is None else _float64_points("normals", normals, sensor.device)
         if kind == "confocal":
             laser_normals = sensor_normals
         elif laser_normals is not None:
-            laser_normals = float64_points("laser_normals", laser_normals, sensor.device)
+            laser_normals = _float64_points("laser_normals", laser_normals, sensor.device)
         shape = None
         if wall is not None:
             surface = Wall.of(wall)
@@ -373,3 +372,81 @@ def _normals_on(surface: Wall, points: Tensor, what: str) -> Tensor:
 def _refuse(name: str, value: Any, kind: str, instead: str) -> None:
     if value is not None:
         raise ArgumentError(f"Scan: {name} has no meaning for kind={kind!r}: {instead}. Leave it out.")
+
+
+def _float64_points(name: str, values: Any, device: torch.device | None = None) -> Tensor:
+    """Return points (..., 3) as float64, with their gradients. Raises ShapeError and UnitError."""
+    plain = values if isinstance(values, Tensor) else real_array(values)
+    if plain is None:
+        raise ShapeError(f"Scan: expected {name} as points of three numbers, got {shown(values)}.")
+    tensor = plain if isinstance(plain, Tensor) else torch.from_numpy(plain)
+    if (
+        tensor.is_complex()
+        or tensor.dtype == torch.bool
+        or tensor.ndim == 0
+        or tensor.shape[-1] != 3
+        or tensor.numel() == 0
+    ):
+        raise ShapeError(f"Scan: expected {name} as points (..., 3), got {tensor.dtype} of {tuple(tensor.shape)}.")
+    tensor = tensor.to(device=device or tensor.device, dtype=torch.float64)
+    if not bool(torch.isfinite(tensor).all()):
+        raise UnitError(f"Scan: expected {name} in finite metres, got NaN or infinity.")
+    return tensor
+
+
+def _unit_normals(name: str, normals: Tensor) -> Tensor:
+    """Return normals (..., 3) of length 1; normalized ones keep every digit. Raises UnitError for zero vectors."""
+    length: Tensor = torch.linalg.vector_norm(normals, dim=-1, keepdim=True)
+    if not bool((length > 0).all()):
+        raise UnitError(f"Scan: expected {name} with a direction, got a zero vector.")
+    off = (length - 1).abs() > 1e-12
+    return torch.where(off, normals / length, normals)
+
+
+def _check_shapes(scan: Scan) -> None:
+    """Raise ShapeError or SceneError unless points, normals and origins have the shapes of the scan's kind."""
+    for name in ("sensor_origin", "laser_origin"):
+        if getattr(scan, name).shape != (3,):
+            raise ShapeError(f"Scan: expected {name} (3,), got {tuple(getattr(scan, name).shape)}.")
+    sensor, laser = scan.sensor_points, scan.laser_points
+    if sensor.ndim not in (2, 3):
+        raise ShapeError(f"Scan: expected sensor_points (Sy, Sx, 3) or (N, 3), got {tuple(sensor.shape)}.")
+    each = scan.kind in ("confocal", "pairs")
+    allowed = {"single": (1,), "exhaustive": (2, 3)}.get(scan.kind, (sensor.ndim,))
+    words = {
+        "single": "(3,), the one spot",
+        "confocal": f"{tuple(sensor.shape)}, the sensor points",
+        "exhaustive": "(Ly, Lx, 3) or (M, 3)",
+        "pairs": f"{tuple(sensor.shape)}, one for each sensor point",
+    }[scan.kind]
+    if laser.ndim not in allowed or (each and laser.shape != sensor.shape):
+        raise ShapeError(f"Scan: expected laser_points {words} for kind={scan.kind!r}, got {tuple(laser.shape)}.")
+    if scan.kind == "confocal" and not bool(torch.equal(laser, sensor)):
+        raise SceneError("Scan: expected the laser points of a confocal scan to be its sensor points, got others.")
+    for name in ("sensor", "laser"):
+        points, normals = getattr(scan, f"{name}_points"), getattr(scan, f"{name}_normals")
+        if normals is not None and normals.shape != points.shape:
+            raise ShapeError(
+                f"Scan: expected {name}_normals {tuple(points.shape)} as the points, got {tuple(normals.shape)}."
+            )
+
+
+def _check_sides(scan: Scan) -> None:
+    """Raise SceneError unless the origins are in front of the wall at each point."""
+    for name in ("sensor", "laser"):
+        normals = getattr(scan, f"{name}_normals")
+        if normals is None:
+            continue
+        origin, points = getattr(scan, f"{name}_origin"), getattr(scan, f"{name}_points")
+        heights = ((origin - points) * normals).sum(-1).detach()
+        behind = int((heights <= 0).sum())
+        if behind:
+            raise SceneError(
+                f"Scan: expected {name}_origin in front of the wall, got {origin.tolist()}, which {behind} of "
+                f"{heights.numel()} points do not see: it is {_behind(float(heights.min()))}. Move "
+                "it to the side that the normals point to, or turn the wall (flip_normals, or the order of corners)."
+            )
+
+
+def _behind(height: float) -> str:
+    return f"behind them by up to {-height:.4g} m" if height < 0 else "in the wall itself"

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.capture.triangles import first_hits, triangle_normals
+from torchtransient.checks import Numbers, as_whole, flag, positive, real_array, shares, shown, transform
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
-from torchtransient.quantities import Numbers, as_whole, flag, positive, real_array, shares, shown, transform
 
 Array = NDArray[np.float64]
 

@@ -168,7 +168,7 @@ def _as_words(value: Any) -> str:
 
 def _check_together(options: dict[str, Any]) -> None:
     """Mistakes that can be told without the file."""
-    from torchtransient.quantities import positive, share
+    from torchtransient.checks import positive, share
 
     positive("--gamma", options["gamma"])
     share("--threshold", options["threshold"])

@@ -10,10 +10,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from torchtransient.checks import path_of, shown
 from torchtransient.errors import MissingPackageError, SceneError
-from torchtransient.file_places import path_of
 from torchtransient.plain_texts import safe_loader, some_of, text_of_file, yaml_data
-from torchtransient.quantities import shown
 
 _MISSING = object()
 

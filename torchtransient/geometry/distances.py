@@ -12,10 +12,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchtransient.checks import positive, shown
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import holds, number_tensor, single, without_autocast
 from torchtransient.geometry.pinhole import camera_matrices, camera_to_world, image_size
-from torchtransient.quantities import positive, shown
 
 
 @without_autocast

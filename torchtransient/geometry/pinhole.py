@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import torch
 from torch import Tensor
 
+from torchtransient.checks import count, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.floating import holds, number_tensor, single, without_autocast
-from torchtransient.quantities import count, shown
 
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera

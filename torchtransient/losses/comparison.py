@@ -15,9 +15,8 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from torchtransient.checks import MOST, finite, is_one_of, shown
 from torchtransient.errors import ArgumentError, DeviceError, ShapeError, TorchTransientError, UnitError
-from torchtransient.given_types import is_one_of
-from torchtransient.quantities import MOST, finite, flag, shown
 from torchtransient.units import SHORTEST_OPL
 
 Reduction = Literal["none", "sum", "mean"]
@@ -155,11 +154,6 @@ def check_option(
     check_level(name, value, torch.empty(shape, dtype=torch.float64, device=device), where, zero=zero, square=square)
 
 
-def check_flag(name: str, value: bool, where: str) -> None:
-    """Raises ArgumentError for what is no truth value: a text that says no is true."""
-    flag(f"{where}: {name}", value)
-
-
 def holds(condition: Tensor) -> bool:
     """Whether it is true everywhere, as far as it can be looked at: not in `torch.vmap`, not without memory."""
     if condition.is_meta:
@@ -196,6 +190,7 @@ def check_whole(name: str, value: object, where: str, error: type[TorchTransient
 
 
 def check_function(name: str, value: object, where: str) -> None:
+    """Raise ArgumentError unless ``value`` is a function of tensors."""
     if not callable(value):
         raise ArgumentError(f"{where}: expected {name} to be a function of tensors, got {shown(value)}.")
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from torch import Tensor, nn
 
+from torchtransient.checks import flag
 from torchtransient.losses.comparison import (
     Reduction,
-    check_flag,
     check_mask,
     check_option,
     check_pair,
@@ -46,7 +46,7 @@ def cumulative_loss(
     """
     where = "cumulative_loss"
     check_held(reduction, dim, where)
-    check_flag("per_root_count", per_root_count, where)
+    flag(f"{where}: per_root_count", per_root_count)
     input, target = check_pair(input, target, where)
     dim = bins_dim(input, dim, where)
     mask = check_mask(mask, input, where)
@@ -72,7 +72,7 @@ class CumulativeLoss(nn.Module):
         super().__init__()
         check_held(reduction, dim, "CumulativeLoss")
         check_option("bin_width_opl", bin_width_opl, "CumulativeLoss")
-        check_flag("per_root_count", per_root_count, "CumulativeLoss")
+        flag("CumulativeLoss: per_root_count", per_root_count)
         self.bin_width_opl, self.per_root_count = bin_width_opl, per_root_count
         self.dim, self.reduction = dim, reduction
 

@@ -12,11 +12,11 @@ import math
 import torch
 from torch import Tensor, nn
 
+from torchtransient.checks import flag, positive
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.losses.comparison import (
     Reduction,
     check_dense,
-    check_flag,
     check_mask,
     check_number,
     check_option,
@@ -36,7 +36,6 @@ from torchtransient.losses.likelihoods import (
     floored,
 )
 from torchtransient.losses.results import TRANSIENT, Transient, reads
-from torchtransient.quantities import positive
 from torchtransient.sensing.dead_time.dead_time_cycle import check_dead_bins
 from torchtransient.sensing.spad.spad import exposed_cycles, first_photon_log_prob
 
@@ -205,7 +204,7 @@ class FirstPhotonNLL(nn.Module):
         where = "FirstPhotonNLL"
         check_held(reduction, dim, where)
         check_option("floor", floor, where, zero=True)
-        check_flag("constant", constant, where)
+        flag(f"{where}: constant", constant)
         self.cycles = check_whole("cycles", cycles, where, UnitError)
         self.dead_bins = None if dead_bins is None else _check_dead_time(dead_bins, where)
         self.floor, self.dim, self.reduction, self.constant = floor, dim, reduction, constant

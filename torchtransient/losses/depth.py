@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from torchtransient.checks import shown
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.losses.comparison import (
     Reduction,
@@ -18,7 +19,6 @@ from torchtransient.losses.comparison import (
     reduce,
 )
 from torchtransient.losses.results import DEPTH, DepthMap, reads
-from torchtransient.quantities import shown
 
 
 @reads(input=DEPTH, target=DEPTH)

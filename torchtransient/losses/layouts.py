@@ -13,9 +13,9 @@ import math
 
 from torch import Tensor
 
+from torchtransient.checks import MOST, as_whole, shown
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.losses.comparison import Reduction, check_level, check_reduction
-from torchtransient.quantities import MOST, as_whole, shown
 
 _IMAGES = -3
 # One or three numbers before points are channels of a list rather than bins.

@@ -27,11 +27,11 @@ from contextvars import ContextVar
 import torch
 from torch import Tensor, nn
 
+from torchtransient.checks import flag
 from torchtransient.errors import GradientError, TorchTransientWarning, UnitError
 from torchtransient.losses.comparison import (
     Reduction,
     check_dense,
-    check_flag,
     check_level,
     check_mask,
     check_option,
@@ -116,7 +116,7 @@ def check_rates(model: Tensor, where: str) -> None:
 
 def check_constant(counts: Tensor, constant: bool, where: str) -> None:
     """The logarithm of a factorial wants counts: UnitError for negative ones."""
-    check_flag("constant", constant, where)
+    flag(f"{where}: constant", constant)
     if constant and bool((counts < 0).any()):
         raise UnitError(f"{where}: expected counts >= 0 with constant=True, got negative ones. Leave the constant out.")
 
@@ -274,8 +274,8 @@ def read_noise_nll(
     """
     where = "read_noise_nll"
     check_reduction(reduction, where)
-    check_flag("shot_noise", shot_noise, where)
-    check_flag("constant", constant, where)
+    flag(f"{where}: shot_noise", shot_noise)
+    flag(f"{where}: constant", constant)
     mean, measured = check_prediction(input, target, where)
     mask = check_mask(mask, mean, where)
     measured, mean = counted(measured, mask), counted(mean, mask)
@@ -302,7 +302,7 @@ class PoissonNLL(nn.Module):
         super().__init__()
         check_held(reduction, dim, "PoissonNLL")
         check_option("floor", floor, "PoissonNLL", zero=True)
-        check_flag("constant", constant, "PoissonNLL")
+        flag("PoissonNLL: constant", constant)
         self.floor, self.dim, self.reduction, self.constant = floor, dim, reduction, constant
 
     def forward(self, input: Light, target: Light, mask: Tensor | None = None) -> Tensor:
@@ -333,8 +333,8 @@ class ReadNoiseNLL(nn.Module):
     ) -> None:
         super().__init__()
         check_held(reduction, None, "ReadNoiseNLL")
-        check_flag("shot_noise", shot_noise, "ReadNoiseNLL")
-        check_flag("constant", constant, "ReadNoiseNLL")
+        flag("ReadNoiseNLL: shot_noise", shot_noise)
+        flag("ReadNoiseNLL: constant", constant)
         check_option("read_noise", read_noise, "ReadNoiseNLL", needed=True, square=True)
         self.read_noise, self.shot_noise, self.reduction = read_noise, shot_noise, reduction
         self.constant = constant

@@ -10,12 +10,12 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
+from torchtransient.checks import flag
 from torchtransient.errors import ArgumentError, ShapeError
 from torchtransient.losses.comparison import (
     Reduction,
     check_dense,
     check_device,
-    check_flag,
     check_function,
     check_mask,
     check_pair,
@@ -97,7 +97,7 @@ def _checked(
 ) -> tuple[Callable[..., Tensor], dict[str, inspect.Parameter]]:
     """`compare` as a function (input, target, mask) with that reduction, and its parameters. Raises ShapeError."""
     check_function("the operator", operator, where)
-    check_flag("scale_invariant", scale_invariant, where)
+    flag(f"{where}: scale_invariant", scale_invariant)
     known = check_compare(compare, where, reduction)
     if not isinstance(compare, nn.Module):
         return functools.partial(_compared, compare, reduction), known

@@ -12,8 +12,8 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor, nn
 
+from torchtransient.checks import is_one_of, shown
 from torchtransient.errors import ShapeError
-from torchtransient.given_types import is_one_of
 from torchtransient.losses.comparison import (
     Reduction,
     check_dense,
@@ -24,7 +24,6 @@ from torchtransient.losses.comparison import (
     working_dtype,
 )
 from torchtransient.losses.triangles import SHARPEST, check_faces, unit_normals
-from torchtransient.quantities import shown
 
 Weights = Literal["uniform", "cotangent"]
 

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from torchtransient.checks import shown
 from torchtransient.errors import ArgumentError, ShapeError
 from torchtransient.losses.comparison import (
     Reduction,
@@ -34,7 +35,6 @@ from torchtransient.losses.likelihoods import averaged_over, in_the_name_of
 from torchtransient.losses.measurement import squared_loss
 from torchtransient.losses.pair_losses import PairLoss, check_compare, shared_dim
 from torchtransient.losses.results import TRANSIENT, Transient, reads
-from torchtransient.quantities import shown
 
 # Options in bins of the record, or of its axis, that would mean something else at each scale.
 _OF_BINS = ("dead_bins", "bin_width_opl", "axis", "spacing")

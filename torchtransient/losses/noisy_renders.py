@@ -11,6 +11,7 @@ from dataclasses import KW_ONLY, dataclass
 
 from torch import Tensor, nn
 
+from torchtransient.checks import finite, shown
 from torchtransient.errors import UnitError
 from torchtransient.losses.comparison import (
     Reduction,
@@ -23,7 +24,6 @@ from torchtransient.losses.comparison import (
     reduce,
 )
 from torchtransient.losses.results import LIGHT, Light, reads
-from torchtransient.quantities import finite, shown
 
 # Of Mitsuba's indices of samples, 32 bits.
 _MOST_SAMPLES = 2**32

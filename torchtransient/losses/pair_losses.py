@@ -9,10 +9,10 @@ from typing import Any, Protocol, cast
 
 from torch import Tensor, nn
 
+from torchtransient.checks import shown
 from torchtransient.errors import ArgumentError
 from torchtransient.losses.comparison import Reduction, check_function
 from torchtransient.losses.layouts import time_dim
-from torchtransient.quantities import shown
 
 # First arguments of what is no loss (input, target): a model there would be taken for a measurement, in silence, since
 # both are tensors of one shape.

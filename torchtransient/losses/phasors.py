@@ -14,11 +14,11 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.checks import flag, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.losses.comparison import (
     Reduction,
     check_dense,
-    check_flag,
     check_level,
     check_mask,
     check_option,
@@ -32,7 +32,6 @@ from torchtransient.losses.comparison import (
 )
 from torchtransient.losses.layouts import bins_dim, check_held, item_dims
 from torchtransient.losses.results import PHASOR, TRANSIENT, Phasors, Transient, reads
-from torchtransient.quantities import shown
 
 # The phasors of dark pixels are noise: relative to the mean modulus of an item, below what has a phase.
 _PHASE_FLOOR = 1e-3
@@ -130,7 +129,7 @@ def _phasor_loss(
     where: str,
 ) -> Tensor:
     phase_only, floor, dim = phases
-    check_flag("phase_only", phase_only, where)
+    flag(f"{where}: phase_only", phase_only)
     check_held(reduction, dim, where)
     check_option("floor", floor, where)
     input, target = check_pair(ours, theirs, where, complex_too=True)
@@ -198,7 +197,7 @@ class PhasorLoss(nn.Module):
     ) -> None:
         super().__init__()
         check_held(reduction, dim, "PhasorLoss")
-        check_flag("phase_only", phase_only, "PhasorLoss")
+        flag("PhasorLoss: phase_only", phase_only)
         check_option("floor", floor, "PhasorLoss")
         self.phase_only, self.floor, self.dim, self.reduction = phase_only, floor, dim, reduction
 
@@ -233,7 +232,7 @@ class TransientPhasorLoss(nn.Module):
             _check_axes(axis, frequencies, "TransientPhasorLoss")
         elif not isinstance(frequencies, FrequencyAxis):
             raise UnitError(f"TransientPhasorLoss: expected frequencies, a FrequencyAxis, got {shown(frequencies)}.")
-        check_flag("phase_only", phase_only, "TransientPhasorLoss")
+        flag("TransientPhasorLoss: phase_only", phase_only)
         check_option("floor", floor, "TransientPhasorLoss")
         self.axis, self.frequencies = axis, frequencies
         self.phase_only, self.floor, self.dim, self.reduction = phase_only, floor, dim, reduction

@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from torchtransient.checks import Numbers, flag, shown
 from torchtransient.errors import ShapeError
 from torchtransient.losses.comparison import (
     Reduction,
     check_dense,
-    check_flag,
     check_level,
     check_mask,
     check_number,
@@ -22,7 +22,6 @@ from torchtransient.losses.comparison import (
     working_dtype,
 )
 from torchtransient.losses.results import VALUES, Volume, reads
-from torchtransient.quantities import Numbers, shown
 
 _DIMS = (-3, -2, -1)
 _SMOOTHING = 1e-3
@@ -52,7 +51,7 @@ def total_variation(
     """
     where = "total_variation"
     check_reduction(reduction, where)
-    check_flag("isotropic", isotropic, where)
+    flag(f"{where}: isotropic", isotropic)
     (volume,) = check_dense((volume,), where)
     if volume.ndim < 3:
         raise ShapeError(f"{where}: expected a volume (..., Z, Y, X), got {tuple(volume.shape)}.")
@@ -131,7 +130,7 @@ class TotalVariation(nn.Module):
     ) -> None:
         super().__init__()
         check_reduction(reduction, "TotalVariation")
-        check_flag("isotropic", isotropic, "TotalVariation")
+        flag("TotalVariation: isotropic", isotropic)
         check_option("smoothing", smoothing, "TotalVariation", zero=True, square=True)
         checked = _check_spacing(spacing, torch.empty((), dtype=torch.float64), "TotalVariation")
         self.spacing = None if spacing is None else checked

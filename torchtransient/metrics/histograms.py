@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
+from torchtransient.checks import share, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.losses.comparison import check_mask, check_pair, counted, holds
 from torchtransient.losses.layouts import bins_dim
 from torchtransient.losses.results import TRANSIENT, Transient, reads
 from torchtransient.metrics.tally import Reduction, Tally, check_finite
-from torchtransient.quantities import share, shown
 
 
 @reads(input=TRANSIENT, target=TRANSIENT)

@@ -8,11 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchtransient.checks import positive, real_array, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.losses.comparison import check_dense
 from torchtransient.losses.results import Volume
 from torchtransient.metrics.tally import Finish, Kind, Reduction, Tally, check_finite, check_reduction
-from torchtransient.quantities import positive, real_array, shown
 from torchtransient.reconstruction.voxels import VoxelGrid
 
 

@@ -10,11 +10,11 @@ import math
 import torch
 from torch import Tensor
 
+from torchtransient.checks import positive
 from torchtransient.errors import UnitError
 from torchtransient.losses.comparison import check_mask, check_pair, counted, holds
 from torchtransient.losses.results import PHASOR, Phasors, reads
 from torchtransient.metrics.tally import Finish, Kind, Reduction, Tally, check_finite, check_weight
-from torchtransient.quantities import positive
 
 _PICTURE = 2
 

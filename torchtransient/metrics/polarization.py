@@ -14,13 +14,13 @@ import torch
 from torch import Tensor
 
 from torchtransient import stokes
+from torchtransient.checks import shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.losses.comparison import check_level, check_mask, check_pair, holds
 from torchtransient.losses.layouts import check_dim
 from torchtransient.losses.results import Picture
 from torchtransient.metrics.phase import phase_mae
 from torchtransient.metrics.tally import Finish, Kind, Reduction, Tally, check_finite, check_reduction
-from torchtransient.quantities import shown
 
 Part = Literal["total", "linear", "circular"]
 _DEGREES = {

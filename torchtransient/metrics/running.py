@@ -10,9 +10,9 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
+from torchtransient.checks import shown
 from torchtransient.errors import ArgumentError
 from torchtransient.metrics.tally import Collector, Finish, Kind
-from torchtransient.quantities import shown
 
 _ROOM = __name__.rpartition(".")[0]
 

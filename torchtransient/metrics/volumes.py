@@ -11,11 +11,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchtransient.checks import flag, share, shown
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.losses.comparison import check_dense, check_mask, check_pair
 from torchtransient.losses.results import Volume
 from torchtransient.metrics.tally import Reduction, Tally, check_finite, check_reduction
-from torchtransient.quantities import flag, share, shown
 from torchtransient.reconstruction.surfaces import depth_map
 from torchtransient.reconstruction.voxels import VoxelGrid
 

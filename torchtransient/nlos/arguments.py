@@ -9,8 +9,8 @@ import torch
 from torch import nn
 
 from torchtransient.capture import Scan
+from torchtransient.checks import as_whole, count, shown
 from torchtransient.errors import ArgumentError, SceneError
-from torchtransient.quantities import as_whole, count, shown
 from torchtransient.rendering.arguments import samples
 from torchtransient.rendering.seeds import SEED_RANGE, drawn
 from torchtransient.sensing import Device

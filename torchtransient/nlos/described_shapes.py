@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from torchtransient import scenes
+from torchtransient.checks import shown
 from torchtransient.errors import SceneError, TorchTransientError
 from torchtransient.files.yaml_files import Section, file_beside
 from torchtransient.nlos.mesh_file import mesh_arrays_shape, mesh_file
-from torchtransient.quantities import shown
 from torchtransient.scenes.parts import diffuse
 from torchtransient.scenes.transforms import Matrix, rotate, scale, translate
 

@@ -25,13 +25,13 @@ from typing import Any
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Scan, Wall
 from torchtransient.capture.scan import GRID_KINDS
+from torchtransient.checks import shown
 from torchtransient.errors import SceneError, TorchTransientError
 from torchtransient.files.yaml_files import Section, as_number, file_beside, read_yaml
 from torchtransient.nlos import defaults
 from torchtransient.nlos.described_shapes import albedo_of, described_shapes
 from torchtransient.nlos.mesh_file import mesh_of_npz
 from torchtransient.plain_texts import told_shortly
-from torchtransient.quantities import shown
 from torchtransient.scenes import bounds
 from torchtransient.sensing import Device
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 
 from torchtransient.capture import Capture, Scan
+from torchtransient.checks import shown, with_article
 from torchtransient.errors import ArgumentError, ShapeError
-from torchtransient.quantities import shown, with_article
 from torchtransient.reconstruction.capture_checks import not_a_capture
 from torchtransient.reconstruction.planar_scan import PlanarScan
 from torchtransient.volume_methods import METHODS as METHODS

@@ -10,9 +10,9 @@ import torch
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture
 from torchtransient.capture.arithmetic import precision_of, summed
+from torchtransient.checks import count, shown
 from torchtransient.errors import DeviceError, ShapeError
 from torchtransient.nlos.measured_light import checked_light
-from torchtransient.quantities import count, shown
 from torchtransient.reconstruction import DiffusionDeconvolution, subtract_legs
 from torchtransient.reconstruction.capture_checks import checked_capture
 

@@ -13,11 +13,11 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture
 from torchtransient.capture.arithmetic import precision_of
+from torchtransient.checks import Numbers, count, finite, positive, real_array, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.nlos.measured_light import checked_light
 from torchtransient.nlos.methods import Choice, check_method, choose_method, default_wavelength, is_planar
 from torchtransient.nlos.volume_memory import AT_ONCE, check_volume_fits
-from torchtransient.quantities import Numbers, count, finite, positive, real_array, shown
 from torchtransient.reconstruction import (
     FK,
     LCT,

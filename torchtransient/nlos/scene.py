@@ -11,11 +11,11 @@ import torch
 
 from torchtransient.capture import Scan
 from torchtransient.capture.wall import checked_mesh
+from torchtransient.checks import MOST, as_number, as_whole, shown
 from torchtransient.errors import SceneError, UnitError
 from torchtransient.nlos import defaults
 from torchtransient.nlos.arguments import check_is_scan
 from torchtransient.nlos.mesh_file import mesh_file
-from torchtransient.quantities import MOST, as_number, as_whole, shown
 from torchtransient.rendering.variant import active_variant
 from torchtransient.scene.edits import BuildOptions
 from torchtransient.scene.load import load

@@ -23,6 +23,7 @@ import torch
 from torchtransient.array_files.array_file import path_of
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
+from torchtransient.checks import Numbers
 from torchtransient.errors import ArgumentError
 from torchtransient.nlos import defaults
 from torchtransient.nlos.answers import checked_module, measured, say_black
@@ -34,7 +35,6 @@ from torchtransient.nlos.renderer import in_film_shape, in_scan_shape
 from torchtransient.nlos.scene import capture_scene, hidden_bounds
 from torchtransient.nlos.variant_choice import choose_variant
 from torchtransient.nlos.work import Film, HiddenWork, SceneWork, Work, seed_of
-from torchtransient.quantities import Numbers
 from torchtransient.rendering.variant import active_variant
 from torchtransient.scene.load import Scene, load
 from torchtransient.sensing import Device

@@ -12,11 +12,11 @@ import torch
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Scan, Wall
 from torchtransient.capture.scan import GRID_KINDS
+from torchtransient.checks import shown
 from torchtransient.errors import SceneError
 from torchtransient.files.yaml_files import Section, as_number, file_beside, read_yaml
 from torchtransient.nlos.tal_materials import material, spectrum
 from torchtransient.plain_texts import some_of, told_shortly
-from torchtransient.quantities import shown
 from torchtransient.scenes.transforms import rotate, scale, translate
 from torchtransient.transform_bins import transform_bins
 

@@ -9,9 +9,9 @@ from typing import Any
 import torch
 
 from torchtransient.capture import Capture
+from torchtransient.checks import count
 from torchtransient.errors import StorageError
 from torchtransient.nlos.forecast import size as size_in_words
-from torchtransient.quantities import count
 from torchtransient.reconstruction import VoxelGrid
 from torchtransient.rendering.memory import available_bytes
 from torchtransient.volume_methods import METHODS

@@ -11,13 +11,13 @@ import torch
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
+from torchtransient.checks import Numbers
 from torchtransient.files.content_key import content_key
 from torchtransient.nlos.renderer import POINTS, SPOTS, CaptureRenderer, as_capture, check_scan
 from torchtransient.nlos.scene import capture_scene
 from torchtransient.nlos.scene_files import files_of
 from torchtransient.nlos.scene_scan import scan_of_scene
 from torchtransient.nlos.variant_choice import VariantChoice
-from torchtransient.quantities import Numbers
 from torchtransient.rendering.renderer import TransientRenderer
 from torchtransient.rendering.variant import active_variant
 from torchtransient.scene.load import Scene, load

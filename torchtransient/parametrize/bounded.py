@@ -7,10 +7,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchtransient.checks import as_number, shown
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import floating, holds, number_tensor, without_autocast
 from torchtransient.parametrize.settings import Settings
-from torchtransient.quantities import as_number, shown
 
 Bound = float | Tensor
 # What single precision makes of the ends of a range, as a share of it.

@@ -14,7 +14,7 @@ import torch
 from torch import nn
 from torch.nn.utils import parametrize
 
-from torchtransient.scalar_state import ScalarState
+from torchtransient.floating import ScalarState
 
 _CONTAINERS = ("_parameters", "_buffers", "_modules")
 

@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchtransient.checks import positive, real_array, shown
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.floating import floating, holds, number_tensor, single, without_autocast
 from torchtransient.parametrize.settings import Settings, choice_code, choice_of
-from torchtransient.quantities import positive, real_array, shown
 
 Frame = Literal["world", "local"]
 _FRAMES: tuple[str, ...] = get_args(Frame)

@@ -7,11 +7,11 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor, nn
 
+from torchtransient.checks import finite, shown
+from torchtransient.checks import positive as greater_than_zero
 from torchtransient.errors import UnitError
 from torchtransient.floating import floating, holds, without_autocast
 from torchtransient.parametrize.settings import Settings, choice_code, choice_of
-from torchtransient.quantities import finite, shown
-from torchtransient.quantities import positive as greater_than_zero
 
 PositiveFunction = Literal["softplus", "exp"]
 _FUNCTIONS: tuple[str, ...] = get_args(PositiveFunction)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import SceneError
-from torchtransient.scalar_state import ScalarState
+from torchtransient.floating import ScalarState
 
 
 class Settings(ScalarState):

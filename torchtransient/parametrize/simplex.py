@@ -7,11 +7,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchtransient.checks import MOST, as_whole, shown
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import floating, holds, without_autocast
 from torchtransient.parametrize.bounded import checked_margin
 from torchtransient.parametrize.settings import Settings
-from torchtransient.quantities import MOST, as_whole, shown
 
 # What single precision makes of a sum of some hundred weights.
 _SLACK = 1e-4

@@ -9,12 +9,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchtransient.checks import count, real_array, shown
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import floating, single, without_autocast
 from torchtransient.parametrize.bounded import Albedo
 from torchtransient.parametrize.positive import Positive
 from torchtransient.parametrize.settings import Settings
-from torchtransient.quantities import count, real_array, shown
 
 
 def spline_basis(wavelengths_nm: Any, coefficients: int) -> NDArray[np.float64]:

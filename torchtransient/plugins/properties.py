@@ -10,10 +10,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from torchtransient.checks import shown
 from torchtransient.errors import SceneError
 from torchtransient.plugins.mitsuba_compat import mesh_faces
 from torchtransient.plugins.node_walk import ShownValue
-from torchtransient.quantities import shown
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Numbers and truth values of a plugin's properties, checked where Python would take others for them.

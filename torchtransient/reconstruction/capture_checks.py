@@ -12,8 +12,8 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
+from torchtransient.checks import as_whole, positive, shown, with_article
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.quantities import as_whole, positive, shown, with_article
 from torchtransient.reconstruction.linear import PRECISIONS
 from torchtransient.reconstruction.planar_scan import PlanarScan, check_real
 

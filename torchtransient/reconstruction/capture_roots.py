@@ -9,8 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from torchtransient.checks import finite, shown
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.quantities import finite, shown
 
 COUNTS_FLOOR = 0.25
 """Floor for photon counts: the slope is at most 2, the root of one count 0.89, that of none zero."""

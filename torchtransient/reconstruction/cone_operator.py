@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.quantities import count
+from torchtransient.checks import count
 from torchtransient.reconstruction.capture_checks import SNR, one_of, within
 from torchtransient.reconstruction.confocal_operator import ConfocalOperator, InverseOperator, chunk_rows
 from torchtransient.reconstruction.light_cone import ConeGrid, Resampling, offset_powers

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
+from torchtransient.checks import as_whole, finite, positive, shown
 from torchtransient.errors import UnitError
-from torchtransient.quantities import as_whole, finite, positive, shown
 from torchtransient.reconstruction.capture_checks import SNR, within
 from torchtransient.reconstruction.confocal_operator import ConfocalOperator, InverseOperator
 from torchtransient.reconstruction.linear import each

@@ -20,8 +20,8 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
+from torchtransient.checks import finite
 from torchtransient.errors import UnitError
-from torchtransient.quantities import finite
 from torchtransient.reconstruction.cone_operator import DEFAULT_SNR, FALL, ConeOperator
 from torchtransient.reconstruction.planar_scan import PlanarScan
 from torchtransient.reconstruction.transient_operator import reconstructed

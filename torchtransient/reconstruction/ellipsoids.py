@@ -15,8 +15,8 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Scan
+from torchtransient.checks import finite
 from torchtransient.errors import UnitError
-from torchtransient.quantities import finite
 from torchtransient.reconstruction.capture_checks import check_falloff
 from torchtransient.reconstruction.filters import sample_places
 from torchtransient.reconstruction.scan_operator import ScanOperator

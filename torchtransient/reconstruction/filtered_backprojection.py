@@ -7,8 +7,8 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
+from torchtransient.checks import shown
 from torchtransient.errors import ArgumentError
-from torchtransient.quantities import shown
 from torchtransient.reconstruction.capture_checks import checked_axis
 from torchtransient.reconstruction.ellipsoids import EllipsoidOperator, Group
 from torchtransient.reconstruction.filters import PhasorFilter, ReconstructionFilter

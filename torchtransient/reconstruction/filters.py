@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from torchtransient.axes import fast_length
+from torchtransient.checks import positive
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.quantities import positive
 from torchtransient.reconstruction.capture_checks import within
 from torchtransient.reconstruction.voxels import VoxelGrid
-from torchtransient.transform_bins import fast_length
 
 # Samples of a wavelength. Lines between them lose (pi / SAMPLES)^2 / 3 of a wave in the mean, 1.3 %.
 SAMPLES = 16

@@ -18,11 +18,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchtransient.axes import TimeAxis
+from torchtransient.axes import TimeAxis, fast_length
 from torchtransient.errors import ShapeError
 from torchtransient.reconstruction.confocal_operator import chunk_rows
 from torchtransient.reconstruction.planar_scan import PlanarScan
-from torchtransient.transform_bins import fast_length
 
 # Longest padded axis of v over the axis itself: what a cone reaches far behind the record costs memory and time.
 LONGEST = 8

@@ -9,10 +9,10 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from torchtransient.axes import TimeAxis
+from torchtransient.axes import TimeAxis, fast_length
 from torchtransient.capture import Capture, Scan
+from torchtransient.checks import finite, shown, with_article
 from torchtransient.errors import ArgumentError, SceneError, ShapeError
-from torchtransient.quantities import finite, shown, with_article
 from torchtransient.reconstruction.cameras import Camera, DirectLight, TransientCamera
 from torchtransient.reconstruction.capture_checks import check_falloff, refuse_pairs
 from torchtransient.reconstruction.filters import PhasorFilter, check_sampling
@@ -22,7 +22,6 @@ from torchtransient.reconstruction.proportions import check_wavelength
 from torchtransient.reconstruction.scan_operator import ScanOperator
 from torchtransient.reconstruction.transient_operator import reconstructed
 from torchtransient.reconstruction.voxels import VoxelGrid
-from torchtransient.transform_bins import fast_length
 
 # Complex numbers of spectra that are worked on at once.
 CPU_CHUNK, GPU_CHUNK = 1 << 20, 1 << 25

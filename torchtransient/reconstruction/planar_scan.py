@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from torchtransient.capture import Scan
+from torchtransient.checks import shown
 from torchtransient.errors import ShapeError
-from torchtransient.quantities import shown
 
 # Share of a pitch that points may be off the grid: single precision of a scan that is metres away from the origin.
 OFF_GRID = 1e-3

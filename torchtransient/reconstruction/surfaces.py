@@ -13,8 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchtransient.checks import share, shown
 from torchtransient.errors import ShapeError
-from torchtransient.quantities import share, shown
 from torchtransient.reconstruction.capture_checks import within
 from torchtransient.reconstruction.voxels import VoxelGrid, checked_depths
 

@@ -10,9 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchtransient.argument_names import arguments_of
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
+from torchtransient.checks import arguments_of
 from torchtransient.errors import ShapeError
 from torchtransient.reconstruction.capture_checks import (
     checked_axis,

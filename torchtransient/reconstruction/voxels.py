@@ -12,8 +12,8 @@ from torch import Tensor
 
 from torchtransient.capture import Scan, Wall
 from torchtransient.capture.distances import bounds_of
+from torchtransient.checks import Numbers, count, positive, real_array, shown
 from torchtransient.errors import SceneError, ShapeError, UnitError
-from torchtransient.quantities import Numbers, count, positive, real_array, shown
 from torchtransient.reconstruction.planar_scan import PlanarScan, hidden_side
 
 # How far points are off one line at most, as a share of its length.

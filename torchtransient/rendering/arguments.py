@@ -10,9 +10,8 @@ import torch
 from torch import nn
 from torch.nn.utils import parametrize
 
+from torchtransient.checks import as_whole, is_one_of, shown, text
 from torchtransient.errors import ArgumentError, ShapeError, UnitError, UnknownKeyError
-from torchtransient.given_types import is_one_of, text
-from torchtransient.quantities import as_whole, shown
 from torchtransient.rendering.films import FilmLayout, film_of_arguments
 from torchtransient.scene.parameters import unknown_key
 from torchtransient.scene.values import as_float, fit_shape

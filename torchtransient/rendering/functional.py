@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import nn
 
-from torchtransient.argument_names import arguments_of
+from torchtransient.checks import arguments_of
 from torchtransient.rendering.arguments import given_values
 from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.output import RenderOutput

@@ -14,9 +14,8 @@ from typing import Any
 import torch
 
 from torchtransient.axes import TimeAxis
+from torchtransient.checks import as_number, as_whole, of_class, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.given_types import of_class
-from torchtransient.quantities import as_number, as_whole, shown
 from torchtransient.rendering.carry_out import Numbered, check_whole, groups_of, refusal
 from torchtransient.rendering.engine import check_values
 from torchtransient.rendering.opaque import opaque

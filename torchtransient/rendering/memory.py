@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
+from torchtransient.array_files.free_memory import available_memory
 from torchtransient.errors import StorageError
-from torchtransient.free_memory import available_memory
 from torchtransient.rendering.variant import device_type
 
 _BYTES_PER_VALUE = 4

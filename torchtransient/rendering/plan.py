@@ -11,13 +11,11 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from torchtransient import plugins
-from torchtransient.argument_names import arguments_of
 from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.checks import Numbers, arguments_of, as_whole, count, is_one_of, several, shown, text
 from torchtransient.errors import ArgumentError, SceneError, UnitError
 from torchtransient.gates import Gate
-from torchtransient.given_types import is_one_of, several, text
 from torchtransient.pulses import Pulse
-from torchtransient.quantities import Numbers, as_whole, count, shown
 from torchtransient.rendering.arguments import checked_depth, checked_filter, checked_keys, film_asked_for
 from torchtransient.rendering.films import FILMS, FilmLayout, layout_of_plugin
 from torchtransient.rendering.opaque import opaque

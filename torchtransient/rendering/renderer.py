@@ -11,13 +11,12 @@ import torch
 from torch import nn
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.checks import Numbers, flag, is_one_of, shown
 from torchtransient.errors import ArgumentError, SceneError, ShapeError
 from torchtransient.gates import Gate
-from torchtransient.given_types import is_one_of
 from torchtransient.parametrize.copies import CopiesParametrized
 from torchtransient.plugins.parameters import check_slope, sun_axes
 from torchtransient.pulses import Pulse
-from torchtransient.quantities import Numbers, flag, shown
 from torchtransient.rendering import engine
 from torchtransient.rendering.arguments import (
     Values,

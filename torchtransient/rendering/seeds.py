@@ -9,8 +9,8 @@ from typing import Any
 
 import torch
 
+from torchtransient.checks import as_whole, shown
 from torchtransient.errors import ShapeError, TorchTransientWarning, UnitError, level_of_user
-from torchtransient.quantities import as_whole, shown
 
 SEED_RANGE = 2**32
 

@@ -7,10 +7,10 @@ from types import TracebackType
 
 import torch
 
+from torchtransient.checks import as_whole, shown
 from torchtransient.errors import DeviceError, UnitError, VariantError
 from torchtransient.plugins.drjit_pool import engine_lock, resize_pool, set_drjit_threads
 from torchtransient.plugins.interrupted import interrupts_wait
-from torchtransient.quantities import as_whole, shown
 from torchtransient.rendering.variant import at_work
 
 MOST_THREADS = 1024

@@ -30,10 +30,9 @@ import torch
 from torch.autograd import forward_ad
 
 from torchtransient._collection import no_collection
+from torchtransient.checks import as_whole, is_one_of, shown
 from torchtransient.errors import ArgumentError, GradientError, ShapeError, UnitError, VariantError
-from torchtransient.given_types import is_one_of
 from torchtransient.plugins.interrupted import interrupts_wait
-from torchtransient.quantities import as_whole, shown
 from torchtransient.rendering.broken_numbers import all_finite, carried_on
 from torchtransient.rendering.derivatives import Asked, run
 from torchtransient.rendering.interrupts import ends_frames

@@ -9,10 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from torchtransient.checks import check_special, shown
 from torchtransient.errors import SceneError
-from torchtransient.file_places import check_special
 from torchtransient.plugins.properties import count_bad, numbers_of, refuse
-from torchtransient.quantities import shown
 from torchtransient.scene.nodes import children, is_film, node_kind
 from torchtransient.scene.objects import LoadedScene
 

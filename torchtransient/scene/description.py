@@ -17,11 +17,10 @@ from typing import Any
 import numpy as np
 
 from torchtransient import plugins
+from torchtransient.checks import check_special, path_of, shown
 from torchtransient.errors import SceneError, StorageError
-from torchtransient.file_places import check_special, path_of
 from torchtransient.plugins.dictionaries import NUMBERS_IN_TEXT, Pixels, Voxels, is_ours, numbers_in_text, parsed
 from torchtransient.plugins.unfinished import afterwards
-from torchtransient.quantities import shown
 from torchtransient.scene.checks import MOST_LEVELS
 from torchtransient.scene.objects import Description, LoadedObject, LoadedScene, describe_object, objects_inside
 

@@ -14,10 +14,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from torchtransient.checks import flag, shown
 from torchtransient.errors import ArgumentError, GradientError, SceneError, TorchTransientError
 from torchtransient.plugins import kind_of, modules_of_others, register_module
 from torchtransient.plugins.unfinished import afterwards
-from torchtransient.quantities import flag, shown
 from torchtransient.rendering.kernel_errors import named_errors
 from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.variant import active_variant, in_variant, resolve_variant

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from torchtransient.checks import is_one_of, shown
 from torchtransient.errors import (
     ArgumentError,
     GradientError,
@@ -23,9 +24,7 @@ from torchtransient.errors import (
     PhysicsWarning,
     level_of_user,
 )
-from torchtransient.given_types import is_one_of
 from torchtransient.plugins.parameters import SHARE, PhysicalRange
-from torchtransient.quantities import shown
 
 MODES = ("warn", "error", "ignore")
 # Largest share of the light outside of the window without a warning.

@@ -14,11 +14,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from torchtransient.axes import TimeAxis
+from torchtransient.checks import is_one_of, shown
 from torchtransient.errors import ArgumentError, SceneError
-from torchtransient.given_types import is_one_of
 from torchtransient.plugins.parameters import check_slope
 from torchtransient.pulses import Pulse
-from torchtransient.quantities import shown
 from torchtransient.rendering.slope import check_filter, filter_for
 from torchtransient.rendering.variant import active_variant
 from torchtransient.scene.edits import NO_LIMIT, BuildOptions

@@ -16,8 +16,8 @@ import torch
 
 from torchtransient import plugins
 from torchtransient.array_files.part_files import writing_said
+from torchtransient.checks import check_folder, path_of
 from torchtransient.errors import SceneError, ShapeError, TorchTransientError, UnitError
-from torchtransient.file_places import check_folder, path_of
 from torchtransient.plugins import kind_of
 from torchtransient.plugins.dictionaries import double_transform
 from torchtransient.plugins.drjit_pool import threads_for_files

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from torch.autograd import forward_ad
 
+from torchtransient.checks import real_array, shown
 from torchtransient.errors import DeviceError, SceneError, ShapeError
 from torchtransient.plugins.mitsuba_compat import check_pose, is_number_of_kernels, is_turned_by_reflections
-from torchtransient.quantities import real_array, shown
 from torchtransient.scene.build import BuiltScene
 from torchtransient.scene.parameters import classify, read_value
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from torchtransient.checks import finite, positive
 from torchtransient.errors import SceneError, UnitError
-from torchtransient.quantities import finite, positive
 from torchtransient.scenes.parts import SceneDict, checked_depth, diffuse, perspective, transient_film
 from torchtransient.scenes.transforms import look_at, rotate, scale, translate
 

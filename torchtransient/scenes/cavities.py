@@ -5,7 +5,7 @@ The solutions are in `torchtransient.testing.closed_forms` under the same names.
 
 from __future__ import annotations
 
-from torchtransient.quantities import finite, positive
+from torchtransient.checks import finite, positive
 from torchtransient.scenes.parts import SceneDict, diffuse, perspective, transient_film, transient_path
 from torchtransient.scenes.transforms import look_at, rotate, scale, translate
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from torchtransient.checks import positive
 from torchtransient.errors import ArgumentError
-from torchtransient.quantities import positive
 from torchtransient.scenes.parts import SceneDict, diffuse, perspective, transient_film, transient_path
 from torchtransient.scenes.transforms import look_at, rotate, scale, translate
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from torchtransient.checks import shown
 from torchtransient.errors import ArgumentError
-from torchtransient.quantities import shown
 
 _S = 0.2  # width of a stroke
 _H = 0.5 * _S

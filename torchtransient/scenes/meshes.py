@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.capture.wall import checked_mesh
+from torchtransient.checks import Numbers, count, positive, transform
 from torchtransient.errors import SceneError, ShapeError
-from torchtransient.quantities import Numbers, count, positive, transform
 from torchtransient.scenes.parts import SceneDict, diffuse
 from torchtransient.scenes.transforms import Matrix, Triple
 

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchtransient.checks import finite, positive, real_array, shown, transform
 from torchtransient.errors import SceneError, ShapeError
-from torchtransient.quantities import finite, positive, real_array, shown, transform
 from torchtransient.scenes.letters import outline
 from torchtransient.scenes.meshes import Albedo, Mesh, ellipsoid, joined, plate, sheet, solid, subdivided, triangle_mesh
 from torchtransient.scenes.parts import SceneDict, diffuse

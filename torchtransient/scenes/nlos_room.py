@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from torchtransient.quantities import flag, positive
+from torchtransient.checks import flag, positive
 from torchtransient.scenes.meshes import triangle_mesh
 from torchtransient.scenes.nlos import mannequin
 from torchtransient.scenes.parts import SceneDict, diffuse

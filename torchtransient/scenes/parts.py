@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
+from torchtransient.checks import Numbers, count, finite, positive, shares, shown, text
 from torchtransient.errors import ArgumentError, SceneError
-from torchtransient.given_types import text
-from torchtransient.quantities import Numbers, count, finite, positive, shares, shown
 from torchtransient.scenes.transforms import Matrix
 
 SceneDict = dict[str, Any]

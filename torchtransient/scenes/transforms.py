@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from torchtransient.checks import finite, real_array, shown
 from torchtransient.errors import SceneError, ShapeError
-from torchtransient.quantities import finite, real_array, shown
 
 Matrix = NDArray[np.float64]
 Triple = Sequence[float] | NDArray[np.float64]

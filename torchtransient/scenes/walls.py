@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+from torchtransient.checks import count, finite, is_one_of, positive, shown
 from torchtransient.errors import ArgumentError
-from torchtransient.given_types import is_one_of
-from torchtransient.quantities import count, finite, positive, shown
 from torchtransient.scenes.parts import SceneDict, diffuse, perspective, transient_film, transient_path
 from torchtransient.scenes.transforms import look_at, rotate, scale, translate
 

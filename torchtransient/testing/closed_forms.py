@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from torchtransient.checks import positive, share
 from torchtransient.errors import ArgumentError, UnitError
-from torchtransient.quantities import positive, share
 from torchtransient.testing.flight_lengths import (
     Array,
     FlightLaw,

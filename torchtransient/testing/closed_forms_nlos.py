@@ -11,8 +11,8 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
+from torchtransient.checks import positive, share
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.quantities import positive, share
 from torchtransient.testing.flight_lengths import Array, checked_edges
 
 

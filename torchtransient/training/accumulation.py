@@ -11,8 +11,8 @@ import torch
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
+from torchtransient.checks import Numbers, as_number, shown
 from torchtransient.errors import ArgumentError, GradientError, ShapeError, UnitError
-from torchtransient.quantities import Numbers, as_number, shown
 
 Part = TypeVar("Part")
 

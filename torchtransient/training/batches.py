@@ -10,9 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Dataset, IterableDataset, Sampler
 
+from torchtransient.checks import by_number, count, flag, shown
 from torchtransient.errors import StorageError, UnitError
-from torchtransient.given_types import by_number
-from torchtransient.quantities import count, flag, shown
 from torchtransient.training.processes import worker_init
 
 _WHAT = "Batches"

@@ -19,6 +19,7 @@ from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 from torch.nn.parameter import is_lazy
 
+from torchtransient.checks import check_folder, check_special, count, path_of, shown
 from torchtransient.errors import (
     ArgumentError,
     ShapeError,
@@ -27,8 +28,6 @@ from torchtransient.errors import (
     TorchTransientWarning,
     UnitError,
 )
-from torchtransient.file_places import check_folder, check_special, path_of
-from torchtransient.quantities import count, shown
 from torchtransient.training.optimizer_states import check_optimizer, kind_of, put_back_optimizer
 from torchtransient.training.plain_state import plain
 from torchtransient.training.random_states import check_random_state, random_state, set_random_state

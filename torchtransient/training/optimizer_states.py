@@ -6,8 +6,8 @@ from typing import Any
 
 import torch
 
+from torchtransient.checks import shown
 from torchtransient.errors import ShapeError, StorageError
-from torchtransient.quantities import shown
 
 # Entries of torch's optimisers that have the shape of their parameter.
 _OF_SHAPE = (

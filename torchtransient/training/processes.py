@@ -12,9 +12,8 @@ from datetime import timedelta
 import torch
 import torch.distributed as dist
 
+from torchtransient.checks import as_number, count, is_one_of, positive, shown
 from torchtransient.errors import DeviceError, UnitError
-from torchtransient.given_types import is_one_of
-from torchtransient.quantities import as_number, count, positive, shown
 
 _TORCHRUN = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import torch
 
+from torchtransient.checks import count, shown
 from torchtransient.errors import ArgumentError, DeviceError, UnitError
-from torchtransient.quantities import count, shown
 
 _BITS = 2**32
 

@@ -10,10 +10,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchtransient import quantities
+from torchtransient import checks
 from torchtransient.axes import TimeAxis
+from torchtransient.checks import is_one_of
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.given_types import is_one_of
 from torchtransient.units import opl_to_seconds
 from torchtransient.vis import colour_maps
 from torchtransient.vis.files import Image, picture_figure, save_figure, save_image, to_bytes
@@ -76,7 +76,7 @@ def rainbow(
     is given. Raises ArgumentError, ShapeError, UnitError and StorageError.
     """
     if not is_one_of(style, STYLES):
-        raise ArgumentError(f"rainbow: expected style 'peak' or 'fusion', got {quantities.shown(style)}.")
+        raise ArgumentError(f"rainbow: expected style 'peak' or 'fusion', got {checks.shown(style)}.")
     cube, axis = transient_of(source, axis, "rainbow")
     axis = axis or TimeAxis(0.0, 1.0, cube.shape[1])
     steady = cube.sum((0, 1))
@@ -149,9 +149,9 @@ def _arrival_limits(cube: Tensor, axis: TimeAxis) -> tuple[float, float]:
 
 def checked_limits(limits: tuple[float, float]) -> tuple[float, float]:
     """Two lengths in metres. Raises ShapeError for what is no pair of numbers, UnitError for those that do not rise."""
-    pair = quantities.real_array(limits)
+    pair = checks.real_array(limits)
     if pair is None or pair.shape != (2,):
-        raise ShapeError(f"limits: expected two lengths in metres, got {quantities.shown(limits)}.")
+        raise ShapeError(f"limits: expected two lengths in metres, got {checks.shown(limits)}.")
     low, high = pair.tolist()
     if not (np.isfinite(pair).all() and low < high):
         raise UnitError(f"limits: expected two lengths in metres, the first below the second, got {limits!r}.")

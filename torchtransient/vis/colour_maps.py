@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchtransient.checks import as_number, is_one_of, numbers, shown
 from torchtransient.errors import ArgumentError, UnitError
-from torchtransient.given_types import is_one_of
-from torchtransient.quantities import as_number, numbers, shown
 from torchtransient.vis.files import figure_type
 
 if TYPE_CHECKING:

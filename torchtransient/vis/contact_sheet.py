@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchtransient.checks import count, mapping, numbers, of_class, several, shown
 from torchtransient.errors import ShapeError
-from torchtransient.given_types import mapping, of_class, several
-from torchtransient.quantities import count, numbers, shown
 from torchtransient.vis.files import figure_type, save_figure
 
 if TYPE_CHECKING:

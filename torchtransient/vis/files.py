@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.array_files.part_files import replacing
+from torchtransient.checks import check_folder, count
 from torchtransient.errors import MissingPackageError, ShapeError, StorageError
-from torchtransient.file_places import check_folder
 from torchtransient.plain_texts import said_in_short
-from torchtransient.quantities import count
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchtransient.checks import Numbers, finite, mapping, numbers, shown
 from torchtransient.errors import ShapeError
-from torchtransient.given_types import mapping
-from torchtransient.quantities import Numbers, finite, numbers, shown
 from torchtransient.vis.files import figure_type, save_figure
 from torchtransient.vis.sources import real_tensor
 from torchtransient.vis.tone_mapping import exposure_of, tone_map

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from torchtransient.checks import as_number, shown
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.quantities import as_number, shown
 from torchtransient.vis import colour_maps
 from torchtransient.vis.files import picture_figure, save_figure
 from torchtransient.vis.sources import Source, as_tensor

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.capture.wall import checked_mesh, triple
+from torchtransient.checks import positive, shown, transform
 from torchtransient.errors import SceneError
-from torchtransient.quantities import positive, shown, transform
 
 Array = NDArray[np.float64]
 

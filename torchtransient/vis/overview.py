@@ -11,9 +11,8 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
+from torchtransient.checks import check_folder, of_class
 from torchtransient.errors import ShapeError, StorageError
-from torchtransient.file_places import check_folder
-from torchtransient.given_types import of_class
 from torchtransient.vis.files import figure_type, save_figure
 from torchtransient.vis.sources import pixel_of, real_tensor
 from torchtransient.vis.tone_mapping import tone_map

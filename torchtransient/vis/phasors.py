@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchtransient.axes import FrequencyAxis
+from torchtransient.checks import Numbers, as_whole, count, several, shown
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.given_types import several
-from torchtransient.quantities import Numbers, as_whole, count, shown
 from torchtransient.units import SPEED_OF_LIGHT
 from torchtransient.vis import colour_maps
 from torchtransient.vis.files import enlarge, figure_type, picture_figure, save_figure, to_bytes

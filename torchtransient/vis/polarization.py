@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchtransient import stokes as st
+from torchtransient.checks import finite, is_one_of, several, shown
 from torchtransient.errors import ArgumentError, UnitError
-from torchtransient.given_types import is_one_of, several
-from torchtransient.quantities import finite, shown
 from torchtransient.vis import colour_maps
 from torchtransient.vis.files import picture_figure, save_figure
 from torchtransient.vis.sources import Source, stokes_of

@@ -12,13 +12,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchtransient import quantities
+from torchtransient import checks
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
 from torchtransient.capture.arithmetic import computed
+from torchtransient.checks import is_one_of, shown
 from torchtransient.errors import ArgumentError, SceneError, ShapeError
-from torchtransient.given_types import is_one_of
-from torchtransient.quantities import shown
 from torchtransient.vis.arrival import checked_limits, peak_time_picture
 from torchtransient.vis.files import figure_type, save_figure
 from torchtransient.vis.hidden_shapes import SQUARE, hidden_polygons
@@ -68,7 +67,7 @@ def transients_grid(
         figure = _image(cube, axis)
     else:
         try:
-            rows, columns = quantities.count("rows", rows), quantities.count("columns", columns)
+            rows, columns = checks.count("rows", rows), checks.count("columns", columns)
         except SceneError:
             raise ShapeError(
                 f"transients_grid: expected at least one row and column, got {shown(rows)} and {shown(columns)}."

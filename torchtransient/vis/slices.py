@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from torch import Tensor
 
-from torchtransient import quantities
+from torchtransient import checks
 from torchtransient.axes import TimeAxis
+from torchtransient.checks import several
 from torchtransient.errors import ArgumentError, ShapeError
-from torchtransient.given_types import several
 from torchtransient.units import opl_to_seconds
 from torchtransient.vis.files import figure_type, picture_figure, save_figure
 from torchtransient.vis.overview import moments_of_arrival
@@ -46,10 +46,10 @@ def streak(
     number, what = (column, "column") if column is not None else (row, "row")
     count = cube.shape[3] if what == "column" else cube.shape[2]
     number = count // 2 if number is None else number
-    place = quantities.as_whole(number)
+    place = checks.as_whole(number)
     if place is None or not -count <= place < count:
         raise ShapeError(
-            f"streak: {what} {quantities.shown(number)} lies outside of an image of {cube.shape[2]} x {cube.shape[3]}."
+            f"streak: {what} {checks.shown(number)} lies outside of an image of {cube.shape[2]} x {cube.shape[3]}."
         )
     number = place % count
     line: Tensor = cube[:, :, :, number] if what == "column" else cube[:, :, number]
@@ -91,7 +91,7 @@ def frame_grid(
     cube, axis, word = images_of(source, axis, "frame_grid")
     total = cube.shape[1]
     columns, number = (
-        quantities.count(f"frame_grid: {name}", value, 1, ShapeError)
+        checks.count(f"frame_grid: {name}", value, 1, ShapeError)
         for name, value in (("columns", columns), ("count", count))
     )
     if bins is None:
@@ -101,8 +101,8 @@ def frame_grid(
     if not bins:
         raise ShapeError("frame_grid: expected some bins, got none.")
     for index in bins:
-        if (place := quantities.as_whole(index)) is None or not 0 <= place < total:
-            raise ShapeError(f"frame_grid: bin {quantities.shown(index)} lies outside of {total} bins.")
+        if (place := checks.as_whole(index)) is None or not 0 <= place < total:
+            raise ShapeError(f"frame_grid: bin {checks.shown(index)} lies outside of {total} bins.")
     bins = [int(index) for index in bins]
     figure, panels = picture_figure(cube.shape[2], cube.shape[3], panels=len(bins), side=2.4, columns=columns)
     for panel, index in zip(panels, bins, strict=False):

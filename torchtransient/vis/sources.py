@@ -14,10 +14,9 @@ from torch import Tensor
 
 from torchtransient.array_files.array_file import damage_said, read_npy, read_some
 from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.checks import as_whole, of_class, real_array, shown
 from torchtransient.errors import ArgumentError, ShapeError, StorageError, UnitError
-from torchtransient.given_types import of_class
 from torchtransient.plain_texts import json_data
-from torchtransient.quantities import as_whole, real_array, shown
 
 Source = Any  # Tensor | NDArray | RenderOutput | Result | str | Path, told apart by what they offer
 _HDF5 = (".h5", ".hdf5")

@@ -8,9 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchtransient.checks import as_number, is_one_of, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.given_types import is_one_of
-from torchtransient.quantities import as_number, shown
 from torchtransient.vis.sources import real_tensor
 
 BROKEN = (1.0, 0.0, 1.0)  # magenta: a pixel that is not finite must not pass for black or white

@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchtransient import quantities
+from torchtransient import checks
 from torchtransient.axes import TimeAxis
+from torchtransient.checks import function, several
 from torchtransient.errors import ShapeError
-from torchtransient.given_types import function, several
 from torchtransient.vis.files import Image, enlarge, to_bytes
 from torchtransient.vis.sources import Source, images_of
 from torchtransient.vis.stamps import moment, with_strip
@@ -43,7 +43,7 @@ class Frames:
     make: Callable[[int], Image]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "count", quantities.count("Frames: count", self.count, 0, ShapeError))
+        object.__setattr__(self, "count", checks.count("Frames: count", self.count, 0, ShapeError))
         function("Frames: make", self.make, "the number of a frame")
 
     def __len__(self) -> int:
@@ -79,7 +79,7 @@ def frames(
     ShapeError and UnitError.
     """
     cube, axis, word = images_of(source, axis, "frames")
-    every = quantities.count("frames: every", every, 1, ShapeError)
+    every = checks.count("frames: every", every, 1, ShapeError)
     bins, (height, width) = cube.shape[1], cube.shape[2:]
     count = -(-bins // every)
     if exposure is not None:
@@ -87,7 +87,7 @@ def frames(
     else:
         exposure = exposure_of(cube.sum(1)) if accumulate else exposure_of_video(_added(cube, every))
     factor = max(1, round(_VISIBLE / max(height, width))) if scale is None else scale
-    factor = quantities.count("frames: scale", factor, 1, ShapeError)
+    factor = checks.count("frames: scale", factor, 1, ShapeError)
     running = _Running(cube) if accumulate else None
 
     def make(index: int) -> Image:
@@ -128,11 +128,11 @@ def side_by_side(parts: Sequence[Frames], gap: int = 4) -> Frames:
     parts = several("side_by_side", parts, "sequences of frames")
     for part in parts:
         if not isinstance(part, (Frames, list, tuple)):
-            raise ShapeError(f"side_by_side: expected several sequences of frames, got {quantities.shown(part)} among "
+            raise ShapeError(f"side_by_side: expected several sequences of frames, got {checks.shown(part)} among "
                              "them; tt.vis.frames makes one.")  # fmt: skip
     if not parts:
         raise ShapeError("side_by_side: expected at least one sequence of frames, got none.")
-    between = quantities.count("side_by_side: gap", gap, 0, ShapeError)
+    between = checks.count("side_by_side: gap", gap, 0, ShapeError)
 
     def make(index: int) -> Image:
         images = [checked_frame(part[index], "side_by_side") for part in parts]

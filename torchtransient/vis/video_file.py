@@ -10,13 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from torchtransient import quantities
+from torchtransient import checks
 from torchtransient.array_files.part_files import replacing
+from torchtransient.checks import check_folder, one_by_one, path_of, positive, shown
 from torchtransient.errors import MissingPackageError, ShapeError, StorageError, UnitError
-from torchtransient.file_places import check_folder, path_of
-from torchtransient.given_types import one_by_one
 from torchtransient.plain_texts import said_in_short
-from torchtransient.quantities import positive, shown
 from torchtransient.vis.files import Image
 from torchtransient.vis.stamps import DIM, GROUND, INK
 
@@ -60,7 +58,7 @@ def write_video(
     except UnitError:
         raise UnitError(f"video: expected fps > 0, got {shown(fps)}.") from None
     one_by_one("video", frames, "frames (H, W, 3) of uint8")
-    many = quantities.count("video: count", count, 0, ShapeError)
+    many = checks.count("video: count", count, 0, ShapeError)
     if not many:
         raise ShapeError("video: expected at least one frame, got none.")
     if target.suffix.lower() != ".mp4" and fps > 50:

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from torchtransient.checks import Numbers, positive, real_array, shown
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.quantities import Numbers, positive, real_array, shown
 from torchtransient.vis.files import figure_type, save_figure
 
 if TYPE_CHECKING:

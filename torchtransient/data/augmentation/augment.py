@@ -8,6 +8,7 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
+from torchtransient.checks import flag, shown
 from torchtransient.data.augmentation.operations import Operation
 from torchtransient.data.augmentation.pixel_map import PixelMap
 from torchtransient.data.augmentation.sample_images import as_image, check_unknown, size_of
@@ -15,7 +16,6 @@ from torchtransient.data.augmentation.scene_values import check_values
 from torchtransient.data.augmentation.stokes_fields import turned_stokes
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.geometry.pinhole import camera_matrices, transforms
-from torchtransient.quantities import flag, shown
 
 Kind = Literal["light", "label", "number", "point", "direction", "unchanged"]
 KINDS: dict[str, Kind] = {

@@ -8,14 +8,13 @@ from typing import Any
 
 from torch.utils.data import Dataset, IterableDataset
 
+from torchtransient.checks import by_number, count, shown
 from torchtransient.data.augmentation.augment import Augment
 from torchtransient.data.reading.recipe_dataset import RecipeDataset
 from torchtransient.data.reading.sample_draws import Epochs, checked_seed, sample_generator, sample_number
 from torchtransient.data.reading.stream import TransientStream
 from torchtransient.data.reading.transient_dataset import TransientDataset
 from torchtransient.errors import ArgumentError, SceneError
-from torchtransient.given_types import by_number
-from torchtransient.quantities import count, shown
 
 
 class Augmented(Epochs, Dataset[Any]):

@@ -10,10 +10,9 @@ from typing import Any, Literal, get_args
 import numpy as np
 import torch
 
+from torchtransient.checks import count, is_one_of, share, shown
 from torchtransient.data.augmentation.pixel_map import PixelMap
 from torchtransient.errors import ArgumentError, SceneError, ShapeError
-from torchtransient.given_types import is_one_of
-from torchtransient.quantities import count, share, shown
 
 Direction = Literal["horizontal", "vertical"]
 

@@ -13,10 +13,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchtransient.checks import as_number, count, of_class, real_array, shown
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.geometry.pinhole import camera_matrices, transforms
-from torchtransient.given_types import of_class
-from torchtransient.quantities import as_number, count, real_array, shown
 
 Matrix = NDArray[np.float64]
 _SIGNED = {torch.uint16: torch.int16, torch.uint32: torch.int32, torch.uint64: torch.int64}

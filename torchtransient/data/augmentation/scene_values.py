@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from torchtransient.checks import shown
 from torchtransient.data.augmentation.pixel_map import PixelMap
 from torchtransient.errors import SceneError
-from torchtransient.quantities import shown
 
 # The same in a mirror, and for every camera. Textures of surfaces among them: they go along with the coordinates `uv`.
 UNAFFECTED = frozenset(

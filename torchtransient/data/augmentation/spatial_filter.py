@@ -7,9 +7,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
+from torchtransient.checks import count
+from torchtransient.checks import function as given_function
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.given_types import function as given_function
-from torchtransient.quantities import count
 
 
 def spatial_filter(function: Callable[[Tensor], Tensor], light: Tensor, images_at_once: int = 4096) -> Tensor:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from torchtransient.array_files.part_files import check_system
+from torchtransient.checks import a_recipe, as_number, count, is_one_of, shown
 from torchtransient.data.generation.ledger import Ledger, facts
 from torchtransient.data.generation.plan import Plan, samples_per_shard
 from torchtransient.data.generation.run_log import RunLog, SampleBar
@@ -30,8 +31,6 @@ from torchtransient.data.generation.settings import (
 from torchtransient.data.recipes.plugin_modules import plugins_here
 from torchtransient.data.storage.file_names import MANIFEST_FILE, RECIPE_FILE, SHARD_FILES, shard_file_name
 from torchtransient.errors import ArgumentError, SceneError, StorageError, TorchTransientError, UnitError, level_of_user
-from torchtransient.given_types import a_recipe, is_one_of
-from torchtransient.quantities import as_number, count, shown
 
 ENGINES = ("local", "ray")
 # Samples that are tried until one tells how large all are.

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from torchtransient.array_files.part_files import whole_file, writing_said
+from torchtransient.checks import check_special
 from torchtransient.data.generation.plan import Plan
 from torchtransient.data.recipes.places import without_places
 from torchtransient.data.recipes.plugin_modules import PluginNames
 from torchtransient.data.storage.file_names import RECIPE_FILE
 from torchtransient.errors import StorageError
-from torchtransient.file_places import check_special
 from torchtransient.plain_texts import json_data, said_in_short
 
 # The first one left samples out whose light the window misses.

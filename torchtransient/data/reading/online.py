@@ -9,12 +9,11 @@ from typing import Any
 import torch
 from torch.utils.data import IterableDataset, get_worker_info
 
+from torchtransient.checks import MOST, a_recipe, as_number, count, shown
 from torchtransient.data.reading.online_producers import WHAT, Producers
 from torchtransient.data.reading.online_schedule import Schedule
 from torchtransient.data.reading.sample_draws import checked_transform
 from torchtransient.errors import ShapeError, TorchTransientError, UnitError
-from torchtransient.given_types import a_recipe
-from torchtransient.quantities import MOST, as_number, count, shown
 
 
 class OnlineDataset(IterableDataset[dict[str, Any]]):

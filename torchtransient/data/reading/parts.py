@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from torchtransient.axes import TimeAxis
+from torchtransient.checks import as_number, shown
 from torchtransient.errors import StorageError, TorchTransientError
-from torchtransient.quantities import as_number, shown
 
 _WHAT = "data set"
 # Borders that differ from a bin's by less, in bins, are that bin's.

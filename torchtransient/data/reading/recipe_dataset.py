@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset
 
+from torchtransient.checks import a_recipe, count, shown
 from torchtransient.data.reading.sample_draws import (
     Epochs,
     checked_seed,
@@ -20,8 +21,6 @@ from torchtransient.data.reading.sample_draws import (
     transformed,
 )
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.given_types import a_recipe
-from torchtransient.quantities import count, shown
 
 _WHAT = "RecipeDataset"
 

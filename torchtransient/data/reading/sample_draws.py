@@ -10,9 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchtransient.checks import count, function, shown
 from torchtransient.errors import UnitError
-from torchtransient.given_types import function
-from torchtransient.quantities import count, shown
 
 
 class Epochs:

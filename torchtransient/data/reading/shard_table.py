@@ -12,12 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchtransient.checks import path_of, several, shown
 from torchtransient.data.storage.manifest import named_shards, shards_of
 from torchtransient.data.storage.shard_file import Shard
 from torchtransient.errors import StorageError, TorchTransientWarning, level_of_user
-from torchtransient.file_places import path_of
-from torchtransient.given_types import several
-from torchtransient.quantities import shown
 
 WHAT = "data set"
 _OPEN = 32

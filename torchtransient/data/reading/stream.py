@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from torch.utils.data import IterableDataset, get_worker_info
 
 from torchtransient.axes import TimeAxis
+from torchtransient.checks import count, flag
 from torchtransient.data.reading.shard_table import WHAT
 from torchtransient.data.reading.transient_dataset import TransientDataset
 from torchtransient.errors import ArgumentError, StorageError
-from torchtransient.quantities import count, flag
 
 
 class TransientStream(IterableDataset[dict[str, Any]]):

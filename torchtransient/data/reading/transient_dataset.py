@@ -11,6 +11,7 @@ from torch.utils.data import Dataset
 
 from torchtransient.array_files.array_file import tensor_in
 from torchtransient.axes import TimeAxis
+from torchtransient.checks import count, several, shown
 from torchtransient.data.reading.parts import axis_of, bins_of, cut_axis, image_size, pixels_of
 from torchtransient.data.reading.sample_draws import (
     Epochs,
@@ -26,8 +27,6 @@ from torchtransient.data.reading.shard_table import WHAT, ShardTable
 from torchtransient.data.storage.encodings import measured_names
 from torchtransient.data.storage.shard_file import Shard
 from torchtransient.errors import ArgumentError, StorageError, UnitError
-from torchtransient.given_types import several
-from torchtransient.quantities import count, shown
 
 _MEASURED = "measurement"
 _VALUES, _INDEX, _OUTSIDE, _TRANSIENT = "values", "index", "outside", "transient"

@@ -10,9 +10,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from torchtransient.checks import real_array, shown
 from torchtransient.data.recipes.streams import Draw
 from torchtransient.errors import SceneError, ShapeError, UnitError
-from torchtransient.quantities import real_array, shown
 
 # Kinds of values: numbers of a shape, a pose (4, 4), or anything (texts, nodes of a scene).
 NUMBERS, POSE, ANYTHING = "numbers", "pose", "anything"

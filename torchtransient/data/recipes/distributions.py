@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchtransient.checks import Numbers, as_number, flag, index, positive, real_array, shown, transform
 from torchtransient.data.recipes.distribution import ANYTHING, NUMBERS, POSE, Distribution, Place, bounds, spread
 from torchtransient.data.recipes.streams import Draw
 from torchtransient.errors import SceneError, ShapeError, UnitError
-from torchtransient.quantities import Numbers, as_number, flag, index, positive, real_array, shown, transform
 
 # A truncated normal distribution keeps at least this share of the untruncated one: beyond, digits of it are lost.
 _LEAST_MASS = 1e-9

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from torchtransient.checks import count
 from torchtransient.data.recipes.checks import SAMPLES, structures_of
 from torchtransient.data.recipes.outside_light import OutsideLight
 from torchtransient.data.recipes.sample import Sample
 from torchtransient.errors import StorageError
-from torchtransient.quantities import count
 from torchtransient.rendering.threads import threads
 
 if TYPE_CHECKING:

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchtransient.checks import shown
 from torchtransient.data.recipes.distribution import ANYTHING, NUMBERS, POSE, Place
 from torchtransient.data.recipes.sample import in_order
 from torchtransient.data.recipes.specification import (
@@ -25,7 +26,6 @@ from torchtransient.data.recipes.written import written_frequencies, written_sha
 from torchtransient.errors import ArgumentError, GradientError, SceneError, ShapeError, TorchTransientError
 from torchtransient.files.scan_data import scan_data
 from torchtransient.plugins import versions_of_others
-from torchtransient.quantities import shown
 from torchtransient.rendering.labels import LABELS, first_return, label_names, material_names, scene_labels
 from torchtransient.rendering.renderer import TransientRenderer
 from torchtransient.rendering.variant import active_variant, stokes_components

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchtransient.checks import real_array
 from torchtransient.data.recipes.distributions import Choice
 from torchtransient.data.recipes.kept_scene import Kept, Measures
 from torchtransient.data.recipes.sample import Sample
@@ -23,7 +24,6 @@ from torchtransient.data.recipes.streams import Stream
 from torchtransient.data.recipes.structures import SCAN, Structure
 from torchtransient.errors import UnitError
 from torchtransient.files.scan_data import scan_data
-from torchtransient.quantities import real_array
 
 # Structures whose scenes are kept. Mitsuba compiles a method call for all objects that are alive: with 8 scenes of the
 # Cornell box a sample takes 350 ms instead of 25, and each new scene compiles anew. To build one takes 50 ms.

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from torchtransient.checks import several
 from torchtransient.errors import PluginRegistrationError, SceneError
-from torchtransient.given_types import several
 
 # A module's name, and the plugins that it said to have.
 PluginNames = tuple[tuple[str, tuple[tuple[str, str], ...]], ...]

@@ -9,10 +9,10 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from torchtransient.checks import real_array, shown
 from torchtransient.data.recipes.distribution import ANYTHING, NUMBERS, POSE, Distribution, Place, bounds, spread
 from torchtransient.data.recipes.streams import Draw
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
-from torchtransient.quantities import real_array, shown
 from torchtransient.scenes.transforms import look_at, rotate
 
 _ABOUT = ("self", "world")

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Self
 
+from torchtransient.checks import count
 from torchtransient.data.recipes import recipe_file
 from torchtransient.data.recipes.checks import check_recipe, light_outside
 from torchtransient.data.recipes.contact_sheet import contact_sheet
@@ -15,7 +16,6 @@ from torchtransient.data.recipes.maker import Maker
 from torchtransient.data.recipes.outside_light import OutsideLight
 from torchtransient.data.recipes.sample import Sample
 from torchtransient.data.recipes.specification import Specification
-from torchtransient.quantities import count
 
 # What is no part of the description, and stays behind when a recipe is pickled or copied.
 _OF_PROCESS = ("_maker", "_parameters", "_outside")

@@ -19,6 +19,7 @@ from typing import Any
 
 from torchtransient.array_files.part_files import write_text
 from torchtransient.axes import TimeAxis
+from torchtransient.checks import path_of, shown
 from torchtransient.data.recipes.places import files_of, without_places
 from torchtransient.data.recipes.specification import Specification
 from torchtransient.data.recipes.structures import OneOf
@@ -34,11 +35,9 @@ from torchtransient.data.recipes.written import (
     written_shape,
 )
 from torchtransient.errors import MissingPackageError, SceneError, TorchTransientError
-from torchtransient.file_places import path_of
 from torchtransient.files.scan_data import scan_data, scan_from_data
 from torchtransient.files.yaml_files import Section, read_yaml
 from torchtransient.plain_texts import json_data, said_in_short, text_of_file, told_shortly
-from torchtransient.quantities import shown
 from torchtransient.scene.description import DictDescription, XmlDescription, describe_dict
 from torchtransient.scene.load import Scene
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Scan
+from torchtransient.checks import MOST, Numbers, as_whole, count, is_one_of, mapping, real_array, shown
 from torchtransient.data.recipes.distribution import Distribution, Place
 from torchtransient.data.recipes.distributions import Choice, pick
 from torchtransient.data.recipes.plugin_modules import check_plugins
@@ -22,9 +23,7 @@ from torchtransient.data.recipes.written import read_distribution
 from torchtransient.errors import ArgumentError, SceneError, ShapeError
 from torchtransient.files.content_key import content_key
 from torchtransient.gates import Gate
-from torchtransient.given_types import is_one_of, mapping
 from torchtransient.pulses import Pulse
-from torchtransient.quantities import MOST, Numbers, as_whole, count, real_array, shown
 from torchtransient.rendering.arguments import checked_filter
 from torchtransient.rendering.variant import resolve_variant
 from torchtransient.sensing import DEVICES, Device

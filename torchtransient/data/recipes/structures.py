@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 
 from torchtransient.capture import Scan
+from torchtransient.checks import Numbers, shown
 from torchtransient.data.recipes.distributions import checked_choices
 from torchtransient.errors import SceneError
 from torchtransient.files.content_key import content_key
-from torchtransient.quantities import Numbers, shown
 from torchtransient.scene.description import DictDescription, Plain, XmlDescription, describe_dict
 from torchtransient.scene.load import Scene, load
 from torchtransient.scene.objects import LoadedScene

@@ -17,6 +17,7 @@ import torch
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Scan
+from torchtransient.checks import shown
 from torchtransient.data.recipes import distributions as distributions
 from torchtransient.data.recipes import poses as poses
 from torchtransient.data.recipes.distribution import Distribution
@@ -27,7 +28,6 @@ from torchtransient.gates import Gate
 from torchtransient.plain_texts import said_in_short
 from torchtransient.plugins.dictionaries import Pixels, Voxels
 from torchtransient.pulses import Pulse
-from torchtransient.quantities import shown
 
 _MOST_LISTED = 64
 # Keys of mappings that stand for what JSON does not have.

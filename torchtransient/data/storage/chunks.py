@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.array_files.hdf5_writing import hdf5_package
+from torchtransient.checks import is_one_of, shown
 from torchtransient.errors import ArgumentError, MissingPackageError, StorageError
-from torchtransient.given_types import is_one_of
-from torchtransient.quantities import shown
 
 COMPRESSIONS = ("blosc2", "gzip", "none")
 # What HDF5 1.10 and later read.

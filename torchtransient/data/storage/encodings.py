@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchtransient.checks import is_one_of, shown
 from torchtransient.errors import ArgumentError, StorageError
-from torchtransient.given_types import is_one_of
-from torchtransient.quantities import shown
 
 STORES = ("exact", "rounded", "counts")
 # What sensors make of a transient; of it alone there are counts.

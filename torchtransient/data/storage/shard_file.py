@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torchtransient.array_files.array_file import check_source, damage_said
 from torchtransient.array_files.hdf5_limits import check_memory, dataset_of, is_number, read_dataset
 from torchtransient.array_files.hdf5_writing import hdf5_package
+from torchtransient.checks import as_whole, shown
 from torchtransient.data.storage.chunks import check_chunks, time_axis
 from torchtransient.data.storage.encodings import ENCODINGS, decoded
 from torchtransient.data.storage.shard_writing import (
@@ -28,7 +29,6 @@ from torchtransient.data.storage.shard_writing import (
 )
 from torchtransient.data.storage.shard_writing import ShardWriter as ShardWriter
 from torchtransient.errors import StorageError
-from torchtransient.quantities import as_whole, shown
 
 _TEXTS = ("format", "store", "compression")
 

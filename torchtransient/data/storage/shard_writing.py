@@ -22,11 +22,10 @@ from numpy.typing import NDArray
 from torchtransient.array_files.array_file import check_folder, path_of
 from torchtransient.array_files.hdf5_writing import new_hdf5
 from torchtransient.array_files.part_files import whole_file, writing_said
+from torchtransient.checks import count, mapping, shown
 from torchtransient.data.storage.chunks import LIBVER, Compressor, check_compression
 from torchtransient.data.storage.encodings import check_store, encoded, encoding_of, measured_names
 from torchtransient.errors import StorageError
-from torchtransient.given_types import mapping
-from torchtransient.quantities import count, shown
 
 FORMAT = "torchtransient shard 1"
 WHAT = "shard"

@@ -8,12 +8,12 @@ from typing import Any
 
 from torchtransient.array_files.array_file import damage_said, path_of
 from torchtransient.capture import Capture, Scan
+from torchtransient.checks import shown
 from torchtransient.data.reading.transient_dataset import TransientDataset
 from torchtransient.data.recipes.written import read_frequencies
 from torchtransient.errors import ArgumentError, StorageError
 from torchtransient.files.captures import tal
 from torchtransient.files.scan_data import scan_from_data
-from torchtransient.quantities import shown
 from torchtransient.rendering.progress import with_bar
 
 _WHAT = "TAL export"

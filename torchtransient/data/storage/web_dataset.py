@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from torchtransient.array_files.array_file import check_source, damage_said, path_of
 from torchtransient.array_files.hdf5_limits import check_memory
 from torchtransient.array_files.part_files import whole_file, writing_said
+from torchtransient.checks import positive
 from torchtransient.data.reading.sample_draws import outside_tensor
 from torchtransient.data.reading.transient_dataset import TransientDataset
 from torchtransient.data.storage.encodings import COUNTED, measured_names
 from torchtransient.errors import MissingPackageError, StorageError
-from torchtransient.quantities import positive
 from torchtransient.rendering.progress import with_bar
 
 _WHAT = "WebDataset"

@@ -15,6 +15,7 @@ from torchtransient.array_files.hdf5_writing import hdf5_package
 from torchtransient.axes import FrequencyAxis
 from torchtransient.capture import Capture
 from torchtransient.capture.files import register_files
+from torchtransient.checks import is_one_of, shown
 from torchtransient.errors import ArgumentError, StorageError
 from torchtransient.files import capture_file
 from torchtransient.files.captures import (
@@ -30,9 +31,7 @@ from torchtransient.files.captures import (
 )
 from torchtransient.files.captures.contents import WHAT, Contents, opened
 from torchtransient.files.captures.gaps import Gaps
-from torchtransient.given_types import is_one_of
 from torchtransient.plain_texts import some_of
-from torchtransient.quantities import shown
 
 OWN = "torchtransient"
 _MAT = (".mat",)

@@ -15,9 +15,9 @@ from torch import Tensor
 from torchtransient.array_files.array_file import array_of
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
+from torchtransient.checks import as_whole, finite, positive, real_array, shown
 from torchtransient.errors import StorageError
 from torchtransient.files.captures.contents import WHAT
-from torchtransient.quantities import as_whole, finite, positive, real_array, shown
 from torchtransient.units import opl_to_seconds, seconds_to_opl
 
 Numbers = NDArray[Any]

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torchtransient.array_files.array_file import array_of, replacing
 from torchtransient.array_files.hdf5_writing import new_hdf5
 from torchtransient.capture import Capture
+from torchtransient.checks import shown
 from torchtransient.errors import StorageError
 from torchtransient.files.captures.contents import WHAT, Contents
 from torchtransient.files.captures.gaps import (
@@ -31,7 +32,6 @@ from torchtransient.files.captures.gaps import (
     time_axis,
 )
 from torchtransient.files.captures.mat_file import write_parts
-from torchtransient.quantities import shown
 
 NAME = "zaragoza"
 _REQUIRED = {"data", "cameraGridPositions", "laserGridPositions", "deltaT"}

@@ -9,8 +9,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.checks import as_whole, shown
 from torchtransient.errors import GradientError, TorchTransientWarning, UnitError
-from torchtransient.quantities import as_whole, shown
 
 # Lanes of one kernel launch. Larger jobs run in several passes, which keeps a progress bar moving and indices in 32
 # bits.

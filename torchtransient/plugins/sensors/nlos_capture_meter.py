@@ -9,11 +9,11 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient.capture.triangles import first_hits
+from torchtransient.checks import real_array, shown
 from torchtransient.errors import SceneError
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.mitsuba_compat import mesh_faces, mesh_texcoords
 from torchtransient.plugins.parameter_effect import ParameterEffect, class_of, declare_effects
-from torchtransient.quantities import real_array, shown
 
 # --------------------------------------------------------------------- where places of a texture lie on a triangle mesh
 

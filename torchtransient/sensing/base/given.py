@@ -12,8 +12,8 @@ import torch
 from torch import Tensor, nn
 from torch.autograd import forward_ad
 
+from torchtransient.checks import shown
 from torchtransient.errors import GradientError, ShapeError, UnitError
-from torchtransient.quantities import shown
 
 
 def tensor_of(array: np.ndarray[Any, Any], where: str) -> Tensor:
@@ -80,13 +80,7 @@ def careful_init(init: Callable[..., None]) -> Callable[..., None]:
         for value in (*given, *named.values()):
             if isinstance(value, Tensor):
                 check_dense(value, where)
-        try:
-            init(self, *given, **named)
-        except TypeError as error:  # of arguments that a class inherits: said of the class, not of its base
-            head = f"{init.__qualname__}() "
-            if not str(error).startswith(head):
-                raise
-            raise TypeError(f"{where}.__init__() {str(error).removeprefix(head)}") from None
+        init(self, *given, **named)
         # once, when the whole object is there; private parts are looked at with what they are part of
         if getattr(type(self).__init__, "__wrapped__", None) is init and not where.startswith("_"):
             names = init.__code__.co_varnames[1:] if hasattr(init, "__code__") else ()

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import WIDEST_BIN_S, TimeAxis
+from torchtransient.checks import MOST, as_number, as_whole, shown, unit_of
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.floating import product as product
 from torchtransient.floating import without_autocast as without_autocast
-from torchtransient.quantities import MOST, as_number, as_whole, shown, unit_of
 from torchtransient.sensing.base.given import check_dense, refuse_cut_off
 
 TIME = -3  # the time dimension of (..., C, T, H, W)

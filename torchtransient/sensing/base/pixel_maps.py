@@ -7,9 +7,9 @@ import math
 import torch
 from torch import Tensor, nn
 
+from torchtransient.checks import unit_of
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import holds
-from torchtransient.quantities import unit_of
 from torchtransient.sensing.base.given import check_dense, no_arrays
 from torchtransient.sensing.base.layout import check_number
 

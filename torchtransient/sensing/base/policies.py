@@ -33,10 +33,9 @@ from typing import Literal, cast, get_args
 import torch
 from torch import Tensor
 
+from torchtransient.checks import is_one_of, shown
 from torchtransient.errors import ArgumentError, GradientError, ShapeError
 from torchtransient.floating import in_single
-from torchtransient.given_types import is_one_of
-from torchtransient.quantities import shown
 from torchtransient.sensing.base.layout import check_generator, going_together, reals
 
 GradPolicy = Literal["expected", "gaussian", "straight_through", "score"]

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import fields, is_dataclass
 from typing import Any, Literal, Self
 
 import torch
 from torch import Tensor, nn
 
-from torchtransient.errors import GradientError, ShapeError, TorchTransientError
-from torchtransient.floating import in_single
-from torchtransient.scalar_state import ScalarState
+from torchtransient.axes import TimeAxis
+from torchtransient.errors import GradientError, ShapeError, TorchTransientError, UnitError
+from torchtransient.floating import ScalarState, in_single
 from torchtransient.sensing.base.given import careful_init
 from torchtransient.sensing.base.layout import TIME, check_generator
 from torchtransient.sensing.base.policies import (
@@ -23,6 +23,11 @@ from torchtransient.sensing.base.policies import (
     record_score,
     straight_through,
 )
+
+Bins = tuple[float | None, int | None]  # width in seconds and number, None where any fits
+
+# Two axes are the same when their bins agree to a millionth of a bin over the whole length.
+SAME_BIN = 1e-6
 
 
 class PhysicalModule(ScalarState):
@@ -198,3 +203,40 @@ class RandomSensor(Sensor):
             return straight_through(measurement, self.expected(x)) if torch.is_grad_enabled() else measurement
         record_score(lambda: self.log_prob(measurement, x), type(self).__name__)
         return measurement
+
+
+def bins_of(sensor: Sensor) -> Bins:
+    """Return the bins that a sensor, or the first stage of a chain with bins, was made for."""
+    for part in sensor.modules():
+        if not isinstance(part, Sensor):
+            continue
+        axis, width = getattr(part, "axis", None), getattr(part, "bin_width_s", None)
+        if isinstance(axis, TimeAxis):
+            return axis.bin_width_s, axis.num_bins
+        if isinstance(width, float) or part.num_bins is not None:
+            return (width if isinstance(width, float) else None), part.num_bins
+    return None, None
+
+
+def common_bins(sensors: Iterable[Sensor], where: str, own: Bins = (None, None)) -> Bins:
+    """Return the bins of all sensors and of ``own``. Raises UnitError for sensors made for different ones."""
+    width, number = own
+    owner = where
+    for sensor in sensors:
+        name, (its_width, its_number) = type(sensor).__name__, bins_of(sensor)
+        most = max(number or 1, its_number or 1)
+        other_width = width and its_width and abs(width - its_width) * most > SAME_BIN * width
+        if other_width or (number and its_number and number != its_number):
+            raise UnitError(
+                f"{where}: expected one time axis for all parts, got {_bins_text(width, number)} in {owner} and "
+                f"{_bins_text(its_width, its_number)} in {name}. Make them with the axis of the light."
+            )
+        if (width is None and its_width) or (number is None and its_number):
+            owner = name
+        width, number = width or its_width, number or its_number
+    return width, number
+
+
+def _bins_text(width: float | None, number: int | None) -> str:
+    many = "bins" if number is None else f"{number} bins"
+    return many if width is None else f"{many} of {width:g} s"

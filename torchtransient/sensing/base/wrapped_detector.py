@@ -9,9 +9,8 @@ from functools import reduce
 import torch
 from torch import Tensor
 
-from torchtransient.sensing.base.own_bins import bins_of
 from torchtransient.sensing.base.policies import GradPolicy, check_policy
-from torchtransient.sensing.base.sensor import RandomSensor
+from torchtransient.sensing.base.sensor import RandomSensor, bins_of
 
 
 def added(parts: Iterable[Tensor]) -> Tensor:

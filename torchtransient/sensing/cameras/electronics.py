@@ -18,10 +18,9 @@ import math
 import torch
 from torch import Tensor, nn
 
+from torchtransient.checks import MOST, as_whole, several, shown
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
-from torchtransient.given_types import several
-from torchtransient.quantities import MOST, as_whole, shown
 from torchtransient.sensing.base.layout import check_count, check_generator, check_number, check_transient, reals
 from torchtransient.sensing.base.policies import (
     VARIANCE_FLOOR,

@@ -17,9 +17,8 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.axes import TimeAxis
+from torchtransient.checks import Numbers, several
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.given_types import several
-from torchtransient.quantities import Numbers
 from torchtransient.sensing.base.given import numbers_of
 from torchtransient.sensing.base.layout import check_number, check_seconds, check_time_axis, reals
 from torchtransient.sensing.base.sensor import Sensor

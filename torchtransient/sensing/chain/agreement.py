@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from torch import Tensor, nn
 
 from torchtransient.axes import TimeAxis
+from torchtransient.checks import as_number
 from torchtransient.errors import UnitError
-from torchtransient.quantities import as_number
 from torchtransient.sensing.base.sensor import Quantity, Sensor
 from torchtransient.sensing.chain.chain_walk import branches_of, in_order, named, parts_of
 

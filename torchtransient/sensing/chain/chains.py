@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from torch import nn
 
+from torchtransient.checks import shown
 from torchtransient.errors import ArgumentError, ShapeError
-from torchtransient.quantities import shown
 from torchtransient.sensing.base.policies import GradPolicy
 from torchtransient.sensing.base.sensor import Sensor
 from torchtransient.sensing.chain.compose import Compose

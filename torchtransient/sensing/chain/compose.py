@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.checks import several
 from torchtransient.errors import ArgumentError, GradientError, ShapeError, UnitError
-from torchtransient.given_types import several
 from torchtransient.sensing.base.layout import TIME, not_a_transient
 from torchtransient.sensing.base.policies import GradPolicy, check_policy
 from torchtransient.sensing.base.sensor import RandomSensor, Sensor

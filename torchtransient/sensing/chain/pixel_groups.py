@@ -7,12 +7,11 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
+from torchtransient.checks import several
 from torchtransient.errors import ArgumentError, GradientError, ShapeError, UnitError
-from torchtransient.given_types import several
 from torchtransient.sensing.base.layout import check_transient
-from torchtransient.sensing.base.own_bins import common_bins
 from torchtransient.sensing.base.policies import GradPolicy, ScoreFunction, check_policy, record_score
-from torchtransient.sensing.base.sensor import RandomSensor, Sensor
+from torchtransient.sensing.base.sensor import RandomSensor, Sensor, common_bins
 from torchtransient.sensing.base.wrapped_detector import added
 from torchtransient.sensing.chain.chain_walk import (
     check_draws,

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.axes import TimeAxis
+from torchtransient.checks import MOST_MADE, Numbers, as_number, shown
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
-from torchtransient.quantities import MOST_MADE, Numbers, as_number, shown
 from torchtransient.sensing.base.given import numbers_of
 from torchtransient.sensing.base.layout import (
     TIME,

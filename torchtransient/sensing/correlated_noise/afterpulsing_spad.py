@@ -12,9 +12,9 @@ from torch import Tensor
 from torchtransient.errors import UnitError
 from torchtransient.floating import in_single
 from torchtransient.sensing.base.layout import TIME, check_transient
-from torchtransient.sensing.base.own_bins import common_bins
 from torchtransient.sensing.base.pixel_maps import kept_map, over_time
 from torchtransient.sensing.base.policies import GradPolicy
+from torchtransient.sensing.base.sensor import common_bins
 from torchtransient.sensing.base.wrapped_detector import WrappedDetector, cycles_of
 from torchtransient.sensing.correlated_noise.afterpulsing import Afterpulsing
 from torchtransient.sensing.correlated_noise.trapped_carriers import of_cycles, of_free_running

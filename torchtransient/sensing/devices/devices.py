@@ -27,9 +27,9 @@ from torch import nn
 
 from torchtransient.array_files.part_files import write_text
 from torchtransient.axes import TimeAxis
+from torchtransient.checks import as_whole, shown
 from torchtransient.errors import MissingPackageError, StorageError, TorchTransientError
 from torchtransient.plain_texts import json_data, said_in_short, some_of, text_of_file, told_shortly, yaml_data
-from torchtransient.quantities import as_whole, shown
 from torchtransient.sensing.base.layout import check_number
 from torchtransient.sensing.base.policies import GradPolicy
 from torchtransient.sensing.cameras.electronics import PixelElectronics

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from torchtransient.checks import shown
 from torchtransient.errors import ArgumentError
-from torchtransient.quantities import shown
 from torchtransient.sensing.devices.devices import Device
 
 _AXIS = "@axis"

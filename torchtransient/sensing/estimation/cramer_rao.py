@@ -20,8 +20,8 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
+from torchtransient.checks import shown
 from torchtransient.errors import ArgumentError, DeviceError, GradientError, ShapeError, UnitError
-from torchtransient.quantities import shown
 from torchtransient.sensing.base.given import check_dense, no_arrays
 from torchtransient.sensing.base.layout import TIME, check_count, check_time_axis
 from torchtransient.sensing.response.impulse_response import Response

@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
+from torchtransient.checks import count
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
-from torchtransient.quantities import count
 from torchtransient.sensing.base.layout import (
     TIME,
     check_bins,

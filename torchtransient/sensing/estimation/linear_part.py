@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from torchtransient.checks import shown
 from torchtransient.errors import ArgumentError, GradientError, ShapeError
 from torchtransient.floating import in_single
-from torchtransient.quantities import shown
 from torchtransient.sensing.base.layout import check_tensors
 from torchtransient.sensing.base.sensor import Sensor
 

@@ -27,9 +27,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.checks import real_array, shown
 from torchtransient.errors import GradientError, ShapeError, UnitError
 from torchtransient.floating import in_single, product
-from torchtransient.quantities import real_array, shown
 from torchtransient.sensing.base.given import refuse_cut_off
 from torchtransient.sensing.base.layout import check_number, check_tensors, check_time_axis, check_transient, reals
 from torchtransient.sensing.base.sensor import Sensor

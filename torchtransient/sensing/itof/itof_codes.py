@@ -19,9 +19,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchtransient.checks import MOST_MADE, as_whole, count, mapping, real_array, several, shown
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.given_types import mapping, several
-from torchtransient.quantities import MOST_MADE, as_whole, count, real_array, shown
 from torchtransient.sensing.base.given import refuse_cut_off
 from torchtransient.sensing.base.layout import check_number, reals
 

@@ -25,10 +25,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchtransient.checks import Numbers, as_number, is_one_of, real_array, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.floating import in_single
-from torchtransient.given_types import is_one_of
-from torchtransient.quantities import Numbers, as_number, real_array, shown
 from torchtransient.sensing.base.given import check_dense, refuse_cut_off, tensor_of
 from torchtransient.sensing.base.layout import (
     check_broadcast,

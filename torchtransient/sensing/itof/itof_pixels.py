@@ -23,9 +23,9 @@ from dataclasses import KW_ONLY, dataclass
 import torch
 from torch import Tensor
 
+from torchtransient.checks import Numbers, real_array, shown
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import holds
-from torchtransient.quantities import Numbers, real_array, shown
 from torchtransient.sensing.base.given import check_dense, no_arrays
 from torchtransient.sensing.base.layout import check_transient
 from torchtransient.sensing.base.sensor import Sensor

@@ -25,9 +25,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchtransient.checks import MOST_MADE, shown
 from torchtransient.errors import ArgumentError, PhysicsWarning, ShapeError, UnitError
 from torchtransient.floating import holds, in_single, without_autocast
-from torchtransient.quantities import MOST_MADE, shown
 from torchtransient.sensing.base.given import no_arrays
 from torchtransient.sensing.base.layout import check_count, check_number, going_together, reals
 from torchtransient.sensing.itof.itof import Frequencies, check_frequencies

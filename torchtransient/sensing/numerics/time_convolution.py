@@ -9,11 +9,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from torchtransient.axes import fast_length
+from torchtransient.checks import count, is_one_of, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.given_types import is_one_of
-from torchtransient.quantities import count, shown
 from torchtransient.sensing.base.layout import TIME, check_transient, reals, without_autocast
-from torchtransient.transform_bins import fast_length
 
 Boundary = Literal["zero", "periodic"]
 Method = Literal["auto", "direct", "fft"]

@@ -21,10 +21,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from torchtransient.checks import Numbers, as_number, count, several, shown
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
-from torchtransient.given_types import several
-from torchtransient.quantities import Numbers, as_number, count, shown
 from torchtransient.sensing.base.given import check_dense, refuse_cut_off
 from torchtransient.sensing.base.layout import (
     check_count,

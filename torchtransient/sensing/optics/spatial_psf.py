@@ -8,8 +8,8 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from torchtransient.checks import shown
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.quantities import shown
 from torchtransient.sensing.base.layout import (
     check_count,
     check_number,

@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
+from torchtransient.checks import Numbers
 from torchtransient.errors import GradientError, UnitError
 from torchtransient.floating import in_single
-from torchtransient.quantities import Numbers
 from torchtransient.sensing.base.layout import (
     TIME,
     bin_width_of,
@@ -28,9 +28,8 @@ from torchtransient.sensing.base.layout import (
     check_tensor,
     check_transient,
 )
-from torchtransient.sensing.base.own_bins import common_bins
 from torchtransient.sensing.base.policies import VARIANCE_FLOOR, GradPolicy, record_score
-from torchtransient.sensing.base.sensor import RandomSensor
+from torchtransient.sensing.base.sensor import RandomSensor, common_bins
 from torchtransient.sensing.base.wrapped_detector import cycles_of, several_of
 from torchtransient.sensing.correlated_noise.afterpulsing_spad import AfterpulsingSPAD
 from torchtransient.sensing.dead_time.dead_time_cycle import highest_level

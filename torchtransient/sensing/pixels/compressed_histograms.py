@@ -7,9 +7,9 @@ import math
 import torch
 from torch import Tensor
 
+from torchtransient.checks import MOST_MADE
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
-from torchtransient.quantities import MOST_MADE
 from torchtransient.sensing.base.layout import TIME, check_bins, check_count, check_transient, product, reals
 from torchtransient.sensing.base.sensor import Sensor
 

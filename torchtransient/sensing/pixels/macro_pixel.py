@@ -8,9 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchtransient.checks import Numbers, several
 from torchtransient.errors import GradientError, ShapeError, UnitError
-from torchtransient.given_types import several
-from torchtransient.quantities import Numbers
 from torchtransient.sensing.base.layout import check_count, check_number, check_transient, reals
 from torchtransient.sensing.base.policies import GradPolicy
 from torchtransient.sensing.base.sensor import RandomSensor, Sensor

@@ -8,9 +8,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from torchtransient.checks import MOST_MADE, as_whole, is_one_of, several, shown
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.given_types import is_one_of, several
-from torchtransient.quantities import MOST_MADE, as_whole, shown
 from torchtransient.sensing.base.layout import check_seconds, reals
 from torchtransient.sensing.numerics.time_convolution import check_choice, filter_rows
 from torchtransient.sensing.response.response_shapes import (

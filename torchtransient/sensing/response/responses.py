@@ -15,9 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from torchtransient.checks import Numbers, several
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.given_types import several
-from torchtransient.quantities import Numbers
 from torchtransient.sensing.base.layout import check_number, check_seconds
 from torchtransient.sensing.base.remembered import remembered
 from torchtransient.sensing.base.sensor import PhysicalModule

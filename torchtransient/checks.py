@@ -1,0 +1,402 @@
+"""Checks of arguments: numbers, flags, rows, mappings, functions, names and paths, and values as messages show them.
+
+Each check returns the value or raises a typed error that says what was expected and what came. Numbers are those of
+Python, numpy and torch; truth values, texts and dates are refused, although Python or numpy convert them. Without
+torch, for the command line and the plugins.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import inspect
+import math
+import operator
+import os
+import re
+import stat
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, StorageError, TorchTransientError, UnitError
+
+if TYPE_CHECKING:
+    import torch
+
+Kind = TypeVar("Kind")
+# Several numbers. A text: nothing here imports torch.
+Numbers: TypeAlias = "Sequence[float] | NDArray[Any] | torch.Tensor"
+
+# Units by the ends of names, with what is most often mistaken.
+_UNITS = {
+    "hz": "hertz (20 MHz are 20e6)",
+    "s": "seconds (50 ps are 50e-12)",
+    "opl": "metres of optical path",
+    "m": "metres",
+    "m2": "square metres (10 um by 10 um are 100e-12)",
+    "nm": "nanometres",
+    "j": "joules",
+    "sr": "steradians",
+    "deg": "degrees",
+    "rad": "radians",
+    "e": "electrons",
+}
+# Files and tensors count in 64 bits.
+MOST = 2**63 - 1
+# Most objects that one call makes.
+MOST_MADE = 2**24
+# Types that need no further look.
+_PLAIN = {int, float}
+# Most numbers of an array that a message shows.
+_WRITTEN = 16
+
+
+def finite(name: str, value: Any) -> float:
+    """Return ``value`` as a float. Raises UnitError unless it is one finite number."""
+    number = _number(value)
+    if not math.isfinite(number):
+        raise UnitError(f"{name}: expected a finite number, got {shown(value)}.")
+    return number
+
+
+def positive(name: str, value: Any) -> float:
+    """Return ``value`` as a float. Raises UnitError unless it is finite and greater than zero."""
+    number = _number(value)
+    if not math.isfinite(number) or number <= 0:
+        raise UnitError(f"{name}: expected a finite number greater than zero, got {shown(value)}.")
+    return number
+
+
+def share(name: str, value: Any) -> float:
+    """Return ``value`` as a float, an albedo for instance. Raises UnitError unless it lies in [0, 1]."""
+    number = _number(value)
+    if not 0.0 <= number <= 1.0:
+        raise UnitError(f"{name}: expected a number between 0 and 1, got {shown(value)}.")
+    return number
+
+
+def shares(name: str, values: Any) -> float | tuple[float, float, float]:
+    """Return one share, or three of a linear sRGB colour from a sequence or an array of three. Raises UnitError."""
+    if not isinstance(values, (list, tuple)) and getattr(values, "ndim", None) != 1:
+        return share(name, values)
+    plain = list(values)
+    if len(plain) != 3:
+        raise UnitError(f"{name}: expected one number between 0 and 1 or three, got {shown(values)}.")
+    red, green, blue = (share(name, value) for value in plain)
+    return red, green, blue
+
+
+def count(
+    name: str, value: Any, least: int | None = 1, error: type[TorchTransientError] = SceneError, most: int | None = MOST
+) -> int:
+    """Return ``value`` as an int. Raises ``error`` unless it is whole, from ``least`` to ``most``; None: no bound."""
+    number = as_whole(value)
+    if number is None:
+        whole = _number(value)
+        number = int(whole) if math.isfinite(whole) and whole == round(whole) else None
+    if number is None or number < (-MOST if least is None else least):
+        bound = "" if least is None else f" of at least {least}"
+        raise error(f"{name}: expected a whole number{bound}, got {shown(value)}.")
+    if most is not None and number > most:
+        raise error(f"{name}: expected a whole number of at most {'2^63 - 1' if most == MOST else most}, got "
+                    f"{shown(value)}.")  # fmt: skip
+    return number
+
+
+def index(name: str, value: Any, size: int, error: type[TorchTransientError] = ArgumentError) -> int:
+    """Return an index among ``size`` entries, from 0 on; negative ones count from the end. Raises ``error``."""
+    number = as_whole(value)
+    if number is None or not -size <= number < size:
+        raise error(f"{name}: expected a whole number from {-size} to {size - 1}, got {shown(value)}.")
+    return number % size
+
+
+def as_whole(value: Any) -> int | None:
+    """Return ``value`` as an int, from any library that has whole numbers; None for 2.0, texts, truth values."""
+    if _is_no_number(value) or getattr(value, "ndim", None):
+        return None
+    try:
+        return operator.index(value)
+    except TypeError:
+        return None
+    except RuntimeError:  # torch: uint64 has no index; tensors on "meta" and in vmap have no number
+        with contextlib.suppress(RuntimeError):
+            return int(value.item())
+        return None
+
+
+def flag(name: str, value: Any) -> bool:
+    """Return ``value`` as a bool. Raises ArgumentError for other types: the text "False" would count as true."""
+    if not _is_truth(value) or getattr(value, "ndim", None):
+        raise ArgumentError(f"{name}: expected True or False, got {shown(value)}.")
+    return bool(value)
+
+
+def real_array(values: Any) -> NDArray[np.float64] | None:
+    """Return real numbers of any library as a detached float64 array.
+
+    None for texts, None, truth values, rows of different lengths and numbers that float64 cannot hold.
+    """
+    try:
+        if _has_no_number(values):
+            return None
+        plain = np.asarray(values.detach().cpu() if hasattr(values, "detach") else values)
+        if plain.dtype.kind in "iuf":
+            return plain.astype(np.float64)
+        # Lists of tensors or of whole numbers beyond 64 bits.
+        return np.asarray(plain.tolist(), dtype=np.float64) if plain.dtype == object and _are_numbers(plain) else None
+    except (TypeError, ValueError, OverflowError, RuntimeError):
+        return None
+
+
+def numbers(name: str, values: Any) -> NDArray[np.float64]:
+    """Return numbers of any shape as :func:`real_array` does. Raises UnitError for anything else."""
+    array = real_array(values)
+    if array is None:
+        raise UnitError(f"{name}: expected real numbers, got {shown(values)}.")
+    return array
+
+
+def _has_no_number(values: Any) -> bool:
+    """Return True for values that numpy converts and that are no numbers, truth values beside numbers for instance."""
+    if not isinstance(values, (list, tuple)):
+        return _is_no_number(values)
+    return any(type(one) not in _PLAIN and _has_no_number(one) for one in values)
+
+
+def _are_numbers(objects: NDArray[Any]) -> bool:
+    return all(hasattr(value, "__float__") and not _is_no_number(value) for value in objects.reshape(-1))
+
+
+def transform(name: str, given: Any) -> NDArray[np.float64]:
+    """Return a transform (4, 4), Mitsuba's included. Raises ShapeError unless it has as many finite numbers."""
+    matrix = real_array(getattr(given, "matrix", given))
+    if matrix is not None and matrix.ndim == 3:  # Dr.Jit's, of one entry
+        matrix = matrix[..., 0]
+    if matrix is None or matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise ShapeError(f"{name}: expected a (4, 4) array of finite numbers, got {shown(given)}.")
+    return matrix
+
+
+def shown(value: Any) -> str:
+    """Return a value as a message shows it, at most 60 characters; large arrays and tensors as their shape."""
+    shape = getattr(value, "shape", None)
+    if isinstance(shape, tuple) and not isinstance(value, type) and math.prod(shape) > _WRITTEN:
+        return f"{with_article(type(value).__name__)} {tuple(shape)}"
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # whole numbers of thousands of digits, lists in themselves
+        text = f"a {type(value).__name__} that cannot be written"
+    text = " ".join(text.split()) if "\n" in text else text
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def unit_of(name: str) -> str:
+    """Return the unit that a name ends in, as it follows a range in a message; empty for names without one."""
+    unit = _UNITS.get(name.rpartition("_")[2]) if "_" in name else None
+    return f" {unit}" if unit else ""
+
+
+def with_article(word: str) -> str:
+    """Return "a confocal", "an exhaustive"."""
+    return f"{'an' if word[:1] in 'aeiou' else 'a'} {word}"
+
+
+def as_number(value: Any) -> float | None:
+    """Return ``value`` as a float, infinities and NaN included; None for anything but a real number."""
+    if _is_no_number(value) or getattr(value, "ndim", None):
+        return None
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf
+    except (TypeError, ValueError, RuntimeError):
+        return None
+
+
+def _number(value: Any) -> float:
+    """Return a float, NaN for anything but a real number."""
+    number = as_number(value)
+    return math.nan if number is None else number
+
+
+def _is_no_number(value: Any) -> bool:
+    """Return True for values that Python or numpy convert to numbers and that are none."""
+    if isinstance(value, (str, bytes)):
+        return True
+    dtype = getattr(value, "dtype", None)
+    return _is_truth(value) or "complex" in str(dtype) or getattr(dtype, "kind", None) in {"m", "M", "S", "U", "V"}
+
+
+def _is_truth(value: Any) -> bool:
+    return isinstance(value, bool) or "bool" in str(getattr(value, "dtype", ""))
+
+
+# ------------------------------------------------------------------------------------------------------ types and texts
+
+
+def of_class(
+    name: str, value: Any, kind: type[Kind], hint: str = "", error: type[TorchTransientError] = ArgumentError
+) -> Kind:
+    """Return an instance of ``kind``. Raises ``error``, with a ``hint`` at its end."""
+    if not isinstance(value, kind):
+        raise error(f"{name}: expected {with_article(kind.__name__)}, got {shown(value)}{hint}.")
+    return value
+
+
+def several(
+    name: str, values: Any, what: str, kind: type[Kind] | None = None, error: type[TorchTransientError] = ShapeError
+) -> list[Kind]:
+    """Return ``values`` as a list, each an instance of ``kind`` if one is given.
+
+    Raises ``error`` for texts, mappings and objects that are not iterable. ``what``: names them in the message,
+    "pixels (row, column)".
+    """
+    found = list(one_by_one(name, values, what, error))
+    for one in found:
+        if kind is not None and not isinstance(one, kind):
+            raise error(f"{name}: expected several {what}, got {shown(one)} among them.")
+    return found
+
+
+def one_by_one(
+    name: str, values: Any, what: str, error: type[TorchTransientError] = ShapeError
+) -> Iterator[Any]:
+    """Return an iterator as :func:`several` returns a list."""
+    with contextlib.suppress(TypeError):
+        if not isinstance(values, (str, bytes, Mapping)):
+            return iter(values)
+    raise error(f"{name}: expected several {what}, got {shown(values)}.")
+
+
+def mapping(name: str, value: Any, what: str, error: type[TorchTransientError] = ArgumentError) -> Mapping[Any, Any]:
+    """Return a mapping. Raises ``error``, with its form in ``what``: "{title: image}"."""
+    if not isinstance(value, Mapping):
+        raise error(f"{name}: expected a dictionary {what}, got {shown(value)}.")
+    return value
+
+
+def function(name: str, value: Any, what: str, error: type[TorchTransientError] = ArgumentError) -> Callable[..., Any]:
+    """Return a callable. Raises ``error``, with its arguments in ``what``: "images (N, 1, H, W)"."""
+    if not callable(value):
+        raise error(f"{name}: expected a function of {what}, got {shown(value)}.")
+    called: Callable[..., Any] = value
+    return called
+
+
+def a_recipe(name: str, value: Any, *methods: str) -> Any:
+    """Return a recipe with ``methods``. Raises ArgumentError, which names the function that reads files of recipes."""
+    missing = [method for method in methods if isinstance(value, type) or not callable(getattr(value, method, None))]
+    if not missing:
+        return value
+    hint = ""
+    if isinstance(value, (str, os.PathLike)):
+        hint = " tt.data.Recipe.read reads files."
+    elif isinstance(value, Mapping):
+        hint = " tt.data.Recipe.from_dict reads dictionaries."
+    raise ArgumentError(f"{name}: expected a recipe, with {missing[0]}(), got {shown(value)}.{hint}")
+
+
+def by_number(name: str, value: Any) -> Any:
+    """Return a data set or list with samples by number. Raises ArgumentError."""
+    is_none = isinstance(value, (type, str, bytes)) or getattr(value, "ndim", None) == 0
+    if is_none or not hasattr(value, "__len__") or not hasattr(value, "__getitem__"):
+        raise ArgumentError(f"{name}: expected a data set of samples by number, got {shown(value)}.")
+    return value
+
+
+def text(name: str, value: Any, what: str, error: type[TorchTransientError] = ArgumentError) -> str:
+    """Return a text. Raises ``error``, with its meaning in ``what``: "the name of a sampler"."""
+    if not isinstance(value, str):
+        raise error(f"{name}: expected {what}, got {shown(value)}.")
+    return value
+
+
+def is_one_of(value: Any, names: Collection[str]) -> bool:
+    """Return True if ``value`` is one of the texts ``names``; arrays never are."""
+    return isinstance(value, str) and value in names
+
+
+# ---------------------------------------------------------------------------------------------------- keyword arguments
+
+
+@contextlib.contextmanager
+def arguments_of(name: str, function: Callable[..., Any], given: Collection[str] = ()) -> Iterator[None]:
+    """Report a TypeError about arguments of ``function`` as one of ``name``, which passes its ``**options`` on.
+
+    The message lists the arguments of ``function`` but for ``given``, which ``name`` passes itself.
+    """
+    try:
+        yield
+    except TypeError as error:
+        head = f"{function.__qualname__}() "
+        if not str(error).startswith(head):
+            raise
+        known = [n for n in inspect.signature(function).parameters if n not in ("self", "kwargs", *given)]
+        wrong = re.search(r"unexpected keyword argument '(\w+)'", str(error))
+        near = difflib.get_close_matches(wrong[1], known, 1) if wrong else []
+        hint = f" Did you mean {near[0]!r}?" if near else ""
+        says = str(error).removeprefix(head)
+        raise TypeError(f"{name}() {says}.{hint} Its other arguments are {', '.join(known)}.") from None
+
+
+# ------------------------------------------------------------------------------------------------------- paths of files
+
+
+def path_of(path: Any, what: str) -> Path:
+    """Return ``path`` as a Path. Raises StorageError for names that this file system cannot have."""
+    try:
+        found = Path(path)
+        os.lstat(found)
+    except (FileNotFoundError, NotADirectoryError):
+        return found
+    except (TypeError, ValueError, OSError) as error:
+        reason = "" if isinstance(error, TypeError) else f": {error}"
+        raise StorageError(f"{what}: expected the name of a file, got {shown(path)}{reason}.") from None
+    return found
+
+
+def is_special(path: str | os.PathLike[str]) -> bool:
+    """Return True for a device, a pipe or a socket: a device has no end, a pipe may have no writer."""
+    try:
+        mode = os.stat(path).st_mode
+    except (OSError, ValueError):
+        return False
+    return not (stat.S_ISREG(mode) or stat.S_ISDIR(mode))
+
+
+def check_special(path: str | os.PathLike[str], what: str, error: type[TorchTransientError] = StorageError) -> None:
+    """Raise ``error`` for a device, a pipe or a socket; missing files are left to the caller that opens them."""
+    if is_special(path):
+        raise error(f"{what}: '{path}' is no file on a disk (a device or a pipe). Give the name of a file.")
+
+
+def check_source(path: Any, what: str) -> Path:
+    """Return the path of a file to read. Raises StorageError for nothing, a folder, a device or a pipe."""
+    source = path_of(path, what)
+    if source.is_file():
+        return source
+    problem = "is a folder" if source.is_dir() else "is no file on a disk" if source.exists() else "does not exist"
+    raise StorageError(f"{what}: '{source}' {problem}. Give the name of a file.")
+
+
+def check_folder(path: Any, what: str) -> Path:
+    """Return the path of a file to write or replace.
+
+    Raises StorageError if its folder is missing or not writable, or if the path is a folder, a device, a pipe or a
+    file without permission.
+    """
+    target = path_of(path, what)
+    # What a link points to is replaced, not the link.
+    place = Path(os.path.realpath(target)) if target.is_symlink() else target
+    if not place.parent.is_dir():
+        raise StorageError(f"{what}: the folder '{place.parent}' does not exist. Create it first.")
+    closed = next((p for p in (place.parent, place) if p.exists() and not os.access(p, os.W_OK)), None)
+    if place.is_dir() or closed or (place.exists() and not place.is_file()):
+        problem = f"cannot be written: no permission for '{closed}'" if closed else "is no file on a disk"
+        raise StorageError(f"{what}: '{target}' {'is a folder' if place.is_dir() else problem}. Choose another place.")
+    return target
