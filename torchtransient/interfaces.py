@@ -293,7 +293,7 @@ class IntegratorInterface(abc.ABC):
 
     @abc.abstractmethod
     def world(self, scene: Any, contents: Any, wanted: Any = None, window: Any = None, settings: Any = None) -> Any:
-        """What the walks of one job are told (``World``); ``settings``: other than the integrator's own."""
+        """What the walks of one job are told (``RenderContext``); ``settings``: other than the integrator's own."""
 
     @abc.abstractmethod
     def silhouettes(self, scene: Any, sensors: Any = None) -> Any:
@@ -314,7 +314,7 @@ class IntegratorInterface(abc.ABC):
         self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, kind: str = RENDER, grad_in: Any = (None, None)
     ) -> Any:
         """A job of :data:`JOBS` with all that is looked up and computed beforehand
-        (:class:`~torchtransient.plugins.integrators.prepared.Prepared`). ``grad_in``: (steady, transient) of a
+        (:class:`~torchtransient.plugins.integrators.job.Prepared`). ``grad_in``: (steady, transient) of a
         backward job, as :meth:`render_backward` takes it.
         """
 

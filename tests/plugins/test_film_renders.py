@@ -14,7 +14,7 @@ from torchtransient import plugins
 from torchtransient.errors import SceneError, StorageError
 from torchtransient.testing.statistics import two_sample_z_test
 
-LANES = "torchtransient.plugins.integrators.launch.MAX_LANES"
+LANES = "torchtransient.plugins.integrators.job.MAX_LANES"
 ENTRIES = "torchtransient.plugins.films.base.MAX_ARRAY_ENTRIES"
 
 

@@ -190,7 +190,7 @@ def test_directional_model_of_a_point():
 
 
 def test_walls_that_stand_elsewhere_have_the_same_vectors_turned():
-    # World coordinates: the same scene in front of a wall that is turned and moved.
+    # RenderContext coordinates: the same scene in front of a wall that is turned and moved.
     turn = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], dtype=F64)
     points = SCAN.sensor_points @ turn.T + torch.tensor([1.0, 2.0, 3.0], dtype=F64)
     origin = turn @ SCAN.sensor_origin + torch.tensor([1.0, 2.0, 3.0], dtype=F64)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 
 from support.sweeps import together
-from torchtransient.plugins.transport.patterns import emits_by_place, scatters_by_place
+from torchtransient.plugins.transport.scene_contents import emits_by_place, scatters_by_place
 from torchtransient.testing.every_plugin import bsdfs
 
 VARIANT = "llvm_ad_rgb"

@@ -16,7 +16,7 @@ import torch
 
 import torchtransient as tt
 from torchtransient.errors import GradientError
-from torchtransient.plugins.transport.sinks import record_room
+from torchtransient.plugins.transport import record as record_room
 from torchtransient.testing.small_room import COLOUR, VARIANT, WALL_POSE, make_room, pose
 
 TESTS = Path(__file__).parents[1]

@@ -72,7 +72,7 @@ def intrinsics(
 
 @without_autocast
 def extrinsics(to_world: Any) -> Tensor:
-    """World to kornia's camera, (..., 4, 4), of a sensor's `to_world`, a rigid motion. Raises ShapeError,
+    """RenderContext to kornia's camera, (..., 4, 4), of a sensor's `to_world`, a rigid motion. Raises ShapeError,
     UnitError.
     """
     matrix = _rigid(to_world, "extrinsics")

@@ -28,7 +28,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.around_corner.outline_table import OutlineTable
-from torchtransient.plugins.integrators.launch import Pass
+from torchtransient.plugins.integrators.job import Pass
 from torchtransient.plugins.polarized import (
     light_type,
     product,
@@ -38,7 +38,7 @@ from torchtransient.plugins.polarized import (
 )
 from torchtransient.plugins.sampling.point_sets import plane_point
 from torchtransient.plugins.transport.carry import total_of
-from torchtransient.plugins.transport.derivative.forward import tangents_of
+from torchtransient.plugins.transport.derivative import tangents_of
 from torchtransient.plugins.transport.strategy import Local
 
 # How far beside an edge one looks past it, and by how much what is seen may be nearer than the edge: parts of the

@@ -15,7 +15,7 @@ from torchtransient.plugins.around_corner.hiding import Part, hiding_pairs, part
 from torchtransient.plugins.around_corner.late_outlines import FIRST, LateOutlines
 from torchtransient.plugins.around_corner.occlusion import BOUNCES, MutualOcclusion
 from torchtransient.plugins.around_corner.outline_table import OutlineTable
-from torchtransient.plugins.integrators.launch import passes_of, seed_array
+from torchtransient.plugins.integrators.job import passes_of, seed_array
 from torchtransient.plugins.pointer_table import registry_number
 from torchtransient.plugins.transport.boundary.moving_edges import (
     Gap,
@@ -23,7 +23,7 @@ from torchtransient.plugins.transport.boundary.moving_edges import (
     edges_in_mirrors,
     rims_without_edges,
 )
-from torchtransient.plugins.transport.segment.material import MaterialVacuum
+from torchtransient.plugins.transport.material_points import MaterialVacuum
 
 # Edge samples of a pixel and viewpoint, as a share of its paths.
 SHARE = 4

@@ -22,7 +22,7 @@ from torchtransient.plugins.around_corner.geometry import occluded, span
 from torchtransient.plugins.around_corner.launches import launches_of
 from torchtransient.plugins.films.colour import ChannelMatch
 from torchtransient.plugins.transport.carry import slope_only, total_of
-from torchtransient.plugins.transport.derivative.forward import tangents_of
+from torchtransient.plugins.transport.derivative import tangents_of
 from torchtransient.plugins.transport.strategy import Local
 
 # Lanes that keep all cores busy.
@@ -162,7 +162,7 @@ class Split:
 
 
 class AdjointReader:
-    """The film's adjoint (:class:`~..integrators.incoming_adjoint.IncomingAdjoint`) at scanned points."""
+    """The film's adjoint (:class:`~..integrators.job.IncomingAdjoint`) at scanned points."""
 
     def __init__(self, film: Any, match: Any, incoming: Any) -> None:
         self.match, self.incoming = match, incoming
