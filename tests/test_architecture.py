@@ -427,8 +427,8 @@ BARE = {
     "files/result_file.py": {"ValueError"},  # likewise
     "nlos/part_file.py": {"ValueError"},  # caught in the same function
     "losses/results.py": {"TypeError"},  # a wrong keyword argument, as Python says it
-    "plugins/transport/contents.py": {"AttributeError"},  # the protocol of objects
-    "plugins/transport/world.py": {"AttributeError"},
+    "plugins/transport/scene_contents.py": {"AttributeError"},  # the protocol of objects
+    "plugins/transport/context.py": {"AttributeError"},
     "rendering/films.py": {"KeyError"},  # caught by its callers
     "scene/edits.py": {"RuntimeError"},  # what Mitsuba says, told by its caller with the place
     "sensing/base/given.py": {"TypeError"},  # a wrong keyword argument, as Python says it

@@ -12,9 +12,9 @@ from torchtransient.plugins.around_corner import outlines, shared_light
 from torchtransient.plugins.kernel_arrays import registry_number
 from torchtransient.plugins.parameter_effect import CORRECT
 from torchtransient.plugins.parameters import effect_of
-from torchtransient.plugins.transport.segment.material import FoundVacuum, MaterialVacuum
-from torchtransient.plugins.transport.segment.vacuum import Vacuum
+from torchtransient.plugins.transport.material_points import FoundVacuum, MaterialVacuum
 from torchtransient.plugins.transport.strategy import Local
+from torchtransient.plugins.transport.vacuum import Vacuum
 
 VARIANT = "llvm_ad_mono"
 

@@ -9,10 +9,9 @@ import pytest
 
 from support.plain_scenes import camera, load
 from torchtransient.errors import GradientError, SceneError, TorchTransientWarning, UnitError
-from torchtransient.plugins.integrators import launch
-from torchtransient.plugins.integrators.incoming_adjoint import IncomingAdjoint
-from torchtransient.plugins.integrators.launch import passes_of, seed_array, share_of
-from torchtransient.plugins.transport.sinks.record import RecordLayout
+from torchtransient.plugins.integrators import job as launch
+from torchtransient.plugins.integrators.job import IncomingAdjoint, passes_of, seed_array, share_of
+from torchtransient.plugins.transport.record import RecordLayout
 from torchtransient.plugins.transport.strategy import Local
 
 VARIANT = "llvm_ad_mono"

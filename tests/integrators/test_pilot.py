@@ -11,7 +11,7 @@ from support.nlos_scenes import film, plane, scan_scene
 from support.plain_scenes import camera, load
 from torchtransient.errors import SceneError, VariantError
 from torchtransient.plugins.integrators import pilot
-from torchtransient.plugins.integrators.launch import Pass, seed_array
+from torchtransient.plugins.integrators.job import Pass, seed_array
 from torchtransient.plugins.integrators.pilot import pilot_events, pilot_size
 from torchtransient.plugins.transport.strategy import Local
 

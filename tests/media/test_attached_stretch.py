@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from torchtransient import plugins
-from torchtransient.plugins.transport.segment.media import Media
+from torchtransient.plugins.transport.media import Media
 from torchtransient.plugins.transport.strategy import Local
 
 FLOOR = -1.0

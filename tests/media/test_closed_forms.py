@@ -9,8 +9,8 @@ from support.marks import long
 from support.media_scenes import film, homogeneous, load, rgb
 from support.runs import T, runs
 from torchtransient.accuracy.statistics import z_test
-from torchtransient.plugins.transport.derivative.wanted import Wanted
-from torchtransient.plugins.transport.sinks.record import RecordedVertex, RecordSink
+from torchtransient.plugins.transport.context import Wanted
+from torchtransient.plugins.transport.record import RecordedVertex, RecordSink
 from torchtransient.plugins.transport.walk import walk
 
 VARIANT = "llvm_ad_mono"

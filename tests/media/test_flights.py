@@ -11,8 +11,9 @@ import pytest
 
 from support.media_scenes import rgb, volume
 from torchtransient.plugins.kernel_arrays import registry_number
-from torchtransient.plugins.transport import media_contents
-from torchtransient.plugins.transport.segment import free_flight, optical_depth
+from torchtransient.plugins.transport import free_flight as free_flight
+from torchtransient.plugins.transport import free_flight as optical_depth
+from torchtransient.plugins.transport import scene_contents as media_contents
 from torchtransient.plugins.transport.strategy import Local
 
 VARIANT = "llvm_ad_rgb"

@@ -7,8 +7,8 @@ import pytest
 from support.media_scenes import block, camera, film, homogeneous, load, volume
 from support.runs import T, runs
 from torchtransient.accuracy.statistics import two_sample_z_test, z_test
-from torchtransient.plugins.transport.media_contents import is_open
-from torchtransient.plugins.transport.segment.free_flight import closed_surface, lets_through
+from torchtransient.plugins.transport.free_flight import closed_surface, lets_through
+from torchtransient.plugins.transport.scene_contents import is_open
 
 VARIANT = "llvm_ad_mono"
 

@@ -8,8 +8,8 @@ import pytest
 
 from support.media_scenes import homogeneous, volume
 from torchtransient.errors import GradientError
-from torchtransient.plugins.transport import media_contents
-from torchtransient.plugins.transport.scattering import medium as scattering
+from torchtransient.plugins.transport import medium_scattering as scattering
+from torchtransient.plugins.transport import scene_contents as media_contents
 from torchtransient.plugins.transport.strategy import Local
 
 VARIANT = "llvm_ad_rgb"

@@ -11,9 +11,9 @@ from support.marks import long
 from support.media_scenes import rgb
 from torchtransient.plugins.bsdfs.mixtures import mixtures_of
 from torchtransient.plugins.kernel_arrays import registry_number
-from torchtransient.plugins.transport.scattering import medium as scattering
-from torchtransient.plugins.transport.scattering.surface import Surface
+from torchtransient.plugins.transport import medium_scattering as scattering
 from torchtransient.plugins.transport.strategy import Local
+from torchtransient.plugins.transport.surface_scattering import Surface
 
 VARIANT = "llvm_ad_rgb"
 RATES = np.array([0.5, 1.25, 2.0])

@@ -165,7 +165,7 @@ def test_dropped_scenes_stay_until_a_kernel_is_traced(monkeypatch, explode):
 
     Scenes that hang in reference cycles are left to the collector, which runs whenever enough objects were made.
     """
-    from torchtransient.plugins.transport.segment import free_flight
+    from torchtransient.plugins.transport import free_flight as free_flight
 
     class Cycle:
         pass
@@ -226,7 +226,7 @@ def test_scenes_are_freed_at_once():
 
 @pytest.mark.slow
 def test_a_scene_dropped_by_another_thread_waits_for_the_trace(monkeypatch):
-    from torchtransient.plugins.transport.segment import free_flight
+    from torchtransient.plugins.transport import free_flight as free_flight
 
     def renderer():
         scene = steady_scene("volpath", **block(homogeneous(1.0, 0.8)))

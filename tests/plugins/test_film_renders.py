@@ -14,7 +14,7 @@ from torchtransient import plugins
 from torchtransient.accuracy.statistics import two_sample_z_test
 from torchtransient.errors import SceneError, StorageError
 
-LANES = "torchtransient.plugins.integrators.launch.MAX_LANES"
+LANES = "torchtransient.plugins.integrators.job.MAX_LANES"
 ENTRIES = "torchtransient.plugins.films.base.MAX_ARRAY_ENTRIES"
 
 

@@ -19,7 +19,7 @@ from torchtransient.plugins import mitsuba_compat as compat
 from torchtransient.plugins.bsdfs.mixtures import hides_lobe_probability, mirrors_matrices
 from torchtransient.plugins.node_walk import objects_below, objects_of
 from torchtransient.plugins.spectral_colours import keeps_coefficients
-from torchtransient.plugins.transport.scattering.surface import strayed
+from torchtransient.plugins.transport.surface_scattering import strayed
 
 RGB, POLARIZED, SPECTRAL = "llvm_ad_rgb", "llvm_ad_mono_polarized", "llvm_ad_spectral"
 

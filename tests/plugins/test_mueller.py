@@ -12,8 +12,8 @@ import pytest
 from torchtransient import plugins
 from torchtransient.plugins import polarized
 from torchtransient.plugins.bsdfs.fresnel import Interface, across_plane, metal_reflection, two_by_two
-from torchtransient.plugins.transport.scattering.surface import Surface
 from torchtransient.plugins.transport.strategy import Local
+from torchtransient.plugins.transport.surface_scattering import Surface
 
 VARIANT = "llvm_ad_mono_polarized"
 COSINES = np.array([1.0, 0.93, 0.7, 0.5, 0.31, 0.12, 0.01])

@@ -335,7 +335,7 @@ def scene_integrator(renderer):
 
 @pytest.mark.slow
 def test_several_launches_are_traced(room_scene, monkeypatch):
-    monkeypatch.setattr("torchtransient.plugins.integrators.launch.MAX_LANES", 20)
+    monkeypatch.setattr("torchtransient.plugins.integrators.job.MAX_LANES", 20)
     traced, recorded = pair(room_scene, parameters=[COLOUR, GREY], spp=4)
     for seed in range(2):
         expected, got = step(traced, seed), step(recorded, seed)

@@ -388,7 +388,7 @@ def small_bands(monkeypatch):
 
 def small_launches(monkeypatch):
     """At most 64 samples per pixel in one kernel launch. Holds while the scene's variant stays active."""
-    from torchtransient.plugins.integrators import launch
+    from torchtransient.plugins.integrators import job as launch
 
     monkeypatch.setattr(launch, "MAX_LANES", 64 * 12)
 

@@ -9,7 +9,7 @@ import pytest
 
 VARIANT = "llvm_ad_mono"
 FILM = "torchtransient.plugins.films.base.MAX_SINGLE_PRECISION_SAMPLES"
-LANES = "torchtransient.plugins.integrators.launch.MAX_LANES"
+LANES = "torchtransient.plugins.integrators.job.MAX_LANES"
 
 
 def mass(samples, count, packets=True):

@@ -11,7 +11,7 @@ from support.gradient_cases.cases_gaps import OFF, corner, lamp, plates
 from support.gradient_cases.problem import Case, Problem
 from support.gradient_cases.unknowns import move
 from support.marks import long
-from torchtransient.plugins.transport import contents
+from torchtransient.plugins.transport import scene_contents as contents
 
 SCENES = {"plates": (plates, (0, 0, 1)), "corner": (corner, (1, 0, 0)), "lamp": (lamp, (0, 0, 1))}
 GAPS = (1e-2, 1e-3, 1e-4)

@@ -5,12 +5,11 @@ from __future__ import annotations
 from support.toy_strategies import AreaOfShape, OwnPointLight, SecondEmitterSample, ThirdEmitterSample
 from torchtransient.plugins import register
 from torchtransient.plugins.integrators import volpath
-from torchtransient.plugins.transport.connection.emitter_found import EmitterFound
-from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
-from torchtransient.plugins.transport.scattering.medium import SurfaceOrMedium
-from torchtransient.plugins.transport.scattering.surface import Surface
-from torchtransient.plugins.transport.segment.media import Media
-from torchtransient.plugins.transport.segment.vacuum import Vacuum
+from torchtransient.plugins.transport.emitter_connections import EmitterFound, EmitterSampled
+from torchtransient.plugins.transport.media import Media
+from torchtransient.plugins.transport.medium_scattering import SurfaceOrMedium
+from torchtransient.plugins.transport.surface_scattering import Surface
+from torchtransient.plugins.transport.vacuum import Vacuum
 
 
 class TwoEmitterSamples(volpath.TransientVolpath):

@@ -10,8 +10,8 @@ import mitsuba as mi
 
 from torchtransient.plugins.polarized import product, scatter_unpolarized
 from torchtransient.plugins.transport.carry import slope_only
-from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
-from torchtransient.plugins.transport.scattering.geometry_terms import distance
+from torchtransient.plugins.transport.emitter_connections import EmitterSampled
+from torchtransient.plugins.transport.geometry_terms import distance
 from torchtransient.plugins.transport.strategy import Connection, Event, EventTerm, Guide, GuidedPoint, Local, Proposal
 
 

@@ -9,10 +9,10 @@ import pytest
 
 from support.plain_scenes import camera, load
 from torchtransient import plugins
-from torchtransient.plugins.integrators.launch import Pass, seed_array
-from torchtransient.plugins.integrators.primary_carry import objective_of, tangent_of
+from torchtransient.plugins.integrators.job import Pass, seed_array
 from torchtransient.plugins.transport import carry as module
 from torchtransient.plugins.transport.carry import Carry
+from torchtransient.plugins.transport.derivative import objective_of, tangent_of
 from torchtransient.plugins.transport.strategy import Local
 
 VARIANT = "llvm_ad_rgb"

@@ -9,9 +9,8 @@ import pytest
 
 from torchtransient.plugins.around_corner.geometry import WallPoints
 from torchtransient.plugins.sampling.lights import DistantReference
-from torchtransient.plugins.transport.connection.emitter_found import EmitterFound
-from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled, is_light
-from torchtransient.plugins.transport.connection.laser_spot import DiffuseSpot, LaserSpot, PackedSpots
+from torchtransient.plugins.transport.emitter_connections import EmitterFound, EmitterSampled, is_light
+from torchtransient.plugins.transport.laser_spot import DiffuseSpot, LaserSpot, PackedSpots
 from torchtransient.plugins.transport.strategy import Local
 
 VARIANT = "llvm_ad_rgb"

@@ -12,8 +12,8 @@ import pytest
 
 from support.gradient_cases.scenes import instances, room
 from torchtransient.plugins.node_walk import shapes_of_scene
-from torchtransient.plugins.transport.contents import SceneContents
-from torchtransient.plugins.transport.derivative.wanted import Wanted
+from torchtransient.plugins.transport.context import Wanted
+from torchtransient.plugins.transport.scene_contents import SceneContents
 
 VARIANT = "llvm_ad_mono"
 
@@ -62,8 +62,8 @@ def test_built_once_a_scene(scene, monkeypatch):
             built.append(args)
             super().__init__(*args)
 
-    monkeypatch.setattr("torchtransient.plugins.integrators.seen_scene.SceneContents", Counted)
-    monkeypatch.setattr("torchtransient.plugins.integrators.launch.MAX_LANES", 8)
+    monkeypatch.setattr("torchtransient.plugins.transport.scene_contents.SceneContents", Counted)
+    monkeypatch.setattr("torchtransient.plugins.integrators.job.MAX_LANES", 8)
     integrator, params = scene.integrator(), mi.traverse(scene)
     shape = scene.sensors()[0].film().cube_shape()
     for seed in range(2):

@@ -39,7 +39,7 @@ def directions():
 def tangents(d):
     """The derivatives of direction, solid angle, drag and slide."""
     mi.set_variant("llvm_ad_mono")
-    from torchtransient.plugins.transport.scattering.geometry_terms import damped_motion
+    from torchtransient.plugins.transport.geometry_terms import damped_motion
 
     def vector(v):
         return mi.Vector3f(np.ascontiguousarray(v.T, dtype=np.float32))

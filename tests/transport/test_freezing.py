@@ -141,7 +141,7 @@ def test_numbers_of_a_call_are_no_literals(kind, monkeypatch):
     assert hashes(scene, seed=np.uint32(7), spp=16) == first
     assert hashes(scene, seed=0, spp=64) == first
     # Several launches: rows and samples of each in turn.
-    monkeypatch.setattr("torchtransient.plugins.integrators.launch.MAX_LANES", 4 * 2 * 16)
+    monkeypatch.setattr("torchtransient.plugins.integrators.job.MAX_LANES", 4 * 2 * 16)
     parts = hashes(scene, seed=0, spp=16)
     assert len(parts) > len(first) and len(set(parts)) == len(first)
 

@@ -9,7 +9,7 @@ import pytest
 
 from support.gradient_cases.cases_curves import file_of
 from torchtransient.plugins.kernel_arrays import PointerTable
-from torchtransient.plugins.transport.scattering import geometry_terms as terms
+from torchtransient.plugins.transport import geometry_terms as terms
 
 VARIANT = "llvm_ad_mono"
 RADIUS = 0.4

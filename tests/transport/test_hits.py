@@ -13,9 +13,16 @@ import scipy.spatial.transform
 
 from support.gradient_cases.cases_curves import DIFFUSE, ellipsoid, file_of, seen_wall
 from support.marks import long, long_rows
-from torchtransient.plugins.transport.hits import DetachedHits, _spline, _starts
-from torchtransient.plugins.transport.instances import AttachedSurfaces, Instances, distance_to, surface_interaction
 from torchtransient.plugins.transport.strategy import Local
+from torchtransient.plugins.transport.surface_interactions import (
+    AttachedSurfaces,
+    DetachedHits,
+    Instances,
+    _spline,
+    _starts,
+    distance_to,
+    surface_interaction,
+)
 
 VARIANT = "llvm_ad_mono"
 OUT_OF_SIGHT = [5.0, 0.0, 30.0, 0.1, 0.1, 0.1, 0.0, 0.0, 0.0, 1.0]

@@ -9,10 +9,9 @@ import pytest
 
 from support.gradient_cases.cases_curves import file_of
 from support.marks import long
-from torchtransient.plugins.transport import instances as module
-from torchtransient.plugins.transport.hits import DetachedHits
-from torchtransient.plugins.transport.instances import AttachedSurfaces, Instances
+from torchtransient.plugins.transport import surface_interactions as module
 from torchtransient.plugins.transport.strategy import Local
+from torchtransient.plugins.transport.surface_interactions import AttachedSurfaces, DetachedHits, Instances
 
 VARIANT = "llvm_ad_mono"
 STEP = 1e-3

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from support.moving_points import MOVE, PLACE, attached_zero, difference, painted_lamp, slopes, unit, vector
-from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
+from torchtransient.plugins.transport.emitter_connections import EmitterSampled
 from torchtransient.plugins.transport.strategy import Local
 
 VARIANT = "llvm_ad_rgb"

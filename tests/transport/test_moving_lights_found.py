@@ -9,7 +9,7 @@ import pytest
 
 from support.moving_points import MOVE, PLACE, attached_zero, difference, slopes, unit, vector
 from torchtransient.plugins.sampling.lights import DistantReference
-from torchtransient.plugins.transport.connection.emitter_found import EmitterFound
+from torchtransient.plugins.transport.emitter_connections import EmitterFound
 from torchtransient.plugins.transport.strategy import Local
 
 VARIANT = "llvm_ad_rgb"

@@ -6,7 +6,7 @@ import mitsuba as mi
 
 from support.sweeps import together
 from tools.every_plugin import bsdfs
-from torchtransient.plugins.transport.patterns import emits_by_place, scatters_by_place
+from torchtransient.plugins.transport.scene_contents import emits_by_place, scatters_by_place
 
 VARIANT = "llvm_ad_rgb"
 BOARD = {"type": "checkerboard"}

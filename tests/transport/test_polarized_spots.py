@@ -9,7 +9,7 @@ import pytest
 
 from support.moving_points import attached_zero, slopes, unit, vector
 from torchtransient.plugins import polarized
-from torchtransient.plugins.transport.connection.laser_spot import GeneralSpot, LaserSpot
+from torchtransient.plugins.transport.laser_spot import GeneralSpot, LaserSpot
 from torchtransient.plugins.transport.strategy import Local
 
 VARIANT = "llvm_ad_mono_polarized"

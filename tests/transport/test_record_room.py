@@ -17,7 +17,7 @@ import torch
 import torchtransient as tt
 from tools.small_room import COLOUR, VARIANT, WALL_POSE, make_room, pose
 from torchtransient.errors import GradientError
-from torchtransient.plugins.transport.sinks import record_room
+from torchtransient.plugins.transport import record as record_room
 
 TESTS = Path(__file__).parents[1]
 ADJOINT = torch.linspace(0, 1, 24)[None, :, None, None]

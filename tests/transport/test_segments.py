@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from torchtransient.plugins.sampling.lights import DistantReference
-from torchtransient.plugins.transport.scattering.surface import Surface, is_black, strayed
-from torchtransient.plugins.transport.segment import vacuum
-from torchtransient.plugins.transport.segment.material import MaterialVacuum
-from torchtransient.plugins.transport.segment.media import reference
+from torchtransient.plugins.transport import vacuum as vacuum
+from torchtransient.plugins.transport.material_points import MaterialVacuum
+from torchtransient.plugins.transport.media import reference
 from torchtransient.plugins.transport.strategy import Guide, Local, Step
+from torchtransient.plugins.transport.surface_scattering import Surface, is_black, strayed
 
 VARIANT = "llvm_ad_mono"
 FAR = DistantReference((0.5, 0.25, 0.0), 4.0)

@@ -9,11 +9,8 @@ import pytest
 
 from support.marks import long
 from support.plain_scenes import as_mitsuba
-from torchtransient.plugins.transport.sinks.adjoint_sum import AdjointSumSink
-from torchtransient.plugins.transport.sinks.arrivals import Arrivals, read_ahead
-from torchtransient.plugins.transport.sinks.event_list import EventListSink
-from torchtransient.plugins.transport.sinks.film import FilmSink
-from torchtransient.plugins.transport.sinks.sink import Sink
+from torchtransient.plugins.transport.record import Arrivals, read_ahead
+from torchtransient.plugins.transport.sinks import AdjointSumSink, EventListSink, FilmSink, Sink
 from torchtransient.plugins.transport.strategy import Local
 from torchtransient.plugins.transport.walk import walk
 from torchtransient.scenes import cornell_box

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from torchtransient.plugins.films.block import AdjointBlock
-from torchtransient.plugins.transport.sinks.sink import Sink
+from torchtransient.plugins.transport.sinks import Sink
 from torchtransient.plugins.transport.strategy import (
     Connection,
     Guide,

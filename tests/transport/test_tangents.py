@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from support.surface_samples import activate
-from torchtransient.plugins.transport.derivative import forward
+from torchtransient.plugins.transport import derivative as forward
 
 
 def test_nothing_attached_outlives_a_vertex(monkeypatch):

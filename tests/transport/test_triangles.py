@@ -11,10 +11,10 @@ from support.gradient_cases.cases_curves import file_of
 from support.hidden_shapes import wall_grid
 from torchtransient.errors import SceneError
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
-from torchtransient.plugins.transport.scattering.guides.hidden_geometry import HiddenGeometry, shape_hit
-from torchtransient.plugins.transport.scattering.surface import Surface
-from torchtransient.plugins.transport.segment.triangles import AttachedTriangles
+from torchtransient.plugins.transport.guides import HiddenGeometry, shape_hit
 from torchtransient.plugins.transport.strategy import Guide, Local
+from torchtransient.plugins.transport.surface_scattering import Surface
+from torchtransient.plugins.transport.vacuum import AttachedTriangles
 
 VARIANT = "llvm_ad_mono"
 SHEETS = {

@@ -9,10 +9,10 @@ import pytest
 
 from support.plain_scenes import camera, load
 from torchtransient.plugins.films.block import ArrivalWindow
-from torchtransient.plugins.transport.sinks.sink import Sink
+from torchtransient.plugins.transport.context import PathSettings, RenderContext
+from torchtransient.plugins.transport.sinks import Sink
 from torchtransient.plugins.transport.strategy import Connection, Event, Local, Step, Vertex
 from torchtransient.plugins.transport.walk import roulette, start, walk
-from torchtransient.plugins.transport.world import PathSettings, World
 
 VARIANT = "llvm_ad_rgb"
 
@@ -98,7 +98,7 @@ def world_of(scene, window=None, **settings):
     contents = integrator.contents(scene, scene.sensors()[0])
     given = {"max_depth": 6, "rr_depth": 3, "hide_emitters": False, "discard_direct_light": False,
              "camera_unwarp": False} | settings  # fmt: skip
-    return World(scene, contents, PathSettings(**given), integrator.strategies(contents), None, window)
+    return RenderContext(scene, contents, PathSettings(**given), integrator.strategies(contents), None, window)
 
 
 def test_events_that_are_deep_enough(scene):

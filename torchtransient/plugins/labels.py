@@ -17,12 +17,12 @@ from torchtransient._collection import no_collection
 from torchtransient.errors import SceneError
 from torchtransient.plugins.films.colour import StandardObserver
 from torchtransient.plugins.frozen_state import says_it_can_be_recorded, state_below
-from torchtransient.plugins.integrators.seen_scene import SeenScene
 from torchtransient.plugins.kernel_arrays import PointerTable
 from torchtransient.plugins.mitsuba_compat import has_surface, is_distant, is_instance, near_clip
 from torchtransient.plugins.node_walk import shapes_of_scene
 from torchtransient.plugins.parameter_effect import class_of
 from torchtransient.plugins.sensors.origin import length_to_sensor_origin, sensors_of, views
+from torchtransient.plugins.transport.scene_contents import SceneCache
 
 # Numbers by pixel of each label; None: the channels of the film.
 COMPONENTS = {
@@ -58,7 +58,7 @@ class LabelTables:
         self._materials = PointerTable(self._bsdfs, list(range(1, len(self._bsdfs) + 1)))
         self.observer = StandardObserver.of_variant()
         self.daylight = _daylight() if mi.is_spectral else []
-        self.seen = SeenScene(scene, integrator)
+        self.seen = SceneCache(scene, integrator)
 
     def lets_light_through(self) -> bool:
         """Whether any surface may let light pass unbent: parameters may add a lobe."""
@@ -177,7 +177,7 @@ class LabelJob:
 
     @staticmethod
     def state_of(jobs: list[LabelJob]) -> tuple[tuple[Any, ...], list[Any]]:
-        """(structure, arrays), as of :func:`torchtransient.plugins.integrators.prepared.state_of`."""
+        """(structure, arrays), as of :func:`torchtransient.plugins.integrators.job.state_of`."""
         held: list[Any] = []
         for job in jobs:
             held += [job.kind, job.names, job.samples, job._size, job._passes, job._hides_emitters, job.sensor]

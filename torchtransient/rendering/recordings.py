@@ -55,7 +55,7 @@ class Recordings:
         return len(self._found)
 
     def run(self, jobs: Sequence[Any]) -> tuple[str, list[list[Any]]]:
-        """Carry out prepared jobs (:class:`~torchtransient.plugins.integrators.prepared.Prepared`) of one scene with
+        """Carry out prepared jobs (:class:`~torchtransient.plugins.integrators.job.Prepared`) of one scene with
         one set of values: how, and what each film has taken (:meth:`~.FilmInterface.taken`), nothing in reverse mode.
         Raises NotRecordedError where they are to be traced; nothing has been rendered then.
         """

@@ -29,7 +29,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.around_corner.outline_table import OutlineTable
-from torchtransient.plugins.integrators.launch import Pass
+from torchtransient.plugins.integrators.job import Pass
 from torchtransient.plugins.polarized import (
     light_type,
     product,
@@ -43,16 +43,15 @@ from torchtransient.plugins.transport.boundary.speeds import behind, sides_from
 from torchtransient.plugins.transport.boundary.term import BoundaryTerm
 from torchtransient.plugins.transport.boundary.vertex import CANDIDATES, VertexPass
 from torchtransient.plugins.transport.carry import total_of
-from torchtransient.plugins.transport.connection.laser_spot import LaserSpot
-from torchtransient.plugins.transport.derivative.forward import tangents_of
-from torchtransient.plugins.transport.scattering.from_light import FromLight
-from torchtransient.plugins.transport.scattering.geometry_terms import displacement
-from torchtransient.plugins.transport.scattering.lambertian import Lambertian
-from torchtransient.plugins.transport.scattering.surface import Surface
-from torchtransient.plugins.transport.segment.material import MaterialVacuum
+from torchtransient.plugins.transport.context import RenderContext
+from torchtransient.plugins.transport.derivative import tangents_of
+from torchtransient.plugins.transport.geometry_terms import displacement
+from torchtransient.plugins.transport.laser_spot import LaserSpot
+from torchtransient.plugins.transport.light_tracing import FromLight
+from torchtransient.plugins.transport.material_points import MaterialVacuum
 from torchtransient.plugins.transport.strategy import Connection, Event, Local, Proposal
+from torchtransient.plugins.transport.surface_scattering import Lambertian, Surface
 from torchtransient.plugins.transport.walk import first_leg
-from torchtransient.plugins.transport.world import World
 
 # How far beside an edge one looks past it, and by how much what is seen may be nearer than the edge: parts of the
 # distance.
@@ -371,10 +370,10 @@ class LateOutlines(BoundaryTerm):
         # Paths begin behind edges.
         spots.dark_at_first = False
         strategies = MaterialVacuum(), scattering, [spots]
-        late = World(world.scene, world.contents, self.settings, strategies, world.wanted, world.window)
+        late = RenderContext(world.scene, world.contents, self.settings, strategies, world.wanted, world.window)
         super().__init__(integrator, late, sensor, film, seed, samples, tuple(self.kinds))
 
-    def _light_world(self) -> World:
+    def _light_world(self) -> RenderContext:
         """The world of paths that start at the spot and are connected to the scanned point."""
         world = self.world
         scattering = Lambertian() if Lambertian.fits(world.contents) else Surface()
@@ -382,7 +381,7 @@ class LateOutlines(BoundaryTerm):
             scattering = FromLight(scattering)
         self.to_scan = ScanSampled()
         strategies = MaterialVacuum(), scattering, [self.to_scan]
-        return World(world.scene, world.contents, self.settings, strategies, None, world.window)
+        return RenderContext(world.scene, world.contents, self.settings, strategies, None, world.window)
 
     def tables(self) -> list[Any]:
         return [*super().tables(), *(table for table in self.world.tables() if dr.grad_enabled(table))]

@@ -13,7 +13,7 @@ from torchtransient.errors import GradientWarning
 from torchtransient.plugins.around_corner.geometry import front_normal
 from torchtransient.plugins.around_corner.occlusion import BOUNCES, FIRST, LateOutlines, MutualOcclusion
 from torchtransient.plugins.around_corner.outline_table import OutlineTable, Part, hiding_pairs, parts_of
-from torchtransient.plugins.integrators.launch import passes_of, seed_array
+from torchtransient.plugins.integrators.job import passes_of, seed_array
 from torchtransient.plugins.kernel_arrays import registry_number
 from torchtransient.plugins.transport.boundary.moving_edges import (
     Gap,
@@ -21,7 +21,7 @@ from torchtransient.plugins.transport.boundary.moving_edges import (
     edges_in_mirrors,
     rims_without_edges,
 )
-from torchtransient.plugins.transport.segment.material import MaterialVacuum
+from torchtransient.plugins.transport.material_points import MaterialVacuum
 
 # Edge samples of a pixel and viewpoint, as a share of its paths.
 SHARE = 4

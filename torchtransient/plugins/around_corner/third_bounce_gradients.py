@@ -23,7 +23,7 @@ from torchtransient.plugins.films.colour import ChannelMatch
 from torchtransient.plugins.sampling.hidden_elements import packed_columns
 from torchtransient.plugins.sampling.shared_samples import material_samples
 from torchtransient.plugins.transport.carry import slope_only, total_of
-from torchtransient.plugins.transport.derivative.forward import tangents_of
+from torchtransient.plugins.transport.derivative import tangents_of
 from torchtransient.plugins.transport.strategy import Local
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -279,7 +279,7 @@ class Split:
 
 
 class AdjointReader:
-    """The film's adjoint (:class:`~..integrators.incoming_adjoint.IncomingAdjoint`) at scanned points."""
+    """The film's adjoint (:class:`~..integrators.job.IncomingAdjoint`) at scanned points."""
 
     def __init__(self, film: Any, match: Any, incoming: Any) -> None:
         self.match, self.incoming = match, incoming

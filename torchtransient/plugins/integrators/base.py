@@ -14,11 +14,16 @@ from torchtransient.plugins.described_scene import note_scene
 from torchtransient.plugins.films.colour import ChannelMatch
 from torchtransient.plugins.films.temporal_filters import check_name, check_stddev
 from torchtransient.plugins.frozen_state import arrays_below, says_it_can_be_recorded
-from torchtransient.plugins.integrators.derivative_passes import backward, forward
-from torchtransient.plugins.integrators.incoming_adjoint import IncomingAdjoint
-from torchtransient.plugins.integrators.launch import Job, Pass, laser_count, passes_of, seed_array
-from torchtransient.plugins.integrators.prepared import Prepared, state_of
-from torchtransient.plugins.integrators.seen_scene import SeenScene
+from torchtransient.plugins.integrators.job import (
+    IncomingAdjoint,
+    Job,
+    Pass,
+    Prepared,
+    laser_count,
+    passes_of,
+    seed_array,
+    state_of,
+)
 from torchtransient.plugins.parameter_effect import class_of
 from torchtransient.plugins.parameters import ParameterTracker, check_slope, check_stand_ins, moving_names
 from torchtransient.plugins.properties import number, truth, whole_number
@@ -32,12 +37,14 @@ from torchtransient.plugins.sensors.origin import (
     views,
 )
 from torchtransient.plugins.transport.boundary.moving_edges import MovingEdges, missing
-from torchtransient.plugins.transport.contents import SceneContents
-from torchtransient.plugins.transport.derivative.forward import propagate_tangents
-from torchtransient.plugins.transport.derivative.wanted import Wanted
-from torchtransient.plugins.transport.sinks.film import FilmSink
+from torchtransient.plugins.transport.context import PathSettings, RenderContext, Wanted
+from torchtransient.plugins.transport.derivative import forward as forward_over
+from torchtransient.plugins.transport.derivative import objective_of, propagate_tangents, tangent_of
+from torchtransient.plugins.transport.derivative import reverse as reverse_over
+from torchtransient.plugins.transport.record import RecordSink
+from torchtransient.plugins.transport.scene_contents import SceneCache, SceneContents
+from torchtransient.plugins.transport.sinks import FilmSink
 from torchtransient.plugins.transport.walk import walk
-from torchtransient.plugins.transport.world import PathSettings, World
 
 UNLIMITED = 0xFFFFFFFF
 
@@ -139,9 +146,9 @@ class TransientIntegrator(mi.CppADIntegrator):
         """The sphere around the scene as described, which light from and to infinity is timed by."""
         return self._seen_scene(scene).reference
 
-    def _seen_scene(self, scene) -> SeenScene:
+    def _seen_scene(self, scene) -> SceneCache:
         if self._seen is None or not self._seen.is_of(scene):
-            self._seen = SeenScene(scene, self)
+            self._seen = SceneCache(scene, self)
         return self._seen
 
     def settings(self) -> PathSettings:
@@ -150,9 +157,9 @@ class TransientIntegrator(mi.CppADIntegrator):
             self.max_depth, self.rr_depth, bool(self.hide_emitters), self.discard_direct_light, self.camera_unwarp
         )
 
-    def world(self, scene, contents, wanted=None, window=None, settings=None) -> World:
+    def world(self, scene, contents, wanted=None, window=None, settings=None) -> RenderContext:
         """What the walks of one job are told; ``settings``: other than the integrator's own."""
-        return World(scene, contents, settings or self.settings(), self.strategies(contents), wanted, window)
+        return RenderContext(scene, contents, settings or self.settings(), self.strategies(contents), wanted, window)
 
     def frozen_state(self, scene, sensor=0) -> list:
         """The arrays that kernels of this scene read beside its parameters, for ``dr.freeze(..., state_fn=...)``: see
@@ -423,3 +430,73 @@ class TransientIntegrator(mi.CppADIntegrator):
             f"{type(self).__name__}[\n  max_depth = {self.max_depth},\n  rr_depth = {self.rr_depth},\n"
             f"  camera_unwarp = {self.camera_unwarp},\n  discard_direct_light = {self.discard_direct_light}\n]"
         )
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# The kernel launches of a derivative: every pass records its paths and goes over the record again.
+
+def backward(job):
+    """Carry out a prepared job (:class:`.prepared.Prepared`) in reverse mode: gradients arrive at the scene's attached
+    parameters and at the job's tables. To be called with gradients suspended.
+    """
+    world = job.world
+    # Derivatives wait at the parameters until all passes are done: following the graph further uses up its edges, and
+    # the first pass would be the only one to arrive.
+    with dr.isolate_grad(), world.contents.hidden_from_mitsuba():
+        for launch in job.launches if world.walks else ():
+            _backward_pass(job, launch)
+            dr.eval()
+        for part in job.beside:
+            part.backward(job.incoming)
+
+
+def forward(job):
+    """Carry out a prepared job in forward mode: its film holds the tangent then. As :func:`backward`."""
+    world, film = job.world, job.film
+    film.start_render(job.samples)
+    with world.contents.hidden_from_mitsuba():
+        for launch in job.launches if world.walks else ():
+            _forward_pass(job, launch)
+            dr.eval(film.bands[launch.band][2], film.steady)
+        for part in job.beside:
+            part.forward()
+    film.finish_render()
+
+
+def _start(job, launch):
+    """(primary rays, map to the film's channels, base and pixel of each lane)."""
+    integrator, world = job.integrator, job.world
+    rays = integrator.start(world.scene, world.contents, job.sensor, job.film, launch)
+    base, pixel = integrator.pixel_indices(job.film, launch, rays)
+    return rays, integrator.channel_match(world.contents, job.film, rays), base, pixel
+
+
+def _record(job, rays, block=None):
+    """Record the paths of one pass, with their arrivals for the adjoint ``block``: (layout of the record, the record,
+    number of vertices).
+    """
+    sink = RecordSink(block, dr.width(rays.ray) if job.world.record_room.in_memory else None)
+    count, store = job.integrator.walk(job.world, job.film, rays, sink)
+    return sink.layout, store, count
+
+
+def _backward_pass(job, launch):
+    world = job.world
+    rays, match, _, pixel = _start(job, launch)
+    block = job.incoming.block(rays, pixel, match)
+    adjoint = reverse_over(world, *_record(job, rays, block), block, dr.detach(rays.ray))
+    with dr.resume_grad():
+        if world.wanted.sensor or dr.grad_enabled(rays.η):
+            # What carries a sensor may move without its rays: they go to points that are given.
+            flags = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
+            dr.backward_from(objective_of(world, rays, adjoint), flags)
+
+
+def _forward_pass(job, launch):
+    world, film = job.world, job.film
+    rays, match, base, pixel = _start(job, launch)
+    block = film.create_event_block(launch, base, match, world.most_events(), tangents=True)
+    tangent = tangent_of(world, rays)
+    dL = forward_over(world, *_record(job, rays), block, dr.detach(rays.ray), tangent)
+    film.add_steady(pixel, match.to_channels(dL))
+    block.finish()

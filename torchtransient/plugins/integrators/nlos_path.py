@@ -29,22 +29,20 @@ from torchtransient.plugins.around_corner.shared_light import (
 )
 from torchtransient.plugins.integrators import base
 from torchtransient.plugins.integrators.base import UNLIMITED
-from torchtransient.plugins.integrators.launch import share_of
+from torchtransient.plugins.integrators.job import share_of
 from torchtransient.plugins.properties import number, truth, whole_number
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 from torchtransient.plugins.transport.boundary.moving_edges import MovingEdges, missing, switched_off
-from torchtransient.plugins.transport.connection.emitter_found import EmitterFound
-from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
-from torchtransient.plugins.transport.connection.laser_spot import LaserSpot
-from torchtransient.plugins.transport.scattering.guides.hidden_geometry import HiddenGeometry
-from torchtransient.plugins.transport.scattering.lambertian import Lambertian
-from torchtransient.plugins.transport.scattering.medium import SurfaceOrMedium
-from torchtransient.plugins.transport.scattering.surface import Surface
-from torchtransient.plugins.transport.segment.material import FoundVacuum, MaterialVacuum
-from torchtransient.plugins.transport.segment.media import Media
-from torchtransient.plugins.transport.segment.vacuum import Vacuum
+from torchtransient.plugins.transport.context import PathSettings, RenderContext
+from torchtransient.plugins.transport.emitter_connections import EmitterFound, EmitterSampled
+from torchtransient.plugins.transport.guides import HiddenGeometry
+from torchtransient.plugins.transport.laser_spot import LaserSpot
+from torchtransient.plugins.transport.material_points import FoundVacuum, MaterialVacuum
+from torchtransient.plugins.transport.media import Media
+from torchtransient.plugins.transport.medium_scattering import SurfaceOrMedium
 from torchtransient.plugins.transport.strategy import Local
-from torchtransient.plugins.transport.world import PathSettings, World
+from torchtransient.plugins.transport.surface_scattering import Lambertian, Surface
+from torchtransient.plugins.transport.vacuum import Vacuum
 
 # Share of the samples drawn over the hidden area: at the relay wall, and beyond it.
 AT_WALL, BEYOND = 0.9, 0.25
@@ -270,7 +268,7 @@ class TransientNLOSPath(base.TransientIntegrator):
             # Paths that have nothing to find beyond end before.
             most = settings.max_depth if wanted is not None else max(division.longest, 1)
             settings = replace(settings, division=division, max_depth=most)
-        return World(scene, contents, settings, self.strategies(contents, table), wanted, window)
+        return RenderContext(scene, contents, settings, self.strategies(contents, table), wanted, window)
 
     def add_light(self, world: Any, sensor: Any, film: Any, job: Any) -> None:
         # Not by the class's name in a function: that is another class once plugins are made for another variant.

@@ -7,11 +7,9 @@ from torchtransient.plugins.integrators.base import TransientIntegrator
 from torchtransient.plugins.properties import truth, whole_number
 from torchtransient.plugins.transport.boundary.moving_edges import moving_edges, switched_off
 from torchtransient.plugins.transport.boundary.term import BoundaryTerm
-from torchtransient.plugins.transport.connection.emitter_found import EmitterFound
-from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
-from torchtransient.plugins.transport.scattering.lambertian import Lambertian
-from torchtransient.plugins.transport.scattering.surface import Surface
-from torchtransient.plugins.transport.segment.vacuum import Vacuum
+from torchtransient.plugins.transport.emitter_connections import EmitterFound, EmitterSampled
+from torchtransient.plugins.transport.surface_scattering import Lambertian, Surface
+from torchtransient.plugins.transport.vacuum import Vacuum
 
 
 class TransientPath(TransientIntegrator):

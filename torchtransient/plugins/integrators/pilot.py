@@ -15,8 +15,8 @@ import numpy as np
 from torchtransient._collection import no_collection
 from torchtransient.errors import VariantError
 from torchtransient.plugins.films.colour import ChannelMatch, mean_of
-from torchtransient.plugins.integrators.launch import Pass, seed_array
-from torchtransient.plugins.transport.sinks.event_list import EventListSink
+from torchtransient.plugins.integrators.job import Pass, seed_array
+from torchtransient.plugins.transport.sinks import EventListSink
 from torchtransient.plugins.transport.walk import walk
 
 # Depth of a pilot's paths. Russian roulette ends most of them long before.

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.integrators import path
-from torchtransient.plugins.transport.connection.emitter_found import EmitterFound
-from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
-from torchtransient.plugins.transport.scattering.medium import SurfaceOrMedium
-from torchtransient.plugins.transport.segment.media import Media
+from torchtransient.plugins.transport.emitter_connections import EmitterFound, EmitterSampled
+from torchtransient.plugins.transport.media import Media
+from torchtransient.plugins.transport.medium_scattering import SurfaceOrMedium
 
 
 class TransientVolpath(path.TransientPath):
     r"""Time-resolved volumetric path tracer (:monosp:`transient_prbvolpath`, :monosp:`transient_volpath`).
 
     The path tracer ``transient_path`` with walks through homogeneous and heterogeneous media between its vertices, see
-    ``transport/segment/free_flight.py``: any phase function, colours of extinction, open (``null``) and refractive
+    ``transport/free_flight.py``: any phase function, colours of extinction, open (``null``) and refractive
     boundaries,
     sensors inside a medium. Parameters as in :class:`TransientIntegrator`; ``max_depth`` counts scattering at surfaces
     and in media, not the passage of an open boundary. A ``mask`` or ``thindielectric`` counts, as in

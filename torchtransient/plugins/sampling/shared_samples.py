@@ -13,7 +13,7 @@ from torchtransient.errors import SceneError, UnitError, VariantError
 from torchtransient.plugins.bsdfs.lambertian import is_lambertian
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 from torchtransient.plugins.sampling.point_sets import plane_points
-from torchtransient.plugins.transport.scattering.geometry_terms import material_point
+from torchtransient.plugins.transport.geometry_terms import material_point
 from torchtransient.plugins.transport.strategy import Local
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -14,9 +14,11 @@ polarized variants.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 
 
 class Local:
@@ -96,6 +98,32 @@ class EventTerm(Local):
 
     # Otherwise the film is asked for the adjoint at ``opl``.
     arrival = None
+
+
+@dataclass
+class VertexEnd:
+    """Where a vertex lies, without derivatives: what the one before sees of it. Loop state of the reverse mode."""
+
+    t: Any      # Float      distance along the ray that found it, which starts a little off the vertex before
+    n: Any      # Normal3f   zero for points in a volume
+    d: Any      # Vector3f   direction of that ray
+    valid: Any  # Bool       something was hit
+
+    @staticmethod
+    def nowhere() -> VertexEnd:
+        """Behind the last vertex of a path."""
+        return VertexEnd(mi.Float(0), mi.Normal3f(0, 0, 1), mi.Vector3f(0, 0, 1), mi.Bool(False))
+
+
+class AttachedVertex(Local):
+    """A recorded vertex with derivatives.
+
+    ``v`` (RecordedVertex), ``si`` (attached), ``sid`` (detached), ``end`` (VertexEnd), ``carry`` (with the throughput
+    at the vertex), ``slope`` (zero with the derivative of the optical length up to it), ``damping_radius`` (with
+    geometry: points nearer than that slide along). The scattering adds ``bsdf``, ``delay``, ``scattered_si`` (``si``
+    with the wavelengths beyond the surface), ``scattered_slope`` and ``scattered_opl`` (behind its delay) and
+    ``rotation``.
+    """
 
 
 class Strategy:

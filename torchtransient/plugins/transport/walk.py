@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.polarized import product
-from torchtransient.plugins.transport.sinks.sink import Sink
+from torchtransient.plugins.transport.sinks import Sink
 from torchtransient.plugins.transport.strategy import Local
 
 

@@ -19,7 +19,7 @@ from torchtransient.plugins.edges.table import BESIDE
 from torchtransient.plugins.edges.topology import BALL, DISK_RIM, Body, bodies_of
 from torchtransient.plugins.kernel_arrays import floats, host_numbers, registry_number
 from torchtransient.plugins.mitsuba_compat import bounds_of, mesh_faces, mesh_positions
-from torchtransient.plugins.transport.media_contents import is_open
+from torchtransient.plugins.transport.scene_contents import is_open
 
 # How deep an edge reaches through a face at least, in parts of the largest coordinate of both bodies: edges that lie
 # less deep, by rounding, in what they stand on are found.

@@ -11,8 +11,8 @@ from torchtransient.plugins.sensors.seen_from import FAR, can_be_connected
 from torchtransient.plugins.transport.boundary.sides import BoundaryPass, at_point, in_memory, is_seen_within, place_at
 from torchtransient.plugins.transport.boundary.specular import attached_ray, ratios_of
 from torchtransient.plugins.transport.boundary.speeds import along_the_ray, dragged_share
-from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
-from torchtransient.plugins.transport.scattering.geometry_terms import EDGE_ON, displacement, material_point
+from torchtransient.plugins.transport.emitter_connections import EmitterSampled
+from torchtransient.plugins.transport.geometry_terms import EDGE_ON, displacement, material_point
 from torchtransient.plugins.transport.strategy import Local
 from torchtransient.plugins.transport.walk import go_on, start
 

@@ -31,7 +31,7 @@ from torchtransient.plugins.parameter_effect import CORRECT, ParameterEffect
 from torchtransient.plugins.sampling.lights import MovingSun
 from torchtransient.plugins.sensors.seen_from import SensorPlaces, can_be_connected, has_eye, sees_one_line
 from torchtransient.plugins.transport.boundary.crossings import crossing_bodies
-from torchtransient.plugins.transport.media_contents import is_open
+from torchtransient.plugins.transport.scene_contents import is_open
 from torchtransient.plugins.transport.strategy import Local
 
 # Roles of what moves edges against what is behind them, and of what bends light, which moves edges that are seen

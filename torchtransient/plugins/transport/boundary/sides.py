@@ -23,7 +23,7 @@ class BoundaryPass:
         raise NotImplementedError
 
     def run(self, mode, job):
-        """Trace the edge samples of the launch ``job`` (:class:`~...integrators.launch.Pass`).
+        """Trace the edge samples of the launch ``job`` (:class:`~...integrators.job.Pass`).
 
         Args:
             mode: :class:`.weigh.Reverse` or :class:`.weigh.Forward`; ``mode.term`` is the job's term.

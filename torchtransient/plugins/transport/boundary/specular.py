@@ -31,12 +31,12 @@ from torchtransient.plugins.transport.boundary.sides import (
     past_edge,
     place_at,
 )
-from torchtransient.plugins.transport.connection.sensor_sampled import first_row, in_sensor_frame
-from torchtransient.plugins.transport.instances import surface_interaction
-from torchtransient.plugins.transport.scattering.surface import Surface
+from torchtransient.plugins.transport.context import RenderContext
+from torchtransient.plugins.transport.light_tracing import first_row, in_sensor_frame
 from torchtransient.plugins.transport.strategy import Connection, Event, Local, Proposal
+from torchtransient.plugins.transport.surface_interactions import surface_interaction
+from torchtransient.plugins.transport.surface_scattering import Surface
 from torchtransient.plugins.transport.walk import advance, start
-from torchtransient.plugins.transport.world import World
 
 # Rays that chains are taken from, and the share of those that end at a surface that goes on with a delta lobe.
 RAYS, _UNFINISHED = 2**14, 0.125
@@ -84,7 +84,8 @@ class Chains:
         )
         segment, _, connections = integrator.strategies(world.contents)
         self._lobes = KnownLobes()
-        self.world = World(world.scene, world.contents, integrator.settings(), (segment, self._lobes, connections))
+        strategies = segment, self._lobes, connections
+        self.world = RenderContext(world.scene, world.contents, integrator.settings(), strategies)
         numbers = places.numbers(sampler)
         rays = places.rays_at(world, sampler, sampler.next_2d() * places.size, numbers)
         found = self.follow(world, rays, sampler, mi.UInt32(self.longest), mi.Bool(True))

@@ -15,9 +15,9 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.transport.instances import surface_interaction
-from torchtransient.plugins.transport.scattering.geometry_terms import displacement, slide
+from torchtransient.plugins.transport.geometry_terms import displacement, slide
 from torchtransient.plugins.transport.strategy import Local
+from torchtransient.plugins.transport.surface_interactions import surface_interaction
 
 
 def dragged_share(r, radius):

@@ -25,7 +25,7 @@ import mitsuba as mi
 
 from torchtransient.plugins.edges.table import EdgeTable
 from torchtransient.plugins.edges.topology import topology_of
-from torchtransient.plugins.integrators.launch import passes_of, seed_array
+from torchtransient.plugins.integrators.job import passes_of, seed_array
 from torchtransient.plugins.sensors.seen_from import SensorPlaces
 from torchtransient.plugins.transport.boundary.light import LightPass
 from torchtransient.plugins.transport.boundary.primary import PrimaryPass
@@ -38,10 +38,9 @@ from torchtransient.plugins.transport.boundary.specular import (
 )
 from torchtransient.plugins.transport.boundary.vertex import VertexPass
 from torchtransient.plugins.transport.boundary.weigh import Forward, Reverse
-from torchtransient.plugins.transport.connection.sensor_sampled import SensorSampled
-from torchtransient.plugins.transport.media_contents import is_open
-from torchtransient.plugins.transport.scattering.from_light import FromLight, shades_by_other_normals
-from torchtransient.plugins.transport.world import World
+from torchtransient.plugins.transport.context import RenderContext
+from torchtransient.plugins.transport.light_tracing import FromLight, SensorSampled, shades_by_other_normals
+from torchtransient.plugins.transport.scene_contents import is_open
 
 PASSES = {"primary": PrimaryPass, "vertex": VertexPass, "light": LightPass, "specular": SpecularPass}
 _SEEDS = {"primary": 0x51, "vertex": 0x52, "light": 0x53, "specular": 0x54, "chains": 0x55, "spot": 0x56}
@@ -100,7 +99,7 @@ class BoundaryTerm:
         settings = replace(integrator.settings(), camera_unwarp=False)
         self.to_sensor = SensorSampled(self.places, integrator.camera_unwarp)
         sensors = [self.to_sensor] if self.through is None else [self.to_sensor, self.through]
-        return World(world.scene, world.contents, settings, (segment, scattering, sensors), None, world.window)
+        return RenderContext(world.scene, world.contents, settings, (segment, scattering, sensors), None, world.window)
 
     def tables(self):
         """The attached ends of edges, and what the strategies of light paths have attached."""

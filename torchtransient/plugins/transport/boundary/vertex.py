@@ -11,8 +11,8 @@ from torchtransient.plugins.sensors.seen_from import sees_one_line
 from torchtransient.plugins.transport.boundary.sides import BoundaryPass, both_sides, in_memory, past_edge
 from torchtransient.plugins.transport.boundary.specular import attached_ray
 from torchtransient.plugins.transport.boundary.speeds import along_the_ray, as_held, behind, dragged, sides_from, slides
-from torchtransient.plugins.transport.contents import DAMPING
-from torchtransient.plugins.transport.scattering.geometry_terms import displacement
+from torchtransient.plugins.transport.geometry_terms import displacement
+from torchtransient.plugins.transport.scene_contents import DAMPING
 from torchtransient.plugins.transport.strategy import Local, Proposal
 from torchtransient.plugins.transport.walk import advance, first_leg, start
 

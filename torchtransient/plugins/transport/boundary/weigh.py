@@ -8,10 +8,8 @@ import mitsuba as mi
 from torchtransient.plugins.films.block import FilmBlock
 from torchtransient.plugins.transport.boundary.sides import in_memory
 from torchtransient.plugins.transport.carry import total_of
-from torchtransient.plugins.transport.derivative.forward import tangents_of
-from torchtransient.plugins.transport.sinks.adjoint_sum import AdjointSumSink
-from torchtransient.plugins.transport.sinks.film import FilmSink
-from torchtransient.plugins.transport.sinks.sink import Sink
+from torchtransient.plugins.transport.derivative import tangents_of
+from torchtransient.plugins.transport.sinks import AdjointSumSink, FilmSink, Sink
 from torchtransient.plugins.transport.strategy import Local
 from torchtransient.plugins.transport.walk import go_on
 

@@ -11,10 +11,9 @@ import mitsuba as mi
 
 from torchtransient.plugins.around_corner.geometry import sees
 from torchtransient.plugins.transport.carry import slope_only
-from torchtransient.plugins.transport.scattering.geometry_terms import distance
-from torchtransient.plugins.transport.segment.triangles import AttachedTriangles
-from torchtransient.plugins.transport.segment.vacuum import Vacuum
+from torchtransient.plugins.transport.geometry_terms import distance
 from torchtransient.plugins.transport.strategy import Local
+from torchtransient.plugins.transport.vacuum import AttachedTriangles, Vacuum
 
 
 class MaterialVacuum(Vacuum):

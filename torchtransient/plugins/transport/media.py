@@ -15,31 +15,23 @@ import mitsuba as mi
 
 from torchtransient.plugins.polarized import attenuated
 from torchtransient.plugins.sampling.rays import shortest
-from torchtransient.plugins.transport.derivative.vertex import VertexEnd
-from torchtransient.plugins.transport.instances import distance_to, surface_interaction
-from torchtransient.plugins.transport.media_contents import FlightSettings
-from torchtransient.plugins.transport.scattering.geometry_terms import displacement
-from torchtransient.plugins.transport.segment.free_flight import (
+from torchtransient.plugins.transport.free_flight import (
+    ARRIVING,
+    CONNECTING,
+    EMITTING,
+    Leg,
     closed_surface,
     medium_along,
     medium_interaction,
     sample_free_flight,
     transmittance,
-)
-from torchtransient.plugins.transport.segment.optical_depth import (
-    ARRIVING,
-    CONNECTING,
-    EMITTING,
-    Leg,
     with_log_slope,
 )
-from torchtransient.plugins.transport.segment.vacuum import (
-    Vacuum,
-    intersection,
-    intersection_fields,
-    intersection_numbers,
-)
-from torchtransient.plugins.transport.strategy import Local, Vertex
+from torchtransient.plugins.transport.geometry_terms import displacement
+from torchtransient.plugins.transport.scene_contents import FlightSettings
+from torchtransient.plugins.transport.strategy import Local, Vertex, VertexEnd
+from torchtransient.plugins.transport.surface_interactions import distance_to, surface_interaction
+from torchtransient.plugins.transport.vacuum import Vacuum, intersection, intersection_fields, intersection_numbers
 
 
 class Media(Vacuum):

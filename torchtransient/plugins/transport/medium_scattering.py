@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.transport.scattering.surface import Surface
+from torchtransient.plugins.transport.surface_scattering import Surface
 
 # Stands for the density of a phase function so narrow that single precision has none; its square is still a number.
 DELTA_LIKE = 1e15

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from torchtransient.checks import as_whole, shown
 from torchtransient.errors import GradientError, TorchTransientWarning, UnitError
+from torchtransient.plugins.frozen_state import state_below
 
 # Lanes of one kernel launch. Larger jobs run in several passes, which keeps a progress bar moving and indices in 32
 # bits.
@@ -150,3 +152,88 @@ def _launch_counts(sampler: Any, spp: int, most: int) -> list[int]:
 def share_of(progress: Any, part: int, count: int) -> Any:
     """The progress of one of several parts of a job."""
     return progress and (lambda done: progress((part + done) / count))
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# A job of an integrator whose look-ups, checks and tables are made: what is left is a function of arrays.
+
+@dataclass
+class Prepared:
+    """One render or one derivative of it. Made outside of recorded code by
+    :meth:`~.base.TransientIntegrator.prepared`, carried out by :meth:`~.base.TransientIntegrator.run`.
+
+    ``kind``: one of :data:`~torchtransient.interfaces.JOBS`. ``launches``: the :class:`.launch.Pass` of its paths;
+    ``seed`` (``UInt32``) of the job; ``samples``: the largest number of a pixel. ``incoming``: the film's adjoint in
+    reverse mode. ``beside``: what derivatives have beside paths. ``plugins``: those of the scene that are
+    written in Python, whose numbers become part of the kernels. ``refusal``: why it cannot be recorded, None where it
+    can.
+    """
+
+    kind: str
+    integrator: Any
+    scene: Any
+    sensor: Any
+    film: Any
+    world: Any
+    launches: list[Any]
+    seed: Any
+    samples: int
+    incoming: Any = None
+    beside: list[Any] = field(default_factory=list)
+    plugins: list[Any] = field(default_factory=list)
+    refusal: str | None = None
+
+    def tables(self) -> list[Any]:
+        """What has been computed of the scene's parameters: attached where they are."""
+        tables = self.world.tables() + [table for part in self.beside for table in part.tables()]
+        with dr.resume_grad():
+            return [table for table in tables if dr.grad_enabled(table)]
+
+
+def state_of(jobs: list[Prepared]) -> tuple[tuple[Any, ...], list[Any]]:
+    """(structure, arrays): what the traced kernels of jobs depend on beside arrays, and the arrays and structures of
+    arrays that they read beside the scene's parameters.
+    """
+    held = [
+        [job.kind, job.integrator, job.film, job.world, job.launches, job.seed, job.samples, job.incoming, job.beside]
+        for job in jobs
+    ]
+    return state_below([held, [vars(plugin) for plugin in jobs[0].plugins]])
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# The adjoint of a film's two images, as the lanes of a backward pass read it.
+
+class IncomingAdjoint:
+    """What ``render_backward`` is given: steady ``(H, W, C)`` or None, and transient as a TensorXf of the film's shape,
+    as the tuple ``(flat array, offset, strides)``, or None. Raises GradientError for another shape.
+    """
+
+    def __init__(self, film: Any, steady: Any, transient: Any) -> None:
+        self.film, self.steady = film, steady
+        self.transient = None if transient is None else self._layout(transient)
+
+    def _layout(self, transient: Any) -> Any:
+        if isinstance(transient, tuple):
+            return transient
+        expected = self.film.cube_shape()
+        if tuple(transient.shape) != expected:
+            raise GradientError(f"render_backward: adjoint of shape {expected} expected, got {tuple(transient.shape)}.")
+        strides = np.cumprod((1, *expected[:0:-1]))[::-1]
+        return transient.array, 0, tuple(int(stride) for stride in strides)
+
+    def block(self, rays: Any, pixel: Any, match: Any) -> Any:
+        """The film's :class:`~..films.block.AdjointBlock` for the primary ``rays`` of the pixels ``pixel``."""
+        film, channels = self.film, self.film.channel_count()
+        steady = [mi.Float(0)] * channels
+        if self.steady is not None:
+            steady = [dr.gather(mi.Float, self.steady.array, pixel * channels + c) for c in range(channels)]
+        transient, base = None, mi.UInt32(0)
+        if self.transient is not None:
+            flat, offset, strides = self.transient
+            base = rays.row * strides[0] + rays.column * strides[1] + offset
+            if rays.laser is not None:
+                row = rays.laser // film.laser_scan_width
+                base += row * strides[2] + (rays.laser - row * film.laser_scan_width) * strides[3]
+            transient = (flat, *strides[-2:])
+        return film.create_adjoint_block(transient, base, steady, match)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.transport.instances import surface_interaction
 from torchtransient.plugins.transport.strategy import Local
+from torchtransient.plugins.transport.surface_interactions import surface_interaction
 
 # Cosines under which a surface is seen edge-on: its points slide along a ray by one over the cosine, which is rounding
 # there. What is left out of derivatives is as rare as the cosine is small.

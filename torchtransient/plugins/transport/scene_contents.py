@@ -1,0 +1,366 @@
+"""What a scene contains, looked up once a scene and sensor, so that the loops hold only what the scene calls for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.errors import GradientError
+from torchtransient.plugins.bsdfs.delay_table import delays_of
+from torchtransient.plugins.bsdfs.mixtures import hides_lobe_probability, mirrors_matrices, mixtures_of
+from torchtransient.plugins.bsdfs.refraction_table import RefractiveBSDFs
+from torchtransient.plugins.cache import Cache
+from torchtransient.plugins.described_scene import check_scene, described
+from torchtransient.plugins.films.colour import StandardObserver
+from torchtransient.plugins.kernel_arrays import PointerTable
+from torchtransient.plugins.mitsuba_compat import (
+    EMIT_ALIKE,
+    SCATTER_ALIKE,
+    has_no_material,
+    has_smooth_shape,
+    has_vertices,
+    is_flat,
+    is_flat_shape,
+    is_instance,
+    lacks_directions,
+    varies,
+)
+from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene, objects_below, shapes_of_scene
+from torchtransient.plugins.parameters import ParameterTracker
+from torchtransient.plugins.sampling.lights import DistantReference
+from torchtransient.plugins.sampling.sphere_lights import ShapeLights, SphereLights
+from torchtransient.plugins.sensors.surroundings import Surroundings
+from torchtransient.plugins.transport.surface_interactions import DetachedHits, Instances
+
+# Derivatives drag points along with the vertex that sees them where they are nearer than this share of the scene's
+# radius and of the path's first segment: in corners and gaps the motion of a direction has no bounded variance. The
+# boundary term counts what edges so near do.
+DAMPING = 0.05
+
+
+class SceneContents:
+    """The static choices of the kernels. Does not change once built.
+
+    ``sensor``: the one that looks. ``bsdfs``: those that paths can meet. ``delta``, ``glossy``: some BSDF has such a
+    lobe. ``instances``: those of shape groups (:class:`.instances.Instances`). ``detached_hits``: the shapes that leave
+    their hit points detached (:class:`.hits.DetachedHits`). ``distant``: reference sphere of infinitely distant
+    emitters. ``refraction``: the transmissive rough BSDFs, which have an index. ``surroundings``: what may lie around
+    the sensor (:class:`~..sensors.surroundings.Surroundings`). ``delays``: the BSDFs that scatter late. ``mixtures``:
+    masks and blends, of which a path may be handed one part. ``two_sided``: the two-sided BSDFs in polarized variants.
+    ``hidden_probability``: BSDFs whose delta lobes hide the derivative of their probability. ``media``: the
+    participating media (:class:`.media_contents.MediaContents`). ``sphere_lights``: the spherical area lights
+    (:class:`~..sampling.sphere_lights.SphereLights`). ``shape_lights``: the area lights that are sampled over their
+    shapes (:class:`~..sampling.shape_lights.ShapeLights`). ``emitting_meshes``: those with vertices of their own;
+    ``meshes``: all of those, of shape groups, too; ``sliding``: the shapes without material points;
+    ``smooth_lights``: lights on meshes with normals at their vertices. Tables, instances, surroundings, mixtures, media
+    and lights are None where the scene has no such thing.
+
+    ``damping_radius`` (Float): see :func:`.scattering.geometry_terms.damped_motion`. ``patterned_lights``: what leaves
+    some surface differs from place to place. ``patterned``: that, or how a surface scatters does, or its normal.
+    ``untraceable``: names of the emitters that derivatives cannot be traced beside. ``observer``: the
+    :class:`~..films.colour.StandardObserver` in spectral variants.
+
+    A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
+    """
+
+    def __init__(self, scene: Any, sensor: Any, reference: DistantReference) -> None:
+        self.sensor = sensor
+        outermost = bsdfs_of_scene(scene)
+        met, self.delays = delays_of(outermost)
+        self.bsdfs, self.mixtures = mixtures_of(met, mi.BSDF, shapes_of_scene(scene))
+        self.delta = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta) for bsdf in self.bsdfs)
+        self.glossy = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) for bsdf in self.bsdfs)
+        self.instances, self.detached_hits = Instances.of(scene), DetachedHits.of(scene)
+        infinite = any(mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in scene.emitters())
+        self.distant = reference if infinite else None
+        self.refraction = RefractiveBSDFs.of(scene, self.bsdfs)
+        self.surroundings = Surroundings.of(scene, sensor, outermost)
+        self.two_sided = _two_sided(self.bsdfs) if mi.is_polarized else None
+        self.hidden_probability = PointerTable.marking([bsdf for bsdf in self.bsdfs if hides_lobe_probability(bsdf)])
+        self.media = media_of(scene, sensor)
+        self.sphere_lights = SphereLights.of(scene)
+        self.shape_lights = ShapeLights(scene) if self.sphere_lights is None else self.sphere_lights.others
+        self.smooth_lights = PointerTable.marking([e for e in scene.emitters() if has_smooth_shape(e)])
+        self.emitting_meshes = PointerTable.marking([s for s in scene.shapes() if s.is_emitter() and has_vertices(s)])
+        self.meshes = PointerTable.marking([s for s in shapes_of_scene(scene) if has_vertices(s)])
+        self.sliding = PointerTable.marking([s for s in scene.shapes() if has_no_material(s)])
+        self.damping_radius = dr.opaque(mi.Float, DAMPING * reference.radius)
+        self.patterned_lights = any(emits_by_place(e) for e in scene.emitters())
+        self.patterned = self.patterned_lights or not all(is_flat(shape) for shape in scene.shapes())
+        self.patterned |= any(scatters_by_place(bsdf) for bsdf in outermost)
+        self.untraceable = [emitter.id() for emitter in scene.emitters() if lacks_directions(emitter)]
+        self.observer = StandardObserver.of_variant()
+        # What was computed of the scene as it was: renders of one that stays as it is begin sooner.
+        self.memory = Cache()
+        self._built = True
+
+    def hidden_from_mitsuba(self) -> AbstractContextManager[None]:
+        """For the time of a derivative: what is attached here instead of by Mitsuba."""
+        return nullcontext() if self.instances is None else self.instances.detached()
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if getattr(self, "_built", False):
+            raise AttributeError(f"SceneContents does not change once built; tried to set {name!r}.")
+        super().__setattr__(name, value)
+
+
+def _two_sided(bsdfs: list[Any]) -> PointerTable | None:
+    found = [bsdf for bsdf in bsdfs if mirrors_matrices(bsdf)]
+    # A path may be handed a part of a BSDF by the part's own pointer.
+    found += [part for bsdf in found for part in bsdfs_below(bsdf) if mirrors_matrices(part)]
+    return PointerTable.marking(found)
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Whether what happens at a surface differs from place to place: where a vertex slides, that changes too.
+
+def scatters_by_place(bsdf: Any) -> bool:
+    """Whether a BSDF, or one that it holds, may scatter otherwise at another place of a flat surface."""
+    held = [bsdf, *objects_below(bsdf, mi.BSDF)]
+    return _varies_by_texture(bsdf) or not all(_is_known(one, SCATTER_ALIKE) for one in held)
+
+
+def emits_by_place(emitter: Any) -> bool:
+    """Whether the light that leaves a surface in a given direction may differ from place to place: a texture, or what
+    counts angles from the normal of a curved shape. Mitsuba's ``area`` asks for the side alone.
+    """
+    if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface):
+        return False
+    declared = mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
+    if declared or _varies_by_texture(emitter) or not _is_known(emitter, EMIT_ALIKE):
+        return True
+    return emitter.class_name() != "AreaLight" and not is_flat_shape(emitter.get_shape())
+
+
+def _varies_by_texture(plugin: Any) -> bool:
+    textures = objects_below(plugin, mi.Texture)
+    return any(varies(t) or _room(t) not in ("mitsuba", "torchtransient") for t in textures)
+
+
+def _is_known(plugin: Any, names: Iterable[str]) -> bool:
+    """Whether a plugin is one of ours, or of these classes of Mitsuba."""
+    return _room(plugin) == "torchtransient" or (_room(plugin) == "mitsuba" and plugin.class_name() in names)
+
+
+def _room(plugin: Any) -> str:
+    """The package that a plugin is written in."""
+    return type(plugin).__module__.split(".")[0]
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# What the participating media of a scene are like, looked up before tracing.
+
+class MediaContents:
+    """The participating media of a scene. Does not change once built.
+
+    ``at_sensor``: the medium that the sensor stands in, or None. ``homogeneous``, ``heterogeneous``: whether there are
+    media of that kind. ``open_boundaries``: some surface lets light through unbent (BSDF ``null``), so that straight
+    lines go through several media. ``transitions``: there is more than one medium, or a place without one.
+    ``shapes_in_groups``: there are instances. ``emitter_sampling``: every medium allows
+    connections to emitters. ``extent``: the size of the scene in metres. ``phase_mixtures``: blends of phase functions,
+    None where there are none.
+
+    A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
+    """
+
+    def __init__(
+        self, media: list[Any], at_sensor: Any, open_boundaries: bool, shapes_in_groups: bool, extent: float,
+        transitions: bool = False,
+    ) -> None:  # fmt: skip
+        self.media = media
+        self.at_sensor = at_sensor
+        self.homogeneous = any(m.is_homogeneous() for m in media)
+        self.heterogeneous = any(not m.is_homogeneous() for m in media)
+        self.emitter_sampling = all(m.use_emitter_sampling() for m in media)
+        self.open_boundaries = open_boundaries
+        self.transitions = transitions
+        self.shapes_in_groups = shapes_in_groups
+        self.extent = extent
+        phases = {phase.ptr: phase for phase in (medium.phase_function() for medium in media)}
+        _, self.phase_mixtures = mixtures_of(list(phases.values()), mi.PhaseFunction)
+
+    @property
+    def one_stretch(self) -> bool:
+        """Whether a straight line needs no loop: one medium up to the next surface, with one analytic step."""
+        return not (self.heterogeneous or self.open_boundaries)
+
+    def check_spheres(self, sphere_lights: bool) -> None:
+        """Where path lengths change, spherical lights (``sphere_lights``) are sampled by connections alone, which every
+        medium has to allow. Raises ``GradientError`` otherwise.
+        """
+        if sphere_lights and not self.emitter_sampling:
+            raise GradientError(
+                "transient_prbvolpath: derivatives of path lengths reach spherical lights through connections only, "
+                "and a medium has sample_emitters = false. Set it to true, or use lights of another shape."
+            )
+
+    @staticmethod
+    def check_sun(moves: bool) -> None:
+        """Raise ``GradientError`` where the direction of the sun has a derivative: the way of its light through a
+        medium changes with it, which is not followed.
+        """
+        if moves:
+            raise GradientError(
+                "transient_prbvolpath: 'sun_direction' has no derivative in a scene with media, expected a scene "
+                "without. Leave out the medium or the parameter; a moving 'point' light has one."
+            )
+
+
+class FlightSettings:
+    """How the walks through media are made in one job: the contents, and what derivatives ask of them.
+
+    ``recorded``: the path is kept. ``extinction_changes``: a transmittance can change. ``keeps_entry``: the boundary
+    before a vertex is kept, since the vertex may move with it. ``rate_floor`` (1 / m, None when no extinction is
+    differentiated): the smallest rate at which collisions are sampled: where the density is zero, its derivative is
+    not, and is found by collisions alone. ``hide_emitters``: rays from the sensor pass light sources.
+    ``surfaces``: what their derivatives need beside Mitsuba (:class:`.instances.AttachedSurfaces`), or None.
+    """
+
+    def __init__(self, contents: MediaContents, wanted: Any, hide_emitters: bool, surfaces: Any = None):
+        self.surfaces = surfaces
+        self.at_sensor, self.emitter_sampling = contents.at_sensor, contents.emitter_sampling
+        self.homogeneous, self.heterogeneous = contents.homogeneous, contents.heterogeneous
+        self.open_boundaries, self.one_stretch = contents.open_boundaries, contents.one_stretch
+        self.transitions = contents.transitions
+        self.shapes_in_groups = contents.shapes_in_groups
+        self.hide_emitters = hide_emitters
+        self.recorded = wanted is not None
+        self.geometry = self.recorded and wanted.geometry
+        self.extinction_changes = self.recorded and (wanted.geometry or wanted.extinction)
+        self.keeps_entry = self.geometry and contents.open_boundaries
+        self.rate_floor = None
+        if self.recorded and wanted.extinction:
+            # Opaque: as a literal, every change of the scene's size would compile another kernel.
+            self.rate_floor = dr.opaque(mi.Float, 0.5 / contents.extent)
+
+
+def media_of(scene: Any, sensor: Any) -> MediaContents | None:
+    """The media of a scene, None when it has none."""
+    shapes = shapes_of_scene(scene)
+    found = [sensor.get_medium() if sensor is not None else None]
+    for shape in shapes:
+        if shape.is_medium_transition():
+            found += [shape.interior_medium(), shape.exterior_medium()]
+    media = {medium.ptr: medium for medium in found if medium is not None}
+    if not media:
+        return None
+    box = scene.bbox()
+    extent = float(dr.norm(box.extents())) if box.valid() else 1.0
+    transitions = len(media) > 1 or any(medium is None for medium in found)
+    open_boundaries, grouped = any(is_open(shape) for shape in shapes), any(is_instance(shape) for shape in shapes)
+    return MediaContents(list(media.values()), found[0], open_boundaries, grouped, max(extent, 1e-6), transitions)
+
+
+def is_open(shape: Any) -> bool:
+    """Whether light passes ``shape`` unbent and unweakened, so that nothing happens there: a BSDF ``null``, no emitter.
+
+    Works on one shape and on arrays of shape pointers.
+    """
+    sides = int(mi.BSDFFlags.FrontSide) | int(mi.BSDFFlags.BackSide)
+    bsdf = shape.bsdf()
+    if isinstance(shape, mi.Shape):
+        return bsdf is not None and (int(bsdf.flags()) & ~sides) == int(mi.BSDFFlags.Null) and not shape.is_emitter()
+    return ((bsdf.flags() & ~mi.UInt32(sides)) == int(mi.BSDFFlags.Null)) & ~shape.is_emitter()
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# What an integrator remembers of the scene that it has seen last.
+
+class SceneCache:
+    """Look-ups that need to be made once a scene: the ``reference`` sphere of distant light, the contents by sensor,
+    the parameters, the BSDFs with all that they hold.
+
+    The reference is that of the scene as described, see :mod:`..described_scene`: neither moving a shape nor what was
+    rendered before may shift the clock. The scene itself is not kept, since it owns the integrator and would never be
+    freed.
+    """
+
+    # What recorded calls depend on of it is in their worlds.
+    only_remembers = True
+
+    def __init__(self, scene: Any, integrator: Any) -> None:
+        self._described = described(scene, integrator)
+        check_scene(scene, known=self._described)
+        self.reference: DistantReference = self._described.reference
+        # So that no later scene can be taken for this one because it got the same addresses.
+        self._kept = scene.shapes()[:1]
+        own = {shape.ptr for shape in scene.shapes()}
+        self._in_groups = [shape for shape in shapes_of_scene(scene) if shape.ptr not in own]
+        self._pointers: tuple[int, ...] = ()
+        self._lobes: list[int] = []
+        self._bsdfs: list[Any] = []
+        self._followers: list[Any] = []
+        self._contents: dict[int, tuple[Any, SceneContents]] = {}
+        self._tracker: ParameterTracker | None = None
+        self._python: list[Any] | None = None
+        # Parameters, by plugin and key, of which it was said which moving edges derivatives do not follow.
+        self.told_of_edges: set[tuple[int, str]] = set()
+
+    def is_of(self, scene: Any) -> bool:
+        """Whether it is this scene."""
+        return self._described.is_of(scene)
+
+    def follow_derivatives(self, scene: Any, asked: bool) -> None:
+        """Let the BSDFs that sample otherwise for derivatives look which parameters carry some now. ``asked``: for a
+        job of derivatives. What they build for it belongs to the scene's contents.
+        """
+        self._forget_replaced(scene)
+        with dr.resume_grad():
+            for bsdf in self._followers:
+                bsdf.follow_derivatives(asked)
+
+    def contents_for(self, scene: Any, sensor: Any) -> SceneContents:
+        """What the scene contains for a sensor, which may stand in a medium."""
+        self._forget_replaced(scene)
+        if sensor.ptr not in self._contents:
+            # With the sensor, so that no later one can be taken for it.
+            self._contents[sensor.ptr] = sensor, SceneContents(scene, sensor, self.reference)
+        return self._contents[sensor.ptr][1]
+
+    def tracker(self, scene: Any) -> ParameterTracker:
+        """The scene's parameters. Walked over when first asked for: a render has no use for it."""
+        self._forget_replaced(scene)
+        if self._tracker is None:
+            self._tracker = ParameterTracker(scene)
+        return self._tracker
+
+    def python_plugins(self, scene: Any) -> list[Any]:
+        """The plugins of the scene that are written in Python: integrator, films, samplers and filters included, and
+        without what plugins do not show.
+        """
+        self._forget_replaced(scene)
+        if self._python is None:
+            # Of these alone: who holds a light or a sensor may hold its shape, and so on up to the scene.
+            below = (mi.BSDF, mi.Texture, mi.Volume, mi.PhaseFunction, mi.Medium)
+            found = [one for one in objects_below(scene, mi.Object) if isinstance(one, below)]
+            self._python = list({one.ptr: one for one in found if _is_python(one)}.values())
+        sensors = scene.sensors()
+        films = [sensor.film() for sensor in sensors]
+        others = [*sensors, *films, *(sensor.sampler() for sensor in sensors), *(film.rfilter() for film in films)]
+        others += [*scene.emitters(), *scene.shapes(), scene.integrator()]
+        return [*self._python, *filter(_is_python, others)]
+
+    def _forget_replaced(self, scene: Any) -> None:
+        """Look up anew when a shape was given another BSDF (``shape.set_bsdf``) or a BSDF got another lobe."""
+        bsdfs = [bsdf for bsdf in (shape.bsdf() for shape in [*scene.shapes(), *self._in_groups]) if bsdf is not None]
+        # By address: those in use are kept by the scene.
+        pointers = (*(bsdf.ptr for bsdf in bsdfs), *(emitter.ptr for emitter in scene.emitters()))
+        if pointers != self._pointers:
+            outermost = {bsdf.ptr: bsdf for bsdf in bsdfs}.values()
+            nested = [part for bsdf in outermost for part in objects_below(bsdf, mi.BSDF)]
+            self._bsdfs = list({bsdf.ptr: bsdf for bsdf in [*outermost, *nested]}.values())
+            self._followers = [bsdf for bsdf in self._bsdfs if hasattr(bsdf, "follow_derivatives")]
+        # Changed parameters may add a lobe, which those around a BSDF do not tell of.
+        lobes = [bsdf.flags() for bsdf in self._bsdfs]
+        if pointers != self._pointers or lobes != self._lobes:
+            self._pointers, self._lobes = pointers, lobes
+            self._tracker = self._python = None
+            self._contents.clear()
+
+
+def _is_python(plugin: Any) -> bool:
+    return type(plugin).__module__ != "mitsuba"

@@ -1,0 +1,115 @@
+"""What becomes of the events and vertices of a walk."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins.polarized import light_type
+from torchtransient.plugins.transport.carry import total_of
+
+
+class Sink:
+    """A loop calls ``begin`` once, ``event`` for every event, ``vertex`` once a vertex, after its last event, and
+    ``end`` after the loop. ``kept`` is the sink's loop state: a dictionary of Dr.Jit values that it may change.
+    """
+
+    # Static: whether events of value zero matter, since their derivatives may not be zero.
+    zeros = False
+    # Static: whether it does anything with vertices.
+    keeps_vertices = True
+
+    def begin(self, world: Any) -> dict[str, Any]:
+        """The loop state before the first vertex."""
+        return {}
+
+    def event(self, kept: dict[str, Any], event: Any) -> None:
+        """An :class:`~..strategy.Event`."""
+
+    def vertex(self, kept: dict[str, Any], path: Any, samples: dict[str, Any]) -> None:
+        """The vertex that ``path`` has reached; ``samples``: what every strategy made of it, by name."""
+
+    def end(self, kept: dict[str, Any]) -> None:
+        """The paths are over."""
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Events onto the film.
+
+class FilmSink(Sink):
+    """Puts events into a film's block; keeps the sum ``L`` over all times, and the energy ``before`` and ``after`` the
+    film's window.
+    """
+
+    keeps_vertices = False
+
+    def __init__(self, block):
+        self.block = block
+
+    def begin(self, world):
+        return {"L": light_type()(0), "before": mi.Float(0), "after": mi.Float(0), "block": self.block.begin()}
+
+    def event(self, kept, event):
+        kept["L"] = kept["L"] + event.value
+        before, after = self.block.put(kept["block"], event.opl, event.value, event.active, event.crowded)
+        kept["before"] = kept["before"] + before
+        kept["after"] = kept["after"] + after
+
+    def end(self, kept):
+        self.block.end(kept["block"])
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Events summed against the film's adjoint.
+
+class AdjointSumSink(Sink):
+    """Keeps ``sum``: that of ``A(opl) value`` over the events of a path, with the adjoint ``A`` of the film.
+
+    What the light behind a point contributes to a loss: paths are traced from there, as a boundary term asks on both
+    sides of an edge.
+    """
+
+    def __init__(self, block):
+        self.block = block
+
+    def begin(self, world):
+        return {"sum": mi.Float(0)}
+
+    def event(self, kept, event):
+        A, _ = self.block.read(event.opl, event.active)
+        kept["sum"] = kept["sum"] + dr.select(event.active, total_of(A, event.value), 0)
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Events into a list, with their depths.
+
+class EventListSink(Sink):
+    """Every lane lists its events in ``slots`` of its own: ``opl`` (Float64, minus the start), ``energy`` (by
+    ``energy_of(value)``, a Float), ``depth`` (0 where a slot is empty). Events without energy are left out; ``used``
+    counts what a lane found, which may be more than there were slots for.
+    """
+
+    def __init__(self, lanes: int, slots: int, energy_of):
+        self.slots, self.energy_of = slots, energy_of
+        self.lane = dr.arange(mi.UInt32, lanes)
+        self.opl = dr.zeros(mi.Float64, slots * lanes)
+        self.energy = dr.zeros(mi.Float, slots * lanes)
+        self.depth = dr.zeros(mi.UInt32, slots * lanes)
+        self.used = None
+
+    def begin(self, world):
+        return {"used": mi.UInt32(0)}
+
+    def event(self, kept, event):
+        energy, used = self.energy_of(event.value), kept["used"]
+        found = event.active & (energy != 0)
+        slot, fits = dr.fma(self.lane, self.slots, used), found & (used < self.slots)
+        dr.scatter(self.opl, event.opl, slot, fits)
+        dr.scatter(self.energy, energy, slot, fits)
+        dr.scatter(self.depth, event.depth, slot, fits)
+        kept["used"] = used + dr.select(found, mi.UInt32(1), 0)
+
+    def end(self, kept):
+        self.used = kept["used"]
