@@ -34,15 +34,6 @@ def attached_carry(v, names, tangents=None):
     return attach(carry, names, tangents)
 
 
-def vertex_terms(world, v, carry, wanted):
-    """(events with derivatives, the Carry to the next vertex, the attached vertex)."""
-    vertex = world.segment.attached(world, v, carry, wanted)
-    world.scattering.look_up_attached(world, vertex, wanted)
-    step = world.scattering.attached(world, vertex, wanted)
-    terms = [term for c in world.connections for term in c.attached(world, vertex, step, wanted)]
-    return terms, step.carry, vertex
-
-
 # --------------------------------------------------------------------------------------------------------------------
 # Reverse mode: walk the record backwards; the adjoint of the Carry goes from vertex to vertex.
 #
@@ -54,34 +45,35 @@ def vertex_terms(world, v, carry, wanted):
 # its adjoints; that of the slope the same light weighed by ``A'``. Nothing is divided: a zero albedo has its right
 # gradient, and no Mueller matrix is inverted.
 
-def step_back(world, layout, store, block, ray, k, live, adjoint, following):
+def step_back(context, layout, store, block, ray, k, live, adjoint, following):
     """(adjoint of the Carry that arrives at vertex ``k``, where the vertex lies); parameters get their gradients."""
-    wanted = world.wanted
+    wanted = context.wanted
     v = RecordedVertex(layout, store, k, live, ray)
     v.next = following
     with dr.resume_grad():
-        carry = attached_carry(v, world.carried)
-        terms, out, vertex = vertex_terms(world, v, carry, wanted)
-        objective = inner(adjoint, out, world.carried)
+        carry = attached_carry(v, context.carried)
+        vertex = context.segment.attached(context, v, carry, wanted)
+        context.scattering.look_up_attached(context, vertex, wanted)
+        step = context.scattering.attached(context, vertex, wanted)
+        terms = []
+        for connection in context.connections:
+            terms += connection.attached(context, vertex, step, wanted)
+        objective = inner(adjoint, step.carry, context.carried)
         for term in terms:
-            A, slope = adjoint_at(layout, store, block, term)
+            if layout.arrivals is None or term.arrival is None:
+                A, slope = block.read(term.opl, term.active)
+            else:
+                A, slope = layout.arrivals.adjoint(store, block, term.arrival, term.active)
             objective += total_of(A, term.value)
             if wanted.geometry:
                 objective += total_of(slope, dr.detach(term.value)) * term.slope
         dr.backward_from(dr.select(live, objective, 0))
-        before = adjoint_of(carry, world.carried)
-    return choose(live, before, adjoint, world.carried), vertex.end
-
-
-def adjoint_at(layout, store, block, term):
-    """The film's adjoint at the arrival of an event, and its slope."""
-    if layout.arrivals is None or term.arrival is None:
-        return block.read(term.opl, term.active)
-    return layout.arrivals.adjoint(store, block, term.arrival, term.active)
+        before = adjoint_of(carry, context.carried)
+    return choose(live, before, adjoint, context.carried), vertex.end
 
 
 @dr.syntax
-def reverse(world, layout, store, count, block, ray):
+def reverse(context, layout, store, count, block, ray):
     """Accumulate the gradients of the recorded paths; returns the adjoint of the Carry of the primary ``ray``.
 
     ``count``: number of recorded vertices. ``block`` reads the film's adjoint. Must run with gradients suspended.
@@ -91,8 +83,8 @@ def reverse(world, layout, store, count, block, ray):
     i = mi.Int32(count) - 1
     live = i >= 0
     adjoint, following = Carry.zeros(), VertexEnd.nowhere()
-    while dr.hint(live, max_iterations=world.max_depth, label="reverse mode"):
-        adjoint, following = step_back(world, layout, store, block, ray, mi.UInt32(i), live, adjoint, following)
+    while dr.hint(live, max_iterations=context.max_depth, label="reverse mode"):
+        adjoint, following = step_back(context, layout, store, block, ray, mi.UInt32(i), live, adjoint, following)
         i -= 1
         live = i >= 0
     return adjoint
@@ -146,31 +138,36 @@ def tangents_of(values):
     return [pushed.pop(0) if dr.grad_enabled(v) else dr.zeros(type(v)) for v in values]
 
 
-def vertex_tangents(world, v, tangent):
+def vertex_tangents(context, v, tangent):
     """(events, detached, with ``d_value`` and ``d_opl``; the tangent of the next Carry).
 
     Everything attached dies on return: a variable that outlived this call would leave an edge of Dr.Jit's graph behind,
     which the next traversal would run into.
     """
-    wanted = world.wanted
+    wanted = context.wanted
     with dr.resume_grad():
-        carry = attached_carry(v, world.carried, tangent)
-        terms, out, _ = vertex_terms(world, v, carry, wanted)
+        carry = attached_carry(v, context.carried, tangent)
+        vertex = context.segment.attached(context, v, carry, wanted)
+        context.scattering.look_up_attached(context, vertex, wanted)
+        step = context.scattering.attached(context, vertex, wanted)
+        terms = []
+        for connection in context.connections:
+            terms += connection.attached(context, vertex, step, wanted)
         values = [term.value for term in terms]
         slopes = [term.slope for term in terms]
-        carried = [getattr(out, name) for name in world.carried]
+        carried = [getattr(step.carry, name) for name in context.carried]
         found = tangents_of(values + slopes + carried)
     n = len(terms)
     for term, d_value, d_opl in zip(terms, found[:n], found[n : 2 * n], strict=True):
         term.value, term.d_value, term.d_opl, term.slope = dr.detach(term.value), d_value, d_opl, None
-    return terms, with_fields(Carry.zeros(), world.carried, found[2 * n :])
+    return terms, with_fields(Carry.zeros(), context.carried, found[2 * n :])
 
 
-def step_on(world, layout, store, block, events, ray, k, live, tangent, dL):
+def step_on(context, layout, store, block, events, ray, k, live, tangent, dL):
     """(tangent of the Carry behind vertex ``k``, ``dL`` with the derivative of its events)."""
     v = RecordedVertex(layout, store, k, live, ray)
-    v.next = world.segment.end(world, v.after())
-    terms, tangent = vertex_tangents(world, v, tangent)
+    v.next = context.segment.end(context, v.after())
+    terms, tangent = vertex_tangents(context, v, tangent)
     for term in terms:
         dL = dL + dr.select(live, term.d_value, 0)
         block.put_slope(events, term.opl, term.d_value, term.value * term.d_opl, term.active)
@@ -178,7 +175,7 @@ def step_on(world, layout, store, block, events, ray, k, live, tangent, dL):
 
 
 @dr.syntax
-def forward(world, layout, store, count, block, ray, tangent):
+def forward(context, layout, store, count, block, ray, tangent):
     """Write the derivative of the transient to ``block``; returns that of the steady radiance.
 
     ``tangent``: that of the Carry of the primary ``ray``.
@@ -187,8 +184,8 @@ def forward(world, layout, store, count, block, ray, tangent):
     live = k < count
     dL = light_type()(0)
     events = block.begin()
-    while dr.hint(live, max_iterations=world.max_depth, label="forward mode"):
-        tangent, dL = step_on(world, layout, store, block, events, ray, k, live, tangent, dL)
+    while dr.hint(live, max_iterations=context.max_depth, label="forward mode"):
+        tangent, dL = step_on(context, layout, store, block, events, ray, k, live, tangent, dL)
         k += 1
         live = k < count
     block.end(events)
@@ -198,12 +195,12 @@ def forward(world, layout, store, count, block, ray, tangent):
 # --------------------------------------------------------------------------------------------------------------------
 # What derivatives of the paths of a pass have to do with the sensor: the Carry of its primary rays.
 
-def objective_of(world: Any, rays: Any, adjoint: Carry) -> Any:
+def objective_of(context: Any, rays: Any, adjoint: Carry) -> Any:
     """``<adjoint, Carry>`` of the primary rays."""
     parts = {"η": adjoint.η}
-    if not world.camera_unwarp:
+    if not context.camera_unwarp:
         parts["slope"] = adjoint.slope
-    if world.wanted.sensor:
+    if context.wanted.sensor:
         parts |= {"o": adjoint.o + adjoint.x, "d": adjoint.d + adjoint.w}
         if mi.is_polarized:
             parts["turn"] = dr.sum(adjoint.β[1, 2] - adjoint.β[2, 1])
@@ -212,18 +209,18 @@ def objective_of(world: Any, rays: Any, adjoint: Carry) -> Any:
     objective = parts["η"] * rays.η
     if "slope" in parts:
         objective += parts["slope"] * rays.length()
-    if world.wanted.sensor:
+    if context.wanted.sensor:
         objective += dr.dot(parts["o"], rays.ray.o) + dr.dot(parts["d"], rays.ray.d)
     if "turn" in parts:
         objective += parts["turn"] * sensor_rotation(rays.seen, rays.ray).angle()
     return objective
 
 
-def tangent_of(world: Any, rays: Any) -> Carry:
+def tangent_of(context: Any, rays: Any) -> Carry:
     """The tangent of the Carry of the primary rays."""
     tangent = Carry.zeros()
     with dr.resume_grad():
-        if not (world.wanted.sensor or dr.grad_enabled(rays.η)):
+        if not (context.wanted.sensor or dr.grad_enabled(rays.η)):
             return tangent
         attached = [rays.ray.o, rays.ray.d, rays.length(), rays.η]
         if mi.is_polarized:
@@ -231,7 +228,7 @@ def tangent_of(world: Any, rays: Any) -> Carry:
         o, d, length, η, *rotation = tangents_of(attached)
     tangent.o, tangent.x = mi.Vector3f(o), mi.Vector3f(o)
     tangent.d, tangent.w = mi.Vector3f(d), mi.Vector3f(d)
-    tangent.slope = mi.Float(0) if world.camera_unwarp else mi.Float(length)
+    tangent.slope = mi.Float(0) if context.camera_unwarp else mi.Float(length)
     tangent.η = mi.Float(η)
     if mi.is_polarized:
         tangent.β = rotation_tangent(rotation[0])

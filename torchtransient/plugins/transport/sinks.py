@@ -21,7 +21,7 @@ class Sink:
     # Static: whether it does anything with vertices.
     keeps_vertices = True
 
-    def begin(self, world: Any) -> dict[str, Any]:
+    def begin(self, context: Any) -> dict[str, Any]:
         """The loop state before the first vertex."""
         return {}
 
@@ -48,7 +48,7 @@ class FilmSink(Sink):
     def __init__(self, block):
         self.block = block
 
-    def begin(self, world):
+    def begin(self, context):
         return {"L": light_type()(0), "before": mi.Float(0), "after": mi.Float(0), "block": self.block.begin()}
 
     def event(self, kept, event):
@@ -74,7 +74,7 @@ class AdjointSumSink(Sink):
     def __init__(self, block):
         self.block = block
 
-    def begin(self, world):
+    def begin(self, context):
         return {"sum": mi.Float(0)}
 
     def event(self, kept, event):
@@ -99,7 +99,7 @@ class EventListSink(Sink):
         self.depth = dr.zeros(mi.UInt32, slots * lanes)
         self.used = None
 
-    def begin(self, world):
+    def begin(self, context):
         return {"used": mi.UInt32(0)}
 
     def event(self, kept, event):

@@ -133,20 +133,20 @@ class Strategy:
 
     name = ""
 
-    def prepare(self, world: Any) -> None:
+    def prepare(self, context: Any) -> None:
         """Once a job, outside of traced code, with gradients enabled: what all lanes share. Arrays that are kept are
         evaluated (``dr.eval``): launches of a job differ in width, and the first one that reads others may widen
         them to its own.
         """
 
-    def start(self, world: Any, rays: Any) -> None:
+    def start(self, context: Any, rays: Any) -> None:
         """Before every launch, outside of traced code: what is told by the lane (``rays``: its primary rays)."""
 
     def tables(self) -> list[Any]:
         """What ``prepare`` has computed of parameters: attached where they are."""
         return []
 
-    def fields(self, world: Any) -> dict[str, Any]:
+    def fields(self, context: Any) -> dict[str, Any]:
         """Types of the numbers that ``attached`` cannot recompute, by name."""
         return {}
 
@@ -167,26 +167,26 @@ class Segment(Strategy):
     # Fields of the Carry that derivatives go through for its sake.
     carried: tuple[str, ...] = ()
 
-    def first(self, world: Any, ray: Any, sampler: Any) -> Any:
+    def first(self, context: Any, ray: Any, sampler: Any) -> Any:
         """The leg of a primary ray."""
         raise NotImplementedError
 
     def depart(
-        self, world: Any, ray: Any, vertex: Vertex, β: Any, sampler: Any, active: Any, seen: bool = False
+        self, context: Any, ray: Any, vertex: Vertex, β: Any, sampler: Any, active: Any, seen: bool = False
     ) -> Any:
         """The leg of ``ray``, which leaves ``vertex`` with throughput ``β``. ``seen``: it is part of a primary ray,
-        which lights are hidden from where ``world.hide_emitters``.
+        which lights are hidden from where ``context.hide_emitters``.
         """
         raise NotImplementedError
 
-    def depart_guided(self, world: Any, ray: Any, vertex: Vertex, step: Step, sampler: Any, active: Any) -> Any:
+    def depart_guided(self, context: Any, ray: Any, vertex: Vertex, step: Step, sampler: Any, active: Any) -> Any:
         """The same where some rays were sent to a point by a guide: ``step.guided``, ``step.point``, and in
         ``step.target`` what is known of it (Local with ``n`` and ``uv``, or None).
         """
-        return self.depart(world, ray, vertex, vertex.β, sampler, active)
+        return self.depart(context, ray, vertex, vertex.β, sampler, active)
 
-    def arrive(self, world: Any, path: Any) -> Vertex:
-        """The vertex at the end of the current leg. Sensors do not see lights where ``world.hide_emitters``."""
+    def arrive(self, context: Any, path: Any) -> Vertex:
+        """The vertex at the end of the current leg. Sensors do not see lights where ``context.hide_emitters``."""
         raise NotImplementedError
 
     def surface_of(self, leg: Any) -> tuple[Any, Any]:
@@ -205,7 +205,7 @@ class Segment(Strategy):
         """(length of ``leg`` from the origin of its ray, whether something is there)."""
         raise NotImplementedError
 
-    def held(self, world: Any, pi: Any, ray: Any, active: Any) -> Any:
+    def held(self, context: Any, pi: Any, ray: Any, active: Any) -> Any:
         """Zero with how far derivatives move the surface point ``pi``, found by ``ray``, as a point of its shape."""
         raise NotImplementedError
 
@@ -217,7 +217,7 @@ class Segment(Strategy):
         """The medium of a ray that leaves ``vertex`` (None: the sensor) in direction ``d``, None in vacuum."""
         raise NotImplementedError
 
-    def medium_at(self, world: Any, p: Any, start: Any, medium: Any, active: Any) -> Any:
+    def medium_at(self, context: Any, p: Any, start: Any, medium: Any, active: Any) -> Any:
         """The medium at ``p``, where that at the point ``start`` is ``medium`` on the side of ``p``; None in vacuum."""
         raise NotImplementedError
 
@@ -226,7 +226,7 @@ class Segment(Strategy):
         raise NotImplementedError
 
     def transmittance(
-        self, world: Any, vertex: Vertex, ds: Any, u: Any, sampler: Any, active: Any, seen: bool = False
+        self, context: Any, vertex: Vertex, ds: Any, u: Any, sampler: Any, active: Any, seen: bool = False
     ) -> tuple[Any, Any]:
         """(whether the point ``ds`` (``p, d, dist``) can be seen, factor per colour). ``u``: two uniform
         numbers that were drawn for this vertex and serve as the start of a generator. ``seen``: as of :meth:`depart`.
@@ -237,11 +237,11 @@ class Segment(Strategy):
         """(Ray3f, PreliminaryIntersection3f) of a recorded vertex; ``ray`` is the primary one."""
         raise NotImplementedError
 
-    def next_surface(self, world: Any, ray: Any, active: Any) -> Any:
+    def next_surface(self, context: Any, ray: Any, active: Any) -> Any:
         """The first surface along ``ray`` that a connection ends at."""
         raise NotImplementedError
 
-    def end(self, world: Any, v: Any) -> Any:
+    def end(self, context: Any, v: Any) -> Any:
         """Where a recorded vertex lies, without derivatives: a :class:`.vertex.VertexEnd`."""
         raise NotImplementedError
 
@@ -253,20 +253,20 @@ class Segment(Strategy):
         """Recorded weight of the leg that led to vertex ``v``."""
         return 1
 
-    def attached(self, world: Any, v: Any, carry: Any, wanted: Any) -> Any:
+    def attached(self, context: Any, v: Any, carry: Any, wanted: Any) -> Any:
         """The :class:`.vertex.AttachedVertex` of a recorded one: slope and throughput of ``carry`` move to it, and its
         ``end`` is what :meth:`end` says.
         """
         raise NotImplementedError
 
-    def motion(self, world: Any, vertex: Any, following: Any, ahead: Any) -> Any:
+    def motion(self, context: Any, vertex: Any, following: Any, ahead: Any) -> Any:
         """How the segment from an attached ``vertex`` to the one that is ``following`` it moves where that one lies
         ``ahead`` (mask): attached ``d``, ``J``, ``drag`` and ``longer()`` as a
         :class:`.scattering.geometry_terms.DampedMotion` has them.
         """
         raise NotImplementedError
 
-    def attached_transmittance(self, world: Any, vertex: Any, connected: Any, active: Any) -> Any:
+    def attached_transmittance(self, context: Any, vertex: Any, connected: Any, active: Any) -> Any:
         """One with the derivative of the logarithm of the transmittance towards ``connected``: Local with attached
         ``p``, detached ``d``, ``far``, and ``ahead`` (whether the segment is the one to the next vertex).
         """
@@ -276,8 +276,8 @@ class Segment(Strategy):
 class Connection(Strategy):
     """Light that is found at a vertex, or that a vertex is connected to.
 
-    What a connection owes: it keeps to ``vertex.goes_on``, ``vertex.connectable`` and ``world.deep_enough``, asks
-    ``world.counted`` before it traces a shadow ray, weighs its samples by :meth:`weight`, and counts time from
+    What a connection owes: it keeps to ``vertex.goes_on``, ``vertex.connectable`` and ``context.deep_enough``, asks
+    ``context.counted`` before it traces a shadow ray, weighs its samples by :meth:`weight`, and counts time from
     ``vertex.scattered_τ`` along ``vertex.η * answer.eta``.
     """
 
@@ -292,23 +292,23 @@ class Connection(Strategy):
         """Events that it has at a vertex at most; in a derivative (``wanted`` is not None) the number of terms."""
         return 1
 
-    def propose(self, world: Any, path: Any, vertex: Vertex, sampler: Any) -> Proposal | None:
+    def propose(self, context: Any, path: Any, vertex: Vertex, sampler: Any) -> Proposal | None:
         """A direction in which scattering is asked for, None where none is."""
         return None
 
-    def connect(self, world: Any, path: Any, vertex: Vertex, proposal: Any, answer: Any, zeros: bool) -> Event:
+    def connect(self, context: Any, path: Any, vertex: Vertex, proposal: Any, answer: Any, zeros: bool) -> Event:
         """The event. ``zeros`` (static): events of value zero matter for a derivative, so that the visible ones of
         them are active, too, unless no attached parameter can change them.
         """
         raise NotImplementedError
 
-    def density(self, world: Any, ref: Any, ds: Any, active: Any) -> Any:
+    def density(self, context: Any, ref: Any, ds: Any, active: Any) -> Any:
         """Density with which this strategy samples the light's point ``ds`` from ``ref``: per solid angle, and for a
         light without extent the probability of choosing it. None where it samples none.
         """
         return None
 
-    def weight(self, world: Any, ref: Any, ds: Any, density: Any, pdf: Any, active: Any) -> Any:
+    def weight(self, context: Any, ref: Any, ds: Any, density: Any, pdf: Any, active: Any) -> Any:
         """Weight of a sample ``ds`` of this strategy, which has the density ``density`` for it; ``pdf``: that with
         which scattering finds it, 0 where it cannot.
 
@@ -316,14 +316,14 @@ class Connection(Strategy):
         heuristic), and share its weight by their densities: ``b_i / B * B^2 / (A^2 + B^2)``. A strategy of another file
         that samples lights changes the weights of all by its ``density`` alone.
         """
-        others = [c.density(world, ref, ds, active) for c in world.connections if c is not self]
+        others = [c.density(context, ref, ds, active) for c in context.connections if c is not self]
         others = [other for other in others if other is not None]
         if not others:
             return mis_weight(density, pdf)
         total = density + sum(others)
         return dr.select(total > 0, density / total, 0) * mis_weight(total, pdf)
 
-    def claims(self, world: Any, emitter: Any, d: Any, wanted: Any) -> Any:
+    def claims(self, context: Any, emitter: Any, d: Any, wanted: Any) -> Any:
         """Mask of the emitters, in the direction ``d``, that derivatives reach by connections alone; None for none."""
         return None
 
@@ -331,7 +331,7 @@ class Connection(Strategy):
         """Two uniform numbers out of the record that were drawn at the vertex, None where there are none."""
         return None
 
-    def attached(self, world: Any, vertex: Any, step: Any, wanted: Any) -> list[EventTerm]:
+    def attached(self, context: Any, vertex: Any, step: Any, wanted: Any) -> list[EventTerm]:
         """The events of a recorded vertex with derivatives."""
         raise NotImplementedError
 
@@ -351,11 +351,11 @@ class Guide(Strategy):
         """
         return self.share
 
-    def draw(self, world: Any, vertex: Vertex, x: Any, y: Any) -> GuidedPoint:
+    def draw(self, context: Any, vertex: Vertex, x: Any, y: Any) -> GuidedPoint:
         """A point on a surface for two uniform numbers (Float64, Float)."""
         raise NotImplementedError
 
-    def density(self, world: Any, p: Any, q: Any, n: Any, shape: Any, active: Any, primitive: Any = None) -> Any:
+    def density(self, context: Any, p: Any, q: Any, n: Any, shape: Any, active: Any, primitive: Any = None) -> Any:
         """Density per solid angle at ``p`` with which it draws the point ``q`` (normal ``n``) of ``shape``.
         ``primitive``: the number of the shape's triangle, None where it is not known: then it is that of any.
         """
@@ -372,31 +372,31 @@ class Scattering(Strategy):
     # Static: whether its value is zero wherever its density is, for all values of its parameters.
     samples_all = False
 
-    def arrive(self, world: Any, path: Any, vertex: Vertex, sampler: Any) -> None:
+    def arrive(self, context: Any, path: Any, vertex: Vertex, sampler: Any) -> None:
         """Look up how the vertex scatters, before any connection is proposed."""
         raise NotImplementedError
 
-    def scatter(self, world: Any, path: Any, vertex: Vertex, proposals: list, sampler: Any) -> tuple[list, Step]:
+    def scatter(self, context: Any, path: Any, vertex: Vertex, proposals: list, sampler: Any) -> tuple[list, Step]:
         """(an answer for each proposal, None for None; the next direction). All proposals come together, so that one
         virtual call can serve the first of them and the next direction.
         """
         raise NotImplementedError
 
-    def weigh(self, world: Any, path: Any, vertex: Vertex, step: Step, ray: Any, leg: Any) -> None:
+    def weigh(self, context: Any, path: Any, vertex: Vertex, step: Step, ray: Any, leg: Any) -> None:
         """With guides: weight and density of ``step``, once it is known how its segment ends."""
 
-    def look_up_attached(self, world: Any, vertex: Any, wanted: Any) -> None:
+    def look_up_attached(self, context: Any, vertex: Any, wanted: Any) -> None:
         """Look up how an attached vertex scatters, before :meth:`attached` and the connections'."""
         raise NotImplementedError
 
-    def evaluate(self, world: Any, vertex: Any, out: Any, active: Any, sampled: bool = False, ds: Any = None) -> Any:
+    def evaluate(self, context: Any, vertex: Any, out: Any, active: Any, sampled: bool = False, ds: Any = None) -> Any:
         """A :class:`Local` with attached ``value``, ``pdf``, ``wo`` (local direction) and ``eta`` towards the attached
         world direction ``out``. ``sampled``: the direction was drawn by the scattering itself. ``ds``: what lies there,
         if it is a light's point.
         """
         raise NotImplementedError
 
-    def attached(self, world: Any, vertex: Any, wanted: Any) -> Any:
+    def attached(self, context: Any, vertex: Any, wanted: Any) -> Any:
         """The next step with derivatives: Local with ``carry`` behind the vertex, ``inv_pdf`` of the recorded
         direction, ``ahead`` (the next vertex was found by a smooth lobe). Its record has the mask ``delta``.
         """
