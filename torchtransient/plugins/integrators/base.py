@@ -1,4 +1,4 @@
-"""What every transient integrator shares: parameters, primary rays, launches and the three entry points."""
+"""Base of the transient integrators: parameters, primary rays, launches and the three entry points."""
 
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ class TransientIntegrator(mi.CppADIntegrator):
     that reaches the sensor without a bounce),
     ``temporal_filter`` (the film's) and ``gaussian_stddev`` (the film's, in bins).
 
-    Subclasses say with :meth:`strategies` what the walk of light is made of, see :mod:`..transport.strategy`;
-    derivatives in both modes follow from that.
+    Subclasses return the parts of their walk from :meth:`strategies`, see :mod:`..transport.strategy`; derivatives in
+    both modes follow.
     """
 
     def __init__(self, props):
@@ -83,12 +83,12 @@ class TransientIntegrator(mi.CppADIntegrator):
             check_stddev(self.gaussian_stddev)
         self._seen = None
 
-    # Whether paths scatter in participating media; others refuse scenes that have them.
+    # Paths scatter in participating media; otherwise scenes with media are refused.
     walks_through_media = False
-    # Whether the laser of a scan lights one position after the other, and whether beams without width are seen.
+    # The laser of a scan lights one position after the other; beams without width are seen.
     scans_exhaustively = False
     aims_lasers = False
-    # Whether derivatives say which moving edges they do not follow: False where the caller does, who knows its keys.
+    # Derivatives warn of moving edges that they do not follow; False if the caller warns, by its keys.
     warns_of_edges = True
 
     def traverse(self, cb):
@@ -98,7 +98,7 @@ class TransientIntegrator(mi.CppADIntegrator):
     # ----------------------------------------------------------------------------------- preparation
 
     def resolve(self, scene, sensor):
-        """The sensor and its film, checked; temporal filter settings of the integrator are handed to the film."""
+        """Return the sensor and its film, checked; set the film's temporal filter by that of the integrator."""
         if not (mi.variant() or "").startswith(("llvm", "cuda")):
             raise VariantError(
                 f"transient rendering needs a JIT variant such as llvm_ad_rgb, the active one is {mi.variant()!r}; "
@@ -136,19 +136,19 @@ class TransientIntegrator(mi.CppADIntegrator):
         return sensor, film
 
     def contents(self, scene, sensor) -> SceneContents:
-        """What the scene contains, looked up when it is first seen by this sensor."""
+        """Return the contents of the scene, cached by sensor."""
         return self._seen_scene(scene).contents_for(scene, sensor)
 
     def parameters(self, scene) -> ParameterTracker:
-        """The parameters of the scene, to be asked which of them carry gradients."""
+        """Return the tracker of the scene's parameters with gradients."""
         return self._seen_scene(scene).tracker(scene)
 
     def silhouettes(self, scene, sensors=None) -> MovingEdges:
-        """Return what derivatives of a scene lack where edges move, seen by some sensors (None: all)."""
+        """Return the gaps of derivatives at moving edges, seen by some sensors (None: all)."""
         return missing(f"{class_of(self)} follows no edges", "Use transient_path or transient_prbvolpath.")
 
     def reference(self, scene):
-        """The sphere around the scene as described, which light from and to infinity is timed by."""
+        """Return the bounding sphere of the described scene, the origin of time for light at infinity."""
         return self._seen_scene(scene).reference
 
     def _seen_scene(self, scene) -> SceneCache:
@@ -157,24 +157,25 @@ class TransientIntegrator(mi.CppADIntegrator):
         return self._seen
 
     def settings(self) -> PathSettings:
-        """The integrator's parameters for a walk."""
+        """Return the integrator's parameters for a walk."""
         return PathSettings(
             self.max_depth, self.rr_depth, bool(self.hide_emitters), self.discard_direct_light, self.camera_unwarp
         )
 
     def world(self, scene, contents, wanted=None, window=None, settings=None) -> RenderContext:
-        """What the walks of one job are told; ``settings``: other than the integrator's own."""
+        """Return the context of a job; ``settings``: others than the integrator's own."""
         return RenderContext(scene, contents, settings or self.settings(), self.strategies(contents), wanted, window)
 
     def frozen_state(self, scene, sensor=0) -> list:
-        """The arrays that kernels of this scene read beside its parameters, for ``dr.freeze(..., state_fn=...)``: see
-        :mod:`..frozen_state`.
+        """Return the arrays that kernels read beside the scene's parameters, for ``dr.freeze(..., state_fn=...)``.
+
+        See :mod:`..frozen_state`.
         """
         sensor, film = self.resolve(scene, sensor)
         return arrays_below([self.contents(scene, sensor), vars(film)])
 
     def start(self, scene, contents, sensor, film, job: Pass) -> PrimaryRays:
-        """The primary rays of one pass."""
+        """Return the :class:`~..sensors.origin.PrimaryRays` of one launch."""
         sampler = sensor.sampler().clone()
         sampler.set_sample_count(job.spp)
         sampler.set_samples_per_wavefront(job.spp)
@@ -215,18 +216,18 @@ class TransientIntegrator(mi.CppADIntegrator):
         return rays
 
     def offset_in_pixel(self, film, sensor, sampler):
-        """(offset of a sample from its pixel's centre, weight or None for one)."""
+        """Return (offset of a sample from its pixel's centre, weight or None for one)."""
         return film.sample_offset(sampler.next_2d())
 
     def channel_match(self, contents, film, rays):
-        """The map from samples of the primary rays to the film's channels, detached."""
+        """Return the detached map from spectra of the primary rays to channels of the film."""
         ray = dr.detach(rays.ray)
         rotation = sensor_rotation(rays.seen, ray) if mi.is_polarized else None
         weight = dr.detach(rays.weight) * rays.scale
         return ChannelMatch(ray.wavelengths, weight, film.curves or contents.observer, rotation)
 
     def pixel_indices(self, film, job, rays):
-        """Index of a pixel's first entry in its band, and of the pixel in the film."""
+        """Return (index of a pixel's first entry in its band, index of the pixel in the film), UInt32."""
         width = int(film.crop_size()[0])
         first = film.band_layout()[job.band][0]
         pixel = dr.fma(rays.row, width, rays.column)
@@ -237,16 +238,20 @@ class TransientIntegrator(mi.CppADIntegrator):
         return base if rays.laser is None else film.pixel_base(base, rays.laser), pixel
 
     def first_opl(self, film, rays):
-        """Optical path before the first ray starts, counted from ``start_opl``: doubles keep late times exact."""
+        """Return the optical path length before the primary ray's origin, minus ``start_opl``, metres (Float64)."""
         length = mi.Float(0)
         if not self.camera_unwarp:
             length = rays.length()
         return mi.Float64(length) - film.start_opl
 
     def beside(self, context, sensor, film, seed, samples):
-        """What derivatives of a job have beside its paths: objects with ``tables()`` (attached to the parameters),
-        ``backward(incoming)``, ``forward()``, and ``can_be_recorded``. Raises GradientError where one is needed and
-        cannot be computed.
+        """Return further terms of the derivatives of a job, such as the boundary term.
+
+        Objects with ``tables()`` (attached to the parameters), ``backward(incoming)``, ``forward()`` and
+        ``can_be_recorded``.
+
+        Raises:
+            GradientError: if a term is needed and cannot be computed.
         """
         return []
 
@@ -277,9 +282,12 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     @no_collection()
     def prepared(self, scene, sensor=0, seed=0, spp=0, kind=RENDER, grad_in=(None, None)):
-        """A :class:`.prepared.Prepared` job of :data:`~torchtransient.interfaces.JOBS` with all that is looked up,
-        checked and computed once; arguments and errors as in :meth:`render`, :meth:`render_backward` and
-        :meth:`render_forward`.
+        """Return a :class:`.job.Prepared` job: contents, checks, launches and tables, outside of recorded code.
+
+        Arguments and errors as in :meth:`render`, :meth:`render_backward` and :meth:`render_forward`.
+
+        Args:
+            kind: one of :data:`~torchtransient.interfaces.JOBS`.
         """
         if kind not in JOBS:
             raise SceneError(f"prepared: expected a kind of job, one of {', '.join(JOBS)}, got {kind!r}.")
@@ -309,7 +317,7 @@ class TransientIntegrator(mi.CppADIntegrator):
             return job
 
     def refusal_of(self, job) -> str | None:
-        """Why ``dr.freeze`` cannot record a job, None where it can."""
+        """Return the reason why ``dr.freeze`` cannot record a job, None if it can."""
         for plugin in job.plugins:
             if not says_it_can_be_recorded(plugin):
                 return f"the plugin {type(plugin).__name__} does not say that it can be (can_be_recorded)"
@@ -321,7 +329,7 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     @staticmethod
     def state_of(jobs):
-        """(structure, arrays) of prepared jobs, see :func:`.prepared.state_of`."""
+        """Return (structure, arrays) of prepared jobs, see :func:`.job.state_of`."""
         return state_of(jobs)
 
     @no_collection()
@@ -397,10 +405,10 @@ class TransientIntegrator(mi.CppADIntegrator):
             self.run(job)
 
     def _wanted(self, scene, sensor, film):
-        """(contents, which derivatives are asked for). Raises GradientError where the film or the depth has none."""
+        """Return (contents, wanted derivatives). Raises GradientError if film or depth have none."""
         self._seen_scene(scene).follow_derivatives(scene, True)
         contents = self.contents(scene, sensor)
-        with dr.resume_grad():  # the question whether a parameter is attached is answered no while suspended
+        with dr.resume_grad():  # while suspended, no parameter counts as attached
             tracker = self.parameters(scene)
             effects = tracker.attached()
             tracker.check_black()
@@ -422,12 +430,12 @@ class TransientIntegrator(mi.CppADIntegrator):
         return contents, Wanted(effects, sensor, contents)
 
     def _warn_of_edges(self, scene, sensor, effects):
-        """Say once a scene of each attached parameter what its derivative lacks."""
-        told = self._seen_scene(scene).told_of_edges
-        new = [one for one in effects if one[2].moves_silhouette and (one[0].ptr, one[1]) not in told]
+        """Warn once a scene of the gaps in the derivative of each attached parameter."""
+        warned = self._seen_scene(scene).told_of_edges
+        new = [one for one in effects if one[2].moves_silhouette and (one[0].ptr, one[1]) not in warned]
         if not new:
             return
-        told.update((node.ptr, key) for node, key, _ in new)
+        warned.update((node.ptr, key) for node, key, _ in new)
         edges, found = self.silhouettes(scene, [sensor]), {}
         for node, key, effect in new:
             for gap in edges.lacking(node, key, effect):

@@ -1,4 +1,4 @@
-"""One recorded vertex as a function ``Carry -> (EventTerms, Carry)``, put together from what the strategies say.
+"""Derivatives of a recorded vertex, a function ``Carry -> (EventTerms, Carry)`` of the strategies' attached forms.
 
 The sampled path is held fixed in this sense: vertices are points of their shapes, dragged along with the vertex before
 where they are near; the first vertex of a camera's path slides along its ray. Where a delta lobe determines the next
@@ -22,11 +22,11 @@ from torchtransient.plugins.transport.strategy import VertexEnd
 
 
 def attached_carry(v, names, tangents=None):
-    """The recorded Carry that arrives at a vertex, with leaves for the fields ``names``."""
+    """Return the recorded Carry that arrives at a vertex, with leaves for the fields ``names``."""
     # A leaf has the width of the lanes, or its gradient would be summed up over them.
     zero = dr.zeros(mi.Float, dr.width(v.ray.d))
     o, d = mi.Point3f(v.ray.o), mi.Vector3f(v.ray.d)
-    # Of its ends, the derivatives alone are asked for.
+    # Of its ends only the derivatives are read.
     carry = Carry(
         β=mi.Spectrum(v.β), slope=zero, η=mi.Float(v.η), o=o, d=d, x=mi.Point3f(o), w=mi.Vector3f(d), p=mi.Point3f(o),
         n=mi.Normal3f(d),
@@ -35,7 +35,7 @@ def attached_carry(v, names, tangents=None):
 
 
 # --------------------------------------------------------------------------------------------------------------------
-# Reverse mode: walk the record backwards; the adjoint of the Carry goes from vertex to vertex.
+# Reverse mode: walk the record backwards, with the adjoint of the Carry.
 #
 # With the adjoint ``A`` of the film at an event's arrival and its slope ``A'``, a vertex back-propagates
 #
@@ -46,7 +46,7 @@ def attached_carry(v, names, tangents=None):
 # gradient, and no Mueller matrix is inverted.
 
 def step_back(context, layout, store, block, ray, k, live, adjoint, following):
-    """(adjoint of the Carry that arrives at vertex ``k``, where the vertex lies); parameters get their gradients."""
+    """Back-propagate vertex ``k``; return (adjoint of the Carry that arrives there, VertexEnd of the vertex)."""
     wanted = context.wanted
     v = RecordedVertex(layout, store, k, live, ray)
     v.next = following
@@ -74,9 +74,17 @@ def step_back(context, layout, store, block, ray, k, live, adjoint, following):
 
 @dr.syntax
 def reverse(context, layout, store, count, block, ray):
-    """Accumulate the gradients of the recorded paths; returns the adjoint of the Carry of the primary ``ray``.
+    """Accumulate the gradients of recorded paths, with gradients suspended.
 
-    ``count``: number of recorded vertices. ``block`` reads the film's adjoint. Must run with gradients suspended.
+    Args:
+        context: :class:`.context.RenderContext` of the job.
+        layout, store: layout of the record, and the record.
+        count: number of recorded vertices, UInt32.
+        block: adjoint block of the film.
+        ray: primary ray, Ray3f.
+
+    Returns:
+        Adjoint of the Carry of the primary ray.
     """
     if dr.hint(layout.arrivals is not None, mode="scalar"):
         store = read_ahead(layout.arrivals, store, block)
@@ -91,18 +99,22 @@ def reverse(context, layout, store, count, block, ray):
 
 
 # --------------------------------------------------------------------------------------------------------------------
-# Forward mode: walk the record once more; the tangent of the Carry goes from vertex to vertex.
+# Forward mode: walk the record forwards, with the tangent of the Carry.
 #
 # Every event puts ``k dvalue + value k' dtau`` onto the film. A vertex is the same function as in reverse mode, so both
 # agree to rounding for one seed.
 
 def propagate_tangents(parameters, tables):
-    """Bring the tangents of the scene's ``parameters`` to where the loop meets them, outside of its isolated scope;
-    ``tables``: what has been computed of them.
+    """Propagate the tangents of the scene's parameters to the arrays that kernels read.
+
+    Args:
+        parameters: :class:`~..parameters.ParameterTracker` of the scene.
+        tables: arrays that strategies computed from parameters.
     """
     attached = parameters.attached_values()
-    # To them, and on to what plugins derive from them, such as the vertices of a rectangle; a caller may have done so
-    # already. In one go: a call of a plugin that tables come from runs into edges that no traversal knows of.
+    # To the parameters, and on to arrays that plugins derive from them, such as the vertices of a rectangle, if the
+    # caller has not done so. In one traversal: a plugin call that tables depend on leaves edges that a second traversal
+    # does not know.
     for value in attached + [table for table in tables if dr.grad_enabled(table)]:
         dr.enqueue(dr.ADMode.Backward, value)
     for value in attached:
@@ -119,7 +131,7 @@ def propagate_tangents(parameters, tables):
 
 
 def _is_untouched(value):
-    """Whether nobody has given a tangent: one that is zero is stored as an array."""
+    """Return True for a value without a tangent; a given tangent of zero is stored as an array."""
     tangent = dr.grad(value)
     tangent = getattr(tangent, "matrix", tangent) if "Transform" in type(tangent).__name__ else tangent
     tangent = tangent.array if dr.is_tensor_v(tangent) else tangent
@@ -128,7 +140,7 @@ def _is_untouched(value):
 
 
 def tangents_of(values):
-    """Tangents of attached values; zero for those that carry none."""
+    """Return the tangents of attached values, zero for detached ones."""
     attached = [v for v in values if dr.grad_enabled(v)]
     if not attached:
         return [dr.zeros(type(v)) for v in values]
@@ -139,10 +151,9 @@ def tangents_of(values):
 
 
 def vertex_tangents(context, v, tangent):
-    """(events, detached, with ``d_value`` and ``d_opl``; the tangent of the next Carry).
+    """Return (detached events with ``d_value`` and ``d_opl``; tangent of the next Carry).
 
-    Everything attached dies on return: a variable that outlived this call would leave an edge of Dr.Jit's graph behind,
-    which the next traversal would run into.
+    No attached variable outlives this call: it would leave an edge in Dr.Jit's graph, which breaks the next traversal.
     """
     wanted = context.wanted
     with dr.resume_grad():
@@ -164,7 +175,7 @@ def vertex_tangents(context, v, tangent):
 
 
 def step_on(context, layout, store, block, events, ray, k, live, tangent, dL):
-    """(tangent of the Carry behind vertex ``k``, ``dL`` with the derivative of its events)."""
+    """Write the events of vertex ``k``; return (tangent of the Carry behind it, ``dL`` with their derivatives)."""
     v = RecordedVertex(layout, store, k, live, ray)
     v.next = context.segment.end(context, v.after())
     terms, tangent = vertex_tangents(context, v, tangent)
@@ -176,9 +187,18 @@ def step_on(context, layout, store, block, events, ray, k, live, tangent, dL):
 
 @dr.syntax
 def forward(context, layout, store, count, block, ray, tangent):
-    """Write the derivative of the transient to ``block``; returns that of the steady radiance.
+    """Write the derivative of the transient to a film, with gradients suspended.
 
-    ``tangent``: that of the Carry of the primary ``ray``.
+    Args:
+        context: :class:`.context.RenderContext` of the job.
+        layout, store: layout of the record, and the record.
+        count: number of recorded vertices, UInt32.
+        block: block of the film.
+        ray: primary ray, Ray3f.
+        tangent: tangent of the Carry of the primary ray.
+
+    Returns:
+        Derivative of the steady radiance, a spectrum.
     """
     k = dr.zeros(mi.UInt32, dr.width(ray.d))
     live = k < count
@@ -193,10 +213,10 @@ def forward(context, layout, store, count, block, ray, tangent):
 
 
 # --------------------------------------------------------------------------------------------------------------------
-# What derivatives of the paths of a pass have to do with the sensor: the Carry of its primary rays.
+# Derivatives by the sensor: adjoint and tangent of the Carry of its primary rays.
 
 def objective_of(context: Any, rays: Any, adjoint: Carry) -> Any:
-    """``<adjoint, Carry>`` of the primary rays."""
+    """Return ``<adjoint, Carry>`` of the primary rays, attached to the sensor."""
     parts = {"η": adjoint.η}
     if not context.camera_unwarp:
         parts["slope"] = adjoint.slope
@@ -217,7 +237,7 @@ def objective_of(context: Any, rays: Any, adjoint: Carry) -> Any:
 
 
 def tangent_of(context: Any, rays: Any) -> Carry:
-    """The tangent of the Carry of the primary rays."""
+    """Return the tangent of the Carry of the primary rays."""
     tangent = Carry.zeros()
     with dr.resume_grad():
         if not (context.wanted.sensor or dr.grad_enabled(rays.η)):

@@ -1,7 +1,7 @@
-"""Vertices into thread-local memory, and back: what the derivative modes cannot recompute cheaply.
+"""Records of paths: the numbers of each vertex that derivatives cannot recompute cheaply, written and read.
 
 The record's size is per lane in flight, not per path, and it lives in the kernel's stack: global memory does not grow
-with the depth. Only a record that is too large for a stack goes to global memory (:mod:`.record_room`).
+with the depth. Only a record that is too large for a stack lies in global memory (:func:`record_room`).
 """
 
 from __future__ import annotations
@@ -24,10 +24,11 @@ from torchtransient.plugins.transport.strategy import Local
 
 
 class RecordSink(Sink):
-    """Writes what every strategy says of itself. ``layout`` tells :class:`RecordedVertex` how to read it.
+    """Writer of the records of all strategies, which :class:`RecordedVertex` reads by their ``layout``.
 
-    ``block``: the film's adjoint block, where arrivals are to be read ahead; None for no list of them. ``lanes``:
-    number of paths, where records lie in global memory.
+    Args:
+        block: adjoint block of the film, where arrivals are read before their vertices; None for no list of them.
+        lanes: number of paths, for records in global memory; None for local arrays.
     """
 
     zeros = True
@@ -44,7 +45,7 @@ class RecordSink(Sink):
             layout = RecordLayout(context, Arrivals(context, self.block))
             if layout.bytes_of(context.max_depth + 1) <= context.record_room.room:
                 return layout
-        # Arrivals are read one after the other where a list of them has no room.
+        # Without room for a list of arrivals each is read at its vertex.
         return RecordLayout(context)
 
     def end(self, kept):
@@ -67,7 +68,7 @@ class RecordSink(Sink):
 
 
 class RecordLayout:
-    """The fields of a record by (strategy, name). A plain object, which Dr.Jit loops leave alone.
+    """Fields of a record by (strategy, name). A plain object, which Dr.Jit loops leave alone.
 
     Masks share the bits of one word: Dr.Jit 1.5 cannot compile a local array of masks (invalid LLVM IR).
     """
@@ -92,16 +93,16 @@ class RecordLayout:
         return fields | ({"η": mi.Float} if context.index_changes else {})
 
     def bytes_of_vertex(self):
-        """Bytes that a vertex takes, without the list of arrivals."""
+        """Return the bytes of a vertex, without the list of arrivals."""
         return sum(bytes_of(kind) for kind in [*self.types.values(), mi.UInt32])
 
     def bytes_of(self, size):
-        """Bytes of the local arrays for ``size`` vertices."""
+        """Return the bytes of the local arrays of ``size`` vertices."""
         listed = 0 if self.arrivals is None else self.arrivals.bytes_of_path()
         return size * self.bytes_of_vertex() + listed
 
     def allocate(self, size, lanes=None):
-        """Local arrays for ``size`` vertices; in global memory where ``lanes`` is given."""
+        """Return arrays of ``size`` vertices: local ones, or in global memory for ``lanes`` paths."""
         kinds = {f"{s}.{name}": kind for (s, name), kind in self.types.items()} | {"flags": mi.UInt32}
         if lanes is not None:
             return {name: GlobalArray(kind, size, lanes) for name, kind in kinds.items()}
@@ -109,13 +110,19 @@ class RecordLayout:
         return arrays if self.arrivals is None else arrays | self.arrivals.allocate()
 
     def mask(self, flags, s, name):
-        """One mask out of the word ``flags`` of a vertex."""
+        """Return a mask of the word ``flags`` of a vertex."""
         return (flags & self.bits[s, name]) != 0
 
 
 class RecordedVertex(Local):
-    """Vertex ``k`` read back: ``active, β, τ, η, rr, goes_on``, ``ray`` and ``pi`` (how it was found), and ``next``
-    (:class:`~..derivative.vertex.VertexEnd`, where the next vertex lies).
+    """Vertex ``k`` of a record.
+
+    Attributes:
+        k, active: its number, UInt32, and the mask of paths that have it.
+        β, τ, η: throughput before its segment, optical path length up to it, index along the segment.
+        rr, goes_on: factor of Russian roulette, mask of paths that continue.
+        ray, pi: ray and PreliminaryIntersection3f that found it.
+        next: :class:`.strategy.VertexEnd` of the next vertex, set by the derivative.
     """
 
     def __init__(self, layout, store, k, active, primary_ray):
@@ -127,7 +134,7 @@ class RecordedVertex(Local):
         self.ray, self.pi = layout.context.segment.restore(self, primary_ray)
 
     def of(self, name):
-        """The record of the strategy called ``name``, as a dictionary."""
+        """Return the record of the strategy called ``name``, as a dictionary."""
         layout = self.layout
         found = {field: self._array(f"{s}.{field}") for s, field in layout.types if s == name}
         masks = [key for key in layout.bits if key[0] == name]
@@ -149,32 +156,32 @@ class RecordedVertex(Local):
             numbers = c.numbers(self.of(c.name))
             if numbers is not None:
                 return numbers
-        # Nothing was drawn: the bits of the ray's direction are as good, since they are hashed.
+        # Without random numbers the bits of the ray's direction serve: they are hashed.
         return [self.ray.d.x, self.ray.d.y]
 
     def before(self, name, field, at_sensor):
-        """A mask of the vertex before, ``at_sensor`` where there is none."""
+        """Return a mask of the vertex before, ``at_sensor`` for the first vertex."""
         there = self.active & (self.k > 0)
         flags = self.store["flags"].read(dr.maximum(self.k, 1) - 1, there)
         return ((self.k == 0) & mi.Bool(at_sensor)) | (there & self.layout.mask(flags, name, field))
 
     def first(self, name, field):
-        """A number that the strategy ``name`` recorded at the first vertex of the path."""
+        """Return a number that the strategy ``name`` recorded at the first vertex of the path."""
         return self.store[f"{name}.{field}"].read(mi.UInt32(0), self.active)
 
     def after(self):
-        """The next vertex, where the path goes on."""
+        """Return the next vertex, active where the path continues."""
         return RecordedVertex(self.layout, self.store, self.k + 1, self.goes_on, self.primary_ray)
 
 
 # --------------------------------------------------------------------------------------------------------------------
-# The arrivals of a recorded path: listed one after the other while it is walked, then the film's adjoint at each.
+# Arrivals of a recorded path: a list that the walk appends to, and the film's adjoint at each of them.
 
 class Arrivals:
-    """Where they are in a record. A plain object, which Dr.Jit loops leave alone.
+    """Layout of the arrivals of a record. A plain object, which Dr.Jit loops leave alone.
 
-    Every vertex records the number of its first arrival, and which connections have one. ``together``: how many are
-    read at once.
+    Every vertex records the number of its first arrival, and a mask of each connection with one. ``together``: number
+    of arrivals that are read at once.
     """
 
     name = "arrivals"
@@ -188,19 +195,19 @@ class Arrivals:
         self.lanes = dr.width(block.base)
 
     def fields(self):
-        """Types of what a vertex records."""
+        """Return the types of the fields of a vertex."""
         return {"first": mi.UInt32} | dict.fromkeys(self.connections, mi.Bool)
 
     def _size(self):
-        # What is read at once may end behind the last one.
+        # The last group that is read at once may be longer than the list.
         return -(-self.most // self.together) * self.together
 
     def bytes_of_path(self):
-        """Bytes of the list."""
+        """Return the bytes of the list of a path."""
         return self._size() * (8 + 4 * self.channels * (2 if self.with_slope else 1))
 
     def allocate(self):
-        """Thread-local memory of a path."""
+        """Return the local arrays of a path."""
         numbers = [f"A.{c}" for c in range(self.channels)]
         numbers += [f"slope.{c}" for c in range(self.channels)] if self.with_slope else []
         size = self._size()
@@ -209,7 +216,7 @@ class Arrivals:
         return kept | {"arrivals": dr.zeros(mi.UInt32, self.lanes), "opl": dr.alloc_local(mi.Float64, size)}
 
     def append(self, kept, samples):
-        """List the events of a vertex; returns what it records."""
+        """Append the events of a vertex; return the fields of its record."""
         found = {"first": kept["arrivals"]}
         for name in self.connections:
             event, n = samples[name].event, kept["arrivals"]
@@ -219,12 +226,12 @@ class Arrivals:
         return found
 
     def number(self, found, name):
-        """The number of a connection's event, by what its vertex has recorded."""
+        """Return the number of a connection's event, from the record of its vertex."""
         before = self.connections[: self.connections.index(name)]
         return found["first"] + sum(dr.select(found[other], mi.UInt32(1), 0) for other in before)
 
     def read_some(self, kept, block, first, live):
-        """Let ``block`` read those from number ``first`` on, of the paths that have it."""
+        """Read the adjoint at the arrivals from number ``first`` on, of ``live`` paths."""
         opls = [kept["opl"].read(first + e, live & (first + e < kept["arrivals"])) for e in range(self.together)]
         A, slope = block.read_together(opls, self.with_slope, live)
         for name, found in (("A", A), ("slope", slope or [])):
@@ -233,7 +240,7 @@ class Arrivals:
                     kept[f"{name}.{c}"].write(value, first + e, live)
 
     def adjoint(self, kept, block, number, active):
-        """The adjoint at an arrival and its slope (None without geometry), as spectra."""
+        """Return the adjoint at an arrival and its slope (None without geometry), as spectra."""
         A = [kept[f"A.{c}"].read(number, active) for c in range(self.channels)]
         slope = None
         if self.with_slope:
@@ -243,7 +250,7 @@ class Arrivals:
 
 @dr.syntax
 def read_ahead(arrivals, kept, block):
-    """The record with the film's adjoint at all arrivals."""
+    """Return the record with the film's adjoint at all arrivals."""
     first = mi.UInt32(0)
     while dr.hint(first < kept["arrivals"], label="arrivals"):
         arrivals.read_some(kept, block, first, first < kept["arrivals"])
@@ -308,7 +315,7 @@ def record_room(context: Any) -> RecordRoom:
 
 
 def bytes_of(kind: Any) -> int:
-    """Bytes of one entry of a Dr.Jit type."""
+    """Return the bytes of one entry of a Dr.Jit type."""
     return dr.itemsize_v(kind) if dr.depth_v(kind) == 1 else dr.size_v(kind) * bytes_of(dr.value_t(kind))
 
 
@@ -393,5 +400,5 @@ class GlobalArray:
         dr.scatter(self.numbers, self.kind(value), self._places(index), active, mode=dr.ReduceMode.Permute)
 
     def read(self, index: Any, active: Any) -> Any:
-        """An entry of every active lane, zero for others."""
+        """Return an entry of every active lane, zero for others."""
         return dr.gather(self.kind, self.numbers, self._places(index), active)
