@@ -75,13 +75,10 @@ def room_of(module):
     return parts[1] if len(parts) > 1 and parts[1] != "__init__" else None
 
 
-def imports(path, package=PACKAGE, *, for_types=True):
-    """Every import of a file as (line, absolute dotted name); `from a import b` gives `a.b`.
-
-    `for_types`: those under `if TYPE_CHECKING:` too.
-    """
+def imports(path, package=PACKAGE):
+    """Every import of a file as (line, absolute dotted name); `from a import b` gives `a.b`."""
     here = ("torchtransient", *path.relative_to(package).parent.parts)
-    for node in nodes(syntax_of(path), for_types):
+    for node in statements(syntax_of(path)):
         if isinstance(node, ast.Import):
             for alias in node.names:
                 yield node.lineno, alias.name
@@ -92,32 +89,19 @@ def imports(path, package=PACKAGE, *, for_types=True):
                 yield node.lineno, f"{module}.{alias.name}"
 
 
-def nodes(tree, for_types):
-    """The statements of a syntax tree, with or without what stands under `if TYPE_CHECKING:`.
-
-    Expressions are left out: they contain no imports, and are nine nodes of ten.
-    """
-    for node in ast.iter_child_nodes(tree):
-        if isinstance(node, ast.expr | ast.arguments):
-            continue
-        yield node
-        if not for_types and isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
-            for other in node.orelse:
-                yield other
-                yield from nodes(other, for_types)
-        else:
-            yield from nodes(node, for_types)
-
-
 def import_circles(package=PACKAGE):
-    """The sets of modules that import each other, in whatever order and wherever the imports stand."""
+    """The sets of modules that import each other, in whatever order and wherever the imports stand, those for types
+    included. The package's own `__init__` is left out: it lists public names, and imports them when they are used.
+    """
     files = {}
     for path in sorted(package.rglob("*.py")):
+        if path.parent == package and path.stem == "__init__":
+            continue
         parts = ("torchtransient", *path.relative_to(package).with_suffix("").parts)
         files[".".join(parts).removesuffix(".__init__")] = path
     edges = {}
     for module, path in files.items():
-        names = {name for _, name in imports(path, package, for_types=False)}
+        names = {name for _, name in imports(path, package)}
         # A name of a package that is no module of its own stands in the package's `__init__`.
         edges[module] = {name if name in files else name.rpartition(".")[0] for name in names} & set(files) - {module}
     reached = {module: reachable(module, edges) for module in edges}
@@ -187,7 +171,7 @@ def test_sizes():
     for path in FILES:
         text = path.read_text(encoding="utf-8")
         assert len(text.splitlines()) <= MOST_LINES["file"], dotted(path)
-        for node in nodes(syntax_of(path), for_types=True):
+        for node in statements(syntax_of(path)):
             if isinstance(node, ast.FunctionDef):
                 assert node.end_lineno - node.lineno < MOST_LINES["function"], f"{dotted(path)}.{node.name}"
 
@@ -278,11 +262,11 @@ def test_tests_share_through_their_support():
     """A bare name of another test file depends on which folders are on the path."""
     shared = {p.stem for p in TESTS.rglob("*.py") if p.parent != TESTS} - {"__init__"}
     names = "|".join(sorted(shared))
-    said = re.compile(rf"^\s*(?:from\s+(?:{names})\b|import\s+(?:.*[\s,])?(?:{names})\b)", re.MULTILINE)
+    named = re.compile(rf"^\s*(?:from\s+(?:{names})\b|import\s+(?:.*[\s,])?(?:{names})\b)", re.MULTILINE)
     for path in TESTS.rglob("*.py"):
         text = path.read_text(encoding="utf-8")
         # Most files import none, by the look of it.
-        for node in nodes(ast.parse(text), for_types=True) if said.search(text) else ():
+        for node in statements(ast.parse(text)) if named.search(text) else ():
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
             names += [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
             assert not {n.split(".")[0] for n in names} & shared, f"{path.relative_to(TESTS)}:{node.lineno}"
@@ -360,7 +344,7 @@ def test_what_rooms_may_import(tmp_path, room, line):
         ("import torchtransient.vis.second", "from . import first", True),
         ("def f():\n    from torchtransient.vis.second import b", "from .first import a", True),
         ("from torchtransient.vis.second import b", "", False),
-        ("import typing\nif typing.TYPE_CHECKING:\n    from .second import b", "from .first import a", False),
+        ("import typing\nif typing.TYPE_CHECKING:\n    from .second import b", "from .first import a", True),
         ("if TYPE_CHECKING:\n    import os\nelse:\n    from .second import b", "from .first import a", True),
         ("from torchtransient.vis import name", "", True),  # the package's `__init__` imports both
     ],
