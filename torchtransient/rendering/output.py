@@ -12,11 +12,11 @@ from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import ShapeError
 from torchtransient.gates import Gate
 from torchtransient.rendering.films import FilmLayout
-from torchtransient.rendering.variant import stokes_components
+from torchtransient.scene.variant import stokes_components
 from torchtransient.tensor_record import TensorRecord
 
 if TYPE_CHECKING:
-    from torchtransient.rendering.session import RenderJob
+    from torchtransient.rendering.job import RenderJob
 
 
 @dataclass(frozen=True)

@@ -31,17 +31,13 @@ from torchtransient.rendering.arguments import (
     samples,
     sensor_list,
 )
-from torchtransient.rendering.autograd import rendered
+from torchtransient.rendering.autograd import RenderCall, run
 from torchtransient.rendering.films import FilmLayout, steady_channels_first
+from torchtransient.rendering.job import Item, RenderJob, Seeding, drawn, rounded_count, samples_drawn
 from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.output import RenderOutput, RenderStats
-from torchtransient.rendering.overrides import boundary_term
 from torchtransient.rendering.progress import Bar
-from torchtransient.rendering.sample_counts import rounded_count, samples_taken
-from torchtransient.rendering.seeds import Item, Seeding, drawn
-from torchtransient.rendering.session import RenderJob
 from torchtransient.rendering.slope import check_filter, filter_for, has_slope, response_of
-from torchtransient.rendering.variant import active_variant, device_type, stokes_components
 from torchtransient.scene.edits import BuildOptions
 from torchtransient.scene.load import Scene, load
 from torchtransient.scene.parameters import ParameterInfo, missing_edges, needing_slope, unknown_key
@@ -50,6 +46,7 @@ from torchtransient.scene.pilot import DepthBound, depth_bound
 from torchtransient.scene.plan import Effects
 from torchtransient.scene.pulses import checked_pulse
 from torchtransient.scene.values import as_float, fit_shape, may_have_derivative
+from torchtransient.scene.variant import active_variant, device_type, stokes_components
 
 
 class TransientRenderer(CopiesParametrized):
@@ -311,7 +308,7 @@ class TransientRenderer(CopiesParametrized):
         """Samples per pixel that a render with ``spp`` really draws: stratified samplers round up."""
         with active_variant(self.scene.variant):
             sensor = self.scene.built(self._options).scene.sensors()[self._sensors[0]]
-            return samples_taken(sensor.sampler().clone(), samples("spp", spp))
+            return samples_drawn(sensor.sampler().clone(), samples("spp", spp))
 
     @opaque
     def forward(
@@ -366,7 +363,8 @@ class TransientRenderer(CopiesParametrized):
             spp_boundary=self.spp_boundary,
         )
         try:
-            steady, response = rendered(job, per_entry, tensors)
+            seed_given = () if per_entry is None else (per_entry,)
+            steady, response = run(RenderCall(job, len(seed_given)), *seed_given, *tensors)
         finally:
             if bar is not None:
                 bar.close()
@@ -421,7 +419,8 @@ class TransientRenderer(CopiesParametrized):
             return
         with active_variant(self.scene.variant):
             built = self.scene.built(self._options)
-            with boundary_term(self.boundary, self.spp_boundary, built.scene.integrator()):
+            integrator = built.scene.integrator()
+            with engine.with_settings(engine.boundary_settings(self.boundary, self.spp_boundary, integrator)):
                 found = missing_edges(built, new, self._sensors)
         for gap, keys in found.items():
             self._watch.warn_of_gradient(gap.message(keys), is_error=not gap.is_asked_for)

@@ -16,9 +16,9 @@ from torchtransient.errors import DeviceError, SceneError, ShapeError, TorchTran
 from torchtransient.plain_texts import one_line
 from torchtransient.plugins.mitsuba_compat import check_pose, is_turned_by_reflections
 from torchtransient.plugins.node_walk import ShownValue
-from torchtransient.rendering.interrupts import quiet
 from torchtransient.scene.parameters import classify, is_transform, read_value, unknown_key
 from torchtransient.scene.values import as_mitsuba_value, changed_with, with_normals
+from torchtransient.scene.variant import quiet
 
 # --------------------------------------------------------------------------------------------------------- PyTrees
 
