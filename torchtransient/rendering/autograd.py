@@ -125,7 +125,7 @@ def _given(tensors: Sequence[torch.Tensor | None]) -> list[torch.Tensor]:
 
 
 def _those(flags: Sequence[bool], asked: Sequence[torch.Tensor | None]) -> tuple[bool, ...]:
-    """Which flags stay, where ``asked`` has an entry for each of those that are set."""
+    """Return the flags whose entry in ``asked``, which has one for each flag that is set, is not None."""
     remaining = iter(asked)
     return tuple(flag and next(remaining) is not None for flag in flags)
 

@@ -1,4 +1,4 @@
-"""Whether a cube fits, asked before it is allocated."""
+"""Memory that is left, and the check that a cube fits before it is allocated."""
 
 from __future__ import annotations
 

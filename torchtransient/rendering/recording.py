@@ -165,7 +165,7 @@ class NotRecordedError(Exception):
 
 
 class Recordings:
-    """Those of one built scene, with the values of one set of keys."""
+    """Recorded calls of one built scene, with the values of one set of keys."""
 
     def __init__(self) -> None:
         self._found: OrderedDict[Any, Recording] = OrderedDict()
@@ -238,7 +238,7 @@ class Recordings:
 
 
 def _difference(before: tuple[Any, ...], now: tuple[Any, ...]) -> str:
-    """Where two structures part."""
+    """Return where two structures part, in words."""
     for a, b in zip(before, now, strict=False):
         if a != b:
             return f"what they depend on changed from {_short(a)} to {_short(b)}"

@@ -91,7 +91,7 @@ def quiet() -> Iterator[None]:
 
 
 def is_differentiable(variant: str | None) -> bool:
-    """Whether a variant compiles kernels and differentiates (``llvm_ad_*``, ``cuda_ad_*``)."""
+    """Return whether a variant compiles kernels and differentiates (``llvm_ad_*``, ``cuda_ad_*``)."""
     return variant is not None and variant.startswith(("llvm_ad_", "cuda_ad_"))
 
 
