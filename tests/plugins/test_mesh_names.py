@@ -15,6 +15,8 @@ import torchtransient as tt
 from torchtransient import plugins
 from torchtransient.plugins import mitsuba_compat as compat
 
+pytestmark = pytest.mark.filterwarnings("ignore::torchtransient.errors.VersionWarning")
+
 PACKAGE = Path(compat.__file__).parents[1]
 POSITIONS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], np.float32)
 NORMALS = np.tile(np.float32([0, 0, 1]), (4, 1))
@@ -139,6 +141,27 @@ def test_renders_and_gradients_are_the_same(request, key):
     assert image.abs().sum() > 0 and grad.abs().sum() > 0
     torch.testing.assert_close(new_image, image)
     torch.testing.assert_close(new_grad, grad, rtol=1e-4, atol=1e-5)
+
+
+def wrapped_derivative(key):
+    """Return values and a gradient of a function of ``mitsuba.SceneParameters``, and the positions that it leaves."""
+    params = mi.traverse(mi.load_dict({"type": "scene", "cube": {"type": "cube"}}))
+    positions = params[key].numpy().reshape(-1, 3)
+    size = positions.size
+    function = tt.wrap(lambda held: compat.flat_array(held[key]) * dr.arange(mi.Float, size), params)
+    x = torch.tensor(positions * 2, requires_grad=True)
+    found = function({key: x})
+    found.square().sum().backward()
+    np.testing.assert_array_equal(params[key].numpy().reshape(-1, 3), positions)
+    return found.detach(), x.grad
+
+
+def test_wrapped_functions_have_the_keys_of_mitsuba(request):
+    found, grad = wrapped_derivative("cube.vertex_positions")
+    request.getfixturevalue("new_meshes")
+    new_found, new_grad = wrapped_derivative("cube.positions")
+    torch.testing.assert_close(new_found, found)
+    torch.testing.assert_close(new_grad, grad)
 
 
 def mesh_of_arrays():

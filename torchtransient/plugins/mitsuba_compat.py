@@ -191,12 +191,13 @@ POSITIONS, NORMALS, TEXCOORDS, FACES = "vertex_positions", "vertex_normals", "ve
 # Columns of the arrays that a user can replace.
 VERTEX_COLUMNS = {POSITIONS: 3, NORMALS: 3, TEXCOORDS: 2}
 # Mitsuba 3.10 (pull request 1933) renames these, shows all arrays as tensors of rows, makes meshes of arrays that are
-# given to the constructor, and has no buffers. Silhouette tables, which it makes on demand, are not used here.
+# given to the constructor, and has no buffers. Its vertices may share rows of positions and normals, so that there are
+# fewer rows than vertices. Silhouette tables, which it makes on demand, are not used here.
 _NEW_NAMES = {POSITIONS: "positions", NORMALS: "normals", TEXCOORDS: "texcoords"}
 _USERS_NAMES = {new: name for name, new in _NEW_NAMES.items()}
-# There, vertices may share rows: the row of each vertex, empty where vertex i has row i.
+# Row of each vertex in these arrays of Mitsuba 3.10, empty where vertex i has row i.
 _SHARED_ROWS = {POSITIONS: "position_index", NORMALS: "normal_index"}
-# There, the material of each face, empty for meshes of one material.
+# Material of each face of Mitsuba 3.10, empty for meshes of one material.
 _MATERIALS = "bsdf_index"
 _WEIGHT = "silhouette_sampling_weight"
 _OWN_PARAMETERS = frozenset((*VERTEX_COLUMNS, FACES, _WEIGHT, *_SHARED_ROWS.values()))
