@@ -53,14 +53,17 @@ def new_meshes(monkeypatch):
     old, shared, get, write = mi.Mesh, {}, mi.get_property, mi.set_property
     walk, changed = old.traverse, old.parameters_changed
     users = {new: name for name, (new, _) in NAMES.items()}
+    exists = {name: getattr(old, f"has_vertex_{name}") for name in ("normals", "texcoords")}
 
     class NewNames(mi.TraversalCallback):
-        def __init__(self, callback):
+        def __init__(self, mesh, callback):
             super().__init__()
-            self.callback = callback
+            self.mesh, self.callback = mesh, callback
 
         def put(self, name, value, flags, cpptype=None):
             new, columns = NAMES.get(name, (name, None))
+            if new in exists and not exists[new](self.mesh):
+                return
             self.callback.put(new, value if columns is None else Rows(value, columns), flags, cpptype)
             if new == "positions":
                 for index in ("position_index", "normal_index", "bsdf_index"):
@@ -86,10 +89,10 @@ def new_meshes(monkeypatch):
     monkeypatch.setattr(mi, "__version__", "3.10.0")
     monkeypatch.setattr(mi, "get_property", get_property)
     monkeypatch.setattr(mi, "set_property", set_property)
-    monkeypatch.setattr(old, "traverse", lambda mesh, callback: walk(mesh, NewNames(callback)))
+    monkeypatch.setattr(old, "traverse", lambda mesh, callback: walk(mesh, NewNames(mesh, callback)))
     monkeypatch.setattr(old, "parameters_changed", parameters_changed)
-    for name in ("normals", "texcoords"):
-        monkeypatch.setattr(old, f"has_{name}", getattr(old, f"has_vertex_{name}"), raising=False)
+    for name, method in exists.items():
+        monkeypatch.setattr(old, f"has_{name}", method, raising=False)
         monkeypatch.delattr(old, f"has_vertex_{name}")
     for name in NAMES:
         monkeypatch.delattr(old, f"{name}_buffer")
@@ -99,7 +102,7 @@ def new_meshes(monkeypatch):
 # --------------------------------------------------------------------------------------------------------- the library
 
 
-def scene():
+def scene(face_normals=False):
     return tt.load(
         {
             "type": "scene",
@@ -108,15 +111,15 @@ def scene():
                 "to_world": mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0]),
                 "film": {"type": "transient_hdr_film", "width": 4, "height": 4},
             },
-            "cube": {"type": "cube", "bsdf": {"type": "diffuse"}},
+            "cube": {"type": "cube", "bsdf": {"type": "diffuse"}, "face_normals": face_normals},
             "light": {"type": "point", "position": [1, 2, 5], "intensity": 10.0},
         }
     )
 
 
-def derivatives(key):
+def derivatives(key, face_normals):
     """Return the table of parameters, a render, and a gradient by ``key``."""
-    loaded = scene()
+    loaded = scene(face_normals)
     table = {name: info.shape for name, info in loaded.parameters().items() if name.startswith("cube.")}
     axis = tt.TimeAxis(start_opl=6.0, bin_width_opl=0.5, num_bins=12)
     render = tt.TransientRenderer(
@@ -129,14 +132,22 @@ def derivatives(key):
     return table, out.transient.detach(), grad
 
 
-@pytest.mark.parametrize("key", ["cube.vertex_positions", "cube.vertex_normals", "cube.to_world"])
-def test_renders_and_gradients_are_the_same(request, key):
-    table, image, grad = derivatives(key)
+@pytest.mark.parametrize(
+    ("key", "face_normals"),
+    [
+        ("cube.vertex_positions", False),
+        ("cube.vertex_normals", False),
+        ("cube.to_world", False),
+        ("cube.to_world", True),
+    ],
+)
+def test_renders_and_gradients_are_the_same(request, key, face_normals):
+    table, image, grad = derivatives(key, face_normals)
     request.getfixturevalue("new_meshes")
     assert set(mi.traverse(mi.load_dict({"type": "cube"})).keys()) >= {"positions", "normals", "texcoords"}
-    new_table, new_image, new_grad = derivatives(key)
+    new_table, new_image, new_grad = derivatives(key, face_normals)
     assert {k: shape for k, shape in new_table.items() if not k.endswith(("faces", "_index"))} == {
-        k: shape for k, shape in table.items() if not k.endswith("faces")
+        k: shape for k, shape in table.items() if not k.endswith("faces") and (shape == () or shape[0] > 0)
     }
     assert image.abs().sum() > 0 and grad.abs().sum() > 0
     torch.testing.assert_close(new_image, image)
