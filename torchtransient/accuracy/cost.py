@@ -17,7 +17,7 @@ from torchtransient.rendering.films import layout_of_output
 from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.output import RenderOutput
 from torchtransient.rendering.renderer import TransientRenderer
-from torchtransient.rendering.variant import active_variant
+from torchtransient.scene.variant import active_variant
 
 Loss = Callable[[RenderOutput], torch.Tensor]
 

@@ -14,7 +14,7 @@ from torchtransient.errors import ArgumentError, SceneError
 from torchtransient.plugins.parameter_effect import class_of
 from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.renderer import TransientRenderer
-from torchtransient.rendering.variant import active_variant
+from torchtransient.scene.variant import active_variant
 
 
 @dataclass(frozen=True)

@@ -21,12 +21,12 @@ from torchtransient.rendering.films import FILMS, FilmLayout, layout_of_plugin
 from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.planned_film import PlannedFilm, planned
 from torchtransient.rendering.renderer import TransientRenderer
-from torchtransient.rendering.variant import resolve_variant
 from torchtransient.scene.inventory import scene_inventory
 from torchtransient.scene.load import load
 from torchtransient.scene.pilot import PilotReport
 from torchtransient.scene.plan import Choice, Draft, Effects, Finder, choose_integrator, choose_variant
 from torchtransient.scene.pulses import checked_pulse
+from torchtransient.scene.variant import resolve_variant
 
 # Outputs that every film can show beside its own measurement.
 _ANY_FILM = ("steady", "stokes", "bands")

@@ -5,17 +5,14 @@ from __future__ import annotations
 import copy
 import itertools
 
-import mitsuba as mi
 import pytest
 import torch
 
 import torchtransient as tt
 from support.marks import long_rows
 from tools.small_room import GREY, WALL_POSE, make_room
-from torchtransient import plugins
 from torchtransient.errors import ArgumentError, GradientError, SceneError
 from torchtransient.plugins.films import temporal_filters
-from torchtransient.rendering.overrides import temporal_filter
 
 VARIANT = "llvm_ad_rgb"
 SIZE = {"width": 4, "height": 3, "rfilter": {"type": "box"}}
@@ -97,50 +94,6 @@ def test_a_plan_is_about_the_film_of_its_sensor():
 
 
 # ---------------------------------------------------------------------------------------- changed and put back
-
-
-@pytest.fixture
-def loaded():
-    """An integrator with a filter of its own, three films that have one and one that has none."""
-    mi.set_variant(VARIANT)
-    plugins.sync()
-    bare = [mi.load_dict(FILMS[name]) for name in ("histogram", "gated", "smooth histogram")]
-    # A pulse and a filter that together cover more bins than are spread while rendering.
-    late = {**HISTOGRAM, "gaussian_stddev": 1e4, "pulse": "gaussian", "pulse_fwhm_opl": 0.5}
-    return mi.load_dict({"type": "transient_path", "temporal_filter": "tent"}), [*bare, mi.load_dict(late)]
-
-
-def state(loaded):
-    integrator, films = loaded
-    used = [(film.temporal_filter, film.filter.name) for film in films if film.temporal_filter]
-    return integrator.temporal_filter, used
-
-
-@pytest.mark.parametrize("backwards", [False, True])
-def test_a_filter_that_one_film_refuses_changes_none(loaded, backwards):
-    before, (integrator, films) = state(loaded), loaded
-    with (
-        pytest.raises(SceneError, match="4096"),
-        temporal_filter("gaussian", integrator, reversed(films) if backwards else films),
-    ):
-        pytest.fail("entered with a film that refused")
-    assert state(loaded) == before
-
-
-def test_what_fails_inside_leaves_no_filter_behind(loaded):
-    before, (integrator, films) = state(loaded), loaded
-
-    def work():
-        with temporal_filter("tent", integrator, films):
-            assert [film.temporal_filter for film in films] == ["tent", "", "tent", "tent"]
-            assert integrator.temporal_filter == ""  # it would replace that of a film
-            raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        work()
-    assert state(loaded) == before
-    with temporal_filter(None, integrator, films):
-        assert state(loaded) == before
 
 
 def test_a_render_that_fails_leaves_no_filter_behind(monkeypatch):
