@@ -24,7 +24,7 @@ BENCHMARKS = sorted((TESTS.parent / "benchmarks").glob("*.py"))
 TOOLS = sorted(p for p in (TESTS.parent / "tools").rglob("*.py") if p.parent.name != "mutants")  # which runs tests
 # Rooms by level: an import goes down, or stays in its room.
 LEVEL = {
-    "errors": 0, "_llvm": 0, "_collection": 0, "checks": 0, "units": 0, "axes": 0, "capture": 0, "interfaces": 0,
+    "errors": 0, "_llvm": 0, "checks": 0, "units": 0, "axes": 0, "capture": 0, "interfaces": 0,
     "pulses": 0, "gates": 0, "stokes": 0, "tensor_record": 0, "floating": 0, "volume_methods": 0, "transform_bins": 0,
     "plain_texts": 0, "array_files": 0,
     "plugins": 1, "sensing": 1, "reconstruction": 1, "losses": 1, "metrics": 1, "vis": 1,
@@ -44,8 +44,8 @@ BESIDE = {
     "losses": {"sensing"}, "metrics": {"losses", "reconstruction"},
     "nlos": {"files"}, "data": {"files", "nlos"}, "testing": {"accuracy"},
 }  # fmt: skip
-# Files of `rendering` that know nothing of renders: variants, locks and interrupts, pulses and slopes of films.
-BELOW_SCENES = {"variant", "opaque", "interrupts", "kernel_errors", "slope", "pulse_properties"}
+# Files of `rendering` that know nothing of renders.
+BELOW_SCENES = {"opaque", "slope"}
 # Packages that a room does without: the one pillar's world in the other, and at level 0 everything bound to a variant.
 MITSUBA, TORCH = {"mitsuba", "drjit"}, {"torch", "kornia"}
 TORCH_PILLAR = {"sensing", "reconstruction", "losses", "metrics", "parametrize", "geometry", "vis"}
