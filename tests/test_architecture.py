@@ -24,8 +24,7 @@ BENCHMARKS = sorted((TESTS.parent / "benchmarks").glob("*.py"))
 TOOLS = sorted(p for p in (TESTS.parent / "tools").rglob("*.py") if p.parent.name != "mutants")  # which runs tests
 LEVEL = {
     "errors": 0, "_llvm": 0, "_collection": 0, "checks": 0, "units": 0, "axes": 0, "capture": 0, "interfaces": 0,
-    "pulses": 0, "gates": 0, "stokes": 0, "tensor_record": 0, "floating": 0, "volume_methods": 0, "transform_bins": 0,
-    "plain_texts": 0, "array_files": 0,
+    "pulses": 0, "gates": 0, "stokes": 0, "tensor_record": 0, "floating": 0, "volume_methods": 0, "array_files": 0,
     "plugins": 1, "sensing": 1, "reconstruction": 1, "losses": 1, "metrics": 1, "vis": 1,
     "parametrize": 1, "geometry": 1,
     "scenes": 2,
@@ -34,8 +33,8 @@ LEVEL = {
     "cli": 5,
     "__main__": 6,
 }  # fmt: skip
-# Files of `rendering` that know nothing of renders: variants, locks and interrupts, pulses and slopes of films.
-BELOW_SCENES = {"variant", "opaque", "interrupts", "kernel_errors", "slope", "pulse_properties"}
+# Files of `rendering` that know nothing of renders: variants, locks and interrupts.
+BELOW_SCENES = {"variant", "interrupts", "kernel_errors"}
 TORCH_PILLAR = {"sensing", "reconstruction", "losses", "metrics", "parametrize", "geometry", "vis"}
 MITSUBA = {"mitsuba", "drjit"}
 # Packages that a room does without: the one pillar's world in the other, and everything bound to a variant at level 0.
@@ -45,8 +44,6 @@ FORBIDDEN = {
     "errors": {"torch", *MITSUBA},
     "checks": MITSUBA,
     "volume_methods": {"torch", *MITSUBA},
-    "transform_bins": {"torch", *MITSUBA},
-    "plain_texts": {"torch", *MITSUBA},
     "array_files": MITSUBA,
     "floating": MITSUBA,
     "units": MITSUBA,
@@ -176,9 +173,9 @@ def is_below(other, room):
         ("capture", "tensor_record"), ("capture", "quantities"), ("nlos", "files"), ("data", "files"), ("data", "nlos"),
         ("floating", "quantities"), ("metrics", "losses"), ("metrics", "reconstruction"), ("axes", "quantities"),
         ("gates", "quantities"), ("pulses", "quantities"), ("capture", "argument_names"),
-        ("array_files", "quantities"), ("array_files", "plain_texts"), ("array_files", "free_memory"),
+        ("array_files", "quantities"), ("array_files", "free_memory"),
         ("units", "quantities"), ("stokes", "quantities"), ("given_types", "quantities"), ("pulses", "given_types"),
-        ("array_files", "file_places"), ("plain_texts", "file_places"), ("file_places", "quantities"),
+        ("array_files", "file_places"), ("file_places", "quantities"),
         ("rendering", "scene"),
     }  # fmt: skip
     return other in {"errors", "checks", "units"} or (room, other) in within

@@ -12,8 +12,9 @@ import torch
 from torchtransient.errors import ShapeError, StorageError
 from torchtransient.rendering import batch, engine, memory, progress, session
 from torchtransient.rendering.batch import Batch
-from torchtransient.rendering.broken_numbers import all_finite, broken_entries, carried_on
+from torchtransient.rendering.broken_numbers import broken_entries, carried_on
 from torchtransient.rendering.output import RenderOutput, RenderStats
+from torchtransient.scene.physics import all_finite
 
 VARIANT = "llvm_ad_mono"
 

@@ -20,7 +20,7 @@ from torchtransient.errors import ArgumentError, SceneError, UnitError
 from torchtransient.interfaces import BACKWARD, FORWARD, RENDER
 from torchtransient.plugins.parameters import check_slope
 from torchtransient.rendering.batch import Batch, take
-from torchtransient.rendering.broken_numbers import all_finite, broken_entries, fill_broken
+from torchtransient.rendering.broken_numbers import broken_entries, fill_broken
 from torchtransient.rendering.carry_out import Numbered, carry_out, groups_of
 from torchtransient.rendering.films import FilmLayout, layout_of_film
 from torchtransient.rendering.interrupts import ends_frames
@@ -30,7 +30,7 @@ from torchtransient.rendering.seeds import Item
 from torchtransient.rendering.session import RenderJob, RunLog, Session, session_of
 from torchtransient.scene.edits import built_depth
 from torchtransient.scene.parameters import needing_slope
-from torchtransient.scene.physics import are_finite, smallest_and_largest
+from torchtransient.scene.physics import all_finite, are_finite, smallest_and_largest
 from torchtransient.scene.values import own_array, wait_for_torch
 
 # ---------------------------------------------------------------------------------------------------------- primal

@@ -18,13 +18,13 @@ from torchtransient.checks import as_number, as_whole, of_class, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.rendering.carry_out import Numbered, check_whole, groups_of, refusal
 from torchtransient.rendering.engine import check_values
-from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.recordings import NotRecordedError
 from torchtransient.rendering.renderer import TransientRenderer
 from torchtransient.rendering.seeds import Seeding
 from torchtransient.rendering.session import RenderJob, Session, session_of
 from torchtransient.rendering.variant import active_variant
 from torchtransient.scene.load import Scene
+from torchtransient.scene.opaque import opaque
 
 LABELS = ("depth", "z_depth", "position", "normals", "uv", "albedo", "shape", "primitive", "material")
 # Labels that are indices, which have no mean.

@@ -33,22 +33,21 @@ from torchtransient.rendering.arguments import (
 )
 from torchtransient.rendering.autograd import rendered
 from torchtransient.rendering.films import FilmLayout, steady_channels_first
-from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.output import RenderOutput, RenderStats
 from torchtransient.rendering.overrides import boundary_term
 from torchtransient.rendering.progress import Bar
 from torchtransient.rendering.sample_counts import rounded_count, samples_taken
 from torchtransient.rendering.seeds import Item, Seeding, drawn
 from torchtransient.rendering.session import RenderJob
-from torchtransient.rendering.slope import check_filter, filter_for, has_slope, response_of
 from torchtransient.rendering.variant import active_variant, device_type, stokes_components
-from torchtransient.scene.edits import BuildOptions
+from torchtransient.scene.edits import BuildOptions, checked_pulse
 from torchtransient.scene.load import Scene, load
+from torchtransient.scene.opaque import opaque
 from torchtransient.scene.parameters import ParameterInfo, missing_edges, needing_slope, unknown_key
 from torchtransient.scene.physics import PhysicsWatch
 from torchtransient.scene.pilot import DepthBound, depth_bound
 from torchtransient.scene.plan import Effects
-from torchtransient.scene.pulses import checked_pulse
+from torchtransient.scene.slope import check_filter, filter_for, has_slope, response_of
 from torchtransient.scene.values import as_float, fit_shape, may_have_derivative
 
 

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from torchtransient._collection import no_collection
+from torchtransient.checks import one_line
 from torchtransient.errors import SceneError, TorchTransientError, VariantError
-from torchtransient.plain_texts import one_line
 from torchtransient.plugins.parameters import lifted
 from torchtransient.plugins.unfinished import afterwards
 from torchtransient.rendering.interrupts import quiet

@@ -18,9 +18,8 @@ import torch
 from torchtransient import plugins
 from torchtransient._collection import forget_traces
 from torchtransient._llvm import ensure_llvm
-from torchtransient.checks import shown
+from torchtransient.checks import one_line, shown
 from torchtransient.errors import TorchTransientWarning, VariantError, level_of_user
-from torchtransient.plain_texts import one_line
 from torchtransient.plugins.drjit_pool import check_process, engine_lock
 from torchtransient.plugins.interrupted import interrupts_wait
 from torchtransient.plugins.unfinished import afterwards, make_good

@@ -33,10 +33,9 @@ from torchtransient._collection import no_collection
 from torchtransient.checks import as_whole, is_one_of, shown
 from torchtransient.errors import ArgumentError, GradientError, ShapeError, UnitError, VariantError
 from torchtransient.plugins.interrupted import interrupts_wait
-from torchtransient.rendering.broken_numbers import all_finite, carried_on
+from torchtransient.rendering.broken_numbers import carried_on
 from torchtransient.rendering.derivatives import Asked, run
 from torchtransient.rendering.interrupts import ends_frames
-from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.seeds import mix_seed
 from torchtransient.rendering.values import (
     Slot,
@@ -57,7 +56,9 @@ from torchtransient.rendering.values import (
     write,
 )
 from torchtransient.rendering.variant import active_variant, at_work, device_type, is_differentiable, take_over
+from torchtransient.scene.opaque import opaque
 from torchtransient.scene.parameters import is_transform
+from torchtransient.scene.physics import all_finite
 from torchtransient.scene.values import as_float
 
 Tensors = tuple[torch.Tensor, ...]

@@ -19,13 +19,13 @@ from torchtransient.errors import ArgumentError, GradientError, SceneError, Torc
 from torchtransient.plugins import kind_of, modules_of_others, register_module
 from torchtransient.plugins.unfinished import afterwards
 from torchtransient.rendering.kernel_errors import named_errors
-from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.variant import active_variant, in_variant, resolve_variant
 from torchtransient.scene.build import BuiltScene, build
 from torchtransient.scene.description import SceneDescription, describe_dict, describe_xml, same_description
 from torchtransient.scene.edits import BuildOptions
 from torchtransient.scene.nodes import children, is_film
 from torchtransient.scene.objects import LoadedScene, transient_dictionary
+from torchtransient.scene.opaque import opaque
 from torchtransient.scene.parameters import ParameterTable, parameter_table, unknown_key
 from torchtransient.scene.save import WAY_OUT, check_same, replaced_files, write_scene
 from torchtransient.scene.values import SlotTable

@@ -20,7 +20,7 @@ from torchtransient.files.result_file import read_result, write_result
 from torchtransient.rendering import films
 from torchtransient.rendering.films import Gates, Histogram, Phasors, measured
 from torchtransient.rendering.output import RenderOutput, RenderStats
-from torchtransient.rendering.planned_film import planned
+from torchtransient.rendering.plan import planned
 
 VARIANT = "llvm_ad_rgb"
 STATS = RenderStats(

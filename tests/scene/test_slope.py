@@ -8,7 +8,7 @@ import pytest
 
 from torchtransient.errors import GradientError
 from torchtransient.rendering.renderer import TransientRenderer
-from torchtransient.rendering.slope import check_filter, filter_for, has_slope
+from torchtransient.scene.slope import check_filter, filter_for, has_slope
 
 
 @pytest.mark.parametrize(
