@@ -159,7 +159,7 @@ class ScalarState(nn.Module):
 
 @functools.cache
 def _first_is_taken() -> bool:
-    """Whether this version of torch loads a number from several."""
+    """Return True if this version of torch loads a number from several."""
     module = nn.Module()
     module.register_buffer("number", torch.zeros(()))
     try:

@@ -1,7 +1,7 @@
-"""Temporal filters of histograms, and the derivatives of parameters that change path lengths.
+"""Slope in time of temporal filters, which derivatives by parameters that change path lengths need.
 
-A box has no slope in time; a tent and a Gaussian have one, and a pulse or an impulse response gives one to every
-filter. Films without a filter have a response of their own: a gate that opens at once has no slope either.
+A box has none; a tent and a Gaussian have one, and a pulse or an impulse response gives one to every filter. Films
+without a filter have a response of their own: a gate that opens at once has no slope either.
 """
 
 from __future__ import annotations
@@ -13,21 +13,36 @@ from torchtransient.plugins.parameters import check_slope
 
 
 def has_slope(temporal_filter: str, pulsed: bool) -> bool:
-    """Whether a film with this filter has a slope in time. ``temporal_filter`` is empty for a film that has none."""
+    """Return True if a film with a temporal filter has a slope in time.
+
+    Args:
+        temporal_filter: name of the filter, empty for a film without one.
+        pulsed: the film has a pulse or an impulse response.
+    """
     return pulsed or temporal_filter != "box"
 
 
 def response_of(films: Iterable[Any]) -> tuple[bool, str, str]:
-    """Whether all those films that have no temporal filter have a slope; if not, what messages call the response of the
-    first one without, and what to do.
+    """Return the slope of the films without a temporal filter.
+
+    Args:
+        films: built films.
+
+    Returns:
+        (all of them have a slope, name of the first response without one, remedy); the texts are for messages, and
+        empty if all have one.
     """
     lacking = (film for film in films if not film.temporal_filter and not film.has_slope)
     return next(((False, film.response_name, film.slope_remedy) for film in lacking), (True, "", ""))
 
 
 def filter_for(moving: Sequence[str], own: str, pulsed: bool) -> str:
-    """The filter that "auto" stands for: the scene's ``own``, unless that has no slope and ``moving`` parameters, which
-    change path lengths, need one.
+    """Return the temporal filter of "auto".
+
+    Args:
+        moving: keys of parameters that change path lengths.
+        own: filter of the scene, which stays unless ``moving`` keys need a slope that it has not.
+        pulsed: the film has a pulse or an impulse response.
     """
     return own if not moving or has_slope(own, pulsed) else "tent"
 
