@@ -23,7 +23,7 @@ TESTS = Path(__file__).parent
 BENCHMARKS = sorted((TESTS.parent / "benchmarks").glob("*.py"))
 TOOLS = sorted(p for p in (TESTS.parent / "tools").rglob("*.py") if p.parent.name != "mutants")  # which runs tests
 LEVEL = {
-    "errors": 0, "_llvm": 0, "_collection": 0, "checks": 0, "units": 0, "axes": 0, "capture": 0, "interfaces": 0,
+    "errors": 0, "_llvm": 0, "checks": 0, "units": 0, "axes": 0, "capture": 0, "interfaces": 0,
     "pulses": 0, "gates": 0, "stokes": 0, "tensor_record": 0, "floating": 0, "volume_methods": 0, "array_files": 0,
     "plugins": 1, "sensing": 1, "reconstruction": 1, "losses": 1, "metrics": 1, "vis": 1,
     "parametrize": 1, "geometry": 1,
@@ -33,8 +33,6 @@ LEVEL = {
     "cli": 5,
     "__main__": 6,
 }  # fmt: skip
-# Files of `rendering` that know nothing of renders: variants, locks and interrupts.
-BELOW_SCENES = {"variant", "interrupts", "kernel_errors"}
 TORCH_PILLAR = {"sensing", "reconstruction", "losses", "metrics", "parametrize", "geometry", "vis"}
 MITSUBA = {"mitsuba", "drjit"}
 # Packages that a room does without: the one pillar's world in the other, and everything bound to a variant at level 0.
@@ -156,8 +154,6 @@ def violations(path, package=PACKAGE):
         if name.startswith("mitsuba.") and not name.startswith("mitsuba.python"):
             yield f"{where}{line} {name}: import mitsuba as mi, and mitsuba.python.ad instead of mitsuba.ad"
         other = room_of(name) if top == "torchtransient" else None
-        if room == "scene" and other == "rendering" and name.split(".")[2] in BELOW_SCENES:
-            continue
         if other is not None and other in LEVEL and other != room and not is_below(other, room):
             yield f"{where}{line} '{room}' (level {LEVEL[room]}) imports '{other}' (level {LEVEL[other]})"
 

@@ -15,7 +15,7 @@ from support.sweeps import together
 from support.text_files import SCENE
 from tools.small_room import CAMERA, COLOUR, VARIANT, make_room, pose
 from torchtransient.errors import ArgumentError, SceneError
-from torchtransient.rendering.variant import active_variant
+from torchtransient.scene.variant import active_variant
 
 
 @pytest.fixture

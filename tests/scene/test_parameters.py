@@ -11,7 +11,7 @@ from torch.autograd import forward_ad
 import torchtransient as tt
 from support.marks import long
 from tools.small_room import CAMERA, COLOUR, GREY, VARIANT, WALL_POSE, make_room, pose
-from torchtransient.rendering.variant import active_variant
+from torchtransient.scene.variant import active_variant
 
 TURN = np.array([[0.8, 0, 0.6, 0], [0, 1, 0, 0], [-0.6, 0, 0.8, 0], [0, 0, 0, 1.0]])
 

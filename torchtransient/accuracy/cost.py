@@ -16,8 +16,8 @@ from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitErr
 from torchtransient.rendering.films import layout_of_output
 from torchtransient.rendering.output import RenderOutput
 from torchtransient.rendering.renderer import TransientRenderer
-from torchtransient.rendering.variant import active_variant
 from torchtransient.scene.opaque import opaque
+from torchtransient.scene.variant import active_variant
 
 Loss = Callable[[RenderOutput], torch.Tensor]
 

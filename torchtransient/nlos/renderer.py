@@ -19,11 +19,11 @@ from torchtransient.nlos.scene import SENSOR, WALL, capture_scene, film_size, hi
 from torchtransient.nlos.scene_scan import check_scan_is_seen, tolerance_of
 from torchtransient.rendering.output import RenderOutput
 from torchtransient.rendering.renderer import TransientRenderer
-from torchtransient.rendering.variant import active_variant
 from torchtransient.scene.edits import BuildOptions
 from torchtransient.scene.load import Scene, load
 from torchtransient.scene.opaque import opaque
 from torchtransient.scene.parameters import needing_slope
+from torchtransient.scene.variant import active_variant
 from torchtransient.sensing import Device
 
 # Where the points of a scan stand in the scene.

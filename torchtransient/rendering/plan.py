@@ -19,13 +19,13 @@ from torchtransient.pulses import Pulse
 from torchtransient.rendering.arguments import checked_depth, checked_filter, checked_keys, film_asked_for
 from torchtransient.rendering.films import FILMS, FilmLayout, Gates, Histogram, Phasors, layout_of_plugin
 from torchtransient.rendering.renderer import TransientRenderer
-from torchtransient.rendering.variant import resolve_variant
 from torchtransient.scene.edits import checked_pulse
 from torchtransient.scene.inventory import scene_inventory
 from torchtransient.scene.load import load
 from torchtransient.scene.opaque import opaque
 from torchtransient.scene.pilot import PilotReport
 from torchtransient.scene.plan import Choice, Draft, Effects, Finder, choose_integrator, choose_variant
+from torchtransient.scene.variant import resolve_variant
 
 # Outputs that every film can show beside its own measurement.
 _ANY_FILM = ("steady", "stokes", "bands")

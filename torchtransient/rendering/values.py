@@ -16,9 +16,9 @@ from torchtransient.checks import one_line
 from torchtransient.errors import DeviceError, SceneError, ShapeError, TorchTransientError, UnknownKeyError
 from torchtransient.plugins.mitsuba_compat import check_pose, is_turned_by_reflections
 from torchtransient.plugins.node_walk import ShownValue
-from torchtransient.rendering.interrupts import quiet
 from torchtransient.scene.parameters import classify, is_transform, read_value, unknown_key
 from torchtransient.scene.values import as_mitsuba_value, changed_with
+from torchtransient.scene.variant import quiet
 
 # --------------------------------------------------------------------------------------------------------- PyTrees
 

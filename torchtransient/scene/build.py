@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 from torchtransient import plugins
-from torchtransient._collection import let_go
 from torchtransient.checks import cut_line, one_line, some_of
 from torchtransient.errors import SceneError, TorchTransientError
 from torchtransient.interfaces import IntegratorInterface, is_time_resolved
 from torchtransient.plugins.described_scene import check_scene
 from torchtransient.plugins.drjit_pool import threads_for_files
+from torchtransient.plugins.guards import let_go
 from torchtransient.plugins.mitsuba_compat import is_dark
 from torchtransient.plugins.node_walk import objects_below
 from torchtransient.plugins.parameter_effect import class_of

@@ -34,7 +34,6 @@ from torchtransient.plugins.mitsuba_compat import (
 )
 from torchtransient.plugins.node_walk import has_mean
 from torchtransient.pulses import Pulse
-from torchtransient.rendering.interrupts import quiet
 from torchtransient.scene.nodes import (
     children,
     descendants,
@@ -45,6 +44,7 @@ from torchtransient.scene.nodes import (
     is_transient_integrator,
     node_kind,
 )
+from torchtransient.scene.variant import quiet
 
 NO_LIMIT = -1
 # Steady integrators, and the transient ones for which their parameters mean the same.

@@ -26,8 +26,8 @@ from torchtransient.plugins.mitsuba_compat import (
 )
 from torchtransient.plugins.node_walk import objects_below, objects_of
 from torchtransient.plugins.parameter_effect import ParameterEffect, class_of
-from torchtransient.rendering.variant import active_variant
 from torchtransient.scene.edits import pixel_format, printed_properties
+from torchtransient.scene.variant import active_variant
 
 # Meshes that are nothing but their buffers and what their base class holds.
 _PLAIN_MESHES = ("Mesh", "PLYMesh", "OBJMesh", "SerializedMesh", "Cube", "MergeShape")

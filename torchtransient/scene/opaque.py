@@ -14,8 +14,6 @@ from typing import Any, ParamSpec, TypeVar
 
 import torch
 
-from torchtransient.rendering.interrupts import ends_frames
-
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
@@ -41,7 +39,7 @@ def opaque(function: Callable[_P, _R]) -> Callable[_P, _R]:
             return function(*args, **kwargs)
         return _untraced(function, disabled, args, kwargs)
 
-    return _stopping(ends_frames(call))
+    return _stopping(call)
 
 
 def _stopping(function: Callable[_P, _R]) -> Callable[_P, _R]:
