@@ -21,7 +21,7 @@ def broken_entries(tensor: torch.Tensor, count: int) -> list[bool]:
     return [False] * count if all_finite(tensor) else [not all_finite(tensor[n]) for n in range(count)]
 
 
-def carried_on(derivative: Callable[[Sequence[torch.Tensor]], Tensors], given: Sequence[torch.Tensor]) -> Tensors:
+def spread_nan(derivative: Callable[[Sequence[torch.Tensor]], Tensors], given: Sequence[torch.Tensor]) -> Tensors:
     """Evaluate a derivative whose result is NaN wherever an adjoint or tangent that is not finite contributes.
 
     Args:
