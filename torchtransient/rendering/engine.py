@@ -125,8 +125,8 @@ class Session:
         if job.bound is not None:
             found.append((integrator, "max_depth", job.bound.depth))
         if job.temporal_filter:
-            # The integrator's own filter would replace the films' when a render begins.
-            found.append((integrator, "temporal_filter", ""))
+            if getattr(integrator, "temporal_filter", ""):  # it would replace the films' when a render begins
+                found.append((integrator, "temporal_filter", ""))
             films = [sensor.film() for sensor in self.sensors]
             found += [
                 (film, "temporal_filter", job.temporal_filter)

@@ -18,7 +18,7 @@ from torchtransient.interfaces import IntegratorInterface, is_time_resolved
 from torchtransient.plugins.described_scene import check_scene
 from torchtransient.plugins.drjit_pool import threads_for_files
 from torchtransient.plugins.guards import let_go
-from torchtransient.plugins.mitsuba_compat import is_dark
+from torchtransient.plugins.mitsuba_compat import is_dark, scene_parameters
 from torchtransient.plugins.node_walk import objects_below
 from torchtransient.plugins.parameter_effect import class_of
 from torchtransient.plugins.parameters import PhysicalRange, described_ranges, ranges_of
@@ -44,7 +44,7 @@ class BuiltScene:
     """A Mitsuba scene with what is known of its nodes.
 
     Attributes:
-        scene, params: the ``mitsuba.Scene``, and what ``mitsuba.traverse`` returns of it.
+        scene, params: the ``mitsuba.Scene``, and its ``mitsuba.SceneParameters`` by users' keys.
         mesh_to_world: transforms (4, 4) of shapes as described, by name.
         integrator: plugin name of the integrator.
         to_world: all transforms as described, by key.
@@ -143,19 +143,17 @@ def _instantiated(description: Plain, variant: str, options: BuildOptions) -> Bu
         if description.objects:
             _check_loaded(scene, description.objects, options)
         _check_integrator(scene, options)
-        params = mi.traverse(scene)
+        params = scene_parameters(scene)
         check_scene(scene, params)
     return BuiltScene(scene, params, mesh_to_world, integrator, to_world, loaded=pointers(description.objects))
 
 
 def _loaded(description: LoadedScene, options: BuildOptions) -> BuiltScene:
     """Return a loaded scene as it is. Raises ``SceneError`` where ``options`` would change it."""
-    import mitsuba as mi
-
     scene = description.scene
     _check_loaded(scene, description.objects, options)
     check_meshes(description.objects)
-    params = mi.traverse(scene)
+    params = scene_parameters(scene)
     check_scene(scene, params)
     name = "" if scene.integrator() is None else class_of(scene.integrator())
     return BuiltScene(scene, params, integrator=name, loaded=pointers(description.objects))
