@@ -25,8 +25,7 @@ TOOLS = sorted(p for p in (TESTS.parent / "tools").rglob("*.py") if p.parent.nam
 # Rooms by level: an import goes down, or stays in its room.
 LEVEL = {
     "errors": 0, "_llvm": 0, "checks": 0, "units": 0, "axes": 0, "capture": 0, "interfaces": 0,
-    "pulses": 0, "gates": 0, "stokes": 0, "tensor_record": 0, "floating": 0, "volume_methods": 0, "transform_bins": 0,
-    "plain_texts": 0, "array_files": 0,
+    "pulses": 0, "gates": 0, "stokes": 0, "tensor_record": 0, "floating": 0, "volume_methods": 0, "array_files": 0,
     "plugins": 1, "sensing": 1, "reconstruction": 1, "losses": 1, "metrics": 1, "vis": 1,
     "parametrize": 1, "geometry": 1,
     "scenes": 2,
@@ -40,17 +39,15 @@ LEVEL = {
 # records with axes, data sets hold captures, whose simulations are files.
 BASIC = {"errors", "checks", "units"}
 BESIDE = {
-    "gates": {"pulses"}, "capture": {"axes", "tensor_record"}, "array_files": {"plain_texts"},
+    "gates": {"pulses"}, "capture": {"axes", "tensor_record"},
     "losses": {"sensing"}, "metrics": {"losses", "reconstruction"},
     "nlos": {"files"}, "data": {"files", "nlos"}, "testing": {"accuracy"},
 }  # fmt: skip
-# Files of `rendering` that know nothing of renders.
-BELOW_SCENES = {"opaque", "slope"}
 # Packages that a room does without: the one pillar's world in the other, and at level 0 everything bound to a variant.
 MITSUBA, TORCH = {"mitsuba", "drjit"}, {"torch", "kornia"}
 TORCH_PILLAR = {"sensing", "reconstruction", "losses", "metrics", "parametrize", "geometry", "vis"}
 WITHOUT_MITSUBA = {*TORCH_PILLAR, "scenes", *(room for room, level in LEVEL.items() if level == 0 and room[0] != "_")}
-WITHOUT_TORCH = {"plugins", "scenes", "errors", "interfaces", "volume_methods", "transform_bins", "plain_texts"}
+WITHOUT_TORCH = {"plugins", "scenes", "errors", "interfaces", "volume_methods"}
 HEAVY = {
     "matplotlib", "h5py", "kornia", "scipy", "imageio", "imageio_ffmpeg", "PIL", "click", "rich", "hdf5plugin",
     "zstandard", "webdataset", "ray",
@@ -137,8 +134,6 @@ def violations(path, package=PACKAGE):
         if name.startswith("mitsuba.") and not name.startswith("mitsuba.python"):
             yield f"{where}{line} {name}: import mitsuba as mi, and mitsuba.python.ad instead of mitsuba.ad"
         other = room_of(name) if top == "torchtransient" else None
-        if room == "scene" and other == "rendering" and name.split(".")[2] in BELOW_SCENES:
-            continue
         if other is not None and other in LEVEL and other != room and not is_below(other, room):
             yield f"{where}{line} '{room}' (level {LEVEL[room]}) imports '{other}' (level {LEVEL[other]})"
 

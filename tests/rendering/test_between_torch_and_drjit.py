@@ -10,8 +10,9 @@ import torch
 
 from torchtransient.errors import StorageError
 from torchtransient.rendering import engine, memory, progress
-from torchtransient.rendering.broken_numbers import all_finite, broken_entries, carried_on
+from torchtransient.rendering.broken_numbers import broken_entries, spread_nan
 from torchtransient.rendering.output import RenderOutput, RenderStats
+from torchtransient.scene.physics import all_finite
 from torchtransient.scene.values import own_array
 
 VARIANT = "llvm_ad_mono"
@@ -153,9 +154,9 @@ def test_broken_numbers_go_on_to_what_they_touch():
         x = given[0].nan_to_num(0.0, 0.0, 0.0)
         return x[:2] * 3, x[2] - x[3], x[0]
 
-    assert [one.tolist() for one in carried_on(derivative, [torch.tensor([1.0, 2.0, 3.0, 5.0])])] == [[3, 6], -2, 1]
+    assert [one.tolist() for one in spread_nan(derivative, [torch.tensor([1.0, 2.0, 3.0, 5.0])])] == [[3, 6], -2, 1]
     assert len(runs) == 1
-    found = carried_on(derivative, [torch.tensor([1.0, np.nan, np.inf, np.inf])])
+    found = spread_nan(derivative, [torch.tensor([1.0, np.nan, np.inf, np.inf])])
     assert found[0][0] == 3 and torch.isnan(found[0][1]) and torch.isnan(found[1]) and found[2] == 1
     marks = runs[2][0]
     assert marks[0] == 0 and ((marks[1:] >= 1) & (marks[1:] < 2)).all() and len(set(marks.tolist())) == 4

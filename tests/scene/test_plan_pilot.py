@@ -1,4 +1,4 @@
-"""What a plan finds by tracing: depth and window hold the light that they promise, and nothing else is paid."""
+"""Decisions of a plan by tracing: depth and window hold the promised light and no more."""
 
 import json
 import time

@@ -14,9 +14,9 @@ from torchtransient.accuracy.report import AccuracyReport, Choice
 from torchtransient.checks import as_whole, shown
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.rendering.films import layout_of_output
-from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.output import RenderOutput
 from torchtransient.rendering.renderer import TransientRenderer
+from torchtransient.scene.opaque import opaque
 from torchtransient.scene.variant import active_variant
 
 Loss = Callable[[RenderOutput], torch.Tensor]

@@ -18,13 +18,13 @@ from typing import Any
 
 import torch
 
+from torchtransient.checks import one_line
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, TorchTransientError, UnitError, VariantError
 from torchtransient.interfaces import BACKWARD, FORWARD, RENDER, is_time_resolved
-from torchtransient.plain_texts import one_line
 from torchtransient.plugins.frozen_state import says_it_can_be_recorded
 from torchtransient.plugins.guards import interrupts_wait, no_collection
 from torchtransient.plugins.parameters import check_slope, lifted
-from torchtransient.rendering.broken_numbers import all_finite, broken_entries, fill_broken
+from torchtransient.rendering.broken_numbers import broken_entries, fill_broken
 from torchtransient.rendering.films import FilmLayout, layout_of_film
 from torchtransient.rendering.job import Item, RenderJob, RunLog, samples_drawn
 from torchtransient.rendering.memory import check_fits
@@ -32,7 +32,7 @@ from torchtransient.rendering.recording import LARGE_FILM, Numbered, Recordings,
 from torchtransient.rendering.values import detached, put_back, values_of
 from torchtransient.scene.edits import built_depth
 from torchtransient.scene.parameters import needing_slope
-from torchtransient.scene.physics import are_finite, smallest_and_largest
+from torchtransient.scene.physics import all_finite, are_finite, smallest_and_largest
 from torchtransient.scene.values import own_array, wait_for_torch
 from torchtransient.scene.variant import active_variant, named_errors, quiet
 

@@ -18,10 +18,10 @@ from torchtransient.checks import as_number, as_whole, of_class, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.rendering.engine import Session, check_values, open_session
 from torchtransient.rendering.job import RenderJob, Seeding
-from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.recording import NotRecordedError, Numbered, check_whole, groups_of, refusal
 from torchtransient.rendering.renderer import TransientRenderer
 from torchtransient.scene.load import Scene
+from torchtransient.scene.opaque import opaque
 from torchtransient.scene.variant import active_variant
 
 LABELS = ("depth", "z_depth", "position", "normals", "uv", "albedo", "shape", "primitive", "material")

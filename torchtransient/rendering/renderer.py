@@ -34,17 +34,16 @@ from torchtransient.rendering.arguments import (
 from torchtransient.rendering.autograd import RenderCall, run
 from torchtransient.rendering.films import FilmLayout, steady_channels_first
 from torchtransient.rendering.job import Item, RenderJob, Seeding, drawn, rounded_count, samples_drawn
-from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.output import RenderOutput, RenderStats
 from torchtransient.rendering.progress import Bar
-from torchtransient.rendering.slope import check_filter, filter_for, has_slope, response_of
-from torchtransient.scene.edits import BuildOptions
+from torchtransient.scene.edits import BuildOptions, checked_pulse
 from torchtransient.scene.load import Scene, load
+from torchtransient.scene.opaque import opaque
 from torchtransient.scene.parameters import ParameterInfo, missing_edges, needing_slope, unknown_key
 from torchtransient.scene.physics import PhysicsWatch
 from torchtransient.scene.pilot import DepthBound, depth_bound
 from torchtransient.scene.plan import Effects
-from torchtransient.scene.pulses import checked_pulse
+from torchtransient.scene.slope import check_filter, filter_for, has_slope, response_of
 from torchtransient.scene.values import as_float, fit_shape, may_have_derivative
 from torchtransient.scene.variant import active_variant, device_type, stokes_components
 

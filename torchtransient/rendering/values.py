@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from torchtransient.checks import one_line
 from torchtransient.errors import DeviceError, SceneError, ShapeError, TorchTransientError, UnknownKeyError
-from torchtransient.plain_texts import one_line
 from torchtransient.plugins.mitsuba_compat import check_pose, is_turned_by_reflections
 from torchtransient.plugins.node_walk import ShownValue
 from torchtransient.scene.parameters import classify, is_transform, read_value, unknown_key

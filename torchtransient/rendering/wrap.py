@@ -33,9 +33,8 @@ from torchtransient.checks import as_whole, is_one_of, shown
 from torchtransient.errors import ArgumentError, GradientError, ShapeError, UnitError, VariantError
 from torchtransient.plugins.guards import interrupts_wait, no_collection
 from torchtransient.rendering.autograd import Asked, run
-from torchtransient.rendering.broken_numbers import all_finite, carried_on
+from torchtransient.rendering.broken_numbers import spread_nan
 from torchtransient.rendering.job import mix_seed
-from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.values import (
     Slot,
     as_tensor,
@@ -54,7 +53,9 @@ from torchtransient.rendering.values import (
     variant_of,
     write,
 )
+from torchtransient.scene.opaque import opaque
 from torchtransient.scene.parameters import is_transform
+from torchtransient.scene.physics import all_finite
 from torchtransient.scene.values import as_float
 from torchtransient.scene.variant import active_variant, at_work, device_type, is_differentiable, take_over
 
@@ -351,7 +352,7 @@ class Call:
             with self._at_work():
                 return self._pullback(asked, tensors, given)
 
-        return carried_on(replay, cotangents)
+        return spread_nan(replay, cotangents)
 
     def pushforward(self, asked: Asked, tensors: Sequence[torch.Tensor], tangents: Sequence[torch.Tensor]) -> Tensors:
         """Return derivatives of the real outputs; NaN where a tangent that is not finite arrives."""
@@ -360,7 +361,7 @@ class Call:
             with self._at_work():
                 return self._pushforward(asked, tensors, given)
 
-        return carried_on(replay, tangents)
+        return spread_nan(replay, tangents)
 
     def result(self, tensors: Tensors) -> Any:
         """Return the result of the function, with tensors in place of its arrays."""

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from torchtransient import plugins
+from torchtransient.checks import cut_line, one_line, some_of
 from torchtransient.errors import SceneError, TorchTransientError
 from torchtransient.interfaces import IntegratorInterface, is_time_resolved
-from torchtransient.plain_texts import line_of, one_line, some_of
 from torchtransient.plugins.described_scene import check_scene
 from torchtransient.plugins.drjit_pool import threads_for_files
 from torchtransient.plugins.guards import let_go
@@ -105,7 +105,8 @@ def build(description: SceneDescription, variant: str, options: BuildOptions) ->
             return build(description, variant, replace(options, merge=False))
         text = one_line(error).replace("While loading string", f"While loading {description.name}")
         unread = _unread_properties(str(error), description.name)
-        raise SceneError(unread or f"{description.name}: Mitsuba could not build the scene. {line_of(text)}") from error
+        message = unread or f"{description.name}: Mitsuba could not build the scene. {cut_line(text)}"
+        raise SceneError(message) from error
 
 
 def _instantiated(description: Plain, variant: str, options: BuildOptions) -> BuiltScene:

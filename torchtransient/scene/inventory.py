@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from torchtransient import plugins
+from torchtransient.checks import one_line
 from torchtransient.errors import SceneError, TorchTransientError
-from torchtransient.plain_texts import one_line
 from torchtransient.plugins._registry import OWN_BSDFS
 from torchtransient.plugins.drjit_pool import threads_for_files
 from torchtransient.scene.checks import check_nodes

@@ -17,12 +17,12 @@ from typing import Any
 from torchtransient.checks import flag, shown
 from torchtransient.errors import ArgumentError, GradientError, SceneError, TorchTransientError
 from torchtransient.plugins import kind_of, modules_of_others, register_module
-from torchtransient.rendering.opaque import opaque
 from torchtransient.scene.build import BuiltScene, build
 from torchtransient.scene.description import SceneDescription, describe_dict, describe_xml, same_description
 from torchtransient.scene.edits import BuildOptions
 from torchtransient.scene.nodes import children, is_film
 from torchtransient.scene.objects import LoadedScene, transient_dictionary
+from torchtransient.scene.opaque import opaque
 from torchtransient.scene.parameters import ParameterTable, parameter_table, unknown_key
 from torchtransient.scene.save import WAY_OUT, check_same, replaced_files, write_scene
 from torchtransient.scene.values import SlotTable
