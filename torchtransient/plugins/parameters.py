@@ -26,6 +26,7 @@ from torchtransient.plugins.mitsuba_compat import (
     forgets_black_samples,
     is_replaced_for,
     normal_texture,
+    users_name,
     weight_slot,
 )
 from torchtransient.plugins.node_walk import ShownValue, objects_of, owners_of, shown_by, unshared
@@ -143,7 +144,7 @@ def attached_effects(params: Any) -> list[tuple[Any, str, ParameterEffect]]:
     for name, (handle, cpptype, node, flags) in params.properties.items():
         value = handle if cpptype is None else mi.get_property(handle, cpptype, node)
         if can_carry_gradients(value) and dr.grad_enabled(value):
-            attached.append((node, name.rsplit(".", 1)[-1], flags))
+            attached.append((node, users_name(node, name.rsplit(".", 1)[-1]), flags))
     # A walk of its own: the names in ``params`` tell of one holder of each plugin, and not of what reads an attribute.
     tracker = ParameterTracker.of(params) if attached else None
     return [(node, key, tracker.effect_of(node, key, flags)) for node, key, flags in attached]
