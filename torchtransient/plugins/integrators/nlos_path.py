@@ -192,7 +192,7 @@ class TransientNLOSPath(base.TransientIntegrator):
 
     @property
     def aims_lasers(self) -> bool:
-        """Whether beams without width are seen."""
+        """True if beams without width are seen."""
         return self.laser_sampling
 
     def settings(self) -> PathSettings:
@@ -217,13 +217,13 @@ class TransientNLOSPath(base.TransientIntegrator):
         return max(settings.min_depth - light, 0), most
 
     def scan_table(self, scene: Any, contents: Any) -> ScanTable:
-        """What the scan of a job looks at and where its laser falls."""
+        """Return the scanned points and laser spots of a job."""
         fov = None if self.equal_grids or self.capture is not CaptureType.EXHAUSTIVE else self.laser_fov
         with dr.resume_grad():
             return ScanTable(scene, contents, self.capture, fov, self.laser_sampling)
 
     def division(self, scene: Any, contents: Any, wanted: Any = None, table: Any = None) -> Division:
-        """Who finds which light. ``table``: the :class:`ScanTable` of the job, where it is known. Raises SceneError
+        """Return the division of light among estimators. ``table``: the :class:`ScanTable` of the job, where it is known. Raises SceneError
         where light has to come from shared samples and cannot.
         """
         settings = self.settings()
@@ -395,7 +395,7 @@ def _choice(props: Any, name: str, shared: str) -> str:
 
 
 def _scanned(scene: Any, sensor: Any) -> Any:
-    """What the rays of a scan meet, one for each pixel: all samples of a pixel look at one point."""
+    """Return the intersections of the rays of a scan, one for each pixel: all samples of a pixel look at one point."""
     found = scene.ray_intersect_preliminary(scan_rays(sensor), coherent=True)
     dr.eval(found)
     return found

@@ -103,11 +103,11 @@ class RenderContext:
         return [self.segment, *self.connections, self.scattering]
 
     def most_events(self) -> int:
-        """How many events a path can have; in a derivative, how many terms."""
+        """Return the largest number of events of a path; of terms in a derivative."""
         return self.max_depth * sum(c.events(self.wanted) for c in self.connections)
 
     def tables(self) -> list[Any]:
-        """What has been computed of the scene's parameters, by the strategies and for the surfaces."""
+        """Return the arrays that strategies and surfaces computed from parameters."""
         tables = [] if self.surfaces is None else self.surfaces.tables()
         return tables + [table for strategy in self.strategies() for table in strategy.tables()]
 

@@ -23,7 +23,7 @@ WALK, SHADOW = 0x9E3779B9, 0x85EBCA6B
 
 
 class FreeFlight:
-    """Where a walk ended; a plain object that only lives within one iteration.
+    """End of a free flight; a plain object that only lives within one iteration.
 
     ``scatter``: in a medium, at distance ``t`` from the ray's origin. Otherwise at the surface ``pi``, or nowhere if
     that is not valid. ``pi`` is the next surface in both cases, counted from the ray's origin. ``medium`` is the one
@@ -173,7 +173,7 @@ def closed_surface(scene, media, ray, active):
 
 
 def lets_through(media, ray, pi, hide):
-    """Whether the surface at ``pi`` is an open boundary; with ``hide`` emitting surfaces count as such."""
+    """Return a mask of open boundaries at ``pi``; with ``hide`` emitting surfaces count as such."""
     shape = pi.shape
     if media.shapes_in_groups:  # of an instance, only the interaction knows which shape of the group was met
         shape = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, pi.is_valid()).shape

@@ -1,4 +1,4 @@
-"""What a scene contains, looked up once a scene and sensor, so that the loops hold only what the scene calls for."""
+"""Contents of a scene, looked up once a scene and sensor, so that the loops hold only what the scene calls for."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def _two_sided(bsdfs: list[Any]) -> PointerTable | None:
 # Whether what happens at a surface differs from place to place: where a vertex slides, that changes too.
 
 def scatters_by_place(bsdf: Any) -> bool:
-    """Whether a BSDF, or one that it holds, may scatter otherwise at another place of a flat surface."""
+    """Return True if a BSDF, or one inside it, may scatter otherwise at another place of a flat surface."""
     held = [bsdf, *objects_below(bsdf, mi.BSDF)]
     return _varies_by_texture(bsdf) or not all(_is_known(one, SCATTER_ALIKE) for one in held)
 
@@ -142,7 +142,7 @@ def _varies_by_texture(plugin: Any) -> bool:
 
 
 def _is_known(plugin: Any, names: Iterable[str]) -> bool:
-    """Whether a plugin is one of ours, or of these classes of Mitsuba."""
+    """Return True for plugins of the library, and of these classes of Mitsuba."""
     return _room(plugin) == "torchtransient" or (_room(plugin) == "mitsuba" and plugin.class_name() in names)
 
 
@@ -185,7 +185,7 @@ class MediaContents:
 
     @property
     def one_stretch(self) -> bool:
-        """Whether a straight line needs no loop: one medium up to the next surface, with one analytic step."""
+        """Return True if a straight line needs no loop: one medium up to the next surface, with one analytic step."""
         return not (self.heterogeneous or self.open_boundaries)
 
     def check_spheres(self, sphere_lights: bool) -> None:
@@ -211,7 +211,7 @@ class MediaContents:
 
 
 class FlightSettings:
-    """How the walks through media are made in one job: the contents, and what derivatives ask of them.
+    """Media of one job: contents and wanted derivatives.
 
     ``recorded``: the path is kept. ``extinction_changes``: a transmittance can change. ``keeps_entry``: the boundary
     before a vertex is kept, since the vertex may move with it. ``rate_floor`` (1 / m, None when no extinction is
@@ -256,7 +256,7 @@ def media_of(scene: Any, sensor: Any) -> MediaContents | None:
 
 
 def is_open(shape: Any) -> bool:
-    """Whether light passes ``shape`` unbent and unweakened, so that nothing happens there: a BSDF ``null``, no emitter.
+    """Return True if light passes ``shape`` unbent and unweakened, so that nothing happens there: a BSDF ``null``, no emitter.
 
     Works on one shape and on arrays of shape pointers.
     """
@@ -301,7 +301,7 @@ class SceneCache:
         self.told_of_edges: set[tuple[int, str]] = set()
 
     def is_of(self, scene: Any) -> bool:
-        """Whether it is this scene."""
+        """Return True if the cache is that of ``scene``."""
         return self._described.is_of(scene)
 
     def follow_derivatives(self, scene: Any, asked: bool) -> None:
@@ -314,7 +314,7 @@ class SceneCache:
                 bsdf.follow_derivatives(asked)
 
     def contents_for(self, scene: Any, sensor: Any) -> SceneContents:
-        """What the scene contains for a sensor, which may stand in a medium."""
+        """Return the contents of the scene for a sensor, which may stand in a medium."""
         self._forget_replaced(scene)
         if sensor.ptr not in self._contents:
             # With the sensor, so that no later one can be taken for it.

@@ -36,7 +36,7 @@ class Instances:
 
     @staticmethod
     def of(scene: Any) -> Instances | None:
-        """Those of ``scene``, None when it has none."""
+        """Return the instances of ``scene``, None without."""
         found = [shape for shape in scene.shapes() if is_instance(shape)]
         return Instances(found) if found else None
 
@@ -122,14 +122,14 @@ class InstanceTable:
 
 
 class AttachedSurfaces:
-    """What derivatives of surfaces need beside Mitsuba. A plain object, which Dr.Jit loops leave alone."""
+    """Attached surface interactions beside Mitsuba's. A plain object, which Dr.Jit loops leave alone."""
 
     def __init__(self, instances: InstanceTable | None, hits: HitTable | None) -> None:
         self._instances, self._hits = instances, hits
 
     @staticmethod
     def of(contents: Any) -> AttachedSurfaces | None:
-        """Those of one job, None where Mitsuba's own interactions are right."""
+        """Return the surfaces of one job, None where Mitsuba's own interactions are right."""
         if contents.instances is None and contents.detached_hits is None:
             return None
         return AttachedSurfaces(*(part and part.read() for part in (contents.instances, contents.detached_hits)))
@@ -139,7 +139,7 @@ class AttachedSurfaces:
         return v if self._instances is None else self._instances.to_world(instance, v)
 
     def tables(self) -> list[Any]:
-        """What has been computed of parameters: attached where they are."""
+        """Return the arrays computed from parameters, attached where these are."""
         tables = [] if self._instances is None else [self._instances.table]
         return tables if self._hits is None else tables + self._hits.tables()
 
@@ -251,7 +251,7 @@ class DetachedHits:
 
 
 class HitTable:
-    """What attaches hit points, by kind of shape. A plain object, which Dr.Jit loops leave alone."""
+    """Tables that attach hit points, by kind of shape. A plain object, which Dr.Jit loops leave alone."""
 
     def __init__(self, kinds: Sequence[Any]) -> None:
         self._kinds = kinds

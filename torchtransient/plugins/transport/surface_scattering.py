@@ -25,7 +25,7 @@ _ANY = 0xFFFFFFFF
 
 
 class Surface(Scattering):
-    """What all vertices do in vacuum; those in media are told apart in :class:`.medium.SurfaceOrMedium`.
+    """Scattering at surfaces; vertices in media are those of :class:`.medium.SurfaceOrMedium`.
 
     ``guides``: a list of :class:`~..strategy.Guide`, whose shares sum to less than one.
     """
@@ -87,7 +87,7 @@ class Surface(Scattering):
         return tuple(copies[id(i)] for i in interactions)
 
     def connectable(self, context, vertex):
-        """Whether light can be found at the vertex by connecting to it."""
+        """Return a mask of vertices with a smooth lobe, which can be connected to lights."""
         return mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Smooth)
 
     def scatter(self, context, path, vertex, proposals, sampler):
@@ -339,7 +339,7 @@ def strayed(wi, bs):
 
 
 def is_black(weight):
-    """Whether scattering by ``weight`` leaves nothing of the light."""
+    """Return a mask of weights of zero."""
     return dr.max(mi.unpolarized_spectrum(weight)) == 0
 
 
@@ -359,7 +359,7 @@ class Lambertian(Surface):
 
     @staticmethod
     def fits(contents):
-        """Whether all that paths meet is Lambertian, in unpolarized light."""
+        """Return True if all scattering is Lambertian, in unpolarized light."""
         special = (contents.delays, contents.mixtures, contents.refraction, contents.media, contents.hidden_probability)
         return not mi.is_polarized and all(s is None for s in special) and all(is_lambertian(b) for b in contents.bsdfs)
 

@@ -167,7 +167,7 @@ class Vacuum(Segment):
         return self.arrived(context, v, carry, ray, si, wanted)
 
     def attached_surface(self, context, v, carry, ray, wanted, active):
-        """What ``ray`` finds where ``active``: attached to it and to the surface, along the ray."""
+        """Return the interaction of ``ray`` where ``active``: attached to it and to the surface, along the ray."""
         si = surface_interaction(context.surfaces, v.pi, ray, mi.RayFlags.All, active)
         if wanted.plain:  # an attached ray would have every shape differentiated
             si.p = si.p + slide(displacement(carry.o, active), v.ray.d, dr.detach(si.n), active)
@@ -287,11 +287,11 @@ class AttachedTriangles:
         self.vertices = _joined([mesh_positions(mesh) for mesh in meshes])
 
     def tables(self) -> list[Any]:
-        """What is attached."""
+        """Return the attached arrays."""
         return [] if self.vertices is None else [self.vertices]
 
     def lists(self, shape: Any) -> Any:
-        """Which of an array of pointers to shapes are in the table."""
+        """Return a mask of pointers to shapes in the table."""
         return mi.Mask(False) if self.starts is None else self.starts.look_up(shape) > 0
 
     def point(self, pi: Any, active: Any) -> Local:
