@@ -182,7 +182,9 @@ class EmitterSampled(Connection):
         return Event(value=value * T, opl=opl, active=active, depth=path.depth + 2, T=T, crowded=True)
 
     def _may_change(self, context, proposal, answer):
-        """Return a mask of samples of value zero that may have a derivative: with an albedo of zero, but not behind a surface."""
+        """Return a mask of samples of value zero that may have a derivative: with an albedo of zero, but not behind
+        a surface.
+        """
         may = mi.Bool(True)
         if not self.lights_change:
             may &= is_light(mi.unpolarized_spectrum(proposal.weight))

@@ -256,7 +256,8 @@ def media_of(scene: Any, sensor: Any) -> MediaContents | None:
 
 
 def is_open(shape: Any) -> bool:
-    """Return True if light passes ``shape`` unbent and unweakened, so that nothing happens there: a BSDF ``null``, no emitter.
+    """Return True if light passes ``shape`` unbent and unweakened, so that nothing happens there: a BSDF ``null``,
+    no emitter.
 
     Works on one shape and on arrays of shape pointers.
     """
