@@ -64,7 +64,7 @@ def active_variant() -> str | None:
 
 
 def is_jit(variant: str | None) -> bool:
-    """Whether a variant compiles its kernels with Dr.Jit (`llvm_*`, `cuda_*`, `metal_*`)."""
+    """Return whether a variant compiles its kernels with Dr.Jit (`llvm_*`, `cuda_*`, `metal_*`)."""
     return variant is not None and variant.startswith(_JIT_PREFIXES)
 
 
@@ -94,7 +94,7 @@ _said: set[str] = set()
 
 
 def untested(name: str, version: str) -> str | None:
-    """What to say of `version` of the package `name`; None of a tested one, and of a package that is not listed.
+    """Return a warning about `version` of the package `name`, None for a tested version or an unlisted package.
 
     Builds of a tested version, such as "1.5.0+local", are tested ones.
     """
@@ -185,8 +185,8 @@ OWN_BSDFS = tuple(name for module in PLUGIN_MODULES for kind, name in module.plu
 
 @dataclass
 class _State:
-    """What is registered. Guarded by `lock`, since scenes are loaded from several threads; but for `listeners`, which
-    need none (:func:`plugin_errors`).
+    """Registered modules and listeners. Guarded by `lock`, since scenes are loaded from several threads, except
+    `listeners`, which need none (:func:`plugin_errors`).
     """
 
     lock: threading.RLock = field(default_factory=threading.RLock)
@@ -272,7 +272,7 @@ def modules_of_others() -> tuple[PluginModule, ...]:
 
 
 def versions_of_others() -> dict[str, str]:
-    """What each module that was added is, by its name: a hash of its source, of a module without one the version of its
+    """Return the version of each added module by name: a hash of its source, or without source the version of its
     package.
     """
     return {entry.module: _version(entry.module) for entry in modules_of_others()}

@@ -1,4 +1,4 @@
-"""What a scene was like before any value was installed in it: the sphere around it, which distant light is timed by.
+"""Bounding sphere of a scene before any value was installed in it: the time reference of distant light.
 
 A Mitsuba scene has no place for it, and its own environment emitters follow the shapes that move. The scene's Python
 plugins keep it: its integrator, the films of its sensors, and whatever integrator renders it. They are told
@@ -208,12 +208,12 @@ class DescribedScene:
         self.is_checked = False
 
     def is_of(self, scene: Any) -> bool:
-        """Whether it is this scene."""
+        """Return whether it is this scene."""
         return self._key == _key_of(scene)
 
 
 def described(scene: Any, *also: Any) -> DescribedScene:
-    """What is known of a scene as described; ``also``: plugins outside of the scene that keep it, too."""
+    """Return the state of a scene as described. ``also``: plugins outside of the scene that keep it as well."""
     keepers = [*also, *_keepers_of(scene)]
     known = (getattr(keeper, "described", None) for keeper in keepers)
     found = next((one for one in known if one is not None and one.is_of(scene)), None)

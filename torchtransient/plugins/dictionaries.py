@@ -85,7 +85,7 @@ class Voxels:
 
 
 def is_ours(node: Mapping[str, Any]) -> bool:
-    """Whether a node is of a plugin of this library, or of one that was added to it."""
+    """Return whether a node is of a plugin of this library, or of one that was added to it."""
     return kind_of(str(node.get("type"))) is not None
 
 

@@ -1,4 +1,4 @@
-"""What a recorded call depends on beside its arguments: arrays to be handed in, and all else, that tells it apart.
+"""State of a recorded call beside its arguments: arrays to be handed in, and a key of everything else.
 
 ``dr.freeze`` finds what it is handed and what plugins show to it; tables sit in plain objects, so that loops leave them
 alone, and have to be named: ``dr.freeze(f, state_fn=lambda *args: integrator.frozen_state(scene))``. Numbers that are
@@ -58,7 +58,7 @@ _REASONS = {
 
 
 class NotComparableError(Exception):
-    """Whether a job is like another one cannot be told: it holds something of a type that is not known."""
+    """Failure to compare a job with another one: it holds an object of an unknown type."""
 
 
 def arrays_below(value: Any) -> list[Any]:
@@ -213,7 +213,7 @@ class _Walk:
 
 
 def _treatment(current: Any, kind: type) -> str:
-    """How a walk deals with objects of a class."""
+    """Return the treatment of objects of a class in a walk."""
     if getattr(kind, "only_remembers", False):
         return "remembers"
     if dr.is_array_v(current):
@@ -241,8 +241,8 @@ def _torch_tensor() -> tuple[type, ...]:
 
 
 def says_it_can_be_recorded(plugin: Any) -> bool:
-    """Whether the class of a plugin says that it can be recorded, itself: one that is made out of it may do otherwise.
-    Those of this library are known to.
+    """Return whether a plugin's own class declares that it can be recorded. Subclasses do not inherit the declaration,
+    since they may behave otherwise; classes of this library can all be recorded.
     """
     kind = type(plugin)
     known = kind.__module__.startswith("torchtransient.plugins.")

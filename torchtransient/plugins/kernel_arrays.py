@@ -127,5 +127,5 @@ class PointerTable:
         return found if self.default == 0 else dr.select(known, found, self.default)
 
     def lists(self, pointer: Any, active: Any = True) -> Any:
-        """Which of an array of pointers are listed, in a table of :meth:`marking`."""
+        """Return a mask of the pointers listed in a table of :meth:`marking`."""
         return self.look_up(pointer, active) == 1

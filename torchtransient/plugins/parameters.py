@@ -59,8 +59,8 @@ class Attached(NamedTuple):
 
 
 def loses_black(node: Any, key: str, owners: Sequence[tuple[Any, str]]) -> bool:
-    """Whether the derivative by a plugin's numbers is lost where they are zero; ``owners``: all that holds it. Of a
-    mesh, its attributes are numbers that textures hold, and shapes themselves are in no map.
+    """Return whether the derivative by a plugin's numbers is lost where they are zero; ``owners``: all that holds it.
+    Of a mesh, its attributes are numbers that textures hold, and shapes themselves are in no map.
     """
     return _is_in_a_map(node, owners) or _is_light(node, key, owners)
 
@@ -100,7 +100,7 @@ def check_black(attached: Iterable[Attached]) -> None:
 
 
 def _zeros(value: Any, how: Any) -> bool:
-    """Whether ``how`` many (``dr.any`` or ``dr.all``) of the numbers of a value are zero."""
+    """Return whether any or all (``how``: ``dr.any`` or ``dr.all``) of the numbers of a value are zero."""
     if not (dr.is_array_v(value) and dr.is_float_v(value)):
         return False
     with dr.suspend_grad():
@@ -112,7 +112,7 @@ def _zeros(value: Any, how: Any) -> bool:
 
 
 def effect_of(node: Any, key: str, flags: int = 0, owners: Sequence[tuple[Any, str]] = ()) -> ParameterEffect:
-    """What the parameter ``key`` of the plugin ``node`` moves, and whether its derivative is right.
+    """Return the effect of the parameter ``key`` of the plugin ``node``, and whether its derivative is right.
 
     ``key``: its name in the plugin, as "to_world"; of a dotted name the last part counts. ``flags``: Mitsuba's
     ``ParamFlags`` of it. ``owners``: what holds the plugin, as in :class:`Site`; without it, what is asked of a texture
@@ -193,7 +193,7 @@ class ParameterTracker:
             self._note_reader(reader, str(attribute_name(reader)))
 
     def _note_reader(self, reader: Any, name: str) -> None:
-        """What a texture reads off the shapes that it lies on, it holds: an attribute of a mesh, or a texture."""
+        """Record a texture as the holder of what it reads off its shapes: a mesh attribute, or a texture."""
         shapes = {holder.ptr: holder for holder, _ in self._owners_of(reader) if isinstance(holder, mi.Shape)}
         for shape in shapes.values():
             self._readers.setdefault((shape.ptr, name), []).append(reader)
@@ -202,14 +202,14 @@ class ParameterTracker:
                     self._holders[texture.ptr].append((reader, name))
 
     def holders_of(self, node: Any, key: str = "") -> list[tuple[Any, str]]:
-        """What holds a plugin directly, as (holder, the name there), and before that the textures that read its
-        attribute ``key``.
+        """Return the direct holders of a plugin as (holder, name there), after the textures that read its attribute
+        ``key``.
         """
         readers = [(reader, key) for reader in self._readers.get((node.ptr, key), ())]
         return readers + self._holders.get(node.ptr, [])
 
     def _owners_of(self, node: Any, key: str = "") -> tuple[tuple[Any, str], ...]:
-        """What holds the parameter ``key`` of a plugin, as in :class:`Site`."""
+        """Return all holders of the parameter ``key`` of a plugin, as in :class:`Site`."""
         found: list[tuple[Any, str]] = []
         for reader in self._readers.get((node.ptr, key), ()):
             found += [(reader, key), *owners_of(reader, self._holders)]
@@ -236,7 +236,7 @@ class ParameterTracker:
         return [(holder, name) for holder, name in owners if is_replaced_for(holder, name)]
 
     def loses_black(self, node: Any, key: str) -> bool:
-        """Whether the derivative by a plugin's numbers is lost where they are zero (:mod:`.black_textures`)."""
+        """Return whether the derivative by a plugin's numbers is lost where they are zero (:mod:`.black_textures`)."""
         return loses_black(node, key, self._owners_of(node, key))
 
     def check_black(self) -> None:
@@ -270,14 +270,14 @@ class ParameterTracker:
 
 
 def can_carry_gradients(value: Any) -> bool:
-    """Whether a parameter is of real numbers that Dr.Jit differentiates, instead of a plain or whole number."""
+    """Return whether a parameter is a floating-point Dr.Jit array, not a Python number or an integer."""
     if "Transform" in type(value).__name__:  # by name: Dr.Jit arrays answer to any attribute made of component letters
         value = value.matrix
     return value is not None and bool(dr.is_diff_v(value) and dr.is_float_v(value))
 
 
 def is_attribute(node: Any, key: str) -> bool:
-    """Whether it is an attribute of a mesh, whose memory moves when another one is added."""
+    """Return whether a parameter is a mesh attribute, whose memory moves when another attribute is added."""
     return isinstance(node, mi.Mesh) and key.startswith(("vertex_", "face_")) and key not in VERTEX_COLUMNS
 
 
@@ -298,8 +298,8 @@ def check_stand_ins(effects: Sequence[tuple[Any, str, ParameterEffect]]) -> None
 
 
 def moving_names(effects: Sequence[tuple[Any, str, ParameterEffect]]) -> list[str]:
-    """Which parameters out of :func:`attached_effects` need a response over time with a slope: those that can change a
-    path length.
+    """Return the parameters out of :func:`attached_effects` that can change a path length, and so need a temporal
+    filter with a slope.
     """
     named = ((f"{node.id()}.{key}".lstrip("."), effect) for node, key, effect in effects)
     return list(dict.fromkeys(name for name, effect in named if effect.moves_length))
@@ -337,11 +337,11 @@ class PhysicalRange:
     is_open: bool = False
 
     def above(self, number: float) -> bool:
-        """Whether a number is beyond the upper end."""
+        """Return whether a number is beyond the upper end."""
         return number >= self.high if self.is_open else number > self.high + _SLACK
 
     def below(self, number: float) -> bool:
-        """Whether a number is beyond the lower end."""
+        """Return whether a number is beyond the lower end."""
         return number <= self.low if self.is_open else number < self.low - _SLACK
 
 
@@ -436,7 +436,7 @@ def described_ranges(params: Any) -> Iterator[tuple[str, PhysicalRange, float, f
 
 
 def sun_axes(params: Any, keys: Iterable[str]) -> dict[str, np.ndarray]:
-    """Of the keys that are directions of a sun, where its sky's third axis points."""
+    """Return the third axis of the sky for each key that is a direction of its sun."""
     suns = [key for key in keys if key.endswith(".sun_direction")]
     matrices = {key: params[f"{key.removesuffix('sun_direction')}to_world"].matrix for key in suns}
     return {key: np.array(unshared(matrix), dtype=float).reshape(4, 4)[:3, 2] for key, matrix in matrices.items()}

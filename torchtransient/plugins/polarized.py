@@ -1,4 +1,4 @@
-"""What light is made of along a path: numbers per colour, or Stokes vectors and Mueller matrices in polarized variants.
+"""Radiance along a path: one value per colour, or Stokes vectors and Mueller matrices in polarized variants.
 
 Every function looks at the active variant while a kernel is traced; in unpolarized variants they reduce to the plain
 products, so that those kernels do not change.
@@ -47,7 +47,9 @@ def product(a, b):
 
 
 def first_column(matrix):
-    """What a throughput makes of unpolarized light of power one; Mitsuba's emitters emit no other."""
+    """Return the Stokes vector that a throughput makes of unpolarized light of unit power, which is all that Mitsuba
+    emits.
+    """
     if not mi.is_polarized:
         return matrix
     return mi.SpectrumEntry(*[matrix[i, 0] for i in range(4)])
@@ -127,7 +129,7 @@ def rotate_stokes(light, rotation):
 
 
 def scatter_unpolarized(value, rotation):
-    """What a BSDF's value makes of unpolarized light, in the frame of the segment towards the sensor."""
+    """Scatter unpolarized light by a BSDF value, into the frame of the segment towards the sensor."""
     if not mi.is_polarized:
         return mi.unpolarized_spectrum(value)
     return rotate_stokes(first_column(value), rotation)

@@ -68,7 +68,7 @@ def as_colours(coefficients: np.ndarray, where: str) -> np.ndarray:
 
 
 def same_spectra(a: np.ndarray, b: np.ndarray) -> bool:
-    """Whether coefficients (..., 3) belong to the same spectra, as far as files keep them."""
+    """Return whether coefficients (..., 3) describe the same spectra, to the precision of files."""
     if a.shape != b.shape or a.size % 3:
         return False
     pairs = zip(a.reshape(-1, 3), b.reshape(-1, 3), strict=True)

@@ -1,4 +1,4 @@
-"""Who finds which light of a capture: hidden samples and chains that scanned points share, or paths."""
+"""Division of a capture's light among hidden samples, chains that scanned points share, and paths."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Division:
 
     @staticmethod
     def of(shared: range, first: int, last: int, wall_lights_itself: bool) -> Division:
-        """Of light of ``first`` to ``last`` bounces: one lights the spot alone, and two go from wall to wall."""
+        """Divide light of ``first`` to ``last`` bounces: one lights the spot alone, and two go from wall to wall."""
         if last >= shared.stop:
             return Division(shared, last)
         before = range(max(first, 2 if wall_lights_itself else 3), shared.start)
@@ -32,7 +32,7 @@ class Division:
 
     @property
     def third_bounce(self) -> bool:
-        """Whether light of three bounces comes from shared samples."""
+        """Return whether light of three bounces comes from shared samples."""
         return BOUNCES in self.shared
 
     @property
@@ -42,7 +42,7 @@ class Division:
 
     @property
     def walks(self) -> bool:
-        """Whether paths have to be followed."""
+        """Return whether paths have to be followed."""
         return self.longest > 0
 
 

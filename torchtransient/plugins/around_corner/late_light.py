@@ -57,7 +57,7 @@ LONGEST_TAIL = 1 + (DIMENSIONS - _FURTHER) // 2
 
 @dataclass
 class ChainPlan:
-    """What chains are made of: ``elements`` (:class:`..sampling.hidden_elements.HiddenElements`), ``center`` (Point3f
+    """Layout of chains: ``elements`` (:class:`..sampling.hidden_elements.HiddenElements`), ``center`` (Point3f
     in memory: about where the scan points are), ``size`` chains of a group (a power of two), ``groups`` of each tile,
     ``tail`` vertices, ``seed`` (UInt32 of width one, in memory).
     """
@@ -137,8 +137,8 @@ def _cosine_direction(n: Any, numbers: list[Any], which: tuple[int, int]) -> Any
 
 
 def _origin(plan: ChainPlan, start: Vertices, towards: Any) -> Any:
-    """Where rays that go off a surface start. Offsets as in :func:`.geometry.occluded`, by the size of the hidden
-    scene.
+    """Return the origin of rays that leave a surface. Offsets as in :func:`.geometry.occluded`, by the size of the
+    hidden scene.
     """
     reach = dr.max(dr.abs(start.p)) + dr.norm(plan.center - start.p)
     offset = dr.mulsign(OFFSET * reach, dr.dot(start.geometric_n, towards))
@@ -146,7 +146,7 @@ def _origin(plan: ChainPlan, start: Vertices, towards: Any) -> Any:
 
 
 def _step(scene: Any, plan: ChainPlan, origin: Any, d: Any, active: Any) -> Vertices:
-    """What a ray meets, its ``value`` still to be said."""
+    """Intersect a ray with the scene; the caller sets ``value``."""
     ray = mi.Ray3f(origin, d)
     pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
     si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
@@ -308,9 +308,9 @@ _STREAM = 0x6C617465
 
 
 class Tiles:
-    """Which scan points share chains: ``side`` of them along each side of the scan, as far apart as possible. ``of``
-    (UInt32): tile of each pixel of a film; ``rank`` (UInt32): place of each tile along a curve that keeps neighbours
-    together; ``count``; ``numbers``: ``of`` as numpy. A plain class.
+    """Groups of scan points that share chains: ``side`` of them along each side of the scan, as far apart as possible.
+    ``of`` (UInt32): tile of each pixel of a film; ``rank`` (UInt32): place of each tile along a curve that keeps
+    neighbours together; ``count``; ``numbers``: ``of`` as numpy. A plain class.
     """
 
     def __init__(self, width: int, height: int, side: int) -> None:
@@ -501,7 +501,7 @@ def _in_regions(row: Any, plan: ChainPlan) -> Any:
 
 
 class LateLanes:
-    """What the lanes of a launch know: constants of the loop, a plain object."""
+    """Data of the lanes of a launch: constants of the loop, a plain object."""
 
     def __init__(self, light: LateLight, part: GroupBlock, launch: LateLaunch) -> None:
         job, lasers = light.job, light.lasers
@@ -551,7 +551,7 @@ def divmod_by(number: Any, divisor: int) -> tuple[Any, Any]:
 
 @dr.syntax
 def sum_over_links(light, part, lanes, target, kept):
-    """What the links of each lane bring, into the film's block."""
+    """Splat the light of each lane's links."""
     k = mi.UInt32(lanes.first)
     while dr.hint(k < lanes.last, label="links"):
         deposit(light, part, lanes, target, kept, k)

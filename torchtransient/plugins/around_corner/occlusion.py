@@ -1,4 +1,4 @@
-"""What the derivative of single-corner light gains where hidden things begin to hide each other.
+"""Boundary term of single-corner light where hidden shapes occlude each other.
 
 With hidden points ``y`` that follow their shapes, the light of a pixel is an integral over material area,
 
@@ -78,7 +78,7 @@ class MutualOcclusion:
         self.edges, self.spots, self.jobs = edges, spots, jobs
 
     def tables(self) -> list[Any]:
-        """What has been computed of the scene's parameters."""
+        """Arrays computed from the scene's parameters."""
         return [end for end in self.edges.ends if dr.grad_enabled(end)]
 
     # ------------------------------------------------------------------------------------------ both modes
@@ -227,7 +227,7 @@ class MutualOcclusion:
         return value * measure, opl, active
 
     def _seen_otherwise(self, other: Any, viewer: Any, si: Any, d: Any, active: Any) -> Any:
-        """How much of the hidden point ``si`` is seen from the ``other`` viewpoint (Float).
+        """Return the visibility of the hidden point ``si`` from the ``other`` viewpoint (Float).
 
         The mean of both sides of the outline, ``d`` pointing to the one that is hidden: where a spot, a scanned point
         and an edge lie in one plane, both viewpoints have the same outline, which counts once and not twice.

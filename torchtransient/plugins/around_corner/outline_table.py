@@ -76,8 +76,8 @@ def _across(v: np.ndarray, ends: np.ndarray, sides: np.ndarray) -> np.ndarray:
 
 
 def _outermost(v: np.ndarray, ends: np.ndarray, around: np.ndarray) -> np.ndarray | None:
-    """Of more than two faces at an edge those on both sides of the widest gap, None where it is no wider than half a
-    turn: no plane through the edge leaves all faces on one side then.
+    """Return the two of several faces at an edge that bound the widest gap, None where it is no wider than half a turn:
+    no plane through the edge leaves all faces on one side then.
     """
     h = _across(v, np.repeat(ends[None], len(around), 0), around)
     t = v[ends[1]] - v[ends[0]]
@@ -277,7 +277,7 @@ def hiding_pairs(parts: list[Part], viewpoints: np.ndarray, of_interest: Any) ->
 
 
 def _is_beyond(hider: Part, hidden: Part, viewpoints: np.ndarray) -> bool:
-    """Whether a plane is found beyond which the hider lies altogether, with all else before it."""
+    """Return whether one of the planes tried separates the hider from the hidden points and the viewpoints."""
     everything = np.concatenate([hider.corners, hidden.corners, viewpoints])
     rounding = ROUNDING * np.ptp(everything, axis=0).max()
     before = np.concatenate([hidden.corners, viewpoints])

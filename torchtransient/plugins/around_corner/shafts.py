@@ -1,4 +1,4 @@
-"""Which hidden elements nothing can hide from any point of a scan: their samples need no visibility rays.
+"""Hidden elements that are visible from every point of a scan: their samples need no visibility rays.
 
 All lines from an element to the scan lie in its *shaft*, the convex hull of both. Where no triangle of the scene meets
 the inside of the shaft, nothing on it is ever hidden. The test is conservative: a triangle counts as outside where one
@@ -48,14 +48,16 @@ class ScanRegion:
         self.scale = float(np.abs(points).max())
 
     def holds(self, points: np.ndarray) -> bool:
-        """Whether all of these points ``(P, 3)`` lie in the box, to rounding."""
+        """Return whether all points (P, 3) lie in the box, to rounding."""
         local = np.asarray(points, dtype=np.float64).reshape(-1, 3) @ self.frame.T
         slack = ROUNDING * self.scale
         return bool(np.all(local >= self.low - slack) and np.all(local <= self.high + slack))
 
 
 def pays(scene: Any, rays: int) -> bool:
-    """Whether finding shafts takes less time than the rays that they may spare: it is some 400 rays a triangle."""
+    """Return whether finding shafts takes less time than the rays that they may spare: it costs some 400 rays a
+    triangle.
+    """
     triangles = sum(int(shape.face_count()) for shape in scene.shapes() if shape.is_mesh())
     return rays > _RAYS_A_TRIANGLE * triangles
 
@@ -187,7 +189,7 @@ def _harmless(triangles: np.ndarray, region: ScanRegion, hidden: np.ndarray, sla
 
 
 def _met(tree: ObstacleTree, planes: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Which shafts meet something."""
+    """Return a mask of the shafts that meet a triangle."""
     shafts = [mi.Vector4d(planes[:, i].T) for i in range(planes.shape[1])]
     own = [mi.Vector3d(corners[:, i].T) for i in range(3)]
     dr.make_opaque(shafts, own)
@@ -212,7 +214,7 @@ def _traverse(tree, shafts, own):
 
 
 def _box_outside(tree, shafts, node):
-    """Whether a box lies beyond one of the planes, by the corner that lies farthest inside."""
+    """Return a mask of boxes beyond one of the planes, by the corner that lies farthest inside."""
     low, high = dr.gather(mi.Point3d, tree.low, node), dr.gather(mi.Point3d, tree.high, node)
     outside = low.x > high.x
     for plane in shafts:

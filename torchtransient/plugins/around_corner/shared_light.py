@@ -119,7 +119,9 @@ def _smoothed(elements: HiddenElements, square: np.ndarray, area: np.ndarray, el
 
 
 def why_not(table: ScanTable, contents: Any, with_wall: bool) -> str | None:
-    """What stands against shared samples in a scene, None for nothing. ``with_wall``: points are drawn on it, too."""
+    """Return the reason why a scene cannot have shared samples, None if it can. ``with_wall``: points are drawn on the
+    wall as well.
+    """
     scene, sensor = table.scene, table.sensor
     if mi.is_spectral or mi.is_polarized:
         return f"the variant {mi.variant()} gives every path wavelengths or a polarization of its own"
@@ -148,9 +150,9 @@ def why_not(table: ScanTable, contents: Any, with_wall: bool) -> str | None:
 
 @dataclass
 class ScanLight:
-    """What shared samples need of a capture: scanned points and laser spots, each with what they scatter, and the
-    laser's energy by colour. Attached where the scene's parameters are. Where every spot is a scanned point, both are
-    one object.
+    """Capture as shared samples see it: scanned points and laser spots, each with its scattering, and the laser's
+    energy by colour. Attached where the scene's parameters are. Where every spot is a scanned point, both are one
+    object.
     """
 
     sensors: WallPoints
@@ -159,7 +161,7 @@ class ScanLight:
 
 
 def scan_light(table: ScanTable, capture: CaptureType, legs: bool) -> ScanLight:
-    """Of the scene as it is now."""
+    """Compute the :class:`ScanLight` of the scene as it is now."""
     origin, spots, seen = mi.Point3f(table.sensor.origin), table.spots, table.seen()
     looked_at = points_of(seen, dr.inv_pi, dr.norm(seen.p - origin) if legs else mi.Float(0))
     if not hasattr(spots.emitter, "energy_at"):
@@ -172,7 +174,7 @@ def scan_light(table: ScanTable, capture: CaptureType, legs: bool) -> ScanLight:
 
 
 def _same(spots: Any, points: Any) -> bool:
-    """Whether laser spots are the scanned points themselves, on the same side of the wall."""
+    """Return whether laser spots are the scanned points themselves, on the same side of the wall."""
     if dr.width(spots.p) != dr.width(points.p):
         return False
     near = dr.norm(spots.p - points.p) <= 1e-6 * (1 + dr.norm(points.p))
@@ -180,13 +182,13 @@ def _same(spots: Any, points: Any) -> bool:
 
 
 def moves(world: Any, shapes: list[Any]) -> bool:
-    """Whether derivatives are asked for of what some of these shapes are or hold."""
+    """Return whether derivatives are requested by parameters of the ``shapes`` or of what they hold."""
     held = {node.ptr for shape in shapes for node in [shape, *objects_below(shape, mi.Object)]}
     return bool(held & world.wanted.nodes)
 
 
 def moves_scan(world: Any, hidden: list[Any]) -> bool:
-    """Whether derivatives are asked for of anything that is no part of the hidden shapes alone: wall, sensor, laser."""
+    """Return whether derivatives are requested by anything beside the hidden shapes: wall, sensor, laser."""
     others = [shape for shape in world.scene.shapes() if shape.ptr not in {one.ptr for one in hidden}]
     held = {node.ptr for shape in hidden for node in [shape, *objects_below(shape, mi.Object)]}
     return bool(world.wanted.nodes - held) or moves(world, others)
@@ -281,7 +283,7 @@ class SharedThirdBounce:
             add_exhaustive(third, self.light.spots)
 
     def tables(self) -> list[Any]:
-        """What has been computed of the scene's parameters."""
+        """Arrays computed from the scene's parameters."""
         with dr.resume_grad():
             return [table for table in self._tables if dr.is_array_v(table) and dr.grad_enabled(table)]
 

@@ -200,8 +200,8 @@ class ScanLanes:
 
 @dr.syntax
 def sum_over_samples(job, table, lane, block, kept, numbers, rays):
-    """What the samples of these ``numbers``, from the first to the last (exclusive), send to the lanes' scan points,
-    into the film's block. ``rays``: whether something may hide them.
+    """Splat the light of the samples ``numbers`` (first, last exclusive) at the lanes' scan points. ``rays``: trace
+    visibility rays.
     """
     k, last = mi.UInt32(numbers[0]), numbers[1]
     while dr.hint(k < last, label="hidden samples"):
@@ -257,7 +257,7 @@ def lit_by(scene: Any, samples: SharedSamples, laser: WallPoints) -> SampleTable
 
 
 def _clear(samples: SharedSamples) -> Any:
-    """Which samples need no rays."""
+    """Return a mask of the samples that need no visibility rays."""
     k, count = dr.arange(mi.UInt32, samples.count * samples.tiles), dr.opaque(mi.UInt32, samples.count)
     tile = k // count
     return k - tile * count < dr.gather(mi.UInt32, samples.clear, tile)

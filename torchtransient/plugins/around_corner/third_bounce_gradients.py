@@ -69,7 +69,7 @@ class Ends:
         return Local(**found)
 
     def tangents(self) -> Ends:
-        """What forward mode has brought to the attached fields."""
+        """Tangents of the attached fields in forward mode."""
         return Ends(self.count, {name: dr.grad(self.fields[name]) for name in self.attached})
 
     def hand_on(self, adjoints: dict[str, Any]) -> None:
@@ -286,7 +286,7 @@ class AdjointReader:
         self.width = dr.opaque(mi.UInt32, int(film.crop_size()[0]))
 
     def block(self, s: Any) -> Any:
-        """That of each lane's point, as :class:`~..films.block.AdjointBlock`."""
+        """Block of each lane's point, as :class:`~..films.block.AdjointBlock`."""
         row = s // self.width
         place = Local(row=row, column=s - row * self.width, laser=None)
         return self.incoming.block(place, s, self.match)

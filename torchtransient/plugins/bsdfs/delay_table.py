@@ -1,4 +1,4 @@
-"""Which BSDFs of a scene scatter late, looked up by their number in Dr.Jit's registry.
+"""Table of the delayed BSDFs of a scene, by their number in Dr.Jit's registry.
 
 A path chooses at each such surface, once for everything that it does there, whether it takes part in the elastic or in
 the delayed scattering; from then on it sees the BSDF of that part alone, by a pointer of its own. So nothing has to be
@@ -33,8 +33,9 @@ def note_creation():
 
 
 class DelaySample:
-    """How a surface scatters a path: ``bsdf`` in its stead, the factor ``weight``, the ``delay`` in metres and the
-    ``wavelengths`` beyond the surface; None where nothing changes. A plain object that lives within one iteration.
+    """Choice between elastic and delayed scattering at a surface: ``bsdf`` in its stead, the factor ``weight``, the
+    ``delay`` in metres and the ``wavelengths`` beyond the surface; None where nothing changes. A plain object that
+    lives within one iteration.
     """
 
     def __init__(self, bsdf, weight=None, delay=None, wavelengths=None):
@@ -113,7 +114,7 @@ class DelayedBSDFs:
 
     @property
     def shifts(self) -> bool:
-        """Whether wavelengths change along a path."""
+        """Return whether wavelengths change along a path."""
         return bool(self.spectral_shifts)
 
     def read(self) -> DelayTable:
@@ -143,7 +144,7 @@ class DelayTable:
         return [t for t in (self.lifetimes, self.elastic_weights, self.delayed_weights) if dr.grad_enabled(t)]
 
     def sample(self, bsdf, u, wavelengths) -> DelaySample:
-        """How surfaces with BSDFs ``bsdf`` scatter, for two uniform numbers ``u``."""
+        """Sample elastic or delayed scattering of the surfaces' ``bsdf``, from two uniform numbers ``u``."""
         row = self._of.rows.look_up(bsdf)
         there = row > 0
         row = dr.select(there, row - 1, 0)
@@ -192,7 +193,7 @@ def _gathered(values):
 
 
 def _scatters_late(bsdf) -> bool:
-    """Whether a BSDF declares that its light comes back late."""
+    """Return whether a BSDF declares that its light comes back late."""
     return getattr(bsdf, "scatters_late", False)
 
 

@@ -32,7 +32,7 @@ _MIN_ROOT_IN_SLOPE = 1e-6
 
 
 class FresnelTerms(NamedTuple):
-    """What happens to unpolarised light at an interface, one entry per direction."""
+    """Fresnel terms of unpolarised light at an interface, one entry per direction."""
 
     reflectance: Any
     """Reflected fraction of the power, in [0, 1]."""

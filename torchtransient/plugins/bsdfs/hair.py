@@ -50,12 +50,12 @@ _POWERS, _INVERSE_POWERS = 21, 12
 
 
 def _power_coefficients(order: int) -> list[float]:
-    """Of ``(x / 2)^order sum_k c_k (x^2 / 4)^k``."""
+    """Return the coefficients of ``(x / 2)^order sum_k c_k (x^2 / 4)^k``."""
     return [1 / (factorial(k) * factorial(k + order)) for k in range(_POWERS)]
 
 
 def _asymptotic_coefficients(order: int) -> list[float]:
-    """Of ``exp(x) / sqrt(2 pi x) sum_k c_k / x^k``."""
+    """Return the coefficients of ``exp(x) / sqrt(2 pi x) sum_k c_k / x^k``."""
     return [
         prod((2 * j - 1) ** 2 - 4 * order**2 for j in range(1, k + 1)) / (factorial(k) * 8**k)
         for k in range(_INVERSE_POWERS)
@@ -105,7 +105,7 @@ LEAST_ROUGHNESS = 1e-3
 
 @dataclass(frozen=True)
 class Fibre:
-    """What the lobes are made of, for light from one direction. Lists have an entry for each lobe, the rest last."""
+    """Parameters of the lobes, for light from one direction. Lists have an entry for each lobe, the rest last."""
 
     sines: list[Any]
     """Of the tilted longitudinal angle that a lobe is reflected from."""
@@ -315,13 +315,13 @@ def _at_least(roughness: Any) -> Any:
 
 
 def _longitudinal_variance(roughness: Any) -> Any:
-    """Of light that is reflected (p = 0); Chiang et al. 2016, equation 7."""
+    """Longitudinal variance of reflected light (p = 0); Chiang et al. 2016, equation 7."""
     r = _at_least(roughness)
     return dr.square(0.726 * r + 0.812 * r**2 + 3.7 * r**20)
 
 
 def _azimuthal_scale(roughness: Any) -> Any:
-    """Of the logistic distribution; Chiang et al. 2016, equation 8."""
+    """Scale of the logistic distribution of azimuths; Chiang et al. 2016, equation 8."""
     r = _at_least(roughness)
     return sqrt(pi / 8) * (0.265 * r + 1.194 * r**2 + 5.372 * r**22)
 

@@ -46,7 +46,8 @@ from torchtransient.plugins.parameter_effect import class_of
 
 
 def hides_lobe_probability(bsdf: Any) -> bool:
-    """Whether the weight of a delta lobe lacks the derivative of the lobe's probability, which has to be put back.
+    """Return whether the weight of a delta lobe lacks the derivative of the lobe's probability, which has to be put
+    back.
 
     Of a mixture (mask, blend) it is asked for each part, since a part's probability hides its weight as well.
     """
@@ -54,7 +55,7 @@ def hides_lobe_probability(bsdf: Any) -> bool:
 
 
 def mirrors_matrices(bsdf: Any) -> bool:
-    """Whether a BSDF is ``twosided`` or holds one (in a mask, in a blend).
+    """Return whether a BSDF is ``twosided`` or holds one (in a mask, in a blend).
 
     From behind, Mitsuba's ``twosided`` evaluates what it holds for the mirror images of the directions, and returns its
     Mueller matrix as if it belonged to the directions themselves: turned, and with the hands of circular light
@@ -64,8 +65,8 @@ def mirrors_matrices(bsdf: Any) -> bool:
 
 
 def _has(bsdf: Any, attribute: str, itself: Callable[[Any], bool], ends: Callable[[Any], bool]) -> bool:
-    """Whether ``bsdf`` declares ``attribute``, or one that it holds has what is asked ``itself``; not below what
-    ``ends`` the search.
+    """Return whether ``bsdf`` or a BSDF that it holds declares ``attribute`` or satisfies ``itself``; the search stops
+    below BSDFs that satisfy ``ends``.
     """
     declared = getattr(bsdf, attribute, None)
     if declared is not None:
@@ -81,7 +82,7 @@ def _has(bsdf: Any, attribute: str, itself: Callable[[Any], bool], ends: Callabl
 
 
 def can_be_rebuilt(wrapper: Any) -> bool:
-    """Whether a BSDF is one that :func:`rebuild_wrapper` knows."""
+    """Return whether a BSDF is one that :func:`rebuild_wrapper` knows."""
     return is_two_sided_itself(wrapper) or normal_texture(wrapper) is not None
 
 
@@ -255,7 +256,7 @@ class Mixture:
         return self.for_derivatives if derivatives else self.always, derivatives and self._has_derivative()
 
     def _has_derivative(self) -> bool:
-        """Whether one of its weights carries derivatives; asked with gradients enabled."""
+        """Return whether one of the weights carries derivatives; call with gradients enabled."""
         numbers = (value for texture in self.textures for value in numbers_below(texture, self._shapes))
         return any(map(dr.grad_enabled, numbers))
 
@@ -307,20 +308,22 @@ class Seal:
 
 
 def needs_choice(node: Any) -> bool:
-    """Whether a mixture has wrong values where Mitsuba samples it as a whole."""
+    """Return whether a mixture has wrong values where Mitsuba samples it as a whole."""
     held = [part for _, part in objects_of(node) if isinstance(part, mi.BSDF)]
     return adds_up_wrongly(node, held, objects_below(node, mi.BSDF))
 
 
 def is_mixture(node: Any) -> bool:
-    """Whether a BSDF or phase function is a mixture, or one that can be rebuilt around the parts of what it holds."""
+    """Return whether a BSDF or phase function is a mixture, or one that can be rebuilt around the parts of what it
+    holds.
+    """
     if weight_slot(node) is not None:
         return True
     return can_be_rebuilt(node) and any(is_mixture(part) for part in bsdfs_below(node))
 
 
 def seals_of(node: Any, kind: type, shapes: Sequence[Any]) -> list[Seal]:
-    """Of a BSDF or phase function and all that it holds."""
+    """Return the seals of a BSDF or phase function and all that it holds."""
     others = (part for part in (node, *objects_below(node, kind)) if weight_slot(part) is None)
     return [
         Seal(part, kind, shapes)
@@ -343,7 +346,9 @@ class Mixtures:
         dr.make_opaque(self._numbers)
 
     def read(self, wanted: Any) -> MixtureChoice | None:
-        """Which of them are taken apart in a job, None for none; ``wanted``: the derivatives of the job, or None."""
+        """Return the mixtures that a job takes apart, None for none; ``wanted``: the derivatives of the job, or
+        None.
+        """
         for mixture in self.mixtures.values():
             mixture.follow()
         with dr.resume_grad():

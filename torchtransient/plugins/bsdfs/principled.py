@@ -33,8 +33,8 @@ LEAST_COLOUR = 1e-4
 
 
 class Reading:
-    """How the weights are read now: ``how``, and ``away``, those that sampling keeps away from their ends because
-    derivatives by them are computed.
+    """Rule for reading the weights: ``how``, and ``away``, the weights kept off their ends in sampling because they
+    carry derivatives.
     """
 
     def __init__(self) -> None:

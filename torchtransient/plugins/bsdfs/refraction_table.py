@@ -1,4 +1,4 @@
-"""Which BSDFs of a scene refract without being a delta function, and by which relative index.
+"""Table of the rough refractive BSDFs of a scene and their relative indices.
 
 Next-event estimation through a rough interface needs the index of the medium that the connection runs in, which is
 not the one that the path arrived in. Mitsuba's ``BSDF.eval`` does not tell it, so it is looked up here by the

@@ -391,5 +391,5 @@ def _across(w: Any, t: Any) -> Any:
 
 
 def _bend(k: Any, ha: Any, hb: Any) -> Any:
-    """How much a crease counts, from 0, flat, to 1. Two bodies may differ where they are flat."""
+    """Weight of a crease, from 0, flat, to 1. Two bodies may differ where they are flat."""
     return dr.select(k.flags & SEAM != 0, 1, 0.5 * dr.norm(ha + hb))

@@ -1,4 +1,4 @@
-"""Which edges and limbs a scene has: corners, faces and shapes, without their numbers.
+"""Edges and limbs of a scene: corners, faces and shapes, without positions.
 
 Laid out with numpy once a scene. Positions are looked at to join what was put together and to order three and more
 faces around an edge; all that is computed of them later is read anew (:class:`.table.EdgeTable`).
@@ -227,7 +227,7 @@ class Topology:
         dr.make_opaque(self.faces, self.owners, self.place, self.index, self.shape, self.instance)
 
     def _found(self, meshes: list[Any]) -> dict[int, tuple[_Rows, np.ndarray]]:
-        """What :func:`_edges_of` says of each mesh that has edges."""
+        """Results of :func:`_edges_of`, one per mesh with edges."""
         self._flat, found = [], {}
         for mesh in {mesh.ptr: mesh for mesh in meshes}.values():
             positions, faces, solid = _numbers_of(mesh)
@@ -238,7 +238,7 @@ class Topology:
         return found
 
     def areas(self) -> bytes:
-        """Which faces have an area now, of the meshes in which some had none; empty where there are none."""
+        """Masks of the faces with an area now, of the meshes in which some had none; empty without such meshes."""
         return b"".join(np.packbits(_numbers_of(mesh)[2]).tobytes() for mesh in self._flat)
 
     def _edges(self, found: dict[int, tuple[_Rows, np.ndarray]]) -> tuple[_Rows, np.ndarray, np.ndarray]:

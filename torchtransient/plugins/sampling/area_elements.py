@@ -145,8 +145,8 @@ def local_point(kind: Any, a: Any, y: Any, math_of: Any, kinds: tuple[int, ...] 
 
 
 def can_be_listed(shape: Any) -> bool:
-    """Whether points can be drawn on a shape. Not on copies of groups, curves, signed distances and ellipsoids, nor on
-    sheared disks, spheres and cylinders, of which Mitsuba's rays meet something else than what its matrix says.
+    """Return whether points can be drawn on a shape. Not on copies of groups, curves, signed distances and ellipsoids,
+    nor on sheared disks, spheres and cylinders, where Mitsuba's rays disagree with the matrix.
     """
     if not has_surface(shape) or shape.is_ellipsoids():
         return False
@@ -154,7 +154,9 @@ def can_be_listed(shape: Any) -> bool:
 
 
 def _is_sheared(shape: Any) -> bool:
-    """Whether the axes of an analytic shape have lost their right angles, or those of a round one their length."""
+    """Return whether the axes of an analytic shape have lost their right angles, or those of a round one their
+    length.
+    """
     axes = _matrix(shape)[:3].T
     length = np.linalg.norm(axes, axis=1)
     same = {"Disk": [], "Sphere": [0, 1, 2], "Cylinder": [0, 1]}[shape.class_name()]
@@ -196,7 +198,7 @@ def _corner_normals(mesh: Any, faces: np.ndarray) -> np.ndarray | None:
 
 
 def has_shading_normals(shape: Any) -> bool:
-    """Whether the normals at the corners of some triangle are not those of one side of its plane."""
+    """Return whether the normals at the corners of some triangle are not those of one side of its plane."""
     if not shape.is_mesh():
         return False
     at_corners = _corner_normals(shape, np.array(mesh_faces(shape), dtype=np.int64).reshape(-1, 3))

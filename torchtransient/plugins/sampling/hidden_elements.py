@@ -372,8 +372,8 @@ class HiddenElements:
         return self._by_primitive.look_up(shape, prim_index, p, active, tile)
 
     def coordinates(self, element: Any, a: Any, y: Any, active: Any = True) -> Any:
-        """Where Mitsuba's interactions place the point of two numbers on an element: barycentrics of triangles, the
-        point of the unit disk (``Point2f``); meaningless for spheres and cylinders.
+        """Return Mitsuba's surface coordinates of the point of two numbers on an element: barycentrics of triangles,
+        the point of the unit disk (``Point2f``); meaningless for spheres and cylinders.
         """
         row, kind = self._row(element, 3, active), self.kind(element, active)
         x = mi.Point2f(*local_point(kind, a, y, dr, self.kinds)[:2])
@@ -388,7 +388,7 @@ class HiddenElements:
         return mi.Float(high - low) / dr.gather(mi.Float, self._area, element, active)
 
     def kind(self, element: Any, active: Any = True) -> Any:
-        """Which row of the table of :mod:`.area_elements` an element is of, ``UInt32``."""
+        """Return the row of an element in the table of :mod:`.area_elements`, ``UInt32``."""
         return mi.UInt32(self._row(element, 3, active).w)
 
     def surface(self, element: Any, active: Any = True) -> tuple[Any, Any]:

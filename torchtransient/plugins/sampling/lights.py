@@ -93,7 +93,7 @@ def least_probability(count: int) -> float:
 
 
 def is_rare(scene: Any, light: Any) -> bool:
-    """Whether a light of a scene is hardly ever drawn."""
+    """Return whether a light of a scene is hardly ever drawn."""
     weights = {emitter.ptr: float(emitter.sampling_weight()) for emitter in scene.emitters()}
     return weights[light.ptr] < least_probability(len(weights)) * sum(weights.values())
 
@@ -130,12 +130,12 @@ class MovingSun:
         return None if sky is None else MovingSun(world.scene, sky)
 
     def contains(self, d: Any) -> Any:
-        """Whether the unit direction ``d`` points into the disk."""
+        """Return whether the unit direction ``d`` points into the disk."""
         return dr.dot(self.direction, d) >= self._cosine
 
     def shines(self, emitter: Any, d: Any) -> Any:
-        """Whether light of ``emitter`` from the direction ``d`` is the sun's: of the light without a place that comes
-        from all around, which a scene has one of, and not of a directional one before it.
+        """Return a mask of light of ``emitter`` from ``d`` that is the sun's: that of the scene's environment, and not
+        of a directional emitter.
         """
         flags = emitter.flags()
         around = mi.has_flag(flags, mi.EmitterFlags.Infinite) & ~mi.has_flag(flags, mi.EmitterFlags.DeltaDirection)

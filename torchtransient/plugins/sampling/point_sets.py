@@ -67,7 +67,7 @@ _BITS = 32
 
 
 def _directions(dimension: int) -> list[int]:
-    """What each bit of an index adds, 32-bit fractions."""
+    """Return the direction numbers of a dimension, one 32-bit fraction per bit of an index."""
     if dimension == 0:
         return [1 << (_BITS - 1 - i) for i in range(_BITS)]
     polynomial, m = _INITIAL[dimension - 1]

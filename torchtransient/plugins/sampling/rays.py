@@ -14,8 +14,8 @@ SHORTEST = 1e-6
 
 
 def past(p: Any) -> Any:
-    """How far behind a hit ``p`` a ray goes on, so that it does not meet the same surface again. Mitsuba's own rays
-    start as far off a surface.
+    """Return the offset behind a hit ``p`` at which a ray goes on without meeting the same surface again. Mitsuba's own
+    rays start as far off a surface.
     """
     return (1 + dr.max(dr.abs(p))) * mi.math.RayEpsilon
 

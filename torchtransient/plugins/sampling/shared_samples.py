@@ -180,7 +180,7 @@ def not_diffuse(shapes: list[Any]) -> list[str]:
 
 
 def _interaction(elements: HiddenElements, element: Any, p: Any, n: Any, a: Any, y: Any) -> Any:
-    """What Mitsuba says of the points: shading frame, texture coordinates."""
+    """Build Mitsuba's interactions of the points: shading frame, texture coordinates."""
     pi, ray = _preliminary(elements, element, p, n, a, y)
     return pi.compute_surface_interaction(ray, mi.RayFlags.All)
 

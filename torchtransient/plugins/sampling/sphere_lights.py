@@ -175,7 +175,7 @@ class SphereLights:
         return SphereLights(scene, numbers) if numbers else None
 
     def read(self, scene: Any) -> SphereLightTable:
-        """Where they are now, attached where their shapes are; to be called outside of loops, once a job."""
+        """Read centres and radii of the lights, attached where their shapes are; call outside of loops, once a job."""
         table = self._cache.get("cones", None, lambda: self._detached(scene))
         with dr.resume_grad():
             attached = [n for n in range(len(self._shapes)) if dr.grad_enabled(self._matrix(n))]
@@ -262,11 +262,11 @@ class SphereLightTable:
         return _Sphere(self, emitter, ref.p, active).sampled(u, ref)
 
     def lists(self, emitter: Any, active: Any = True) -> Any:
-        """Which of an array of emitter pointers are spherical lights."""
+        """Return a mask of the emitter pointers that are spherical lights."""
         return self._marks.look_up(emitter, active) > 0
 
     def draws(self, emitter: Any) -> Any:
-        """Which of an array of emitter pointers are spherical lights that :meth:`sample` chooses often enough."""
+        """Return a mask of the emitter pointers that are spherical lights which :meth:`sample` chooses often enough."""
         listed = self.lists(emitter)
         return listed & (self.numbers(emitter, listed)[7] >= self._least_pmf)
 

@@ -171,7 +171,7 @@ class NLOSCaptureMeter(mi.Sensor):
         return self.targets((row + int(y)) * int(film.size()[0]) + (index - row * int(width)) + int(x))
 
     def spots(self) -> Any:
-        """Where the laser points (Point3f), None where nothing of the sensor says so."""
+        """Targets of the laser (Point3f), None if the sensor sets none."""
         if self.lookat_pixel is None:
             return self.laser_points
         shape, size = self._surface(), self.film().size()

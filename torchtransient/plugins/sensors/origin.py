@@ -1,4 +1,4 @@
-"""Where the time of flight of a sensor's rays begins."""
+"""Origin of the time of flight of a sensor's rays."""
 
 from __future__ import annotations
 

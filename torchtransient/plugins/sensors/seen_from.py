@@ -1,4 +1,4 @@
-"""Where on the film of a sensor points of the scene are seen: the inverse of its primary rays."""
+"""Film positions of scene points: the inverse of a sensor's primary rays."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ OUTSIDE = None
 
 
 class Surroundings:
-    """What may lie around the sensors behind ``sensor``: the refractive BSDFs of a scene.
+    """Refractive BSDFs that may surround the sensors behind ``sensor``.
 
     Sensors at infinity stand in nothing. The lines are followed when a sensor or a body of these BSDFs has moved, and
     not for every render; a sensor in air then leaves nothing of the question in a kernel.
@@ -144,7 +144,7 @@ def _index_inside(level: Any, eta: Any) -> Any:
 
 
 def _all_directions():
-    """Which lines do not follow a ray of the sensor."""
+    """Return a mask of the lines that do not follow a ray of the sensor."""
     return (dr.arange(mi.UInt32, LINES) & 1) == 1
 
 

@@ -96,10 +96,10 @@ class LightPass(BoundaryPass):
         return mode.sum_of_pixels(kept, factors)
 
     def _in_line(self, term, edges, light, x, ray, medium, numbers, sampler, active):
-        """Where the sensor sees the shadow at ``x`` past the edge itself, as from a place at the light: whether the
-        shadow is ``shown``, as :class:`~..connection.sensor_sampled.SensorSampled` asks for it. A ray to the sensor
-        would let rounding decide, once more than in the pass of the sensor. That one sees past the edge either what the
-        light reaches, or the shadow: where it is not lit, the edge of the shadow is in view.
+        """Find where the sensor sees the shadow at ``x`` past the edge itself, as from a place at the light; returns
+        ``shown``, as :class:`~..connection.sensor_sampled.SensorSampled` asks for it. A ray to the sensor would let
+        rounding decide, once more than in the pass of the sensor. That one sees past the edge either what the light
+        reaches, or the shadow: where it is not lit, the edge of the shadow is in view.
         """
         world, b, ds = term.world, light.b, light.ds
         scale = BESIDE * (1 + dr.max(dr.abs(b.p)))

@@ -1,4 +1,4 @@
-"""What derivatives lack of moving edges in a scene, in words: for the table of parameters and for warnings."""
+"""Gaps in the derivatives of moving edges, in words: for the table of parameters and for warnings."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def moves_edges(key: str, effect: ParameterEffect) -> bool:
 
 
 class MovingEdges:
-    """What derivatives of a scene lack where edges move, asked by parameter (:meth:`lacking`).
+    """Gaps in a scene's derivatives where edges move, looked up by parameter (:meth:`lacking`).
 
     ``always``: gaps of every parameter that moves edges. ``bent``: of what bends light alone. ``scene``: where
     textures and bodies that run into each other are looked for, None for nowhere. ``words``: gaps that the table of
@@ -206,7 +206,7 @@ def edges_in_mirrors(scene: Any) -> list[Gap]:
 def _seen_through_delta_lobes(
     scene: Any, sensors: Sequence[Any], smooth: Sequence[Any], max_depth: int | None
 ) -> list[Gap]:
-    """What is left out where delta lobes of the shapes ``smooth`` show edges, and send light past them."""
+    """Return gaps where delta lobes of the shapes ``smooth`` show edges, or send light past them."""
     media = any(shape.is_medium_transition() for shape in shapes_of_scene(scene))
     followed = not media and all(has_eye(sensor) and sensor.get_medium() is None for sensor in sensors)
     plane = [one for one in smooth if followed and _is_plane(one)]
@@ -231,7 +231,7 @@ def _smooth_shapes(scene: Any) -> list[Any]:
 
 
 def _is_plane(shape: Any) -> bool:
-    """Whether a shape consists of few planes that mirror or refract by their own normals."""
+    """Return whether a shape consists of few planes that mirror or refract by their own normals."""
     if not is_flat(shape):
         return False
     if isinstance(shape, mi.Mesh) and _number_of_planes(shape) > _PLANES:
@@ -267,14 +267,14 @@ def shapes_without_edges(scene: Any) -> list[Any]:
 
 
 def _is_met_by_connections_alone(emitter: Any) -> bool:
-    """Whether derivatives of light are those of connections: of points, directions and spheres."""
+    """Return whether connections alone differentiate an emitter: points, directions and spheres."""
     delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
     shape = emitter.get_shape()
     return bool(mi.has_flag(emitter.flags(), delta)) or (shape is not None and is_sphere(shape))
 
 
 def _is_in_view(scene: Any, sky: Any) -> bool:
-    """Whether a sensor looks into the sun of a sky, whatever is in between."""
+    """Return whether a sensor looks into the sun of a sky, whatever is in between."""
     at, d = dr.zeros(mi.Interaction3f), dr.detach(MovingSun(scene, sky).direction)
     for sensor in filter(can_be_connected, scene.sensors()):
         places = SensorPlaces(sensor, sensor.film(), mi.Float(1))
@@ -297,7 +297,7 @@ def has_delta_lobe(shape: Any) -> bool:
 
 
 def _is_stepped(shape: Any) -> bool:
-    """Whether something jumps from place to place on a shape: a texture with steps, the slope of a bump map."""
+    """Return whether something jumps from place to place on a shape: a texture with steps, the slope of a bump map."""
     holders = [part for part in (shape.bsdf(), shape.emitter()) if part is not None]
     nested = [bsdf for holder in holders for bsdf in (holder, *objects_below(holder, mi.BSDF))]
     if any(isinstance(bsdf, mi.BSDF) and is_bump_map(bsdf) for bsdf in nested):
@@ -306,7 +306,9 @@ def _is_stepped(shape: Any) -> bool:
 
 
 def _has_steps(texture: Any) -> bool:
-    """Whether a texture is flat wherever it is asked, and not the same everywhere. Mitsuba does not show its filter."""
+    """Return whether a texture is flat wherever it is asked, and not the same everywhere. Mitsuba does not show its
+    filter.
+    """
     attribute = attribute_name(texture)
     if attribute is not None:
         return attribute.startswith("face_")
@@ -328,7 +330,7 @@ def _has_steps(texture: Any) -> bool:
 
 
 def _has_rim(emitter: Any) -> bool:
-    """Whether the light of an emitter ends at once beside its direction."""
+    """Return whether the light of an emitter ends at once beside its direction."""
     if emitter.class_name() == "Projector":
         return True
     if emitter.class_name() == "SpotLight":

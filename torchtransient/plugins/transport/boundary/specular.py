@@ -231,7 +231,9 @@ class Chains:
         return dr.select(better, tried, ω), dr.select(better, across, step * 0.5), dr.select(better, miss, least)
 
     def _sent(self, chain, eye, ω):
-        """Where a ray arrives behind the chain, with the derivatives of ``o, d`` by ``ω`` along two ``axes``."""
+        """Trace a ray through the chain to where it arrives, with the derivatives of ``o, d`` by ``ω`` along two
+        ``axes``.
+        """
         o, d, length, first, valid = mi.Point3f(eye), mi.Vector3f(ω), mi.Float(0), mi.Float(0), mi.Bool(True)
         axes = [mi.Vector3f(axis) for axis in mi.coordinate_system(ω)]
         moves = [(mi.Vector3f(0), axis) for axis in axes]

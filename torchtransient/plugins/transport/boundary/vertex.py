@@ -171,7 +171,7 @@ class VertexPass(BoundaryPass):
 
 
 def _has_lights_with_rims(world):
-    """Whether paths find area lights other than spheres."""
+    """Return whether paths find area lights other than spheres."""
     return world.finds_light and any(
         mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface) and not is_sphere(emitter.get_shape())
         for emitter in world.scene.emitters()
