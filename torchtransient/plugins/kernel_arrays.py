@@ -62,7 +62,7 @@ _POINTERS = {
     "Sensor": "SensorPtr",
     "Shape": "ShapePtr",
 }
-# Kinds that kernels ask as well, and that nobody has a table of.
+# Kinds that kernels look up as well, and that have no table.
 _MORE_POINTERS = ("MeshPtr", "TexturePtr")
 
 

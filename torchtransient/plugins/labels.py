@@ -99,7 +99,7 @@ def _has_axis(sensor: Any) -> bool:
     return near_clip(sensor) is not None or bool(sensor.class_name() == "RadianceMeter")
 
 
-class Taken:
+class LabelResults:
     """Results of a recorded call, handed over as by a film."""
 
     def __init__(self) -> None:
@@ -122,7 +122,7 @@ class Taken:
 @dataclass
 class LabelJob:
     """Labels ``names`` of one ``sensor``, the mean of ``samples`` places in each pixel, or at its centre for 0.
-    Results (:meth:`Taken.taken`) come in the order of the names, one array for each component.
+    Results (:meth:`LabelResults.taken`) come in the order of the names, one array for each component.
     """
 
     scene: Any
@@ -132,7 +132,7 @@ class LabelJob:
     samples: int
     kind: str = "labels"
     launches: list[Any] = field(default_factory=list)
-    film: Taken = field(default_factory=Taken)
+    film: LabelResults = field(default_factory=LabelResults)
     refusal: str | None = None
     plugins: list[Any] = field(default_factory=list)
 
@@ -177,7 +177,7 @@ class LabelJob:
 
     @staticmethod
     def state_of(jobs: list[LabelJob]) -> tuple[tuple[Any, ...], list[Any]]:
-        """(structure, arrays), as of :func:`torchtransient.plugins.integrators.job.state_of`."""
+        """Return (structure, arrays), as of :func:`torchtransient.plugins.integrators.job.state_of`."""
         held: list[Any] = []
         for job in jobs:
             held += [job.kind, job.names, job.samples, job._size, job._passes, job._hides_emitters, job.sensor]
@@ -303,7 +303,7 @@ def _along_axis(seen: list[Any], p: Any) -> Any:
 
 
 def _places(count: int) -> np.ndarray:
-    """(count, 4) places in a pixel and in the aperture that are spread evenly: the additive recurrence of Roberts, by
+    """Return evenly spread places (count, 4) in a pixel and in the aperture: the additive recurrence of Roberts, by
     the powers of the root of x^5 = x + 1.
     """
     root = 1.1673039782614187

@@ -325,8 +325,8 @@ def misplaces_hits(shape: Any) -> bool:
 
 
 def has_no_material(shape: Any) -> bool:
-    """Return whether no point of a shape can be followed: Mitsuba's interactions say where the surface goes, and not
-    where its points and areas do.
+    """Return whether no point of a shape can be followed: Mitsuba's interactions follow the surface, not its points and
+    areas.
     """
     return bool(shape.class_name() in ("Ellipsoids", "EllipsoidsMesh", "LinearCurve", "BSplineCurve", "SDFGrid"))
 
@@ -495,7 +495,7 @@ _SPECTRA = frozenset((
 
 
 def read_as(node: Any, slot: str) -> str:
-    """The method of the texture in a slot that a BSDF or emitter calls, empty where that is not known."""
+    """Return the texture method that a BSDF or emitter calls for a slot, empty if unknown."""
     if isinstance(node, mi.BSDF) and normal_texture(node) == slot:
         return "eval_1" if is_bump_map(node) else "eval_3"
     if slot == "eta":
@@ -531,7 +531,7 @@ _TURNED_BY_REFLECTIONS = frozenset({("Sphere", "to_world"), ("Cylinder", "to_wor
 
 
 def is_number_of_kernels(class_name: str, name: str) -> bool:
-    """Return whether a value becomes plain numbers of kernels, other ones with each value."""
+    """Return whether kernels contain a value as a literal, so that each value compiles its own."""
     return (class_name, name) in _READ_WHEN_INSTALLED
 
 

@@ -253,8 +253,8 @@ def _is_in_hair(site: Site) -> bool:
     return any(is_absorption_of_hair(holder, name) for holder, name in site.owners)
 
 
-def _is_of_a_dark_light(site: Site) -> bool:
-    """Return whether a texture is that of lights that stay dark, and of nothing else."""
+def _lies_in_dark_light(site: Site) -> bool:
+    """Return whether all holders of a texture are lights that paths never find."""
     kinds = (mi.BSDF, mi.Emitter, mi.Medium)
     holders = [holder for holder, _ in site.owners if isinstance(holder, kinds)]
     return bool(holders) and all(isinstance(holder, mi.Emitter) and is_dark(holder) for holder in holders)
@@ -264,10 +264,10 @@ IN_HAIR = Row(FIBRE, _is_in_hair, "the absorption of hair")
 IN_NORMALS = Row(NORMAL, _is_normal, "normals or heights of a BSDF with a delta lobe")
 IN_EXTINCTION = Row(MEDIUM, _is_extinction, "in a medium: its extinction, or a phase function of flakes (sggx)")
 
-OF_A_DARK_LIGHT = Row(DARK, _is_of_a_dark_light, "the radiance of a directionalarea")
+IN_DARK_LIGHT = Row(DARK, _lies_in_dark_light, "the radiance of a directionalarea")
 
 # Of what gives numbers to other plugins: textures, volumes, attributes of meshes.
-OF_NUMBERS = (IN_NORMALS, IN_EXTINCTION, *_rows_of_weights(), IN_HAIR, OF_A_DARK_LIGHT)
+NUMBER_ROWS = (IN_NORMALS, IN_EXTINCTION, *_rows_of_weights(), IN_HAIR, IN_DARK_LIGHT)
 
 # ---------------------------------------------------------------------------------------------------------------- rows
 
@@ -287,7 +287,7 @@ declare_effects(
             Row(COORDINATES),
         ),
         # Attributes: what a `mesh_attribute` makes of them is told by where that one is.
-        ANY_KEY: OF_NUMBERS,
+        ANY_KEY: NUMBER_ROWS,
     },
 )
 for _curve in ("BSplineCurve", "LinearCurve"):
@@ -319,13 +319,13 @@ _LOST_INDEX = Row(replace(EXCHANGED_INDEX, stand_in_needed=True), _is_an_index_o
 declare_effects("Principled", dict.fromkeys(("eta", "specular"), (_LOST_INDEX, Row(EXCHANGED_INDEX))))
 # Nothing is refracted onwards by these: their index changes how much is reflected, and no direction.
 declare_effects("ThinDielectric", {"eta": VALUE})
-_OF_HAIR = ("longitudinal_roughness", "azimuthal_roughness", "scale_tilt", "eta", "eumelanin", "pheomelanin")
-declare_effects("Hair", dict.fromkeys(_OF_HAIR, FIBRE))
+_HAIR_KEYS = ("longitudinal_roughness", "azimuthal_roughness", "scale_tilt", "eta", "eumelanin", "pheomelanin")
+declare_effects("Hair", dict.fromkeys(_HAIR_KEYS, FIBRE))
 declare_effects("SmoothPlastic", {"eta": VARNISH})
 declare_effects("RoughPlastic", {"eta": COATING, "alpha": COATING})
 
-declare_effects("Texture", {ANY_KEY: OF_NUMBERS})
+declare_effects("Texture", {ANY_KEY: NUMBER_ROWS})
 declare_effects("IrregularSpectrum", {"wavelengths": WAVELENGTHS})
-declare_effects("Volume", {ANY_KEY: OF_NUMBERS})
+declare_effects("Volume", {ANY_KEY: NUMBER_ROWS})
 declare_effects("PhaseFunction", {ANY_KEY: (IN_EXTINCTION,)})
 declare_effects("Medium", {ANY_KEY: MEDIUM})

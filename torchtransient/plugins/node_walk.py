@@ -39,8 +39,8 @@ class ShownValue(NamedTuple):
 
 
 def unshared(value: Any) -> Any:
-    """A Dr.Jit array as one of its own: whoever looks at numbers of a plugin's literal would make memory of it, which
-    recorded calls cannot find in every plugin (``hg`` shows it to Mitsuba alone).
+    """Copy a Dr.Jit array: reading a plugin's literal would evaluate it into memory, which recorded calls cannot find
+    in every plugin (``hg`` shows it to Mitsuba alone).
     """
     return type(value)(value) if dr.is_jit_v(value) else value
 
@@ -71,7 +71,7 @@ def _collector(base: type) -> type:
 
 
 def shown_by(node: Any) -> tuple[list[ShownValue], list[tuple[str, Any, int]]]:
-    """(parameters, objects) of one plugin, objects as (name, object, flags)."""
+    """Return (parameters, objects) of one plugin, objects as (name, object, flags)."""
     collector = _collector(mi.TraversalCallback)()
     node.traverse(collector)
     if shows_rows() and isinstance(node, mi.Mesh):

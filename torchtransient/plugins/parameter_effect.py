@@ -114,7 +114,7 @@ def declare_effects(plugin: type | str, effects: Mapping[str, ParameterEffect | 
 
 
 def all_rows() -> Iterator[tuple[str, str, Row]]:
-    """(class, key, row) for the whole table, in the order of entry."""
+    """Return (class, key, row) for the whole table, in the order of entry."""
     for name, by_key in _rows.items():
         for key, rows in by_key.items():
             for row in rows:
@@ -130,7 +130,7 @@ def lineage(node: Any) -> tuple[str, ...]:
 
 
 def class_of(node: Any) -> str:
-    """The name of a plugin's class, for messages: of one in Python its own."""
+    """Return the name of a plugin's class for messages; for plugins in Python, that of the Python class."""
     return lineage(node)[0]
 
 

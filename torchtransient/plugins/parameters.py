@@ -132,7 +132,7 @@ def effect_of(node: Any, key: str, flags: int = 0, owners: Sequence[tuple[Any, s
 
 
 def attached_effects(params: Any) -> list[tuple[Any, str, ParameterEffect]]:
-    """(plugin, key, effect) of the parameters that carry gradients now.
+    """Return (plugin, key, effect) of the parameters that carry gradients now.
 
     ``params``: what ``mi.traverse`` returns, or a :class:`ParameterTracker`, which asks again
     without a walk over the scene. Gradients must not be suspended while this is asked.
@@ -145,7 +145,7 @@ def attached_effects(params: Any) -> list[tuple[Any, str, ParameterEffect]]:
         if can_carry_gradients(value) and dr.grad_enabled(value):
             attached.append((node, name.rsplit(".", 1)[-1], flags))
     # A walk of its own: the names in ``params`` tell of one holder of each plugin, and not of what reads an attribute.
-    tracker = ParameterTracker.of(params) if attached else None
+    tracker = ParameterTracker.from_params(params) if attached else None
     return [(node, key, tracker.effect_of(node, key, flags)) for node, key, flags in attached]
 
 
@@ -167,7 +167,7 @@ class ParameterTracker:
         self._walk(root)
 
     @staticmethod
-    def of(params: Any) -> ParameterTracker:
+    def from_params(params: Any) -> ParameterTracker:
         """The parameters below the plugin that ``mi.traverse`` started at to return ``params``."""
         return ParameterTracker(next(node for node, (holder, *_) in params.hierarchy.items() if holder is None))
 
@@ -223,12 +223,12 @@ class ParameterTracker:
             self._fixed += [(node, v._replace(flags=v.flags | inherited)) for v in differentiable]
 
     def effect_of(self, node: Any, key: str, flags: int = 0) -> ParameterEffect:
-        """As the function of this name, with everything that holds the plugin ``node``."""
+        """Return :func:`effect_of`, with everything that holds the plugin ``node``."""
         return effect_of(node, key, flags, self._owners_of(node, key.rsplit(".", 1)[-1]))
 
     def stood_in_for(self, node: Any, key: str) -> list[tuple[Any, str]]:
-        """The plugins that are built as others where the derivative by a parameter of ``node`` is asked for, if there
-        is a ``stand_in``: itself, or the holders of a texture, each with the name it has there.
+        """Return the plugins that are replaced for the derivative by a parameter of ``node``, if there is a
+        ``stand_in``: itself, or the holders of a texture, each with the name it has there.
         """
         if isinstance(node, mi.BSDF):
             return [(node, "")]
@@ -259,13 +259,13 @@ class ParameterTracker:
         return [entry for entry in found if dr.grad_enabled(entry[2])]
 
     def attached(self) -> list[tuple[Any, str, ParameterEffect]]:
-        """(plugin, key, effect) of the parameters that carry gradients now."""
+        """Return (plugin, key, effect) of the parameters that carry gradients now."""
         return [
             (node, shown.key, self.effect_of(node, shown.key, shown.flags)) for node, shown, _ in self._carrying()
         ]
 
     def attached_values(self) -> list[Any]:
-        """The values of those parameters, in the same order."""
+        """Values of the parameters of :meth:`attached`, in the same order."""
         return [value for _, _, value in self._carrying()]
 
 
@@ -329,7 +329,9 @@ _SLACK = 1e-5
 
 @dataclass(frozen=True)
 class PhysicalRange:
-    """From ``low`` to ``high``. ``meaning``: what a parameter is, in words. ``is_open``: the ends are outside."""
+    """Range of a parameter from ``low`` to ``high``. ``meaning``: what a parameter is, in words. ``is_open``: the ends
+    are outside.
+    """
 
     meaning: str
     low: float
@@ -357,7 +359,7 @@ ANGLE = PhysicalRange("an angle of view in degrees", 0, 180, is_open=True)
 LENGTH = PhysicalRange("a length", 0)
 
 # Names under which plugins keep such a number, or the texture or volume of them.
-_OF_BSDFS = {
+_BSDF_RANGES = {
     **dict.fromkeys(
         (
             "reflectance", "transmittance", "diffuse_reflectance", "specular_reflectance", "specular_transmittance",
@@ -376,9 +378,9 @@ _OF_BSDFS = {
     "eta": INDEX,
     "k": OPTICAL,
 }  # fmt: skip
-_OF_MEDIA = {"albedo": SHARE, "sigma_t": EXTINCTION}
-_OF_EMITTERS = dict.fromkeys(("radiance", "intensity", "irradiance", "energy"), LIGHT)
-_OF_SENSORS = {"x_fov": ANGLE, "aperture_radius": LENGTH, "focus_distance": LENGTH}
+_MEDIUM_RANGES = {"albedo": SHARE, "sigma_t": EXTINCTION}
+_EMITTER_RANGES = dict.fromkeys(("radiance", "intensity", "irradiance", "energy"), LIGHT)
+_SENSOR_RANGES = {"x_fov": ANGLE, "aperture_radius": LENGTH, "focus_distance": LENGTH}
 
 def ranges_of(params: Any) -> dict[str, PhysicalRange]:
     """The ranges of the parameters that have one, by key of ``mi.traverse``.
@@ -386,7 +388,7 @@ def ranges_of(params: Any) -> dict[str, PhysicalRange]:
     The numbers of textures, volumes and attributes of meshes have the range of what they supply, through whatever
     textures they are read. Coefficients of spectral models have none.
     """
-    tracker, found = ParameterTracker.of(params), {}
+    tracker, found = ParameterTracker.from_params(params), {}
     for key in params.properties:
         limits = list(_ranges_at(tracker, params.properties[key][2], key.rsplit(".", 1)[-1]))
         if limits:  # one that serves for several things: the one with the least room
@@ -418,17 +420,17 @@ def _ranges_at(tracker: ParameterTracker, node: Any, name: str) -> Iterator[Phys
 def _range_in(node: Any, name: str) -> PhysicalRange | None:
     if isinstance(node, mi.BSDF):
         is_metal = "Conductor" in node.class_name() + type(node).__name__
-        return OPTICAL if name == "eta" and is_metal else _OF_BSDFS.get(name)
+        return OPTICAL if name == "eta" and is_metal else _BSDF_RANGES.get(name)
     if isinstance(node, mi.PhaseFunction):
         return {"g": ANISOTROPY, "weight": SHARE}.get(name)
-    for kind, ranges in ((mi.Medium, _OF_MEDIA), (mi.Emitter, _OF_EMITTERS), (mi.Sensor, _OF_SENSORS)):
+    for kind, ranges in ((mi.Medium, _MEDIUM_RANGES), (mi.Emitter, _EMITTER_RANGES), (mi.Sensor, _SENSOR_RANGES)):
         if isinstance(node, kind):
             return ranges.get(name)
     return None
 
 
 def described_ranges(params: Any) -> Iterator[tuple[str, PhysicalRange, float, float]]:
-    """(key, range, smallest, largest) of what has a range in a scene, as it is now."""
+    """Return (key, range, smallest, largest) of what has a range in a scene, as it is now."""
     for key, limits in ranges_of(params).items():
         numbers = np.array(unshared(params[key]))
         if numbers.size:

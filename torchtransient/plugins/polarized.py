@@ -98,7 +98,8 @@ def stokes_frame_of(d):
 
 
 def rotation_to_sensor(si, d):
-    """From the BSDF's frame to the segment's, on the sensor's side of ``si``, which a ray in direction ``d`` found.
+    """Return the rotation from the BSDF's frame to the segment's, on the sensor's side of ``si``, which a ray in
+    direction ``d`` found.
 
     None in unpolarized variants, as :func:`rotation_from_light`. Where ``si.wi`` is attached to the direction, ``d``
     must be.
@@ -109,7 +110,8 @@ def rotation_to_sensor(si, d):
 
 
 def rotation_from_light(si, wo, out=None, d=None):
-    """From the BSDF's frame to the segment's, on the side of the light, where the path goes on in direction ``wo``.
+    """Return the rotation from the BSDF's frame to the segment's, on the side of the light, where the path goes on in
+    direction ``wo``.
 
     ``out``: that direction in the world, attached where ``wo`` is; ``d``: the next ray's direction to the bit. Without
     them both are computed as the next ray's is.

@@ -46,7 +46,7 @@ def _places(mesh: Any, attribute: str) -> int:
 
 
 def colours_of(coefficients: np.ndarray) -> tuple[np.ndarray, float]:
-    """(colours, error) for ``coefficients`` (..., 3): linear sRGB in [0, 1] of the same shape, and the largest
+    """Return (colours, error) for ``coefficients`` (..., 3): linear sRGB in [0, 1] of the same shape, and the largest
     difference between the spectra that they have and those that are asked for. Above :data:`TOLERANCE` there is no
     such colour. Needs a spectral variant.
     """

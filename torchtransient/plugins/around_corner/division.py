@@ -46,7 +46,7 @@ class Division:
         return self.longest > 0
 
 
-# ------------------------------------------ how ``transient_nlos_path`` finds which light of a scene, and why, in words
+# ------------------------------------------------------------------------------------------ explanation of the division
 
 SHARED = "from hidden samples that all scanned points share"
 

@@ -100,7 +100,7 @@ class WallPoints:
         dr.make_opaque(self.p, self.n, self.value, self.leg)
 
     def take(self, index: Any, active: Any = True) -> tuple[Any, Any, Any, Any]:
-        """(``p``, ``n``, ``value``, ``leg``) of these points."""
+        """Return (``p``, ``n``, ``value``, ``leg``) of these points."""
         return (
             dr.gather(mi.Point3f, self.p, index, active),
             _one_or_each(self.n, index, active),

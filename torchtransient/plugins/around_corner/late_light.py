@@ -84,7 +84,8 @@ class Vertices(Local):
 
 
 def trace_chains(scene: Any, plan: ChainPlan, index: Any) -> tuple[Vertices, list[Vertices]]:
-    """(heads, vertices of tails) of the chains of numbers ``index`` (UInt32) of Sobol's points. Not evaluated."""
+    """Return (heads, vertices of tails) of the chains of numbers ``index`` (UInt32) of Sobol's points. Not evaluated.
+    """
     numbers = [sobol(index, d, plan.seed) for d in range(_FURTHER + 2 * (plan.tail - 1))]
     head = _drawn(plan, numbers, _HEAD, _SIDES[0])
     guided = unit_float(numbers[_CHOICE]) < AREA_SHARE
@@ -166,7 +167,7 @@ def _step(scene: Any, plan: ChainPlan, origin: Any, d: Any, active: Any) -> Vert
 
 
 def _guided_step(scene: Any, plan: ChainPlan, start: Vertices, numbers: list[Any], which: tuple[int, int]) -> Any:
-    """(next vertex, cosine over pi and the density of its direction) by a mixture of cosines and hidden area."""
+    """Return (next vertex, cosine over pi and the density of its direction) by a mixture of cosines and hidden area."""
     u, v = (numbers[i] for i in which)
     hidden = plan.elements.per_area(start.shape, start.primitive, start.p, start.alive) > 0
     share = dr.select(hidden, mi.Float(AREA_SHARE), WALL_SHARE)
@@ -214,9 +215,9 @@ class VertexTable:
 
     def take(self, index: Any) -> Local:
         """``p, n, geometric_n, value, length, alive`` of vertices."""
-        taken = Local(**{name: _gather(getattr(self, name), index) for name in self._FIELDS})
-        taken.geometric_n = _gather(self.geometric_n, index) if self.smooth else taken.n
-        return taken
+        rows = Local(**{name: _gather(getattr(self, name), index) for name in self._FIELDS})
+        rows.geometric_n = _gather(self.geometric_n, index) if self.smooth else rows.n
+        return rows
 
 
 def _gather(array: Any, index: Any) -> Any:
@@ -277,7 +278,7 @@ class Links:
 
 
 def _ends(lane: Any, size: int) -> tuple[Any, Any]:
-    """(tail, head) of the pairs of groups of a power of two."""
+    """Return (tail, head) of the pairs of groups of a power of two."""
     bits = size.bit_length() - 1
     tail = lane >> bits
     return tail, (tail & ~mi.UInt32(size - 1)) + (lane & (size - 1))
@@ -526,7 +527,7 @@ class LateLanes:
 
     @staticmethod
     def _numbers(light: LateLight, part: GroupBlock, launch: LateLaunch) -> tuple[Any, Any, Any, Any]:
-        """(pixel, group, piece, laser) of each lane, ``UInt32``."""
+        """Return (pixel, group, piece, laser) of each lane, ``UInt32``."""
         width = int(light.job.film.crop_size()[0])
         pixels = np.arange(launch.first_row * width, (launch.first_row + launch.rows) * width)
         if not launch.listed:  # points of a tile, which read the same links, stand together
@@ -543,7 +544,7 @@ class LateLanes:
 
 
 def divmod_by(number: Any, divisor: int) -> tuple[Any, Any]:
-    """(quotient, rest) of group_of_all numbers, by one in memory."""
+    """Return (quotient, rest) of group_of_all numbers, by one in memory."""
     by = dr.opaque(mi.UInt32, divisor)
     quotient = number // by
     return quotient, number - quotient * by

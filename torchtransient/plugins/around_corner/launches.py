@@ -111,8 +111,7 @@ def _with_events(band: int, band_first: int, rows: int, width: int, samples: int
 
 
 # ----------------------------------------------------------------------------------------------------------------------
-# What brings light of a scan to a film, whichever way: scene, film, scan points, and the laser's energy.
-#
+# Jobs of a scan: scene, film, scan points, and the laser's energy.
 
 
 class ScanJob:

@@ -209,7 +209,8 @@ class MutualOcclusion:
         return Local(value=value, outwards=dr.select(active, outwards, 0), opl=opl, active=active)
 
     def _light(self, place: Local, si: Any, from_spot: bool, active: Any) -> tuple[Any, Any, Any]:
-        """(light by way of a hidden point per solid angle around the viewpoint, arrival, which lanes have some)."""
+        """Return (light by way of a hidden point per solid angle around the viewpoint, arrival, which lanes have some).
+        """
         world, seen, lit = self.world, dr.copy(place.seen), place.lit
         to_hidden, to_spot = si.p - seen.p, lit.p - si.p
         r_seen, r_spot = dr.norm(to_hidden), dr.norm(to_spot)
@@ -248,7 +249,7 @@ class MutualOcclusion:
 
 
 # ----------------------------------------------------------------------------------------------------------------------
-# The boundary term of captures in light of more than three bounces: outlines seen from hidden points, too.
+# The boundary term of captures in light of more than three bounces: outlines seen from hidden points.
 # Light of the spot L, of hidden points y_n to y_1 and of the scanned point S is an integral over material areas,
 #
 #     I = int  f V(S, y_1) V(y_1, y_2) ... V(y_n, L)  dA(y_1) ... dA(y_n),

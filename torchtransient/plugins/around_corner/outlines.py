@@ -103,10 +103,10 @@ def mutual_occlusion(
     moves_viewpoints |= any(registry_number(shapes[k]) in viewpoints.shapes for k in moving)
     parts, triangles = parts_of(shapes)
 
-    def of_interest(i: int, j: int) -> bool:
+    def is_requested(i: int, j: int) -> bool:
         return bool(moves_viewpoints or moving & parts[i].shapes or moving & parts[j].shapes)
 
-    pairs = hiding_pairs(parts, viewpoints.p, of_interest)
+    pairs = hiding_pairs(parts, viewpoints.p, is_requested)
     if not pairs:
         return None
     _warn_of_limbs(shapes, parts, pairs)

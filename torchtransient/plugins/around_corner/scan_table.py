@@ -62,8 +62,8 @@ def overlaps(scene: Any, elements: HiddenElements, points: np.ndarray, normals: 
 
 
 def _look(scene: Any, elements: HiddenElements, viewer: Local, seed: Any, active: Any) -> tuple[Local, Any, Any]:
-    """(drawn points with the normals of the sides that are seen, which of them are seen, and of these the ones that
-    something else lies in).
+    """Return (drawn points with the normals of the sides that are seen, which of them are seen, and of these the ones
+    that something else lies in).
     """
     x, y = plane_points(POINTS, seed)
     # Points in another order than those that see them.
@@ -236,7 +236,7 @@ class LaserSpots:
         self.shape = pi.shape
         _check_hit(np.array(pi.t), "laser")
         self.length = dr.norm(si.p - self.origin)
-        # What lanes read of it and may be attached, see :meth:`arrays`; its other fields are told by the lanes.
+        # What lanes read of it and may be attached, see :meth:`arrays`; the lanes provide its other fields.
         self.si = dr.detach(si)
         for name in _FIELDS:
             setattr(self.si, name, getattr(si, name))

@@ -34,8 +34,7 @@ from torchtransient.plugins.sampling.shared_samples import ScanTiles, distance_t
 from torchtransient.plugins.transport.strategy import Local
 
 # ----------------------------------------------------------------------------------------------------------------------
-# Where heads of chains are drawn: by what light of four bounces weighs there, as a few thousand of them tell.
-#
+# Density of the heads of chains: proportional to light of four bounces, estimated from a pilot of a few thousand.
 
 # Points of the pilot, and how many of them a weight is the mean of.
 _POINTS, _BUCKET = 2**15, 64
@@ -195,7 +194,7 @@ def moves_scan(world: Any, hidden: list[Any]) -> bool:
 
 
 def _rows(vectors: Any, width: int) -> np.ndarray:
-    """(width, 3), detached."""
+    """Return (width, 3), detached."""
     return np.broadcast_to(host_numbers(vectors).T, (width, 3))
 
 
@@ -256,7 +255,7 @@ class SharedThirdBounce:
         tiles = ScanTiles(p, n, distance_to(elements.elements.centers(), p[some]))
         if tiles.count == 1:
             return elements
-        self.tile = tiles.of_points()
+        self.tile = tiles.tile_per_point()
         memory = self.world.contents.memory
         return copy(HiddenElements.cached(memory, elements.shapes, tiles.points, tiles.normals))
 

@@ -27,8 +27,7 @@ from torchtransient.plugins.transport.derivative import tangents_of
 from torchtransient.plugins.transport.strategy import Local
 
 # ----------------------------------------------------------------------------------------------------------------------
-# Samples and points of the wall with derivatives: what they are of the scene's parameters, and as leaves of a lane.
-#
+# Samples and wall points with derivatives: as functions of the scene's parameters, and as leaves of a lane.
 
 
 class Ends:
@@ -160,7 +159,7 @@ class ThirdBounceGradients:
         self.window = film.arrivals()
 
     def connection(self, sample: Any, point: Any, k: Any) -> tuple[Any, Any, Any, Any]:
-        """(value, length and arrival minus the film's start of sample ``k`` at a point, whether it arrives)."""
+        """Return (value, length and arrival minus the film's start of sample ``k`` at a point, whether it arrives)."""
         geometric_n = sample.geometric_n if self.smooth else sample.n
         start = Local(p=sample.p, n=sample.n, geometric_n=geometric_n)
         line = span(start, point.p, point.n)
@@ -200,13 +199,13 @@ class ThirdBounceGradients:
             for ends, adjoints in found:
                 ends.hand_on(adjoints)
 
-    def step_back(self, read: AdjointReader, kept: dict[str, Any], pair: Local, of_sample: bool) -> None:
+    def step_back(self, read: AdjointReader, kept: dict[str, Any], pair: Local, by_sample: bool) -> None:
         """Add the adjoints of one connection to ``kept``: those of its sample, or of its point. ``pair``: ``sample``
         and ``point``, number ``k`` and ``s``.
         """
         with dr.resume_grad():
             sample, point = dr_copy(pair.sample), dr_copy(pair.point)
-            found = leaves(sample if of_sample else point, list(kept), dr.width(pair.k))
+            found = leaves(sample if by_sample else point, list(kept), dr.width(pair.k))
             value, length, opl, arrives = self.connection(sample, point, pair.k)
             A, slope = read.block(pair.s).read(opl, arrives)
             objective = total_of(A, value) + total_of(slope, dr.detach(value)) * slope_only(length)

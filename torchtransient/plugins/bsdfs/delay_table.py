@@ -69,7 +69,7 @@ class SpectralShift:
         self.emission = _distribution(emission, "emission")
 
     def draw(self, u, wavelengths):
-        """(wavelengths absorbed, factor of the radiance) for wavelengths emitted and one uniform number."""
+        """Return (wavelengths absorbed, factor of the radiance) for wavelengths emitted and one uniform number."""
         numbers = mi.sample_shifted(u)
         absorbed, factor = mi.UnpolarizedSpectrum(0), mi.UnpolarizedSpectrum(0)
         for k in range(len(wavelengths)):
@@ -198,8 +198,8 @@ def _scatters_late(bsdf) -> bool:
 
 
 def delays_of(bsdfs):
-    """(BSDFs that paths can meet, the delayed ones): delayed BSDFs are replaced by their parts; the latter is None
-    where there are none. Raises SceneError for one inside another BSDF.
+    """Return (BSDFs that paths can meet, the delayed ones): delayed BSDFs are replaced by their parts; the latter is
+    None where there are none. Raises SceneError for one inside another BSDF.
     """
     if _created == 0:
         return bsdfs, None

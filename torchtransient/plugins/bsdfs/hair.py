@@ -368,13 +368,13 @@ def _draw(fibre: Fibre, chances: list[Any], wi: Any, sample1: Any, sample2: Any)
         chance = dr.select(further, chances[after + 1], chance)
     u = dr.clip(left / dr.select(chance > 0, chance, 1), 0, 1)
 
-    def of_lobe(entries: list[Any]) -> Any:
+    def select_lobe(entries: list[Any]) -> Any:
         chosen = entries[-1]
         for p in range(LOBES):
             chosen = dr.select(lobe == p, entries[p], chosen)
         return chosen
 
-    sin_i, cos_i, concentration = map(of_lobe, (fibre.sines, fibre.cosines, fibre.concentrations))
+    sin_i, cos_i, concentration = map(select_lobe, (fibre.sines, fibre.cosines, fibre.concentrations))
     # The polar angle of a von Mises-Fisher distribution, as one minus its cosine.
     fading = dr.exp(-2 * concentration)
     away = -dr.log(sample2.x + (1 - sample2.x) * fading) / concentration
@@ -386,7 +386,7 @@ def _draw(fibre: Fibre, chances: list[Any], wi: Any, sample1: Any, sample2: Any)
     cut = 0.5 * (1 - dr.tanh(0.5 * pi / fibre.scale))
     logistic = cut + u * (1 - 2 * cut)
     strayed = dr.clip(fibre.scale * dr.log(logistic / (1 - logistic)), -pi, pi)
-    turn = dr.select(lobe == LOBES, 2 * pi * u, of_lobe([*fibre.turns, mi.Float(0)]) + strayed)
+    turn = dr.select(lobe == LOBES, 2 * pi * u, select_lobe([*fibre.turns, mi.Float(0)]) + strayed)
     sin_phi, cos_phi = dr.sincos(_angle(wi.z, wi.x) + turn)
     return dr.normalize(mi.Vector3f(cos_o * cos_phi, sin_o, cos_o * sin_phi))
 

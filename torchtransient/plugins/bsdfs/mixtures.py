@@ -40,9 +40,9 @@ from torchtransient.plugins.node_walk import bsdfs_below, objects_below, objects
 from torchtransient.plugins.parameter_effect import class_of
 
 # ----------------------------------------------------------------------------------------------------------------------
-# What a BSDF has of those that it holds: mistakes of Mitsuba's that shine through whatever is around them.
-# They are told by the classes of all BSDFs that a plugin shows. Plugins of others do what they like with what they
-# hold, and say so by an attribute of the name of the function here, True or False, which counts for all below as well.
+# Mistakes of nested BSDFs that remain in the BSDFs around them, recognised by the classes of all BSDFs that a plugin
+# shows. Other plugins declare them by an attribute with the name of the function here, True or False, which counts for
+# all BSDFs below as well.
 
 
 def hides_lobe_probability(bsdf: Any) -> bool:
@@ -78,7 +78,6 @@ def _has(bsdf: Any, attribute: str, itself: Callable[[Any], bool], ends: Callabl
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Copies of BSDFs that hold one other (two-sided, bump and normal maps), around another nested one.
-#
 
 
 def can_be_rebuilt(wrapper: Any) -> bool:
@@ -252,7 +251,7 @@ class Mixture:
                 params.update()
 
     def taken_apart(self, derivatives: bool) -> tuple[bool, bool]:
-        """(everywhere, where a weight is about 0 or 1)."""
+        """Return (everywhere, where a weight is about 0 or 1)."""
         return self.for_derivatives if derivatives else self.always, derivatives and self._has_derivative()
 
     def _has_derivative(self) -> bool:
@@ -276,7 +275,7 @@ class Seal:
                     f"{self._names(part)}. Mitsuba samples a blend wrongly of which a part has a delta lobe or lets "
                     f"light through, or works on other sides than another. {self._REMEDY}"
                 )
-        # One that says what its weights hide is taken at its word.
+        # A declared value counts without a look at the parts.
         silent = getattr(node, "hides_lobe_probability", None) is None
         self._hides = silent and any(hides_lobe_probability(part) for part in held)
 
@@ -381,7 +380,7 @@ class MixtureChoice:
         sample.weight = weight if sample.weight is None else sample.weight * weight
 
     def part_of(self, pointer: Any, interaction: Any, u: Any, active: Any) -> tuple[Any, Any]:
-        """(pointer to one part of what ``pointer`` points to, its weight over its probability)."""
+        """Return (pointer to one part of what ``pointer`` points to, its weight over its probability)."""
         kind = type(pointer)
         pointer_or_none = dr.select(active, pointer, dr.zeros(kind))
         index, weight, apart = dr.dispatch(pointer_or_none, self._choose, interaction, u, active)
@@ -390,7 +389,7 @@ class MixtureChoice:
         return dr.reinterpret_array(kind, number), dr.select(apart, weight, 1)
 
     def _choose(self, node: Any, interaction: Any, u: Any, active: Any) -> tuple[Any, Any, Any]:
-        """(number of a part, its weight over its probability, whether it takes the place of ``node``)."""
+        """Return (number of a part, its weight over its probability, whether it takes the place of ``node``)."""
         everywhere, at_ends = self._chosen.get(node.ptr, (False, False))
         if not (everywhere or at_ends):
             return mi.UInt32(0), mi.Float(1), mi.Bool(False)
@@ -399,7 +398,9 @@ class MixtureChoice:
 
 
 def _descend(tree: Any, interaction: Any, u: Any, active: Any, at_ends: bool) -> tuple[Any, Any, Any]:
-    """(number of a part, its weight over its probability, whether a weight on the way or beside it is about 0 or 1)."""
+    """Return (number of a part, its weight over its probability, whether a weight on the way or beside it is about 0 or
+    1).
+    """
     if isinstance(tree, Leaf):
         return mi.UInt32(tree.index), mi.Float(1), mi.Bool(False)
     if isinstance(tree, Sides):
@@ -423,8 +424,9 @@ def _descend(tree: Any, interaction: Any, u: Any, active: Any, at_ends: bool) ->
 
 
 def mixtures_of(nodes: list[Any], kind: type, shapes: Sequence[Any] = ()) -> tuple[list[Any], Mixtures | None]:
-    """(BSDFs or phase functions that paths can meet, the mixtures among them or None): a mixture that is always taken
-    apart is replaced by its parts, the parts of others join it. ``shapes``: those that weights may be attributes of.
+    """Return (BSDFs or phase functions that paths can meet, the mixtures among them or None): a mixture that is always
+    taken apart is replaced by its parts, the parts of others join it. ``shapes``: those that weights may be attributes
+    of.
     """
     met: list[Any] = []
     mixtures: list[Mixture] = []

@@ -216,7 +216,7 @@ class DiffPrincipled(mi.BSDF):
 
     # ------------------------------------------------------------------------------------------- as it is read
 
-    def _asked(self, how: str, method: str, *arguments: Any) -> Any:
+    def _call(self, how: str, method: str, *arguments: Any) -> Any:
         self.reading.how = how
         try:
             return getattr(self.own, method)(*arguments)
@@ -225,17 +225,17 @@ class DiffPrincipled(mi.BSDF):
 
     def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
         with dr.suspend_grad():
-            value = self._asked(AS_IT_IS, "eval", ctx, si, wo, active)
-        return dr.replace_grad(value, self._asked(BESIDE_ITS_END, "eval", ctx, si, wo, active))
+            value = self._call(AS_IT_IS, "eval", ctx, si, wo, active)
+        return dr.replace_grad(value, self._call(BESIDE_ITS_END, "eval", ctx, si, wo, active))
 
     def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-        return self._asked(AWAY_FROM_ITS_END, "pdf", ctx, si, wo, active)
+        return self._call(AWAY_FROM_ITS_END, "pdf", ctx, si, wo, active)
 
     def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
         return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
 
     def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> Any:
-        bs, weight = self._asked(AWAY_FROM_ITS_END, "sample", ctx, si, sample1, sample2, active)
+        bs, weight = self._call(AWAY_FROM_ITS_END, "sample", ctx, si, sample1, sample2, active)
         # Samples that Mitsuba throws away have a density all the same.
         kept = mi.Mask(active) & (bs.pdf > 0) & (dr.max(mi.unpolarized_spectrum(weight)) > 0)
         bs = dr.detach(bs)

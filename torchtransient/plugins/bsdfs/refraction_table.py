@@ -94,8 +94,8 @@ class RefractionTable:
 
 
 def boundaries_of(bsdfs: list[Any]) -> list[tuple[Any, Any]]:
-    """(BSDF, what holds its relative index) for those of ``bsdfs`` that light enters another medium through, by a
-    smooth or a rough lobe. Of parts with different indices, the first counts: see :class:`..sensors.surroundings`.
+    """Return (BSDF, what holds its relative index) for those of ``bsdfs`` that light enters another medium through, by
+    a smooth or a rough lobe. Of parts with different indices, the first counts: see :class:`..sensors.surroundings`.
     """
     lobes = (mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.GlossyTransmission)
     leaves = ((bsdf, _refractive_leaves(bsdf, lobes)) for bsdf in bsdfs)

@@ -124,8 +124,8 @@ def _numbers_of(mesh: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _edges_of(positions: np.ndarray, faces: np.ndarray, solid: np.ndarray) -> tuple[_Rows, np.ndarray]:
-    """(the edges of a mesh with vertices (V, 3) and faces (F, 3), flat ones included; joined places of the corners of
-    its faces, (F, 3), zeros where a face is not ``solid`` (F,): has no area).
+    """Return (the edges of a mesh with vertices (V, 3) and faces (F, 3), flat ones included; joined places of the
+    corners of its faces, (F, 3), zeros where a face is not ``solid`` (F,): has no area).
     """
     all_places = np.zeros(faces.shape, int)
     number = np.flatnonzero(solid)
@@ -242,7 +242,9 @@ class Topology:
         return b"".join(np.packbits(_numbers_of(mesh)[2]).tobytes() for mesh in self._flat)
 
     def _edges(self, found: dict[int, tuple[_Rows, np.ndarray]]) -> tuple[_Rows, np.ndarray, np.ndarray]:
-        """(edges of all meshes, vertices counted through; bodies of both faces, (E, 2); first vertices of meshes)."""
+        """Return (edges of all meshes, vertices counted through; bodies of both faces, (E, 2); first vertices of
+        meshes).
+        """
         parts = [found[body.shape.ptr][0] for body in self._meshes]
         self.spokes = None
         if parts:

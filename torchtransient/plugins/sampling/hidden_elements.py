@@ -89,8 +89,8 @@ def cuts_of(elements: AreaElements, points: np.ndarray) -> np.ndarray:
 
 
 def cut(elements: AreaElements, cuts: np.ndarray) -> tuple[AreaElements, np.ndarray, np.ndarray]:
-    """(the parts, ``(M,)``: whose part each is, ``(M,)``: in which cell of it). Cells are numbered along the two edges,
-    two for each square of a grid: ``2 (j n + i)``, and one more for the upper triangle.
+    """Return (the parts, ``(M,)``: whose part each is, ``(M,)``: in which cell of it). Cells are numbered along the two
+    edges, two for each square of a grid: ``2 (j n + i)``, and one more for the upper triangle.
     """
     numbers, cells = [np.flatnonzero(cuts == 1)], [np.zeros((cuts == 1).sum(), dtype=int)]
     for n in np.unique(cuts[cuts > 1]):
@@ -278,7 +278,7 @@ class HiddenElements:
     # ----------------------------------------------------------------------------------------- tables
 
     def _probabilities(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """(tiles, elements)"""
+        """Return (tiles, elements)"""
         pairs = zip(points, normals, strict=True)
         return np.array([self._mixed(facing_weight(self.elements, q, n)) for q, n in pairs])
 

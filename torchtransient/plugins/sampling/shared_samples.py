@@ -49,7 +49,7 @@ class ScanTiles:
         chosen = [_spread(np.flatnonzero(self.tile == t)) for t in range(self.count)]
         self.points, self.normals = points[chosen], normals[chosen]
 
-    def of_points(self) -> Any:
+    def tile_per_point(self) -> Any:
         """The tile of every scan point, ``UInt32`` in memory."""
         tile = mi.UInt32(self.tile.astype(np.uint32))
         dr.make_opaque(tile)
@@ -186,7 +186,7 @@ def _interaction(elements: HiddenElements, element: Any, p: Any, n: Any, a: Any,
 
 
 def _preliminary(elements: HiddenElements, element: Any, p: Any, n: Any, a: Any, y: Any) -> tuple[Any, Any]:
-    """(the points as they would be found, by a ray from a metre before them)."""
+    """Return (the points as they would be found, by a ray from a metre before them)."""
     pi = dr.zeros(mi.PreliminaryIntersection3f, dr.width(p))
     pi.shape, pi.prim_index = elements.surface(element)
     pi.valid, pi.t = mi.Mask(True), mi.Float(1)

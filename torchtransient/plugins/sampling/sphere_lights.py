@@ -48,7 +48,9 @@ class ShapeLights:
             self._numbers = mi.UInt32(numbers)
 
     def sample(self, scene: Any, ref: Any, u: Any, active: Any) -> tuple[Any, Any]:
-        """(direction sample, emission over density), as ``scene.sample_emitter_direction(ref, u, False, active)``."""
+        """Return (direction sample, emission over density), as ``scene.sample_emitter_direction(ref, u, False,
+        active)``.
+        """
         if not self._shapes:
             return scene.sample_emitter_direction(ref, u, False, active)
         number, choice, x = scene.sample_emitter(u.x, active)
@@ -64,7 +66,7 @@ class ShapeLights:
         slot = self._marks.look_up(emitter, active)
         listed = slot > 0
         with dr.suspend_grad():
-            ds = _asked([_sampler_of(*shape) for shape in self._shapes], slot, listed, ref, u)
+            ds = _call_each([_sampler_of(*shape) for shape in self._shapes], slot, listed, ref, u)
         ds.emitter = emitter
         ds.pdf = dr.select(dr.dot(ds.d, ds.n) < 0, ds.pdf, 0)
         weight = emitter.eval_direction(ref, ds, listed) * dr.select(ds.pdf > 0, dr.rcp(ds.pdf), 0)
@@ -81,14 +83,14 @@ class ShapeLights:
         listed = slot > 0
         lit = listed & (dr.dot(ds.d, ds.n) < 0)
         with dr.suspend_grad():
-            pdf = _asked([shape.pdf_direction for shape, _ in self._shapes], slot, lit, ref, ds)
+            pdf = _call_each([shape.pdf_direction for shape, _ in self._shapes], slot, lit, ref, ds)
         pdf *= scene.pdf_emitter(dr.gather(mi.UInt32, self._numbers, slot - 1, listed), listed)
         if self._all:
             return pdf
         return dr.select(listed, pdf, scene.pdf_emitter_direction(ref, ds, active & ~listed))
 
 
-def _asked(methods: list[Any], slot: Any, active: Any, ref: Any, *arguments: Any) -> Any:
+def _call_each(methods: list[Any], slot: Any, active: Any, ref: Any, *arguments: Any) -> Any:
     """A method of the listed lights' shapes. Not a call of shape pointers: Dr.Jit would trace it for all shapes, some
     of which cannot be sampled.
     """
@@ -271,7 +273,7 @@ class SphereLightTable:
         return listed & (self.numbers(emitter, listed)[7] >= self._least_pmf)
 
     def sample(self, scene: Any, ref: Any, u: Any, active: Any) -> tuple[Any, Any]:
-        """(direction sample, emission over density) towards an emitter of the scene, as
+        """Return (direction sample, emission over density) towards an emitter of the scene, as
         ``scene.sample_emitter_direction(ref, u, False, active)``. Attached where ``ref`` and the shapes are.
         """
         number, choice, x = scene.sample_emitter(u.x, active)

@@ -75,9 +75,9 @@ def moves_edges(key: str, effect: ParameterEffect) -> bool:
 class MovingEdges:
     """Gaps in a scene's derivatives where edges move, looked up by parameter (:meth:`lacking`).
 
-    ``always``: gaps of every parameter that moves edges. ``bent``: of what bends light alone. ``scene``: where
-    textures and bodies that run into each other are looked for, None for nowhere. ``words``: gaps that the table of
-    parameters speaks of and that no scene can be said to have. ``has_term``: whether there is a boundary term at all.
+    ``always``: gaps of every parameter that moves edges. ``bent``: of what bends light alone. ``scene``: searched
+    for textures with steps and for bodies that run into each other, or None. ``words``: gaps that only the table of
+    parameters names, whatever the scene. ``has_term``: whether there is a boundary term at all.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class MovingEdges:
         if not moves and (effect.role in _BEND or name == "vertex_normals"):
             found += self.bent
         if (moves and effect.role in ("shape", "sensor")) or name == "vertex_texcoords":
-            # Of what an instance shows, Mitsuba says nothing; a sensor sees everything move.
+            # Mitsuba does not show the members of an instance; relative to a moving sensor all shapes move.
             alone = effect.role != "sensor" and isinstance(node, mi.Shape) and not is_instance(node)
             found += self._jumps(node if alone else None)
         if moves and (effect.role == "sensor" or isinstance(node, mi.Shape)):
@@ -117,9 +117,9 @@ class MovingEdges:
         words += [gap.where for gap in self.lacking(node, key, effect)]
         if not words:
             return effect.reason
-        said = f"{CORRECT} except {', '.join(words)} (no boundary term)"
+        text = f"{CORRECT} except {', '.join(words)} (no boundary term)"
         more = effect.reason.removeprefix(CORRECT).removeprefix("; ")
-        return f"{said}; {more}" if more else said
+        return f"{text}; {more}" if more else text
 
     def _jumps(self, shape: Any) -> tuple[Gap, ...]:
         """The gap of textures with steps on a shape, on any for None."""
