@@ -52,7 +52,7 @@ SHARED = "from hidden samples that all scanned points share"
 
 
 def explanation(integrator: Any, scene: Any, contents: Any) -> str:
-    """One line: of light of three bounces, and of later light."""
+    """Describe in one line how light of three bounces and later light are found."""
     division, (least, most) = integrator.division(scene, contents), integrator.asked_bounces()
     parts = []
     if least <= BOUNCES and (most is None or most >= BOUNCES):

@@ -185,7 +185,7 @@ def sum_over_block(job, block, pairs, target, kept, wanted):
 
 
 def deposit(job, block, pairs, target, kept, k):
-    """One sample's light."""
+    """Splat one sample's light."""
     seen = dr.gather(mi.Vector2f, block.seen, k * pairs.sensor_count + pairs.pixel)
     lit = dr.gather(mi.Vector2f, block.lit, k * pairs.laser_count + pairs.laser)
     g = seen.x * lit.x

@@ -214,7 +214,7 @@ class VertexTable:
         dr.schedule(self.geometric_n, *(getattr(self, name) for name in self._FIELDS))
 
     def take(self, index: Any) -> Local:
-        """``p, n, geometric_n, value, length, alive`` of vertices."""
+        """Gather ``p, n, geometric_n, value, length, alive`` of vertices."""
         rows = Local(**{name: _gather(getattr(self, name), index) for name in self._FIELDS})
         rows.geometric_n = _gather(self.geometric_n, index) if self.smooth else rows.n
         return rows
@@ -329,8 +329,8 @@ class Tiles:
 
 @dataclass
 class LateLaunch:
-    """``rows`` rows of pixels from ``first_row`` on of a band, in ``spp`` lanes each (named as the film asks for it):
-    ``pieces`` for each group, of so many links at most. ``listed``: lanes of a pixel stand together.
+    """Launch of ``rows`` rows of pixels from ``first_row`` on of a band, in ``spp`` lanes each (named as the film asks
+    for it): ``pieces`` for each group, of so many links at most. ``listed``: lanes of a pixel stand together.
     """
 
     band: int
@@ -513,9 +513,9 @@ class LateLanes:
         self.factor = value * job.energy * spot_value
         self.opl = leg + spot_leg - job.film.start_opl
         tile = dr.gather(mi.UInt32, light.tiles.of, self.pixel)
-        group_of_all = tile * dr.opaque(mi.UInt32, part.groups) + group
-        first = dr.gather(mi.UInt32, part.links.first, group_of_all)
-        end = first + dr.gather(mi.UInt32, part.links.count, group_of_all)
+        tile_group = tile * dr.opaque(mi.UInt32, part.groups) + group
+        first = dr.gather(mi.UInt32, part.links.first, tile_group)
+        end = first + dr.gather(mi.UInt32, part.links.count, tile_group)
         self.first = first + piece * dr.opaque(mi.UInt32, launch.links)
         self.last = dr.minimum(self.first + dr.opaque(mi.UInt32, launch.links), end)
         # A chain's number counts through all tiles; a row of the tables through those of one.
@@ -544,7 +544,7 @@ class LateLanes:
 
 
 def divmod_by(number: Any, divisor: int) -> tuple[Any, Any]:
-    """Return (quotient, rest) of group_of_all numbers, by one in memory."""
+    """Return (quotient, rest) of whole numbers, divided by a number in memory."""
     by = dr.opaque(mi.UInt32, divisor)
     quotient = number // by
     return quotient, number - quotient * by
@@ -561,7 +561,7 @@ def sum_over_links(light, part, lanes, target, kept):
 
 
 def deposit(light, part, lanes, target, kept, k):
-    """The events of one link."""
+    """Splat the events of one link."""
     link = dr.gather(mi.Vector4f, part.links.flat, k)
     head, tail = mi.UInt32(link.z), mi.UInt32(link.w)
     seen = dr.gather(mi.Vector2f, part.seen, (head - lanes.offset) * lanes.stride + lanes.pixel)

@@ -264,8 +264,8 @@ FIRST = 4
 
 
 class SpotPass(BoundaryPass):
-    """An edge point seen from the laser's spot is drawn as :class:`VertexPass` does, and a path goes on behind it, to
-    the scanned point.
+    """Boundary pass that draws an edge point seen from the laser's spot, as :class:`VertexPass` does, and follows a
+    path behind it to the scanned point.
     """
 
     @staticmethod
@@ -318,7 +318,7 @@ class SpotPass(BoundaryPass):
 
 
 class ScanSampled(Connection):
-    """The scanned point as what a path from the laser's spot is connected to; the way from there to the sensor has been
+    """Connection of a path from the laser's spot to the scanned point; the way from there to the sensor has been
     counted. As in :class:`LaserSpot`, an event's depth is its number of bounces.
     """
 

@@ -143,7 +143,7 @@ def _attached(triangles: Triangles, mesh: np.ndarray, vertices: np.ndarray) -> A
 
 
 def _weights(p: np.ndarray, viewpoints: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """``(E,)``, of edges with ends and sides ``p`` (E, 4, 3)."""
+    """Weights (E,) of edges with ends and sides ``p`` (E, 4, 3)."""
     blocks = [_weights_of_some(p[i : i + BLOCK], viewpoints, normals) for i in range(0, len(p), BLOCK)]
     return np.concatenate(blocks)
 
@@ -286,7 +286,7 @@ def _is_beyond(hider: Part, hidden: Part, viewpoints: np.ndarray) -> bool:
 
 
 def _cones_apart(a: np.ndarray, b: np.ndarray, viewpoints: np.ndarray) -> np.ndarray:
-    """From which viewpoints ``(P,)`` a plane through them is found that parts the points ``a`` and ``b``.
+    """Return a mask (P,) of viewpoints through which a plane is found that separates the points ``a`` and ``b``.
 
     The perceptron: a plane that has a point on its wrong side is turned towards it.
     """

@@ -152,7 +152,7 @@ class ScanTable:
         return self.memory.get("overlaps", elements.key, found) if elements.key else found()
 
     def lambertian_spots(self, legs: bool) -> WallPoints | None:
-        """The spots as points of a flat diffuse wall, None where they are more than that: on curved walls, with
+        """Return the spots as points of a flat diffuse wall, None if they cannot be described so: on curved walls, with
         normals that are interpolated, or in light with wavelengths or a polarization.
         """
         if self.wall is None or mi.is_spectral or mi.is_polarized:
@@ -373,7 +373,7 @@ def scan_rays(sensor: Any) -> Any:
 
 
 def scanned_points(scene: Any, sensor: Any) -> Any:
-    """The scanned points (Point3f): as the sensor says, or what its pixels see."""
+    """Return the scanned points (Point3f): the sensor's targets, or the points that its pixels see."""
     if hasattr(sensor, "scanned"):
         return sensor.scanned()
     ray = scan_rays(sensor)

@@ -75,7 +75,8 @@ def spare_rays(scene: Any, elements: HiddenElements, points: np.ndarray, normals
 
 
 def clear_elements(shapes: list[Any], elements: AreaElements, region: ScanRegion, smooth: bool = False) -> np.ndarray:
-    """``(E,)``: which elements nothing hides from any point of the region, ``shapes`` being all of the scene.
+    """Return a mask (E,) of elements that nothing hides from any point of the region, ``shapes`` being all of the
+    scene.
 
     Only triangles are ever clear, and only those that lie before the whole region. ``smooth``: normals are
     interpolated, so that points may be seen from behind their planes; then only those with the region on one side.
@@ -224,7 +225,9 @@ def _box_outside(tree, shafts, node):
 
 
 def _triangle_outside(tree, shafts, own, leaf, active):
-    """The same of a triangle; or its plane has element and region on one side. False for what is a box."""
+    """Return as :func:`_box_outside`, for triangles; true as well where element and region lie on one side of its
+    plane. False for boxes.
+    """
     corners = [mi.Vector3d(dr.gather(mi.Point3d, c, leaf, active)) for c in tree.corners]
     outside = mi.Mask(False)
     for plane in shafts:

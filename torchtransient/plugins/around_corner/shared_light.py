@@ -72,7 +72,9 @@ def late_density(
 
 
 def _density(scene: Any, elements: HiddenElements, wall: tuple[np.ndarray, np.ndarray], s: Any, side: Any) -> Any:
-    """``side``: the middle of the scan, normals towards it, and whether something is scattered there."""
+    """Density of heads by tile. ``side``: the middle of the scan, normals towards it, and whether something is
+    scattered there.
+    """
     points, normals = wall
     center, n, lit = side
     numbers = np.random.default_rng(_SEED).random((2, _POINTS)).astype(np.float32)

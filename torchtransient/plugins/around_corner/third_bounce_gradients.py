@@ -51,13 +51,13 @@ class Ends:
         return [name for name, value in self.fields.items() if dr.grad_enabled(value)]
 
     def detached(self) -> Ends:
-        """The same without derivatives. A virtual call attaches what it returns as soon as any plugin is attached that
+        """Return a detached copy. A virtual call attaches what it returns as soon as any plugin is attached that
         it could have gone to: fields may be attached that nothing moves.
         """
         return Ends(self.count, {name: dr.detach(value) for name, value in self.fields.items()})
 
     def load(self, index: Any) -> Local:
-        """The fields of some of them, without derivatives."""
+        """Gather the fields of some of them, detached."""
         rows = [dr.gather(mi.Vector4f, self.flat, index * self.rows + i) for i in range(self.rows)]
         columns = [row[i] for row in rows for i in range(4)]
         found = {}
@@ -246,7 +246,7 @@ class ThirdBounceGradients:
 
 
 def dr_copy(local: Local) -> Local:
-    """The same fields under another roof: what becomes a leaf in it does not in the other."""
+    """Return a copy of the containers with the same fields: leaves made in the copy leave the original as it is."""
     return Local(**vars(local))
 
 

@@ -115,7 +115,7 @@ class DiffRoughConductor(mi.BSDF):
         return across_plane(matrix, normal, towards_sensor, towards_light)
 
     def _coated(self, ctx: Any, si: Any, wo: Any, mirrored: Any, active: Any) -> Any:
-        """``mirrored`` by facets of metal instead of perfect mirrors."""
+        """Reflectance ``mirrored`` times that of facets of metal."""
         share = mi.unpolarized_spectrum(mirrored)
         metal = self._reflection(ctx, si, wo, active)
         # Where nothing is mirrored, too: a colour of zero has a derivative.

@@ -27,7 +27,7 @@ _created = 0
 
 
 def note_creation():
-    """A plugin of this kind exists: before that, no scene needs to be searched for it."""
+    """Record that a delayed BSDF exists: before that, no scene needs to be searched for one."""
     global _created
     _created += 1
 
@@ -57,7 +57,7 @@ class DelaySample:
 
 
 class SpectralShift:
-    """From the wavelength that a path left a surface with to the one that it was excited by.
+    """Shift from the wavelength with which a path left a surface to the one that excited it.
 
     With photons per nanometre ``emission`` (normalised) and absorptance ``excitation``, the radiance at L is
     ``emission(L) / L`` times the integral of ``excitation(l) l`` times the radiance at l; l is drawn in proportion to
@@ -95,7 +95,7 @@ def _distribution(curve, name):
 
 
 class DelayedBSDFs:
-    """The delayed BSDFs of a scene: what of them does not change with their parameters."""
+    """Delayed BSDFs of a scene, as far as they do not change with their parameters."""
 
     def __init__(self, bsdfs):
         self.bsdfs = bsdfs

@@ -22,7 +22,7 @@ from torchtransient.units import SPEED_OF_LIGHT
 
 
 class DelayedBSDF(mi.BSDF):
-    """A nested BSDF whose light comes back late, beside one that scatters at once (:monosp:`delayed`).
+    """Nested BSDF with delayed scattering, beside one that scatters at once (:monosp:`delayed`).
 
     The light that the nested BSDF scatters is held for a random time and multiplied by the quantum yield:
     ``f(t) = f_elastic delta(t) + quantum_yield f_nested p(t)`` with the density ``p`` of the delay.

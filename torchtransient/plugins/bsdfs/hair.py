@@ -178,8 +178,8 @@ class DiffHair(mi.BSDF):
         return sum(getattr(self, name) * spectrum(si) for name, spectrum in self.pigments.items())
 
     def _shares(self, si: Any, active: Any, inside: Any, beyond: Any) -> list[Any]:
-        """``A_p``. ``inside``: the index times the cosine of the refracted ray; ``beyond``: that of its projection on
-        the plane along the fibre, squared.
+        """Attenuations ``A_p``. ``inside``: the index times the cosine of the refracted ray; ``beyond``: that of its
+        projection on the plane along the fibre, squared.
         """
         # Where nothing enters, nothing is inside.
         length = 2 * self.eta * inside / dr.select(beyond > 0, beyond, 1)
@@ -221,7 +221,7 @@ class DiffHair(mi.BSDF):
         )
 
     def _densities(self, fibre: Fibre, wi: Any, wo: Any) -> list[Any]:
-        """``M_p N_p`` per solid angle."""
+        """Densities ``M_p N_p`` per solid angle."""
         sin_o, cos_o = wo.y, sqrt_with_bounded_slope(wo.x * wo.x + wo.z * wo.z)
         around_fibre = _angle(wo.z * wi.x - wo.x * wi.z, wo.x * wi.x + wo.z * wi.z)
         around = [_azimuthal(around_fibre - turn, fibre.scale) for turn in fibre.turns] + [mi.Float(0.5 / pi)]
@@ -330,7 +330,7 @@ def _azimuthal_scale(roughness: Any) -> Any:
 
 
 def _longitudinal(sin_i: Any, cos_i: Any, sin_o: Any, cos_o: Any, concentration: Any) -> Any:
-    """``M_p``, which integrates to one over the sine of the angle."""
+    """Longitudinal term ``M_p``, which integrates to one over the sine of the angle."""
     # 1 + sin sin' - cos cos', whose digits a concentration of thousands needs.
     deviation = 0.5 * (dr.square(sin_i + sin_o) + dr.square(cos_i - cos_o))
     peak = scaled_i0(concentration * cos_i * cos_o) * dr.exp(-concentration * deviation)
@@ -338,7 +338,7 @@ def _longitudinal(sin_i: Any, cos_i: Any, sin_o: Any, cos_o: Any, concentration:
 
 
 def _azimuthal(angle: Any, scale: Any) -> Any:
-    """``N_p`` at an angle from the perfect path, which integrates to one over a turn."""
+    """Azimuthal term ``N_p`` at an angle from the perfect path, which integrates to one over a turn."""
     turn = 2 * pi
     angle = dr.abs(angle - turn * dr.round(angle / turn))
     fading = dr.exp(-angle / scale)
@@ -346,7 +346,7 @@ def _azimuthal(angle: Any, scale: Any) -> Any:
 
 
 def _angle(y: Any, x: Any) -> Any:
-    """``atan2``, zero with a slope of zero where both are zero."""
+    """Return ``atan2``, zero with a slope of zero where both are zero."""
     nowhere = (y == 0) & (x == 0)
     return dr.atan2(y, dr.select(nowhere, 1, x))
 
@@ -358,7 +358,7 @@ def _brightness(spectrum: Any, si: Any) -> Any:
 
 
 def _draw(fibre: Fibre, chances: list[Any], wi: Any, sample1: Any, sample2: Any) -> Any:
-    """A direction out of the lobes; d'Eon, Marschner and Hanika 2013."""
+    """Sample a direction from the lobes; d'Eon, Marschner and Hanika 2013."""
     lobe = mi.UInt32(0)
     left, chance = mi.Float(sample1), chances[0]
     for after in range(LOBES):

@@ -86,7 +86,7 @@ def can_be_rebuilt(wrapper: Any) -> bool:
 
 
 def rebuild_wrapper(wrapper: Any, nested: Any, flags: dict[str, bool]) -> Any:
-    """A BSDF that does to ``nested`` what ``wrapper`` (two-sided, bump or normal map) does to the one it holds. Shares
+    """Wrap ``nested`` as ``wrapper`` (two-sided, bump or normal map) wraps its own nested BSDF. Shares
     the textures. ``flags``: see :func:`flags_of`.
     """
     slot = normal_texture(wrapper)
@@ -120,7 +120,7 @@ def flags_of(wrapper: Any) -> dict[str, bool]:
 
 @contextmanager
 def _telling_values(wrapper: Any) -> Iterator[None]:
-    """For the time of a question: random numbers in all textures below a BSDF, and a scale that is not zero."""
+    """Put random numbers in all textures below a BSDF, and a scale that is not zero, within the context."""
     rng, before = np.random.default_rng(0), []
     try:
         with dr.resume_grad():
@@ -174,14 +174,14 @@ FAINT = 0.05
 
 @dataclass(frozen=True)
 class Leaf:
-    """A part; ``index`` among those of its mixture."""
+    """Part of a mixture; ``index`` among its parts."""
 
     index: int
 
 
 @dataclass(frozen=True)
 class Choice:
-    """``second`` with the weight that ``texture`` has, ``first`` with the rest."""
+    """Choice of ``second`` with the weight of ``texture``, of ``first`` with the rest."""
 
     texture: Any
     first: Any
@@ -332,7 +332,7 @@ def seals_of(node: Any, kind: type, shapes: Sequence[Any]) -> list[Seal]:
 
 
 class Mixtures:
-    """The mixtures of a scene: what of them does not change with their parameters."""
+    """Mixtures of a scene, as far as they do not change with their parameters."""
 
     def __init__(self, mixtures: list[Mixture], seals: list[Seal]) -> None:
         self.mixtures, self._seals = {mixture.node.ptr: mixture for mixture in mixtures}, seals

@@ -209,7 +209,7 @@ class DiffPrincipled(mi.BSDF):
         params.update()
 
     def _away_from_one(self) -> Any:
-        """The index as Mitsuba is handed it, with the derivative."""
+        """Return the index for Mitsuba, moved off one, with the derivative."""
         one, instead = ONE[self.index]
         value = self.index_value
         return dr.select(dr.abs(value - one) < 1e-12, value + (instead - one), value)
@@ -266,7 +266,7 @@ class DiffPrincipledThin(DiffPrincipled):
     )  # fmt: skip
 
     def _read_index(self, props: Any) -> None:
-        """The index of a thin sheet is a texture."""
+        """Read the index; that of a thin sheet is a texture."""
 
     @staticmethod
     def _texture(props: Any, name: str, default: float) -> Any:

@@ -51,7 +51,7 @@ class RefractiveBSDFs:
         return RefractiveBSDFs(entries) if entries else None
 
     def read(self) -> RefractionTable:
-        """The indices as they are now; to be called outside of loops, once a job. Raises as :meth:`of` where values
+        """Read the current indices; call outside of loops, once a job. Raises as :meth:`of` where values
         were installed since; a call that is recorded cannot look at numbers.
         """
         if not dr.flag(dr.JitFlag.FreezingScope):

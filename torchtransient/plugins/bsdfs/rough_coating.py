@@ -72,7 +72,7 @@ def _beside_one(eta: Any) -> Any:
 
 
 def _with_slopes(f: Callable[[Any, Any], Any], alpha: Any, eta: Any, smooth: bool) -> Any:
-    """``f(alpha, eta)`` with its derivatives by what is attached, taken in forward mode: the graph that stays behind
+    """Evaluate ``f(alpha, eta)`` with derivatives by attached arguments in forward mode: the graph that remains
     has the size of the result instead of that of the quadrature. ``smooth``: by ``eta`` no difference is needed.
     """
     a, e = dr.detach(alpha), dr.detach(eta)

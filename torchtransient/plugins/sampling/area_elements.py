@@ -62,7 +62,7 @@ class AreaElements:
 
     @staticmethod
     def of(shapes: list[Any]) -> AreaElements:
-        """The elements of Mitsuba shapes, those without area too."""
+        """Build the elements of Mitsuba shapes, those without area included."""
         parts, left_out = [], []
         for number, shape in enumerate(shapes):
             rows = _rows_of(shape)
@@ -92,11 +92,11 @@ class AreaElements:
         return len(self.area)
 
     def take(self, order: np.ndarray) -> AreaElements:
-        """The elements of these numbers, in this order."""
+        """Return the elements of the given numbers, in order."""
         return AreaElements(*(column[order] for column in self.columns()), self.left_out)
 
     def columns(self) -> tuple[np.ndarray, ...]:
-        """The arrays, without the names of what is left out."""
+        """Return the arrays, without the names of the shapes left out."""
         return self.axes, self.kind, self.shape, self.primitive, self.area, self.normal, self.two_sided
 
     def centers(self) -> np.ndarray:

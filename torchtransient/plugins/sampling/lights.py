@@ -54,8 +54,8 @@ class LightBox:
 
     @staticmethod
     def of(scene, bsdfs) -> LightBox | None:
-        """The box of a scene's lights; None where lights are infinitely far, have no known place, or where light can
-        pass into a medium of another index, in which optical lengths may be shorter than geometric ones.
+        """Return the box of a scene's lights; None where lights are infinitely far, have no known place, or where light
+        can pass into a medium of another index, in which optical lengths may be shorter than geometric ones.
         """
         if any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission) for bsdf in bsdfs):
             return None
@@ -125,7 +125,7 @@ class MovingSun:
 
     @staticmethod
     def of(world: Any) -> MovingSun | None:
-        """The one that a job asks the derivative of, if it does."""
+        """Return the sun of the sky that a job differentiates, or None."""
         sky = None if world.wanted is None else world.wanted.sky
         return None if sky is None else MovingSun(world.scene, sky)
 
@@ -142,6 +142,6 @@ class MovingSun:
         return around & self.contains(d)
 
     def followed(self, d: Any, active: Any) -> Any:
-        """``d``, turning with the sun where ``active``."""
+        """Attach ``d`` to the rotation of the sun where ``active``."""
         turn = dr.cross(dr.detach(self.direction), self.direction)
         return dr.select(active, dr.replace_grad(d, d + dr.cross(turn, d)), d)

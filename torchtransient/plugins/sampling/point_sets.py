@@ -26,8 +26,8 @@ def scrambled(x: Any, seed: Any) -> Any:
 
 
 def plane_points(count: int, seed: Any, sets: int = 1) -> tuple[Any, Any]:
-    """``count`` points of the unit square, (``Float64``, ``Float``), in ascending order of the first coordinate; of
-    several ``sets``, with seeds of their own, one set after the other.
+    """Return ``count`` points of the unit square, (``Float64``, ``Float``), in ascending order of the first coordinate;
+    of several ``sets``, with seeds of their own, one set after the other.
 
     Hammersley's set, the second coordinate scrambled, and both shifted by the same random part of ``1 / count`` (of the
     next power of two) for all points: every point is uniform by itself, so that means are unbiased, and with a power of
@@ -100,10 +100,10 @@ def sobol(index: Any, dimension: int, seed: Any) -> Any:
 
 
 def unit_float(bits: Any) -> Any:
-    """A ``Float`` in (0, 1) from a 32-bit fraction."""
+    """Return a ``Float`` in (0, 1) from a 32-bit fraction."""
     return mi.Float(bits >> 8) * 2.0**-24 + 2.0**-25
 
 
 def unit_double(bits: Any) -> Any:
-    """A ``Float64`` in (0, 1) from a 32-bit fraction."""
+    """Return a ``Float64`` in (0, 1) from a 32-bit fraction."""
     return (mi.Float64(bits) + 0.5) * 2.0**-32

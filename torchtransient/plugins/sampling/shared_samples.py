@@ -65,7 +65,7 @@ def distance_to(vertices: np.ndarray, points: np.ndarray) -> float:
 
 
 def _spread(numbers: np.ndarray) -> np.ndarray:
-    """25 of these, in equal steps; some more than once where there are fewer."""
+    """Select 25 of the rows in equal steps; some repeat where there are fewer."""
     return numbers[np.linspace(0, len(numbers) - 1, _POINTS).round().astype(int)]
 
 
@@ -77,8 +77,8 @@ MAX_SAMPLES = 2**26
 
 @dataclass
 class SharedSamples:
-    """``count`` points for each of ``tiles`` tiles of the scan, one tile after the other, in the order of the elements
-    of ``HiddenElements`` (neighbours stand together).
+    """Samples shared by scan points: ``count`` points for each of ``tiles`` tiles of the scan, one tile after the
+    other, in the order of the elements of ``HiddenElements`` (neighbours stand together).
 
     ``p`` (``Point3f``); ``n`` shading and ``geometric_n`` geometric normal (``Normal3f``), the same where ``smooth`` is
     false; ``front``, ``back`` (``UnpolarizedSpectrum``): albedo over pi of the side that the shading normal points to,
@@ -108,8 +108,8 @@ class SharedSamples:
 
 
 def draw_samples(elements: HiddenElements, count: int, seed: Any) -> SharedSamples:
-    """``count`` samples of the hidden geometry's density, for each tile of the table; ``seed``: UInt32 of width one, in
-    memory, or a whole number.
+    """Draw ``count`` samples of the hidden geometry's density, for each tile of the table; ``seed``: UInt32 of width
+    one, in memory, or a whole number.
 
     Raises SceneError for surfaces that are not plainly diffuse (``diffuse``, ``twosided`` around it), UnitError,
     and VariantError in spectral and polarized variants, where a sample has no colour of its own.

@@ -60,7 +60,7 @@ class ShapeLights:
         return ds, weight * choice
 
     def sample_direction(self, emitter: Any, ref: Any, u: Any, active: Any) -> tuple[Any, Any]:
-        """As ``emitter.sample_direction(ref, u, active)`` of an array of emitter pointers."""
+        """Sample as ``emitter.sample_direction(ref, u, active)`` of an array of emitter pointers."""
         if not self._shapes:
             return emitter.sample_direction(ref, u, active)
         slot = self._marks.look_up(emitter, active)
@@ -91,7 +91,7 @@ class ShapeLights:
 
 
 def _call_each(methods: list[Any], slot: Any, active: Any, ref: Any, *arguments: Any) -> Any:
-    """A method of the listed lights' shapes. Not a call of shape pointers: Dr.Jit would trace it for all shapes, some
+    """Call a method of the listed lights' shapes. Not by shape pointers: Dr.Jit would trace it for all shapes, some
     of which cannot be sampled.
     """
     place = mi.Interaction3f(0.0, ref.time, ref.wavelengths, ref.p, ref.n)
@@ -99,7 +99,7 @@ def _call_each(methods: list[Any], slot: Any, active: Any, ref: Any, *arguments:
 
 
 def _sampler_of(shape: Any, inside_out: bool) -> Any:
-    """The method of a shape that draws directions, with the normals that rays find."""
+    """Return the method of a shape that samples directions, with the normals that rays find."""
     if not inside_out:
         return shape.sample_direction
 
@@ -241,7 +241,7 @@ class SphereLightTable:
                 dr.scatter(values, number, mi.UInt32(self._width * n + k))
 
     def attached(self, rows: dict[int, list[Any]]) -> SphereLightTable:
-        """A table with other, attached rows in some places: gathered from one array, which derivatives come to."""
+        """Return a table with attached rows in some places: gathered from one array, which derivatives come to."""
         table = copy.copy(self)
         table._only, table._values = None, mi.Float(self._laid_out(self._rows))
         table._write(table._values, rows)
@@ -312,7 +312,7 @@ class SphereLightTable:
 
 
 class _Sphere:
-    """One light per lane, seen from ``p``: ``outside`` (where ``p`` is), ``solid_angle`` of the cone, ``pmf``."""
+    """Spherical light per lane, seen from ``p``: ``outside`` (where ``p`` is), ``solid_angle`` of the cone, ``pmf``."""
 
     def __init__(self, table: SphereLightTable, emitter: Any, p: Any, active: Any) -> None:
         x, y, z, self.radius, r2, edge2, self.outward, self.pmf, *self.matrix = table.numbers(emitter, active)
