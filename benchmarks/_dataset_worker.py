@@ -31,7 +31,7 @@ from _dataset_cases import NoOne, captures, described, moving_boxes, several_vie
 
 from torchtransient.data.generation.settings import Settings
 from torchtransient.data.generation.shard_making import ShardMaker
-from torchtransient.rendering.variant import active_variant
+from torchtransient.scene.variant import active_variant
 
 CPU = time.process_time
 MB = 1e6

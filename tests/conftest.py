@@ -21,7 +21,7 @@ import torch
 from _pytest.faulthandler import fault_handler_stderr_fd_key
 
 from torchtransient import plugins
-from torchtransient.rendering.variant import syntax_kept
+from torchtransient.scene.variant import syntax_kept
 
 # A shell lets what it starts in the background ignore interrupts: tests send some to themselves and to their children.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN and threading.current_thread() is threading.main_thread():

@@ -22,41 +22,32 @@ PACKAGE = Path(torchtransient.__file__).parent
 TESTS = Path(__file__).parent
 BENCHMARKS = sorted((TESTS.parent / "benchmarks").glob("*.py"))
 TOOLS = sorted(p for p in (TESTS.parent / "tools").rglob("*.py") if p.parent.name != "mutants")  # which runs tests
+# Rooms by level: an import goes down, or stays in its room.
 LEVEL = {
-    "errors": 0, "_llvm": 0, "_collection": 0, "checks": 0, "units": 0, "axes": 0, "capture": 0, "interfaces": 0,
-    "pulses": 0, "gates": 0, "stokes": 0, "tensor_record": 0, "floating": 0, "volume_methods": 0, "transform_bins": 0,
-    "plain_texts": 0, "array_files": 0,
+    "errors": 0, "_llvm": 0, "checks": 0, "units": 0, "axes": 0, "capture": 0, "interfaces": 0,
+    "pulses": 0, "gates": 0, "stokes": 0, "tensor_record": 0, "floating": 0, "volume_methods": 0, "array_files": 0,
     "plugins": 1, "sensing": 1, "reconstruction": 1, "losses": 1, "metrics": 1, "vis": 1,
     "parametrize": 1, "geometry": 1,
     "scenes": 2,
-    "scene": 3, "rendering": 3,
-    "files": 4, "nlos": 4, "data": 4, "accuracy": 4, "testing": 4, "training": 4,
-    "cli": 5,
-    "__main__": 6,
+    "scene": 3,
+    "rendering": 4,
+    "files": 5, "nlos": 5, "data": 5, "accuracy": 5, "testing": 5, "training": 5,
+    "cli": 6,
+    "__main__": 7,
 }  # fmt: skip
-# Files of `rendering` that know nothing of renders: variants, locks and interrupts, pulses and slopes of films.
-BELOW_SCENES = {"variant", "opaque", "interrupts", "kernel_errors", "slope", "pulse_properties"}
+# Rooms that everything may import, and imports within a level: likelihoods are those of the sensors, captures are
+# records with axes, data sets hold captures, whose simulations are files.
+BASIC = {"errors", "checks", "units"}
+BESIDE = {
+    "gates": {"pulses"}, "capture": {"axes", "tensor_record"},
+    "losses": {"sensing"}, "metrics": {"losses", "reconstruction"},
+    "nlos": {"files"}, "data": {"files", "nlos"}, "testing": {"accuracy"},
+}  # fmt: skip
+# Packages that a room does without: the one pillar's world in the other, and at level 0 everything bound to a variant.
+MITSUBA, TORCH = {"mitsuba", "drjit"}, {"torch", "kornia"}
 TORCH_PILLAR = {"sensing", "reconstruction", "losses", "metrics", "parametrize", "geometry", "vis"}
-MITSUBA = {"mitsuba", "drjit"}
-# Packages that a room does without: the one pillar's world in the other, and everything bound to a variant at level 0.
-FORBIDDEN = {
-    "plugins": {"torch", "kornia"},
-    "scenes": {"torch", "kornia", *MITSUBA},
-    "errors": {"torch", *MITSUBA},
-    "checks": MITSUBA,
-    "volume_methods": {"torch", *MITSUBA},
-    "transform_bins": {"torch", *MITSUBA},
-    "plain_texts": {"torch", *MITSUBA},
-    "array_files": MITSUBA,
-    "floating": MITSUBA,
-    "units": MITSUBA,
-    "axes": MITSUBA,
-    "capture": MITSUBA,
-    "stokes": MITSUBA,
-    "tensor_record": MITSUBA,
-    "interfaces": {"torch", *MITSUBA},
-    **dict.fromkeys(TORCH_PILLAR, MITSUBA),
-}
+WITHOUT_MITSUBA = {*TORCH_PILLAR, "scenes", *(room for room, level in LEVEL.items() if level == 0 and room[0] != "_")}
+WITHOUT_TORCH = {"plugins", "scenes", "errors", "interfaces", "volume_methods"}
 HEAVY = {
     "matplotlib", "h5py", "kornia", "scipy", "imageio", "imageio_ffmpeg", "PIL", "click", "rich", "hdf5plugin",
     "zstandard", "webdataset", "ray",
@@ -81,13 +72,10 @@ def room_of(module):
     return parts[1] if len(parts) > 1 and parts[1] != "__init__" else None
 
 
-def imports(path, package=PACKAGE, *, for_types=True):
-    """Every import of a file as (line, absolute dotted name); `from a import b` gives `a.b`.
-
-    `for_types`: those under `if TYPE_CHECKING:` too.
-    """
+def imports(path, package=PACKAGE):
+    """Every import of a file as (line, absolute dotted name); `from a import b` gives `a.b`."""
     here = ("torchtransient", *path.relative_to(package).parent.parts)
-    for node in nodes(syntax_of(path), for_types):
+    for node in statements(syntax_of(path)):
         if isinstance(node, ast.Import):
             for alias in node.names:
                 yield node.lineno, alias.name
@@ -98,32 +86,19 @@ def imports(path, package=PACKAGE, *, for_types=True):
                 yield node.lineno, f"{module}.{alias.name}"
 
 
-def nodes(tree, for_types):
-    """The statements of a syntax tree, with or without what stands under `if TYPE_CHECKING:`.
-
-    Expressions are left out: they contain no imports, and are nine nodes of ten.
-    """
-    for node in ast.iter_child_nodes(tree):
-        if isinstance(node, ast.expr | ast.arguments):
-            continue
-        yield node
-        if not for_types and isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
-            for other in node.orelse:
-                yield other
-                yield from nodes(other, for_types)
-        else:
-            yield from nodes(node, for_types)
-
-
 def import_circles(package=PACKAGE):
-    """The sets of modules that import each other, in whatever order and wherever the imports stand."""
+    """The sets of modules that import each other, in whatever order and wherever the imports stand, those for types
+    included. The package's own `__init__` is left out: it lists public names, and imports them when they are used.
+    """
     files = {}
     for path in sorted(package.rglob("*.py")):
+        if path.parent == package and path.stem == "__init__":
+            continue
         parts = ("torchtransient", *path.relative_to(package).with_suffix("").parts)
         files[".".join(parts).removesuffix(".__init__")] = path
     edges = {}
     for module, path in files.items():
-        names = {name for _, name in imports(path, package, for_types=False)}
+        names = {name for _, name in imports(path, package)}
         # A name of a package that is no module of its own stands in the package's `__init__`.
         edges[module] = {name if name in files else name.rpartition(".")[0] for name in names} & set(files) - {module}
     reached = {module: reachable(module, edges) for module in edges}
@@ -150,38 +125,21 @@ def violations(path, package=PACKAGE):
     if room == "__init__":
         return
     if room not in LEVEL:
-        yield f"{where}1 room '{room}' has no level; see LEVEL in this test and docs"
+        yield f"{where}1 room '{room}' has no level; see LEVEL in this test"
         return
     for line, name in imports(path, package):
         top = name.split(".")[0]
-        if top in FORBIDDEN.get(room, ()):
+        if (top in MITSUBA and room in WITHOUT_MITSUBA) or (top in TORCH and room in WITHOUT_TORCH):
             yield f"{where}{line} '{room}' must not know {top}"
         if name.startswith("mitsuba.") and not name.startswith("mitsuba.python"):
             yield f"{where}{line} {name}: import mitsuba as mi, and mitsuba.python.ad instead of mitsuba.ad"
         other = room_of(name) if top == "torchtransient" else None
-        if room == "scene" and other == "rendering" and name.split(".")[2] in BELOW_SCENES:
-            continue
         if other is not None and other in LEVEL and other != room and not is_below(other, room):
             yield f"{where}{line} '{room}' (level {LEVEL[room]}) imports '{other}' (level {LEVEL[other]})"
 
 
 def is_below(other, room):
-    if LEVEL[other] != LEVEL[room]:
-        return LEVEL[other] < LEVEL[room]
-    # Within a level: `testing` judges by the statistics of `accuracy`, and everything may know errors and units;
-    # likelihoods are those of the sensors; metrics read results as losses do, and volumes; captures are records with
-    # axes; simulated ones have files, data sets both.
-    within = {
-        ("testing", "accuracy"), ("gates", "pulses"), ("losses", "sensing"), ("capture", "axes"),
-        ("capture", "tensor_record"), ("capture", "quantities"), ("nlos", "files"), ("data", "files"), ("data", "nlos"),
-        ("floating", "quantities"), ("metrics", "losses"), ("metrics", "reconstruction"), ("axes", "quantities"),
-        ("gates", "quantities"), ("pulses", "quantities"), ("capture", "argument_names"),
-        ("array_files", "quantities"), ("array_files", "plain_texts"), ("array_files", "free_memory"),
-        ("units", "quantities"), ("stokes", "quantities"), ("given_types", "quantities"), ("pulses", "given_types"),
-        ("array_files", "file_places"), ("plain_texts", "file_places"), ("file_places", "quantities"),
-        ("rendering", "scene"),
-    }  # fmt: skip
-    return other in {"errors", "checks", "units"} or (room, other) in within
+    return LEVEL[other] < LEVEL[room] or other in BASIC or other in BESIDE.get(room, ())
 
 
 @together("path", FILES, dotted)
@@ -204,11 +162,11 @@ def test_no_circle_of_imports():
 
 
 def test_sizes():
-    """A file holds one subject and a function one step; a sampling loop is the longest there is."""
+    """A generous limit; what a file holds is a matter of its subject."""
     for path in FILES:
         text = path.read_text(encoding="utf-8")
         assert len(text.splitlines()) <= MOST_LINES["file"], dotted(path)
-        for node in nodes(syntax_of(path), for_types=True):
+        for node in statements(syntax_of(path)):
             if isinstance(node, ast.FunctionDef):
                 assert node.end_lineno - node.lineno < MOST_LINES["function"], f"{dotted(path)}.{node.name}"
 
@@ -219,7 +177,7 @@ def violations_in_sensing(path, package=PACKAGE):
     if room == "__init__.py":
         return
     if not below or room not in SENSING:
-        yield f"{room} stands in no room of `sensing`; see SENSING in this test and docs/design.md"
+        yield f"{room} stands in no room of `sensing`; see SENSING in this test"
         return
     for line, name in imports(path, package):
         if not name.startswith("torchtransient.sensing."):
@@ -299,11 +257,11 @@ def test_tests_share_through_their_support():
     """A bare name of another test file depends on which folders are on the path."""
     shared = {p.stem for p in TESTS.rglob("*.py") if p.parent != TESTS} - {"__init__"}
     names = "|".join(sorted(shared))
-    said = re.compile(rf"^\s*(?:from\s+(?:{names})\b|import\s+(?:.*[\s,])?(?:{names})\b)", re.MULTILINE)
+    named = re.compile(rf"^\s*(?:from\s+(?:{names})\b|import\s+(?:.*[\s,])?(?:{names})\b)", re.MULTILINE)
     for path in TESTS.rglob("*.py"):
         text = path.read_text(encoding="utf-8")
         # Most files import none, by the look of it.
-        for node in nodes(ast.parse(text), for_types=True) if said.search(text) else ():
+        for node in statements(ast.parse(text)) if named.search(text) else ():
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
             names += [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
             assert not {n.split(".")[0] for n in names} & shared, f"{path.relative_to(TESTS)}:{node.lineno}"
@@ -381,7 +339,7 @@ def test_what_rooms_may_import(tmp_path, room, line):
         ("import torchtransient.vis.second", "from . import first", True),
         ("def f():\n    from torchtransient.vis.second import b", "from .first import a", True),
         ("from torchtransient.vis.second import b", "", False),
-        ("import typing\nif typing.TYPE_CHECKING:\n    from .second import b", "from .first import a", False),
+        ("import typing\nif typing.TYPE_CHECKING:\n    from .second import b", "from .first import a", True),
         ("if TYPE_CHECKING:\n    import os\nelse:\n    from .second import b", "from .first import a", True),
         ("from torchtransient.vis import name", "", True),  # the package's `__init__` imports both
     ],
@@ -395,30 +353,19 @@ def test_circles_are_found(tmp_path, first, second, closed):
     assert bool(import_circles(tmp_path)) == closed
 
 
-def test_files_of_the_structure_page_exist():
-    """Every file that docs/design.md names by its place in the package."""
-    page = (PACKAGE.parent / "docs" / "design.md").read_text(encoding="utf-8")
-    rooms = "plugins|rendering|transport|films|bsdfs|sinks|segment|connection|scattering|derivative"
-    named = set(re.findall(rf"`((?:{rooms})/[\w/]+\.py)`", page))
-    assert named
-    known = {path.relative_to(PACKAGE).as_posix() for path in FILES}
-    missing = [name for name in named if not any(path == name or path.endswith(f"/{name}") for path in known)]
-    assert missing == []
-
-
 # ---------------------------------------------------------------------------------------------- errors that are raised
 
 
 PYTHONS = {
     name for name, value in vars(builtins).items() if isinstance(value, type) and issubclass(value, BaseException)
 }
-# Bare errors of Python that are raised on purpose, by file, and who takes them.
+# What a subclass has to define, the protocol of objects and modules, the end of a command.
+ALWAYS = {"NotImplementedError", "AttributeError", "SystemExit"}
+# Other bare errors of Python that are raised on purpose, by file, and who takes them.
 BARE = {
-    "__init__.py": {"AttributeError"},  # the protocol of modules
     "checks.py": {"TypeError"},  # a wrong keyword argument, as Python says it
     "capture/capture.py": {"TypeError"},  # caught where tensors are made, and told
     "capture/metadata.py": {"TypeError"},  # caught by its callers, who know the file
-    "data/augmentation/augmented.py": {"AttributeError"},  # the protocol of objects
     "data/reading/sample_draws.py": {"IndexError"},  # the protocol of sequences, which ends loops
     "data/storage/shard_file.py": {"ValueError"},  # caught where files are opened, and told with their names
     "data/storage/web_dataset.py": {"ValueError"},  # likewise
@@ -427,17 +374,11 @@ BARE = {
     "files/result_file.py": {"ValueError"},  # likewise
     "nlos/part_file.py": {"ValueError"},  # caught in the same function
     "losses/results.py": {"TypeError"},  # a wrong keyword argument, as Python says it
-    "plugins/transport/scene_contents.py": {"AttributeError"},  # the protocol of objects
-    "plugins/transport/context.py": {"AttributeError"},
     "rendering/films.py": {"KeyError"},  # caught by its callers
     "scene/edits.py": {"RuntimeError"},  # what Mitsuba says, told by its caller with the place
-    "sensing/base/given.py": {"TypeError"},  # a wrong keyword argument, as Python says it
-    "sensing/itof/itof_reading.py": {"AttributeError"},  # the protocol of objects
     "sensing/dead_time/free_running_ring.py": {"AssertionError"},  # what its own calls rule out
-    "tensor_record.py": {"AttributeError"},  # the protocol of objects
     "vis/video.py": {"IndexError"},  # the protocol of sequences
 }
-ABSTRACT = "NotImplementedError"  # what a subclass has to define
 
 
 def raised(tree):
@@ -451,7 +392,7 @@ def raised(tree):
 
 def bare(path, package=PACKAGE):
     """The errors of Python's own that a file raises and may not, as (line, name)."""
-    allowed = {*BARE.get(path.relative_to(package).as_posix(), ()), ABSTRACT, "SystemExit"}
+    allowed = {*BARE.get(path.relative_to(package).as_posix(), ()), *ALWAYS}
     tree = syntax_of(path)
     return [(line, name) for line, name in raised(tree) if name in PYTHONS - allowed]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import pickle
 from fractions import Fraction
 
@@ -9,11 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.axes import FrequencyAxis, TimeAxis, fast_length
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.units import SPEED_OF_LIGHT
 
 AXIS = TimeAxis(start_opl=3.5, bin_width_opl=0.02, num_bins=300)
+SMOOTH = sorted(2**a * 3**b * 5**c for a, b, c in itertools.product(range(13), range(8), range(6)))
 
 
 def test_edges_and_centres():
@@ -164,3 +166,10 @@ def test_frequencies_that_are_refused(arguments, error, message):
 def test_a_phase_origin_that_is_refused():
     with pytest.raises(UnitError, match="start_opl"):
         FrequencyAxis((1.0,), float("nan"))
+
+
+@pytest.mark.parametrize("multiple", [1, 2, 7])
+def test_the_next_length_of_small_factors(multiple):
+    """Beside the list of all products of 2, 3 and 5."""
+    for least in (*range(1, 700), 4097, 4375):
+        assert fast_length(least, multiple) == next(multiple * n for n in SMOOTH if multiple * n >= least)

@@ -36,8 +36,9 @@ NONE = [True, np.bool_(True), None, "x", "3", b"3", 1j, np.complex64(1), torch.t
 def test_what_is_no_list_of_numbers(name):
     call, good = SEVERAL_NUMBERS[name]
     call(*good)
+    hidden = np.ma.array([0.0, 1.0, 2.0], mask=[False, True, False])
     for place in range(len(good)):
-        for bad in [*NONE[2:-1], 10**400]:
+        for bad in [*NONE[2:-1], hidden, 10**400]:
             given = [*good]
             given[place] = bad
             with pytest.raises((UnitError, ShapeError), match="expected"):
@@ -73,6 +74,8 @@ def test_gates_of_numbers_that_are_none(gate):
 def test_what_python_takes_for_a_number():
     assert [as_number(bad) for bad in NONE[:-1]] == [None] * len(NONE[:-1])
     assert real_array([True, 10**30]) is None and real_array(np.array([DATE])) is None
+    assert real_array(np.ma.array([1.0, 2.0], mask=[False, True])) is None
+    np.testing.assert_array_equal(real_array(np.ma.array([1.0, 2.0])), [1.0, 2.0])
 
 
 def test_messages_are_one_line():

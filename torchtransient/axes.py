@@ -1,4 +1,4 @@
-"""The axes of a measurement: equal half-open bins over optical path length, or frequencies."""
+"""Axes of a measurement: equal half-open bins over optical path length, or frequencies."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torchtransient.checks import Numbers, as_number, as_whole, numbers, shown
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.units import LATEST_S, SHORTEST_OPL, SPEED_OF_LIGHT, near_seconds, opl_to_seconds, seconds_to_opl
 
-# What a number in another unit looks like. The bins of real records are 1 ps to 1 us wide: in nanoseconds, picoseconds
+# Bounds that tell numbers in other units. The bins of real records are 1 ps to 1 us wide: in nanoseconds, picoseconds
 # or femtoseconds that is 1e-3 to 1e9, and in seconds taken for metres at most 1e-6.
 WIDEST_BIN_S = 1e-6  # 300 m of path; a picosecond in microseconds is as much
 LOWEST_HERTZ = 1e3  # 1 GHz in megahertz
@@ -25,13 +25,21 @@ MOST_PER_METRE = 5e6  # a wavelength of 200 nm; 5 MHz taken for cycles per metre
 
 @dataclass(frozen=True)
 class TimeAxis:
-    """`num_bins` bins `[start_opl + k bin_width_opl, start_opl + (k + 1) bin_width_opl)` in metres of optical path.
+    """Axis of equal bins over optical path length.
 
-    The origin is the moment when the light leaves the emitter. Frozen, hashable and picklable; two axes are equal when
-    their three numbers are. Tensors it returns are float64 on the CPU: at 1 km, float32 resolves 6e-5 m only.
+    Bin ``k`` is ``[start_opl + k bin_width_opl, start_opl + (k + 1) bin_width_opl)``. Length zero is the moment when
+    the light leaves the emitter. Frozen, hashable and picklable; two axes are equal if their three numbers are. Tensors
+    are float64 on the CPU: at 1 km, float32 resolves 6e-5 m only.
 
-    Raises UnitError when a length is not finite, the width is not positive, below 1e-7 m (a time in seconds) or too
-    narrow for float64 at that distance; ShapeError when `num_bins` is not a positive whole number.
+    Args:
+        start_opl: start of the first bin, metres.
+        bin_width_opl: width of a bin, metres.
+        num_bins: number of bins, T.
+
+    Raises:
+        UnitError: for lengths that are not finite, and widths that are not positive, below 1e-7 m (a time in seconds)
+            or too narrow for float64 at that distance.
+        ShapeError: unless ``num_bins`` is a positive whole number.
     """
 
     start_opl: float
@@ -66,10 +74,17 @@ class TimeAxis:
 
     @classmethod
     def from_seconds(cls, start_s: float, bin_width_s: float, num_bins: int) -> TimeAxis:
-        """The axis whose bins start at `start_s` and are `bin_width_s` wide, both in seconds. Errors as the class.
+        """Return an axis from times in seconds.
 
-        Refuses bins of 1 us or more and starts 10 ms or more from zero, which are most likely picoseconds, nanoseconds
-        or metres: UnitError. Records of that kind are made in metres, `TimeAxis(start_opl, bin_width_opl, num_bins)`.
+        Args:
+            start_s: start of the first bin, seconds, less than 10 ms from zero.
+            bin_width_s: width of a bin, seconds, below 1 us.
+            num_bins: number of bins.
+
+        Raises:
+            UnitError: as the class, and for longer times, which are most likely picoseconds, nanoseconds or metres;
+                make such axes in metres.
+            ShapeError: as the class.
         """
         start, width = _finite(start_s, "start_s"), _finite(bin_width_s, "bin_width_s")
         near_seconds(width, "bin_width_s", "TimeAxis.from_seconds", limit_s=WIDEST_BIN_S)
@@ -78,46 +93,53 @@ class TimeAxis:
 
     @property
     def end_opl(self) -> float:
-        """End of the last bin, in metres; the first length that is outside."""
+        """End of the last bin, metres; the first length outside."""
         return self.start_opl + self.num_bins * self.bin_width_opl
 
     @property
     def start_s(self) -> float:
-        """Start of the first bin, in seconds."""
+        """Start of the first bin, seconds."""
         return opl_to_seconds(self.start_opl)
 
     @property
     def bin_width_s(self) -> float:
-        """Width of a bin, in seconds."""
+        """Width of a bin, seconds."""
         return opl_to_seconds(self.bin_width_opl)
 
     @property
     def edges_opl(self) -> Tensor:
-        """(T + 1,) float64: the borders of the bins, in metres."""
+        """Edges of the bins, (T + 1,) float64, metres."""
         # Not a running sum, which would carry its rounding along the axis.
         return self.start_opl + torch.arange(self.num_bins + 1, dtype=torch.float64, device="cpu") * self.bin_width_opl
 
     @property
     def centers_opl(self) -> Tensor:
-        """(T,) float64: the middles of the bins, in metres."""
+        """Centres of the bins, (T,) float64, metres."""
         middles = torch.arange(self.num_bins, dtype=torch.float64, device="cpu") + 0.5
         return self.start_opl + middles * self.bin_width_opl
 
     @property
     def edges_s(self) -> Tensor:
-        """(T + 1,) float64: the borders of the bins, in seconds."""
+        """Edges of the bins, (T + 1,) float64, seconds."""
         return opl_to_seconds(self.edges_opl)
 
     @property
     def centers_s(self) -> Tensor:
-        """(T,) float64: the middles of the bins, in seconds."""
+        """Centres of the bins, (T,) float64, seconds."""
         return opl_to_seconds(self.centers_opl)
 
     def bin_index(self, opl: float | Tensor) -> Tensor:
-        """Index of the bin that holds each length, int64, in the shape given; -1 before the axis, `num_bins` after it.
+        """Find the bins of optical path lengths.
 
-        `opl` in metres, a number or a tensor on any device; compared in float64 with `edges_opl`, so that an edge
-        belongs to the bin that starts there. Raises UnitError for NaN.
+        Args:
+            opl: metres, a number or a tensor of any shape on any device; compared in float64 with ``edges_opl``. An
+                edge belongs to the bin that starts there.
+
+        Returns:
+            Index of the bin, int64, in the shape of ``opl``; -1 before the axis, ``num_bins`` after it.
+
+        Raises:
+            UnitError: for NaN.
         """
         if not isinstance(opl, Tensor) or opl.is_complex() or opl.dtype == torch.bool:
             opl = torch.from_numpy(numbers("TimeAxis.bin_index: opl", opl))
@@ -130,18 +152,24 @@ class TimeAxis:
 
 @dataclass(frozen=True)
 class FrequencyAxis:
-    """The frequencies of a phasor image in cycles per metre of optical path: one over the wavelength.
+    """Frequencies of a phasor image in cycles per metre of optical path: one over the wavelength.
 
-    A phasor is the sum of `radiance * exp(-2 pi i frequency (opl - start_opl))` over all arrivals; with `start_opl`
-    zero its phase counts from the moment when the light leaves the emitter. Any iterable of numbers is taken for
-    `frequencies`, zero and negative ones too. Frozen, hashable and picklable. Raises UnitError for a number that is
-    not finite or beyond 5e6 (hertz), ShapeError for no frequency at all.
+    A phasor is the sum of ``radiance * exp(-2 pi i frequency (opl - start_opl))`` over all arrivals; with ``start_opl``
+    zero its phase counts from the moment when the light leaves the emitter. Frozen, hashable and picklable.
+
+    Args:
+        frequencies: cycles per metre, one number or several, zero and negative ones too.
+        start_opl: length of phase zero, metres.
+
+    Raises:
+        UnitError: for numbers that are not finite or beyond 5e6 (hertz).
+        ShapeError: for no frequency at all.
     """
 
     frequencies: tuple[float, ...]
     start_opl: float = 0.0
 
-    if TYPE_CHECKING:  # what is taken is more than what is kept
+    if TYPE_CHECKING:  # the constructor accepts more types than the field keeps
 
         def __init__(self, frequencies: float | Iterable[float] | Numbers, start_opl: float = 0.0) -> None: ...
 
@@ -160,15 +188,31 @@ class FrequencyAxis:
 
     @classmethod
     def uniform(cls, first: float, step: float, count: int, *, start_opl: float = 0.0) -> FrequencyAxis:
-        """`count` frequencies `first + k step`, in cycles per metre. Equal steps render faster than arbitrary ones."""
+        """Return an axis of equal steps, which renders faster than arbitrary frequencies.
+
+        Args:
+            first, step: cycles per metre.
+            count: number of frequencies ``first + k step``.
+            start_opl: length of phase zero, metres.
+
+        Raises:
+            UnitError, ShapeError: as the class.
+        """
         low, width = _finite(first, "first", "FrequencyAxis.uniform"), _finite(step, "step", "FrequencyAxis.uniform")
         number = checks.count("FrequencyAxis.uniform: count", count, 1, ShapeError, checks.MOST_MADE)
         return cls(tuple(low + k * width for k in range(number)), start_opl)
 
     @classmethod
     def from_hertz(cls, frequencies_hz: float | Iterable[float] | Numbers, start_opl: float = 0.0) -> FrequencyAxis:
-        """Modulation frequencies in hertz. Refuses those below 1 kHz but zero, which are most likely megahertz:
-        UnitError. Cycles as long as that, 300 km, are given per metre.
+        """Return an axis from modulation frequencies.
+
+        Args:
+            frequencies_hz: hertz, one number or several.
+            start_opl: length of phase zero, metres.
+
+        Raises:
+            UnitError: below 1 kHz but for zero, which are most likely megahertz; give cycles of 300 km and more per
+                metre.
         """
         given = _row(frequencies_hz, "FrequencyAxis.from_hertz")
         for f in given:
@@ -181,22 +225,22 @@ class FrequencyAxis:
 
     @property
     def num_frequencies(self) -> int:
-        """F, the number of frequencies."""
+        """Number of frequencies, F."""
         return len(self.frequencies)
 
     @property
     def per_metre(self) -> Tensor:
-        """(F,) float64: cycles per metre of optical path."""
+        """Cycles per metre of optical path, (F,) float64."""
         return torch.tensor(self.frequencies, dtype=torch.float64, device="cpu")
 
     @property
     def hertz(self) -> Tensor:
-        """(F,) float64: frequencies in hertz."""
+        """Frequencies in hertz, (F,) float64."""
         return self.per_metre * SPEED_OF_LIGHT
 
     @property
     def wavelengths_opl(self) -> Tensor:
-        """(F,) float64: metres of optical path per cycle; infinite at zero frequency."""
+        """Metres of optical path per cycle, (F,) float64; infinite at zero frequency."""
         return 1 / self.per_metre.abs()
 
     def __repr__(self) -> str:
@@ -206,7 +250,7 @@ class FrequencyAxis:
 
 
 def _row(given: Any, owner: str) -> tuple[float, ...]:
-    """The numbers of one frequency or of several: any iterable, an array, a tensor."""
+    """Return the numbers of one frequency or of several, from any iterable."""
     plain = given.tolist() if isinstance(given, Tensor) else given
     alone = isinstance(plain, (str, bytes)) or not isinstance(plain, Iterable) or getattr(plain, "ndim", None) == 0
     values = (plain,) if alone else tuple(plain)
@@ -223,8 +267,11 @@ def _finite(value: float, name: str, owner: str = "TimeAxis") -> float:
 
 
 def fast_length(least: int, multiple: int = 1) -> int:
-    """The smallest length from ``least`` on, both positive, that is ``multiple`` times 2^a 3^b 5^c: transforms are fast
-    at such lengths, and real ones halve even ones.
+    """Return a length that transforms are fast at: ``multiple`` times 2^a 3^b 5^c, at least ``least``.
+
+    Args:
+        least: smallest length.
+        multiple: divisor of the length; even for real transforms, which halve it.
     """
     units = -(-least // multiple)
     while True:

@@ -53,6 +53,13 @@ MOST_MADE = 2**24
 _PLAIN = {int, float}
 # Most numbers of an array that a message shows.
 _WRITTEN = 16
+# Longest message of another package that is quoted, and of one that quotes a file: all of it, or beginning and end.
+_SHORT = 160
+_MOST, _BEGINNING, _END = 360, 220, 120
+# Tracebacks of Python and places in C++ in messages of Mitsuba, and the longest one that is quoted.
+_TRACEBACK = re.compile(r"Traceback \(most recent call last\):\n(?:[ \t].*\n)*")
+_PLACE_IN_SOURCE = re.compile(r"\[\w+\.(?:cpp|h):\d+\] ")
+_LONGEST = 600
 
 
 def finite(name: str, value: Any) -> float:
@@ -226,7 +233,8 @@ def _number(value: Any) -> float:
 
 def _is_no_number(value: Any) -> bool:
     """Return True for values that Python or numpy convert to numbers and that are none."""
-    if isinstance(value, (str, bytes)):
+    # A hidden entry has a number behind it that numpy hands out. torch.compile does not follow `is_masked`.
+    if isinstance(value, (str, bytes)) or (isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value)):
         return True
     dtype = getattr(value, "dtype", None)
     return _is_truth(value) or "complex" in str(dtype) or getattr(dtype, "kind", None) in {"m", "M", "S", "U", "V"}
@@ -319,6 +327,56 @@ def text(name: str, value: Any, what: str, error: type[TorchTransientError] = Ar
 def is_one_of(value: Any, names: Collection[str]) -> bool:
     """Return True if ``value`` is one of the texts ``names``; arrays never are."""
     return isinstance(value, str) and value in names
+
+
+# ----------------------------------------------------------------------------------------- names and errors in messages
+
+
+def some_of(names: Any, letters: int = 240) -> str:
+    """Return names for a message: at most ``letters`` characters of them, and the number of those left out."""
+    names = [name if len(name) <= 60 else f"{name[:57]}..." for name in map(str, names)]
+    text = ", ".join(names)
+    if len(text) <= letters:
+        return text
+    kept = text[:letters].rpartition(", ")[0] or text[:letters]
+    left = len(names) - kept.count(", ") - 1
+    return f"{kept} and {left} more"
+
+
+def short_message(error: BaseException) -> str:
+    """Return the message of an error of another package, at most 160 characters in one line."""
+    message = " ".join(str(error).split()).rstrip(".") or type(error).__name__
+    return message if len(message) <= _SHORT else f"{message[: _SHORT - 3]}..."
+
+
+def one_line(error: BaseException) -> str:
+    """Return the message of an error of Mitsuba in one line, without tracebacks and places in its sources."""
+    words = " ".join(_PLACE_IN_SOURCE.sub("", _TRACEBACK.sub("", str(error))).split())
+    return words if len(words) <= _LONGEST else f"{words[: _LONGEST - 3]}..."
+
+
+def cut_line(text: str) -> str:
+    """Return a text in one line, of a long one its beginning and its end."""
+    line = " ".join(text.split())
+    return line if len(line) <= _MOST else f"{line[:_BEGINNING]} ... {line[-_END:]}"
+
+
+@contextlib.contextmanager
+def short_errors(what: str) -> Iterator[None]:
+    """Shorten messages of this library's errors that quote a file to one line.
+
+    Raises:
+        StorageError: in place of an OSError, for a file that ``what`` names.
+    """
+    try:
+        yield
+    except TorchTransientError as error:
+        message = str(error)
+        if len(message) <= _MOST and "\n" not in message:
+            raise
+        raise type(error)(cut_line(message)) from error
+    except OSError as error:
+        raise StorageError(f"{what}: a file that it names cannot be read: {short_message(error)}.") from error
 
 
 # ---------------------------------------------------------------------------------------------------- keyword arguments

@@ -1,4 +1,4 @@
-"""The errors and warnings of the library. A message says in one line what was expected, what came and what to do."""
+"""Errors and warnings of the library. A message says in one line what was expected, what came and what to do."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _INSIDE = ("torchtransient", "torch", "contextlib")
 
 
 class _InOneLine(Exception):  # noqa: N818 - no error of its own
-    """What is shown in a message, an array of several rows for instance, does not break it into lines."""
+    """Base whose messages are one line, also where they show an array of several rows."""
 
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*(" ".join(a.split()) if isinstance(a, str) and "\n" in a else a for a in args), **kwargs)
@@ -33,21 +33,21 @@ class SceneError(TorchTransientError, ValueError):
 
 
 class PhysicsError(SceneError):
-    """What ``PhysicsWarning`` is about, where an error was asked for (``physics="error"``)."""
+    """A scene or value is unphysical, and an error was asked for (``physics="error"``). See ``PhysicsWarning``."""
 
 
 class UnknownKeyError(SceneError, KeyError):
-    """A table or a renderer has nothing under a key."""
+    """A table or a renderer has no entry under a key."""
 
     __str__ = Exception.__str__  # that of KeyError would put the message in quotation marks
 
 
 class ArgumentError(TorchTransientError, ValueError):
-    """An option of a function or class is none of its choices, is of another type, or does not go with the others."""
+    """An option of a function or class has an unknown value or type, or excludes another one."""
 
 
 class MissingPackageError(TorchTransientError, ImportError):
-    """What was asked for needs a package that is not installed; the message says how to install it."""
+    """A function needs a package that is not installed; the message says how to install it."""
 
 
 class StorageError(TorchTransientError, ValueError):
@@ -75,23 +75,25 @@ class TorchTransientWarning(_InOneLine, UserWarning):
 
 
 class PhysicsWarning(TorchTransientWarning):
-    """A scene, a value or a render that is computed as it is asked for, and that no physical system can be: more light
-    scattered than arrives, a transform without an inverse, a window that misses the light, paths that end early.
+    """A scene, a value or a render is computed as asked for, although no physical system is like that.
+
+    More light scattered than arrives, a transform without an inverse, a window that misses the light, paths that end
+    early.
     """
 
 
 class GradientWarning(TorchTransientWarning):
-    """A derivative that is computed and lacks a part: what moving edges hide and uncover, where they are not followed
-    or were left out.
+    """A derivative is computed and lacks a part: the light that moving edges hide and uncover, if edges are not
+    followed or the boundary term was switched off.
     """
 
 
 class VariantWarning(TorchTransientWarning, RuntimeWarning):
-    """What is loaded already cannot do what variants of this library need."""
+    """A library that is loaded already does not work with the variants of this library."""
 
 
 class VersionWarning(TorchTransientWarning):
-    """Mitsuba or Dr.Jit is of a version that this library was never tested with."""
+    """Mitsuba or Dr.Jit has a version that this library was never tested with."""
 
 
 def level_of_user() -> int:

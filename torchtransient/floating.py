@@ -74,10 +74,13 @@ class _Product(torch.autograd.Function):
 
 
 def product(matrix: Tensor, x: Tensor) -> Tensor:
-    """``matrix (M, K) @ x (..., K, P)``, in the dtype of both, and so are its derivatives, wherever they are taken.
+    """Multiply ``matrix`` (M, K) and ``x`` (..., K, P) in their dtype, in derivatives of any order too.
 
     `without_autocast` covers the forward pass. The derivative of a product is made of products, and inside
     `torch.autocast` a backward pass would round those to half precision, by up to 1e-2 of a gradient.
+
+    Returns:
+        (..., M, P).
     """
     if torch.compiler.is_compiling() or x.device.type == "meta":
         return matrix @ x
@@ -148,7 +151,7 @@ class ScalarState(nn.Module):
     def _load_from_state_dict(self, state: Any, prefix: str, *rest: Any) -> None:
         super()._load_from_state_dict(state, prefix, *rest)
         errors = rest[-1]
-        if not _first_is_taken():
+        if not _loads_first_of_several():
             return
         for name, own in itertools.chain(self.named_parameters(), self.named_buffers()):
             given, key = state.get(prefix + name), prefix + name
@@ -157,9 +160,8 @@ class ScalarState(nn.Module):
                 errors.append(f"size mismatch for {key}: {tuple(given.shape)} in the state, expected one number.")
 
 
-@functools.cache
-def _first_is_taken() -> bool:
-    """Whether this version of torch loads a number from several."""
+def _loads_first_of_several() -> bool:
+    """Return True if this version of torch loads a number from several."""
     module = nn.Module()
     module.register_buffer("number", torch.zeros(()))
     try:

@@ -1,6 +1,6 @@
-"""Gates of a time-gated camera: how sensitive it is to light by the time that it arrives.
+"""Gates of a time-gated camera: sensitivity over the arrival time of light.
 
-Optical path length in metres from the moment when the light leaves the emitter. No Mitsuba and no torch.
+Optical path length in metres from the moment when the light leaves the emitter. Neither Mitsuba nor torch is imported.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 KINDS = ("rectangular", "gaussian", "tabulated")
 # A profile that is not straight is handed to a film as straight lines between this many points.
 NODES = 2049
-# What to do where a derivative in time meets a gate with a jump.
+# Advice of errors about derivatives in time with a gate that jumps.
 SLOPE_REMEDY = (
     "Use gates that rise from zero and fall to zero (gaussian, or tabulated with zeros at both ends), or give the film "
     "a pulse."
@@ -33,11 +33,21 @@ SLOPE_REMEDY = (
 
 @dataclass(frozen=True)
 class Gate:
-    """Sensitivity over the arrival of light: what arrives at ``opl`` counts ``value(opl)`` times.
+    """Sensitivity over the arrival of light: an arrival at ``opl`` counts ``value(opl)`` times.
 
-    Make one with :meth:`rectangular`, :meth:`gaussian` or :meth:`tabulated`. Metres of optical path. Frozen, hashable,
-    picklable. Raises UnitError for an end before its start, a width that is not positive, or values that are negative,
-    not finite or zero everywhere; ShapeError for tables of different lengths.
+    Make one with :meth:`rectangular`, :meth:`gaussian` or :meth:`tabulated`. Frozen, hashable, picklable.
+
+    Args:
+        kind: "rectangular", "gaussian" or "tabulated".
+        start_opl, end_opl: first length with sensitivity and first one after it, metres.
+        opl: lengths of a table, rising, metres; centre and full width at half maximum of a Gaussian.
+        values: sensitivities of a table.
+
+    Raises:
+        ArgumentError: for other kinds.
+        UnitError: for an end before its start, widths that are not positive, and values that are negative, not finite
+            or zero everywhere.
+        ShapeError: for tables of different lengths.
     """
 
     kind: str
@@ -65,12 +75,20 @@ class Gate:
 
     @classmethod
     def rectangular(cls, start_opl: float, end_opl: float) -> Gate:
-        """Fully open in ``[start_opl, end_opl)``, else closed. It has no slope, hence no gradient in time."""
+        """Return a gate that is fully open in ``[start_opl, end_opl)``; it has no slope, hence no gradient in time."""
         return cls("rectangular", start_opl, end_opl)
 
     @classmethod
     def gaussian(cls, center_opl: float, fwhm_opl: float) -> Gate:
-        """Fully open at ``center_opl``; closes like a Gaussian, to zero at four standard deviations."""
+        """Return a gate that is fully open at its centre and closes like a Gaussian.
+
+        Args:
+            center_opl: centre, metres.
+            fwhm_opl: full width at half maximum, metres; sensitivity is zero from four standard deviations on.
+
+        Raises:
+            UnitError: for widths that are not positive.
+        """
         center, fwhm = finite("Gate.gaussian: center_opl", center_opl), finite("Gate.gaussian: fwhm_opl", fwhm_opl)
         if not fwhm > 0:
             raise UnitError(f"Gate.gaussian: expected fwhm_opl > 0 metres, got {fwhm!r}.")
@@ -80,7 +98,15 @@ class Gate:
 
     @classmethod
     def tabulated(cls, opl: Numbers, values: Numbers) -> Gate:
-        """A measured profile: linear between ``values`` at the lengths ``opl`` (rising), zero outside them."""
+        """Return a measured profile, linear between its values and zero outside.
+
+        Args:
+            opl: lengths, (N,), rising, metres.
+            values: sensitivities there, (N,).
+
+        Raises:
+            UnitError, ShapeError: as the class.
+        """
         lengths = numbers("Gate.tabulated: opl", opl).ravel()
         heights = numbers("Gate.tabulated: values", values).ravel()
         if lengths.size != heights.size or lengths.size < 2:
@@ -100,18 +126,18 @@ class Gate:
 
     @classmethod
     def rectangular_s(cls, start_s: float, end_s: float) -> Gate:
-        """As :meth:`rectangular`, in seconds."""
+        """Return :meth:`rectangular` from seconds. Raises UnitError for times of 10 ms and more."""
         start, end = (near_seconds(t, "start_s and end_s", "Gate.rectangular_s") for t in (start_s, end_s))
         return cls.rectangular(seconds_to_opl(start), seconds_to_opl(end))
 
     @classmethod
     def gaussian_s(cls, center_s: float, fwhm_s: float) -> Gate:
-        """As :meth:`gaussian`, in seconds."""
+        """Return :meth:`gaussian` from seconds. Raises UnitError for times of 10 ms and more."""
         center, fwhm = (near_seconds(t, "center_s and fwhm_s", "Gate.gaussian_s") for t in (center_s, fwhm_s))
         return cls.gaussian(seconds_to_opl(center), seconds_to_opl(fwhm))
 
     def shifted(self, opl: float) -> Gate:
-        """The same gate, opened ``opl`` metres later."""
+        """Return the same gate, opened ``opl`` metres later."""
         opl = finite("Gate.shifted: opl", opl)
         if self.kind == "gaussian":
             return Gate.gaussian(self.opl[0] + opl, self.opl[1])
@@ -119,7 +145,15 @@ class Gate:
         return Gate(self.kind, self.start_opl + opl, self.end_opl + opl, opl=moved, values=self.values)
 
     def sequence(self, step_opl: float, count: int) -> tuple[Gate, ...]:
-        """``count`` gates of this shape, each ``step_opl`` metres after the one before."""
+        """Return gates of this shape at equal distances.
+
+        Args:
+            step_opl: distance of a gate from the one before, metres.
+            count: number of gates.
+
+        Raises:
+            ShapeError: for counts that are negative or too large.
+        """
         step = finite("Gate.sequence: step_opl", step_opl)
         number = checks.count("Gate.sequence: count", count, 0, ShapeError, checks.MOST_MADE)
         return tuple(self.shifted(k * step) for k in range(number))
@@ -127,7 +161,14 @@ class Gate:
     # ------------------------------------------------------------------------------------------------ the profile
 
     def value(self, opl: Any) -> Array:
-        """Sensitivity to light that arrives at ``opl``, in double precision; NaN where that is NaN."""
+        """Evaluate the sensitivity.
+
+        Args:
+            opl: arrivals of any shape, metres.
+
+        Returns:
+            Sensitivity in the shape of ``opl``, float64; NaN at NaN.
+        """
         x = numbers("Gate.value: opl", opl)
         inside = (x >= self.start_opl) & (x < self.end_opl)
         outside = np.where(np.isnan(x), np.nan, 0.0)
@@ -142,13 +183,13 @@ class Gate:
 
     @property
     def is_continuous(self) -> bool:
-        """Whether the profile rises from zero and falls to zero without a jump, so that it has a slope."""
+        """The profile rises from zero and falls to zero without a jump, and so has a slope."""
         if self.kind == "tabulated":
             return self.values[0] == 0 and self.values[-1] == 0
         return self.kind == "gaussian"
 
     def nodes(self) -> Array:
-        """The profile (N,) at equal distances from start to end, straight in between; exact for straight ones."""
+        """Return the profile (N,) at equal distances from start to end, linear in between; exact for linear ones."""
         if self.kind == "rectangular":
             return np.ones(2)
         if self.kind == "tabulated" and np.allclose(np.diff(self.opl), self.opl[1] - self.opl[0], rtol=1e-9, atol=0):
@@ -159,7 +200,7 @@ class Gate:
         return values
 
     def spread(self, pulse: Pulse) -> Gate:
-        """The gate as a pulsed light sees it: an arrival is spread over the pulse before the gate is asked."""
+        """Return the gate for light with a pulse: its sensitivity averaged over the pulse around each arrival."""
         low, high = pulse.support_opl
         at = np.linspace(self.start_opl - high, self.end_opl - low, NODES)
         if self.kind == "rectangular":
@@ -177,7 +218,7 @@ class Gate:
     # --------------------------------------------------------------------------------------------------- as text
 
     def __str__(self) -> str:
-        """The gate in the notation of scene files, see :func:`gates_from_text`."""
+        """Return the gate in the notation of scene files, see :func:`gates_from_text`."""
         if self.kind == "tabulated":
             pairs = zip(self.opl, self.values, strict=True)
             return "tabulated " + " ".join(f"{length!r}:{value!r}" for length, value in pairs)
@@ -187,21 +228,25 @@ class Gate:
 
 
 def jump_in(gates: Sequence[Gate]) -> str:
-    """What messages call the first gate that opens or closes at once and so has no slope; empty without one."""
+    """Return a name for the first gate that opens or closes at once, for messages; empty if all have a slope."""
     return next((f"{gate.kind} gate" for gate in gates if not gate.is_continuous), "")
 
 
 def gates_to_text(gates: Sequence[Gate]) -> str:
-    """Gates in the notation of scene files."""
+    """Return gates in the notation of scene files."""
     return "; ".join(map(str, gates))
 
 
 def gates_from_text(text: str) -> tuple[Gate, ...]:
-    """Gates separated by semicolons, each one of::
+    """Parse gates separated by semicolons, each one of::
 
         rectangular START END        gaussian CENTER FWHM        tabulated OPL:VALUE OPL:VALUE ...
 
-    Metres of optical path. Raises UnitError for anything else.
+    Args:
+        text: gates, metres of optical path.
+
+    Raises:
+        UnitError: for other texts, and gates that :class:`Gate` refuses.
     """
     gates = []
     for part in filter(None, (p.strip() for p in str(text).split(";"))):

@@ -1,7 +1,7 @@
-"""Shapes over time: the pulse of a light source, the impulse response of a sensor, the profile of a gate.
+"""Shapes over time: pulses of light sources, impulse responses of sensors.
 
-Everything here is optical path length in metres; seconds are converted where they come in. No Mitsuba and no torch: the
-films of ``plugins/`` and the torch functions of ``sensing/`` build their kernels from the same shapes.
+Optical path length in metres; seconds are converted on entry. Neither Mitsuba nor torch is imported: the films of
+``plugins/`` and the torch functions of ``sensing/`` build their kernels from the same shapes.
 """
 
 from __future__ import annotations
@@ -30,12 +30,22 @@ _erf = np.frompyfunc(math.erf, 1, 1)
 
 @dataclass(frozen=True)
 class Pulse:
-    """A probability density over optical path length, in metres: how light that would arrive at one moment is spread.
+    """Probability density over optical path length by which light of one moment is spread.
 
-    Make one with :meth:`gaussian`, :meth:`rectangular` or :meth:`tabulated`. ``center_opl`` shifts the shape: zero is
-    the moment that path lengths are counted from. Its integral is one; the power of a laser is that of the emitter.
-    Frozen, hashable, picklable. Raises UnitError for widths that are not positive and densities that are negative, not
-    finite or zero everywhere, ShapeError for tables of different lengths.
+    Make one with :meth:`gaussian`, :meth:`rectangular` or :meth:`tabulated`. Its integral is one; the power of a laser
+    is that of the emitter. Frozen, hashable, picklable.
+
+    Args:
+        kind: "gaussian", "rectangular" or "tabulated".
+        width_opl: full width, at half maximum for a Gaussian, metres.
+        center_opl: shift of the shape, metres; zero is the moment that path lengths are counted from.
+        opl: lengths of a table, rising, metres.
+        values: densities at these lengths, of any scale.
+
+    Raises:
+        ArgumentError: for other kinds.
+        UnitError: for widths that are not positive, and densities that are negative, not finite or zero everywhere.
+        ShapeError: for tables of different lengths.
     """
 
     kind: str
@@ -80,38 +90,47 @@ class Pulse:
 
     @classmethod
     def gaussian(cls, fwhm_opl: float, center_opl: float = 0.0) -> Pulse:
-        """A Gaussian of full width at half maximum ``fwhm_opl``, cut at four standard deviations."""
+        """Return a Gaussian of full width at half maximum ``fwhm_opl`` (metres), cut at four standard deviations."""
         return cls("gaussian", fwhm_opl, center_opl)
 
     @classmethod
     def rectangular(cls, width_opl: float, center_opl: float = 0.0) -> Pulse:
-        """Constant over ``width_opl``."""
+        """Return a pulse that is constant over ``width_opl`` (metres)."""
         return cls("rectangular", width_opl, center_opl)
 
     @classmethod
     def tabulated(cls, opl: Numbers, values: Numbers, center_opl: float = 0.0) -> Pulse:
-        """A measured shape: linear between ``values`` at the lengths ``opl`` (metres, rising), zero outside them."""
+        """Return a measured shape, linear between its values and zero outside.
+
+        Args:
+            opl: lengths, (N,), rising, metres.
+            values: densities there, (N,), of any scale.
+            center_opl: shift of the shape, metres.
+
+        Raises:
+            UnitError, ShapeError: as the class.
+        """
         lengths = numbers("Pulse.tabulated: opl", opl).ravel()
         heights = numbers("Pulse.tabulated: values", values).ravel()
         return cls("tabulated", 0.0, center_opl, opl=tuple(lengths.tolist()), values=tuple(heights.tolist()))
 
     @classmethod
     def gaussian_s(cls, fwhm_s: float, center_s: float = 0.0) -> Pulse:
-        """As :meth:`gaussian`, in seconds."""
+        """Return :meth:`gaussian` from seconds. Raises UnitError for widths of 1 ms and more."""
         width = near_seconds(fwhm_s, "fwhm_s", "Pulse.gaussian_s", limit_s=LONGEST_PULSE_S)
         center = near_seconds(center_s, "center_s", "Pulse.gaussian_s")
         return cls.gaussian(seconds_to_opl(width), seconds_to_opl(center))
 
     @classmethod
     def rectangular_s(cls, width_s: float, center_s: float = 0.0) -> Pulse:
-        """As :meth:`rectangular`, in seconds."""
+        """Return :meth:`rectangular` from seconds. Raises UnitError for widths of 1 ms and more."""
         width = near_seconds(width_s, "width_s", "Pulse.rectangular_s", limit_s=LONGEST_PULSE_S)
         center = near_seconds(center_s, "center_s", "Pulse.rectangular_s")
         return cls.rectangular(seconds_to_opl(width), seconds_to_opl(center))
 
     @classmethod
     def tabulated_s(cls, times_s: Numbers, values: Numbers, center_s: float = 0.0) -> Pulse:
-        """As :meth:`tabulated`, with times in seconds."""
+        """Return :meth:`tabulated` from times in seconds. Raises UnitError for times of 10 ms and more."""
         times = numbers("Pulse.tabulated_s: times_s", times_s).ravel()
         for time in times.tolist():
             near_seconds(time, "times_s", "Pulse.tabulated_s")
@@ -119,14 +138,14 @@ class Pulse:
         return cls.tabulated(seconds_to_opl(times), values, seconds_to_opl(center))
 
     def shifted(self, opl: float) -> Pulse:
-        """The same shape, ``opl`` metres later."""
+        """Return the same shape, ``opl`` metres later."""
         return replace(self, center_opl=self.center_opl + finite("Pulse.shifted: opl", opl))
 
     # ------------------------------------------------------------------------------------------------ the density
 
     @property
     def support_opl(self) -> tuple[float, float]:
-        """First and last length where the density is not zero, in metres."""
+        """First and last length where the density is not zero, metres."""
         if self.kind == "tabulated":
             return self.opl[0] + self.center_opl, self.opl[-1] + self.center_opl
         half = self.width_opl / 2
@@ -135,7 +154,14 @@ class Pulse:
         return self.center_opl - half, self.center_opl + half
 
     def cumulative(self, opl: Any) -> Array:
-        """Share of the pulse up to the lengths ``opl``: 0 before the support and 1 after it, in double precision."""
+        """Evaluate the cumulative distribution.
+
+        Args:
+            opl: lengths of any shape, metres.
+
+        Returns:
+            Share of the pulse up to each length, float64: 0 before the support, 1 after it.
+        """
         x = numbers("Pulse.cumulative: opl", opl) - self.center_opl
         if self.kind == "rectangular":
             return np.asarray(np.clip(x / self.width_opl + 0.5, 0, 1), dtype=np.float64)
@@ -154,10 +180,21 @@ class Pulse:
 
 
 def transform(pulse: Pulse, frequencies: Any) -> NDArray[np.complex128]:
-    """Fourier transform of a pulse (F,): what it does to a phasor at frequencies (F,) in cycles per metre.
+    """Evaluate the Fourier transform of a pulse, the factor by which it changes a phasor.
 
-    A phasor film spreads no arrivals; ``out.phasor`` times this, one factor for each frequency, is what it would
-    measure under the pulse. One at frequency zero.
+    A phasor film spreads no arrivals: ``out.phasor`` times this, one factor per frequency, is its measurement of light
+    with the pulse.
+
+    Args:
+        pulse: the pulse.
+        frequencies: (F,), cycles per metre.
+
+    Returns:
+        (F,) complex128; one at frequency zero.
+
+    Raises:
+        ArgumentError: unless ``pulse`` is a pulse.
+        UnitError: for frequencies that are not finite.
     """
     low, high = of_class("transform: pulse", pulse, Pulse).support_opl
     wanted = numbers("transform: frequencies", frequencies).ravel()
@@ -173,11 +210,18 @@ def transform(pulse: Pulse, frequencies: Any) -> NDArray[np.complex128]:
 
 
 def cumulative_of_sum(pulses: Sequence[Pulse], step: float) -> tuple[int, Array]:
-    """Cumulative distribution of the sum of independent delays, one from each pulse: the convolution of the pulses.
+    """Evaluate the cumulative distribution of a sum of independent delays: of the convolution of pulses.
 
-    Returns ``(first, values)``: ``values[j]`` belongs to the length ``(first + j) step``, the first one is 0, the last
-    one 1. Exact at these lengths for one pulse, of second order in ``step`` for several. Raises UnitError without a
-    pulse.
+    Args:
+        pulses: the pulses.
+        step: distance of the lengths, metres.
+
+    Returns:
+        (first, values): ``values[j]`` belongs to the length ``(first + j) step``; the first one is 0, the last one 1.
+        Exact for one pulse, of second order in ``step`` for several.
+
+    Raises:
+        UnitError: without a pulse, and for steps that are not positive.
     """
     pulses = several("cumulative_of_sum", pulses, "pulses", Pulse)
     if not pulses:

@@ -1,6 +1,6 @@
 """Stokes vectors and Mueller matrices as torch tensors: degrees and angle of polarization, frames, ideal elements.
 
-A Stokes vector ``(S0, S1, S2, S3)`` describes light in a frame across its direction of travel, seen by the receiver
+A Stokes vector ``(S0, S1, S2, S3)`` describes light in a frame across its direction of travel, seen by the receiver,
 who looks towards the source: the horizontal axis x, and y a quarter turn counter-clockwise from it. ``S1 > 0`` is
 horizontal light, ``S2 > 0`` light at +45 degrees, ``S3 > 0`` right circular light (Mitsuba's convention). For a camera
 of this library x points to the right of the image and y up.
@@ -8,9 +8,8 @@ of this library x points to the right of the image and y up.
 Tensors hold the four components along ``dim``: -5 in a transient ``(..., 4, C, T, H, W)`` (``TRANSIENT_DIM``), -4 in a
 steady image ``(..., 4, C, H, W)`` (``STEADY_DIM``). Angles are radians. Any real floating dtype and device.
 
-Nothing here divides zero by zero, forwards or backwards: dark entries and unpolarised ones have the value and the
-derivative zero, where the functions themselves have no derivative. Second derivatives exist away from these entries.
-NaN in the light is NaN in what is made of it.
+No function divides zero by zero, forwards or backwards: at dark and unpolarized entries value and derivative are zero,
+where the functions have no derivative. Second derivatives exist away from these entries. NaN in the light gives NaN.
 """
 
 from __future__ import annotations
@@ -33,33 +32,53 @@ STEADY_DIM = -4
 
 
 def degree_of_polarization(stokes: Tensor, dim: int, floor: float = 0.0) -> Tensor:
-    """``|(S1, S2, S3)| / S0``, the shape of ``stokes`` without ``dim``.
+    """Return ``|(S1, S2, S3)| / S0``.
 
-    Zero where ``S0 <= floor``. Exceeds one where noise makes the components inconsistent: clamp it for display only. To
-    fit polarization, prefer a loss on :func:`normalized_components`, which has no kink at zero.
+    Args:
+        stokes: light with four components along ``dim``.
+        dim: axis of the components.
+        floor: the result is zero where ``S0 <= floor``.
 
-    Raises ``ShapeError`` unless ``stokes`` has four real components along ``dim``, ``UnitError`` for a negative
-    ``floor``.
+    Returns:
+        The shape of ``stokes`` without ``dim``. Above one where noise makes the components inconsistent: clamp it for
+        display only. To fit polarization, prefer a loss on :func:`normalized_components`, which has no kink at zero.
+
+    Raises:
+        ShapeError: unless ``stokes`` has four real components along ``dim``.
+        UnitError: for a negative ``floor``.
     """
     return _degree(stokes, dim, (1, 2, 3), floor)
 
 
 def degree_of_linear_polarization(stokes: Tensor, dim: int, floor: float = 0.0) -> Tensor:
-    """``|(S1, S2)| / S0``; shapes, dark entries and errors as for :func:`degree_of_polarization`."""
+    """Return ``|(S1, S2)| / S0``. Arguments, shape and errors as :func:`degree_of_polarization`."""
     return _degree(stokes, dim, (1, 2), floor)
 
 
 def degree_of_circular_polarization(stokes: Tensor, dim: int, floor: float = 0.0) -> Tensor:
-    """``S3 / S0`` in [-1, 1], positive for right circular light; otherwise as :func:`degree_of_polarization`."""
+    """Return ``S3 / S0`` in [-1, 1], positive for right circular light.
+
+    Arguments, shape and errors as :func:`degree_of_polarization`.
+    """
     return normalized_components(stokes, dim, floor).select(_axis(stokes, dim), 2)
 
 
 def angle_of_linear_polarization(stokes: Tensor, dim: int, floor: float = 0.0) -> Tensor:
-    """Angle of the plane of oscillation against the horizontal axis, in (-pi/2, pi/2], without ``dim``.
+    """Return the angle of the plane of oscillation against the horizontal axis, counter-clockwise for the receiver.
 
-    Counter-clockwise for the receiver. Zero, with derivative zero, where the linear part ``|(S1, S2)|`` does not exceed
-    ``floor``: there is no angle. The angle jumps by pi at its ends and its derivative grows as one over the linear
-    part; a loss on :func:`normalized_components` has neither problem. Errors as for :func:`degree_of_polarization`.
+    The angle jumps by pi at its ends, and its derivative grows as one over the linear part; a loss on
+    :func:`normalized_components` has neither problem.
+
+    Args:
+        stokes: light with four components along ``dim``.
+        dim: axis of the components.
+        floor: value and derivative are zero where the linear part ``|(S1, S2)|`` does not exceed it.
+
+    Returns:
+        Radians in (-pi/2, pi/2], the shape of ``stokes`` without ``dim``.
+
+    Raises:
+        ShapeError, UnitError: as :func:`degree_of_polarization`.
     """
     part = _components(stokes, dim)
     floor = _checked_floor(floor)
@@ -74,10 +93,21 @@ def angle_of_linear_polarization(stokes: Tensor, dim: int, floor: float = 0.0) -
 
 
 def normalized_components(stokes: Tensor, dim: int, floor: float = 0.0) -> Tensor:
-    """``(S1, S2, S3) / S0`` with three entries along ``dim``; zero, with derivative zero, where ``S0 <= floor``.
+    """Return ``(S1, S2, S3) / S0``.
 
-    Its first two entries are ``DoLP (cos 2 AoLP, sin 2 AoLP)``: smooth through zero polarization and around the angle's
-    jump. Errors as for :func:`degree_of_polarization`.
+    The first two entries are ``DoLP (cos 2 AoLP, sin 2 AoLP)``: smooth through zero polarization and around the jump of
+    the angle.
+
+    Args:
+        stokes: light with four components along ``dim``.
+        dim: axis of the components.
+        floor: value and derivative are zero where ``S0 <= floor``.
+
+    Returns:
+        The shape of ``stokes`` with three entries along ``dim``.
+
+    Raises:
+        ShapeError, UnitError: as :func:`degree_of_polarization`.
     """
     part = _components(stokes, dim)
     lit, s0 = _intensity(part[0], floor)
@@ -98,7 +128,7 @@ def _degree(stokes: Tensor, dim: int, which: tuple[int, ...], floor: float) -> T
 
 
 def _intensity(s0: Tensor, floor: float) -> tuple[Tensor, Tensor]:
-    """Where there is light, and a divisor that is one elsewhere."""
+    """Return the mask of entries with light, and a divisor that is one elsewhere."""
     lit = ~(s0 <= max(_checked_floor(floor), torch.finfo(s0.dtype).tiny))
     return lit, torch.where(lit, s0, 1.0)
 
@@ -107,10 +137,18 @@ def _intensity(s0: Tensor, floor: float) -> tuple[Tensor, Tensor]:
 
 
 def rotate_frame(stokes: Tensor, angle: Tensor | float, dim: int) -> Tensor:
-    """The same light in a frame turned counter-clockwise (for the receiver) by ``angle``; the shape of ``stokes``.
+    """Express light in a frame turned counter-clockwise, for the receiver.
 
-    Light at the angle ``a`` reads ``a - angle`` in the new frame. ``angle``: a number, or a tensor that broadcasts
-    against ``stokes`` without ``dim``. Raises ``ShapeError``.
+    Args:
+        stokes: light with four components along ``dim``.
+        angle: turn of the frame, radians; a number, or a tensor that broadcasts against ``stokes`` without ``dim``.
+        dim: axis of the components.
+
+    Returns:
+        The shape of ``stokes``. Light at the angle ``a`` has ``a - angle`` in the new frame.
+
+    Raises:
+        ShapeError: for angles of another shape.
     """
     s0, s1, s2, s3 = _components(stokes, dim)
     double = 2 * _real("angle", angle).to(stokes)
@@ -125,9 +163,20 @@ def rotate_frame(stokes: Tensor, angle: Tensor | float, dim: int) -> Tensor:
 
 
 def apply_mueller(matrix: Tensor, stokes: Tensor, dim: int) -> Tensor:
-    """``M S``: what an element makes of light. ``matrix``: (4, 4); result in the shape of ``stokes``.
+    """Return ``M S``, light after an element.
 
-    Several elements: multiply their matrices, the one that the light meets first on the right. Raises ``ShapeError``.
+    For several elements multiply their matrices, the one that the light meets first on the right.
+
+    Args:
+        matrix: Mueller matrix, (4, 4).
+        stokes: light with four components along ``dim``.
+        dim: axis of the components.
+
+    Returns:
+        The shape of ``stokes``.
+
+    Raises:
+        ShapeError: for matrices of another shape.
     """
     _components(stokes, dim)
     dim, mueller = _axis(stokes, dim), _real("matrix", matrix)
@@ -140,7 +189,14 @@ def apply_mueller(matrix: Tensor, stokes: Tensor, dim: int) -> Tensor:
 
 
 def rotator(angle: Tensor | float) -> Tensor:
-    """Change to a frame turned counter-clockwise by ``angle`` (a number or a tensor ``(...)``), shape (..., 4, 4)."""
+    """Return the Mueller matrix of a change to a frame turned counter-clockwise.
+
+    Args:
+        angle: radians, a number or a tensor (...).
+
+    Returns:
+        (..., 4, 4).
+    """
     double = 2 * _floating("angle", angle)
     c, s = torch.cos(double), torch.sin(double)
     o, i = torch.zeros_like(c), torch.ones_like(c)
@@ -148,10 +204,18 @@ def rotator(angle: Tensor | float) -> Tensor:
 
 
 def linear_polarizer(angle: Tensor | float = 0.0, extinction: Tensor | float = 0.0) -> Tensor:
-    """Polarizer that passes light oscillating at ``angle``; shape (..., 4, 4).
+    """Return the Mueller matrix of a polarizer that passes light oscillating at an angle.
 
-    ``extinction``: power transmitted of the light across it, relative to that along it, in [0, 1]: 0 is ideal, real
-    sensors have 1/100 to 1/400. Raises ``UnitError`` outside of that range.
+    Args:
+        angle: radians, a number or a tensor (...).
+        extinction: transmitted power of the light across the angle, relative to that along it, in [0, 1]: 0 is ideal,
+            real sensors have 1/100 to 1/400.
+
+    Returns:
+        (..., 4, 4).
+
+    Raises:
+        UnitError: for extinctions outside [0, 1].
     """
     double, e = _together(2 * _floating("angle", angle), _floating("extinction", extinction))
     if not bool(((e >= 0) & (e <= 1)).all()):
@@ -167,9 +231,14 @@ def linear_polarizer(angle: Tensor | float = 0.0, extinction: Tensor | float = 0
 
 
 def linear_retarder(angle: Tensor | float, delay: Tensor | float) -> Tensor:
-    """Wave plate with its fast axis at ``angle`` that delays the other axis by ``delay`` radians; shape (..., 4, 4).
+    """Return the Mueller matrix of a wave plate.
 
-    A quarter-wave plate has pi/2, a half-wave plate pi.
+    Args:
+        angle: angle of the fast axis, radians, a number or a tensor (...).
+        delay: delay of the other axis, radians: pi/2 for a quarter-wave plate, pi for a half-wave plate.
+
+    Returns:
+        (..., 4, 4).
     """
     double, phase = _together(2 * _floating("angle", angle), _floating("delay", delay))
     c, s, cd, sd = torch.cos(double), torch.sin(double), torch.cos(phase), torch.sin(phase)
@@ -186,7 +255,7 @@ def linear_retarder(angle: Tensor | float, delay: Tensor | float) -> Tensor:
 
 
 def circular_polarizer(left_handed: bool = False) -> Tensor:
-    """Ideal polarizer for right (or left) circular light; shape (4, 4)."""
+    """Return the Mueller matrix (4, 4) of an ideal polarizer for right (or left) circular light."""
     sign = -0.5 if left_handed else 0.5
     matrix = torch.zeros(4, 4)
     matrix[0, 0] = matrix[3, 3] = 0.5
@@ -195,7 +264,7 @@ def circular_polarizer(left_handed: bool = False) -> Tensor:
 
 
 def depolarizer() -> Tensor:
-    """Keeps the power and forgets the polarization; shape (4, 4)."""
+    """Return the Mueller matrix (4, 4) that keeps the power and removes the polarization."""
     matrix = torch.zeros(4, 4)
     matrix[0, 0] = 1
     return matrix
@@ -232,7 +301,7 @@ def _checked_floor(floor: float) -> float:
 
 
 def _real(name: str, value: Any) -> Tensor:
-    """Numbers as a tensor, with its gradient. Raises UnitError for what is no real number."""
+    """Return numbers as a tensor with its gradient. Raises UnitError unless they are real and finite."""
     if isinstance(value, Tensor):
         if value.is_complex() or value.dtype == torch.bool:
             raise UnitError(f"{name}: expected real numbers, got {value.dtype}.")
@@ -244,7 +313,7 @@ def _real(name: str, value: Any) -> Tensor:
 
 
 def _floating(name: str, value: Any) -> Tensor:
-    """As :func:`_real`, in floating point: numbers without a precision of their own have that of torch."""
+    """Return :func:`_real` in floating point: numbers without a precision have the default dtype of torch."""
     tensor = _real(name, value)
     own = tensor.is_floating_point() if isinstance(value, Tensor) else getattr(value, "dtype", None) == np.float64
     return tensor if own else tensor.to(torch.get_default_dtype())

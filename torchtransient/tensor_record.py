@@ -1,7 +1,7 @@
-"""Results as torch knows them: moved, detached, put into batches, taken apart and put together.
+"""Base of results with tensors: moved, detached, stacked in batches, flattened to trees of torch.
 
-A record is a dataclass with tensors among its fields. ``torch.utils._pytree``, on which ``torch.func``, DDP and FSDP
-rest, sees its tensors; ``torch.utils.data.default_collate`` stacks records as it stacks dictionaries.
+A record is a dataclass with tensors among its fields. ``torch.utils._pytree``, which ``torch.func``, DDP and FSDP use,
+sees its tensors; ``torch.utils.data.default_collate`` stacks records as it stacks dictionaries.
 """
 
 from __future__ import annotations
@@ -24,11 +24,12 @@ from torchtransient.errors import ArgumentError, ShapeError
 class TensorRecord:
     """Base of a frozen dataclass whose fields, and the entries of whose ``others``, are tensors, settings or None.
 
-    Two records are equal when their settings are, and their tensors hold the same numbers of the same kind, on any
-    device (``eq=False`` of derived dataclasses leaves it so).
+    Two records are equal if their settings are, and their tensors hold the same numbers of the same dtype, on any
+    device (derive dataclasses with ``eq=False``).
 
-    ``notes``: fields that say how the record was made. They do not tell records apart, and become those of a batch by
-    :meth:`merged_notes`. All other settings must agree in a batch.
+    Attributes:
+        notes: fields about the making of the record. They do not enter comparisons; :meth:`merged_notes` makes those of
+            a batch. All other settings must agree in a batch.
     """
 
     notes: ClassVar[tuple[str, ...]] = ()
@@ -41,7 +42,7 @@ class TensorRecord:
     if not TYPE_CHECKING:  # for type checkers there are no other attributes
 
         def __getattr__(self, name: str) -> Any:
-            """What is not there: a record that was taken for a tensor is told what its tensors are."""
+            """Raise AttributeError, with the names of the tensors if a record was taken for one."""
             what = f"'{type(self).__name__}' object has no attribute '{name}'"
             own = {field.name for field in fields(self)}  # of a record that is not whole yet
             if not name.startswith("_") and name not in own and hasattr(torch.Tensor, name):
@@ -51,16 +52,18 @@ class TensorRecord:
     # ------------------------------------------------------------------------------------------------------ as torch
 
     def tensors(self) -> dict[str, torch.Tensor]:
-        """The tensors by name, those of ``others`` too."""
+        """Return the tensors by name, those in ``others`` included."""
         return {name: value for name, value in self._entries().items() if isinstance(value, torch.Tensor)}
 
     def map(self, function: Callable[[torch.Tensor], torch.Tensor]) -> Self:
-        """A copy in which every tensor is ``function`` of what it was."""
+        """Return a copy with ``function`` applied to every tensor."""
         return self._with({name: function(tensor) for name, tensor in self.tensors().items()})
 
     def to(self, *args: Any, **keywords: Any) -> Self:
-        """Every tensor through its ``to``. As in modules, a dtype is for real numbers; complex tensors take the complex
-        one of its precision, and whole numbers and truth values stay what they are.
+        """Return a copy with every tensor moved or cast, as ``torch.Tensor.to``.
+
+        As in modules, a dtype applies to real numbers; complex tensors take the complex dtype of its precision, and
+        whole numbers and truth values keep theirs.
         """
 
         def moved(tensor: torch.Tensor) -> torch.Tensor:
@@ -71,40 +74,46 @@ class TensorRecord:
         return self.map(moved)
 
     def cpu(self) -> Self:
-        """``to("cpu")``."""
+        """Return a copy on the CPU."""
         return self.to("cpu")
 
     def cuda(self, device: Any = None) -> Self:
-        """``to("cuda")``, or to the device of that number."""
+        """Return a copy on the current CUDA device, or on ``device``."""
         return self.map(lambda tensor: tensor.cuda(device))
 
     def detach(self) -> Self:
-        """Without gradients."""
+        """Return a copy without gradients."""
         return self.map(torch.Tensor.detach)
 
     def clone(self) -> Self:
-        """In memory of its own, in torch's order."""
+        """Return a copy in memory of its own, contiguous."""
         return self.map(lambda tensor: tensor.clone(memory_format=torch.contiguous_format))
 
     def pin_memory(self) -> Self:
-        """In pinned memory, as ``DataLoader(pin_memory=True)`` asks for."""
+        """Return a copy in pinned memory, as ``DataLoader(pin_memory=True)`` asks for."""
         return self.map(torch.Tensor.pin_memory)
 
     @classmethod
     def stack(cls, records: Sequence[Self]) -> Self:
-        """Records as one with a new leading dimension, as ``torch.stack``. Raises ``ShapeError`` where their settings
-        or shapes differ.
+        """Stack records along a new leading dimension, as ``torch.stack``.
+
+        Args:
+            records: records of this class with equal settings, apart from ``notes``, and equal shapes.
+
+        Raises:
+            ArgumentError: for entries of other classes.
+            ShapeError: for different settings or shapes, and for no record.
         """
         return cls._joined(records, lambda tensors: torch.stack(list(tensors)))
 
     @classmethod
     def cat(cls, records: Sequence[Self]) -> Self:
-        """Records with a leading dimension, one behind another along it, as ``torch.cat``. Raises as :meth:`stack`."""
+        """Concatenate records along their leading dimension, as ``torch.cat``; else as :meth:`stack`."""
         return cls._joined(records, lambda tensors: torch.cat(list(tensors)))
 
     @classmethod
     def merged_notes(cls, records: Sequence[Self]) -> dict[str, Any]:
-        """The ``notes`` of a batch. Raises ``ShapeError`` for records that were not made alike."""
+        """Return the ``notes`` of a batch. Raises ``ShapeError`` for records that were made differently."""
         return {}
 
     @classmethod
@@ -145,7 +154,7 @@ class TensorRecord:
         return {**found, **found.pop("others", {})}
 
     def _settings(self) -> dict[str, Any]:
-        """What must agree in a batch: everything but tensors, of which there must be the same ones, and notes."""
+        """Return the entries that must agree in a batch: names of the tensors, settings without notes."""
         return {
             "tensors": tuple(self.tensors()),
             **{
@@ -156,7 +165,7 @@ class TensorRecord:
         }
 
     def _with(self, entries: Mapping[str, Any]) -> Self:
-        """A copy with some entries replaced."""
+        """Return a copy with some entries replaced."""
         others: Mapping[str, Any] = getattr(self, "others", {})
         changes = {name: value for name, value in entries.items() if name not in others}
         if others:
@@ -177,7 +186,7 @@ class TensorRecord:
     # -------------------------------------------------------------------------------------------------------- shown
 
     def _shown(self) -> dict[str, str]:
-        """What is shown, by name: a line for each tensor and for each setting that is there."""
+        """Return a line for each tensor and each setting with a value, by name."""
         shown = {name: _described(tensor) for name, tensor in self.tensors().items()}
         for name, value in self._entries().items():
             if name not in shown and name not in self.notes and value not in (None, (), {}):
@@ -191,7 +200,7 @@ class TensorRecord:
         return f"{type(self).__name__}({', '.join(f'{name}={text}' for name, text in self._shown().items())})"
 
     def _repr_html_(self) -> str:
-        """A table for notebooks."""
+        """Return a table for notebooks."""
         rows = "".join(
             f"<tr><th style='text-align:left'>{html.escape(name)}</th>"
             f"<td style='text-align:left'>{html.escape(text)}</td></tr>"
@@ -220,7 +229,7 @@ def _dtype_for(tensor: torch.Tensor, value: Any) -> Any:
 
 
 class _Rest:
-    """What is left of a record without its tensors. Equal where the settings are, however the records were made."""
+    """Record without its tensors, the context of a tree. Equal if the settings are."""
 
     def __init__(self, record: TensorRecord):
         self.names = _leaves_of(record)
@@ -236,7 +245,7 @@ class _Rest:
 
 
 def _leaves_of(record: TensorRecord) -> list[str]:
-    """Names of what a tree takes out of a record: its tensors, or what another tree has put in their places."""
+    """Return the names of the leaves of a record: its tensors, or the objects that a tree put in their places."""
     found: list[str] | None = record.__dict__.get("_leaves")
     return list(record.tensors()) if found is None else found
 
@@ -262,7 +271,7 @@ def _put_together(leaves: Any, rest: _Rest) -> Any:
 
 
 def _unchecked(record: TensorRecord, entries: Mapping[str, Any]) -> TensorRecord:
-    """A copy with anything in the places of tensors, which is no record as its class has them."""
+    """Return a copy with any objects in the places of tensors, which the class itself would refuse."""
     twin, others = copy.copy(record), getattr(record, "others", {})
     twin.__dict__.pop("_leaves", None)
     for name in entries.keys() - others.keys():
@@ -282,8 +291,13 @@ def _collated(batch: Any, *, collate_fn_map: Any = None) -> Any:
 
 
 def same(a: Any, b: Any) -> bool:
-    """Whether two tensors, arrays or dictionaries of them hold equal values, NaN in the same places, wherever they are.
-    Tensors of different dtypes are different.
+    """Compare tensors, arrays, or dictionaries of them.
+
+    Args:
+        a, b: values on any device.
+
+    Returns:
+        True for equal shapes, dtypes and values, with NaN in the same places.
     """
     if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor):
         if a.shape != b.shape or a.dtype != b.dtype:

@@ -1,8 +1,8 @@
-"""Optical path length and time. The one place where the speed of light stands.
+"""Optical path length and time. The only place of the speed of light.
 
 Time is optical path length (`opl`) in metres everywhere in the library, unless a name ends in `_s` (seconds). The
-optical path length of a flight is its geometric length times the index of refraction along it, so that dividing by the
-speed of light in vacuum gives the time of flight, in any medium.
+optical path length of a flight is its geometric length times the index of refraction along it: divided by the speed of
+light in vacuum it is the time of flight, in any medium.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 SPEED_OF_LIGHT = 299_792_458.0  # m/s in vacuum, exact by the definition of the metre (SI)
-# What a number in another unit looks like. Bins and pulses are 0.3 fs long and more, a quarter of a period of visible
+# Bounds that tell numbers in other units. Bins and pulses are 0.3 fs long and more, a quarter of a period of visible
 # light: a shorter length is a time in seconds.
 SHORTEST_OPL = 1e-7
 # Pulses are far below the 1 ms that a picosecond is in nanoseconds, and light comes back from 1500 km away in 10 ms.
@@ -29,26 +29,52 @@ Quantity = TypeVar("Quantity", "float", "Tensor", "NDArray[Any]")
 
 
 def opl_to_seconds(opl: Quantity) -> Quantity:
-    """Time of flight in seconds of an optical path length in metres. Keeps the type, shape and dtype given.
+    """Convert optical path lengths to times of flight.
 
-    A half-precision tensor is refused with UnitError: a metre is 3.3e-9 s, below the smallest float16.
+    Args:
+        opl: metres, a number, tensor or array of any shape.
+
+    Returns:
+        Seconds, in the type, shape and dtype of ``opl``.
+
+    Raises:
+        UnitError: for half-precision tensors, since a metre is 3.3e-9 s, below the smallest float16, and for
+            anything but numbers.
     """
     _refuse_half(opl, "opl_to_seconds")
     return opl / SPEED_OF_LIGHT
 
 
 def seconds_to_opl(time_s: Quantity) -> Quantity:
-    """Optical path length in metres of a time of flight in seconds. Keeps the type, shape and dtype given.
+    """Convert times of flight to optical path lengths.
 
-    A half-precision tensor is refused with UnitError, as in `opl_to_seconds`.
+    Args:
+        time_s: seconds, a number, tensor or array of any shape.
+
+    Returns:
+        Metres, in the type, shape and dtype of ``time_s``.
+
+    Raises:
+        UnitError: as :func:`opl_to_seconds`.
     """
     _refuse_half(time_s, "seconds_to_opl")
     return time_s * SPEED_OF_LIGHT
 
 
 def near_seconds(time_s: float, name: str, where: str, *, limit_s: float = LATEST_S) -> float:
-    """A time in seconds. UnitError from `limit_s` on, either side of zero: picoseconds, nanoseconds or metres, and for
-    what is no number.
+    """Check that a number is a time in seconds, rather than in picoseconds, nanoseconds or metres.
+
+    Args:
+        time_s: the time, seconds.
+        name: name of the argument, for messages.
+        where: name of the function, for messages.
+        limit_s: smallest absolute value that is refused, seconds.
+
+    Returns:
+        The time as a float, seconds.
+
+    Raises:
+        UnitError: from ``limit_s`` on, and unless the time is one number.
     """
     number, limit = as_number(time_s), as_number(limit_s)
     if limit is None or not limit > 0:

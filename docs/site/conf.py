@@ -20,6 +20,7 @@ extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
     "sphinx.ext.mathjax",
     "sphinx_gallery.gen_gallery",
 ]
@@ -39,6 +40,8 @@ autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
 autodoc_default_options = {"members": True, "show-inheritance": False}
 autosummary_generate = False
+napoleon_numpy_docstring = False
+napoleon_use_rtype = False
 
 sphinx_gallery_conf = {
     "examples_dirs": [str(SOURCE / "training_examples")],
@@ -61,4 +64,5 @@ html_copy_source = False
 
 
 def setup(app):  # type: ignore[no-untyped-def]
-    app.connect("autodoc-process-docstring", as_restructured)
+    # Before napoleon, which takes "Args:", "Returns:" and "Raises:" apart.
+    app.connect("autodoc-process-docstring", as_restructured, priority=400)

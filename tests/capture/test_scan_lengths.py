@@ -10,8 +10,7 @@ import torch
 from support.scalars import no_gradient_is_lost
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
-from torchtransient.capture.distances import bounds_of, longest, shortest
-from torchtransient.capture.scan import laser_index
+from torchtransient.capture.scan import bounds_of, laser_index, longest, shortest
 from torchtransient.errors import SceneError, ShapeError, UnitError
 from torchtransient.files.captures.gaps import hidden_side
 from torchtransient.files.content_key import content_key

@@ -22,7 +22,7 @@ from torchtransient.cli.main import main
 from torchtransient.cli.options import assignments, scene_values
 from torchtransient.cli.pictures import write_pictures
 from torchtransient.cli.reconstruct import Numbers, _as_words, _check_together, _draw, _grid, _wall_size
-from torchtransient.rendering.variant import active_variant
+from torchtransient.scene.variant import active_variant
 
 # ----------------------------------------------------------------------------------------------------------- options
 

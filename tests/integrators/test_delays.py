@@ -12,10 +12,10 @@ from scipy.stats import gamma
 import torchtransient as tt
 from support.gradient_cases.scenes import camera, film, room
 from torchtransient import plugins
-from torchtransient._collection import no_collection
 from torchtransient.accuracy.statistics import two_sample_z_test, z_test
 from torchtransient.errors import SceneError
 from torchtransient.plugins.bsdfs.delay_table import DECAY_NODES, DelayedBSDFs, _distribution
+from torchtransient.plugins.guards import no_collection
 from torchtransient.pulses import Pulse
 from torchtransient.sensing.response.pulse import pulse_kernel
 from torchtransient.units import SPEED_OF_LIGHT

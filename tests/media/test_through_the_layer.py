@@ -12,7 +12,7 @@ import torch
 import torchtransient as tt
 from support.media_scenes import block, camera, clouds, homogeneous
 from torchtransient.errors import SceneError
-from torchtransient.rendering.variant import active_variant
+from torchtransient.scene.variant import active_variant
 
 VARIANT = "llvm_ad_rgb"
 AXIS = tt.TimeAxis(start_opl=0.0, bin_width_opl=0.2, num_bins=100)

@@ -82,3 +82,5 @@ def test_it_is_built_without_a_warning(tmp_path):
     for script in scripts:
         assert (html / "gallery" / f"{script.stem}.html").is_file(), script
     assert "poisson_nll" in (html / "reference" / "losses.html").read_text(encoding="utf-8")
+    sections = (html / "reference" / "torchtransient.html").read_text(encoding="utf-8")
+    assert all(title in sections for title in ("Parameters", "Returns", "Raises"))

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from support.hidden_shapes import ball, disc, join, mesh
-from torchtransient._collection import no_collection
 from torchtransient.plugins.cache import Cache
 from torchtransient.plugins.edges.table import EdgeTable
 from torchtransient.plugins.edges.topology import Topology, topology_of
 from torchtransient.plugins.frozen_state import state_below
+from torchtransient.plugins.guards import no_collection
 from torchtransient.plugins.node_walk import members_of
 
 VARIANT = "llvm_ad_mono"

@@ -5,24 +5,29 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import torch
 
+import torchtransient as tt
 from torchtransient import plugins
 from torchtransient.plugins import mitsuba_compat as compat
+
+pytestmark = pytest.mark.filterwarnings("ignore::torchtransient.errors.VersionWarning")
 
 PACKAGE = Path(compat.__file__).parents[1]
 POSITIONS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], np.float32)
 NORMALS = np.tile(np.float32([0, 0, 1]), (4, 1))
 TEXCOORDS = POSITIONS[:, :2]
 FACES = np.array([[0, 1, 2], [2, 1, 3]], np.uint32)
-# Users' keys of the arrays, and their names and types in Mitsuba 3.10.
-NEW = {
-    "vertex_positions": ("positions", POSITIONS),
-    "vertex_normals": ("normals", NORMALS),
-    "vertex_texcoords": ("texcoords", TEXCOORDS),
-    "faces": ("faces", FACES),
+# Names in Mitsuba 3.9, those in Mitsuba 3.10, and columns.
+NAMES = {
+    "vertex_positions": ("positions", 3),
+    "vertex_normals": ("normals", 3),
+    "vertex_texcoords": ("texcoords", 2),
+    "faces": ("faces", 3),
 }
 
 
@@ -30,6 +35,144 @@ NEW = {
 def _variant():
     mi.set_variant("llvm_ad_rgb")
     plugins.sync()
+
+
+# ----------------------------------------------------------------------------------------- Mitsuba 3.10 in Mitsuba 3.9
+
+
+class Rows:
+    """Handle of an array that is shown as rows: an array of Mitsuba 3.9, or the rows that vertices share."""
+
+    def __init__(self, handle=None, columns=1, value=None):
+        self.handle, self.columns, self.value = handle, columns, value
+
+
+@pytest.fixture
+def new_meshes(monkeypatch):
+    """Meshes as those of Mitsuba 3.10: other names, rows, no buffers. Returns the rows that their vertices share."""
+    old, shared, get, write = mi.Mesh, {}, mi.get_property, mi.set_property
+    walk, changed = old.traverse, old.parameters_changed
+    users = {new: name for name, (new, _) in NAMES.items()}
+    exists = {name: getattr(old, f"has_vertex_{name}") for name in ("normals", "texcoords")}
+
+    class NewNames(mi.TraversalCallback):
+        def __init__(self, mesh, callback):
+            super().__init__()
+            self.mesh, self.callback = mesh, callback
+
+        def put(self, name, value, flags, cpptype=None):
+            new, columns = NAMES.get(name, (name, None))
+            if new in exists and not exists[new](self.mesh):
+                return
+            self.callback.put(new, value if columns is None else Rows(value, columns), flags, cpptype)
+            if new == "positions":
+                for index in ("position_index", "normal_index", "bsdf_index"):
+                    self.callback.put(index, Rows(value=shared.get(index, mi.UInt32())), 0, mi.UInt32)
+
+    def get_property(handle, kind, node):
+        if not isinstance(handle, Rows):
+            return get(handle, kind, node)
+        if handle.handle is None:
+            return handle.value
+        flat = get(handle.handle, kind, node)
+        return dr.tensor_t(type(flat))(flat, (dr.width(flat) // handle.columns, handle.columns))
+
+    def set_property(handle, kind, value):
+        if not isinstance(handle, Rows):
+            return write(handle, kind, value)
+        assert dr.is_tensor_v(value) and value.shape[1] == handle.columns
+        return write(handle.handle, kind, value.array)
+
+    def parameters_changed(mesh, keys=()):
+        changed(mesh, [users.get(name, "unknown" if name in NAMES else name) for name in keys])
+
+    monkeypatch.setattr(mi, "__version__", "3.10.0")
+    monkeypatch.setattr(mi, "get_property", get_property)
+    monkeypatch.setattr(mi, "set_property", set_property)
+    monkeypatch.setattr(old, "traverse", lambda mesh, callback: walk(mesh, NewNames(mesh, callback)))
+    monkeypatch.setattr(old, "parameters_changed", parameters_changed)
+    for name, method in exists.items():
+        monkeypatch.setattr(old, f"has_{name}", method, raising=False)
+        monkeypatch.delattr(old, f"has_vertex_{name}")
+    for name in NAMES:
+        monkeypatch.delattr(old, f"{name}_buffer")
+    return shared
+
+
+# --------------------------------------------------------------------------------------------------------- the library
+
+
+def scene(face_normals=False):
+    return tt.load(
+        {
+            "type": "scene",
+            "sensor": {
+                "type": "perspective",
+                "to_world": mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0]),
+                "film": {"type": "transient_hdr_film", "width": 4, "height": 4},
+            },
+            "cube": {"type": "cube", "bsdf": {"type": "diffuse"}, "face_normals": face_normals},
+            "light": {"type": "point", "position": [1, 2, 5], "intensity": 10.0},
+        }
+    )
+
+
+def derivatives(key, face_normals):
+    """Return the table of parameters, a render, and a gradient by ``key``."""
+    loaded = scene(face_normals)
+    table = {name: info.shape for name, info in loaded.parameters().items() if name.startswith("cube.")}
+    axis = tt.TimeAxis(start_opl=6.0, bin_width_opl=0.5, num_bins=12)
+    render = tt.TransientRenderer(
+        loaded, [key], time_axis=axis, spp=16, max_depth=3, temporal_filter="gaussian"
+    )
+    value = torch.as_tensor(loaded.parameters()[key].value * 1.01).requires_grad_()
+    out = render({key: value}, seed=1)
+    steps = torch.arange(out.transient.numel()).reshape(out.transient.shape).float()
+    (grad,) = torch.autograd.grad((out.transient * torch.sin(steps)).sum(), value)
+    return table, out.transient.detach(), grad
+
+
+@pytest.mark.parametrize(
+    ("key", "face_normals"),
+    [
+        ("cube.vertex_positions", False),
+        ("cube.vertex_normals", False),
+        ("cube.to_world", False),
+        ("cube.to_world", True),
+    ],
+)
+def test_renders_and_gradients_are_the_same(request, key, face_normals):
+    table, image, grad = derivatives(key, face_normals)
+    request.getfixturevalue("new_meshes")
+    assert set(mi.traverse(mi.load_dict({"type": "cube"})).keys()) >= {"positions", "normals", "texcoords"}
+    new_table, new_image, new_grad = derivatives(key, face_normals)
+    assert {k: shape for k, shape in new_table.items() if not k.endswith(("faces", "_index"))} == {
+        k: shape for k, shape in table.items() if not k.endswith("faces") and (shape == () or shape[0] > 0)
+    }
+    assert image.abs().sum() > 0 and grad.abs().sum() > 0
+    torch.testing.assert_close(new_image, image)
+    torch.testing.assert_close(new_grad, grad, rtol=1e-4, atol=1e-5)
+
+
+def wrapped_derivative(key):
+    """Return values and a gradient of a function of ``mitsuba.SceneParameters``, and the positions that it leaves."""
+    params = mi.traverse(mi.load_dict({"type": "scene", "cube": {"type": "cube"}}))
+    positions = params[key].numpy().reshape(-1, 3)
+    size = positions.size
+    function = tt.wrap(lambda held: compat.flat_array(held[key]) * dr.arange(mi.Float, size), params)
+    x = torch.tensor(positions * 2, requires_grad=True)
+    found = function({key: x})
+    found.square().sum().backward()
+    np.testing.assert_array_equal(params[key].numpy().reshape(-1, 3), positions)
+    return found.detach(), x.grad
+
+
+def test_wrapped_functions_have_the_keys_of_mitsuba(request):
+    found, grad = wrapped_derivative("cube.vertex_positions")
+    request.getfixturevalue("new_meshes")
+    new_found, new_grad = wrapped_derivative("cube.positions")
+    torch.testing.assert_close(new_found, found)
+    torch.testing.assert_close(new_grad, grad)
 
 
 def mesh_of_arrays():
@@ -44,38 +187,32 @@ def mesh_of_arrays():
     )
 
 
-@pytest.fixture(params=["3.9", "3.10"])
-def mesh(request, monkeypatch):
-    """A mesh; that of version 3.10 shows rows under other names, and has no buffers."""
-    found = mesh_of_arrays()
-    if request.param == "3.9":
-        return found
-    monkeypatch.setattr(compat, "shows_rows", lambda: True)
-    tensors = {name: (mi.TensorXu if name == "faces" else mi.TensorXf)(array) for name, array in NEW.values()}
-    monkeypatch.setattr(compat.mi, "traverse", lambda shape: tensors if shape is None else pytest.fail("a buffer"))
-    return None
+READERS = {
+    compat.mesh_positions: POSITIONS,
+    compat.mesh_normals: NORMALS,
+    compat.mesh_texcoords: TEXCOORDS,
+    compat.mesh_faces: FACES,
+}
 
 
-def test_arrays(mesh):
-    for read, array in [
-        (compat.mesh_positions, POSITIONS), (compat.mesh_normals, NORMALS), (compat.mesh_texcoords, TEXCOORDS),
-        (compat.mesh_faces, FACES),
-    ]:  # fmt: skip
+@pytest.mark.parametrize("name", ["3.9", "3.10"])
+def test_arrays(request, name):
+    mesh = mesh_of_arrays()
+    if name == "3.10":
+        request.getfixturevalue("new_meshes")
+    for read, array in READERS.items():
         found = read(mesh)
         assert isinstance(found, mi.UInt32 if array is FACES else mi.Float)
         np.testing.assert_array_equal(np.array(found), array.ravel())
 
 
-def test_keys_of_users(monkeypatch):
-    mesh = mesh_of_arrays()
-    shown = set(mi.traverse(mesh).properties)
-    for rows in (False, True):
-        monkeypatch.setattr(compat, "shows_rows", lambda rows=rows: rows)
-        for key, (new, _) in NEW.items():
-            assert key in shown or rows
-            assert compat.users_name(mesh, new if rows else key) == key
-        assert compat.users_name(mesh, "vertex_color") == "vertex_color"
-        assert compat.users_name(mesh.bsdf(), "positions") == "positions"
+def test_vertices_that_share_positions(new_meshes):
+    cube = mi.load_dict({"type": "cube"})
+    rows = np.array(compat.mesh_positions(cube)).reshape(-1, 3)
+    index = np.arange(len(rows))[::-1].copy()
+    new_meshes["position_index"] = mi.UInt32(index)
+    np.testing.assert_array_equal(np.array(compat.mesh_positions(cube)).reshape(-1, 3), rows[index])
+    np.testing.assert_array_equal(compat.rows_of_faces(cube, "vertex_positions"), np.arange(len(rows)))
 
 
 def test_new_meshes_are_handed_their_arrays(monkeypatch):
@@ -94,8 +231,10 @@ def test_versions(monkeypatch, version, rows):
     assert compat.shows_rows() == rows
 
 
-def test_buffers_are_read_in_one_file():
+def test_mitsubas_names_stand_in_one_file():
+    names = r"vertex_(positions|normals|texcoords)"
+    spelled = rf"({names}|faces)_buffer\(|has_{names}\(|[\"'.]{names}[\"']"
     for path in PACKAGE.rglob("*.py"):
         if path.stem != "mitsuba_compat":
-            found = re.search(r"(vertex_\w+|faces)_buffer\(", path.read_text(encoding="utf-8"))
+            found = re.search(spelled, path.read_text(encoding="utf-8"))
             assert found is None, f"{path}: {found}"

@@ -1,4 +1,4 @@
-"""An operator that is written as docs/design.md says: nothing else is needed."""
+"""An operator that is written as docs/contributing.md says: nothing else is needed."""
 
 from __future__ import annotations
 

@@ -3,17 +3,17 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 import torch
 
-from torchtransient.errors import ShapeError, StorageError
-from torchtransient.rendering import batch, engine, memory, progress, session
-from torchtransient.rendering.batch import Batch
-from torchtransient.rendering.broken_numbers import all_finite, broken_entries, carried_on
+from torchtransient.errors import StorageError
+from torchtransient.rendering import engine, memory, progress
+from torchtransient.rendering.broken_numbers import broken_entries, spread_nan
 from torchtransient.rendering.output import RenderOutput, RenderStats
+from torchtransient.scene.physics import all_finite
+from torchtransient.scene.values import own_array
 
 VARIANT = "llvm_ad_mono"
 
@@ -25,11 +25,11 @@ VARIANT = "llvm_ad_mono"
 def test_copies_of_few_and_of_many_numbers(rows):
     """Of memory that the caller has not, whatever he holds: a transposed view, one with a gradient."""
     given = (torch.arange(rows * 3.0).reshape(3, rows) % 7).T.clone().requires_grad_().T.T
-    flat, before = session.own_array(given), given.detach().numpy().ravel().copy()
+    flat, before = own_array(given), given.detach().numpy().ravel().copy()
     with torch.no_grad():
         given *= 3
     assert type(flat) is mi.Float and np.array_equal(np.array(flat), before)
-    assert session.own_array(torch.tensor(3.0, requires_grad=True))[0] == 3
+    assert own_array(torch.tensor(3.0, requires_grad=True))[0] == 3
 
 
 def test_negative_views_are_their_numbers():
@@ -38,7 +38,7 @@ def test_negative_views_are_their_numbers():
         view = torch.view_as_complex(torch.arange(2.0 * count).reshape(count, 2)).conj().imag
         assert view.is_neg()
         expected = -np.arange(1.0, 2 * count, 2)
-        assert np.array_equal(np.array(session.own_array(view)), expected)
+        assert np.array_equal(np.array(own_array(view)), expected)
         flat, offset, strides = engine._cube_adjoint(view)
         assert np.array_equal(np.array(flat)[offset :: strides[0]][:count], expected)
         assert np.array_equal(np.array(engine._steady_adjoint(view)), expected)
@@ -77,63 +77,6 @@ def test_adjoints_beyond_32_bits_are_laid_as_the_film_is(step, whole):
 # ------------------------------------------------------------------------------------------------------------ memory
 
 
-@pytest.mark.parametrize(
-    ("count", "rows", "lent"),
-    [(2, 2**16, True), (2, 2**16 - 1, False), (1, 2**16, False), (2**14 - 1, 2**16, True), (2**14, 2**16, False)],
-)
-def test_large_films_of_a_batch_write_to_their_place(monkeypatch, count, rows, lent):
-    """From 2^18 values on, as far as 32 bits number all of them."""
-    monkeypatch.setattr(batch, "says_it_can_be_recorded", lambda integrator: integrator == "ours")
-    monkeypatch.setattr(Batch, "_lend", lambda self, film, n, entries: film.lend((n, entries)))
-    places = []
-    film = SimpleNamespace(cube_shape=lambda: (rows, 2, 2, 1), can_borrow=lambda spp: spp == 3, lend=places.append)
-    for integrator, spp in (("ours", 3), ("ours", 4), ("theirs", 3)):
-        with Batch(count, [film], integrator).lent_to(film, 1, spp) as given:
-            assert given == (lent and integrator == "ours" and spp == 3)
-    assert places == ([(1, 4 * rows), None] if lent else [])
-
-
-def test_places_of_a_batch():
-    given = []
-    film = SimpleNamespace(cube_shape=lambda: (2, 3, 5, 1), lend=given.append)
-    films = Batch(4, [film], None)
-    for n in (0, 3):
-        films._lend(film, n, 30)
-    assert [place for _, place in given] == [0, 90]
-    assert given[0][0] is given[1][0] and dr.width(given[0][0]) == 120
-    with pytest.raises(ShapeError, match="at least one entry, got 0"):
-        Batch(0, [], None).tensors()
-
-
-def test_results_that_are_in_their_place(monkeypatch):
-    """Of films that wrote to it only the image is taken; of others, and where none was lent, both, item by item."""
-    monkeypatch.setattr(batch, "_take_steady", lambda film: torch.full((2, 3, 1), film.light))
-    into = []
-
-    def take(film, place):
-        into.append(None if place is None else tuple(place.shape))
-        return torch.full((2, 3, 1), film.light), torch.full((2, 3, 5, 1), film.light)
-
-    monkeypatch.setattr(batch, "take", take)
-    memory = object()
-
-    def film(light, *bands):
-        return SimpleNamespace(light=light, bands=[(0, 2, band) for band in bands])
-
-    for lent, others in ((memory, [False, True, True]), (None, [True, True, True])):
-        whole, into[:] = Batch(3, [], None), []
-        whole._memory = lent
-        for n, one in enumerate((film(2.0, memory), film(3.0, object()), film(5.0))):
-            whole.take(one, n)
-        steady, response = whole.tensors()
-        assert steady.shape == (3, 2, 3, 1) and steady[:, 1, 2, 0].tolist() == [2, 3, 5]
-        assert response.shape == (3, 2, 3, 5, 1) and response[1:, 0, 0, 0, 0].tolist() == [3, 5]
-        assert into == [None, *[(2, 3, 5, 1)] * (sum(others) - 1)]
-    alone = Batch(1, [], None)
-    alone.take(film(7.0, object()), 0)
-    assert [tuple(one.shape) for one in alone.tensors()] == [(2, 3, 1), (2, 3, 5, 1)]
-
-
 def test_cubes_that_fit(monkeypatch):
     """Up to 4 MiB nobody asks; of several renders one film more than there are renders is held at a time."""
     monkeypatch.setattr(memory, "available_bytes", lambda variant: 10 * 2**20)
@@ -170,15 +113,6 @@ def test_sizes_in_words(size, words):
 
 
 # ---------------------------------------------------------------------------------------------------------- progress
-
-
-def test_fractions_of_renders_add_up():
-    told = []
-    job = SimpleNamespace(progress=told.append, items=[0, 1, 2, 3])
-    for n, fraction in ((0, 0.0), (0, 0.5), (2, 0.25), (3, 1.0)):
-        engine._fraction(job, n)(fraction)
-    assert told == [0, 0.125, 0.5625, 1]
-    assert engine._fraction(SimpleNamespace(progress=None, items=[0]), 0) is None
 
 
 def test_a_bar_moves_by_what_is_new(monkeypatch):
@@ -220,9 +154,9 @@ def test_broken_numbers_go_on_to_what_they_touch():
         x = given[0].nan_to_num(0.0, 0.0, 0.0)
         return x[:2] * 3, x[2] - x[3], x[0]
 
-    assert [one.tolist() for one in carried_on(derivative, [torch.tensor([1.0, 2.0, 3.0, 5.0])])] == [[3, 6], -2, 1]
+    assert [one.tolist() for one in spread_nan(derivative, [torch.tensor([1.0, 2.0, 3.0, 5.0])])] == [[3, 6], -2, 1]
     assert len(runs) == 1
-    found = carried_on(derivative, [torch.tensor([1.0, np.nan, np.inf, np.inf])])
+    found = spread_nan(derivative, [torch.tensor([1.0, np.nan, np.inf, np.inf])])
     assert found[0][0] == 3 and torch.isnan(found[0][1]) and torch.isnan(found[1]) and found[2] == 1
     marks = runs[2][0]
     assert marks[0] == 0 and ((marks[1:] >= 1) & (marks[1:] < 2)).all() and len(set(marks.tolist())) == 4

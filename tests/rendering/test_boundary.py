@@ -17,7 +17,7 @@ import torchtransient as tt
 from support.marks import long
 from tools.small_room import pose
 from torchtransient.errors import ArgumentError, GradientError, GradientWarning
-from torchtransient.rendering.variant import active_variant
+from torchtransient.scene.variant import active_variant
 
 VARIANT = "llvm_ad_mono"
 BODY, PAINT = "body.to_world", "body.bsdf.reflectance.value"

@@ -14,6 +14,7 @@ import torch
 
 import torchtransient as tt
 from tools.small_room import COLOUR, GREY, WALL_POSE
+from torchtransient.scene.variant import active_variant
 
 START = torch.tensor([0.8, 0.5, 0.2])
 NAN, INF = math.nan, math.inf
@@ -153,7 +154,7 @@ def test_tangents_of_wrapped_functions(gathered):
 
 @pytest.mark.slow
 def test_wrapped_render(room):
-    with tt.rendering.variant.active_variant("llvm_ad_rgb"):
+    with active_variant("llvm_ad_rgb"):
         scene = mi.load_dict(room)
         params = mi.traverse(scene)
     wrapped = tt.wrap(lambda params, seed: mi.render(scene, params, spp=4, seed=seed)[1], params)

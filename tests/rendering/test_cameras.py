@@ -10,7 +10,7 @@ import torchtransient as tt
 from tools.small_room import VARIANT, make_room, pose
 from torchtransient.errors import ArgumentError, SceneError
 from torchtransient.rendering.cameras import camera_of
-from torchtransient.rendering.variant import active_variant
+from torchtransient.scene.variant import active_variant
 
 POSE = pose(0.3, -0.2, 2.5, 1.0)
 KEYS = ["eye.x_fov", "eye.principal_point_offset_x", "eye.principal_point_offset_y", "eye.to_world"]

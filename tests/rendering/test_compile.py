@@ -17,7 +17,7 @@ from support.marks import long
 from support.sensing.all_entries import ENTRIES
 from tools.small_room import COLOUR
 from tools.small_room import VARIANT as VARIANT
-from torchtransient.rendering.opaque import opaque
+from torchtransient.scene.opaque import opaque
 
 START = torch.tensor([0.8, 0.5, 0.2])
 

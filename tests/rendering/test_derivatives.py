@@ -9,7 +9,7 @@ import torch
 from torch.autograd import forward_ad
 
 from torchtransient.errors import GradientError, ShapeError
-from torchtransient.rendering.derivatives import Asked, run
+from torchtransient.rendering.autograd import Asked, run
 
 # Outputs (2,), (3,) and whole numbers of values (3,), (2,) and whole ones: 3 x 2, no symmetry.
 A = torch.tensor([[1.0, -2.0, 3.0], [0.5, 4.0, -1.0]], dtype=torch.float64)

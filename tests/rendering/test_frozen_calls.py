@@ -19,9 +19,9 @@ from tools.boundary_cases.moving_edges import CASES
 from tools.gradient_sweep.measure import quiet
 from tools.gradient_sweep.settings import Setting, all_settings
 from tools.small_room import COLOUR, GREY, VARIANT, WALL_POSE, make_room
-from torchtransient.rendering import recordings
-from torchtransient.rendering.recordings import FIRST, LAUNCHED, NO_FREEZING, PROGRESS, RECORDED, SEVERAL, SWITCHED_OFF
-from torchtransient.rendering.variant import active_variant
+from torchtransient.rendering import recording
+from torchtransient.rendering.recording import FIRST, LAUNCHED, NO_FREEZING, PROGRESS, RECORDED, SEVERAL, SWITCHED_OFF
+from torchtransient.scene.variant import active_variant
 
 # The same kernels but for the order of atomic sums: the last digits of single precision.
 TOLERANCE = 2e-5
@@ -314,7 +314,7 @@ def test_interrupts_leave_everything_as_it_was(stage, kind, monkeypatch):
             # In the middle of it, once: a call that is tried again must not hide it.
             patched.setattr(type(integrator), "walk", interrupt)
         else:
-            patched.setattr(recordings.Recording, "run", interrupt)
+            patched.setattr(recording.Recording, "run", interrupt)
         with pytest.raises(KeyboardInterrupt):
             recorded(seed=8) if out is None else out.transient.sum().backward()
     for seed in range(4):
@@ -346,7 +346,7 @@ def test_several_launches_are_traced(room_scene, monkeypatch):
 
 def test_a_large_batch_is_rendered_in_place(monkeypatch, room_scene):
     # By the module: the package has a function of the name.
-    for name in ("carry_out", "batch"):
+    for name in ("recording", "engine"):
         monkeypatch.setattr(sys.modules[f"torchtransient.rendering.{name}"], "LARGE_FILM", 1)
     colours = torch.tensor([[0.9, 0.1, 0.3], [0.2, 0.8, 0.5]])
     for film in ({}, {"gates": FILMS["gates"]["gates"]}):
@@ -414,7 +414,7 @@ def test_numbers_of_a_plugin_in_python_count(room_scene):
 
 @pytest.mark.slow
 def test_recordings_are_bounded_and_said(monkeypatch):
-    monkeypatch.setattr(recordings, "MAX_STRUCTURES", 3)
+    monkeypatch.setattr(recording, "MAX_STRUCTURES", 3)
     renderer = tt.TransientRenderer(tt.load(make_room(), variant=VARIANT), parameters=[COLOUR])
 
     def take_turns():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import random
 import signal
 import time
@@ -14,11 +13,8 @@ import torch
 
 import torchtransient as tt
 from tools.small_room import COLOUR, VARIANT, WALL_POSE, make_room
-from torchtransient._collection import no_collection
 from torchtransient.plugins import _registry
-from torchtransient.rendering import interrupts
-from torchtransient.rendering.interrupts import quiet
-from torchtransient.rendering.variant import active_variant
+from torchtransient.scene.variant import active_variant
 
 
 def interrupt(*args, **kwargs):
@@ -115,17 +111,6 @@ def test_in_wrapped_functions(level):
         assert torch.autograd.grad(y.sum(), x)[0].tolist() == [2, 2]
 
 
-def test_level_of_messages_is_put_back_when_an_interrupt_cuts_its_end_off(level, monkeypatch):
-    def cut_off():
-        with active_variant(VARIANT), quiet():
-            assert mi.logger().log_level() == mi.LogLevel.Error
-
-    once, put_back = [interrupt], interrupts.put_back_log_level
-    monkeypatch.setattr(interrupts, "put_back_log_level", lambda: (once.pop() if once else put_back)())
-    with pytest.raises(KeyboardInterrupt):
-        cut_off()
-
-
 def test_errors_that_are_no_interrupts_stay_what_they_are(renderer, monkeypatch):
     def broken(*args, **kwargs):
         raise ValueError("a plain mistake")
@@ -191,26 +176,6 @@ def test_in_dictionaries_that_mitsuba_loads(monkeypatch, level):
             with pytest.raises(KeyboardInterrupt):
                 mi.load_dict(room)
     assert mi.load_dict(make_room()) is not None
-
-
-@pytest.mark.parametrize("switch", ["disable", "enable"])
-def test_the_collector_goes_on(monkeypatch, switch):
-    """An interrupt while the collector is stopped, or set going again: at the latest the next block makes it good."""
-    done = getattr(gc, switch)
-    for after in (False, True):
-
-        def cut_off(after=after):
-            if after:
-                done()
-            raise KeyboardInterrupt
-
-        with monkeypatch.context() as patched:
-            patched.setattr(gc, switch, cut_off)
-            with pytest.raises(KeyboardInterrupt), no_collection():
-                pass
-        with no_collection():
-            assert not gc.isenabled()
-        assert gc.isenabled()
 
 
 # --------------------------------------------------------------------------------------- interrupted changes of variant

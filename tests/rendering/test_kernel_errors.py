@@ -11,7 +11,7 @@ import torch
 import torchtransient as tt
 from support.gradient_cases.scenes import room
 from torchtransient.errors import GradientError, SceneError
-from torchtransient.rendering.kernel_errors import _reason, named_errors
+from torchtransient.scene.variant import _reason, named_errors
 
 
 @pytest.fixture(autouse=True)

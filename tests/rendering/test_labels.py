@@ -24,7 +24,7 @@ from torchtransient.rendering.labels import (
     material_names,
     scene_labels,
 )  # fmt: skip
-from torchtransient.rendering.recordings import FIRST, LAUNCHED, RECORDED, SWITCHED_OFF
+from torchtransient.rendering.recording import FIRST, LAUNCHED, RECORDED, SWITCHED_OFF
 from torchtransient.scenes.transforms import look_at, rotate, scale, translate
 
 FLOATS = [name for name in LABELS if name not in NUMBERED]
@@ -794,7 +794,7 @@ def test_built_scenes_are_freed():
     renderer.scene._builds.clear()
     renderer.scene._slots.clear()
     renderer.scene.recordings.clear()
-    renderer.scene._unsettled.clear()
+    renderer.scene.installed.clear()
     renderer.scene._table = None
     gc.collect()
     gc.collect()

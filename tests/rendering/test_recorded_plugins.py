@@ -13,8 +13,8 @@ import torchtransient as tt
 from support import foreign_paint
 from support.marks import long_rows
 from tools.small_room import GREY, VARIANT, make_room
-from torchtransient.rendering.recordings import LAUNCHED, OWN_ENTRY
-from torchtransient.rendering.variant import active_variant
+from torchtransient.rendering.recording import LAUNCHED, OWN_ENTRY
+from torchtransient.scene.variant import active_variant
 
 KEY = "wall.bsdf.value"
 

@@ -9,8 +9,8 @@ import pytest
 
 from torchtransient.errors import TorchTransientError
 from torchtransient.plugins.frozen_state import NotComparableError
-from torchtransient.rendering import recordings
-from torchtransient.rendering.recordings import (
+from torchtransient.rendering import recording
+from torchtransient.rendering.recording import (
     FIRST,
     LAUNCHED,
     RECORDED,
@@ -83,7 +83,7 @@ def test_what_is_not_recorded(kept):
 
 def test_structures_that_are_kept(kept, monkeypatch):
     """The last ones that were called: a call keeps its structure."""
-    monkeypatch.setattr(recordings, "MAX_STRUCTURES", 3)
+    monkeypatch.setattr(recording, "MAX_STRUCTURES", 3)
     for name in "abc":
         called(kept, name)
     called(kept, "a")
@@ -152,11 +152,11 @@ def test_what_waits_is_recorded_another_time(monkeypatch):
     def fail(scene, arrays):
         raise RuntimeError("collect()")
 
-    monkeypatch.setattr(recordings, "not_recordable", lambda error, before: recordings.WAITS)
+    monkeypatch.setattr(recording, "not_recordable", lambda error, before: recording.WAITS)
     one._frozen = fail
-    with pytest.raises(NotRecordedError, match=recordings.WAITS):
+    with pytest.raises(NotRecordedError, match=recording.WAITS):
         one.run([job_of("a")], [])
-    assert one.refusal is None and one.waits == f"traced: Dr.Jit cannot record it: {recordings.WAITS}"
+    assert one.refusal is None and one.waits == f"traced: Dr.Jit cannot record it: {recording.WAITS}"
     one._frozen = lambda scene, arrays: []
     assert one.run([job_of("a")], []) == ([], True) and one.waits == ""
 
@@ -223,7 +223,7 @@ def test_what_failed_is_raised_as_a_traced_call_raises_it(monkeypatch, word):
         setattr(inside, word, first)
         setattr(raised, word, below)
         one._frozen = fail
-        monkeypatch.setattr(recordings, "not_recordable", lambda error, before, reason=reason: reason)
+        monkeypatch.setattr(recording, "not_recordable", lambda error, before, reason=reason: reason)
         with pytest.raises(RuntimeError) as caught:
             one.run([job_of("a")], [])
         assert caught.value is expected and one.refusal is None
@@ -231,7 +231,7 @@ def test_what_failed_is_raised_as_a_traced_call_raises_it(monkeypatch, word):
             assert getattr(caught.value, word) is first
             assert caught.value.__suppress_context__ is (word == "__cause__")
     one._frozen = fail
-    monkeypatch.setattr(recordings, "not_recordable", lambda error, before: "it changes its type")
+    monkeypatch.setattr(recording, "not_recordable", lambda error, before: "it changes its type")
     with pytest.raises(NotRecordedError, match=r"traced: Dr\.Jit cannot record it: it changes its type") as caught:
         one.run([job_of("a")], [])
     assert caught.value.broken and one.refusal == str(caught.value)

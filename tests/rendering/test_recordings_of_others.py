@@ -12,8 +12,8 @@ import torch
 import torchtransient as tt
 from tools.small_room import COLOUR, VARIANT, make_room
 from torchtransient.plugins.frozen_state import WAITS
-from torchtransient.rendering.recordings import LAUNCHED, RECORDED
-from torchtransient.rendering.variant import active_variant
+from torchtransient.rendering.recording import LAUNCHED, RECORDED
+from torchtransient.scene.variant import active_variant
 
 
 @pytest.fixture

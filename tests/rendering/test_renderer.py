@@ -13,8 +13,8 @@ import torchtransient as tt
 from tools.small_room import CAMERA, COLOUR, GREY, VARIANT, WALL_POSE, make_room, pose
 from torchtransient.errors import TorchTransientWarning
 from torchtransient.rendering import memory
-from torchtransient.rendering.seeds import mix_seed
-from torchtransient.rendering.variant import active_variant
+from torchtransient.rendering.job import mix_seed
+from torchtransient.scene.variant import active_variant
 
 START = torch.tensor([0.8, 0.5, 0.2])
 

@@ -9,8 +9,8 @@ import torch
 
 import torchtransient as tt
 from tools.small_room import COLOUR, VARIANT, WALL_POSE, make_room
-from torchtransient.rendering import batch
-from torchtransient.rendering.variant import active_variant
+from torchtransient.rendering import engine
+from torchtransient.scene.variant import active_variant
 
 
 def resident_bytes(field: str = "VmRSS") -> int:
@@ -36,13 +36,13 @@ def big_room(bins):
 
 def test_tensor_is_the_films_own_memory(room_scene, monkeypatch):
     addresses = []
-    take = batch.take
+    take = engine._tensors_of
 
     def spy(film, into):
         addresses.append(film.transient_bands()[0][2].torch().data_ptr())
         return take(film, into)
 
-    monkeypatch.setattr(batch, "take", spy)
+    monkeypatch.setattr(engine, "_tensors_of", spy)
     renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=4)
     assert renderer(seed=0).transient.data_ptr() == addresses[0]
     assert renderer({COLOUR: torch.rand(1, 3)}, seed=0).transient.data_ptr() == addresses[1]

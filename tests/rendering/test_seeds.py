@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchtransient.errors import ShapeError, TorchTransientWarning, UnitError
-from torchtransient.rendering.seeds import Item, Seeding, drawn, mix_seed, whole_number
+from torchtransient.rendering.job import Item, Seeding, drawn, mix_seed, whole_number
 
 
 def test_numbers_are_those_of_splitmix64():

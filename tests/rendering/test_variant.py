@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from tools.small_room import COLOUR, VARIANT, make_room
-from torchtransient.rendering.variant import active_variant, is_differentiable, resolve_variant
+from torchtransient.scene.variant import active_variant, is_differentiable, resolve_variant
 
 
 def run(script: str) -> str:
@@ -169,7 +169,7 @@ def test_fork_before_rendering_is_fine_and_after_it_is_refused():
 def test_many_switches_are_mentioned_once(monkeypatch):
     import mitsuba as mi
 
-    from torchtransient.rendering import variant
+    from torchtransient.scene import variant
 
     monkeypatch.setattr(variant, "MANY_SWITCHES", 2)
     monkeypatch.setitem(variant._switches, "count", 0)

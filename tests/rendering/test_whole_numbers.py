@@ -125,7 +125,7 @@ def test_values_that_are_no_numbers():
     ones = torch.ones(3)
     wrong = [
         np.array(["2020"] * 3, "datetime64[s]"), ["0.5"] * 3, np.array(["1"] * 3), [10**400] * 3, [True] * 3,
-        torch.nested.nested_tensor([ones, ones]), ones.to_sparse(),
+        np.ma.array([0.5] * 3, mask=[False, True, False]), torch.nested.nested_tensor([ones, ones]), ones.to_sparse(),
         torch.quantize_per_tensor(ones, 0.1, 0, torch.qint8), [ones[0], "x", 1.0], [ones, ones[:2]], [1j] * 3,
     ]  # fmt: skip
     for value in wrong:

@@ -457,11 +457,11 @@ def test_decorators_methods_and_partial_functions():
 
         @tt.wrap(source="torch", target="drjit")
         def times(self, x):
-            """What it does."""
+            """Scale a tensor."""
             return x * self.factor
 
     x = torch.ones(2, requires_grad=True)
-    assert torch.equal(Scaled().times(x), torch.full((2,), 3.0)) and Scaled.times.__doc__ == "What it does."
+    assert torch.equal(Scaled().times(x), torch.full((2,), 3.0)) and Scaled.times.__doc__ == "Scale a tensor."
     assert torch.equal(tt.wrap(functools.partial(Scaled.times.__wrapped__, Scaled()))(x), torch.full((2,), 3.0))
     assert torch.equal(tt.wrap(Scaled().times.__wrapped__, source=torch, target=dr)(Scaled(), x), torch.full((2,), 3.0))
 

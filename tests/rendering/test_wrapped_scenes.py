@@ -152,19 +152,6 @@ def test_every_way_to_a_scene(scene, way):
     assert np.all(np.array(params[KEY]) == 7.0) and not dr.grad_enabled(params[KEY]), "left behind by the derivative"
 
 
-def test_parameters_are_not_looked_for_twice(scene, monkeypatch):
-    """Where a function names parameters of a scene beside it, the scene is not traversed."""
-    params = mi.traverse(scene)
-    params.keep([KEY])
-    wrapped, alone = tt.wrap(lambda x: x * len((scene, params))), tt.wrap(lambda x: x * len((scene,)))
-    traversed = []
-    monkeypatch.setattr(mi, "traverse", lambda node, traverse=mi.traverse: traversed.append(node) or traverse(node))
-    assert torch.equal(wrapped(torch.ones(2)), torch.full((2,), 2.0)) and not traversed
-    for _ in range(2):
-        assert torch.equal(alone(torch.ones(2)), torch.ones(2))
-    assert traversed == [scene], "once for all calls"
-
-
 def held(value, levels):
     for _ in range(levels):
         value = [value]
@@ -172,7 +159,7 @@ def held(value, levels):
 
 
 def left_behind(scene, function):
-    """Whether a function that is wrapped leaves its value in the scene."""
+    """Return True if a wrapped function leaves its value in the scene."""
     tt.wrap(function)(torch.full((2, 2, 3), 2.0))
     params = mi.traverse(scene)
     found = np.any(np.array(params[KEY]) != 0.5)
@@ -240,7 +227,7 @@ def test_scenes_of_two_variants_are_refused(scene):
 
 
 def test_parameters_that_are_not_set():
-    """As the absorption of hair that has pigments."""
+    """Hair with pigments has no absorption that is set."""
     hair = mi.load_dict({"type": "hair", "eumelanin": 0.25, "pheomelanin": 0.5})
     assert torch.equal(tt.wrap(lambda x: x * len((hair,)))(torch.ones(2)), torch.ones(2))
 
@@ -286,7 +273,7 @@ def test_attached_arrays_are_refused_wherever_they_are(way):
 
 
 def test_a_scene_that_is_attached_and_not_found_is_refused(scene):
-    """As after a step of ``mi.ad.Adam``, in a place too deep to be found: its derivative would be lost."""
+    """A step of ``mi.ad.Adam`` attaches scenes; in a place too deep to be found the derivative would be lost."""
     params = mi.traverse(scene)
     attached = mi.TensorXf(params[KEY])
     dr.enable_grad(attached)

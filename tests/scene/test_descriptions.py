@@ -1,4 +1,4 @@
-"""What scenes are reduced to: plain data, told apart by every number, and what has no description."""
+"""Reduction of scenes to plain data that differs for every number, and objects without a description."""
 
 from __future__ import annotations
 
@@ -255,7 +255,7 @@ def test_ready_scenes_that_stay_as_they_are():
 
 
 def test_samples_over_seconds():
-    """Of all pixels of all films, each with its number of samples."""
+    """The rate counts all pixels of all films, each with its number of samples."""
     room = make_room()
     scene = tt.load(room, variant=VARIANT)
     stats = tt.render(scene, {GREY: torch.rand(3) * 0.5}, spp=4, seed=0).stats

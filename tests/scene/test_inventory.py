@@ -1,4 +1,4 @@
-"""The lists of what plugins do, held against what the plugins really do."""
+"""Lists of polarizing plugins, compared with their Mueller matrices."""
 
 
 import drjit as dr
@@ -47,7 +47,7 @@ def mueller_matrices(bsdf) -> np.ndarray:
 
 
 def polarizes(matrices: np.ndarray) -> bool:
-    """Whether some matrix is neither an ideal depolarizer nor a multiple of the identity."""
+    """Return True if some matrix is neither an ideal depolarizer nor a multiple of the identity."""
     depolarizer, identity = np.zeros((4, 4)), np.eye(4)
     depolarizer[0, 0] = 1
     scale = matrices[:, :1, :1]

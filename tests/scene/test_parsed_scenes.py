@@ -1,4 +1,4 @@
-"""What is read off the nodes of a parsed scene, and which are refused, before anything is built."""
+"""Properties read off the nodes of a parsed scene, and nodes that are refused before anything is built."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -216,7 +216,7 @@ def test_nodes_of_a_surface_as_many_as_there_may_be():
 
 
 def refused(kind, plugin, **properties):
-    """What is wrong with one node, None where nothing is."""
+    """Return the error about one node, None without one."""
     node = mi.parser.SceneNode()
     node.type, node.props = kind, mi.Properties(plugin)
     for key, value in properties.items():

@@ -1,4 +1,4 @@
-"""What no physical system has is said once, with the key and the number, or is an error where that was asked for."""
+"""Unphysical values: one warning each, with key and number, or an error where one is asked for."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a watch says of numbers, transforms and windows, at the edges and one beside them. No scene is built."""
+"""Messages about numbers, transforms and windows, at the edges and one beside them. No scene is built."""
 
 import warnings
 
@@ -29,14 +29,6 @@ def watch(mode="warn"):
 
 
 # ------------------------------------------------------------------------------------------------------------ ranges
-
-
-
-
-
-
-
-
 
 
 def test_both_ends_of_a_range_are_said_once_each():
@@ -156,10 +148,8 @@ def test_windows_are_errors_each_time():
             each.window(40.0, 3.0, 7.0)
 
 
-
-
 def test_warnings_point_at_the_line_outside():
-    """Of the library and of torch, however many calls of theirs are in between."""
+    """Lines of the library and of torch are passed over, however many calls are in between."""
     calls = (
         lambda: watch().warn("a", "b"),
         lambda: watch().scene({"a": "b"}),

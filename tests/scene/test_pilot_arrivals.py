@@ -1,4 +1,4 @@
-"""What is read off a list of arrivals, in numbers that can be followed by hand: shares, blocks, depth, window, axis."""
+"""Shares, blocks, depth, window and axis of a list of arrivals, in numbers that can be followed by hand."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ def share_of(found, chosen, energy_of=slice(None), paths=None):
 
 
 def negligible(found, chosen, share):
-    """As the docstring says, block by block."""
+    """Apply the rule of the docstring block by block."""
     part, error = share_of(found, chosen)
     if part + 2 * error > share:
         return False

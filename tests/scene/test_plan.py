@@ -1,4 +1,4 @@
-"""What a plan decides from the description alone: nothing that a scene contains is overlooked, nothing else is paid."""
+"""Decisions of a plan from the description alone: it overlooks nothing in a scene and pays for nothing else."""
 
 import pickle
 import time

@@ -118,7 +118,7 @@ GATES = {
 
 
 def test_a_box_that_was_asked_for_stays_one():
-    """As with an explicit box of the renderer: no tent takes its place without a word."""
+    """An explicit box of the renderer stays one too: no tent replaces it in silence."""
     own = tt.plan(make_room(), pilot=False, time_axis="scene")
     assert own.renderer(parameters=[WALL_POSE]).effective_filter == "tent"
     asked = tt.plan(make_room(), pilot=False, time_axis="scene", temporal_filter="box")

@@ -1,4 +1,4 @@
-"""What a plan finds by tracing: depth and window hold the light that they promise, and nothing else is paid."""
+"""Decisions of a plan by tracing: depth and window hold the promised light and no more."""
 
 import json
 import time
@@ -16,9 +16,9 @@ from torchtransient.accuracy.statistics import two_sample_z_test
 from torchtransient.cli.main import main
 from torchtransient.errors import ArgumentError, SceneError
 from torchtransient.rendering.films import Histogram
-from torchtransient.rendering.variant import active_variant
 from torchtransient.scene.edits import BuildOptions
 from torchtransient.scene.pilot import Arrivals, axis_over
+from torchtransient.scene.variant import active_variant
 
 VARIANT = "llvm_ad_mono"
 

@@ -13,7 +13,7 @@ import torch
 import torchtransient as tt
 from tools.every_plugin import every_plugin
 from tools.small_room import COLOUR, VARIANT, make_room, pose
-from torchtransient.rendering.variant import active_variant
+from torchtransient.scene.variant import active_variant
 
 TEXTURE, VERTICES, PLACE = "wall.bsdf.reflectance.data", "box.vertex_positions", "wall.to_world"
 

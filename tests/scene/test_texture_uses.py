@@ -197,7 +197,7 @@ def test_lights_that_stay_dark_may_have_them():
 
 
 def test_numbers_of_attributes_belong_to_their_shapes():
-    """Those that a texture reads, of the shapes that are named, and no others."""
+    """Only attributes that a texture reads, of the named shapes, count."""
     ply = mi.Mesh("shape", 3, 1)
     ply.add_attribute("vertex_color", 3, np.arange(9, dtype=np.float32))
     ply.add_attribute("vertex_other", 1, np.float32([20, 21, 22]))

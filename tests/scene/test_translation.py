@@ -330,10 +330,10 @@ def test_which_values_can_be_differentiated_by():
 @pytest.mark.slow
 @pytest.mark.parametrize(("albedo", "share"), [(0.97, 1e-3), (0.99, 0.99**512)])
 def test_bounds_of_bright_rooms(albedo, share):
-    """Where Russian roulette would leave the light to no path: no bound is deeper than 512, and the rest is said.
+    """No bound is deeper than 512 where Russian roulette ends no path, and a warning gives the rest.
 
-    What a pilot run of that depth takes for all light lacks a^512 of it, and by the middle, a^256, the light has fallen
-    to as much as it falls from there.
+    A pilot run of that depth lacks a^512 of the light that it takes for all, and by the middle, a^256, the light has
+    fallen to as much as it falls from there.
     """
     mi.set_variant("llvm_ad_mono")
     scene = oven()
@@ -346,7 +346,7 @@ def test_bounds_of_bright_rooms(albedo, share):
 
 @pytest.mark.slow
 def test_a_bound_that_leaves_too_much_is_an_error_where_asked():
-    """Of an albedo of 0.999 more than half of the light is deeper than 512."""
+    """More than half of the light is deeper than 512 at an albedo of 0.999."""
     mi.set_variant("llvm_ad_mono")
     scene = oven()
     scene["ball"]["bsdf"]["reflectance"]["value"] = 0.999
@@ -357,7 +357,7 @@ def test_a_bound_that_leaves_too_much_is_an_error_where_asked():
 
 @pytest.mark.slow
 def test_which_calls_have_a_bound():
-    """Those whose values can be differentiated by, in whichever mode."""
+    """Calls that may be differentiated, in either mode, have one."""
     mi.set_variant("llvm_ad_mono")
     renderer = tt.TransientRenderer(oven(), parameters=[KEY], time_axis=WINDOW, spp=16, physics="ignore")
     depths, value = [], torch.tensor(ALBEDO)

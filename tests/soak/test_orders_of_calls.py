@@ -18,8 +18,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_state_machine_as_test
 
 from support.call_orders import CASES, FACTORS, SEEDS, VARIANTS, Calls
-from torchtransient import _collection
-from torchtransient.plugins import _registry
+from torchtransient.plugins import _registry, guards
 from torchtransient.plugins.drjit_pool import engine_lock
 
 pytestmark = pytest.mark.filterwarnings("ignore")
@@ -35,7 +34,7 @@ def at_rest() -> None:
     locked: list[str] = []
 
     def ask() -> None:
-        locks = {"engine": engine_lock, "registry": _registry._state.lock, "collection": _collection._lock}
+        locks = {"engine": engine_lock, "registry": _registry._state.lock, "collection": guards._lock}
         for name, lock in locks.items():
             if lock.acquire(timeout=5):
                 lock.release()

@@ -25,7 +25,7 @@ import torch
 import torchtransient as tt
 from tools.small_room import COLOUR, GREY, WALL_POSE, make_room
 from torchtransient.errors import TorchTransientError
-from torchtransient.plugins.interrupted import interrupts_wait
+from torchtransient.plugins.guards import interrupts_wait
 
 VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_mono_polarized", "scalar_rgb")
 # Lanes add up in the order in which threads come; poses and fog amplify what single precision rounds.

@@ -9,10 +9,10 @@ import numpy as np
 import torch
 
 from tools.gradient_sweep.measure import Subject
-from torchtransient.rendering.engine import jvp, primal, vjp
-from torchtransient.rendering.recordings import LAUNCHED
-from torchtransient.rendering.seeds import Item, Seeding
-from torchtransient.rendering.session import RenderJob
+from torchtransient.interfaces import BACKWARD, FORWARD, RENDER
+from torchtransient.rendering.engine import run
+from torchtransient.rendering.job import Item, RenderJob, Seeding
+from torchtransient.rendering.recording import LAUNCHED
 from torchtransient.scene.edits import BuildOptions
 from torchtransient.scene.load import Scene
 from torchtransient.scene.physics import PhysicsWatch
@@ -70,9 +70,9 @@ class Runs:
         differences: dict[str, float] = {}
         said: dict[str, list[str]] = {"render": [], "reverse": [], "forward": []}
         for seed, value in self.values():
-            for kind, run in (("render", self.render), ("reverse", self.reverse), ("forward", self.forward)):
-                expected, _ = run(seed, value, False)
-                got, words = run(seed, value, True)
+            for kind, call in (("render", self.render), ("reverse", self.reverse), ("forward", self.forward)):
+                expected, _ = call(seed, value, False)
+                got, words = call(seed, value, True)
                 said[kind].append(words)
                 scale = max(float(np.abs(expected).max()), 1e-12)
                 worst = float(np.abs(got - expected).max()) / scale if expected.size else 0.0
@@ -81,17 +81,17 @@ class Runs:
 
     def render(self, seed: int, value: torch.Tensor, freeze: bool) -> tuple[np.ndarray, str]:
         job = self.job(seed, freeze)
-        steady, response = primal(job, [value])
+        steady, response = run(job, RENDER, [value])
         return np.concatenate([steady.numpy().ravel(), response.numpy().ravel()]), job.log[0].recorded[0]
 
     def reverse(self, seed: int, value: torch.Tensor, freeze: bool) -> tuple[np.ndarray, str]:
         job = self.job(seed, freeze, (True,))
         shape = self.subject._cube_shape()
         weights = torch.cos(torch.arange(float(np.prod(shape)))).reshape(shape)
-        (gradient,) = vjp(job, [value], torch.ones(*shape[:2], shape[-1]), weights)
+        (gradient,) = run(job, BACKWARD, [value], [torch.ones(*shape[:2], shape[-1]), weights])
         return gradient.numpy().ravel(), job.derivative_log[0]
 
     def forward(self, seed: int, value: torch.Tensor, freeze: bool) -> tuple[np.ndarray, str]:
         job = self.job(seed, freeze, (True,))
-        steady, response = jvp(job, [value], [self.direction])
+        steady, response = run(job, FORWARD, [value], [self.direction])
         return np.concatenate([steady.numpy().ravel(), response.numpy().ravel()]), job.derivative_log[0]

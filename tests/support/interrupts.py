@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-# Signals that are delayed (`plugins.interrupted.interrupts_wait`) reach nothing: the first of their handlers is
+# Signals that are delayed (`plugins.guards.interrupts_wait`) reach nothing: the first of their handlers is
 # replaced first and put back last.
 WAITING = "interrupts_wait"
 

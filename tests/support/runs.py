@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from torchtransient._collection import no_collection
+from torchtransient.plugins.guards import no_collection
 
 
 def T():

@@ -14,7 +14,7 @@ import pytest
 
 from support.marks import long, long_rows
 from support.plain_scenes import as_mitsuba
-from torchtransient._collection import no_collection
+from torchtransient.plugins.guards import no_collection
 from torchtransient.scenes import cornell_box
 
 VARIANT = "llvm_ad_mono"

@@ -10,9 +10,9 @@ import numpy as np
 
 import torchtransient.plugins
 from tools.boundary_cases.moving_edges import Array, MovingEdge
-from torchtransient.rendering.variant import active_variant
 from torchtransient.scene.edits import BuildOptions
 from torchtransient.scene.load import load
+from torchtransient.scene.variant import active_variant
 
 PASSES = ("primary", "vertex", "light", "specular")
 

@@ -16,12 +16,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchtransient.rendering.engine import jvp, primal, vjp
-from torchtransient.rendering.seeds import Item, Seeding
-from torchtransient.rendering.session import RenderJob
-from torchtransient.rendering.variant import active_variant
+from torchtransient.interfaces import BACKWARD, FORWARD, RENDER
+from torchtransient.rendering.engine import run
+from torchtransient.rendering.job import Item, RenderJob, Seeding
 from torchtransient.scene.edits import BuildOptions
 from torchtransient.scene.physics import PhysicsWatch
+from torchtransient.scene.variant import active_variant
 
 if TYPE_CHECKING:
     from torchtransient.scene.load import Scene
@@ -77,7 +77,7 @@ class Subject:
 
     def losses(self, value: torch.Tensor, seed: int, spp: int) -> tuple[float, float]:
         """The loss, and the loss by the absolute values of its weights."""
-        _, response = primal(self._job(seed, spp, False), [value])
+        _, response = run(self._job(seed, spp, False), RENDER, [value])
         response = response.double().sum((0, 1))
         return float((response * self._weights).sum()), float((response * self._weights.abs()).abs().sum())
 
@@ -85,12 +85,12 @@ class Subject:
         """The gradient of the loss, flat."""
         shape = self._cube_shape()
         weights = self._weights.float().expand(shape).contiguous()
-        (gradient,) = vjp(self._job(seed, spp, True), [self.value], None, weights)
+        (gradient,) = run(self._job(seed, spp, True), BACKWARD, [self.value], [None, weights])
         return gradient.double().reshape(-1).numpy()
 
     def forward(self, direction: torch.Tensor, seed: int, spp: int) -> float:
         """The derivative of the loss along a direction."""
-        _, response = jvp(self._job(seed, spp, True), [self.value], [direction])
+        _, response = run(self._job(seed, spp, True), FORWARD, [self.value], [direction])
         return float((response.double().sum((0, 1)) * self._weights).sum())
 
     def difference(self, tangent: Tangent, seed: int, spp: int, step: float) -> tuple[float, float]:

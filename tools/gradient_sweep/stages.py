@@ -94,7 +94,7 @@ def plate_pose(half: float = 30.0) -> Matrix:
 
 
 def fading(value: float, texels: int = 16) -> Description:
-    """A texture that fades to nothing at its rim: an edge that nobody sees, in whichever mirror it stands."""
+    """Return a texture that fades to zero at its rim: its edge is dark in every mirror."""
     along = np.linspace(-1.0, 1.0, texels) ** 2
     data = value * np.outer(1 - along, 1 - along)[..., None].astype(np.float32)
     return {"type": "bitmap", "data": data, "raw": True, "wrap_mode": "clamp"}

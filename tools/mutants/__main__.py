@@ -40,7 +40,7 @@ FIRST = 4  # test files
 # Tests that do not execute a line notice its change by what others have left in a cache, or in another process. Files
 # of so many seconds are asked: what only longer ones would notice counts as not noticed.
 OTHERS_SECONDS = 90.0
-# In place of the default tests; those that need something else are nobody's.
+# Replaces the default selection; tests that need a GPU, peers or hours are left out.
 SLOW = ("-m", "slow and not soak and not gpu and not peer and not measured")
 HAS_SLOW = re.compile(r"\bslow\b|support\.marks")
 ADOPTS_ORPHANS = 36  # PR_SET_CHILD_SUBREAPER

@@ -14,10 +14,10 @@ from torchtransient.accuracy.report import AccuracyReport, Choice
 from torchtransient.checks import as_whole, shown
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.rendering.films import layout_of_output
-from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.output import RenderOutput
 from torchtransient.rendering.renderer import TransientRenderer
-from torchtransient.rendering.variant import active_variant
+from torchtransient.scene.opaque import opaque
+from torchtransient.scene.variant import active_variant
 
 Loss = Callable[[RenderOutput], torch.Tensor]
 

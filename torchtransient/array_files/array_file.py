@@ -28,9 +28,8 @@ from torchtransient.array_files.part_files import replacing as replacing
 from torchtransient.checks import check_folder as check_folder
 from torchtransient.checks import check_source as check_source
 from torchtransient.checks import path_of as path_of
-from torchtransient.checks import shown
+from torchtransient.checks import short_message, shown
 from torchtransient.errors import StorageError, TorchTransientError
-from torchtransient.plain_texts import said_in_short
 
 HDF5 = (".h5", ".hdf5")
 ENDINGS = (*HDF5, ".npz")
@@ -159,7 +158,7 @@ def damage_said(source: Path, what: str, kind: str = "") -> Iterator[None]:
         if isinstance(error, TorchTransientError) and kind:
             raise StorageError(f"{what}: '{source}': {error}") from error
         kind = kind or f"a {what.removesuffix(' file')} of torchtransient"
-        raise StorageError(f"{what}: '{source}' is not {kind}, or is damaged: {said_in_short(error)}.") from error
+        raise StorageError(f"{what}: '{source}' is not {kind}, or is damaged: {short_message(error)}.") from error
 
 
 def array_of(tensor: torch.Tensor, what: str) -> NDArray[Any]:

@@ -75,7 +75,7 @@ def command(output: Path, resolution: int, spp: int, steps: int) -> None:
     import torchtransient as tt
     from torchtransient.errors import StorageError
     from torchtransient.files.result_file import write_result
-    from torchtransient.rendering.variant import DEFAULT_VARIANT
+    from torchtransient.scene.variant import DEFAULT_VARIANT
     from torchtransient.vis.fit_progress import plot_fit
     from torchtransient.vis.overview import plot_overview
 

@@ -10,9 +10,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from torchtransient.checks import path_of, shown
+from torchtransient.array_files.plain_texts import safe_loader, text_of_file, yaml_data
+from torchtransient.checks import path_of, shown, some_of
 from torchtransient.errors import MissingPackageError, SceneError
-from torchtransient.plain_texts import safe_loader, some_of, text_of_file, yaml_data
 
 _MISSING = object()
 

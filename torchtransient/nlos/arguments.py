@@ -12,7 +12,7 @@ from torchtransient.capture import Scan
 from torchtransient.checks import as_whole, count, shown
 from torchtransient.errors import ArgumentError, SceneError
 from torchtransient.rendering.arguments import samples
-from torchtransient.rendering.seeds import SEED_RANGE, drawn
+from torchtransient.rendering.job import SEED_RANGE, drawn
 from torchtransient.sensing import Device
 
 

@@ -25,13 +25,12 @@ from typing import Any
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Scan, Wall
 from torchtransient.capture.scan import GRID_KINDS
-from torchtransient.checks import shown
+from torchtransient.checks import short_errors, shown
 from torchtransient.errors import SceneError, TorchTransientError
 from torchtransient.files.yaml_files import Section, as_number, file_beside, read_yaml
 from torchtransient.nlos import defaults
 from torchtransient.nlos.described_shapes import albedo_of, described_shapes
 from torchtransient.nlos.mesh_file import mesh_of_npz
-from torchtransient.plain_texts import told_shortly
 from torchtransient.scenes import bounds
 from torchtransient.sensing import Device
 
@@ -73,7 +72,7 @@ def read_description(source: str | Path) -> CaptureDescription:
     Names of files are looked up from the YAML file's folder. Raises SceneError for unknown, missing and wrong entries,
     StorageError for files that cannot be read, and the errors of Scan, Wall, TimeAxis and Device.
     """
-    with told_shortly("capture description"):
+    with short_errors("capture description"):
         return _description(source)
 
 

@@ -13,7 +13,7 @@ from torchtransient.errors import PhysicsWarning, StorageError
 from torchtransient.nlos.renderer import light_of
 from torchtransient.nlos.work import Work
 from torchtransient.rendering.memory import available_bytes
-from torchtransient.rendering.variant import active_variant
+from torchtransient.scene.variant import active_variant
 
 # Shares of the samples that the time is estimated by, and the fewest that tell something.
 FEW, SOME, LEAST = 512, 128, 16

@@ -19,8 +19,8 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchtransient.checks import short_message
 from torchtransient.errors import StorageError
-from torchtransient.plain_texts import said_in_short
 
 FORMAT = "torchtransient part 2"
 Rows = NDArray[np.float32]
@@ -74,7 +74,7 @@ class PartFile:
         except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
             raise StorageError(
                 f"part file: '{self.path}' is not the part file of a simulation ({FORMAT}), or is damaged: "
-                f"{said_in_short(error)}. Give another name, or delete it to start anew."
+                f"{short_message(error)}. Give another name, or delete it to start anew."
             ) from error
         if form == FORMAT and not self._key:
             return

@@ -17,13 +17,13 @@ from torchtransient.nlos.arguments import check_is_scan, check_seeds, check_sens
 from torchtransient.nlos.scan_watch import HIDDEN, LASER_RAYS, SENSOR_RAYS, ScanWatch
 from torchtransient.nlos.scene import SENSOR, WALL, capture_scene, film_size, hidden_bounds, laser_size
 from torchtransient.nlos.scene_scan import check_scan_is_seen, tolerance_of
-from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.output import RenderOutput
 from torchtransient.rendering.renderer import TransientRenderer
-from torchtransient.rendering.variant import active_variant
 from torchtransient.scene.edits import BuildOptions
 from torchtransient.scene.load import Scene, load
+from torchtransient.scene.opaque import opaque
 from torchtransient.scene.parameters import needing_slope
+from torchtransient.scene.variant import active_variant
 from torchtransient.sensing import Device
 
 # Where the points of a scan stand in the scene.

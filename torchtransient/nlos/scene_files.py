@@ -6,9 +6,9 @@ from pathlib import Path
 
 from torchtransient.errors import SceneError
 from torchtransient.files.content_key import contents_of
-from torchtransient.rendering.variant import active_variant
 from torchtransient.scene.load import Scene
 from torchtransient.scene.objects import LoadedScene
+from torchtransient.scene.variant import active_variant
 
 
 def files_of(scene: Scene) -> dict[str, str]:

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from torchtransient.array_files.array_file import path_of
+from torchtransient.checks import short_errors
 from torchtransient.errors import SceneError
 from torchtransient.files.yaml_files import read_yaml
 from torchtransient.nlos.description import read_description
 from torchtransient.nlos.scene import ALL_BOUNCES
 from torchtransient.nlos.tal_yaml import TalSettings, read_tal_yaml
-from torchtransient.plain_texts import told_shortly
 from torchtransient.scene.load import load
 
 # Bounces of light that goes from spot to scan point, and around one corner.
@@ -33,7 +33,7 @@ def read_setup(path: str | Path, **xml_parameters: Any) -> dict[str, Any]:
 
     Raises StorageError for files that cannot be read, SceneError for what they say.
     """
-    with told_shortly("read_setup"):
+    with short_errors("read_setup"):
         return _setup(path, xml_parameters)
 
 

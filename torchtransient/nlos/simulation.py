@@ -35,8 +35,8 @@ from torchtransient.nlos.renderer import in_film_shape, in_scan_shape
 from torchtransient.nlos.scene import capture_scene, hidden_bounds
 from torchtransient.nlos.variant_choice import choose_variant
 from torchtransient.nlos.work import Film, HiddenWork, SceneWork, Work, seed_of
-from torchtransient.rendering.variant import active_variant
 from torchtransient.scene.load import Scene, load
+from torchtransient.scene.variant import active_variant
 from torchtransient.sensing import Device
 
 

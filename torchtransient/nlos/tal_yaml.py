@@ -12,13 +12,12 @@ import torch
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Scan, Wall
 from torchtransient.capture.scan import GRID_KINDS
-from torchtransient.checks import shown
+from torchtransient.checks import short_errors, shown, some_of
 from torchtransient.errors import SceneError
 from torchtransient.files.yaml_files import Section, as_number, file_beside, read_yaml
 from torchtransient.nlos.tal_materials import material, spectrum
-from torchtransient.plain_texts import some_of, told_shortly
+from torchtransient.plugins.films.transform_bins import transform_bins
 from torchtransient.scenes.transforms import rotate, scale, translate
-from torchtransient.transform_bins import transform_bins
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 _KNOWN = (
@@ -80,7 +79,7 @@ def read_tal_yaml(source: str | Path) -> TalSettings:
     what is not supported: a laser that is not sampled as a spot, bins that are found automatically, spots laid out by
     a field of view, walls that are no rectangle.
     """
-    with told_shortly("y-tal scene"):
+    with short_errors("y-tal scene"):
         return _settings(source)
 
 

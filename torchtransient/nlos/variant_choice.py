@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torchtransient.rendering.variant import is_differentiable, resolve_variant
 from torchtransient.scene.inventory import scene_inventory
 from torchtransient.scene.load import Scene, load
 from torchtransient.scene.plan import some
+from torchtransient.scene.variant import is_differentiable, resolve_variant
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ from torchtransient.nlos.scene_files import files_of
 from torchtransient.nlos.scene_scan import scan_of_scene
 from torchtransient.nlos.variant_choice import VariantChoice
 from torchtransient.rendering.renderer import TransientRenderer
-from torchtransient.rendering.variant import active_variant
 from torchtransient.scene.load import Scene, load
+from torchtransient.scene.variant import active_variant
 
 
 @dataclass(frozen=True)

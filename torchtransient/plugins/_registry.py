@@ -49,7 +49,7 @@ import mitsuba as mi
 from torchtransient._llvm import ensure_llvm
 from torchtransient.errors import PluginRegistrationError, TorchTransientError, VariantError, VersionWarning
 from torchtransient.interfaces import missing_members
-from torchtransient.plugins.interrupted import interrupts_wait
+from torchtransient.plugins.guards import interrupts_wait
 
 # ---------------------------------------------------------------- what the plugins ask about the active Mitsuba variant
 # Nothing here is bound to one variant: every function looks at the variant that is active when it is called.

@@ -27,10 +27,12 @@ from torchtransient.plugins.mitsuba_compat import (
     attribute_name,
     attribute_sizes,
     has_surface,
+    has_texcoords,
     is_bump_map,
     is_dark,
     normal_texture,
     read_as,
+    scene_parameters,
 )
 from torchtransient.plugins.node_walk import objects_below, objects_of, shown_by
 from torchtransient.plugins.parameter_effect import class_of
@@ -181,7 +183,7 @@ def _check_radiance(emitter: Any) -> None:
             )
     shape = emitter.get_shape()
     textured = mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
-    if textured and isinstance(shape, mi.Mesh) and not shape.has_vertex_texcoords():
+    if textured and isinstance(shape, mi.Mesh) and not has_texcoords(shape):
         # Mitsuba's sampling of textures raises while kernels are traced, those of other scenes too.
         raise SceneError(
             f"{shape.id()!r}: expected texture coordinates of a mesh that shines with a texture, got a mesh without. "
@@ -241,14 +243,19 @@ def note_scene(plugin: Any, callback: Any) -> None:
 
 
 def check_scene(scene: Any, params: Any = None, known: DescribedScene | None = None) -> None:
-    """Raise ``SceneError`` where a number of a scene is NaN or infinite, or a texture stands where it cannot be read;
-    a scene that was found right is not asked again. ``params``: its ``mi.traverse``, ``known``: what is known of it,
-    where the caller has them.
+    """Check the numbers and textures of a scene, once.
+
+    Args:
+        params: the scene's parameters by users' keys, if the caller has them.
+        known: the scene's :class:`DescribedScene`, if the caller has it.
+
+    Raises:
+        SceneError: if a number is NaN or infinite, or a texture stands where it cannot be read.
     """
     known = known or described(scene)
     if known.is_checked or dr.flag(dr.JitFlag.FreezingScope):  # a recording has no values
         return
-    params = mi.traverse(scene) if params is None else params
+    params = scene_parameters(scene) if params is None else params
     check_parameters(params)
     check_textures(params)
     known.is_checked = True

@@ -18,7 +18,7 @@ import numpy as np
 
 from torchtransient.errors import SceneError
 from torchtransient.plugins._registry import kind_of
-from torchtransient.plugins.interrupted import interrupt_behind
+from torchtransient.plugins.guards import interrupt_behind
 
 # Properties of this library's plugins that hold any number of numbers, which Mitsuba only knows as a text: its own
 # lists are vectors and colours of three.

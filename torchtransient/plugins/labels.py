@@ -1,6 +1,6 @@
 """Labels of the pixels of a sensor: one ray through each pixel's centre, and properties of the surface that it meets.
 
-A :class:`LabelJob` has what :class:`~torchtransient.rendering.recordings.Recordings` asks of a job, so that it is
+A :class:`LabelJob` has what :class:`~torchtransient.rendering.recording.Recordings` asks of a job, so that it is
 recorded as renders are. Nothing here has derivatives.
 """
 
@@ -13,10 +13,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from torchtransient._collection import no_collection
 from torchtransient.errors import SceneError
 from torchtransient.plugins.films.colour import StandardObserver
 from torchtransient.plugins.frozen_state import says_it_can_be_recorded, state_below
+from torchtransient.plugins.guards import no_collection
 from torchtransient.plugins.kernel_arrays import PointerTable
 from torchtransient.plugins.mitsuba_compat import has_surface, is_distant, is_instance, near_clip
 from torchtransient.plugins.node_walk import shapes_of_scene

@@ -7,6 +7,7 @@ and what asks for it can go. Our own plugins are told by what they declare, neve
 
 from __future__ import annotations
 
+import functools
 import math
 import re
 from typing import Any
@@ -193,11 +194,16 @@ POSITIONS, NORMALS, TEXCOORDS, FACES = "vertex_positions", "vertex_normals", "ve
 # Columns of the arrays that a user can replace.
 VERTEX_COLUMNS = {POSITIONS: 3, NORMALS: 3, TEXCOORDS: 2}
 # Mitsuba 3.10 (pull request 1933) renames these, shows all arrays as tensors of rows, makes meshes of arrays that are
-# given to the constructor, and has no buffers. What a mesh lets vertices share (`position_index`) is not read here.
+# given to the constructor, and has no buffers. Its vertices may share rows of positions and normals, so that there are
+# fewer rows than vertices. Silhouette tables, which it makes on demand, are not used here.
 _NEW_NAMES = {POSITIONS: "positions", NORMALS: "normals", TEXCOORDS: "texcoords"}
 _USERS_NAMES = {new: name for name, new in _NEW_NAMES.items()}
+# Row of each vertex in these arrays of Mitsuba 3.10, empty where vertex i has row i.
+_SHARED_ROWS = {POSITIONS: "position_index", NORMALS: "normal_index"}
+# Material of each face of Mitsuba 3.10, empty for meshes of one material.
+_MATERIALS = "bsdf_index"
 _WEIGHT = "silhouette_sampling_weight"
-MESH_PARAMETERS = frozenset((*VERTEX_COLUMNS, FACES, _WEIGHT))
+_OWN_PARAMETERS = frozenset((*VERTEX_COLUMNS, FACES, _WEIGHT, *_SHARED_ROWS.values()))
 
 
 def shows_rows() -> bool:
@@ -209,6 +215,51 @@ def shows_rows() -> bool:
 def users_name(node: Any, name: str) -> str:
     """Return users' key of the parameter that Mitsuba shows as ``name`` of a plugin."""
     return _USERS_NAMES.get(name, name) if shows_rows() and isinstance(node, mi.Mesh) else name
+
+
+def scene_parameters(scene: Any) -> Any:
+    """Return the ``mitsuba.SceneParameters`` of a scene by users' keys."""
+    shown = mi.traverse(scene)
+    if not shows_rows():
+        return shown
+    properties = {}
+    for key, entry in shown.properties.items():
+        prefix, dot, name = key.rpartition(".")
+        properties[prefix + dot + users_name(entry[2], name)] = entry
+    return _users_parameters(mi.SceneParameters)(properties, shown.hierarchy)
+
+
+@functools.cache
+def _users_parameters(base: type) -> type:
+    """Return the class of parameters by users' keys, of which meshes hear under Mitsuba's names."""
+
+    class UsersParameters(base):  # type: ignore[misc, valid-type]
+        def set_dirty(self, key: str) -> Any:
+            entry = super().set_dirty(key)
+            node = entry[2]
+            if isinstance(node, mi.Mesh):
+                changed = (self.hierarchy[node][1], node)
+                self.nodes_to_update[changed] = {_NEW_NAMES.get(name, name) for name in self.nodes_to_update[changed]}
+            return entry
+
+    return UsersParameters
+
+
+def names_array(key: str, name: str) -> bool:
+    """Return whether a key of scene parameters, users' or Mitsuba's, names an array of a mesh, such as POSITIONS."""
+    own = key.rsplit(".", 1)[-1]
+    return own == name or (shows_rows() and own == _NEW_NAMES.get(name))
+
+
+def key_beside(key: str, name: str) -> str:
+    """Return the key of an array of the mesh that has the parameter ``key``, in the spelling of that key."""
+    prefix, dot, own = key.rpartition(".")
+    return prefix + dot + (_NEW_NAMES.get(name, name) if own in _USERS_NAMES else name)
+
+
+def flat_array(value: Any) -> Any:
+    """Return the numbers of an array of a mesh in a row, from what Mitsuba shows."""
+    return value.array if dr.is_tensor_v(value) else value
 
 
 def mesh_positions(mesh: Any) -> Any:
@@ -232,9 +283,46 @@ def mesh_faces(mesh: Any) -> Any:
 
 
 def _mesh_array(mesh: Any, name: str) -> Any:
-    if shows_rows():
-        return mi.traverse(mesh)[_NEW_NAMES.get(name, name)].array
-    return getattr(mesh, f"{name}_buffer")()
+    if not shows_rows():
+        return getattr(mesh, f"{name}_buffer")()
+    shown = mi.traverse(mesh)
+    if _NEW_NAMES.get(name, name) not in shown:
+        return mi.Float()
+    rows = shown[_NEW_NAMES.get(name, name)].array
+    index = _shared_rows(mesh, name)
+    return rows if index is None else dr.ravel(dr.gather(mi.Point3f, rows, index))
+
+
+def _shared_rows(mesh: Any, name: str) -> Any:
+    """Return the row of each vertex in an array, None where vertex i has row i."""
+    if not shows_rows() or name not in _SHARED_ROWS:
+        return None
+    index = mi.traverse(mesh)[_SHARED_ROWS[name]]
+    return index if dr.width(index) else None
+
+
+def rows_of_faces(mesh: Any, name: str) -> np.ndarray:
+    """Return the numbers of the rows of an array or attribute at vertices that faces refer to, in order."""
+    faces, index = np.array(mesh_faces(mesh)), _shared_rows(mesh, name)
+    vertices = np.unique(faces[faces < mesh.vertex_count()])
+    return vertices if index is None else np.unique(np.array(index)[vertices])
+
+
+def has_normals(mesh: Any) -> bool:
+    """Return whether a mesh has normals at its vertices."""
+    return bool(mesh.has_normals() if shows_rows() else mesh.has_vertex_normals())
+
+
+def has_texcoords(mesh: Any) -> bool:
+    """Return whether a mesh has texture coordinates at its vertices."""
+    return bool(mesh.has_texcoords() if shows_rows() else mesh.has_vertex_texcoords())
+
+
+def has_more_than_arrays(mesh: Any) -> bool:
+    """Return whether a mesh has parameters beside its arrays and its weight: attributes, or a material by face."""
+    shown = mi.traverse(mesh)
+    names = {users_name(mesh, name) for name in shown.properties if "." not in name} - _OWN_PARAMETERS
+    return any(name != _MATERIALS or dr.width(shown[name]) for name in names)
 
 
 def silhouette_weight(mesh: Any) -> dict[str, float]:
@@ -342,7 +430,7 @@ def has_smooth_shape(emitter: Any) -> bool:
     more.
     """
     shape = emitter.get_shape() if mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface) else None
-    return shape is not None and has_vertices(shape) and bool(shape.has_vertex_normals())
+    return shape is not None and has_vertices(shape) and has_normals(shape)
 
 
 # Meshes, and what of the others has edges or limbs in closed form.
@@ -376,7 +464,7 @@ def is_flat(shape: Any) -> bool:
     """
     if not isinstance(shape, mi.Mesh):
         return is_flat_shape(shape)
-    if not shape.has_vertex_normals():
+    if not has_normals(shape):
         return True
     if shape.face_count() > _LARGE_MESH:
         return False

@@ -26,6 +26,7 @@ from torchtransient.plugins.mitsuba_compat import (
     forgets_black_samples,
     is_replaced_for,
     normal_texture,
+    users_name,
     weight_slot,
 )
 from torchtransient.plugins.node_walk import ShownValue, objects_of, owners_of, shown_by, unshared
@@ -114,9 +115,11 @@ def _zeros(value: Any, how: Any) -> bool:
 def effect_of(node: Any, key: str, flags: int = 0, owners: Sequence[tuple[Any, str]] = ()) -> ParameterEffect:
     """Return the effect of the parameter ``key`` of the plugin ``node``, and whether its derivative is right.
 
-    ``key``: its name in the plugin, as "to_world"; of a dotted name the last part counts. ``flags``: Mitsuba's
-    ``ParamFlags`` of it. ``owners``: what holds the plugin, as in :class:`Site`; without it, what is asked of a texture
-    or volume is answered as if it stood alone.
+    Args:
+        node: plugin that has the parameter.
+        key: name in the plugin, as "to_world"; of a dotted name the last part counts.
+        flags: Mitsuba's ``ParamFlags`` of the parameter.
+        owners: holders of the plugin, as in :class:`Site`; without them a texture or volume is judged by itself alone.
     """
     site = Site(node, key.rsplit(".", 1)[-1], tuple(owners))
     effect = matching_effect(site)
@@ -143,7 +146,7 @@ def attached_effects(params: Any) -> list[tuple[Any, str, ParameterEffect]]:
     for name, (handle, cpptype, node, flags) in params.properties.items():
         value = handle if cpptype is None else mi.get_property(handle, cpptype, node)
         if can_carry_gradients(value) and dr.grad_enabled(value):
-            attached.append((node, name.rsplit(".", 1)[-1], flags))
+            attached.append((node, users_name(node, name.rsplit(".", 1)[-1]), flags))
     # A walk of its own: the names in ``params`` tell of one holder of each plugin, and not of what reads an attribute.
     tracker = ParameterTracker.from_params(params) if attached else None
     return [(node, key, tracker.effect_of(node, key, flags)) for node, key, flags in attached]

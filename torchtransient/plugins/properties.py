@@ -12,7 +12,7 @@ import numpy as np
 
 from torchtransient.checks import shown
 from torchtransient.errors import SceneError
-from torchtransient.plugins.mitsuba_compat import mesh_faces
+from torchtransient.plugins.mitsuba_compat import VERTEX_COLUMNS, rows_of_faces
 from torchtransient.plugins.node_walk import ShownValue
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -70,8 +70,9 @@ def check_parameters(params: Any) -> None:
     for key, (handle, cpptype, node, _) in params.properties.items():
         array = numbers_of(ShownValue(key, handle, 0, cpptype).read(node))
         if array is not None and not np.isfinite(array).all():
-            if isinstance(node, mi.Mesh) and ".vertex_" in f".{key}":
-                array = _at_faces(node, array)
+            name = key.rsplit(".", 1)[-1]
+            if isinstance(node, mi.Mesh) and (name in VERTEX_COLUMNS or name.startswith("vertex_")):
+                array = _at_faces(node, name, array)
             count_bad(bad, key, array)
     refuse(bad)
 
@@ -120,8 +121,7 @@ def _components(value: Any) -> np.ndarray:
     return np.array(value)
 
 
-def _at_faces(mesh: Any, array: np.ndarray) -> np.ndarray:
-    """The entries of a vertex attribute that faces refer to."""
-    faces = np.array(mesh_faces(mesh))
-    count = mesh.vertex_count()
-    return array.reshape(count, -1)[np.unique(faces[faces < count])]
+def _at_faces(mesh: Any, name: str, array: np.ndarray) -> np.ndarray:
+    """Return the entries of an array or attribute at vertices that faces refer to."""
+    rows = array if array.ndim > 1 else array.reshape(mesh.vertex_count(), -1)
+    return rows[rows_of_faces(mesh, name)]

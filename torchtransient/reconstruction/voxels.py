@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.capture import Scan, Wall
-from torchtransient.capture.distances import bounds_of
+from torchtransient.capture.scan import bounds_of
 from torchtransient.checks import Numbers, count, positive, real_array, shown
 from torchtransient.errors import SceneError, ShapeError, UnitError
 from torchtransient.reconstruction.planar_scan import PlanarScan, hidden_side

@@ -1,31 +1,282 @@
-"""A render as a function of torch: what :mod:`.derivatives` runs, and runs again for its derivatives.
+"""The three autograd functions of calls that are run, and run again for their derivatives.
 
-All outputs are real: complex phasors are a view that torch differentiates itself. A derivative has samples of its own,
-the job's (``grad_seed``).
+``Run`` keeps no Dr.Jit graph. It saves its inputs, and its derivatives are runs of their own: ``Pullback`` and
+``Pushforward``, linear in the cotangents and tangents. They are functions of torch too, so that ``torch.func`` can
+batch them, and each is the other's derivative by its linear arguments (``torch.autograd.functional.jvp`` rests on
+that). Differentiating them by the *values* is refused (``OnceDifferentiable``), since Dr.Jit has no second derivatives.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any, NoReturn, Protocol
 
 import torch
 
+from torchtransient.errors import GradientError, ShapeError
+from torchtransient.interfaces import BACKWARD, FORWARD, RENDER
 from torchtransient.rendering import engine
-from torchtransient.rendering.derivatives import Asked, Tensors, run
-from torchtransient.rendering.session import RenderJob
+from torchtransient.rendering.job import RenderJob
 
-
-def rendered(job: RenderJob, seed: torch.Tensor | None, values: Sequence[torch.Tensor]) -> Tensors:
-    """(steady, response) in the film's layout. ``seed``: None, or a number that is known only inside of a ``vmap``."""
-    first = () if seed is None else (seed,)
-    steady, response = run(_Render(job, len(first)), *first, *values)
-    return steady, response
+Tensors = tuple[torch.Tensor, ...]
 
 
 @dataclass(frozen=True)
-class _Render:
-    """A job as something to replay. ``seeds``: how many of the tensors are seeds, none or the first."""
+class Asked:
+    """Derivatives of one call.
+
+    Args:
+        needs: for each input tensor, whether there is a derivative by it.
+        given: for each real output, whether it has a cotangent.
+    """
+
+    needs: tuple[bool, ...]
+    given: tuple[bool, ...] = ()
+
+
+class Replayable(Protocol):
+    """Call that is run, and run again for its derivatives. ``what`` is its name in messages."""
+
+    @property
+    def what(self) -> str: ...
+
+    def primal(self, tensors: Sequence[torch.Tensor]) -> Tensors:
+        """Return the outputs."""
+
+    def pullback(self, asked: Asked, tensors: Sequence[torch.Tensor], cotangents: Sequence[torch.Tensor]) -> Tensors:
+        """Return the gradients of the sum over outputs of <cotangent, output> by the tensors that need one."""
+
+    def pushforward(self, asked: Asked, tensors: Sequence[torch.Tensor], tangents: Sequence[torch.Tensor]) -> Tensors:
+        """Return the derivatives of all real outputs along tangents of the tensors that need one."""
+
+
+def run(job: Replayable, *tensors: torch.Tensor) -> Tensors:
+    """Return the outputs of a call, differentiable by the real ones of its tensors."""
+    outputs: Tensors = Run.apply(job, *tensors)  # type: ignore[no-untyped-call]
+    return outputs
+
+
+class OnceDifferentiable(torch.autograd.Function):
+    """Value of a derivative, by which a derivative would be a second one.
+
+    Autograd calls it only where one is asked for; a derivative by the cotangent or tangent alone passes by.
+    """
+
+    @staticmethod
+    def forward(what: str, value: torch.Tensor) -> torch.Tensor:
+        return value.view_as(value)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+        ctx.what = inputs[0]
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Any) -> NoReturn:
+        _refuse_second(ctx.what, "reverse")
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> NoReturn:
+        _refuse_second(ctx.what, "forward")
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[Any, ...], what: str, value: torch.Tensor) -> tuple[Any, Any]:
+        return OnceDifferentiable.apply(what, value), in_dims[1]  # type: ignore[no-untyped-call]
+
+
+def _refuse_second(what: str, mode: str) -> NoReturn:
+    raise GradientError(
+        f"second derivatives of {what} are not available: its gradient or tangent was differentiated again in {mode} "
+        "mode. Expected a first derivative; for curvature use finite differences of gradients, or a Gauss-Newton "
+        "product J^T J v from torch.func.jvp and torch.func.vjp."
+    )
+
+
+def _once(job: Replayable, tensors: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+    return [OnceDifferentiable.apply(job.what, t) if t.is_floating_point() else t for t in tensors]  # type: ignore[no-untyped-call]
+
+
+def _check_runs(job: Replayable, tensors: Sequence[torch.Tensor]) -> None:
+    """Raise ``GradientError`` where a run would become a constant of a graph that torch is tracing, and for the batches
+    of ``torch.autograd``, which reach ``forward`` as one tensor without memory.
+    """
+    if any(torch._C._functorch.is_legacy_batchedtensor(tensor) for tensor in tensors):
+        raise GradientError(
+            f"{job.what} has no rule for the batches of torch.autograd (jacobian and hessian with vectorize=True, grad "
+            "with is_grads_batched=True). Expected torch.func.jacrev, torch.func.jacfwd or torch.func.vmap, or "
+            "vectorize=False."
+        )
+    modes: Any = torch._ops
+    key = torch._C._TorchDispatchModeKey.PROXY
+    tracing = torch._C._get_dispatch_mode(key) or modes._get_dispatch_mode_pre_dispatch(key)
+    fake = sys.modules.get("torch._subclasses.fake_tensor")
+    if tracing is None and not (fake is not None and any(isinstance(tensor, fake.FakeTensor) for tensor in tensors)):
+        return
+    raise GradientError(
+        f"{job.what} cannot be traced: in the graphs of torch.func.linearize, torch.export and make_fx it would be a "
+        "constant, and tensors without memory have no values. Expected tensors with values: use torch.func.jvp and "
+        "torch.func.vjp, which are evaluated again for every tangent."
+    )
+
+
+def _given(tensors: Sequence[torch.Tensor | None]) -> list[torch.Tensor]:
+    return [tensor for tensor in tensors if tensor is not None]
+
+
+def _those(flags: Sequence[bool], asked: Sequence[torch.Tensor | None]) -> tuple[bool, ...]:
+    """Return the flags whose entry in ``asked``, which has one for each flag that is set, is not None."""
+    remaining = iter(asked)
+    return tuple(flag and next(remaining) is not None for flag in flags)
+
+
+def _zeros(tensors: Sequence[torch.Tensor]) -> list[torch.Tensor | None]:
+    return [torch.zeros_like(tensor) if tensor.is_floating_point() else None for tensor in tensors]
+
+
+def _each(
+    function: Any, info: Any, in_dims: tuple[Any, ...], args: tuple[Any, ...]
+) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    """``vmap`` by one call per entry: what a loop over the entries would give."""
+    if not info.batch_size:
+        raise ShapeError(f"{args[0].what}: expected a batch of at least one entry under torch.func.vmap, got none.")
+    columns = []
+    for i in range(info.batch_size):
+        entry = [arg if dim is None else arg.select(dim, i) for arg, dim in zip(args, in_dims, strict=True)]
+        columns.append(function.apply(*entry))
+    outputs = tuple(torch.stack(column) for column in zip(*columns, strict=True))
+    return outputs, (0,) * len(outputs)
+
+
+class Run(torch.autograd.Function):
+    """(job, *tensors) -> outputs."""
+
+    @staticmethod
+    def forward(job: Replayable, *tensors: torch.Tensor) -> Tensors:
+        _check_runs(job, tensors)
+        return job.primal(tensors)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+        ctx.job, *tensors = inputs
+        ctx.is_real = [out.is_floating_point() for out in output]
+        ctx.mark_non_differentiable(*(out for out in output if not out.is_floating_point()))
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(*tensors)
+        ctx.save_for_forward(*tensors)
+
+    @staticmethod
+    def backward(ctx: Any, *cotangents: torch.Tensor | None) -> tuple[Any, ...]:
+        real = [g for g, is_real in zip(cotangents, ctx.is_real, strict=True) if is_real]
+        asked = Asked(tuple(ctx.needs_input_grad[1:]), tuple(g is not None for g in real))
+        if not any(asked.given) or not any(asked.needs):
+            return (None,) * (1 + len(asked.needs))
+        found = iter(Pullback.apply(ctx.job, asked, *_given(real), *_once(ctx.job, ctx.saved_tensors)))  # type: ignore[no-untyped-call]
+        return (None, *(next(found) if need else None for need in asked.needs))
+
+    @staticmethod
+    def jvp(ctx: Any, _: None, *tangents: torch.Tensor | None) -> tuple[Any, ...]:
+        asked = Asked(tuple(tangent is not None for tangent in tangents))
+        found = iter(Pushforward.apply(ctx.job, asked, *_given(tangents), *_once(ctx.job, ctx.saved_tensors)))  # type: ignore[no-untyped-call]
+        return tuple(next(found) if is_real else None for is_real in ctx.is_real)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[Any, Any]:
+        return _each(Run, info, in_dims, args)
+
+
+class Pullback(torch.autograd.Function):
+    """(job, asked, *cotangents that are given, *tensors) -> gradients of the tensors that need one."""
+
+    @staticmethod
+    def forward(job: Replayable, asked: Asked, *tensors: torch.Tensor) -> Tensors:
+        _check_runs(job, tensors)
+        count = sum(asked.given)
+        return job.pullback(asked, tensors[count:], tensors[:count])
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+        ctx.job, ctx.asked, *tensors = inputs
+        ctx.set_materialize_grads(False)
+        values = tensors[sum(ctx.asked.given) :]
+        ctx.save_for_backward(*values)
+        ctx.save_for_forward(*values)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: torch.Tensor | None) -> tuple[Any, ...]:
+        values, asked = ctx.saved_tensors, replace(ctx.asked, needs=_those(ctx.asked.needs, grads))
+        found: Sequence[Any] = [None] * len(asked.given)
+        if any(asked.needs):
+            found = Pushforward.apply(ctx.job, asked, *_given(grads), *values)  # type: ignore[no-untyped-call]
+        of_cotangents = [d for d, is_given in zip(found, asked.given, strict=True) if is_given]
+        wanted = ctx.needs_input_grad[2 : 2 + len(of_cotangents)]
+        return (
+            None,
+            None,
+            *(d if want else None for d, want in zip(of_cotangents, wanted, strict=True)),
+            *_zeros(values),
+        )
+
+    @staticmethod
+    def jvp(ctx: Any, _: None, __: None, *tangents: torch.Tensor | None) -> Tensors:
+        of_cotangents = tangents[: sum(ctx.asked.given)]
+        asked = replace(ctx.asked, given=_those(ctx.asked.given, of_cotangents))
+        found: Tensors = Pullback.apply(ctx.job, asked, *_given(of_cotangents), *ctx.saved_tensors)  # type: ignore[no-untyped-call]
+        return found
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[Any, Any]:
+        return _each(Pullback, info, in_dims, args)
+
+
+class Pushforward(torch.autograd.Function):
+    """(job, asked, *tangents of the tensors that need one, *tensors) -> derivatives of the real outputs."""
+
+    @staticmethod
+    def forward(job: Replayable, asked: Asked, *tensors: torch.Tensor) -> Tensors:
+        _check_runs(job, tensors)
+        count = sum(asked.needs)
+        return job.pushforward(asked, tensors[count:], tensors[:count])
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+        ctx.job, ctx.asked, *tensors = inputs
+        ctx.set_materialize_grads(False)
+        values = tensors[sum(ctx.asked.needs) :]
+        ctx.save_for_backward(*values)
+        ctx.save_for_forward(*values)
+
+    @staticmethod
+    def backward(ctx: Any, *cotangents: torch.Tensor | None) -> tuple[Any, ...]:
+        asked = replace(ctx.asked, given=tuple(g is not None for g in cotangents))
+        grads: Sequence[Any] = (None,) * sum(asked.needs)
+        if any(asked.given):
+            grads = Pullback.apply(ctx.job, asked, *_given(cotangents), *ctx.saved_tensors)  # type: ignore[no-untyped-call]
+        return (None, None, *grads, *_zeros(ctx.saved_tensors))
+
+    @staticmethod
+    def jvp(ctx: Any, _: None, __: None, *tangents: torch.Tensor | None) -> Tensors:
+        of_tangents = tangents[: sum(ctx.asked.needs)]
+        asked = replace(ctx.asked, needs=_those(ctx.asked.needs, of_tangents))
+        found: Tensors = Pushforward.apply(ctx.job, asked, *_given(of_tangents), *ctx.saved_tensors)  # type: ignore[no-untyped-call]
+        return found
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[Any, Any]:
+        return _each(Pushforward, info, in_dims, args)
+
+
+# ------------------------------------------------------------------------------------------------------------ renders
+
+
+@dataclass(frozen=True)
+class RenderCall:
+    """Render of a job, as a call of :func:`run`.
+
+    Args:
+        job: the job.
+        seeds: number of leading tensors that are seeds, known inside of a ``vmap`` alone: 0 or 1.
+    """
 
     job: RenderJob
     seeds: int
@@ -35,18 +286,18 @@ class _Render:
         return "a render"
 
     def primal(self, tensors: Sequence[torch.Tensor]) -> Tensors:
-        """(steady, response)."""
-        return engine.primal(self._seeded(tensors), tensors[self.seeds :])
+        """Return steady and response."""
+        return engine.run(self._seeded(tensors), RENDER, tensors[self.seeds :])
 
     def pullback(self, asked: Asked, tensors: Sequence[torch.Tensor], cotangents: Sequence[torch.Tensor]) -> Tensors:
-        """Gradients of the values that need one."""
+        """Return the gradients of the values that need one."""
         given = iter(cotangents)
-        steady, response = (next(given) if is_given else None for is_given in asked.given)
-        return tuple(engine.vjp(self._seeded(tensors, asked), tensors[self.seeds :], steady, response))
+        adjoints = [next(given) if is_given else None for is_given in asked.given]
+        return engine.run(self._seeded(tensors, asked), BACKWARD, tensors[self.seeds :], adjoints)
 
     def pushforward(self, asked: Asked, tensors: Sequence[torch.Tensor], tangents: Sequence[torch.Tensor]) -> Tensors:
-        """Derivatives of (steady, response)."""
-        return engine.jvp(self._seeded(tensors, asked), tensors[self.seeds :], tangents)
+        """Return the derivatives of steady and response."""
+        return engine.run(self._seeded(tensors, asked), FORWARD, tensors[self.seeds :], tangents)
 
     def _seeded(self, tensors: Sequence[torch.Tensor], asked: Asked | None = None) -> RenderJob:
         job = self.job.seeded(tensors[0] if self.seeds else None)

@@ -12,9 +12,9 @@ from torchtransient import geometry
 from torchtransient.checks import as_whole, shown
 from torchtransient.errors import ArgumentError, SceneError
 from torchtransient.plugins.parameter_effect import class_of
-from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.renderer import TransientRenderer
-from torchtransient.rendering.variant import active_variant
+from torchtransient.scene.opaque import opaque
+from torchtransient.scene.variant import active_variant
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
-"""Runs of a Mitsuba scene on torch tensors: primal, reverse and forward mode, without any torch graph.
+"""Engine: renders and their derivatives in both modes, from torch tensors to torch tensors, without a torch graph.
 
-Every run installs its values in the scene, renders and reads the result, under one lock. The described values are put
-back before anybody else looks at the scene (:meth:`.load.Scene.leave`), and no Dr.Jit graph outlives a run.
+:func:`run` installs the values of a job in its built scene, has the integrator's jobs executed (recorded or traced,
+:mod:`.recording`) and reads the results, under one lock. No Dr.Jit graph outlives a run.
 
 Tensors are real and in the film's layout here: steady (H, W, C) and the film's response, which is the transient (H, W,
 T, C) or the phasors (H, W, F, 2 C) with real and imaginary parts in turn; with a leading dimension of items when there
@@ -10,90 +10,341 @@ are several.
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import torch
 
-from torchtransient.errors import ArgumentError, SceneError, UnitError
-from torchtransient.interfaces import BACKWARD, FORWARD, RENDER
-from torchtransient.plugins.parameters import check_slope
-from torchtransient.rendering.batch import Batch, take
-from torchtransient.rendering.broken_numbers import all_finite, broken_entries, fill_broken
-from torchtransient.rendering.carry_out import Numbered, carry_out, groups_of
+from torchtransient.checks import one_line
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, TorchTransientError, UnitError, VariantError
+from torchtransient.interfaces import BACKWARD, FORWARD, RENDER, is_time_resolved
+from torchtransient.plugins.frozen_state import says_it_can_be_recorded
+from torchtransient.plugins.guards import interrupts_wait, no_collection
+from torchtransient.plugins.parameters import check_slope, lifted
+from torchtransient.rendering.broken_numbers import broken_entries, fill_broken
 from torchtransient.rendering.films import FilmLayout, layout_of_film
-from torchtransient.rendering.interrupts import ends_frames
+from torchtransient.rendering.job import Item, RenderJob, RunLog, samples_drawn
 from torchtransient.rendering.memory import check_fits
-from torchtransient.rendering.sample_counts import samples_taken
-from torchtransient.rendering.seeds import Item
-from torchtransient.rendering.session import RenderJob, RunLog, Session, session_of
+from torchtransient.rendering.recording import LARGE_FILM, Numbered, Recordings, execute, groups_of
+from torchtransient.rendering.values import detached, put_back, values_of
 from torchtransient.scene.edits import built_depth
 from torchtransient.scene.parameters import needing_slope
-from torchtransient.scene.physics import are_finite, smallest_and_largest
+from torchtransient.scene.physics import all_finite, are_finite, smallest_and_largest
 from torchtransient.scene.values import own_array, wait_for_torch
+from torchtransient.scene.variant import active_variant, named_errors, quiet
 
-# ---------------------------------------------------------------------------------------------------------- primal
+
+def run(
+    job: RenderJob, kind: str, values: Sequence[torch.Tensor], given: Sequence[torch.Tensor | None] = ()
+) -> tuple[torch.Tensor, ...]:
+    """Execute a job.
+
+    Args:
+        job: the call.
+        kind: ``RENDER``, ``BACKWARD`` or ``FORWARD`` of :mod:`torchtransient.interfaces`.
+        values: one tensor per key of the job, with a leading dimension of entries where ``job.batched`` says so.
+        given: for ``BACKWARD`` the adjoints of steady and response, None for zero; for ``FORWARD`` the tangents of the
+            values that need a derivative.
+
+    Returns:
+        Of ``RENDER`` steady and response, of ``FORWARD`` their derivatives, of ``BACKWARD`` the gradients of the values
+        that need one, in their shapes. Adjoints and tangents that are not finite make all that they reach NaN.
+
+    Raises:
+        UnitError: for values that are not finite.
+        SceneError, StorageError, GradientError, VariantError: for scenes, films and derivatives that cannot be.
+    """
+    if kind == RENDER:
+        check_values(job, values)
+    if kind == BACKWARD and all(g is None for g in given):
+        return tuple(torch.zeros_like(v) for v, need in zip(values, job.needs, strict=True) if need)
+    with open_session(job) as session:
+        kinds: dict[str, Any] = {RENDER: Images, BACKWARD: Gradients, FORWARD: Tangents}
+        results = kinds[kind](session, values, given)
+        for group in groups_of(session):
+            execute(session, results, group)
+        found: tuple[torch.Tensor, ...] = results.finish()
+        return found
 
 
-@ends_frames
-def primal(job: RenderJob, values: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
-    """Render every item. Returns (steady, response); a single item is a view of the film's own memory."""
-    check_values(job, values)
-    with session_of(job) as session:
-        started = time.perf_counter()
+# ---------------------------------------------------------------------------------------------------- a scene in use
+
+
+class Session:
+    """A built scene in use by one job."""
+
+    def __init__(self, job: RenderJob):
+        self.job = job
+        self.slots = job.scene.slots(job.keys, job.options)
+        self.scene = self.slots.built.scene
+        self.params = self.slots.built.params
+        self.integrator = self.scene.integrator()
+        self.recordings = job.scene.recordings.setdefault(job.options, {}).setdefault(job.keys, Recordings())
+        self.sensors = self.scene.sensors()
+
+    def film(self, item: Item) -> Any:
+        """Return the film of an item."""
+        return self.sensors[item.sensor].film()
+
+    def entries(self, item: Item) -> int:
+        """Return the number of values behind the pixels of an item's film."""
+        return math.prod(self.film(item).cube_shape())
+
+    def install(self, item: Item, values: Sequence[torch.Tensor], needs: Sequence[bool]) -> list[Any]:
+        """Write the values of one batch entry into the scene; leaves that need it carry gradients."""
+        import drjit as dr
+
+        leaves: list[Any] = []
+        self.job.scene.installed[self.job.options] = self.slots
+        for slot, value, batched, need in zip(self.slots.slots, values, self.job.batched, needs, strict=True):
+            entry = value[item.entry] if batched else value
+            slot.check(entry)
+            leaf = own_array(entry)
+            if need and slot.loses_black():
+                leaf = lifted(leaf)
+            if need:
+                dr.enable_grad(leaf)
+            leaves.append(leaf)
+        try:
+            with quiet():
+                self.slots.install(leaves)
+        except (RuntimeError, ValueError, TypeError) as error:
+            if isinstance(error, TorchTransientError):
+                raise
+            keys = ", ".join(self.job.keys)
+            raise SceneError(f"values of {keys}: Mitsuba refuses them: {one_line(error)}") from error
+        return leaves
+
+    def settings(self) -> list[tuple[Any, str, Any]]:
+        """Return the attributes of plugins that the job sets, as (plugin, name, value)."""
+        job, integrator = self.job, self.integrator
+        found: list[tuple[Any, str, Any]] = []
+        if job.bound is not None:
+            found.append((integrator, "max_depth", job.bound.depth))
+        if job.temporal_filter:
+            if getattr(integrator, "temporal_filter", ""):  # it would replace the films' when a render begins
+                found.append((integrator, "temporal_filter", ""))
+            films = [sensor.film() for sensor in self.sensors]
+            found += [
+                (film, "temporal_filter", job.temporal_filter)
+                for film in films
+                if is_time_resolved(film) and film.temporal_filter
+            ]
+        return [*found, *boundary_settings(job.boundary, job.spp_boundary, integrator)]
+
+
+def boundary_settings(boundary: bool, spp: int | None, integrator: Any) -> list[tuple[Any, str, Any]]:
+    """Return the attributes of an integrator that switch its boundary term; the layer warns in its place."""
+    changes: dict[str, Any] = {"warns_of_edges": False}
+    changes |= ({} if boundary else {"boundary": False}) | ({} if spp is None else {"spp_boundary": spp})
+    return [(integrator, name, value) for name, value in changes.items() if hasattr(integrator, name)]
+
+
+@contextmanager
+def with_settings(settings: Sequence[tuple[Any, str, Any]]) -> Iterator[None]:
+    """Set attributes of plugins for the time of a block."""
+    before = [(plugin, name, getattr(plugin, name)) for plugin, name, _ in settings]
+    try:
+        for plugin, name, value in settings:
+            setattr(plugin, name, value)
+        yield
+    finally:
+        with interrupts_wait():
+            for plugin, name, value in reversed(before):
+                setattr(plugin, name, value)
+
+
+@contextmanager
+def open_session(job: RenderJob) -> Iterator[Session]:
+    """Hold the engine lock with the job's scene built, in its variant and with the settings of the job."""
+    import drjit as dr
+
+    with active_variant(job.scene.variant), no_collection(), named_errors():
+        if not dr.flag(dr.JitFlag.SymbolicLoops):
+            raise VariantError(
+                "the flag SymbolicLoops of Dr.Jit is off, without which gradients of a render are wrong; switch it on: "
+                "drjit.set_flag(drjit.JitFlag.SymbolicLoops, True)."
+            )
+        with _values_at_call(job):
+            session = Session(job)
+            attached = True  # an error may leave derivatives
+            try:
+                with with_settings(session.settings()):
+                    yield session
+                attached = any(job.needs)
+            finally:
+                if attached or job.scene.is_shared:
+                    with interrupts_wait():
+                        job.scene.restore(job.options, session.slots)
+
+
+@contextmanager
+def _values_at_call(job: RenderJob) -> Iterator[None]:
+    """Give a scene that is shared with its owner the values of the call, without derivatives, for a block."""
+    import drjit as dr
+
+    if not job.scene.is_shared:
+        yield
+        return
+    params = job.scene.built(job.options).params
+    with dr.resume_grad():
+        now = values_of(params)
+    try:
+        with dr.resume_grad():
+            if not job.at_call:
+                job.at_call.append(detached(now))
+            put_back(params, job.at_call[0], now)
+        yield
+    finally:
+        with interrupts_wait(), dr.resume_grad():
+            put_back(params, now)
+
+
+# ------------------------------------------------------------------------------------------------------------ renders
+
+
+class Images:
+    """Results of ``RENDER``: all items in one tensor each; of a single one the film's own memory.
+
+    Large films write straight to their place: a copy would cost as much as a third of a render of 16 samples per pixel.
+    """
+
+    kind = RENDER
+
+    def __init__(self, session: Session, values: Sequence[torch.Tensor], _given: Sequence[torch.Tensor | None]):
+        job = session.job
+        self.session, self.values, self.count = session, values, len(job.items)
+        self._started = time.perf_counter()
+        self._energies: list[tuple[float, float]] = []
+        # How the call of each item was made: launched, recorded, or the reason why it was traced.
+        self.calls: list[str] = []
+        self._steady: torch.Tensor | None = None
+        self._response: torch.Tensor | None = None
+        self._memory: Any = None
+        if not job.items:
+            raise ShapeError("a batch must have at least one entry, got 0.")
         check_items(session.sensors, job.items)
-        check_fits(session.film(job.items[0]).cube_shape(), len(job.items), job.scene.variant)
-        steady, response, before, after, said = _render_items(session, values)
-        seconds, spp = time.perf_counter() - started, _drawn_samples(session)
-        channels = len(session.film(job.items[0]).channel_names())
-        light = steady[..., :channels].sum((-3, -2, -1), dtype=torch.float64) / channels
-        total: tuple[float, ...] = tuple(light.reshape(-1).tolist())
+        self.films = [session.film(item) for item in job.items]
+        check_fits(self.films[0].cube_shape(), self.count, job.scene.variant)
+
+    def install(self, item: Item, group: Sequence[Numbered]) -> None:
+        """Install the values of an entry, which the items of a group share."""
+        self.session.install(item, self.values, [False] * len(self.values))
+        for _, each in group:
+            self.session.job.watch.placed(self.session.scene, each.sensor)
+
+    def adjoint(self, _n: int) -> tuple[None, None]:
+        """Return no adjoint."""
+        return None, None
+
+    def progress(self, n: int) -> Callable[[float], None] | None:
+        """Return the function that is called with the share of item ``n`` that is done."""
+        report = self.session.job.progress
+        return None if report is None else lambda fraction: report((n + fraction) / self.count)
+
+    @contextmanager
+    def storage(self, film: Any, n: int) -> Iterator[bool]:
+        """Let a large film write to the place of item ``n``; yields whether it does."""
+        entries = math.prod(film.cube_shape())
+        large = self.count > 1 and entries >= LARGE_FILM and self.count * entries < 2**32
+        # An integrator of others may not know of first entries.
+        able = large and says_it_can_be_recorded(self.session.integrator)
+        if not able or not all(other.can_borrow(self.session.job.spp) for other in self.films):
+            yield False
+            return
+        import mitsuba as mi
+
+        from torchtransient.plugins.films.base import zeros
+
+        if self._memory is None:
+            self._memory = zeros(mi.Float, self.count * entries)  # type: ignore[no-untyped-call]
+        try:
+            film.lend((self._memory, n * entries))
+            yield True
+        finally:
+            film.lend(None)
+
+    def collect(self, n: int, item: Item) -> None:
+        """Take the result of item ``n`` from its film."""
+        film = self.session.film(item)
+        self._energies.append(film.energies_outside())
+        if self._memory is not None and film.bands and film.bands[0][2] is self._memory:
+            steady, response = _lent_steady(film), None
+        else:
+            steady, response = _tensors_of(film, None if self._response is None else self._response[n])
+        if self.count == 1:
+            self._steady, self._response = steady, response
+            return
+        if self._steady is None:
+            self._steady = steady.new_empty((self.count, *steady.shape))
+        self._steady[n].copy_(steady)
+        if response is not None:
+            if self._response is None:
+                self._response = response.new_empty((self.count, *response.shape))
+            self._response[n].copy_(response)
+
+    def finish(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return steady and response, and report to the job's log."""
+        import mitsuba as mi
+
+        session, job, film = self.session, self.session.job, self.films[0]
+        if self._response is None:
+            self._response = mi.TensorXf(self._memory, (self.count, *film.cube_shape())).torch()
+        assert self._steady is not None and self._response is not None
+        seconds = time.perf_counter() - self._started
+        spp = samples_drawn(session.sensors[job.items[0].sensor].sampler().clone(), job.spp)
+        channels = len(film.channel_names())
+        light = self._steady[..., :channels].sum((-3, -2, -1), dtype=torch.float64) / channels
+        total = tuple(light.reshape(-1).tolist())
+        before, after = zip(*self._energies, strict=True)
         integrator, depth = session.slots.built.integrator, built_depth(session.integrator)
-        job.log.append(RunLog(job.items, seconds, integrator, spp, before, after, total, said, depth))
-    if job.watch.enabled:
-        job.watch.window(sum(total), sum(before), sum(after))
+        calls = tuple(self.calls)
+        job.log.append(RunLog(job.items, seconds, integrator, spp, before, after, total, calls, depth))
+        if job.watch.enabled:
+            job.watch.window(sum(total), sum(before), sum(after))
+        return self._steady, self._response
+
+
+def _lent_steady(film: Any) -> torch.Tensor:
+    """Return the steady image of a film that has written its array to memory that was lent to it."""
+    import drjit as dr
+    import mitsuba as mi
+
+    dr.eval(film.steady, film.bands[0][2])
+    dr.sync_thread()
+    shape = film.cube_shape()
+    steady: torch.Tensor = mi.TensorXf(film.steady, (shape[0], shape[1], film.channel_count())).torch()
+    film.clear()
+    return steady
+
+
+def _tensors_of(film: Any, into: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return steady and response, which own the film's memory; of a cube in several bands they are put together."""
+    import drjit as dr
+    import mitsuba as mi
+
+    bands = film.transient_bands()
+    shape = film.cube_shape()
+    dr.eval(film.steady, *(band[2] for band in bands))
+    dr.sync_thread()
+    steady = mi.TensorXf(film.steady, (shape[0], shape[1], film.channel_count())).torch()
+    if len(bands) == 1:
+        response = mi.TensorXf(bands[0][2], shape).torch()
+    else:
+        response = torch.empty(shape, dtype=steady.dtype, device=steady.device) if into is None else into
+        while bands:
+            first, rows, flat = bands.pop(0)
+            response[first : first + rows].copy_(flat.torch().view(rows, *shape[1:]))
+            del flat
+    film.clear()
     return steady, response
 
 
-def _render_items(
-    session: Session, values: Sequence[torch.Tensor]
-) -> tuple[torch.Tensor, torch.Tensor, tuple[float, ...], tuple[float, ...], tuple[str, ...]]:
-    job = session.job
-    batch = Batch(len(job.items), [session.film(item) for item in job.items], session.integrator)
-    energies: list[tuple[float, float]] = []
-    said: list[str] = []
-    for group in groups_of(session):
-
-        def install(item: Item, group: Sequence[Numbered] = group) -> None:
-            session.install(item, values, [False] * len(values))
-            for _, each in group:
-                job.watch.placed(session.scene, each.sensor)
-
-        def collect(n: int, item: Item) -> None:
-            film = session.film(item)
-            energies.append(film.energies_outside())
-            batch.take(film, n)
-
-        with batch.lent_to(session.film(group[0][1]), group[0][0], job.spp) as lent:
-            said += carry_out(session, RENDER, group, install, collect, report=lambda n: _fraction(job, n), lent=lent)
-    steady, response = batch.tensors()
-    before, after = zip(*energies, strict=True)
-    return steady, response, before, after, tuple(said)
-
-
-def _drawn_samples(session: Session) -> int:
-    """Samples per pixel that are really drawn: stratified samplers round the number that is asked for."""
-    return samples_taken(session.sensors[session.job.items[0].sensor].sampler().clone(), session.job.spp)
-
-
-def _fraction(job: RenderJob, n: int) -> Callable[[float], None] | None:
-    report, count = job.progress, len(job.items)
-    return None if report is None else lambda fraction: report((n + fraction) / count)
-
-
 def check_items(sensors: Sequence[Any], items: Sequence[Item]) -> FilmLayout:
-    """What the films of a call measure, which has to be the same in one shape. Raises ``SceneError``."""
+    """Return the layout of the films of a call, which measure the same in one shape. Raises ``SceneError``."""
     found: dict[int, tuple[FilmLayout, tuple[int, ...], tuple[str, ...]]] = {}
     for item in items:
         if not 0 <= item.sensor < len(sensors):
@@ -101,19 +352,19 @@ def check_items(sensors: Sequence[Any], items: Sequence[Item]) -> FilmLayout:
         film = sensors[item.sensor].film()
         found[item.sensor] = layout_of_film(film), tuple(film.cube_shape()), tuple(film.channel_names())
     if len(set(found.values())) > 1:
-        said = "; ".join(
-            f"sensor {sensor}: {choice} of shape {shape} and channels {'/'.join(channels)}"
-            for sensor, (choice, shape, channels) in found.items()
+        films = "; ".join(
+            f"sensor {sensor}: {layout} of shape {shape} and channels {'/'.join(channels)}"
+            for sensor, (layout, shape, channels) in found.items()
         )
         raise SceneError(
-            f"sensors: films rendered in one call must measure the same in one shape, got {said}. Use one "
+            f"sensors: films rendered in one call must measure the same in one shape, got {films}. Use one "
             "TransientRenderer per sensor."
         )
     return next(iter(found.values()))[0]
 
 
 def check_values(job: RenderJob, values: Sequence[torch.Tensor]) -> None:
-    """Raise ``UnitError`` for values that are not finite; say what is unphysical."""
+    """Raise ``UnitError`` for values that are not finite, and warn of unphysical ones."""
     for key, value in zip(job.keys, values, strict=True):
         low, high = smallest_and_largest(value)
         if not are_finite(low, high):
@@ -125,150 +376,109 @@ def check_values(job: RenderJob, values: Sequence[torch.Tensor]) -> None:
             job.watch.value(key, value, low, high)
 
 
-# ----------------------------------------------------------------------------------------------------- derivatives
+# -------------------------------------------------------------------------------------------------------- derivatives
 
 
-@ends_frames
-def vjp(
-    job: RenderJob, values: Sequence[torch.Tensor], g_steady: torch.Tensor | None, g_response: torch.Tensor | None
-) -> list[torch.Tensor]:
-    """Gradients of ``<g_steady, steady> + <g_response, response>`` for the values that need one, in their shapes.
+class _Derivatives:
+    """Results of derivatives: the leaves of the values that were installed last."""
 
-    The adjoint of a film that is not finite makes every gradient that the film can have NaN: that of its entry of the
-    batch, and those of values without a batch.
-    """
-    import drjit as dr
+    def __init__(self, session: Session, values: Sequence[torch.Tensor], given: Sequence[torch.Tensor | None]):
+        self.session, self.values, self.given = session, values, given
+        self.leaves: list[Any] = []
+        self.calls: list[str] = []
+        job = session.job
+        wanted = [key for key, need in zip(job.keys, job.needs, strict=True) if need]
+        moving = needing_slope(job.scene.known_parameters(), wanted)
+        for item in job.items if moving else ():
+            film = session.film(item)
+            check_slope(moving, film.has_slope, film.response_name, film.slope_remedy)
 
-    grads: list[torch.Tensor | None] = [
-        torch.zeros_like(v) if need else None for v, need in zip(values, job.needs, strict=True)
-    ]
-    if g_steady is not None or g_response is not None:
-        with session_of(job) as session:
-            _check_slope(session)
-            for group in groups_of(session):
-                leaves: list[Any] = []
+    def install(self, item: Item, _group: Sequence[Numbered]) -> None:
+        """Install the values of an entry, attached."""
+        self.leaves = self.session.install(item, self.values, self.session.job.needs)
 
-                def install(item: Item, leaves: list[Any] = leaves) -> None:
-                    leaves[:] = session.install(item, values, job.needs)
+    def adjoint(self, _n: int) -> tuple[Any, Any]:
+        """Return the adjoints of steady and response."""
+        return None, None
 
-                def adjoint(n: int) -> tuple[Any, Any]:
-                    several = len(job.items) > 1
-                    gs = None if g_steady is None else _steady_adjoint(g_steady[n] if several else g_steady)
-                    gr = None if g_response is None else _cube_adjoint(g_response[n] if several else g_response)
-                    return gs, gr
+    def progress(self, _n: int) -> None:
+        """Derivatives report no progress."""
 
-                def collect(n: int, item: Item, leaves: list[Any] = leaves) -> None:
-                    _finish_backward(session, leaves)
-                    for grad, leaf, batched in zip(grads, leaves, job.batched, strict=True):
-                        if grad is not None:
-                            target = grad[item.entry] if batched else grad
-                            target += dr.grad(leaf).torch().view(target.shape)
-                    leaves.clear()
-
-                job.derivative_log.extend(carry_out(session, BACKWARD, group, install, collect, adjoint))
-        for item in _broken_items(job, [g for g in (g_steady, g_response) if g is not None]):
-            fill_broken(
-                grad[item.entry] if batched else grad
-                for grad, batched in zip(grads, job.batched, strict=True)
-                if grad is not None
-            )
-    return [grad for grad in grads if grad is not None]
+    @contextmanager
+    def storage(self, _film: Any, _n: int) -> Iterator[bool]:
+        """Films of derivatives write to memory of their own."""
+        yield False
 
 
-def _broken_items(job: RenderJob, adjoints: Sequence[torch.Tensor]) -> list[Item]:
-    """The films whose adjoints are not finite."""
-    if len(job.items) == 1:
-        return [] if all(map(all_finite, adjoints)) else list(job.items)
-    columns = [broken_entries(adjoint, len(job.items)) for adjoint in adjoints]
-    return [item for item, broken in zip(job.items, zip(*columns, strict=True), strict=True) if any(broken)]
+class Gradients(_Derivatives):
+    """Results of ``BACKWARD``: gradients of ``<g_steady, steady> + <g_response, response>``."""
+
+    kind = BACKWARD
+
+    def __init__(self, session: Session, values: Sequence[torch.Tensor], given: Sequence[torch.Tensor | None]):
+        super().__init__(session, values, given)
+        self._grads = [
+            torch.zeros_like(value) if need else None for value, need in zip(values, session.job.needs, strict=True)
+        ]
+
+    def adjoint(self, n: int) -> tuple[Any, Any]:
+        several = len(self.session.job.items) > 1
+        steady, response = (g if g is None or not several else g[n] for g in self.given)
+        return _steady_adjoint(steady), _cube_adjoint(response)
+
+    def collect(self, _n: int, item: Item) -> None:
+        """Carry the gradients at the scene's parameters on to the leaves, and add them up."""
+        import drjit as dr
+
+        job, slots = self.session.job, self.session.slots
+        for key in slots.originals:
+            value = self.session.params[key]
+            if dr.grad_enabled(value):
+                dr.enqueue(dr.ADMode.Backward, value)
+        dr.traverse(dr.ADMode.Backward)
+        dr.eval([dr.grad(leaf) for leaf in self.leaves])
+        dr.sync_thread()
+        for grad, leaf, batched in zip(self._grads, self.leaves, job.batched, strict=True):
+            if grad is not None:
+                target = grad[item.entry] if batched else grad
+                target += dr.grad(leaf).torch().view(target.shape)
+        self.leaves = []
+
+    def finish(self) -> tuple[torch.Tensor, ...]:
+        """Return the gradients, NaN where a film's adjoint is not finite: of its entry, and of unbatched values."""
+        self.session.job.derivative_log.extend(self.calls)
+        job, adjoints = self.session.job, [g for g in self.given if g is not None]
+        if len(job.items) == 1:
+            broken = [not all(map(all_finite, adjoints))]
+        else:
+            columns = [broken_entries(adjoint, len(job.items)) for adjoint in adjoints]
+            broken = list(map(any, zip(*columns, strict=True)))
+        for item, is_broken in zip(job.items, broken, strict=True):
+            if is_broken:
+                fill_broken(
+                    grad[item.entry] if batched else grad
+                    for grad, batched in zip(self._grads, job.batched, strict=True)
+                    if grad is not None
+                )
+        return tuple(grad for grad in self._grads if grad is not None)
 
 
-def _finish_backward(session: Session, leaves: Sequence[Any]) -> None:
-    """Carry what has arrived at the scene's parameters on to the leaves."""
-    import drjit as dr
-
-    for target in session.slots.originals:
-        value = session.params[target]
-        if dr.grad_enabled(value):
-            dr.enqueue(dr.ADMode.Backward, value)
-    dr.traverse(dr.ADMode.Backward)
-    dr.eval([dr.grad(leaf) for leaf in leaves])
-    dr.sync_thread()
-
-
-@ends_frames
-def jvp(
-    job: RenderJob, values: Sequence[torch.Tensor], tangents: Sequence[torch.Tensor]
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Derivatives of (steady, response) along ``tangents``, given for the values that need one. Tangents that are not
-    finite make all of a film NaN.
-    """
-    steady_all, response_all = [], []
-    batched = [batched for batched, need in zip(job.batched, job.needs, strict=True) if need]
-    broken = {item.entry for item in job.items if not all(map(all_finite, _tangents_of(item, tangents, batched)))}
-    with session_of(job) as session:
-        _check_slope(session)
-        for group in groups_of(session):
-            leaves: list[Any] = []
-
-            def install(item: Item, leaves: list[Any] = leaves) -> None:
-                leaves[:] = session.install(item, values, job.needs)
-                _set_tangents(job, item, leaves, tangents)
-
-            def collect(n: int, item: Item) -> None:
-                d_steady, d_response = take(session.film(item), None)
-                if item.entry in broken:
-                    fill_broken((d_steady, d_response))
-                steady_all.append(d_steady)
-                response_all.append(d_response)
-
-            job.derivative_log.extend(carry_out(session, FORWARD, group, install, collect))
-            leaves.clear()
-    if len(job.items) == 1:
-        return steady_all[0], response_all[0]
-    return torch.stack(steady_all), torch.stack(response_all)
-
-
-def _tangents_of(item: Item, tangents: Sequence[torch.Tensor], batched: Sequence[bool]) -> list[torch.Tensor]:
-    return [tangent[item.entry] if several else tangent for tangent, several in zip(tangents, batched, strict=True)]
-
-
-def _set_tangents(job: RenderJob, item: Item, leaves: Sequence[Any], tangents: Sequence[torch.Tensor]) -> None:
-    """Bring tangents to the leaves that need one, and on to the scene's parameters."""
-    import drjit as dr
-
-    given = iter(tangents)
-    for leaf, need, batched in zip(leaves, job.needs, job.batched, strict=True):
-        if need:
-            tangent = next(given)
-            dr.set_grad(leaf, own_array(tangent[item.entry] if batched else tangent))
-            dr.enqueue(dr.ADMode.Forward, leaf)
-    # Interior nodes keep their tangents: the loops of the integrator read them at their boundary.
-    dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)
-
-
-def _check_slope(session: Session) -> None:
-    """A path length that changes needs films whose response over time has a slope."""
-    job = session.job
-    wanted = [key for key, need in zip(job.keys, job.needs, strict=True) if need]
-    moving = needing_slope(job.scene.known_parameters(), wanted)
-    for item in job.items if moving else ():
-        film = session.film(item)
-        check_slope(moving, film.has_slope, film.response_name, film.slope_remedy)
-
-
-def _steady_adjoint(g: torch.Tensor) -> Any:
+def _steady_adjoint(g: torch.Tensor | None) -> Any:
     import mitsuba as mi
 
+    if g is None:
+        return None
     g = g.resolve_neg().contiguous()
     wait_for_torch(g)
     return mi.TensorXf(g)
 
 
-def _cube_adjoint(g: torch.Tensor) -> Any:
-    """The adjoint cube as (flat array, offset, strides): read where it is, in whatever layout torch left it."""
+def _cube_adjoint(g: torch.Tensor | None) -> Any:
+    """Return the adjoint cube as (flat array, offset, strides): read in place, in whatever layout torch left it."""
     import mitsuba as mi
 
+    if g is None:
+        return None
     g = g.detach().resolve_neg()
     wait_for_torch(g)
     span = 1 + sum((size - 1) * stride for size, stride in zip(g.shape, g.stride(), strict=True))
@@ -277,3 +487,48 @@ def _cube_adjoint(g: torch.Tensor) -> Any:
         return mi.TensorXf(g.contiguous())
     flat = g.as_strided((span,), (1,), g.storage_offset())
     return mi.Float(flat), 0, tuple(int(stride) for stride in g.stride())
+
+
+class Tangents(_Derivatives):
+    """Results of ``FORWARD``: derivatives of steady and response along the tangents."""
+
+    kind = FORWARD
+
+    def __init__(self, session: Session, values: Sequence[torch.Tensor], given: Sequence[torch.Tensor | None]):
+        super().__init__(session, values, given)
+        job = session.job
+        self._batched = [batched for batched, need in zip(job.batched, job.needs, strict=True) if need]
+        self._steady: list[torch.Tensor] = []
+        self._response: list[torch.Tensor] = []
+
+    def _of_entry(self, item: Item) -> list[torch.Tensor]:
+        given = [tangent for tangent in self.given if tangent is not None]
+        return [t[item.entry] if batched else t for t, batched in zip(given, self._batched, strict=True)]
+
+    def install(self, item: Item, group: Sequence[Numbered]) -> None:
+        """Install the values of an entry, and carry their tangents on to the scene's parameters."""
+        import drjit as dr
+
+        super().install(item, group)
+        wanted = [leaf for leaf, need in zip(self.leaves, self.session.job.needs, strict=True) if need]
+        for leaf, tangent in zip(wanted, self._of_entry(item), strict=True):
+            dr.set_grad(leaf, own_array(tangent))
+            dr.enqueue(dr.ADMode.Forward, leaf)
+        # Interior nodes keep their tangents: the loops of the integrator read them at their boundary.
+        dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)
+
+    def collect(self, _n: int, item: Item) -> None:
+        """Take the derivatives of an item from its film; NaN where a tangent is not finite."""
+        d_steady, d_response = _tensors_of(self.session.film(item), None)
+        if not all(map(all_finite, self._of_entry(item))):
+            fill_broken((d_steady, d_response))
+        self._steady.append(d_steady)
+        self._response.append(d_response)
+
+    def finish(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the derivatives of steady and response."""
+        self.leaves = []
+        self.session.job.derivative_log.extend(self.calls)
+        if len(self.session.job.items) == 1:
+            return self._steady[0], self._response[0]
+        return torch.stack(self._steady), torch.stack(self._response)

@@ -9,9 +9,9 @@ from torch import nn
 
 from torchtransient.checks import arguments_of
 from torchtransient.rendering.arguments import given_values
-from torchtransient.rendering.opaque import opaque
 from torchtransient.rendering.output import RenderOutput
 from torchtransient.rendering.renderer import TransientRenderer
+from torchtransient.scene.opaque import opaque
 
 
 @opaque

@@ -16,15 +16,13 @@ import torch
 from torchtransient.axes import TimeAxis
 from torchtransient.checks import as_number, as_whole, of_class, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.rendering.carry_out import Numbered, check_whole, groups_of, refusal
-from torchtransient.rendering.engine import check_values
-from torchtransient.rendering.opaque import opaque
-from torchtransient.rendering.recordings import NotRecordedError
+from torchtransient.rendering.engine import Session, check_values, open_session
+from torchtransient.rendering.job import RenderJob, Seeding
+from torchtransient.rendering.recording import NotRecordedError, Numbered, check_whole, groups_of, refusal
 from torchtransient.rendering.renderer import TransientRenderer
-from torchtransient.rendering.seeds import Seeding
-from torchtransient.rendering.session import RenderJob, Session, session_of
-from torchtransient.rendering.variant import active_variant
 from torchtransient.scene.load import Scene
+from torchtransient.scene.opaque import opaque
+from torchtransient.scene.variant import active_variant
 
 LABELS = ("depth", "z_depth", "position", "normals", "uv", "albedo", "shape", "primitive", "material")
 # Labels that are indices, which have no mean.
@@ -181,7 +179,7 @@ def _labels(
     check_values(job, tensors)
     found: list[list[torch.Tensor]] = []
     calls: list[str] = []
-    with session_of(job) as session:
+    with open_session(job) as session:
         for group in groups_of(session):
             session.install(group[0][1], tensors, job.needs)
             how, per_item = _group_labels(session, group, wanted, samples if average else 0)
@@ -242,7 +240,7 @@ def _group_labels(
     jobs = [
         LabelJob(session.scene, session.sensors[item.sensor], names, tables, samples).prepare() for _, item in group
     ]
-    reason = refusal(session, group)
+    reason = refusal(session)
     if reason is None:
         try:
             how, results = session.recordings.run(jobs)

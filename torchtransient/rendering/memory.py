@@ -1,4 +1,4 @@
-"""Whether a cube fits, asked before it is allocated."""
+"""Memory that is left, and the check that a cube fits before it is allocated."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 
 from torchtransient.array_files.free_memory import available_memory
 from torchtransient.errors import StorageError
-from torchtransient.rendering.variant import device_type
+from torchtransient.scene.variant import device_type
 
 _BYTES_PER_VALUE = 4
 # So little is not asked for: the question takes as long as a small render.

@@ -1,4 +1,4 @@
-"""What a render returns."""
+"""Result of a render: tensors with their axes, and statistics."""
 
 from __future__ import annotations
 
@@ -12,27 +12,33 @@ from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import ShapeError
 from torchtransient.gates import Gate
 from torchtransient.rendering.films import FilmLayout
-from torchtransient.rendering.variant import stokes_components
+from torchtransient.scene.variant import stokes_components
 from torchtransient.tensor_record import TensorRecord
 
 if TYPE_CHECKING:
-    from torchtransient.rendering.session import RenderJob
+    from torchtransient.rendering.job import RenderJob
 
 
 @dataclass(frozen=True)
 class RenderStats:
-    """How a result was made.
+    """Statistics of a render.
 
-    ``seconds`` is wall time, without loading and without the wait for other threads; ``samples_per_second``
-    counts camera paths. ``energy_before`` and ``energy_after`` hold, per rendered item, the light outside the time
-    axis: sum over pixels of the mean over channels; zero for films without a window (phasors, gates).
-    ``energy_total``: likewise, all light of ``steady``. ``RenderOutput.outside`` has the shares.
-    ``temporal_filter`` is empty for films without one. ``seeds`` are the items' seeds. ``recorded``: what became of
-    each item's recording, "launched", "recorded", or "traced: " and why; ``derivatives_recorded``: the same of the
-    derivatives that have been asked for since. ``max_depth``: of the paths, -1 for no limit, None for integrators
-    without one. ``light_beyond``: share of the light in deeper paths, where a pilot run has found ``max_depth`` for
-    derivatives of a scene that states none; else None. It is that of the described values: brighter ones, given or
-    learnt, have the same ``max_depth`` and more light beyond it.
+    Attributes:
+        spp: samples per pixel.
+        seconds: wall time, without loading and without the wait for other threads.
+        samples_per_second: camera paths per second.
+        variant, integrator: names.
+        temporal_filter: of the film; empty for films without one.
+        seeds: one per item (entry of the batch and sensor).
+        energy_before, energy_after: light outside of the time axis, per item: sum over pixels of the mean over
+            channels; zero for films without a window (phasors, gates). ``RenderOutput.outside`` has the shares.
+        energy_total: likewise, all light of ``steady``.
+        recorded: per item "launched", "recorded", or "traced: " and the reason.
+        derivatives_recorded: the same of the derivatives since.
+        max_depth: of the paths, -1 for no limit, None for integrators without one.
+        light_beyond: share of the light in deeper paths, where a pilot run has found ``max_depth`` for derivatives of a
+            scene that states none; else None. It is that of the described values: brighter ones, given or learnt, have
+            the same ``max_depth`` and more light beyond it.
     """
 
     _: KW_ONLY
@@ -53,7 +59,7 @@ class RenderStats:
 
     @classmethod
     def of_job(cls, job: RenderJob, pixels: int) -> RenderStats:
-        """Those of a job that has run, on films of so many pixels."""
+        """Return the statistics of a job that has run, on films of so many pixels."""
         runs = job.log
         items, seconds = [item for run in runs for item in run.items], sum(run.seconds for run in runs)
         return cls(
@@ -75,7 +81,7 @@ class RenderStats:
 
     @classmethod
     def of_batch(cls, several: Sequence[RenderStats]) -> RenderStats:
-        """Those of renders that are put into one batch: seeds and energies one behind another, times added up. Raises
+        """Join the statistics of renders of one batch: seeds and energies in a row, times added up. Raises
         ``ShapeError`` for renders that were not made alike.
         """
         first = several[0]
@@ -144,7 +150,7 @@ class RenderOutput(TensorRecord):
 
     @property
     def polarized(self) -> bool:
-        """Whether the Stokes components come before the channels."""
+        """Return whether the Stokes components come before the channels."""
         return stokes_components(self.stats.variant) > 1
 
     @property
@@ -184,7 +190,7 @@ class RenderOutput(TensorRecord):
 
 
 def named_fields(film: FilmLayout, response: torch.Tensor) -> dict[str, Any]:
-    """What a film measured as arguments of a dataclass like ``RenderOutput``; what has no field goes to ``others``."""
+    """Return a film's measurements as arguments of a dataclass like ``RenderOutput``; ``others`` holds the rest."""
     found = {film.measures: response, **film.attributes()}
     named = {name: found.pop(name, None) for name in _OF_FILMS}
     return {**named, "others": found}

@@ -31,84 +31,81 @@ from torchtransient.rendering.arguments import (
     samples,
     sensor_list,
 )
-from torchtransient.rendering.autograd import rendered
+from torchtransient.rendering.autograd import RenderCall, run
 from torchtransient.rendering.films import FilmLayout, steady_channels_first
-from torchtransient.rendering.opaque import opaque
+from torchtransient.rendering.job import Item, RenderJob, Seeding, drawn, rounded_count, samples_drawn
 from torchtransient.rendering.output import RenderOutput, RenderStats
-from torchtransient.rendering.overrides import boundary_term
 from torchtransient.rendering.progress import Bar
-from torchtransient.rendering.sample_counts import rounded_count, samples_taken
-from torchtransient.rendering.seeds import Item, Seeding, drawn
-from torchtransient.rendering.session import RenderJob
-from torchtransient.rendering.slope import check_filter, filter_for, has_slope, response_of
-from torchtransient.rendering.variant import active_variant, device_type, stokes_components
-from torchtransient.scene.edits import BuildOptions
+from torchtransient.scene.edits import BuildOptions, checked_pulse
 from torchtransient.scene.load import Scene, load
+from torchtransient.scene.opaque import opaque
 from torchtransient.scene.parameters import ParameterInfo, missing_edges, needing_slope, unknown_key
 from torchtransient.scene.physics import PhysicsWatch
 from torchtransient.scene.pilot import DepthBound, depth_bound
 from torchtransient.scene.plan import Effects
-from torchtransient.scene.pulses import checked_pulse
+from torchtransient.scene.slope import check_filter, filter_for, has_slope, response_of
 from torchtransient.scene.values import as_float, fit_shape, may_have_derivative
+from torchtransient.scene.variant import active_variant, device_type, stokes_components
 
 
 class TransientRenderer(CopiesParametrized):
-    """A scene as a differentiable layer.
-
-    ``scene``: what :func:`torchtransient.load` takes. A steady ``hdrfilm`` and ``path`` are taken too: with
-    ``time_axis`` they become a ``transient_hdr_film`` of its size and filter and a ``transient_path`` of its depth.
-
-    ``parameters``: keys of ``scene.parameters()`` that get an ``nn.Parameter`` each, starting at the scene's value,
-    or a mapping from keys to start values. In ``state_dict`` and ``named_parameters`` the dots of a key are slashes,
-    since torch forbids dots; ``renderer.values`` maps keys to parameters. ``tt.parametrize`` keeps them in range.
-
-    ``time_axis``: replaces the one of the scene's films; phasor films become histograms. ``frequencies``: a
-    :class:`FrequencyAxis`, or numbers in cycles per metre; the films become phasor films, and ``out.phasor`` takes the
-    place of ``out.transient``. ``gates``: :class:`Gate` objects; the films become gated films with ``out.gated``.
-    ``film``: the same as an object of ``torchtransient.rendering.films``, and how films of others are asked for. At
-    most one of the four. ``max_depth``: replaces the integrator's. Where that is no limit, calls whose values can be
-    differentiated by use a bound that a pilot run finds, for value and derivative: ``out.stats.max_depth``, beyond
-    which ``out.stats.light_beyond`` of the light lies. ``spp``, ``spp_grad``: samples per pixel of the render and of
-    its derivatives; None takes the scene's and the render's.
-
-    ``temporal_filter``: "box", "tent", "gaussian", or "auto": the scene's own, except that a box becomes a tent as
-    soon as a parameter can change a path length (shapes, light position, sensor pose, index of refraction), because
-    a box has no slope in time. Asking for such a derivative through an explicit box raises ``GradientError``. Phasors
-    are smooth in time and take no filter.
-
-    ``steady``: False for a histogram without a steady image of its own: paths end with the window, and ``out.steady``
-    is the sum over the bins.
-
-    ``pulse``, ``irf``: shape of the light's pulse and impulse response of the sensor (:class:`Pulse`), for every film
-    instead of its own; each arrival is spread by both while rendering, what falls beyond the axis counts as outside,
-    and every filter has a slope then. After a render ``sensing.apply_pulse`` does the same to a transient.
-
-    ``sensors``: an index (None: the first, or a plan's), a list of indices, or "all": a list adds a leading sensor
-    dimension, and its films must measure the same in one shape. ``grad_seed``: None draws the samples of the derivative
-    independently of the render (which makes gradients of squared losses unbiased), "same" takes the render's seed, an
-    integer is taken as it is.
-
-    ``effects``: "auto" keeps the scene's transient film and integrator, and gives a steady scene the integrator that
-    its contents call for; a :class:`Plan` of :func:`torchtransient.plan` brings variant, integrator, depth, time axis
-    or frequencies, and temporal filter, where the arguments beside it do not say otherwise; it speaks of one sensor.
-    ``sampler``: plugin name of a Mitsuba sampler that replaces those of the sensors, with the same number of samples.
-
-    ``physics``: what becomes of what no physical system has: reflectances, albedos and other shares of the light
-    outside of [0, 1], described or given, transforms without an inverse, windows that miss more than 5 % of the
-    light, and depths that had to be bounded. "warn" says each once for a scene, as a ``PhysicsWarning`` with the key
-    and the number; "error" raises ``PhysicsError``, of bounds for those that leave out more than 5 %; "ignore" does not
-    look.
-
-    ``boundary``: derivatives by keys that move silhouettes hold what moving edges hide and uncover (the boundary term,
-    see ``docs/gradients.md``), unless the scene's integrator leaves it out; False leaves it out. ``spp_boundary``:
-    samples per pixel of each of its passes, None for half of those of the derivative. Where a derivative lacks a part,
-    the first call with values that can be differentiated by warns with the keys (``GradientWarning``), and with
-    ``physics="error"`` raises ``GradientError``, unless the part was left out.
-
-    ``freeze``: True records what a call launches, so that later calls need no tracing, with the same values, gradients
-    and noise; ``out.stats.recorded`` says what became of it, ``docs/speed.md`` what makes a new recording.
+    """Scene as a differentiable layer: its parameters are the module's, its output is time-resolved light.
 
     Copies and pickles carry the description. One lock makes threads safe. Second derivatives raise ``GradientError``.
+
+    Args:
+        scene: anything that :func:`torchtransient.load` takes. A steady ``hdrfilm`` and ``path`` are taken too: with
+            ``time_axis`` they become a ``transient_hdr_film`` of its size and filter and a ``transient_path`` of its
+            depth.
+        parameters: keys of ``scene.parameters()`` that get an ``nn.Parameter`` each, starting at the scene's value, or
+            a mapping from keys to start values. In ``state_dict`` and ``named_parameters`` the dots of a key are
+            slashes, since torch forbids dots; ``renderer.values`` maps keys to parameters. ``tt.parametrize`` keeps
+            them in range.
+        time_axis: replaces the one of the scene's films; phasor films become histograms. At most one of ``time_axis``,
+            ``frequencies``, ``gates`` and ``film``.
+        frequencies: a :class:`FrequencyAxis`, or numbers in cycles per metre; the films become phasor films, and
+            ``out.phasor`` takes the place of ``out.transient``.
+        gates: :class:`Gate` objects; the films become gated films with ``out.gated``.
+        film: the same as an object of ``torchtransient.rendering.films``; films of one's own are asked for so.
+        max_depth: replaces the integrator's. Where that is no limit, calls whose values can be differentiated by use a
+            bound that a pilot run finds, for value and derivative: ``out.stats.max_depth``, beyond which
+            ``out.stats.light_beyond`` of the light lies.
+        spp, spp_grad: samples per pixel of the render and of its derivatives; None takes the scene's and the render's.
+        temporal_filter: "box", "tent", "gaussian", or "auto": the scene's own, except that a box becomes a tent as soon
+            as a parameter can change a path length (shapes, light position, sensor pose, index of refraction), because
+            a box has no slope in time. Asking for such a derivative through an explicit box raises ``GradientError``.
+            Phasors are smooth in time and take no filter.
+        steady: False for a histogram without a steady image of its own: paths end with the window, and ``out.steady``
+            is the sum over the bins.
+        pulse, irf: shape of the light's pulse and impulse response of the sensor (:class:`Pulse`), for every film
+            instead of its own; each arrival is spread by both while rendering, light beyond the axis counts as outside,
+            and every filter has a slope then. After a render ``sensing.apply_pulse`` does the same to a transient.
+        sensors: an index (None: the first, or a plan's), a list of indices, or "all": a list adds a leading sensor
+            dimension, and its films must measure the same in one shape.
+        grad_seed: None draws the samples of the derivative independently of the render (which makes gradients of
+            squared losses unbiased), "same" takes the render's seed, an integer is taken as it is.
+        effects: "auto" keeps the scene's transient film and integrator, and gives a steady scene the integrator that
+            its contents call for; a :class:`Plan` of :func:`torchtransient.plan` brings variant, integrator, depth,
+            time axis or frequencies, and temporal filter, where the arguments beside it do not say otherwise; it speaks
+            of one sensor.
+        sampler: plugin name of a Mitsuba sampler that replaces those of the sensors, with the same number of samples.
+        physics: response to what no physical system has: reflectances, albedos and other shares of the light outside of
+            [0, 1], described or given, transforms without an inverse, windows that miss more than 5 % of the light, and
+            depths that had to be bounded. "warn" gives a ``PhysicsWarning`` with the key and the number, once for a
+            scene; "error" raises ``PhysicsError``, of bounds for those that leave out more than 5 %; "ignore" does not
+            look.
+        boundary: derivatives by keys that move silhouettes hold what moving edges hide and uncover (the boundary term,
+            see ``docs/gradients.md``), unless the scene's integrator leaves it out; False leaves it out. Where a
+            derivative lacks a part, the first call with values that can be differentiated by warns with the keys
+            (``GradientWarning``), and with ``physics="error"`` raises ``GradientError``, unless the part was left out.
+        spp_boundary: samples per pixel of each pass of the boundary term, None for half of those of the derivative.
+        freeze: True records the kernels of a call, so that later calls need no tracing, with the same values, gradients
+            and noise; ``out.stats.recorded`` says whether, ``docs/speed.md`` when a recording is made anew.
+
+    Raises:
+        ArgumentError, UnitError, ShapeError: for other arguments.
+        SceneError: for scenes without a sensor, keys that the scene does not have, and whatever Mitsuba refuses.
+        GradientError: for keys without a derivative.
     """
 
     @opaque
@@ -300,8 +297,10 @@ class TransientRenderer(CopiesParametrized):
         return twin
 
     def has_slope_for(self, keys: Sequence[str]) -> bool:
-        """Whether gradients for ``keys`` exist with the filter or gates in use: a box has none of path lengths. Raises
-        ``UnknownKeyError`` for keys that the renderer does not have.
+        """Return whether gradients for ``keys`` exist with the filter or gates in use: a box has none of path lengths.
+
+        Raises:
+            UnknownKeyError: for keys that the renderer does not have.
         """
         moving = needing_slope(self._infos, checked_keys(keys, tuple(self._infos)))
         return not moving or (has_slope(self.effective_filter, self._pulsed) and self._response[0])
@@ -311,7 +310,7 @@ class TransientRenderer(CopiesParametrized):
         """Samples per pixel that a render with ``spp`` really draws: stratified samplers round up."""
         with active_variant(self.scene.variant):
             sensor = self.scene.built(self._options).scene.sensors()[self._sensors[0]]
-            return samples_taken(sensor.sampler().clone(), samples("spp", spp))
+            return samples_drawn(sensor.sampler().clone(), samples("spp", spp))
 
     @opaque
     def forward(
@@ -322,19 +321,26 @@ class TransientRenderer(CopiesParametrized):
         spp: int | None = None,
         progress: bool = False,
     ) -> RenderOutput:
-        """Render. ``values`` replaces the module's own parameters, key by key; keys are those of ``parameters``.
+        """Render.
 
-        A value is a tensor, an array, a list or a number of the shape listed by ``scene.parameters()``, or with one
-        leading batch dimension B more; values without it are used for every entry. Any real dtype is taken and computed
-        in float32.
+        Args:
+            values: by key of ``parameters``, in place of the module's own: tensors, arrays, lists or numbers of the
+                shapes that ``scene.parameters()`` lists, or with one leading batch dimension B more; values without it
+                are used for every entry. Any real dtype is taken and computed in float32.
+            seed: same seed, same tensor. None draws one from torch's generator (``torch.manual_seed``). In a batch
+                every entry has its own seed, derived from this one, the first entry the seed itself; or give one seed
+                per entry.
+            spp: instead of the renderer's.
+            progress: whether a bar is shown.
 
-        ``seed``: same seed, same tensor. None draws one from torch's generator (``torch.manual_seed``). In a batch
-        every entry has its own seed, derived from this one, the first entry the seed itself; or give one seed per
-        entry. ``spp``: instead of the renderer's. ``progress``: a bar.
+        Returns:
+            A :class:`RenderOutput` whose tensors carry gradients to the values.
 
-        Returns a :class:`RenderOutput` whose tensors carry gradients to the values. Raises ``SceneError`` for
-        unknown keys, ``ShapeError``, ``DeviceError``, ``UnitError`` for values that are not finite, ``StorageError``
-        when the cube would not fit into memory, ``GradientError`` for a derivative through a box.
+        Raises:
+            SceneError: for unknown keys.
+            ShapeError, DeviceError, UnitError: for values of other shapes or devices, and values that are not finite.
+            StorageError: when the cube would not fit into memory.
+            GradientError: for a derivative through a box.
         """
         tensors, batched, batch = self._collect(values)
         temporal_filter = self.effective_filter
@@ -366,7 +372,8 @@ class TransientRenderer(CopiesParametrized):
             spp_boundary=self.spp_boundary,
         )
         try:
-            steady, response = rendered(job, per_entry, tensors)
+            seed_given = () if per_entry is None else (per_entry,)
+            steady, response = run(RenderCall(job, len(seed_given)), *seed_given, *tensors)
         finally:
             if bar is not None:
                 bar.close()
@@ -421,7 +428,8 @@ class TransientRenderer(CopiesParametrized):
             return
         with active_variant(self.scene.variant):
             built = self.scene.built(self._options)
-            with boundary_term(self.boundary, self.spp_boundary, built.scene.integrator()):
+            integrator = built.scene.integrator()
+            with engine.with_settings(engine.boundary_settings(self.boundary, self.spp_boundary, integrator)):
                 found = missing_edges(built, new, self._sensors)
         for gap, keys in found.items():
             self._watch.warn_of_gradient(gap.message(keys), is_error=not gap.is_asked_for)

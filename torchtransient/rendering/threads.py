@@ -10,8 +10,8 @@ import torch
 from torchtransient.checks import as_whole, shown
 from torchtransient.errors import DeviceError, UnitError, VariantError
 from torchtransient.plugins.drjit_pool import engine_lock, resize_pool, set_drjit_threads
-from torchtransient.plugins.interrupted import interrupts_wait
-from torchtransient.rendering.variant import at_work
+from torchtransient.plugins.guards import interrupts_wait
+from torchtransient.scene.variant import at_work
 
 MOST_THREADS = 1024
 

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from torchtransient.checks import one_line
 from torchtransient.errors import DeviceError, SceneError, ShapeError, TorchTransientError, UnknownKeyError
-from torchtransient.plain_texts import one_line
 from torchtransient.plugins.mitsuba_compat import check_pose, is_turned_by_reflections
 from torchtransient.plugins.node_walk import ShownValue
-from torchtransient.rendering.interrupts import quiet
 from torchtransient.scene.parameters import classify, is_transform, read_value, unknown_key
-from torchtransient.scene.values import as_mitsuba_value, changed_with
+from torchtransient.scene.values import as_mitsuba_value, changed_with, with_normals
+from torchtransient.scene.variant import quiet
 
 # --------------------------------------------------------------------------------------------------------- PyTrees
 
@@ -267,8 +267,7 @@ def put_back(params: Any, values: Mapping[str, Any], now: Mapping[str, Any] | No
     if not keys:
         return
     # Mitsuba recomputes normals when positions change: both have to go back.
-    normals = [key.replace(".vertex_positions", ".vertex_normals") for key in keys]
-    keys = list(dict.fromkeys(key for key in (*keys, *normals) if key in values))
+    keys = with_normals(keys, values)
     for key in keys:
         params[key] = values[key]
     _update(params, keys)

@@ -29,15 +29,12 @@ import numpy as np
 import torch
 from torch.autograd import forward_ad
 
-from torchtransient._collection import no_collection
 from torchtransient.checks import as_whole, is_one_of, shown
 from torchtransient.errors import ArgumentError, GradientError, ShapeError, UnitError, VariantError
-from torchtransient.plugins.interrupted import interrupts_wait
-from torchtransient.rendering.broken_numbers import all_finite, carried_on
-from torchtransient.rendering.derivatives import Asked, run
-from torchtransient.rendering.interrupts import ends_frames
-from torchtransient.rendering.opaque import opaque
-from torchtransient.rendering.seeds import mix_seed
+from torchtransient.plugins.guards import interrupts_wait, no_collection
+from torchtransient.rendering.autograd import Asked, run
+from torchtransient.rendering.broken_numbers import spread_nan
+from torchtransient.rendering.job import mix_seed
 from torchtransient.rendering.values import (
     Slot,
     as_tensor,
@@ -56,9 +53,11 @@ from torchtransient.rendering.values import (
     variant_of,
     write,
 )
-from torchtransient.rendering.variant import active_variant, at_work, device_type, is_differentiable, take_over
+from torchtransient.scene.opaque import opaque
 from torchtransient.scene.parameters import is_transform
+from torchtransient.scene.physics import all_finite
 from torchtransient.scene.values import as_float
+from torchtransient.scene.variant import active_variant, at_work, device_type, is_differentiable, take_over
 
 Tensors = tuple[torch.Tensor, ...]
 
@@ -336,7 +335,6 @@ class Call:
     # Arrays of Dr.Jit are freed inside of the lock, at the end of the inner functions: a graph that is freed beside the
     # work of another thread waits for it, and it for the graph.
 
-    @ends_frames
     def primal(self, tensors: Sequence[torch.Tensor]) -> Tensors:
         """Return the arrays that the function returns."""
         for key, value in zip(self.keys or (), tensors, strict=False):
@@ -347,7 +345,6 @@ class Call:
         with self._at_work():
             return self._primal(tensors)
 
-    @ends_frames
     def pullback(self, asked: Asked, tensors: Sequence[torch.Tensor], cotangents: Sequence[torch.Tensor]) -> Tensors:
         """Return gradients of <cotangents, outputs>; NaN where a cotangent that is not finite arrives."""
 
@@ -355,9 +352,8 @@ class Call:
             with self._at_work():
                 return self._pullback(asked, tensors, given)
 
-        return carried_on(replay, cotangents)
+        return spread_nan(replay, cotangents)
 
-    @ends_frames
     def pushforward(self, asked: Asked, tensors: Sequence[torch.Tensor], tangents: Sequence[torch.Tensor]) -> Tensors:
         """Return derivatives of the real outputs; NaN where a tangent that is not finite arrives."""
 
@@ -365,7 +361,7 @@ class Call:
             with self._at_work():
                 return self._pushforward(asked, tensors, given)
 
-        return carried_on(replay, tangents)
+        return spread_nan(replay, tangents)
 
     def result(self, tensors: Tensors) -> Any:
         """Return the result of the function, with tensors in place of its arrays."""
@@ -511,7 +507,7 @@ class Call:
 
         with (
             _working_in(self.variant),
-            no_collection(of_call=True),
+            no_collection(),
             dr.resume_grad(),
             # A part in torch inside of the function differentiates itself, and in all runs alike.
             torch.enable_grad(),

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from torchtransient import plugins
-from torchtransient._collection import let_go
+from torchtransient.checks import cut_line, one_line, some_of
 from torchtransient.errors import SceneError, TorchTransientError
 from torchtransient.interfaces import IntegratorInterface, is_time_resolved
-from torchtransient.plain_texts import line_of, one_line, some_of
 from torchtransient.plugins.described_scene import check_scene
 from torchtransient.plugins.drjit_pool import threads_for_files
-from torchtransient.plugins.mitsuba_compat import is_dark
+from torchtransient.plugins.guards import let_go
+from torchtransient.plugins.mitsuba_compat import is_dark, scene_parameters
 from torchtransient.plugins.node_walk import objects_below
 from torchtransient.plugins.parameter_effect import class_of
 from torchtransient.plugins.parameters import PhysicalRange, described_ranges, ranges_of
@@ -44,7 +44,7 @@ class BuiltScene:
     """A Mitsuba scene with what is known of its nodes.
 
     Attributes:
-        scene, params: the ``mitsuba.Scene``, and what ``mitsuba.traverse`` returns of it.
+        scene, params: the ``mitsuba.Scene``, and its ``mitsuba.SceneParameters`` by users' keys.
         mesh_to_world: transforms (4, 4) of shapes as described, by name.
         integrator: plugin name of the integrator.
         to_world: all transforms as described, by key.
@@ -105,7 +105,8 @@ def build(description: SceneDescription, variant: str, options: BuildOptions) ->
             return build(description, variant, replace(options, merge=False))
         text = one_line(error).replace("While loading string", f"While loading {description.name}")
         unread = _unread_properties(str(error), description.name)
-        raise SceneError(unread or f"{description.name}: Mitsuba could not build the scene. {line_of(text)}") from error
+        message = unread or f"{description.name}: Mitsuba could not build the scene. {cut_line(text)}"
+        raise SceneError(message) from error
 
 
 def _instantiated(description: Plain, variant: str, options: BuildOptions) -> BuiltScene:
@@ -142,19 +143,17 @@ def _instantiated(description: Plain, variant: str, options: BuildOptions) -> Bu
         if description.objects:
             _check_loaded(scene, description.objects, options)
         _check_integrator(scene, options)
-        params = mi.traverse(scene)
+        params = scene_parameters(scene)
         check_scene(scene, params)
     return BuiltScene(scene, params, mesh_to_world, integrator, to_world, loaded=pointers(description.objects))
 
 
 def _loaded(description: LoadedScene, options: BuildOptions) -> BuiltScene:
     """Return a loaded scene as it is. Raises ``SceneError`` where ``options`` would change it."""
-    import mitsuba as mi
-
     scene = description.scene
     _check_loaded(scene, description.objects, options)
     check_meshes(description.objects)
-    params = mi.traverse(scene)
+    params = scene_parameters(scene)
     check_scene(scene, params)
     name = "" if scene.integrator() is None else class_of(scene.integrator())
     return BuiltScene(scene, params, integrator=name, loaded=pointers(description.objects))

@@ -11,6 +11,7 @@ import numpy as np
 
 from torchtransient.checks import check_special, shown
 from torchtransient.errors import SceneError
+from torchtransient.plugins.mitsuba_compat import mesh_faces
 from torchtransient.plugins.properties import count_bad, numbers_of, refuse
 from torchtransient.scene.nodes import children, is_film, node_kind
 from torchtransient.scene.objects import LoadedScene
@@ -192,12 +193,7 @@ def check_meshes(objects: Any) -> None:
 
 
 def _check_faces(mesh: Any, name: str) -> None:
-    import mitsuba as mi
-
-    params = mi.traverse(mesh)
-    if "faces" not in params:  # a rectangle of Mitsuba is a mesh by its class
-        return
-    count, faces = mesh.vertex_count(), np.array(params["faces"])
+    count, faces = mesh.vertex_count(), np.array(mesh_faces(mesh))
     if faces.size and int(faces.max()) >= count:
         raise SceneError(_wrong_faces(name, count, int(faces.max())))
 

@@ -20,7 +20,6 @@ from torchtransient import plugins
 from torchtransient.checks import check_special, path_of, shown
 from torchtransient.errors import SceneError, StorageError
 from torchtransient.plugins.dictionaries import NUMBERS_IN_TEXT, Pixels, Voxels, is_ours, numbers_in_text, parsed
-from torchtransient.plugins.unfinished import afterwards
 from torchtransient.scene.checks import MOST_LEVELS
 from torchtransient.scene.objects import Description, LoadedObject, LoadedScene, describe_object, objects_inside
 
@@ -106,13 +105,11 @@ def _search_path(folder: str) -> Iterator[None]:
     resolver = mi.FileResolver(before)
     resolver.prepend(folder)
 
-    def put_back() -> None:
-        if mi.file_resolver() is resolver:  # which another call may have replaced meanwhile
-            mi.set_file_resolver(before)
-
-    with afterwards(put_back):
-        mi.set_file_resolver(resolver)
+    mi.set_file_resolver(resolver)
+    try:
         yield
+    finally:
+        mi.set_file_resolver(before)
 
 
 # ------------------------------------------------------------------------------------------------------------ equality

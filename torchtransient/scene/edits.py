@@ -22,7 +22,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from torchtransient.errors import SceneError
+from torchtransient.errors import ArgumentError, SceneError
 from torchtransient.plugins import kind_of
 from torchtransient.plugins.mitsuba_compat import (
     BUILDS_LOBES,
@@ -34,7 +34,6 @@ from torchtransient.plugins.mitsuba_compat import (
 )
 from torchtransient.plugins.node_walk import has_mean
 from torchtransient.pulses import Pulse
-from torchtransient.rendering.interrupts import quiet
 from torchtransient.scene.nodes import (
     children,
     descendants,
@@ -45,7 +44,7 @@ from torchtransient.scene.nodes import (
     is_transient_integrator,
     node_kind,
 )
-from torchtransient.scene.pulses import PREFIXES, PROPERTIES, write_pulse
+from torchtransient.scene.variant import quiet
 
 NO_LIMIT = -1
 # Steady integrators, and the transient ones for which their parameters mean the same.
@@ -85,6 +84,11 @@ _SILHOUETTES = {
 }  # fmt: skip
 # Values of `pixel_format` that an `hdrfilm` prints in another way.
 _PRINTED = {"y": "luminance", "ya": "luminance_alpha"}
+# Pulses and impulse responses as properties of films, and the films that spread arrivals by them.
+_PULSES = ("pulse", "irf")
+_PULSE_NUMBERS = ("fwhm_opl", "width_opl", "center_opl", "opl", "values")
+_PULSE_PROPERTIES = tuple(prefix + suffix for prefix in _PULSES for suffix in ("", *(f"_{n}" for n in _PULSE_NUMBERS)))
+_SPREADING = ("transient_hdr_film", "gated_hdr_film")
 
 
 class FilmRequest(Protocol):
@@ -226,8 +230,8 @@ def _edit_films(state: Any, options: BuildOptions) -> None:
         if film is not None:
             _edit_film(state, film, options)
             props = state.nodes[film].props
-            for prefix in PREFIXES:
-                write_pulse(props, prefix, getattr(options, prefix))
+            for prefix in _PULSES:
+                _write_pulse(props, prefix, getattr(options, prefix))
             if not options.steady:
                 props["steady"] = False  # which Mitsuba reports as unread for films that have no such property
 
@@ -246,11 +250,11 @@ def _edit_film(state: Any, index: int, options: BuildOptions) -> None:
     if plugin in _STEADY_FILMS and not options.transient:
         return
     if plugin != film.plugin and (plugin in _STEADY_FILMS or kind_of(plugin) == "film"):
-        if not film.takes_pulse and any(prefix in props for prefix in PREFIXES):
+        if not film.takes_pulse and any(prefix in props for prefix in _PULSES):
             raise SceneError(
                 f"the film {plugin!r} has a pulse or an irf, which a {film.plugin} would lose; take it out."
             )
-        _become(state, index, film.plugin, keep=_FILM_PROPERTIES + PROPERTIES)
+        _become(state, index, film.plugin, keep=_FILM_PROPERTIES + _PULSE_PROPERTIES)
         props = state.nodes[index].props
     if not film.fits(props.plugin_name()):
         raise SceneError(f"the film {plugin!r} cannot become a {film.plugin}; make it one.")
@@ -524,3 +528,40 @@ def pixel_format(film: Any) -> str:
     """Return ``pixel_format`` of a built ``hdrfilm``; file format and variant may have replaced the described one."""
     printed = printed_properties(film)["pixel_format"].strip()
     return _PRINTED.get(printed, printed)
+
+# -------------------------------------------------------------------------------------------------------------- pulses
+
+
+def checked_pulse(name: str, value: Any) -> Pulse | None:
+    """Return a pulse of a call, or None.
+
+    Raises:
+        ArgumentError: for anything else.
+    """
+    if value is None or isinstance(value, Pulse):
+        return value
+    raise ArgumentError(
+        f"{name}: expected a tt.Pulse, for instance tt.Pulse.gaussian(fwhm_opl=0.05), got {type(value).__name__}."
+    )
+
+
+def _write_pulse(props: Any, prefix: str, pulse: Pulse | None) -> None:
+    """Replace the pulse of a film node; None leaves the film its own."""
+    if pulse is None:
+        return
+    if props.plugin_name() not in _SPREADING:
+        raise SceneError(
+            f"{prefix}: the film {props.plugin_name()!r} does not spread arrivals over time, "
+            f"{' and '.join(_SPREADING)} do. "
+            "Multiply a phasor by torchtransient.pulses.transform(pulse, frequencies) instead, or leave it out."
+        )
+    for name in _PULSE_NUMBERS:
+        if f"{prefix}_{name}" in props:
+            del props[f"{prefix}_{name}"]
+    props[prefix] = pulse.kind
+    props[f"{prefix}_center_opl"] = pulse.center_opl
+    if pulse.kind == "tabulated":
+        props[f"{prefix}_opl"] = ", ".join(map(repr, pulse.opl))
+        props[f"{prefix}_values"] = ", ".join(map(repr, pulse.values))
+    else:
+        props[f"{prefix}_{'fwhm' if pulse.kind == 'gaussian' else 'width'}_opl"] = pulse.width_opl

@@ -15,11 +15,10 @@ from typing import Any
 import numpy as np
 
 from torchtransient import plugins
+from torchtransient.checks import one_line
 from torchtransient.errors import SceneError, TorchTransientError
-from torchtransient.plain_texts import one_line
 from torchtransient.plugins._registry import OWN_BSDFS
 from torchtransient.plugins.drjit_pool import threads_for_files
-from torchtransient.rendering.variant import active_variant
 from torchtransient.scene.checks import check_nodes
 from torchtransient.scene.edits import NO_LIMIT, described_depth
 from torchtransient.scene.load import Scene
@@ -34,6 +33,7 @@ from torchtransient.scene.nodes import (
     rendered_children,
 )
 from torchtransient.scene.objects import LoadedScene
+from torchtransient.scene.variant import active_variant
 
 # Optical elements whose only purpose is polarization: without it even a single one is drawn wrongly.
 POLARIZING_ELEMENTS = ("polarizer", "retarder", "circular", "pplastic", "measured_polarized")

@@ -17,18 +17,16 @@ from typing import Any
 from torchtransient.checks import flag, shown
 from torchtransient.errors import ArgumentError, GradientError, SceneError, TorchTransientError
 from torchtransient.plugins import kind_of, modules_of_others, register_module
-from torchtransient.plugins.unfinished import afterwards
-from torchtransient.rendering.kernel_errors import named_errors
-from torchtransient.rendering.opaque import opaque
-from torchtransient.rendering.variant import active_variant, in_variant, resolve_variant
 from torchtransient.scene.build import BuiltScene, build
 from torchtransient.scene.description import SceneDescription, describe_dict, describe_xml, same_description
 from torchtransient.scene.edits import BuildOptions
 from torchtransient.scene.nodes import children, is_film
 from torchtransient.scene.objects import LoadedScene, transient_dictionary
+from torchtransient.scene.opaque import opaque
 from torchtransient.scene.parameters import ParameterTable, parameter_table, unknown_key
 from torchtransient.scene.save import WAY_OUT, check_same, replaced_files, write_scene
 from torchtransient.scene.values import SlotTable
+from torchtransient.scene.variant import active_variant, named_errors, resolve_variant
 
 # Built scenes kept per description: one for every combination of time axis, depth and substituted plugins in use.
 _MAX_BUILDS = 8
@@ -52,8 +50,8 @@ class Scene:
         self._builds: OrderedDict[BuildOptions, BuiltScene] = OrderedDict()
         # Not in the built scenes: objects that refer to themselves are freed late.
         self._slots: dict[BuildOptions, dict[tuple[str, ...], SlotTable]] = {}
-        # Built scenes that still hold the values of the last run: the next one most likely brings its own.
-        self._unsettled: dict[BuildOptions, SlotTable] = {}
+        # Slots of the values that a built scene holds: set by the engine, which brings its own at every run.
+        self.installed: dict[BuildOptions, SlotTable] = {}
         self._table: ParameterTable | None = None
         # Options of the table: a shared scene may be built with some alone.
         self._table_options = BuildOptions(real_bitmaps=True)
@@ -127,8 +125,10 @@ class Scene:
         with replaced_files(path) as (target, draft, folder), active_variant(self.variant):
             options = self._save_options(given)
             slots = self.slots(given, options)
-            with afterwards(in_variant(self.variant, lambda: self.leave(options, slots, attached=True))):
+            try:
                 written = write_scene(description, self.variant, slots, given, draft, folder)
+            finally:
+                self.restore(options, slots)
             again = load(draft, variant=self.variant)
             try:
                 built = again.built(again._save_options(given))
@@ -152,7 +152,9 @@ class Scene:
 
         Called inside ``active_variant(scene.variant)``.
         """
-        self._settle(options)
+        installed = self.installed.get(options)
+        if installed is not None:
+            self.restore(options, installed)
         return self._build(options)
 
     def _build(self, options: BuildOptions) -> BuiltScene:
@@ -168,7 +170,7 @@ class Scene:
     def drop(self, options: BuildOptions) -> None:
         """Forget one built scene; the next use builds it anew."""
         self._builds.pop(options, None)
-        self._unsettled.pop(options, None)
+        self.installed.pop(options, None)
         self._slots.pop(options, None)
         self.recordings.pop(options, None)
 
@@ -206,48 +208,33 @@ class Scene:
         return replace(options, substitute=frozenset(substitute), real_bitmaps=True, merge=False)
 
     def slots(self, keys: Iterable[str], options: BuildOptions) -> SlotTable:
-        """Return the slots of ``keys`` in the built scene, which holds described values or those of the last run.
+        """Return the slots of ``keys`` in the built scene.
 
-        Called inside ``active_variant(scene.variant)``.
+        Called inside ``active_variant(scene.variant)``. The scene holds described values or those of the last run with
+        these keys.
         """
         wanted = tuple(keys)
         if self.is_shared:  # the scene goes back to the values that it holds now
             return SlotTable(self.built(options), wanted)
-        found = self._slots.setdefault(options, {}).get(wanted)
-        if found is not None and self._unsettled.get(options) is found:
-            del self._unsettled[options]
-            self._builds.move_to_end(options)
-            return found
-        built = self.built(options)
-        # Building may have dropped other scenes, or the tables of this one.
-        tables = self._slots.setdefault(options, {})
-        if wanted not in tables:
-            tables[wanted] = SlotTable(built, wanted)
-        return tables[wanted]
+        found = self._slots.get(options, {}).get(wanted)
+        if found is None or self.installed.get(options) is not found:
+            built = self.built(options)
+            # Building may have dropped other scenes, or the tables of this one.
+            tables = self._slots.setdefault(options, {})
+            if wanted not in tables:
+                tables[wanted] = SlotTable(built, wanted)
+            found = tables[wanted]
+        self._builds.move_to_end(options)
+        return found
 
-    def leave(self, options: BuildOptions, slots: SlotTable, attached: bool) -> None:
-        """End a run: described values are put back before anything but a run with the same keys uses the scene.
-
-        ``attached``: values have derivatives and are put back at once, so that no graph outlives a run.
-        """
-        if not slots.originals:
-            return
-        if self._builds.get(options) is not slots.built:
-            if attached:  # its restoring was cut off by an interrupt (`_settle`); others may hold it still
-                slots.restore()
-            return
-        self._unsettled[options] = slots
-        if attached or self.is_shared:
-            self._settle(options)
-
-    def _settle(self, options: BuildOptions) -> None:
-        slots = self._unsettled.pop(options, None)
-        if slots is not None:
-            try:
-                slots.restore()
-            except BaseException:
-                self.drop(options)
-                raise
+    def restore(self, options: BuildOptions, slots: SlotTable) -> None:
+        """Put described values back, so that no graph of derivatives is left; a scene that cannot is built anew."""
+        try:
+            slots.restore()
+        except BaseException:
+            self.drop(options)
+            raise
+        self.installed.pop(options, None)
 
     # --------------------------------------------------------------------------------------------- pickles and copies
 

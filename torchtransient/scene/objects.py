@@ -16,18 +16,19 @@ import numpy as np
 from torchtransient.errors import SceneError
 from torchtransient.plugins.dictionaries import Voxels
 from torchtransient.plugins.mitsuba_compat import (
-    MESH_PARAMETERS,
+    has_more_than_arrays,
+    has_normals,
+    has_texcoords,
     mesh_faces,
     mesh_normals,
     mesh_positions,
     mesh_texcoords,
     silhouette_weight,
-    users_name,
 )
 from torchtransient.plugins.node_walk import objects_below, objects_of
 from torchtransient.plugins.parameter_effect import ParameterEffect, class_of
-from torchtransient.rendering.variant import active_variant
 from torchtransient.scene.edits import pixel_format, printed_properties
+from torchtransient.scene.variant import active_variant
 
 # Meshes that are nothing but their buffers and what their base class holds.
 _PLAIN_MESHES = ("Mesh", "PLYMesh", "OBJMesh", "SerializedMesh", "Cube", "MergeShape")
@@ -180,8 +181,9 @@ def _described_mesh(mesh: Any) -> dict[str, Any] | None:
 
     surface = _described_surface(mesh.bsdf())
     held = [value for _, value in objects_of(mesh) if not isinstance(value, mi.BSDF)]
-    numbers = {users_name(mesh, name) for name in mi.traverse(mesh).properties if "." not in name} - MESH_PARAMETERS
-    if surface is None or held or mesh.is_emitter() or mesh.is_sensor() or numbers or not mesh.face_count():
+    if surface is None or held or mesh.is_emitter() or mesh.is_sensor() or not mesh.face_count():
+        return None
+    if has_more_than_arrays(mesh):
         return None
     described: dict[str, Any] = {
         "type": "mesh_arrays",
@@ -189,9 +191,9 @@ def _described_mesh(mesh: Any) -> dict[str, Any] | None:
         "faces": np.array(mesh_faces(mesh), dtype=np.int64).reshape(-1, 3),
         "bsdf": surface,
     }
-    if mesh.has_vertex_normals():
+    if has_normals(mesh):
         described["normals"] = np.array(mesh_normals(mesh), dtype=np.float64).reshape(-1, 3)
-    if mesh.has_vertex_texcoords():
+    if has_texcoords(mesh):
         described["texcoords"] = np.array(mesh_texcoords(mesh), dtype=np.float64).reshape(-1, 2)
     described |= silhouette_weight(mesh)
     flags = {"face_normals": mesh.has_face_normals(), "flip_normals": mesh.has_flipped_normals()}

@@ -1,8 +1,8 @@
 """Table of a scene's parameters: shapes, values, and which of them have derivatives.
 
-Keys are those of ``mitsuba.traverse``. Meshes apply ``to_world`` while loading and forget it; a key
-``<mesh>.to_world`` is offered for them all the same: the matrix replaces the one of the description, and vertices
-and normals follow.
+Keys are those of ``mitsuba.traverse``, with the names of Mitsuba 3.9 for the arrays of meshes in every version. Meshes
+apply ``to_world`` while loading and forget it; a key ``<mesh>.to_world`` is offered for them all the same: the matrix
+replaces the one of the description, and vertices and normals follow.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 
 from torchtransient.errors import UnknownKeyError
 from torchtransient.interfaces import IntegratorInterface
-from torchtransient.plugins.mitsuba_compat import VERTEX_COLUMNS
+from torchtransient.plugins.mitsuba_compat import FACES, POSITIONS, VERTEX_COLUMNS, key_beside
 from torchtransient.plugins.node_walk import ShownValue, unshared
 from torchtransient.plugins.parameter_effect import UNCHECKED, is_checked
 from torchtransient.plugins.parameters import ParameterEffect, ParameterTracker
@@ -141,7 +141,7 @@ def parameter_table(built: BuiltScene) -> ParameterTable:
     for key in built.params.properties:
         node = built.params.properties[key][2]
         found = [_describe(built, tracker, key, node)]
-        if key.endswith(".vertex_positions"):
+        if key.endswith(f".{POSITIONS}"):
             found.append(_mesh_to_world(built, tracker, key, node))
         entries += [_placed(_with_gaps(info, edges, tracker, node), tracker, node) for info in found]
     return ParameterTable(entries)
@@ -163,7 +163,7 @@ def missing_edges(built: BuiltScene, keys: Iterable[str], sensors: Iterable[int]
     tracker = built.scene.integrator().parameters(built.scene)
     found: dict[Gap, list[str]] = {}
     for key in keys:
-        shown = key if key in built.params else f"{key.rsplit('.', 1)[0]}.vertex_positions"
+        shown = key if key in built.params else key_beside(key, POSITIONS)
         node = built.params.properties[shown][2]
         for gap in edges.lacking(node, key, tracker.effect_of(node, key)):
             found.setdefault(gap, []).append(key)
@@ -234,7 +234,7 @@ def _describe(built: BuiltScene, tracker: ParameterTracker, key: str, node: Any)
     if kind == "plain":
         effect = replace(effect, supported=False, reason="a plain value, fixed when the scene is built")
     elif kind == "integer":
-        reason = "a list of vertex numbers" if name == "faces" else "not a real number"
+        reason = "a list of vertex numbers" if name == FACES else "not a real number"
         effect = replace(effect, supported=False, reason=reason)
     elif kind == "vertices" and shape is not None and shape[0] == 0:
         effect = replace(effect, supported=False, reason="the mesh has none")
@@ -267,6 +267,9 @@ def classify(key: str, current: Any) -> tuple[str, tuple[int, ...] | None]:
         if dr.is_array_v(current):
             return "plain", (len(current),)
         return "plain", () if isinstance(current, (bool, int, float)) else None
+    columns = VERTEX_COLUMNS.get(key.rsplit(".", 1)[-1])
+    if columns is not None and dr.is_float_v(current) and (dr.is_tensor_v(current) or dr.depth_v(current) == 1):
+        return "vertices", (dr.width(current) // columns, columns)
     if dr.is_tensor_v(current):
         return "tensor" if dr.is_float_v(current) else "integer", tuple(int(n) for n in current.shape)
     if not dr.is_float_v(current):
@@ -276,9 +279,6 @@ def classify(key: str, current: Any) -> tuple[str, tuple[int, ...] | None]:
         several = width > 1 or key.rsplit(".", 1)[-1] == "points"
         return ("points", (width, len(current))) if several else ("vector", (len(current),))
     size = dr.width(current)
-    columns = VERTEX_COLUMNS.get(key.rsplit(".", 1)[-1])
-    if columns is not None:
-        return "vertices", (size // columns, columns)
     return ("number", ()) if size == 1 else ("list", (size,))
 
 

@@ -200,9 +200,12 @@ def is_singular(matrix: np.ndarray) -> bool:
 
 
 def smallest_and_largest(value: torch.Tensor) -> tuple[float, float]:
-    """Return both numbers of a tensor, NaN where it holds one, 0 for an empty one. Waits once for the device."""
+    """Return both numbers of a real tensor, NaN if it holds one, 0 for an empty one. Waits once for the device."""
     if value.numel() == 0:
         return 0.0, 0.0
+    for dim, stride in enumerate(value.stride()):  # entries that `expand` has repeated are read once
+        if stride == 0 and value.shape[dim] > 1:
+            value = value.narrow(dim, 0, 1)
     low, high = torch.stack(torch.aminmax(value.detach())).tolist()
     return low, high
 
@@ -210,3 +213,8 @@ def smallest_and_largest(value: torch.Tensor) -> tuple[float, float]:
 def are_finite(low: float, high: float) -> bool:
     """Return whether all numbers of a tensor with this smallest and largest one are finite."""
     return math.isfinite(low) and math.isfinite(high)
+
+
+def all_finite(value: torch.Tensor) -> bool:
+    """Return whether all numbers of a real tensor are finite."""
+    return are_finite(*smallest_and_largest(value))

@@ -18,10 +18,10 @@ import numpy as np
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ArgumentError, GradientError
 from torchtransient.gates import Gate
-from torchtransient.rendering.variant import active_variant
 from torchtransient.scene.edits import NO_LIMIT, BuildOptions, built_depth
 from torchtransient.scene.load import Scene, load
 from torchtransient.scene.physics import MISSED, PhysicsWatch
+from torchtransient.scene.variant import active_variant
 
 PILOT_PATHS = 32768
 PILOT_PIXELS = 2048

@@ -18,14 +18,14 @@ from torchtransient.checks import is_one_of, shown
 from torchtransient.errors import ArgumentError, SceneError
 from torchtransient.plugins.parameters import check_slope
 from torchtransient.pulses import Pulse
-from torchtransient.rendering.slope import check_filter, filter_for
-from torchtransient.rendering.variant import active_variant
 from torchtransient.scene.edits import NO_LIMIT, BuildOptions
 from torchtransient.scene.inventory import Finding, SceneInventory
 from torchtransient.scene.load import Scene, load
 from torchtransient.scene.nodes import is_transient_integrator
 from torchtransient.scene.parameters import ParameterInfo, needing_slope, unknown_key
 from torchtransient.scene.pilot import MOST_BINS, Arrivals, PilotReport, axis_over, pilot_run
+from torchtransient.scene.slope import check_filter, filter_for
+from torchtransient.scene.variant import active_variant
 
 _SURFACES, _VOLUMES = "transient_path", "transient_prbvolpath"
 _ALIASES = {"transient_volpath": _VOLUMES}

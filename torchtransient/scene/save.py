@@ -21,15 +21,20 @@ from torchtransient.errors import SceneError, ShapeError, TorchTransientError, U
 from torchtransient.plugins import kind_of
 from torchtransient.plugins.dictionaries import double_transform
 from torchtransient.plugins.drjit_pool import threads_for_files
-from torchtransient.plugins.mitsuba_compat import DIFFERENTIABLE_PLUGINS, POLARIZED_PLUGINS, VERTEX_COLUMNS
+from torchtransient.plugins.mitsuba_compat import (
+    DIFFERENTIABLE_PLUGINS,
+    POLARIZED_PLUGINS,
+    VERTEX_COLUMNS,
+    has_normals,
+)
 from torchtransient.plugins.node_walk import ShownValue, objects_below, objects_of
 from torchtransient.plugins.spectral_colours import as_colours, keeps_coefficients, same_spectra
-from torchtransient.rendering.variant import device_type
 from torchtransient.scene.build import BuiltScene
 from torchtransient.scene.description import Plain
 from torchtransient.scene.nodes import children, name_children, node_kind, split_merged_shapes
 from torchtransient.scene.parameters import read_value
 from torchtransient.scene.values import Slot, SlotTable, as_float, fit_shape, own_array
+from torchtransient.scene.variant import device_type
 
 # Numbers that went through a file differ by the rounding of single precision.
 _RTOL, _ATOL = 1e-5, 1e-6
@@ -383,7 +388,7 @@ def _save_mesh(writer: XmlWriter, index: int, mesh: Any) -> None:
     new = mi.Properties("ply")
     new.set_id(old.id())
     new["filename"] = str(path)
-    new["face_normals"] = not mesh.has_vertex_normals()
+    new["face_normals"] = not has_normals(mesh)
     for key in list(old.keys()):
         if key not in (*_IN_MESH_FILE, "face_normals"):
             new[key] = old[key]

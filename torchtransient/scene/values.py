@@ -12,7 +12,17 @@ from torch.autograd import forward_ad
 
 from torchtransient.checks import real_array, shown
 from torchtransient.errors import DeviceError, SceneError, ShapeError
-from torchtransient.plugins.mitsuba_compat import check_pose, is_number_of_kernels, is_turned_by_reflections
+from torchtransient.plugins.mitsuba_compat import (
+    NORMALS,
+    POSITIONS,
+    TEXCOORDS,
+    check_pose,
+    flat_array,
+    is_number_of_kernels,
+    is_turned_by_reflections,
+    key_beside,
+    names_array,
+)
 from torchtransient.scene.build import BuiltScene
 from torchtransient.scene.parameters import classify, read_value
 
@@ -162,10 +172,10 @@ class Slot:
             self.targets = [key]
         else:
             self.kind, shape = "mesh_transform", (4, 4)
-            prefix = key.rsplit(".", 1)[0]
-            node = params.properties[f"{prefix}.vertex_positions"][2]
+            targets = [key_beside(key, name) for name in (POSITIONS, NORMALS)]
+            node = params.properties[targets[0]][2]
             self.initial = built.mesh_to_world.get(node.id(), np.eye(4))
-            self.targets = [f"{prefix}.vertex_positions", f"{prefix}.vertex_normals"]
+            self.targets = [target for target in targets if target in params]
         assert shape is not None, key  # keys without a derivative, such as texts, are refused before
         self.shape: tuple[int, ...] = shape
 
@@ -203,16 +213,19 @@ class Slot:
         import drjit as dr
         import mitsuba as mi
 
-        params = self._built.params
-        positions_key, normals_key = self.targets
         entries = [dr.gather(mi.Float, leaf, mi.UInt32(i)) for i in range(16)]
         relative = mi.Matrix4f(*entries) @ mi.Matrix4f(np.linalg.inv(self.initial))
         transform = mi.Transform4f(relative)
-        points = dr.unravel(mi.Point3f, originals[positions_key])
-        params[positions_key] = dr.ravel(transform @ points)
-        if len(originals[normals_key]):
-            normals = dr.unravel(mi.Normal3f, originals[normals_key])
-            params[normals_key] = dr.ravel(dr.normalize(transform @ normals))
+        for key in self.targets:
+            flat = flat_array(originals[key])
+            if key == self.targets[0]:
+                moved = transform @ dr.unravel(mi.Point3f, flat)
+            elif len(flat):
+                moved = dr.normalize(transform @ dr.unravel(mi.Normal3f, flat))
+            else:
+                continue
+            shape = (len(flat) // 3, 3)
+            self._built.params[key] = as_mitsuba_value("vertices", shape, originals[key], dr.ravel(moved))
 
 
 def as_mitsuba_value(kind: str, shape: tuple[int, ...], current: Any, leaf: Any) -> Any:
@@ -220,7 +233,7 @@ def as_mitsuba_value(kind: str, shape: tuple[int, ...], current: Any, leaf: Any)
     import drjit as dr
     import mitsuba as mi
 
-    if kind == "tensor":
+    if dr.is_tensor_v(current):
         return type(current)(leaf, shape=shape)
     if kind in ("vector", "points"):
         return dr.unravel(type(current), leaf)
@@ -238,10 +251,15 @@ def changed_with(keys: Iterable[str], params: Any) -> list[str]:
     A light with a texture is sampled by a map from texture coordinates to points, which Mitsuba keeps until positions
     change; where those do and normals do not, it makes up new normals.
     """
-    ending = ".vertex_texcoords"
-    meshes = [key.removesuffix(ending) for key in keys if key.endswith(ending)]
-    others = [f"{mesh}.{name}" for mesh in meshes for name in ("vertex_positions", "vertex_normals")]
+    moved = [key for key in keys if names_array(key, TEXCOORDS)]
+    others = [key_beside(key, name) for key in moved for name in (POSITIONS, NORMALS)]
     return [key for key in others if key in params]
+
+
+def with_normals(keys: Iterable[str], params: Mapping[str, Any]) -> list[str]:
+    """Return the keys, each once, and those of the normals that Mitsuba computes where positions among them change."""
+    normals = [key_beside(key, NORMALS) for key in keys if names_array(key, POSITIONS)]
+    return list(dict.fromkeys((*keys, *(key for key in normals if key in params))))
 
 
 class SlotTable:
@@ -250,12 +268,8 @@ class SlotTable:
     def __init__(self, built: BuiltScene, keys: tuple[str, ...]):
         self.built = built
         self.slots = [Slot(built, key) for key in keys]
-        touched = dict.fromkeys(target for slot in self.slots for target in slot.targets)
-        for target in list(touched):
-            # Mitsuba recomputes normals when positions change: both have to go back.
-            normals = target.replace(".vertex_positions", ".vertex_normals")
-            if normals != target and normals in built.params:
-                touched[normals] = None
+        # Mitsuba recomputes normals when positions change: both have to go back.
+        touched = with_normals([target for slot in self.slots for target in slot.targets], built.params)
         self._check_overlap()
         self._changed_too = changed_with(touched, built.params)
         # Copies: what `params` returns may be the plugin's own variable, which changes when it is written.

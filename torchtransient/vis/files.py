@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.array_files.part_files import replacing
-from torchtransient.checks import check_folder, count
+from torchtransient.checks import check_folder, count, short_message
 from torchtransient.errors import MissingPackageError, ShapeError, StorageError
-from torchtransient.plain_texts import said_in_short
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -62,7 +61,7 @@ def _place_of(path: Any, who: str) -> Iterator[tuple[Path, str]]:
         said = str(error).removeprefix(f"{who}: ").removeprefix(f"'{path}' could not be written: ")
         raise StorageError(f"{who}: cannot write '{path}': {said}") from error
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:  # of an unknown ending, too
-        said = said_in_short(error)
+        said = short_message(error)
         raise StorageError(f"{who}: cannot write '{path}': {said}. Choose a writable .png.") from error
 
 

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from torchtransient.array_files.array_file import damage_said, read_npy, read_some
+from torchtransient.array_files.plain_texts import json_data
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.checks import as_whole, of_class, real_array, shown
 from torchtransient.errors import ArgumentError, ShapeError, StorageError, UnitError
-from torchtransient.plain_texts import json_data
 
 Source = Any  # Tensor | NDArray | RenderOutput | Result | str | Path, told apart by what they offer
 _HDF5 = (".h5", ".hdf5")

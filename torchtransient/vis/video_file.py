@@ -12,9 +12,8 @@ import numpy as np
 
 from torchtransient import checks
 from torchtransient.array_files.part_files import replacing
-from torchtransient.checks import check_folder, one_by_one, path_of, positive, shown
+from torchtransient.checks import check_folder, one_by_one, path_of, positive, short_message, shown
 from torchtransient.errors import MissingPackageError, ShapeError, StorageError, UnitError
-from torchtransient.plain_texts import said_in_short
 from torchtransient.vis.files import Image
 from torchtransient.vis.stamps import DIM, GROUND, INK
 
@@ -71,7 +70,7 @@ def write_video(
                 palette = _palette(frames, many)
                 _write_gif(unfinished, _followed(frames, many, progress), palette, fps)
         except OSError as error:  # with the command and its output, where it is ffmpeg's
-            raise StorageError(f"video: '{target}' could not be written: {said_in_short(error)}.") from error
+            raise StorageError(f"video: '{target}' could not be written: {short_message(error)}.") from error
     return target
 
 

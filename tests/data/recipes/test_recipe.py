@@ -28,7 +28,7 @@ from torchtransient.errors import (
     UnitError,
 )
 from torchtransient.files.scan_data import scan_from_data
-from torchtransient.rendering.variant import active_variant
+from torchtransient.scene.variant import active_variant
 
 D = tt.data
 VARIANT = "llvm_ad_mono"

@@ -16,7 +16,7 @@ from torchtransient.capture import Capture
 from torchtransient.errors import StorageError
 from torchtransient.files.captures import formats, gaps, tal_scene_info
 from torchtransient.files.captures.mat_file import write_mat, write_parts
-from torchtransient.transform_bins import transform_bins
+from torchtransient.plugins.films.transform_bins import transform_bins
 
 assert "tal" in formats.FORMATS  # what reads and writes is registered
 

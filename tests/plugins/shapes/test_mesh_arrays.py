@@ -11,7 +11,7 @@ import torch
 import torchtransient as tt
 from torchtransient import plugins
 from torchtransient.errors import SceneError
-from torchtransient.rendering.variant import active_variant
+from torchtransient.scene.variant import active_variant
 from torchtransient.scenes.bottle import write_ply
 from torchtransient.scenes.transforms import rotate, scale, translate
 

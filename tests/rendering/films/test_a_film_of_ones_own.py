@@ -56,7 +56,7 @@ class Moments(FilmLayout):
 
 @pytest.fixture(autouse=True)
 def _listed(monkeypatch):
-    """As if the plugin stood in `PLUGIN_MODULES` and the class in `FILMS`."""
+    """List the plugin in `PLUGIN_MODULES` and the class in `FILMS`."""
     monkeypatch.syspath_prepend(str(Path(__file__).parent))
     FILMS.append(Moments)
     mi.set_variant(VARIANT)

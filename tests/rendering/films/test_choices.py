@@ -20,7 +20,6 @@ from torchtransient.files.result_file import read_result, write_result
 from torchtransient.rendering import films
 from torchtransient.rendering.films import Gates, Histogram, Phasors, measured
 from torchtransient.rendering.output import RenderOutput, RenderStats
-from torchtransient.rendering.planned_film import planned
 
 VARIANT = "llvm_ad_rgb"
 STATS = RenderStats(
@@ -73,7 +72,7 @@ def test_the_list():
 
 @each
 def test_plugin_and_back(argument):
-    """What is written into a film node is what the plugin says that it measures."""
+    """The plugin measures with the settings that are written into its node."""
     plugins.sync()
     choice = choice_for(argument)
     film = mi.load_dict(film_node(choice))
@@ -108,7 +107,7 @@ def test_output_and_file(tmp_path, argument, ending, leading, components):
 
 
 def first_version(values):
-    """As files were before they had checksums."""
+    """Return a file of the first version, without checksums."""
     kept = {name: value for name, value in values.items() if name != "checksums"}
     return {**kept, "format": np.array("torchtransient result 1")}
 
@@ -285,21 +284,6 @@ def test_layouts_of_torch(leading, components):
     np.testing.assert_allclose(found.numpy(), expected(cube * (2 - 3j), "hwtsc", "scthw"), rtol=1e-12)
 
 
-def test_what_is_planned_for_outputs():
-    """A histogram unless something else is asked for; one bin for all times where nothing over time is."""
-    for outputs, name, words, all_times in (
-        (("steady",), "steady", "one bin for all times", True),
-        (("transient",), "transient", "transients are asked for", False),
-        (("steady", "transient"), "transient", "transients are asked for", False),
-        (("peak_time",), "transient", "peak_time over time is asked for", False),
-    ):
-        found = planned(outputs)
-        assert (found.name, found.all_times) == (name, all_times) and words in found.reason
-    asked = {"peak_time": Histogram, "phasor": Phasors, "gates": Gates, "transient": Histogram}
-    assert [planned(["steady", name]).kind for name in asked] == list(asked.values())
-    assert planned(["phasor"]).reason == "film: phasor, since phasors are asked for; no time axis is stored"
-
-
 def test_histograms_of_files_have_an_axis_and_an_array():
     axis = {"start_opl": 3.5, "bin_width_opl": 0.25, "num_bins": 5}
     assert Histogram.from_entries({**axis, "transient": 0}) == choice_for("time_axis")
@@ -311,13 +295,6 @@ def test_what_an_object_holds_under_a_name():
     held = SimpleNamespace(phasor=None, transient=3, others={"phasor": 5, "transient": 7})
     assert [measured(held, name) for name in ("transient", "phasor", "gated")] == [3, 5, None]
     assert measured(SimpleNamespace(transient=None), "transient") is None
-
-
-def test_plugins_in_words():
-    assert films.film_plugins() == "transient_hdr_film, phasor_hdr_film, gated_hdr_film"
-    assert films.film_plugins([Gates, Histogram]) == "gated_hdr_film, transient_hdr_film"
-    assert films.layout_of_plugin("hdrfilm") is None
-    assert Histogram.fits("streak_hdr_film") and not Gates.fits("transient_hdr_film") and Gates.fits("gated_hdr_film")
 
 
 def test_explicit_frequencies_replace_those_that_a_film_had():

@@ -5,17 +5,13 @@ from __future__ import annotations
 import copy
 import itertools
 
-import mitsuba as mi
 import pytest
 import torch
 
 import torchtransient as tt
 from support.marks import long_rows
-from tools.small_room import GREY, WALL_POSE, make_room
-from torchtransient import plugins
+from tools.small_room import WALL_POSE, make_room
 from torchtransient.errors import ArgumentError, GradientError, SceneError
-from torchtransient.plugins.films import temporal_filters
-from torchtransient.rendering.overrides import temporal_filter
 
 VARIANT = "llvm_ad_rgb"
 SIZE = {"width": 4, "height": 3, "rfilter": {"type": "box"}}
@@ -37,12 +33,6 @@ def room_of(*films, **integrator):
     for number, film in enumerate(films):
         room[f"sensor_{number}"] = {**copy.deepcopy(sensor), "film": film}
     return room
-
-
-def filters_of(renderer):
-    """What the films and the integrator of a renderer's scene use now."""
-    scene = renderer.scene.built(renderer._options).scene
-    return scene.integrator().temporal_filter, [sensor.film().temporal_filter for sensor in scene.sensors()]
 
 
 def measured(out):
@@ -70,9 +60,7 @@ def test_each_sensor_renders_as_if_it_were_alone(pair, of_integrator):
         for wanted in ("tent",) if "histogram" in name else ("auto",):
             arguments = {"parameters": [WALL_POSE], "temporal_filter": wanted, "spp": 4, "grad_seed": "same"}
             renderer = tt.TransientRenderer(scene, sensors=sensor, **arguments)
-            before = filters_of(renderer)
             found = grad_and_values(renderer)
-            assert filters_of(renderer) == before and before[0] == of_integrator
             expected = grad_and_values(tt.TransientRenderer(alone, **arguments))
             torch.testing.assert_close(found[0], expected[0])
             torch.testing.assert_close(found[1], expected[1], rtol=1e-4, atol=1e-5)
@@ -96,64 +84,16 @@ def test_a_plan_is_about_the_film_of_its_sensor():
     assert [plan.time_axis.bin_width_opl for plan in plans] == [0.25, 0.5]
 
 
-# ---------------------------------------------------------------------------------------- changed and put back
-
-
-@pytest.fixture
-def loaded():
-    """An integrator with a filter of its own, three films that have one and one that has none."""
-    mi.set_variant(VARIANT)
-    plugins.sync()
-    bare = [mi.load_dict(FILMS[name]) for name in ("histogram", "gated", "smooth histogram")]
+def test_a_filter_that_one_film_refuses_changes_no_other():
     # A pulse and a filter that together cover more bins than are spread while rendering.
     late = {**HISTOGRAM, "gaussian_stddev": 1e4, "pulse": "gaussian", "pulse_fwhm_opl": 0.5}
-    return mi.load_dict({"type": "transient_path", "temporal_filter": "tent"}), [*bare, mi.load_dict(late)]
-
-
-def state(loaded):
-    integrator, films = loaded
-    used = [(film.temporal_filter, film.filter.name) for film in films if film.temporal_filter]
-    return integrator.temporal_filter, used
-
-
-@pytest.mark.parametrize("backwards", [False, True])
-def test_a_filter_that_one_film_refuses_changes_none(loaded, backwards):
-    before, (integrator, films) = state(loaded), loaded
-    with (
-        pytest.raises(SceneError, match="4096"),
-        temporal_filter("gaussian", integrator, reversed(films) if backwards else films),
-    ):
-        pytest.fail("entered with a film that refused")
-    assert state(loaded) == before
-
-
-def test_what_fails_inside_leaves_no_filter_behind(loaded):
-    before, (integrator, films) = state(loaded), loaded
-
-    def work():
-        with temporal_filter("tent", integrator, films):
-            assert [film.temporal_filter for film in films] == ["tent", "", "tent", "tent"]
-            assert integrator.temporal_filter == ""  # it would replace that of a film
-            raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        work()
-    assert state(loaded) == before
-    with temporal_filter(None, integrator, films):
-        assert state(loaded) == before
-
-
-def test_a_render_that_fails_leaves_no_filter_behind(monkeypatch):
-    scene = tt.load(room_of(HISTOGRAM, FILMS["gated"], FILMS["smooth histogram"]), variant=VARIANT)
-    renderer = tt.TransientRenderer(scene, parameters=[GREY], temporal_filter="tent", spp=2)
-    before = filters_of(renderer)
-    integrator = type(renderer.scene.built(renderer._options).scene.integrator())
-    with monkeypatch.context() as patch:
-        patch.setattr(integrator, "start", lambda *_a, **_k: 1 / 0)
-        with pytest.raises(ZeroDivisionError):
-            renderer(seed=0)
-    assert filters_of(renderer) == before
-    assert renderer(seed=0).transient.sum() > 0
+    scene = tt.load(room_of(HISTOGRAM, late), variant=VARIANT)
+    first, second = (tt.TransientRenderer(scene, sensors=n, spp=2) for n in range(2))
+    expected = [renderer(seed=0).transient for renderer in (first, second)]
+    with pytest.raises(SceneError, match="4096"):
+        tt.TransientRenderer(scene, sensors=1, temporal_filter="gaussian", spp=2)(seed=0)
+    for renderer, before in zip((first, second), expected, strict=True):
+        assert torch.equal(renderer(seed=0).transient, before)
 
 
 # -------------------------------------------------------------------------------------- several films in one call
@@ -204,29 +144,3 @@ def test_every_film_of_a_call_needs_a_slope():
     assert tt.TransientRenderer(scene, **arguments).effective_filter == "tent"
     with pytest.raises(GradientError, match="no slope"):
         tt.TransientRenderer(scene, temporal_filter="box", **arguments)(seed=0).transient.sum().backward()
-
-
-# ------------------------------------------------------------------------------------------------- tables of pulses
-
-
-def test_a_render_makes_no_table_twice(monkeypatch):
-    """The kernel table of a pulse is made with the film and for every filter that is used, not for every render."""
-    calls, original = [], temporal_filters.cumulative_of_sum
-
-    def counting(*arguments):
-        calls.append(arguments)
-        return original(*arguments)
-
-    monkeypatch.setattr(temporal_filters, "cumulative_of_sum", counting)
-    pulsed = {**HISTOGRAM, "pulse": "gaussian", "pulse_fwhm_opl": 0.5}
-    scene = tt.load(room_of(pulsed, gaussian_stddev=0.5), variant=VARIANT)
-    renderer = tt.TransientRenderer(scene, parameters=[GREY], spp=2)
-    assert len(calls) == 1
-    for seed in range(2):
-        renderer(seed=seed)
-    assert len(calls) == 1
-    tent = renderer.variation(temporal_filter="tent")
-    for seed in range(2):
-        tent(seed=seed)
-        renderer(seed=seed)
-    assert len(calls) == 2

@@ -13,6 +13,7 @@ from typing import Any
 from torchtransient.checks import shown
 from torchtransient.data.augmentation.pixel_map import PixelMap
 from torchtransient.errors import SceneError
+from torchtransient.plugins.mitsuba_compat import VERTEX_COLUMNS
 
 # The same in a mirror, and for every camera. Textures of surfaces among them: they go along with the coordinates `uv`.
 UNAFFECTED = frozenset(
@@ -32,11 +33,10 @@ _THROWN = frozenset(("intensity", "irradiance", "energy"))
 # Of the world, and of no camera: false in a mirror, true for another camera.
 OF_THE_WORLD = frozenset(
     (
-        "position", "positions", "direction", "center", "p0", "p1", "vertex_positions", "vertex_normals",
-        "vertex_texcoords", "control_points", "data", "grid", "extent", "opacities", "value", "values", "sun_direction",
-        "theta", "left_handed", "normalmap", "nested_texture", "texture", "S", "to_uv", "filename", "bsdf",
-        "scale_tilt", "volume", "color0", "color1", "latitude", "longitude", "timezone", "year", "month", "day", "hour",
-        "minute", "second", *_THROWN,
+        "position", "positions", "direction", "center", "p0", "p1", "control_points", "data", "grid", "extent",
+        "opacities", "value", "values", "sun_direction", "theta", "left_handed", "normalmap", "nested_texture",
+        "texture", "S", "to_uv", "filename", "bsdf", "scale_tilt", "volume", "color0", "color1", "latitude",
+        "longitude", "timezone", "year", "month", "day", "hour", "minute", "second", *VERTEX_COLUMNS, *_THROWN,
     )
 )  # fmt: skip
 # A camera may have them, and everything else.

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from torchtransient.array_files.part_files import whole_file, writing_said
-from torchtransient.checks import check_special
+from torchtransient.array_files.plain_texts import json_data
+from torchtransient.checks import check_special, short_message
 from torchtransient.data.generation.plan import Plan
 from torchtransient.data.recipes.places import without_places
 from torchtransient.data.recipes.plugin_modules import PluginNames
 from torchtransient.data.storage.file_names import RECIPE_FILE
 from torchtransient.errors import StorageError
-from torchtransient.plain_texts import json_data, said_in_short
 
 # The first one left samples out whose light the window misses.
 FORMAT = "torchtransient data set 2"
@@ -87,7 +87,7 @@ def read_description(folder: Path) -> dict[str, Any] | None:
     except FileNotFoundError:
         return None
     except (OSError, UnicodeDecodeError) as error:
-        raise StorageError(f"{_WHAT}: '{path}' cannot be read, or is damaged: {said_in_short(error)}.") from error
+        raise StorageError(f"{_WHAT}: '{path}' cannot be read, or is damaged: {short_message(error)}.") from error
     missing = [name for name in (*DECIDING, "about") if not isinstance(found, dict) or name not in found]
     if missing:
         raise StorageError(f"{_WHAT}: '{path}' is none of a data set: it lacks {missing[0]!r}. Choose another folder.")

@@ -21,8 +21,8 @@ from torchtransient.data.recipes.structures import Structure
 from torchtransient.errors import SceneError, TorchTransientError, TorchTransientWarning, UnitError, level_of_user
 from torchtransient.plugins.parameters import PhysicalRange
 from torchtransient.rendering.progress import with_bar
-from torchtransient.rendering.variant import active_variant
 from torchtransient.scene.physics import is_singular, outside_message, singular_message
+from torchtransient.scene.variant import active_variant
 
 # Samples that are drawn, and structures among them that are built, for a look.
 SAMPLES, STRUCTURES = 64, 8

@@ -28,9 +28,9 @@ from torchtransient.files.scan_data import scan_data
 from torchtransient.plugins import versions_of_others
 from torchtransient.rendering.labels import LABELS, first_return, label_names, material_names, scene_labels
 from torchtransient.rendering.renderer import TransientRenderer
-from torchtransient.rendering.variant import active_variant, stokes_components
 from torchtransient.scene.load import Scene, load
 from torchtransient.scene.parameters import ParameterTable, unknown_key
+from torchtransient.scene.variant import active_variant, stokes_components
 from torchtransient.sensing import Analyzers, Compose, Device, PolarizationMosaic
 
 if TYPE_CHECKING:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torchtransient.data.recipes.distribution import POSE
 from torchtransient.data.recipes.kept_scene import Kept
 from torchtransient.errors import SceneError
+from torchtransient.plugins.mitsuba_compat import POSITIONS
 
 # (2, 3): lower and upper corner of a box along the axes of the world; a point is a box without a size.
 Box = NDArray[np.float64]
@@ -54,7 +55,7 @@ def _moved(kept: Kept, drawn: Mapping[str, Any], boxes: Mapping[str, Box]) -> di
             continue
         if entry == "to_world" and place.kind == POSE:
             found[name] = _transformed(boxes[name], drawn[key] @ np.linalg.inv(place.described))
-        elif entry == "vertex_positions":
+        elif entry == POSITIONS:
             vertices = np.asarray(drawn[key]).reshape(-1, 3)
             found[name] = np.stack([vertices.min(0), vertices.max(0)])
     return found

@@ -18,8 +18,9 @@ from pathlib import Path
 from typing import Any
 
 from torchtransient.array_files.part_files import write_text
+from torchtransient.array_files.plain_texts import json_data, text_of_file
 from torchtransient.axes import TimeAxis
-from torchtransient.checks import path_of, shown
+from torchtransient.checks import path_of, short_errors, short_message, shown
 from torchtransient.data.recipes.places import files_of, without_places
 from torchtransient.data.recipes.specification import Specification
 from torchtransient.data.recipes.structures import OneOf
@@ -37,7 +38,6 @@ from torchtransient.data.recipes.written import (
 from torchtransient.errors import MissingPackageError, SceneError, TorchTransientError
 from torchtransient.files.scan_data import scan_data, scan_from_data
 from torchtransient.files.yaml_files import Section, read_yaml
-from torchtransient.plain_texts import json_data, said_in_short, text_of_file, told_shortly
 from torchtransient.scene.description import DictDescription, XmlDescription, describe_dict
 from torchtransient.scene.load import Scene
 
@@ -182,12 +182,12 @@ def faults_said() -> Iterator[None]:
     where they are used.
     """
     try:
-        with told_shortly("recipe"):
+        with short_errors("recipe"):
             yield
     except (TypeError, KeyError, ValueError, AttributeError, IndexError, OverflowError, RecursionError) as error:
         if isinstance(error, TorchTransientError):
             raise
-        said = f"{type(error).__name__}: {said_in_short(error)}"
+        said = f"{type(error).__name__}: {short_message(error)}"
         raise SceneError(f"recipe: an entry is not what it should be: {said}.") from error
 
 

@@ -25,7 +25,7 @@ from torchtransient.files.content_key import content_key
 from torchtransient.gates import Gate
 from torchtransient.pulses import Pulse
 from torchtransient.rendering.arguments import checked_filter
-from torchtransient.rendering.variant import resolve_variant
+from torchtransient.scene.variant import resolve_variant
 from torchtransient.sensing import DEVICES, Device
 from torchtransient.sensing import device as device_by_name
 

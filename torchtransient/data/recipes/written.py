@@ -17,7 +17,7 @@ import torch
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Scan
-from torchtransient.checks import shown
+from torchtransient.checks import short_message, shown
 from torchtransient.data.recipes import distributions as distributions
 from torchtransient.data.recipes import poses as poses
 from torchtransient.data.recipes.distribution import Distribution
@@ -25,7 +25,6 @@ from torchtransient.errors import SceneError
 from torchtransient.files.plain_data import plain, restored
 from torchtransient.files.scan_data import scan_data, scan_from_data
 from torchtransient.gates import Gate
-from torchtransient.plain_texts import said_in_short
 from torchtransient.plugins.dictionaries import Pixels, Voxels
 from torchtransient.pulses import Pulse
 
@@ -117,7 +116,7 @@ def read_distribution(where: str, value: Any) -> Distribution:
     try:
         return made(**nested)
     except TypeError as error:
-        raise SceneError(f"{where}: {name}: {said_in_short(error)}. Its entries are {', '.join(fields)}.") from error
+        raise SceneError(f"{where}: {name}: {short_message(error)}. Its entries are {', '.join(fields)}.") from error
 
 
 def _nested(where: str, content: Any) -> Any:

@@ -15,11 +15,11 @@ from typing import Any
 
 from torchtransient.array_files.part_files import sweep_parts as sweep_parts
 from torchtransient.array_files.part_files import whole_file, writing_said
+from torchtransient.array_files.plain_texts import json_data
 from torchtransient.checks import check_special, path_of, shown
 from torchtransient.data.storage.file_names import MANIFEST_FILE, RECIPE_FILE, SHARD_FILES, shard_file_name
 from torchtransient.data.storage.shard_file import Shard, stored_checksum
 from torchtransient.errors import StorageError
-from torchtransient.plain_texts import json_data
 from torchtransient.rendering.progress import with_bar
 
 FORMAT = "torchtransient manifest 1"

@@ -15,7 +15,7 @@ from torchtransient.array_files.hdf5_writing import hdf5_package
 from torchtransient.axes import FrequencyAxis
 from torchtransient.capture import Capture
 from torchtransient.capture.files import register_files
-from torchtransient.checks import is_one_of, shown
+from torchtransient.checks import is_one_of, shown, some_of
 from torchtransient.errors import ArgumentError, StorageError
 from torchtransient.files import capture_file
 from torchtransient.files.captures import (
@@ -31,7 +31,6 @@ from torchtransient.files.captures import (
 )
 from torchtransient.files.captures.contents import WHAT, Contents, opened
 from torchtransient.files.captures.gaps import Gaps
-from torchtransient.plain_texts import some_of
 
 OWN = "torchtransient"
 _MAT = (".mat",)

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from torchtransient.array_files.plain_texts import safe_loader, yaml_data
 from torchtransient.errors import MissingPackageError, StorageError
-from torchtransient.plain_texts import safe_loader, yaml_data
 
 # Ground truth of 1024 x 1024 points with normals takes 43 MB as text.
 MOST_CHARACTERS = 2**27

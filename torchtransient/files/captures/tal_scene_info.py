@@ -12,7 +12,7 @@ from torchtransient.capture import Capture
 from torchtransient.errors import StorageError
 from torchtransient.files.captures.plain_yaml import read_plain_yaml, write_plain_yaml
 from torchtransient.files.plain_data import plain, restored
-from torchtransient.transform_bins import transform_bins
+from torchtransient.plugins.films.transform_bins import transform_bins
 
 # Our part of the information: a JSON text, in which numbers keep every digit.
 _OWN = "torchtransient"

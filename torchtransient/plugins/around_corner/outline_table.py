@@ -248,11 +248,15 @@ def _is_convex(triangles: Triangles, faces: np.ndarray, v: np.ndarray, tolerance
 
 
 def hiding_pairs(parts: list[Part], viewpoints: np.ndarray, is_requested: Any) -> list[tuple[int, int]]:
-    """Return (hider, hidden) by number: a pair for each part that may hide another, or points of its own, from some of
-    the ``viewpoints`` (P, 3).
+    """Find pairs of parts of which one may hide the other, or points of its own, from a viewpoint.
 
-    ``is_requested(i, j)``: the pairs that count. Conservative: what is left out cannot happen. Of more than
-    ``MOST_PARTS`` each one may hide another.
+    Args:
+        viewpoints: points of the wall, (P, 3), metres.
+        is_requested: predicate of (hider, hidden) for the pairs that count.
+
+    Returns:
+        Pairs (hider, hidden) by number. Conservative: pairs left out cannot occur. Of more than ``MOST_PARTS`` parts
+        each may hide every other.
     """
     pairs = []
     some = np.unique(np.linspace(0, len(viewpoints) - 1, min(len(viewpoints), FEW)).astype(int))

@@ -316,11 +316,15 @@ def aims_of(scene: Any, sensor: Any, capture: CaptureType, fov: float | None) ->
     """Return the directions of the laser from its origin (Vector3f, of any length): one direction, or one for every
     pixel, or one for every laser position.
 
-    ``fov``: horizontal field of view in degrees of a grid of laser positions around the emitter's axis, None for those
-    of the sensor. Raises SceneError where two say where the laser points, and for a field of view that is none.
+    Args:
+        fov: horizontal field of view in degrees of a grid of laser positions around the emitter's axis, None for the
+            laser positions of the sensor.
+
+    Raises:
+        SceneError: if several of the scene's parts aim the laser, or the field of view is not an angle.
     """
     transform, origin = laser_of(scene).world_transform(), origin_of(scene, sensor)
-    _check_said_once(sensor, capture, fov)
+    _check_aimed_once(sensor, capture, fov)
     given = sensor.spots() if hasattr(sensor, "spots") and capture is not CaptureType.CONFOCAL else None
     if given is not None:
         return given - origin
@@ -341,7 +345,7 @@ def aims_of(scene: Any, sensor: Any, capture: CaptureType, fov: float | None) ->
     return transform @ mi.Vector3f(-x * half, -y * half * rows / columns, 1)
 
 
-def _check_said_once(sensor: Any, capture: CaptureType, fov: float | None) -> None:
+def _check_aimed_once(sensor: Any, capture: CaptureType, fov: float | None) -> None:
     given = getattr(sensor, "laser_points", None) is not None
     if given and capture is CaptureType.CONFOCAL:
         raise SceneError(

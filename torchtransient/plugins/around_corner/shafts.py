@@ -75,11 +75,16 @@ def spare_rays(scene: Any, elements: HiddenElements, points: np.ndarray, normals
 
 
 def clear_elements(shapes: list[Any], elements: AreaElements, region: ScanRegion, smooth: bool = False) -> np.ndarray:
-    """Return a mask (E,) of elements that nothing hides from any point of the region, ``shapes`` being all of the
-    scene.
+    """Find the elements that nothing hides from any point of a region.
 
-    Only triangles are ever clear, and only those that lie before the whole region. ``smooth``: normals are
-    interpolated, so that points may be seen from behind their planes; then only those with the region on one side.
+    Args:
+        shapes: all shapes of the scene.
+        region: box of scan points and laser spots.
+        smooth: normals are interpolated, so that points may be seen from behind their planes; then only elements with
+            the region on one side of their planes are clear.
+
+    Returns:
+        Mask (E,) of clear elements: triangles that lie before the whole region.
     """
     found = np.zeros(len(elements), dtype=bool)
     numbers = np.flatnonzero(elements.kind == TRIANGLE)

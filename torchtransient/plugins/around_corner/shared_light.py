@@ -72,8 +72,9 @@ def late_density(
 
 
 def _density(scene: Any, elements: HiddenElements, wall: tuple[np.ndarray, np.ndarray], s: Any, side: Any) -> Any:
-    """Density of heads by tile. ``side``: the middle of the scan, normals towards it, and whether something is
-    scattered there.
+    """Density of hidden points in late light.
+
+    ``side``: the middle of the scan, normals towards it, and a mask of points that scatter there.
     """
     points, normals = wall
     center, n, lit = side
@@ -120,8 +121,10 @@ def _smoothed(elements: HiddenElements, square: np.ndarray, area: np.ndarray, el
 
 
 def why_not(table: ScanTable, contents: Any, with_wall: bool) -> str | None:
-    """Return the reason why a scene cannot have shared samples, None if it can. ``with_wall``: points are drawn on the
-    wall as well.
+    """Return the reason why a scene cannot have shared samples, None if it can.
+
+    Args:
+        with_wall: points are drawn on the wall as well.
     """
     scene, sensor = table.scene, table.sensor
     if mi.is_spectral or mi.is_polarized:

@@ -23,8 +23,8 @@ from torchtransient.plugins.films.phasor_sums import (
     rotation,
     slots_for,
 )
+from torchtransient.plugins.films.transform_bins import transform_bins
 from torchtransient.plugins.properties import number, whole_number
-from torchtransient.transform_bins import transform_bins
 
 _LIST = ("frequencies",)
 _GRID = ("frequency_first", "frequency_step", "frequency_count")

@@ -7,13 +7,13 @@ import warnings
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient._collection import no_collection
 from torchtransient.errors import GradientError, GradientWarning, SceneError, VariantError
 from torchtransient.interfaces import BACKWARD, FORWARD, JOBS, RENDER, IntegratorInterface, is_time_resolved
 from torchtransient.plugins.described_scene import note_scene
 from torchtransient.plugins.films.colour import ChannelMatch
 from torchtransient.plugins.films.temporal_filters import check_name, check_stddev
 from torchtransient.plugins.frozen_state import arrays_below, says_it_can_be_recorded
+from torchtransient.plugins.guards import no_collection
 from torchtransient.plugins.integrators.job import (
     IncomingAdjoint,
     Job,

@@ -12,9 +12,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from torchtransient._collection import no_collection
 from torchtransient.errors import VariantError
 from torchtransient.plugins.films.colour import ChannelMatch, mean_of
+from torchtransient.plugins.guards import no_collection
 from torchtransient.plugins.integrators.job import Pass, seed_array
 from torchtransient.plugins.transport.sinks import EventListSink
 from torchtransient.plugins.transport.walk import walk

@@ -28,7 +28,7 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient.plugins.kernel_arrays import host_numbers
-from torchtransient.plugins.mitsuba_compat import has_surface, mesh_faces, mesh_normals, mesh_positions
+from torchtransient.plugins.mitsuba_compat import has_normals, has_surface, mesh_faces, mesh_normals, mesh_positions
 from torchtransient.plugins.node_walk import shown_by
 from torchtransient.plugins.parameter_effect import class_of
 
@@ -192,7 +192,7 @@ def _triangles(mesh: Any) -> tuple[np.ndarray, int, np.ndarray, np.ndarray]:
 
 def _corner_normals(mesh: Any, faces: np.ndarray) -> np.ndarray | None:
     """The normals at the corners of the triangles (F, 3, 3), None where there are none but those of their planes."""
-    if mesh.has_face_normals() or not mesh.has_vertex_normals():
+    if mesh.has_face_normals() or not has_normals(mesh):
         return None
     return host_numbers(mesh_normals(mesh)).reshape(-1, 3)[faces]
 

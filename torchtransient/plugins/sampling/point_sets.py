@@ -26,14 +26,21 @@ def scrambled(x: Any, seed: Any) -> Any:
 
 
 def plane_points(count: int, seed: Any, sets: int = 1) -> tuple[Any, Any]:
-    """Return ``count`` points of the unit square, (``Float64``, ``Float``), in ascending order of the first coordinate;
-    of several ``sets``, with seeds of their own, one set after the other.
+    """Return points of the unit square, in ascending order of the first coordinate.
+
+    Args:
+        count: number of points of each set.
+        seed: UInt32 of width one, in memory.
+        sets: number of sets, each with its own seed.
+
+    Returns:
+        (``Float64``, ``Float``): both coordinates, one set after the other.
 
     Hammersley's set, the second coordinate scrambled, and both shifted by the same random part of ``1 / count`` (of the
     next power of two) for all points: every point is uniform by itself, so that means are unbiased, and with a power of
     two the points are a (0, m, 2)-net as those of Sobol's sequence are. What is sorted by the first coordinate needs no
     sorting afterwards. A common shift leaves half of the variance that shifts of their own would, where a bin of time
-    is an interval of one coordinate. ``seed``: UInt32 of width one, in memory.
+    is an interval of one coordinate.
     """
     j = dr.arange(mi.UInt32, sets * count)
     number = j // dr.opaque(mi.UInt32, count)

@@ -108,11 +108,16 @@ class SharedSamples:
 
 
 def draw_samples(elements: HiddenElements, count: int, seed: Any) -> SharedSamples:
-    """Draw ``count`` samples of the hidden geometry's density, for each tile of the table; ``seed``: UInt32 of width
-    one, in memory, or a whole number.
+    """Draw samples of the hidden geometry's density, for each tile of the table.
 
-    Raises SceneError for surfaces that are not plainly diffuse (``diffuse``, ``twosided`` around it), UnitError,
-    and VariantError in spectral and polarized variants, where a sample has no colour of its own.
+    Args:
+        count: number of samples of each tile.
+        seed: UInt32 of width one, in memory, or a whole number.
+
+    Raises:
+        SceneError: for surfaces that are not plainly diffuse (``diffuse``, ``twosided`` around it).
+        UnitError: if ``count`` is out of range.
+        VariantError: in spectral and polarized variants, where a sample has no fixed colour.
     """
     sets = elements.tile_count
     if not 1 <= count <= MAX_SAMPLES // sets:

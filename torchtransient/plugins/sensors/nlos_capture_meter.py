@@ -12,7 +12,7 @@ from torchtransient.capture.triangles import first_hits
 from torchtransient.checks import real_array, shown
 from torchtransient.errors import SceneError
 from torchtransient.plugins._registry import register
-from torchtransient.plugins.mitsuba_compat import mesh_faces, mesh_texcoords
+from torchtransient.plugins.mitsuba_compat import has_texcoords, mesh_faces, mesh_texcoords
 from torchtransient.plugins.parameter_effect import ParameterEffect, class_of, declare_effects
 
 # --------------------------------------------------------------------- where places of a texture lie on a triangle mesh
@@ -153,7 +153,7 @@ class NLOSCaptureMeter(mi.Sensor):
                 "nlos_capture_meter: expected a shape to scan or 'points', got neither. Put the sensor into the relay "
                 "wall's shape, or give the points."
             )
-        if _is_rectangle(shape) or (shape.is_mesh() and shape.has_vertex_texcoords()):
+        if _is_rectangle(shape) or (shape.is_mesh() and has_texcoords(shape)):
             return shape
         kind = "a mesh without texture coordinates" if shape.is_mesh() else f"the shape {class_of(shape)}"
         raise SceneError(

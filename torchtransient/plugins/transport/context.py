@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.errors import SceneError
+from torchtransient.plugins.mitsuba_compat import NORMALS, POSITIONS
 from torchtransient.plugins.parameter_effect import ParameterEffect
 from torchtransient.plugins.sampling.lights import LightBox
 from torchtransient.plugins.sensors.origin import sensors_of, shapes_of_sensors
@@ -168,7 +169,7 @@ class Wanted:
         self.sensor |= any(node.ptr in carriers for node in moved("shape"))
         self.sphere_lights = self.geometry and contents.sphere_lights is not None
         self.ray = self.geometry and (contents.delta or self.sensor)
-        bent = any(key.endswith(("vertex_normals", "vertex_positions")) for _, key, _ in effects)
+        bent = any(key in (NORMALS, POSITIONS) for _, key, _ in effects)
         self.plain = self.geometry and not (self.ray or bent or contents.patterned)
         self.extinction = any(effect.moves_medium for _, _, effect in effects)
         self.carried: tuple[str, ...] = ("β",)

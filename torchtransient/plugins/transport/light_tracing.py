@@ -11,7 +11,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.mitsuba_compat import has_surface, has_vertices, normal_texture
+from torchtransient.plugins.mitsuba_compat import has_normals, has_surface, has_vertices, normal_texture
 from torchtransient.plugins.node_walk import objects_below, shapes_of_scene
 from torchtransient.plugins.polarized import (
     intensity,
@@ -120,7 +120,7 @@ class FromLight:
 def shades_by_other_normals(scene: Any) -> bool:
     """Return whether some surface has normals at its vertices or in a texture."""
     shapes = [shape for shape in shapes_of_scene(scene) if has_surface(shape) and shape.bsdf() is not None]
-    if any(has_vertices(shape) and shape.has_vertex_normals() for shape in shapes):
+    if any(has_vertices(shape) and has_normals(shape) for shape in shapes):
         return True
     bsdfs = {bsdf.ptr: bsdf for bsdf in (shape.bsdf() for shape in shapes)}
     nested = [one for bsdf in bsdfs.values() for one in (bsdf, *objects_below(bsdf, mi.BSDF))]

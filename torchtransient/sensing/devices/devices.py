@@ -26,10 +26,10 @@ import torch
 from torch import nn
 
 from torchtransient.array_files.part_files import write_text
+from torchtransient.array_files.plain_texts import json_data, text_of_file, yaml_data
 from torchtransient.axes import TimeAxis
-from torchtransient.checks import as_whole, shown
+from torchtransient.checks import as_whole, short_errors, short_message, shown, some_of
 from torchtransient.errors import MissingPackageError, StorageError, TorchTransientError
-from torchtransient.plain_texts import json_data, said_in_short, some_of, text_of_file, told_shortly, yaml_data
 from torchtransient.sensing.base.layout import check_number
 from torchtransient.sensing.base.policies import GradPolicy
 from torchtransient.sensing.cameras.electronics import PixelElectronics
@@ -221,7 +221,7 @@ class Device:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Device:
         """What `to_dict` made. Raises StorageError for missing or unknown entries."""
-        with told_shortly("Device"):
+        with short_errors("Device"):
             return cls._from_dict(data)
 
     @classmethod
@@ -291,7 +291,7 @@ def build_stage(spec: Any, axis: TimeAxis | None = None, budget: Mapping[str, An
     except TypeError as error:
         raise StorageError(
             f"build_stage: expected arguments of {spec['kind']}, got {some_of(sorted(arguments))}: "
-            f"{said_in_short(error)}."
+            f"{short_message(error)}."
         ) from error
 
 

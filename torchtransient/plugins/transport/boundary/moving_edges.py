@@ -14,6 +14,8 @@ import numpy as np
 from torchtransient.plugins.edges.topology import Body
 from torchtransient.plugins.kernel_arrays import host_numbers
 from torchtransient.plugins.mitsuba_compat import (
+    NORMALS,
+    TEXCOORDS,
     attribute_name,
     has_limb,
     has_surface,
@@ -38,7 +40,7 @@ from torchtransient.plugins.transport.strategy import Local
 # through it.
 _MOVE, _BEND = ("shape", "emitter", "sun", "sensor"), ("index", "normal")
 # Of a mesh: they move no point.
-_PLACELESS = ("vertex_normals", "vertex_texcoords")
+_PLACELESS = (NORMALS, TEXCOORDS)
 # Delta vertices at most between a sensor and the edges that it sees through them: a slab of glass has two, one that is
 # seen in a mirror three.
 LONGEST = 4
@@ -99,9 +101,9 @@ class MovingEdges:
             return ()
         name, moves = key.rsplit(".", 1)[-1], moves_edges(key, effect)
         found = self.always if moves else ()
-        if not moves and (effect.role in _BEND or name == "vertex_normals"):
+        if not moves and (effect.role in _BEND or name == NORMALS):
             found += self.bent
-        if (moves and effect.role in ("shape", "sensor")) or name == "vertex_texcoords":
+        if (moves and effect.role in ("shape", "sensor")) or name == TEXCOORDS:
             # Mitsuba does not show the members of an instance; relative to a moving sensor all shapes move.
             alone = effect.role != "sensor" and isinstance(node, mi.Shape) and not is_instance(node)
             found += self._jumps(node if alone else None)

@@ -1,7 +1,7 @@
-"""What ``torch.compile`` leaves alone.
+"""Functions that ``torch.compile`` calls as they are.
 
-The compiler follows Python calls into a function and runs them on tensors without data; a render is locks, objects of
-Mitsuba and kernels of Dr.Jit. An opaque function is called as it stands, between the compiled parts around it.
+The compiler follows Python calls and runs them on tensors without data; a render is locks, objects of Mitsuba and
+kernels of Dr.Jit. An opaque function runs between the compiled parts around it.
 """
 
 from __future__ import annotations
@@ -14,8 +14,6 @@ from typing import Any, ParamSpec, TypeVar
 
 import torch
 
-from torchtransient.rendering.interrupts import ends_frames
-
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
@@ -26,11 +24,13 @@ _REASON = (
 
 
 def opaque(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """``torch.compiler.disable``, without its price for those who do not compile: it imports the compiler, which takes
-    longer than everything else that is imported here.
+    """Keep the compiler out of a function, as ``torch.compiler.disable`` does.
+
+    That one imports the compiler, which takes longer than all other imports of this library; here it is called only if
+    the compiler is loaded.
     """
 
-    # Here, and in no table of all functions: with it goes what a function holds, scenes for instance.
+    # Kept by the function, not in a table: it is freed with the function and the scenes that it holds.
     disabled: list[Callable[..., Any]] = []
 
     @functools.wraps(function)
@@ -39,11 +39,11 @@ def opaque(function: Callable[_P, _R]) -> Callable[_P, _R]:
             return function(*args, **kwargs)
         return _untraced(function, disabled, args, kwargs)
 
-    return _stopping(ends_frames(call))
+    return _stopping(call)
 
 
 def _stopping(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Where the compiler meets a call of the function it stops before it, as at one of ``torch.compiler.disable``."""
+    """Mark a function as disabled, so that the compiler stops before a call of it."""
     function._torchdynamo_disable = True  # type: ignore[attr-defined]
     function._torchdynamo_disable_msg = _REASON  # type: ignore[attr-defined]
     return function
@@ -54,7 +54,7 @@ def _untraced(
     function: Callable[..., _R], disabled: list[Callable[..., Any]], args: tuple[Any, ...], kwargs: dict[str, Any]
 ) -> _R:
     if not disabled:
-        # what is disabled says why from torch 2.7 on
+        # torch 2.7 and later show the reason
         why = {"reason": _REASON} if "reason" in inspect.signature(torch.compiler.disable).parameters else {}
         disabled.append(torch.compiler.disable(function, **why))  # type: ignore[no-untyped-call]
     result: _R = disabled[0](*args, **kwargs)

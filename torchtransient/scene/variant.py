@@ -1,4 +1,4 @@
-"""Which Mitsuba variant a call runs under, and :func:`at_work`, which keeps calls apart.
+"""Variant, lock and errors of a call.
 
 Mitsuba's variant is a property of the process. A scene of this library is bound to one variant; every call that
 touches it runs inside :func:`active_variant`, which switches to that variant when another one is active and switches
@@ -7,24 +7,29 @@ back afterwards. When no variant was active at all, there is nothing to go back 
 
 from __future__ import annotations
 
+import sys
+import traceback
 import types
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import torch
 
 from torchtransient import plugins
-from torchtransient._collection import forget_traces
 from torchtransient._llvm import ensure_llvm
 from torchtransient.checks import shown
-from torchtransient.errors import TorchTransientWarning, VariantError, level_of_user
-from torchtransient.plain_texts import one_line
+from torchtransient.errors import (
+    GradientError,
+    SceneError,
+    TorchTransientError,
+    TorchTransientWarning,
+    VariantError,
+    level_of_user,
+)
 from torchtransient.plugins.drjit_pool import check_process, engine_lock
-from torchtransient.plugins.interrupted import interrupts_wait
-from torchtransient.plugins.unfinished import afterwards, make_good
-from torchtransient.rendering.interrupts import interrupts_pass
+from torchtransient.plugins.guards import chain_of, interrupt_behind, interrupts_wait
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 
@@ -35,56 +40,58 @@ _switches = {"count": 0}
 
 @contextmanager
 def at_work() -> Iterator[bool]:
-    """Hold the engine lock: a call. Raises interrupts as themselves, and puts back what interrupted calls have left, at
-    the end of the outermost call or at the beginning of the next. Yields whether it is the outermost one. Raises
-    ``VariantError`` as :func:`check_process`.
+    """Hold the engine lock, and raise interrupts as themselves. Yields whether this is the outermost block of a thread.
+
+    Raises:
+        VariantError: in a forked child, as :func:`check_process`.
     """
-    check_process()  # before the lock, too: in the child of a fork, a thread that did not come along may hold it
+    check_process()  # before the lock: a thread that did not come along in a fork may hold it
     # Private, but what threading.Condition asks: there is no other way to ask whether this thread holds it.
     outermost = not engine_lock._is_owned()  # type: ignore[attr-defined]
     with engine_lock, interrupts_pass():
-        check_process()
-        try:
-            if outermost:
-                put_back_what_is_left()
-            yield outermost
-        finally:
-            if outermost:
-                put_back_what_is_left()
+        yield outermost
 
 
-def put_back_what_is_left() -> None:
-    """Carry out :func:`make_good`, with a warning for what cannot be put back, and let the collector go on. The engine
-    lock is held, and no call is under way.
-    """
-    forget_traces()
-    for error in make_good():
-        warnings.warn(
-            f"a call was interrupted and left a change that cannot be undone: {type(error).__name__}: "
-            f"{one_line(error)}. If it was rendering a scene, load that scene again.",
-            TorchTransientWarning,
-            stacklevel=level_of_user(),
-        )
+@contextmanager
+def interrupts_pass() -> Iterator[None]:
+    """Raise the interrupt that ended the block, in place of the RuntimeError that C++ makes of it."""
+    # Read before the block: a call in an except block has not failed because of the exception that is handled there.
+    interrupt, handled = None, sys.exc_info()[1]
+    try:
+        yield
+    except Exception as error:
+        interrupt = interrupt_behind(error, handled)
+        if interrupt is None:
+            raise
+        clear_frames(error, handled)
+        raise interrupt from None
+    finally:
+        # The frame that raises is in the traceback of what it raises: together they would stay until they are
+        # collected, and the scene with them.
+        del interrupt, handled
 
 
-def in_variant(variant: str | None, put_back: Callable[[], object]) -> Callable[[], object]:
-    """For :func:`.unfinished.afterwards`, ``put_back`` of something that belongs to a variant: another one may be
-    active when it runs late.
-    """
+def clear_frames(error: BaseException, handled: BaseException | None = None) -> None:
+    """Drop the local variables in the frames of a traceback: attached arrays, and plugins of scenes out of use."""
+    for cause in chain_of(error, handled):
+        traceback.clear_frames(cause.__traceback__)
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Silence Mitsuba's warnings of parameters that it does not list as differentiable: our table knows better."""
     import mitsuba as mi
 
-    def run() -> None:
-        if variant is None or mi.variant() == variant:
-            put_back()
-            return
-        with active_variant(variant):
-            put_back()
-
-    return run
+    before = mi.logger().log_level()
+    mi.logger().set_log_level(mi.LogLevel.Error)
+    try:
+        yield
+    finally:
+        mi.logger().set_log_level(before)
 
 
 def is_differentiable(variant: str | None) -> bool:
-    """Whether a variant compiles kernels and differentiates (``llvm_ad_*``, ``cuda_ad_*``)."""
+    """Return whether a variant compiles kernels and differentiates (``llvm_ad_*``, ``cuda_ad_*``)."""
     return variant is not None and variant.startswith(("llvm_ad_", "cuda_ad_"))
 
 
@@ -141,29 +148,23 @@ def active_variant(variant: str) -> Iterator[None]:
     """Hold the engine lock with ``variant`` active and this library's plugins registered for it.
 
     Another active variant is put back at the end (a switch costs some 6 ms); when none was active, ``variant``
-    stays. Nested calls are free. An interrupt inside of it is raised as such.
+    stays. Nested calls are free. An interrupt inside of the block is raised as such.
     """
     import mitsuba as mi
 
     with at_work() as outermost:
         before = mi.variant()
-
-        def switch_back() -> None:
-            if mi.variant() == variant:  # and nobody has switched meanwhile
-                _put_back(before)
-
-        with afterwards(switch_back):
-            try:
-                if before != variant:
-                    _set_variant(variant)
-                    _count_switch(before, variant)
-                with interrupts_wait():
-                    plugins.sync()
-                if outermost:
-                    take_over(device_type(variant))
-                yield
-            finally:
-                _put_back(before)
+        try:
+            if before != variant:
+                _set_variant(variant)
+                _count_switch(before, variant)
+            with interrupts_wait():
+                plugins.sync()
+            if outermost:
+                take_over(device_type(variant))
+            yield
+        finally:
+            _put_back(before)
 
 
 def _put_back(before: str | None) -> None:
@@ -232,3 +233,67 @@ def _set_variant(variant: str) -> None:
         raise VariantError(
             f"variant {variant!r} could not be activated: {error}. Run `torchtransient doctor` to see what is missing."
         ) from error
+
+
+# --------------------------------------------------------------------------------------- errors of kernels
+
+# Dr.Jit's words for an exception inside a loop or call that it traces, and for forward mode that it cannot do.
+_INSIDE = "encountered an exception"
+_ACROSS = "dr.isolate_grad() scope"
+# And for a plugin that asks for the numbers of an array which is not there yet.
+_EVALUATED = ": not permitted. "
+
+
+@contextmanager
+def named_errors() -> Iterator[None]:
+    """For the time of a render: raise the error of this library that ended it, or one that names the reason."""
+    raised: BaseException | None = None
+    handled = sys.exc_info()[1]
+    try:
+        yield
+    except RuntimeError as error:
+        raised = _instead_of(error, handled)
+        if raised is error:
+            raise
+        clear_frames(error, handled)
+        raise raised from (None if raised in chain_of(error, handled) else error)
+    finally:
+        # A frame must not hold what it raises: both would stay until they are collected, and the scene with them.
+        del raised, handled
+
+
+def _instead_of(error: RuntimeError, handled: BaseException | None) -> BaseException:
+    chain = chain_of(error, handled)
+    own = next((cause for cause in chain if isinstance(cause, TorchTransientError)), None)
+    if own is None and any(words in str(error) for words in (_INSIDE, _ACROSS)):
+        return _named(_reason(chain))
+    return own or error
+
+
+def _reason(chain: list[BaseException]) -> BaseException:
+    """The first cause that says more than that something happened inside."""
+    return next((one for one in reversed(chain) if str(one) and "(see above)" not in str(one)), chain[-1])
+
+
+def _named(reason: BaseException) -> TorchTransientError:
+    words = " ".join(str(reason).split()).rstrip("!.")
+    if _ACROSS in words:
+        return GradientError(
+            "forward mode: Dr.Jit cannot push the tangent of a value into the calls that read it (known of attributes "
+            "of shapes with one number at each place, read as a roughness or the weight of a lobe). Use reverse mode, "
+            "or a 'bitmap' in the surface itself. Or another scene of this process holds values that are attached "
+            "(dr.enable_grad on its parameters, or values computed from such): Dr.Jit builds calls into all objects "
+            "alive. Detach them, or let that scene go."
+        )
+    if _EVALUATED in words:
+        return SceneError(
+            f"the scene cannot be rendered: one of its plugins evaluates an array while its kernel is built "
+            f"({words.split(_EVALUATED)[0]}). Mitsuba's 'timed_sunsky' does: describe a 'sunsky' at its time. A plugin "
+            "of your own may not look at values (print them, compare them in an `if`, make numpy arrays of them) in "
+            "methods that paths call."
+        )
+    hint = " A texture or volume may have another number of channels than the place that it stands in."
+    return SceneError(
+        f"the scene cannot be rendered, {type(reason).__name__} while its kernel was built: {words}."
+        + (hint if isinstance(reason, RuntimeError) else "")
+    )

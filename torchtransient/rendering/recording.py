@@ -1,8 +1,8 @@
-"""Jobs that are traced once and launched ever after: the recorded calls of one built scene.
+"""Recorded or traced: how the jobs of an integrator are executed on a built scene.
 
-The first call of a kind is traced as it comes, and fills what the scene remembers; the second is recorded
+The first call of a kind is traced as it comes, and fills the caches of the scene; the second is recorded
 (``dr.freeze``), and from the third on its kernels are launched. A recording is good for one structure: keys and film,
-samples, plan, which values need derivatives, layout of the adjoint, numbers of the plugins, see
+samples, plan, values that need derivatives, layout of the adjoint, numbers of the plugins, see
 :func:`torchtransient.plugins.frozen_state.state_below`; Dr.Jit tells types, sizes and flags of the arrays apart within
 it. Recordings hold kernels alone, no results; they are bounded in number and go with the scene.
 """
@@ -12,12 +12,13 @@ from __future__ import annotations
 import sys
 import warnings
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
-from torchtransient.errors import level_of_user
-from torchtransient.interfaces import BACKWARD
+from torchtransient.errors import SceneError, level_of_user
+from torchtransient.interfaces import BACKWARD, FORWARD, RENDER
 from torchtransient.plugins.frozen_state import WAITS, NotComparableError, not_recordable
+from torchtransient.rendering.job import Item
 
 # Structures of one built scene and set of keys, and recordings of each of them for other sizes and flags of arrays.
 MAX_STRUCTURES, MAX_RECORDINGS = 64, 8
@@ -33,6 +34,128 @@ PROGRESS = "traced: progress is reported"
 OWN_ENTRY = "traced: the integrator has a render of its own"
 
 
+# Items of one recording at most, and values of a film from which on each item is a call of its own.
+MOST_AT_ONCE, LARGE_FILM = 16, 2**18
+
+Numbered = tuple[int, Item]
+
+
+def groups_of(session: Any) -> Iterator[list[Numbered]]:
+    """Yield the items of a call, numbered, in groups that share their values and are one call of kernels.
+
+    A group holds the sensors of an entry of a batch where their films are small.
+    """
+    group: list[Numbered] = []
+    for n, item in enumerate(session.job.items):
+        most = 1 if session.entries(item) >= LARGE_FILM else MOST_AT_ONCE
+        if group and (len(group) >= most or item.entry != group[-1][1].entry):
+            yield group
+            group = []
+        group.append((n, item))
+    if group:
+        yield group
+
+
+def execute(session: Any, results: Any, group: Sequence[Numbered]) -> None:
+    """Execute the jobs of items with the same values: launched, recorded, or traced.
+
+    Args:
+        session: the built scene in use (:class:`.engine.Session`).
+        results: receives the results; installs values and has adjoints (:class:`.engine.Images` and its siblings).
+        group: the items.
+    """
+    job, integrator, kind = session.job, session.integrator, results.kind
+
+    def prepared(n: int, item: Item) -> Any:
+        seed, spp = (item.seed, job.spp) if kind == RENDER else (item.grad_seed, job.spp_grad)
+        return integrator.prepared(session.scene, item.sensor, seed, spp, kind, results.adjoint(n))
+
+    with results.storage(session.film(group[0][1]), group[0][0]) as lent:
+        own = _entry_of_its_own(integrator, kind)
+        reason = OWN_ENTRY if own is not None else refusal(session, results.progress(group[0][0]) is not None, lent)
+        results.install(group[0][1], group)
+        if reason is None:
+            jobs = [prepared(n, item) for n, item in group]
+            try:
+                call, arrays = session.recordings.run(jobs)
+            except NotRecordedError as error:
+                check_whole(session, error)
+                reason = str(error)
+                del jobs
+                if kind != RENDER:
+                    # Derivatives have used up the graph from the scene to the values.
+                    results.install(group[0][1], group)
+            else:
+                results.calls += [call] * len(group)
+                if kind == BACKWARD:
+                    results.collect(*group[-1])
+                    return
+                for (n, item), each, of_film in zip(group, jobs, arrays, strict=True):
+                    each.film.hold(of_film)
+                    results.collect(n, item)
+                return
+        results.calls += [reason] * len(group)
+        for i, (n, item) in enumerate(group):
+            if i > 0 and kind != RENDER:
+                results.install(item, group)
+            if own is None:
+                integrator.run(prepared(n, item), progress=results.progress(n))
+            else:
+                _call(own, session, results, n, item)
+            results.collect(n, item)
+
+
+def _entry_of_its_own(integrator: Any, kind: str) -> Any:
+    """Return the method of an integrator for a kind of job, where its class overrides that of the library's base."""
+    name = {RENDER: "render", BACKWARD: "render_backward", FORWARD: "render_forward"}[kind]
+    owner = next(base for base in type(integrator).__mro__ if name in vars(base))
+    return None if owner.__module__ == "torchtransient.plugins.integrators.base" else getattr(integrator, name)
+
+
+def _call(entry: Any, session: Any, results: Any, n: int, item: Item) -> None:
+    """Call an integrator's own method for a job."""
+    job, kind = session.job, results.kind
+    seed, spp = (item.seed, job.spp) if kind == RENDER else (item.grad_seed, job.spp_grad)
+    common = {"sensor": item.sensor, "seed": seed, "spp": spp}
+    if kind == RENDER:
+        entry(session.scene, **common, develop=False, progress_callback=results.progress(n))
+    elif kind == BACKWARD:
+        entry(session.scene, session.params, results.adjoint(n), **common)
+    else:
+        entry(session.scene, session.params, **common, develop=False)
+
+
+def refusal(session: Any, progress: bool = False, lent: bool = False) -> str | None:
+    """Return the reason why a call cannot be recorded, None where it can.
+
+    Args:
+        session: the built scene in use.
+        progress: the call reports its progress.
+        lent: its film writes to memory of a batch, of which a recording would have a copy.
+    """
+    import drjit as dr
+
+    if not session.job.freeze:
+        return SWITCHED_OFF
+    if not dr.flag(dr.JitFlag.KernelFreezing):
+        return NO_FREEZING
+    for slot in session.slots.slots:
+        if slot.is_number_of_kernels():
+            return f"traced: numbers of {slot.key} become part of the kernels"
+    return PROGRESS if progress else LARGE if lent else None
+
+
+def check_whole(session: Any, error: NotRecordedError) -> None:
+    """Raise ``SceneError``, and forget the built scene, where a recording that failed has left it broken."""
+    if error.broken:
+        session.job.scene.drop(session.job.options)
+        raise SceneError(
+            "a plugin written in Python changed the type of an attribute while its calls were recorded, for instance "
+            "from None to an array. Make it in parameters_changed, or take can_be_recorded = True out of its class. "
+            f"{error}"
+        ) from error
+
+
 class NotRecordedError(Exception):
     """A call could not be recorded, and is to be traced from its installation on; the text says why. ``broken``: the
     scene is not what it was.
@@ -42,7 +165,7 @@ class NotRecordedError(Exception):
 
 
 class Recordings:
-    """Those of one built scene, with the values of one set of keys."""
+    """Recorded calls of one built scene, with the values of one set of keys."""
 
     def __init__(self) -> None:
         self._found: OrderedDict[Any, Recording] = OrderedDict()
@@ -115,7 +238,7 @@ class Recordings:
 
 
 def _difference(before: tuple[Any, ...], now: tuple[Any, ...]) -> str:
-    """Where two structures part."""
+    """Return where two structures part, in words."""
     for a, b in zip(before, now, strict=False):
         if a != b:
             return f"what they depend on changed from {_short(a)} to {_short(b)}"

@@ -1,4 +1,4 @@
-"""Frequencies that a phasor film of mitransient keeps of a discrete Fourier transform."""
+"""Frequencies that a phasor film of mitransient keeps of a Fourier transform. Without Mitsuba: files have them too."""
 
 from __future__ import annotations
 
@@ -11,11 +11,21 @@ from torchtransient.errors import SceneError
 
 
 def transform_bins(wl_mean: float, wl_sigma: float, bins: int, width: float) -> NDArray[np.float64]:
-    """The frequencies of a discrete Fourier transform of ``bins`` bins within three sigma of ``1 / wl_mean``,
-    cycles per metre.
+    """Return the frequencies of a discrete Fourier transform within three sigma of ``1 / wl_mean``.
 
-    The rules of mitransient 1.3, which include the Nyquist frequency with its negative sign for even ``bins``.
-    Raises SceneError.
+    Follows mitransient 1.3, which includes the Nyquist frequency with its negative sign for even ``bins``.
+
+    Args:
+        wl_mean: wavelength of the mean frequency, metres.
+        wl_sigma: wavelength of the standard deviation of the frequencies, metres.
+        bins: number of bins of the transform.
+        width: width of a bin, metres.
+
+    Returns:
+        Cycles per metre, (F,) float64.
+
+    Raises:
+        SceneError: for lengths that are not positive, no bins, and bands beyond the shortest wavelength of the bins.
     """
     for name, value in (("wl_mean", wl_mean), ("wl_sigma", wl_sigma), ("bin_width_opl", width)):
         if not (math.isfinite(value) and value > 0):
@@ -31,5 +41,5 @@ def transform_bins(wl_mean: float, wl_sigma: float, bins: int, width: float) -> 
             f"{2 * width} m; use narrower bins or give frequencies."
         )
     index = np.arange(first, last + 1)
-    found: NDArray[np.float64] = np.where((index == bins // 2) & (bins % 2 == 0), -index, index) / window
-    return found
+    frequencies: NDArray[np.float64] = np.where((index == bins // 2) & (bins % 2 == 0), -index, index) / window
+    return frequencies

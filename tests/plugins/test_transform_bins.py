@@ -1,25 +1,13 @@
-"""Lengths that transforms are fast at, and the lines of a transform around a wavelength."""
+"""Lines of a transform around a wavelength."""
 
 from __future__ import annotations
-
-import itertools
 
 import numpy as np
 import pytest
 
 from support.sweeps import together
-from torchtransient.axes import fast_length
 from torchtransient.errors import SceneError
-from torchtransient.transform_bins import transform_bins
-
-SMOOTH = sorted(2**a * 3**b * 5**c for a, b, c in itertools.product(range(13), range(8), range(6)))
-
-
-@pytest.mark.parametrize("multiple", [1, 2, 7])
-def test_the_next_length_of_small_factors(multiple):
-    """Beside the list of all products of 2, 3 and 5."""
-    for least in (*range(1, 700), 4097, 4375):
-        assert fast_length(least, multiple) == next(multiple * n for n in SMOOTH if multiple * n >= least)
+from torchtransient.plugins.films.transform_bins import transform_bins
 
 
 @together("bins", [1, 2, 63, 64, 300])

@@ -1,9 +1,14 @@
-"""What an interrupt becomes when it comes while Python code runs below C++, a ``RuntimeError`` that names it; and how
-interrupts wait where nothing may be left half made.
+"""Guards of what must not be cut in two: signals that wait, a garbage collector that waits, interrupts below C++.
+
+A method call on Mitsuba's objects is compiled for all objects alive at that moment. When a scene is freed in the middle
+of a trace, two calls in one kernel are compiled for different numbers of objects, and where this changes "several" to
+"one" Dr.Jit 1.5 (LLVM) writes the same function twice: the compiler refuses, and the process is aborted. Scenes are
+freed by Python's garbage collector at any time, and by other threads: :func:`no_collection` keeps them.
 """
 
 from __future__ import annotations
 
+import gc
 import re
 import signal
 import threading
@@ -16,8 +21,10 @@ _PRINTED = re.compile(r"^(KeyboardInterrupt|SystemExit)\b(?:: (\d+)$)?", re.MULT
 
 
 def chain_of(error: BaseException, handled: BaseException | None = None) -> list[BaseException]:
-    """An exception and what caused it, the root last, hidden contexts (``from None``) included. It ends before
-    ``handled``, what was being handled at the call: a call in an ``except`` block did not fail because of it.
+    """Return an exception and its causes, the root last, hidden contexts (``from None``) included.
+
+    The chain ends before ``handled``, the exception handled at the call: a call in an ``except`` block did not fail
+    because of it.
     """
     found = [error]
     while (below := found[-1].__cause__ or found[-1].__context__) is not None and below not in found:
@@ -28,8 +35,9 @@ def chain_of(error: BaseException, handled: BaseException | None = None) -> list
 
 
 def interrupt_behind(error: BaseException, handled: BaseException | None = None) -> BaseException | None:
-    """The interrupt (or another exception that is no ``Exception``) that an error came of, None where it did not.
-    ``handled``: as :func:`chain_of`.
+    """Return the interrupt, or other exception that is no ``Exception``, that caused an error; None without one.
+
+    ``handled``: as for :func:`chain_of`.
     """
     chain = chain_of(error, handled)
     own = next((cause for cause in reversed(chain) if not isinstance(cause, Exception)), None)
@@ -52,9 +60,10 @@ _SIGNALS = tuple(getattr(signal, f"SIG{name}") for name in _NAMES if hasattr(sig
 
 @contextmanager
 def interrupts_wait() -> Iterator[None]:
-    """Delay the handlers of signals set in Python (Ctrl-C, alarms, a scheduler's SIGTERM) until the block is done: for
-    changes of the process that must not be left half made. Each is called once, as signals that wait in the system are.
-    Does nothing in other threads than the main one, where Python runs no handlers.
+    """Delay Python's handlers of signals (Ctrl-C, alarms, a scheduler's SIGTERM) to the end of the block.
+
+    For changes of the process that must not be left half made. Each handler is called once, as signals that wait in the
+    system are. Without effect outside of the main thread, where Python runs no handlers.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -81,3 +90,42 @@ def _put_back_handlers(left: list[tuple[int, Any]]) -> None:
     finally:
         if left:  # one of those put back has raised
             _put_back_handlers(left)
+
+
+# ------------------------------------------------------------------------------------------- no collection in a trace
+
+# Reentrant: freeing objects runs finalizers that free others.
+_lock = threading.RLock()
+# Blocks under way in all threads, whether the first of them stopped the collector, and objects to free after the last.
+_blocks = 0
+_stopped = False
+_waiting: list[Any] = []
+
+
+@contextmanager
+def no_collection() -> Iterator[None]:
+    """Hold back the garbage collector and :func:`let_go` in every thread. May be nested; also a decorator."""
+    global _blocks, _stopped
+    with _lock:
+        _blocks += 1
+        if gc.isenabled():
+            gc.disable()
+            _stopped = True
+    try:
+        yield
+    finally:
+        with _lock:
+            _blocks -= 1
+            if not _blocks:
+                _waiting.clear()
+                if _stopped:
+                    _stopped = False
+                    gc.enable()
+
+
+def let_go(contents: list[Any]) -> None:
+    """Empty a list that holds the last references to Mitsuba objects: now, or after the last :func:`no_collection`."""
+    with _lock:
+        if _blocks:
+            _waiting.extend(contents)
+        contents.clear()

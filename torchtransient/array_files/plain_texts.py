@@ -1,0 +1,122 @@
+"""YAML and JSON texts of any origin as plain data.
+
+Nothing is executed, and aliases expand to no more nodes than the text has characters. Every failure is a StorageError
+of one line.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+from torchtransient.checks import check_special, path_of, short_message
+from torchtransient.errors import StorageError, TorchTransientError
+
+MOST_LEVELS = 100
+# Most nodes of a text with fewer characters, once aliases are expanded.
+_NODES = 2**16
+_WITHOUT_POINT = re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+")
+# Errors of PyYAML's constructors and Python's parsers for texts in another format.
+_WRONG = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, RecursionError, MemoryError)
+
+
+def text_of_file(path: Any, what: str) -> str:
+    """Return the text of a file in UTF-8.
+
+    Args:
+        path: path of the file.
+        what: subject of messages.
+
+    Raises:
+        StorageError: for missing and unreadable files, and for devices and pipes, which may have no end.
+    """
+    check_special(path_of(path, what), what)
+    try:
+        return Path(path).read_text(encoding="utf-8")
+    except (OSError, ValueError, TypeError) as error:
+        reason = short_message(error)
+        raise StorageError(f"{what}: expected a text, but '{str(path)[:200]}' cannot be read: {reason}.") from error
+
+
+def json_data(text: str | bytes, what: str) -> Any:
+    """Return the data of a JSON text. Raises StorageError; ``what``: subject of its message."""
+    try:
+        return json.loads(text)
+    except _WRONG as error:
+        raise StorageError(f"{what}: expected JSON, got what cannot be read: {short_message(error)}.") from error
+
+
+def yaml_data(text: str, what: str, yaml: Any, loader: Any = None, most_nodes: int | None = None) -> Any:
+    """Return the data of a YAML text, with 1e-10 as a number.
+
+    Args:
+        text: the text.
+        what: subject of messages.
+        yaml: the package PyYAML.
+        loader: one of its safe loaders, None for :func:`safe_loader`.
+        most_nodes: most nodes with aliases expanded; by default the number of characters, 65536 at least.
+
+    Raises:
+        StorageError: for texts in another format, more than 100 levels and more than ``most_nodes`` nodes.
+        TorchTransientError: errors that constructors of ``loader`` raise.
+    """
+    loader = loader or safe_loader(yaml)
+    try:
+        _check_events(yaml, text, what, most_nodes or max(_NODES, len(text)))
+        return yaml.load(text, Loader=reads_exponents(type("Loader", (loader,), {})))
+    except TorchTransientError:
+        raise
+    except yaml.YAMLError as error:
+        raise StorageError(f"{what}: expected YAML, got what cannot be read{_place(error)}.") from error
+    except _WRONG as error:
+        raise StorageError(f"{what}: expected YAML, got what cannot be read: {short_message(error)}.") from error
+
+
+def safe_loader(yaml: Any) -> Any:
+    """Return the loader of PyYAML that makes plain data only, the one in C if it is installed."""
+    return getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+def reads_exponents(loader: Any) -> Any:
+    """Return a loader class of PyYAML after changing it to read plain 1e-10 as a number, as JSON and YAML 1.2 do.
+
+    Quoted 1e-10 stays a text. PyYAML follows YAML 1.1, where a number needs a point.
+    """
+    loader.add_implicit_resolver("tag:yaml.org,2002:float", _WITHOUT_POINT, list("-+0123456789"))
+    return loader
+
+
+def _place(error: Any) -> str:
+    """Return place and reason of a syntax error."""
+    mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
+    if mark is None or problem is None:
+        return f": {short_message(error)}"
+    context = getattr(error, "context", None)
+    reason = f"{context}: {problem}" if context else str(problem)
+    return f" in line {mark.line + 1}, column {mark.column + 1}: {short_message(ValueError(reason))}"
+
+
+def _check_events(yaml: Any, text: str, what: str, most: int) -> None:
+    """Raise StorageError for too many nodes, aliases expanded, or levels, before anything is built."""
+    sizes: list[int] = [0]
+    anchors: dict[str, int] = {}
+    names: list[str | None] = [None]
+    for event in yaml.parse(text, Loader=safe_loader(yaml)):
+        if isinstance(event, yaml.AliasEvent):
+            sizes[-1] += anchors.get(event.anchor, 1)
+        elif isinstance(event, yaml.ScalarEvent):
+            sizes[-1] += 1
+            if event.anchor is not None:
+                anchors[event.anchor] = 1
+        elif isinstance(event, yaml.CollectionStartEvent):
+            sizes.append(1)
+            names.append(event.anchor)
+        elif isinstance(event, yaml.CollectionEndEvent):
+            size, name = sizes.pop(), names.pop()
+            sizes[-1] += size
+            if name is not None:
+                anchors[name] = size
+        if len(sizes) > MOST_LEVELS or sizes[-1] > most:
+            raise StorageError(f"{what}: expected YAML of at most {most:,} nodes and {MOST_LEVELS} levels, got more.")

@@ -1,0 +1,259 @@
+"""Job of a call: everything about it that is no tensor; seeds and numbers of samples."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping, Sequence, Set
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+
+from torchtransient.checks import as_whole, shown
+from torchtransient.errors import ShapeError, TorchTransientWarning, UnitError, level_of_user
+from torchtransient.scene.edits import BuildOptions
+from torchtransient.scene.load import Scene
+from torchtransient.scene.physics import PhysicsWatch
+from torchtransient.scene.pilot import DepthBound
+from torchtransient.scene.variant import quiet
+
+SEED_RANGE = 2**32
+
+
+@dataclass(frozen=True)
+class Item:
+    """One film to fill: entry of the batch, sensor, and seeds of the render and of its derivatives."""
+
+    entry: int
+    sensor: int
+    seed: int
+    grad_seed: int
+
+
+@dataclass(frozen=True)
+class Seeding:
+    """Films of a call, and how their seeds follow from the call's.
+
+    Args:
+        sensors: indices of the sensors.
+        entries: size of the batch.
+        grad_seed: seed of derivatives, as the renderer takes it.
+    """
+
+    sensors: tuple[int, ...]
+    entries: int
+    grad_seed: int | str | None
+
+    def items(self, seed: Any) -> tuple[Item, ...]:
+        """Return one item for each entry and sensor; ``seed`` is a whole number, or one for each entry."""
+        per_entry = len(self.sensors)
+        if (number := whole_number(seed)) is not None:
+            _warn_of_range([number])
+            seeds = [mix_seed(number, n) for n in range(self.entries * per_entry)]
+        else:
+            given = [_each_number(one) for one in seed]
+            if len(given) != self.entries:
+                raise ShapeError(
+                    f"seed: expected one integer, or one for each of {self.entries} batch entries, got {len(given)}."
+                )
+            _check_distinct(given)
+            _warn_of_range(given)
+            seeds = [mix_seed(s, n) for s in given for n in range(per_entry)]
+        return tuple(
+            Item(n // per_entry, self.sensors[n % per_entry], value, self._of_gradient(value, n))
+            for n, value in enumerate(seeds)
+        )
+
+    def _of_gradient(self, seed: int, number: int) -> int:
+        if self.grad_seed == "same":
+            return seed
+        if isinstance(self.grad_seed, int):
+            return mix_seed(self.grad_seed, number)
+        return mix_seed(seed, 0x5EED)
+
+
+@dataclass(frozen=True)
+class RunLog:
+    """Report of one render, item by item.
+
+    Args:
+        items: films that were filled.
+        seconds: wall time.
+        integrator: plugin name.
+        spp: samples per pixel that were drawn.
+        energy_before, energy_after: light before and after the window.
+        energy_total: all light.
+        recorded: how each call was made: launched, recorded, or the reason why it was traced.
+        max_depth: of the integrator, -1 for no limit, None for one without.
+    """
+
+    items: tuple[Item, ...]
+    seconds: float
+    integrator: str
+    spp: int
+    energy_before: tuple[float, ...]
+    energy_after: tuple[float, ...]
+    energy_total: tuple[float, ...]
+    recorded: tuple[str, ...]
+    max_depth: int | None = None
+
+
+@dataclass(frozen=True)
+class RenderJob:
+    """Everything about a call that is no tensor. Does not change but for its two logs.
+
+    Args:
+        scene, options, keys: what is built, and which of its parameters the values are for.
+        items: films to fill, empty where the seed is known later; ``seeding`` makes them then.
+        batched: for each value, whether it has a leading batch dimension.
+        spp, spp_grad: samples per pixel of the render and of its derivatives.
+        temporal_filter: of the films; None for the scene's.
+        watch: warns of unphysical values.
+        needs: for each value, whether it wants a derivative.
+        bound: on the depth; None for the scene's.
+        boundary, spp_boundary: whether derivatives have the boundary term, and its samples per pixel; None for the
+            integrator's.
+        progress: called with the fraction that is done.
+        freeze: whether calls are recorded.
+        at_call: values of a shared scene at the call.
+        log: a report of each render; under ``vmap`` a call is several.
+        derivative_log: how the calls of its derivatives were made.
+    """
+
+    scene: Scene
+    options: BuildOptions
+    keys: tuple[str, ...]
+    items: tuple[Item, ...]
+    seeding: Seeding
+    batched: tuple[bool, ...]
+    spp: int
+    spp_grad: int
+    temporal_filter: str | None
+    watch: PhysicsWatch
+    needs: tuple[bool, ...] = ()
+    bound: DepthBound | None = None
+    boundary: bool = True
+    spp_boundary: int | None = None
+    progress: Callable[[float], None] | None = None
+    freeze: bool = True
+    at_call: list[Mapping[str, Any]] = field(default_factory=list)
+    log: list[RunLog] = field(default_factory=list)
+    derivative_log: list[str] = field(default_factory=list)
+
+    def seeded(self, seed: torch.Tensor | None) -> RenderJob:
+        """Return the job with the items of a seed, known inside of a ``vmap`` alone; None for its own items."""
+        return self if seed is None else replace(self, items=self.seeding.items(int(seed.item())))
+
+
+# ------------------------------------------------------------------------------------------------------------ seeds
+
+
+def _warn_of_range(seeds: list[int]) -> None:
+    """Warn of seeds that count as others."""
+    beyond = [seed for seed in seeds if not 0 <= seed < SEED_RANGE]
+    if beyond:
+        warnings.warn(
+            f"seed: expected whole numbers from 0 to 2^32 - 1, got {shown(beyond[0])}, which counts as "
+            f"{beyond[0] % SEED_RANGE}: seeds count modulo 2^32.",
+            TorchTransientWarning,
+            stacklevel=level_of_user(),
+        )
+
+
+def _check_distinct(seeds: list[int]) -> None:
+    """Raise UnitError for seeds that are not the same and count as the same: their renders would have one noise."""
+    seen: dict[int, int] = {}
+    for seed in seeds:
+        other = seen.setdefault(seed % SEED_RANGE, seed)
+        if other != seed:
+            raise UnitError(f"seed: {other} and {seed} are one seed: seeds count modulo 2^32. Take others.")
+
+
+def drawn(seed: int | Sequence[int] | torch.Tensor | None) -> tuple[Any, torch.Tensor | None]:
+    """Return the seed of a call as (seed, None), or as (None, tensor) where ``vmap`` has one for each of its entries.
+
+    None draws from torch's generator, under ``vmap`` as its ``randomness`` says. Raises ``UnitError`` where that is
+    "error", as it is unless something else is asked for.
+    """
+    if seed is None:
+        try:
+            seed = torch.randint(0, SEED_RANGE, (), dtype=torch.int64)
+        except RuntimeError as error:
+            if "randomness" not in str(error):
+                raise
+            raise UnitError(
+                "seed: under torch.func.vmap a render without a seed would draw random numbers for all entries. Pass "
+                "seed=..., which every entry uses, or say what is meant: vmap(..., randomness='same') draws one seed "
+                "for all entries, randomness='different' one for each."
+            ) from error
+    if not isinstance(seed, torch.Tensor) or seed.ndim != 0 or seed.is_floating_point() or seed.dtype == torch.bool:
+        return seed, None
+    try:
+        return int(seed.item()), None
+    except RuntimeError:
+        # Its number differs from entry to entry of a `vmap`: the autograd function takes it apart.
+        return None, seed
+
+
+def whole_number(seed: Any) -> int | None:
+    """Return a seed as one number; None for a sequence. Raises ``UnitError`` for anything else."""
+    number = as_whole(seed)
+    if number is not None:
+        return number
+    try:
+        several = len(seed) >= 0 and not isinstance(seed, (str, bytes, Mapping, Set))
+    except TypeError:
+        several = False
+    if not several:
+        raise UnitError(f"seed: expected a whole number, or one for each batch entry, got {shown(seed)}.")
+    return None
+
+
+def _each_number(seed: Any) -> int:
+    number = as_whole(seed)
+    if number is None:
+        raise UnitError(f"seed: expected whole numbers, one for each batch entry, got {shown(seed)} among them.")
+    return number
+
+
+def mix_seed(seed: int, number: int) -> int:
+    """A 32-bit seed that looks unrelated to ``seed``; 0 leaves it as it is (a splitmix64 step, Steele et al. 2014)."""
+    if number == 0:
+        return seed % SEED_RANGE
+    z = (seed + number * 0x9E3779B97F4A7C15) % 2**64
+    z = ((z ^ (z >> 30)) * 0xBF58476D1CE4E5B9) % 2**64
+    z = ((z ^ (z >> 27)) * 0x94D049BB133111EB) % 2**64
+    return (z ^ (z >> 31)) % SEED_RANGE
+
+
+# ------------------------------------------------------------------------------------------------ numbers of samples
+
+
+def rounded_count(asked: int, known: dict[int, int], drawn: Callable[[int], int]) -> int:
+    """Return the number of samples that a sampler draws for ``asked``, and warn once where it differs.
+
+    Args:
+        asked: samples per pixel.
+        known: numbers that were found before, to which this one is added.
+        drawn: asks the sampler.
+    """
+    if asked not in known:
+        known[asked] = drawn(asked)
+        if known[asked] != asked:
+            warnings.warn(
+                f"spp={asked} is rounded to {known[asked]}, a number of samples that the scene's sampler can draw.",
+                TorchTransientWarning,
+                stacklevel=level_of_user(),
+            )
+    return known[asked]
+
+
+def samples_drawn(sampler: Any, count: int | None) -> int:
+    """Set a sampler's number of samples, None for its own, and return the number that it draws.
+
+    Mitsuba's message that it rounds is held back: it comes at every call. Under the engine lock.
+    """
+    with quiet():
+        if count is not None:
+            sampler.set_sample_count(count)
+    return int(sampler.sample_count())
