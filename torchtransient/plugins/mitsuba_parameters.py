@@ -199,7 +199,7 @@ def _is_weight_in(cls: str, site: Site) -> bool:
 
 
 def _is_lost_in(cls: str, site: Site) -> bool:
-    """Return whether one is lost now."""
+    """Return whether a BSDF of the class ``cls`` has lost such a lobe at the current value."""
     held = [(holder, name) for holder, name in site.owners if holder.class_name() == cls and lost_at(holder, name)]
     with dr.suspend_grad():
         if cls in PLASTICS:

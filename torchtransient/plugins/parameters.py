@@ -239,7 +239,7 @@ class ParameterTracker:
         return [(holder, name) for holder, name in owners if is_replaced_for(holder, name)]
 
     def loses_black(self, node: Any, key: str) -> bool:
-        """Return whether the derivative by a plugin's numbers is lost where they are zero (:mod:`.black_textures`)."""
+        """Return whether the derivative by a plugin's numbers is lost where they are zero (:func:`loses_black`)."""
         return loses_black(node, key, self._owners_of(node, key))
 
     def check_black(self) -> None:
@@ -250,7 +250,7 @@ class ParameterTracker:
         )
 
     def location_of(self, node: Any, key: str) -> tuple[str, ...]:
-        """Names of a parameter and of everything that it is in (:mod:`.swept_parameters`)."""
+        """Names of a parameter and of everything that it is in (:func:`.parameter_effect.is_checked`)."""
         name = key.rsplit(".", 1)[-1]
         return location_of(Site(node, name, self._owners_of(node, name)))
 

@@ -1,4 +1,4 @@
-"""Light of four and more bounces from chains that neighbouring scan points share (:mod:`.chains`).
+"""Light of four and more bounces from chains that neighbouring scan points share (:class:`ChainPlan`).
 
 A scan point sees the heads of its tile's chains, a laser spot the vertices of their tails: one ray each. What is in
 between is the same for all points of the tile, so that an event costs two loads and a product::
@@ -345,9 +345,8 @@ class LateLaunch:
 class LateLight:
     """Late light of one capture, of ``lowest`` to ``highest`` bounces (within ``FIRST`` and ``MOST``).
 
-    ``job``: a :class:`.scan_job.ScanJob`; ``elements``: the density of heads, see
-    :mod:`.late_density`; ``lasers``: the spots, one each of the scan points in confocal captures. ``side``: scan points
-    of a tile along each side of the scan; ``size``: chains of a group, a power of two.
+    ``job``: a :class:`.launches.ScanJob`; ``elements``: the density of heads, see :func:`.shared_light.late_density`;
+    ``lasers``: the spots, one each of the scan points in confocal captures. ``side``: scan points of a tile along each side of the scan; ``size``: chains of a group, a power of two.
 
     Mono and RGB variants, diffuse surfaces, every film. Not supported: derivatives.
     """

@@ -103,7 +103,7 @@ def ends_of_samples(scene: Any, elements: Any, samples: Any, meshes: Any, laser:
     """Shared samples as material points: ``p``, ``n``, ``front`` and ``back`` (what the sides scatter of light, times
     the area that a sample stands for), and ``geometric_n`` where normals are interpolated.
 
-    ``laser`` (:class:`.wall_points.WallPoints` of one point): the spot that lights them all. ``n`` then points to the
+    ``laser`` (:class:`.geometry.WallPoints` of one point): the spot that lights them all. ``n`` then points to the
     side that is lit, ``front`` holds what arrives there, and ``delay`` is the length of the way to the spot.
     """
     found = material_samples(elements, samples, meshes)
@@ -146,7 +146,7 @@ BUSY = 2**14
 
 
 class ThirdBounceGradients:
-    """One job of derivatives. ``samples`` and ``points``: :class:`.attached.Ends`, attached; ``clear``: how many of the
+    """One job of derivatives. ``samples`` and ``points``: :class:`Ends`, attached; ``clear``: how many of the
     samples, the first ones, nothing can hide.
 
     A plain class, which Dr.Jit loops leave alone.

@@ -197,7 +197,7 @@ DEFENSIVE = 0.1
 
 class HiddenElements:
     """A density over the area of ``shapes``: uniform within an element, see :mod:`.area_elements`; triangles that are
-    large beside their distance from the wall are several elements (:mod:`.split_triangles`).
+    large beside their distance from the wall are several elements (:func:`cut`).
 
     The probability of an element is its area times the root mean square over wall points of ``cos^2 cos^2 / r^4``
     (both cosines, to the wall point and there), mixed with ``defensive`` of plain area. ``points`` and ``normals``

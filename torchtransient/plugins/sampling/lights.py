@@ -108,7 +108,7 @@ _MARGIN = 1.001
 
 class MovingSun:
     """The disk of one sky. ``rare``: it is hardly ever drawn, and paths that escape into it have to do
-    (:mod:`.rare_lights`).
+    (:func:`is_rare`).
 
     A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
     """

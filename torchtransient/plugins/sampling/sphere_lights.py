@@ -155,7 +155,7 @@ _PACKET = 4
 class SphereLights:
     """The spherical lights among those of a scene; ``numbers``: which ones. ``all``: there are no others; ``others``:
     how these are sampled. ``textured``: one of them has a texture. ``marks``: one plus the place of each in the table,
-    zero for all others. ``least_pmf``: of lights that are hardly ever drawn less (:mod:`.rare_lights`).
+    zero for all others. ``least_pmf``: of lights that are hardly ever drawn less (:func:`.lights.is_rare`).
     """
 
     def __init__(self, scene: Any, numbers: list[int]) -> None:
