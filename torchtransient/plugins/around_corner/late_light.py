@@ -346,7 +346,8 @@ class LateLight:
     """Late light of one capture, of ``lowest`` to ``highest`` bounces (within ``FIRST`` and ``MOST``).
 
     ``job``: a :class:`.launches.ScanJob`; ``elements``: the density of heads, see :func:`.shared_light.late_density`;
-    ``lasers``: the spots, one each of the scan points in confocal captures. ``side``: scan points of a tile along each side of the scan; ``size``: chains of a group, a power of two.
+    ``lasers``: the spots, one each of the scan points in confocal captures. ``side``: scan points of a tile
+    along each side of the scan; ``size``: chains of a group, a power of two.
 
     Mono and RGB variants, diffuse surfaces, every film. Not supported: derivatives.
     """
