@@ -273,7 +273,7 @@ class ParameterTracker:
 
 
 def can_carry_gradients(value: Any) -> bool:
-    """Return whether a parameter is a floating-point Dr.Jit array, not a Python number or an integer."""
+    """Return whether a parameter is a floating-point Dr.Jit array or a transform of one, not a plain number."""
     if "Transform" in type(value).__name__:  # by name: Dr.Jit arrays answer to any attribute made of component letters
         value = value.matrix
     return value is not None and bool(dr.is_diff_v(value) and dr.is_float_v(value))

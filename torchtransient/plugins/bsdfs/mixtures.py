@@ -65,8 +65,8 @@ def mirrors_matrices(bsdf: Any) -> bool:
 
 
 def _has(bsdf: Any, attribute: str, itself: Callable[[Any], bool], ends: Callable[[Any], bool]) -> bool:
-    """Return whether ``bsdf`` or a BSDF that it holds declares ``attribute`` or satisfies ``itself``; the search stops
-    below BSDFs that satisfy ``ends``.
+    """Return the ``attribute`` that ``bsdf`` declares, else whether it or a BSDF below satisfies ``itself``; the search
+    stops at BSDFs that satisfy ``ends``.
     """
     declared = getattr(bsdf, attribute, None)
     if declared is not None:

@@ -66,8 +66,7 @@ def _refracts_all(eta: Any) -> bool:
 
 
 def _beside_one(eta: Any) -> Any:
-    """Move an index of exactly one aside, where its slope would divide by zero; smooth coatings have no limit there.
-    """
+    """Move an index off exactly one, where its slope would divide by zero; smooth coatings have no limit there."""
     return dr.select(dr.detach(eta) == 1, 1 + _ABOVE, eta)
 
 
