@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from support.plain_scenes import camera, load
+from support.walks import launches as launches_of
 from torchtransient.errors import GradientError, SceneError, TorchTransientWarning, UnitError
 from torchtransient.plugins.integrators import job as launch
 from torchtransient.plugins.integrators.job import IncomingAdjoint, passes_of, seed_array, share_of
@@ -222,8 +223,7 @@ def test_a_shutter_spreads_the_moments_of_rays():
         with dr.suspend_grad():
             sensor, film = integrator.resolve(one, 0)
             contents = integrator.contents(one, sensor)
-            world = integrator.world(one, contents)
-            job = integrator.passes(world, sensor, film, 3, 64)[0][0]
+            job = launches_of(integrator.world(one, contents), sensor, film, 3, 64)[0]
             times.append(np.array(integrator.start(one, contents, sensor, film, job).ray.time))
     assert times[0].min() >= 2 and times[0].max() < 5
     np.testing.assert_allclose(np.quantile(times[0], [0.25, 0.5, 0.75]), [2.75, 3.5, 4.25], atol=0.15)

@@ -8,6 +8,7 @@ import pytest
 
 from support.plain_scenes import camera, load
 from support.runs import T
+from support.walks import launches
 from torchtransient.accuracy.statistics import two_sample_z_test, z_test
 from torchtransient.plugins.films import phasor_sums
 
@@ -164,7 +165,7 @@ def test_several_launches_and_bands(monkeypatch):
         film = scene.sensors()[0].film()
         integrator, sensor = scene.integrator(), scene.sensors()[0]
         world = integrator.world(scene, integrator.contents(scene, sensor))
-        assert len(integrator.passes(world, sensor, film, 0, 16)[0]) > 1
+        assert len(launches(world, sensor, film, 0, 16)) > 1
         several = np.array([render(scene, 30 + seed)[1] for seed in range(12)])
         for part in (np.real, np.imag):
             result = two_sample_z_test(part(one), part(several), rounding=1e-6)

@@ -8,10 +8,9 @@ import pytest
 from support.marks import long
 from support.media_scenes import film, homogeneous, load, rgb
 from support.runs import T, runs
+from support.walks import RecordedVertex, RecordSink, trace
 from torchtransient.accuracy.statistics import z_test
 from torchtransient.plugins.transport.context import Wanted
-from torchtransient.plugins.transport.record import RecordedVertex, RecordSink
-from torchtransient.plugins.transport.walk import walk
 
 VARIANT = "llvm_ad_mono"
 
@@ -40,7 +39,7 @@ def vertices(scene, lanes, seed):
         ray, _ = sensor.sample_ray(mi.Float(0), mi.Float(0), mi.Point2f(0.5), mi.Point2f(0.5))
         ray.o, ray.d = [dr.repeat(x, lanes) if dr.width(x) == 1 else x for x in (ray.o, ray.d)]
         sink = RecordSink()
-        count, store = walk(world, sampler, ray, mi.Float64(0), sink)
+        count, store = trace(world, sampler, ray, mi.Float64(0), sink)
         points, lengths, weights = [], [], []
         for k in range(integrator.max_depth):
             there = mi.UInt32(k) < count

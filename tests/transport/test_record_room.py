@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
@@ -108,21 +109,6 @@ def test_stacks_of_python_threads_are_asked_for():
     assert 2**10 < found[0] <= 2**19 < 16 * record_room.room_of_path()
 
 
-def test_the_first_thread_is_asked_once_for_each_limit(monkeypatch):
-    resource = pytest.importorskip("resource")
-    limits, asked = [(2**20, -1), (2**20, -1), (2**21, -1)], []
-    monkeypatch.setattr(resource, "getrlimit", lambda kind: limits[0])
-    monkeypatch.setattr(record_room, "_stack_of_this_thread", lambda: asked.append(limits[0][0]) or 1000)
-    record_room._stack_of_first_thread.cache_clear()
-    try:
-        while limits:
-            assert record_room._smallest_stack() == 1000
-            limits.pop(0)
-    finally:
-        record_room._stack_of_first_thread.cache_clear()
-    assert asked == [2**20, 2**21]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("variant", [VARIANT, "llvm_ad_mono"])
 def test_paths_of_twenty_thousand_bounces(variant):
@@ -182,9 +168,14 @@ def test_where_a_record_lies(monkeypatch):
     """On the stack up to its room, in memory up to as much as all paths may take, at most so many at once."""
     monkeypatch.setattr(record_room, "room_of_path", lambda: 1000)
     monkeypatch.setattr(record_room, "MEMORY", 2300)
-    of = record_room.RecordRoom.of
-    assert of(100, 10) == record_room.RecordRoom(in_memory=False, lanes=None, room=1000)
-    assert of(100, 11) == record_room.RecordRoom(in_memory=True, lanes=2, room=1000)
-    assert of(100, 23) == record_room.RecordRoom(in_memory=True, lanes=1, room=1000)
+    monkeypatch.setattr(record_room.RecordLayout, "__init__", lambda layout, context: None)
+    monkeypatch.setattr(record_room.RecordLayout, "bytes_of_vertex", lambda layout: 100)
+
+    def of(vertices):
+        return record_room.record_room(SimpleNamespace(max_depth=vertices - 1))
+
+    assert of(10) == record_room.RecordRoom(in_memory=False, lanes=None, room=1000)
+    assert of(11) == record_room.RecordRoom(in_memory=True, lanes=2, room=1000)
+    assert of(23) == record_room.RecordRoom(in_memory=True, lanes=1, room=1000)
     with pytest.raises(GradientError, match=r"100 bytes a bounce.*max_depth up to 22 .*, got 23\."):
-        of(100, 24)
+        of(24)

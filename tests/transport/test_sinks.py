@@ -9,10 +9,10 @@ import pytest
 
 from support.marks import long
 from support.plain_scenes import as_mitsuba
+from support.walks import primary_rays, trace
 from torchtransient.plugins.transport.record import Arrivals, read_ahead
 from torchtransient.plugins.transport.sinks import AdjointSumSink, EventListSink, FilmSink, Sink
 from torchtransient.plugins.transport.strategy import Local
-from torchtransient.plugins.transport.walk import walk
 from torchtransient.scenes import cornell_box
 
 VARIANT = "llvm_ad_mono"
@@ -33,14 +33,11 @@ def scene_of(kind, depth=5):
 
 def traced(scene, sink_of):
     """The paths of one pass: (the sink of ``sink_of(integrator, contents, film, rays, job)``, what it kept)."""
-    integrator = scene.integrator()
+    of = primary_rays(scene, SEED, SPP)
     with dr.suspend_grad():
-        sensor, film = integrator.resolve(scene, 0)
-        world = integrator.world(scene, integrator.contents(scene, sensor))
-        job = integrator.passes(world, sensor, film, SEED, SPP)[0][0]
-        rays = integrator.start(scene, world.contents, sensor, film, job)
-        sink = sink_of(integrator, world.contents, film, rays, job)
-        _, kept = walk(world, rays.sampler, dr.detach(rays.ray), integrator.first_opl(film, rays), sink)
+        sink = sink_of(of.integrator, of.contents, of.film, of.rays, of.job)
+        first_opl = of.integrator.first_opl(of.film, of.rays)
+        _, kept = trace(of.context, of.rays.sampler, dr.detach(of.rays.ray), first_opl, sink)
         dr.eval(kept)
         return sink, kept
 

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from support.plain_scenes import camera, load
+from support.walks import trace
 from torchtransient.plugins.films.block import ArrivalWindow
 from torchtransient.plugins.transport.context import PathSettings, RenderContext
 from torchtransient.plugins.transport.sinks import Sink
 from torchtransient.plugins.transport.strategy import Connection, Event, Local, Step, Vertex
-from torchtransient.plugins.transport.walk import roulette, start, walk
+from torchtransient.plugins.transport.walk import roulette, start
 
 VARIANT = "llvm_ad_rgb"
 
@@ -190,10 +191,9 @@ class Connected(Connection):
     name, finds_light = "connected", False
 
     def __init__(self, first=True):
-        self.first, self.dark_at_first, self.asked = first, not first, []
+        self.first, self.dark_at_first = first, not first
 
     def connect(self, world, path, vertex, proposal, answer, zeros):
-        self.asked.append("connection")
         active = vertex.goes_on & (mi.Bool(self.first) | (path.depth > 0))
         return Event(value=mi.Spectrum(3), opl=vertex.scattered_τ, active=active, depth=path.depth + 2)
 
@@ -201,8 +201,8 @@ class Connected(Connection):
 class Numbers(Sink):
     """Events by depth, four bits each, their light and lengths; with ``vertices`` what paths are there."""
 
-    def __init__(self, vertices, asked):
-        self.keeps_vertices, self.asked = vertices, asked
+    def __init__(self, vertices):
+        self.keeps_vertices = vertices
 
     def begin(self, world):
         kept = {"events": mi.UInt32(0), "light": mi.Spectrum(0), "opl": mi.Float64(0)}
@@ -214,7 +214,6 @@ class Numbers(Sink):
         kept["opl"] += dr.select(event.active, event.opl, 0)
 
     def vertex(self, kept, path, samples):
-        self.asked.append("vertex")
         walk = samples["walk"]
         seen = {"τ": walk.τ, "β": walk.β[0], "η": walk.η, "pdf": path.prev_pdf, "n": path.prev_n.z}
         seen |= {"off": dr.norm(path.prev_p), "goes_on": dr.select(walk.goes_on, 1.0, 0.0)}
@@ -229,8 +228,8 @@ def walked(connection, most, vertices=False, leg=None, window=lambda active, τ,
                   finds_light=connection.finds_light, dark_at_first=connection.dark_at_first,
                   plays_roulette=False)  # fmt: skip
     ray = mi.Ray3f(mi.Point3f(0, 0, mi.Float([0] * 4)), mi.Vector3f(0, 0, 1))
-    sink = Numbers(vertices, getattr(connection, "asked", []))
-    count, kept = walk(world, None, ray, mi.Float64(0.125), sink, 1.25, leg)
+    sink = Numbers(vertices)
+    count, kept = trace(world, None, ray, mi.Float64(0.125), sink, 1.25, leg)
     dr.eval(count, kept)
     return np.broadcast_to(np.array(count), 4), kept
 
@@ -258,19 +257,6 @@ def test_events_of_a_walk(most, vertices):
             assert list(count) == [min(end + 1, max(most - 1, min(most, 1))) for end in Line.ends]
         elif not first and most == 2:
             assert list(count) == [0] * 4  # nothing is to be found: no turn is taken
-
-
-def test_no_turn_is_traced_in_vain():
-    """Of a last vertex connections alone are asked, which is no turn where vertices are kept; of the second of three
-    where the first one is dark, there is no loop.
-    """
-    for vertices, last in ((False, "connection"), (True, "vertex")):
-        connection = Connected()
-        walked(connection, 4, vertices)
-        assert connection.asked[-1] == last
-    connection = Connected(first=False)
-    walked(connection, 3)
-    assert connection.asked == ["vertex", "connection"]
 
 
 def digits(values):

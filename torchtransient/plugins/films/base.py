@@ -325,7 +325,7 @@ class TimeResolvedFilm(mi.Film):
 
     def entries_per_pixel(self) -> int:
         """Return the number of floats behind one pixel."""
-        return self.laser_count() * self.entries_per_array()
+        return self.laser_count() * math.prod(self.cube_shape()[-2:])
 
     def pixel_base(self, base, laser):
         """Index of the array of one laser position (``row * laser_scan_width + column``, None without a scan), where

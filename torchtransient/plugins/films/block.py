@@ -14,11 +14,18 @@ from torchtransient.plugins.polarized import light_type
 
 
 class FilmBlock:
-    """The samples of one pass: which band of the film they write to, from which entry on, with which weight; whether
-    each of them has a ``base`` of its own (``exclusive``); from which length on theirs are counted (``origin``).
+    """Events of the samples of one launch on their way to the film.
 
     A loop calls ``begin`` once, ``put`` (or ``put_slope`` in forward mode) for every event and ``end`` after the last
-    one; whoever launched the loop calls ``finish`` when all of it is recorded. A histogram writes every event at once.
+    one; the integrator calls ``finish`` behind the loop. A histogram writes every event at once.
+
+    Args:
+        film: film that is written to.
+        band: number of its storage band.
+        base: index of each sample's first entry in the band, UInt32.
+        match: :class:`.colour.ChannelMatch` of the samples.
+        exclusive: every sample has a base of its own.
+        origin: path length (Float64, by sample) that those of the events are counted from, None for zero.
     """
 
     def __init__(self, film, band: int, base, match, exclusive: bool = False, origin=None):
@@ -26,50 +33,62 @@ class FilmBlock:
         self.exclusive, self.origin = exclusive, origin
 
     def begin(self):
-        """Return the state that the film carries along a path: loop state, handed back at every event."""
+        """Return the loop state of the film: a PyTree that ``put``, ``put_slope`` and ``end`` receive."""
         return {}
 
     def put(self, events, opl, value, active, crowded=False):
-        """Write a contribution; returns what fell before and after the window (mean over channels). ``crowded``: most
-        lanes have one, see :class:`~..transport.strategy.Event`.
+        """Write an event.
+
+        Args:
+            events: loop state of the film.
+            opl: optical path length, minus the film's start, metres (Float64).
+            value: contribution, throughput included, a spectrum.
+            active: mask of lanes that have the event.
+            crowded: most lanes have it, see :class:`~..transport.strategy.Event`.
+
+        Returns:
+            Energy (mean over channels) before and after the film's window.
         """
         channels = self.match.to_channels(value)
-        before, after = self.store(opl, channels, active, crowded)
+        options = {"exclusive": True} if self.exclusive else {}
+        if crowded and self.film.knows_crowds:
+            options["crowded"] = True
+        before, after = self.film.put(self.band, self.base, self.counted(opl), channels, active, **options)
         energy = dr.select(active, mean_of(channels), 0)
         return energy * before, energy * after
 
-    def store(self, opl, channels, active, crowded):
-        """Write to the film; returns the fractions before and after the window."""
-        # Films that know nothing of it add as always.
-        how = {"exclusive": True} if self.exclusive else {}
-        if crowded and self.film.knows_crowds:
-            how["crowded"] = True
-        return self.film.put(self.band, self.base, self.counted(opl), channels, active, **how)
-
     def counted(self, opl):
-        """A path length from the film's start on, ``Float64``."""
+        """Return a path length from the film's start on, Float64."""
         return opl if self.origin is None else self.origin + mi.Float64(opl)
 
     def put_slope(self, events, opl, d_value, value_d_opl, active):
-        """Forward mode: write ``k df + f k' dtau``."""
+        """Write the derivative ``k df + f k' dtau`` of an event, with the film's response ``k``.
+
+        Args:
+            events: loop state of the film.
+            opl: optical path length, minus the film's start, metres (Float64).
+            d_value: derivative ``df`` of the contribution, a spectrum.
+            value_d_opl: contribution times derivative of the path length, ``f dtau``.
+            active: mask of lanes that have the event.
+        """
         d, slope = self.match.to_channels(d_value), self.match.to_channels(value_d_opl)
         self.film.put_slope(self.band, self.base, self.counted(opl), d, slope, active)
 
     def end(self, events):
-        """The paths are over."""
+        """Finish the loop state, after the last event of all paths."""
 
     def finish(self):
-        """Bring what was written to the film. Called outside of the loop, may launch a kernel."""
+        """Write pending events to the film, outside of the loop; may launch a kernel."""
 
 
 class AdjointBlock:
-    """Reads ``A(tau)`` and ``A'(tau)`` of the incoming adjoint for the samples in flight."""
+    """Adjoint ``A(tau)`` of the film and its slope ``A'(tau)``, read by the samples of one launch."""
 
     def __init__(self, film, response, base, steady, match):
         self.film, self.response, self.base, self.steady, self.match = film, response, base, steady, match
 
     def read(self, opl, active):
-        """Adjoint and its slope in opl, as spectra that weigh a contribution of one primary ray."""
+        """Return adjoint and slope (per metre) at ``opl`` as spectra that weigh a contribution of a primary ray."""
         if not self.film.keeps_steady:
             A, slope = self.film.read(self.response, self.base, opl, active, self.steady)
             return self.match.to_spectrum(A), self.match.to_spectrum(slope)
@@ -78,38 +97,38 @@ class AdjointBlock:
         return self.as_spectra(*self.film.read(self.response, self.base, opl, active))
 
     def as_spectra(self, A, slope):
-        """The two by channel, the adjoint of the steady image added, as spectra; ``slope`` may be None."""
+        """Return adjoint (plus that of the steady image) and slope (None for none), given by channel, as spectra."""
         A = [a + s for a, s in zip(A, self.steady, strict=True)]
         return self.match.to_spectrum(A), None if slope is None else self.match.to_spectrum(slope)
 
     def together(self, most, with_slope):
-        """Return the number of arrivals, out of ``most`` of a path, that are read at once and ahead.
+        """Return the number of arrivals, out of ``most`` of a path, that are read at once, before their vertices.
 
-        0 where each is read by itself; more in films where reading costs more than keeping.
+        0: each arrival is read at its vertex. A film whose readings are expensive returns more.
         """
         return 0
 
     def read_together(self, opls, with_slope, active):
-        """(A, its slope or None) by channel, for each of several arrivals."""
+        """Return (A, its slope or None) by channel for each of several arrivals."""
         raise NotImplementedError
 
 
 class ArrivalWindow:
-    """Arrivals between ``first`` and ``last`` (metres after the film's ``start_opl``) count, others do not.
+    """Arrivals that a film counts: from ``first`` to ``last``, metres after its ``start_opl``.
 
-    No later event of a path can count once the path itself is longer than ``last``. A plain object, which Dr.Jit loops
-    leave alone.
+    A path that is longer than ``last`` has no further event that counts. A plain object, which Dr.Jit loops leave
+    alone.
     """
 
     def __init__(self, first: float, last: float):
         self.first, self.last = float(first), float(last)
 
     def counts(self, opl):
-        """Return a mask of arrivals at ``opl`` (``Float64``) that can count."""
+        """Return a mask of arrivals at ``opl`` (Float64) that count."""
         return (opl >= self.first) & (opl < self.last)
 
     def over(self, opl):
-        """Return a mask of lengths ``opl`` after which nothing can count."""
+        """Return a mask of path lengths ``opl`` behind which no arrival counts."""
         return opl >= self.last
 
 
@@ -139,8 +158,11 @@ class BinLayout:
 
 
 def reduce_mode(exclusive, direct=False):
-    """Return the mode of lanes that share their target with others (``Auto``: atomically, equal addresses together),
-    or that have one of their own. ``direct``: each lane by itself.
+    """Return Dr.Jit's mode of adding to an array.
+
+    Args:
+        exclusive: every lane has a target of its own.
+        direct: every lane adds by itself; otherwise lanes with equal addresses are summed up before.
     """
     if exclusive:
         return dr.ReduceMode.NoConflicts

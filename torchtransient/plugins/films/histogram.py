@@ -9,6 +9,7 @@ from torchtransient.errors import SceneError
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.films.base import TimeResolvedFilm
 from torchtransient.plugins.films.block import ArrivalWindow, BinLayout, FilmBlock, reduce_mode
+from torchtransient.plugins.films.colour import mean_of
 from torchtransient.plugins.films.temporal_filters import (
     PulsedFilter,
     check_name,
@@ -51,11 +52,14 @@ class HistogramBlock(FilmBlock):
         self.scale = mi.Float(1 / film.bin_width_opl)
         dr.eval(self.fraction, self.window, self.first)
 
-    def store(self, opl, channels, active, crowded):
+    def put(self, events, opl, value, active, crowded=False):
+        channels = self.match.to_channels(value)
         x = dr.fma(mi.Float(opl), self.scale, self.fraction)
         cube = self.film.band_array(self.band)
         mode = self.film.reduce_mode(cube, self.exclusive, crowded)
-        return self.film.put_bins(cube, self.first, x, self.window, channels, active, mode)
+        before, after = self.film.put_bins(cube, self.first, x, self.window, channels, active, mode)
+        energy = dr.select(active, mean_of(channels), 0)
+        return energy * before, energy * after
 
 
 class TransientHDRFilm(TimeResolvedFilm):
@@ -217,7 +221,7 @@ class TransientHDRFilm(TimeResolvedFilm):
         """
         cube = self.band_array(band)
         x = self.bin_position(opl_from_start)
-        bins, channels = self.temporal_bins, self.channel_count()
+        bins, channels = self.temporal_bins, len(value)
         base = self.pixel_base(base, laser)
         if self._long:
             layout = BinLayout(cube, base, channels, 1, bins, channels, exclusive)
@@ -229,7 +233,7 @@ class TransientHDRFilm(TimeResolvedFilm):
         """Add to the bins that the filter reaches from ``x``, in bins (``Float`` or ``Float64``). ``base``: index of
         bin 0; ``window``: first bin that is stored, and the one after the last.
         """
-        channels = self.channel_count()
+        channels = len(value)
         low, high = window
         before, after = mi.Float(0), mi.Float(0)
         first, taps = self.filter.weights(x)

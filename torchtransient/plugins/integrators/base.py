@@ -1,4 +1,4 @@
-"""What every transient integrator shares: parameters, primary rays, launches and the three entry points."""
+"""Base of the transient integrators: parameters, primary rays, launches and the three entry points."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from torchtransient.plugins.integrators.job import (
     laser_count,
     passes_of,
     seed_array,
+    share_of,
     state_of,
 )
 from torchtransient.plugins.parameter_effect import class_of
@@ -38,13 +39,17 @@ from torchtransient.plugins.sensors.origin import (
 )
 from torchtransient.plugins.transport.boundary.moving_edges import MovingEdges, missing
 from torchtransient.plugins.transport.context import PathSettings, RenderContext, Wanted
-from torchtransient.plugins.transport.derivative import forward as forward_over
-from torchtransient.plugins.transport.derivative import objective_of, propagate_tangents, tangent_of
-from torchtransient.plugins.transport.derivative import reverse as reverse_over
+from torchtransient.plugins.transport.derivative import (
+    forward,
+    objective_of,
+    propagate_tangents,
+    reverse,
+    tangent_of,
+)
 from torchtransient.plugins.transport.record import RecordSink
 from torchtransient.plugins.transport.scene_contents import SceneCache, SceneContents
 from torchtransient.plugins.transport.sinks import FilmSink
-from torchtransient.plugins.transport.walk import walk
+from torchtransient.plugins.transport.walk import first_leg, start, walk
 
 UNLIMITED = 0xFFFFFFFF
 
@@ -58,8 +63,8 @@ class TransientIntegrator(mi.CppADIntegrator):
     that reaches the sensor without a bounce),
     ``temporal_filter`` (the film's) and ``gaussian_stddev`` (the film's, in bins).
 
-    Subclasses say with :meth:`strategies` what the walk of light is made of, see :mod:`..transport.strategy`;
-    derivatives in both modes follow from that.
+    Subclasses return the parts of their walk from :meth:`strategies`, see :mod:`..transport.strategy`; derivatives in
+    both modes follow.
     """
 
     def __init__(self, props):
@@ -78,12 +83,12 @@ class TransientIntegrator(mi.CppADIntegrator):
             check_stddev(self.gaussian_stddev)
         self._seen = None
 
-    # Whether paths scatter in participating media; others refuse scenes that have them.
+    # Paths scatter in participating media; otherwise scenes with media are refused.
     walks_through_media = False
-    # Whether the laser of a scan lights one position after the other, and whether beams without width are seen.
+    # The laser of a scan lights one position after the other; beams without width are seen.
     scans_exhaustively = False
     aims_lasers = False
-    # Whether derivatives say which moving edges they do not follow: False where the caller does, who knows its keys.
+    # Derivatives warn of moving edges that they do not follow; False if the caller warns, by its keys.
     warns_of_edges = True
 
     def traverse(self, cb):
@@ -93,7 +98,7 @@ class TransientIntegrator(mi.CppADIntegrator):
     # ----------------------------------------------------------------------------------- preparation
 
     def resolve(self, scene, sensor):
-        """The sensor and its film, checked; temporal filter settings of the integrator are handed to the film."""
+        """Return the sensor and its film, checked; set the film's temporal filter by that of the integrator."""
         if not (mi.variant() or "").startswith(("llvm", "cuda")):
             raise VariantError(
                 f"transient rendering needs a JIT variant such as llvm_ad_rgb, the active one is {mi.variant()!r}; "
@@ -131,19 +136,19 @@ class TransientIntegrator(mi.CppADIntegrator):
         return sensor, film
 
     def contents(self, scene, sensor) -> SceneContents:
-        """What the scene contains, looked up when it is first seen by this sensor."""
+        """Return the contents of the scene, cached by sensor."""
         return self._seen_scene(scene).contents_for(scene, sensor)
 
     def parameters(self, scene) -> ParameterTracker:
-        """The parameters of the scene, to be asked which of them carry gradients."""
+        """Return the tracker of the scene's parameters with gradients."""
         return self._seen_scene(scene).tracker(scene)
 
     def silhouettes(self, scene, sensors=None) -> MovingEdges:
-        """Return what derivatives of a scene lack where edges move, seen by some sensors (None: all)."""
+        """Return the gaps of derivatives at moving edges, seen by some sensors (None: all)."""
         return missing(f"{class_of(self)} follows no edges", "Use transient_path or transient_prbvolpath.")
 
     def reference(self, scene):
-        """The sphere around the scene as described, which light from and to infinity is timed by."""
+        """Return the bounding sphere of the described scene, the origin of time for light at infinity."""
         return self._seen_scene(scene).reference
 
     def _seen_scene(self, scene) -> SceneCache:
@@ -152,29 +157,25 @@ class TransientIntegrator(mi.CppADIntegrator):
         return self._seen
 
     def settings(self) -> PathSettings:
-        """The integrator's parameters for a walk."""
+        """Return the integrator's parameters for a walk."""
         return PathSettings(
             self.max_depth, self.rr_depth, bool(self.hide_emitters), self.discard_direct_light, self.camera_unwarp
         )
 
     def world(self, scene, contents, wanted=None, window=None, settings=None) -> RenderContext:
-        """What the walks of one job are told; ``settings``: other than the integrator's own."""
+        """Return the context of a job; ``settings``: others than the integrator's own."""
         return RenderContext(scene, contents, settings or self.settings(), self.strategies(contents), wanted, window)
 
     def frozen_state(self, scene, sensor=0) -> list:
-        """The arrays that kernels of this scene read beside its parameters, for ``dr.freeze(..., state_fn=...)``: see
-        :mod:`..frozen_state`.
+        """Return the arrays that kernels read beside the scene's parameters, for ``dr.freeze(..., state_fn=...)``.
+
+        See :mod:`..frozen_state`.
         """
         sensor, film = self.resolve(scene, sensor)
         return arrays_below([self.contents(scene, sensor), vars(film)])
 
-    def passes(self, world, sensor, film, seed, spp) -> tuple[list[Pass], int]:
-        """The launches of a job, and the largest number of samples per pixel."""
-        lanes = None if world.record_room is None else world.record_room.lanes
-        return passes_of(sensor.sampler().clone(), film, seed, spp, world.most_events(), lanes)
-
     def start(self, scene, contents, sensor, film, job: Pass) -> PrimaryRays:
-        """The primary rays of one pass."""
+        """Return the :class:`~..sensors.origin.PrimaryRays` of one launch."""
         sampler = sensor.sampler().clone()
         sampler.set_sample_count(job.spp)
         sampler.set_samples_per_wavefront(job.spp)
@@ -215,18 +216,18 @@ class TransientIntegrator(mi.CppADIntegrator):
         return rays
 
     def offset_in_pixel(self, film, sensor, sampler):
-        """(offset of a sample from its pixel's centre, weight or None for one)."""
+        """Return (offset of a sample from its pixel's centre, weight or None for one)."""
         return film.sample_offset(sampler.next_2d())
 
     def channel_match(self, contents, film, rays):
-        """The map from samples of the primary rays to the film's channels, detached."""
+        """Return the detached map from spectra of the primary rays to channels of the film."""
         ray = dr.detach(rays.ray)
         rotation = sensor_rotation(rays.seen, ray) if mi.is_polarized else None
         weight = dr.detach(rays.weight) * rays.scale
         return ChannelMatch(ray.wavelengths, weight, film.curves or contents.observer, rotation)
 
     def pixel_indices(self, film, job, rays):
-        """Index of a pixel's first entry in its band, and of the pixel in the film."""
+        """Return (index of a pixel's first entry in its band, index of the pixel in the film), UInt32."""
         width = int(film.crop_size()[0])
         first = film.band_layout()[job.band][0]
         pixel = dr.fma(rays.row, width, rays.column)
@@ -237,32 +238,56 @@ class TransientIntegrator(mi.CppADIntegrator):
         return base if rays.laser is None else film.pixel_base(base, rays.laser), pixel
 
     def first_opl(self, film, rays):
-        """Optical path before the first ray starts, counted from ``start_opl``: doubles keep late times exact."""
+        """Return the optical path length before the primary ray's origin, minus ``start_opl``, metres (Float64)."""
         length = mi.Float(0)
         if not self.camera_unwarp:
             length = rays.length()
         return mi.Float64(length) - film.start_opl
 
-    def beside(self, world, sensor, film, seed, samples):
-        """What derivatives of a job have beside its paths: objects with ``tables()`` (attached to the parameters),
-        ``backward(incoming)``, ``forward()``, and ``can_be_recorded``. Raises GradientError where one is needed and
-        cannot be computed.
+    def beside(self, context, sensor, film, seed, samples):
+        """Return further terms of the derivatives of a job, such as the boundary term.
+
+        Objects with ``tables()`` (attached to the parameters), ``backward(incoming)``, ``forward()`` and
+        ``can_be_recorded``.
+
+        Raises:
+            GradientError: if a term is needed and cannot be computed.
         """
         return []
 
-    def walk(self, world, film, rays, sink):
-        """Trace the paths of primary rays into a sink: (number of vertices, what it kept)."""
+    def primary_path(self, context, film, rays):
+        """Return the :class:`~..transport.walk.Path` of detached primary rays, and prepare the strategies for them.
+
+        Args:
+            context: :class:`~..transport.context.RenderContext` of the job.
+            film: film of the sensor.
+            rays: :class:`~..sensors.origin.PrimaryRays` of a launch.
+        """
         ray, η = dr.detach(rays.ray), dr.detach(rays.η)
-        world.start(rays)
-        return walk(world, rays.sampler, ray, self.first_opl(film, rays), sink, η, rays.leg)
+        context.start(rays)
+        path = start(context, ray, self.first_opl(film, rays), η)
+        path.leg = first_leg(context, rays.sampler, ray, rays.leg)
+        return path
+
+    def shared_light(self, context, film):
+        """Return functions that add light to the film which no path finds; each takes a :class:`.job.Job`.
+
+        Args:
+            context: :class:`~..transport.context.RenderContext` of the job.
+            film: film of the sensor, ready to be written to.
+        """
+        return []
 
     # ----------------------------------------------------------------------------------- entry points
 
     @no_collection()
     def prepared(self, scene, sensor=0, seed=0, spp=0, kind=RENDER, grad_in=(None, None)):
-        """A :class:`.prepared.Prepared` job of :data:`~torchtransient.interfaces.JOBS` with all that is looked up,
-        checked and computed once; arguments and errors as in :meth:`render`, :meth:`render_backward` and
-        :meth:`render_forward`.
+        """Return a :class:`.job.Prepared` job: contents, checks, launches and tables, outside of recorded code.
+
+        Arguments and errors as in :meth:`render`, :meth:`render_backward` and :meth:`render_forward`.
+
+        Args:
+            kind: one of :data:`~torchtransient.interfaces.JOBS`.
         """
         if kind not in JOBS:
             raise SceneError(f"prepared: expected a kind of job, one of {', '.join(JOBS)}, got {kind!r}.")
@@ -274,13 +299,15 @@ class TransientIntegrator(mi.CppADIntegrator):
                 contents = self.contents(scene, sensor)
             else:
                 contents, wanted = self._wanted(scene, sensor, film)
-            world = self.world(scene, contents, wanted, film.arrivals())
-            launches, samples = self.passes(world, sensor, film, seed, int(spp))
+            context = self.world(scene, contents, wanted, film.arrivals())
+            lanes = None if context.record_room is None else context.record_room.lanes
+            sampler = sensor.sampler().clone()
+            launches, samples = passes_of(sampler, film, seed, int(spp), context.most_events(), lanes)
             film.tabulate_filter()
-            job = Prepared(kind, self, scene, sensor, film, world, launches, seed_array(seed), samples)
+            job = Prepared(kind, self, scene, sensor, film, context, launches, seed_array(seed), samples)
             job.plugins = self._seen_scene(scene).python_plugins(scene)
             if wanted is not None:
-                job.beside = self.beside(world, sensor, film, seed, samples)
+                job.beside = self.beside(context, sensor, film, seed, samples)
             if kind == BACKWARD:
                 job.incoming = IncomingAdjoint(film, *grad_in)
             if kind == FORWARD:
@@ -290,7 +317,7 @@ class TransientIntegrator(mi.CppADIntegrator):
             return job
 
     def refusal_of(self, job) -> str | None:
-        """Why ``dr.freeze`` cannot record a job, None where it can."""
+        """Return the reason why ``dr.freeze`` cannot record a job, None if it can."""
         for plugin in job.plugins:
             if not says_it_can_be_recorded(plugin):
                 return f"the plugin {type(plugin).__name__} does not say that it can be (can_be_recorded)"
@@ -302,19 +329,51 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     @staticmethod
     def state_of(jobs):
-        """(structure, arrays) of prepared jobs, see :func:`.prepared.state_of`."""
+        """Return (structure, arrays) of prepared jobs, see :func:`.job.state_of`."""
         return state_of(jobs)
 
     @no_collection()
     def run(self, prepared, evaluate=True, progress=None):
-        """Carry out a job that is :meth:`prepared`: a render or a tangent stays in the film, gradients arrive at the
-        parameters of the scene and at the tables of the job. What ``dr.freeze`` records is this alone.
+        """Execute a prepared job; this is what ``dr.freeze`` records.
+
+        A render or a tangent stays in the film, gradients arrive at the parameters of the scene and at the tables of
+        the job.
+
+        Args:
+            prepared: :class:`.job.Prepared` by :meth:`prepared`.
+            evaluate: run the kernels of a render, instead of only recording them.
+            progress: function of the share of a render that is done, or None.
         """
         with dr.suspend_grad():
-            if prepared.kind == RENDER:
-                self._render(prepared, evaluate, progress)
-            else:
-                (backward if prepared.kind == BACKWARD else forward)(prepared)
+            if prepared.kind != RENDER:
+                (_backward if prepared.kind == BACKWARD else _forward)(prepared)
+                return
+
+            context, film, launches = prepared.world, prepared.film, prepared.launches
+            film.start_render(prepared.samples)
+
+            # ------------------------------------------------------------------------- samples that pixels share
+            shared = self.shared_light(context, film)
+            parts = len(shared) + bool(context.walks)
+            for i, add in enumerate(shared):
+                add(Job(launches, prepared.seed, prepared.samples, evaluate, share_of(progress, i, parts)))
+
+            # ------------------------------------------------------------------------- paths
+            progress = share_of(progress, len(shared), parts)
+            for i, launch in enumerate(launches if context.walks else ()):
+                rays, match, base, pixel = _primary_rays(prepared, launch)
+                block = film.create_event_block(launch, base, match, context.most_events())
+                path = self.primary_path(context, film, rays)
+                _, kept = walk(context, rays.sampler, path, FilmSink(block))
+                film.add_steady(pixel, match.to_channels(kept["L"]))
+                film.add_outside(pixel, kept["before"], kept["after"])
+                block.finish()
+                if evaluate or len(launches) > 1:
+                    dr.eval(film.bands[launch.band][2], film.steady, film.outside)
+                if progress:
+                    dr.sync_thread()
+                    progress((i + 1) / len(launches))
+            film.finish_render()
 
     @no_collection()
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True, progress_callback=None):
@@ -329,32 +388,6 @@ class TransientIntegrator(mi.CppADIntegrator):
             job = self.prepared(scene, sensor, seed, spp)
             self.run(job, evaluate, progress_callback)
             return job.film.develop() if develop else None
-
-    def _render(self, job, evaluate, progress):
-        job.film.start_render(job.samples)
-        launches = Job(job.launches, job.seed, job.samples, evaluate, progress)
-        self.add_light(job.world, job.sensor, job.film, launches)
-        job.film.finish_render()
-
-    def add_light(self, world, sensor, film, job):
-        """Bring all light to a film that is prepared; ``job``: a :class:`.launch.Job`."""
-        for i, launch in enumerate(job.passes):
-            self._render_pass(world, sensor, film, launch)
-            if job.evaluate or len(job.passes) > 1:
-                dr.eval(film.bands[launch.band][2], film.steady, film.outside)
-            if job.progress:
-                dr.sync_thread()
-                job.progress((i + 1) / len(job.passes))
-
-    def _render_pass(self, world, sensor, film, job):
-        rays = self.start(world.scene, world.contents, sensor, film, job)
-        match = self.channel_match(world.contents, film, rays)
-        base, pixel = self.pixel_indices(film, job, rays)
-        block = film.create_event_block(job, base, match, world.most_events())
-        _, kept = self.walk(world, film, rays, FilmSink(block))
-        film.add_steady(pixel, match.to_channels(kept["L"]))
-        film.add_outside(pixel, kept["before"], kept["after"])
-        block.finish()
 
     @no_collection()
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
@@ -372,10 +405,10 @@ class TransientIntegrator(mi.CppADIntegrator):
             self.run(job)
 
     def _wanted(self, scene, sensor, film):
-        """(contents, which derivatives are asked for). Raises GradientError where the film or the depth has none."""
+        """Return (contents, wanted derivatives). Raises GradientError if film or depth have none."""
         self._seen_scene(scene).follow_derivatives(scene, True)
         contents = self.contents(scene, sensor)
-        with dr.resume_grad():  # the question whether a parameter is attached is answered no while suspended
+        with dr.resume_grad():  # while suspended, no parameter counts as attached
             tracker = self.parameters(scene)
             effects = tracker.attached()
             tracker.check_black()
@@ -397,12 +430,12 @@ class TransientIntegrator(mi.CppADIntegrator):
         return contents, Wanted(effects, sensor, contents)
 
     def _warn_of_edges(self, scene, sensor, effects):
-        """Say once a scene of each attached parameter what its derivative lacks."""
-        told = self._seen_scene(scene).told_of_edges
-        new = [one for one in effects if one[2].moves_silhouette and (one[0].ptr, one[1]) not in told]
+        """Warn once a scene of the gaps in the derivative of each attached parameter."""
+        warned = self._seen_scene(scene).told_of_edges
+        new = [one for one in effects if one[2].moves_silhouette and (one[0].ptr, one[1]) not in warned]
         if not new:
             return
-        told.update((node.ptr, key) for node, key, _ in new)
+        warned.update((node.ptr, key) for node, key, _ in new)
         edges, found = self.silhouettes(scene, [sensor]), {}
         for node, key, effect in new:
             for gap in edges.lacking(node, key, effect):
@@ -433,70 +466,62 @@ class TransientIntegrator(mi.CppADIntegrator):
 
 
 # --------------------------------------------------------------------------------------------------------------------
-# The kernel launches of a derivative: every pass records its paths and goes over the record again.
+# Launches of a job. Each launch of a derivative records its paths and walks over the record again.
 
-def backward(job):
-    """Carry out a prepared job (:class:`.prepared.Prepared`) in reverse mode: gradients arrive at the scene's attached
-    parameters and at the job's tables. To be called with gradients suspended.
-    """
-    world = job.world
-    # Derivatives wait at the parameters until all passes are done: following the graph further uses up its edges, and
-    # the first pass would be the only one to arrive.
-    with dr.isolate_grad(), world.contents.hidden_from_mitsuba():
-        for launch in job.launches if world.walks else ():
-            _backward_pass(job, launch)
+def _primary_rays(job, launch):
+    """Return (primary rays, map to the film's channels, first entry and pixel of each lane)."""
+    integrator, context = job.integrator, job.world
+    rays = integrator.start(context.scene, context.contents, job.sensor, job.film, launch)
+    match = integrator.channel_match(context.contents, job.film, rays)
+    base, pixel = integrator.pixel_indices(job.film, launch, rays)
+    return rays, match, base, pixel
+
+
+def _record_sink(job, rays, block=None):
+    """Return the sink that records paths, with their arrivals for the adjoint ``block``."""
+    return RecordSink(block, dr.width(rays.ray) if job.world.record_room.in_memory else None)
+
+
+def _backward(job):
+    """Execute a prepared job in reverse mode, with gradients suspended."""
+    integrator, context = job.integrator, job.world
+    # Derivatives wait at the parameters until all launches are done: following the graph further uses up its edges,
+    # and only those of the first launch would arrive.
+    with dr.isolate_grad(), context.contents.hidden_from_mitsuba():
+        for launch in job.launches if context.walks else ():
+            rays, match, _, pixel = _primary_rays(job, launch)
+            block = job.incoming.block(rays, pixel, match)
+            path, sink = integrator.primary_path(context, job.film, rays), _record_sink(job, rays, block)
+            count, record = walk(context, rays.sampler, path, sink)
+            adjoint = reverse(context, sink.layout, record, count, block, dr.detach(rays.ray))
+            with dr.resume_grad():
+                if context.wanted.sensor or dr.grad_enabled(rays.η):
+                    # A sensor on a moving shape may have rays to given points, which do not move.
+                    flags = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
+                    dr.backward_from(objective_of(context, rays, adjoint), flags)
+            # Dropped before the next launch is traced.
+            del rays, match, pixel, block, path, sink, count, record, adjoint
             dr.eval()
         for part in job.beside:
             part.backward(job.incoming)
 
 
-def forward(job):
-    """Carry out a prepared job in forward mode: its film holds the tangent then. As :func:`backward`."""
-    world, film = job.world, job.film
+def _forward(job):
+    """Execute a prepared job in forward mode, with gradients suspended: the film holds the tangent afterwards."""
+    integrator, context, film = job.integrator, job.world, job.film
     film.start_render(job.samples)
-    with world.contents.hidden_from_mitsuba():
-        for launch in job.launches if world.walks else ():
-            _forward_pass(job, launch)
+    with context.contents.hidden_from_mitsuba():
+        for launch in job.launches if context.walks else ():
+            rays, match, base, pixel = _primary_rays(job, launch)
+            block = film.create_event_block(launch, base, match, context.most_events(), tangents=True)
+            tangent = tangent_of(context, rays)
+            path, sink = integrator.primary_path(context, film, rays), _record_sink(job, rays)
+            count, record = walk(context, rays.sampler, path, sink)
+            dL = forward(context, sink.layout, record, count, block, dr.detach(rays.ray), tangent)
+            film.add_steady(pixel, match.to_channels(dL))
+            block.finish()
+            del rays, match, base, pixel, block, tangent, path, sink, count, record, dL
             dr.eval(film.bands[launch.band][2], film.steady)
         for part in job.beside:
             part.forward()
     film.finish_render()
-
-
-def _start(job, launch):
-    """(primary rays, map to the film's channels, base and pixel of each lane)."""
-    integrator, world = job.integrator, job.world
-    rays = integrator.start(world.scene, world.contents, job.sensor, job.film, launch)
-    base, pixel = integrator.pixel_indices(job.film, launch, rays)
-    return rays, integrator.channel_match(world.contents, job.film, rays), base, pixel
-
-
-def _record(job, rays, block=None):
-    """Record the paths of one pass, with their arrivals for the adjoint ``block``: (layout of the record, the record,
-    number of vertices).
-    """
-    sink = RecordSink(block, dr.width(rays.ray) if job.world.record_room.in_memory else None)
-    count, store = job.integrator.walk(job.world, job.film, rays, sink)
-    return sink.layout, store, count
-
-
-def _backward_pass(job, launch):
-    world = job.world
-    rays, match, _, pixel = _start(job, launch)
-    block = job.incoming.block(rays, pixel, match)
-    adjoint = reverse_over(world, *_record(job, rays, block), block, dr.detach(rays.ray))
-    with dr.resume_grad():
-        if world.wanted.sensor or dr.grad_enabled(rays.η):
-            # What carries a sensor may move without its rays: they go to points that are given.
-            flags = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
-            dr.backward_from(objective_of(world, rays, adjoint), flags)
-
-
-def _forward_pass(job, launch):
-    world, film = job.world, job.film
-    rays, match, base, pixel = _start(job, launch)
-    block = film.create_event_block(launch, base, match, world.most_events(), tangents=True)
-    tangent = tangent_of(world, rays)
-    dL = forward_over(world, *_record(job, rays), block, dr.detach(rays.ray), tangent)
-    film.add_steady(pixel, match.to_channels(dL))
-    block.finish()

@@ -1,4 +1,4 @@
-"""The kernel launches that a job is made of."""
+"""Jobs of an integrator, their kernel launches, and the incoming adjoint."""
 
 from __future__ import annotations
 
@@ -21,8 +21,9 @@ MAX_LANES = 2**26
 
 @dataclass
 class Pass:
-    """One kernel launch: ``spp`` of ``total`` samples per pixel for ``rows`` rows of one storage band. ``seed`` is a
-    UInt32 in memory: as a number it would be a literal of the kernel.
+    """Kernel launch: ``spp`` of ``total`` samples per pixel for ``rows`` rows of one storage band.
+
+    ``seed`` is a UInt32 in memory: a number would be a literal of the kernel.
     """
 
     band: int
@@ -35,8 +36,14 @@ class Pass:
 
 @dataclass
 class Job:
-    """A render: its launches, the seed and the largest number of samples of a pixel that they are made of, whether what
-    is recorded is run, and who is told of the progress (a function of the share that is done, or None).
+    """Render, as estimators with samples of their own receive it.
+
+    Attributes:
+        passes: launches of the paths.
+        seed: seed of the job, UInt32.
+        samples: largest number of samples of a pixel.
+        evaluate: run the kernels, instead of only recording them.
+        progress: function of the share that is done, or None.
     """
 
     passes: list[Pass]
@@ -47,7 +54,7 @@ class Job:
 
 
 def laser_count(film: Any) -> int:
-    """How many laser positions every pixel of a film tells apart."""
+    """Return the number of laser positions of every pixel of a film."""
     return film.laser_count() if film.exhaustive_scan else 1
 
 
@@ -150,7 +157,7 @@ def _launch_counts(sampler: Any, spp: int, most: int) -> list[int]:
 
 
 def share_of(progress: Any, part: int, count: int) -> Any:
-    """The progress of one of several parts of a job."""
+    """Return the progress function of one of several parts of a job."""
     return progress and (lambda done: progress((part + done) / count))
 
 
@@ -184,15 +191,16 @@ class Prepared:
     refusal: str | None = None
 
     def tables(self) -> list[Any]:
-        """What has been computed of the scene's parameters: attached where they are."""
+        """Return the attached arrays that were computed from the scene's parameters."""
         tables = self.world.tables() + [table for part in self.beside for table in part.tables()]
         with dr.resume_grad():
             return [table for table in tables if dr.grad_enabled(table)]
 
 
 def state_of(jobs: list[Prepared]) -> tuple[tuple[Any, ...], list[Any]]:
-    """(structure, arrays): what the traced kernels of jobs depend on beside arrays, and the arrays and structures of
-    arrays that they read beside the scene's parameters.
+    """Return (structure, arrays) of jobs: what their kernels depend on beside arrays, and the arrays that they read.
+
+    The scene's parameters are not among them.
     """
     held = [
         [job.kind, job.integrator, job.film, job.world, job.launches, job.seed, job.samples, job.incoming, job.beside]
@@ -205,8 +213,15 @@ def state_of(jobs: list[Prepared]) -> tuple[tuple[Any, ...], list[Any]]:
 # The adjoint of a film's two images, as the lanes of a backward pass read it.
 
 class IncomingAdjoint:
-    """What ``render_backward`` is given: steady ``(H, W, C)`` or None, and transient as a TensorXf of the film's shape,
-    as the tuple ``(flat array, offset, strides)``, or None. Raises GradientError for another shape.
+    """Adjoint of a film's images, the argument of ``render_backward``.
+
+    Args:
+        film: film of the job.
+        steady: adjoint of the steady image, (H, W, C), or None.
+        transient: TensorXf of the film's shape, the tuple (flat array, offset, strides), or None.
+
+    Raises:
+        GradientError: if the transient has another shape.
     """
 
     def __init__(self, film: Any, steady: Any, transient: Any) -> None:
@@ -223,7 +238,7 @@ class IncomingAdjoint:
         return transient.array, 0, tuple(int(stride) for stride in strides)
 
     def block(self, rays: Any, pixel: Any, match: Any) -> Any:
-        """The film's :class:`~..films.block.AdjointBlock` for the primary ``rays`` of the pixels ``pixel``."""
+        """Return the film's :class:`~..films.block.AdjointBlock` for the primary ``rays`` of the pixels ``pixel``."""
         film, channels = self.film, self.film.channel_count()
         steady = [mi.Float(0)] * channels
         if self.steady is not None:

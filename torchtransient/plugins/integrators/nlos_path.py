@@ -29,7 +29,6 @@ from torchtransient.plugins.around_corner.shared_light import (
 )
 from torchtransient.plugins.integrators import base
 from torchtransient.plugins.integrators.base import UNLIMITED
-from torchtransient.plugins.integrators.job import share_of
 from torchtransient.plugins.properties import number, truth, whole_number
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 from torchtransient.plugins.transport.boundary.moving_edges import MovingEdges, missing, switched_off
@@ -270,19 +269,15 @@ class TransientNLOSPath(base.TransientIntegrator):
             settings = replace(settings, division=division, max_depth=most)
         return RenderContext(scene, contents, settings, self.strategies(contents, table), wanted, window)
 
-    def add_light(self, world: Any, sensor: Any, film: Any, job: Any) -> None:
-        # Not by the class's name in a function: that is another class once plugins are made for another variant.
-        division, parts, follow_paths = world.division, [], super().add_light
+    def shared_light(self, context: Any, film: Any) -> Any:
+        division, parts = context.division, []
         if division.third_bounce:
-            parts.append(lambda run: self._shared(world, film, run.seed, run.samples).add(run.progress))
+            parts.append(lambda job: self._shared(context, film, job.seed, job.samples).add(job.progress))
         if division.chained:
-            table = self._table(world)
-            of_scan = Local(light=self._light(table), elements=self._elements(world), capture=self.capture)
-            parts.append(lambda run: add_late_light(table, film, of_scan, division.chained, run))
-        if division.walks:
-            parts.append(lambda run: follow_paths(world, sensor, film, run))
-        for i, part in enumerate(parts):
-            part(replace(job, progress=share_of(job.progress, i, len(parts))))
+            table = self._table(context)
+            scan = Local(light=self._light(table), elements=self._elements(context), capture=self.capture)
+            parts.append(lambda job: add_late_light(table, film, scan, division.chained, job))
+        return parts
 
     def refusal_of(self, job: Any) -> str | None:
         if job.world.wanted is None and (job.world.division.third_bounce or job.world.division.chained):
@@ -363,33 +358,33 @@ class TransientNLOSPath(base.TransientIntegrator):
         settings = self.settings()
         return silhouettes(scene, settings.min_depth, settings.max_depth)
 
-    def beside(self, world: Any, sensor: Any, film: Any, seed: Any, samples: int) -> list[Any]:
+    def beside(self, context: Any, sensor: Any, film: Any, seed: Any, samples: int) -> list[Any]:
         if not self.laser_sampling:
             return []
-        shared = [self._shared(world, film, seed, samples)] if world.division.third_bounce else []
+        shared = [self._shared(context, film, seed, samples)] if context.division.third_bounce else []
         if not self.boundary:
             return shared
-        edges = mutual_occlusion(self, world, sensor, film, seed, samples, dr.detach(self._table(world).seen()))
-        late = late_outlines(self, world, sensor, film, seed, samples)
+        edges = mutual_occlusion(self, context, sensor, film, seed, samples, dr.detach(self._table(context).seen()))
+        late = late_outlines(self, context, sensor, film, seed, samples)
         return shared + [term for term in (edges, late) if term is not None]
 
     @staticmethod
-    def _table(world: Any) -> ScanTable:
-        return next(c.table for c in world.connections if isinstance(c, LaserSpot))
+    def _table(context: Any) -> ScanTable:
+        return next(c.table for c in context.connections if isinstance(c, LaserSpot))
 
     def _light(self, table: ScanTable) -> Any:
         with dr.resume_grad():
             return scan_light(table, self.capture, self.legs)
 
-    def _elements(self, world: Any) -> HiddenElements:
+    def _elements(self, context: Any) -> HiddenElements:
         """Hidden points as shared samples draw them: on the wall, too, where it lights itself."""
-        table = self._table(world)
+        table = self._table(context)
         # A copy, of which elements may be put in another order.
         return copy(table.elements([] if self.samples_wall or table.wall is None else table.wall))
 
-    def _shared(self, world: Any, film: Any, seed: Any, samples: int) -> SharedThirdBounce:
-        light, elements = self._light(self._table(world)), self._elements(world)
-        return SharedThirdBounce(world, film, light, elements, self.capture, (seed, samples))
+    def _shared(self, context: Any, film: Any, seed: Any, samples: int) -> SharedThirdBounce:
+        light, elements = self._light(self._table(context)), self._elements(context)
+        return SharedThirdBounce(context, film, light, elements, self.capture, (seed, samples))
 
 
 def _choice(props: Any, name: str, shared: str) -> str:

@@ -49,11 +49,11 @@ class TransientPath(TransientIntegrator):
             return switched_off()
         return moving_edges(scene, scene.sensors() if sensors is None else sensors, self.max_depth)
 
-    def beside(self, world, sensor, film, seed, samples):
-        if not (self.boundary and world.wanted.silhouettes):
+    def beside(self, context, sensor, film, seed, samples):
+        if not (self.boundary and context.wanted.silhouettes):
             return []
         count = self.spp_boundary or max(1, samples // 2)
-        return [BoundaryTerm(self, world, sensor, film, seed, count, self.boundary_passes)]
+        return [BoundaryTerm(self, context, sensor, film, seed, count, self.boundary_passes)]
 
     def strategies(self, contents):
         scattering = Lambertian(draws_lobe=True) if Lambertian.fits(contents) else Surface()

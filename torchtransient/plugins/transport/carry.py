@@ -1,7 +1,7 @@
-"""Everything differentiable that goes from one vertex of a path to the next.
+"""Differentiable state of a path between two vertices.
 
 A vertex is a function ``Carry -> (EventTerms, Carry)``. Reverse mode carries the adjoint of a Carry backwards, forward
-mode its tangent forwards; neither knows what is in it.
+mode its tangent forwards; neither depends on its fields.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import mitsuba as mi
 
 @dataclass
 class Carry:
-    """A dataclass on purpose: the adjoint and the tangent are loop state. Copied, never changed."""
+    """Differentiable state of a path. A dataclass: its adjoint and tangent are loop state. Copied, never changed."""
 
     β: Any      # Spectrum    throughput; its adjoint is the light beyond, weighed by the film's adjoint
     slope: Any  # Float       zero with the derivative of the optical path length so far
@@ -30,13 +30,13 @@ class Carry:
 
     @staticmethod
     def zeros() -> Carry:
-        """No adjoint or tangent."""
+        """Return a Carry of zeros."""
         vectors = (mi.Vector3f(0) for _ in range(6))
         return Carry(mi.Spectrum(0), mi.Float(0), mi.Float(0), *vectors)
 
 
 def attach(carry: Carry, names: Sequence[str], tangents: Carry | None = None) -> Carry:
-    """The carry with fresh leaves for the fields ``names``, with ``tangents`` in forward mode."""
+    """Return the Carry with new leaves for the fields ``names``, which have ``tangents`` in forward mode."""
     leaves = {}
     for name in names:
         leaf = type(getattr(carry, name))(getattr(carry, name))
@@ -48,17 +48,17 @@ def attach(carry: Carry, names: Sequence[str], tangents: Carry | None = None) ->
 
 
 def adjoint_of(carry: Carry, names: Sequence[str]) -> Carry:
-    """What a traversal left at the leaves ``names``."""
+    """Return the gradients of the leaves ``names``, zeros for other fields."""
     return with_fields(Carry.zeros(), names, [dr.grad(getattr(carry, name)) for name in names])
 
 
 def with_fields(carry: Carry, names: Sequence[str], values: Sequence[Any]) -> Carry:
-    """The carry with some fields replaced by values of their types."""
+    """Return the Carry with the fields ``names`` replaced by ``values``."""
     return replace(carry, **{n: type(getattr(carry, n))(v) for n, v in zip(names, values, strict=True)})
 
 
 def inner(adjoint: Carry, carry: Carry, names: Sequence[str]) -> Any:
-    """``<adjoint, carry>`` over the fields ``names``."""
+    """Return ``<adjoint, carry>`` over the fields ``names``."""
     total = mi.Float(0)
     for name in names:
         total += total_of(getattr(adjoint, name), getattr(carry, name))
@@ -66,7 +66,7 @@ def inner(adjoint: Carry, carry: Carry, names: Sequence[str]) -> Any:
 
 
 def total_of(a: Any, b: Any) -> Any:
-    """Sum over all entries of ``a b``: of numbers, vectors, spectra, Stokes vectors of spectra, Mueller matrices."""
+    """Return the sum of ``a b`` over entries of numbers, vectors, spectra, Stokes vectors or Mueller matrices."""
     if mi.is_polarized and isinstance(b, mi.Spectrum):
         return dr.sum(sum(a[i, j] * b[i, j] for i in range(4) for j in range(4)))
     if mi.is_polarized and isinstance(b, mi.SpectrumEntry):
@@ -75,10 +75,10 @@ def total_of(a: Any, b: Any) -> Any:
 
 
 def choose(mask: Any, a: Carry, b: Carry, names: Sequence[str]) -> Carry:
-    """``a`` where ``mask``, else ``b``, in the fields ``names``; the others are those of ``b``."""
+    """Return ``a`` where ``mask`` and ``b`` elsewhere in the fields ``names``, and other fields of ``b``."""
     return replace(b, **{name: dr.select(mask, getattr(a, name), getattr(b, name)) for name in names})
 
 
 def slope_only(x: Any) -> Any:
-    """Zero with the derivative of ``x``."""
+    """Return zero with the derivative of ``x``."""
     return dr.replace_grad(mi.Float(0), x)

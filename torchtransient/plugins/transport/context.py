@@ -1,4 +1,4 @@
-"""What a walk is told: scene, contents, settings of the integrator and strategies, fixed for one job."""
+"""Context of a walk: scene, contents, settings of the integrator, strategies and derivatives of one job."""
 
 from __future__ import annotations
 
@@ -21,9 +21,11 @@ from torchtransient.plugins.transport.surface_interactions import AttachedSurfac
 
 @dataclass(frozen=True)
 class PathSettings:
-    """The parameters of an integrator that a walk asks for, see :class:`.TransientIntegrator`. ``min_depth``: events
-    of smaller depths do not count. ``division``: who finds light of which depths
-    (:class:`~..around_corner.division.Division`), None where paths find all.
+    """Parameters of an integrator that a walk reads, see :class:`~..integrators.base.TransientIntegrator`.
+
+    Attributes:
+        min_depth: smallest depth of events that count.
+        division: :class:`~..around_corner.division.Division` of depths among estimators, None if paths find all light.
     """
 
     max_depth: int
@@ -36,12 +38,17 @@ class PathSettings:
 
 
 class RenderContext:
-    """One job: a render, or a pass over it for derivatives. Built outside of traced code, not changed afterwards.
+    """Context of one job, a render or a derivative. Built outside of traced code, not changed afterwards.
 
-    ``wanted``: which derivatives (:class:`.derivative.wanted.Wanted`), None in a render. ``window``: which arrivals the
-    film counts, None where its steady image counts them all.
+    A plain class: Dr.Jit loops would take a dataclass apart as loop state.
 
-    A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
+    Args:
+        scene: Mitsuba scene.
+        contents: :class:`.scene_contents.SceneContents`.
+        settings: parameters of the integrator.
+        strategies: (segment, scattering, list of connections), see :mod:`.strategy`.
+        wanted: :class:`Wanted` derivatives, None in a render.
+        window: :class:`~..films.block.ArrivalWindow` of the film, None if its steady image counts all arrivals.
     """
 
     def __init__(self, scene: Any, contents: Any, settings: PathSettings, strategies: Any, wanted=None, window=None):
@@ -52,24 +59,24 @@ class RenderContext:
         self.discard_direct_light = settings.discard_direct_light
         self.camera_unwarp = settings.camera_unwarp
         self.window = window
-        # Only where path lengths change is it asked how surfaces move.
+        # The motion of surfaces matters only where path lengths change.
         self.surfaces = AttachedSurfaces.of(contents) if wanted is not None and wanted.geometry else None
         self.segment, self.scattering, self.connections = strategies
         self.finds_light = any(connection.finds_light for connection in self.connections)
-        # Media have connections draw numbers, which derivatives have to draw as well.
+        # In media connections draw random numbers, which derivatives draw as well.
         self.dark_at_first = contents.media is None and all(c.dark_at_first for c in self.connections)
-        # Where paths end before they would be thinned out, no number is drawn for it.
+        # Paths that end before Russian roulette draw no number for it.
         self.plays_roulette = self.finds_light or self.max_depth > self.rr_depth + 2
         self._check_names()
-        # A lower bound of what a path still has to travel, where all light is that of the scene's emitters.
+        # Lower bound of the remaining length of a path, where all light comes from emitters of the scene.
         bounded = window is not None and all(c.light_of_scene_alone for c in self.connections)
         self._light_box = LightBox.of(scene, contents.bsdfs) if bounded else None
         with dr.resume_grad():  # tables are attached where the parameters are
             for strategy in self.strategies():
                 strategy.prepare(self)
-        # The fields of the Carry that derivatives go through.
+        # Fields of the Carry that derivatives pass through.
         self.carried = () if wanted is None else wanted.carried + self.segment.carried
-        # Where derivatives keep what they record.
+        # Memory of the records of derivatives.
         self.record_room = None if wanted is None else record_room(self)
         self._built = True
 
@@ -106,16 +113,16 @@ class RenderContext:
 
     @property
     def walks(self) -> bool:
-        """Whether there is light that paths have to find."""
+        """Return True if paths find some of the light."""
         return self.division is None or self.division.walks
 
     @property
     def index_changes(self) -> bool:
-        """Whether paths can run in media of different indices of refraction, or through delta lobes."""
+        """Return True if paths run in media of different indices of refraction, or through delta lobes."""
         return self.contents.delta or self.contents.refraction is not None
 
     def deep_enough(self, active: Any, depth: Any) -> Any:
-        """Which events of depth ``depth`` (UInt32) count."""
+        """Return a mask of events of depth ``depth`` (UInt32) that count."""
         active = active if self.min_depth == 0 else active & (depth >= self.min_depth)
         if self.division is None or not self.division.shared:
             return active
@@ -123,33 +130,43 @@ class RenderContext:
         return active & ((depth < shared.start) | (depth >= shared.stop))
 
     def in_time(self, active: Any, τ: Any, p: Any) -> Any:
-        """Which paths of length ``τ`` up to the point ``p`` can still have an event that the film counts."""
+        """Return a mask of paths of length ``τ`` up to ``p`` that can have a further event in the film's window."""
         if self.window is None:
             return active
         least = τ if self._light_box is None else τ + mi.Float64(self._light_box.distance(p))
         return active & ~self.window.over(least)
 
     def counted(self, active: Any, τ: Any) -> Any:
-        """Which arrivals at ``τ`` the film counts."""
+        """Return a mask of arrivals at ``τ`` in the film's window."""
         return active if self.window is None else active & self.window.counts(τ)
 
 
 # --------------------------------------------------------------------------------------------------------------------
-# Which derivatives a job asks for, from what the scene's attached parameters move.
+# Derivatives of a job, by the effects of the attached parameters.
 
 class Wanted:
-    """Built once a job, outside of traced code; does not change afterwards.
+    """Derivatives of a job. Built outside of traced code, not changed afterwards.
 
-    ``nodes``: pointers of the plugins with attached parameters. ``geometry``: path lengths change. ``silhouettes``:
-    edges move against what is behind them. ``shapes``: pointers of the shapes that move. ``light``: an emitter without
-    a shape moves. ``sky``: the emitter whose sun moves, or None.
-    ``emitter_shape``: the shape of a light does. ``sphere_lights``: path lengths change and some lights are spheres.
-    ``sensor``: the sensor moves. ``index``: an index of refraction changes. ``ray``: the ray itself is handed on,
-    behind delta lobes or a sensor that moves. ``plain``: where a point slides on its surface, nothing but its place
-    changes. ``extinction``: that of a medium changes. ``carried``: the fields of the :class:`~..carry.Carry` that
-    derivatives go through, beside those of the segments.
+    Attributes:
+        nodes: pointers of the plugins with attached parameters.
+        geometry: path lengths change.
+        silhouettes: edges move against their background.
+        shapes: pointers of the shapes that move.
+        light: an emitter without a shape moves.
+        sky: emitter of the sun that moves, None without.
+        emitter_shape: the shape of an emitter moves.
+        sphere_lights: path lengths change and some emitters are spheres.
+        sensor: the sensor moves.
+        index: an index of refraction changes.
+        ray: the Carry has the ray, behind delta lobes or a moving sensor.
+        plain: a point that slides on its surface changes in position alone.
+        extinction: the extinction of a medium changes.
+        carried: fields of the :class:`.carry.Carry` that derivatives pass through, without those of the segments.
 
-    ``effects``: (plugin, key, effect) of the attached parameters, see :mod:`torchtransient.plugins.parameters`.
+    Args:
+        effects: (plugin, key, effect) of the attached parameters, see :mod:`torchtransient.plugins.parameters`.
+        sensor: sensor of the job.
+        contents: :class:`.scene_contents.SceneContents`.
     """
 
     def __init__(self, effects: Sequence[tuple[Any, str, ParameterEffect]], sensor: Any, contents: Any) -> None:

@@ -1,4 +1,4 @@
-"""One recorded vertex as a function ``Carry -> (EventTerms, Carry)``, put together from what the strategies say.
+"""Derivatives of a recorded vertex, a function ``Carry -> (EventTerms, Carry)`` of the strategies' attached forms.
 
 The sampled path is held fixed in this sense: vertices are points of their shapes, dragged along with the vertex before
 where they are near; the first vertex of a camera's path slides along its ray. Where a delta lobe determines the next
@@ -22,11 +22,11 @@ from torchtransient.plugins.transport.strategy import VertexEnd
 
 
 def attached_carry(v, names, tangents=None):
-    """The recorded Carry that arrives at a vertex, with leaves for the fields ``names``."""
+    """Return the recorded Carry that arrives at a vertex, with leaves for the fields ``names``."""
     # A leaf has the width of the lanes, or its gradient would be summed up over them.
     zero = dr.zeros(mi.Float, dr.width(v.ray.d))
     o, d = mi.Point3f(v.ray.o), mi.Vector3f(v.ray.d)
-    # Of its ends, the derivatives alone are asked for.
+    # Of its ends only the derivatives are read.
     carry = Carry(
         β=mi.Spectrum(v.β), slope=zero, η=mi.Float(v.η), o=o, d=d, x=mi.Point3f(o), w=mi.Vector3f(d), p=mi.Point3f(o),
         n=mi.Normal3f(d),
@@ -34,17 +34,8 @@ def attached_carry(v, names, tangents=None):
     return attach(carry, names, tangents)
 
 
-def vertex_terms(world, v, carry, wanted):
-    """(events with derivatives, the Carry to the next vertex, the attached vertex)."""
-    vertex = world.segment.attached(world, v, carry, wanted)
-    world.scattering.look_up_attached(world, vertex, wanted)
-    step = world.scattering.attached(world, vertex, wanted)
-    terms = [term for c in world.connections for term in c.attached(world, vertex, step, wanted)]
-    return terms, step.carry, vertex
-
-
 # --------------------------------------------------------------------------------------------------------------------
-# Reverse mode: walk the record backwards; the adjoint of the Carry goes from vertex to vertex.
+# Reverse mode: walk the record backwards, with the adjoint of the Carry.
 #
 # With the adjoint ``A`` of the film at an event's arrival and its slope ``A'``, a vertex back-propagates
 #
@@ -54,63 +45,76 @@ def vertex_terms(world, v, carry, wanted):
 # its adjoints; that of the slope the same light weighed by ``A'``. Nothing is divided: a zero albedo has its right
 # gradient, and no Mueller matrix is inverted.
 
-def step_back(world, layout, store, block, ray, k, live, adjoint, following):
-    """(adjoint of the Carry that arrives at vertex ``k``, where the vertex lies); parameters get their gradients."""
-    wanted = world.wanted
+def step_back(context, layout, store, block, ray, k, live, adjoint, following):
+    """Back-propagate vertex ``k``; return (adjoint of the Carry that arrives there, VertexEnd of the vertex)."""
+    wanted = context.wanted
     v = RecordedVertex(layout, store, k, live, ray)
     v.next = following
     with dr.resume_grad():
-        carry = attached_carry(v, world.carried)
-        terms, out, vertex = vertex_terms(world, v, carry, wanted)
-        objective = inner(adjoint, out, world.carried)
+        carry = attached_carry(v, context.carried)
+        vertex = context.segment.attached(context, v, carry, wanted)
+        context.scattering.look_up_attached(context, vertex, wanted)
+        step = context.scattering.attached(context, vertex, wanted)
+        terms = []
+        for connection in context.connections:
+            terms += connection.attached(context, vertex, step, wanted)
+        objective = inner(adjoint, step.carry, context.carried)
         for term in terms:
-            A, slope = adjoint_at(layout, store, block, term)
+            if layout.arrivals is None or term.arrival is None:
+                A, slope = block.read(term.opl, term.active)
+            else:
+                A, slope = layout.arrivals.adjoint(store, block, term.arrival, term.active)
             objective += total_of(A, term.value)
             if wanted.geometry:
                 objective += total_of(slope, dr.detach(term.value)) * term.slope
         dr.backward_from(dr.select(live, objective, 0))
-        before = adjoint_of(carry, world.carried)
-    return choose(live, before, adjoint, world.carried), vertex.end
-
-
-def adjoint_at(layout, store, block, term):
-    """The film's adjoint at the arrival of an event, and its slope."""
-    if layout.arrivals is None or term.arrival is None:
-        return block.read(term.opl, term.active)
-    return layout.arrivals.adjoint(store, block, term.arrival, term.active)
+        before = adjoint_of(carry, context.carried)
+    return choose(live, before, adjoint, context.carried), vertex.end
 
 
 @dr.syntax
-def reverse(world, layout, store, count, block, ray):
-    """Accumulate the gradients of the recorded paths; returns the adjoint of the Carry of the primary ``ray``.
+def reverse(context, layout, store, count, block, ray):
+    """Accumulate the gradients of recorded paths, with gradients suspended.
 
-    ``count``: number of recorded vertices. ``block`` reads the film's adjoint. Must run with gradients suspended.
+    Args:
+        context: :class:`.context.RenderContext` of the job.
+        layout, store: layout of the record, and the record.
+        count: number of recorded vertices, UInt32.
+        block: adjoint block of the film.
+        ray: primary ray, Ray3f.
+
+    Returns:
+        Adjoint of the Carry of the primary ray.
     """
     if dr.hint(layout.arrivals is not None, mode="scalar"):
         store = read_ahead(layout.arrivals, store, block)
     i = mi.Int32(count) - 1
     live = i >= 0
     adjoint, following = Carry.zeros(), VertexEnd.nowhere()
-    while dr.hint(live, max_iterations=world.max_depth, label="reverse mode"):
-        adjoint, following = step_back(world, layout, store, block, ray, mi.UInt32(i), live, adjoint, following)
+    while dr.hint(live, max_iterations=context.max_depth, label="reverse mode"):
+        adjoint, following = step_back(context, layout, store, block, ray, mi.UInt32(i), live, adjoint, following)
         i -= 1
         live = i >= 0
     return adjoint
 
 
 # --------------------------------------------------------------------------------------------------------------------
-# Forward mode: walk the record once more; the tangent of the Carry goes from vertex to vertex.
+# Forward mode: walk the record forwards, with the tangent of the Carry.
 #
 # Every event puts ``k dvalue + value k' dtau`` onto the film. A vertex is the same function as in reverse mode, so both
 # agree to rounding for one seed.
 
 def propagate_tangents(parameters, tables):
-    """Bring the tangents of the scene's ``parameters`` to where the loop meets them, outside of its isolated scope;
-    ``tables``: what has been computed of them.
+    """Propagate the tangents of the scene's parameters to the arrays that kernels read.
+
+    Args:
+        parameters: :class:`~..parameters.ParameterTracker` of the scene.
+        tables: arrays that strategies computed from parameters.
     """
     attached = parameters.attached_values()
-    # To them, and on to what plugins derive from them, such as the vertices of a rectangle; a caller may have done so
-    # already. In one go: a call of a plugin that tables come from runs into edges that no traversal knows of.
+    # To the parameters, and on to arrays that plugins derive from them, such as the vertices of a rectangle, if the
+    # caller has not done so. In one traversal: a plugin call that tables depend on leaves edges that a second traversal
+    # does not know.
     for value in attached + [table for table in tables if dr.grad_enabled(table)]:
         dr.enqueue(dr.ADMode.Backward, value)
     for value in attached:
@@ -127,7 +131,7 @@ def propagate_tangents(parameters, tables):
 
 
 def _is_untouched(value):
-    """Whether nobody has given a tangent: one that is zero is stored as an array."""
+    """Return True for a value without a tangent; a given tangent of zero is stored as an array."""
     tangent = dr.grad(value)
     tangent = getattr(tangent, "matrix", tangent) if "Transform" in type(tangent).__name__ else tangent
     tangent = tangent.array if dr.is_tensor_v(tangent) else tangent
@@ -136,7 +140,7 @@ def _is_untouched(value):
 
 
 def tangents_of(values):
-    """Tangents of attached values; zero for those that carry none."""
+    """Return the tangents of attached values, zero for detached ones."""
     attached = [v for v in values if dr.grad_enabled(v)]
     if not attached:
         return [dr.zeros(type(v)) for v in values]
@@ -146,31 +150,35 @@ def tangents_of(values):
     return [pushed.pop(0) if dr.grad_enabled(v) else dr.zeros(type(v)) for v in values]
 
 
-def vertex_tangents(world, v, tangent):
-    """(events, detached, with ``d_value`` and ``d_opl``; the tangent of the next Carry).
+def vertex_tangents(context, v, tangent):
+    """Return (detached events with ``d_value`` and ``d_opl``; tangent of the next Carry).
 
-    Everything attached dies on return: a variable that outlived this call would leave an edge of Dr.Jit's graph behind,
-    which the next traversal would run into.
+    No attached variable outlives this call: it would leave an edge in Dr.Jit's graph, which breaks the next traversal.
     """
-    wanted = world.wanted
+    wanted = context.wanted
     with dr.resume_grad():
-        carry = attached_carry(v, world.carried, tangent)
-        terms, out, _ = vertex_terms(world, v, carry, wanted)
+        carry = attached_carry(v, context.carried, tangent)
+        vertex = context.segment.attached(context, v, carry, wanted)
+        context.scattering.look_up_attached(context, vertex, wanted)
+        step = context.scattering.attached(context, vertex, wanted)
+        terms = []
+        for connection in context.connections:
+            terms += connection.attached(context, vertex, step, wanted)
         values = [term.value for term in terms]
         slopes = [term.slope for term in terms]
-        carried = [getattr(out, name) for name in world.carried]
+        carried = [getattr(step.carry, name) for name in context.carried]
         found = tangents_of(values + slopes + carried)
     n = len(terms)
     for term, d_value, d_opl in zip(terms, found[:n], found[n : 2 * n], strict=True):
         term.value, term.d_value, term.d_opl, term.slope = dr.detach(term.value), d_value, d_opl, None
-    return terms, with_fields(Carry.zeros(), world.carried, found[2 * n :])
+    return terms, with_fields(Carry.zeros(), context.carried, found[2 * n :])
 
 
-def step_on(world, layout, store, block, events, ray, k, live, tangent, dL):
-    """(tangent of the Carry behind vertex ``k``, ``dL`` with the derivative of its events)."""
+def step_on(context, layout, store, block, events, ray, k, live, tangent, dL):
+    """Write the events of vertex ``k``; return (tangent of the Carry behind it, ``dL`` with their derivatives)."""
     v = RecordedVertex(layout, store, k, live, ray)
-    v.next = world.segment.end(world, v.after())
-    terms, tangent = vertex_tangents(world, v, tangent)
+    v.next = context.segment.end(context, v.after())
+    terms, tangent = vertex_tangents(context, v, tangent)
     for term in terms:
         dL = dL + dr.select(live, term.d_value, 0)
         block.put_slope(events, term.opl, term.d_value, term.value * term.d_opl, term.active)
@@ -178,17 +186,26 @@ def step_on(world, layout, store, block, events, ray, k, live, tangent, dL):
 
 
 @dr.syntax
-def forward(world, layout, store, count, block, ray, tangent):
-    """Write the derivative of the transient to ``block``; returns that of the steady radiance.
+def forward(context, layout, store, count, block, ray, tangent):
+    """Write the derivative of the transient to a film, with gradients suspended.
 
-    ``tangent``: that of the Carry of the primary ``ray``.
+    Args:
+        context: :class:`.context.RenderContext` of the job.
+        layout, store: layout of the record, and the record.
+        count: number of recorded vertices, UInt32.
+        block: block of the film.
+        ray: primary ray, Ray3f.
+        tangent: tangent of the Carry of the primary ray.
+
+    Returns:
+        Derivative of the steady radiance, a spectrum.
     """
     k = dr.zeros(mi.UInt32, dr.width(ray.d))
     live = k < count
     dL = light_type()(0)
     events = block.begin()
-    while dr.hint(live, max_iterations=world.max_depth, label="forward mode"):
-        tangent, dL = step_on(world, layout, store, block, events, ray, k, live, tangent, dL)
+    while dr.hint(live, max_iterations=context.max_depth, label="forward mode"):
+        tangent, dL = step_on(context, layout, store, block, events, ray, k, live, tangent, dL)
         k += 1
         live = k < count
     block.end(events)
@@ -196,14 +213,14 @@ def forward(world, layout, store, count, block, ray, tangent):
 
 
 # --------------------------------------------------------------------------------------------------------------------
-# What derivatives of the paths of a pass have to do with the sensor: the Carry of its primary rays.
+# Derivatives by the sensor: adjoint and tangent of the Carry of its primary rays.
 
-def objective_of(world: Any, rays: Any, adjoint: Carry) -> Any:
-    """``<adjoint, Carry>`` of the primary rays."""
+def objective_of(context: Any, rays: Any, adjoint: Carry) -> Any:
+    """Return ``<adjoint, Carry>`` of the primary rays, attached to the sensor."""
     parts = {"η": adjoint.η}
-    if not world.camera_unwarp:
+    if not context.camera_unwarp:
         parts["slope"] = adjoint.slope
-    if world.wanted.sensor:
+    if context.wanted.sensor:
         parts |= {"o": adjoint.o + adjoint.x, "d": adjoint.d + adjoint.w}
         if mi.is_polarized:
             parts["turn"] = dr.sum(adjoint.β[1, 2] - adjoint.β[2, 1])
@@ -212,18 +229,18 @@ def objective_of(world: Any, rays: Any, adjoint: Carry) -> Any:
     objective = parts["η"] * rays.η
     if "slope" in parts:
         objective += parts["slope"] * rays.length()
-    if world.wanted.sensor:
+    if context.wanted.sensor:
         objective += dr.dot(parts["o"], rays.ray.o) + dr.dot(parts["d"], rays.ray.d)
     if "turn" in parts:
         objective += parts["turn"] * sensor_rotation(rays.seen, rays.ray).angle()
     return objective
 
 
-def tangent_of(world: Any, rays: Any) -> Carry:
-    """The tangent of the Carry of the primary rays."""
+def tangent_of(context: Any, rays: Any) -> Carry:
+    """Return the tangent of the Carry of the primary rays."""
     tangent = Carry.zeros()
     with dr.resume_grad():
-        if not (world.wanted.sensor or dr.grad_enabled(rays.η)):
+        if not (context.wanted.sensor or dr.grad_enabled(rays.η)):
             return tangent
         attached = [rays.ray.o, rays.ray.d, rays.length(), rays.η]
         if mi.is_polarized:
@@ -231,7 +248,7 @@ def tangent_of(world: Any, rays: Any) -> Carry:
         o, d, length, η, *rotation = tangents_of(attached)
     tangent.o, tangent.x = mi.Vector3f(o), mi.Vector3f(o)
     tangent.d, tangent.w = mi.Vector3f(d), mi.Vector3f(d)
-    tangent.slope = mi.Float(0) if world.camera_unwarp else mi.Float(length)
+    tangent.slope = mi.Float(0) if context.camera_unwarp else mi.Float(length)
     tangent.η = mi.Float(η)
     if mi.is_polarized:
         tangent.β = rotation_tangent(rotation[0])

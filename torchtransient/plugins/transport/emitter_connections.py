@@ -27,8 +27,8 @@ class EmitterFound(Connection):
     name = "emitter_found"
     light_of_scene_alone = True
 
-    def prepare(self, world):
-        sun = MovingSun.of(world)
+    def prepare(self, context):
+        sun = MovingSun.of(context)
         self.sun = sun if sun is not None and sun.rare else None
 
     def events(self, wanted):
@@ -36,24 +36,24 @@ class EmitterFound(Connection):
 
     # ------------------------------------------------------------------------------------------------- primal
 
-    def connect(self, world, path, vertex, proposal, answer, zeros):
+    def connect(self, context, path, vertex, proposal, answer, zeros):
         seen = path.active & vertex.surface
-        if world.hide_emitters:
+        if context.hide_emitters:
             seen &= (path.depth > 0) | vertex.valid
-        if world.discard_direct_light:
+        if context.discard_direct_light:
             seen &= path.depth > 0
-        seen = world.deep_enough(seen, path.depth + 1)
-        emitter = vertex.si.emitter(world.scene)
+        seen = context.deep_enough(seen, path.depth + 1)
+        emitter = vertex.si.emitter(context.scene)
         hit = (emitter != None) & seen  # noqa: E711 (a Dr.Jit comparison)
         prev = dr.zeros(mi.Interaction3f)
         prev.p, prev.n = path.prev_p, path.prev_n
         prev.time, prev.wavelengths = path.ray.time, path.ray.wavelengths
-        ds = mi.DirectionSample3f(world.scene, si=vertex.si, ref=prev)
-        if world.contents.smooth_lights is not None:
+        ds = mi.DirectionSample3f(context.scene, si=vertex.si, ref=prev)
+        if context.contents.smooth_lights is not None:
             # The face's area, on the side that emission is told by: on a mirrored mesh it is the other one.
             ds.n = dr.mulsign(vertex.si.n, dr.dot(vertex.si.n, ds.d) * dr.dot(ds.n, ds.d))
         connected = hit & ~path.prev_unconnected
-        sampled = [c.density(world, prev, ds, connected) for c in world.connections if c is not self]
+        sampled = [c.density(context, prev, ds, connected) for c in context.connections if c is not self]
         sampled = sum(density for density in sampled if density is not None)
         mis = dr.select(hit, mis_weight(path.prev_pdf, sampled), 0)
         value = first_column(vertex.β) * mis * mi.unpolarized_spectrum(emitter.eval(vertex.si, hit))
@@ -61,7 +61,7 @@ class EmitterFound(Connection):
 
     # ------------------------------------------------------------------------------------------------- record
 
-    def fields(self, world):
+    def fields(self, context):
         return {"mis": mi.Float}
 
     def record(self, sample):
@@ -69,51 +69,51 @@ class EmitterFound(Connection):
 
     # ----------------------------------------------------------------------------------------------- attached
 
-    def attached(self, world, vertex, step, wanted):
-        terms = [self._here(world, vertex, wanted)]
+    def attached(self, context, vertex, step, wanted):
+        terms = [self._here(context, vertex, wanted)]
         if self.sun is not None:
-            terms.append(self._sun_ahead(world, vertex, step))
+            terms.append(self._sun_ahead(context, vertex, step))
         return terms
 
-    def _here(self, world, vertex, wanted):
+    def _here(self, context, vertex, wanted):
         v, si = vertex.v, vertex.si
         mis = v.of(self.name)["mis"]
         hit = v.active & (mis > 0)
-        emitter = vertex.sid.emitter(world.scene)
-        elsewhere = self._claimed(world, emitter, v.ray.d, wanted)
+        emitter = vertex.sid.emitter(context.scene)
+        elsewhere = self._claimed(context, emitter, v.ray.d, wanted)
         if self.sun is not None:
             shines = self.sun.shines(emitter, v.ray.d)
             elsewhere = shines if elsewhere is None else elsewhere | shines
         if elsewhere is not None:
-            hit &= v.before(world.scattering.name, "delta", at_sensor=True) | ~elsewhere
+            hit &= v.before(context.scattering.name, "delta", at_sensor=True) | ~elsewhere
         Le = dr.select(hit, mis * mi.unpolarized_spectrum(emitter.eval(si, hit)), 0)
         value = first_column(vertex.carry.β) * Le
         return EventTerm(value=value, slope=vertex.slope, opl=v.τ, active=hit, arrival=v.arrival(self.name))
 
-    def _claimed(self, world, emitter, d, wanted):
+    def _claimed(self, context, emitter, d, wanted):
         """Mask of the emitters, in the direction ``d``, that derivatives reach by another strategy alone; None for
         none.
         """
-        claims = [c.claims(world, emitter, d, wanted) for c in world.connections if c is not self]
+        claims = [c.claims(context, emitter, d, wanted) for c in context.connections if c is not self]
         claims = [c for c in claims if c is not None]
         return reduce(or_, claims) if claims else None
 
-    def _sun_ahead(self, world, vertex, step):
+    def _sun_ahead(self, context, vertex, step):
         """Light of the sun along a path that escapes into it: the direction that was drawn turns with it."""
         following = vertex.v.after()
         mis = following.of(self.name)["mis"]
         lit = (step.inv_pdf > 0) & ~step.ahead & (mis > 0)
         with dr.suspend_grad():
             sky = following.pi.compute_surface_interaction(following.ray, mi.RayFlags.Minimal, lit)
-            emitter = sky.emitter(world.scene)
+            emitter = sky.emitter(context.scene)
             lit &= self.sun.shines(emitter, following.ray.d)
         d = self.sun.followed(mi.Vector3f(following.ray.d), lit)
         sky.wi = -d
-        towards = world.scattering.evaluate(world, vertex, d, lit)
+        towards = context.scattering.evaluate(context, vertex, d, lit)
         Le = mi.unpolarized_spectrum(emitter.eval(sky, lit))
         value = scatter_unpolarized(towards.value, vertex.rotation) * (step.inv_pdf * mis) * Le
         value = product(vertex.carry.β, dr.select(lit, value, 0))
-        length = world.contents.distant.length(vertex.scattered_si.p, d)
+        length = context.contents.distant.length(vertex.scattered_si.p, d)
         slope = vertex.scattered_slope + slope_only(step.carry.η * length)
         return EventTerm(value=value, slope=slope, opl=following.τ, active=lit, arrival=following.arrival(self.name))
 
@@ -128,25 +128,25 @@ class EmitterSampled(Connection):
     light_of_scene_alone = True
     finds_light = False
 
-    def prepare(self, world):
-        lights = world.contents.sphere_lights
-        self.spheres = None if lights is None else lights.read(world.scene)
-        self.sun = MovingSun.of(world)
+    def prepare(self, context):
+        lights = context.contents.sphere_lights
+        self.spheres = None if lights is None else lights.read(context.scene)
+        self.sun = MovingSun.of(context)
         # A light without attached numbers is dark where it is dark.
-        self.lights_change = world.wanted is not None and any(map(carries_derivatives, world.scene.emitters()))
+        self.lights_change = context.wanted is not None and any(map(carries_derivatives, context.scene.emitters()))
 
     def tables(self):
         return [] if self.spheres is None else self.spheres.tables()
 
-    def sample(self, world, ref, u, active):
+    def sample(self, context, ref, u, active):
         """(direction sample, emission over density) towards an emitter."""
-        lights = world.contents.shape_lights if self.spheres is None else self.spheres
-        found = lights.sample(world.scene, ref, u, active)
-        return found if world.contents.smooth_lights is None else self._by_faces(world, ref, *found, active)
+        lights = context.contents.shape_lights if self.spheres is None else self.spheres
+        found = lights.sample(context.scene, ref, u, active)
+        return found if context.contents.smooth_lights is None else self._by_faces(context, ref, *found, active)
 
-    def _by_faces(self, world, ref, ds, weight, active):
+    def _by_faces(self, context, ref, ds, weight, active):
         """The sample with the solid angle of the face that it lies on; Mitsuba takes the interpolated normal for it."""
-        _, _, there, n = self._found_by_ray(world, ref, ds, active & world.contents.smooth_lights.lists(ds.emitter))
+        _, _, there, n = self._found_by_ray(context, ref, ds, active & context.contents.smooth_lights.lists(ds.emitter))
         cos = dr.abs_dot(ds.n, ds.d)
         ratio = dr.select(there & (cos > 0), dr.abs_dot(n, ds.d) / cos, 1)
         ds.pdf = dr.select(ratio > 0, ds.pdf / ratio, 0)
@@ -154,62 +154,62 @@ class EmitterSampled(Connection):
 
     # ------------------------------------------------------------------------------------------------- primal
 
-    def propose(self, world, path, vertex, sampler):
-        active = world.deep_enough(vertex.goes_on & vertex.connectable, path.depth + 2)
+    def propose(self, context, path, vertex, sampler):
+        active = context.deep_enough(vertex.goes_on & vertex.connectable, path.depth + 2)
         u = sampler.next_2d()
-        ds, weight = self.sample(world, vertex.at, u, active)
+        ds, weight = self.sample(context, vertex.at, u, active)
         active &= ds.pdf > 0
         return Proposal(d=ds.d, active=active, ds=ds, weight=weight, u=u, sampler=sampler)
 
-    def density(self, world, ref, ds, active):
+    def density(self, context, ref, ds, active):
         smooth = active & ~ds.delta
-        lights = world.contents.shape_lights if self.spheres is None else self.spheres
-        pdf = lights.pdf(world.scene, ref, ds, smooth)
+        lights = context.contents.shape_lights if self.spheres is None else self.spheres
+        pdf = lights.pdf(context.scene, ref, ds, smooth)
         # An environment map that shines in the rows at its poles alone has no distribution: NaN.
         return dr.select(ds.delta, ds.pdf, dr.select(pdf > 0, pdf, 0))
 
-    def connect(self, world, path, vertex, proposal, answer, zeros):
+    def connect(self, context, path, vertex, proposal, answer, zeros):
         ds, active = proposal.ds, proposal.active
         pdf = dr.select(ds.delta, 0, answer.pdf)
-        value = product(vertex.β, answer.value) * self.weight(world, vertex.at, ds, ds.pdf, pdf, active)
+        value = product(vertex.β, answer.value) * self.weight(context, vertex.at, ds, ds.pdf, pdf, active)
         value *= mi.unpolarized_spectrum(proposal.weight)
         # Shadow rays only where they can matter.
-        active = active & (self._may_change(world, proposal, answer) if zeros else is_light(intensity(value)))
-        length = self._length(world, vertex.at.p, ds, ds.d) * (vertex.η * answer.eta)
+        active = active & (self._may_change(context, proposal, answer) if zeros else is_light(intensity(value)))
+        length = self._length(context, vertex.at.p, ds, ds.d) * (vertex.η * answer.eta)
         opl = vertex.scattered_τ + mi.Float64(length)
-        active = world.counted(active, opl)
-        active, T = world.segment.transmittance(world, vertex, ds, proposal.u, proposal.sampler, active)
+        active = context.counted(active, opl)
+        active, T = context.segment.transmittance(context, vertex, ds, proposal.u, proposal.sampler, active)
         return Event(value=value * T, opl=opl, active=active, depth=path.depth + 2, T=T, crowded=True)
 
-    def _may_change(self, world, proposal, answer):
+    def _may_change(self, context, proposal, answer):
         """Whether a sample of value zero may have a derivative: with an albedo of zero, but not behind a surface."""
         may = mi.Bool(True)
         if not self.lights_change:
             may &= is_light(mi.unpolarized_spectrum(proposal.weight))
-        if world.scattering.samples_all:
+        if context.scattering.samples_all:
             may &= answer.pdf > 0
         return may
 
     @staticmethod
-    def _length(world, p, ds, d):
+    def _length(context, p, ds, d):
         """Length of the connection from ``p`` to a sampled point of a light, or to a distant one in direction ``d``."""
-        if world.contents.distant is None:
+        if context.contents.distant is None:
             return ds.dist
         far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-        return dr.select(far, world.contents.distant.length(p, d), ds.dist)
+        return dr.select(far, context.contents.distant.length(p, d), ds.dist)
 
     # ------------------------------------------------------------------------------------------------- record
 
-    def fields(self, world):
+    def fields(self, context):
         fields = {"u": mi.Point2f, "lit": mi.Bool}
-        return fields if world.contents.media is None else fields | {"T": mi.UnpolarizedSpectrum}
+        return fields if context.contents.media is None else fields | {"T": mi.UnpolarizedSpectrum}
 
     def record(self, sample):
         return {"u": sample.proposal.u, "lit": sample.event.active, "T": sample.event.T}
 
     # ----------------------------------------------------------------------------------------------- attached
 
-    def claims(self, world, emitter, d, wanted):
+    def claims(self, context, emitter, d, wanted):
         # The limb of a sphere turns away from the vertex: in area measure its derivative has infinite variance. A
         # sphere is sampled over the cone that it fills, which moves with it, and by this strategy alone. So is the sun.
         claimed = self.spheres.draws(emitter) if wanted.sphere_lights else None
@@ -221,41 +221,41 @@ class EmitterSampled(Connection):
     def numbers(self, recorded):
         return [recorded["u"].x, recorded["u"].y]
 
-    def attached(self, world, vertex, step, wanted):
+    def attached(self, context, vertex, step, wanted):
         v, si = vertex.v, vertex.scattered_si
         r = v.of(self.name)
         lit = r["lit"]
-        light = self._light(world, si, r["u"], lit, wanted)
-        d = self._move(world, vertex, light, wanted) if wanted.geometry else mi.Vector3f(light.ds.d)
+        light = self._light(context, si, r["u"], lit, wanted)
+        d = self._move(context, vertex, light, wanted) if wanted.geometry else mi.Vector3f(light.ds.d)
         if self.sun is not None:
             d = self.sun.followed(d, light.sun)
-        Le = self._emission(world, si, light, d, lit, wanted)
-        towards = world.scattering.evaluate(world, vertex, d, lit, ds=light.ds)
+        Le = self._emission(context, si, light, d, lit, wanted)
+        towards = context.scattering.evaluate(context, vertex, d, lit, ds=light.ds)
         alone = light.ds.delta | light.cone
         if self.sun is not None and not self.sun.rare:
             alone |= light.sun
         pdf = dr.select(alone, 0, towards.pdf)
         with dr.suspend_grad():
-            mis = self.weight(world, si, light.ds, light.ds.pdf, pdf, lit)
+            mis = self.weight(context, si, light.ds, light.ds.pdf, pdf, lit)
         value = scatter_unpolarized(towards.value, vertex.rotation) * Le * mis
         if "T" in r:
             value *= r["T"]
         end = Local(p=light.p, d=mi.Vector3f(light.ds.d), far=light.far, ahead=False)
-        value *= world.segment.attached_transmittance(world, vertex, end, lit)
+        value *= context.segment.attached_transmittance(context, vertex, end, lit)
         # Selected before the product: what an idle lane holds must not reach the adjoint of the throughput.
         value = product(vertex.carry.β, dr.select(lit, value, 0))
-        length = (self._length(world, si.p, light.ds, d) + light.longer) * towards.eta
+        length = (self._length(context, si.p, light.ds, d) + light.longer) * towards.eta
         opl = vertex.scattered_opl + mi.Float64(dr.detach(length) * v.η)
         slope = vertex.scattered_slope
         if wanted.geometry:
             slope = slope + slope_only(vertex.carry.η * length)
         return [EventTerm(value=value, slope=slope, opl=opl, active=lit, arrival=v.arrival(self.name))]
 
-    def _light(self, world, si, u, lit, wanted):
+    def _light(self, context, si, u, lit, wanted):
         """The sampled point of a light, attached: ``p, n``, its ``area`` element, and what kind it is of."""
-        scene = world.scene
+        scene = context.scene
         with dr.suspend_grad():
-            ds, weight = self.sample(world, si, u, lit)
+            ds, weight = self.sample(context, si, u, lit)
             flags = ds.emitter.flags()
             far = lit & mi.has_flag(flags, mi.EmitterFlags.Infinite)
             surface = lit & mi.has_flag(flags, mi.EmitterFlags.Surface) & ~far
@@ -272,46 +272,46 @@ class EmitterSampled(Connection):
             moving, _ = scene.sample_emitter_direction(si, u, False, at_point)
             light.p = dr.replace_grad(light.p, dr.select(at_point, moving.p, 0))
         if wanted.sphere_lights:
-            light.cone = surface & self.claims(world, ds.emitter, ds.d, wanted)
+            light.cone = surface & self.claims(context, ds.emitter, ds.d, wanted)
             light.surface = surface & ~light.cone
-            moving, light.cone_weight = self.sample(world, si, u, light.cone)
+            moving, light.cone_weight = self.sample(context, si, u, light.cone)
             light.p = dr.replace_grad(light.p, dr.select(light.cone, moving.p, 0))
-        if wanted.geometry and world.contents.smooth_lights is not None:
-            _, _, there, n = self._found(world, si, light)
+        if wanted.geometry and context.contents.smooth_lights is not None:
+            _, _, there, n = self._found(context, si, light)
             light.face_n = dr.select(there, n, light.face_n)
         if wanted.emitter_shape:
-            self._follow_shape(world, si, light)
+            self._follow_shape(context, si, light)
         return light
 
     @staticmethod
-    def _found_by_ray(world, ref, ds, active):
+    def _found_by_ray(context, ref, ds, active):
         """(the ray to the point of a light, its intersection, where it finds the light, the normal of the face there):
         what knows the shape.
         """
         with dr.suspend_grad():
             ray = ref.spawn_ray(ds.d)
-            pi = world.segment.next_surface(world, ray, active)
+            pi = context.segment.next_surface(context, ray, active)
             there = active & pi.is_valid()
             found = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, there)
-            return ray, pi, there & (found.emitter(world.scene) == ds.emitter), found.n
+            return ray, pi, there & (found.emitter(context.scene) == ds.emitter), found.n
 
-    def _found(self, world, si, light):
+    def _found(self, context, si, light):
         """As above, of the point of ``light``, looked for once."""
         if light.found is None:
-            light.found = self._found_by_ray(world, si, light.ds, light.surface)
+            light.found = self._found_by_ray(context, si, light.ds, light.surface)
         return light.found
 
-    def _follow_shape(self, world, si, light):
+    def _follow_shape(self, context, si, light):
         """Make the point a material one of the light's shape."""
-        ray, pi, there, _ = self._found(world, si, light)
-        found, area = material_point(pi, ray, there, world.contents.emitting_meshes)
+        ray, pi, there, _ = self._found(context, si, light)
+        found, area = material_point(pi, ray, there, context.contents.emitting_meshes)
         light.p = dr.select(there, dr.replace_grad(light.p, found.p), light.p)
         light.n = dr.select(there, dr.replace_grad(light.n, found.sh_frame.n), light.n)
         light.face_n = dr.select(there, dr.replace_grad(light.face_n, found.n), light.face_n)
         light.uv = dr.select(there, dr.replace_grad(light.uv, found.uv), light.uv)
         light.area = dr.relative_grad(area)
 
-    def _move(self, world, vertex, light, wanted):
+    def _move(self, context, vertex, light, wanted):
         """The attached direction towards the point of a light, which slides like any other one that is near: points
         that are found must move as those that are sampled.
         """
@@ -325,24 +325,24 @@ class EmitterSampled(Connection):
         light.J = dr.select(on_surface, light.J, 1)
         light.p = light.p + dr.select(on_surface, motion.slide(n), 0)
         light.longer = dr.select(near, motion.longer(n), 0)
-        if world.contents.patterned_lights:
-            ray, pi, there, _ = self._found(world, si, light)
+        if context.contents.patterned_lights:
+            ray, pi, there, _ = self._found(context, si, light)
             slide = slide_on_shape(pi, ray, motion.drag, there)
             light.uv, light.n = light.uv + slide.uv, light.n + slide.sh_n
         return motion.d
 
     @staticmethod
-    def _emission(world, si, light, d, lit, wanted):
+    def _emission(context, si, light, d, lit, wanted):
         """Emission over density, with the derivative of the emission and of the solid angle."""
         ds = dr.copy(light.ds)
         if wanted.emitter_shape:  # a pattern that moves over the shape
             ds.uv = light.uv
         if wanted.geometry:
             ds.d, ds.dist = d, light.ds.dist + light.longer
-            if wanted.emitter_shape or wanted.light or wanted.sphere_lights or world.contents.patterned_lights:
+            if wanted.emitter_shape or wanted.light or wanted.sphere_lights or context.contents.patterned_lights:
                 ds.p, ds.n, ds.uv = light.p, light.n, light.uv
         inv_pdf = dr.select(light.ds.pdf > 0, dr.rcp(light.ds.pdf), 0)
-        value = mi.unpolarized_spectrum(world.scene.eval_emitter_direction(si, ds, lit)) * inv_pdf
+        value = mi.unpolarized_spectrum(context.scene.eval_emitter_direction(si, ds, lit)) * inv_pdf
         if wanted.geometry:
             value *= light.J
         if wanted.sphere_lights:

@@ -25,23 +25,23 @@ class HiddenGeometry(Guide):
     def share_at(self, depth):
         return dr.select(depth == 0, mi.Float(self.at_wall), mi.Float(self.share))
 
-    def draw(self, world, vertex, x, y):
+    def draw(self, context, vertex, x, y):
         p, n, uv, shape, primitive = self.elements.draw_with_surface(x, y, vertex.goes_on)
         return GuidedPoint(p, shape, primitive, n, uv)
 
-    def density(self, world, p, q, n, shape, active, primitive=None):
+    def density(self, context, p, q, n, shape, active, primitive=None):
         v = dr.select(active, q - p, mi.Vector3f(0, 0, 1))
         if primitive is None:  # a light was asked for a point of its shape, and does not say of which triangle
             ray = mi.Ray3f(mi.Point3f(p), dr.normalize(v))
             with dr.suspend_grad():
-                primitive = shape_hit(world, ray, shape, active)
+                primitive = shape_hit(context, ray, shape, active)
         per_area = self.elements.per_area(shape, primitive, q, active)
         d2 = dr.squared_norm(v)
         cos = dr.abs_dot(n, v) * dr.rsqrt(d2)
         return dr.select(active & (cos > 0), per_area * d2 / cos, 0)
 
 
-def shape_hit(world, ray, shape, active):
+def shape_hit(context, ray, shape, active):
     """Number of the triangle of ``shape`` that a ray meets first (of what is hidden from there, any will do)."""
-    found = world.segment.next_surface(world, ray, active)
+    found = context.segment.next_surface(context, ray, active)
     return dr.select(active & (found.shape == shape), found.prim_index, 0)

@@ -41,8 +41,8 @@ class LaserSpot(Connection):
         # No point of a flat wall sees another; pixels of cameras may look past the wall.
         self.dark_at_first = table.wall is not None and table.looks_at_points
 
-    def prepare(self, world):
-        if not world.scattering.turns_freely:
+    def prepare(self, context):
+        if not context.scattering.turns_freely:
             return
         # Where everything is diffuse, a few numbers say all of a spot.
         self.points = self.table.lambertian_spots(self.legs)
@@ -56,7 +56,7 @@ class LaserSpot(Connection):
             arrays += [self.points.p, self.points.n, self.points.value, self.points.leg]
         return [array for array in arrays if dr.grad_enabled(array)]
 
-    def start(self, world, rays):
+    def start(self, context, rays):
         self.index = rays.spot
 
     # ------------------------------------------------------------------------------------------------ the spot
@@ -75,8 +75,8 @@ class LaserSpot(Connection):
 
     # ------------------------------------------------------------------------------------------------- primal
 
-    def propose(self, world, path, vertex, sampler):
-        active = world.deep_enough(vertex.goes_on & vertex.connectable, path.depth + 2)
+    def propose(self, context, path, vertex, sampler):
+        active = context.deep_enough(vertex.goes_on & vertex.connectable, path.depth + 2)
         spot = self.spot(vertex.at.wavelengths, active)
         to = spot.p - vertex.at.p
         dist = dr.norm(to)
@@ -84,46 +84,46 @@ class LaserSpot(Connection):
         d = to / dr.select(active, dist, 1)
         ds = Local(p=spot.p, n=spot.n, d=d, dist=dist, delta=mi.Bool(True), emitter=None)
         active &= dr.dot(d, vertex.at.n) != 0
-        u = sampler.next_2d() if world.contents.media is not None else mi.Point2f(0)
+        u = sampler.next_2d() if context.contents.media is not None else mi.Point2f(0)
         return Proposal(d=d, active=active, ds=ds, spot=spot, u=u, sampler=sampler)
 
-    def connect(self, world, path, vertex, proposal, answer, zeros):
+    def connect(self, context, path, vertex, proposal, answer, zeros):
         ds, active = proposal.ds, proposal.active
         light = proposal.spot.light(ds.d, active) * dr.select(active, dr.rcp(dr.square(ds.dist)), 0)
         value = product(vertex.β, product(answer.matrix, light))
         if not zeros:
             active = active & (dr.max(dr.abs(intensity(value))) > 0)
         opl = vertex.scattered_τ + mi.Float64(ds.dist * (vertex.η * answer.eta)) + mi.Float64(proposal.spot.leg)
-        active = world.counted(active, opl)
+        active = context.counted(active, opl)
         test = active
-        if self.confocal and world.contents.media is None:
+        if self.confocal and context.contents.media is None:
             test = active & (path.depth != 1)
-        seen, T = world.segment.transmittance(world, vertex, ds, proposal.u, sampler=proposal.sampler, active=test)
+        seen, T = context.segment.transmittance(context, vertex, ds, proposal.u, sampler=proposal.sampler, active=test)
         active = (active & ~test) | seen
         return Event(value=value * T, opl=opl, active=active, depth=path.depth + 2, T=T)
 
     # ------------------------------------------------------------------------------------------------- record
 
-    def fields(self, world):
-        return {"lit": mi.Bool} | ({"T": mi.UnpolarizedSpectrum} if world.contents.media is not None else {})
+    def fields(self, context):
+        return {"lit": mi.Bool} | ({"T": mi.UnpolarizedSpectrum} if context.contents.media is not None else {})
 
     def record(self, sample):
         return {"lit": sample.event.active, "T": sample.event.T}
 
     # ----------------------------------------------------------------------------------------------- attached
 
-    def attached(self, world, vertex, step, wanted):
+    def attached(self, context, vertex, step, wanted):
         si, r = vertex.scattered_si, vertex.v.of(self.name)
         lit = r["lit"]
         spot = self.spot(si.wavelengths, lit, attached=True)
         to = dr.select(lit, spot.p - si.p, mi.Vector3f(0, 0, 1))
         length = dr.norm(to)
         d = to / length
-        towards = world.scattering.evaluate(world, vertex, d, lit)
+        towards = context.scattering.evaluate(context, vertex, d, lit)
         matrix = rotate_mueller(towards.value, vertex.rotation, rotation_from_light(si, towards.wo, d))
         light = spot.light(d, lit) * dr.rcp(dr.square(length)) * r.get("T", 1)
         end = Local(p=spot.p, d=dr.detach(d), far=mi.Bool(False), ahead=False)
-        light *= world.segment.attached_transmittance(world, vertex, end, lit)
+        light *= context.segment.attached_transmittance(context, vertex, end, lit)
         value = dr.select(lit, product(matrix, light), 0)
         leg = mi.Float(spot.leg)
         opl = (

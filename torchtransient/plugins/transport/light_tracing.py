@@ -37,28 +37,28 @@ class SensorSampled(Connection):
     def __init__(self, places, unwarp):
         self.places, self.unwarp, self.numbers, self.in_line = places, unwarp, None, None
 
-    def propose(self, world, path, vertex, sampler):
-        active = world.deep_enough(vertex.goes_on & vertex.connectable, path.depth + 2)
+    def propose(self, context, path, vertex, sampler):
+        active = context.deep_enough(vertex.goes_on & vertex.connectable, path.depth + 2)
         ds, importance = self.places.seen_from(vertex.at, self.numbers, active)
         return Proposal(d=ds.d, active=active & (ds.pdf > 0), ds=ds, importance=importance, u=sampler.next_2d(),
                         sampler=sampler)  # fmt: skip
 
-    def connect(self, world, path, vertex, proposal, answer, zeros):
+    def connect(self, context, path, vertex, proposal, answer, zeros):
         ds = proposal.ds
         value = in_sensor_frame(first_row(product(vertex.β, answer.matrix)), mi.Vector3f(ds.d)) * proposal.importance
         active = proposal.active & (dr.max(dr.abs(intensity(value))) > 0)
-        if world.hide_emitters:  # primary rays pass lights
+        if context.hide_emitters:  # primary rays pass lights
             active &= ~(vertex.surface & vertex.si.shape.is_emitter())
         length = mi.Float(0) if self.unwarp else ds.dist * vertex.η * answer.eta
         opl = vertex.scattered_τ + mi.Float64(length)
-        active = world.counted(active, opl)
+        active = context.counted(active, opl)
         depth = path.depth + 2
         first, at, known = depth == 2, vertex, self.in_line
         if known is not None:
             at = dr.copy(vertex)
             at.at = dr.copy(vertex.at)
             at.at.p += dr.select(first & known.near, known.step, 0)
-        seen, T = world.segment.transmittance(world, at, ds, proposal.u, proposal.sampler, active, seen=True)
+        seen, T = context.segment.transmittance(context, at, ds, proposal.u, proposal.sampler, active, seen=True)
         active = seen if known is None else dr.select(first & known.near, active & known.shown, seen)
         return Event(value=value * T, opl=opl, active=active, depth=depth, uv=ds.uv, d=ds.d, first=first, speed=0)
 
@@ -94,9 +94,9 @@ class FromLight:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._scattering, name)
 
-    def scatter(self, world: Any, path: Any, vertex: Any, proposals: Any, sampler: Any) -> Any:
+    def scatter(self, context: Any, path: Any, vertex: Any, proposals: Any, sampler: Any) -> Any:
         """As :meth:`~..strategy.Scattering.scatter`."""
-        answers, step = self._scattering.scatter(world, path, vertex, proposals, sampler)
+        answers, step = self._scattering.scatter(context, path, vertex, proposals, sampler)
         for proposal, answer in zip(proposals, answers, strict=True):
             if answer is not None:
                 factor = self._factor(vertex, proposal.d, proposal.active)

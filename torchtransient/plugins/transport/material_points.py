@@ -21,27 +21,27 @@ class MaterialVacuum(Vacuum):
 
     drags = False
 
-    def prepare(self, world):
-        super().prepare(world)
-        moving = frozenset() if world.wanted is None or not world.wanted.geometry else world.wanted.shapes
-        self.triangles = AttachedTriangles(world.scene.shapes(), moving)
+    def prepare(self, context):
+        super().prepare(context)
+        moving = frozenset() if context.wanted is None or not context.wanted.geometry else context.wanted.shapes
+        self.triangles = AttachedTriangles(context.scene.shapes(), moving)
         # A point and its normal are all that Lambertian surfaces ask for: whoever has gathered a triangle's vertices to
         # go there hands them on, and each is back-propagated to once.
-        self.carried = ("p", "n") if moving and self.triangles.holds_all and world.scattering.turns_freely else ()
+        self.carried = ("p", "n") if moving and self.triangles.holds_all and context.scattering.turns_freely else ()
 
-    def attached(self, world, v, carry, wanted):
-        vertex = super().attached(world, v, carry, wanted)
+    def attached(self, context, v, carry, wanted):
+        vertex = super().attached(context, v, carry, wanted)
         if wanted.geometry:
             # The vertex before has counted the segment between two material points.
-            vertex.slope = dr.select(self._free(world, v), carry.slope, vertex.slope)
+            vertex.slope = dr.select(self._free(context, v), carry.slope, vertex.slope)
         return vertex
 
-    def attached_surface(self, world, v, carry, ray, wanted, active):
+    def attached_surface(self, context, v, carry, ray, wanted, active):
         if not wanted.geometry:
-            return super().attached_surface(world, v, carry, ray, wanted, active)
+            return super().attached_surface(context, v, carry, ray, wanted, active)
         # Each lane asks for one of the two: what is back-propagated to a surface is scattered for every active lane.
-        free = self._free(world, v)
-        found = super().attached_surface(world, v, carry, ray, wanted, active & ~free)
+        free = self._free(context, v)
+        found = super().attached_surface(context, v, carry, ray, wanted, active & ~free)
         return dr.select(free, self._material(v, carry, active & free), found)
 
     def _material(self, v, carry, active):
@@ -56,13 +56,13 @@ class MaterialVacuum(Vacuum):
         return si
 
     @staticmethod
-    def _free(world, v):
-        return v.active & ~v.before(world.scattering.name, "delta", at_sensor=True)
+    def _free(context, v):
+        return v.active & ~v.before(context.scattering.name, "delta", at_sensor=True)
 
-    def motion(self, world, vertex, following, ahead):
+    def motion(self, context, vertex, following, ahead):
         v, si = vertex.v, vertex.scattered_si
         after = v.after()
-        p, n, area = self.material(world, after.pi, after.ray, following.n, ahead)
+        p, n, area = self.material(context, after.pi, after.ray, following.n, ahead)
         to = dr.select(ahead, p - si.p, mi.Vector3f(following.d))
         r2 = dr.squared_norm(to)
         d = to * dr.rsqrt(r2)
@@ -85,29 +85,29 @@ class FoundVacuum(MaterialVacuum):
     def __init__(self, overlaps):
         self.overlaps = overlaps
 
-    def first(self, world, ray, sampler):
-        return self.known(super().first(world, ray, sampler), ray)
+    def first(self, context, ray, sampler):
+        return self.known(super().first(context, ray, sampler), ray)
 
     def known(self, pi, ray):
         return {"pi": pi, "si": pi.compute_surface_interaction(ray, mi.RayFlags.All)}
 
-    def depart(self, world, ray, vertex, β, sampler, active):
+    def depart(self, context, ray, vertex, β, sampler, active):
         # One by one: of surfaces at one place, what a packet of rays meets depends on where the others go.
-        pi = world.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+        pi = context.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
         return {"pi": pi, "si": pi.compute_surface_interaction(ray, mi.RayFlags.All, active)}
 
-    def depart_guided(self, world, ray, vertex, step, sampler, active):
+    def depart_guided(self, context, ray, vertex, step, sampler, active):
         target = step.target
         # Of surfaces in surfaces, a ray meets one.
         if target is None or self.overlaps:
-            return self.depart(world, ray, vertex, vertex.β, sampler, active)
+            return self.depart(context, ray, vertex, vertex.β, sampler, active)
         # What a guide has drawn is there: all that is asked is whether it is seen, which rays find faster than what
         # they meet.
         guided = active & step.guided
-        pi = world.scene.ray_intersect_preliminary(ray, coherent=False, active=active & ~guided)
+        pi = context.scene.ray_intersect_preliminary(ray, coherent=False, active=active & ~guided)
         start, end = Local(p=vertex.at.p, geometric_n=mi.Vector3f(vertex.at.n)), step.point
         n = dr.mulsign(mi.Vector3f(target.n), dr.dot(target.n, start.p - end))
-        seen = sees(world.scene, start, end, n, guided)
+        seen = sees(context.scene, start, end, n, guided)
         pi.t = dr.select(guided, dr.select(seen, dr.norm(end - ray.o), dr.inf), pi.t)
         pi.prim_uv = dr.select(guided, target.uv, pi.prim_uv)
         pi.prim_index = dr.select(guided, step.primitive, pi.prim_index)

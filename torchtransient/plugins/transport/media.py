@@ -44,29 +44,29 @@ class Media(Vacuum):
 
     clip = None
 
-    def prepare(self, world):
-        super().prepare(world)
-        self.settings = FlightSettings(world.contents.media, world.wanted, world.hide_emitters, world.surfaces)
+    def prepare(self, context):
+        super().prepare(context)
+        self.settings = FlightSettings(context.contents.media, context.wanted, context.hide_emitters, context.surfaces)
 
-    def start(self, world, rays):
-        super().start(world, rays)
+    def start(self, context, rays):
+        super().start(context, rays)
         self.clip = rays.clip
 
     # ------------------------------------------------------------------------------------------------- primal
 
-    def first(self, world, ray, sampler):
+    def first(self, context, ray, sampler):
         medium = dr.zeros(mi.MediumPtr, dr.width(ray.d))
         if self.settings.at_sensor is not None:
             medium = mi.MediumPtr(self.settings.at_sensor)
-        return self._leg(world, ray, medium, mi.UnpolarizedSpectrum(1), sampler, mi.Bool(True), True, self.clip)
+        return self._leg(context, ray, medium, mi.UnpolarizedSpectrum(1), sampler, mi.Bool(True), True, self.clip)
 
-    def depart(self, world, ray, vertex, β, sampler, active, seen=False):
+    def depart(self, context, ray, vertex, β, sampler, active, seen=False):
         medium = medium_behind(vertex.si, ray.d, vertex.medium, vertex.surface)
-        return self._leg(world, ray, medium, mi.unpolarized_spectrum(β), sampler, active, first=seen)
+        return self._leg(context, ray, medium, mi.unpolarized_spectrum(β), sampler, active, first=seen)
 
-    def _leg(self, world, ray, medium, carried, sampler, active, first=False, clip=None):
+    def _leg(self, context, ray, medium, carried, sampler, active, first=False, clip=None):
         u, lanes = sampler.next_1d(), lane_numbers(sampler)
-        end = sample_free_flight(world.scene, self.settings, ray, medium, carried, u, lanes, active, first, clip)
+        end = sample_free_flight(context.scene, self.settings, ray, medium, carried, u, lanes, active, first, clip)
         t = end.t
         if self.settings.geometry:
             # A collision on top of the vertex before has no direction to it: as far as single precision can tell apart.
@@ -78,14 +78,14 @@ class Media(Vacuum):
             leg["entry"] = end.entry
         return leg
 
-    def arrive(self, world, path):
+    def arrive(self, context, path):
         leg, scatter = path.leg, path.leg["scatter"]
         mei = medium_interaction(path.ray, leg["medium"], leg["t"])
         si = leg["pi"].compute_surface_interaction(path.ray, mi.RayFlags.All, ~scatter)
         at, valid = reference(si, mei, scatter), si.is_valid() | scatter
         return Vertex(
             si=si, at=at, valid=valid, surface=~scatter, β=attenuated(path.β, leg["weight"]), ray=path.ray, leg=leg,
-            scatter=scatter, mei=mei, medium=leg["medium"], opl=self.optical_length(world, path, at.p, valid),
+            scatter=scatter, mei=mei, medium=leg["medium"], opl=self.optical_length(context, path, at.p, valid),
         )  # fmt: skip
 
     def found(self, leg, ray, flags, active=True):
@@ -112,35 +112,35 @@ class Media(Vacuum):
         lanes = dr.zeros(mi.MediumPtr, dr.width(d))
         return lanes if self.settings.at_sensor is None else mi.MediumPtr(self.settings.at_sensor)
 
-    def medium_at(self, world, p, start, medium, active):
+    def medium_at(self, context, p, start, medium, active):
         if not self.settings.transitions:
             return medium
         ray = mi.Ray3f(start, dr.normalize(p - start))
         ray.maxt = dr.norm(p - start)
-        return medium_along(world.scene, ray, medium, active)
+        return medium_along(context.scene, ray, medium, active)
 
     def share_of_surface(self, leg):
         return dr.select(leg["scatter"], leg["t"] / leg["pi"].t, 1)
 
-    def transmittance(self, world, vertex, ds, u, sampler, active, seen=False):
+    def transmittance(self, context, vertex, ds, u, sampler, active, seen=False):
         ray = vertex.at.spawn_ray_to(ds.p)
         medium = medium_behind(vertex.si, ds.d, vertex.medium, vertex.surface)
         lanes = lane_numbers(sampler)
         hide = seen and self.settings.hide_emitters
-        T, free = transmittance(world.scene, self.settings, ray, ds.dist, medium, [u.x, u.y], lanes, active, hide)
+        T, free = transmittance(context.scene, self.settings, ray, ds.dist, medium, [u.x, u.y], lanes, active, hide)
         return free, T
 
-    def next_surface(self, world, ray, active):
-        return closed_surface(world.scene, self.settings, ray, active)
+    def next_surface(self, context, ray, active):
+        return closed_surface(context.scene, self.settings, ray, active)
 
     # ------------------------------------------------------------------------------------------------- record
 
-    def fields(self, world):
-        fields = super().fields(world) | {
+    def fields(self, context):
+        fields = super().fields(context) | {
             "scatter": mi.Bool, "t_end": mi.Float, "begin": mi.UInt32, "end": mi.UInt32,
             "weight": mi.UnpolarizedSpectrum,
         }  # fmt: skip
-        return fields | (intersection_fields(world, "entry_") if self.settings.keeps_entry else {})
+        return fields | (intersection_fields(context, "entry_") if self.settings.keeps_entry else {})
 
     def record(self, vertex):
         leg, of_ray = vertex.leg, Local(ray=vertex.ray, leg=vertex.leg["pi"])
@@ -161,7 +161,7 @@ class Media(Vacuum):
 
     # ----------------------------------------------------------------------------------------------- attached
 
-    def end(self, world, v):
+    def end(self, context, v):
         si = v.pi.compute_surface_interaction(v.ray, mi.RayFlags.Minimal, v.active & ~v.scatter)
         t = dr.select(v.scatter, v.t, si.t)
         n = dr.select(v.scatter, mi.Normal3f(0), si.n)
@@ -170,24 +170,24 @@ class Media(Vacuum):
     def has_no_normal(self, end):
         return dr.all(end.n == 0)
 
-    def attached(self, world, v, carry, wanted):
+    def attached(self, context, v, carry, wanted):
         if wanted.geometry:
-            carry = self.from_meter(world, v, carry)
+            carry = self.from_meter(context, v, carry)
         ray = mi.Ray3f(v.ray)
         ray.o, ray.d = carry.o, carry.d
-        si, mei, stretch = self._surface_or_medium(world, v, carry, ray, wanted)
-        vertex = self.arrived(world, v, carry, ray, si, wanted)
+        si, mei, stretch = self._surface_or_medium(context, v, carry, ray, wanted)
+        vertex = self.arrived(context, v, carry, ray, si, wanted)
         vertex.scatter, vertex.mei = v.scatter, mei
         far = ~vertex.sid.is_valid()
         clip = None if self.clip is None else dr.select(v.k == 0, self.clip, 0)
         leg = Leg(v, v.ray.o, vertex.sid.p, v.ray.d, far, v.begin, ARRIVING, clip)
-        T = v.weight * with_log_slope(world.scene, self.settings, leg, carry.x, si.p, carry.β[0], v.active)
+        T = v.weight * with_log_slope(context.scene, self.settings, leg, carry.x, si.p, carry.β[0], v.active)
         if wanted.geometry:
             T *= dr.relative_grad(dr.select(v.scatter, stretch, 1))
         vertex.carry = replace(carry, β=attenuated(carry.β, T))
         return vertex
 
-    def _surface_or_medium(self, world, v, carry, ray, wanted):
+    def _surface_or_medium(self, context, v, carry, ray, wanted):
         """(interaction, medium interaction, attached length of the stretch that a vertex in a medium divides).
 
         Vertices in media come as surface interactions too: at the point itself, with no normal and no shape.
@@ -197,7 +197,7 @@ class Media(Vacuum):
         if wanted.geometry:
             # How far a vertex slides sideways depends on its distance: where it divides the stretch must not depend on
             # that again.
-            dragged = v.scatter & ~v.before(world.scattering.name, "delta", at_sensor=True)
+            dragged = v.scatter & ~v.before(context.scattering.name, "delta", at_sensor=True)
             along = mi.Ray3f(ray)
             along.o = dr.select(dragged, v.ray.o, ray.o)
         t, stretch = self._attached_distance(v, carry, along, wanted)
@@ -226,7 +226,7 @@ class Media(Vacuum):
         ratio = dr.detach((v.t - begin) / stretch)
         return dr.fma(ratio, stretch, begin), dr.select(bounded, stretch, 1)
 
-    def attached_transmittance(self, world, vertex, connected, active):
+    def attached_transmittance(self, context, vertex, connected, active):
         v = vertex.v
         if connected.ahead:
             stream, medium = EMITTING, v.after().begin
@@ -234,7 +234,7 @@ class Media(Vacuum):
             stream, medium = CONNECTING, medium_behind(vertex.sid, connected.d, v.end, ~v.scatter)
         leg = Leg(v, vertex.sid.p, dr.detach(connected.p), connected.d, connected.far, medium, stream)
         hook = vertex.carry.β[0]
-        return with_log_slope(world.scene, self.settings, leg, vertex.si.p, connected.p, hook, active)
+        return with_log_slope(context.scene, self.settings, leg, vertex.si.p, connected.p, hook, active)
 
 
 def lane_numbers(sampler):

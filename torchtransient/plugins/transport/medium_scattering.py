@@ -34,10 +34,10 @@ def phase_and_scattering(mei, active):
 class SurfaceOrMedium(Surface):
     """In a medium the vertex scatters by the phase function times the scattering coefficient."""
 
-    def prepare(self, world):
-        super().prepare(world)
-        blends = world.contents.media.phase_mixtures
-        self.blends = None if blends is None else blends.read(world.wanted)
+    def prepare(self, context):
+        super().prepare(context)
+        blends = context.contents.media.phase_mixtures
+        self.blends = None if blends is None else blends.read(context.wanted)
 
     def _phase_and_scattering(self, mei, u, active):
         """(phase function, or the part of one that ``u`` chooses; scattering coefficient times its weight)."""
@@ -49,16 +49,16 @@ class SurfaceOrMedium(Surface):
 
     # ------------------------------------------------------------------------------------------------- primal
 
-    def arrive(self, world, path, vertex, sampler):
-        super().arrive(world, path, vertex, sampler)
+    def arrive(self, context, path, vertex, sampler):
+        super().arrive(context, path, vertex, sampler)
         vertex.u_phase = None if self.blends is None else sampler.next_1d()
 
-    def connectable(self, world, vertex):
-        smooth = super().connectable(world, vertex)
-        allowed = True if world.contents.media.emitter_sampling else vertex.medium.use_emitter_sampling()
+    def connectable(self, context, vertex):
+        smooth = super().connectable(context, vertex)
+        allowed = True if context.contents.media.emitter_sampling else vertex.medium.use_emitter_sampling()
         return dr.select(vertex.scatter, allowed, smooth)
 
-    def elsewhere(self, world, vertex, proposals, answers, step):
+    def elsewhere(self, context, vertex, proposals, answers, step):
         ctx, mei, scatter = mi.PhaseFunctionContext(None), vertex.mei, vertex.scatter
         active = vertex.goes_on & scatter
         step.u_phase = vertex.u_phase
@@ -76,11 +76,11 @@ class SurfaceOrMedium(Surface):
         step.out, step.pdf = dr.select(scatter, out, step.out), dr.select(scatter, pdf, step.pdf)
         step.eta, step.delta = dr.select(scatter, 1, step.eta), step.delta & ~scatter
         step.unconnected = step.delta
-        if not world.contents.media.emitter_sampling:
+        if not context.contents.media.emitter_sampling:
             step.unconnected = step.delta | (scatter & ~vertex.medium.use_emitter_sampling())
 
-    def value_towards(self, world, path, vertex, out, active):
-        value, pdf = super().value_towards(world, path, vertex, out, active)
+    def value_towards(self, context, path, vertex, out, active):
+        value, pdf = super().value_towards(context, path, vertex, out, active)
         scatter, mei = vertex.scatter, vertex.mei
         phase, σ_s = self._phase_and_scattering(mei, vertex.u_phase, active & scatter)
         f, f_pdf = phase.eval_pdf(mi.PhaseFunctionContext(None), mei, out, active & scatter)
@@ -89,13 +89,13 @@ class SurfaceOrMedium(Surface):
 
     # ------------------------------------------------------------------------------------------------- record
 
-    def fields(self, world):
-        return super().fields(world) | ({} if self.blends is None else {"u_phase": mi.Float})
+    def fields(self, context):
+        return super().fields(context) | ({} if self.blends is None else {"u_phase": mi.Float})
 
     # ----------------------------------------------------------------------------------------------- attached
 
-    def look_up_attached(self, world, vertex, wanted):
-        super().look_up_attached(world, vertex, wanted)
+    def look_up_attached(self, context, vertex, wanted):
+        super().look_up_attached(context, vertex, wanted)
         u, active = vertex.v.of(self.name).get("u_phase"), vertex.v.active & vertex.scatter
         vertex.phase, vertex.σ_s = self._phase_and_scattering(vertex.mei, u, active)
 

@@ -1,7 +1,7 @@
-"""Vertices into thread-local memory, and back: what the derivative modes cannot recompute cheaply.
+"""Records of paths: the numbers of each vertex that derivatives cannot recompute cheaply, written and read.
 
 The record's size is per lane in flight, not per path, and it lives in the kernel's stack: global memory does not grow
-with the depth. Only a record that is too large for a stack goes to global memory (:mod:`.record_room`).
+with the depth. Only a record that is too large for a stack lies in global memory (:func:`record_room`).
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import functools
 import os
 import sys
 import threading
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,10 +24,11 @@ from torchtransient.plugins.transport.strategy import Local
 
 
 class RecordSink(Sink):
-    """Writes what every strategy says of itself. ``layout`` tells :class:`RecordedVertex` how to read it.
+    """Writer of the records of all strategies, which :class:`RecordedVertex` reads by their ``layout``.
 
-    ``block``: the film's adjoint block, where arrivals are to be read ahead; None for no list of them. ``lanes``:
-    number of paths, where records lie in global memory.
+    Args:
+        block: adjoint block of the film, where arrivals are read before their vertices; None for no list of them.
+        lanes: number of paths, for records in global memory; None for local arrays.
     """
 
     zeros = True
@@ -36,38 +36,49 @@ class RecordSink(Sink):
     def __init__(self, block=None, lanes=None):
         self.block, self.lanes = block, lanes
 
-    def begin(self, world):
-        self.layout = self._layout(world)
-        return self.layout.allocate(world.max_depth + 1, self.lanes)
+    def begin(self, context):
+        self.layout = self._layout(context)
+        return self.layout.allocate(context.max_depth + 1, self.lanes)
 
-    def _layout(self, world):
+    def _layout(self, context):
         if self.block is not None and self.lanes is None:
-            layout = RecordLayout(world, Arrivals(world, self.block))
-            if layout.bytes_of(world.max_depth + 1) <= world.record_room.room:
+            layout = RecordLayout(context, Arrivals(context, self.block))
+            if layout.bytes_of(context.max_depth + 1) <= context.record_room.room:
                 return layout
-        # Arrivals are read one after the other where a list of them has no room.
-        return RecordLayout(world)
+        # Without room for a list of arrivals each is read at its vertex.
+        return RecordLayout(context)
 
     def end(self, kept):
         if self.lanes is not None:
             dr.eval([array.numbers for array in kept.values()])
 
     def vertex(self, kept, path, samples):
-        self.layout.write(kept, path, samples)
+        layout, k, active = self.layout, path.depth, path.active
+        values = {"walk": vars(samples["walk"])}
+        for strategy in layout.context.strategies():
+            values[strategy.name] = strategy.record(samples[strategy.name])
+        if layout.arrivals is not None:
+            values[layout.arrivals.name] = layout.arrivals.append(kept, samples)
+        for s, name in layout.types:
+            kept[f"{s}.{name}"].write(values[s][name], k, active)
+        flags = mi.UInt32(0)
+        for (s, name), bit in layout.bits.items():
+            flags |= dr.select(values[s][name], mi.UInt32(bit), 0)
+        kept["flags"].write(flags, k, active)
 
 
 class RecordLayout:
-    """The fields of a record by (strategy, name). A plain object, which Dr.Jit loops leave alone.
+    """Fields of a record by (strategy, name). A plain object, which Dr.Jit loops leave alone.
 
     Masks share the bits of one word: Dr.Jit 1.5 cannot compile a local array of masks (invalid LLVM IR).
     """
 
-    def __init__(self, world, arrivals=None):
-        self.world = world
+    def __init__(self, context, arrivals=None):
+        self.context = context
         self.arrivals = arrivals if arrivals is not None and arrivals.together else None
-        types = {("walk", name): kind for name, kind in self._of_walk(world).items()}
-        for s in world.strategies():
-            types |= {(s.name, name): kind for name, kind in s.fields(world).items()}
+        types = {("walk", name): kind for name, kind in self._of_walk(context).items()}
+        for s in context.strategies():
+            types |= {(s.name, name): kind for name, kind in s.fields(context).items()}
         if self.arrivals is not None:
             types |= {(arrivals.name, name): kind for name, kind in arrivals.fields().items()}
         masks = [key for key, kind in types.items() if kind is mi.Bool]
@@ -77,49 +88,41 @@ class RecordLayout:
         self.types = {key: kind for key, kind in types.items() if key not in self.bits}
 
     @staticmethod
-    def _of_walk(world):
+    def _of_walk(context):
         fields = {"β": mi.Spectrum, "τ": mi.Float64, "rr": mi.Float, "goes_on": mi.Bool}
-        return fields | ({"η": mi.Float} if world.index_changes else {})
+        return fields | ({"η": mi.Float} if context.index_changes else {})
 
     def bytes_of_vertex(self):
-        """Bytes that a vertex takes, without the list of arrivals."""
+        """Return the bytes of a vertex, without the list of arrivals."""
         return sum(bytes_of(kind) for kind in [*self.types.values(), mi.UInt32])
 
     def bytes_of(self, size):
-        """Bytes of the local arrays for ``size`` vertices."""
+        """Return the bytes of the local arrays of ``size`` vertices."""
         listed = 0 if self.arrivals is None else self.arrivals.bytes_of_path()
         return size * self.bytes_of_vertex() + listed
 
     def allocate(self, size, lanes=None):
-        """Local arrays for ``size`` vertices; in global memory where ``lanes`` is given."""
+        """Return arrays of ``size`` vertices: local ones, or in global memory for ``lanes`` paths."""
         kinds = {f"{s}.{name}": kind for (s, name), kind in self.types.items()} | {"flags": mi.UInt32}
         if lanes is not None:
             return {name: GlobalArray(kind, size, lanes) for name, kind in kinds.items()}
         arrays = {name: dr.alloc_local(kind, size) for name, kind in kinds.items()}
         return arrays if self.arrivals is None else arrays | self.arrivals.allocate()
 
-    def write(self, store, path, samples):
-        """Write the vertex that ``path`` has reached."""
-        k, active = path.depth, path.active
-        values = {"walk": vars(samples["walk"])}
-        values |= {s.name: s.record(samples[s.name]) for s in self.world.strategies()}
-        if self.arrivals is not None:
-            values[self.arrivals.name] = self.arrivals.append(store, samples)
-        for s, name in self.types:
-            store[f"{s}.{name}"].write(values[s][name], k, active)
-        flags = mi.UInt32(0)
-        for (s, name), bit in self.bits.items():
-            flags |= dr.select(values[s][name], mi.UInt32(bit), 0)
-        store["flags"].write(flags, k, active)
-
     def mask(self, flags, s, name):
-        """One mask out of the word ``flags`` of a vertex."""
+        """Return a mask of the word ``flags`` of a vertex."""
         return (flags & self.bits[s, name]) != 0
 
 
 class RecordedVertex(Local):
-    """Vertex ``k`` read back: ``active, β, τ, η, rr, goes_on``, ``ray`` and ``pi`` (how it was found), and ``next``
-    (:class:`~..derivative.vertex.VertexEnd`, where the next vertex lies).
+    """Vertex ``k`` of a record.
+
+    Attributes:
+        k, active: its number, UInt32, and the mask of paths that have it.
+        β, τ, η: throughput before its segment, optical path length up to it, index along the segment.
+        rr, goes_on: factor of Russian roulette, mask of paths that continue.
+        ray, pi: ray and PreliminaryIntersection3f that found it.
+        next: :class:`.strategy.VertexEnd` of the next vertex, set by the derivative.
     """
 
     def __init__(self, layout, store, k, active, primary_ray):
@@ -128,10 +131,10 @@ class RecordedVertex(Local):
         self._read = {}
         self.η = mi.Float(1)
         vars(self).update(self.of("walk"))
-        self.ray, self.pi = layout.world.segment.restore(self, primary_ray)
+        self.ray, self.pi = layout.context.segment.restore(self, primary_ray)
 
     def of(self, name):
-        """The record of the strategy called ``name``, as a dictionary."""
+        """Return the record of the strategy called ``name``, as a dictionary."""
         layout = self.layout
         found = {field: self._array(f"{s}.{field}") for s, field in layout.types if s == name}
         masks = [key for key in layout.bits if key[0] == name]
@@ -149,67 +152,62 @@ class RecordedVertex(Local):
 
     def numbers(self):
         """Two uniform random numbers that were drawn at this vertex."""
-        for c in self.layout.world.connections:
+        for c in self.layout.context.connections:
             numbers = c.numbers(self.of(c.name))
             if numbers is not None:
                 return numbers
-        # Nothing was drawn: the bits of the ray's direction are as good, since they are hashed.
+        # Without random numbers the bits of the ray's direction serve: they are hashed.
         return [self.ray.d.x, self.ray.d.y]
 
     def before(self, name, field, at_sensor):
-        """A mask of the vertex before, ``at_sensor`` where there is none."""
+        """Return a mask of the vertex before, ``at_sensor`` for the first vertex."""
         there = self.active & (self.k > 0)
         flags = self.store["flags"].read(dr.maximum(self.k, 1) - 1, there)
         return ((self.k == 0) & mi.Bool(at_sensor)) | (there & self.layout.mask(flags, name, field))
 
     def first(self, name, field):
-        """A number that the strategy ``name`` recorded at the first vertex of the path."""
+        """Return a number that the strategy ``name`` recorded at the first vertex of the path."""
         return self.store[f"{name}.{field}"].read(mi.UInt32(0), self.active)
 
     def after(self):
-        """The next vertex, where the path goes on."""
+        """Return the next vertex, active where the path continues."""
         return RecordedVertex(self.layout, self.store, self.k + 1, self.goes_on, self.primary_ray)
 
 
-def record_room(world):
-    """The :class:`RecordRoom` of a job's records. Raises GradientError where there is none."""
-    return RecordRoom.of(RecordLayout(world).bytes_of_vertex(), world.max_depth + 1)
-
-
 # --------------------------------------------------------------------------------------------------------------------
-# The arrivals of a recorded path: listed one after the other while it is walked, then the film's adjoint at each.
+# Arrivals of a recorded path: a list that the walk appends to, and the film's adjoint at each of them.
 
 class Arrivals:
-    """Where they are in a record. A plain object, which Dr.Jit loops leave alone.
+    """Layout of the arrivals of a record. A plain object, which Dr.Jit loops leave alone.
 
-    Every vertex records the number of its first arrival, and which connections have one. ``together``: how many are
-    read at once.
+    Every vertex records the number of its first arrival, and a mask of each connection with one. ``together``: number
+    of arrivals that are read at once.
     """
 
     name = "arrivals"
 
-    def __init__(self, world, block):
-        self.connections = [connection.name for connection in world.connections]
-        self.with_slope = world.wanted.geometry
-        self.most = world.max_depth * len(self.connections)
+    def __init__(self, context, block):
+        self.connections = [connection.name for connection in context.connections]
+        self.with_slope = context.wanted.geometry
+        self.most = context.max_depth * len(self.connections)
         self.together = block.together(self.most, self.with_slope)
         self.channels = block.film.channel_count()
         self.lanes = dr.width(block.base)
 
     def fields(self):
-        """Types of what a vertex records."""
+        """Return the types of the fields of a vertex."""
         return {"first": mi.UInt32} | dict.fromkeys(self.connections, mi.Bool)
 
     def _size(self):
-        # What is read at once may end behind the last one.
+        # The last group that is read at once may be longer than the list.
         return -(-self.most // self.together) * self.together
 
     def bytes_of_path(self):
-        """Bytes of the list."""
+        """Return the bytes of the list of a path."""
         return self._size() * (8 + 4 * self.channels * (2 if self.with_slope else 1))
 
     def allocate(self):
-        """Thread-local memory of a path."""
+        """Return the local arrays of a path."""
         numbers = [f"A.{c}" for c in range(self.channels)]
         numbers += [f"slope.{c}" for c in range(self.channels)] if self.with_slope else []
         size = self._size()
@@ -218,7 +216,7 @@ class Arrivals:
         return kept | {"arrivals": dr.zeros(mi.UInt32, self.lanes), "opl": dr.alloc_local(mi.Float64, size)}
 
     def append(self, kept, samples):
-        """List the events of a vertex; returns what it records."""
+        """Append the events of a vertex; return the fields of its record."""
         found = {"first": kept["arrivals"]}
         for name in self.connections:
             event, n = samples[name].event, kept["arrivals"]
@@ -228,12 +226,12 @@ class Arrivals:
         return found
 
     def number(self, found, name):
-        """The number of a connection's event, by what its vertex has recorded."""
+        """Return the number of a connection's event, from the record of its vertex."""
         before = self.connections[: self.connections.index(name)]
         return found["first"] + sum(dr.select(found[other], mi.UInt32(1), 0) for other in before)
 
     def read_some(self, kept, block, first, live):
-        """Let ``block`` read those from number ``first`` on, of the paths that have it."""
+        """Read the adjoint at the arrivals from number ``first`` on, of ``live`` paths."""
         opls = [kept["opl"].read(first + e, live & (first + e < kept["arrivals"])) for e in range(self.together)]
         A, slope = block.read_together(opls, self.with_slope, live)
         for name, found in (("A", A), ("slope", slope or [])):
@@ -242,7 +240,7 @@ class Arrivals:
                     kept[f"{name}.{c}"].write(value, first + e, live)
 
     def adjoint(self, kept, block, number, active):
-        """The adjoint at an arrival and its slope (None without geometry), as spectra."""
+        """Return the adjoint at an arrival and its slope (None without geometry), as spectra."""
         A = [kept[f"A.{c}"].read(number, active) for c in range(self.channels)]
         slope = None
         if self.with_slope:
@@ -252,7 +250,7 @@ class Arrivals:
 
 @dr.syntax
 def read_ahead(arrivals, kept, block):
-    """The record with the film's adjoint at all arrivals."""
+    """Return the record with the film's adjoint at all arrivals."""
     first = mi.UInt32(0)
     while dr.hint(first < kept["arrivals"], label="arrivals"):
         arrivals.read_some(kept, block, first, first < kept["arrivals"])
@@ -261,65 +259,75 @@ def read_ahead(arrivals, kept, block):
 
 
 # --------------------------------------------------------------------------------------------------------------------
-# Where the record of a path lies: on the stack of the thread that follows it, or in global memory.
+# Memory of the record of a path: the stack of the thread that traces it, or global memory.
 #
-# Dr.Jit's local arrays are on the stack of a kernel, one for each lane of a vector. Nothing asks whether they fit:
-# beyond its end the process dies, or what lies there is overwritten. So the room is known before, and a record that
-# is larger goes to global memory, of which all paths of a launch take their share at once.
+# Dr.Jit's local arrays are on the stack of a kernel, one for each lane of a vector. Dr.Jit does not check their size:
+# beyond the end of the stack the process dies, or other data is overwritten. A record that is larger than the room
+# computed here lies in global memory, where all paths of a launch have their records at once.
 
-# Of a stack the rest is Python's, Dr.Jit's and what kernels keep beside records.
+# Share of a stack for records; Python, Dr.Jit and other variables of kernels use the rest.
 SHARE = 0.75
-# Stacks of threads where the system does not say.
+# Bytes of the stack of a thread on systems without a query.
 _STACKS = {"darwin": 2**19, "win32": 2**20}
 _STACK_UNKNOWN = 2**19
-# The widest vectors that there are, where Dr.Jit does not say.
+# Lanes of the widest vectors, where Dr.Jit has no query.
 _WIDEST = 16
-# Of a lane of CUDA: the driver sets as much aside for every thread that may be resident, 2048 on each of its cores.
+# Bytes of a lane of CUDA: the driver reserves as much for each thread that can be resident, 2048 per multiprocessor.
 CUDA_ROOM = 2**14
-# Of all paths of a launch.
+# Bytes of the records of a launch in global memory.
 MEMORY = 2**31
 
 
 @dataclass(frozen=True)
 class RecordRoom:
-    """``in_memory``: whether records lie in global memory. ``lanes``: so many paths a launch at most, None for any
-    number. ``room``: bytes that the local arrays of one path may take.
+    """Memory of the records of a job.
+
+    Attributes:
+        in_memory: records lie in global memory.
+        lanes: largest number of paths of a launch, None for any.
+        room: bytes that the local arrays of one path may take.
     """
 
     in_memory: bool
     lanes: int | None
     room: int
 
-    @classmethod
-    def of(cls, bytes_of_vertex: int, vertices: int) -> RecordRoom:
-        """For records of so many bytes a vertex. Raises GradientError for what no memory holds."""
-        room, needed = room_of_path(), bytes_of_vertex * vertices
-        if needed <= room:
-            return cls(False, None, room)
-        if needed > MEMORY:
-            raise GradientError(
-                f"gradients keep a record of {bytes_of_vertex} bytes a bounce, and one path may take {MEMORY >> 30} "
-                f"GiB: expected max_depth up to {MEMORY // bytes_of_vertex - 1} for this scene, got {vertices - 1}. "
-                "Set max_depth to where the throughput that remains no longer matters; russian roulette (rr_depth) "
-                "ends paths long before."
-            )
-        return cls(True, MEMORY // needed, room)
+
+def record_room(context: Any) -> RecordRoom:
+    """Return the memory of the records of a job.
+
+    Args:
+        context: :class:`.context.RenderContext` of a job with derivatives.
+
+    Raises:
+        GradientError: if global memory does not hold the record of one path.
+    """
+    vertex, vertices, room = RecordLayout(context).bytes_of_vertex(), context.max_depth + 1, room_of_path()
+    needed = vertex * vertices
+    if needed > max(room, MEMORY):
+        raise GradientError(
+            f"gradients keep a record of {vertex} bytes a bounce, and one path may take {MEMORY >> 30} "
+            f"GiB: expected max_depth up to {MEMORY // vertex - 1} for this scene, got {vertices - 1}. "
+            "Set max_depth to where the throughput that remains no longer matters; russian roulette (rr_depth) "
+            "ends paths long before."
+        )
+    return RecordRoom(False, None, room) if needed <= room else RecordRoom(True, MEMORY // needed, room)
 
 
 def bytes_of(kind: Any) -> int:
-    """Bytes of one entry of a Dr.Jit type."""
+    """Return the bytes of one entry of a Dr.Jit type."""
     return dr.itemsize_v(kind) if dr.depth_v(kind) == 1 else dr.size_v(kind) * bytes_of(dr.value_t(kind))
 
 
 def room_of_path() -> int:
-    """Bytes that the local arrays of a path may take in a kernel of the active variant."""
+    """Return the bytes that the local arrays of a path may take in a kernel of the active variant."""
     if (mi.variant() or "").startswith("cuda"):
         return CUDA_ROOM
     return int(SHARE * _smallest_stack()) // _lanes_of_vector()
 
 
 def _smallest_stack() -> int:
-    """Bytes of the smaller stack of those that kernels run on: that of the calling thread, and those of Dr.Jit's."""
+    """Return the bytes of the smallest stack that kernels run on: calling thread and threads of Dr.Jit."""
     if not sys.platform.startswith("linux"):
         return _STACKS.get(sys.platform, _STACK_UNKNOWN)
     import resource  # Windows has none
@@ -327,48 +335,43 @@ def _smallest_stack() -> int:
     if threading.get_native_id() == os.getpid():
         own = _stack_of_first_thread(os.getpid(), resource.getrlimit(resource.RLIMIT_STACK)[0])
     else:
-        own = _stack_of_this_thread()
-    # Dr.Jit's threads are made with the default.
-    return min(own, _stack_said(lambda library, attributes: library.pthread_getattr_default_np(attributes)))
+        own = _stack_size(calling_thread=True)
+    # Dr.Jit starts its threads with the default size.
+    return min(own, _stack_size(calling_thread=False))
 
 
 @functools.lru_cache(maxsize=1)
 def _stack_of_first_thread(process: int, limit: int) -> int:
-    """Asked once for each limit: the C library reads the list of all that is mapped into the process, which takes a
-    millisecond, and ten where many kernels are.
-    """
-    return _stack_of_this_thread()
+    """Return the bytes of its stack, cached: the C library reads the list of the process's mappings, up to 10 ms."""
+    return _stack_size(calling_thread=True)
 
 
-def _stack_of_this_thread() -> int:
-    return _stack_said(
-        lambda library, attributes: library.pthread_getattr_np(ctypes.c_void_p(library.pthread_self()), attributes)
-    )
-
-
-def _stack_said(ask: Callable[[Any, Any], int]) -> int:
-    """Bytes of the stack in the attributes that ``ask`` fills."""
+def _stack_size(calling_thread: bool) -> int:
+    """Return the bytes of the stack of the calling thread, or of new threads."""
     library = ctypes.CDLL(None)
     library.pthread_self.restype = ctypes.c_void_p
     attributes, size = ctypes.create_string_buffer(256), ctypes.c_size_t()
     try:
-        said = ask(library, attributes) == 0
-        said = said and library.pthread_attr_getstacksize(attributes, ctypes.byref(size)) == 0
+        if calling_thread:
+            error = library.pthread_getattr_np(ctypes.c_void_p(library.pthread_self()), attributes)
+        else:
+            error = library.pthread_getattr_default_np(attributes)
+        error = error or library.pthread_attr_getstacksize(attributes, ctypes.byref(size))
     except AttributeError:  # another C library
         return _STACK_UNKNOWN
     library.pthread_attr_destroy(attributes)
-    return size.value if said else _STACK_UNKNOWN
+    return _STACK_UNKNOWN if error else size.value
 
 
 def _lanes_of_vector() -> int:
-    """Lanes that one thread computes at once."""
+    """Return the number of lanes that a thread computes at once."""
     ask = _vector_width()
     return _WIDEST if ask is None else max(1, int(ask()))
 
 
 @functools.cache
 def _vector_width() -> Any:
-    """Dr.Jit's own function, which Python does not offer; None where it is not found."""
+    """Return the function of Dr.Jit that has no Python binding, None if it is not found."""
     library = next(Path(dr.__file__).parent.glob("*drjit-core*"), None)
     try:
         return None if library is None else ctypes.CDLL(str(library))._Z21jit_llvm_vector_widthv
@@ -377,8 +380,9 @@ def _vector_width() -> Any:
 
 
 class GlobalArray:
-    """As Dr.Jit's local arrays, in global memory: ``size`` entries of type ``kind`` for each of ``lanes``. A plain
-    object, which Dr.Jit loops leave alone. What is written in one kernel is read in the next.
+    """Replacement for a local array of Dr.Jit in global memory: ``size`` entries of type ``kind`` for each lane.
+
+    A plain object, which Dr.Jit loops leave alone. One kernel writes it, the next one reads it.
     """
 
     def __init__(self, kind: Any, size: int, lanes: int):
@@ -396,5 +400,5 @@ class GlobalArray:
         dr.scatter(self.numbers, self.kind(value), self._places(index), active, mode=dr.ReduceMode.Permute)
 
     def read(self, index: Any, active: Any) -> Any:
-        """An entry of every active lane, zero for others."""
+        """Return an entry of every active lane, zero for others."""
         return dr.gather(self.kind, self.numbers, self._places(index), active)

@@ -1,4 +1,4 @@
-"""What becomes of the events and vertices of a walk."""
+"""Sinks: consumers of the events and vertices of a walk."""
 
 from __future__ import annotations
 
@@ -12,35 +12,38 @@ from torchtransient.plugins.transport.carry import total_of
 
 
 class Sink:
-    """A loop calls ``begin`` once, ``event`` for every event, ``vertex`` once a vertex, after its last event, and
+    """Base of sinks, which ignores everything.
+
+    The loop calls ``begin`` once, ``event`` for every event, ``vertex`` once a vertex, after its last event, and
     ``end`` after the loop. ``kept`` is the sink's loop state: a dictionary of Dr.Jit values that it may change.
     """
 
-    # Static: whether events of value zero matter, since their derivatives may not be zero.
+    # Static: events of value zero matter, since their derivatives can differ from zero.
     zeros = False
-    # Static: whether it does anything with vertices.
+    # Static: vertices matter.
     keeps_vertices = True
 
-    def begin(self, world: Any) -> dict[str, Any]:
-        """The loop state before the first vertex."""
+    def begin(self, context: Any) -> dict[str, Any]:
+        """Return the loop state before the first vertex."""
         return {}
 
     def event(self, kept: dict[str, Any], event: Any) -> None:
-        """An :class:`~..strategy.Event`."""
+        """Receive an :class:`.strategy.Event`."""
 
     def vertex(self, kept: dict[str, Any], path: Any, samples: dict[str, Any]) -> None:
-        """The vertex that ``path`` has reached; ``samples``: what every strategy made of it, by name."""
+        """Receive the vertex that ``path`` reached; ``samples``: samples of the strategies there, by name."""
 
     def end(self, kept: dict[str, Any]) -> None:
-        """The paths are over."""
+        """Finish the loop state."""
 
 
 # --------------------------------------------------------------------------------------------------------------------
-# Events onto the film.
+# Film.
 
 class FilmSink(Sink):
-    """Puts events into a film's block; keeps the sum ``L`` over all times, and the energy ``before`` and ``after`` the
-    film's window.
+    """Writer of events to a film, through its block.
+
+    Its state has the sum ``L`` over all times, and the energy ``before`` and ``after`` the film's window.
     """
 
     keeps_vertices = False
@@ -48,7 +51,7 @@ class FilmSink(Sink):
     def __init__(self, block):
         self.block = block
 
-    def begin(self, world):
+    def begin(self, context):
         return {"L": light_type()(0), "before": mi.Float(0), "after": mi.Float(0), "block": self.block.begin()}
 
     def event(self, kept, event):
@@ -62,19 +65,18 @@ class FilmSink(Sink):
 
 
 # --------------------------------------------------------------------------------------------------------------------
-# Events summed against the film's adjoint.
+# Sum of events, weighted by the film's adjoint.
 
 class AdjointSumSink(Sink):
-    """Keeps ``sum``: that of ``A(opl) value`` over the events of a path, with the adjoint ``A`` of the film.
+    """Sum of ``A(opl) value`` over the events of a path, with the adjoint ``A`` of the film; its state is ``sum``.
 
-    What the light behind a point contributes to a loss: paths are traced from there, as a boundary term asks on both
-    sides of an edge.
+    A boundary term traces paths from both sides of an edge: the sum is the contribution of their light to a loss.
     """
 
     def __init__(self, block):
         self.block = block
 
-    def begin(self, world):
+    def begin(self, context):
         return {"sum": mi.Float(0)}
 
     def event(self, kept, event):
@@ -83,12 +85,16 @@ class AdjointSumSink(Sink):
 
 
 # --------------------------------------------------------------------------------------------------------------------
-# Events into a list, with their depths.
+# List of events with their depths.
 
 class EventListSink(Sink):
-    """Every lane lists its events in ``slots`` of its own: ``opl`` (Float64, minus the start), ``energy`` (by
-    ``energy_of(value)``, a Float), ``depth`` (0 where a slot is empty). Events without energy are left out; ``used``
-    counts what a lane found, which may be more than there were slots for.
+    """List of events, in slots of each lane.
+
+    Attributes:
+        opl: optical path length, minus the film's start, Float64.
+        energy: ``energy_of(value)``, Float; events without energy are left out.
+        depth: depth of the event, 0 in empty slots.
+        used: number of events of each lane, which may exceed ``slots``.
     """
 
     def __init__(self, lanes: int, slots: int, energy_of):
@@ -99,7 +105,7 @@ class EventListSink(Sink):
         self.depth = dr.zeros(mi.UInt32, slots * lanes)
         self.used = None
 
-    def begin(self, world):
+    def begin(self, context):
         return {"used": mi.UInt32(0)}
 
     def event(self, kept, event):

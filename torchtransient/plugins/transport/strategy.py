@@ -1,15 +1,30 @@
-"""What the loop, its strategies and its sinks say to each other. Nothing here knows an effect by name.
+"""Contracts of the walk: strategies, and the values that they exchange in one iteration of :func:`.walk.bounce`.
 
-One turn of the loop (:func:`.walk.bounce`) asks a *segment* for the vertex at the end of a straight line, every
-*connection* for a direction it wants to connect along, the *scattering* for the values in these directions and for the
-next one, and the connections for events; a *sink* decides what becomes of events and vertices.
+1. :class:`Segment` finds the :class:`Vertex` at the end of a straight line (``arrive``).
+2. :class:`Scattering` looks up its BSDF or phase function (``arrive``).
+3. Every :class:`Connection` may propose a direction towards light (``propose``).
+4. :class:`Scattering` evaluates these directions and samples the next one (``scatter``).
+5. Every :class:`Connection` returns an :class:`Event`, weighted and tested for visibility (``connect``); the sink
+   receives it.
+6. :class:`Segment` follows the next ray (``depart``); with a :class:`Guide` the density of a guided direction is
+   computed behind it (``weigh``).
 
-Every strategy has three forms side by side: the primal one; ``fields`` and ``record``, what of it cannot be recomputed
-and is kept for derivatives; and the ``attached`` one, which re-evaluates a recorded vertex with derivatives. Forward
-and reverse mode follow from the last one.
+Every strategy has three forms:
 
-Shapes: every Float is one number per lane; ``value`` is per colour (``mi.UnpolarizedSpectrum``), a Stokes vector in
-polarized variants.
+- the primal one, as above;
+- its record: ``fields`` (types) and ``record`` (values) of what derivatives cannot recompute, random numbers above all;
+- the attached one (``attached``): the recorded vertex evaluated again with derivatives, from a
+  :class:`.carry.Carry` to the next one and to :class:`EventTerm`. Forward and reverse mode follow from it.
+
+Strategies return values. Only the loop changes a path, and only a sink changes its own state (:mod:`.sinks`). Films
+receive events through a block (:class:`~torchtransient.plugins.films.block.FilmBlock`) and are read by derivatives
+through an adjoint block.
+
+Arguments that all methods share: ``context`` is the :class:`.context.RenderContext` of the job, ``path`` the
+:class:`.walk.Path` before the vertex, ``vertex`` the :class:`Vertex` or :class:`AttachedVertex`, ``sampler`` Mitsuba's
+sampler of the lanes, ``active`` a mask of lanes, ``wanted`` the :class:`.context.Wanted` derivatives of the job. Every
+Float is one number per lane. ``value`` is a spectrum (``mi.UnpolarizedSpectrum``), in polarized variants a Stokes
+vector. Lengths are metres, densities per solid angle unless stated otherwise.
 """
 
 from __future__ import annotations
@@ -32,45 +47,74 @@ class Local:
 
 
 class Vertex(Local):
-    """The end of a segment in the primal walk. Connections read it; ``path`` still belongs to the segment before.
+    """End of a segment in the primal walk; ``path`` belongs to the segment before.
 
-    From the segment: ``si`` (SurfaceInteraction3f, valid at surfaces), ``at`` (Interaction3f that rays and emitter
-    samples start from), ``valid`` (something was hit), ``surface`` (it is not a point in a medium), ``opl`` (Float64,
-    optical length of the segment), ``β`` (throughput at its end), ``ray`` and ``leg`` (how it was reached); in media
-    also ``scatter, mei, medium``. From the loop: ``τ`` (Float64, optical path length up to it), ``η`` (index along the
-    segment), ``goes_on`` (the path may have a further vertex). From the scattering: ``bsdf``, ``delay``
-    (DelaySample), ``scattered_si`` and ``at`` with the wavelengths beyond the surface, ``connectable`` (light can be
-    found by connecting to it), ``scattered_τ`` (``τ`` and the delay: where connections start to count).
+    Attributes:
+        si: SurfaceInteraction3f, valid at surfaces (segment).
+        at: Interaction3f that rays and emitter samples start from (segment; wavelengths by the scattering).
+        valid: mask, the segment hit something (segment).
+        surface: mask, the vertex is no point in a medium (segment).
+        opl: optical length of the segment, Float64 (segment).
+        β: throughput at the end of the segment (segment).
+        ray, leg: ray and leg that found the vertex (segment).
+        scatter, mei, medium: real collision, MediumInteraction3f and medium (segment through media).
+        τ: optical path length up to the vertex, minus the film's start, Float64 (loop).
+        η: index of refraction along the segment (loop).
+        goes_on: mask, the path may have a further vertex (loop).
+        bsdf: BSDF at the vertex (scattering).
+        delay: delay of the scattering, DelaySample (scattering).
+        scattered_si: ``si`` with the wavelengths behind the surface (scattering).
+        connectable: mask, a connection can find light from here (scattering).
+        scattered_τ: ``τ`` and the delay, where connections start to count (loop).
     """
 
 
 class Proposal(Local):
-    """Where a connection wants to connect to: ``d`` (unit Vector3f in the world), ``active`` (a subset of
-    ``vertex.goes_on``, which keeps to ``max_depth``), ``ds`` (what lies there: ``p, n, d, dist, delta`` of a
-    DirectionSample3f and its ``emitter``, None for a light that is no part of the scene), and what is the connection's
-    own.
+    """Direction that a connection asks the scattering for.
+
+    Attributes:
+        d: unit Vector3f in world space.
+        active: mask, a subset of ``vertex.goes_on``, which keeps to ``max_depth``.
+        ds: point of the light: ``p, n, d, dist, delta`` of a DirectionSample3f and ``emitter``, None for a light
+            outside of the scene.
+
+    Further attributes are the connection's own.
     """
 
 
 class Answer(Local):
-    """Scattering towards a proposal: ``value`` (what it makes of unpolarized light, in the frame of the segment towards
-    the sensor), ``pdf`` (per solid angle, with which the walk would have gone there), ``eta`` (relative index on that
-    side). ``matrix``: that value between the frames of the segment and of the connection, for light that may be
-    polarized. Not defined where the proposal is not active.
+    """Scattering towards a proposal; undefined where the proposal is not active.
+
+    Attributes:
+        value: scattered part of unpolarized light, in the frame of the segment towards the sensor.
+        pdf: density of the direction in the walk.
+        eta: relative index of refraction on that side.
+        matrix: ``value`` for polarized light, between the frames of the segment and of the connection.
     """
 
 
 class Step(Local):
-    """The next direction ``out`` (``wo`` in the local frame): ``weight`` (value over pdf), ``pdf``, ``eta`` (relative
-    index), ``delta`` (Bool), ``unconnected`` (no connection could have found what lies there), the random numbers
-    ``u_lobe, u_dir, u_delay``.
+    """Sampled direction of the next segment.
+
+    Attributes:
+        out, wo: direction in world space and in the local frame.
+        weight: value over density.
+        pdf: density.
+        eta: relative index of refraction.
+        delta: mask, sampled by a delta lobe.
+        unconnected: mask, no connection can find what lies ahead.
+        u_lobe, u_dir, u_delay: random numbers of the sample.
     """
 
 
 class GuidedPoint(Local):
-    """A point on a surface that a :class:`Guide` has drawn: ``p``, ``shape`` (ShapePtr), ``primitive`` (the number of
-    its triangle, None where that does not matter), and ``n`` and ``uv`` as intersections have them, both None where
-    they are not known: then a ray has to find the point.
+    """Point on a surface, sampled by a :class:`Guide`.
+
+    Attributes:
+        p: Point3f.
+        shape: ShapePtr.
+        primitive: number of the triangle, None if irrelevant.
+        n, uv: normal and texture coordinates of intersections there; both None if unknown, then a ray finds the point.
     """
 
     def __init__(self, p, shape, primitive=None, n=None, uv=None):
@@ -78,31 +122,40 @@ class GuidedPoint(Local):
 
 
 class Event(Local):
-    """Light that arrives: ``value`` (throughput included), ``opl`` (Float64, minus the film's start), ``active``,
-    ``depth`` (UInt32, the smallest ``max_depth`` of a render that contains it), and what the strategy records of it.
-    The loop makes ``value`` zero where it is not active. ``crowded`` (static): most paths have it at once, so that sums
-    are added up without a search for lanes that share an address.
+    """Light that arrives at the sensor.
+
+    Attributes:
+        value: contribution, throughput included; the loop zeroes it where inactive.
+        opl: optical path length, minus the film's start, Float64.
+        active: mask of lanes that have the event.
+        depth: smallest ``max_depth`` of a render that contains it, UInt32.
+        crowded: static; most lanes have the event at once, so that sums search no lanes with equal addresses.
+
+    Further attributes are the connection's own record.
     """
 
     crowded = False
 
 
 class EventTerm(Local):
-    """An event with derivatives: ``value`` (attached, times the attached throughput), ``slope`` (Float: zero with the
-    derivative of the arrival), ``opl`` (Float64, detached), ``active``; ``arrival``, as ``v.arrival(name)`` says,
-    where it is the recorded event of a connection, which then was active wherever the term is.
+    """Event of a recorded vertex with derivatives.
 
-    ``value`` has to be zero where it is not active, selected before it is multiplied with the throughput: what an idle
-    lane holds must not reach the adjoint.
+    Attributes:
+        value: attached contribution, times the attached throughput. Zero where inactive, by a selection before the
+            product with the throughput: values of idle lanes must not reach the adjoint.
+        slope: Float, zero with the derivative of the arrival.
+        opl: detached optical path length, Float64.
+        active: mask of lanes that have the event.
+        arrival: ``v.arrival(name)`` of the recorded event of a connection, active wherever the term is; None for other
+            terms, for which the film is read at ``opl``.
     """
 
-    # Otherwise the film is asked for the adjoint at ``opl``.
     arrival = None
 
 
 @dataclass
 class VertexEnd:
-    """Where a vertex lies, without derivatives: what the one before sees of it. Loop state of the reverse mode."""
+    """Place of a vertex without derivatives, as seen from the vertex before. Loop state of the reverse mode."""
 
     t: Any      # Float      distance along the ray that found it, which starts a little off the vertex before
     n: Any      # Normal3f   zero for points in a volume
@@ -111,300 +164,341 @@ class VertexEnd:
 
     @staticmethod
     def nowhere() -> VertexEnd:
-        """Behind the last vertex of a path."""
+        """Return the end that follows the last vertex of a path."""
         return VertexEnd(mi.Float(0), mi.Normal3f(0, 0, 1), mi.Vector3f(0, 0, 1), mi.Bool(False))
 
 
 class AttachedVertex(Local):
-    """A recorded vertex with derivatives.
+    """Recorded vertex with derivatives.
 
-    ``v`` (RecordedVertex), ``si`` (attached), ``sid`` (detached), ``end`` (VertexEnd), ``carry`` (with the throughput
-    at the vertex), ``slope`` (zero with the derivative of the optical length up to it), ``damping_radius`` (with
-    geometry: points nearer than that slide along). The scattering adds ``bsdf``, ``delay``, ``scattered_si`` (``si``
-    with the wavelengths beyond the surface), ``scattered_slope`` and ``scattered_opl`` (behind its delay) and
-    ``rotation``.
+    Attributes:
+        v: :class:`.record.RecordedVertex`.
+        si, sid: SurfaceInteraction3f, attached and detached (segment).
+        end: :class:`VertexEnd` (segment).
+        carry: :class:`.carry.Carry` with the throughput at the vertex (segment).
+        slope: Float, zero with the derivative of the optical path length up to the vertex (segment).
+        damping_radius: distance below which points are dragged along, with moving geometry (segment).
+        bsdf, delay: as of :class:`Vertex` (scattering).
+        scattered_si: ``si`` with the wavelengths behind the surface (scattering).
+        scattered_slope, scattered_opl: slope and optical path length behind the delay (scattering).
+        rotation: rotation of Stokes vectors to the frame of the segment (scattering).
     """
 
 
 class Strategy:
-    """A part of the walk. ``name`` is unique within a world and names its part of the record. Integrators make new
-    strategies for every job, so that ``prepare`` may keep what it likes.
+    """Base of the parts of a walk.
+
+    ``name`` is unique within a context and names a part of the record. Integrators create new strategies for every
+    job: ``prepare`` may keep state.
     """
 
     name = ""
 
-    def prepare(self, world: Any) -> None:
-        """Once a job, outside of traced code, with gradients enabled: what all lanes share. Arrays that are kept are
-        evaluated (``dr.eval``): launches of a job differ in width, and the first one that reads others may widen
-        them to its own.
+    def prepare(self, context: Any) -> None:
+        """Compute what all lanes share: once a job, outside of traced code, with gradients enabled.
+
+        Arrays that are kept must be evaluated (``dr.eval``): launches of a job differ in width, and Dr.Jit widens
+        unevaluated ones to the width of the first launch that reads them.
         """
 
-    def start(self, world: Any, rays: Any) -> None:
-        """Before every launch, outside of traced code: what is told by the lane (``rays``: its primary rays)."""
+    def start(self, context: Any, rays: Any) -> None:
+        """Compute values per lane of the primary ``rays``: before every launch, outside of traced code."""
 
     def tables(self) -> list[Any]:
-        """What ``prepare`` has computed of parameters: attached where they are."""
+        """Return the arrays that ``prepare`` computed from parameters, attached where these are."""
         return []
 
-    def fields(self, world: Any) -> dict[str, Any]:
-        """Types of the numbers that ``attached`` cannot recompute, by name."""
+    def fields(self, context: Any) -> dict[str, Any]:
+        """Return the types of the numbers that ``attached`` cannot recompute, by name."""
         return {}
 
     def record(self, sample: Any) -> dict[str, Any]:
-        """Those numbers for one sample: what ``arrive``, ``scatter``, or proposal and event were."""
+        """Return these numbers for the sample of a vertex.
+
+        Args:
+            sample: :class:`Vertex` of a segment, :class:`Step` of a scattering, ``proposal`` and ``event`` of a
+                connection.
+        """
         return {}
 
 
 class Segment(Strategy):
-    """From vertex to vertex along a straight line.
+    """Straight line from vertex to vertex.
 
-    ``leg`` is loop state of the strategy's own form: how the segment that is being followed ends.
+    A ``leg`` is the end of the current segment: loop state of the strategy's own form.
     """
 
     name = "segment"
-    # Whether near points are dragged along with the vertex that sees them (``damped_motion``).
+    # Points near a vertex move along with it (``damped_motion``).
     drags = True
-    # Fields of the Carry that derivatives go through for its sake.
+    # Further fields of the Carry that derivatives pass through.
     carried: tuple[str, ...] = ()
 
-    def first(self, world: Any, ray: Any, sampler: Any) -> Any:
-        """The leg of a primary ray."""
+    def first(self, context: Any, ray: Any, sampler: Any) -> Any:
+        """Return the leg of a primary ray."""
         raise NotImplementedError
 
     def depart(
-        self, world: Any, ray: Any, vertex: Vertex, β: Any, sampler: Any, active: Any, seen: bool = False
+        self, context: Any, ray: Any, vertex: Vertex, β: Any, sampler: Any, active: Any, seen: bool = False
     ) -> Any:
-        """The leg of ``ray``, which leaves ``vertex`` with throughput ``β``. ``seen``: it is part of a primary ray,
-        which lights are hidden from where ``world.hide_emitters``.
+        """Return the leg of ``ray``, which leaves ``vertex`` with throughput ``β``.
+
+        ``seen``: the ray is part of a primary ray, which passes lights where ``context.hide_emitters``.
         """
         raise NotImplementedError
 
-    def depart_guided(self, world: Any, ray: Any, vertex: Vertex, step: Step, sampler: Any, active: Any) -> Any:
-        """The same where some rays were sent to a point by a guide: ``step.guided``, ``step.point``, and in
-        ``step.target`` what is known of it (Local with ``n`` and ``uv``, or None).
-        """
-        return self.depart(world, ray, vertex, vertex.β, sampler, active)
+    def depart_guided(self, context: Any, ray: Any, vertex: Vertex, step: Step, sampler: Any, active: Any) -> Any:
+        """Return the leg of ``ray``, which a guide sent to ``step.point`` where ``step.guided``.
 
-    def arrive(self, world: Any, path: Any) -> Vertex:
-        """The vertex at the end of the current leg. Sensors do not see lights where ``world.hide_emitters``."""
+        ``step.target`` has ``n`` and ``uv`` of the point, or is None.
+        """
+        return self.depart(context, ray, vertex, vertex.β, sampler, active)
+
+    def arrive(self, context: Any, path: Any) -> Vertex:
+        """Return the vertex at the end of the current leg; sensors see no lights where ``context.hide_emitters``."""
         raise NotImplementedError
 
     def surface_of(self, leg: Any) -> tuple[Any, Any]:
-        """(PreliminaryIntersection3f of the next surface, whether the leg ends there)."""
+        """Return (PreliminaryIntersection3f of the next surface, mask: the leg ends there)."""
         raise NotImplementedError
 
     def found(self, leg: Any, ray: Any, flags: Any, active: Any = True) -> Any:
-        """SurfaceInteraction3f of the next surface along ``ray``, with what the ``flags`` ask for at least."""
+        """Return the SurfaceInteraction3f of the next surface along ``ray``, with the fields of ``flags`` at least."""
         raise NotImplementedError
 
     def known(self, pi: Any, ray: Any) -> Any:
-        """The leg of a primary ray whose PreliminaryIntersection3f is known."""
+        """Return the leg of a primary ray with a known PreliminaryIntersection3f."""
         return pi
 
     def length_of(self, leg: Any) -> tuple[Any, Any]:
-        """(length of ``leg`` from the origin of its ray, whether something is there)."""
+        """Return (length of ``leg`` from the origin of its ray, mask: it ends at something)."""
         raise NotImplementedError
 
-    def held(self, world: Any, pi: Any, ray: Any, active: Any) -> Any:
-        """Zero with how far derivatives move the surface point ``pi``, found by ``ray``, as a point of its shape."""
+    def held(self, context: Any, pi: Any, ray: Any, active: Any) -> Any:
+        """Return zero with the derivative of the surface point ``pi``, found by ``ray``, as a point of its shape."""
         raise NotImplementedError
 
     def ends_at(self, pi: Any, medium: Any) -> Any:
-        """The leg that ends at the surface ``pi``, in the ``medium`` that :meth:`medium_towards` says."""
+        """Return the leg that ends at the surface ``pi``, in the ``medium`` of :meth:`medium_towards`."""
         raise NotImplementedError
 
     def medium_towards(self, d: Any, vertex: Any = None) -> Any:
-        """The medium of a ray that leaves ``vertex`` (None: the sensor) in direction ``d``, None in vacuum."""
+        """Return the medium of a ray that leaves ``vertex`` (None: the sensor) along ``d``, None in vacuum."""
         raise NotImplementedError
 
-    def medium_at(self, world: Any, p: Any, start: Any, medium: Any, active: Any) -> Any:
-        """The medium at ``p``, where that at the point ``start`` is ``medium`` on the side of ``p``; None in vacuum."""
+    def medium_at(self, context: Any, p: Any, start: Any, medium: Any, active: Any) -> Any:
+        """Return the medium at ``p``, None in vacuum; ``medium`` is that at ``start`` on the side of ``p``."""
         raise NotImplementedError
 
     def share_of_surface(self, leg: Any) -> Any:
-        """How much of the motion of the surface behind it the end of ``leg`` follows."""
+        """Return the share of the motion of the surface behind it that the end of ``leg`` follows."""
         raise NotImplementedError
 
     def transmittance(
-        self, world: Any, vertex: Vertex, ds: Any, u: Any, sampler: Any, active: Any, seen: bool = False
+        self, context: Any, vertex: Vertex, ds: Any, u: Any, sampler: Any, active: Any, seen: bool = False
     ) -> tuple[Any, Any]:
-        """(whether the point ``ds`` (``p, d, dist``) can be seen, factor per colour). ``u``: two uniform
-        numbers that were drawn for this vertex and serve as the start of a generator. ``seen``: as of :meth:`depart`.
+        """Return (mask: the point ``ds`` is visible, transmittance towards it per colour).
+
+        Args:
+            ds: ``p, d, dist`` of the point.
+            u: two uniform numbers, drawn for this vertex, which seed a generator.
+            seen: as of :meth:`depart`.
         """
         raise NotImplementedError
 
     def restore(self, v: Any, ray: Any) -> tuple[Any, Any]:
-        """(Ray3f, PreliminaryIntersection3f) of a recorded vertex; ``ray`` is the primary one."""
+        """Return (Ray3f, PreliminaryIntersection3f) of a recorded vertex; ``ray`` is the primary one."""
         raise NotImplementedError
 
-    def next_surface(self, world: Any, ray: Any, active: Any) -> Any:
-        """The first surface along ``ray`` that a connection ends at."""
+    def next_surface(self, context: Any, ray: Any, active: Any) -> Any:
+        """Return the first surface along ``ray`` that ends a connection."""
         raise NotImplementedError
 
-    def end(self, world: Any, v: Any) -> Any:
-        """Where a recorded vertex lies, without derivatives: a :class:`.vertex.VertexEnd`."""
+    def end(self, context: Any, v: Any) -> Any:
+        """Return the :class:`VertexEnd` of a recorded vertex."""
         raise NotImplementedError
 
     def has_no_normal(self, end: Any) -> Any:
-        """Mask of the :class:`.vertex.VertexEnd` that lie in a volume, None where none can."""
+        """Return a mask of ends (:class:`VertexEnd`) in a volume, None without media."""
         return None
 
     def weight(self, v: Any) -> Any:
-        """Recorded weight of the leg that led to vertex ``v``."""
+        """Return the recorded weight of the leg that led to vertex ``v``."""
         return 1
 
-    def attached(self, world: Any, v: Any, carry: Any, wanted: Any) -> Any:
-        """The :class:`.vertex.AttachedVertex` of a recorded one: slope and throughput of ``carry`` move to it, and its
-        ``end`` is what :meth:`end` says.
+    def attached(self, context: Any, v: Any, carry: Any, wanted: Any) -> Any:
+        """Return the :class:`AttachedVertex` of a recorded vertex.
+
+        Slope and throughput of ``carry`` include the segment; its ``end`` is that of :meth:`end`.
         """
         raise NotImplementedError
 
-    def motion(self, world: Any, vertex: Any, following: Any, ahead: Any) -> Any:
-        """How the segment from an attached ``vertex`` to the one that is ``following`` it moves where that one lies
-        ``ahead`` (mask): attached ``d``, ``J``, ``drag`` and ``longer()`` as a
-        :class:`.scattering.geometry_terms.DampedMotion` has them.
+    def motion(self, context: Any, vertex: Any, following: Any, ahead: Any) -> Any:
+        """Return the motion of the segment from an attached ``vertex`` to the ``following`` one, where ``ahead``.
+
+        The result has attached ``d``, ``J``, ``drag`` and ``longer()``, as :class:`.geometry_terms.DampedMotion`.
         """
         raise NotImplementedError
 
-    def attached_transmittance(self, world: Any, vertex: Any, connected: Any, active: Any) -> Any:
-        """One with the derivative of the logarithm of the transmittance towards ``connected``: Local with attached
-        ``p``, detached ``d``, ``far``, and ``ahead`` (whether the segment is the one to the next vertex).
+    def attached_transmittance(self, context: Any, vertex: Any, connected: Any, active: Any) -> Any:
+        """Return one with the derivative of the logarithm of the transmittance towards a point.
+
+        Args:
+            connected: attached ``p``, detached ``d``, ``far`` (mask of points at infinity), ``ahead`` (static: the
+                segment is the one to the next vertex).
         """
         return 1
 
 
 class Connection(Strategy):
-    """Light that is found at a vertex, or that a vertex is connected to.
+    """Emission that is found at a vertex, or a light that a vertex is connected to.
 
-    What a connection owes: it keeps to ``vertex.goes_on``, ``vertex.connectable`` and ``world.deep_enough``, asks
-    ``world.counted`` before it traces a shadow ray, weighs its samples by :meth:`weight`, and counts time from
-    ``vertex.scattered_τ`` along ``vertex.η * answer.eta``.
+    A connection respects ``vertex.goes_on``, ``vertex.connectable`` and ``context.deep_enough``, masks with
+    ``context.counted`` before it traces a shadow ray, weights its samples by :meth:`weight`, and adds lengths to
+    ``vertex.scattered_τ`` with the index ``vertex.η * answer.eta``.
     """
 
-    # Whether all of its light is that of the scene's emitters, so that their box bounds where it can come from.
+    # All light comes from emitters of the scene, whose bounding box limits the remaining path length.
     light_of_scene_alone = False
-    # Whether it may have an event at the last vertex of a path, from where nothing is connected any more.
+    # The last vertex of a path, which connects to nothing, can have an event.
     finds_light = True
-    # Whether it has no event at the first vertex, of any path of the job.
+    # The first vertex has no event, on any path of the job.
     dark_at_first = False
 
     def events(self, wanted: Any) -> int:
-        """Events that it has at a vertex at most; in a derivative (``wanted`` is not None) the number of terms."""
+        """Return the largest number of events at a vertex; of terms in a derivative (``wanted`` is not None)."""
         return 1
 
-    def propose(self, world: Any, path: Any, vertex: Vertex, sampler: Any) -> Proposal | None:
-        """A direction in which scattering is asked for, None where none is."""
+    def propose(self, context: Any, path: Any, vertex: Vertex, sampler: Any) -> Proposal | None:
+        """Return a direction for the scattering to evaluate, None for none."""
         return None
 
-    def connect(self, world: Any, path: Any, vertex: Vertex, proposal: Any, answer: Any, zeros: bool) -> Event:
-        """The event. ``zeros`` (static): events of value zero matter for a derivative, so that the visible ones of
-        them are active, too, unless no attached parameter can change them.
+    def connect(self, context: Any, path: Any, vertex: Vertex, proposal: Any, answer: Any, zeros: bool) -> Event:
+        """Return the event of the vertex.
+
+        Args:
+            proposal, answer: result of :meth:`propose` and the scattering towards it, both None for none.
+            zeros: static; visible events of value zero are active, since their derivatives can differ from zero,
+                unless no attached parameter changes them.
         """
         raise NotImplementedError
 
-    def density(self, world: Any, ref: Any, ds: Any, active: Any) -> Any:
-        """Density with which this strategy samples the light's point ``ds`` from ``ref``: per solid angle, and for a
-        light without extent the probability of choosing it. None where it samples none.
+    def density(self, context: Any, ref: Any, ds: Any, active: Any) -> Any:
+        """Return the density of the light's point ``ds`` seen from ``ref``, None if the strategy samples no points.
+
+        Per solid angle; for a light without extent the probability of its choice.
         """
         return None
 
-    def weight(self, world: Any, ref: Any, ds: Any, density: Any, pdf: Any, active: Any) -> Any:
-        """Weight of a sample ``ds`` of this strategy, which has the density ``density`` for it; ``pdf``: that with
-        which scattering finds it, 0 where it cannot.
+    def weight(self, context: Any, ref: Any, ds: Any, density: Any, pdf: Any, active: Any) -> Any:
+        """Return the multiple importance weight of a sample of this strategy.
+
+        Args:
+            ref: interaction that the light is seen from.
+            ds: sampled point of the light.
+            density: density of ``ds`` in this strategy.
+            pdf: density of ``ds`` in the scattering, 0 where that cannot find it.
+            active: mask of lanes.
 
         All connections count as one technique of density ``B = sum b_i`` beside scattering with density ``A`` (power
         heuristic), and share its weight by their densities: ``b_i / B * B^2 / (A^2 + B^2)``. A strategy of another file
         that samples lights changes the weights of all by its ``density`` alone.
         """
-        others = [c.density(world, ref, ds, active) for c in world.connections if c is not self]
+        others = [c.density(context, ref, ds, active) for c in context.connections if c is not self]
         others = [other for other in others if other is not None]
         if not others:
             return mis_weight(density, pdf)
         total = density + sum(others)
         return dr.select(total > 0, density / total, 0) * mis_weight(total, pdf)
 
-    def claims(self, world: Any, emitter: Any, d: Any, wanted: Any) -> Any:
-        """Mask of the emitters, in the direction ``d``, that derivatives reach by connections alone; None for none."""
+    def claims(self, context: Any, emitter: Any, d: Any, wanted: Any) -> Any:
+        """Return a mask of emitters in direction ``d`` that derivatives reach by connections alone, None for none."""
         return None
 
     def numbers(self, recorded: dict[str, Any]) -> list[Any] | None:
-        """Two uniform numbers out of the record that were drawn at the vertex, None where there are none."""
+        """Return two uniform numbers of the record that were drawn at the vertex, None for none."""
         return None
 
-    def attached(self, world: Any, vertex: Any, step: Any, wanted: Any) -> list[EventTerm]:
-        """The events of a recorded vertex with derivatives."""
+    def attached(self, context: Any, vertex: Any, step: Any, wanted: Any) -> list[EventTerm]:
+        """Return the events of a recorded vertex with derivatives."""
         raise NotImplementedError
 
 
 class Guide(Strategy):
-    """Draws some of the next vertices in place of the scattering: a point, which counts only if the ray arrives there.
+    """Sampling of next vertices as points on surfaces, for a share of the samples of the scattering.
 
-    ``share`` of all samples are its own; the scattering weighs them by the densities of guides and scattering together.
-    It needs no attached form: the vertex is differentiated as every other one.
+    A point counts only if its ray arrives there. The scattering weights samples by the densities of guides and its own
+    together. A guide has no attached form: its vertices are differentiated as all others.
     """
 
     share = 0.5
 
     def share_at(self, depth: Any) -> Any:
-        """Its share of the samples at the vertices number ``depth`` of their paths (UInt32). All shares of a vertex may
-        sum to one only where the guides reach all that the scattering does, and it has no delta lobe.
+        """Return the share of samples at vertices number ``depth`` (UInt32) of their paths.
+
+        The shares of all guides sum to one only where they reach every direction of a scattering without delta lobes.
         """
         return self.share
 
-    def draw(self, world: Any, vertex: Vertex, x: Any, y: Any) -> GuidedPoint:
-        """A point on a surface for two uniform numbers (Float64, Float)."""
+    def draw(self, context: Any, vertex: Vertex, x: Any, y: Any) -> GuidedPoint:
+        """Return a point on a surface for two uniform numbers (Float64, Float)."""
         raise NotImplementedError
 
-    def density(self, world: Any, p: Any, q: Any, n: Any, shape: Any, active: Any, primitive: Any = None) -> Any:
-        """Density per solid angle at ``p`` with which it draws the point ``q`` (normal ``n``) of ``shape``.
-        ``primitive``: the number of the shape's triangle, None where it is not known: then it is that of any.
+    def density(self, context: Any, p: Any, q: Any, n: Any, shape: Any, active: Any, primitive: Any = None) -> Any:
+        """Return the density per solid angle at ``p`` of the point ``q`` (normal ``n``) of ``shape``.
+
+        ``primitive``: number of the triangle, None if unknown, for the density of any.
         """
         raise NotImplementedError
 
 
 class Scattering(Strategy):
-    """What happens to light at a vertex. Which indices of refraction and delta lobes there are follows from the scene's
-    contents.
-    """
+    """Scattering at surfaces or in media: evaluation towards proposals, sampling of the next direction."""
 
     name = "scattering"
     guides: Any = ()
-    # Static: whether its value is zero wherever its density is, for all values of its parameters.
+    # Static: the value is zero wherever the density is, for all values of the parameters.
     samples_all = False
 
-    def arrive(self, world: Any, path: Any, vertex: Vertex, sampler: Any) -> None:
-        """Look up how the vertex scatters, before any connection is proposed."""
+    def arrive(self, context: Any, path: Any, vertex: Vertex, sampler: Any) -> None:
+        """Look up the scattering of a vertex, before connections propose directions."""
         raise NotImplementedError
 
-    def scatter(self, world: Any, path: Any, vertex: Vertex, proposals: list, sampler: Any) -> tuple[list, Step]:
-        """(an answer for each proposal, None for None; the next direction). All proposals come together, so that one
-        virtual call can serve the first of them and the next direction.
+    def scatter(self, context: Any, path: Any, vertex: Vertex, proposals: list, sampler: Any) -> tuple[list, Step]:
+        """Return (an answer for each proposal, None for None; the next direction).
+
+        All proposals come together: one virtual call serves the first of them and the next direction.
         """
         raise NotImplementedError
 
-    def weigh(self, world: Any, path: Any, vertex: Vertex, step: Step, ray: Any, leg: Any) -> None:
-        """With guides: weight and density of ``step``, once it is known how its segment ends."""
+    def weigh(self, context: Any, path: Any, vertex: Vertex, step: Step, ray: Any, leg: Any) -> None:
+        """Set weight and density of ``step`` by the end of its segment; called with guides alone."""
 
-    def look_up_attached(self, world: Any, vertex: Any, wanted: Any) -> None:
-        """Look up how an attached vertex scatters, before :meth:`attached` and the connections'."""
+    def look_up_attached(self, context: Any, vertex: Any, wanted: Any) -> None:
+        """Look up the scattering of an attached vertex, before :meth:`attached` and those of connections."""
         raise NotImplementedError
 
-    def evaluate(self, world: Any, vertex: Any, out: Any, active: Any, sampled: bool = False, ds: Any = None) -> Any:
-        """A :class:`Local` with attached ``value``, ``pdf``, ``wo`` (local direction) and ``eta`` towards the attached
-        world direction ``out``. ``sampled``: the direction was drawn by the scattering itself. ``ds``: what lies there,
-        if it is a light's point.
+    def evaluate(self, context: Any, vertex: Any, out: Any, active: Any, sampled: bool = False, ds: Any = None) -> Any:
+        """Return attached ``value``, ``pdf``, ``wo`` (local direction) and ``eta`` towards a direction.
+
+        Args:
+            out: attached direction in world space.
+            sampled: the scattering sampled the direction itself.
+            ds: point of a light in that direction, None otherwise.
         """
         raise NotImplementedError
 
-    def attached(self, world: Any, vertex: Any, wanted: Any) -> Any:
-        """The next step with derivatives: Local with ``carry`` behind the vertex, ``inv_pdf`` of the recorded
-        direction, ``ahead`` (the next vertex was found by a smooth lobe). Its record has the mask ``delta``.
+    def attached(self, context: Any, vertex: Any, wanted: Any) -> Any:
+        """Return the next step with derivatives; the record of a scattering has the mask ``delta``.
+
+        The result has ``carry`` behind the vertex, ``inv_pdf`` of the recorded direction and ``ahead`` (mask: a smooth
+        lobe found the next vertex).
         """
         raise NotImplementedError
 
 
 def mis_weight(pdf_a: Any, pdf_b: Any) -> Any:
-    """Power heuristic, zero where both densities are."""
+    """Return the weight of the power heuristic, zero where both densities are zero."""
     a2 = dr.square(pdf_a)
     w = a2 / dr.fma(pdf_b, pdf_b, a2)
     return dr.select(dr.isfinite(w), w, 0)

@@ -157,7 +157,7 @@ class AttachedSurfaces:
 def surface_interaction(surfaces: AttachedSurfaces | None, pi: Any, ray: Any, flags: int, active: Any) -> Any:
     """``pi.compute_surface_interaction(ray, flags, active)``, attached to the ray, the shape, and what moves the shape.
 
-    ``surfaces``: those of ``world``, None where Mitsuba's own are right.
+    ``surfaces``: those of ``context``, None where Mitsuba's own are right.
     """
     if surfaces is None:
         return pi.compute_surface_interaction(ray, flags, active)

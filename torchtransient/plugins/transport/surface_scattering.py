@@ -43,18 +43,18 @@ class Surface(Scattering):
         """Share of the next directions that the scattering draws itself, at the vertices number ``depth``."""
         return 1 - sum(guide.share_at(depth) for guide in self.guides)
 
-    def prepare(self, world):
-        contents = world.contents
+    def prepare(self, context):
+        contents = context.contents
         self.refraction = None if contents.refraction is None else contents.refraction.read()
         self.delays = None if contents.delays is None else contents.delays.read()
-        self.mixtures = None if contents.mixtures is None else contents.mixtures.read(world.wanted)
+        self.mixtures = None if contents.mixtures is None else contents.mixtures.read(context.wanted)
         for guide in self.guides:
-            guide.prepare(world)
+            guide.prepare(context)
 
-    def start(self, world, rays):
+    def start(self, context, rays):
         self.strata = rays.strata
         for guide in self.guides:
-            guide.start(world, rays)
+            guide.start(context, rays)
 
     def tables(self):
         tables = [] if self.delays is None else self.delays.attached()
@@ -63,7 +63,7 @@ class Surface(Scattering):
 
     # ------------------------------------------------------------------------------------------------- primal
 
-    def arrive(self, world, path, vertex, sampler):
+    def arrive(self, context, path, vertex, sampler):
         vertex.u_delay = None if self.delays is None else sampler.next_2d()
         vertex.u_part = None if self.mixtures is None else sampler.next_1d()
         vertex.delay = self.delay(vertex.si.bsdf(path.ray), vertex.u_delay, path.ray.wavelengths)
@@ -71,7 +71,7 @@ class Surface(Scattering):
             self.mixtures.take_part(vertex.delay, vertex.si, vertex.u_part, vertex.si.is_valid())
         vertex.bsdf = vertex.delay.bsdf
         vertex.scattered_si, vertex.at = self.behind(vertex.delay, vertex.si, vertex.at)
-        vertex.connectable = self.connectable(world, vertex)
+        vertex.connectable = self.connectable(context, vertex)
 
     def delay(self, bsdf, u, wavelengths):
         """Whether a surface scatters late: which BSDF takes its place, when, and with which weight."""
@@ -86,11 +86,11 @@ class Surface(Scattering):
         delay.shift_wavelengths(*copies.values())
         return tuple(copies[id(i)] for i in interactions)
 
-    def connectable(self, world, vertex):
+    def connectable(self, context, vertex):
         """Whether light can be found at the vertex by connecting to it."""
         return mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Smooth)
 
-    def scatter(self, world, path, vertex, proposals, sampler):
+    def scatter(self, context, path, vertex, proposals, sampler):
         ctx, si, bsdf = mi.BSDFContext(), vertex.scattered_si, vertex.bsdf
         u_lobe, u_dir = sampler.next_1d(), sampler.next_2d()
         answers, sample = [], None
@@ -103,19 +103,19 @@ class Surface(Scattering):
                 value, pdf, *sample = bsdf.eval_pdf_sample(ctx, si, wo, u_lobe, u_dir, vertex.goes_on)
             else:
                 value, pdf = bsdf.eval_pdf(ctx, si, wo, p.active)
-            value = self.correct_two_sided(world, bsdf, si, wo, vertex.delay.scaled(value))
+            value = self.correct_two_sided(context, bsdf, si, wo, vertex.delay.scaled(value))
             answers.append(Answer(value=value, pdf=pdf, eta=self.relative_index(bsdf, si, wo), wo=wo))
         bs, weight = sample or self.sample(bsdf, si, u_lobe, u_dir, vertex.goes_on)
-        weight = self.correct_two_sided(world, bsdf, si, bs.wo, vertex.delay.scaled(weight))
+        weight = self.correct_two_sided(context, bsdf, si, bs.wo, vertex.delay.scaled(weight))
         step = Step(
             out=si.to_world(bs.wo), wo=bs.wo, weight=weight, pdf=bs.pdf, eta=bs.eta, u_lobe=u_lobe, u_dir=u_dir,
             u_delay=vertex.u_delay, u_part=vertex.u_part,
             delta=mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta),
         )  # fmt: skip
         step.unconnected = step.delta
-        if world.wanted is not None and world.contents.glossy:
+        if context.wanted is not None and context.contents.glossy:
             step.pdf = dr.select(is_black(weight) & strayed(si.wi, bs), 0, step.pdf)
-        self.elsewhere(world, vertex, proposals, answers, step)
+        self.elsewhere(context, vertex, proposals, answers, step)
         rotation = rotation_to_sensor(si, path.ray.d)
         for p, answer in zip(proposals, answers, strict=True):
             if answer is not None:
@@ -123,22 +123,22 @@ class Surface(Scattering):
                 answer.value = scatter_unpolarized(answer.value, rotation)
         step.weight = rotate_mueller(step.weight, rotation, rotation_from_light(si, step.wo, step.out))
         if self.guides:
-            self._follow_guides(world, path, vertex, step, sampler)
+            self._follow_guides(context, path, vertex, step, sampler)
             for p, answer in zip(proposals, answers, strict=True):
                 if p is not None:
-                    answer.pdf = self.mixture(world, path.depth, vertex.at.p, p.ds, answer.pdf, p.active)
+                    answer.pdf = self.mixture(context, path.depth, vertex.at.p, p.ds, answer.pdf, p.active)
         return answers, step
 
     def sample(self, bsdf, si, u_lobe, u_dir, active):
         """A direction and its weight where nothing is connected."""
         return bsdf.sample(mi.BSDFContext(), si, u_lobe, u_dir, active)
 
-    def elsewhere(self, world, vertex, proposals, answers, step):
+    def elsewhere(self, context, vertex, proposals, answers, step):
         """Change answers and step where the vertex is not on a surface."""
 
     # ------------------------------------------------------------------------------------------------- guides
 
-    def _follow_guides(self, world, path, vertex, step, sampler):
+    def _follow_guides(self, context, path, vertex, step, sampler):
         """Let guides draw some of the next vertices: ``step.guided``, at ``step.point``. Of the scattering's own sample
         and those of the guides one is used.
 
@@ -157,7 +157,7 @@ class Surface(Scattering):
             chosen = (u >= below) & (u < below + share)
             # What is left of the number that has chosen is uniform again.
             x = dr.clip((u - below) / mi.Float64(share), 0, 1 - dr.epsilon(mi.Float64))
-            drawn = guide.draw(world, vertex, x, step.u_dir.y)
+            drawn = guide.draw(context, vertex, x, step.u_dir.y)
             step.point, step.shape = dr.select(chosen, drawn.p, step.point), dr.select(chosen, drawn.shape, step.shape)
             step.primitive = dr.select(chosen, _ANY if drawn.primitive is None else drawn.primitive, step.primitive)
             below += share
@@ -168,7 +168,7 @@ class Surface(Scattering):
         step.delta, step.unconnected = step.delta & ~step.guided, step.unconnected & ~step.guided
         step.weight = dr.select(step.delta, step.weight / own, step.weight)
 
-    def mixture(self, world, depth, p, ds, pdf, active):
+    def mixture(self, context, depth, p, ds, pdf, active):
         """Density with which the walk goes from its vertex ``p``, number ``depth``, to the light's point ``ds``;
         ``pdf``: that of the scattering.
         """
@@ -177,22 +177,22 @@ class Surface(Scattering):
         if ds.emitter is None:  # a light that lies on no shape
             return self.own_share(depth) * pdf
         active = active & ~ds.delta
-        guided = self.guided_density(world, depth, p, ds, ds.emitter.get_shape(), active)
+        guided = self.guided_density(context, depth, p, ds, ds.emitter.get_shape(), active)
         return self.own_share(depth) * pdf + dr.select(active, guided, 0)
 
-    def guided_density(self, world, depth, p, to, shape, active, primitive=None):
+    def guided_density(self, context, depth, p, to, shape, active, primitive=None):
         """Density per solid angle, shares included, with which guides draw the point ``to`` (``p, n``) from ``p``."""
-        return sum(g.share_at(depth) * g.density(world, p, to.p, to.n, shape, active, primitive) for g in self.guides)
+        return sum(g.share_at(depth) * g.density(context, p, to.p, to.n, shape, active, primitive) for g in self.guides)
 
-    def weigh(self, world, path, vertex, step, ray, leg):
+    def weigh(self, context, path, vertex, step, ray, leg):
         smooth = vertex.goes_on & ~step.delta
-        pi, reached = world.segment.surface_of(leg)
+        pi, reached = context.segment.surface_of(leg)
         reached = smooth & reached & pi.is_valid()
-        found = world.segment.found(leg, ray, mi.RayFlags.Minimal, reached)
+        found = context.segment.found(leg, ray, mi.RayFlags.Minimal, reached)
         # From the vertex itself to what was found, not from beside it, where the ray starts.
         p, to = vertex.at.p, dr.select(reached, found.p - vertex.at.p, ray.d)
-        value, pdf = self.value_towards(world, path, vertex, to * dr.rsqrt(dr.squared_norm(to)), smooth)
-        guided = self.guided_density(world, path.depth, p, found, pi.shape, reached, pi.prim_index)
+        value, pdf = self.value_towards(context, path, vertex, to * dr.rsqrt(dr.squared_norm(to)), smooth)
+        guided = self.guided_density(context, path.depth, p, found, pi.shape, reached, pi.prim_index)
         pdf = self.own_share(path.depth) * pdf + dr.select(reached, guided, 0)
         # A guided sample stands for the point that was drawn, and for no other that its ray runs into before: nor for
         # one just above it, where a surface lies below another one.
@@ -206,20 +206,20 @@ class Surface(Scattering):
         wo = vertex.scattered_si.to_local(step.out)
         step.eta = dr.select(smooth, self.relative_index(vertex.bsdf, vertex.scattered_si, wo), step.eta)
 
-    def value_towards(self, world, path, vertex, out, active):
+    def value_towards(self, context, path, vertex, out, active):
         """(value between the frames of the segments, density) of the scattering towards the world direction ``out``."""
         si = vertex.scattered_si
         wo = si.to_local(out)
         value, pdf = vertex.bsdf.eval_pdf(mi.BSDFContext(), si, wo, active)
-        value = self.correct_two_sided(world, vertex.bsdf, si, wo, vertex.delay.scaled(value))
+        value = self.correct_two_sided(context, vertex.bsdf, si, wo, vertex.delay.scaled(value))
         return rotate_mueller(value, rotation_to_sensor(si, path.ray.d), rotation_from_light(si, wo, out)), pdf
 
     # ---------------------------------------------------------------------------------------- scene contents
 
     @staticmethod
-    def correct_two_sided(world, bsdf, si, wo, value):
+    def correct_two_sided(context, bsdf, si, wo, value):
         """``value`` of a BSDF towards ``wo``, put right where Mitsuba's two-sided BSDFs mirror it."""
-        two_sided = world.contents.two_sided
+        two_sided = context.contents.two_sided
         if two_sided is None:
             return value
         return from_mirrored_frames(value, si.wi, wo, two_sided.lists(bsdf) & (si.wi.z < 0))
@@ -229,16 +229,16 @@ class Surface(Scattering):
         return mi.Float(1) if self.refraction is None else self.refraction.relative_index(bsdf, si, wo)
 
     @staticmethod
-    def lobe_probability(world, bsdf, bs):
+    def lobe_probability(context, bsdf, bs):
         """One, with the derivative of a delta lobe's probability where the BSDF's weight hides it."""
-        hidden = world.contents.hidden_probability
+        hidden = context.contents.hidden_probability
         return 1 if hidden is None else dr.select(hidden.lists(bsdf), dr.relative_grad(bs.pdf), 1)
 
     # ------------------------------------------------------------------------------------------------- record
 
-    def fields(self, world):
-        fields = {"delta": mi.Bool} | ({"black": mi.Bool} if world.contents.glossy else {})
-        if world.contents.delta:
+    def fields(self, context):
+        fields = {"delta": mi.Bool} | ({"black": mi.Bool} if context.contents.glossy else {})
+        if context.contents.delta:
             fields |= {"u_lobe": mi.Float, "u_dir": mi.Point2f}
         if self.delays is not None:
             fields["u_delay"] = mi.Point2f
@@ -251,7 +251,7 @@ class Surface(Scattering):
 
     # ----------------------------------------------------------------------------------------------- attached
 
-    def look_up_attached(self, world, vertex, wanted):
+    def look_up_attached(self, context, vertex, wanted):
         v, si = vertex.v, vertex.si
         vertex.rotation = rotation_to_sensor(si, vertex.carry.w)
         u = v.of(self.name).get("u_delay")
@@ -265,31 +265,31 @@ class Surface(Scattering):
         if wanted.geometry and vertex.delay.delay is not None:
             vertex.scattered_slope = vertex.slope + slope_only(vertex.delay.delay)
 
-    def evaluate(self, world, vertex, out, active, sampled=False, ds=None):
+    def evaluate(self, context, vertex, out, active, sampled=False, ds=None):
         si = vertex.scattered_si
         wo = si.to_local(out)
         value, pdf = self.eval_pdf(vertex, wo, out, active, sampled)
         if ds is not None:
-            pdf = self.mixture(world, vertex.v.k, si.p, ds, pdf, active)
-        value = self.correct_two_sided(world, vertex.bsdf, si, wo, vertex.delay.scaled(value))
+            pdf = self.mixture(context, vertex.v.k, si.p, ds, pdf, active)
+        value = self.correct_two_sided(context, vertex.bsdf, si, wo, vertex.delay.scaled(value))
         return Local(value=value, pdf=pdf, wo=wo, eta=self.relative_index(vertex.bsdf, si, wo))
 
     def eval_pdf(self, vertex, wo, out, active, sampled):
         """Value and density towards the local direction ``wo``, in the world ``out``."""
         return vertex.bsdf.eval_pdf(mi.BSDFContext(), vertex.scattered_si, wo, active)
 
-    def attached(self, world, vertex, wanted):
+    def attached(self, context, vertex, wanted):
         v, si, r, following = vertex.v, vertex.scattered_si, vertex.v.of(self.name), vertex.v.next
         smooth, mirrored = v.goes_on & ~r["delta"], v.goes_on & r["delta"]
         ahead = smooth & following.valid
         out, J, drag = mi.Vector3f(following.d), mi.Float(1), mi.Vector3f(0)
         if wanted.geometry:
-            motion = world.segment.motion(world, vertex, following, ahead)
+            motion = context.segment.motion(context, vertex, following, ahead)
             out, J, drag = motion.d, motion.J, motion.drag
-        towards = self.evaluate(world, vertex, out, smooth, sampled=True)
+        towards = self.evaluate(context, vertex, out, smooth, sampled=True)
         pdf = r["pdf"] if self.guides else dr.detach(towards.pdf)
         counts = smooth & (pdf > 0)
-        if world.contents.glossy:
+        if context.contents.glossy:
             # Some BSDFs throw samples away (the facet that was drawn mirrors to behind the surface): their weight is
             # zero, though other lobes have a value and a density there.
             counts &= ~r["black"] | is_black(towards.value)
@@ -301,13 +301,13 @@ class Surface(Scattering):
         weight = dr.select(smooth, weight * (inv_pdf * J), 0)
         eta = dr.select(smooth, towards.eta, 1)
         o, d, w = mi.Point3f(drag), mi.Vector3f(0), dr.select(ahead, out, 0)
-        if world.contents.delta:
+        if context.contents.delta:
             bs, delta_weight = vertex.bsdf.sample(mi.BSDFContext(), si, r["u_lobe"], r["u_dir"], mirrored)
-            delta_weight = self.correct_two_sided(world, vertex.bsdf, si, bs.wo, vertex.delay.scaled(delta_weight))
+            delta_weight = self.correct_two_sided(context, vertex.bsdf, si, bs.wo, vertex.delay.scaled(delta_weight))
             d_out = si.to_world(bs.wo)
             from_light = rotation_from_light(si, bs.wo, d_out, following.d)
             delta_weight = rotate_mueller(delta_weight, vertex.rotation, from_light)
-            delta_weight *= self.lobe_probability(world, vertex.bsdf, bs) * (v.rr / self.own_share(v.k))
+            delta_weight *= self.lobe_probability(context, vertex.bsdf, bs) * (v.rr / self.own_share(v.k))
             weight = dr.select(mirrored, delta_weight, weight)
             eta = dr.select(mirrored, bs.eta, eta)
             o, d, w = dr.select(mirrored, si.p, o), dr.select(mirrored, d_out, 0), dr.select(mirrored, d_out, w)
@@ -316,11 +316,11 @@ class Surface(Scattering):
         if wanted.geometry:
             # What the other end adds when it moves or slides is counted where it is attached.
             longer = dr.select(ahead, motion.longer(), 0)
-            if world.contents.distant is not None:
-                far_away = slope_only(world.contents.distant.length(si.p, following.d))
+            if context.contents.distant is not None:
+                far_away = slope_only(context.contents.distant.length(si.p, following.d))
                 longer = dr.select(smooth & ~ahead, far_away, longer)
             slope = slope + η * longer
-        p, n = (motion.p, motion.n) if "p" in world.carried else (mi.Point3f(0), mi.Normal3f(0))
+        p, n = (motion.p, motion.n) if "p" in context.carried else (mi.Point3f(0), mi.Normal3f(0))
         carry = Carry(
             β=product(vertex.carry.β, weight), slope=slope, η=η, o=o, d=d, x=dr.select(v.goes_on, si.p, 0), w=w, p=p,
             n=n,
@@ -363,14 +363,14 @@ class Lambertian(Surface):
         special = (contents.delays, contents.mixtures, contents.refraction, contents.media, contents.hidden_probability)
         return not mi.is_polarized and all(s is None for s in special) and all(is_lambertian(b) for b in contents.bsdfs)
 
-    def arrive(self, world, path, vertex, sampler):
+    def arrive(self, context, path, vertex, sampler):
         si = vertex.si
         vertex.u_delay = vertex.u_part = None
         vertex.bsdf = si.bsdf(path.ray)
         vertex.delay, vertex.scattered_si = DelaySample(vertex.bsdf), si
         vertex.connectable = mi.Bool(True)
 
-    def scatter(self, world, path, vertex, proposals, sampler):
+    def scatter(self, context, path, vertex, proposals, sampler):
         u_lobe = sampler.next_1d() if self.draws_lobe else mi.Float(0)
         u_dir = sampler.next_2d()
         # After the lights were asked, as BSDFs are: kernels of a scene are then the same whatever was rendered before.
@@ -387,10 +387,10 @@ class Lambertian(Surface):
             unconnected=mi.Bool(False),
         )  # fmt: skip
         if self.guides:
-            self._follow_guides(world, path, vertex, step, sampler)
+            self._follow_guides(context, path, vertex, step, sampler)
             for p, answer in zip(proposals, answers, strict=True):
                 if p is not None:
-                    answer.pdf = self.mixture(world, path.depth, vertex.at.p, p.ds, answer.pdf, p.active)
+                    answer.pdf = self.mixture(context, path.depth, vertex.at.p, p.ds, answer.pdf, p.active)
         return answers, step
 
     @staticmethod
@@ -401,14 +401,14 @@ class Lambertian(Surface):
         value = vertex.ρ * pdf
         return Answer(value=value, matrix=value, pdf=pdf, eta=mi.Float(1))
 
-    def value_towards(self, world, path, vertex, out, active):
+    def value_towards(self, context, path, vertex, out, active):
         answer = self._towards(vertex, out)
         return answer.value, answer.pdf
 
     # ----------------------------------------------------------------------------------------------- attached
 
-    def look_up_attached(self, world, vertex, wanted):
-        super().look_up_attached(world, vertex, wanted)
+    def look_up_attached(self, context, vertex, wanted):
+        super().look_up_attached(context, vertex, wanted)
         vertex.side = _side(vertex.bsdf, vertex.sid)
         vertex.ρ = _albedo(vertex.bsdf, vertex.si, vertex.v.active & vertex.sid.is_valid())
 

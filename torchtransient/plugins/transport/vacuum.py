@@ -23,9 +23,9 @@ from torchtransient.plugins.transport.surface_interactions import surface_intera
 NUMBERS = {"t": "Float", "prim_uv": "Point2f", "prim_index": "UInt32", "shape_index": "UInt32"}
 
 
-def intersection_fields(world, prefix=""):
+def intersection_fields(context, prefix=""):
     """Types of the numbers that a preliminary intersection is kept as."""
-    pointers = ("shape", "instance") if world.contents.instances else ("shape",)
+    pointers = ("shape", "instance") if context.contents.instances else ("shape",)
     return {prefix + name: getattr(mi, kind) for name, kind in NUMBERS.items()} | {
         prefix + name: mi.UInt32 for name in pointers
     }
@@ -65,13 +65,13 @@ class Vacuum(Segment):
     near points are dragged along with the vertex that sees them (:func:`~..scattering.geometry_terms.damped_motion`).
     """
 
-    def prepare(self, world):
+    def prepare(self, context):
         self.meter_normal = None
-        moving = frozenset() if world.wanted is None or not world.wanted.geometry else world.wanted.shapes
+        moving = frozenset() if context.wanted is None or not context.wanted.geometry else context.wanted.shapes
         # Where no shape moves, every vertex stays where it is but for what it is dragged along.
-        self.triangles = AttachedTriangles(world.scene.shapes(), moving) if moving else None
+        self.triangles = AttachedTriangles(context.scene.shapes(), moving) if moving else None
 
-    def start(self, world, rays):
+    def start(self, context, rays):
         self.meter_normal = rays.meter_normal
 
     def tables(self):
@@ -80,27 +80,27 @@ class Vacuum(Segment):
 
     # ------------------------------------------------------------------------------------------------- primal
 
-    def first(self, world, ray, sampler):
-        pi = world.scene.ray_intersect_preliminary(ray, coherent=True)
-        return behind_area_lights(world.scene, ray, pi) if world.hide_emitters else pi
+    def first(self, context, ray, sampler):
+        pi = context.scene.ray_intersect_preliminary(ray, coherent=True)
+        return behind_area_lights(context.scene, ray, pi) if context.hide_emitters else pi
 
-    def depart(self, world, ray, vertex, β, sampler, active, seen=False):
-        pi = world.scene.ray_intersect_preliminary(ray, active=active)
-        return behind_area_lights(world.scene, ray, pi) if seen and world.hide_emitters else pi
+    def depart(self, context, ray, vertex, β, sampler, active, seen=False):
+        pi = context.scene.ray_intersect_preliminary(ray, active=active)
+        return behind_area_lights(context.scene, ray, pi) if seen and context.hide_emitters else pi
 
-    def arrive(self, world, path):
+    def arrive(self, context, path):
         si, (leg, _) = self.found(path.leg, path.ray, mi.RayFlags.All), self.surface_of(path.leg)
         return Vertex(
             si=si, at=si, valid=si.is_valid(), surface=mi.Bool(True), β=path.β, ray=path.ray, leg=leg,
-            opl=self.optical_length(world, path, si.p, si.is_valid()),
+            opl=self.optical_length(context, path, si.p, si.is_valid()),
         )  # fmt: skip
 
-    def optical_length(self, world, path, p, valid):
+    def optical_length(self, context, path, p, valid):
         """Optical length of the segment that ends at ``p``, measured between hit points."""
         length = dr.norm(p - path.prev_p)
-        if world.contents.distant is not None:
-            length = dr.select(valid, length, world.contents.distant.length(path.prev_p, path.ray.d))
-        if world.camera_unwarp:
+        if context.contents.distant is not None:
+            length = dr.select(valid, length, context.contents.distant.length(path.prev_p, path.ray.d))
+        if context.camera_unwarp:
             length = dr.select(path.depth == 0, 0, length)
         return mi.Float64(length * path.η)
 
@@ -116,7 +116,7 @@ class Vacuum(Segment):
     def medium_towards(self, d, vertex=None):
         return None
 
-    def medium_at(self, world, p, start, medium, active):
+    def medium_at(self, context, p, start, medium, active):
         return None
 
     def share_of_surface(self, leg):
@@ -125,22 +125,22 @@ class Vacuum(Segment):
     def found(self, leg, ray, flags, active=True):
         return leg.compute_surface_interaction(ray, flags, active)
 
-    def transmittance(self, world, vertex, ds, u, sampler, active, seen=False):
+    def transmittance(self, context, vertex, ds, u, sampler, active, seen=False):
         ray = vertex.at.spawn_ray_to(ds.p)
-        if not (seen and world.hide_emitters):
-            return active & ~world.scene.ray_test(ray, active), 1
-        pi = behind_area_lights(world.scene, ray, world.scene.ray_intersect_preliminary(ray, active=active))
+        if not (seen and context.hide_emitters):
+            return active & ~context.scene.ray_test(ray, active), 1
+        pi = behind_area_lights(context.scene, ray, context.scene.ray_intersect_preliminary(ray, active=active))
         return active & ~pi.is_valid(), 1
 
-    def next_surface(self, world, ray, active):
-        return world.scene.ray_intersect_preliminary(ray, active=active)
+    def next_surface(self, context, ray, active):
+        return context.scene.ray_intersect_preliminary(ray, active=active)
 
     # ------------------------------------------------------------------------------------------------- record
 
-    def fields(self, world):
-        shifted = world.contents.delays is not None and world.contents.delays.shifts
+    def fields(self, context):
+        shifted = context.contents.delays is not None and context.contents.delays.shifts
         of_ray = {"o": mi.Point3f, "d": mi.Vector3f} | ({"wavelengths": mi.UnpolarizedSpectrum} if shifted else {})
-        return of_ray | intersection_fields(world)
+        return of_ray | intersection_fields(context)
 
     def record(self, vertex):
         ray = vertex.ray
@@ -153,21 +153,22 @@ class Vacuum(Segment):
 
     # ----------------------------------------------------------------------------------------------- attached
 
-    def end(self, world, v):
+    def end(self, context, v):
         si = v.pi.compute_surface_interaction(v.ray, mi.RayFlags.Minimal, v.active)
         return VertexEnd(si.t, si.n, v.ray.d, si.is_valid() & v.active)
 
-    def attached(self, world, v, carry, wanted):
+    def attached(self, context, v, carry, wanted):
         if wanted.geometry:
-            carry = self.from_meter(world, v, carry)
+            carry = self.from_meter(context, v, carry)
         ray = mi.Ray3f(v.ray)
         if not wanted.plain:
             ray.o, ray.d = carry.o, carry.d
-        return self.arrived(world, v, carry, ray, self.attached_surface(world, v, carry, ray, wanted, v.active), wanted)
+        si = self.attached_surface(context, v, carry, ray, wanted, v.active)
+        return self.arrived(context, v, carry, ray, si, wanted)
 
-    def attached_surface(self, world, v, carry, ray, wanted, active):
+    def attached_surface(self, context, v, carry, ray, wanted, active):
         """What ``ray`` finds where ``active``: attached to it and to the surface, along the ray."""
-        si = surface_interaction(world.surfaces, v.pi, ray, mi.RayFlags.All, active)
+        si = surface_interaction(context.surfaces, v.pi, ray, mi.RayFlags.All, active)
         if wanted.plain:  # an attached ray would have every shape differentiated
             si.p = si.p + slide(displacement(carry.o, active), v.ray.d, dr.detach(si.n), active)
         if wanted.geometry:
@@ -176,7 +177,7 @@ class Vacuum(Segment):
             si = dr.select(edge_on, dr.detach(si), si)
         return si
 
-    def arrived(self, world, v, carry, ray, si, wanted):
+    def arrived(self, context, v, carry, ray, si, wanted):
         """The attached vertex at ``si``, behind the optical length of its segment."""
         vertex = AttachedVertex(v=v, si=si, sid=dr.detach(si), carry=carry, slope=carry.slope)
         valid = vertex.sid.is_valid()
@@ -184,27 +185,27 @@ class Vacuum(Segment):
         if wanted.geometry:
             # Of what the path sees first, too: a floor without end says nothing of the things that stand on it.
             first = v.first(self.name, "t") * DAMPING
-            vertex.damping_radius = dr.minimum(world.contents.damping_radius, first)
+            vertex.damping_radius = dr.minimum(context.contents.damping_radius, first)
             si.wi = dr.select(valid, si.to_local(-carry.w), -carry.w)
             # Shifted sideways, a ray gets no longer.
             o = ray.o if wanted.ray else v.ray.o
-            length = length_to(world.contents, o, si.p, valid, ray.d)
-            if world.camera_unwarp:
+            length = length_to(context.contents, o, si.p, valid, ray.d)
+            if context.camera_unwarp:
                 length = dr.select(v.k == 0, 0, length)
             vertex.slope = carry.slope + slope_only(carry.η * length)
         return vertex
 
-    def motion(self, world, vertex, following, ahead):
+    def motion(self, context, vertex, following, ahead):
         δ = displacement(vertex.scattered_si.p, ahead)
-        return self.motion_to(world, vertex.v.after(), δ, following, ahead, vertex.damping_radius)
+        return self.motion_to(context, vertex.v.after(), δ, following, ahead, vertex.damping_radius)
 
-    def motion_to(self, world, after, δ, following, ahead, radius):
+    def motion_to(self, context, after, δ, following, ahead, radius):
         """:meth:`motion` to the vertex ``after`` from a point that moves by ``δ``."""
         d, volume = mi.Vector3f(following.d), self.has_no_normal(following)
         if self.triangles is None:
             return damped_motion(δ, d, following.t, following.n, ahead, radius, volume=volume)
         surface = ahead if volume is None else ahead & ~volume
-        p, n, area = self.material(world, after.pi, after.ray, following.n, surface)
+        p, n, area = self.material(context, after.pi, after.ray, following.n, surface)
         moved = displacement(p, surface)
         motion = damped_motion(δ - moved, d, following.t, following.n, ahead, radius, volume=volume)
         J = motion.J * dr.select(surface, motion.of_material(n, dr.relative_grad(area)), 1)
@@ -212,13 +213,13 @@ class Vacuum(Segment):
         drag = motion.drag + (moved - d * dr.dot(d, moved))
         return Local(d=motion.d, J=J, drag=drag, longer=lambda: -dr.dot(δ, d))
 
-    def material(self, world, pi, ray, n, active):
+    def material(self, context, pi, ray, n, active):
         """(point, normal, area element) of hit points that follow their shapes, whose normals are ``n``. Points of
         shapes without material points stay where they are.
         """
         with dr.suspend_grad():
-            if world.contents.sliding is not None:
-                active = active & ~world.contents.sliding.lists(pi.shape)
+            if context.contents.sliding is not None:
+                active = active & ~context.contents.sliding.lists(pi.shape)
             listed = active & self.triangles.lists(pi.shape)
             at = ray(pi.t)
         point = self.triangles.point(pi, listed)
@@ -227,18 +228,18 @@ class Vacuum(Segment):
         if self.triangles.holds_all:
             return dr.select(listed, point.p, at), dr.select(listed, across, n), dr.select(listed, twice, 1)
         other = active & ~listed
-        si, area = material_point(pi, ray, other, world.contents.meshes, world.surfaces)
+        si, area = material_point(pi, ray, other, context.contents.meshes, context.surfaces)
         p, n = dr.select(other, si.p, at), dr.select(other, si.n, n)
         return dr.select(listed, point.p, p), dr.select(listed, across, n), dr.select(listed, twice, area)
 
-    def held(self, world, pi, ray, active):
+    def held(self, context, pi, ray, active):
         """Zero with how far derivatives move the surface point ``pi``, found by ``ray``, as a point of its shape."""
         if self.triangles is None:
             return mi.Vector3f(0)
-        p, _, _ = self.material(world, pi, ray, mi.Normal3f(0, 0, 1), active & pi.is_valid())
+        p, _, _ = self.material(context, pi, ray, mi.Normal3f(0, 0, 1), active & pi.is_valid())
         return displacement(p, active & pi.is_valid())
 
-    def from_meter(self, world, v, carry):
+    def from_meter(self, context, v, carry):
         """The ``carry`` at the first vertex of a path that starts on an irradiance meter at rest: a point of its shape
         like those after it, since no pixel holds the ray.
         """
@@ -246,9 +247,9 @@ class Vacuum(Segment):
             return carry
         first = v.active & (v.k == 0)
         with dr.suspend_grad():
-            end = self.end(world, v)
-        radius = world.contents.damping_radius
-        motion = self.motion_to(world, v, mi.Vector3f(0), end, first & end.valid, radius)
+            end = self.end(context, v)
+        radius = context.contents.damping_radius
+        motion = self.motion_to(context, v, mi.Vector3f(0), end, first & end.valid, radius)
         n = dr.select(first, self.meter_normal, mi.Normal3f(v.ray.d))
         J = motion.J * dr.relative_grad(dr.select(first, dr.abs_dot(n, motion.d), 1))
         return replace(

@@ -1,4 +1,8 @@
-"""The one loop: segment, vertex, connections, scattering, next segment. What becomes of it is the sink's."""
+"""Loop over the vertices of light paths: segment, vertex, connections, scattering, next segment.
+
+:func:`walk` traces paths to their ends, :func:`advance` up to a vertex. Both repeat :func:`bounce`, which asks the
+strategies of a context (:mod:`.strategy`) and hands events and vertices to a sink (:mod:`.sinks`).
+"""
 
 from __future__ import annotations
 
@@ -15,24 +19,29 @@ from torchtransient.plugins.transport.strategy import Local
 
 @dataclass
 class Path:
-    """Loop state of a walk. A dataclass on purpose: Dr.Jit takes it apart, so that one name is the whole state."""
+    """State of the loop. A dataclass, which Dr.Jit takes apart, so that one name is the whole state."""
 
-    ray: Any               # Ray3f      current ray
-    leg: Any               # PyTree     how it ends, in the form of the segment strategy
+    ray: Any               # Ray3f      ray of the current segment
+    leg: Any               # PyTree     end of that segment, in the form of the segment strategy
     depth: Any             # UInt32     vertices so far
     β: Any                 # Spectrum   throughput before the current segment
-    η: Any                 # Float      index of the medium of the current ray
-    τ: Any                 # Float64    optical path length so far, minus the film's start
+    η: Any                 # Float      index of refraction along the current segment
+    τ: Any                 # Float64    optical path length up to the current segment, minus the film's start, metres
     prev_p: Any            # Point3f    vertex that the ray left
     prev_n: Any            # Normal3f   normal there
     prev_pdf: Any          # Float      density of the ray's direction, per solid angle
-    prev_unconnected: Any  # Bool       no connection could have found what lies ahead (sensor, delta lobe)
-    active: Any            # Bool
+    prev_unconnected: Any  # Bool       no connection can find what lies ahead (sensor, delta lobe)
+    active: Any            # Bool       the path has a further vertex
 
 
-def start(world, ray, first_opl, η) -> Path:
-    """A path at the sensor; ``first_opl``: optical length before the ray's origin, minus the film's start; ``η``: index
-    of refraction there.
+def start(context, ray, first_opl, η) -> Path:
+    """Return a path at the sensor, whose first leg is not set.
+
+    Args:
+        context: :class:`.context.RenderContext` of the job.
+        ray: primary ray, Ray3f.
+        first_opl: optical path length before the ray's origin, minus the film's start, metres (Float64).
+        η: index of refraction at the ray's origin.
     """
     return Path(
         ray=mi.Ray3f(ray),
@@ -45,129 +54,160 @@ def start(world, ray, first_opl, η) -> Path:
         prev_n=mi.Normal3f(0),
         prev_pdf=mi.Float(1),
         prev_unconnected=mi.Bool(True),
-        active=mi.Bool(world.max_depth > 0),
+        active=mi.Bool(context.max_depth > 0),
     )
 
 
-def look_around(world, path, kept, sampler, sink, *, dark=False):
-    """What a path finds at its next vertex: changes ``kept``; returns (vertex, next step, samples by strategy).
-    ``dark``: no connection finds light there.
+def first_leg(context, sampler, ray, pi):
+    """Return the leg of a primary ray.
+
+    Args:
+        context: :class:`.context.RenderContext` of the job.
+        sampler: Mitsuba sampler of the lanes.
+        ray: primary ray, Ray3f.
+        pi: PreliminaryIntersection3f at the end of the leg, None if unknown.
     """
-    connections = [] if dark else world.connections
+    return context.segment.first(context, ray, sampler) if pi is None else context.segment.known(pi, ray)
+
+
+@dr.syntax
+def walk(context, sampler, path, sink):
+    """Trace paths to their ends and hand their events and vertices to a sink.
+
+    Args:
+        context: :class:`.context.RenderContext` of the job.
+        sampler: Mitsuba sampler of the lanes.
+        path: :class:`Path` that starts at the sensor or continues from any vertex; its ``leg`` is set.
+        sink: :class:`.sinks.Sink` of events and vertices.
+
+    Returns:
+        (number of vertices, UInt32; state of the sink).
+    """
+    kept = sink.begin(context)
+    # Without emission that is run into, the last vertex only connects to lights: it needs no iteration of the loop.
+    turns = context.max_depth if context.finds_light or sink.keeps_vertices else max(context.max_depth - 2, 0)
+    dark = context.dark_at_first and not sink.keeps_vertices and turns > 0
+    if dr.hint(dark, mode="scalar"):
+        bounce(context, path, kept, sampler, sink, dark=True)
+    # Dr.Jit compiles a loop without iterations all the same.
+    if dr.hint(turns > dark or sink.keeps_vertices, mode="scalar"):
+        while dr.hint(path.active & (path.depth < turns), max_iterations=turns, label="path"):
+            bounce(context, path, kept, sampler, sink)
+    if dr.hint(not (context.finds_light or sink.keeps_vertices), mode="scalar"):
+        bounce(context, path, kept, sampler, sink, last=True)
+    sink.end(kept)
+    return path.depth, kept
+
+
+@dr.syntax
+def advance(context, sampler, path, target):
+    """Trace paths on until their next vertex is number ``target``, without looking for light.
+
+    Args:
+        context: :class:`.context.RenderContext` of the job.
+        sampler: Mitsuba sampler of the lanes.
+        path: :class:`Path` with its ``leg``; inactive afterwards where it ends before.
+        target: number of a vertex, UInt32.
+
+    Returns:
+        (path, (PreliminaryIntersection3f of the last surface that was reached, the ray that found it)).
+    """
+    kept, sink = {}, Sink()
+    pi, ray = mi.PreliminaryIntersection3f(context.segment.surface_of(path.leg)[0]), mi.Ray3f(path.ray)
+    going = path.active & (path.depth < target)
+    while dr.hint(going, max_iterations=context.max_depth, label="to a vertex"):
+        pi, ray = mi.PreliminaryIntersection3f(context.segment.surface_of(path.leg)[0]), mi.Ray3f(path.ray)
+        bounce(context, path, kept, sampler, sink, dark=True)
+        going = path.active & (path.depth < target)
+    path.active &= path.depth == target
+    return path, (pi, ray)
+
+
+def bounce(context, path, kept, sampler, sink, *, dark=False, last=False):
+    """Follow paths over one vertex: an iteration of the loop, which changes ``path`` at its end.
+
+    Plain Python: lists cost nothing where they are empty, and Dr.Jit does not rewrite its syntax.
+
+    Args:
+        context: :class:`.context.RenderContext` of the job.
+        path: :class:`Path` before the vertex.
+        kept: state of the sink.
+        sampler: Mitsuba sampler of the lanes.
+        sink: :class:`.sinks.Sink` of events and vertices.
+        dark: no connection has light at the vertex.
+        last: the paths end at the vertex, and ``path`` stays as it is.
+    """
+    connections = [] if dark else context.connections
     # ------------------------------------------------------------------------- vertex
-    vertex = world.segment.arrive(world, path)
+    vertex = context.segment.arrive(context, path)
     vertex.τ, vertex.η = path.τ + vertex.opl, path.η
-    vertex.goes_on = path.active & (path.depth + 1 < world.max_depth) & vertex.valid
-    vertex.goes_on = world.in_time(vertex.goes_on, vertex.τ, vertex.at.p)
-    world.scattering.arrive(world, path, vertex, sampler)
+    vertex.goes_on = path.active & (path.depth + 1 < context.max_depth) & vertex.valid
+    vertex.goes_on = context.in_time(vertex.goes_on, vertex.τ, vertex.at.p)
+    context.scattering.arrive(context, path, vertex, sampler)
     vertex.scattered_τ = vertex.delay.after(vertex.τ)
 
     # ------------------------------------------------------------------------- events
-    proposals = [c.propose(world, path, vertex, sampler) for c in connections]
-    answers, step = world.scattering.scatter(world, path, vertex, proposals, sampler)
+    proposals = [c.propose(context, path, vertex, sampler) for c in connections]
+    answers, step = context.scattering.scatter(context, path, vertex, proposals, sampler)
     samples = {}
     for c, proposal, answer in zip(connections, proposals, answers, strict=True):
-        event = c.connect(world, path, vertex, proposal, answer, sink.zeros)
+        event = c.connect(context, path, vertex, proposal, answer, sink.zeros)
         event.value = dr.select(event.active, event.value, 0)
         sink.event(kept, event)
         samples[c.name] = Local(proposal=proposal, event=event)
-    return vertex, step, samples
+    if last:
+        return
 
-
-def bounce(world, path, kept, sampler, sink, *, dark=False):
-    """One turn of the loop: changes ``path`` (at its end) and ``kept``. ``dark``: as in :func:`look_around`.
-
-    Plain Python, so that lists cost nothing where they are empty and Dr.Jit's rewriting of syntax sees none of it.
-    """
-    vertex, step, samples = look_around(world, path, kept, sampler, sink, dark=dark)
-    # ------------------------------------------------------------- to the next vertex
+    # ------------------------------------------------------------------------- next direction
     onward = vertex.goes_on
-    if not world.finds_light:  # nothing would be looked for at the last vertex
-        onward &= path.depth + 2 < world.max_depth
+    if not context.finds_light:  # the last vertex has no event
+        onward &= path.depth + 2 < context.max_depth
     ray, leg = vertex.at.spawn_ray(step.out), None
-    if world.scattering.guides:  # the density of what a guide drew is known once the segment has ended
-        leg = world.segment.depart_guided(world, ray, vertex, step, sampler, onward)
-        world.scattering.weigh(world, path, vertex, step, ray, leg)
-    β, goes_on, rr = roulette(world, path, vertex, step, sampler, onward, sink.zeros)
-    samples[world.segment.name], samples[world.scattering.name] = vertex, step
+    if context.scattering.guides:  # the density of a guided direction is known at the end of its segment
+        leg = context.segment.depart_guided(context, ray, vertex, step, sampler, onward)
+        context.scattering.weigh(context, path, vertex, step, ray, leg)
+
+    # ------------------------------------------------------------------------- Russian roulette
+    β, goes_on, rr = roulette(context, path, vertex, step, sampler, onward, sink.zeros)
+    samples[context.segment.name], samples[context.scattering.name] = vertex, step
     samples["walk"] = Local(β=path.β, τ=vertex.τ, η=path.η, rr=rr, goes_on=goes_on)
     sink.vertex(kept, path, samples)
 
+    # ------------------------------------------------------------------------- next segment
     path.ray, path.depth, path.active = ray, path.depth + 1, goes_on
     path.prev_p, path.prev_n = vertex.at.p, vertex.at.n
     path.prev_pdf, path.prev_unconnected = step.pdf, step.unconnected
     path.β, path.η, path.τ = β, path.η * step.eta, vertex.scattered_τ
-    path.leg = leg if leg is not None else world.segment.depart(world, ray, vertex, β, sampler, goes_on)
+    path.leg = leg if leg is not None else context.segment.depart(context, ray, vertex, β, sampler, goes_on)
 
 
-def roulette(world, path, vertex, step, sampler, goes_on, zeros):
-    """(throughput behind the vertex, whether the path goes on, factor of the throughput)."""
+def roulette(context, path, vertex, step, sampler, goes_on, zeros):
+    """Return (throughput behind the vertex, mask of paths that continue, factor of the throughput).
+
+    Args:
+        context: :class:`.context.RenderContext` of the job.
+        path: :class:`Path` before the vertex.
+        vertex: :class:`.strategy.Vertex`.
+        step: :class:`.strategy.Step`, the sampled direction.
+        sampler: Mitsuba sampler of the lanes.
+        goes_on: mask of paths that have a further vertex.
+        zeros: paths of throughput zero matter (:attr:`.sinks.Sink.zeros`).
+    """
     β = product(vertex.β, step.weight)
     β_max = dr.max(mi.unpolarized_spectrum(β))
     if zeros:
-        # The derivative of a product with one factor of zero needs the light beyond it: go on past the first black
-        # surface.
+        # The derivative of a product with one factor of zero is the product of the others: paths continue behind
+        # their first black surface.
         weight_max = dr.max(mi.unpolarized_spectrum(step.weight))
         first_black = (weight_max == 0) & (dr.max(mi.unpolarized_spectrum(vertex.β)) > 0) & (step.pdf > 0)
         goes_on &= (weight_max > 0) | first_black
         β_max = dr.select(β_max == 0, 1, β_max)
     else:
         goes_on &= β_max != 0
-    if not world.plays_roulette:
+    if not context.plays_roulette:
         return β, goes_on, mi.Float(1)
     chance = dr.minimum(β_max * dr.square(path.η * step.eta), 0.95)
-    plays = path.depth >= world.rr_depth
+    plays = path.depth >= context.rr_depth
     rr = dr.select(plays, dr.rcp(chance), 1)
     survives = sampler.next_1d() < chance
     return β * rr, goes_on & (~plays | survives), rr
-
-
-def walk(world, sampler, ray, first_opl, sink, η=1, leg=None):
-    """Trace the paths of one pass into ``sink``; returns (number of vertices, what the sink kept). ``η``: index of
-    refraction where they start; ``leg``: PreliminaryIntersection3f at the end of their first segment, None where that
-    is not known.
-    """
-    path = start(world, ray, first_opl, η)
-    path.leg = first_leg(world, sampler, ray, leg)
-    return go_on(world, sampler, path, sink)
-
-
-def first_leg(world, sampler, ray, leg):
-    """The leg of a primary ray; ``leg``: as of :func:`walk`."""
-    return world.segment.first(world, ray, sampler) if leg is None else world.segment.known(leg, ray)
-
-
-@dr.syntax
-def advance(world, sampler, path, target):
-    """Let paths go on to their vertex number ``target`` (UInt32), which they are then on the way to, and look for no
-    light before. Those that end before are not active. Returns the path, and what its last vertex was found by: (the
-    surface's PreliminaryIntersection3f, the ray).
-    """
-    kept, sink = {}, Sink()
-    pi, ray = mi.PreliminaryIntersection3f(world.segment.surface_of(path.leg)[0]), mi.Ray3f(path.ray)
-    going = path.active & (path.depth < target)
-    while dr.hint(going, max_iterations=world.max_depth, label="to a vertex"):
-        pi, ray = mi.PreliminaryIntersection3f(world.segment.surface_of(path.leg)[0]), mi.Ray3f(path.ray)
-        bounce(world, path, kept, sampler, sink, dark=True)
-        going = path.active & (path.depth < target)
-    path.active &= path.depth == target
-    return path, (pi, ray)
-
-
-@dr.syntax
-def go_on(world, sampler, path, sink):
-    """Trace paths on from wherever they are; returns as :func:`walk`."""
-    kept = sink.begin(world)
-    # Of the last vertex nothing is asked but its connections where no light is found: it needs no turn of the loop.
-    turns = world.max_depth if world.finds_light or sink.keeps_vertices else max(world.max_depth - 2, 0)
-    dark = world.dark_at_first and not sink.keeps_vertices and turns > 0
-    if dr.hint(dark, mode="scalar"):
-        bounce(world, path, kept, sampler, sink, dark=True)
-    # A loop of no turn would be compiled all the same.
-    if dr.hint(turns > dark or sink.keeps_vertices, mode="scalar"):
-        while dr.hint(path.active & (path.depth < turns), max_iterations=turns, label="path"):
-            bounce(world, path, kept, sampler, sink)
-    if dr.hint(not (world.finds_light or sink.keeps_vertices), mode="scalar"):
-        look_around(world, path, kept, sampler, sink)
-    sink.end(kept)
-    return path.depth, kept

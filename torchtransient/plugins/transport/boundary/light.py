@@ -14,7 +14,7 @@ from torchtransient.plugins.transport.boundary.speeds import along_the_ray, drag
 from torchtransient.plugins.transport.emitter_connections import EmitterSampled
 from torchtransient.plugins.transport.geometry_terms import EDGE_ON, displacement, material_point
 from torchtransient.plugins.transport.strategy import Local
-from torchtransient.plugins.transport.walk import go_on, start
+from torchtransient.plugins.transport.walk import start, walk
 
 # Distance past an edge, in parts of the largest coordinate, up to which a surface touches it: ten times as far as paths
 # pass beside edges.
@@ -93,7 +93,7 @@ class LightPass(BoundaryPass):
             speeds = self._speeds(term, edges, light, x, path, ray, numbers, sampler, active)
         u = sampler.next_2d()
         sink, factors = mode.sink_of_pixels(middle, job, u, factor, speeds)
-        _, kept = go_on(lit, sampler, path, sink)
+        _, kept = walk(lit, sampler, path, sink)
         return mode.sum_of_pixels(kept, factors)
 
     def _in_line(self, term, edges, light, x, ray, medium, numbers, sampler, active):

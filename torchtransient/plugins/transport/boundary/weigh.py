@@ -11,7 +11,7 @@ from torchtransient.plugins.transport.carry import total_of
 from torchtransient.plugins.transport.derivative import tangents_of
 from torchtransient.plugins.transport.sinks import AdjointSumSink, FilmSink, Sink
 from torchtransient.plugins.transport.strategy import Local
-from torchtransient.plugins.transport.walk import go_on
+from torchtransient.plugins.transport.walk import walk
 
 
 class Reverse:
@@ -41,7 +41,7 @@ class Reverse:
 
     def follow(self, world, sampler, path, block, factor, speed):
         """Trace ``path``; returns what its events contribute to the loss."""
-        _, kept = go_on(world, sampler, path, AdjointSumSink(block))
+        _, kept = walk(world, sampler, path, AdjointSumSink(block))
         return finite(kept["sum"] * factor)
 
     def sink_of_pixels(self, middle, job, u, factor, speeds):
@@ -116,7 +116,7 @@ class Forward:
     def follow(self, world, sampler, path, view, factor, speed):
         """Trace ``path`` onto the film."""
         film, (block, match, pixel) = self.term.film, view
-        _, kept = go_on(world, sampler, path, ScaledFilmSink(block, finite(factor * speed)))
+        _, kept = walk(world, sampler, path, ScaledFilmSink(block, finite(factor * speed)))
         film.add_steady(pixel, match.to_channels(kept["L"]))
         block.finish()
 
