@@ -18,8 +18,8 @@ VARIANT = "llvm_ad_mono"
 
 
 def edges_of(*meshes):
-    triangles = Triangles.of(list(meshes))
-    return triangles, Edges.of(triangles, np.arange(len(triangles.faces)))
+    triangles = Triangles.from_meshes(list(meshes))
+    return triangles, Edges.from_faces(triangles, np.arange(len(triangles.faces)))
 
 
 def test_a_plate_has_its_rim_alone():
@@ -69,7 +69,7 @@ def test_rims_of_two_meshes_are_one_edge():
 
 def test_parts():
     """Connected pieces are told apart, over the borders of meshes."""
-    triangles = Triangles.of([mesh("body", mannequin(1)), mesh("plate", plate(1, 1, (0, 0, 2)))])
+    triangles = Triangles.from_meshes([mesh("body", mannequin(1)), mesh("plate", plate(1, 1, (0, 0, 2)))])
     label = triangles.parts()
     assert len(np.unique(label)) == 7
     assert [len(np.unique(label[triangles.mesh == m])) for m in (0, 1)] == [6, 1]

@@ -95,8 +95,8 @@ def page(x, z, far=1.0):
 
 
 def edges_of(*pages):
-    triangles = Triangles.of([mesh("book", join(*pages))])
-    return Edges.of(triangles, np.arange(len(triangles.faces)))
+    triangles = Triangles.from_meshes([mesh("book", join(*pages))])
+    return Edges.from_faces(triangles, np.arange(len(triangles.faces)))
 
 
 def test_creases_exactly_as_flat_as_is_allowed_are_none(monkeypatch):

@@ -110,9 +110,9 @@ def term_of(monkeypatch, pairs, moving=(), spp=10, **facts):
     shapes = [Local(ptr=100 + k, number=10 + k, id=lambda k=k: f"s{k}") for k in range(4)]
     parts, asked = [Local(shapes=frozenset([k]), edges=edges) for k, edges in PARTS], []
 
-    def hiding_pairs(given, viewpoints, of_interest):
+    def hiding_pairs(given, viewpoints, is_requested):
         assert given is parts and viewpoints is points.p
-        asked.append([[of_interest(i, j) for j in range(4)] for i in range(4)])
+        asked.append([[is_requested(i, j) for j in range(4)] for i in range(4)])
         return pairs
 
     monkeypatch.setattr(outlines, "follows_outlines", lambda segment, contents: facts["followed"])

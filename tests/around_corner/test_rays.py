@@ -114,8 +114,8 @@ def test_connections_of_samples_with_derivatives(monkeypatch, lit, smooth, windo
     assert 4 < asked[0].sum() < COUNT - 8
 
 
-@pytest.mark.parametrize("of_sample", [True, False])
-def test_derivatives_of_connections(monkeypatch, of_sample):
+@pytest.mark.parametrize("by_sample", [True, False])
+def test_derivatives_of_connections(monkeypatch, by_sample):
     """In both modes, of what arrives alone: ``A df + f A' dtau``, and ``df`` and ``f dtau``; against differences."""
     ends, asked = Ends(9), asked_of(monkeypatch, gradients)
     fields = {"p": mi.Point3f(ends.p.T), "n": mi.Vector3f(ends.n.T), "front": spectrum(ends.front),
@@ -138,24 +138,24 @@ def test_derivatives_of_connections(monkeypatch, of_sample):
         up, down = (light(name, sign * step * np.asarray(change)) for sign in (1, -1))
         return [(a - b) / (2 * step) for a, b in zip(up, down, strict=True)]
 
-    place, number = ("p", "front") if of_sample else ("q", "leg")
-    kept = {"p": mi.Point3f(0), "front": mi.UnpolarizedSpectrum(0)} if of_sample else {
+    place, number = ("p", "front") if by_sample else ("q", "leg")
+    kept = {"p": mi.Point3f(0), "front": mi.UnpolarizedSpectrum(0)} if by_sample else {
         "p": mi.Point3f(0), "leg": mi.Float(0)}  # fmt: skip
     read = Local(block=lambda s: Local(read=lambda opl, active: (spectrum(A[None]), spectrum(slope[None]))))
-    job.step_back(read, kept, Local(sample=samples.load(k), point=point, k=k, s=k), of_sample)
+    job.step_back(read, kept, Local(sample=samples.load(k), point=point, k=k, s=k), by_sample)
     cos, _, wall, _ = ends.line(LANES, LANES)
     arrives = (np.abs(cos) * wall > 0) & seen_of(asked[0])
     assert 8 < arrives.sum() < COUNT - 8
     for name, found, change in [(place, kept["p"][i], np.eye(3)[i]) for i in range(3)] + [
-        (number, kept["front"][0] if of_sample else kept["leg"], 1.0)]:  # fmt: skip
+        (number, kept["front"][0] if by_sample else kept["leg"], 1.0)]:  # fmt: skip
         d_value, d_length = slopes(name, change)
         expected = np.where(arrives, A * d_value + slope * light("p", 0)[0] * d_length, 0)
         np.testing.assert_allclose(np.array(found), expected, rtol=2e-3, atol=2e-4)
     # Forward mode, along the first axis and by the number.
-    along = {"p": mi.Vector3f(mi.Float(1), 0, 0), **({"front": spectrum([np.full(COUNT, 2)])} if of_sample else {
+    along = {"p": mi.Vector3f(mi.Float(1), 0, 0), **({"front": spectrum([np.full(COUNT, 2)])} if by_sample else {
         "leg": mi.Float(2)})}  # fmt: skip
-    tangents = attached.Ends(COUNT, along if of_sample else {})
-    lane = Local(own=k, fields=point, tangent=Local(**({} if of_sample else along)))
+    tangents = attached.Ends(COUNT, along if by_sample else {})
+    lane = Local(own=k, fields=point, tangent=Local(**({} if by_sample else along)))
     put, total = [], {"dL": mi.UnpolarizedSpectrum(5), "block": None}
     job.step_on(tangents, Local(put_slope=lambda *given: put.append(given)), total, lane, k)
     d_value, d_length = (a + 2 * b for a, b in zip(slopes(place, [1, 0, 0]), slopes(number, 1.0), strict=True))

@@ -54,15 +54,15 @@ def test_one_direction_or_those_of_scanned_points(monkeypatch):
     np.testing.assert_allclose(single, [9.5, 8, 6.75], rtol=1e-5)
 
 
-def test_laser_positions_are_said_once():
+def test_the_laser_is_aimed_once():
     sensor = Local(laser_points="given")
     with pytest.raises(SceneError, match="a confocal capture lights its scanned points"):
-        scan_table._check_said_once(sensor, CaptureType.CONFOCAL, None)
+        scan_table._check_aimed_once(sensor, CaptureType.CONFOCAL, None)
     with pytest.raises(SceneError, match="both say where the laser points"):
-        scan_table._check_said_once(sensor, CaptureType.EXHAUSTIVE, 20.0)
-    scan_table._check_said_once(sensor, CaptureType.EXHAUSTIVE, None)
-    scan_table._check_said_once(Local(laser_points=None), CaptureType.CONFOCAL, None)
-    scan_table._check_said_once(Local(), CaptureType.EXHAUSTIVE, 179.0)
+        scan_table._check_aimed_once(sensor, CaptureType.EXHAUSTIVE, 20.0)
+    scan_table._check_aimed_once(sensor, CaptureType.EXHAUSTIVE, None)
+    scan_table._check_aimed_once(Local(laser_points=None), CaptureType.CONFOCAL, None)
+    scan_table._check_aimed_once(Local(), CaptureType.EXHAUSTIVE, 179.0)
 
 
 def test_as_many_aims_as_a_capture_asks_for():

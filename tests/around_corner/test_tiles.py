@@ -64,7 +64,7 @@ def test_less_noise_and_no_bias(arm, single):
 
 def run(scene, film, table, arm, seed, single, tiles):
     _, _, points, normals = arm
-    tile = None if tiles is None else tiles.of_points()
+    tile = None if tiles is None else tiles.tile_per_point()
     samples = draw_samples(table, 256, seed)
 
     def add():
@@ -82,10 +82,10 @@ def test_tiles_have_to_be_told(arm):
     many = draw_samples(HiddenElements(shapes, tiles.points, tiles.normals), 8, 0)
     one = draw_samples(HiddenElements(shapes, *wall_grid(5)), 8, 0)
     sensors = wall_of(points, normals)
-    for samples, tile in ((many, None), (one, tiles.of_points())):
+    for samples, tile in ((many, None), (one, tiles.tile_per_point())):
         with pytest.raises(ShapeError, match="tile"):
             ThirdBounce(scene, film, samples, sensors, tile=tile)
     pairs = film_of(GRID, GRID, exhaustive_scan=True, laser_scan_width=GRID, laser_scan_height=GRID)
     pairs.start_render()
     with pytest.raises(SceneError, match="16 tiles"):
-        add_exhaustive(ThirdBounce(scene, pairs, many, sensors, tile=tiles.of_points()), sensors)
+        add_exhaustive(ThirdBounce(scene, pairs, many, sensors, tile=tiles.tile_per_point()), sensors)

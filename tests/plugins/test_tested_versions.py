@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[2]
 def other_mitsuba(monkeypatch):
     """As if the tests had run with an earlier Mitsuba than the one that is here."""
     monkeypatch.setitem(tested_versions.TESTED, "mitsuba", ("3.9.0",))
-    monkeypatch.setattr(tested_versions, "_said", set())
+    monkeypatch.setattr(tested_versions, "_warned", set())
 
 
 def render():

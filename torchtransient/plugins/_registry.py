@@ -64,7 +64,7 @@ def active_variant() -> str | None:
 
 
 def is_jit(variant: str | None) -> bool:
-    """Whether a variant compiles its kernels with Dr.Jit (`llvm_*`, `cuda_*`, `metal_*`)."""
+    """Return whether a variant compiles its kernels with Dr.Jit (`llvm_*`, `cuda_*`, `metal_*`)."""
     return variant is not None and variant.startswith(_JIT_PREFIXES)
 
 
@@ -90,11 +90,11 @@ def require_jit_variant(what: str) -> str:
 
 # A version comes in here when the whole test set, slow tests included, has passed with it.
 TESTED: dict[str, tuple[str, ...]] = {"mitsuba": ("3.9.1",), "drjit": ("1.5.0",)}
-_said: set[str] = set()
+_warned: set[str] = set()
 
 
 def untested(name: str, version: str) -> str | None:
-    """What to say of `version` of the package `name`; None of a tested one, and of a package that is not listed.
+    """Return a warning about `version` of the package `name`, None for a tested version or an unlisted package.
 
     Builds of a tested version, such as "1.5.0+local", are tested ones.
     """
@@ -117,8 +117,8 @@ def warn_of_untested() -> None:
     found = {"mitsuba": mitsuba.__version__, "drjit": drjit.__version__}
     messages = [message for name, version in found.items() if (message := untested(name, version)) is not None]
     text = " ".join(messages)
-    if text and text not in _said:
-        _said.add(text)
+    if text and text not in _warned:
+        _warned.add(text)
         warnings.warn(text, VersionWarning, stacklevel=4)
 
 
@@ -185,8 +185,8 @@ OWN_BSDFS = tuple(name for module in PLUGIN_MODULES for kind, name in module.plu
 
 @dataclass
 class _State:
-    """What is registered. Guarded by `lock`, since scenes are loaded from several threads; but for `listeners`, which
-    need none (:func:`plugin_errors`).
+    """Registered modules and listeners. Guarded by `lock`, since scenes are loaded from several threads, except
+    `listeners`, which need none (:func:`plugin_errors`).
     """
 
     lock: threading.RLock = field(default_factory=threading.RLock)
@@ -266,13 +266,13 @@ def register_module(module: str, plugins: tuple[tuple[str, str], ...] = ()) -> N
 
 
 def modules_of_others() -> tuple[PluginModule, ...]:
-    """The modules that were added with :func:`register_module`, in the order in which they were."""
+    """Modules added with :func:`register_module`, in order."""
     with _state.lock:
         return tuple(_state.third_party)
 
 
 def versions_of_others() -> dict[str, str]:
-    """What each module that was added is, by its name: a hash of its source, of a module without one the version of its
+    """Return the version of each added module by name: a hash of its source, or without source the version of its
     package.
     """
     return {entry.module: _version(entry.module) for entry in modules_of_others()}
@@ -345,18 +345,18 @@ def plugin_errors() -> Iterator[None]:
     Use it around `mi.load_dict` and `mi.load_file`.
     """
     # No lock is held: an interrupt on the way into a block that holds one would leave it locked. Loads of other threads
-    # may be heard here, too: which error is ours stands in Mitsuba's text.
-    heard: list[BaseException] = []
+    # may add theirs: Mitsuba's text contains the message of this one's.
+    errors: list[BaseException] = []
     try:
-        _state.listeners.append(heard)
+        _state.listeners.append(errors)
         yield
     except RuntimeError as error:
-        own = [one for one in heard if str(one) in str(error)]
+        own = [one for one in errors if str(one) in str(error)]
         if own and not isinstance(error, TorchTransientError):
             raise own[0] from error
         raise
     finally:
-        _state.listeners[:] = [other for other in _state.listeners if other is not heard]
+        _state.listeners[:] = [other for other in _state.listeners if other is not errors]
 
 
 def _on_variant_change(_old: str | None, new: str | None) -> None:
@@ -461,8 +461,8 @@ def _keeping_errors(constructor: Callable[..., object]) -> Callable[[object], ob
             # later virtual call of the variant.
             traceback.clear_frames(error.__traceback__)
             if isinstance(error, TorchTransientError) or not isinstance(error, Exception):
-                for heard in _state.listeners:
-                    heard.append(error)
+                for errors in _state.listeners:
+                    errors.append(error)
             raise
 
     return construct

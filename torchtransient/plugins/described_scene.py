@@ -1,10 +1,10 @@
-"""What a scene was like before any value was installed in it: the sphere around it, which distant light is timed by.
+"""Bounding sphere of a scene before any value was installed in it: the time reference of distant light.
 
 A Mitsuba scene has no place for it, and its own environment emitters follow the shapes that move. The scene's Python
-plugins keep it: its integrator, the films of its sensors, and whatever integrator renders it. They are told
+plugins keep it: its integrator, the films of its sensors, and whatever integrator renders it. They record it
 
 - when ``mi.traverse`` walks the scene, the one way by which values come in (:func:`note_scene`);
-- when the scene is rendered and no one has been told before: then nothing was installed yet.
+- when the scene is rendered and none has recorded it before: then nothing was installed yet.
 
 So it does not depend on what is rendered first. Where the values came in otherwise, for instance by ``mi.traverse`` of
 a single shape, or where neither the scene's integrator nor a film of its sensors is one of this library, it is that of
@@ -85,7 +85,7 @@ def check_textures(params: Any) -> None:
 
 
 def _check_channels(node: Any, somewhere: Any) -> None:
-    """A texture that cannot be read ends the kernels of all scenes that are alive with it."""
+    """Raise for a texture that cannot be read: it would end the kernels of all living scenes."""
     for slot, texture in objects_of(node):
         how = read_as(node, slot) if isinstance(texture, mi.Texture) else ""
         reason = _refusal(texture, how, somewhere) if how else ""
@@ -121,22 +121,23 @@ class Read(NamedTuple):
 
 
 def _check_attributes(shape: Any, surface: Any, known: dict[int, list[Read]]) -> None:
-    """``known``: what is read by surfaces that were looked at before, by their address."""
+    """Check the attributes that a surface reads. ``known``: attributes read by the surfaces checked before, by address.
+    """
     if surface.ptr not in known:
         known[surface.ptr] = list(_attributes_of(surface))
     for read in known[surface.ptr]:
         sizes = attributes_of(shape)
-        said = f"{shape.id()!r}: expected an attribute {read.name!r} for {read.slot!r} of its surface"
+        message = f"{shape.id()!r}: expected an attribute {read.name!r} for {read.slot!r} of its surface"
         if read.name not in sizes:
             has = ", ".join(map(repr, sizes)) or "none"
             raise SceneError(
-                f"{said} ({_named(read.texture)}), got a shape that has {has}; Mitsuba would take it for zero. Give "
+                f"{message} ({_named(read.texture)}), got a shape that has {has}; Mitsuba would take it for zero. Give "
                 "the shape the attribute, or the surface another texture."
             )
         size = sizes[read.name]
         if size is not None and size not in read.sizes:
             raise SceneError(
-                f"{said} of size {' or '.join(map(str, read.sizes))} at each place, got one of size {size:g}, which "
+                f"{message} of size {' or '.join(map(str, read.sizes))} at each place, got one of size {size:g}, which "
                 "Mitsuba would take for zero. Add an attribute of that size (mesh.add_attribute) or give a 'bitmap'."
             )
 
@@ -198,9 +199,10 @@ def _named(texture: Any) -> str:
 
 
 class DescribedScene:
-    """``reference``: the sphere around a scene as described. Told from other scenes by the addresses of the scene and
-    of its shapes; one shape is kept, so that no later scene can be taken for this one because it got the same ones:
-    none that carries a sensor, whose film may keep this, and neither would ever be freed.
+    """State of a scene as described; ``reference``: the sphere around it.
+
+    The scene is identified by its address and those of its shapes. One shape is kept, so that no later scene gets the
+    same addresses: one without a sensor, whose film may keep this object, as a cycle would never be freed.
     """
 
     def __init__(self, scene: Any) -> None:
@@ -210,15 +212,15 @@ class DescribedScene:
         self.is_checked = False
 
     def is_of(self, scene: Any) -> bool:
-        """Whether it is this scene."""
+        """Return whether ``scene`` is the scene of this state."""
         return self._key == _key_of(scene)
 
 
-def described(scene: Any, *also: Any) -> DescribedScene:
-    """What is known of a scene as described; ``also``: plugins outside of the scene that keep it, too."""
-    keepers = [*also, *_keepers_of(scene)]
+def described(scene: Any, *plugins: Any) -> DescribedScene:
+    """Return the state of a scene as described. ``plugins``: further plugins that keep it."""
+    keepers = [*plugins, *_keepers_of(scene)]
     known = (getattr(keeper, "described", None) for keeper in keepers)
-    found = next((one for one in known if one is not None and one.is_of(scene)), None)
+    found = next((state for state in known if state is not None and state.is_of(scene)), None)
     if found is None:
         found = DescribedScene(scene)
     for keeper in keepers:
@@ -227,8 +229,9 @@ def described(scene: Any, *also: Any) -> DescribedScene:
 
 
 def note_scene(plugin: Any, callback: Any) -> None:
-    """For the ``traverse`` of a plugin that keeps what a scene was like: a scene that ``mi.traverse`` walks is as
-    described, or was noted before.
+    """Record the scene that ``mi.traverse`` walks; for the ``traverse`` of a plugin that keeps a described scene.
+
+    Such a scene is as described, or was recorded before.
     """
     # Mitsuba's own callback knows the way down to each plugin; others do not install values.
     hierarchy = getattr(callback, "hierarchy", {})
@@ -240,9 +243,14 @@ def note_scene(plugin: Any, callback: Any) -> None:
 
 
 def check_scene(scene: Any, params: Any = None, known: DescribedScene | None = None) -> None:
-    """Raise ``SceneError`` where a number of a scene is NaN or infinite, or a texture stands where it cannot be read;
-    a scene that was found right is not asked again. ``params``: its parameters by users' keys, ``known``: what is known
-    of it, where the caller has them.
+    """Check the numbers and textures of a scene, once.
+
+    Args:
+        params: the scene's parameters by users' keys, if the caller has them.
+        known: the scene's :class:`DescribedScene`, if the caller has it.
+
+    Raises:
+        SceneError: if a number is NaN or infinite, or a texture stands where it cannot be read.
     """
     known = known or described(scene)
     if known.is_checked or dr.flag(dr.JitFlag.FreezingScope):  # a recording has no values

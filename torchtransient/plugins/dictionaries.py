@@ -35,8 +35,8 @@ _SCAN, _SCAN_KEYS = "nlos_capture_meter", ("points", "laser_points")
 
 @dataclass(frozen=True)
 class Pixels:
-    """A ``mitsuba.Bitmap`` as plain data: values as stored, whether they are gamma-encoded, and the name of the pixel
-    format, empty for that which the number of channels says.
+    """Plain data of a ``mitsuba.Bitmap``: values as stored, whether they are gamma-encoded, and the name of the pixel
+    format, empty for the default of the number of channels.
     """
 
     values: np.ndarray
@@ -47,21 +47,21 @@ class Pixels:
     def of(cls, bitmap: Any) -> Pixels:
         """A bitmap as plain data."""
         values, given = np.array(bitmap), bitmap.pixel_format()
-        said = "" if mi.Bitmap(values).pixel_format() == given else str(given).rsplit(".", 1)[-1]
-        return cls(values, bool(bitmap.srgb_gamma()), said)
+        pixel_format = "" if mi.Bitmap(values).pixel_format() == given else str(given).rsplit(".", 1)[-1]
+        return cls(values, bool(bitmap.srgb_gamma()), pixel_format)
 
     def to_mitsuba(self) -> Any:
-        """The bitmap."""
-        said = getattr(mi.Bitmap.PixelFormat, self.pixel_format) if self.pixel_format else None
-        bitmap = mi.Bitmap(self.values, said)
+        """Return the ``mitsuba.Bitmap``."""
+        pixel_format = getattr(mi.Bitmap.PixelFormat, self.pixel_format) if self.pixel_format else None
+        bitmap = mi.Bitmap(self.values, pixel_format)
         bitmap.set_srgb_gamma(self.srgb_gamma)
         return bitmap
 
 
 @dataclass(frozen=True)
 class Voxels:
-    """A ``mitsuba.VolumeGrid`` as plain data: the bytes of its file, which has the values and the box that they fill,
-    and the largest value as the grid says it.
+    """Plain data of a ``mitsuba.VolumeGrid``: the bytes of its file, which has the values and the box that they fill,
+    and the largest value as the grid reports it.
     """
 
     file: bytes
@@ -75,7 +75,7 @@ class Voxels:
         return cls(bytes(stream.raw_buffer()), float(grid.max()))
 
     def to_mitsuba(self) -> Any:
-        """The grid."""
+        """Return the ``mitsuba.VolumeGrid``."""
         stream = mi.MemoryStream()
         stream.write(self.file)
         stream.seek(0)
@@ -85,7 +85,7 @@ class Voxels:
 
 
 def is_ours(node: Mapping[str, Any]) -> bool:
-    """Whether a node is of a plugin of this library, or of one that was added to it."""
+    """Return whether a node is of a plugin of this library, or of one that was added to it."""
     return kind_of(str(node.get("type"))) is not None
 
 
@@ -101,7 +101,8 @@ def numbers_in_text(entry: Any, where: str) -> str:
 
 
 def for_mitsuba(value: Any, key: str = "") -> Any:
-    """The dictionary that Mitsuba reads, for the active variant; what Mitsuba takes itself stays as it is."""
+    """Return the dictionary that Mitsuba reads, for the active variant; values that Mitsuba accepts stay as they are.
+    """
     if isinstance(value, Mapping):
         return {name: _entry(value, name, item) for name, item in value.items()}
     if hasattr(value, "to_mitsuba"):  # pixels, voxels, objects

@@ -1,4 +1,4 @@
-"""What a recorded call depends on beside its arguments: arrays to be handed in, and all else, that tells it apart.
+"""State of a recorded call beside its arguments: arrays to be handed in, and a key of everything else.
 
 ``dr.freeze`` finds what it is handed and what plugins show to it; tables sit in plain objects, so that loops leave them
 alone, and have to be named: ``dr.freeze(f, state_fn=lambda *args: integrator.frozen_state(scene))``. Numbers that are
@@ -31,7 +31,7 @@ _OTHERS = ("builtins", "drjit", "mitsuba", "numpy", "torch")
 _PLAIN = (type(None), bool, int, str, bytes)
 # By class: how a walk deals with its objects.
 _TREATED: dict[type, str] = {**dict.fromkeys(_PLAIN, "plain"), float: "float", list: "list", tuple: "list"}
-# What Dr.Jit says of functions that it cannot record.
+# Messages of Dr.Jit about functions that it cannot record.
 _NOT_RECORDABLE = (
     "recording a frozen function",
     "record(): ",
@@ -58,7 +58,7 @@ _REASONS = {
 
 
 class NotComparableError(Exception):
-    """Whether a job is like another one cannot be told: it holds something of a type that is not known."""
+    """Failure to compare a job with another one: it holds an object of an unknown type."""
 
 
 def arrays_below(value: Any) -> list[Any]:
@@ -69,9 +69,9 @@ def arrays_below(value: Any) -> list[Any]:
 
 
 def state_below(value: Any) -> tuple[tuple[Any, ...], list[Any]]:
-    """(structure, arrays). The structure is all that is no array in plain objects and in the containers they hold, with
-    the places and types of arrays: of two jobs with the same structure the same kernels are traced. Hashable; Mitsuba's
-    objects count by their address. Arrays: as :func:`arrays_below`. Raises NotComparableError.
+    """Return (structure, arrays). The structure is all that is no array in plain objects and in the containers they
+    hold, with the places and types of arrays: of two jobs with the same structure the same kernels are traced.
+    Hashable; Mitsuba's objects count by their address. Arrays: as :func:`arrays_below`. Raises NotComparableError.
     """
     walk = _Walk(value)
     return tuple(walk.structure), walk.arrays
@@ -85,7 +85,7 @@ class _Walk:
     def __init__(self, value: Any) -> None:
         self.arrays: list[Any] = []
         self.structure: list[Any] = []
-        # Objects are told by their numbers in order: what is made on the way has to live as long.
+        # Objects are identified by their numbers in order, so temporary ones have to live as long as the walk.
         self._seen: dict[int, tuple[int, Any]] = {}
         self._waiting = [value]
         # A walk is part of every call: most of what it meets is plain, or an array, and is dealt with here.
@@ -118,9 +118,9 @@ class _Walk:
             elif treated == "object":
                 self._attributes(current, kind)
             else:
-                self._other(current, kind)
+                self._add_other(current, kind)
 
-    def _other(self, current: Any, kind: type) -> None:
+    def _add_other(self, current: Any, kind: type) -> None:
         if kind not in _TREATED:
             _TREATED[kind] = _treatment(current, kind)
             # Again, as that.
@@ -213,7 +213,7 @@ class _Walk:
 
 
 def _treatment(current: Any, kind: type) -> str:
-    """How a walk deals with objects of a class."""
+    """Return the treatment of objects of a class in a walk."""
     if getattr(kind, "only_remembers", False):
         return "remembers"
     if dr.is_array_v(current):
@@ -235,14 +235,14 @@ def _slots_of(kind: type) -> list[str]:
 
 
 def _torch_tensor() -> tuple[type, ...]:
-    """The class of torch's tensors where somebody has imported it: plugins do not."""
+    """Return the class of torch's tensors if torch is imported; plugins do not import it."""
     torch = sys.modules.get("torch")
     return () if torch is None else (torch.Tensor,)
 
 
 def says_it_can_be_recorded(plugin: Any) -> bool:
-    """Whether the class of a plugin says that it can be recorded, itself: one that is made out of it may do otherwise.
-    Those of this library are known to.
+    """Return whether a plugin's own class declares that it can be recorded. Subclasses do not inherit the declaration,
+    since they may behave otherwise; classes of this library can all be recorded.
     """
     kind = type(plugin)
     known = kind.__module__.startswith("torchtransient.plugins.")

@@ -62,7 +62,7 @@ _POINTERS = {
     "Sensor": "SensorPtr",
     "Shape": "ShapePtr",
 }
-# Kinds that kernels ask as well, and that nobody has a table of.
+# Kinds that kernels look up as well, and that have no table.
 _MORE_POINTERS = ("MeshPtr", "TexturePtr")
 
 
@@ -127,5 +127,5 @@ class PointerTable:
         return found if self.default == 0 else dr.select(known, found, self.default)
 
     def lists(self, pointer: Any, active: Any = True) -> Any:
-        """Which of an array of pointers are listed, in a table of :meth:`marking`."""
+        """Return a mask of the pointers listed in a table of :meth:`marking`."""
         return self.look_up(pointer, active) == 1

@@ -1,4 +1,4 @@
-"""What the pixels of a sensor look at: one ray through each pixel's centre, and what is known of the surface it meets.
+"""Labels of the pixels of a sensor: one ray through each pixel's centre, and properties of the surface that it meets.
 
 A :class:`LabelJob` has what :class:`~torchtransient.rendering.recording.Recordings` asks of a job, so that it is
 recorded as renders are. Nothing here has derivatives.
@@ -40,8 +40,8 @@ _GROUPS, _FIRST, _LAST = 16, 360.0, 830.0
 
 
 class LabelTables:
-    """What has to be looked up once of a built scene: names of its shapes and materials in the order of the
-    description, their numbers by pointer, and what of it is written in Python.
+    """Lookup tables of a built scene: names of its shapes and materials in the order of the description, their numbers
+    by pointer, and its plugins written in Python.
     """
 
     def __init__(self, scene: Any, integrator: Any) -> None:
@@ -61,11 +61,11 @@ class LabelTables:
         self.seen = SceneCache(scene, integrator)
 
     def lets_light_through(self) -> bool:
-        """Whether any surface may let light pass unbent: parameters may add a lobe."""
+        """Return whether any surface may let light pass unbent: parameters may add a lobe."""
         return any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in self._bsdfs)
 
     def tables(self) -> list[Any]:
-        """What kernels read of it."""
+        """Arrays that kernels read."""
         return [self._shapes, self._materials, self.observer]
 
     def shape(self, si: Any, hit: Any) -> Any:
@@ -99,8 +99,8 @@ def _has_axis(sensor: Any) -> bool:
     return near_clip(sensor) is not None or bool(sensor.class_name() == "RadianceMeter")
 
 
-class Taken:
-    """Where results of a recorded call are handed over, as by a film."""
+class LabelResults:
+    """Results of a recorded call, handed over as by a film."""
 
     def __init__(self) -> None:
         self._arrays: list[Any] = []
@@ -110,7 +110,7 @@ class Taken:
         self._arrays = arrays
 
     def taken(self) -> list[Any]:
-        """What has been computed; nothing is held any more."""
+        """Return the results and release them."""
         found, self._arrays = self._arrays, []
         return found
 
@@ -122,7 +122,7 @@ class Taken:
 @dataclass
 class LabelJob:
     """Labels ``names`` of one ``sensor``, the mean of ``samples`` places in each pixel, or at its centre for 0.
-    Results (:meth:`Taken.taken`) come in the order of the names, one array for each component.
+    Results (:meth:`LabelResults.taken`) come in the order of the names, one array for each component.
     """
 
     scene: Any
@@ -132,7 +132,7 @@ class LabelJob:
     samples: int
     kind: str = "labels"
     launches: list[Any] = field(default_factory=list)
-    film: Taken = field(default_factory=Taken)
+    film: LabelResults = field(default_factory=LabelResults)
     refusal: str | None = None
     plugins: list[Any] = field(default_factory=list)
 
@@ -172,12 +172,12 @@ class LabelJob:
 
     @property
     def integrator(self) -> LabelJob:
-        """Who carries it out."""
+        """Integrator that executes the job."""
         return self
 
     @staticmethod
     def state_of(jobs: list[LabelJob]) -> tuple[tuple[Any, ...], list[Any]]:
-        """(structure, arrays), as of :func:`torchtransient.plugins.integrators.job.state_of`."""
+        """Return (structure, arrays), as of :func:`torchtransient.plugins.integrators.job.state_of`."""
         held: list[Any] = []
         for job in jobs:
             held += [job.kind, job.names, job.samples, job._size, job._passes, job._hides_emitters, job.sensor]
@@ -219,7 +219,7 @@ class LabelJob:
         return found
 
     def _positions(self) -> tuple[Any, Any]:
-        """Where rays go through the film, in [0, 1]^2 of its crop window, and through the aperture."""
+        """Positions of the rays on the film, in [0, 1]^2 of its crop window, and on the aperture."""
         width, height = self._size
         if self._spots is None:
             pixel, offset, aperture = dr.arange(mi.UInt32, width * height), mi.Point2f(0.5), mi.Point2f(0.5)
@@ -263,9 +263,8 @@ class LabelJob:
 
 @dr.syntax
 def first_surface(scene: Any, ray: Any, passes: bool, hides_emitters: bool) -> Any:
-    """What rays look at: the first surface that does not let most of the light pass unbent. ``passes``: whether there
-    may be such that do; ``hides_emitters``: surfaces that shine are not seen, as the integrator's ``hide_emitters``
-    says.
+    """Find the first surface along each ray that does not let most of the light pass unbent. ``passes``: the scene may
+    have surfaces that do; ``hides_emitters``: emitting surfaces are skipped, as by an integrator's ``hide_emitters``.
     """
     si = scene.ray_intersect(ray)
     if dr.hint(passes or hides_emitters, mode="scalar"):
@@ -282,7 +281,7 @@ def first_surface(scene: Any, ray: Any, passes: bool, hides_emitters: bool) -> A
 
 
 def lets_pass(si: Any, passes: bool, hides_emitters: bool) -> Any:
-    """Whether a pixel looks through the surface that was met."""
+    """Return a mask of surface interactions that a pixel looks through."""
     through = mi.Mask(False)
     if passes:
         clear = mi.unpolarized_spectrum(si.bsdf().eval_null_transmission(si, si.is_valid()))
@@ -304,7 +303,7 @@ def _along_axis(seen: list[Any], p: Any) -> Any:
 
 
 def _places(count: int) -> np.ndarray:
-    """(count, 4) places in a pixel and in the aperture that are spread evenly: the additive recurrence of Roberts, by
+    """Return evenly spread places (count, 4) in a pixel and in the aperture: the additive recurrence of Roberts, by
     the powers of the root of x^5 = x + 1.
     """
     root = 1.1673039782614187

@@ -1,4 +1,4 @@
-"""What depends on a class or a version of Mitsuba: names of its classes, and its mistakes that are put right elsewhere.
+"""Dependencies on classes and versions of Mitsuba: names of its classes, and mistakes that are corrected elsewhere.
 
 Written against Mitsuba 3.9.1 (Dr.Jit 1.5). Everything that a later version may mend has a test in
 ``tests/plugins/test_mitsuba_compat.py`` that shows the mistake on Mitsuba alone: when one of them fails, the entry here
@@ -30,7 +30,7 @@ _WEIGHT_SLOTS = {"MaskBSDF": "opacity", "BlendBSDF": "weight", "BlendPhaseFuncti
 
 
 def cancels_lobe_probability(bsdf: Any) -> bool:
-    """Whether the weight of a BSDF's own delta lobe lacks the derivative of the lobe's probability."""
+    """Return whether the weight of a BSDF's own delta lobe lacks the derivative of the lobe's probability."""
     return bsdf.class_name() in _CANCELLING
 
 
@@ -42,9 +42,9 @@ def weight_slot(bsdf: Any) -> str | None:
 
 
 def adds_up_wrongly(bsdf: Any, held: list[Any], nested: list[Any]) -> bool:
-    """Whether a BSDF is a blend of which a part has a delta lobe or lets light through, or works on a side of the
-    surface where another does nothing. ``held``: the parts; ``nested``: all BSDFs in it, asked themselves since a blend
-    does not notice lobes that they get later.
+    """Return whether a BSDF is a blend of which a part has a delta lobe or lets light through, or works on a side of
+    the surface where another does nothing. ``held``: the parts; ``nested``: all BSDFs in it, asked themselves since a
+    blend does not notice lobes that they get later.
 
     Mitsuba divides the sum of both parts' values by the sum of their densities. The density of a delta lobe is a
     probability instead. Other parts draw directions that they throw away, on the other side of the surface: a diffuse
@@ -59,12 +59,12 @@ def adds_up_wrongly(bsdf: Any, held: list[Any], nested: list[Any]) -> bool:
 
 
 def is_two_sided_itself(bsdf: Any) -> bool:
-    """Whether a BSDF is ``twosided``, whose Mueller matrices are wrong from behind."""
+    """Return whether a BSDF is ``twosided``, whose Mueller matrices are wrong from behind."""
     return bool(bsdf.class_name() == "TwoSidedBRDF")
 
 
 def has_equal_sides(bsdf: Any) -> bool:
-    """Whether the same medium lies on both sides, although a lobe of transmission is not symmetric: a fibre."""
+    """Return whether the same medium lies on both sides, although a lobe of transmission is not symmetric: a fibre."""
     return bool(bsdf.class_name() == "Hair" or getattr(bsdf, "has_equal_sides", False))
 
 
@@ -81,9 +81,9 @@ def normal_texture(bsdf: Any) -> str | None:
 
 
 def forgets_black_samples(bsdf: Any) -> bool:
-    """Whether a BSDF drops samples of the one it holds whose weight is zero, so that the derivative of what is black,
-    by the light that comes from elsewhere, is lost. A normal map reports no density for them, and paths end there; a
-    bump map masks the weight, of which a delta lobe has no other value.
+    """Return whether a BSDF drops samples of the one it holds whose weight is zero, so that the derivative of what is
+    black, by the light that comes from elsewhere, is lost. A normal map reports no density for them, and paths end
+    there; a bump map masks the weight, of which a delta lobe has no other value.
     """
     return bsdf.class_name() in ("NormalMap", "BumpMap")
 
@@ -146,7 +146,8 @@ _LEAST_PRODUCT = 0.008
 
 
 def loses_slope_of_metal(slot: str, eta: tuple[float, float], k: tuple[float, float]) -> bool:
-    """Whether Mitsuba's Fresnel term of a metal loses its derivative by ``slot``, for indices in the ranges ``eta, k``.
+    """Return whether Mitsuba's Fresnel term of a metal loses its derivative by ``slot``, for indices in the ranges
+    ``eta, k``.
 
     It takes a root of the difference of ``n^2 = |(eta - i k)^2 - sin^2|`` and its real part's modulus, which are equal
     in single precision where ``eta k`` is small: in total reflection (``eta < 1``), and in metals without losses. Its
@@ -162,12 +163,14 @@ def loses_slope_of_metal(slot: str, eta: tuple[float, float], k: tuple[float, fl
 
 
 def is_absorption_of_hair(bsdf: Any, slot: str) -> bool:
-    """Whether what a BSDF holds under the name ``slot`` is the absorption of Mitsuba's ``hair``."""
+    """Return whether what a BSDF holds under the name ``slot`` is the absorption of Mitsuba's ``hair``."""
     return bool(bsdf.class_name() == "Hair" and slot == "sigma_a")
 
 
 def is_replaced_for(bsdf: Any, slot: str) -> bool:
-    """Whether another BSDF is built in place of one where a derivative by what it holds under ``slot`` is asked for."""
+    """Return whether another BSDF is built in place of one where a derivative by what it holds under ``slot`` is asked
+    for.
+    """
     return bool(lost_at(bsdf, slot)) or is_absorption_of_hair(bsdf, slot)
 
 
@@ -353,7 +356,7 @@ def mesh_of_arrays(
 
 
 def is_instance(shape: Any) -> bool:
-    """Whether a shape is one copy of a shape group."""
+    """Return whether a shape is one copy of a shape group."""
     return bool(shape.class_name() == "Instance")
 
 
@@ -366,62 +369,65 @@ def group_name(instance: Any) -> str:
 
 
 def has_surface(shape: Any) -> bool:
-    """Whether rays can meet a shape itself. Groups and their copies only hold others, and have a BSDF nevertheless."""
+    """Return whether rays can meet a shape itself. Groups and their copies only hold others, and have a BSDF
+    nevertheless.
+    """
     return shape.class_name() not in ("Instance", "ShapeGroupPlugin")
 
 
 def is_sphere(shape: Any) -> bool:
-    """Whether a shape is Mitsuba's ``sphere``, which is sampled over the cone that it fills."""
+    """Return whether a shape is Mitsuba's ``sphere``, which is sampled over the cone that it fills."""
     return bool(shape.class_name() == "Sphere")
 
 
 def samples_its_shape(emitter: Any) -> bool:
-    """Whether an emitter is an area light that asks its shape for a direction. Mitsuba's sphere answers with the solid
-    angle ``2 pi (1 - cos)`` of its cone in single precision, which has no digits left for small spheres, and from a
-    point on its own surface with one of two densities that are not the same; see ``sampling/sphere_lights.py``.
+    """Return whether an emitter is an area light that asks its shape for a direction. Mitsuba's sphere answers with the
+    solid angle ``2 pi (1 - cos)`` of its cone in single precision, which has no digits left for small spheres, and from
+    a point on its own surface with one of two densities that are not the same; see ``sampling/sphere_lights.py``.
     """
     return bool(emitter.class_name() == "AreaLight" or getattr(emitter, "samples_its_shape", False))
 
 
 def is_dark(emitter: Any) -> bool:
-    """Whether no path that starts at a sensor finds an emitter: it shines along its normals and nowhere else."""
+    """Return whether no path that starts at a sensor finds an emitter: it shines along its normals and nowhere else."""
     return bool(emitter.class_name() == "DirectionalArea" or getattr(emitter, "stays_dark", False))
 
 
 def lacks_directions(emitter: Any) -> bool:
-    """Whether an emitter raises where it is asked for its light in a direction: derivatives cannot be traced."""
+    """Return whether an emitter raises where it is asked for its light in a direction: derivatives cannot be traced."""
     return bool(emitter.class_name() == "DirectionalArea")
 
 
 def leaves_hits_detached(shape: Any) -> bool:
-    """Whether the interactions of a shape lie at a detached distance along the ray: they follow neither the shape nor a
-    ray that moves.
+    """Return whether the interactions of a shape lie at a detached distance along the ray: they follow neither the
+    shape nor a ray that moves.
     """
     return bool(shape.class_name() in ("Ellipsoids", "LinearCurve"))
 
 
 def misplaces_hits(shape: Any) -> bool:
-    """Whether the place along a curve, at which a ray hits it, has a wrong derivative, and the normal with it: Mitsuba
-    projects onto one of two directions of its surface as if they were perpendicular.
+    """Return whether the place along a curve, at which a ray hits it, has a wrong derivative, and the normal with it:
+    Mitsuba projects onto one of two directions of its surface as if they were perpendicular.
     """
     return bool(shape.class_name() == "BSplineCurve")
 
 
 def has_no_material(shape: Any) -> bool:
-    """Whether no point of a shape can be followed: Mitsuba's interactions say where the surface goes, and not where its
-    points and areas do.
+    """Return whether no point of a shape can be followed: Mitsuba's interactions follow the surface, not its points and
+    areas.
     """
     return bool(shape.class_name() in ("Ellipsoids", "EllipsoidsMesh", "LinearCurve", "BSplineCurve", "SDFGrid"))
 
 
 def has_vertices(shape: Any) -> bool:
-    """Whether a shape is a mesh whose vertices move with its parameters. Mitsuba's rectangles are meshes too."""
+    """Return whether a shape is a mesh whose vertices move with its parameters. Mitsuba's rectangles are meshes too."""
     return isinstance(shape, mi.Mesh) and shape.class_name() not in _FLAT
 
 
 def has_smooth_shape(emitter: Any) -> bool:
-    """Whether a light lies on a mesh with normals at its vertices. Mitsuba's density per solid angle of a point on it
-    is that of a face with the interpolated normal: lights of few faces are too bright or too dark, by 20 % and more.
+    """Return whether a light lies on a mesh with normals at its vertices. Mitsuba's density per solid angle of a point
+    on it is that of a face with the interpolated normal: lights of few faces are too bright or too dark, by 20 % and
+    more.
     """
     shape = emitter.get_shape() if mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface) else None
     return shape is not None and has_vertices(shape) and has_normals(shape)
@@ -432,7 +438,7 @@ _OUTLINED = ("Sphere", "Disk", "Cylinder", "Ellipsoids", "Instance", "ShapeGroup
 
 
 def lacks_edges(shape: Any) -> bool:
-    """Whether a shape has outlines that no table of edges holds: curves and grids of distances."""
+    """Return whether a shape has outlines that no table of edges holds: curves and grids of distances."""
     return not (shape.is_mesh() or shape.class_name() in _OUTLINED)
 
 
@@ -448,13 +454,13 @@ _LARGE_MESH = 10_000
 
 
 def is_flat_shape(shape: Any) -> bool:
-    """Whether a shape is a rectangle or a disk."""
+    """Return whether a shape is a rectangle or a disk."""
     return bool(shape.class_name() in _FLAT)
 
 
 def is_flat(shape: Any) -> bool:
-    """Whether the shading normal does not change along a face. Mitsuba's rectangles, its cube and the mesh that it
-    merges them into have normals at their vertices: across the faces.
+    """Return whether the shading normal does not change along a face. Mitsuba's rectangles, its cube and the mesh that
+    it merges them into have normals at their vertices: across the faces.
     """
     if not isinstance(shape, mi.Mesh):
         return is_flat_shape(shape)
@@ -518,24 +524,24 @@ def sun_half_angle(emitter: Any) -> float:
 
 
 def is_distant(sensor: Any) -> bool:
-    """Whether a sensor sits at infinity (two classes, by the kind of target)."""
+    """Return whether a sensor sits at infinity (two classes, by the kind of target)."""
     return bool(sensor.class_name().startswith("DistantSensor"))
 
 
 def is_batch(sensor: Any) -> bool:
-    """Whether a sensor only holds others, which share its film. Derivatives through its virtual call to them end the
-    process in forward mode, so they are asked one by one.
+    """Return whether a sensor only holds others, which share its film. Derivatives through its virtual call to them end
+    the process in forward mode, so they are asked one by one.
     """
     return bool(sensor.class_name() == "BatchSensor")
 
 
 def is_irradiance_meter(sensor: Any) -> bool:
-    """Whether a sensor collects light from all directions over a shape, without a pixel for each."""
+    """Return whether a sensor collects light from all directions over a shape, without a pixel for each."""
     return bool(sensor.class_name() == "IrradianceMeter")
 
 
 def starts_off_itself(sensor: Any) -> bool:
-    """Whether the rays of a sensor start a little off the sensor, by ``mi.math.RayEpsilon``."""
+    """Return whether the rays of a sensor start a little off the sensor, by ``mi.math.RayEpsilon``."""
     return bool(sensor.class_name() in ("RadianceMeter", "IrradianceMeter"))
 
 
@@ -551,8 +557,8 @@ def near_clip(sensor: Any) -> Any:
 
 
 def attribute_name(texture: Any) -> str | None:
-    """Which attribute of the shapes that it lies on a texture reads (``vertex_color``), None for other textures. It
-    shows the name in its description alone.
+    """Return the name of the shape attribute that a texture reads (``vertex_color``), None for other textures. Mitsuba
+    shows the name in the texture's description alone.
     """
     if texture.class_name() != "MeshAttribute":
         return None
@@ -577,7 +583,7 @@ _SPECTRA = frozenset((
 
 
 def read_as(node: Any, slot: str) -> str:
-    """The method of the texture in a slot that a BSDF or emitter calls, empty where that is not known."""
+    """Return the texture method that a BSDF or emitter calls for a slot, empty if unknown."""
     if isinstance(node, mi.BSDF) and normal_texture(node) == slot:
         return "eval_1" if is_bump_map(node) else "eval_3"
     if slot == "eta":
@@ -586,12 +592,14 @@ def read_as(node: Any, slot: str) -> str:
 
 
 def attribute_sizes(bsdf: Any, slot: str) -> tuple[int, ...]:
-    """How many numbers an attribute of a mesh may have at each place for a BSDF; with others it reads as zero."""
+    """Return the numbers of channels that a BSDF can read from a mesh attribute; with others it reads zero."""
     return {"eval_1": (1,), "eval_3": (3,)}.get(read_as(bsdf, slot), (1, 3))
 
 
 def varies(texture: Any) -> bool:
-    """Whether a texture may have another value at another place. Mitsuba's ``mesh_attribute`` does not say so."""
+    """Return whether a texture may have another value at another place. Mitsuba's ``mesh_attribute`` does not say
+    so.
+    """
     return bool(texture.is_spatially_varying() or texture.class_name() == "MeshAttribute")
 
 
@@ -611,12 +619,12 @@ _TURNED_BY_REFLECTIONS = frozenset({("Sphere", "to_world"), ("Cylinder", "to_wor
 
 
 def is_number_of_kernels(class_name: str, name: str) -> bool:
-    """Whether a value becomes plain numbers of kernels, other ones with each value."""
+    """Return whether kernels contain a value as a literal, so that each value compiles its own."""
     return (class_name, name) in _READ_WHEN_INSTALLED
 
 
 def is_turned_by_reflections(class_name: str, name: str) -> bool:
-    """Whether a pose that reflects turns the shape inside out once more at every installation."""
+    """Return whether a pose that reflects turns the shape inside out once more at every installation."""
     return (class_name, name) in _TURNED_BY_REFLECTIONS
 
 

@@ -125,7 +125,7 @@ def index_by_stand_in(plugin: str) -> ParameterEffect:
 
 
 def _turns_delta_lobes(bsdf: object) -> bool:
-    """Whether a BSDF with a delta lobe has its frame turned by a texture."""
+    """Return whether a BSDF with a delta lobe has its frame turned by a texture."""
     return normal_texture(bsdf) is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)  # type: ignore[attr-defined]
 
 
@@ -136,12 +136,12 @@ def _bsdfs_of(site: Site) -> list[Any]:
 
 
 def _places_normals(site: Site) -> bool:
-    """Whether the texture coordinates of a mesh place normals of a delta lobe."""
+    """Return whether the texture coordinates of a mesh place normals of a delta lobe."""
     return any(_turns_delta_lobes(bsdf) for bsdf in _bsdfs_of(site))
 
 
 def _places_slopes(site: Site) -> bool:
-    """Whether the texture coordinates of a mesh place the slopes of a bump map."""
+    """Return whether the texture coordinates of a mesh place the slopes of a bump map."""
     return any(is_bump_map(bsdf) for bsdf in _bsdfs_of(site))
 
 
@@ -150,7 +150,7 @@ def _places_delta_slopes(site: Site) -> bool:
 
 
 def _places_light(site: Site) -> bool:
-    """Whether the texture coordinates of a mesh place what it emits."""
+    """Return whether the texture coordinates of a mesh place what it emits."""
     emitter = site.node.emitter()
     return emitter is not None and any(t.is_spatially_varying() for t in objects_below(emitter, mi.Texture))
 
@@ -160,12 +160,12 @@ def _places_light_and_normals(site: Site) -> bool:
 
 
 def _is_clamped(site: Site) -> bool:
-    """Whether the opacities of ellipsoids decide how large they are."""
+    """Return whether the opacities of ellipsoids decide how large they are."""
     return any(shown.key == "extent_adaptive_clamping" and shown.read(site.node) for shown in shown_by(site.node)[0])
 
 
 def _is_normal(site: Site) -> bool:
-    """Whether a texture holds normals or heights of a delta lobe."""
+    """Return whether a texture holds normals or heights of a delta lobe."""
     return any(
         isinstance(holder, mi.BSDF) and normal_texture(holder) == name and _turns_delta_lobes(holder)
         for holder, name in site.owners
@@ -173,13 +173,13 @@ def _is_normal(site: Site) -> bool:
 
 
 def _is_extinction(site: Site) -> bool:
-    """Whether a plugin is part of a medium's extinction."""
+    """Return whether a plugin is part of a medium's extinction."""
     return any(isinstance(holder, mi.Medium) and _attenuates(holder, name) for holder, name in site.owners)
 
 
 def _attenuates(medium: Any, name: str) -> bool:
-    """Whether what a medium holds under ``name`` changes how far light gets. The albedo does not; a phase function does
-    where it is one of flakes, whose projected area is a factor of the extinction.
+    """Return whether what a medium holds under ``name`` changes how far light gets. The albedo does not; a phase
+    function does where it is one of flakes, whose projected area is a factor of the extinction.
     """
     if name == "phase_function":
         return bool(mi.has_flag(medium.phase_function().flags(), mi.PhaseFunctionFlags.Microflake))
@@ -187,19 +187,19 @@ def _attenuates(medium: Any, name: str) -> bool:
 
 
 def _is_an_index_of_one(site: Site) -> bool:
-    """Whether the index of a principled surface is (what Mitsuba takes for) one."""
+    """Return whether the index of a principled surface is (what Mitsuba takes for) one."""
     now = mi.traverse(site.node)[site.key]
     taken_for = (0, 1e-3) if site.key == "specular" else (1, 1.001)
     return any(bool(dr.any(dr.abs(now - value) < 1e-7)) for value in taken_for)
 
 
 def _is_weight_in(cls: str, site: Site) -> bool:
-    """Whether a texture is the weight of a lobe that a BSDF of the class ``cls`` loses at some value."""
+    """Return whether a texture is the weight of a lobe that a BSDF of the class ``cls`` loses at some value."""
     return any(holder.class_name() == cls and lost_at(holder, name) for holder, name in site.owners)
 
 
 def _is_lost_in(cls: str, site: Site) -> bool:
-    """Whether one is lost now."""
+    """Return whether a BSDF of the class ``cls`` has lost such a lobe at the current value."""
     held = [(holder, name) for holder, name in site.owners if holder.class_name() == cls and lost_at(holder, name)]
     with dr.suspend_grad():
         if cls in PLASTICS:
@@ -253,8 +253,8 @@ def _is_in_hair(site: Site) -> bool:
     return any(is_absorption_of_hair(holder, name) for holder, name in site.owners)
 
 
-def _is_of_a_dark_light(site: Site) -> bool:
-    """Whether a texture is that of lights that stay dark, and of nothing else."""
+def _lies_in_dark_light(site: Site) -> bool:
+    """Return whether all holders of a texture are lights that paths never find."""
     kinds = (mi.BSDF, mi.Emitter, mi.Medium)
     holders = [holder for holder, _ in site.owners if isinstance(holder, kinds)]
     return bool(holders) and all(isinstance(holder, mi.Emitter) and is_dark(holder) for holder in holders)
@@ -264,10 +264,10 @@ IN_HAIR = Row(FIBRE, _is_in_hair, "the absorption of hair")
 IN_NORMALS = Row(NORMAL, _is_normal, "normals or heights of a BSDF with a delta lobe")
 IN_EXTINCTION = Row(MEDIUM, _is_extinction, "in a medium: its extinction, or a phase function of flakes (sggx)")
 
-OF_A_DARK_LIGHT = Row(DARK, _is_of_a_dark_light, "the radiance of a directionalarea")
+IN_DARK_LIGHT = Row(DARK, _lies_in_dark_light, "the radiance of a directionalarea")
 
 # Of what gives numbers to other plugins: textures, volumes, attributes of meshes.
-OF_NUMBERS = (IN_NORMALS, IN_EXTINCTION, *_rows_of_weights(), IN_HAIR, OF_A_DARK_LIGHT)
+NUMBER_ROWS = (IN_NORMALS, IN_EXTINCTION, *_rows_of_weights(), IN_HAIR, IN_DARK_LIGHT)
 
 # ---------------------------------------------------------------------------------------------------------------- rows
 
@@ -287,7 +287,7 @@ declare_effects(
             Row(COORDINATES),
         ),
         # Attributes: what a `mesh_attribute` makes of them is told by where that one is.
-        ANY_KEY: OF_NUMBERS,
+        ANY_KEY: NUMBER_ROWS,
     },
 )
 for _curve in ("BSplineCurve", "LinearCurve"):
@@ -319,13 +319,13 @@ _LOST_INDEX = Row(replace(EXCHANGED_INDEX, stand_in_needed=True), _is_an_index_o
 declare_effects("Principled", dict.fromkeys(("eta", "specular"), (_LOST_INDEX, Row(EXCHANGED_INDEX))))
 # Nothing is refracted onwards by these: their index changes how much is reflected, and no direction.
 declare_effects("ThinDielectric", {"eta": VALUE})
-_OF_HAIR = ("longitudinal_roughness", "azimuthal_roughness", "scale_tilt", "eta", "eumelanin", "pheomelanin")
-declare_effects("Hair", dict.fromkeys(_OF_HAIR, FIBRE))
+_HAIR_KEYS = ("longitudinal_roughness", "azimuthal_roughness", "scale_tilt", "eta", "eumelanin", "pheomelanin")
+declare_effects("Hair", dict.fromkeys(_HAIR_KEYS, FIBRE))
 declare_effects("SmoothPlastic", {"eta": VARNISH})
 declare_effects("RoughPlastic", {"eta": COATING, "alpha": COATING})
 
-declare_effects("Texture", {ANY_KEY: OF_NUMBERS})
+declare_effects("Texture", {ANY_KEY: NUMBER_ROWS})
 declare_effects("IrregularSpectrum", {"wavelengths": WAVELENGTHS})
-declare_effects("Volume", {ANY_KEY: OF_NUMBERS})
+declare_effects("Volume", {ANY_KEY: NUMBER_ROWS})
 declare_effects("PhaseFunction", {ANY_KEY: (IN_EXTINCTION,)})
 declare_effects("Medium", {ANY_KEY: MEDIUM})

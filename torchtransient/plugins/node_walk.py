@@ -39,8 +39,8 @@ class ShownValue(NamedTuple):
 
 
 def unshared(value: Any) -> Any:
-    """A Dr.Jit array as one of its own: whoever looks at numbers of a plugin's literal would make memory of it, which
-    recorded calls cannot find in every plugin (``hg`` shows it to Mitsuba alone).
+    """Copy a Dr.Jit array: reading a plugin's literal would evaluate it into memory, which recorded calls cannot find
+    in every plugin (``hg`` shows it to Mitsuba alone).
     """
     return type(value)(value) if dr.is_jit_v(value) else value
 
@@ -71,7 +71,7 @@ def _collector(base: type) -> type:
 
 
 def shown_by(node: Any) -> tuple[list[ShownValue], list[tuple[str, Any, int]]]:
-    """(parameters, objects) of one plugin, objects as (name, object, flags)."""
+    """Return (parameters, objects) of one plugin, objects as (name, object, flags)."""
     collector = _collector(mi.TraversalCallback)()
     node.traverse(collector)
     if shows_rows() and isinstance(node, mi.Mesh):
@@ -110,8 +110,8 @@ def has_mean(texture: Any) -> bool:
 
 
 def carries_derivatives(node: Any) -> bool:
-    """Whether a number of a plugin, or of what it holds, is attached; to be asked with gradients enabled. Of textures
-    that read an attribute of the shapes that they lie on, it may be.
+    """Return whether a number of a plugin, or of what it holds, is attached; call with gradients enabled. True for
+    textures that read an attribute of their shapes, which may be attached.
     """
     below = (node, *objects_below(node, mi.Object))
     if any(isinstance(part, mi.Texture) and attribute_name(part) is not None for part in below):
@@ -120,7 +120,7 @@ def carries_derivatives(node: Any) -> bool:
 
 
 def attached_as(*values: Any) -> tuple[int, ...]:
-    """Which nodes of the graph of derivatives arrays are, 0 for none; to be asked with gradients enabled."""
+    """Return the AD node of each array, 0 for detached arrays; call with gradients enabled."""
     return tuple(value.index_ad if dr.grad_enabled(value) else 0 for value in values)
 
 

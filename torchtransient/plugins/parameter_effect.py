@@ -1,4 +1,4 @@
-"""What a parameter of a plugin can move, as rows by plugin class and key that every plugin module enters for itself.
+"""Effects of plugin parameters, as rows by plugin class and key that every plugin module enters for itself.
 
 The questions are asked of :mod:`.parameters`; the rows of Mitsuba's plugins stand in :mod:`.mitsuba_parameters`.
 
@@ -31,7 +31,7 @@ ROLES = ("shape", "normal", "emitter", "sun", "sensor", "index", "delay", "mediu
 
 @dataclass(frozen=True)
 class ParameterEffect:
-    """What a parameter can move, and how good its derivative is.
+    """Effect of a parameter on geometry, and quality of its derivative.
 
     ``moves_length``: it can change an optical path length. ``moves_silhouette``: it can move a visibility edge, seen
     directly, in a mirror or through glass. ``moves_medium``: it can change an extinction (transmittances, sampled
@@ -63,7 +63,7 @@ class ParameterEffect:
 
     @property
     def moves(self) -> bool:
-        """Whether it moves anything at all."""
+        """True if the parameter moves anything at all."""
         return self.moves_length or self.moves_silhouette or self.moves_medium
 
 
@@ -72,7 +72,7 @@ VALUE = ParameterEffect()
 
 @dataclass(frozen=True)
 class Site:
-    """Where a parameter is: the plugin ``node`` that has it under the name ``key``, and what holds the plugin, directly
+    """Place of a parameter: the plugin ``node`` that has it under the name ``key``, and what holds the plugin, directly
     or not, as (holder, name there), nearest first. A plugin that is shared has several holders.
     """
 
@@ -114,7 +114,7 @@ def declare_effects(plugin: type | str, effects: Mapping[str, ParameterEffect | 
 
 
 def all_rows() -> Iterator[tuple[str, str, Row]]:
-    """(class, key, row) for the whole table, in the order of entry."""
+    """Return (class, key, row) for the whole table, in the order of entry."""
     for name, by_key in _rows.items():
         for key, rows in by_key.items():
             for row in rows:
@@ -130,7 +130,7 @@ def lineage(node: Any) -> tuple[str, ...]:
 
 
 def class_of(node: Any) -> str:
-    """The name of a plugin's class, for messages: of one in Python its own."""
+    """Return the name of a plugin's class for messages; for plugins in Python, that of the Python class."""
     return lineage(node)[0]
 
 
@@ -170,6 +170,6 @@ def _swept() -> tuple[frozenset[str], tuple[frozenset[str], ...]]:
 
 
 def is_checked(place: Sequence[str]) -> bool:
-    """Whether the sweep has compared a parameter in such a place with finite differences, and decided."""
+    """Return whether the sweep has compared a parameter in such a place with finite differences, and decided."""
     checked, undecided = _swept()
     return checked.issuperset(place) and not any(places.issubset(place) for places in undecided)

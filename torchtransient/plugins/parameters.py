@@ -60,8 +60,8 @@ class Attached(NamedTuple):
 
 
 def loses_black(node: Any, key: str, owners: Sequence[tuple[Any, str]]) -> bool:
-    """Whether the derivative by a plugin's numbers is lost where they are zero; ``owners``: all that holds it. Of a
-    mesh, its attributes are numbers that textures hold, and shapes themselves are in no map.
+    """Return whether the derivative by a plugin's numbers is lost where they are zero; ``owners``: all that holds it.
+    Of a mesh, its attributes are numbers that textures hold, and shapes themselves are in no map.
     """
     return _is_in_a_map(node, owners) or _is_light(node, key, owners)
 
@@ -101,7 +101,7 @@ def check_black(attached: Iterable[Attached]) -> None:
 
 
 def _zeros(value: Any, how: Any) -> bool:
-    """Whether ``how`` many (``dr.any`` or ``dr.all``) of the numbers of a value are zero."""
+    """Return whether any or all (``how``: ``dr.any`` or ``dr.all``) of the numbers of a value are zero."""
     if not (dr.is_array_v(value) and dr.is_float_v(value)):
         return False
     with dr.suspend_grad():
@@ -113,11 +113,13 @@ def _zeros(value: Any, how: Any) -> bool:
 
 
 def effect_of(node: Any, key: str, flags: int = 0, owners: Sequence[tuple[Any, str]] = ()) -> ParameterEffect:
-    """What the parameter ``key`` of the plugin ``node`` moves, and whether its derivative is right.
+    """Return the effect of the parameter ``key`` of the plugin ``node``, and whether its derivative is right.
 
-    ``key``: its name in the plugin, as "to_world"; of a dotted name the last part counts. ``flags``: Mitsuba's
-    ``ParamFlags`` of it. ``owners``: what holds the plugin, as in :class:`Site`; without it, what is asked of a texture
-    or volume is answered as if it stood alone.
+    Args:
+        node: plugin that has the parameter.
+        key: name in the plugin, as "to_world"; of a dotted name the last part counts.
+        flags: Mitsuba's ``ParamFlags`` of the parameter.
+        owners: holders of the plugin, as in :class:`Site`; without them a texture or volume is judged by itself alone.
     """
     site = Site(node, key.rsplit(".", 1)[-1], tuple(owners))
     effect = matching_effect(site)
@@ -133,7 +135,7 @@ def effect_of(node: Any, key: str, flags: int = 0, owners: Sequence[tuple[Any, s
 
 
 def attached_effects(params: Any) -> list[tuple[Any, str, ParameterEffect]]:
-    """(plugin, key, effect) of the parameters that carry gradients now.
+    """Return (plugin, key, effect) of the parameters that carry gradients now.
 
     ``params``: what ``mi.traverse`` returns, or a :class:`ParameterTracker`, which asks again
     without a walk over the scene. Gradients must not be suspended while this is asked.
@@ -146,7 +148,7 @@ def attached_effects(params: Any) -> list[tuple[Any, str, ParameterEffect]]:
         if can_carry_gradients(value) and dr.grad_enabled(value):
             attached.append((node, users_name(node, name.rsplit(".", 1)[-1]), flags))
     # A walk of its own: the names in ``params`` tell of one holder of each plugin, and not of what reads an attribute.
-    tracker = ParameterTracker.of(params) if attached else None
+    tracker = ParameterTracker.from_params(params) if attached else None
     return [(node, key, tracker.effect_of(node, key, flags)) for node, key, flags in attached]
 
 
@@ -168,7 +170,7 @@ class ParameterTracker:
         self._walk(root)
 
     @staticmethod
-    def of(params: Any) -> ParameterTracker:
+    def from_params(params: Any) -> ParameterTracker:
         """The parameters below the plugin that ``mi.traverse`` started at to return ``params``."""
         return ParameterTracker(next(node for node, (holder, *_) in params.hierarchy.items() if holder is None))
 
@@ -194,7 +196,7 @@ class ParameterTracker:
             self._note_reader(reader, str(attribute_name(reader)))
 
     def _note_reader(self, reader: Any, name: str) -> None:
-        """What a texture reads off the shapes that it lies on, it holds: an attribute of a mesh, or a texture."""
+        """Record a texture as the holder of what it reads off its shapes: a mesh attribute, or a texture."""
         shapes = {holder.ptr: holder for holder, _ in self._owners_of(reader) if isinstance(holder, mi.Shape)}
         for shape in shapes.values():
             self._readers.setdefault((shape.ptr, name), []).append(reader)
@@ -203,14 +205,14 @@ class ParameterTracker:
                     self._holders[texture.ptr].append((reader, name))
 
     def holders_of(self, node: Any, key: str = "") -> list[tuple[Any, str]]:
-        """What holds a plugin directly, as (holder, the name there), and before that the textures that read its
-        attribute ``key``.
+        """Return the direct holders of a plugin as (holder, name there), after the textures that read its attribute
+        ``key``.
         """
         readers = [(reader, key) for reader in self._readers.get((node.ptr, key), ())]
         return readers + self._holders.get(node.ptr, [])
 
     def _owners_of(self, node: Any, key: str = "") -> tuple[tuple[Any, str], ...]:
-        """What holds the parameter ``key`` of a plugin, as in :class:`Site`."""
+        """Return all holders of the parameter ``key`` of a plugin, as in :class:`Site`."""
         found: list[tuple[Any, str]] = []
         for reader in self._readers.get((node.ptr, key), ()):
             found += [(reader, key), *owners_of(reader, self._holders)]
@@ -224,12 +226,12 @@ class ParameterTracker:
             self._fixed += [(node, v._replace(flags=v.flags | inherited)) for v in differentiable]
 
     def effect_of(self, node: Any, key: str, flags: int = 0) -> ParameterEffect:
-        """As the function of this name, with everything that holds the plugin ``node``."""
+        """Return :func:`effect_of`, with everything that holds the plugin ``node``."""
         return effect_of(node, key, flags, self._owners_of(node, key.rsplit(".", 1)[-1]))
 
     def stood_in_for(self, node: Any, key: str) -> list[tuple[Any, str]]:
-        """The plugins that are built as others where the derivative by a parameter of ``node`` is asked for, if there
-        is a ``stand_in``: itself, or the holders of a texture, each with the name it has there.
+        """Return the plugins that are replaced for the derivative by a parameter of ``node``, if there is a
+        ``stand_in``: itself, or the holders of a texture, each with the name it has there.
         """
         if isinstance(node, mi.BSDF):
             return [(node, "")]
@@ -237,7 +239,7 @@ class ParameterTracker:
         return [(holder, name) for holder, name in owners if is_replaced_for(holder, name)]
 
     def loses_black(self, node: Any, key: str) -> bool:
-        """Whether the derivative by a plugin's numbers is lost where they are zero (:mod:`.black_textures`)."""
+        """Return whether the derivative by a plugin's numbers is lost where they are zero (:func:`loses_black`)."""
         return loses_black(node, key, self._owners_of(node, key))
 
     def check_black(self) -> None:
@@ -248,7 +250,7 @@ class ParameterTracker:
         )
 
     def location_of(self, node: Any, key: str) -> tuple[str, ...]:
-        """Names of a parameter and of everything that it is in (:mod:`.swept_parameters`)."""
+        """Names of a parameter and of everything that it is in (:func:`.parameter_effect.is_checked`)."""
         name = key.rsplit(".", 1)[-1]
         return location_of(Site(node, name, self._owners_of(node, name)))
 
@@ -260,25 +262,25 @@ class ParameterTracker:
         return [entry for entry in found if dr.grad_enabled(entry[2])]
 
     def attached(self) -> list[tuple[Any, str, ParameterEffect]]:
-        """(plugin, key, effect) of the parameters that carry gradients now."""
+        """Return (plugin, key, effect) of the parameters that carry gradients now."""
         return [
             (node, shown.key, self.effect_of(node, shown.key, shown.flags)) for node, shown, _ in self._carrying()
         ]
 
     def attached_values(self) -> list[Any]:
-        """The values of those parameters, in the same order."""
+        """Values of the parameters of :meth:`attached`, in the same order."""
         return [value for _, _, value in self._carrying()]
 
 
 def can_carry_gradients(value: Any) -> bool:
-    """Whether a parameter is of real numbers that Dr.Jit differentiates, instead of a plain or whole number."""
+    """Return whether a parameter is a floating-point Dr.Jit array or a transform of one, not a plain number."""
     if "Transform" in type(value).__name__:  # by name: Dr.Jit arrays answer to any attribute made of component letters
         value = value.matrix
     return value is not None and bool(dr.is_diff_v(value) and dr.is_float_v(value))
 
 
 def is_attribute(node: Any, key: str) -> bool:
-    """Whether it is an attribute of a mesh, whose memory moves when another one is added."""
+    """Return whether a parameter is a mesh attribute, whose memory moves when another attribute is added."""
     return isinstance(node, mi.Mesh) and key.startswith(("vertex_", "face_")) and key not in VERTEX_COLUMNS
 
 
@@ -299,8 +301,8 @@ def check_stand_ins(effects: Sequence[tuple[Any, str, ParameterEffect]]) -> None
 
 
 def moving_names(effects: Sequence[tuple[Any, str, ParameterEffect]]) -> list[str]:
-    """Which parameters out of :func:`attached_effects` need a response over time with a slope: those that can change a
-    path length.
+    """Return the parameters out of :func:`attached_effects` that can change a path length, and so need a temporal
+    filter with a slope.
     """
     named = ((f"{node.id()}.{key}".lstrip("."), effect) for node, key, effect in effects)
     return list(dict.fromkeys(name for name, effect in named if effect.moves_length))
@@ -330,7 +332,9 @@ _SLACK = 1e-5
 
 @dataclass(frozen=True)
 class PhysicalRange:
-    """From ``low`` to ``high``. ``meaning``: what a parameter is, in words. ``is_open``: the ends are outside."""
+    """Range of a parameter from ``low`` to ``high``. ``meaning``: what a parameter is, in words. ``is_open``: the ends
+    are outside.
+    """
 
     meaning: str
     low: float
@@ -338,11 +342,11 @@ class PhysicalRange:
     is_open: bool = False
 
     def above(self, number: float) -> bool:
-        """Whether a number is beyond the upper end."""
+        """Return whether a number is beyond the upper end."""
         return number >= self.high if self.is_open else number > self.high + _SLACK
 
     def below(self, number: float) -> bool:
-        """Whether a number is beyond the lower end."""
+        """Return whether a number is beyond the lower end."""
         return number <= self.low if self.is_open else number < self.low - _SLACK
 
 
@@ -358,7 +362,7 @@ ANGLE = PhysicalRange("an angle of view in degrees", 0, 180, is_open=True)
 LENGTH = PhysicalRange("a length", 0)
 
 # Names under which plugins keep such a number, or the texture or volume of them.
-_OF_BSDFS = {
+_BSDF_RANGES = {
     **dict.fromkeys(
         (
             "reflectance", "transmittance", "diffuse_reflectance", "specular_reflectance", "specular_transmittance",
@@ -377,9 +381,9 @@ _OF_BSDFS = {
     "eta": INDEX,
     "k": OPTICAL,
 }  # fmt: skip
-_OF_MEDIA = {"albedo": SHARE, "sigma_t": EXTINCTION}
-_OF_EMITTERS = dict.fromkeys(("radiance", "intensity", "irradiance", "energy"), LIGHT)
-_OF_SENSORS = {"x_fov": ANGLE, "aperture_radius": LENGTH, "focus_distance": LENGTH}
+_MEDIUM_RANGES = {"albedo": SHARE, "sigma_t": EXTINCTION}
+_EMITTER_RANGES = dict.fromkeys(("radiance", "intensity", "irradiance", "energy"), LIGHT)
+_SENSOR_RANGES = {"x_fov": ANGLE, "aperture_radius": LENGTH, "focus_distance": LENGTH}
 
 def ranges_of(params: Any) -> dict[str, PhysicalRange]:
     """The ranges of the parameters that have one, by key of ``mi.traverse``.
@@ -387,7 +391,7 @@ def ranges_of(params: Any) -> dict[str, PhysicalRange]:
     The numbers of textures, volumes and attributes of meshes have the range of what they supply, through whatever
     textures they are read. Coefficients of spectral models have none.
     """
-    tracker, found = ParameterTracker.of(params), {}
+    tracker, found = ParameterTracker.from_params(params), {}
     for key in params.properties:
         limits = list(_ranges_at(tracker, params.properties[key][2], key.rsplit(".", 1)[-1]))
         if limits:  # one that serves for several things: the one with the least room
@@ -419,17 +423,17 @@ def _ranges_at(tracker: ParameterTracker, node: Any, name: str) -> Iterator[Phys
 def _range_in(node: Any, name: str) -> PhysicalRange | None:
     if isinstance(node, mi.BSDF):
         is_metal = "Conductor" in node.class_name() + type(node).__name__
-        return OPTICAL if name == "eta" and is_metal else _OF_BSDFS.get(name)
+        return OPTICAL if name == "eta" and is_metal else _BSDF_RANGES.get(name)
     if isinstance(node, mi.PhaseFunction):
         return {"g": ANISOTROPY, "weight": SHARE}.get(name)
-    for kind, ranges in ((mi.Medium, _OF_MEDIA), (mi.Emitter, _OF_EMITTERS), (mi.Sensor, _OF_SENSORS)):
+    for kind, ranges in ((mi.Medium, _MEDIUM_RANGES), (mi.Emitter, _EMITTER_RANGES), (mi.Sensor, _SENSOR_RANGES)):
         if isinstance(node, kind):
             return ranges.get(name)
     return None
 
 
 def described_ranges(params: Any) -> Iterator[tuple[str, PhysicalRange, float, float]]:
-    """(key, range, smallest, largest) of what has a range in a scene, as it is now."""
+    """Return (key, range, smallest, largest) of what has a range in a scene, as it is now."""
     for key, limits in ranges_of(params).items():
         numbers = np.array(unshared(params[key]))
         if numbers.size:
@@ -437,7 +441,7 @@ def described_ranges(params: Any) -> Iterator[tuple[str, PhysicalRange, float, f
 
 
 def sun_axes(params: Any, keys: Iterable[str]) -> dict[str, np.ndarray]:
-    """Of the keys that are directions of a sun, where its sky's third axis points."""
+    """Return the third axis of the sky for each key that is a direction of its sun."""
     suns = [key for key in keys if key.endswith(".sun_direction")]
     matrices = {key: params[f"{key.removesuffix('sun_direction')}to_world"].matrix for key in suns}
     return {key: np.array(unshared(matrix), dtype=float).reshape(4, 4)[:3, 2] for key, matrix in matrices.items()}

@@ -1,4 +1,4 @@
-"""What light is made of along a path: numbers per colour, or Stokes vectors and Mueller matrices in polarized variants.
+"""Radiance along a path: one value per colour, or Stokes vectors and Mueller matrices in polarized variants.
 
 Every function looks at the active variant while a kernel is traced; in unpolarized variants they reduce to the plain
 products, so that those kernels do not change.
@@ -47,7 +47,9 @@ def product(a, b):
 
 
 def first_column(matrix):
-    """What a throughput makes of unpolarized light of power one; Mitsuba's emitters emit no other."""
+    """Return the Stokes vector that a throughput makes of unpolarized light of unit power, which is all that Mitsuba
+    emits.
+    """
     if not mi.is_polarized:
         return matrix
     return mi.SpectrumEntry(*[matrix[i, 0] for i in range(4)])
@@ -96,7 +98,8 @@ def stokes_frame_of(d):
 
 
 def rotation_to_sensor(si, d):
-    """From the BSDF's frame to the segment's, on the sensor's side of ``si``, which a ray in direction ``d`` found.
+    """Return the rotation from the BSDF's frame to the segment's, on the sensor's side of ``si``, which a ray in
+    direction ``d`` found.
 
     None in unpolarized variants, as :func:`rotation_from_light`. Where ``si.wi`` is attached to the direction, ``d``
     must be.
@@ -107,7 +110,8 @@ def rotation_to_sensor(si, d):
 
 
 def rotation_from_light(si, wo, out=None, d=None):
-    """From the BSDF's frame to the segment's, on the side of the light, where the path goes on in direction ``wo``.
+    """Return the rotation from the BSDF's frame to the segment's, on the side of the light, where the path goes on in
+    direction ``wo``.
 
     ``out``: that direction in the world, attached where ``wo`` is; ``d``: the next ray's direction to the bit. Without
     them both are computed as the next ray's is.
@@ -127,7 +131,7 @@ def rotate_stokes(light, rotation):
 
 
 def scatter_unpolarized(value, rotation):
-    """What a BSDF's value makes of unpolarized light, in the frame of the segment towards the sensor."""
+    """Scatter unpolarized light by a BSDF value, into the frame of the segment towards the sensor."""
     if not mi.is_polarized:
         return mi.unpolarized_spectrum(value)
     return rotate_stokes(first_column(value), rotation)

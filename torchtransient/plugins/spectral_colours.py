@@ -46,9 +46,14 @@ def _places(mesh: Any, attribute: str) -> int:
 
 
 def colours_of(coefficients: np.ndarray) -> tuple[np.ndarray, float]:
-    """(colours, error) for ``coefficients`` (..., 3): linear sRGB in [0, 1] of the same shape, and the largest
-    difference between the spectra that they have and those that are asked for. Above :data:`TOLERANCE` there is no
-    such colour. Needs a spectral variant.
+    """Find the colours whose spectra have given coefficients. Needs a spectral variant.
+
+    Args:
+        coefficients: Mitsuba's coefficients of a reflectance spectrum, (..., 3).
+
+    Returns:
+        (colours, error): linear sRGB in [0, 1], (..., 3), and the largest difference between their spectra and the
+        requested ones. Above :data:`TOLERANCE` there is no such colour.
     """
     rows = np.asarray(coefficients, dtype=np.float64).reshape(-1, 3)
     found = np.array([_colour_of(row) for row in rows])
@@ -68,7 +73,7 @@ def as_colours(coefficients: np.ndarray, where: str) -> np.ndarray:
 
 
 def same_spectra(a: np.ndarray, b: np.ndarray) -> bool:
-    """Whether coefficients (..., 3) belong to the same spectra, as far as files keep them."""
+    """Return whether coefficients (..., 3) describe the same spectra, to the precision of files."""
     if a.shape != b.shape or a.size % 3:
         return False
     pairs = zip(a.reshape(-1, 3), b.reshape(-1, 3), strict=True)

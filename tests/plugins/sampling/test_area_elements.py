@@ -264,7 +264,7 @@ def test_tiles_along_the_two_widest_directions():
         chosen = np.linspace(0, 11, 25).round().astype(int)
         np.testing.assert_array_equal(tiles.points[t], own[chosen])
         assert tiles.normals[t].shape == (25, 3)
-    assert tiles.of_points().numpy().tolist() == tiles.tile.tolist()
+    assert tiles.tile_per_point().numpy().tolist() == tiles.tile.tolist()
     # Of width 11/6 m, one tile from 11/12 m on, and four at most.
     assert [ScanTiles(points, normals, d).count for d in (0.917, 0.916, 0.01)] == [1, 2, 16]
 

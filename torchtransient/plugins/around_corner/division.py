@@ -1,4 +1,4 @@
-"""Who finds which light of a capture: hidden samples and chains that scanned points share, or paths."""
+"""Division of a capture's light among hidden samples, chains that scanned points share, and paths."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Division:
 
     @staticmethod
     def of(shared: range, first: int, last: int, wall_lights_itself: bool) -> Division:
-        """Of light of ``first`` to ``last`` bounces: one lights the spot alone, and two go from wall to wall."""
+        """Divide light of ``first`` to ``last`` bounces: one lights the spot alone, and two go from wall to wall."""
         if last >= shared.stop:
             return Division(shared, last)
         before = range(max(first, 2 if wall_lights_itself else 3), shared.start)
@@ -32,7 +32,7 @@ class Division:
 
     @property
     def third_bounce(self) -> bool:
-        """Whether light of three bounces comes from shared samples."""
+        """Return whether light of three bounces comes from shared samples."""
         return BOUNCES in self.shared
 
     @property
@@ -42,17 +42,17 @@ class Division:
 
     @property
     def walks(self) -> bool:
-        """Whether paths have to be followed."""
+        """Return whether paths have to be followed."""
         return self.longest > 0
 
 
-# ------------------------------------------ how ``transient_nlos_path`` finds which light of a scene, and why, in words
+# ------------------------------------------------------------------------------------------ explanation of the division
 
 SHARED = "from hidden samples that all scanned points share"
 
 
 def explanation(integrator: Any, scene: Any, contents: Any) -> str:
-    """One line: of light of three bounces, and of later light."""
+    """Describe in one line how light of three bounces and later light are found."""
     division, (least, most) = integrator.division(scene, contents), integrator.asked_bounces()
     parts = []
     if least <= BOUNCES and (most is None or most >= BOUNCES):

@@ -132,7 +132,7 @@ class SampleBlock:
 
 
 class Pairs:
-    """What the lanes of a launch know of their pairs: constants of the loop, a plain object."""
+    """Pairs of the lanes of a launch: constants of the loop, a plain object."""
 
     def __init__(self, job: ThirdBounce, lasers: WallPoints, pixel: Any, laser: Any) -> None:
         _, _, value, leg = job.sensors.take(pixel)
@@ -173,7 +173,7 @@ def _count(film: Any, match: Any, pixel: Any, kept: dict[str, Any], active: Any)
 
 @dr.syntax
 def sum_over_block(job, block, pairs, target, kept, wanted):
-    """What the samples of a block send from each lane's laser spot to its scan point, into the film's block."""
+    """Splat the light that the samples of a block send from each lane's laser spot to its scan point."""
     k = mi.UInt32(0)
     going = mi.Mask(wanted)
     while dr.hint(going, label="pairs of points"):
@@ -185,7 +185,7 @@ def sum_over_block(job, block, pairs, target, kept, wanted):
 
 
 def deposit(job, block, pairs, target, kept, k):
-    """One sample's light."""
+    """Splat one sample's light."""
     seen = dr.gather(mi.Vector2f, block.seen, k * pairs.sensor_count + pairs.pixel)
     lit = dr.gather(mi.Vector2f, block.lit, k * pairs.laser_count + pairs.laser)
     g = seen.x * lit.x
@@ -204,7 +204,7 @@ def deposit(job, block, pairs, target, kept, k):
 
 
 def _rows_at_once(points: int, size: int) -> int:
-    """How many scan points' rows of histograms are mirrored together: what is in flight stays small."""
+    """Return the number of scan points whose histograms are mirrored together, few enough to bound the memory."""
     return max(1, MOST_MIRRORED // (points * size))
 
 

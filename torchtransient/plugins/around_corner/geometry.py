@@ -46,7 +46,7 @@ def front_normal(si: Any) -> Any:
 
 
 def sees(scene: Any, start: Any, end: Any, n: Any, active: Any) -> Any:
-    """Whether points ``start`` (``p``, ``geometric_n``) see the points ``end``, which face them with the side of
+    """Return whether points ``start`` (``p``, ``geometric_n``) see the points ``end``, which face them with the side of
     ``n``: points of one plane do not.
     """
     to = mi.Vector3f(end - start.p)
@@ -57,7 +57,7 @@ def sees(scene: Any, start: Any, end: Any, n: Any, active: Any) -> Any:
 
 
 def occluded(scene: Any, sample: Any, line: Any, p: Any, n: Any, active: Any) -> Any:
-    """Whether something stands between samples and wall points.
+    """Return whether something stands between samples and wall points.
 
     Both ends are moved off their surfaces along the geometric normals, by what single precision leaves of the largest
     coordinate on the way: on curved meshes neighbouring triangles are not met, whatever the scale of the scene. What
@@ -100,7 +100,7 @@ class WallPoints:
         dr.make_opaque(self.p, self.n, self.value, self.leg)
 
     def take(self, index: Any, active: Any = True) -> tuple[Any, Any, Any, Any]:
-        """(``p``, ``n``, ``value``, ``leg``) of these points."""
+        """Return (``p``, ``n``, ``value``, ``leg``) of these points."""
         return (
             dr.gather(mi.Point3f, self.p, index, active),
             _one_or_each(self.n, index, active),
@@ -110,8 +110,8 @@ class WallPoints:
 
 
 def points_of(si: Any, factor: Any, length: Any) -> WallPoints:
-    """What interactions with a diffuse wall make of light that comes along ``si.wi``, or goes that way: their albedo
-    times ``factor``, and the legs ``length``.
+    """Build wall points from interactions with a diffuse wall, for light along ``si.wi``: their albedo times
+    ``factor``, and the legs ``length``.
     """
     bsdf, valid = si.bsdf(), si.is_valid()
     side = dr.select(si.wi.z > 0, 1, dr.select(scatters_behind(bsdf) & (si.wi.z < 0), -1, 0))

@@ -1,4 +1,4 @@
-"""Light of four and more bounces from chains that neighbouring scan points share (:mod:`.chains`).
+"""Light of four and more bounces from chains that neighbouring scan points share (:class:`ChainPlan`).
 
 A scan point sees the heads of its tile's chains, a laser spot the vertices of their tails: one ray each. What is in
 between is the same for all points of the tile, so that an event costs two loads and a product::
@@ -57,7 +57,7 @@ LONGEST_TAIL = 1 + (DIMENSIONS - _FURTHER) // 2
 
 @dataclass
 class ChainPlan:
-    """What chains are made of: ``elements`` (:class:`..sampling.hidden_elements.HiddenElements`), ``center`` (Point3f
+    """Layout of chains: ``elements`` (:class:`..sampling.hidden_elements.HiddenElements`), ``center`` (Point3f
     in memory: about where the scan points are), ``size`` chains of a group (a power of two), ``groups`` of each tile,
     ``tail`` vertices, ``seed`` (UInt32 of width one, in memory).
     """
@@ -84,7 +84,8 @@ class Vertices(Local):
 
 
 def trace_chains(scene: Any, plan: ChainPlan, index: Any) -> tuple[Vertices, list[Vertices]]:
-    """(heads, vertices of tails) of the chains of numbers ``index`` (UInt32) of Sobol's points. Not evaluated."""
+    """Return (heads, vertices of tails) of the chains of numbers ``index`` (UInt32) of Sobol's points. Not evaluated.
+    """
     numbers = [sobol(index, d, plan.seed) for d in range(_FURTHER + 2 * (plan.tail - 1))]
     head = _drawn(plan, numbers, _HEAD, _SIDES[0])
     guided = unit_float(numbers[_CHOICE]) < AREA_SHARE
@@ -137,8 +138,8 @@ def _cosine_direction(n: Any, numbers: list[Any], which: tuple[int, int]) -> Any
 
 
 def _origin(plan: ChainPlan, start: Vertices, towards: Any) -> Any:
-    """Where rays that go off a surface start. Offsets as in :func:`.geometry.occluded`, by the size of the hidden
-    scene.
+    """Return the origin of rays that leave a surface. Offsets as in :func:`.geometry.occluded`, by the size of the
+    hidden scene.
     """
     reach = dr.max(dr.abs(start.p)) + dr.norm(plan.center - start.p)
     offset = dr.mulsign(OFFSET * reach, dr.dot(start.geometric_n, towards))
@@ -146,7 +147,7 @@ def _origin(plan: ChainPlan, start: Vertices, towards: Any) -> Any:
 
 
 def _step(scene: Any, plan: ChainPlan, origin: Any, d: Any, active: Any) -> Vertices:
-    """What a ray meets, its ``value`` still to be said."""
+    """Intersect a ray with the scene; the caller sets ``value``."""
     ray = mi.Ray3f(origin, d)
     pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
     si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
@@ -166,7 +167,7 @@ def _step(scene: Any, plan: ChainPlan, origin: Any, d: Any, active: Any) -> Vert
 
 
 def _guided_step(scene: Any, plan: ChainPlan, start: Vertices, numbers: list[Any], which: tuple[int, int]) -> Any:
-    """(next vertex, cosine over pi and the density of its direction) by a mixture of cosines and hidden area."""
+    """Return (next vertex, cosine over pi and the density of its direction) by a mixture of cosines and hidden area."""
     u, v = (numbers[i] for i in which)
     hidden = plan.elements.per_area(start.shape, start.primitive, start.p, start.alive) > 0
     share = dr.select(hidden, mi.Float(AREA_SHARE), WALL_SHARE)
@@ -213,10 +214,10 @@ class VertexTable:
         dr.schedule(self.geometric_n, *(getattr(self, name) for name in self._FIELDS))
 
     def take(self, index: Any) -> Local:
-        """``p, n, geometric_n, value, length, alive`` of vertices."""
-        taken = Local(**{name: _gather(getattr(self, name), index) for name in self._FIELDS})
-        taken.geometric_n = _gather(self.geometric_n, index) if self.smooth else taken.n
-        return taken
+        """Gather ``p, n, geometric_n, value, length, alive`` of vertices."""
+        rows = Local(**{name: _gather(getattr(self, name), index) for name in self._FIELDS})
+        rows.geometric_n = _gather(self.geometric_n, index) if self.smooth else rows.n
+        return rows
 
 
 def _gather(array: Any, index: Any) -> Any:
@@ -277,7 +278,7 @@ class Links:
 
 
 def _ends(lane: Any, size: int) -> tuple[Any, Any]:
-    """(tail, head) of the pairs of groups of a power of two."""
+    """Return (tail, head) of the pairs of groups of a power of two."""
     bits = size.bit_length() - 1
     tail = lane >> bits
     return tail, (tail & ~mi.UInt32(size - 1)) + (lane & (size - 1))
@@ -308,9 +309,9 @@ _STREAM = 0x6C617465
 
 
 class Tiles:
-    """Which scan points share chains: ``side`` of them along each side of the scan, as far apart as possible. ``of``
-    (UInt32): tile of each pixel of a film; ``rank`` (UInt32): place of each tile along a curve that keeps neighbours
-    together; ``count``; ``numbers``: ``of`` as numpy. A plain class.
+    """Groups of scan points that share chains: ``side`` of them along each side of the scan, as far apart as possible.
+    ``of`` (UInt32): tile of each pixel of a film; ``rank`` (UInt32): place of each tile along a curve that keeps
+    neighbours together; ``count``; ``numbers``: ``of`` as numpy. A plain class.
     """
 
     def __init__(self, width: int, height: int, side: int) -> None:
@@ -328,8 +329,8 @@ class Tiles:
 
 @dataclass
 class LateLaunch:
-    """``rows`` rows of pixels from ``first_row`` on of a band, in ``spp`` lanes each (named as the film asks for it):
-    ``pieces`` for each group, of so many links at most. ``listed``: lanes of a pixel stand together.
+    """Launch of ``rows`` rows of pixels from ``first_row`` on of a band, in ``spp`` lanes each (named as the film asks
+    for it): ``pieces`` for each group, of so many links at most. ``listed``: lanes of a pixel stand together.
     """
 
     band: int
@@ -344,9 +345,9 @@ class LateLaunch:
 class LateLight:
     """Late light of one capture, of ``lowest`` to ``highest`` bounces (within ``FIRST`` and ``MOST``).
 
-    ``job``: a :class:`.scan_job.ScanJob`; ``elements``: the density of heads, see
-    :mod:`.late_density`; ``lasers``: the spots, one each of the scan points in confocal captures. ``side``: scan points
-    of a tile along each side of the scan; ``size``: chains of a group, a power of two.
+    ``job``: a :class:`.launches.ScanJob`; ``elements``: the density of heads, see :func:`.shared_light.late_density`;
+    ``lasers``: the spots, one each of the scan points in confocal captures. ``side``: scan points of a tile
+    along each side of the scan; ``size``: chains of a group, a power of two.
 
     Mono and RGB variants, diffuse surfaces, every film. Not supported: derivatives.
     """
@@ -501,7 +502,7 @@ def _in_regions(row: Any, plan: ChainPlan) -> Any:
 
 
 class LateLanes:
-    """What the lanes of a launch know: constants of the loop, a plain object."""
+    """Data of the lanes of a launch: constants of the loop, a plain object."""
 
     def __init__(self, light: LateLight, part: GroupBlock, launch: LateLaunch) -> None:
         job, lasers = light.job, light.lasers
@@ -512,9 +513,9 @@ class LateLanes:
         self.factor = value * job.energy * spot_value
         self.opl = leg + spot_leg - job.film.start_opl
         tile = dr.gather(mi.UInt32, light.tiles.of, self.pixel)
-        group_of_all = tile * dr.opaque(mi.UInt32, part.groups) + group
-        first = dr.gather(mi.UInt32, part.links.first, group_of_all)
-        end = first + dr.gather(mi.UInt32, part.links.count, group_of_all)
+        tile_group = tile * dr.opaque(mi.UInt32, part.groups) + group
+        first = dr.gather(mi.UInt32, part.links.first, tile_group)
+        end = first + dr.gather(mi.UInt32, part.links.count, tile_group)
         self.first = first + piece * dr.opaque(mi.UInt32, launch.links)
         self.last = dr.minimum(self.first + dr.opaque(mi.UInt32, launch.links), end)
         # A chain's number counts through all tiles; a row of the tables through those of one.
@@ -526,7 +527,7 @@ class LateLanes:
 
     @staticmethod
     def _numbers(light: LateLight, part: GroupBlock, launch: LateLaunch) -> tuple[Any, Any, Any, Any]:
-        """(pixel, group, piece, laser) of each lane, ``UInt32``."""
+        """Return (pixel, group, piece, laser) of each lane, ``UInt32``."""
         width = int(light.job.film.crop_size()[0])
         pixels = np.arange(launch.first_row * width, (launch.first_row + launch.rows) * width)
         if not launch.listed:  # points of a tile, which read the same links, stand together
@@ -543,7 +544,7 @@ class LateLanes:
 
 
 def divmod_by(number: Any, divisor: int) -> tuple[Any, Any]:
-    """(quotient, rest) of group_of_all numbers, by one in memory."""
+    """Return (quotient, rest) of whole numbers, divided by a number in memory."""
     by = dr.opaque(mi.UInt32, divisor)
     quotient = number // by
     return quotient, number - quotient * by
@@ -551,7 +552,7 @@ def divmod_by(number: Any, divisor: int) -> tuple[Any, Any]:
 
 @dr.syntax
 def sum_over_links(light, part, lanes, target, kept):
-    """What the links of each lane bring, into the film's block."""
+    """Splat the light of each lane's links."""
     k = mi.UInt32(lanes.first)
     while dr.hint(k < lanes.last, label="links"):
         deposit(light, part, lanes, target, kept, k)
@@ -560,7 +561,7 @@ def sum_over_links(light, part, lanes, target, kept):
 
 
 def deposit(light, part, lanes, target, kept, k):
-    """The events of one link."""
+    """Splat the events of one link."""
     link = dr.gather(mi.Vector4f, part.links.flat, k)
     head, tail = mi.UInt32(link.z), mi.UInt32(link.w)
     seen = dr.gather(mi.Vector2f, part.seen, (head - lanes.offset) * lanes.stride + lanes.pixel)

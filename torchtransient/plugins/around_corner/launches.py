@@ -23,8 +23,8 @@ EVENTS = 16
 
 @dataclass
 class Launch:
-    """``rows`` rows of pixels from ``first_row`` on in one storage band, samples ``first`` to ``last`` (exclusive), in
-    ``spp`` lanes each (named as the film asks for it).
+    """Launch of ``rows`` rows of pixels from ``first_row`` on in one storage band, samples ``first`` to ``last``
+    (exclusive), in ``spp`` lanes each (named as the film asks for it).
     """
 
     band: int
@@ -111,12 +111,11 @@ def _with_events(band: int, band_first: int, rows: int, width: int, samples: int
 
 
 # ----------------------------------------------------------------------------------------------------------------------
-# What brings light of a scan to a film, whichever way: scene, film, scan points, and the laser's energy.
-#
+# Jobs of a scan: scene, film, scan points, and the laser's energy.
 
 
 class ScanJob:
-    """``film``: one with a pixel for each scan point, row by row, on which ``prepare`` was called (and
+    """Job of a scan. ``film``: one with a pixel for each scan point, row by row, on which ``prepare`` was called (and
     ``finish_render`` will be): light is added to what it holds. ``sensors``: the scan points; ``energy`` (J, a number
     or an ``UnpolarizedSpectrum``): of the laser, by colour. ``scene``: everything that can stand in the way, the wall
     too. ``progress(fraction)`` is called after every kernel launch. Raises SceneError, ShapeError, VariantError.

@@ -1,4 +1,4 @@
-"""What the derivative of single-corner light gains where hidden things begin to hide each other.
+"""Boundary term of single-corner light where hidden shapes occlude each other.
 
 With hidden points ``y`` that follow their shapes, the light of a pixel is an integral over material area,
 
@@ -78,7 +78,7 @@ class MutualOcclusion:
         self.edges, self.spots, self.jobs = edges, spots, jobs
 
     def tables(self) -> list[Any]:
-        """What has been computed of the scene's parameters."""
+        """Arrays computed from the scene's parameters."""
         return [end for end in self.edges.ends if dr.grad_enabled(end)]
 
     # ------------------------------------------------------------------------------------------ both modes
@@ -209,7 +209,8 @@ class MutualOcclusion:
         return Local(value=value, outwards=dr.select(active, outwards, 0), opl=opl, active=active)
 
     def _light(self, place: Local, si: Any, from_spot: bool, active: Any) -> tuple[Any, Any, Any]:
-        """(light by way of a hidden point per solid angle around the viewpoint, arrival, which lanes have some)."""
+        """Return (light by way of a hidden point per solid angle around the viewpoint, arrival, which lanes have some).
+        """
         world, seen, lit = self.world, dr.copy(place.seen), place.lit
         to_hidden, to_spot = si.p - seen.p, lit.p - si.p
         r_seen, r_spot = dr.norm(to_hidden), dr.norm(to_spot)
@@ -227,7 +228,7 @@ class MutualOcclusion:
         return value * measure, opl, active
 
     def _seen_otherwise(self, other: Any, viewer: Any, si: Any, d: Any, active: Any) -> Any:
-        """How much of the hidden point ``si`` is seen from the ``other`` viewpoint (Float).
+        """Return the visibility of the hidden point ``si`` from the ``other`` viewpoint (Float).
 
         The mean of both sides of the outline, ``d`` pointing to the one that is hidden: where a spot, a scanned point
         and an edge lie in one plane, both viewpoints have the same outline, which counts once and not twice.
@@ -248,7 +249,7 @@ class MutualOcclusion:
 
 
 # ----------------------------------------------------------------------------------------------------------------------
-# The boundary term of captures in light of more than three bounces: outlines seen from hidden points, too.
+# The boundary term of captures in light of more than three bounces: outlines seen from hidden points.
 # Light of the spot L, of hidden points y_n to y_1 and of the scanned point S is an integral over material areas,
 #
 #     I = int  f V(S, y_1) V(y_1, y_2) ... V(y_n, L)  dA(y_1) ... dA(y_n),
@@ -263,8 +264,8 @@ FIRST = 4
 
 
 class SpotPass(BoundaryPass):
-    """An edge point seen from the laser's spot is drawn as :class:`VertexPass` does, and a path goes on behind it, to
-    the scanned point.
+    """Boundary pass that draws an edge point seen from the laser's spot, as :class:`VertexPass` does, and follows a
+    path behind it to the scanned point.
     """
 
     @staticmethod
@@ -317,7 +318,7 @@ class SpotPass(BoundaryPass):
 
 
 class ScanSampled(Connection):
-    """The scanned point as what a path from the laser's spot is connected to; the way from there to the sensor has been
+    """Connection of a path from the laser's spot to the scanned point; the way from there to the sensor has been
     counted. As in :class:`LaserSpot`, an event's depth is its number of bounces.
     """
 

@@ -37,11 +37,11 @@ class Edges:
     closed: bool
 
     @staticmethod
-    def of(all_of_them: Triangles, faces: np.ndarray) -> Edges:
+    def from_faces(triangles: Triangles, faces: np.ndarray) -> Edges:
         """The edges that can be outlines of some faces (F,), given by their numbers."""
-        corners = all_of_them.faces[faces]
-        key, proper = edge_keys(all_of_them.joined[faces])
-        mesh = np.repeat(all_of_them.mesh[faces], 3)
+        corners = triangles.faces[faces]
+        key, proper = edge_keys(triangles.joined[faces])
+        mesh = np.repeat(triangles.mesh[faces], 3)
         order = np.lexsort((mesh, key))
         order = order[proper[order]]
         ends = np.stack([corners.ravel(), corners[:, [1, 2, 0]].ravel()], 1)[order]
@@ -52,10 +52,10 @@ class Edges:
         sides = np.stack([third[first], third[np.minimum(first + 1, len(third) - 1)]], 1)
         sides[count == 1, 1] = sides[count == 1, 0]
         chosen, two = np.ones(len(first), dtype=bool), count == 2
-        h = [_across(all_of_them.vertices, ends[first[two]], sides[two, i]) for i in range(2)]
+        h = [_across(triangles.vertices, ends[first[two]], sides[two, i]) for i in range(2)]
         chosen[two] = (h[0] * h[1]).sum(1) > -1 + FLAT
         for e in np.flatnonzero(count > 2):
-            pair = _outermost(all_of_them.vertices, ends[first[e]], third[first[e] : first[e] + count[e]])
+            pair = _outermost(triangles.vertices, ends[first[e]], third[first[e] : first[e] + count[e]])
             chosen[e] = pair is not None
             if pair is not None:
                 sides[e] = pair
@@ -76,8 +76,8 @@ def _across(v: np.ndarray, ends: np.ndarray, sides: np.ndarray) -> np.ndarray:
 
 
 def _outermost(v: np.ndarray, ends: np.ndarray, around: np.ndarray) -> np.ndarray | None:
-    """Of more than two faces at an edge those on both sides of the widest gap, None where it is no wider than half a
-    turn: no plane through the edge leaves all faces on one side then.
+    """Return the two of several faces at an edge that bound the widest gap, None where it is no wider than half a turn:
+    no plane through the edge leaves all faces on one side then.
     """
     h = _across(v, np.repeat(ends[None], len(around), 0), around)
     t = v[ends[1]] - v[ends[0]]
@@ -143,7 +143,7 @@ def _attached(triangles: Triangles, mesh: np.ndarray, vertices: np.ndarray) -> A
 
 
 def _weights(p: np.ndarray, viewpoints: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """``(E,)``, of edges with ends and sides ``p`` (E, 4, 3)."""
+    """Weights (E,) of edges with ends and sides ``p`` (E, 4, 3)."""
     blocks = [_weights_of_some(p[i : i + BLOCK], viewpoints, normals) for i in range(0, len(p), BLOCK)]
     return np.concatenate(blocks)
 
@@ -164,10 +164,9 @@ def _weights_of_some(p: np.ndarray, viewpoints: np.ndarray, normals: np.ndarray)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
-# Which parts of a scene may hide which, seen from points of a wall: a cheap test that never misses one.
-#
+# Pairs of parts of a scene of which one may hide the other from a wall: a cheap, conservative test.
 
-# Parts of a scene that are told apart; of more, everything may hide everything.
+# Largest number of parts of a scene that are tested; with more, every part may hide every other.
 MOST_PARTS = 64
 # Corners of a part that are looked at one by one; larger ones are stood for by a box.
 MOST_CORNERS = 64
@@ -175,7 +174,7 @@ MOST_CORNERS = 64
 MOST_PRODUCTS = 1 << 24
 # Rounding of positions, in parts of the size of what is compared.
 ROUNDING = 1e-5
-# Viewpoints that are asked first.
+# Viewpoints that are requested first.
 FEW = 16
 # Steps in which a plane between two cones has to be found.
 STEPS = 64
@@ -199,18 +198,18 @@ class Part:
 def parts_of(shapes: list[Any]) -> tuple[list[Part], Triangles]:
     """The parts of all shapes, and the triangles of the meshes. Of very many pieces those of a mesh count as one."""
     numbers = [k for k, shape in enumerate(shapes) if shape.is_mesh()]
-    triangles = Triangles.of([shapes[k] for k in numbers])
+    triangles = Triangles.from_meshes([shapes[k] for k in numbers])
     label = triangles.parts()
     if label.max(initial=-1) >= MOST_PARTS:
         label = triangles.mesh
     order = np.argsort(label, kind="stable")
     pieces = np.split(order, np.flatnonzero(np.diff(label[order])) + 1) if len(order) else []
-    found = [_of_faces(frozenset(numbers[k] for k in np.unique(triangles.mesh[f])), triangles, f) for f in pieces]
-    found += [_of_bounds(k, shape) for k, shape in enumerate(shapes) if not shape.is_mesh()]
+    found = [_part_of_faces(frozenset(numbers[k] for k in np.unique(triangles.mesh[f])), triangles, f) for f in pieces]
+    found += [_part_of_bounds(k, shape) for k, shape in enumerate(shapes) if not shape.is_mesh()]
     return found, triangles
 
 
-def _of_bounds(number: int, shape: Any) -> Part:
+def _part_of_bounds(number: int, shape: Any) -> Part:
     bounds = bounds_of(shape)
     corners = _box(*(np.array(corner, dtype=np.float64).ravel() for corner in (bounds.min, bounds.max)))
     # A tube shows its inside; spheres and disks cannot hide themselves.
@@ -223,8 +222,8 @@ def _box(low: np.ndarray, high: np.ndarray) -> np.ndarray:
     return np.array([[(low, high)[i >> axis & 1][axis] for axis in range(3)] for i in range(8)])
 
 
-def _of_faces(shapes: frozenset[int], triangles: Triangles, faces: np.ndarray) -> Part:
-    edges = Edges.of(triangles, faces)
+def _part_of_faces(shapes: frozenset[int], triangles: Triangles, faces: np.ndarray) -> Part:
+    edges = Edges.from_faces(triangles, faces)
     v = triangles.vertices[np.unique(triangles.faces[faces])]
     middle = v.mean(0)
     _, axes = np.linalg.eigh((v - middle).T @ (v - middle))
@@ -248,27 +247,31 @@ def _is_convex(triangles: Triangles, faces: np.ndarray, v: np.ndarray, tolerance
     return bool(np.all((heights.max(1) < tolerance) | (heights.min(1) > -tolerance)))
 
 
-def hiding_pairs(parts: list[Part], viewpoints: np.ndarray, of_interest: Any) -> list[tuple[int, int]]:
-    """(hider, hidden) by number: a pair for each part that may hide another, or points of its own, from some of the
-    ``viewpoints`` (P, 3).
+def hiding_pairs(parts: list[Part], viewpoints: np.ndarray, is_requested: Any) -> list[tuple[int, int]]:
+    """Find pairs of parts of which one may hide the other, or points of its own, from a viewpoint.
 
-    ``of_interest(i, j)``: which pairs are asked for. Conservative: what is left out cannot happen. Of more than
-    ``MOST_PARTS`` each one may hide another.
+    Args:
+        viewpoints: points of the wall, (P, 3), metres.
+        is_requested: predicate of (hider, hidden) for the pairs that count.
+
+    Returns:
+        Pairs (hider, hidden) by number. Conservative: pairs left out cannot occur. Of more than ``MOST_PARTS`` parts
+        each may hide every other.
     """
     pairs = []
     some = np.unique(np.linspace(0, len(viewpoints) - 1, min(len(viewpoints), FEW)).astype(int))
     for i, hider in enumerate(parts):
-        asked = [j for j in range(len(parts)) if of_interest(i, j)]
-        found = [i] if i in asked and hider.hides_itself else None
-        asked = [j for j in asked if j != i]
+        requested = [j for j in range(len(parts)) if is_requested(i, j)]
+        found = [i] if i in requested and hider.hides_itself else None
+        requested = [j for j in requested if j != i]
         if found is None and len(parts) > MOST_PARTS:
-            found = asked[:1]
+            found = requested[:1]
         if found is None:
-            asked = [j for j in asked if not _is_beyond(hider, parts[j], viewpoints)]
+            requested = [j for j in requested if not _is_beyond(hider, parts[j], viewpoints)]
             hidden = (
                 j
                 for q in (viewpoints[some], viewpoints)
-                for j in asked
+                for j in requested
                 if not _cones_apart(hider.corners, parts[j].corners, q).all()
             )
             found = [j for j in (next(hidden, None),) if j is not None]
@@ -277,7 +280,7 @@ def hiding_pairs(parts: list[Part], viewpoints: np.ndarray, of_interest: Any) ->
 
 
 def _is_beyond(hider: Part, hidden: Part, viewpoints: np.ndarray) -> bool:
-    """Whether a plane is found beyond which the hider lies altogether, with all else before it."""
+    """Return whether one of the planes tried separates the hider from the hidden points and the viewpoints."""
     everything = np.concatenate([hider.corners, hidden.corners, viewpoints])
     rounding = ROUNDING * np.ptp(everything, axis=0).max()
     before = np.concatenate([hidden.corners, viewpoints])
@@ -287,7 +290,7 @@ def _is_beyond(hider: Part, hidden: Part, viewpoints: np.ndarray) -> bool:
 
 
 def _cones_apart(a: np.ndarray, b: np.ndarray, viewpoints: np.ndarray) -> np.ndarray:
-    """From which viewpoints ``(P,)`` a plane through them is found that parts the points ``a`` and ``b``.
+    """Return a mask (P,) of viewpoints through which a plane is found that separates the points ``a`` and ``b``.
 
     The perceptron: a plane that has a point on its wrong side is turned towards it.
     """

@@ -1,4 +1,4 @@
-"""Whether a job of derivatives needs the boundary term of mutual occlusion, and what of it cannot be computed."""
+"""Choice of the boundary term of mutual occlusion for a job of derivatives, and its gaps."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ _SEED = 0x85EBCA6B
 
 
 def follows_outlines(segment: type, contents: Any) -> bool:
-    """Whether outlines are followed in derivatives: where hidden points are points of their shapes (``segment``), and
-    nothing scatters late.
+    """Return whether outlines are followed in derivatives: where hidden points are points of their shapes
+    (``segment``), and nothing scatters late.
     """
     return issubclass(segment, MaterialVacuum) and contents.delays is None
 
@@ -54,7 +54,7 @@ def silhouettes(scene: Any, least: int, most: int) -> MovingEdges:
 
 
 class Viewpoints:
-    """Where hidden things are seen from: the scanned points and the laser's spots that there are, ``p, n`` (P, 3), of
+    """Viewpoints of the hidden shapes: the scanned points and the laser's spots, ``p, n`` (P, 3), of
     the former and of the latter; ``shapes``: registry numbers of what they lie on.
     """
 
@@ -103,10 +103,10 @@ def mutual_occlusion(
     moves_viewpoints |= any(registry_number(shapes[k]) in viewpoints.shapes for k in moving)
     parts, triangles = parts_of(shapes)
 
-    def of_interest(i: int, j: int) -> bool:
+    def is_requested(i: int, j: int) -> bool:
         return bool(moves_viewpoints or moving & parts[i].shapes or moving & parts[j].shapes)
 
-    pairs = hiding_pairs(parts, viewpoints.p, of_interest)
+    pairs = hiding_pairs(parts, viewpoints.p, is_requested)
     if not pairs:
         return None
     _warn_of_limbs(shapes, parts, pairs)

@@ -1,4 +1,4 @@
-"""Which points a scan looks at, and where its laser falls: computed once a job, attached where parameters are."""
+"""Scanned points and laser spots: computed once a job, attached where parameters are."""
 
 from __future__ import annotations
 
@@ -62,8 +62,8 @@ def overlaps(scene: Any, elements: HiddenElements, points: np.ndarray, normals: 
 
 
 def _look(scene: Any, elements: HiddenElements, viewer: Local, seed: Any, active: Any) -> tuple[Local, Any, Any]:
-    """(drawn points with the normals of the sides that are seen, which of them are seen, and of these the ones that
-    something else lies in).
+    """Return (drawn points with the normals of the sides that are seen, which of them are seen, and of these the ones
+    that something else lies in).
     """
     x, y = plane_points(POINTS, seed)
     # Points in another order than those that see them.
@@ -89,7 +89,7 @@ def _look(scene: Any, elements: HiddenElements, viewer: Local, seed: Any, active
 
 
 def _is_inside(elements: HiddenElements, element: Any, a: Any, y: Any) -> Any:
-    """Whether points are off the edges of their triangles."""
+    """Return a mask of points off the edges of their triangles."""
     uv = elements.coordinates(element, a, y)
     least = dr.minimum(dr.minimum(uv.x, uv.y), 1 - uv.x - uv.y)
     return (elements.kind(element) != TRIANGLE) | (least > _EDGE)
@@ -105,7 +105,7 @@ _FIELDS = ("p", "n", "sh_frame", "uv", "dp_du", "dp_dv")
 
 
 class ScanTable:
-    """What a scan looks at and where its laser falls, traced once a job.
+    """Scanned points and laser spots of a capture, traced once a job.
 
     ``scene``, ``sensor``; ``rays`` (Ray3f, one a pixel, attached where the sensor is), ``found``
     (PreliminaryIntersection3f of those); ``spots`` (:class:`LaserSpots`), None where lights are sampled. Built with
@@ -128,7 +128,7 @@ class ScanTable:
 
     @property
     def looks_at_points(self) -> bool:
-        """Whether all samples of a pixel look at one point, which cameras do not."""
+        """Return whether all samples of a pixel look at one point, which cameras do not."""
         return hasattr(self.sensor, "scanned")
 
     def elements(self, without: list[Any]) -> HiddenElements:
@@ -152,7 +152,7 @@ class ScanTable:
         return self.memory.get("overlaps", elements.key, found) if elements.key else found()
 
     def lambertian_spots(self, legs: bool) -> WallPoints | None:
-        """The spots as points of a flat diffuse wall, None where they are more than that: on curved walls, with
+        """Return the spots as points of a flat diffuse wall, None if they cannot be described so: on curved walls, with
         normals that are interpolated, or in light with wavelengths or a polarization.
         """
         if self.wall is None or mi.is_spectral or mi.is_polarized:
@@ -161,7 +161,7 @@ class ScanTable:
         return self.spots.points(legs) if diffuse else None
 
     def seen(self) -> Any:
-        """What the rays meet (SurfaceInteraction3f), attached where sensor or shape are."""
+        """Interactions of the rays (SurfaceInteraction3f), attached where sensor or shape are."""
         return self.found.compute_surface_interaction(self.rays, mi.RayFlags.All)
 
     def reference_points(self) -> tuple[np.ndarray, np.ndarray]:
@@ -236,14 +236,14 @@ class LaserSpots:
         self.shape = pi.shape
         _check_hit(np.array(pi.t), "laser")
         self.length = dr.norm(si.p - self.origin)
-        # What lanes read of it and may be attached, see :meth:`arrays`; its other fields are told by the lanes.
+        # What lanes read of it and may be attached, see :meth:`arrays`; the lanes provide its other fields.
         self.si = dr.detach(si)
         for name in _FIELDS:
             setattr(self.si, name, getattr(si, name))
         dr.eval(self.si, self.length, self.ray, self.origin)
 
     def arrays(self) -> list[Any]:
-        """What is attached where the scene's parameters are."""
+        """Arrays that are attached where the scene's parameters are."""
         frame = self.si.sh_frame
         fields = [getattr(self.si, name) for name in _FIELDS if name != "sh_frame"]
         return [*fields, frame.s, frame.t, frame.n, self.length, self.ray.d]
@@ -265,7 +265,7 @@ class LaserSpots:
         return points_of(si, factor * dr.inv_pi, self.length if legs else mi.Float(0))
 
     def energy(self, wavelengths: Any, index: Any, cos: Any, active: Any) -> Any:
-        """What falls on a spot, per colour, and per cosine ``cos`` of the beam there (UnpolarizedSpectrum).
+        """Return the energy on a spot, per colour, and per cosine ``cos`` of the beam there (UnpolarizedSpectrum).
 
         A ``laser_beam`` brings its energy however it falls. For Mitsuba's emitters the irradiance at the spot is taken
         over a square metre, as mitransient does, with the emitter turned towards it.
@@ -307,20 +307,24 @@ def laser_of(scene: Any) -> Any:
 
 
 def origin_of(scene: Any, sensor: Any) -> Any:
-    """Where the laser stands (Point3f)."""
+    """Return the position of the laser (Point3f, metres)."""
     given = getattr(sensor, "laser_origin", None)
     return mi.Point3f(laser_of(scene).world_transform().translation()) if given is None else given
 
 
 def aims_of(scene: Any, sensor: Any, capture: CaptureType, fov: float | None) -> Any:
-    """Where the laser points from its origin (Vector3f, of any length): one direction, or one for every pixel, or one
-    for every laser position.
+    """Return the directions of the laser from its origin (Vector3f, of any length): one direction, or one for every
+    pixel, or one for every laser position.
 
-    ``fov``: horizontal field of view in degrees of a grid of laser positions around the emitter's axis, None for those
-    of the sensor. Raises SceneError where two say where the laser points, and for a field of view that is none.
+    Args:
+        fov: horizontal field of view in degrees of a grid of laser positions around the emitter's axis, None for the
+            laser positions of the sensor.
+
+    Raises:
+        SceneError: if several of the scene's parts aim the laser, or the field of view is not an angle.
     """
     transform, origin = laser_of(scene).world_transform(), origin_of(scene, sensor)
-    _check_said_once(sensor, capture, fov)
+    _check_aimed_once(sensor, capture, fov)
     given = sensor.spots() if hasattr(sensor, "spots") and capture is not CaptureType.CONFOCAL else None
     if given is not None:
         return given - origin
@@ -341,7 +345,7 @@ def aims_of(scene: Any, sensor: Any, capture: CaptureType, fov: float | None) ->
     return transform @ mi.Vector3f(-x * half, -y * half * rows / columns, 1)
 
 
-def _check_said_once(sensor: Any, capture: CaptureType, fov: float | None) -> None:
+def _check_aimed_once(sensor: Any, capture: CaptureType, fov: float | None) -> None:
     given = getattr(sensor, "laser_points", None) is not None
     if given and capture is CaptureType.CONFOCAL:
         raise SceneError(
@@ -373,7 +377,7 @@ def scan_rays(sensor: Any) -> Any:
 
 
 def scanned_points(scene: Any, sensor: Any) -> Any:
-    """The scanned points (Point3f): as the sensor says, or what its pixels see."""
+    """Return the scanned points (Point3f): the sensor's targets, or the points that its pixels see."""
     if hasattr(sensor, "scanned"):
         return sensor.scanned()
     ray = scan_rays(sensor)

@@ -1,4 +1,4 @@
-"""Which hidden elements nothing can hide from any point of a scan: their samples need no visibility rays.
+"""Hidden elements that are visible from every point of a scan: their samples need no visibility rays.
 
 All lines from an element to the scan lie in its *shaft*, the convex hull of both. Where no triangle of the scene meets
 the inside of the shaft, nothing on it is ever hidden. The test is conservative: a triangle counts as outside where one
@@ -48,14 +48,16 @@ class ScanRegion:
         self.scale = float(np.abs(points).max())
 
     def holds(self, points: np.ndarray) -> bool:
-        """Whether all of these points ``(P, 3)`` lie in the box, to rounding."""
+        """Return whether all points (P, 3) lie in the box, to rounding."""
         local = np.asarray(points, dtype=np.float64).reshape(-1, 3) @ self.frame.T
         slack = ROUNDING * self.scale
         return bool(np.all(local >= self.low - slack) and np.all(local <= self.high + slack))
 
 
 def pays(scene: Any, rays: int) -> bool:
-    """Whether finding shafts takes less time than the rays that they may spare: it is some 400 rays a triangle."""
+    """Return whether finding shafts takes less time than the rays that they may spare: it costs some 400 rays a
+    triangle.
+    """
     triangles = sum(int(shape.face_count()) for shape in scene.shapes() if shape.is_mesh())
     return rays > _RAYS_A_TRIANGLE * triangles
 
@@ -73,10 +75,16 @@ def spare_rays(scene: Any, elements: HiddenElements, points: np.ndarray, normals
 
 
 def clear_elements(shapes: list[Any], elements: AreaElements, region: ScanRegion, smooth: bool = False) -> np.ndarray:
-    """``(E,)``: which elements nothing hides from any point of the region, ``shapes`` being all of the scene.
+    """Find the elements that nothing hides from any point of a region.
 
-    Only triangles are ever clear, and only those that lie before the whole region. ``smooth``: normals are
-    interpolated, so that points may be seen from behind their planes; then only those with the region on one side.
+    Args:
+        shapes: all shapes of the scene.
+        region: box of scan points and laser spots.
+        smooth: normals are interpolated, so that points may be seen from behind their planes; then only elements with
+            the region on one side of their planes are clear.
+
+    Returns:
+        Mask (E,) of clear elements: triangles that lie before the whole region.
     """
     found = np.zeros(len(elements), dtype=bool)
     numbers = np.flatnonzero(elements.kind == TRIANGLE)
@@ -187,7 +195,7 @@ def _harmless(triangles: np.ndarray, region: ScanRegion, hidden: np.ndarray, sla
 
 
 def _met(tree: ObstacleTree, planes: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Which shafts meet something."""
+    """Return a mask of the shafts that meet a triangle."""
     shafts = [mi.Vector4d(planes[:, i].T) for i in range(planes.shape[1])]
     own = [mi.Vector3d(corners[:, i].T) for i in range(3)]
     dr.make_opaque(shafts, own)
@@ -212,7 +220,7 @@ def _traverse(tree, shafts, own):
 
 
 def _box_outside(tree, shafts, node):
-    """Whether a box lies beyond one of the planes, by the corner that lies farthest inside."""
+    """Return a mask of boxes beyond one of the planes, by the corner that lies farthest inside."""
     low, high = dr.gather(mi.Point3d, tree.low, node), dr.gather(mi.Point3d, tree.high, node)
     outside = low.x > high.x
     for plane in shafts:
@@ -222,7 +230,9 @@ def _box_outside(tree, shafts, node):
 
 
 def _triangle_outside(tree, shafts, own, leaf, active):
-    """The same of a triangle; or its plane has element and region on one side. False for what is a box."""
+    """Return as :func:`_box_outside`, for triangles; true as well where element and region lie on one side of its
+    plane. False for boxes.
+    """
     corners = [mi.Vector3d(dr.gather(mi.Point3d, c, leaf, active)) for c in tree.corners]
     outside = mi.Mask(False)
     for plane in shafts:

@@ -34,8 +34,7 @@ from torchtransient.plugins.sampling.shared_samples import ScanTiles, distance_t
 from torchtransient.plugins.transport.strategy import Local
 
 # ----------------------------------------------------------------------------------------------------------------------
-# Where heads of chains are drawn: by what light of four bounces weighs there, as a few thousand of them tell.
-#
+# Density of the heads of chains: proportional to light of four bounces, estimated from a pilot of a few thousand.
 
 # Points of the pilot, and how many of them a weight is the mean of.
 _POINTS, _BUCKET = 2**15, 64
@@ -73,7 +72,10 @@ def late_density(
 
 
 def _density(scene: Any, elements: HiddenElements, wall: tuple[np.ndarray, np.ndarray], s: Any, side: Any) -> Any:
-    """``side``: the middle of the scan, normals towards it, and whether something is scattered there."""
+    """Density of hidden points in late light.
+
+    ``side``: the middle of the scan, normals towards it, and a mask of points that scatter there.
+    """
     points, normals = wall
     center, n, lit = side
     numbers = np.random.default_rng(_SEED).random((2, _POINTS)).astype(np.float32)
@@ -119,7 +121,11 @@ def _smoothed(elements: HiddenElements, square: np.ndarray, area: np.ndarray, el
 
 
 def why_not(table: ScanTable, contents: Any, with_wall: bool) -> str | None:
-    """What stands against shared samples in a scene, None for nothing. ``with_wall``: points are drawn on it, too."""
+    """Return the reason why a scene cannot have shared samples, None if it can.
+
+    Args:
+        with_wall: points are drawn on the wall as well.
+    """
     scene, sensor = table.scene, table.sensor
     if mi.is_spectral or mi.is_polarized:
         return f"the variant {mi.variant()} gives every path wavelengths or a polarization of its own"
@@ -148,9 +154,9 @@ def why_not(table: ScanTable, contents: Any, with_wall: bool) -> str | None:
 
 @dataclass
 class ScanLight:
-    """What shared samples need of a capture: scanned points and laser spots, each with what they scatter, and the
-    laser's energy by colour. Attached where the scene's parameters are. Where every spot is a scanned point, both are
-    one object.
+    """Capture as shared samples see it: scanned points and laser spots, each with its scattering, and the laser's
+    energy by colour. Attached where the scene's parameters are. Where every spot is a scanned point, both are one
+    object.
     """
 
     sensors: WallPoints
@@ -159,7 +165,7 @@ class ScanLight:
 
 
 def scan_light(table: ScanTable, capture: CaptureType, legs: bool) -> ScanLight:
-    """Of the scene as it is now."""
+    """Compute the :class:`ScanLight` of the scene as it is now."""
     origin, spots, seen = mi.Point3f(table.sensor.origin), table.spots, table.seen()
     looked_at = points_of(seen, dr.inv_pi, dr.norm(seen.p - origin) if legs else mi.Float(0))
     if not hasattr(spots.emitter, "energy_at"):
@@ -172,7 +178,7 @@ def scan_light(table: ScanTable, capture: CaptureType, legs: bool) -> ScanLight:
 
 
 def _same(spots: Any, points: Any) -> bool:
-    """Whether laser spots are the scanned points themselves, on the same side of the wall."""
+    """Return whether laser spots are the scanned points themselves, on the same side of the wall."""
     if dr.width(spots.p) != dr.width(points.p):
         return False
     near = dr.norm(spots.p - points.p) <= 1e-6 * (1 + dr.norm(points.p))
@@ -180,20 +186,20 @@ def _same(spots: Any, points: Any) -> bool:
 
 
 def moves(world: Any, shapes: list[Any]) -> bool:
-    """Whether derivatives are asked for of what some of these shapes are or hold."""
+    """Return whether derivatives are requested by parameters of the ``shapes`` or of what they hold."""
     held = {node.ptr for shape in shapes for node in [shape, *objects_below(shape, mi.Object)]}
     return bool(held & world.wanted.nodes)
 
 
 def moves_scan(world: Any, hidden: list[Any]) -> bool:
-    """Whether derivatives are asked for of anything that is no part of the hidden shapes alone: wall, sensor, laser."""
+    """Return whether derivatives are requested by anything beside the hidden shapes: wall, sensor, laser."""
     others = [shape for shape in world.scene.shapes() if shape.ptr not in {one.ptr for one in hidden}]
     held = {node.ptr for shape in hidden for node in [shape, *objects_below(shape, mi.Object)]}
     return bool(world.wanted.nodes - held) or moves(world, others)
 
 
 def _rows(vectors: Any, width: int) -> np.ndarray:
-    """(width, 3), detached."""
+    """Return (width, 3), detached."""
     return np.broadcast_to(host_numbers(vectors).T, (width, 3))
 
 
@@ -254,7 +260,7 @@ class SharedThirdBounce:
         tiles = ScanTiles(p, n, distance_to(elements.elements.centers(), p[some]))
         if tiles.count == 1:
             return elements
-        self.tile = tiles.of_points()
+        self.tile = tiles.tile_per_point()
         memory = self.world.contents.memory
         return copy(HiddenElements.cached(memory, elements.shapes, tiles.points, tiles.normals))
 
@@ -281,7 +287,7 @@ class SharedThirdBounce:
             add_exhaustive(third, self.light.spots)
 
     def tables(self) -> list[Any]:
-        """What has been computed of the scene's parameters."""
+        """Arrays computed from the scene's parameters."""
         with dr.resume_grad():
             return [table for table in self._tables if dr.is_array_v(table) and dr.grad_enabled(table)]
 

@@ -51,7 +51,7 @@ class SampleTable:
         self.flat = packed_columns(rows, samples.count * samples.tiles)
 
     def load(self, k: Any, active: Any = True) -> Local:
-        """``p``, ``n``, ``geometric_n``, ``front``, ``back`` and ``delay`` of samples."""
+        """Load ``p``, ``n``, ``geometric_n``, ``front``, ``back`` and ``delay`` of samples."""
         rows = [dr.gather(mi.Vector4f, self.flat, k * self.packets + i, active) for i in range(self.packets)]
         n = mi.Vector3f(rows[1].x, rows[1].y, rows[1].z)
         front, back = [rows[0].w], [rows[1].w]
@@ -104,12 +104,12 @@ class ThirdBounce(ScanJob):
         self.check_region(sensors)
 
     def add_pairs(self, lasers: WallPoints) -> None:
-        """The laser falls on a spot of its own for each scan point."""
+        """Add light of a laser with a separate spot for each scan point."""
         self._add_each("add_pairs", lasers, apart=True)
 
     def add_confocal(self, lasers: WallPoints | None = None) -> None:
-        """The laser falls on each scan point while that one is looked at. ``lasers``: the same points with the legs and
-        albedo of the laser's side, where those differ.
+        """Add light of a laser that falls on each scan point while it is scanned. ``lasers``: the same points with the
+        legs and albedo of the laser's side, where those differ.
         """
         self._add_each("add_confocal", self.sensors if lasers is None else lasers, apart=False)
 
@@ -124,7 +124,7 @@ class ThirdBounce(ScanJob):
         self._run(SampleTable(self.samples), lasers, apart)
 
     def add_single(self, laser: WallPoints) -> None:
-        """The laser falls on one spot all the time."""
+        """Add light of a laser with one fixed spot."""
         if laser.width != 1:
             raise ShapeError(f"add_single: expected one laser spot, got {laser.width}.")
         self._check_not_exhaustive("add_single")
@@ -200,8 +200,8 @@ class ScanLanes:
 
 @dr.syntax
 def sum_over_samples(job, table, lane, block, kept, numbers, rays):
-    """What the samples of these ``numbers``, from the first to the last (exclusive), send to the lanes' scan points,
-    into the film's block. ``rays``: whether something may hide them.
+    """Splat the light of the samples ``numbers`` (first, last exclusive) at the lanes' scan points. ``rays``: trace
+    visibility rays.
     """
     k, last = mi.UInt32(numbers[0]), numbers[1]
     while dr.hint(k < last, label="hidden samples"):
@@ -211,7 +211,7 @@ def sum_over_samples(job, table, lane, block, kept, numbers, rays):
 
 
 def deposit(job, table, lane, block, kept, k, rays):
-    """One sample's light."""
+    """Splat one sample's light."""
     sample = table.load(k)
     line = span(sample, lane.p, lane.n)
     to_spot = span(sample, lane.spot_p, lane.spot_n) if lane.apart else None
@@ -257,7 +257,7 @@ def lit_by(scene: Any, samples: SharedSamples, laser: WallPoints) -> SampleTable
 
 
 def _clear(samples: SharedSamples) -> Any:
-    """Which samples need no rays."""
+    """Return a mask of the samples that need no visibility rays."""
     k, count = dr.arange(mi.UInt32, samples.count * samples.tiles), dr.opaque(mi.UInt32, samples.count)
     tile = k // count
     return k - tile * count < dr.gather(mi.UInt32, samples.clear, tile)

@@ -27,8 +27,7 @@ from torchtransient.plugins.transport.derivative import tangents_of
 from torchtransient.plugins.transport.strategy import Local
 
 # ----------------------------------------------------------------------------------------------------------------------
-# Samples and points of the wall with derivatives: what they are of the scene's parameters, and as leaves of a lane.
-#
+# Samples and wall points with derivatives: as functions of the scene's parameters, and as leaves of a lane.
 
 
 class Ends:
@@ -52,13 +51,13 @@ class Ends:
         return [name for name, value in self.fields.items() if dr.grad_enabled(value)]
 
     def detached(self) -> Ends:
-        """The same without derivatives. A virtual call attaches what it returns as soon as any plugin is attached that
+        """Return a detached copy. A virtual call attaches what it returns as soon as any plugin is attached that
         it could have gone to: fields may be attached that nothing moves.
         """
         return Ends(self.count, {name: dr.detach(value) for name, value in self.fields.items()})
 
     def load(self, index: Any) -> Local:
-        """The fields of some of them, without derivatives."""
+        """Gather the fields of some of them, detached."""
         rows = [dr.gather(mi.Vector4f, self.flat, index * self.rows + i) for i in range(self.rows)]
         columns = [row[i] for row in rows for i in range(4)]
         found = {}
@@ -69,7 +68,7 @@ class Ends:
         return Local(**found)
 
     def tangents(self) -> Ends:
-        """What forward mode has brought to the attached fields."""
+        """Tangents of the attached fields in forward mode."""
         return Ends(self.count, {name: dr.grad(self.fields[name]) for name in self.attached})
 
     def hand_on(self, adjoints: dict[str, Any]) -> None:
@@ -104,7 +103,7 @@ def ends_of_samples(scene: Any, elements: Any, samples: Any, meshes: Any, laser:
     """Shared samples as material points: ``p``, ``n``, ``front`` and ``back`` (what the sides scatter of light, times
     the area that a sample stands for), and ``geometric_n`` where normals are interpolated.
 
-    ``laser`` (:class:`.wall_points.WallPoints` of one point): the spot that lights them all. ``n`` then points to the
+    ``laser`` (:class:`.geometry.WallPoints` of one point): the spot that lights them all. ``n`` then points to the
     side that is lit, ``front`` holds what arrives there, and ``delay`` is the length of the way to the spot.
     """
     found = material_samples(elements, samples, meshes)
@@ -147,7 +146,7 @@ BUSY = 2**14
 
 
 class ThirdBounceGradients:
-    """One job of derivatives. ``samples`` and ``points``: :class:`.attached.Ends`, attached; ``clear``: how many of the
+    """One job of derivatives. ``samples`` and ``points``: :class:`Ends`, attached; ``clear``: how many of the
     samples, the first ones, nothing can hide.
 
     A plain class, which Dr.Jit loops leave alone.
@@ -160,7 +159,7 @@ class ThirdBounceGradients:
         self.window = film.arrivals()
 
     def connection(self, sample: Any, point: Any, k: Any) -> tuple[Any, Any, Any, Any]:
-        """(value, length and arrival minus the film's start of sample ``k`` at a point, whether it arrives)."""
+        """Return (value, length and arrival minus the film's start of sample ``k`` at a point, whether it arrives)."""
         geometric_n = sample.geometric_n if self.smooth else sample.n
         start = Local(p=sample.p, n=sample.n, geometric_n=geometric_n)
         line = span(start, point.p, point.n)
@@ -200,13 +199,13 @@ class ThirdBounceGradients:
             for ends, adjoints in found:
                 ends.hand_on(adjoints)
 
-    def step_back(self, read: AdjointReader, kept: dict[str, Any], pair: Local, of_sample: bool) -> None:
+    def step_back(self, read: AdjointReader, kept: dict[str, Any], pair: Local, by_sample: bool) -> None:
         """Add the adjoints of one connection to ``kept``: those of its sample, or of its point. ``pair``: ``sample``
         and ``point``, number ``k`` and ``s``.
         """
         with dr.resume_grad():
             sample, point = dr_copy(pair.sample), dr_copy(pair.point)
-            found = leaves(sample if of_sample else point, list(kept), dr.width(pair.k))
+            found = leaves(sample if by_sample else point, list(kept), dr.width(pair.k))
             value, length, opl, arrives = self.connection(sample, point, pair.k)
             A, slope = read.block(pair.s).read(opl, arrives)
             objective = total_of(A, value) + total_of(slope, dr.detach(value)) * slope_only(length)
@@ -247,7 +246,7 @@ class ThirdBounceGradients:
 
 
 def dr_copy(local: Local) -> Local:
-    """The same fields under another roof: what becomes a leaf in it does not in the other."""
+    """Return a copy of the containers with the same fields: leaves made in the copy leave the original as it is."""
     return Local(**vars(local))
 
 
@@ -286,7 +285,7 @@ class AdjointReader:
         self.width = dr.opaque(mi.UInt32, int(film.crop_size()[0]))
 
     def block(self, s: Any) -> Any:
-        """That of each lane's point, as :class:`~..films.block.AdjointBlock`."""
+        """Block of each lane's point, as :class:`~..films.block.AdjointBlock`."""
         row = s // self.width
         place = Local(row=row, column=s - row * self.width, laser=None)
         return self.incoming.block(place, s, self.match)

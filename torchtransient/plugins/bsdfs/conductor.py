@@ -103,7 +103,7 @@ class DiffRoughConductor(mi.BSDF):
             cb.put(name, getattr(self, name, texture), flags)
 
     def _reflection(self, ctx: Any, si: Any, wo: Any, active: Any) -> Any:
-        """What the facets that mirror one direction into the other leave of the light: a share or a Mueller matrix."""
+        """Return the reflectance of the facets between two directions, or its Mueller matrix."""
         normal, _ = half_vector(si.wi, wo, 1.0)
         cosine = dr.dot(si.wi, normal)
         cosine = dr.select(cosine > 0, cosine, 1)
@@ -115,7 +115,7 @@ class DiffRoughConductor(mi.BSDF):
         return across_plane(matrix, normal, towards_sensor, towards_light)
 
     def _coated(self, ctx: Any, si: Any, wo: Any, mirrored: Any, active: Any) -> Any:
-        """``mirrored`` by facets of metal instead of perfect mirrors."""
+        """Reflectance ``mirrored`` times that of facets of metal."""
         share = mi.unpolarized_spectrum(mirrored)
         metal = self._reflection(ctx, si, wo, active)
         # Where nothing is mirrored, too: a colour of zero has a derivative.

@@ -1,4 +1,4 @@
-"""Which BSDFs of a scene scatter late, looked up by their number in Dr.Jit's registry.
+"""Table of the delayed BSDFs of a scene, by their number in Dr.Jit's registry.
 
 A path chooses at each such surface, once for everything that it does there, whether it takes part in the elastic or in
 the delayed scattering; from then on it sees the BSDF of that part alone, by a pointer of its own. So nothing has to be
@@ -27,14 +27,15 @@ _created = 0
 
 
 def note_creation():
-    """A plugin of this kind exists: before that, no scene needs to be searched for it."""
+    """Record that a delayed BSDF exists: before that, no scene needs to be searched for one."""
     global _created
     _created += 1
 
 
 class DelaySample:
-    """How a surface scatters a path: ``bsdf`` in its stead, the factor ``weight``, the ``delay`` in metres and the
-    ``wavelengths`` beyond the surface; None where nothing changes. A plain object that lives within one iteration.
+    """Choice between elastic and delayed scattering at a surface: ``bsdf`` in its stead, the factor ``weight``, the
+    ``delay`` in metres and the ``wavelengths`` beyond the surface; None where nothing changes. A plain object that
+    lives within one iteration.
     """
 
     def __init__(self, bsdf, weight=None, delay=None, wavelengths=None):
@@ -56,7 +57,7 @@ class DelaySample:
 
 
 class SpectralShift:
-    """From the wavelength that a path left a surface with to the one that it was excited by.
+    """Shift from the wavelength with which a path left a surface to the one that excited it.
 
     With photons per nanometre ``emission`` (normalised) and absorptance ``excitation``, the radiance at L is
     ``emission(L) / L`` times the integral of ``excitation(l) l`` times the radiance at l; l is drawn in proportion to
@@ -68,7 +69,7 @@ class SpectralShift:
         self.emission = _distribution(emission, "emission")
 
     def draw(self, u, wavelengths):
-        """(wavelengths absorbed, factor of the radiance) for wavelengths emitted and one uniform number."""
+        """Return (wavelengths absorbed, factor of the radiance) for wavelengths emitted and one uniform number."""
         numbers = mi.sample_shifted(u)
         absorbed, factor = mi.UnpolarizedSpectrum(0), mi.UnpolarizedSpectrum(0)
         for k in range(len(wavelengths)):
@@ -94,7 +95,7 @@ def _distribution(curve, name):
 
 
 class DelayedBSDFs:
-    """The delayed BSDFs of a scene: what of them does not change with their parameters."""
+    """Delayed BSDFs of a scene, as far as they do not change with their parameters."""
 
     def __init__(self, bsdfs):
         self.bsdfs = bsdfs
@@ -113,7 +114,7 @@ class DelayedBSDFs:
 
     @property
     def shifts(self) -> bool:
-        """Whether wavelengths change along a path."""
+        """Return whether wavelengths change along a path."""
         return bool(self.spectral_shifts)
 
     def read(self) -> DelayTable:
@@ -143,7 +144,7 @@ class DelayTable:
         return [t for t in (self.lifetimes, self.elastic_weights, self.delayed_weights) if dr.grad_enabled(t)]
 
     def sample(self, bsdf, u, wavelengths) -> DelaySample:
-        """How surfaces with BSDFs ``bsdf`` scatter, for two uniform numbers ``u``."""
+        """Sample elastic or delayed scattering of the surfaces' ``bsdf``, from two uniform numbers ``u``."""
         row = self._of.rows.look_up(bsdf)
         there = row > 0
         row = dr.select(there, row - 1, 0)
@@ -192,13 +193,13 @@ def _gathered(values):
 
 
 def _scatters_late(bsdf) -> bool:
-    """Whether a BSDF declares that its light comes back late."""
+    """Return whether a BSDF declares that its light comes back late."""
     return getattr(bsdf, "scatters_late", False)
 
 
 def delays_of(bsdfs):
-    """(BSDFs that paths can meet, the delayed ones): delayed BSDFs are replaced by their parts; the latter is None
-    where there are none. Raises SceneError for one inside another BSDF.
+    """Return (BSDFs that paths can meet, the delayed ones): delayed BSDFs are replaced by their parts; the latter is
+    None where there are none. Raises SceneError for one inside another BSDF.
     """
     if _created == 0:
         return bsdfs, None

@@ -22,7 +22,7 @@ from torchtransient.units import SPEED_OF_LIGHT
 
 
 class DelayedBSDF(mi.BSDF):
-    """A nested BSDF whose light comes back late, beside one that scatters at once (:monosp:`delayed`).
+    """Nested BSDF with delayed scattering, beside one that scatters at once (:monosp:`delayed`).
 
     The light that the nested BSDF scatters is held for a random time and multiplied by the quantum yield:
     ``f(t) = f_elastic delta(t) + quantum_yield f_nested p(t)`` with the density ``p`` of the delay.
@@ -148,7 +148,7 @@ class DelayedBSDF(mi.BSDF):
 
 
 def _children(props: Any) -> tuple[Any, Any]:
-    """(nested, elastic)."""
+    """Return (nested, elastic)."""
     found = {}
     for name in list(props.keys()):
         if props.type(name) == mi.Properties.Type.Object:
@@ -174,7 +174,7 @@ def _number(props: Any, name: str, default: float, low: float, high: float) -> A
 
 
 def _decay(props: Any) -> tuple[np.ndarray | None, float | None]:
-    """(delays in units of their mean at equal steps of probability, mean in metres); None for an exponential."""
+    """Return (delays in units of their mean at equal steps of probability, mean in metres); None for an exponential."""
     given = [name for name in ("decay_opl", "decay_values") if name in props]
     if not given:
         return None, None

@@ -32,7 +32,7 @@ _MIN_ROOT_IN_SLOPE = 1e-6
 
 
 class FresnelTerms(NamedTuple):
-    """What happens to unpolarised light at an interface, one entry per direction."""
+    """Fresnel terms of unpolarised light at an interface, one entry per direction."""
 
     reflectance: Any
     """Reflected fraction of the power, in [0, 1]."""
@@ -167,7 +167,7 @@ def two_by_two(a: Any, b: Any, c: Any, s: Any) -> Any:
 
 
 def across_plane(matrix: Any, normal: Any, wi: Any, wo: Any) -> Any:
-    """A matrix between the frames across the plane of incidence, given between Mitsuba's implicit frames instead.
+    """Convert a matrix between the frames across the plane of incidence to one between Mitsuba's implicit frames.
 
     Light comes along ``-wo`` and leaves along ``wi``; ``normal`` spans the plane with them.
     """
@@ -211,6 +211,6 @@ def metal_reflection(cos_theta_i: Any, eta: Any, k: Any) -> Any:
 
 
 def _reciprocal(x: Any) -> Any:
-    """One over ``x``, zero where it is zero: a grazing direction on a medium that is not there."""
+    """Return 1 / x, zero at zero: a grazing direction where both indices are equal."""
     there = x > 1e-36
     return dr.select(there, dr.rcp(dr.select(there, x, 1.0)), 0.0)

@@ -50,12 +50,12 @@ _POWERS, _INVERSE_POWERS = 21, 12
 
 
 def _power_coefficients(order: int) -> list[float]:
-    """Of ``(x / 2)^order sum_k c_k (x^2 / 4)^k``."""
+    """Return the coefficients of ``(x / 2)^order sum_k c_k (x^2 / 4)^k``."""
     return [1 / (factorial(k) * factorial(k + order)) for k in range(_POWERS)]
 
 
 def _asymptotic_coefficients(order: int) -> list[float]:
-    """Of ``exp(x) / sqrt(2 pi x) sum_k c_k / x^k``."""
+    """Return the coefficients of ``exp(x) / sqrt(2 pi x) sum_k c_k / x^k``."""
     return [
         prod((2 * j - 1) ** 2 - 4 * order**2 for j in range(1, k + 1)) / (factorial(k) * 8**k)
         for k in range(_INVERSE_POWERS)
@@ -105,7 +105,7 @@ LEAST_ROUGHNESS = 1e-3
 
 @dataclass(frozen=True)
 class Fibre:
-    """What the lobes are made of, for light from one direction. Lists have an entry for each lobe, the rest last."""
+    """Parameters of the lobes, for light from one direction. Lists have an entry for each lobe, the rest last."""
 
     sines: list[Any]
     """Of the tilted longitudinal angle that a lobe is reflected from."""
@@ -178,8 +178,8 @@ class DiffHair(mi.BSDF):
         return sum(getattr(self, name) * spectrum(si) for name, spectrum in self.pigments.items())
 
     def _shares(self, si: Any, active: Any, inside: Any, beyond: Any) -> list[Any]:
-        """``A_p``. ``inside``: the index times the cosine of the refracted ray; ``beyond``: that of its projection on
-        the plane along the fibre, squared.
+        """Attenuations ``A_p``. ``inside``: the index times the cosine of the refracted ray; ``beyond``: that of its
+        projection on the plane along the fibre, squared.
         """
         # Where nothing enters, nothing is inside.
         length = 2 * self.eta * inside / dr.select(beyond > 0, beyond, 1)
@@ -221,7 +221,7 @@ class DiffHair(mi.BSDF):
         )
 
     def _densities(self, fibre: Fibre, wi: Any, wo: Any) -> list[Any]:
-        """``M_p N_p`` per solid angle."""
+        """Densities ``M_p N_p`` per solid angle."""
         sin_o, cos_o = wo.y, sqrt_with_bounded_slope(wo.x * wo.x + wo.z * wo.z)
         around_fibre = _angle(wo.z * wi.x - wo.x * wi.z, wo.x * wi.x + wo.z * wi.z)
         around = [_azimuthal(around_fibre - turn, fibre.scale) for turn in fibre.turns] + [mi.Float(0.5 / pi)]
@@ -315,13 +315,13 @@ def _at_least(roughness: Any) -> Any:
 
 
 def _longitudinal_variance(roughness: Any) -> Any:
-    """Of light that is reflected (p = 0); Chiang et al. 2016, equation 7."""
+    """Longitudinal variance of reflected light (p = 0); Chiang et al. 2016, equation 7."""
     r = _at_least(roughness)
     return dr.square(0.726 * r + 0.812 * r**2 + 3.7 * r**20)
 
 
 def _azimuthal_scale(roughness: Any) -> Any:
-    """Of the logistic distribution; Chiang et al. 2016, equation 8."""
+    """Scale of the logistic distribution of azimuths; Chiang et al. 2016, equation 8."""
     r = _at_least(roughness)
     return sqrt(pi / 8) * (0.265 * r + 1.194 * r**2 + 5.372 * r**22)
 
@@ -330,7 +330,7 @@ def _azimuthal_scale(roughness: Any) -> Any:
 
 
 def _longitudinal(sin_i: Any, cos_i: Any, sin_o: Any, cos_o: Any, concentration: Any) -> Any:
-    """``M_p``, which integrates to one over the sine of the angle."""
+    """Longitudinal term ``M_p``, which integrates to one over the sine of the angle."""
     # 1 + sin sin' - cos cos', whose digits a concentration of thousands needs.
     deviation = 0.5 * (dr.square(sin_i + sin_o) + dr.square(cos_i - cos_o))
     peak = scaled_i0(concentration * cos_i * cos_o) * dr.exp(-concentration * deviation)
@@ -338,7 +338,7 @@ def _longitudinal(sin_i: Any, cos_i: Any, sin_o: Any, cos_o: Any, concentration:
 
 
 def _azimuthal(angle: Any, scale: Any) -> Any:
-    """``N_p`` at an angle from the perfect path, which integrates to one over a turn."""
+    """Azimuthal term ``N_p`` at an angle from the perfect path, which integrates to one over a turn."""
     turn = 2 * pi
     angle = dr.abs(angle - turn * dr.round(angle / turn))
     fading = dr.exp(-angle / scale)
@@ -346,7 +346,7 @@ def _azimuthal(angle: Any, scale: Any) -> Any:
 
 
 def _angle(y: Any, x: Any) -> Any:
-    """``atan2``, zero with a slope of zero where both are zero."""
+    """Return ``atan2``, zero with a slope of zero where both are zero."""
     nowhere = (y == 0) & (x == 0)
     return dr.atan2(y, dr.select(nowhere, 1, x))
 
@@ -358,7 +358,7 @@ def _brightness(spectrum: Any, si: Any) -> Any:
 
 
 def _draw(fibre: Fibre, chances: list[Any], wi: Any, sample1: Any, sample2: Any) -> Any:
-    """A direction out of the lobes; d'Eon, Marschner and Hanika 2013."""
+    """Sample a direction from the lobes; d'Eon, Marschner and Hanika 2013."""
     lobe = mi.UInt32(0)
     left, chance = mi.Float(sample1), chances[0]
     for after in range(LOBES):
@@ -368,13 +368,13 @@ def _draw(fibre: Fibre, chances: list[Any], wi: Any, sample1: Any, sample2: Any)
         chance = dr.select(further, chances[after + 1], chance)
     u = dr.clip(left / dr.select(chance > 0, chance, 1), 0, 1)
 
-    def of_lobe(entries: list[Any]) -> Any:
+    def select_lobe(entries: list[Any]) -> Any:
         chosen = entries[-1]
         for p in range(LOBES):
             chosen = dr.select(lobe == p, entries[p], chosen)
         return chosen
 
-    sin_i, cos_i, concentration = map(of_lobe, (fibre.sines, fibre.cosines, fibre.concentrations))
+    sin_i, cos_i, concentration = map(select_lobe, (fibre.sines, fibre.cosines, fibre.concentrations))
     # The polar angle of a von Mises-Fisher distribution, as one minus its cosine.
     fading = dr.exp(-2 * concentration)
     away = -dr.log(sample2.x + (1 - sample2.x) * fading) / concentration
@@ -386,7 +386,7 @@ def _draw(fibre: Fibre, chances: list[Any], wi: Any, sample1: Any, sample2: Any)
     cut = 0.5 * (1 - dr.tanh(0.5 * pi / fibre.scale))
     logistic = cut + u * (1 - 2 * cut)
     strayed = dr.clip(fibre.scale * dr.log(logistic / (1 - logistic)), -pi, pi)
-    turn = dr.select(lobe == LOBES, 2 * pi * u, of_lobe([*fibre.turns, mi.Float(0)]) + strayed)
+    turn = dr.select(lobe == LOBES, 2 * pi * u, select_lobe([*fibre.turns, mi.Float(0)]) + strayed)
     sin_phi, cos_phi = dr.sincos(_angle(wi.z, wi.x) + turn)
     return dr.normalize(mi.Vector3f(cos_o * cos_phi, sin_o, cos_o * sin_phi))
 

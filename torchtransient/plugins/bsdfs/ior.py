@@ -16,7 +16,7 @@ LEAST_SHARE = 0.25
 
 
 def relative_index(props: Any, plugin: str, default: str = "bk7") -> Any:
-    """``int_ior / ext_ior`` as a Dr.Jit scalar; each a number or a material name, by ``default`` in ``air``.
+    """Return ``int_ior / ext_ior`` as a Dr.Jit scalar; each a number or a material name, by ``default`` in ``air``.
 
     Names are looked up by Mitsuba itself: its own ``dielectric`` is built from the same two values and asked for its
     ``eta``, so that the table of materials and its spelling are the installed version's.
@@ -57,7 +57,9 @@ def opaque(value: Any) -> Any:
 
 
 def textured(value: Any, texture: Any | None, si: Any, active: Any) -> Any:
-    """``value`` times the texture's colour at ``si``, as an unpolarised spectrum; a factor of one without a texture."""
+    """Return ``value`` times the texture's colour at ``si``, as an unpolarised spectrum; a factor of one without a
+    texture.
+    """
     if texture is None:
         return mi.UnpolarizedSpectrum(value)
     return texture.eval(si, active) * value

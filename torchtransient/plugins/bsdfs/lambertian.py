@@ -1,4 +1,4 @@
-"""Which BSDFs are Lambertian: what scatters alike in all directions can be written down without asking a plugin."""
+"""Recognition of Lambertian BSDFs, whose value is known without calling the plugin."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ from torchtransient.plugins.node_walk import bsdfs_below
 
 
 def is_lambertian(bsdf: Any) -> bool:
-    """Whether a BSDF is Mitsuba's ``diffuse``, or ``twosided`` around nothing else.
-
-    By class: the flags of a BSDF of someone else may say that it is diffuse, and mean that it is not glossy.
+    """Return whether a BSDF is Mitsuba's ``diffuse``, or ``twosided`` around nothing else. By class, since other
+    plugins may set the diffuse flag without being Lambertian.
     """
     name = bsdf.class_name()
     if name == "TwoSidedBRDF":
@@ -22,5 +21,5 @@ def is_lambertian(bsdf: Any) -> bool:
 
 
 def scatters_behind(bsdf: Any) -> Any:
-    """Whether light scatters on the side that the normal turns away from, too (a mask for BSDF pointers)."""
+    """Return whether light scatters behind the normal as well (a mask for BSDF pointers)."""
     return mi.has_flag(bsdf.flags(), mi.BSDFFlags.BackSide)

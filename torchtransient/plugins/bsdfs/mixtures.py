@@ -40,13 +40,14 @@ from torchtransient.plugins.node_walk import bsdfs_below, objects_below, objects
 from torchtransient.plugins.parameter_effect import class_of
 
 # ----------------------------------------------------------------------------------------------------------------------
-# What a BSDF has of those that it holds: mistakes of Mitsuba's that shine through whatever is around them.
-# They are told by the classes of all BSDFs that a plugin shows. Plugins of others do what they like with what they
-# hold, and say so by an attribute of the name of the function here, True or False, which counts for all below as well.
+# Mistakes of nested BSDFs that remain in the BSDFs around them, recognised by the classes of all BSDFs that a plugin
+# shows. Other plugins declare them by an attribute with the name of the function here, True or False, which counts for
+# all BSDFs below as well.
 
 
 def hides_lobe_probability(bsdf: Any) -> bool:
-    """Whether the weight of a delta lobe lacks the derivative of the lobe's probability, which has to be put back.
+    """Return whether the weight of a delta lobe lacks the derivative of the lobe's probability, which has to be put
+    back.
 
     Of a mixture (mask, blend) it is asked for each part, since a part's probability hides its weight as well.
     """
@@ -54,7 +55,7 @@ def hides_lobe_probability(bsdf: Any) -> bool:
 
 
 def mirrors_matrices(bsdf: Any) -> bool:
-    """Whether a BSDF is ``twosided`` or holds one (in a mask, in a blend).
+    """Return whether a BSDF is ``twosided`` or holds one (in a mask, in a blend).
 
     From behind, Mitsuba's ``twosided`` evaluates what it holds for the mirror images of the directions, and returns its
     Mueller matrix as if it belonged to the directions themselves: turned, and with the hands of circular light
@@ -64,8 +65,8 @@ def mirrors_matrices(bsdf: Any) -> bool:
 
 
 def _has(bsdf: Any, attribute: str, itself: Callable[[Any], bool], ends: Callable[[Any], bool]) -> bool:
-    """Whether ``bsdf`` declares ``attribute``, or one that it holds has what is asked ``itself``; not below what
-    ``ends`` the search.
+    """Return the ``attribute`` that ``bsdf`` declares, else whether it or a BSDF below satisfies ``itself``; the search
+    stops at BSDFs that satisfy ``ends``.
     """
     declared = getattr(bsdf, attribute, None)
     if declared is not None:
@@ -77,16 +78,15 @@ def _has(bsdf: Any, attribute: str, itself: Callable[[Any], bool], ends: Callabl
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Copies of BSDFs that hold one other (two-sided, bump and normal maps), around another nested one.
-#
 
 
 def can_be_rebuilt(wrapper: Any) -> bool:
-    """Whether a BSDF is one that :func:`rebuild_wrapper` knows."""
+    """Return whether a BSDF is one that :func:`rebuild_wrapper` knows."""
     return is_two_sided_itself(wrapper) or normal_texture(wrapper) is not None
 
 
 def rebuild_wrapper(wrapper: Any, nested: Any, flags: dict[str, bool]) -> Any:
-    """A BSDF that does to ``nested`` what ``wrapper`` (two-sided, bump or normal map) does to the one it holds. Shares
+    """Wrap ``nested`` as ``wrapper`` (two-sided, bump or normal map) wraps its own nested BSDF. Shares
     the textures. ``flags``: see :func:`flags_of`.
     """
     slot = normal_texture(wrapper)
@@ -120,7 +120,7 @@ def flags_of(wrapper: Any) -> dict[str, bool]:
 
 @contextmanager
 def _telling_values(wrapper: Any) -> Iterator[None]:
-    """For the time of a question: random numbers in all textures below a BSDF, and a scale that is not zero."""
+    """Put random numbers in all textures below a BSDF, and a scale that is not zero, within the context."""
     rng, before = np.random.default_rng(0), []
     try:
         with dr.resume_grad():
@@ -174,14 +174,14 @@ FAINT = 0.05
 
 @dataclass(frozen=True)
 class Leaf:
-    """A part; ``index`` among those of its mixture."""
+    """Part of a mixture; ``index`` among its parts."""
 
     index: int
 
 
 @dataclass(frozen=True)
 class Choice:
-    """``second`` with the weight that ``texture`` has, ``first`` with the rest."""
+    """Choice of ``second`` with the weight of ``texture``, of ``first`` with the rest."""
 
     texture: Any
     first: Any
@@ -251,11 +251,11 @@ class Mixture:
                 params.update()
 
     def taken_apart(self, derivatives: bool) -> tuple[bool, bool]:
-        """(everywhere, where a weight is about 0 or 1)."""
+        """Return (everywhere, where a weight is about 0 or 1)."""
         return self.for_derivatives if derivatives else self.always, derivatives and self._has_derivative()
 
     def _has_derivative(self) -> bool:
-        """Whether one of its weights carries derivatives; asked with gradients enabled."""
+        """Return whether one of the weights carries derivatives; call with gradients enabled."""
         numbers = (value for texture in self.textures for value in numbers_below(texture, self._shapes))
         return any(map(dr.grad_enabled, numbers))
 
@@ -275,7 +275,7 @@ class Seal:
                     f"{self._names(part)}. Mitsuba samples a blend wrongly of which a part has a delta lobe or lets "
                     f"light through, or works on other sides than another. {self._REMEDY}"
                 )
-        # One that says what its weights hide is taken at its word.
+        # A declared value counts without a look at the parts.
         silent = getattr(node, "hides_lobe_probability", None) is None
         self._hides = silent and any(hides_lobe_probability(part) for part in held)
 
@@ -307,20 +307,22 @@ class Seal:
 
 
 def needs_choice(node: Any) -> bool:
-    """Whether a mixture has wrong values where Mitsuba samples it as a whole."""
+    """Return whether a mixture has wrong values where Mitsuba samples it as a whole."""
     held = [part for _, part in objects_of(node) if isinstance(part, mi.BSDF)]
     return adds_up_wrongly(node, held, objects_below(node, mi.BSDF))
 
 
 def is_mixture(node: Any) -> bool:
-    """Whether a BSDF or phase function is a mixture, or one that can be rebuilt around the parts of what it holds."""
+    """Return whether a BSDF or phase function is a mixture, or one that can be rebuilt around the parts of what it
+    holds.
+    """
     if weight_slot(node) is not None:
         return True
     return can_be_rebuilt(node) and any(is_mixture(part) for part in bsdfs_below(node))
 
 
 def seals_of(node: Any, kind: type, shapes: Sequence[Any]) -> list[Seal]:
-    """Of a BSDF or phase function and all that it holds."""
+    """Return the seals of a BSDF or phase function and all that it holds."""
     others = (part for part in (node, *objects_below(node, kind)) if weight_slot(part) is None)
     return [
         Seal(part, kind, shapes)
@@ -330,7 +332,7 @@ def seals_of(node: Any, kind: type, shapes: Sequence[Any]) -> list[Seal]:
 
 
 class Mixtures:
-    """The mixtures of a scene: what of them does not change with their parameters."""
+    """Mixtures of a scene, as far as they do not change with their parameters."""
 
     def __init__(self, mixtures: list[Mixture], seals: list[Seal]) -> None:
         self.mixtures, self._seals = {mixture.node.ptr: mixture for mixture in mixtures}, seals
@@ -343,7 +345,9 @@ class Mixtures:
         dr.make_opaque(self._numbers)
 
     def read(self, wanted: Any) -> MixtureChoice | None:
-        """Which of them are taken apart in a job, None for none; ``wanted``: the derivatives of the job, or None."""
+        """Return the mixtures that a job takes apart, None for none; ``wanted``: the derivatives of the job, or
+        None.
+        """
         for mixture in self.mixtures.values():
             mixture.follow()
         with dr.resume_grad():
@@ -376,7 +380,7 @@ class MixtureChoice:
         sample.weight = weight if sample.weight is None else sample.weight * weight
 
     def part_of(self, pointer: Any, interaction: Any, u: Any, active: Any) -> tuple[Any, Any]:
-        """(pointer to one part of what ``pointer`` points to, its weight over its probability)."""
+        """Return (pointer to one part of what ``pointer`` points to, its weight over its probability)."""
         kind = type(pointer)
         pointer_or_none = dr.select(active, pointer, dr.zeros(kind))
         index, weight, apart = dr.dispatch(pointer_or_none, self._choose, interaction, u, active)
@@ -385,7 +389,7 @@ class MixtureChoice:
         return dr.reinterpret_array(kind, number), dr.select(apart, weight, 1)
 
     def _choose(self, node: Any, interaction: Any, u: Any, active: Any) -> tuple[Any, Any, Any]:
-        """(number of a part, its weight over its probability, whether it takes the place of ``node``)."""
+        """Return (number of a part, its weight over its probability, whether it takes the place of ``node``)."""
         everywhere, at_ends = self._chosen.get(node.ptr, (False, False))
         if not (everywhere or at_ends):
             return mi.UInt32(0), mi.Float(1), mi.Bool(False)
@@ -394,7 +398,9 @@ class MixtureChoice:
 
 
 def _descend(tree: Any, interaction: Any, u: Any, active: Any, at_ends: bool) -> tuple[Any, Any, Any]:
-    """(number of a part, its weight over its probability, whether a weight on the way or beside it is about 0 or 1)."""
+    """Return (number of a part, its weight over its probability, whether a weight on the way or beside it is about 0 or
+    1).
+    """
     if isinstance(tree, Leaf):
         return mi.UInt32(tree.index), mi.Float(1), mi.Bool(False)
     if isinstance(tree, Sides):
@@ -418,8 +424,9 @@ def _descend(tree: Any, interaction: Any, u: Any, active: Any, at_ends: bool) ->
 
 
 def mixtures_of(nodes: list[Any], kind: type, shapes: Sequence[Any] = ()) -> tuple[list[Any], Mixtures | None]:
-    """(BSDFs or phase functions that paths can meet, the mixtures among them or None): a mixture that is always taken
-    apart is replaced by its parts, the parts of others join it. ``shapes``: those that weights may be attributes of.
+    """Return (BSDFs or phase functions that paths can meet, the mixtures among them or None): a mixture that is always
+    taken apart is replaced by its parts, the parts of others join it. ``shapes``: those that weights may be attributes
+    of.
     """
     met: list[Any] = []
     mixtures: list[Mixture] = []

@@ -50,7 +50,7 @@ class DiffPlastic(mi.BSDF):
         self.follow_derivatives(True)
 
     def follow_derivatives(self, asked: bool) -> None:
-        """As :meth:`.principled.DiffPrincipled.follow_derivatives`."""
+        """Follow derivatives as :meth:`.principled.DiffPrincipled.follow_derivatives`."""
         lobes = [lobe for lobe in (self.specular_reflectance, self.diffuse_reflectance) if lobe is not None]
         followed = asked and any(carries_derivatives(lobe) for lobe in lobes)
         if followed != self._followed:

@@ -15,8 +15,8 @@ _DIFFUSE, _SPECULAR = "diffuse_reflectance", "specular_reflectance"
 
 
 class Reflectance(mi.Texture):
-    """The reflectance of a lobe. Mitsuba's plugin samples its lobes by the means of their textures; ``share`` is what
-    it is told instead.
+    """Reflectance of a lobe. Mitsuba's plugin samples its lobes by the means of their textures; ``share`` replaces that
+    mean.
     """
 
     def __init__(self, texture: Any) -> None:
@@ -64,7 +64,7 @@ class DiffPolarizedPlastic(mi.BSDF):
         self.follow_derivatives(True)
 
     def follow_derivatives(self, asked: bool) -> None:
-        """As :meth:`.principled.DiffPrincipled.follow_derivatives`."""
+        """Follow derivatives as :meth:`.principled.DiffPrincipled.follow_derivatives`."""
         given = [texture for texture in self.textures.values() if texture is not None]
         followed = asked and any(carries_derivatives(texture) for texture in given)
         if followed == self._followed:

@@ -33,8 +33,8 @@ LEAST_COLOUR = 1e-4
 
 
 class Reading:
-    """How the weights are read now: ``how``, and ``away``, those that sampling keeps away from their ends because
-    derivatives by them are computed.
+    """Rule for reading the weights: ``how``, and ``away``, the weights kept off their ends in sampling because they
+    carry derivatives.
     """
 
     def __init__(self) -> None:
@@ -209,14 +209,14 @@ class DiffPrincipled(mi.BSDF):
         params.update()
 
     def _away_from_one(self) -> Any:
-        """The index as Mitsuba is handed it, with the derivative."""
+        """Return the index for Mitsuba, moved off one, with the derivative."""
         one, instead = ONE[self.index]
         value = self.index_value
         return dr.select(dr.abs(value - one) < 1e-12, value + (instead - one), value)
 
     # ------------------------------------------------------------------------------------------- as it is read
 
-    def _asked(self, how: str, method: str, *arguments: Any) -> Any:
+    def _call(self, how: str, method: str, *arguments: Any) -> Any:
         self.reading.how = how
         try:
             return getattr(self.own, method)(*arguments)
@@ -225,17 +225,17 @@ class DiffPrincipled(mi.BSDF):
 
     def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
         with dr.suspend_grad():
-            value = self._asked(AS_IT_IS, "eval", ctx, si, wo, active)
-        return dr.replace_grad(value, self._asked(BESIDE_ITS_END, "eval", ctx, si, wo, active))
+            value = self._call(AS_IT_IS, "eval", ctx, si, wo, active)
+        return dr.replace_grad(value, self._call(BESIDE_ITS_END, "eval", ctx, si, wo, active))
 
     def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-        return self._asked(AWAY_FROM_ITS_END, "pdf", ctx, si, wo, active)
+        return self._call(AWAY_FROM_ITS_END, "pdf", ctx, si, wo, active)
 
     def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
         return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
 
     def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> Any:
-        bs, weight = self._asked(AWAY_FROM_ITS_END, "sample", ctx, si, sample1, sample2, active)
+        bs, weight = self._call(AWAY_FROM_ITS_END, "sample", ctx, si, sample1, sample2, active)
         # Samples that Mitsuba throws away have a density all the same.
         kept = mi.Mask(active) & (bs.pdf > 0) & (dr.max(mi.unpolarized_spectrum(weight)) > 0)
         bs = dr.detach(bs)
@@ -266,7 +266,7 @@ class DiffPrincipledThin(DiffPrincipled):
     )  # fmt: skip
 
     def _read_index(self, props: Any) -> None:
-        """The index of a thin sheet is a texture."""
+        """Read the index; that of a thin sheet is a texture."""
 
     @staticmethod
     def _texture(props: Any, name: str, default: float) -> Any:

@@ -1,4 +1,4 @@
-"""Which BSDFs of a scene refract without being a delta function, and by which relative index.
+"""Table of the rough refractive BSDFs of a scene and their relative indices.
 
 Next-event estimation through a rough interface needs the index of the medium that the connection runs in, which is
 not the one that the path arrived in. Mitsuba's ``BSDF.eval`` does not tell it, so it is looked up here by the
@@ -51,7 +51,7 @@ class RefractiveBSDFs:
         return RefractiveBSDFs(entries) if entries else None
 
     def read(self) -> RefractionTable:
-        """The indices as they are now; to be called outside of loops, once a job. Raises as :meth:`of` where values
+        """Read the current indices; call outside of loops, once a job. Raises as :meth:`of` where values
         were installed since; a call that is recorded cannot look at numbers.
         """
         if not dr.flag(dr.JitFlag.FreezingScope):
@@ -94,8 +94,8 @@ class RefractionTable:
 
 
 def boundaries_of(bsdfs: list[Any]) -> list[tuple[Any, Any]]:
-    """(BSDF, what holds its relative index) for those of ``bsdfs`` that light enters another medium through, by a
-    smooth or a rough lobe. Of parts with different indices, the first counts: see :class:`..sensors.surroundings`.
+    """Return (BSDF, what holds its relative index) for those of ``bsdfs`` that light enters another medium through, by
+    a smooth or a rough lobe. Of parts with different indices, the first counts: see :class:`..sensors.surroundings`.
     """
     lobes = (mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.GlossyTransmission)
     leaves = ((bsdf, _refractive_leaves(bsdf, lobes)) for bsdf in bsdfs)

@@ -1,4 +1,4 @@
-"""How much light passes a rough dielectric coating, as tables that carry derivatives by roughness and index.
+"""Transmittance of a rough dielectric coating, as tables that carry derivatives by roughness and index.
 
 Mitsuba's ``roughplastic`` has the same tables, computed by the same quadrature outside of its graph.
 """
@@ -61,19 +61,17 @@ def look_up(table: Any, cos_theta: Any, active: Any) -> Any:
 
 
 def _refracts_all(eta: Any) -> bool:
-    """Whether light refracts at every angle on its way to the side whose relative index is ``eta``."""
+    """Return whether light refracts at every angle on its way to the side whose relative index is ``eta``."""
     return bool(dr.all(eta > 1))
 
 
 def _beside_one(eta: Any) -> Any:
-    """Where the slope by an index is taken: at exactly one there is no difference to divide by, and that beside it
-    stands in, which has no limit for smooth coatings.
-    """
+    """Move an index off exactly one, where its slope would divide by zero; smooth coatings have no limit there."""
     return dr.select(dr.detach(eta) == 1, 1 + _ABOVE, eta)
 
 
 def _with_slopes(f: Callable[[Any, Any], Any], alpha: Any, eta: Any, smooth: bool) -> Any:
-    """``f(alpha, eta)`` with its derivatives by what is attached, taken in forward mode: the graph that stays behind
+    """Evaluate ``f(alpha, eta)`` with derivatives by attached arguments in forward mode: the graph that remains
     has the size of the result instead of that of the quadrature. ``smooth``: by ``eta`` no difference is needed.
     """
     a, e = dr.detach(alpha), dr.detach(eta)

@@ -75,7 +75,7 @@ class DiffRoughPlastic(mi.BSDF):
         self.follow_derivatives(True)
 
     def follow_derivatives(self, asked: bool) -> None:
-        """As :meth:`.principled.DiffPrincipled.follow_derivatives`."""
+        """Follow derivatives as :meth:`.principled.DiffPrincipled.follow_derivatives`."""
         lobes = [lobe for lobe in (self.specular_reflectance, self.diffuse_reflectance) if lobe is not None]
         followed = asked and any(carries_derivatives(lobe) for lobe in lobes)
         if followed != self._followed:
@@ -110,7 +110,7 @@ class DiffRoughPlastic(mi.BSDF):
         wi = si.wi
         active = mi.Mask(active) & (wi.z > 0) & (wo.z > 0)
         passes = look_up(self.transmittance, wi.z, active)
-        of_specular = self._specular_probability(ctx, passes)
+        specular = self._specular_probability(ctx, passes)
 
         # The facet that mirrors one direction into the other, Walter et al. 2007, equation 20.
         alpha = self._alpha()
@@ -119,7 +119,7 @@ class DiffRoughPlastic(mi.BSDF):
         visible = smith_g1_over_cos(wi, m, alpha, alpha, self.ggx)
         wo_m = dr.dot(wo, m)
         drawn = visible if self.sample_visible else m.z / dr.select(active & (wo_m > 0), wo_m, 1)
-        pdf = dr.select(defined, of_specular * facets * drawn, 0) + (1 - of_specular) * wo.z * dr.inv_pi
+        pdf = dr.select(defined, specular * facets * drawn, 0) + (1 - specular) * wo.z * dr.inv_pi
 
         value = mi.UnpolarizedSpectrum(0)
         if has_specular:

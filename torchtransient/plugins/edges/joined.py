@@ -35,7 +35,7 @@ class Triangles:
     mesh: np.ndarray
 
     @staticmethod
-    def of(meshes: list[Any]) -> Triangles:
+    def from_meshes(meshes: list[Any]) -> Triangles:
         """Those of Mitsuba meshes, as they are now."""
         v = [host_numbers(mesh_positions(m), np.float32).reshape(-1, 3) for m in meshes]
         f = [np.array(mesh_faces(m), dtype=np.int64).reshape(-1, 3) for m in meshes]
@@ -102,8 +102,8 @@ def near_places(positions: np.ndarray, reach: np.ndarray) -> np.ndarray:
         cell = p[some] / np.ldexp(APART, size)
         # Two points nearer than half a cell share one in some of the eight shifted grids.
         for shift in range(8 if len(some) else 0):
-            of_grid = np.floor(cell + 0.5 * np.array([shift & 1, shift >> 1 & 1, shift >> 2 & 1])).astype(np.int64)
-            _, index, inverse = np.unique(of_grid, axis=0, return_index=True, return_inverse=True)
+            cells = np.floor(cell + 0.5 * np.array([shift & 1, shift >> 1 & 1, shift >> 2 & 1])).astype(np.int64)
+            _, index, inverse = np.unique(cells, axis=0, return_index=True, return_inverse=True)
             groups.append(np.stack([some, some[index[inverse.ravel()]]], 1))
     return merged(np.concatenate(groups), len(p), numbered=False)
 

@@ -91,11 +91,11 @@ class EdgeTable:
             weight = self._by_length_and_body()
             self.by_length = self.of_moving = EdgeDensity(weight, dr.cumsum(mi.Float64(weight)))
             if (moves := topology.moves(moving)) is not None:
-                own, of_all = weight * moves, self.by_length
+                own, whole = weight * moves, self.by_length
                 self.of_moving = EdgeDensity(own, dr.cumsum(mi.Float64(own)))
-                share = [dr.select(one.total > 0, dr.rcp(one.total), 0) for one in (of_all, self.of_moving)]
+                share = [dr.select(one.total > 0, dr.rcp(one.total), 0) for one in (whole, self.of_moving)]
                 mixed = weight * mi.Float(share[0]) + own * mi.Float(share[1])
-                cumulative = of_all.cumulative * share[0] + self.of_moving.cumulative * share[1]
+                cumulative = whole.cumulative * share[0] + self.of_moving.cumulative * share[1]
                 self.by_length = EdgeDensity(mixed, cumulative)
         dr.eval(self.ends, self.third, self.flags, vars(self.by_length), vars(self.of_moving))
 
@@ -177,7 +177,7 @@ class EdgeTable:
             k.near = dr.select(k.kind == EDGE, k.near, near)
 
     def _pick_around(self, density: EdgeDensity, around: Any, x: Any, u: Any) -> Local:
-        """As :meth:`pick`, but of the edges around a face for who is on one."""
+        """Pick as :meth:`pick` does, but of the edges around a face for viewers on it."""
         spokes = self.topology.spokes
         with dr.suspend_grad():
             e, _ = density.sample(x)
@@ -349,7 +349,8 @@ class EdgeTable:
         return mi.Vector3f(*[dr.dot(c, w) / volume for c in across]), [c * dr.sign(volume) for c in across]
 
     def _limb(self, k: Any, V: Any) -> tuple[Any, Any, Any, Any]:
-        """(place in the unit space, derivative of the point by ``u``, normal of a limb, whether ``V`` sees one)."""
+        """Return (place in the unit space, derivative of the point by ``u``, normal of a limb, whether ``V`` sees one).
+        """
         v, across = self._to_local(k, V - k.a)
         ball, tube = k.kind == BALL, _is_tube(k.kind)
         sin, cos = dr.sincos(k.u * dr.two_pi)
@@ -391,5 +392,5 @@ def _across(w: Any, t: Any) -> Any:
 
 
 def _bend(k: Any, ha: Any, hb: Any) -> Any:
-    """How much a crease counts, from 0, flat, to 1. Two bodies may differ where they are flat."""
+    """Weight of a crease, from 0, flat, to 1. Two bodies may differ where they are flat."""
     return dr.select(k.flags & SEAM != 0, 1, 0.5 * dr.norm(ha + hb))

@@ -1,4 +1,4 @@
-"""Which edges and limbs a scene has: corners, faces and shapes, without their numbers.
+"""Edges and limbs of a scene: corners, faces and shapes, without positions.
 
 Laid out with numpy once a scene. Positions are looked at to join what was put together and to order three and more
 faces around an edge; all that is computed of them later is read anew (:class:`.table.EdgeTable`).
@@ -124,8 +124,8 @@ def _numbers_of(mesh: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _edges_of(positions: np.ndarray, faces: np.ndarray, solid: np.ndarray) -> tuple[_Rows, np.ndarray]:
-    """(the edges of a mesh with vertices (V, 3) and faces (F, 3), flat ones included; joined places of the corners of
-    its faces, (F, 3), zeros where a face is not ``solid`` (F,): has no area).
+    """Return (the edges of a mesh with vertices (V, 3) and faces (F, 3), flat ones included; joined places of the
+    corners of its faces, (F, 3), zeros where a face is not ``solid`` (F,): has no area).
     """
     all_places = np.zeros(faces.shape, int)
     number = np.flatnonzero(solid)
@@ -227,7 +227,7 @@ class Topology:
         dr.make_opaque(self.faces, self.owners, self.place, self.index, self.shape, self.instance)
 
     def _found(self, meshes: list[Any]) -> dict[int, tuple[_Rows, np.ndarray]]:
-        """What :func:`_edges_of` says of each mesh that has edges."""
+        """Results of :func:`_edges_of`, one per mesh with edges."""
         self._flat, found = [], {}
         for mesh in {mesh.ptr: mesh for mesh in meshes}.values():
             positions, faces, solid = _numbers_of(mesh)
@@ -238,11 +238,13 @@ class Topology:
         return found
 
     def areas(self) -> bytes:
-        """Which faces have an area now, of the meshes in which some had none; empty where there are none."""
+        """Masks of the faces with an area now, of the meshes in which some had none; empty without such meshes."""
         return b"".join(np.packbits(_numbers_of(mesh)[2]).tobytes() for mesh in self._flat)
 
     def _edges(self, found: dict[int, tuple[_Rows, np.ndarray]]) -> tuple[_Rows, np.ndarray, np.ndarray]:
-        """(edges of all meshes, vertices counted through; bodies of both faces, (E, 2); first vertices of meshes)."""
+        """Return (edges of all meshes, vertices counted through; bodies of both faces, (E, 2); first vertices of
+        meshes).
+        """
         parts = [found[body.shape.ptr][0] for body in self._meshes]
         self.spokes = None
         if parts:

@@ -62,7 +62,7 @@ class AreaElements:
 
     @staticmethod
     def of(shapes: list[Any]) -> AreaElements:
-        """The elements of Mitsuba shapes, those without area too."""
+        """Build the elements of Mitsuba shapes, those without area included."""
         parts, left_out = [], []
         for number, shape in enumerate(shapes):
             rows = _rows_of(shape)
@@ -92,11 +92,11 @@ class AreaElements:
         return len(self.area)
 
     def take(self, order: np.ndarray) -> AreaElements:
-        """The elements of these numbers, in this order."""
+        """Return the elements of the given numbers, in order."""
         return AreaElements(*(column[order] for column in self.columns()), self.left_out)
 
     def columns(self) -> tuple[np.ndarray, ...]:
-        """The arrays, without the names of what is left out."""
+        """Return the arrays, without the names of the shapes left out."""
         return self.axes, self.kind, self.shape, self.primitive, self.area, self.normal, self.two_sided
 
     def centers(self) -> np.ndarray:
@@ -145,8 +145,8 @@ def local_point(kind: Any, a: Any, y: Any, math_of: Any, kinds: tuple[int, ...] 
 
 
 def can_be_listed(shape: Any) -> bool:
-    """Whether points can be drawn on a shape. Not on copies of groups, curves, signed distances and ellipsoids, nor on
-    sheared disks, spheres and cylinders, of which Mitsuba's rays meet something else than what its matrix says.
+    """Return whether points can be drawn on a shape. Not on copies of groups, curves, signed distances and ellipsoids,
+    nor on sheared disks, spheres and cylinders, where Mitsuba's rays disagree with the matrix.
     """
     if not has_surface(shape) or shape.is_ellipsoids():
         return False
@@ -154,7 +154,9 @@ def can_be_listed(shape: Any) -> bool:
 
 
 def _is_sheared(shape: Any) -> bool:
-    """Whether the axes of an analytic shape have lost their right angles, or those of a round one their length."""
+    """Return whether the axes of an analytic shape have lost their right angles, or those of a round one their
+    length.
+    """
     axes = _matrix(shape)[:3].T
     length = np.linalg.norm(axes, axis=1)
     same = {"Disk": [], "Sphere": [0, 1, 2], "Cylinder": [0, 1]}[shape.class_name()]
@@ -165,7 +167,7 @@ def _is_sheared(shape: Any) -> bool:
 
 
 def _rows_of(shape: Any) -> tuple[np.ndarray, int, np.ndarray, np.ndarray] | None:
-    """(axes, kind, area, normal) of one shape, None for what cannot be listed."""
+    """Return (axes, kind, area, normal) of one shape, None for what cannot be listed."""
     if not can_be_listed(shape):
         return None
     return _triangles(shape) if shape.is_mesh() else _analytic(shape, _KINDS[shape.class_name()])
@@ -196,7 +198,7 @@ def _corner_normals(mesh: Any, faces: np.ndarray) -> np.ndarray | None:
 
 
 def has_shading_normals(shape: Any) -> bool:
-    """Whether the normals at the corners of some triangle are not those of one side of its plane."""
+    """Return whether the normals at the corners of some triangle are not those of one side of its plane."""
     if not shape.is_mesh():
         return False
     at_corners = _corner_normals(shape, np.array(mesh_faces(shape), dtype=np.int64).reshape(-1, 3))

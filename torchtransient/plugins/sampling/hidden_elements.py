@@ -27,7 +27,7 @@ from torchtransient.plugins.sampling.area_elements import (
 
 
 def packed(values: np.ndarray) -> Any:
-    """A flat ``Float`` of the numbers, in memory of Dr.Jit's own.
+    """Copy numbers to a flat ``Float`` in Dr.Jit's own memory.
 
     Dr.Jit lays its array over numpy's memory otherwise. Where that does not begin at a multiple of 16 bytes, which is
     chance, packets are loaded number by number, by a kernel of its own.
@@ -40,8 +40,8 @@ def packed(values: np.ndarray) -> Any:
 
 
 def packed_columns(rows: list[list[Any]], count: int) -> Any:
-    """A flat ``Float`` with ``rows`` of four numbers (``Float`` arrays) for each lane, one lane after the other, filled
-    up with zeros to ``count`` lanes.
+    """Pack a flat ``Float`` with ``rows`` of four numbers (``Float`` arrays) for each lane, one lane after the other,
+    filled up with zeros to ``count`` lanes.
     """
     width = max(dr.width(column) for row in rows for column in row)
     target = dr.zeros(mi.Float, 4 * len(rows) * count)
@@ -89,8 +89,8 @@ def cuts_of(elements: AreaElements, points: np.ndarray) -> np.ndarray:
 
 
 def cut(elements: AreaElements, cuts: np.ndarray) -> tuple[AreaElements, np.ndarray, np.ndarray]:
-    """(the parts, ``(M,)``: whose part each is, ``(M,)``: in which cell of it). Cells are numbered along the two edges,
-    two for each square of a grid: ``2 (j n + i)``, and one more for the upper triangle.
+    """Return (the parts, ``(M,)``: whose part each is, ``(M,)``: in which cell of it). Cells are numbered along the two
+    edges, two for each square of a grid: ``2 (j n + i)``, and one more for the upper triangle.
     """
     numbers, cells = [np.flatnonzero(cuts == 1)], [np.zeros((cuts == 1).sum(), dtype=int)]
     for n in np.unique(cuts[cuts > 1]):
@@ -150,7 +150,7 @@ class PrimitiveDensity:
             self._frames = packed(_frames(uncut.take(records), cuts[records]))
 
     def look_up(self, shape: Any, prim_index: Any, p: Any, active: Any, tile: Any) -> Any:
-        """``Float``; 0 for what is not in the table."""
+        """Return the density (Float), 0 for what is not in the table."""
         start = self._start.look_up(shape, active)
         listed = mi.Mask(active) & (start > 0)
         index = start - 1 + prim_index
@@ -197,7 +197,7 @@ DEFENSIVE = 0.1
 
 class HiddenElements:
     """A density over the area of ``shapes``: uniform within an element, see :mod:`.area_elements`; triangles that are
-    large beside their distance from the wall are several elements (:mod:`.split_triangles`).
+    large beside their distance from the wall are several elements (:func:`cut`).
 
     The probability of an element is its area times the root mean square over wall points of ``cos^2 cos^2 / r^4``
     (both cosines, to the wall point and there), mixed with ``defensive`` of plain area. ``points`` and ``normals``
@@ -267,7 +267,7 @@ class HiddenElements:
         return memory.get("hidden elements", key, made)
 
     def reweighted(self, weights: np.ndarray) -> HiddenElements:
-        """The same elements drawn by other weights ``(tiles, E)``, finite and not negative, in the order of
+        """Return the same elements drawn by other weights ``(tiles, E)``, finite and not negative, in the order of
         ``elements``; the share of plain area stays. Before :meth:`put_first` alone.
         """
         other = copy(self)
@@ -278,7 +278,7 @@ class HiddenElements:
     # ----------------------------------------------------------------------------------------- tables
 
     def _probabilities(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """(tiles, elements)"""
+        """Return (tiles, elements)"""
         pairs = zip(points, normals, strict=True)
         return np.array([self._mixed(facing_weight(self.elements, q, n)) for q, n in pairs])
 
@@ -321,14 +321,14 @@ class HiddenElements:
     # ---------------------------------------------------------------------------------------- in kernels
 
     def draw(self, u: Any, active: Any = True, tile: Any = None) -> tuple[Any, Any]:
-        """A point and the geometric normal there (``Point3f``, ``Normal3f``) for two random numbers (``Point2f``) of
-        each lane; ``tile`` (``UInt32``): of which tile's density, the first where None.
+        """Draw a point and the geometric normal there (``Point3f``, ``Normal3f``) for two random numbers (``Point2f``)
+        of each lane; ``tile`` (``UInt32``): of which tile's density, the first where None.
         """
         element, a = self.select_element(mi.Float64(u.x), active, tile)
         return self.point(element, a, u.y, active)
 
     def draw_with_surface(self, x: Any, y: Any, active: Any = True) -> tuple[Any, Any, Any, Any, Any]:
-        """A point for two numbers in [0, 1) (``Float64``, ``Float``), the geometric normal there, its place on the
+        """Draw a point for two numbers in [0, 1) (``Float64``, ``Float``), the geometric normal there, its place on the
         primitive as in :meth:`coordinates`, and the shape and primitive that it lies on.
         """
         element, a = self.select_element(x, active)
@@ -336,8 +336,8 @@ class HiddenElements:
         return point, n, self.coordinates(element, a, y, active), *self.surface(element, active)
 
     def select_element(self, x: Any, active: Any = True, tile: Any = None) -> tuple[Any, Any]:
-        """An element (its number in the table) for a ``Float64`` in [0, 1), and what is left of that number: uniform in
-        [0, 1) again.
+        """Select an element (its number in the table) for a ``Float64`` in [0, 1), and what is left of that number:
+        uniform in [0, 1) again.
         """
         row = mi.UInt32(0) if tile is None else tile * (self._count + 1)
         element = _search((self._cuts, self._cdf), row, self._count, x, active)
@@ -347,7 +347,7 @@ class HiddenElements:
         return element, dr.clip(rest, 0, 1 - dr.epsilon(mi.Float))
 
     def point(self, element: Any, a: Any, y: Any, active: Any = True) -> tuple[Any, Any]:
-        """The point of an element for two numbers in [0, 1), and the geometric normal there."""
+        """Return the point of an element for two numbers in [0, 1), and the geometric normal there."""
         first, axes = self._row(element, 0, active), [self._row(element, i, active) for i in (1, 2)]
         n = mi.Vector3f(first.w, axes[0].w, axes[1].w)
         p = mi.Vector3f(first.x, first.y, first.z)
@@ -372,8 +372,8 @@ class HiddenElements:
         return self._by_primitive.look_up(shape, prim_index, p, active, tile)
 
     def coordinates(self, element: Any, a: Any, y: Any, active: Any = True) -> Any:
-        """Where Mitsuba's interactions place the point of two numbers on an element: barycentrics of triangles, the
-        point of the unit disk (``Point2f``); meaningless for spheres and cylinders.
+        """Return Mitsuba's surface coordinates of the point of two numbers on an element: barycentrics of triangles,
+        the point of the unit disk (``Point2f``); meaningless for spheres and cylinders.
         """
         row, kind = self._row(element, 3, active), self.kind(element, active)
         x = mi.Point2f(*local_point(kind, a, y, dr, self.kinds)[:2])
@@ -388,7 +388,7 @@ class HiddenElements:
         return mi.Float(high - low) / dr.gather(mi.Float, self._area, element, active)
 
     def kind(self, element: Any, active: Any = True) -> Any:
-        """Which row of the table of :mod:`.area_elements` an element is of, ``UInt32``."""
+        """Return the row of an element in the table of :mod:`.area_elements`, ``UInt32``."""
         return mi.UInt32(self._row(element, 3, active).w)
 
     def surface(self, element: Any, active: Any = True) -> tuple[Any, Any]:
@@ -401,8 +401,8 @@ class HiddenElements:
 
 
 def _cut_points(cdf: np.ndarray) -> np.ndarray:
-    """For each of as many equal parts of [0, 1] as there are intervals, and one more, the interval that it begins in: a
-    search has but a few to choose from (Chen and Asau 1974).
+    """Return for each of as many equal parts of [0, 1] as there are intervals, and one more, the interval that it
+    begins in: a search has but a few to choose from (Chen and Asau 1974).
     """
     count = len(cdf) - 1
     begins = np.searchsorted(cdf, np.arange(count + 1) / count, side="right") - 1

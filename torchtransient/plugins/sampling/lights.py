@@ -54,8 +54,8 @@ class LightBox:
 
     @staticmethod
     def of(scene, bsdfs) -> LightBox | None:
-        """The box of a scene's lights; None where lights are infinitely far, have no known place, or where light can
-        pass into a medium of another index, in which optical lengths may be shorter than geometric ones.
+        """Return the box of a scene's lights; None where lights are infinitely far, have no known place, or where light
+        can pass into a medium of another index, in which optical lengths may be shorter than geometric ones.
         """
         if any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission) for bsdf in bsdfs):
             return None
@@ -93,7 +93,7 @@ def least_probability(count: int) -> float:
 
 
 def is_rare(scene: Any, light: Any) -> bool:
-    """Whether a light of a scene is hardly ever drawn."""
+    """Return whether a light of a scene is hardly ever drawn."""
     weights = {emitter.ptr: float(emitter.sampling_weight()) for emitter in scene.emitters()}
     return weights[light.ptr] < least_probability(len(weights)) * sum(weights.values())
 
@@ -108,7 +108,7 @@ _MARGIN = 1.001
 
 class MovingSun:
     """The disk of one sky. ``rare``: it is hardly ever drawn, and paths that escape into it have to do
-    (:mod:`.rare_lights`).
+    (:func:`is_rare`).
 
     A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
     """
@@ -125,23 +125,23 @@ class MovingSun:
 
     @staticmethod
     def of(world: Any) -> MovingSun | None:
-        """The one that a job asks the derivative of, if it does."""
+        """Return the sun of the sky that a job differentiates, or None."""
         sky = None if world.wanted is None else world.wanted.sky
         return None if sky is None else MovingSun(world.scene, sky)
 
     def contains(self, d: Any) -> Any:
-        """Whether the unit direction ``d`` points into the disk."""
+        """Return whether the unit direction ``d`` points into the disk."""
         return dr.dot(self.direction, d) >= self._cosine
 
     def shines(self, emitter: Any, d: Any) -> Any:
-        """Whether light of ``emitter`` from the direction ``d`` is the sun's: of the light without a place that comes
-        from all around, which a scene has one of, and not of a directional one before it.
+        """Return a mask of light of ``emitter`` from ``d`` that is the sun's: that of the scene's environment, and not
+        of a directional emitter.
         """
         flags = emitter.flags()
         around = mi.has_flag(flags, mi.EmitterFlags.Infinite) & ~mi.has_flag(flags, mi.EmitterFlags.DeltaDirection)
         return around & self.contains(d)
 
     def followed(self, d: Any, active: Any) -> Any:
-        """``d``, turning with the sun where ``active``."""
+        """Attach ``d`` to the rotation of the sun where ``active``."""
         turn = dr.cross(dr.detach(self.direction), self.direction)
         return dr.select(active, dr.replace_grad(d, d + dr.cross(turn, d)), d)

@@ -26,14 +26,21 @@ def scrambled(x: Any, seed: Any) -> Any:
 
 
 def plane_points(count: int, seed: Any, sets: int = 1) -> tuple[Any, Any]:
-    """``count`` points of the unit square, (``Float64``, ``Float``), in ascending order of the first coordinate; of
-    several ``sets``, with seeds of their own, one set after the other.
+    """Return points of the unit square, in ascending order of the first coordinate.
+
+    Args:
+        count: number of points of each set.
+        seed: UInt32 of width one, in memory.
+        sets: number of sets, each with its own seed.
+
+    Returns:
+        (``Float64``, ``Float``): both coordinates, one set after the other.
 
     Hammersley's set, the second coordinate scrambled, and both shifted by the same random part of ``1 / count`` (of the
     next power of two) for all points: every point is uniform by itself, so that means are unbiased, and with a power of
     two the points are a (0, m, 2)-net as those of Sobol's sequence are. What is sorted by the first coordinate needs no
     sorting afterwards. A common shift leaves half of the variance that shifts of their own would, where a bin of time
-    is an interval of one coordinate. ``seed``: UInt32 of width one, in memory.
+    is an interval of one coordinate.
     """
     j = dr.arange(mi.UInt32, sets * count)
     number = j // dr.opaque(mi.UInt32, count)
@@ -67,7 +74,7 @@ _BITS = 32
 
 
 def _directions(dimension: int) -> list[int]:
-    """What each bit of an index adds, 32-bit fractions."""
+    """Return the direction numbers of a dimension, one 32-bit fraction per bit of an index."""
     if dimension == 0:
         return [1 << (_BITS - 1 - i) for i in range(_BITS)]
     polynomial, m = _INITIAL[dimension - 1]
@@ -100,10 +107,10 @@ def sobol(index: Any, dimension: int, seed: Any) -> Any:
 
 
 def unit_float(bits: Any) -> Any:
-    """A ``Float`` in (0, 1) from a 32-bit fraction."""
+    """Return a ``Float`` in (0, 1) from a 32-bit fraction."""
     return mi.Float(bits >> 8) * 2.0**-24 + 2.0**-25
 
 
 def unit_double(bits: Any) -> Any:
-    """A ``Float64`` in (0, 1) from a 32-bit fraction."""
+    """Return a ``Float64`` in (0, 1) from a 32-bit fraction."""
     return (mi.Float64(bits) + 0.5) * 2.0**-32

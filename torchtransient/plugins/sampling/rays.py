@@ -14,14 +14,14 @@ SHORTEST = 1e-6
 
 
 def past(p: Any) -> Any:
-    """How far behind a hit ``p`` a ray goes on, so that it does not meet the same surface again. Mitsuba's own rays
-    start as far off a surface.
+    """Return the offset behind a hit ``p`` at which a ray goes on without meeting the same surface again. Mitsuba's own
+    rays start as far off a surface.
     """
     return (1 + dr.max(dr.abs(p))) * mi.math.RayEpsilon
 
 
 def shortest(o: Any) -> Any:
-    """The shortest distance from ``o`` to a point that has a direction seen from there."""
+    """Return the shortest distance from ``o`` to a point that has a direction seen from there."""
     return (1 + dr.max(dr.abs(o))) * SHORTEST
 
 
@@ -30,7 +30,7 @@ def shortest(o: Any) -> Any:
 
 @dr.syntax
 def behind_area_lights(scene, ray, pi):
-    """The first hit along ``ray`` at or behind ``pi`` that is not an area light.
+    """Find the first hit along ``ray`` at or behind ``pi`` that is not an area light.
 
     Each search starts on the ray itself and distances stay those from ``ray.o``: an origin lifted off the light along
     its normal would land the hit beside the ray, at a wrong distance.

@@ -49,7 +49,7 @@ class ScanTiles:
         chosen = [_spread(np.flatnonzero(self.tile == t)) for t in range(self.count)]
         self.points, self.normals = points[chosen], normals[chosen]
 
-    def of_points(self) -> Any:
+    def tile_per_point(self) -> Any:
         """The tile of every scan point, ``UInt32`` in memory."""
         tile = mi.UInt32(self.tile.astype(np.uint32))
         dr.make_opaque(tile)
@@ -65,7 +65,7 @@ def distance_to(vertices: np.ndarray, points: np.ndarray) -> float:
 
 
 def _spread(numbers: np.ndarray) -> np.ndarray:
-    """25 of these, in equal steps; some more than once where there are fewer."""
+    """Select 25 of the rows in equal steps; some repeat where there are fewer."""
     return numbers[np.linspace(0, len(numbers) - 1, _POINTS).round().astype(int)]
 
 
@@ -77,8 +77,8 @@ MAX_SAMPLES = 2**26
 
 @dataclass
 class SharedSamples:
-    """``count`` points for each of ``tiles`` tiles of the scan, one tile after the other, in the order of the elements
-    of ``HiddenElements`` (neighbours stand together).
+    """Samples shared by scan points: ``count`` points for each of ``tiles`` tiles of the scan, one tile after the
+    other, in the order of the elements of ``HiddenElements`` (neighbours stand together).
 
     ``p`` (``Point3f``); ``n`` shading and ``geometric_n`` geometric normal (``Normal3f``), the same where ``smooth`` is
     false; ``front``, ``back`` (``UnpolarizedSpectrum``): albedo over pi of the side that the shading normal points to,
@@ -108,11 +108,16 @@ class SharedSamples:
 
 
 def draw_samples(elements: HiddenElements, count: int, seed: Any) -> SharedSamples:
-    """``count`` samples of the hidden geometry's density, for each tile of the table; ``seed``: UInt32 of width one, in
-    memory, or a whole number.
+    """Draw samples of the hidden geometry's density, for each tile of the table.
 
-    Raises SceneError for surfaces that are not plainly diffuse (``diffuse``, ``twosided`` around it), UnitError,
-    and VariantError in spectral and polarized variants, where a sample has no colour of its own.
+    Args:
+        count: number of samples of each tile.
+        seed: UInt32 of width one, in memory, or a whole number.
+
+    Raises:
+        SceneError: for surfaces that are not plainly diffuse (``diffuse``, ``twosided`` around it).
+        UnitError: if ``count`` is out of range.
+        VariantError: in spectral and polarized variants, where a sample has no fixed colour.
     """
     sets = elements.tile_count
     if not 1 <= count <= MAX_SAMPLES // sets:
@@ -180,13 +185,13 @@ def not_diffuse(shapes: list[Any]) -> list[str]:
 
 
 def _interaction(elements: HiddenElements, element: Any, p: Any, n: Any, a: Any, y: Any) -> Any:
-    """What Mitsuba says of the points: shading frame, texture coordinates."""
+    """Build Mitsuba's interactions of the points: shading frame, texture coordinates."""
     pi, ray = _preliminary(elements, element, p, n, a, y)
     return pi.compute_surface_interaction(ray, mi.RayFlags.All)
 
 
 def _preliminary(elements: HiddenElements, element: Any, p: Any, n: Any, a: Any, y: Any) -> tuple[Any, Any]:
-    """(the points as they would be found, by a ray from a metre before them)."""
+    """Return (the points as they would be found, by a ray from a metre before them)."""
     pi = dr.zeros(mi.PreliminaryIntersection3f, dr.width(p))
     pi.shape, pi.prim_index = elements.surface(element)
     pi.valid, pi.t = mi.Mask(True), mi.Float(1)

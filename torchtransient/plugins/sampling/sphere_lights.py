@@ -48,7 +48,9 @@ class ShapeLights:
             self._numbers = mi.UInt32(numbers)
 
     def sample(self, scene: Any, ref: Any, u: Any, active: Any) -> tuple[Any, Any]:
-        """(direction sample, emission over density), as ``scene.sample_emitter_direction(ref, u, False, active)``."""
+        """Return (direction sample, emission over density), as ``scene.sample_emitter_direction(ref, u, False,
+        active)``.
+        """
         if not self._shapes:
             return scene.sample_emitter_direction(ref, u, False, active)
         number, choice, x = scene.sample_emitter(u.x, active)
@@ -58,13 +60,13 @@ class ShapeLights:
         return ds, weight * choice
 
     def sample_direction(self, emitter: Any, ref: Any, u: Any, active: Any) -> tuple[Any, Any]:
-        """As ``emitter.sample_direction(ref, u, active)`` of an array of emitter pointers."""
+        """Sample as ``emitter.sample_direction(ref, u, active)`` of an array of emitter pointers."""
         if not self._shapes:
             return emitter.sample_direction(ref, u, active)
         slot = self._marks.look_up(emitter, active)
         listed = slot > 0
         with dr.suspend_grad():
-            ds = _asked([_sampler_of(*shape) for shape in self._shapes], slot, listed, ref, u)
+            ds = _call_each([_sampler_of(*shape) for shape in self._shapes], slot, listed, ref, u)
         ds.emitter = emitter
         ds.pdf = dr.select(dr.dot(ds.d, ds.n) < 0, ds.pdf, 0)
         weight = emitter.eval_direction(ref, ds, listed) * dr.select(ds.pdf > 0, dr.rcp(ds.pdf), 0)
@@ -81,15 +83,15 @@ class ShapeLights:
         listed = slot > 0
         lit = listed & (dr.dot(ds.d, ds.n) < 0)
         with dr.suspend_grad():
-            pdf = _asked([shape.pdf_direction for shape, _ in self._shapes], slot, lit, ref, ds)
+            pdf = _call_each([shape.pdf_direction for shape, _ in self._shapes], slot, lit, ref, ds)
         pdf *= scene.pdf_emitter(dr.gather(mi.UInt32, self._numbers, slot - 1, listed), listed)
         if self._all:
             return pdf
         return dr.select(listed, pdf, scene.pdf_emitter_direction(ref, ds, active & ~listed))
 
 
-def _asked(methods: list[Any], slot: Any, active: Any, ref: Any, *arguments: Any) -> Any:
-    """A method of the listed lights' shapes. Not a call of shape pointers: Dr.Jit would trace it for all shapes, some
+def _call_each(methods: list[Any], slot: Any, active: Any, ref: Any, *arguments: Any) -> Any:
+    """Call a method of the listed lights' shapes. Not by shape pointers: Dr.Jit would trace it for all shapes, some
     of which cannot be sampled.
     """
     place = mi.Interaction3f(0.0, ref.time, ref.wavelengths, ref.p, ref.n)
@@ -97,7 +99,7 @@ def _asked(methods: list[Any], slot: Any, active: Any, ref: Any, *arguments: Any
 
 
 def _sampler_of(shape: Any, inside_out: bool) -> Any:
-    """The method of a shape that draws directions, with the normals that rays find."""
+    """Return the method of a shape that samples directions, with the normals that rays find."""
     if not inside_out:
         return shape.sample_direction
 
@@ -153,7 +155,7 @@ _PACKET = 4
 class SphereLights:
     """The spherical lights among those of a scene; ``numbers``: which ones. ``all``: there are no others; ``others``:
     how these are sampled. ``textured``: one of them has a texture. ``marks``: one plus the place of each in the table,
-    zero for all others. ``least_pmf``: of lights that are hardly ever drawn less (:mod:`.rare_lights`).
+    zero for all others. ``least_pmf``: of lights that are hardly ever drawn less (:func:`.lights.is_rare`).
     """
 
     def __init__(self, scene: Any, numbers: list[int]) -> None:
@@ -175,7 +177,7 @@ class SphereLights:
         return SphereLights(scene, numbers) if numbers else None
 
     def read(self, scene: Any) -> SphereLightTable:
-        """Where they are now, attached where their shapes are; to be called outside of loops, once a job."""
+        """Read centres and radii of the lights, attached where their shapes are; call outside of loops, once a job."""
         table = self._cache.get("cones", None, lambda: self._detached(scene))
         with dr.resume_grad():
             attached = [n for n in range(len(self._shapes)) if dr.grad_enabled(self._matrix(n))]
@@ -239,7 +241,7 @@ class SphereLightTable:
                 dr.scatter(values, number, mi.UInt32(self._width * n + k))
 
     def attached(self, rows: dict[int, list[Any]]) -> SphereLightTable:
-        """A table with other, attached rows in some places: gathered from one array, which derivatives come to."""
+        """Return a table with attached rows in some places: gathered from one array, which derivatives come to."""
         table = copy.copy(self)
         table._only, table._values = None, mi.Float(self._laid_out(self._rows))
         table._write(table._values, rows)
@@ -262,16 +264,16 @@ class SphereLightTable:
         return _Sphere(self, emitter, ref.p, active).sampled(u, ref)
 
     def lists(self, emitter: Any, active: Any = True) -> Any:
-        """Which of an array of emitter pointers are spherical lights."""
+        """Return a mask of the emitter pointers that are spherical lights."""
         return self._marks.look_up(emitter, active) > 0
 
     def draws(self, emitter: Any) -> Any:
-        """Which of an array of emitter pointers are spherical lights that :meth:`sample` chooses often enough."""
+        """Return a mask of the emitter pointers that are spherical lights which :meth:`sample` chooses often enough."""
         listed = self.lists(emitter)
         return listed & (self.numbers(emitter, listed)[7] >= self._least_pmf)
 
     def sample(self, scene: Any, ref: Any, u: Any, active: Any) -> tuple[Any, Any]:
-        """(direction sample, emission over density) towards an emitter of the scene, as
+        """Return (direction sample, emission over density) towards an emitter of the scene, as
         ``scene.sample_emitter_direction(ref, u, False, active)``. Attached where ``ref`` and the shapes are.
         """
         number, choice, x = scene.sample_emitter(u.x, active)
@@ -310,7 +312,7 @@ class SphereLightTable:
 
 
 class _Sphere:
-    """One light per lane, seen from ``p``: ``outside`` (where ``p`` is), ``solid_angle`` of the cone, ``pmf``."""
+    """Spherical light per lane, seen from ``p``: ``outside`` (where ``p`` is), ``solid_angle`` of the cone, ``pmf``."""
 
     def __init__(self, table: SphereLightTable, emitter: Any, p: Any, active: Any) -> None:
         x, y, z, self.radius, r2, edge2, self.outward, self.pmf, *self.matrix = table.numbers(emitter, active)

@@ -92,7 +92,7 @@ class NLOSCaptureMeter(mi.Sensor):
         self.laser_points = _points_of(props, "laser_points")
         self.laser_origin = mi.Point3f(_place_of(props, "laser_origin")) if "laser_origin" in props else None
         self.lookat_pixel = list(_place_of(props, "laser_lookat_pixel")) if "laser_lookat_pixel" in props else None
-        # Said once more in older scenes: the integrator knows them.
+        # Older scenes repeat these properties of the integrator here.
         for name in ("account_first_and_last_bounces", "confocal"):
             props.get(name, None)
         # Of a wall that is a mesh, once they are asked for.
@@ -127,7 +127,7 @@ class NLOSCaptureMeter(mi.Sensor):
                 cb.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
 
     def world_transform(self) -> Any:
-        """The sensor's place, for the frame that polarization is told in: upright, as the world is."""
+        """Pose of the sensor, for the frame of polarization: upright, as the world is."""
         return mi.Transform4f().translate(self.origin)
 
     def targets(self, pixel: Any) -> Any:
@@ -146,7 +146,7 @@ class NLOSCaptureMeter(mi.Sensor):
         return self._grid.points(shape, pixel)
 
     def _surface(self) -> Any:
-        """The shape, whose texture coordinates say where points of it are."""
+        """Return the shape, whose texture coordinates place the scanned points."""
         shape = self.get_shape()
         if shape is None:
             raise SceneError(
@@ -171,7 +171,7 @@ class NLOSCaptureMeter(mi.Sensor):
         return self.targets((row + int(y)) * int(film.size()[0]) + (index - row * int(width)) + int(x))
 
     def spots(self) -> Any:
-        """Where the laser points (Point3f), None where nothing of the sensor says so."""
+        """Targets of the laser (Point3f), None if the sensor sets none."""
         if self.lookat_pixel is None:
             return self.laser_points
         shape, size = self._surface(), self.film().size()

@@ -1,4 +1,4 @@
-"""Where the time of flight of a sensor's rays begins."""
+"""Origin of the time of flight of a sensor's rays."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ def length_to_sensor_origin(seen: list[View], ray: Any) -> Any:
 
 
 def start_at_sensor(seen: list[View], ray: Any) -> tuple[Any, Any]:
-    """(``ray`` from the origin of a projective camera on, attached where it is; distance to its near clip plane,
+    """Return (``ray`` from the origin of a projective camera on, attached where it is; distance to its near clip plane,
     detached, 0 for rays of other sensors, None without such cameras): a medium around the camera attenuates and
     scatters light there, too.
     """

@@ -1,4 +1,4 @@
-"""Where on the film of a sensor points of the scene are seen: the inverse of its primary rays."""
+"""Film positions of scene points: the inverse of a sensor's primary rays."""
 
 from __future__ import annotations
 
@@ -132,8 +132,8 @@ class SensorPlaces:
 
     @staticmethod
     def _line(camera: Any, place: Any, aperture: Any) -> tuple[Any, Any]:
-        """(start on the plane of the lens, direction with a unit part along the axis) of the ray through a ``place`` of
-        the film in [0, 1]^2.
+        """Return (start on the plane of the lens, direction with a unit part along the axis) of the ray through a
+        ``place`` of the film in [0, 1]^2.
         """
         axis, near, _ = _axis_and_clips(camera)
         ray, _ = camera.sample_ray_differential(camera.shutter_open(), 0.5, mi.Point2f(*place), aperture)
@@ -179,7 +179,7 @@ class SensorPlaces:
 
 
 def _axis_and_clips(camera: Any) -> tuple[Any, Any, Any]:
-    """(unit vector along the axis, distances of both clip planes) of a camera, in the world."""
+    """Return (unit vector along the axis, distances of both clip planes) of a camera, in the world."""
     axis = mi.Vector3f(camera.world_transform() @ mi.Vector3f(0, 0, 1))
     scale = dr.norm(axis)
     return axis / scale, near_clip(camera) * scale, camera.far_clip() * scale

@@ -33,14 +33,14 @@ LINES = 64
 SHARE = 1 / 16
 # The share of the lines in all directions that enter what surrounds the sensor; a flat surface is met by half of them.
 ENCLOSED = 0.9
-# Bodies of one material around each other that are told apart, and surfaces along one line.
+# Bodies of one material around each other that are distinguished, and surfaces along one line.
 _NESTED, _SURFACES = 4, 1000
 # Stands for no body: nothing has to be asked of its material.
 OUTSIDE = None
 
 
 class Surroundings:
-    """What may lie around the sensors behind ``sensor``: the refractive BSDFs of a scene.
+    """Refractive BSDFs that may surround the sensors behind ``sensor``.
 
     Sensors at infinity stand in nothing. The lines are followed when a sensor or a body of these BSDFs has moved, and
     not for every render; a sensor in air then leaves nothing of the question in a kernel.
@@ -69,8 +69,8 @@ class Surroundings:
         return Surroundings(sensor, boundaries, shapes_of_scene(scene)) if boundaries else None
 
     def indices(self, scene: Any) -> list[Any]:
-        """The index at each sensor as it is now, attached where the indices of the surfaces are. To be called outside
-        of loops, with gradients enabled.
+        """Return the current index of refraction at each sensor, attached where the indices of the surfaces are. Call
+        outside of loops, with gradients enabled.
         """
         count = len(self._leaves)
         levels = self._cache.get("levels", self._crops(), lambda: self._levels(scene))
@@ -92,9 +92,9 @@ class Surroundings:
         return tuple((*film.size(), *film.crop_size(), *film.crop_offset()) for film in films)
 
     def _levels(self, scene: Any) -> list[Any]:
-        """For each sensor and material how many bodies around each other the sensor is in, -1 for outside of one that
-        is turned inside out, ``OUTSIDE`` for none: whole numbers, or arrays where a call is recorded, which has no
-        numbers yet.
+        """Return for each sensor and material the number of bodies around each other that the sensor is in, -1 for
+        outside of one that is turned inside out, ``OUTSIDE`` for none: whole numbers, or arrays where a call is
+        recorded, which has no numbers yet.
         """
         levels = self._counted(scene)
         if dr.flag(dr.JitFlag.FreezingScope):
@@ -102,7 +102,7 @@ class Surroundings:
         return [int(level) or OUTSIDE for level in np.array(levels)]
 
     def _counted(self, scene: Any) -> Any:
-        """As :meth:`_levels`, in one array."""
+        """Return :meth:`_levels` in one array."""
         count = len(self._leaves)
         with dr.suspend_grad():
             left, levels, entered = (dr.zeros(mi.Float, len(self._sensors) * count) for _ in range(3))
@@ -117,7 +117,7 @@ class Surroundings:
         return levels
 
     def _lines(self, sensor: Any) -> Any:
-        """From where the sensor's rays start, half of them along the rays."""
+        """Sample lines from the origins of the sensor's rays, half of them along the rays."""
         ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, self._film, self._aperture)
         return mi.Ray3f(dr.detach(ray.o), dr.select(_all_directions(), self._around, dr.detach(ray.d)))
 
@@ -144,14 +144,14 @@ def _index_inside(level: Any, eta: Any) -> Any:
 
 
 def _all_directions():
-    """Which lines do not follow a ray of the sensor."""
+    """Return a mask of the lines that do not follow a ray of the sensor."""
     return (dr.arange(mi.UInt32, LINES) & 1) == 1
 
 
 @dr.syntax
 def _count_crossings(scene, slots, count, ray, first, left, levels, entered):
-    """For each material, how many lines leave bodies of it that they have not entered (``left``; ``levels`` counts the
-    bodies), and how many of those in all directions enter one that they never leave.
+    """Count for each material the lines that leave bodies of it that they have not entered (``left``; ``levels`` counts
+    the bodies), and those of them in all directions that enter one that they never leave.
     """
     # Slot 0 is that of everything else.
     now, most = (dr.alloc_local(mi.Int32, count + 1, value=mi.Int32(0)) for _ in range(2))

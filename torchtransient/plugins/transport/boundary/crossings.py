@@ -189,7 +189,7 @@ def _crossings(scene: Any, solids: list[_Solid]) -> list[tuple[Body, Body]]:
         hit = np.isfinite(t)
         rows, address, cosine, inside = rows[hit], address[:, hit], cosine[hit], inside[hit]
         at[rows] += t[hit]
-        other = owners.of(address)
+        other = owners.find(address)
         depth = cosine * np.minimum(at[rows], length[rows] - at[rows])
         counts = (other >= 0) & (other != own[rows]) & (cosine > _GRAZING) & (inside | ~is_mesh[other])
         counts &= depth > _DEPTH * np.maximum(reach[own[rows]], reach[other])
@@ -211,7 +211,7 @@ class _Owners:
             numbers = self._numbers.setdefault(address, np.full(count, -1))
             numbers[slice(None) if solid.rows is None else solid.rows] = k
 
-    def of(self, address: np.ndarray) -> np.ndarray:
+    def find(self, address: np.ndarray) -> np.ndarray:
         """Return the numbers for registry numbers of shapes and instances and numbers of faces (3, N), -1 for none."""
         found = np.full(address.shape[1], -1)
         for pair in np.unique(address[:2], axis=1).T:

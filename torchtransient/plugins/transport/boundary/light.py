@@ -26,9 +26,10 @@ _STEEP = 10.0
 
 
 class LightPass(BoundaryPass):
-    """An edge point p is drawn, then a point y of a light, and a path goes on behind p, on its shadow, to the sensor: a
-    walk with one connection (:class:`~..connection.sensor_sampled.SensorSampled`). Its first vertex x is held on the
-    ray of the camera where it is connected at once (``direct``), and is a point of its shape where it goes on.
+    """Boundary pass that draws an edge point p and a point y of a light, and follows a path behind p, on its shadow, to
+    the sensor: a walk with one connection (:class:`~..connection.sensor_sampled.SensorSampled`). Its first vertex x is
+    held on the ray of the camera where it is connected at once (``direct``), and is a point of its shape where it goes
+    on.
     """
 
     def __init__(self, world):
@@ -85,9 +86,9 @@ class LightPass(BoundaryPass):
         term.to_sensor.in_line = None
         if self.is_sharp and term.places.is_sharp:
             term.to_sensor.in_line = self._in_line(term, edges, light, x, ray, medium, numbers, sampler, active)
-        of_edge, of_path = (vars(b.k), b.n, b.p, b.dist), (x.at.p, x.si.n, path.leg, path.β, path.τ, ray)
-        of_chain = None if through is None else vars(through.chain)
-        in_memory(world, sampler, of_edge, of_path, of_chain, active, factor, numbers.aperture)
+        edge_state, path_state = (vars(b.k), b.n, b.p, b.dist), (x.at.p, x.si.n, path.leg, path.β, path.τ, ray)
+        chain_state = None if through is None else vars(through.chain)
+        in_memory(world, sampler, edge_state, path_state, chain_state, active, factor, numbers.aperture)
         with dr.resume_grad():
             speeds = self._speeds(term, edges, light, x, path, ray, numbers, sampler, active)
         u = sampler.next_2d()
@@ -96,10 +97,10 @@ class LightPass(BoundaryPass):
         return mode.sum_of_pixels(kept, factors)
 
     def _in_line(self, term, edges, light, x, ray, medium, numbers, sampler, active):
-        """Where the sensor sees the shadow at ``x`` past the edge itself, as from a place at the light: whether the
-        shadow is ``shown``, as :class:`~..connection.sensor_sampled.SensorSampled` asks for it. A ray to the sensor
-        would let rounding decide, once more than in the pass of the sensor. That one sees past the edge either what the
-        light reaches, or the shadow: where it is not lit, the edge of the shadow is in view.
+        """Find where the sensor sees the shadow at ``x`` past the edge itself, as from a place at the light; returns
+        ``shown``, as :class:`~..connection.sensor_sampled.SensorSampled` asks for it. A ray to the sensor would let
+        rounding decide, once more than in the pass of the sensor. That one sees past the edge either what the light
+        reaches, or the shadow: where it is not lit, the edge of the shadow is in view.
         """
         world, b, ds = term.world, light.b, light.ds
         scale = BESIDE * (1 + dr.max(dr.abs(b.p)))

@@ -1,4 +1,4 @@
-"""What derivatives lack of moving edges in a scene, in words: for the table of parameters and for warnings."""
+"""Gaps in the derivatives of moving edges, in words: for the table of parameters and for warnings."""
 
 from __future__ import annotations
 
@@ -75,11 +75,11 @@ def moves_edges(key: str, effect: ParameterEffect) -> bool:
 
 
 class MovingEdges:
-    """What derivatives of a scene lack where edges move, asked by parameter (:meth:`lacking`).
+    """Gaps in a scene's derivatives where edges move, looked up by parameter (:meth:`lacking`).
 
-    ``always``: gaps of every parameter that moves edges. ``bent``: of what bends light alone. ``scene``: where
-    textures and bodies that run into each other are looked for, None for nowhere. ``words``: gaps that the table of
-    parameters speaks of and that no scene can be said to have. ``has_term``: whether there is a boundary term at all.
+    ``always``: gaps of every parameter that moves edges. ``bent``: of what bends light alone. ``scene``: searched
+    for textures with steps and for bodies that run into each other, or None. ``words``: gaps that only the table of
+    parameters names, whatever the scene. ``has_term``: whether there is a boundary term at all.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class MovingEdges:
         if not moves and (effect.role in _BEND or name == NORMALS):
             found += self.bent
         if (moves and effect.role in ("shape", "sensor")) or name == TEXCOORDS:
-            # Of what an instance shows, Mitsuba says nothing; a sensor sees everything move.
+            # Mitsuba does not show the members of an instance; relative to a moving sensor all shapes move.
             alone = effect.role != "sensor" and isinstance(node, mi.Shape) and not is_instance(node)
             found += self._jumps(node if alone else None)
         if moves and (effect.role == "sensor" or isinstance(node, mi.Shape)):
@@ -119,9 +119,9 @@ class MovingEdges:
         words += [gap.where for gap in self.lacking(node, key, effect)]
         if not words:
             return effect.reason
-        said = f"{CORRECT} except {', '.join(words)} (no boundary term)"
+        text = f"{CORRECT} except {', '.join(words)} (no boundary term)"
         more = effect.reason.removeprefix(CORRECT).removeprefix("; ")
-        return f"{said}; {more}" if more else said
+        return f"{text}; {more}" if more else text
 
     def _jumps(self, shape: Any) -> tuple[Gap, ...]:
         """The gap of textures with steps on a shape, on any for None."""
@@ -208,7 +208,7 @@ def edges_in_mirrors(scene: Any) -> list[Gap]:
 def _seen_through_delta_lobes(
     scene: Any, sensors: Sequence[Any], smooth: Sequence[Any], max_depth: int | None
 ) -> list[Gap]:
-    """What is left out where delta lobes of the shapes ``smooth`` show edges, and send light past them."""
+    """Return gaps where delta lobes of the shapes ``smooth`` show edges, or send light past them."""
     media = any(shape.is_medium_transition() for shape in shapes_of_scene(scene))
     followed = not media and all(has_eye(sensor) and sensor.get_medium() is None for sensor in sensors)
     plane = [one for one in smooth if followed and _is_plane(one)]
@@ -233,7 +233,7 @@ def _smooth_shapes(scene: Any) -> list[Any]:
 
 
 def _is_plane(shape: Any) -> bool:
-    """Whether a shape consists of few planes that mirror or refract by their own normals."""
+    """Return whether a shape consists of few planes that mirror or refract by their own normals."""
     if not is_flat(shape):
         return False
     if isinstance(shape, mi.Mesh) and _number_of_planes(shape) > _PLANES:
@@ -269,14 +269,14 @@ def shapes_without_edges(scene: Any) -> list[Any]:
 
 
 def _is_met_by_connections_alone(emitter: Any) -> bool:
-    """Whether derivatives of light are those of connections: of points, directions and spheres."""
+    """Return whether connections alone differentiate an emitter: points, directions and spheres."""
     delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
     shape = emitter.get_shape()
     return bool(mi.has_flag(emitter.flags(), delta)) or (shape is not None and is_sphere(shape))
 
 
 def _is_in_view(scene: Any, sky: Any) -> bool:
-    """Whether a sensor looks into the sun of a sky, whatever is in between."""
+    """Return whether a sensor looks into the sun of a sky, whatever is in between."""
     at, d = dr.zeros(mi.Interaction3f), dr.detach(MovingSun(scene, sky).direction)
     for sensor in filter(can_be_connected, scene.sensors()):
         places = SensorPlaces(sensor, sensor.film(), mi.Float(1))
@@ -299,7 +299,7 @@ def has_delta_lobe(shape: Any) -> bool:
 
 
 def _is_stepped(shape: Any) -> bool:
-    """Whether something jumps from place to place on a shape: a texture with steps, the slope of a bump map."""
+    """Return whether something jumps from place to place on a shape: a texture with steps, the slope of a bump map."""
     holders = [part for part in (shape.bsdf(), shape.emitter()) if part is not None]
     nested = [bsdf for holder in holders for bsdf in (holder, *objects_below(holder, mi.BSDF))]
     if any(isinstance(bsdf, mi.BSDF) and is_bump_map(bsdf) for bsdf in nested):
@@ -308,7 +308,9 @@ def _is_stepped(shape: Any) -> bool:
 
 
 def _has_steps(texture: Any) -> bool:
-    """Whether a texture is flat wherever it is asked, and not the same everywhere. Mitsuba does not show its filter."""
+    """Return whether a texture is flat wherever it is asked, and not the same everywhere. Mitsuba does not show its
+    filter.
+    """
     attribute = attribute_name(texture)
     if attribute is not None:
         return attribute.startswith("face_")
@@ -330,7 +332,7 @@ def _has_steps(texture: Any) -> bool:
 
 
 def _has_rim(emitter: Any) -> bool:
-    """Whether the light of an emitter ends at once beside its direction."""
+    """Return whether the light of an emitter ends at once beside its direction."""
     if emitter.class_name() == "Projector":
         return True
     if emitter.class_name() == "SpotLight":

@@ -25,8 +25,8 @@ FACING = 1e-3
 
 
 class PrimaryPass(BoundaryPass):
-    """An edge point is drawn, and the pixel that sees it. Creases count, too: a point on a camera's ray slides along
-    the ray, and where a face ends under it the light jumps.
+    """Boundary pass that draws an edge point and a pixel that sees it. Creases count as well: a point on a camera's ray
+    slides along the ray, and where a face ends under it the light jumps.
     """
 
     @staticmethod

@@ -35,7 +35,7 @@ class BoundaryPass:
 
 
 def past_edge(world, b, ray, medium, β, sampler, active, seen=False):
-    """(the ray past an outline, its leg); of a crease the other face, seen from x. ``seen``: x is the sensor."""
+    """Return (the ray past an outline, its leg); of a crease the other face, seen from x. ``seen``: x is the sensor."""
     place = Local(si=dr.zeros(mi.SurfaceInteraction3f), medium=medium, surface=mi.Bool(False))
     past = mi.Ray3f(ray)
     past.o, past.d = dr.select(b.crease, b.V, b.beside), b.d

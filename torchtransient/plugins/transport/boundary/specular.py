@@ -44,7 +44,7 @@ RAYS, _UNFINISHED = 2**14, 0.125
 _BUCKETS = 2**18
 _STEPS = 12
 # How far from p its ray may pass, in parts of the way; the walk starts its rays a little beside the planes, and may
-# miss it by more. Planes are told apart by a hundredth of their normals and the first share of the scene's radius,
+# miss it by more. Planes are distinguished by a hundredth of their normals and the first share of the scene's radius,
 # which is the least distance of an edge from the last plane, too.
 _MISS, _MISS_OF_WALK = 1e-4, 2e-3
 
@@ -217,9 +217,9 @@ class Chains:
         )  # fmt: skip
 
     def turned(self, chain, eye, p, ω, step, least):
-        """One try of Newton's method at ``ω + step``: (direction, next step, how far the direction misses ``p``). What
-        is no better than the ``least`` miss so far, or no ray at all (total reflection), is tried again with half of
-        the step.
+        """Make one try of Newton's method at ``ω + step``: (direction, next step, how far the direction misses ``p``).
+        What is no better than the ``least`` miss so far, or no ray at all (total reflection), is tried again with half
+        of the step.
         """
         tried = dr.normalize(ω + step)
         end = self._sent(chain, eye, tried)
@@ -231,7 +231,9 @@ class Chains:
         return dr.select(better, tried, ω), dr.select(better, across, step * 0.5), dr.select(better, miss, least)
 
     def _sent(self, chain, eye, ω):
-        """Where a ray arrives behind the chain, with the derivatives of ``o, d`` by ``ω`` along two ``axes``."""
+        """Trace a ray through the chain to where it arrives, with the derivatives of ``o, d`` by ``ω`` along two
+        ``axes``.
+        """
         o, d, length, first, valid = mi.Point3f(eye), mi.Vector3f(ω), mi.Float(0), mi.Float(0), mi.Bool(True)
         axes = [mi.Vector3f(axis) for axis in mi.coordinate_system(ω)]
         moves = [(mi.Vector3f(0), axis) for axis in axes]
@@ -257,7 +259,9 @@ class Chains:
 
     @staticmethod
     def _missed(end, p):
-        """(change of direction that brings the ray to ``p``, how far it passes ``p`` across, determinant)."""
+        """Return (change of direction that brings the ray to ``p``, distance across by which it misses ``p``,
+        determinant).
+        """
         t = dr.dot(p - end.o, end.d)
         u, v = mi.coordinate_system(end.d)
         r = p - (end.o + end.d * t)
@@ -285,7 +289,7 @@ def attached_ray(world, ray, ratios, count, active):
 
 
 def ratios_of(chain):
-    """By plane, the ratio of the index behind it to that before, 0 for a mirror."""
+    """Return for each plane the ratio of the index behind it to that before, 0 for a mirror."""
     return [ratio for _, _, ratio in chain.planes]
 
 
@@ -305,7 +309,7 @@ def mirrored(p, n, offset):
 
 
 def bent(d, n, ratio):
-    """(direction behind a plane, derivative of its part along ``n`` by that of ``d``)."""
+    """Return (direction behind a plane, derivative of its part along ``n`` by that of ``d``)."""
     cos = dr.dot(n, d)
     mirrors = ratio == 0
     inverse = dr.rcp(dr.select(mirrors, 1, ratio))
@@ -320,7 +324,8 @@ def _concatenated(parts):
 
 
 class SpecularPass(BoundaryPass):
-    """An edge point is drawn, and the pixel that sees it through a chain, as in the pass of primary edges."""
+    """Boundary pass that draws an edge point and a pixel that sees it through a chain, as in the pass of primary edges.
+    """
 
     @staticmethod
     def exists(world, sensor):
@@ -356,8 +361,8 @@ class SpecularPass(BoundaryPass):
         β = attenuated(path.β, mi.UnpolarizedSpectrum(T))
         factor = seen.importance * chain.inverse * b.sin * b.inv_pdf * weight * share
         past = past_edge(world, b, path.ray, medium, β, sampler, active)
-        of_edge, of_path = (vars(b.k), b.n, b.limb, b.inner), (path, past, β)
-        in_memory(world, sampler, of_edge, of_path, vars(seen), vars(chain), vars(numbers), active, factor)
+        edge_state, path_state = (vars(b.k), b.n, b.limb, b.inner), (path, past, β)
+        in_memory(world, sampler, edge_state, path_state, vars(seen), vars(chain), vars(numbers), active, factor)
         with dr.resume_grad():
             ray = attached_ray(world, rays.ray, ratios_of(chain), chain.count, active)
             moves = edges.moving(b) - ray.o - ray.d * seen.way
@@ -370,7 +375,7 @@ class SpecularPass(BoundaryPass):
 
 
 def traced(chains, chain, seen, rays, sampler, active):
-    """(whether ``rays`` run through their chains to what is ``seen``, the paths behind these)."""
+    """Return (a mask of ``rays`` that run through their chains to what is ``seen``, the paths behind these)."""
     mirrors = [ratio == 0 for ratio in ratios_of(chain)]
     found = chains.follow(chains.world, rays, sampler, chain.count, active, mirrors)
     path = found.path
@@ -402,7 +407,7 @@ class SensorThroughChain(Connection):
         self._eye = self.chains.places.eye(numbers)
 
     def seen_from(self, p, active):
-        """(what :meth:`Chains.look` says of ``p``, the primary rays)."""
+        """Return (the result of :meth:`Chains.look` for ``p``, the primary rays)."""
         chains = self.chains
         seen = chains.look(self.chain, self._eye, p, self.numbers, active & (self.chain.inverse > 0))
         return seen, chains.places.rays_at(chains.world, None, seen.uv, self.numbers, η=self.η)

@@ -136,8 +136,8 @@ class BoundaryTerm:
         return sampler
 
     def pixel(self, uv, u):
-        """(row, column, weight, whether there is one) of a pixel that sees the place ``uv`` of the film, in pixels,
-        chosen by ``u`` of those that the reconstruction filter makes see it.
+        """Return (row, column, weight, whether there is one) of a pixel that sees the place ``uv`` of the film, in
+        pixels, chosen by ``u`` of those that the reconstruction filter makes see it.
         """
         size = mi.ScalarVector2f(self.film.crop_size())
         rfilter, weight, cell = self.film.rfilter(), mi.Float(1), dr.floor(uv)

@@ -23,11 +23,11 @@ _SELDOM = 0.1
 
 
 class VertexPass(BoundaryPass):
-    """A path is traced to a vertex x, chosen uniformly of those that may have one after them; an edge point seen from
-    there is chosen of several candidates in proportion to its span over the squared distance (resampling, Talbot et
-    al. 2005). Vertices behind the edge are points of their shapes, so that only outlines matter, and of them the outer
-    side, but for what is near x and dragged along, lights included. Lights past edges are found by the pass of the
-    lights, or here where paths of lights do not find the sensor.
+    """Boundary pass that traces a path to a vertex x, chosen uniformly of those that may have one after them; an edge
+    point seen from there is chosen of several candidates in proportion to its span over the squared distance
+    (resampling, Talbot et al. 2005). Vertices behind the edge are points of their shapes, so that only outlines matter,
+    and of them the outer side, but for what is near x and dragged along, lights included. Lights past edges are found
+    by the pass of the lights, or here where paths of lights do not find the sensor.
     """
 
     @staticmethod
@@ -83,10 +83,10 @@ class VertexPass(BoundaryPass):
         β = dr.select(active, β, 0)
         medium = world.segment.medium_at(world, b.beside, x, world.segment.medium_towards(b.d, vertex), active)
         past = past_edge(world, b, path.ray, medium, β, sampler, active)
-        of_edge = vars(b.k), b.n, b.p, b.dist, b.crease, b.inner, b.facing
-        of_path = before, path.ray, path.prev_p, at, target, radius, vertex.at.p, vertex.at.n, τ, η
-        of_lead = None if lead is None else (lead.all, lead.ratios, path.prev_unconnected)
-        in_memory(world, sampler, of_edge, of_path, of_lead, past, active, factor, β)
+        edge_state = vars(b.k), b.n, b.p, b.dist, b.crease, b.inner, b.facing
+        path_state = before, path.ray, path.prev_p, at, target, radius, vertex.at.p, vertex.at.n, τ, η
+        lead_state = None if lead is None else (lead.all, lead.ratios, path.prev_unconnected)
+        in_memory(world, sampler, edge_state, path_state, lead_state, past, active, factor, β)
         with dr.resume_grad():
             v_x = self._motion(world, rays, path, before, lead, target, vertex, radius, active)
             speeds = sides_from(world, b, edges, v_x, behind(world, b, *past, active), radius, active)
@@ -104,8 +104,8 @@ class VertexPass(BoundaryPass):
         return both_sides(world, mode, sampler, view, b, past, first, factor, speeds, needed, lit)
 
     def _target(self, world, u, finds_light):
-        """(number of a vertex, one over its probability). The last vertex, after which there is nothing but emission,
-        is chosen seldom where only lights with rims are of use to it.
+        """Return (number of a vertex, one over its probability). The last vertex, after which there is nothing but
+        emission, is chosen seldom where only lights with rims are of use to it.
         """
         if finds_light:
             count = world.max_depth - 1
@@ -171,7 +171,7 @@ class VertexPass(BoundaryPass):
 
 
 def _has_lights_with_rims(world):
-    """Whether paths find area lights other than spheres."""
+    """Return whether paths find area lights other than spheres."""
     return world.finds_light and any(
         mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface) and not is_sphere(emitter.get_shape())
         for emitter in world.scene.emitters()

@@ -25,7 +25,7 @@ class Reverse:
         return self.block(rays, rays)
 
     def kept(self, row):
-        """(which rows of pixels count, weight of a sample of the whole film)."""
+        """Return (mask of the rows of pixels that count, weight of a sample of the whole film)."""
         return mi.Bool(True), 1
 
     def block(self, rays, place):
@@ -45,7 +45,7 @@ class Reverse:
         return finite(kept["sum"] * factor)
 
     def sink_of_pixels(self, middle, job, u, factor, speeds):
-        """(sink of events that have a pixel each, what :meth:`sum_of_pixels` takes)."""
+        """Return (sink of events that have a pixel each, the factors of :meth:`sum_of_pixels`)."""
         return PixelSums(self, middle, u, len(speeds)), (factor, speeds)
 
     def sum_of_pixels(self, kept, factors):
@@ -91,7 +91,7 @@ class Forward:
         self.stop, self.scale = self.first + rows, int(term.film.crop_size()[1]) / rows
 
     def view(self, rays):
-        """(film block, map to channels, pixel) of primary rays."""
+        """Return (film block, map to channels, pixel) of primary rays."""
         term, film = self.term, self.term.film
         match, (base, pixel) = term.integrator.channel_match(term.world.contents, film, rays), self._indices(rays)
         if rays.strata is not None:
@@ -100,7 +100,7 @@ class Forward:
         return FilmBlock(film, self.job.band, base, match), match, pixel
 
     def kept(self, row):
-        """As in reverse mode; here those of one band of storage."""
+        """Return as in reverse mode, for the rows of one band of storage."""
         return (row >= self.first) & (row < self.stop), self.scale
 
     def _indices(self, place):
@@ -121,7 +121,7 @@ class Forward:
         block.finish()
 
     def sink_of_pixels(self, middle, job, u, factor, speeds):
-        """As in reverse mode."""
+        """Return the sink and factors, as in reverse mode."""
         return PixelFilmSink(self, middle, u, [finite(factor * speed) for speed in self.speeds(speeds)]), None
 
     def sum_of_pixels(self, kept, factors):
