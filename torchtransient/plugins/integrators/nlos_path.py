@@ -223,7 +223,8 @@ class TransientNLOSPath(base.TransientIntegrator):
             return ScanTable(scene, contents, self.capture, fov, self.laser_sampling)
 
     def division(self, scene: Any, contents: Any, wanted: Any = None, table: Any = None) -> Division:
-        """Return the division of light among estimators. ``table``: the :class:`ScanTable` of the job, where it is known. Raises SceneError
+        """Return the division of light among estimators. ``table``: the :class:`ScanTable` of the job, where it is
+        known. Raises SceneError
         where light has to come from shared samples and cannot.
         """
         settings = self.settings()
