@@ -129,7 +129,7 @@ class OutlineTable:
         return [dr.gather(mi.Point3f, end, index) for end in self.ends]
 
     def third_corners(self, index: Any) -> list[Any]:
-        """Those (Point3f) of the outermost faces at edges."""
+        """Return the corners (Point3f) of the outermost faces at edges."""
         return [dr.gather(mi.Point3f, side, index) for side in self._sides]
 
 

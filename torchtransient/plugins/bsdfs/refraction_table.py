@@ -38,7 +38,8 @@ class RefractiveBSDFs:
 
     @staticmethod
     def of(scene: Any, bsdfs: list[Any] | None = None) -> RefractiveBSDFs | None:
-        """Those of ``scene``, or None when nothing in it refracts through a lobe that can be connected to.
+        """Return the refractive surfaces of ``scene``, or None when nothing in it refracts through a lobe that can be
+        connected to.
 
         ``bsdfs``: those of the scene where they are known already.
         Raises SceneError for a BSDF of which two parts have different indices, where a connection has no single optical

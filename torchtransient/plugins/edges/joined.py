@@ -36,7 +36,7 @@ class Triangles:
 
     @staticmethod
     def from_meshes(meshes: list[Any]) -> Triangles:
-        """Those of Mitsuba meshes, as they are now."""
+        """Read the triangles of Mitsuba meshes, as they are now."""
         v = [host_numbers(mesh_positions(m), np.float32).reshape(-1, 3) for m in meshes]
         f = [np.array(mesh_faces(m), dtype=np.int64).reshape(-1, 3) for m in meshes]
         first = np.cumsum([0, *(len(one) for one in v)])

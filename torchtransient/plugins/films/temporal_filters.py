@@ -182,7 +182,7 @@ class PulsedFilter:
         return dr.fma(high - low, share, low), (high - low) * self.nodes_per_bin
 
     def weights(self, x):
-        """As the plain filters do: first bin, and ``(offset, weight, d weight / dx)`` for every bin that is reached."""
+        """Return first bin, and ``(offset, weight, d weight / dx)`` for every bin that is reached."""
         first, node, share = self.begin(x)
         taps, low = [], self.edge(node, share)
         for k in range(self.count):

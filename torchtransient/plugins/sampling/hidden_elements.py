@@ -250,8 +250,8 @@ class HiddenElements:
     def cached(
         memory: Cache, shapes: list[Any], points: Any, normals: Any, beside: Sequence[Any] = ()
     ) -> HiddenElements:
-        """Those of shapes that are where they were before are the same: not to be changed. ``beside``: the other shapes
-        of the scene. ``key`` holds where all of them are, and is empty where some do not say.
+        """Return the elements of shapes, the same object while they stay in place: not to be changed. ``beside``: the
+        other shapes of the scene. ``key`` holds where all of them are, and is empty where some do not say.
         """
         every, others = AreaElements.of(shapes), AreaElements.of(list(beside))
         parts = [array for each in (every, others) for array in each.columns()]

@@ -172,7 +172,7 @@ class SphereLights:
 
     @staticmethod
     def of(scene: Any) -> SphereLights | None:
-        """Those of ``scene``, None when it has none."""
+        """Return the spherical lights of ``scene``, None when it has none."""
         numbers = [n for n, emitter in enumerate(scene.emitters()) if _is_sphere_light(emitter)]
         return SphereLights(scene, numbers) if numbers else None
 

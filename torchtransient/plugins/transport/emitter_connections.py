@@ -298,7 +298,7 @@ class EmitterSampled(Connection):
             return ray, pi, there & (found.emitter(context.scene) == ds.emitter), found.n
 
     def _found(self, context, si, light):
-        """As above, of the point of ``light``, looked for once."""
+        """Find the point of ``light``, once."""
         if light.found is None:
             light.found = self._found_by_ray(context, si, light.ds, light.surface)
         return light.found

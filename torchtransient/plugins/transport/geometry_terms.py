@@ -40,8 +40,8 @@ def material_point(pi, ray, active, meshes=None, surfaces=None):
 
 
 def slide_on_shape(pi, ray, drag, active):
-    """What changes where a point slides on its shape, held in place, as ``ray`` is shifted by ``drag``: ``uv, n`` and
-    ``sh_n``, the shading normal, each zero with the derivative.
+    """Return the changes of a point that slides on its shape, held in place, as ``ray`` is shifted by ``drag``: ``uv,
+    n`` and ``sh_n``, the shading normal, each zero with the derivative.
     """
     shifted = mi.Ray3f(ray)
     shifted.o = shifted.o + dr.select(active, drag, 0)
@@ -60,17 +60,16 @@ def displacement(p, active):
 
 
 def slide(drag, d, n, active):
-    """Where the point goes that a ray in direction ``d`` finds on a surface of normal ``n`` when it is shifted by
-    ``drag``, across its direction.
+    """Return the displacement of the point that a ray in direction ``d`` finds on a surface of normal ``n`` when it is
+    shifted by ``drag``, across its direction.
     """
     cos = dr.dot(n, d)
     return drag - d * (dr.dot(n, drag) * dr.select(active & (dr.abs(cos) > EDGE_ON), dr.rcp(cos), 0))
 
 
 class DampedMotion(Local):
-    """How a connection to a point follows its vertex: direction ``d`` (attached), ``J`` (one, with the derivative of
-    the solid angle), ``drag`` (zero, with how far the ray to the point is shifted
-    sideways).
+    """Motion of a connection to a point that follows its vertex: direction ``d`` (attached), ``J`` (one, with the
+    derivative of the solid angle), ``drag`` (zero, with how far the ray to the point is shifted sideways).
     """
 
     def slide(self, n):

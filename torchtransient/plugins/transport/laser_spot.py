@@ -150,8 +150,8 @@ class GeneralSpot:
 
 
     def light(self, d, active):
-        """What the spot sends against the ray of direction ``d`` that finds it, times the squared distance: a spectrum,
-        or a Stokes vector in the frame of that ray.
+        """Return the light that the spot sends against the ray of direction ``d`` that finds it, times the squared
+        distance: a spectrum, or a Stokes vector in the frame of that ray.
         """
         beam = dr.gather(mi.Vector3f, self.spots.ray.d, self.index, active)
         spot = dr.copy(self.si)
@@ -175,7 +175,7 @@ class DiffuseSpot:
         self.valid = dr.any(self.n != 0)
 
     def light(self, d, active):
-        """As :meth:`GeneralSpot.light`."""
+        """Return the light of the spot, see :meth:`GeneralSpot.light`."""
         cos = -dr.dot(self.n, d)
         return dr.select(active & (cos > 0), mi.Spectrum(self.value) * cos, 0)
 

@@ -64,7 +64,7 @@ class SensorSampled(Connection):
 
 
 def first_row(matrix):
-    """What unpolarized light becomes that runs through a chain of matrices the other way round: U changes its sign."""
+    """Return unpolarized light after it has run through a chain of matrices the other way round: U changes its sign."""
     if not mi.is_polarized:
         return matrix
     return mi.SpectrumEntry(*[matrix[0, i] * (-1 if i == 2 else 1) for i in range(4)])
@@ -95,7 +95,7 @@ class FromLight:
         return getattr(self._scattering, name)
 
     def scatter(self, context: Any, path: Any, vertex: Any, proposals: Any, sampler: Any) -> Any:
-        """As :meth:`~..strategy.Scattering.scatter`."""
+        """Sample the next direction, see :meth:`~..strategy.Scattering.scatter`."""
         answers, step = self._scattering.scatter(context, path, vertex, proposals, sampler)
         for proposal, answer in zip(proposals, answers, strict=True):
             if answer is not None:

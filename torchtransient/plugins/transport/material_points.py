@@ -17,7 +17,7 @@ from torchtransient.plugins.transport.vacuum import AttachedTriangles, Vacuum
 
 
 class MaterialVacuum(Vacuum):
-    """As :class:`.vacuum.Vacuum`, without a damping radius."""
+    """Segments like :class:`.vacuum.Vacuum`'s, without a damping radius."""
 
     drags = False
 

@@ -125,8 +125,8 @@ def scatters_by_place(bsdf: Any) -> bool:
 
 
 def emits_by_place(emitter: Any) -> bool:
-    """Whether the light that leaves a surface in a given direction may differ from place to place: a texture, or what
-    counts angles from the normal of a curved shape. Mitsuba's ``area`` asks for the side alone.
+    """Return whether the light that leaves a surface in a given direction may differ from place to place: a texture, or
+    what counts angles from the normal of a curved shape. Mitsuba's ``area`` asks for the side alone.
     """
     if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface):
         return False
@@ -189,8 +189,9 @@ class MediaContents:
         return not (self.heterogeneous or self.open_boundaries)
 
     def check_spheres(self, sphere_lights: bool) -> None:
-        """Where path lengths change, spherical lights (``sphere_lights``) are sampled by connections alone, which every
-        medium has to allow. Raises ``GradientError`` otherwise.
+        """Raise ``GradientError`` where a medium forbids connections and path lengths to spherical lights change.
+
+        Spherical lights (``sphere_lights``) are sampled by connections alone then.
         """
         if sphere_lights and not self.emitter_sampling:
             raise GradientError(

@@ -88,7 +88,7 @@ class InstanceTable:
         return _vector(self._matrices(instance)[0], v)
 
     def interaction(self, pi: Any, ray: Any, flags: int, active: Any, hits: HitTable | None) -> Any:
-        """As :func:`surface_interaction`."""
+        """Return the attached interaction, see :func:`surface_interaction`."""
         with dr.suspend_grad():
             si = pi.compute_surface_interaction(ray, flags, active)
             valid = si.is_valid()
@@ -144,7 +144,7 @@ class AttachedSurfaces:
         return tables if self._hits is None else tables + self._hits.tables()
 
     def interaction(self, pi: Any, ray: Any, flags: int, active: Any) -> Any:
-        """As :func:`surface_interaction`."""
+        """Return the attached interaction, see :func:`surface_interaction`."""
         if self._instances is not None:
             return self._instances.interaction(pi, ray, flags, active, self._hits)
         pi = self._hits.attach(pi, pi.shape, ray, active & pi.is_valid())
@@ -218,7 +218,9 @@ class DetachedHits:
         self._find_starts()
 
     def _find_starts(self) -> None:
-        """Where each shape's ellipsoids or segments begin, counted from one: what is not listed has none."""
+        """Return the place where each shape's ellipsoids or segments begin, counted from one: what is not listed has
+        none.
+        """
         ellipsoids = _starts([_floats(values["data"].read(shape)) for shape, values in self._ellipsoids], _ELLIPSOID)
         segments, pieces = (
             _starts([values["segment_indices"].read(shape) for shape, values in curves], 1)
@@ -232,7 +234,7 @@ class DetachedHits:
 
     @staticmethod
     def of(scene: Any) -> DetachedHits | None:
-        """Those of ``scene``, shape groups included; None when it has none."""
+        """Return the shapes of ``scene``, shape groups included; None when it has none."""
         found = [s for s in shapes_of_scene(scene) if leaves_hits_detached(s) or misplaces_hits(s)]
         return DetachedHits(found) if found else None
 
@@ -419,7 +421,7 @@ def _floats(value: Any) -> Any:
 
 
 def _starts(arrays: Sequence[Any], size: int) -> list[int]:
-    """Where the entries of each array begin, when they follow each other; ``size``: numbers per entry."""
+    """Return the first entry of each array, when they follow each other; ``size``: numbers per entry."""
     starts = [0]
     for array in arrays:
         starts.append(starts[-1] + dr.width(array) // size)

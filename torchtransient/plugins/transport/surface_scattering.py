@@ -74,7 +74,7 @@ class Surface(Scattering):
         vertex.connectable = self.connectable(context, vertex)
 
     def delay(self, bsdf, u, wavelengths):
-        """Whether a surface scatters late: which BSDF takes its place, when, and with which weight."""
+        """Return the delay of a surface: the BSDF in its place, where it holds, and its weight."""
         return DelaySample(bsdf) if self.delays is None else self.delays.sample(bsdf, u, wavelengths)
 
     @staticmethod
@@ -329,8 +329,8 @@ class Surface(Scattering):
 
 
 def strayed(wi, bs):
-    """Whether a sample of a lobe of reflection or transmission ended on the other side of the surface. BSDFs throw it
-    away; what they hold has a density there, and may be black.
+    """Return whether a sample of a lobe of reflection or transmission ended on the other side of the surface. BSDFs
+    throw it away; what they hold has a density there, and may be black.
     """
     reflects = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Reflection)
     transmits = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Transmission)

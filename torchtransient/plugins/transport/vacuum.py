@@ -295,7 +295,7 @@ class AttachedTriangles:
         return mi.Mask(False) if self.starts is None else self.starts.look_up(shape) > 0
 
     def point(self, pi: Any, active: Any) -> Local:
-        """Where the hit points ``pi`` on listed shapes are, as their shapes move: ``p``, ``across`` (twice the area
+        """Return the hit points ``pi`` on listed shapes, as their shapes move: ``p``, ``across`` (twice the area
         along the normal of either side).
         """
         if self.starts is None:
