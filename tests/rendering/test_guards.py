@@ -11,7 +11,7 @@ import torchtransient as tt
 from tools.small_room import COLOUR, VARIANT, WALL_POSE, make_room
 from torchtransient.errors import SceneError, ShapeError
 from torchtransient.plugins.drjit_pool import engine_lock
-from torchtransient.plugins.guards import interrupts_wait, no_collection
+from torchtransient.plugins.guards import interrupts_wait, no_collection, surely
 from torchtransient.scene.variant import active_variant
 
 
@@ -54,6 +54,19 @@ def test_an_interrupted_call_leaves_nothing_behind(kind, place, monkeypatch):
     with active_variant(VARIANT):
         now = mi.traverse(renderer.scene.built(renderer._options).scene)
         assert {key: str(now[key]) for key in before} == before
+
+
+def test_settings_are_put_back_when_an_interrupt_cuts_that_off():
+    done, interrupts = [], [KeyboardInterrupt()]
+
+    def put_back():
+        if interrupts:
+            raise interrupts.pop()
+        done.append(1)
+
+    with pytest.raises(KeyboardInterrupt):
+        surely(put_back)
+    assert done == [1]
 
 
 def test_the_collector_waits_in_every_block():

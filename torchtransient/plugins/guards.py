@@ -12,7 +12,7 @@ import gc
 import re
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
@@ -90,6 +90,18 @@ def _put_back_handlers(left: list[tuple[int, Any]]) -> None:
     finally:
         if left:  # one of those put back has raised
             _put_back_handlers(left)
+
+
+def surely(put_back: Callable[[], object]) -> None:
+    """Call ``put_back``, which may run twice: once more where an interrupt has cut it off.
+
+    For ``finally`` blocks. Only a second Ctrl-C within the same call can leave a scene with the settings of that call.
+    """
+    try:
+        put_back()
+    except BaseException:
+        put_back()
+        raise
 
 
 # ------------------------------------------------------------------------------------------- no collection in a trace

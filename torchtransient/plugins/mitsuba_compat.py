@@ -420,7 +420,7 @@ def has_no_material(shape: Any) -> bool:
 
 
 def has_vertices(shape: Any) -> bool:
-    """Return whether a shape is a mesh whose vertices move with its parameters. Mitsuba's rectangles are meshes too."""
+    """Return whether a shape is a mesh of listed vertices: False of rectangles and disks, which are `mi.Mesh` too."""
     return isinstance(shape, mi.Mesh) and shape.class_name() not in _FLAT
 
 

@@ -11,6 +11,7 @@ are several.
 from __future__ import annotations
 
 import math
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -22,7 +23,7 @@ from torchtransient.checks import one_line
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, TorchTransientError, UnitError, VariantError
 from torchtransient.interfaces import BACKWARD, FORWARD, RENDER, is_time_resolved
 from torchtransient.plugins.frozen_state import says_it_can_be_recorded
-from torchtransient.plugins.guards import interrupts_wait, no_collection
+from torchtransient.plugins.guards import no_collection, surely
 from torchtransient.plugins.parameters import check_slope, lifted
 from torchtransient.rendering.broken_numbers import broken_entries, fill_broken
 from torchtransient.rendering.films import FilmLayout, layout_of_film
@@ -34,7 +35,7 @@ from torchtransient.scene.edits import built_depth
 from torchtransient.scene.parameters import needing_slope
 from torchtransient.scene.physics import all_finite, are_finite, smallest_and_largest
 from torchtransient.scene.values import own_array, wait_for_torch
-from torchtransient.scene.variant import active_variant, named_errors, quiet
+from torchtransient.scene.variant import active_variant, clear_frames, named_errors, quiet
 
 
 def run(
@@ -61,13 +62,24 @@ def run(
         check_values(job, values)
     if kind == BACKWARD and all(g is None for g in given):
         return tuple(torch.zeros_like(v) for v, need in zip(values, job.needs, strict=True) if need)
-    with open_session(job) as session:
-        kinds: dict[str, Any] = {RENDER: Images, BACKWARD: Gradients, FORWARD: Tangents}
-        results = kinds[kind](session, values, given)
-        for group in groups_of(session):
-            execute(session, results, group)
-        found: tuple[torch.Tensor, ...] = results.finish()
-        return found
+    kinds: dict[str, Any] = {RENDER: Images, BACKWARD: Gradients, FORWARD: Tangents}
+    handled = sys.exc_info()[1]
+    try:
+        with open_session(job) as session:
+            results = kinds[kind](session, values, given)
+            for group in groups_of(session):
+                execute(session, results, group)
+            found: tuple[torch.Tensor, ...] = results.finish()
+            return found
+    except Exception:
+        raise
+    except BaseException as interrupt:
+        # One that comes at the beginning of a block's __exit__ leaves its generator waiting as long as the traceback is
+        # kept (notebooks do), and with it the lock and the variant.
+        clear_frames(interrupt, handled)
+        raise
+    finally:
+        del handled
 
 
 # ---------------------------------------------------------------------------------------------------- a scene in use
@@ -147,14 +159,17 @@ def boundary_settings(boundary: bool, spp: int | None, integrator: Any) -> list[
 def with_settings(settings: Sequence[tuple[Any, str, Any]]) -> Iterator[None]:
     """Set attributes of plugins for the time of a block."""
     before = [(plugin, name, getattr(plugin, name)) for plugin, name, _ in settings]
+
+    def put_back() -> None:
+        for plugin, name, value in reversed(before):
+            setattr(plugin, name, value)
+
     try:
         for plugin, name, value in settings:
             setattr(plugin, name, value)
         yield
     finally:
-        with interrupts_wait():
-            for plugin, name, value in reversed(before):
-                setattr(plugin, name, value)
+        surely(put_back)
 
 
 @contextmanager
@@ -177,8 +192,7 @@ def open_session(job: RenderJob) -> Iterator[Session]:
                 attached = any(job.needs)
             finally:
                 if attached or job.scene.is_shared:
-                    with interrupts_wait():
-                        job.scene.restore(job.options, session.slots)
+                    surely(lambda: job.scene.restore(job.options, session.slots))
 
 
 @contextmanager
@@ -192,6 +206,11 @@ def _values_at_call(job: RenderJob) -> Iterator[None]:
     params = job.scene.built(job.options).params
     with dr.resume_grad():
         now = values_of(params)
+
+    def restore() -> None:
+        with dr.resume_grad():
+            put_back(params, now)
+
     try:
         with dr.resume_grad():
             if not job.at_call:
@@ -199,8 +218,7 @@ def _values_at_call(job: RenderJob) -> Iterator[None]:
             put_back(params, job.at_call[0], now)
         yield
     finally:
-        with interrupts_wait(), dr.resume_grad():
-            put_back(params, now)
+        surely(restore)
 
 
 # ------------------------------------------------------------------------------------------------------------ renders

@@ -14,6 +14,8 @@ from typing import Any, ParamSpec, TypeVar
 
 import torch
 
+from torchtransient.scene.variant import clear_frames
+
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
@@ -35,9 +37,18 @@ def opaque(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
     @functools.wraps(function)
     def call(*args: _P.args, **kwargs: _P.kwargs) -> _R:
-        if "torch._dynamo" not in sys.modules:
-            return function(*args, **kwargs)
-        return _untraced(function, disabled, args, kwargs)
+        handled = sys.exc_info()[1]
+        try:
+            if "torch._dynamo" not in sys.modules:
+                return function(*args, **kwargs)
+            return _untraced(function, disabled, args, kwargs)
+        except Exception:
+            raise
+        except BaseException as interrupt:
+            clear_frames(interrupt, handled)  # blocks that it has cut off at their end are ended now
+            raise
+        finally:
+            del handled
 
     return _stopping(call)
 

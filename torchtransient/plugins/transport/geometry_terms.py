@@ -23,7 +23,7 @@ def material_point(pi, ray, active, meshes=None, surfaces=None):
 
     ``meshes`` (PointerTable or None): those that may be met. Their derivatives by texture coordinates change with
     these, or are made up where there are none; the area is that of the triangle. ``surfaces``: as in
-    :func:`~..instances.surface_interaction`.
+    :func:`~.surface_interactions.surface_interaction`.
     """
     si = surface_interaction(surfaces, pi, ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
     area = dr.cross(si.dp_du, si.dp_dv)

@@ -25,7 +25,7 @@ _ANY = 0xFFFFFFFF
 
 
 class Surface(Scattering):
-    """Scattering at surfaces; vertices in media are those of :class:`.medium.SurfaceOrMedium`.
+    """Scattering at surfaces; vertices in media are those of :class:`.medium_scattering.SurfaceOrMedium`.
 
     ``guides``: a list of :class:`~..strategy.Guide`, whose shares sum to less than one.
     """
@@ -347,7 +347,7 @@ def is_black(weight):
 # Scattering where every surface is Lambertian: cosines instead of virtual calls.
 
 class Lambertian(Surface):
-    """:class:`.surface.Surface` for scenes that :meth:`fits`. ``draws_lobe``: draw the number that chooses a lobe, so
+    """:class:`.Surface` for scenes that :meth:`fits`. ``draws_lobe``: draw the number that chooses a lobe, so
     that a seed gives the same paths as there.
     """
 

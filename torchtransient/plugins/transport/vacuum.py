@@ -62,7 +62,7 @@ class Vacuum(Segment):
 
     In derivatives the first vertex and those behind delta lobes slide along the rays that found them. All others are
     points of their shapes, so that the integral over a surface that moves has no edges but where something hides it;
-    near points are dragged along with the vertex that sees them (:func:`~..scattering.geometry_terms.damped_motion`).
+    near points are dragged along with the vertex that sees them (:func:`~.geometry_terms.damped_motion`).
     """
 
     def prepare(self, context):
