@@ -301,18 +301,18 @@ def test_interrupts_leave_everything_as_it_was(stage, kind, monkeypatch):
     integrator = scene_integrator(recorded)
 
     failed = []
-    walk = type(integrator).walk
+    start = type(integrator).start
 
     def interrupt(*args, **kwargs):
         if not failed:
             failed.append(True)
             raise KeyboardInterrupt
-        return walk(*args, **kwargs)
+        return start(*args, **kwargs)
 
     with monkeypatch.context() as patched:
         if stage == "recorded":
             # In the middle of it, once: a call that is tried again must not hide it.
-            patched.setattr(type(integrator), "walk", interrupt)
+            patched.setattr(type(integrator), "start", interrupt)
         else:
             patched.setattr(recording.Recording, "run", interrupt)
         with pytest.raises(KeyboardInterrupt):
