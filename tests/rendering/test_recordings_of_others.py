@@ -1,7 +1,8 @@
 """Recorded calls beside scenes whose calls were cut off: Dr.Jit finds the arrays of every living plugin."""
 
-from __future__ import sys
+from __future__ import annotations
 
+import sys
 import threading
 
 import drjit as dr
