@@ -20,6 +20,7 @@ import pytest
 import torch
 from _pytest.faulthandler import fault_handler_stderr_fd_key
 
+from tools.small_room import VARIANT, make_room
 from torchtransient import plugins
 from torchtransient.scene.variant import syntax_kept
 
@@ -94,6 +95,20 @@ def _no_earlier_modules(request):
     if {"mi", "VARIANT"} & set(vars(request.module)):
         gc.collect()
         gc.freeze()
+
+
+@pytest.fixture
+def room() -> dict:
+    """The room as a dictionary that a test may change."""
+    return make_room()
+
+
+@pytest.fixture(scope="module")
+def room_scene() -> torchtransient.Scene:
+    """The room loaded once; scenes are immutable. A scene keeps what was built of it for each kind of film, and every
+    kernel has all plugins that are alive: those of other modules are not carried along.
+    """
+    return torchtransient.load(make_room(), variant=VARIANT)
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 
+import drjit as dr
 import numpy as np
 import pytest
 import torch
@@ -12,7 +13,7 @@ import torch
 import torchtransient as tt
 from support import foreign_paint
 from support.marks import long_rows
-from tools.small_room import GREY, VARIANT, make_room
+from tools.small_room import GREY, VARIANT, WALL_POSE, make_room
 from torchtransient.rendering.recording import LAUNCHED, OWN_ENTRY
 from torchtransient.scene.variant import active_variant
 
@@ -211,3 +212,17 @@ def test_plugins_of_no_scene(kinds):
         out = recorded(seed=seed)
         torch.testing.assert_close(out.transient, traced(seed=seed).transient, rtol=1e-5, atol=0)
     assert out.stats.recorded == (LAUNCHED,) and again
+
+
+def test_gradients_that_an_integrator_leaves_at_parameters_arrive():
+    """Mitsuba's contract: ``render_backward`` adds gradients to the scene's parameters."""
+    from torchtransient.plugins.integrators.path import TransientPath
+
+    class Own(TransientPath):
+        def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
+            dr.accum_grad(params[WALL_POSE].matrix, 2.0)
+
+    renderer = tt.TransientRenderer(tt.load(make_room(), variant=VARIANT), parameters=[WALL_POSE], spp=2)
+    renderer.scene.built(renderer._options).scene.integrator().__class__ = Own
+    renderer(seed=0).transient.sum().backward()
+    assert renderer.values[WALL_POSE].grad.max() == 2

@@ -445,10 +445,11 @@ class Gradients(_Derivatives):
         return _steady_adjoint(steady), _cube_adjoint(response)
 
     def collect(self, _n: int, item: Item) -> None:
-        """Carry the gradients at the scene's parameters on to the leaves, and add them up."""
+        """Add up the gradients that have arrived at the leaves."""
         import drjit as dr
 
         job, slots = self.session.job, self.session.slots
+        # A render_backward of an integrator's own may leave gradients at the scene's parameters, as Mitsuba asks of it.
         for key in slots.originals:
             value = self.session.params[key]
             if dr.grad_enabled(value):

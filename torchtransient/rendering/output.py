@@ -73,7 +73,7 @@ class RenderStats:
             energy_before=tuple(energy for run in runs for energy in run.energy_before),
             energy_after=tuple(energy for run in runs for energy in run.energy_after),
             energy_total=tuple(energy for run in runs for energy in run.energy_total),
-            recorded=tuple(said for run in runs for said in run.recorded),
+            recorded=tuple(call for run in runs for call in run.recorded),
             derivatives_recorded=job.derivative_log,
             max_depth=runs[0].max_depth,
             light_beyond=None if job.bound is None else job.bound.beyond,
@@ -102,8 +102,8 @@ class RenderStats:
             energy_before=tuple(energy for stats in several for energy in stats.energy_before),
             energy_after=tuple(energy for stats in several for energy in stats.energy_after),
             energy_total=tuple(energy for stats in several for energy in stats.energy_total),
-            recorded=tuple(said for stats in several for said in stats.recorded),
-            derivatives_recorded=[said for stats in several for said in stats.derivatives_recorded],
+            recorded=tuple(call for stats in several for call in stats.recorded),
+            derivatives_recorded=[call for stats in several for call in stats.derivatives_recorded],
         )
 
 

@@ -22,7 +22,7 @@ from torchtransient.rendering.job import Item
 
 # Structures of one built scene and set of keys, and recordings of each of them for other sizes and flags of arrays.
 MAX_STRUCTURES, MAX_RECORDINGS = 64, 8
-# Calls in a row none of which could be launched, after which it is said; as many kinds as are kept may take turns.
+# Calls in a row that could not be launched, after which there is a warning; as many kinds as are kept may take turns.
 IN_VAIN = 24
 
 FIRST, RECORDED, LAUNCHED = "traced: the first call", "recorded", "launched"
@@ -178,9 +178,16 @@ class Recordings:
         return len(self._found)
 
     def run(self, jobs: Sequence[Any]) -> tuple[str, list[list[Any]]]:
-        """Carry out prepared jobs (:class:`~torchtransient.plugins.integrators.job.Prepared`) of one scene with
-        one set of values: how, and what each film has taken (:meth:`~.FilmInterface.taken`), nothing in reverse mode.
-        Raises NotRecordedError where they are to be traced; nothing has been rendered then.
+        """Execute prepared jobs of one scene with one set of values: recorded, or launched from a recording.
+
+        Args:
+            jobs: :class:`~torchtransient.plugins.integrators.job.Prepared` jobs.
+
+        Returns:
+            ``RECORDED`` or ``LAUNCHED``, and the arrays of each film for its ``hold``; none in reverse mode.
+
+        Raises:
+            NotRecordedError: where they are to be traced; nothing has been rendered then.
         """
         import drjit as dr
 
@@ -214,9 +221,9 @@ class Recordings:
 
     def _watch(self, launched: bool, kind: str, structure: tuple[Any, ...]) -> None:
         self._in_vain = 0 if launched else self._in_vain + 1
-        # Calls that come again are launched from the third time on: of many kinds that take turns, each is owed two.
-        owed = 2 * sum(found.calls > 1 for found in self._found.values())
-        if self._in_vain >= max(IN_VAIN, MAX_STRUCTURES) + owed and not self._warned:
+        # Calls that come again are launched from the third time on: of many kinds that take turns, each needs two.
+        first = 2 * sum(found.calls > 1 for found in self._found.values())
+        if self._in_vain >= max(IN_VAIN, MAX_STRUCTURES) + first and not self._warned:
             self._warned = True
             warnings.warn(
                 f"the last {self._in_vain} renders and derivatives of a scene were all traced anew, none could use a "
@@ -248,8 +255,8 @@ def _difference(before: tuple[Any, ...], now: tuple[Any, ...]) -> str:
 
 
 def _short(value: Any) -> str:
-    said = repr(value[1] if isinstance(value, tuple) and len(value) == 2 else value)
-    return said if len(said) <= 80 else said[:77] + "..."
+    text = repr(value[1] if isinstance(value, tuple) and len(value) == 2 else value)
+    return text if len(text) <= 80 else text[:77] + "..."
 
 
 class Recording:

@@ -306,7 +306,7 @@ _USED_AS_TORCH = re.compile(r"must be Tensor, not TensorX|'TensorX\w+' object ha
 
 @dataclass(frozen=True)
 class Call:
-    """Everything about a call that is not a tensor (:class:`.derivatives.Replayable`).
+    """Everything about a call that is not a tensor (:class:`.autograd.Replayable`).
 
     Attributes:
         tree, leaves: the arguments ``(args, kwargs)``, with a :class:`Slot` for each tensor.

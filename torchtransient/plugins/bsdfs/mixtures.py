@@ -1,9 +1,10 @@
 """Mixtures (``mask``, ``blendbsdf``, ``blendphase``): a path chooses one part of them and sees that part alone.
 
 Mitsuba samples such a mixture as a whole. Where a part has a delta lobe or lets light through that goes wrong: a blend
-divides by a sum of densities that is not that of its samples (:func:`.mitsuba_compat.adds_up_wrongly`), and the
+divides by a sum of densities that is not that of its samples
+(:func:`~torchtransient.plugins.mitsuba_compat.adds_up_wrongly`), and the
 derivative of the probability with which a part was chosen is lost. Here the choice is made outside of the BSDFs'
-methods, as between delayed and prompt light (:mod:`.bsdfs.delay_table`): the path is handed the pointer of a part and
+methods, as between delayed and prompt light (:mod:`.delay_table`): the path is handed the pointer of a part and
 the factor ``weight / probability``, of which the weight is attached and the probability is not.
 
 Which mixtures are taken apart: blends of delta lobes, of what lets light through, and of what works on different sides
@@ -373,7 +374,7 @@ class MixtureChoice:
         self._of, self._chosen = mixtures, chosen
 
     def take_part(self, sample: Any, si: Any, u: Any, active: Any) -> None:
-        """Change ``sample`` (a :class:`.bsdfs.delay_table.DelaySample`) to one part, chosen by the uniform number
+        """Change ``sample`` (a :class:`.delay_table.DelaySample`) to one part, chosen by the uniform number
         ``u``.
         """
         sample.bsdf, weight = self.part_of(sample.bsdf, si, u, active)

@@ -44,7 +44,7 @@ class RefractiveBSDFs:
         ``bsdfs``: those of the scene where they are known already.
         Raises SceneError for a BSDF of which two parts have different indices, where a connection has no single optical
         length, and for a refractive plugin that does not expose ``eta``. A path sees one part of the blends of a scene
-        (:mod:`..mixtures`); a plugin of others may hold several.
+        (:mod:`.mixtures`); a plugin of others may hold several.
         """
         found = bsdfs if bsdfs is not None else bsdfs_of_scene(scene)
         leaves = ((bsdf, _refractive_leaves(bsdf, (mi.BSDFFlags.GlossyTransmission,))) for bsdf in found)

@@ -485,8 +485,8 @@ def _record_sink(job, rays, block=None):
 def _backward(job):
     """Execute a prepared job in reverse mode, with gradients suspended."""
     integrator, context = job.integrator, job.world
-    # Derivatives wait at the parameters until all launches are done: following the graph further uses up its edges,
-    # and only those of the first launch would arrive.
+    # Derivatives wait at the arrays that kernels read until the scope ends after the last launch; Dr.Jit carries on
+    # then: following the graph further uses up its edges, and only those of the first launch would arrive.
     with dr.isolate_grad(), context.contents.hidden_from_mitsuba():
         for launch in job.launches if context.walks else ():
             rays, match, _, pixel = _primary_rays(job, launch)

@@ -169,7 +169,7 @@ class Prepared:
     """One render or one derivative of it. Made outside of recorded code by
     :meth:`~.base.TransientIntegrator.prepared`, carried out by :meth:`~.base.TransientIntegrator.run`.
 
-    ``kind``: one of :data:`~torchtransient.interfaces.JOBS`. ``launches``: the :class:`.Pass` of its paths;
+    ``kind``: one of :data:`~torchtransient.interfaces.JOBS`. ``launches``: the :class:`Pass` of its paths;
     ``seed`` (``UInt32``) of the job; ``samples``: the largest number of a pixel. ``incoming``: the film's adjoint in
     reverse mode. ``beside``: what derivatives have beside paths. ``plugins``: those of the scene that are
     written in Python, whose numbers become part of the kernels. ``refusal``: why it cannot be recorded, None where it

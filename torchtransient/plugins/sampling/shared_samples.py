@@ -166,7 +166,7 @@ def samples_at(elements: HiddenElements, x: Any, y: Any, count: int, tile: Any =
 def material_samples(elements: HiddenElements, samples: SharedSamples, meshes: Any) -> Local:
     """Samples as points that follow their shapes, attached where these are: ``p``, ``n``, ``geometric_n``, and
     ``front`` and ``back``, albedo over pi of the sides times the area that a sample stands for. ``meshes``
-    (:class:`~..pointer_table.PointerTable`): the shapes with vertices of their own.
+    (:class:`~..kernel_arrays.PointerTable`): the shapes with vertices of their own.
     """
     a, y = samples.u.x, samples.u.y
     pi, ray = _preliminary(elements, samples.element, samples.p, samples.geometric_n, a, y)

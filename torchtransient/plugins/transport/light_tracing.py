@@ -95,7 +95,7 @@ class FromLight:
         return getattr(self._scattering, name)
 
     def scatter(self, context: Any, path: Any, vertex: Any, proposals: Any, sampler: Any) -> Any:
-        """Sample the next direction, see :meth:`~..strategy.Scattering.scatter`."""
+        """Sample the next direction, see :meth:`~.strategy.Scattering.scatter`."""
         answers, step = self._scattering.scatter(context, path, vertex, proposals, sampler)
         for proposal, answer in zip(proposals, answers, strict=True):
             if answer is not None:

@@ -79,7 +79,7 @@ class FoundVacuum(MaterialVacuum):
     """The same for walks with guides, which look at the end of a segment before they weigh it: what was found there is
     carried to the next turn of the loop. A leg is ``pi`` and ``si``, of which the loop keeps what is used.
 
-    ``overlaps``: some of what guides draw lies in something else (:mod:`~..around_corner.overlaps`).
+    ``overlaps``: some of what guides draw lies in something else (:mod:`~..around_corner.scan_table`).
     """
 
     def __init__(self, overlaps):

@@ -43,26 +43,34 @@ DAMPING = 0.05
 
 
 class SceneContents:
-    """The static choices of the kernels. Does not change once built.
+    """Contents of a scene that decide which kernels are traced. Does not change once built.
 
-    ``sensor``: the one that looks. ``bsdfs``: those that paths can meet. ``delta``, ``glossy``: some BSDF has such a
-    lobe. ``instances``: those of shape groups (:class:`.instances.Instances`). ``detached_hits``: the shapes that leave
-    their hit points detached (:class:`.hits.DetachedHits`). ``distant``: reference sphere of infinitely distant
-    emitters. ``refraction``: the transmissive rough BSDFs, which have an index. ``surroundings``: what may lie around
-    the sensor (:class:`~..sensors.surroundings.Surroundings`). ``delays``: the BSDFs that scatter late. ``mixtures``:
-    masks and blends, of which a path may be handed one part. ``two_sided``: the two-sided BSDFs in polarized variants.
-    ``hidden_probability``: BSDFs whose delta lobes hide the derivative of their probability. ``media``: the
-    participating media (:class:`.media_contents.MediaContents`). ``sphere_lights``: the spherical area lights
-    (:class:`~..sampling.sphere_lights.SphereLights`). ``shape_lights``: the area lights that are sampled over their
-    shapes (:class:`~..sampling.shape_lights.ShapeLights`). ``emitting_meshes``: those with vertices of their own;
-    ``meshes``: all of those, of shape groups, too; ``sliding``: the shapes without material points;
-    ``smooth_lights``: lights on meshes with normals at their vertices. Tables, instances, surroundings, mixtures, media
-    and lights are None where the scene has no such thing.
+    Tables, instances, surroundings, mixtures, media and lights are None where the scene has no such thing.
 
-    ``damping_radius`` (Float): see :func:`.scattering.geometry_terms.damped_motion`. ``patterned_lights``: what leaves
-    some surface differs from place to place. ``patterned``: that, or how a surface scatters does, or its normal.
-    ``untraceable``: names of the emitters that derivatives cannot be traced beside. ``observer``: the
-    :class:`~..films.colour.StandardObserver` in spectral variants.
+    Attributes:
+        sensor: the sensor of the job.
+        bsdfs: BSDFs that paths can meet.
+        delta, glossy: whether some BSDF has such a lobe.
+        instances: shape groups (:class:`.surface_interactions.Instances`).
+        detached_hits: shapes whose hit points Mitsuba leaves detached (:class:`.surface_interactions.DetachedHits`).
+        distant: reference sphere of infinitely distant emitters.
+        refraction: transmissive rough BSDFs, which have an index.
+        surroundings: media and bodies around the sensor (:class:`~..sensors.surroundings.Surroundings`).
+        delays: BSDFs that scatter late.
+        mixtures: masks and blends, one part of which scatters a path.
+        two_sided: two-sided BSDFs in polarized variants.
+        hidden_probability: BSDFs whose delta lobes hide the derivative of their probability.
+        media: participating media (:class:`MediaContents`).
+        sphere_lights: spherical area lights (:class:`~..sampling.sphere_lights.SphereLights`).
+        shape_lights: area lights that are sampled over their shapes (:class:`~..sampling.sphere_lights.ShapeLights`).
+        meshes, emitting_meshes: meshes with vertices of their own, in shape groups too; those that emit.
+        sliding: shapes without material points.
+        smooth_lights: lights on meshes with normals at their vertices.
+        damping_radius: ``Float``, metres, see :func:`.geometry_terms.damped_motion`.
+        patterned_lights: whether the light that leaves some surface differs from place to place.
+        patterned: whether that, the scattering of a surface, or its normal does.
+        untraceable: names of emitters beside which derivatives cannot be traced.
+        observer: :class:`~..films.colour.StandardObserver` in spectral variants.
 
     A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
     """
@@ -218,7 +226,7 @@ class FlightSettings:
     before a vertex is kept, since the vertex may move with it. ``rate_floor`` (1 / m, None when no extinction is
     differentiated): the smallest rate at which collisions are sampled: where the density is zero, its derivative is
     not, and is found by collisions alone. ``hide_emitters``: rays from the sensor pass light sources.
-    ``surfaces``: what their derivatives need beside Mitsuba (:class:`.instances.AttachedSurfaces`), or None.
+    ``surfaces``: what their derivatives need beside Mitsuba (:class:`.surface_interactions.AttachedSurfaces`), or None.
     """
 
     def __init__(self, contents: MediaContents, wanted: Any, hide_emitters: bool, surfaces: Any = None):

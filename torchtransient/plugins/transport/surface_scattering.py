@@ -27,7 +27,7 @@ _ANY = 0xFFFFFFFF
 class Surface(Scattering):
     """Scattering at surfaces; vertices in media are those of :class:`.medium_scattering.SurfaceOrMedium`.
 
-    ``guides``: a list of :class:`~..strategy.Guide`, whose shares sum to less than one.
+    ``guides``: a list of :class:`~.strategy.Guide`, whose shares sum to less than one.
     """
 
     # Whether light scatters alike around the normal, whatever the tangents are.
@@ -347,7 +347,7 @@ def is_black(weight):
 # Scattering where every surface is Lambertian: cosines instead of virtual calls.
 
 class Lambertian(Surface):
-    """:class:`.Surface` for scenes that :meth:`fits`. ``draws_lobe``: draw the number that chooses a lobe, so
+    """:class:`Surface` for scenes that :meth:`fits`. ``draws_lobe``: draw the number that chooses a lobe, so
     that a seed gives the same paths as there.
     """
 
@@ -395,7 +395,7 @@ class Lambertian(Surface):
 
     @staticmethod
     def _towards(vertex, d):
-        """The :class:`~..strategy.Answer` towards the world direction ``d``."""
+        """The :class:`~.strategy.Answer` towards the world direction ``d``."""
         cos = dr.dot(vertex.si.sh_frame.n, d) * vertex.side
         pdf = dr.select(cos > 0, cos, 0) * dr.inv_pi
         value = vertex.ρ * pdf

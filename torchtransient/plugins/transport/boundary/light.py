@@ -27,7 +27,7 @@ _STEEP = 10.0
 
 class LightPass(BoundaryPass):
     """Boundary pass that draws an edge point p and a point y of a light, and follows a path behind p, on its shadow, to
-    the sensor: a walk with one connection (:class:`~..connection.sensor_sampled.SensorSampled`). Its first vertex x is
+    the sensor: a walk with one connection (:class:`~..light_tracing.SensorSampled`). Its first vertex x is
     held on the ray of the camera where it is connected at once (``direct``), and is a point of its shape where it goes
     on.
     """
@@ -98,7 +98,7 @@ class LightPass(BoundaryPass):
 
     def _in_line(self, term, edges, light, x, ray, medium, numbers, sampler, active):
         """Find where the sensor sees the shadow at ``x`` past the edge itself, as from a place at the light; returns
-        ``shown``, as :class:`~..connection.sensor_sampled.SensorSampled` asks for it. A ray to the sensor would let
+        ``shown``, as :class:`~..light_tracing.SensorSampled` asks for it. A ray to the sensor would let
         rounding decide, once more than in the pass of the sensor. That one sees past the edge either what the light
         reaches, or the shadow: where it is not lit, the edge of the shadow is in view.
         """

@@ -69,7 +69,7 @@ class Chains:
 
     Args:
         integrator, world: of the job.
-        places: :class:`~..sensors.seen_from.SensorPlaces`.
+        places: :class:`~torchtransient.plugins.sensors.seen_from.SensorPlaces`.
         sampler: seeded, with ``RAYS`` lanes.
 
     ``move``: some of them move, and so do edges at rest as seen through them.
@@ -392,7 +392,7 @@ def sees_chains(world, sensor):
 
 class SensorThroughChain(Connection):
     """The sensor as seen through a chain, which is one for all vertices of a path: :meth:`set` before a launch. Events
-    are as those of :class:`~..connection.sensor_sampled.SensorSampled`.
+    are as those of :class:`~..light_tracing.SensorSampled`.
     """
 
     name = "sensor_through_chain"
