@@ -242,7 +242,7 @@ def test_adjoint_samples_are_independent_of_the_render(room_scene, weights):
 
 def test_samples_of_the_gradient_are_a_choice(room_scene, weights):
     def spread(spp_grad):
-        renderer = make_renderer(room_scene, spp_grad=spp_grad)
+        renderer = make_renderer(room_scene, spp_grad=spp_grad, sampler="independent")
         return torch.stack([gradient(renderer, START, weights, seed) for seed in range(24)]).std(0).mean()
 
     # 64 times the samples: an eighth of the spread. Between 24 seeds the ratio itself is known to about 15 %.

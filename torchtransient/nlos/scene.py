@@ -69,7 +69,6 @@ def capture_scene(
         "sensor_origin": _numbers(scan.sensor_origin).tolist(),
         "laser_origin": _numbers(scan.laser_origin).tolist(),
         "points": _numbers(scan.sensor_points).reshape(-1, 3),
-        "sampler": {"type": "independent"},
         "film": film,
     }
     if scan.kind != "confocal":

@@ -157,6 +157,7 @@ PLUGIN_MODULES: tuple[PluginModule, ...] = (
     PluginModule("torchtransient.plugins.sensors.nlos_capture_meter", (("sensor", "nlos_capture_meter"),)),
     PluginModule("torchtransient.plugins.integrators.nlos_path", (("integrator", "transient_nlos_path"),)),
     PluginModule("torchtransient.plugins.emitters.laser_beam", (("emitter", "laser_beam"),)),
+    PluginModule("torchtransient.plugins.samplers.owen", (("sampler", "owen"),)),
     PluginModule("torchtransient.plugins.shapes.mesh_arrays", (("shape", "mesh_arrays"),)),
     PluginModule("torchtransient.plugins.emitters.angular_area", (("emitter", "angulararea"),)),
     PluginModule("torchtransient.plugins.emitters.directional_area", (("emitter", "diff_directionalarea"),)),

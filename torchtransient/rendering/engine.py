@@ -32,6 +32,7 @@ from torchtransient.rendering.memory import check_fits
 from torchtransient.rendering.recording import LARGE_FILM, Numbered, Recordings, execute, groups_of
 from torchtransient.rendering.values import detached, put_back, values_of
 from torchtransient.scene.edits import built_depth
+from torchtransient.scene.objects import sampler_plugin
 from torchtransient.scene.parameters import needing_slope
 from torchtransient.scene.physics import all_finite, are_finite, smallest_and_largest
 from torchtransient.scene.values import own_array, wait_for_torch
@@ -313,14 +314,16 @@ class Images:
             self._response = mi.TensorXf(self._memory, (self.count, *film.cube_shape())).torch()
         assert self._steady is not None and self._response is not None
         seconds = time.perf_counter() - self._started
-        spp = samples_drawn(session.sensors[job.items[0].sensor].sampler().clone(), job.spp)
+        sampler = session.sensors[job.items[0].sensor].sampler()
+        spp = samples_drawn(sampler.clone(), job.spp)
         channels = len(film.channel_names())
         light = self._steady[..., :channels].sum((-3, -2, -1), dtype=torch.float64) / channels
         total = tuple(light.reshape(-1).tolist())
         before, after = zip(*self._energies, strict=True)
         integrator, depth = session.slots.built.integrator, built_depth(session.integrator)
         calls = tuple(self.calls)
-        job.log.append(RunLog(job.items, seconds, integrator, spp, before, after, total, calls, depth))
+        name = sampler_plugin(sampler)
+        job.log.append(RunLog(job.items, seconds, integrator, spp, before, after, total, calls, depth, name))
         if job.watch.enabled:
             job.watch.window(sum(total), sum(before), sum(after))
         return self._steady, self._response

@@ -85,6 +85,7 @@ class RunLog:
         energy_total: all light.
         recorded: how each call was made: launched, recorded, or the reason why it was traced.
         max_depth: of the integrator, -1 for no limit, None for one without.
+        sampler: plugin name.
     """
 
     items: tuple[Item, ...]
@@ -96,6 +97,7 @@ class RunLog:
     energy_total: tuple[float, ...]
     recorded: tuple[str, ...]
     max_depth: int | None = None
+    sampler: str = ""
 
 
 @dataclass(frozen=True)

@@ -39,6 +39,7 @@ class RenderStats:
         light_beyond: share of the light in deeper paths, where a pilot run has found ``max_depth`` for derivatives of a
             scene that states none; else None. It is that of the described values: brighter ones, given or learnt, have
             the same ``max_depth`` and more light beyond it.
+        sampler: plugin name; "owen" where the scene names ``independent``, or none.
     """
 
     _: KW_ONLY
@@ -56,6 +57,7 @@ class RenderStats:
     derivatives_recorded: list[str] = field(default_factory=list, compare=False)
     max_depth: int | None = None
     light_beyond: float | None = None
+    sampler: str = ""
 
     @classmethod
     def of_job(cls, job: RenderJob, pixels: int) -> RenderStats:
@@ -77,6 +79,7 @@ class RenderStats:
             derivatives_recorded=job.derivative_log,
             max_depth=runs[0].max_depth,
             light_beyond=None if job.bound is None else job.bound.beyond,
+            sampler=runs[0].sampler,
         )
 
     @classmethod

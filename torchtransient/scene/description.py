@@ -79,10 +79,11 @@ class DictDescription(Description):
         import mitsuba as mi
 
         state = parsed(config, self.tree)
+        kinds = {"shape": mi.ObjectType.Shape, "sampler": mi.ObjectType.Sampler}
         for node in state.nodes:
             # Mitsuba learns the kind of a plugin written in Python when it builds it.
-            if node.type == mi.ObjectType.Unknown and plugins.kind_of(node.props.plugin_name()) == "shape":
-                node.type = mi.ObjectType.Shape
+            if node.type == mi.ObjectType.Unknown:
+                node.type = kinds.get(plugins.kind_of(node.props.plugin_name()) or "", node.type)
         return state
 
     @contextmanager

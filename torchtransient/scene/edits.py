@@ -116,6 +116,9 @@ class FilmRequest(Protocol):
         """Write the properties into those of a film node."""
 
 
+DEFAULT_SAMPLER = "owen"
+
+
 @dataclass(frozen=True)
 class BuildOptions:
     """Changes of a description when it is built.
@@ -127,7 +130,8 @@ class BuildOptions:
         real_bitmaps: store bitmaps as real numbers; Mitsuba keeps 8-bit images in 8 bits, which have no derivative.
         merge: let Mitsuba merge meshes and equal materials, which is faster to trace but takes parameters away.
         transient: turn a steady film and integrator into transient ones.
-        sampler: plugin name of a sampler that replaces those of the sensors, with the same number of samples.
+        sampler: plugin name of a sampler that replaces those of the sensors, with the same number of samples; None
+            replaces ``independent``, and the one of a sensor without a sampler, by :data:`DEFAULT_SAMPLER`.
         pulse, irf: shape of the pulse and impulse response of every film, None to keep their own.
         steady: False takes the steady image from the histograms.
         integrator: plugin name of a transient integrator that replaces the scene's, with the parameters of both.
@@ -362,10 +366,12 @@ def _become_path(state: Any, index: int) -> None:
 
 
 def _edit_samplers(state: Any, options: BuildOptions) -> None:
-    """Replace the samplers of all sensors by another plugin with the same number of samples."""
+    """Replace the samplers of all sensors by the one asked for, with the same number of samples. None was asked for:
+    replace those that the scene names by habit.
+    """
     import mitsuba as mi
 
-    if options.sampler is None:
+    if options.sampler is None and not options.transient:
         return
     for index in range(len(state.nodes)):
         node = state.nodes[index]
@@ -373,11 +379,21 @@ def _edit_samplers(state: Any, options: BuildOptions) -> None:
             continue
         sampler = find_child(state, node, lambda child: child.type == mi.ObjectType.Sampler)
         loaded = _loaded_child(node, mi.Sampler)
+        if options.sampler is None and not _names_by_habit(state, node, sampler, loaded):
+            continue
+        plugin = options.sampler or DEFAULT_SAMPLER
         if sampler is None:
             count = {} if loaded is None else {"sample_count": node.props[loaded].sample_count()}
-            _add_child(state, index, loaded or "sampler", options.sampler, mi.ObjectType.Sampler, count)
+            _add_child(state, index, loaded or "sampler", plugin, mi.ObjectType.Sampler, count)
         else:
-            _become(state, sampler, options.sampler, keep=("sample_count", "seed"))
+            _become(state, sampler, plugin, keep=("sample_count", "seed"))
+
+
+def _names_by_habit(state: Any, node: Any, sampler: int | None, loaded: str | None) -> bool:
+    """Return whether a sensor has the sampler that every scene file names, or none."""
+    if loaded is not None:
+        return bool(node.props[loaded].class_name() == "IndependentSampler")
+    return sampler is None or state.nodes[sampler].props.plugin_name() == "independent"
 
 
 # --------------------------------------------------------------------------------------------------------------- twins

@@ -229,7 +229,7 @@ _CAMERAS = {
 }
 _SAMPLERS = {
     "IndependentSampler": "independent", "StratifiedSampler": "stratified", "MultijitterSampler": "multijitter",
-    "OrthogonalSampler": "orthogonal", "LowDiscrepancySampler": "ldsampler",
+    "OrthogonalSampler": "orthogonal", "LowDiscrepancySampler": "ldsampler", "OwenSampler": "owen",
 }  # fmt: skip
 
 
@@ -319,9 +319,15 @@ def _rfilter(rfilter: Any) -> dict[str, Any] | None:
     return found.get(kind)
 
 
+def sampler_plugin(sampler: Any) -> str:
+    """Return the plugin name of a sampler, or its class for one of others."""
+    name = sampler.class_name() if type(sampler).__module__ == "mitsuba" else type(sampler).__name__
+    return _SAMPLERS.get(name, name)
+
+
 def _sampler(sampler: Any) -> dict[str, Any] | None:
-    plugin, printed = _SAMPLERS.get(sampler.class_name()), printed_properties(sampler)
-    if plugin is None:
+    plugin, printed = sampler_plugin(sampler), printed_properties(sampler)
+    if plugin not in _SAMPLERS.values():
         return None
     found: dict[str, Any] = {"type": plugin, "sample_count": int(sampler.sample_count())}
     if "jitter" in printed:

@@ -25,6 +25,27 @@ def scrambled(x: Any, seed: Any) -> Any:
     return dr.brev(x)
 
 
+def hashed(x: Any) -> Any:
+    """Return a bijective hash of 32 bits (constants of Wellons' lowbias32)."""
+    x = mi.UInt32(x)
+    x ^= x >> 16
+    x *= mi.UInt32(0x7FEB352D)
+    x ^= x >> 15
+    x *= mi.UInt32(0x846CA68B)
+    return x ^ (x >> 16)
+
+
+def sobol_second(index: Any) -> Any:
+    """Return the second coordinate of Sobol's points, a ``UInt32`` fraction; the first one is ``dr.brev(index)``.
+
+    Its direction numbers are the rows of Pascal's triangle modulo 2, which five steps multiply with.
+    """
+    x = dr.brev(mi.UInt32(index))
+    for shift, mask in ((16, 0x0000FFFF), (8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
+        x ^= (x & mi.UInt32(mask)) << shift
+    return x
+
+
 def plane_points(count: int, seed: Any, sets: int = 1) -> tuple[Any, Any]:
     """Return points of the unit square, in ascending order of the first coordinate.
 
@@ -58,7 +79,7 @@ def plane_point(j: Any, count: int, seed: Any, number: Any = 0) -> tuple[Any, An
     x = (mi.Float64(j) + (mi.Float64(shift) + 0.5) * 2.0**-32) / dr.opaque(mi.Float64, float(count))
     common = mi.sample_tea_32(shift, key, ROUNDS)[0]
     y = (scrambled(dr.brev(j), key) & ~below) | (common & below)
-    return x, mi.Float(y >> 8) * 2.0**-24 + 2.0**-25
+    return x, unit_float(y)
 
 
 # --------------------------------------- sobol's points in some dimensions, scrambled, in integer arithmetic of kernels
@@ -108,7 +129,8 @@ def sobol(index: Any, dimension: int, seed: Any) -> Any:
 
 def unit_float(bits: Any) -> Any:
     """Return a ``Float`` in (0, 1) from a 32-bit fraction."""
-    return mi.Float(bits >> 8) * 2.0**-24 + 2.0**-25
+    # With one more bit the largest would be rounded to one.
+    return mi.Float(bits >> 9) * 2.0**-23 + 2.0**-24
 
 
 def unit_double(bits: Any) -> Any:
