@@ -92,7 +92,7 @@ def _put_back_handlers(left: list[tuple[int, Any]]) -> None:
             _put_back_handlers(left)
 
 
-def surely(put_back: Callable[[], object]) -> None:
+def ensure_restored(put_back: Callable[[], object]) -> None:
     """Call ``put_back``, which may run twice: once more where an interrupt has cut it off.
 
     For ``finally`` blocks. Only a second Ctrl-C within the same call can leave a scene with the settings of that call.
@@ -116,7 +116,7 @@ _waiting: list[Any] = []
 
 @contextmanager
 def no_collection() -> Iterator[None]:
-    """Hold back the garbage collector and :func:`let_go` in every thread. May be nested; also a decorator."""
+    """Hold back the garbage collector and :func:`release_when_safe` in every thread. May be nested, or a decorator."""
     global _blocks, _stopped
     with _lock:
         _blocks += 1
@@ -135,7 +135,7 @@ def no_collection() -> Iterator[None]:
                     gc.enable()
 
 
-def let_go(contents: list[Any]) -> None:
+def release_when_safe(contents: list[Any]) -> None:
     """Empty a list that holds the last references to Mitsuba objects: now, or after the last :func:`no_collection`."""
     with _lock:
         if _blocks:

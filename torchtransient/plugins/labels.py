@@ -109,7 +109,7 @@ class LabelResults:
         """Hold what has been computed."""
         self._arrays = arrays
 
-    def taken(self) -> list[Any]:
+    def release_storage(self) -> list[Any]:
         """Return the results and release them."""
         found, self._arrays = self._arrays, []
         return found

@@ -78,7 +78,7 @@ def _is_light(node: Any, key: str, owners: Sequence[tuple[Any, str]]) -> bool:
     return isinstance(node, mi.Texture) and any(isinstance(holder, mi.Emitter) for holder, _ in owners)
 
 
-def lifted(value: Any) -> Any:
+def without_zeros(value: Any) -> Any:
     """An array of numbers, of which none is exactly zero."""
     return dr.select(value == 0, ALMOST_BLACK, value)
 
@@ -229,7 +229,7 @@ class ParameterTracker:
         """Return :func:`effect_of`, with everything that holds the plugin ``node``."""
         return effect_of(node, key, flags, self._owners_of(node, key.rsplit(".", 1)[-1]))
 
-    def stood_in_for(self, node: Any, key: str) -> list[tuple[Any, str]]:
+    def replaced_plugins(self, node: Any, key: str) -> list[tuple[Any, str]]:
         """Return the plugins that are replaced for the derivative by a parameter of ``node``, if there is a
         ``stand_in``: itself, or the holders of a texture, each with the name it has there.
         """

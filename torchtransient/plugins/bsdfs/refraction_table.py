@@ -37,7 +37,7 @@ class RefractiveBSDFs:
         self._check()
 
     @staticmethod
-    def of(scene: Any, bsdfs: list[Any] | None = None) -> RefractiveBSDFs | None:
+    def from_scene(scene: Any, bsdfs: list[Any] | None = None) -> RefractiveBSDFs | None:
         """Return the refractive surfaces of ``scene``, or None when nothing in it refracts through a lobe that can be
         connected to.
 

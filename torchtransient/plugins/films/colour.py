@@ -169,7 +169,7 @@ class SensorResponse:
         return [mi.unpolarized_spectrum(curve.eval(si)) for curve in self.textures]
 
     @staticmethod
-    def of(props) -> SensorResponse | None:
+    def from_properties(props) -> SensorResponse | None:
         """The bands among the properties of a film; None when it has none."""
         names = [name for name in list(props.keys()) if _is_curve(props, name)]
         if not names:

@@ -162,7 +162,7 @@ class TransientIntegrator(mi.CppADIntegrator):
             self.max_depth, self.rr_depth, bool(self.hide_emitters), self.discard_direct_light, self.camera_unwarp
         )
 
-    def world(self, scene, contents, wanted=None, window=None, settings=None) -> RenderContext:
+    def render_context(self, scene, contents, wanted=None, window=None, settings=None) -> RenderContext:
         """Return the context of a job; ``settings``: others than the integrator's own."""
         return RenderContext(scene, contents, settings or self.settings(), self.strategies(contents), wanted, window)
 
@@ -299,7 +299,7 @@ class TransientIntegrator(mi.CppADIntegrator):
                 contents = self.contents(scene, sensor)
             else:
                 contents, wanted = self._wanted(scene, sensor, film)
-            context = self.world(scene, contents, wanted, film.arrivals())
+            context = self.render_context(scene, contents, wanted, film.arrivals())
             lanes = None if context.record_room is None else context.record_room.lanes
             sampler = sensor.sampler().clone()
             launches, samples = passes_of(sampler, film, seed, int(spp), context.most_events(), lanes)
@@ -321,7 +321,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         for plugin in job.plugins:
             if not says_it_can_be_recorded(plugin):
                 return f"the plugin {type(plugin).__name__} does not say that it can be (can_be_recorded)"
-        if job.world.record_room is not None and job.world.record_room.in_memory:
+        if job.context.record_room is not None and job.context.record_room.in_memory:
             return "records of so many bounces lie in global memory"
         if not all(part.can_be_recorded for part in job.beside):
             return "derivatives beside paths read numbers of the scene"
@@ -349,7 +349,7 @@ class TransientIntegrator(mi.CppADIntegrator):
                 (_backward if prepared.kind == BACKWARD else _forward)(prepared)
                 return
 
-            context, film, launches = prepared.world, prepared.film, prepared.launches
+            context, film, launches = prepared.context, prepared.film, prepared.launches
             film.start_render(prepared.samples)
 
             # ------------------------------------------------------------------------- samples that pixels share
@@ -364,9 +364,9 @@ class TransientIntegrator(mi.CppADIntegrator):
                 rays, match, base, pixel = _primary_rays(prepared, launch)
                 block = film.create_event_block(launch, base, match, context.most_events())
                 path = self.primary_path(context, film, rays)
-                _, kept = walk(context, rays.sampler, path, FilmSink(block))
-                film.add_steady(pixel, match.to_channels(kept["L"]))
-                film.add_outside(pixel, kept["before"], kept["after"])
+                _, state = walk(context, rays.sampler, path, FilmSink(block))
+                film.add_steady(pixel, match.to_channels(state["L"]))
+                film.add_outside(pixel, state["before"], state["after"])
                 block.finish()
                 if evaluate or len(launches) > 1:
                     dr.eval(film.bands[launch.band][2], film.steady, film.outside)
@@ -431,7 +431,7 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     def _warn_of_edges(self, scene, sensor, effects):
         """Warn once a scene of the gaps in the derivative of each attached parameter."""
-        warned = self._seen_scene(scene).told_of_edges
+        warned = self._seen_scene(scene).warned_of_edges
         new = [one for one in effects if one[2].moves_silhouette and (one[0].ptr, one[1]) not in warned]
         if not new:
             return
@@ -470,7 +470,7 @@ class TransientIntegrator(mi.CppADIntegrator):
 
 def _primary_rays(job, launch):
     """Return (primary rays, map to the film's channels, first entry and pixel of each lane)."""
-    integrator, context = job.integrator, job.world
+    integrator, context = job.integrator, job.context
     rays = integrator.start(context.scene, context.contents, job.sensor, job.film, launch)
     match = integrator.channel_match(context.contents, job.film, rays)
     base, pixel = integrator.pixel_indices(job.film, launch, rays)
@@ -479,12 +479,12 @@ def _primary_rays(job, launch):
 
 def _record_sink(job, rays, block=None):
     """Return the sink that records paths, with their arrivals for the adjoint ``block``."""
-    return RecordSink(block, dr.width(rays.ray) if job.world.record_room.in_memory else None)
+    return RecordSink(block, dr.width(rays.ray) if job.context.record_room.in_memory else None)
 
 
 def _backward(job):
     """Execute a prepared job in reverse mode, with gradients suspended."""
-    integrator, context = job.integrator, job.world
+    integrator, context = job.integrator, job.context
     # Derivatives wait at the arrays that kernels read until the scope ends after the last launch; Dr.Jit carries on
     # then: following the graph further uses up its edges, and only those of the first launch would arrive.
     with dr.isolate_grad(), context.contents.hidden_from_mitsuba():
@@ -508,7 +508,7 @@ def _backward(job):
 
 def _forward(job):
     """Execute a prepared job in forward mode, with gradients suspended: the film holds the tangent afterwards."""
-    integrator, context, film = job.integrator, job.world, job.film
+    integrator, context, film = job.integrator, job.context, job.film
     film.start_render(job.samples)
     with context.contents.hidden_from_mitsuba():
         for launch in job.launches if context.walks else ():

@@ -181,7 +181,7 @@ class Prepared:
     scene: Any
     sensor: Any
     film: Any
-    world: Any
+    context: Any
     launches: list[Any]
     seed: Any
     samples: int
@@ -192,7 +192,7 @@ class Prepared:
 
     def tables(self) -> list[Any]:
         """Return the attached arrays that were computed from the scene's parameters."""
-        tables = self.world.tables() + [table for part in self.beside for table in part.tables()]
+        tables = self.context.tables() + [table for part in self.beside for table in part.tables()]
         with dr.resume_grad():
             return [table for table in tables if dr.grad_enabled(table)]
 
@@ -203,7 +203,7 @@ def state_of(jobs: list[Prepared]) -> tuple[tuple[Any, ...], list[Any]]:
     The scene's parameters are not among them.
     """
     held = [
-        [job.kind, job.integrator, job.film, job.world, job.launches, job.seed, job.samples, job.incoming, job.beside]
+        [job.kind, job.integrator, job.film, job.context, job.launches, job.seed, job.samples, job.incoming, job.beside]
         for job in jobs
     ]
     return state_below([held, [vars(plugin) for plugin in jobs[0].plugins]])

@@ -61,7 +61,7 @@ class AreaElements:
     left_out: list[str]
 
     @staticmethod
-    def of(shapes: list[Any]) -> AreaElements:
+    def from_shapes(shapes: list[Any]) -> AreaElements:
         """Build the elements of Mitsuba shapes, those without area included."""
         parts, left_out = [], []
         for number, shape in enumerate(shapes):

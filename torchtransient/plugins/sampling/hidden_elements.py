@@ -228,7 +228,7 @@ class HiddenElements:
             raise ShapeError(
                 f"HiddenElements: points and normals of the wall have to match, got {points.shape} and {normals.shape}."
             )
-        every = AreaElements.of(shapes) if every is None else every
+        every = AreaElements.from_shapes(shapes) if every is None else every
         self.left_out, self.key = every.left_out, b""
         if not np.any(every.area > 0):
             raise SceneError(
@@ -253,7 +253,7 @@ class HiddenElements:
         """Return the elements of shapes, the same object while they stay in place: not to be changed. ``beside``: the
         other shapes of the scene. ``key`` holds where all of them are, and is empty where some do not say.
         """
-        every, others = AreaElements.of(shapes), AreaElements.of(list(beside))
+        every, others = AreaElements.from_shapes(shapes), AreaElements.from_shapes(list(beside))
         parts = [array for each in (every, others) for array in each.columns()]
         numbers = np.array([registry_number(shape) for shape in (*shapes, *beside)])
         seen_from = (np.asarray(points, dtype=np.float64), np.asarray(normals, dtype=np.float64))

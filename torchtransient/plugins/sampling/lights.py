@@ -53,7 +53,7 @@ class LightBox:
         dr.make_opaque(self._low, self._high)
 
     @staticmethod
-    def of(scene, bsdfs) -> LightBox | None:
+    def from_scene(scene, bsdfs) -> LightBox | None:
         """Return the box of a scene's lights; None where lights are infinitely far, have no known place, or where light
         can pass into a medium of another index, in which optical lengths may be shorter than geometric ones.
         """
@@ -124,10 +124,10 @@ class MovingSun:
         self._cosine = float(dr.cos(_MARGIN * sun_half_angle(emitter)))
 
     @staticmethod
-    def of(world: Any) -> MovingSun | None:
+    def from_context(context: Any) -> MovingSun | None:
         """Return the sun of the sky that a job differentiates, or None."""
-        sky = None if world.wanted is None else world.wanted.sky
-        return None if sky is None else MovingSun(world.scene, sky)
+        sky = None if context.wanted is None else context.wanted.sky
+        return None if sky is None else MovingSun(context.scene, sky)
 
     def contains(self, d: Any) -> Any:
         """Return whether the unit direction ``d`` points into the disk."""
@@ -141,7 +141,7 @@ class MovingSun:
         around = mi.has_flag(flags, mi.EmitterFlags.Infinite) & ~mi.has_flag(flags, mi.EmitterFlags.DeltaDirection)
         return around & self.contains(d)
 
-    def followed(self, d: Any, active: Any) -> Any:
+    def attach_direction(self, d: Any, active: Any) -> Any:
         """Attach ``d`` to the rotation of the sun where ``active``."""
         turn = dr.cross(dr.detach(self.direction), self.direction)
         return dr.select(active, dr.replace_grad(d, d + dr.cross(turn, d)), d)

@@ -171,7 +171,7 @@ class SphereLights:
         self._cache = Cache([*self._shapes, *lights])
 
     @staticmethod
-    def of(scene: Any) -> SphereLights | None:
+    def from_scene(scene: Any) -> SphereLights | None:
         """Return the spherical lights of ``scene``, None when it has none."""
         numbers = [n for n, emitter in enumerate(scene.emitters()) if _is_sphere_light(emitter)]
         return SphereLights(scene, numbers) if numbers else None

@@ -79,7 +79,7 @@ class SensorPlaces:
         return eye
 
     def rays_at(
-        self, world: Any, sampler: Any, uv: Any, numbers: Any, row: Any = None, column: Any = None,
+        self, context: Any, sampler: Any, uv: Any, numbers: Any, row: Any = None, column: Any = None,
         total: int | None = None, η: Any = None,
     ) -> PrimaryRays:
         """Return the primary rays through places ``uv`` of the film, in pixels, attached to the sensor.
@@ -96,8 +96,8 @@ class SensorPlaces:
             if self.film.curves is not None:
                 ray, weight = self.film.curves.draw(self.sensor, ray, weight, u)
             if η is None:
-                η = index_at_sensor(seen, world.contents.surroundings, world.scene)
-            if world.contents.media is not None and world.contents.media.at_sensor is not None:
+                η = index_at_sensor(seen, context.contents.surroundings, context.scene)
+            if context.contents.media is not None and context.contents.media.at_sensor is not None:
                 ray, clip = start_at_sensor(seen, ray)
         scale = None if total is None else dr.opaque(mi.Float, 1 / total)
         return PrimaryRays(sampler, ray, weight, scale, row, column, seen, η, clip=clip)

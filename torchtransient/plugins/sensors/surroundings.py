@@ -63,7 +63,7 @@ class Surroundings:
         self._cache = Cache(_bodies(shapes, bsdfs) + _with_shapes(self._sensors))
 
     @staticmethod
-    def of(scene: Any, sensor: Any, bsdfs: list[Any]) -> Surroundings | None:
+    def from_scene(scene: Any, sensor: Any, bsdfs: list[Any]) -> Surroundings | None:
         """None where nothing in a scene of these outermost BSDFs refracts."""
         boundaries = boundaries_of(bsdfs)
         return Surroundings(sensor, boundaries, shapes_of_scene(scene)) if boundaries else None

@@ -60,7 +60,7 @@ class RenderContext:
         self.camera_unwarp = settings.camera_unwarp
         self.window = window
         # The motion of surfaces matters only where path lengths change.
-        self.surfaces = AttachedSurfaces.of(contents) if wanted is not None and wanted.geometry else None
+        self.surfaces = AttachedSurfaces.from_contents(contents) if wanted is not None and wanted.geometry else None
         self.segment, self.scattering, self.connections = strategies
         self.finds_light = any(connection.finds_light for connection in self.connections)
         # In media connections draw random numbers, which derivatives draw as well.
@@ -70,7 +70,7 @@ class RenderContext:
         self._check_names()
         # Lower bound of the remaining length of a path, where all light comes from emitters of the scene.
         bounded = window is not None and all(c.light_of_scene_alone for c in self.connections)
-        self._light_box = LightBox.of(scene, contents.bsdfs) if bounded else None
+        self._light_box = LightBox.from_scene(scene, contents.bsdfs) if bounded else None
         with dr.resume_grad():  # tables are attached where the parameters are
             for strategy in self.strategies():
                 strategy.prepare(self)
@@ -187,7 +187,7 @@ class Wanted:
         self.sphere_lights = self.geometry and contents.sphere_lights is not None
         self.ray = self.geometry and (contents.delta or self.sensor)
         bent = any(key in (NORMALS, POSITIONS) for _, key, _ in effects)
-        self.plain = self.geometry and not (self.ray or bent or contents.patterned)
+        self.slides_position_only = self.geometry and not (self.ray or bent or contents.patterned)
         self.extinction = any(effect.moves_medium for _, _, effect in effects)
         self.carried: tuple[str, ...] = ("β",)
         if self.geometry:

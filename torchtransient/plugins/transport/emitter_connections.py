@@ -28,7 +28,7 @@ class EmitterFound(Connection):
     light_of_scene_alone = True
 
     def prepare(self, context):
-        sun = MovingSun.of(context)
+        sun = MovingSun.from_context(context)
         self.sun = sun if sun is not None and sun.rare else None
 
     def events(self, wanted):
@@ -77,7 +77,7 @@ class EmitterFound(Connection):
 
     def _here(self, context, vertex, wanted):
         v, si = vertex.v, vertex.si
-        mis = v.of(self.name)["mis"]
+        mis = v.record_of(self.name)["mis"]
         hit = v.active & (mis > 0)
         emitter = vertex.sid.emitter(context.scene)
         elsewhere = self._claimed(context, emitter, v.ray.d, wanted)
@@ -101,13 +101,13 @@ class EmitterFound(Connection):
     def _sun_ahead(self, context, vertex, step):
         """Light of the sun along a path that escapes into it: the direction that was drawn turns with it."""
         following = vertex.v.after()
-        mis = following.of(self.name)["mis"]
+        mis = following.record_of(self.name)["mis"]
         lit = (step.inv_pdf > 0) & ~step.ahead & (mis > 0)
         with dr.suspend_grad():
             sky = following.pi.compute_surface_interaction(following.ray, mi.RayFlags.Minimal, lit)
             emitter = sky.emitter(context.scene)
             lit &= self.sun.shines(emitter, following.ray.d)
-        d = self.sun.followed(mi.Vector3f(following.ray.d), lit)
+        d = self.sun.attach_direction(mi.Vector3f(following.ray.d), lit)
         sky.wi = -d
         towards = context.scattering.evaluate(context, vertex, d, lit)
         Le = mi.unpolarized_spectrum(emitter.eval(sky, lit))
@@ -131,7 +131,7 @@ class EmitterSampled(Connection):
     def prepare(self, context):
         lights = context.contents.sphere_lights
         self.spheres = None if lights is None else lights.read(context.scene)
-        self.sun = MovingSun.of(context)
+        self.sun = MovingSun.from_context(context)
         # A light without attached numbers is dark where it is dark.
         self.lights_change = context.wanted is not None and any(map(carries_derivatives, context.scene.emitters()))
 
@@ -225,12 +225,12 @@ class EmitterSampled(Connection):
 
     def attached(self, context, vertex, step, wanted):
         v, si = vertex.v, vertex.scattered_si
-        r = v.of(self.name)
+        r = v.record_of(self.name)
         lit = r["lit"]
         light = self._light(context, si, r["u"], lit, wanted)
         d = self._move(context, vertex, light, wanted) if wanted.geometry else mi.Vector3f(light.ds.d)
         if self.sun is not None:
-            d = self.sun.followed(d, light.sun)
+            d = self.sun.attach_direction(d, light.sun)
         Le = self._emission(context, si, light, d, lit, wanted)
         towards = context.scattering.evaluate(context, vertex, d, lit, ds=light.ds)
         alone = light.ds.delta | light.cone

@@ -113,7 +113,7 @@ class LaserSpot(Connection):
     # ----------------------------------------------------------------------------------------------- attached
 
     def attached(self, context, vertex, step, wanted):
-        si, r = vertex.scattered_si, vertex.v.of(self.name)
+        si, r = vertex.scattered_si, vertex.v.record_of(self.name)
         lit = r["lit"]
         spot = self.spot(si.wavelengths, lit, attached=True)
         to = dr.select(lit, spot.p - si.p, mi.Vector3f(0, 0, 1))

@@ -62,7 +62,7 @@ class MaterialVacuum(Vacuum):
     def motion(self, context, vertex, following, ahead):
         v, si = vertex.v, vertex.scattered_si
         after = v.after()
-        p, n, area = self.material(context, after.pi, after.ray, following.n, ahead)
+        p, n, area = self.material_hits(context, after.pi, after.ray, following.n, ahead)
         to = dr.select(ahead, p - si.p, mi.Vector3f(following.d))
         r2 = dr.squared_norm(to)
         d = to * dr.rsqrt(r2)
@@ -86,9 +86,9 @@ class FoundVacuum(MaterialVacuum):
         self.overlaps = overlaps
 
     def first(self, context, ray, sampler):
-        return self.known(super().first(context, ray, sampler), ray)
+        return self.leg_to(super().first(context, ray, sampler), ray)
 
-    def known(self, pi, ray):
+    def leg_to(self, pi, ray):
         return {"pi": pi, "si": pi.compute_surface_interaction(ray, mi.RayFlags.All)}
 
     def depart(self, context, ray, vertex, β, sampler, active):
@@ -119,5 +119,5 @@ class FoundVacuum(MaterialVacuum):
     def surface_of(self, leg):
         return leg["pi"], mi.Bool(True)
 
-    def found(self, leg, ray, flags, active=True):
+    def interaction_of(self, leg, ray, flags, active=True):
         return leg["si"]

@@ -88,7 +88,7 @@ class Media(Vacuum):
             scatter=scatter, mei=mei, medium=leg["medium"], opl=self.optical_length(context, path, at.p, valid),
         )  # fmt: skip
 
-    def found(self, leg, ray, flags, active=True):
+    def interaction_of(self, leg, ray, flags, active=True):
         return leg["pi"].compute_surface_interaction(ray, flags, active)
 
     def surface_of(self, leg):
@@ -150,7 +150,7 @@ class Media(Vacuum):
         return values | (intersection_numbers(leg["entry"], "entry_") if "entry" in leg else {})
 
     def restore(self, v, ray):
-        r = v.of(self.name)
+        r = v.record_of(self.name)
         v.scatter, v.t, v.weight = r["scatter"], r["t_end"], r["weight"]
         v.begin, v.end = (dr.reinterpret_array(mi.MediumPtr, r[name]) for name in ("begin", "end"))
         v.entry = intersection(r, v.active, "entry_") if self.settings.keeps_entry else None

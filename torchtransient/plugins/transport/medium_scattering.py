@@ -58,7 +58,7 @@ class SurfaceOrMedium(Surface):
         allowed = True if context.contents.media.emitter_sampling else vertex.medium.use_emitter_sampling()
         return dr.select(vertex.scatter, allowed, smooth)
 
-    def elsewhere(self, context, vertex, proposals, answers, step):
+    def scatter_in_volume(self, context, vertex, proposals, answers, step):
         ctx, mei, scatter = mi.PhaseFunctionContext(None), vertex.mei, vertex.scatter
         active = vertex.goes_on & scatter
         step.u_phase = vertex.u_phase
@@ -96,7 +96,7 @@ class SurfaceOrMedium(Surface):
 
     def look_up_attached(self, context, vertex, wanted):
         super().look_up_attached(context, vertex, wanted)
-        u, active = vertex.v.of(self.name).get("u_phase"), vertex.v.active & vertex.scatter
+        u, active = vertex.v.record_of(self.name).get("u_phase"), vertex.v.active & vertex.scatter
         vertex.phase, vertex.σ_s = self._phase_and_scattering(vertex.mei, u, active)
 
     def eval_pdf(self, vertex, wo, out, active, sampled):

@@ -48,23 +48,23 @@ class RecordSink(Sink):
         # Without room for a list of arrivals each is read at its vertex.
         return RecordLayout(context)
 
-    def end(self, kept):
+    def end(self, state):
         if self.lanes is not None:
-            dr.eval([array.numbers for array in kept.values()])
+            dr.eval([array.numbers for array in state.values()])
 
-    def vertex(self, kept, path, samples):
+    def vertex(self, state, path, samples):
         layout, k, active = self.layout, path.depth, path.active
         values = {"walk": vars(samples["walk"])}
         for strategy in layout.context.strategies():
             values[strategy.name] = strategy.record(samples[strategy.name])
         if layout.arrivals is not None:
-            values[layout.arrivals.name] = layout.arrivals.append(kept, samples)
+            values[layout.arrivals.name] = layout.arrivals.append(state, samples)
         for s, name in layout.types:
-            kept[f"{s}.{name}"].write(values[s][name], k, active)
+            state[f"{s}.{name}"].write(values[s][name], k, active)
         flags = mi.UInt32(0)
         for (s, name), bit in layout.bits.items():
             flags |= dr.select(values[s][name], mi.UInt32(bit), 0)
-        kept["flags"].write(flags, k, active)
+        state["flags"].write(flags, k, active)
 
 
 class RecordLayout:
@@ -130,10 +130,10 @@ class RecordedVertex(Local):
         # Dr.Jit does not merge equal reads of thread-local memory: each array is read once a vertex.
         self._read = {}
         self.η = mi.Float(1)
-        vars(self).update(self.of("walk"))
+        vars(self).update(self.record_of("walk"))
         self.ray, self.pi = layout.context.segment.restore(self, primary_ray)
 
-    def of(self, name):
+    def record_of(self, name):
         """Return the record of the strategy called ``name``, as a dictionary."""
         layout = self.layout
         found = {field: self._array(f"{s}.{field}") for s, field in layout.types if s == name}
@@ -148,12 +148,12 @@ class RecordedVertex(Local):
     def arrival(self, name):
         """The number of a connection's event among the arrivals of the path, None where they are not listed."""
         arrivals = self.layout.arrivals
-        return None if arrivals is None else arrivals.number(self.of(arrivals.name), name)
+        return None if arrivals is None else arrivals.number(self.record_of(arrivals.name), name)
 
     def numbers(self):
         """Two uniform random numbers that were drawn at this vertex."""
         for c in self.layout.context.connections:
-            numbers = c.numbers(self.of(c.name))
+            numbers = c.numbers(self.record_of(c.name))
             if numbers is not None:
                 return numbers
         # Without random numbers the bits of the ray's direction serve: they are hashed.
@@ -211,17 +211,17 @@ class Arrivals:
         numbers = [f"A.{c}" for c in range(self.channels)]
         numbers += [f"slope.{c}" for c in range(self.channels)] if self.with_slope else []
         size = self._size()
-        kept = {name: dr.alloc_local(mi.Float, size) for name in numbers}
+        state = {name: dr.alloc_local(mi.Float, size) for name in numbers}
         # As wide as the lanes: Dr.Jit takes an index of one entry to be the same in all of them.
-        return kept | {"arrivals": dr.zeros(mi.UInt32, self.lanes), "opl": dr.alloc_local(mi.Float64, size)}
+        return state | {"arrivals": dr.zeros(mi.UInt32, self.lanes), "opl": dr.alloc_local(mi.Float64, size)}
 
-    def append(self, kept, samples):
+    def append(self, state, samples):
         """Append the events of a vertex; return the fields of its record."""
-        found = {"first": kept["arrivals"]}
+        found = {"first": state["arrivals"]}
         for name in self.connections:
-            event, n = samples[name].event, kept["arrivals"]
-            kept["opl"].write(event.opl, n, event.active)
-            kept["arrivals"] = n + dr.select(event.active, mi.UInt32(1), 0)
+            event, n = samples[name].event, state["arrivals"]
+            state["opl"].write(event.opl, n, event.active)
+            state["arrivals"] = n + dr.select(event.active, mi.UInt32(1), 0)
             found[name] = event.active
         return found
 
@@ -230,32 +230,32 @@ class Arrivals:
         before = self.connections[: self.connections.index(name)]
         return found["first"] + sum(dr.select(found[other], mi.UInt32(1), 0) for other in before)
 
-    def read_some(self, kept, block, first, live):
+    def read_group(self, store, block, first, live):
         """Read the adjoint at the arrivals from number ``first`` on, of ``live`` paths."""
-        opls = [kept["opl"].read(first + e, live & (first + e < kept["arrivals"])) for e in range(self.together)]
+        opls = [store["opl"].read(first + e, live & (first + e < store["arrivals"])) for e in range(self.together)]
         A, slope = block.read_together(opls, self.with_slope, live)
         for name, found in (("A", A), ("slope", slope or [])):
             for e, channels in enumerate(found):
                 for c, value in enumerate(channels):
-                    kept[f"{name}.{c}"].write(value, first + e, live)
+                    store[f"{name}.{c}"].write(value, first + e, live)
 
-    def adjoint(self, kept, block, number, active):
+    def adjoint(self, store, block, number, active):
         """Return the adjoint at an arrival and its slope (None without geometry), as spectra."""
-        A = [kept[f"A.{c}"].read(number, active) for c in range(self.channels)]
+        A = [store[f"A.{c}"].read(number, active) for c in range(self.channels)]
         slope = None
         if self.with_slope:
-            slope = [kept[f"slope.{c}"].read(number, active) for c in range(self.channels)]
+            slope = [store[f"slope.{c}"].read(number, active) for c in range(self.channels)]
         return block.as_spectra(A, slope)
 
 
 @dr.syntax
-def read_ahead(arrivals, kept, block):
+def read_ahead(arrivals, store, block):
     """Return the record with the film's adjoint at all arrivals."""
     first = mi.UInt32(0)
-    while dr.hint(first < kept["arrivals"], label="arrivals"):
-        arrivals.read_some(kept, block, first, first < kept["arrivals"])
+    while dr.hint(first < store["arrivals"], label="arrivals"):
+        arrivals.read_group(store, block, first, first < store["arrivals"])
         first += arrivals.together
-    return kept
+    return store
 
 
 # --------------------------------------------------------------------------------------------------------------------

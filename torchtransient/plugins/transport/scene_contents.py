@@ -82,15 +82,15 @@ class SceneContents:
         self.bsdfs, self.mixtures = mixtures_of(met, mi.BSDF, shapes_of_scene(scene))
         self.delta = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta) for bsdf in self.bsdfs)
         self.glossy = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) for bsdf in self.bsdfs)
-        self.instances, self.detached_hits = Instances.of(scene), DetachedHits.of(scene)
+        self.instances, self.detached_hits = Instances.from_scene(scene), DetachedHits.from_scene(scene)
         infinite = any(mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in scene.emitters())
         self.distant = reference if infinite else None
-        self.refraction = RefractiveBSDFs.of(scene, self.bsdfs)
-        self.surroundings = Surroundings.of(scene, sensor, outermost)
+        self.refraction = RefractiveBSDFs.from_scene(scene, self.bsdfs)
+        self.surroundings = Surroundings.from_scene(scene, sensor, outermost)
         self.two_sided = _two_sided(self.bsdfs) if mi.is_polarized else None
         self.hidden_probability = PointerTable.marking([bsdf for bsdf in self.bsdfs if hides_lobe_probability(bsdf)])
         self.media = media_of(scene, sensor)
-        self.sphere_lights = SphereLights.of(scene)
+        self.sphere_lights = SphereLights.from_scene(scene)
         self.shape_lights = ShapeLights(scene) if self.sphere_lights is None else self.sphere_lights.others
         self.smooth_lights = PointerTable.marking([e for e in scene.emitters() if has_smooth_shape(e)])
         self.emitting_meshes = PointerTable.marking([s for s in scene.shapes() if s.is_emitter() and has_vertices(s)])
@@ -308,7 +308,7 @@ class SceneCache:
         self._tracker: ParameterTracker | None = None
         self._python: list[Any] | None = None
         # Parameters, by plugin and key, of which it was said which moving edges derivatives do not follow.
-        self.told_of_edges: set[tuple[int, str]] = set()
+        self.warned_of_edges: set[tuple[int, str]] = set()
 
     def is_of(self, scene: Any) -> bool:
         """Return True if the cache is that of ``scene``."""

@@ -15,7 +15,7 @@ class Sink:
     """Base of sinks, which ignores everything.
 
     The loop calls ``begin`` once, ``event`` for every event, ``vertex`` once a vertex, after its last event, and
-    ``end`` after the loop. ``kept`` is the sink's loop state: a dictionary of Dr.Jit values that it may change.
+    ``end`` after the loop. ``state`` is the sink's loop state: a dictionary of Dr.Jit values that it may change.
     """
 
     # Static: events of value zero matter, since their derivatives can differ from zero.
@@ -27,13 +27,13 @@ class Sink:
         """Return the loop state before the first vertex."""
         return {}
 
-    def event(self, kept: dict[str, Any], event: Any) -> None:
+    def event(self, state: dict[str, Any], event: Any) -> None:
         """Receive an :class:`.strategy.Event`."""
 
-    def vertex(self, kept: dict[str, Any], path: Any, samples: dict[str, Any]) -> None:
+    def vertex(self, state: dict[str, Any], path: Any, samples: dict[str, Any]) -> None:
         """Receive the vertex that ``path`` reached; ``samples``: samples of the strategies there, by name."""
 
-    def end(self, kept: dict[str, Any]) -> None:
+    def end(self, state: dict[str, Any]) -> None:
         """Finish the loop state."""
 
 
@@ -54,14 +54,14 @@ class FilmSink(Sink):
     def begin(self, context):
         return {"L": light_type()(0), "before": mi.Float(0), "after": mi.Float(0), "block": self.block.begin()}
 
-    def event(self, kept, event):
-        kept["L"] = kept["L"] + event.value
-        before, after = self.block.put(kept["block"], event.opl, event.value, event.active, event.crowded)
-        kept["before"] = kept["before"] + before
-        kept["after"] = kept["after"] + after
+    def event(self, state, event):
+        state["L"] = state["L"] + event.value
+        before, after = self.block.put(state["block"], event.opl, event.value, event.active, event.crowded)
+        state["before"] = state["before"] + before
+        state["after"] = state["after"] + after
 
-    def end(self, kept):
-        self.block.end(kept["block"])
+    def end(self, state):
+        self.block.end(state["block"])
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -79,9 +79,9 @@ class AdjointSumSink(Sink):
     def begin(self, context):
         return {"sum": mi.Float(0)}
 
-    def event(self, kept, event):
+    def event(self, state, event):
         A, _ = self.block.read(event.opl, event.active)
-        kept["sum"] = kept["sum"] + dr.select(event.active, total_of(A, event.value), 0)
+        state["sum"] = state["sum"] + dr.select(event.active, total_of(A, event.value), 0)
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -108,14 +108,14 @@ class EventListSink(Sink):
     def begin(self, context):
         return {"used": mi.UInt32(0)}
 
-    def event(self, kept, event):
-        energy, used = self.energy_of(event.value), kept["used"]
+    def event(self, state, event):
+        energy, used = self.energy_of(event.value), state["used"]
         found = event.active & (energy != 0)
         slot, fits = dr.fma(self.lane, self.slots, used), found & (used < self.slots)
         dr.scatter(self.opl, event.opl, slot, fits)
         dr.scatter(self.energy, energy, slot, fits)
         dr.scatter(self.depth, event.depth, slot, fits)
-        kept["used"] = used + dr.select(found, mi.UInt32(1), 0)
+        state["used"] = used + dr.select(found, mi.UInt32(1), 0)
 
-    def end(self, kept):
-        self.used = kept["used"]
+    def end(self, state):
+        self.used = state["used"]

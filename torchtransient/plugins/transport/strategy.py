@@ -262,11 +262,11 @@ class Segment(Strategy):
         """Return (PreliminaryIntersection3f of the next surface, mask: the leg ends there)."""
         raise NotImplementedError
 
-    def found(self, leg: Any, ray: Any, flags: Any, active: Any = True) -> Any:
+    def interaction_of(self, leg: Any, ray: Any, flags: Any, active: Any = True) -> Any:
         """Return the SurfaceInteraction3f of the next surface along ``ray``, with the fields of ``flags`` at least."""
         raise NotImplementedError
 
-    def known(self, pi: Any, ray: Any) -> Any:
+    def leg_to(self, pi: Any, ray: Any) -> Any:
         """Return the leg of a primary ray with a known PreliminaryIntersection3f."""
         return pi
 
@@ -274,7 +274,7 @@ class Segment(Strategy):
         """Return (length of ``leg`` from the origin of its ray, mask: it ends at something)."""
         raise NotImplementedError
 
-    def held(self, context: Any, pi: Any, ray: Any, active: Any) -> Any:
+    def material_displacement(self, context: Any, pi: Any, ray: Any, active: Any) -> Any:
         """Return zero with the derivative of the surface point ``pi``, found by ``ray``, as a point of its shape."""
         raise NotImplementedError
 

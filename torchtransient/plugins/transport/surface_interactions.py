@@ -35,7 +35,7 @@ class Instances:
         self._identities = mi.Float(np.tile(np.eye(4, dtype=np.float32).reshape(-1), 2 * (1 + max(self._numbers))))
 
     @staticmethod
-    def of(scene: Any) -> Instances | None:
+    def from_scene(scene: Any) -> Instances | None:
         """Return the instances of ``scene``, None without."""
         found = [shape for shape in scene.shapes() if is_instance(shape)]
         return Instances(found) if found else None
@@ -128,7 +128,7 @@ class AttachedSurfaces:
         self._instances, self._hits = instances, hits
 
     @staticmethod
-    def of(contents: Any) -> AttachedSurfaces | None:
+    def from_contents(contents: Any) -> AttachedSurfaces | None:
         """Return the surfaces of one job, None where Mitsuba's own interactions are right."""
         if contents.instances is None and contents.detached_hits is None:
             return None
@@ -233,7 +233,7 @@ class DetachedHits:
             self._starts = [ellipsoids, segments, pieces]
 
     @staticmethod
-    def of(scene: Any) -> DetachedHits | None:
+    def from_scene(scene: Any) -> DetachedHits | None:
         """Return the shapes of ``scene``, shape groups included; None when it has none."""
         found = [s for s in shapes_of_scene(scene) if leaves_hits_detached(s) or misplaces_hits(s)]
         return DetachedHits(found) if found else None

@@ -70,7 +70,7 @@ class Surface(Scattering):
         if self.mixtures is not None:
             self.mixtures.take_part(vertex.delay, vertex.si, vertex.u_part, vertex.si.is_valid())
         vertex.bsdf = vertex.delay.bsdf
-        vertex.scattered_si, vertex.at = self.behind(vertex.delay, vertex.si, vertex.at)
+        vertex.scattered_si, vertex.at = self.with_shifted_wavelengths(vertex.delay, vertex.si, vertex.at)
         vertex.connectable = self.connectable(context, vertex)
 
     def delay(self, bsdf, u, wavelengths):
@@ -78,7 +78,7 @@ class Surface(Scattering):
         return DelaySample(bsdf) if self.delays is None else self.delays.sample(bsdf, u, wavelengths)
 
     @staticmethod
-    def behind(delay, *interactions):
+    def with_shifted_wavelengths(delay, *interactions):
         """The interactions with the wavelengths beyond the surface."""
         if delay.wavelengths is None:
             return interactions
@@ -114,8 +114,8 @@ class Surface(Scattering):
         )  # fmt: skip
         step.unconnected = step.delta
         if context.wanted is not None and context.contents.glossy:
-            step.pdf = dr.select(is_black(weight) & strayed(si.wi, bs), 0, step.pdf)
-        self.elsewhere(context, vertex, proposals, answers, step)
+            step.pdf = dr.select(is_black(weight) & is_on_wrong_side(si.wi, bs), 0, step.pdf)
+        self.scatter_in_volume(context, vertex, proposals, answers, step)
         rotation = rotation_to_sensor(si, path.ray.d)
         for p, answer in zip(proposals, answers, strict=True):
             if answer is not None:
@@ -133,7 +133,7 @@ class Surface(Scattering):
         """A direction and its weight where nothing is connected."""
         return bsdf.sample(mi.BSDFContext(), si, u_lobe, u_dir, active)
 
-    def elsewhere(self, context, vertex, proposals, answers, step):
+    def scatter_in_volume(self, context, vertex, proposals, answers, step):
         """Change answers and step where the vertex is not on a surface."""
 
     # ------------------------------------------------------------------------------------------------- guides
@@ -188,7 +188,7 @@ class Surface(Scattering):
         smooth = vertex.goes_on & ~step.delta
         pi, reached = context.segment.surface_of(leg)
         reached = smooth & reached & pi.is_valid()
-        found = context.segment.found(leg, ray, mi.RayFlags.Minimal, reached)
+        found = context.segment.interaction_of(leg, ray, mi.RayFlags.Minimal, reached)
         # From the vertex itself to what was found, not from beside it, where the ray starts.
         p, to = vertex.at.p, dr.select(reached, found.p - vertex.at.p, ray.d)
         value, pdf = self.value_towards(context, path, vertex, to * dr.rsqrt(dr.squared_norm(to)), smooth)
@@ -254,13 +254,13 @@ class Surface(Scattering):
     def look_up_attached(self, context, vertex, wanted):
         v, si = vertex.v, vertex.si
         vertex.rotation = rotation_to_sensor(si, vertex.carry.w)
-        u = v.of(self.name).get("u_delay")
+        u = v.record_of(self.name).get("u_delay")
         vertex.delay = self.delay(vertex.sid.bsdf(v.ray), u, v.ray.wavelengths)
         if self.mixtures is not None:
-            u_part = v.of(self.name)["u_part"]
+            u_part = v.record_of(self.name)["u_part"]
             self.mixtures.take_part(vertex.delay, si, u_part, vertex.sid.is_valid())
         vertex.bsdf = vertex.delay.bsdf
-        (vertex.scattered_si,) = self.behind(vertex.delay, si)
+        (vertex.scattered_si,) = self.with_shifted_wavelengths(vertex.delay, si)
         vertex.scattered_slope, vertex.scattered_opl = vertex.slope, vertex.delay.after(v.τ)
         if wanted.geometry and vertex.delay.delay is not None:
             vertex.scattered_slope = vertex.slope + slope_only(vertex.delay.delay)
@@ -279,7 +279,7 @@ class Surface(Scattering):
         return vertex.bsdf.eval_pdf(mi.BSDFContext(), vertex.scattered_si, wo, active)
 
     def attached(self, context, vertex, wanted):
-        v, si, r, following = vertex.v, vertex.scattered_si, vertex.v.of(self.name), vertex.v.next
+        v, si, r, following = vertex.v, vertex.scattered_si, vertex.v.record_of(self.name), vertex.v.next
         smooth, mirrored = v.goes_on & ~r["delta"], v.goes_on & r["delta"]
         ahead = smooth & following.valid
         out, J, drag = mi.Vector3f(following.d), mi.Float(1), mi.Vector3f(0)
@@ -328,7 +328,7 @@ class Surface(Scattering):
         return Local(carry=carry, inv_pdf=inv_pdf, ahead=ahead)
 
 
-def strayed(wi, bs):
+def is_on_wrong_side(wi, bs):
     """Return whether a sample of a lobe of reflection or transmission ended on the other side of the surface. BSDFs
     throw it away; what they hold has a density there, and may be black.
     """

@@ -89,7 +89,7 @@ class Vacuum(Segment):
         return behind_area_lights(context.scene, ray, pi) if seen and context.hide_emitters else pi
 
     def arrive(self, context, path):
-        si, (leg, _) = self.found(path.leg, path.ray, mi.RayFlags.All), self.surface_of(path.leg)
+        si, (leg, _) = self.interaction_of(path.leg, path.ray, mi.RayFlags.All), self.surface_of(path.leg)
         return Vertex(
             si=si, at=si, valid=si.is_valid(), surface=mi.Bool(True), β=path.β, ray=path.ray, leg=leg,
             opl=self.optical_length(context, path, si.p, si.is_valid()),
@@ -122,7 +122,7 @@ class Vacuum(Segment):
     def share_of_surface(self, leg):
         return mi.Float(1)
 
-    def found(self, leg, ray, flags, active=True):
+    def interaction_of(self, leg, ray, flags, active=True):
         return leg.compute_surface_interaction(ray, flags, active)
 
     def transmittance(self, context, vertex, ds, u, sampler, active, seen=False):
@@ -147,7 +147,7 @@ class Vacuum(Segment):
         return {"o": ray.o, "d": ray.d, "wavelengths": ray.wavelengths} | intersection_numbers(vertex.leg)
 
     def restore(self, v, ray):
-        r = v.of(self.name)
+        r = v.record_of(self.name)
         wavelengths = r.get("wavelengths", ray.wavelengths)
         return mi.Ray3f(r["o"], r["d"], ray.time, wavelengths), intersection(r, v.active)
 
@@ -161,7 +161,7 @@ class Vacuum(Segment):
         if wanted.geometry:
             carry = self.from_meter(context, v, carry)
         ray = mi.Ray3f(v.ray)
-        if not wanted.plain:
+        if not wanted.slides_position_only:
             ray.o, ray.d = carry.o, carry.d
         si = self.attached_surface(context, v, carry, ray, wanted, v.active)
         return self.arrived(context, v, carry, ray, si, wanted)
@@ -169,7 +169,7 @@ class Vacuum(Segment):
     def attached_surface(self, context, v, carry, ray, wanted, active):
         """Return the interaction of ``ray`` where ``active``: attached to it and to the surface, along the ray."""
         si = surface_interaction(context.surfaces, v.pi, ray, mi.RayFlags.All, active)
-        if wanted.plain:  # an attached ray would have every shape differentiated
+        if wanted.slides_position_only:  # an attached ray would have every shape differentiated
             si.p = si.p + slide(displacement(carry.o, active), v.ray.d, dr.detach(si.n), active)
         if wanted.geometry:
             with dr.suspend_grad():
@@ -205,7 +205,7 @@ class Vacuum(Segment):
         if self.triangles is None:
             return damped_motion(δ, d, following.t, following.n, ahead, radius, volume=volume)
         surface = ahead if volume is None else ahead & ~volume
-        p, n, area = self.material(context, after.pi, after.ray, following.n, surface)
+        p, n, area = self.material_hits(context, after.pi, after.ray, following.n, surface)
         moved = displacement(p, surface)
         motion = damped_motion(δ - moved, d, following.t, following.n, ahead, radius, volume=volume)
         J = motion.J * dr.select(surface, motion.of_material(n, dr.relative_grad(area)), 1)
@@ -213,7 +213,7 @@ class Vacuum(Segment):
         drag = motion.drag + (moved - d * dr.dot(d, moved))
         return Local(d=motion.d, J=J, drag=drag, longer=lambda: -dr.dot(δ, d))
 
-    def material(self, context, pi, ray, n, active):
+    def material_hits(self, context, pi, ray, n, active):
         """(point, normal, area element) of hit points that follow their shapes, whose normals are ``n``. Points of
         shapes without material points stay where they are.
         """
@@ -232,11 +232,11 @@ class Vacuum(Segment):
         p, n = dr.select(other, si.p, at), dr.select(other, si.n, n)
         return dr.select(listed, point.p, p), dr.select(listed, across, n), dr.select(listed, twice, area)
 
-    def held(self, context, pi, ray, active):
+    def material_displacement(self, context, pi, ray, active):
         """Zero with how far derivatives move the surface point ``pi``, found by ``ray``, as a point of its shape."""
         if self.triangles is None:
             return mi.Vector3f(0)
-        p, _, _ = self.material(context, pi, ray, mi.Normal3f(0, 0, 1), active & pi.is_valid())
+        p, _, _ = self.material_hits(context, pi, ray, mi.Normal3f(0, 0, 1), active & pi.is_valid())
         return displacement(p, active & pi.is_valid())
 
     def from_meter(self, context, v, carry):

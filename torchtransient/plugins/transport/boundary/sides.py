@@ -14,11 +14,11 @@ class BoundaryPass:
     hold: its derivatives would outlive the job).
     """
 
-    def __init__(self, world):
+    def __init__(self, context):
         """Prepare what launches share."""
 
     @staticmethod
-    def exists(world, sensor):
+    def exists(context, sensor):
         """Return whether a job has such edges."""
         raise NotImplementedError
 
@@ -34,16 +34,16 @@ class BoundaryPass:
         raise NotImplementedError
 
 
-def past_edge(world, b, ray, medium, β, sampler, active, seen=False):
+def past_edge(context, b, ray, medium, β, sampler, active, seen=False):
     """Return (the ray past an outline, its leg); of a crease the other face, seen from x. ``seen``: x is the sensor."""
     place = Local(si=dr.zeros(mi.SurfaceInteraction3f), medium=medium, surface=mi.Bool(False))
     past = mi.Ray3f(ray)
     past.o, past.d = dr.select(b.crease, b.V, b.beside), b.d
-    leg = world.segment.depart(world, past, place, β, sampler, active & ~b.crease, seen)
-    return past, dr.select(b.crease, world.segment.ends_at(b.facing, medium), leg)
+    leg = context.segment.depart(context, past, place, β, sampler, active & ~b.crease, seen)
+    return past, dr.select(b.crease, context.segment.ends_at(b.facing, medium), leg)
 
 
-def both_sides(world, mode, sampler, view, b, past, first, factor, speeds, needed, lit=None):
+def both_sides(context, mode, sampler, view, b, past, first, factor, speeds, needed, lit=None):
     """Trace the two sides of the outlines ``b``.
 
     Args:
@@ -60,14 +60,14 @@ def both_sides(world, mode, sampler, view, b, past, first, factor, speeds, neede
     factor = dr.select(active, factor, 0)
     near = mi.Ray3f(ray)
     near.o, near.d = b.V, b.d_in
-    sides = (near, world.segment.ends_at(b.inner, first["medium"])), past
+    sides = (near, context.segment.ends_at(b.inner, first["medium"])), past
     fields = {key: value for key, value in first.items() if key != "medium"}
     objective = mi.Float(0)
     for k, ((ray, leg), speed, need) in enumerate(zip(sides, mode.speeds(speeds), needed, strict=True)):
         if need is None:
             continue
         sign = 1 - 2 * k
-        path = start(world, ray, mi.Float64(0), 1)
+        path = start(context, ray, mi.Float64(0), 1)
         for key, value in fields.items():
             setattr(path, key, type(getattr(path, key))(value))
         path.leg, path.active = leg, active & need
@@ -75,7 +75,7 @@ def both_sides(world, mode, sampler, view, b, past, first, factor, speeds, neede
             path.prev_unconnected = mi.Bool(lit[k])
             path.prev_pdf = dr.select(path.prev_unconnected, mi.Float(1), 0)
         # The same random numbers on both sides.
-        value = mode.follow(world, sampler.clone(), path, view, dr.select(need, sign * factor, 0), speed)
+        value = mode.follow(context, sampler.clone(), path, view, dr.select(need, sign * factor, 0), speed)
         if value is not None:
             in_memory(mode.term.world, None, value)
             with dr.resume_grad():
@@ -83,22 +83,22 @@ def both_sides(world, mode, sampler, view, b, past, first, factor, speeds, neede
     return objective
 
 
-def in_memory(world, sampler, *values):
+def in_memory(context, sampler, *values):
     """Evaluate what speeds are made of where the sensor moves: each entry of its pose is a sum over lanes by itself,
     which would trace the paths once more.
     """
-    if world.wanted.sensor:
+    if context.wanted.sensor:
         if sampler is not None:
             sampler.schedule_state()
         dr.eval(values)
 
 
-def is_seen_within(world, b, ray, end, medium, sampler, active, seen=True):
+def is_seen_within(context, b, ray, end, medium, sampler, active, seen=True):
     """Mask of outlines of which the inner side is seen, too, from the point ``end`` (Local). It is hidden where what is
     in front ends in line with them: there is but one edge then, that of what is in front.
     """
     place = place_at(b.within, ray, medium)
-    return world.segment.transmittance(world, place, end, sampler.next_2d(), sampler, active, seen)[0]
+    return context.segment.transmittance(context, place, end, sampler.next_2d(), sampler, active, seen)[0]
 
 
 def at_point(p, ray=None):

@@ -25,14 +25,14 @@ def dragged_share(r, radius):
     return dr.select(r < radius, dr.square(1 - dr.square(r / radius)), 0)
 
 
-def sides_from(world, b, edges, v_x, y, radius, active):
+def sides_from(context, b, edges, v_x, y, radius, active):
     """Attached speeds (inner, outer) of the outline ``b`` of ``edges``, seen from a point that moves by ``v_x``.
 
     Args:
         y: Local with ``dist`` (from x, infinite for none) and ``v`` (attached motion as held) of the point behind.
     """
     n_x, n_p = dr.dot(b.n, v_x), dr.dot(b.n, edges.moving(b))
-    held = n_p if world.contents.sliding is None else dr.select(slides(world, b), 0, n_p)
+    held = n_p if context.contents.sliding is None else dr.select(slides(context, b), 0, n_p)
     n_y = dr.select(b.crease, n_p, dr.dot(b.n, y.v))
     s = dr.select(b.crease, 1, dr.select(dr.isfinite(y.dist), b.dist / y.dist, 0))
     near, far = dragged_share(b.dist, radius), dragged_share(dr.select(b.crease, b.dist, y.dist), radius)
@@ -41,18 +41,19 @@ def sides_from(world, b, edges, v_x, y, radius, active):
     return [dr.select(active, speed, 0) for speed in (inner, outer)]
 
 
-def slides(world, b):
+def slides(context, b):
     """Mask of outlines of shapes without material points."""
-    table = world.contents.sliding
+    table = context.contents.sliding
     return mi.Bool(False) if table is None else table.lists(b.inner.shape)
 
 
-def behind(world, b, ray, leg, active):
+def behind(context, b, ray, leg, active):
     """The point behind an outline, at the end of ``leg``, as :func:`sides_from` asks for it."""
-    t, found = world.segment.length_of(leg)
-    pi, on_surface = world.segment.surface_of(leg)
+    t, found = context.segment.length_of(leg)
+    pi, on_surface = context.segment.surface_of(leg)
     dist = dr.select(found, dr.norm(ray.o - b.V) + t, dr.inf)
-    return Local(dist=dist, v=world.segment.held(world, pi, ray, active & found & on_surface & ~b.crease))
+    held = active & found & on_surface & ~b.crease
+    return Local(dist=dist, v=context.segment.material_displacement(context, pi, ray, held))
 
 
 def dragged(v_x, v_before, r, d, n, radius, active):
@@ -63,18 +64,18 @@ def dragged(v_x, v_before, r, d, n, radius, active):
     return v_x + dr.select(active, dragged_share(r, radius) * slide(δ - d * dr.dot(d, δ), d, n, active), 0)
 
 
-def along_the_ray(world, pi, ray, active):
+def along_the_ray(context, pi, ray, active):
     """Attached displacement of where ``ray``, attached or not, meets the surface ``pi``."""
-    si = surface_interaction(world.surfaces, pi, ray, mi.RayFlags.All, active & pi.is_valid())
+    si = surface_interaction(context.surfaces, pi, ray, mi.RayFlags.All, active & pi.is_valid())
     return displacement(si.p, active & pi.is_valid())
 
 
-def as_held(world, pi, ray, active):
+def interior_displacement(context, pi, ray, active):
     """Attached motion of a vertex that ``ray`` found, as a point of its shape, or along the ray where the
     shape has none.
     """
-    v = world.segment.held(world, pi, ray, active)
-    if world.contents.sliding is None:
+    v = context.segment.material_displacement(context, pi, ray, active)
+    if context.contents.sliding is None:
         return v
-    slid = active & world.contents.sliding.lists(pi.shape)
-    return dr.select(slid, along_the_ray(world, pi, ray, slid), v)
+    slid = active & context.contents.sliding.lists(pi.shape)
+    return dr.select(slid, along_the_ray(context, pi, ray, slid), v)

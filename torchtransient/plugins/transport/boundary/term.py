@@ -58,17 +58,17 @@ class BoundaryTerm:
     can_be_recorded = True
     kinds = PASSES
 
-    def __init__(self, integrator, world, sensor, film, seed, samples, names=tuple(PASSES)):
-        self.integrator, self.world, self.sensor, self.film = integrator, world, sensor, film
-        self._sampler = world.contents.memory.get("sampler", b"", lambda: mi.load_dict({"type": "independent"}))
-        scene, wanted = world.scene, world.wanted
+    def __init__(self, integrator, context, sensor, film, seed, samples, names=tuple(PASSES)):
+        self.integrator, self.world, self.sensor, self.film = integrator, context, sensor, film
+        self._sampler = context.contents.memory.get("sampler", b"", lambda: mi.load_dict({"type": "independent"}))
+        scene, wanted = context.scene, context.wanted
         views_move = wanted.sensor or wanted.light
         # A sensor at rest sees the edges of what moves alone; behind an edge at rest something else may move.
         moving = frozenset() if views_move else wanted.shapes
         # Paths through media pass open boundaries, which hide nothing.
-        media = world.contents.media
+        media = context.contents.media
         hides = None if media is None or not media.open_boundaries else lambda shape: not is_open(shape)
-        topology = topology_of(scene, world.contents.memory, hides)
+        topology = topology_of(scene, context.contents.memory, hides)
         self.edges = EdgeTable(topology, moving)
         self.radius = dr.opaque(mi.Float, integrator.reference(scene).radius)
         self.has_vertex_normals = shades_by_other_normals(scene)
@@ -78,28 +78,29 @@ class BoundaryTerm:
             self.light_world = self._light_world()
         self.passes, self.jobs = {}, {}
         for name in names if topology.count else ():
-            if self.kinds[name].exists(world, sensor):
-                self.passes[name] = self.kinds[name](world)
+            if self.kinds[name].exists(context, sensor):
+                self.passes[name] = self.kinds[name](context)
                 own = sensor.sampler().clone()
-                self.jobs[name], _ = passes_of(own, film, seeds[name], samples, world.most_events())
+                self.jobs[name], _ = passes_of(own, film, seeds[name], samples, context.most_events())
 
     def _light_world(self):
         """The world of paths that start at a light and are connected to the sensor."""
-        world, integrator = self.world, self.integrator
+        context, integrator = self.world, self.integrator
         self.places = SensorPlaces(self.sensor, self.film, self.radius)
         self.is_meter = self.places.is_meter
-        if sees_chains(world, self.sensor):
-            with world.contents.hidden_from_mitsuba():
-                self.chains = Chains(integrator, world, self.places, self.independent(self._seed_of_chains, RAYS))
-            self.through = SensorThroughChain(self.chains) if world.max_depth > 2 else None
-        segment, scattering, _ = integrator.strategies(world.contents)
+        if sees_chains(context, self.sensor):
+            with context.contents.hidden_from_mitsuba():
+                self.chains = Chains(integrator, context, self.places, self.independent(self._seed_of_chains, RAYS))
+            self.through = SensorThroughChain(self.chains) if context.max_depth > 2 else None
+        segment, scattering, _ = integrator.strategies(context.contents)
         if self.has_vertex_normals:
             scattering = FromLight(scattering)
         # Whether the sensor's segment counts in time is asked by its connection: here it is the last one of a path.
         settings = replace(integrator.settings(), camera_unwarp=False)
         self.to_sensor = SensorSampled(self.places, integrator.camera_unwarp)
         sensors = [self.to_sensor] if self.through is None else [self.to_sensor, self.through]
-        return RenderContext(world.scene, world.contents, settings, (segment, scattering, sensors), None, world.window)
+        strategies = segment, scattering, sensors
+        return RenderContext(context.scene, context.contents, settings, strategies, None, context.window)
 
     def tables(self):
         """The attached ends of edges, and what the strategies of light paths have attached."""

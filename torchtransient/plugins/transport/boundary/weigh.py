@@ -24,7 +24,7 @@ class Reverse:
         """The adjoint block of primary rays."""
         return self.block(rays, rays)
 
-    def kept(self, row):
+    def rows_in_band(self, row):
         """Return (mask of the rows of pixels that count, weight of a sample of the whole film)."""
         return mi.Bool(True), 1
 
@@ -39,22 +39,22 @@ class Reverse:
         """Speeds as :meth:`follow` takes them."""
         return attached
 
-    def follow(self, world, sampler, path, block, factor, speed):
+    def follow(self, context, sampler, path, block, factor, speed):
         """Trace ``path``; returns what its events contribute to the loss."""
-        _, kept = walk(world, sampler, path, AdjointSumSink(block))
-        return finite(kept["sum"] * factor)
+        _, state = walk(context, sampler, path, AdjointSumSink(block))
+        return finite(state["sum"] * factor)
 
     def sink_of_pixels(self, middle, job, u, factor, speeds):
         """Return (sink of events that have a pixel each, the factors of :meth:`sum_of_pixels`)."""
         return PixelSums(self, middle, u, len(speeds)), (factor, speeds)
 
-    def sum_of_pixels(self, kept, factors):
+    def sum_of_pixels(self, state, factors):
         """The attached objective."""
         factor, speeds = factors
-        in_memory(self.term.world, None, kept)
+        in_memory(self.term.world, None, state)
         with dr.resume_grad():
             names = PixelSums.NAMES[: len(speeds)]
-            return sum(finite(kept[name] * factor) * speed for name, speed in zip(names, speeds, strict=True))
+            return sum(finite(state[name] * factor) * speed for name, speed in zip(names, speeds, strict=True))
 
 
 class PixelSums(Sink):
@@ -67,18 +67,18 @@ class PixelSums(Sink):
     def __init__(self, mode, middle, u, count):
         self.mode, self.middle, self.u, self.names = mode, middle, u, self.NAMES[:count]
 
-    def begin(self, world):
+    def begin(self, context):
         return {name: mi.Float(0) for name in self.names}
 
-    def event(self, kept, event):
+    def event(self, state, event):
         term = self.mode.term
         row, column, weight, inside = term.pixel(event.uv, self.u)
         active, place = event.active & inside, Local(row=row, column=column, laser=None)
         A, _ = self.mode.block(seen_along(self.middle, event.d), place).read(event.opl, active)
         value = dr.select(active, total_of(A, event.value) * weight, 0)
         name = self.NAMES[event.speed]
-        kept[name] = kept[name] + dr.select(event.first, value, 0)
-        kept["rest"] = kept["rest"] + dr.select(event.first, 0, value)
+        state[name] = state[name] + dr.select(event.first, value, 0)
+        state["rest"] = state["rest"] + dr.select(event.first, 0, value)
 
 
 class Forward:
@@ -99,7 +99,7 @@ class Forward:
         # Rays that go anywhere are not in the order of pixels, which some films count on.
         return FilmBlock(film, self.job.band, base, match), match, pixel
 
-    def kept(self, row):
+    def rows_in_band(self, row):
         """Return as in reverse mode, for the rows of one band of storage."""
         return (row >= self.first) & (row < self.stop), self.scale
 
@@ -113,18 +113,18 @@ class Forward:
                 return [mi.Float(0)] * len(attached)
             return tangents_of(list(attached))
 
-    def follow(self, world, sampler, path, view, factor, speed):
+    def follow(self, context, sampler, path, view, factor, speed):
         """Trace ``path`` onto the film."""
         film, (block, match, pixel) = self.term.film, view
-        _, kept = walk(world, sampler, path, ScaledFilmSink(block, finite(factor * speed)))
-        film.add_steady(pixel, match.to_channels(kept["L"]))
+        _, state = walk(context, sampler, path, ScaledFilmSink(block, finite(factor * speed)))
+        film.add_steady(pixel, match.to_channels(state["L"]))
         block.finish()
 
     def sink_of_pixels(self, middle, job, u, factor, speeds):
         """Return the sink and factors, as in reverse mode."""
         return PixelFilmSink(self, middle, u, [finite(factor * speed) for speed in self.speeds(speeds)]), None
 
-    def sum_of_pixels(self, kept, factors):
+    def sum_of_pixels(self, state, factors):
         """All is on the film."""
         return mi.Float(0)
 
@@ -136,9 +136,9 @@ class ScaledFilmSink(FilmSink):
         super().__init__(block)
         self.scale = scale
 
-    def event(self, kept, event):
+    def event(self, state, event):
         event.value = event.value * self.scale
-        super().event(kept, event)
+        super().event(state, event)
 
 
 class PixelFilmSink(Sink):
@@ -147,11 +147,11 @@ class PixelFilmSink(Sink):
     def __init__(self, mode, middle, u, scales):
         self.mode, self.middle, self.u, self.scales = mode, middle, u, scales
 
-    def event(self, kept, event):
+    def event(self, state, event):
         mode, term = self.mode, self.mode.term
         film = term.film
         row, column, weight, inside = term.pixel(event.uv, self.u)
-        own, share = mode.kept(row)
+        own, share = mode.rows_in_band(row)
         active = event.active & inside & own
         place = Local(row=dr.select(active, row, mode.first), column=column, laser=None)
         match = term.integrator.channel_match(term.world.contents, film, seen_along(self.middle, event.d))
