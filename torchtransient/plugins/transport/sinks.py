@@ -28,10 +28,17 @@ class Sink:
         return {}
 
     def event(self, state: dict[str, Any], event: Any) -> None:
-        """Receive an :class:`.strategy.Event`."""
+        """Receive an :class:`.strategy.Event` of the current vertex."""
 
     def vertex(self, state: dict[str, Any], path: Any, samples: dict[str, Any]) -> None:
-        """Receive the vertex that ``path`` reached; ``samples``: samples of the strategies there, by name."""
+        """Receive the vertex that ``path`` reached.
+
+        Args:
+            state: loop state of the sink.
+            path: :class:`.walk.Path` before the vertex.
+            samples: samples of the strategies there, by name, as :meth:`.strategy.Strategy.record` takes them;
+                ``walk``: those of the loop.
+        """
 
     def end(self, state: dict[str, Any]) -> None:
         """Finish the loop state."""
@@ -41,9 +48,12 @@ class Sink:
 # Film.
 
 class FilmSink(Sink):
-    """Writer of events to a film, through its block.
+    """Sink that writes events to a film, through its block.
 
     Its state has the sum ``L`` over all times, and the energy ``before`` and ``after`` the film's window.
+
+    Args:
+        block: :class:`~..films.block.FilmBlock` of the launch.
     """
 
     keeps_vertices = False
@@ -68,9 +78,13 @@ class FilmSink(Sink):
 # Sum of events, weighted by the film's adjoint.
 
 class AdjointSumSink(Sink):
-    """Sum of ``A(opl) value`` over the events of a path, with the adjoint ``A`` of the film; its state is ``sum``.
+    """Sink that sums ``A(opl) value`` over the events of a path, with the adjoint ``A`` of the film.
 
-    A boundary term traces paths from both sides of an edge: the sum is the contribution of their light to a loss.
+    A boundary term traces paths from both sides of an edge: the sum is the contribution of their light to a loss. Its
+    state is ``sum``.
+
+    Args:
+        block: :class:`~..films.block.AdjointBlock` of the launch.
     """
 
     def __init__(self, block):
@@ -88,11 +102,16 @@ class AdjointSumSink(Sink):
 # List of events with their depths.
 
 class EventListSink(Sink):
-    """List of events, in slots of each lane.
+    """Sink that lists events, in slots of each lane.
+
+    Args:
+        lanes: number of paths.
+        slots: number of events that fit for each path.
+        energy_of: function of an event's value that returns its energy, Float; events without energy are left out.
 
     Attributes:
         opl: optical path length, minus the film's start, Float64.
-        energy: ``energy_of(value)``, Float; events without energy are left out.
+        energy: energy, Float.
         depth: depth of the event, 0 in empty slots.
         used: number of events of each lane, which may exceed ``slots``.
     """

@@ -1,4 +1,4 @@
-"""Segments through vacuum: straight lines from surface to surface."""
+"""Segments through vacuum: straight lines from surface to surface. Arguments that all methods share: :mod:`.strategy`."""
 
 from __future__ import annotations
 
@@ -24,7 +24,12 @@ NUMBERS = {"t": "Float", "prim_uv": "Point2f", "prim_index": "UInt32", "shape_in
 
 
 def intersection_fields(context, prefix=""):
-    """Types of the numbers that a preliminary intersection is kept as."""
+    """Return the types of the numbers that record a preliminary intersection.
+
+    Args:
+        context: :class:`.context.RenderContext` of the job.
+        prefix: prefix of their names.
+    """
     pointers = ("shape", "instance") if context.contents.instances else ("shape",)
     return {prefix + name: getattr(mi, kind) for name, kind in NUMBERS.items()} | {
         prefix + name: mi.UInt32 for name in pointers
@@ -32,13 +37,19 @@ def intersection_fields(context, prefix=""):
 
 
 def intersection_numbers(pi, prefix=""):
-    """A preliminary intersection as numbers."""
+    """Return the numbers that record the PreliminaryIntersection3f ``pi``, by name."""
     values = {prefix + name: getattr(pi, name) for name in NUMBERS}
     return values | {prefix + n: dr.reinterpret_array(mi.UInt32, getattr(pi, n)) for n in ("shape", "instance")}
 
 
 def intersection(numbers, active, prefix=""):
-    """The preliminary intersection again."""
+    """Return the recorded PreliminaryIntersection3f.
+
+    Args:
+        numbers: record, by name.
+        active: mask of lanes that have one.
+        prefix: prefix of the names.
+    """
     pi = dr.zeros(mi.PreliminaryIntersection3f)
     for name in NUMBERS:
         setattr(pi, name, numbers[prefix + name])
@@ -50,7 +61,14 @@ def intersection(numbers, active, prefix=""):
 
 
 def length_to(contents, p, q, valid, d):
-    """Length from ``p`` to the point ``q``, or to the distant light in direction ``d`` where ``q`` is not valid."""
+    """Return the length of a segment, metres.
+
+    Args:
+        contents: :class:`.scene_contents.SceneContents`.
+        p, q: ends, Point3f.
+        valid: mask of segments that end at ``q``; others lead to distant light, or nowhere (length 0).
+        d: direction of the segment.
+    """
     length = dr.norm(dr.select(valid, q - p, mi.Vector3f(0, 0, 1)))
     if contents.distant is None:
         return dr.select(valid, length, 0)
@@ -58,11 +76,12 @@ def length_to(contents, p, q, valid, d):
 
 
 class Vacuum(Segment):
-    """Nothing between surfaces. A leg is the preliminary intersection at its end.
+    """Segment through vacuum. A leg is the preliminary intersection at its end.
 
     In derivatives the first vertex and those behind delta lobes slide along the rays that found them. All others are
-    points of their shapes, so that the integral over a surface that moves has no edges but where something hides it;
-    near points are dragged along with the vertex that sees them (:func:`~.geometry_terms.damped_motion`).
+    material points: they move with their shapes, so that the integral over a surface that moves has no edges but where
+    something hides it. Near points are dragged along with the vertex that sees them
+    (:func:`~.geometry_terms.damped_motion`).
     """
 
     def prepare(self, context):
@@ -96,7 +115,16 @@ class Vacuum(Segment):
         )  # fmt: skip
 
     def optical_length(self, context, path, p, valid):
-        """Optical length of the segment that ends at ``p``, measured between hit points."""
+        """Return the optical length of the segment that ends at ``p``, measured between hit points.
+
+        Args:
+            path: :class:`.walk.Path` before the vertex, with the start ``prev_p`` and the index ``η`` of the segment.
+            p: end, Point3f.
+            valid: mask of segments that end at a surface; others lead to distant light.
+
+        Returns:
+            Metres times index, Float64. Zero for the first segment where ``context.camera_unwarp``.
+        """
         length = dr.norm(p - path.prev_p)
         if context.contents.distant is not None:
             length = dr.select(valid, length, context.contents.distant.length(path.prev_p, path.ray.d))
@@ -167,7 +195,16 @@ class Vacuum(Segment):
         return self.arrived(context, v, carry, ray, si, wanted)
 
     def attached_surface(self, context, v, carry, ray, wanted, active):
-        """Return the interaction of ``ray`` where ``active``: attached to it and to the surface, along the ray."""
+        """Return the SurfaceInteraction3f of a recorded vertex, attached to its ray and to the surface.
+
+        The hit moves along the ray as the surface moves. Where ``wanted.slides_position_only``, a shift ``carry.o`` of
+        the ray is added to the position as a vector; else the ray itself is attached. Seen edge-on
+        (:data:`.geometry_terms.EDGE_ON`) the hit stays: it would move by one over the cosine, which is rounding there.
+
+        Args:
+            carry: attached Carry that arrives there.
+            ray: Ray3f of the segment, attached if need be.
+        """
         si = surface_interaction(context.surfaces, v.pi, ray, mi.RayFlags.All, active)
         if wanted.slides_position_only:  # an attached ray would have every shape differentiated
             si.p = si.p + slide(displacement(carry.o, active), v.ray.d, dr.detach(si.n), active)
@@ -178,7 +215,17 @@ class Vacuum(Segment):
         return si
 
     def arrived(self, context, v, carry, ray, si, wanted):
-        """The attached vertex at ``si``, behind the optical length of its segment."""
+        """Return the attached vertex (:class:`.strategy.AttachedVertex`) at the end of a segment of known interaction.
+
+        With the Carry's slope before the segment and its index η, the slope at the vertex is ``slope + η d|p - o|``. A
+        sideways shift makes a ray no longer, so that the origin ``o`` is attached only where the ray is
+        (``wanted.ray``).
+
+        Args:
+            carry: attached Carry before the segment.
+            ray: Ray3f of the segment, attached if need be.
+            si: attached SurfaceInteraction3f at its end.
+        """
         vertex = AttachedVertex(v=v, si=si, sid=dr.detach(si), carry=carry, slope=carry.slope)
         valid = vertex.sid.is_valid()
         vertex.end = VertexEnd(vertex.sid.t, vertex.sid.n, v.ray.d, valid)
@@ -200,7 +247,26 @@ class Vacuum(Segment):
         return self.motion_to(context, vertex.v.after(), δ, following, ahead, vertex.damping_radius)
 
     def motion_to(self, context, after, δ, following, ahead, radius):
-        """:meth:`motion` to the vertex ``after`` from a point that moves by ``δ``."""
+        """Return the motion of a segment from a point x, which moves by ``δ``, to a recorded vertex y.
+
+        y is a material point and moves by ``v`` with its shape (:meth:`material_hits`; zero where no shape moves).
+        Relative to y, the start moves by ``δ - v``, to which :func:`~.geometry_terms.damped_motion` gives the direction
+        ``d - W (δ - v)_perp``, the solid angle ``J`` and a drag of y by the share ``a = 1 - W r``. To these come
+
+            J     *= 1 + (1 - a) (dA / A + dn.d / n.d)    since the element of area and the normal at y move,
+            drag  += v_perp                               so that the ray meets y where it went,
+            longer = -δ.d                                 by the start alone: :meth:`arrived` counts the end.
+
+        Args:
+            after: :class:`.record.RecordedVertex` of y.
+            δ: displacement of x, Vector3f: zero, with the derivative.
+            following: :class:`.strategy.VertexEnd` of y.
+            ahead: mask of paths that a smooth lobe led to y.
+            radius: damping radius, metres: nearer points are dragged along.
+
+        Returns:
+            Attached ``d``, ``J``, ``drag`` and ``longer()``, see :meth:`~.strategy.Segment.motion`.
+        """
         d, volume = mi.Vector3f(following.d), self.has_no_normal(following)
         if self.triangles is None:
             return damped_motion(δ, d, following.t, following.n, ahead, radius, volume=volume)
@@ -214,8 +280,23 @@ class Vacuum(Segment):
         return Local(d=motion.d, J=J, drag=drag, longer=lambda: -dr.dot(δ, d))
 
     def material_hits(self, context, pi, ray, n, active):
-        """(point, normal, area element) of hit points that follow their shapes, whose normals are ``n``. Points of
-        shapes without material points stay where they are.
+        """Return recorded hits as material points: attached to the parameters that move their shapes.
+
+        A material point keeps its coordinates (u, v) on its triangle with the corners a, b, c:
+
+            p = a + u (b - a) + v (c - a),    n ~ (b - a) x (c - a),    A = |(b - a) x (c - a)|.
+
+        Triangles that move are gathered from :class:`AttachedTriangles`; for other shapes Mitsuba computes the same
+        (:func:`~.geometry_terms.material_point`). Shapes without material points (``contents.sliding``) stay where they
+        are.
+
+        Args:
+            pi: PreliminaryIntersection3f of the hits.
+            ray: Ray3f that found them.
+            n: their detached normals, whose side the results take.
+
+        Returns:
+            (p, Point3f; n, Normal3f; A, Float, of which only the relative derivative counts).
         """
         with dr.suspend_grad():
             if context.contents.sliding is not None:
@@ -240,8 +321,15 @@ class Vacuum(Segment):
         return displacement(p, active & pi.is_valid())
 
     def from_meter(self, context, v, carry):
-        """The ``carry`` at the first vertex of a path that starts on an irradiance meter at rest: a point of its shape
-        like those after it, since no pixel holds the ray.
+        """Return the Carry of paths from an irradiance meter at rest, whose first vertex is a material point, too.
+
+        No pixel holds the rays of a meter, so that its first vertex may move as all others do. With the motion of the
+        segment to it from a start at rest, the throughput is multiplied by ``J`` and by the relative change of the
+        cosine at the meter.
+
+        Args:
+            v: :class:`.record.RecordedVertex`; other vertices than the first keep their Carry.
+            carry: attached Carry that arrives there.
         """
         if self.meter_normal is None:
             return carry
@@ -267,10 +355,16 @@ class Vacuum(Segment):
 # own: many times the sums of one gather.
 
 class AttachedTriangles:
-    """The triangles of the ``shapes`` whose vertices are attached and whose normals are those of their planes.
+    """Triangles of meshes whose vertices are attached and whose normals are those of their planes, in one table.
 
-    ``lists(shape)``: which shapes those are; ``holds_all``: no other of the shapes with the pointers ``moving`` moves.
     A plain object, which Dr.Jit loops leave alone.
+
+    Args:
+        shapes: shapes of the scene.
+        moving: pointers of the shapes that move.
+
+    Attributes:
+        holds_all: the table has all shapes that move.
     """
 
     def __init__(self, shapes: list[Any], moving: frozenset[Any]) -> None:
@@ -295,8 +389,14 @@ class AttachedTriangles:
         return mi.Mask(False) if self.starts is None else self.starts.look_up(shape) > 0
 
     def point(self, pi: Any, active: Any) -> Local:
-        """Return the hit points ``pi`` on listed shapes, as their shapes move: ``p``, ``across`` (twice the area
-        along the normal of either side).
+        """Return hits on listed triangles as material points.
+
+        Args:
+            pi: PreliminaryIntersection3f of the hits.
+            active: mask of hits on listed shapes.
+
+        Returns:
+            Attached ``p`` (Point3f) and ``across`` (Vector3f): twice the area, along the normal of either side.
         """
         if self.starts is None:
             return Local(p=mi.Point3f(0), across=mi.Vector3f(0, 0, 1))
@@ -314,7 +414,7 @@ def _is_listed(shape: Any) -> bool:
 
 
 def _joined(buffers: list[Any]) -> Any:
-    """One buffer, attached to all; None for none."""
+    """Return the buffers as one, attached to all; None for none."""
     if len(buffers) < 2:
         return buffers[0] if buffers else None
     joined, first = dr.zeros(mi.Float, sum(map(dr.width, buffers))), 0
