@@ -21,10 +21,11 @@ receive events through a block (:class:`~torchtransient.plugins.films.block.Film
 through an adjoint block.
 
 Arguments that all methods share: ``context`` is the :class:`.context.RenderContext` of the job, ``path`` the
-:class:`.walk.Path` before the vertex, ``vertex`` the :class:`Vertex` or :class:`AttachedVertex`, ``sampler`` Mitsuba's
-sampler of the lanes, ``active`` a mask of lanes, ``wanted`` the :class:`.context.Wanted` derivatives of the job, ``v``
-a :class:`.record.RecordedVertex`. Every Float is one number per lane. ``value`` is a spectrum (``mi.UnpolarizedSpectrum``), in polarized variants a Stokes
-vector. Lengths are metres, densities per solid angle unless stated otherwise.
+:class:`.walk.Path` before the vertex, ``vertex`` the :class:`Vertex` or :class:`AttachedVertex`, ``v`` a
+:class:`.record.RecordedVertex`, ``sampler`` Mitsuba's sampler of the lanes, ``active`` a mask of lanes, ``wanted`` the
+:class:`.context.Wanted` derivatives of the job. Every Float is one number per lane. ``value`` is a spectrum
+(``mi.UnpolarizedSpectrum``), in polarized variants a Stokes vector. Lengths are metres, densities per solid angle
+unless stated otherwise.
 """
 
 from __future__ import annotations

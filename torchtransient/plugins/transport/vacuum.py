@@ -1,4 +1,7 @@
-"""Segments through vacuum: straight lines from surface to surface. Arguments that all methods share: :mod:`.strategy`."""
+"""Segments through vacuum: straight lines from surface to surface.
+
+Arguments that all methods share are explained in :mod:`.strategy`.
+"""
 
 from __future__ import annotations
 
