@@ -107,7 +107,7 @@ class SceneContents:
         self._built = True
 
     def hidden_from_mitsuba(self) -> AbstractContextManager[None]:
-        """For the time of a derivative: what is attached here instead of by Mitsuba."""
+        """Return a context manager that detaches in Mitsuba what is attached here instead, during a derivative."""
         return nullcontext() if self.instances is None else self.instances.detached()
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -222,11 +222,18 @@ class MediaContents:
 class FlightSettings:
     """Media of one job: contents and wanted derivatives.
 
-    ``recorded``: the path is kept. ``extinction_changes``: a transmittance can change. ``keeps_entry``: the boundary
-    before a vertex is kept, since the vertex may move with it. ``rate_floor`` (1 / m, None when no extinction is
-    differentiated): the smallest rate at which collisions are sampled: where the density is zero, its derivative is
-    not, and is found by collisions alone. ``hide_emitters``: rays from the sensor pass light sources.
-    ``surfaces``: what their derivatives need beside Mitsuba (:class:`.surface_interactions.AttachedSurfaces`), or None.
+    Args:
+        contents: media of the scene.
+        wanted: :class:`.context.Wanted` derivatives, None in a render.
+        hide_emitters: rays from the sensor pass light sources.
+        surfaces: :class:`.surface_interactions.AttachedSurfaces`, or None.
+
+    Attributes:
+        recorded: paths are recorded for derivatives.
+        extinction_changes: a transmittance can change.
+        keeps_entry: the boundary before a vertex is recorded, since the vertex may move with it.
+        rate_floor: smallest rate at which collisions are sampled, 1 / m; None when no extinction is differentiated.
+            Where the density is zero, its derivative is not, and is found by collisions alone.
     """
 
     def __init__(self, contents: MediaContents, wanted: Any, hide_emitters: bool, surfaces: Any = None):
@@ -248,7 +255,7 @@ class FlightSettings:
 
 
 def media_of(scene: Any, sensor: Any) -> MediaContents | None:
-    """The media of a scene, None when it has none."""
+    """Return the media of a scene, None when it has none."""
     shapes = shapes_of_scene(scene)
     found = [sensor.get_medium() if sensor is not None else None]
     for shape in shapes:
@@ -315,8 +322,13 @@ class SceneCache:
         return self._described.is_of(scene)
 
     def follow_derivatives(self, scene: Any, asked: bool) -> None:
-        """Let the BSDFs that sample otherwise for derivatives look which parameters carry some now. ``asked``: for a
-        job of derivatives. What they build for it belongs to the scene's contents.
+        """Let the BSDFs that sample otherwise for derivatives look up which parameters carry some now.
+
+        What they build for it belongs to the scene's contents.
+
+        Args:
+            scene: scene of the job.
+            asked: the job is a derivative.
         """
         self._forget_replaced(scene)
         with dr.resume_grad():
@@ -332,15 +344,16 @@ class SceneCache:
         return self._contents[sensor.ptr][1]
 
     def tracker(self, scene: Any) -> ParameterTracker:
-        """The scene's parameters. Walked over when first asked for: a render has no use for it."""
+        """Return the tracker of the scene's parameters, built when first asked for: a render has no use for it."""
         self._forget_replaced(scene)
         if self._tracker is None:
             self._tracker = ParameterTracker(scene)
         return self._tracker
 
     def python_plugins(self, scene: Any) -> list[Any]:
-        """The plugins of the scene that are written in Python: integrator, films, samplers and filters included, and
-        without what plugins do not show.
+        """Return the plugins of the scene that are written in Python.
+
+        Integrator, films, samplers and filters are included; what plugins do not show is not.
         """
         self._forget_replaced(scene)
         if self._python is None:
