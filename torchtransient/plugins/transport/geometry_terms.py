@@ -101,7 +101,10 @@ class DampedMotion(Local):
         return self.drag - self.fixed * dr.dot(n, self.drag) * self.per_cos
 
     def longer(self, n=None):
-        """Zero with the derivative of the length: what is due to the vertex, and with ``n`` to the slide of the point.
+        """Return zero with the derivative of the length, due to the vertex alone.
+
+        Args:
+            n: normal of the point's surface, to add what its slide lengthens.
         """
         if n is None:
             return -dr.dot(self.δ, self.fixed)

@@ -24,11 +24,19 @@ from torchtransient.plugins.transport.strategy import Connection, Event, Proposa
 
 
 class SensorSampled(Connection):
-    """``places``: :class:`~..sensors.seen_from.SensorPlaces`; ``numbers``: those that choose the sensor's point, set
-    before a launch. ``unwarp``: the segment to the sensor does not count in time. Events carry ``uv``, in pixels, ``d``
-    towards the sensor, ``first`` (the path's first vertex is connected), and ``speed``: which of the speeds of a pass
-    of the boundary term is theirs then. ``in_line``: None, or Local with masks ``near`` of paths of which it is known
-    whether the first vertex is ``shown``, and a ``step`` from it to where nothing is in the way then.
+    """Connection of a path that starts at a light to the sensor.
+
+    Events carry ``uv``, in pixels, ``d`` towards the sensor, ``first`` (the path's first vertex is connected), and
+    ``speed``, the number of their speed in a pass of the boundary term.
+
+    Args:
+        places: :class:`~..sensors.seen_from.SensorPlaces`.
+        unwarp: the segment to the sensor does not count in time.
+
+    Attributes:
+        numbers: numbers that choose the sensor's point, set before a launch.
+        in_line: None, or Local with masks ``near`` of paths of which it is known whether the first vertex is ``shown``,
+            and a ``step`` from it to where nothing is in the way then.
     """
 
     name = "sensor_sampled"
@@ -118,7 +126,7 @@ class FromLight:
 
 
 def shades_by_other_normals(scene: Any) -> bool:
-    """Return whether some surface has normals at its vertices or in a texture."""
+    """Return True if some surface has normals at its vertices or in a texture."""
     shapes = [shape for shape in shapes_of_scene(scene) if has_surface(shape) and shape.bsdf() is not None]
     if any(has_vertices(shape) and has_normals(shape) for shape in shapes):
         return True

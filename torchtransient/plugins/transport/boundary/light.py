@@ -26,10 +26,11 @@ _STEEP = 10.0
 
 
 class LightPass(BoundaryPass):
-    """Boundary pass that draws an edge point p and a point y of a light, and follows a path behind p, on its shadow, to
-    the sensor: a walk with one connection (:class:`~..light_tracing.SensorSampled`). Its first vertex x is
-    held on the ray of the camera where it is connected at once (``direct``), and is a point of its shape where it goes
-    on.
+    """Boundary pass of edges between the last vertex of a path and a light.
+
+    It draws an edge point p and a point y of a light, and follows a path behind p, on its shadow, to the sensor: a walk
+    with one connection (:class:`~..light_tracing.SensorSampled`). Its first vertex x is held on the ray of the camera
+    where it is connected at once (``direct``), and is a point of its shape where it goes on.
     """
 
     def __init__(self, context):
@@ -41,7 +42,7 @@ class LightPass(BoundaryPass):
 
     @staticmethod
     def exists(context, sensor):
-        """Return whether there are lights and a sensor that can be connected to."""
+        """Return True if there are lights and a sensor that can be connected to."""
         return context.max_depth > 1 and len(context.scene.emitters()) > 0 and can_be_connected(sensor)
 
     def run(self, mode, job):
@@ -97,10 +98,11 @@ class LightPass(BoundaryPass):
         return mode.sum_of_pixels(state, factors)
 
     def _in_line(self, term, edges, light, x, ray, medium, numbers, sampler, active):
-        """Find where the sensor sees the shadow at ``x`` past the edge itself, as from a place at the light; returns
-        ``shown``, as :class:`~..light_tracing.SensorSampled` asks for it. A ray to the sensor would let
-        rounding decide, once more than in the pass of the sensor. That one sees past the edge either what the light
-        reaches, or the shadow: where it is not lit, the edge of the shadow is in view.
+        """Return where the sensor sees the shadow at x past the edge itself.
+
+        The result is that of :attr:`~..light_tracing.SensorSampled.in_line`. A ray to the sensor would let rounding
+        decide, once more than in the pass of the sensor. That one sees past the edge either what the light reaches, or
+        the shadow: where it is not lit, the edge of the shadow is in view.
         """
         context, b, ds = term.world, light.b, light.ds
         scale = BESIDE * (1 + dr.max(dr.abs(b.p)))
@@ -126,8 +128,10 @@ class LightPass(BoundaryPass):
         return Local(near=near, shown=free & ~lit, step=step)
 
     def _light(self, term, edges, k, ray, u):
-        """A point of a light drawn from the edge ``k``, and the outline seen from there: ``ds, b, far, Le`` (emission
-        over the density by solid angle at the edge).
+        """Return a point of a light drawn from the edge ``k``, and the outline seen from there.
+
+        ``ds, b, far, Le`` (emission over the density per solid angle at the edge), ``near, u`` (what it was drawn
+        from).
         """
         context = term.world
         near = at_point(k.near, ray)
@@ -146,8 +150,9 @@ class LightPass(BoundaryPass):
         return Local(ds=ds, b=b, far=far, Le=dr.select(k.ball, other, Le), near=near, u=u)
 
     def _speeds(self, term, edges, light, x, path, ray, numbers, sampler, active):
-        """Attached speeds of the edge: where x is the first vertex of a path of the sensor, where it is another, and
-        where the sensor sees it through a chain.
+        """Return the attached speeds of the edge by :data:`.weigh.PixelSums.NAMES`.
+
+        For x as the first vertex of a path of the sensor, as another one, and as the first one seen through a chain.
         """
         b = light.b
         context = term.world
@@ -189,14 +194,15 @@ class LightPass(BoundaryPass):
 
     @staticmethod
     def _on_ray(δ, w, n, q, surface):
-        """Motion of the point of a surface, which moves by ``q`` along its normal ``n``, on a ray in direction ``w``
-        that moves by ``δ``.
+        """Return the displacement of a surface point on a ray in direction ``w`` that moves by ``δ``.
+
+        The surface moves by ``q`` along its normal ``n``.
         """
         cos = dr.dot(n, w)
         return δ + w * dr.select(surface & (dr.abs(cos) > EDGE_ON), (q - dr.dot(n, δ)) / cos, 0)
 
     def _through_chain(self, term, x, n, pi, ray, surface, active):
-        """Motion of x on the ray of the sensor that sees it through a chain."""
+        """Return the displacement of x on the ray of the sensor that sees it through a chain."""
         context, through = term.world, term.through
         with dr.suspend_grad():
             seen, rays = through.seen_from(x, active)
@@ -206,9 +212,10 @@ class LightPass(BoundaryPass):
         return self._on_ray(displacement(last.o + last.d * seen.way, found), seen.d, n, q, surface)
 
     def _motion(self, context, light, x, v_x, active):
-        """Attached motion of a light's point, as interior derivatives hold it, seen from ``x``, which moves by ``v_x``:
-        points and spots move, areas are points of their shapes, dragged along where they are near, and spheres keep the
-        place in the cone that they fill.
+        """Return the attached displacement of a light's point, as interior derivatives hold it, seen from x.
+
+        x moves by ``v_x``. Points and spots move, areas are points of their shapes, dragged along where they are near,
+        and spheres keep the place in the cone that they fill.
         """
         wanted, ds, b = context.wanted, light.ds, light.b
         v = mi.Vector3f(0)

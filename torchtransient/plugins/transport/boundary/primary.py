@@ -25,13 +25,15 @@ FACING = 1e-3
 
 
 class PrimaryPass(BoundaryPass):
-    """Boundary pass that draws an edge point and a pixel that sees it. Creases count as well: a point on a camera's ray
-    slides along the ray, and where a face ends under it the light jumps.
+    """Boundary pass of edges between the sensor and the first vertex: draws an edge point and a pixel that sees it.
+
+    Creases count as well: a point on a camera's ray slides along the ray, and where a face ends under it the light
+    jumps.
     """
 
     @staticmethod
     def exists(context, sensor):
-        """Return whether edges can lie there: rays that are drawn from no area meet none."""
+        """Return True if edges can lie there: rays that are drawn from no area meet none."""
         return context.max_depth > 0 and can_be_connected(sensor)
 
     def run(self, mode, job):
@@ -87,8 +89,10 @@ class PrimaryPass(BoundaryPass):
 
 
 def where_normals_face(b):
-    """The face that hides, moved from its edge to where its interpolated normal faces the sensor: between there and the
-    edge it is black, a rim that gets as narrow as the faces of the mesh and is taken to move with the edge.
+    """Return the inner hit of an outline, moved from its edge to where the interpolated normal faces the sensor.
+
+    Between there and the edge the face is black, a rim that gets as narrow as the faces of the mesh and is taken to
+    move with the edge.
     """
     u, v = b.inner.prim_uv
     w, ray = 1 - u - v, mi.Ray3f(b.V, b.d_in)

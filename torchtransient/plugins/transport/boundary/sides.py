@@ -10,8 +10,9 @@ from torchtransient.plugins.transport.walk import start
 
 
 class BoundaryPass:
-    """Edges between two kinds of points of a path. Built once a job (a :class:`.term.BoundaryTerm`, which it does not
-    hold: its derivatives would outlive the job).
+    """Base of the passes: edges between two kinds of points of a path, see :mod:`.term`.
+
+    Built once a job. A pass does not hold its :class:`.term.BoundaryTerm`, whose derivatives would outlive the job.
     """
 
     def __init__(self, context):
@@ -19,14 +20,11 @@ class BoundaryPass:
 
     @staticmethod
     def exists(context, sensor):
-        """Return whether a job has such edges."""
+        """Return True if a job has such edges."""
         raise NotImplementedError
 
     def run(self, mode, job):
-        """Trace the edge samples of the launch ``job`` (:class:`~...integrators.job.Pass`).
-
-        Args:
-            mode: :class:`.weigh.Reverse` or :class:`.weigh.Forward`; ``mode.term`` is the job's term.
+        """Trace the edge samples of a launch.
 
         Returns:
             In reverse mode the attached objective: sums of events times the film's adjoint, times speeds of edges.
@@ -35,7 +33,16 @@ class BoundaryPass:
 
 
 def past_edge(context, b, ray, medium, β, sampler, active, seen=False):
-    """Return (the ray past an outline, its leg); of a crease the other face, seen from x. ``seen``: x is the sensor."""
+    """Return the rays past outlines; for a crease they end at its other face.
+
+    Args:
+        b: outlines seen from x.
+        ray: ray of the path that led to x, for time and wavelengths.
+        seen: x is the sensor, which may see no lights.
+
+    Returns:
+        (Ray3f from beside the outline, its leg).
+    """
     place = Local(si=dr.zeros(mi.SurfaceInteraction3f), medium=medium, surface=mi.Bool(False))
     past = mi.Ray3f(ray)
     past.o, past.d = dr.select(b.crease, b.V, b.beside), b.d
@@ -44,12 +51,15 @@ def past_edge(context, b, ray, medium, β, sampler, active, seen=False):
 
 
 def both_sides(context, mode, sampler, view, b, past, first, factor, speeds, needed, lit=None):
-    """Trace the two sides of the outlines ``b``.
+    """Trace the two sides of outlines.
 
     Args:
-        past: what :func:`past_edge` says.
-        first: fields of the paths at x: ``ray`` and those of :class:`~..walk.Path`.
-        factor: detached weight of a sample; ``speeds``: attached (inner, outer).
+        view: film block or adjoint block of the samples, as of ``mode.view``.
+        b: outlines seen from x.
+        past: ray past them and its leg, as of :func:`past_edge`.
+        first: fields of the paths at x: ``ray``, ``medium`` and those of :class:`~..walk.Path`.
+        factor: detached weight of a sample.
+        speeds: attached (inner, outer).
         needed: masks (inner, outer) of the sides that can have a speed; None where a side has none.
         lit: masks (inner, outer) of the sides whose own emission counts, in full; None: as ``first`` says.
 
@@ -84,8 +94,13 @@ def both_sides(context, mode, sampler, view, b, past, first, factor, speeds, nee
 
 
 def in_memory(context, sampler, *values):
-    """Evaluate what speeds are made of where the sensor moves: each entry of its pose is a sum over lanes by itself,
-    which would trace the paths once more.
+    """Evaluate the values that speeds are made of, where the sensor moves.
+
+    Each entry of its pose is a sum over lanes by itself, which would trace the paths once more.
+
+    Args:
+        sampler: sampler whose state is evaluated as well, or None.
+        values: trees of arrays.
     """
     if context.wanted.sensor:
         if sampler is not None:
@@ -94,15 +109,26 @@ def in_memory(context, sampler, *values):
 
 
 def is_seen_within(context, b, ray, end, medium, sampler, active, seen=True):
-    """Mask of outlines of which the inner side is seen, too, from the point ``end`` (Local). It is hidden where what is
-    in front ends in line with them: there is but one edge then, that of what is in front.
+    """Return a mask of outlines whose inner side is seen from a point, too.
+
+    It is hidden where something in front ends in line with it: then there is one edge, that of what is in front.
+
+    Args:
+        ray: ray for time and wavelengths.
+        end: the point, Local with ``p, d, dist``.
+        seen: the point is the sensor.
     """
     place = place_at(b.within, ray, medium)
     return context.segment.transmittance(context, place, end, sampler.next_2d(), sampler, active, seen)[0]
 
 
 def at_point(p, ray=None):
-    """An Interaction3f without a normal."""
+    """Return an Interaction3f without a normal.
+
+    Args:
+        p: Point3f.
+        ray: ray whose time and wavelengths it takes, or None.
+    """
     it = dr.zeros(mi.Interaction3f)
     it.p = p
     if ray is not None:
@@ -111,5 +137,10 @@ def at_point(p, ray=None):
 
 
 def place_at(p, ray, medium):
-    """A place in space, of no surface, as rays of a segment depart from it."""
+    """Return a vertex in space, on no surface, which rays of a segment may leave.
+
+    Args:
+        p: Point3f.
+        ray: ray whose time and wavelengths it takes.
+    """
     return Local(at=at_point(p, ray), si=dr.zeros(mi.SurfaceInteraction3f), medium=medium, surface=mi.Bool(False))

@@ -50,7 +50,7 @@ _MISS, _MISS_OF_WALK = 1e-4, 2e-3
 
 
 class KnownLobes(Surface):
-    """Goes on by delta lobes alone: by reflection where ``mirrors``, else through the surface."""
+    """Scattering by delta lobes alone: by reflection where ``mirrors``, else through the surface."""
 
     mirrors = False
 
@@ -65,14 +65,17 @@ class KnownLobes(Surface):
 
 
 class Chains:
-    """The chains that a sensor sees, see the module.
+    """Chains of planes that a sensor sees, see the module.
 
     Args:
-        integrator, world: of the job.
+        integrator, context: of the job.
         places: :class:`~torchtransient.plugins.sensors.seen_from.SensorPlaces`.
         sampler: seeded, with ``RAYS`` lanes.
 
-    ``move``: some of them move, and so do edges at rest as seen through them.
+    Attributes:
+        context: :class:`~..context.RenderContext` of paths that go on by delta lobes alone.
+        longest: largest number of planes.
+        move: some planes move, and so do edges at rest as seen through them.
     """
 
     def __init__(self, integrator, context, places, sampler):
@@ -106,9 +109,12 @@ class Chains:
         dr.eval(self.keys, self.directions, self.normals, self.offsets, self.ratios, vars(self.density), self.counts)
 
     def draw(self, x):
-        """Draw a chain by a uniform number: ``count`` of its planes, ``planes`` (normal n, offset n . p, ratio of the
-        index behind it to that before, 0 for a mirror), ``key``, ``inverse`` (one over its probability),
-        ``ω`` (direction of a ray that runs through it).
+        """Draw a chain by a uniform number.
+
+        Returns:
+            ``count`` of its planes, ``planes`` (normal n, offset n . p, ratio of the index behind it to that before, 0
+            for a mirror), ``key``, ``inverse`` (one over its probability), ``ω`` (direction of a ray that runs through
+            it).
         """
         row, p = self.density.sample(x)
         ray, active = row % RAYS, p > 0
@@ -123,8 +129,13 @@ class Chains:
         return Local(count=row // RAYS + 1, planes=planes, key=key, inverse=inverse, ω=ω)
 
     def follow(self, context, rays, sampler, count, active, mirrors=None):
-        """Trace primary rays through up to ``count`` delta vertices in ``world``. ``mirrors``: by vertex, the lobes
-        that :class:`KnownLobes` takes.
+        """Trace primary rays through delta vertices.
+
+        Args:
+            context: context of the walk.
+            rays: :class:`~...sensors.origin.PrimaryRays`.
+            count: largest number of vertices, UInt32.
+            mirrors: by vertex, the lobes that :class:`KnownLobes` takes; None for the sampled ones.
 
         Returns:
             ``path``, behind the last one, active where all were delta vertices; by vertex ``reached`` (mask),
@@ -160,11 +171,11 @@ class Chains:
         return Local(path=path, reached=reached, planes=planes, keys=keys, key=key)
 
     def lead(self, context, path, sampler, target):
-        """Let paths go on to their vertex number ``target`` as :func:`~..walk.advance` does.
+        """Trace paths on to their vertex number ``target``, as :func:`~..walk.advance` does.
 
         Returns:
-            ``path``, ``before`` (what advance says); ``all`` (mask: all vertices are those of a chain) and their
-            ``ratios``.
+            ``path``, ``before`` (last surface and ray, as of advance); ``all`` (mask: all vertices are those of a
+            chain) and their ``ratios``.
         """
         every, ratios = target <= self.longest, []
         pi, ray = mi.PreliminaryIntersection3f(context.segment.surface_of(path.leg)[0]), mi.Ray3f(path.ray)
@@ -182,13 +193,13 @@ class Chains:
     # -------------------------------------------------------------------------------------------- rays through planes
 
     def image_of_eye(self, chain, eye):
-        """The image of the ``eye`` in the mirrors of a chain."""
+        """Return the image of the ``eye`` in the mirrors of a chain."""
         for i, (n, offset, ratio) in enumerate(chain.planes):
             eye = dr.select((i < chain.count) & (ratio == 0), mirrored(eye, n, offset), eye)
         return mi.Point3f(eye)
 
     def look(self, chain, eye, p, numbers, active):
-        """The ray from ``eye`` through a ``chain`` to the point ``p``.
+        """Find the ray from the ``eye`` through a ``chain`` to a point ``p``.
 
         Returns:
             ``ω`` at the eye, ``uv`` (place on the film, in pixels), ``importance`` per area across at ``p``, last
@@ -217,9 +228,17 @@ class Chains:
         )  # fmt: skip
 
     def turned(self, chain, eye, p, ω, step, least):
-        """Make one try of Newton's method at ``ω + step``: (direction, next step, how far the direction misses ``p``).
-        What is no better than the ``least`` miss so far, or no ray at all (total reflection), is tried again with half
-        of the step.
+        """Take one step of Newton's method.
+
+        A direction that is no better, or no ray at all (total reflection), is tried again with half of the step.
+
+        Args:
+            ω: best direction so far.
+            step: change to be tried.
+            least: distance by which ``ω`` misses ``p``.
+
+        Returns:
+            (best direction, next step, its distance).
         """
         tried = dr.normalize(ω + step)
         end = self._sent(chain, eye, tried)
@@ -231,9 +250,7 @@ class Chains:
         return dr.select(better, tried, ω), dr.select(better, across, step * 0.5), dr.select(better, miss, least)
 
     def _sent(self, chain, eye, ω):
-        """Trace a ray through the chain to where it arrives, with the derivatives of ``o, d`` by ``ω`` along two
-        ``axes``.
-        """
+        """Trace a ray through the chain, with the derivatives of ``o, d`` at its end by ``ω`` along two ``axes``."""
         o, d, length, first, valid = mi.Point3f(eye), mi.Vector3f(ω), mi.Float(0), mi.Float(0), mi.Bool(True)
         axes = [mi.Vector3f(axis) for axis in mi.coordinate_system(ω)]
         moves = [(mi.Vector3f(0), axis) for axis in axes]
@@ -272,7 +289,13 @@ class Chains:
 
 
 def attached_ray(context, ray, ratios, count, active):
-    """The last ray (attached ``o``, ``d``) of the attached primary ``ray`` through ``count`` planes, which move."""
+    """Return the last ray of an attached primary ray through planes, which move: attached ``o`` and ``d``.
+
+    Args:
+        ray: attached primary ray.
+        ratios: by plane, ratio of the index behind it to that before, 0 for a mirror.
+        count: number of planes, UInt32.
+    """
     carried = mi.Ray3f(ray)
     for i, ratio in enumerate(ratios):
         on = active & (i < count)
@@ -295,7 +318,7 @@ def ratios_of(chain):
 
 @dr.syntax
 def newton(chains, chain, eye, p, ω):
-    """The direction at ``eye`` of the ray to ``p``, from one for which there is a ray."""
+    """Return the direction at the ``eye`` of the ray to ``p``, from a direction ``ω`` of some ray through the chain."""
     i, step, least = mi.UInt32(0), mi.Vector3f(0), mi.Float(dr.inf)
     while dr.hint(i < _STEPS, max_iterations=_STEPS, label="ray through a chain"):
         ω, step, least = chains.turned(chain, eye, p, ω, step, least)
@@ -304,12 +327,17 @@ def newton(chains, chain, eye, p, ω):
 
 
 def mirrored(p, n, offset):
-    """The image of ``p`` in a plane."""
+    """Return the image of ``p`` in the plane ``n . q = offset``."""
     return p - n * (2 * (dr.dot(n, p) - offset))
 
 
 def bent(d, n, ratio):
-    """Return (direction behind a plane, derivative of its part along ``n`` by that of ``d``)."""
+    """Return (direction behind a plane, derivative of its part along ``n`` by that of ``d``).
+
+    Args:
+        d, n: direction before it, normal of the plane.
+        ratio: of the index behind it to that before, 0 for a mirror.
+    """
     cos = dr.dot(n, d)
     mirrors = ratio == 0
     inverse = dr.rcp(dr.select(mirrors, 1, ratio))
@@ -324,12 +352,11 @@ def _concatenated(parts):
 
 
 class SpecularPass(BoundaryPass):
-    """Boundary pass that draws an edge point and a pixel that sees it through a chain, as in the pass of primary edges.
-    """
+    """Boundary pass of edges that the sensor sees through a chain: draws an edge point and a pixel that sees it."""
 
     @staticmethod
     def exists(context, sensor):
-        """Return whether the sensor can see edges through chains."""
+        """Return True if the sensor can see edges through chains."""
         return sees_chains(context, sensor)
 
     def run(self, mode, job):
@@ -375,7 +402,15 @@ class SpecularPass(BoundaryPass):
 
 
 def traced(chains, chain, seen, rays, sampler, active):
-    """Return (a mask of ``rays`` that run through their chains to what is ``seen``, the paths behind these)."""
+    """Trace rays through their chains to a point.
+
+    Args:
+        chain, seen: results of :meth:`Chains.draw` and :meth:`Chains.look`.
+        rays: primary rays through ``seen.uv``.
+
+    Returns:
+        (mask of rays that visit the same planes and arrive there, the paths behind the planes).
+    """
     mirrors = [ratio == 0 for ratio in ratios_of(chain)]
     found = chains.follow(chains.context, rays, sampler, chain.count, active, mirrors)
     path = found.path
@@ -385,14 +420,15 @@ def traced(chains, chain, seen, rays, sampler, active):
 
 
 def sees_chains(context, sensor):
-    """Return whether a sensor has a point of view from which it may see something in mirrors or through glass."""
+    """Return True if a sensor has a point of view from which it may see something in mirrors or through glass."""
     contents = context.contents
     return context.max_depth > 1 and contents.delta and contents.media is None and has_eye(sensor)
 
 
 class SensorThroughChain(Connection):
-    """The sensor as seen through a chain, which is one for all vertices of a path: :meth:`set` before a launch. Events
-    are as those of :class:`~..light_tracing.SensorSampled`.
+    """Connection to the sensor as seen through a chain, one for all vertices of a path: :meth:`set` before a launch.
+
+    Events are as those of :class:`~..light_tracing.SensorSampled`.
     """
 
     name = "sensor_through_chain"
@@ -402,12 +438,17 @@ class SensorThroughChain(Connection):
         self.chains = chains
 
     def set(self, chain, numbers, η):
-        """Take a drawn ``chain``, ``numbers`` of the sensor, and the index of refraction ``η`` there."""
+        """Set the chain of a launch.
+
+        Args:
+            chain: result of :meth:`Chains.draw`.
+            η: index of refraction at the sensor.
+        """
         self.chain, self.numbers, self.η = chain, numbers, η
         self._eye = self.chains.places.eye(numbers)
 
     def seen_from(self, p, active):
-        """Return (the result of :meth:`Chains.look` for ``p``, the primary rays)."""
+        """Return (result of :meth:`Chains.look` for the point ``p``, primary rays there)."""
         chains = self.chains
         seen = chains.look(self.chain, self._eye, p, self.numbers, active & (self.chain.inverse > 0))
         return seen, chains.places.rays_at(chains.context, None, seen.uv, self.numbers, η=self.η)

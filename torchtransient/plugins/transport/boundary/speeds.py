@@ -21,15 +21,18 @@ from torchtransient.plugins.transport.surface_interactions import surface_intera
 
 
 def dragged_share(r, radius):
-    """The share a of ``damped_motion`` at distance ``r``."""
+    """Return the share ``a`` of :func:`~..geometry_terms.damped_motion` at distance ``r``."""
     return dr.select(r < radius, dr.square(1 - dr.square(r / radius)), 0)
 
 
 def sides_from(context, b, edges, v_x, y, radius, active):
-    """Attached speeds (inner, outer) of the outline ``b`` of ``edges``, seen from a point that moves by ``v_x``.
+    """Return the speeds of both sides of outlines, ``v_in`` and ``v_out`` above, attached.
 
     Args:
-        y: Local with ``dist`` (from x, infinite for none) and ``v`` (attached motion as held) of the point behind.
+        b: outlines seen from x.
+        v_x: attached displacement of x.
+        y: point behind: ``dist`` from x (infinite for none) and attached displacement ``v``, as of :func:`behind`.
+        radius: damping radius, metres.
     """
     n_x, n_p = dr.dot(b.n, v_x), dr.dot(b.n, edges.moving(b))
     held = n_p if context.contents.sliding is None else dr.select(slides(context, b), 0, n_p)
@@ -42,13 +45,18 @@ def sides_from(context, b, edges, v_x, y, radius, active):
 
 
 def slides(context, b):
-    """Mask of outlines of shapes without material points."""
+    """Return a mask of outlines of shapes without material points."""
     table = context.contents.sliding
     return mi.Bool(False) if table is None else table.lists(b.inner.shape)
 
 
 def behind(context, b, ray, leg, active):
-    """The point behind an outline, at the end of ``leg``, as :func:`sides_from` asks for it."""
+    """Return the point behind outlines, with ``dist`` and ``v`` as :func:`sides_from` takes them.
+
+    Args:
+        b: outlines seen from x.
+        ray, leg: ray past them, and its leg, as of :func:`.sides.past_edge`.
+    """
     t, found = context.segment.length_of(leg)
     pi, on_surface = context.segment.surface_of(leg)
     dist = dr.select(found, dr.norm(ray.o - b.V) + t, dr.inf)
@@ -57,22 +65,39 @@ def behind(context, b, ray, leg, active):
 
 
 def dragged(v_x, v_before, r, d, n, radius, active):
-    """Motion of a point that moves by ``v_x`` as a point of its shape, dragged along by the vertex before it, at
-    distance ``r``, which moves by ``v_before``; ``d``: direction of the ray between them, ``n``: normal at the point.
+    """Return the displacement of a material point that is dragged along by the vertex before it.
+
+    Args:
+        v_x: its displacement as a material point.
+        v_before: displacement of the vertex before.
+        r: distance of both, metres.
+        d: direction of the ray between them.
+        n: normal at the point.
+        radius: damping radius, metres.
     """
     δ = v_before - v_x
     return v_x + dr.select(active, dragged_share(r, radius) * slide(δ - d * dr.dot(d, δ), d, n, active), 0)
 
 
 def along_the_ray(context, pi, ray, active):
-    """Attached displacement of where ``ray``, attached or not, meets the surface ``pi``."""
+    """Return the displacement of the place where a ray meets a surface.
+
+    Args:
+        pi: PreliminaryIntersection3f of the surface.
+        ray: Ray3f, attached or not.
+    """
     si = surface_interaction(context.surfaces, pi, ray, mi.RayFlags.All, active & pi.is_valid())
     return displacement(si.p, active & pi.is_valid())
 
 
 def interior_displacement(context, pi, ray, active):
-    """Attached motion of a vertex that ``ray`` found, as a point of its shape, or along the ray where the
-    shape has none.
+    """Return the displacement with which interior derivatives move a vertex.
+
+    That of a material point, or along the ray for shapes without material points.
+
+    Args:
+        pi: PreliminaryIntersection3f of the vertex.
+        ray: Ray3f that found it.
     """
     v = context.segment.material_displacement(context, pi, ray, active)
     if context.contents.sliding is None:

@@ -1,4 +1,4 @@
-r"""The boundary term of derivatives: the light that a moving edge uncovers and hides.
+"""The boundary term of derivatives: the light that a moving edge uncovers and hides.
 
 A point p of an edge with tangent t is seen from x in direction d; n is normal to d and t and points out of the surface
 that hides; P is the density of p by length. With the adjoint A(pixel, tau) of the film,
@@ -14,6 +14,13 @@ known. Every edge between two vertices belongs to one of these passes:
     specular  x is the sensor, behind plane mirrors and glass (:mod:`.specular`): c as in the first pass
 
 The speeds v are those of the edge against the samples that interior derivatives hold, see :mod:`.speeds`.
+
+Arguments that functions of this folder share: ``context`` is the :class:`~..context.RenderContext` of the job, ``b`` an
+outline or crease seen from x (:meth:`~...edges.table.EdgeTable.seen_from`), ``edges`` the
+:class:`~...edges.table.EdgeTable`, ``mode`` :class:`.weigh.Reverse` or :class:`.weigh.Forward`, ``job`` a launch
+(:class:`~...integrators.job.Pass`), ``numbers`` those that choose a point of the sensor
+(:meth:`~...sensors.seen_from.SensorPlaces.numbers`), ``medium`` a MediumPtr or None, ``β`` a throughput, ``sampler``
+Mitsuba's sampler of the lanes, ``active`` a mask of lanes.
 """
 
 from __future__ import annotations
@@ -47,12 +54,20 @@ _SEEDS = {"primary": 0x51, "vertex": 0x52, "light": 0x53, "specular": 0x54, "cha
 
 
 class BoundaryTerm:
-    """The boundary term of one job of derivatives.
+    """Boundary term of one job of derivatives.
 
     Args:
-        integrator, world, sensor, film, seed: of the job.
+        integrator, context, sensor, film, seed: of the job.
         samples: edge samples per pixel of each pass.
         names: passes to run, of ``kinds``.
+
+    Attributes:
+        world: ``context``.
+        light_world: :class:`~..context.RenderContext` of paths that start at a light and are connected to the sensor.
+        edges: :class:`~...edges.table.EdgeTable` of the scene.
+        places: :class:`~...sensors.seen_from.SensorPlaces`.
+        chains: :class:`.specular.Chains` that the sensor sees, None without.
+        passes, jobs: passes of the job by name, and their launches.
     """
 
     can_be_recorded = True
@@ -84,7 +99,7 @@ class BoundaryTerm:
                 self.jobs[name], _ = passes_of(own, film, seeds[name], samples, context.most_events())
 
     def _light_world(self):
-        """The world of paths that start at a light and are connected to the sensor."""
+        """Return the context of paths that start at a light and are connected to the sensor."""
         context, integrator = self.world, self.integrator
         self.places = SensorPlaces(self.sensor, self.film, self.radius)
         self.is_meter = self.places.is_meter
@@ -103,12 +118,16 @@ class BoundaryTerm:
         return RenderContext(context.scene, context.contents, settings, strategies, None, context.window)
 
     def tables(self):
-        """The attached ends of edges, and what the strategies of light paths have attached."""
+        """Return the attached arrays: ends of edges, and tables of the strategies of light paths."""
         lights = self.passes["light"].lights.tables() if "light" in self.passes else []
         return [table for table in (*self.edges.ends, *lights) if dr.grad_enabled(table)]
 
     def backward(self, incoming):
-        """Back-propagate to the parameters and the tables."""
+        """Back-propagate to the parameters and the tables.
+
+        Args:
+            incoming: :class:`~...integrators.job.IncomingAdjoint` of the film.
+        """
         for name, one in self.passes.items():
             for job in self.jobs[name]:
                 objective = one.run(Reverse(self, incoming), job)
@@ -127,18 +146,24 @@ class BoundaryTerm:
     # ------------------------------------------------------------------------------------------------- the sensor
 
     def sampler(self, job):
-        """A seeded sampler of independent numbers with a lane for each sample of ``job``."""
+        """Return a seeded sampler of independent numbers with a lane for each sample of ``job``."""
         return self.independent(job.seed, int(self.film.crop_size()[0]) * job.rows * job.spp)
 
     def independent(self, seed, lanes):
-        """A seeded sampler of independent numbers."""
+        """Return a seeded sampler of independent numbers with ``lanes`` lanes."""
         sampler = self._sampler.clone()
         sampler.seed(seed, lanes)
         return sampler
 
     def pixel(self, uv, u):
-        """Return (row, column, weight, whether there is one) of a pixel that sees the place ``uv`` of the film, in
-        pixels, chosen by ``u`` of those that the reconstruction filter makes see it.
+        """Choose a pixel that sees a place of the film, among those that the reconstruction filter allows.
+
+        Args:
+            uv: place, Point2f, pixels.
+            u: two uniform numbers, Point2f.
+
+        Returns:
+            (row, column, UInt32; weight, Float; mask of places with a pixel).
         """
         size = mi.ScalarVector2f(self.film.crop_size())
         rfilter, weight, cell = self.film.rfilter(), mi.Float(1), dr.floor(uv)

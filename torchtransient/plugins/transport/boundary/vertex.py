@@ -30,16 +30,18 @@ _SELDOM = 0.1
 
 
 class VertexPass(BoundaryPass):
-    """Boundary pass that traces a path to a vertex x, chosen uniformly of those that may have one after them; an edge
-    point seen from there is chosen of several candidates in proportion to its span over the squared distance
-    (resampling, Talbot et al. 2005). Vertices behind the edge are points of their shapes, so that only outlines matter,
-    and of them the outer side, but for what is near x and dragged along, lights included. Lights past edges are found
-    by the pass of the lights, or here where paths of lights do not find the sensor.
+    """Boundary pass of edges between two vertices of a path.
+
+    It traces a path to a vertex x, chosen uniformly of those that may have one after them. An edge point seen from
+    there is chosen of several candidates in proportion to its span over the squared distance (resampling, Talbot et al.
+    2005). Vertices behind the edge are points of their shapes, so that only outlines matter, and of them the outer
+    side, but for what is near x and dragged along, lights included. Lights past edges are found by the pass of the
+    lights, or here where paths of lights do not find the sensor.
     """
 
     @staticmethod
     def exists(context, sensor):
-        """Return whether paths have two vertices."""
+        """Return True if paths have two vertices."""
         at_last = context.finds_light and (sees_one_line(sensor) or _has_lights_with_rims(context))
         return context.max_depth > (1 if at_last else 2)
 
@@ -111,8 +113,9 @@ class VertexPass(BoundaryPass):
         return both_sides(context, mode, sampler, view, b, past, first, factor, speeds, needed, lit)
 
     def _target(self, context, u, finds_light):
-        """Return (number of a vertex, one over its probability). The last vertex, after which there is nothing but
-        emission, is chosen seldom where only lights with rims are of use to it.
+        """Return (number of a vertex, one over its probability).
+
+        The last vertex, which only has emission after it, is chosen rarely where only lights with rims need it.
         """
         if finds_light:
             count = context.max_depth - 1
@@ -127,14 +130,14 @@ class VertexPass(BoundaryPass):
         return dr.select(last, mi.UInt32(count), number), dr.select(last, 1 / seldom, count / (1 - seldom))
 
     def _is_dragged(self, context, shape):
-        """Mask of lights of which derivatives drag near points along with who sees them."""
+        """Return a mask of lights whose derivatives drag near points along with the vertex that sees them."""
         mask = shape.is_emitter()
         if context.wanted.sphere_lights:
             mask &= ~context.contents.sphere_lights.marks.lists(shape.emitter())
         return mask
 
     def _motion(self, context, rays, path, before, lead, target, vertex, radius, active):
-        """Attached motion of x, as interior derivatives hold it."""
+        """Return the attached displacement of x, as interior derivatives hold it."""
         at_first = target == 0
         pi, _ = context.segment.surface_of(path.leg)
         surface, first = active & vertex.surface, active & at_first
@@ -178,7 +181,7 @@ class VertexPass(BoundaryPass):
 
 
 def _has_lights_with_rims(context):
-    """Return whether paths find area lights other than spheres."""
+    """Return True if paths find area lights other than spheres."""
     return context.finds_light and any(
         mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface) and not is_sphere(emitter.get_shape())
         for emitter in context.scene.emitters()
