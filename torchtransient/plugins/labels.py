@@ -61,7 +61,7 @@ class LabelTables:
         self.seen = SceneCache(scene, integrator)
 
     def lets_light_through(self) -> bool:
-        """Return whether any surface may let light pass unbent: parameters may add a lobe."""
+        """Return True if any surface may let light pass unbent: parameters may add a lobe."""
         return any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in self._bsdfs)
 
     def tables(self) -> list[Any]:

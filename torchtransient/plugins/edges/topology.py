@@ -191,14 +191,22 @@ class Corners:
 
 
 class Topology:
-    """The edges and limbs of ``scene``: ``count`` rows, of which the last ``rounds`` are limbs and rims of what has no
-    triangles. ``hides``: which shapes count, None for all.
+    """Edges and limbs of a scene, without positions.
 
     A plain object of Dr.Jit arrays, to be kept with the scene and to be named as state of recorded calls.
 
     Two meshes that touch along rims have edges there with one face of each, listed for both, with half of the light:
     where they come apart later, each is a rim of its own. What comes together later is not joined, and the order of
     three and more faces around an edge stays. Faces without area are left out (:func:`topology_of` looks again).
+
+    Args:
+        scene: Mitsuba scene.
+        hides: function of a shape that says whether it hides light, None for all.
+
+    Attributes:
+        count: number of rows.
+        rounds: number of limbs and rims of shapes without triangles, the last of the rows.
+        bodies: :class:`Body` objects with rows.
     """
 
     def __init__(self, scene: Any, hides: Callable[[Any], bool] | None = None) -> None:

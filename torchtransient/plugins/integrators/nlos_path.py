@@ -211,7 +211,8 @@ class TransientNLOSPath(base.TransientIntegrator):
         return 0 if self.laser_sampling else 1
 
     def asked_bounces(self) -> tuple[int, int | None]:
-        """The smallest and the largest number of bounces whose light is asked for, the latter None without a limit."""
+        """Return the smallest and the largest number of bounces whose light is wanted, the latter None without a limit.
+        """
         settings, light = self.settings(), self._light_segments
         most = None if settings.max_depth == UNLIMITED else settings.max_depth - light
         return max(settings.min_depth - light, 0), most

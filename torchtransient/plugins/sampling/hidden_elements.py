@@ -241,7 +241,7 @@ class HiddenElements:
 
     Attributes:
         left_out: names of the shapes that are not in the table (copies of shape groups, curves, signed distances,
-            ellipsoids). Nothing is ever drawn on them: who samples this density alone has to refuse them.
+            ellipsoids). Nothing is ever drawn on them: estimators by this density alone refuse them.
         smooth: some shape has normals that are interpolated.
 
     Raises:

@@ -213,13 +213,13 @@ def not_diffuse(shapes: list[Any]) -> list[str]:
 
 
 def _interaction(elements: HiddenElements, element: Any, p: Any, n: Any, a: Any, y: Any) -> Any:
-    """Build Mitsuba's interactions of the points: shading frame, texture coordinates."""
+    """Return Mitsuba's interactions of the points: shading frame, texture coordinates."""
     pi, ray = _preliminary(elements, element, p, n, a, y)
     return pi.compute_surface_interaction(ray, mi.RayFlags.All)
 
 
 def _preliminary(elements: HiddenElements, element: Any, p: Any, n: Any, a: Any, y: Any) -> tuple[Any, Any]:
-    """Return (the points as they would be found, by a ray from a metre before them)."""
+    """Return (the points as hits, the rays that find them from a metre away along their normals)."""
     pi = dr.zeros(mi.PreliminaryIntersection3f, dr.width(p))
     pi.shape, pi.prim_index = elements.surface(element)
     pi.valid, pi.t = mi.Mask(True), mi.Float(1)
@@ -230,7 +230,7 @@ def _preliminary(elements: HiddenElements, element: Any, p: Any, n: Any, a: Any,
 
 
 def _scattered(si: Any, side: float) -> Any:
-    """Albedo over pi of one side."""
+    """Return the albedo over pi of one side."""
     si = mi.SurfaceInteraction3f(si)
     si.wi = mi.Vector3f(0, 0, side)
     return mi.unpolarized_spectrum(si.bsdf().eval(mi.BSDFContext(), si, mi.Vector3f(0, 0, side)))

@@ -139,19 +139,19 @@ def _is_listed(emitter: Any) -> bool:
 
 
 def _fills_the_unit_square(shape: Any) -> bool:
-    """Return whether texture coordinates lie on a shape as Mitsuba's sampling of textures takes them to."""
+    """Return True if texture coordinates lie on a shape as Mitsuba's sampling of textures assumes."""
     return bool(shape.class_name() == "Rectangle" and not shape.has_flipped_normals())
 
 
 def _is_plain_bitmap(texture: Any) -> bool:
-    """Return whether a texture is a bitmap without a transform, which Mitsuba 3.9 ignores where it draws texels."""
+    """Return True if a texture is a bitmap without a transform, which Mitsuba 3.9 ignores where it draws texels."""
     if not texture.class_name().startswith("BitmapTextureImpl"):
         return False
     return np.array_equal(_matrix(texture, "to_uv"), np.eye(3).ravel())
 
 
 def _is_inside_out(shape: Any) -> bool:
-    """Return whether rays find the opposite of the normals that a shape is sampled with."""
+    """Return True if rays find the opposite of the normals that a shape is sampled with."""
     if shape.class_name() != "Cylinder":
         return False
     return bool(np.linalg.det(_matrix(shape, "to_world").reshape(4, 4)) < 0)

@@ -23,7 +23,7 @@ FAR = 300
 
 
 def can_be_connected(sensor: Any) -> bool:
-    """Return whether rays of a sensor fill a solid angle or a beam in which a point of the scene is found again."""
+    """Return True if rays of a sensor fill a solid angle or a beam in which a point of the scene is found again."""
     return all(is_irradiance_meter(one) or near_clip(one) is not None for one in sensors_of(sensor))
 
 

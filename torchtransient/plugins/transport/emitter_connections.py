@@ -51,7 +51,7 @@ class EmitterFound(Connection):
         prev.time, prev.wavelengths = path.ray.time, path.ray.wavelengths
         ds = mi.DirectionSample3f(context.scene, si=vertex.si, ref=prev)
         if context.contents.smooth_lights is not None:
-            # The face's area, on the side that emission is told by: on a mirrored mesh it is the other one.
+            # The face's normal, on the side of that which emission depends on: on a mirrored mesh it is the other one.
             ds.n = dr.mulsign(vertex.si.n, dr.dot(vertex.si.n, ds.d) * dr.dot(ds.n, ds.d))
         connected = hit & ~path.prev_unconnected
         sampled = [c.density(context, prev, ds, connected) for c in context.connections if c is not self]
@@ -275,7 +275,7 @@ class EmitterSampled(Connection):
             surface = lit & mi.has_flag(flags, mi.EmitterFlags.Surface) & ~far
         light = Local(ds=ds, weight=mi.unpolarized_spectrum(weight), far=far, near=lit & ~far, surface=surface)
         light.p, light.n, light.uv, light.area = mi.Point3f(ds.p), mi.Normal3f(ds.n), mi.Point2f(ds.uv), mi.Float(1)
-        # That of the face, and the one that emission is told by.
+        # Normal of the face; ``n`` is that which emission depends on.
         light.face_n = mi.Normal3f(ds.n)
         light.longer, light.found = mi.Float(0), None
         light.cone, light.cone_weight, light.sun = mi.Bool(False), None, mi.Bool(False)

@@ -89,12 +89,7 @@ def in_sensor_frame(light, d):
 # Scattering on the way from lights, where shading normals are not those of the surface (Veach 1997, 5.3).
 
 class FromLight:
-    """The ``scattering`` of paths that run against those of the sensor.
-
-    A value holds the cosine of the side that it is asked for. Paths of the sensor hold that of the light's side,
-    against the normal that the BSDF shades by, and the area of a surface changes from one side's to the other's by the
-    true normal: the values of both ways differ by ``|n . wo| f(wo, wi) / (|n . wi| f(wi, wo))``, cosines included in f.
-    """
+    """Scattering of paths that run from lights towards the sensor."""
 
     def __init__(self, scattering: Any) -> None:
         self._scattering = scattering

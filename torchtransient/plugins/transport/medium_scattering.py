@@ -32,7 +32,7 @@ def phase_and_scattering(mei, active):
 
 
 class SurfaceOrMedium(Surface):
-    """In a medium the vertex scatters by the phase function times the scattering coefficient."""
+    """Scattering at surfaces, and in media by the phase function times the scattering coefficient."""
 
     def prepare(self, context):
         super().prepare(context)
@@ -40,7 +40,7 @@ class SurfaceOrMedium(Surface):
         self.blends = None if blends is None else blends.read(context.wanted)
 
     def _phase_and_scattering(self, mei, u, active):
-        """(phase function, or the part of one that ``u`` chooses; scattering coefficient times its weight)."""
+        """Return (phase function, or the part of one that ``u`` chooses; scattering coefficient times its weight)."""
         phase, σ_s = phase_and_scattering(mei, active)
         if self.blends is None:
             return phase, σ_s
@@ -100,7 +100,9 @@ class SurfaceOrMedium(Surface):
         vertex.phase, vertex.σ_s = self._phase_and_scattering(vertex.mei, u, active)
 
     def eval_pdf(self, vertex, wo, out, active, sampled):
-        """A phase function too narrow for single precision has no light towards a given point, and its own samples
+        """Return value and density of an attached vertex towards a direction, as of :meth:`.Surface.eval_pdf`.
+
+        A phase function too narrow for single precision has no light towards a given point, and its own samples
         (``sampled``) have the ratio of value and density that they were drawn with.
         """
         surface_value, surface_pdf = super().eval_pdf(vertex, wo, out, active, sampled)

@@ -133,7 +133,7 @@ def scatters_by_place(bsdf: Any) -> bool:
 
 
 def emits_by_place(emitter: Any) -> bool:
-    """Return whether the light that leaves a surface in a given direction may differ from place to place: a texture, or
+    """Return True if the light that leaves a surface in a given direction may differ from place to place: a texture, or
     what counts angles from the normal of a curved shape. Mitsuba's ``area`` asks for the side alone.
     """
     if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface):
@@ -155,7 +155,7 @@ def _is_known(plugin: Any, names: Iterable[str]) -> bool:
 
 
 def _room(plugin: Any) -> str:
-    """The package that a plugin is written in."""
+    """Return the package that a plugin is written in."""
     return type(plugin).__module__.split(".")[0]
 
 
@@ -296,7 +296,7 @@ class SceneCache:
     freed.
     """
 
-    # What recorded calls depend on of it is in their worlds.
+    # What recorded calls depend on is in the contexts of their jobs.
     only_remembers = True
 
     def __init__(self, scene: Any, integrator: Any) -> None:
@@ -314,7 +314,7 @@ class SceneCache:
         self._contents: dict[int, tuple[Any, SceneContents]] = {}
         self._tracker: ParameterTracker | None = None
         self._python: list[Any] | None = None
-        # Parameters, by plugin and key, of which it was said which moving edges derivatives do not follow.
+        # Parameters, by plugin and key, whose gaps at moving edges a warning has named.
         self.warned_of_edges: set[tuple[int, str]] = set()
 
     def is_of(self, scene: Any) -> bool:

@@ -317,7 +317,8 @@ class Vacuum(Segment):
         return dr.select(listed, point.p, p), dr.select(listed, across, n), dr.select(listed, twice, area)
 
     def material_displacement(self, context, pi, ray, active):
-        """Zero with how far derivatives move the surface point ``pi``, found by ``ray``, as a point of its shape."""
+        """Return the displacement of a hit as a material point, see :meth:`~.strategy.Segment.material_displacement`.
+        """
         if self.triangles is None:
             return mi.Vector3f(0)
         p, _, _ = self.material_hits(context, pi, ray, mi.Normal3f(0, 0, 1), active & pi.is_valid())
