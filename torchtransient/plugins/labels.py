@@ -122,7 +122,7 @@ class LabelResults:
 @dataclass
 class LabelJob:
     """Labels ``names`` of one ``sensor``, the mean of ``samples`` places in each pixel, or at its centre for 0.
-    Results (:meth:`LabelResults.taken`) come in the order of the names, one array for each component.
+    Results (:meth:`LabelResults.release_storage`) come in the order of the names, one array for each component.
     """
 
     scene: Any

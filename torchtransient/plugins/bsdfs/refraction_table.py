@@ -52,7 +52,7 @@ class RefractiveBSDFs:
         return RefractiveBSDFs(entries) if entries else None
 
     def read(self) -> RefractionTable:
-        """Read the current indices; call outside of loops, once a job. Raises as :meth:`of` where values
+        """Read the current indices; call outside of loops, once a job. Raises as :meth:`from_scene` where values
         were installed since; a call that is recorded cannot look at numbers.
         """
         if not dr.flag(dr.JitFlag.FreezingScope):

@@ -100,7 +100,7 @@ class SurfaceOrMedium(Surface):
         vertex.phase, vertex.σ_s = self._phase_and_scattering(vertex.mei, u, active)
 
     def eval_pdf(self, vertex, wo, out, active, sampled):
-        """Return value and density of an attached vertex towards a direction, as of :meth:`.Surface.eval_pdf`.
+        """Return value and density of an attached vertex towards a direction.
 
         A phase function too narrow for single precision has no light towards a given point, and its own samples
         (``sampled``) have the ratio of value and density that they were drawn with.

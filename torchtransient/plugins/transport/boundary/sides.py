@@ -1,4 +1,4 @@
-"""Paths on both sides of an edge."""
+"""Paths on both sides of an edge. Arguments that all functions share are explained in :mod:`.term`."""
 
 from __future__ import annotations
 

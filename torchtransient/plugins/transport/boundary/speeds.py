@@ -4,10 +4,12 @@ On a line of sight from x past an edge point p to y, with s = |p - x| / |y - x|,
 
     v_in = n . (v_p - v(p)),    v_out = n . (v_p - (1 - s) v_x - s v(y)),
 
-where v(y) is how the interior derivative moves a sample at y (:meth:`~..strategy.Segment.held`), which near x is
-dragged along by a share a of the motion of x: v(y) = (1 - a) v_y + a v_x. On the inner side v_p is the motion of the
-surface itself, and nothing is left of it but the drag. A point on a ray that is held, as the first one of a camera,
-slides along it, which n does not see.
+where v(y) is how the interior derivative moves a sample at y: as a material point, by v_y
+(:meth:`~..strategy.Segment.material_displacement`), which near x is dragged along by a share a of the motion of x:
+v(y) = (1 - a) v_y + a v_x. On the inner side v_p is the motion of the surface itself, and nothing is left of it but the
+drag. A point on a ray that is held, as the first one of a camera, slides along it, which n does not see.
+
+Arguments that all functions share are explained in :mod:`.term`.
 """
 
 from __future__ import annotations
