@@ -223,7 +223,7 @@ def test_a_shutter_spreads_the_moments_of_rays():
         with dr.suspend_grad():
             sensor, film = integrator.resolve(one, 0)
             contents = integrator.contents(one, sensor)
-            job = launches_of(integrator.world(one, contents), sensor, film, 3, 64)[0]
+            job = launches_of(integrator.render_context(one, contents), sensor, film, 3, 64)[0]
             times.append(np.array(integrator.start(one, contents, sensor, film, job).ray.time))
     assert times[0].min() >= 2 and times[0].max() < 5
     np.testing.assert_allclose(np.quantile(times[0], [0.25, 0.5, 0.75]), [2.75, 3.5, 4.25], atol=0.15)

@@ -164,7 +164,7 @@ def test_several_launches_and_bands(monkeypatch):
         monkeypatch.setattr(f"{FILMS}.phasor.MAX_EVENT_BYTES", limit)
         film = scene.sensors()[0].film()
         integrator, sensor = scene.integrator(), scene.sensors()[0]
-        world = integrator.world(scene, integrator.contents(scene, sensor))
+        world = integrator.render_context(scene, integrator.contents(scene, sensor))
         assert len(launches(world, sensor, film, 0, 16)) > 1
         several = np.array([render(scene, 30 + seed)[1] for seed in range(12)])
         for part in (np.real, np.imag):

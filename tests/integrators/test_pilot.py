@@ -119,10 +119,10 @@ def test_depths_and_roulette_of_a_pilot(monkeypatch):
     pilot does.
     """
     asked = []
-    world = type(lit_wall().integrator()).world
+    world = type(lit_wall().integrator()).render_context
     for arguments in ({"max_depth": 2, "rr_depth": 3}, {"max_depth": 9, "rr_depth": 20}):
         scene = lit_wall(**arguments)
-        monkeypatch.setattr(type(scene.integrator()), "world", lambda self, *a, settings=None: (
+        monkeypatch.setattr(type(scene.integrator()), "render_context", lambda self, *a, settings=None: (
             asked.append((settings.max_depth, settings.rr_depth)) or world(self, *a, settings=settings)))  # fmt: skip
         events_of(scene)
     assert asked == [(512, 3), (512, 5)]

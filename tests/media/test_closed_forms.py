@@ -32,7 +32,7 @@ def vertices(scene, lanes, seed):
     """
     integrator, sensor = scene.integrator(), scene.sensors()[0]
     contents = integrator.contents(scene, sensor)
-    world = integrator.world(scene, contents, Wanted([], sensor, contents))
+    world = integrator.render_context(scene, contents, Wanted([], sensor, contents))
     sampler = sensor.sampler().clone()
     sampler.seed(seed, lanes)
     with dr.suspend_grad():

@@ -74,7 +74,7 @@ def test_scattering_in_a_medium(name, monkeypatch):
     one = scattering.SurfaceOrMedium()
     one.blends = None
     proposals, answers, step = asked()
-    one.elsewhere(world, vertex, proposals, answers, step)
+    one.scatter_in_volume(world, vertex, proposals, answers, step)
     there = np.array(inside)
     value = phase(OUT[2])
     expected = np.where(there, np.outer(coefficients, value), [[7], [11], [13]])
@@ -94,7 +94,7 @@ def test_scattering_in_a_medium(name, monkeypatch):
     monkeypatch.setattr(Surface, "value_towards", lambda *a: (mi.Color3f(7, 11, 13), mi.Float(17)))
     monkeypatch.setattr(Surface, "eval_pdf", lambda *a: (mi.Color3f(7, 11, 13), mi.Float(17)))
     monkeypatch.setattr(Surface, "look_up_attached", lambda *a: None)
-    vertex.v = Local(of=lambda name: {}, active=mi.Bool(True))
+    vertex.v = Local(record_of=lambda name: {}, active=mi.Bool(True))
     one.look_up_attached(world, vertex, None)
     again = [one.value_towards(world, None, vertex, proposals[0].d, mi.Bool(True))]
     again += [one.eval_pdf(vertex, None, proposals[0].d, mi.Bool(True), sampled) for sampled in (False, True)]
@@ -117,7 +117,7 @@ def test_media_that_no_light_is_connected_to(all_do):
     one.blends = None
     step = asked(3)[2]
     step.delta = mi.Bool([False, False, False, True])
-    one.elsewhere(world, vertex, [], [], step)
+    one.scatter_in_volume(world, vertex, [], [], step)
     assert np.array(step.unconnected).tolist() == [False, not all_do, False, True]
     assert np.array(one.connectable(world, vertex)).tolist() == [True, all_do, False, True]
 
@@ -155,7 +155,7 @@ def test_phase_functions_without_a_value(monkeypatch):
     proposals = [Local(d=mi.Vector3f(0, 0, 1), active=lanes)]
     answers, step = [Local(value=mi.Color3f(7), pdf=mi.Float(7))], asked()[2]
     step.delta = lanes
-    one.elsewhere(world, vertex, proposals, answers, step)
+    one.scatter_in_volume(world, vertex, proposals, answers, step)
     np.testing.assert_allclose(np.array(answers[0].value), np.outer(RATES, [0.5, 0, 0.5, 0, 0]))
     assert np.array(answers[0].pdf).tolist() == [2, 0, 0, 3, 0]
     np.testing.assert_allclose(np.array(step.weight), np.outer(RATES, [0.5, 0, 0, 0, 0]))
@@ -182,7 +182,7 @@ def test_phase_functions_are_asked_where_light_scatters(monkeypatch):
     step = asked(4)[2]
     answers = [Local(value=mi.Color3f(7), pdf=mi.Float(7))]
     proposals = [Local(d=mi.Vector3f(0, 0, 1), active=mi.Bool([True, False, True, False]))]
-    one.elsewhere(world, vertex, proposals, answers, step)
+    one.scatter_in_volume(world, vertex, proposals, answers, step)
     assert one.asked == [[True, True, False, False], [True, False, False, False], [True, True, False, False]]
     assert step.u_phase == "number"
     monkeypatch.setattr(Surface, "value_towards", lambda *a: (mi.Color3f(7), mi.Float(7)))
@@ -192,7 +192,7 @@ def test_phase_functions_are_asked_where_light_scatters(monkeypatch):
     one.asked.clear()
     one.value_towards(world, None, vertex, mi.Vector3f(0, 0, 1), active)
     assert one.asked == [both, both]
-    vertex.v = Local(of=lambda name: {"u_phase": "number"}, active=active)
+    vertex.v = Local(record_of=lambda name: {"u_phase": "number"}, active=active)
     one.look_up_attached(world, vertex, None)
     one.eval_pdf(vertex, None, mi.Vector3f(0, 0, 1), active, False)
     assert one.asked[2:] == [both, both] and one.numbers == ["number"] * 3

@@ -44,7 +44,7 @@ def primary_rays(scene, seed, spp):
     with dr.suspend_grad():
         sensor, film = integrator.resolve(scene, 0)
         contents = integrator.contents(scene, sensor)
-        context = integrator.world(scene, contents)
+        context = integrator.render_context(scene, contents)
         job = launches(context, sensor, film, seed, spp)[0]
         rays = integrator.start(scene, contents, sensor, film, job)
     return SimpleNamespace(

@@ -186,7 +186,7 @@ def test_a_spot_s_light_with_derivatives(media):
 
     world.scattering, world.segment = Local(evaluate=evaluate), Local(attached_transmittance=transmittance)
     record = {"lit": lit} | ({"T": mi.Color3f(0.5, 0.25, 0.125)} if media else {})
-    v = Local(of=lambda name: record, η=mi.Float(1.25), arrival=lambda name: f"arrival of {name}")
+    v = Local(record_of=lambda name: record, η=mi.Float(1.25), arrival=lambda name: f"arrival of {name}")
     vertex = Local(scattered_si=Local(p=mi.Point3f(p), wavelengths=[]), v=v, rotation=None,
                    carry=Local(β=mi.Spectrum(0.5, 0.25, 2), η=mi.Float(1.25)), scattered_opl=mi.Float64(3),
                    scattered_slope=7 * (x - dr.detach(x)))  # fmt: skip

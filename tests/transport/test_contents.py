@@ -36,7 +36,7 @@ def test_does_not_change(scene):
 
 
 def test_a_world_does_not_change(scene):
-    world = scene.integrator().world(scene, contents_of(scene))
+    world = scene.integrator().render_context(scene, contents_of(scene))
     with pytest.raises(AttributeError, match="does not change once built"):
         world.max_depth = 3
 
@@ -49,7 +49,7 @@ def test_strategies_need_names_of_their_own(scene, monkeypatch, names):
         connection.name = name
     monkeypatch.setattr(type(integrator), "strategies", lambda *_: (segment, scattering, connections))
     with pytest.raises(ValueError, match="expected a name of its own for each"):
-        integrator.world(scene, contents_of(scene))
+        integrator.render_context(scene, contents_of(scene))
 
 
 @pytest.mark.slow
@@ -136,9 +136,10 @@ def test_wanted_follows_what_parameters_move(scene):
     colour = wanted("side.bsdf.reflectance.value")
     assert colour.carried == ("β",) and not colour.geometry
     pose = wanted("wall.to_world")
-    assert pose.geometry and pose.plain and not pose.ray and pose.carried == ("β", "slope", "w", "o")
+    assert pose.geometry and pose.slides_position_only and not pose.ray and pose.carried == ("β", "slope", "w", "o")
     camera = wanted("sensor.to_world")
-    assert camera.sensor and camera.ray and not camera.plain and set(camera.carried) == {"β", "slope", "w", "o", "d"}
+    assert camera.sensor and camera.ray and not camera.slides_position_only
+    assert set(camera.carried) == {"β", "slope", "w", "o", "d"}
     light = wanted("light.position")
     assert light.light and light.geometry and not light.emitter_shape
 

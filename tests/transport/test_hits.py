@@ -85,7 +85,7 @@ def slopes_of_hits(ours):
         params["curve.control_points"] = start + direction * x
         params.update()
         pi = scene.ray_intersect_preliminary(ray)
-        surfaces = AttachedSurfaces(None, DetachedHits.of(scene).read()) if ours else None
+        surfaces = AttachedSurfaces(None, DetachedHits.from_scene(scene).read()) if ours else None
         si = surface_interaction(surfaces, pi, ray, mi.RayFlags.All, mi.Bool(True))
         return [si.t, si.n, si.sh_frame.n, si.uv]
 
@@ -172,7 +172,7 @@ def rays_to_targets(x):
 
 
 def read_fields(scene, ray, fields):
-    surfaces = AttachedSurfaces.of(contents_of(scene))
+    surfaces = AttachedSurfaces.from_contents(contents_of(scene))
     pi = scene.ray_intersect_preliminary(dr.detach(ray))
     si = surface_interaction(surfaces, pi, ray, mi.RayFlags.All, mi.Bool(ACTIVE))
     found = {"t": si.t, "n": si.n, "shading": si.sh_frame.n, "s": si.sh_frame.s, "uv": si.uv, "dp_du": si.dp_du}
@@ -181,7 +181,7 @@ def read_fields(scene, ray, fields):
 
 def contents_of(scene):
     """What the interactions of a job ask the contents of its scene for."""
-    return Local(instances=Instances.of(scene), detached_hits=DetachedHits.of(scene))
+    return Local(instances=Instances.from_scene(scene), detached_hits=DetachedHits.from_scene(scene))
 
 
 STEP = 1e-3
@@ -296,7 +296,7 @@ def test_what_is_none_of_theirs_moves_as_it_did(kind):
     """The lanes of other shapes, of nothing and of what is not asked for: no infinity reaches their rays and points."""
     scene = mi.load_dict({"type": "scene", **two_of_each(kind)}, optimize=False)
     ray = rays_to_targets(0.0)
-    pi, table = scene.ray_intersect_preliminary(ray), DetachedHits.of(scene).read()
+    pi, table = scene.ray_intersect_preliminary(ray), DetachedHits.from_scene(scene).read()
     plain, others = pi.compute_surface_interaction(ray), slice(6, 9)
     si, p = mi.SurfaceInteraction3f(plain), mi.Point3f(plain.p)
     dr.enable_grad(ray.o, ray.d, p)
@@ -324,7 +324,7 @@ def test_a_cone_as_steep_as_its_radius_has_no_slope_along_it():
     params.update()
     pi.t, pi.prim_uv, pi.shape = mi.Float(2), mi.Point2f(0.5, 0), mi.ShapePtr(scene.shapes()[0])
     ray = mi.Ray3f(mi.Point3f(0.3, 0.2, -4), mi.Vector3f(0, 0, 1))
-    found = DetachedHits.of(scene).read().attach(pi, pi.shape, ray, mi.Bool(True))
+    found = DetachedHits.from_scene(scene).read().attach(pi, pi.shape, ray, mi.Bool(True))
     dr.backward(found.t + found.prim_uv.x)
     slope = np.array(dr.grad(params["shape.control_points"])).reshape(2, 4)
     # The distance alone: |off|^2 = r^2 at (0.3, 0.2, -2), in the middle between both ends.
@@ -340,7 +340,7 @@ def test_a_spline_that_bends_as_its_surface_has_no_slope():
     dr.enable_grad(x)
     # The curve begins at (0, 1, 0) with the slope (3, 0, 0) and bends by (0, -3, 0).
     si.p, si.shape, si.uv, si.dp_du = mi.Point3f(x, -2, 0), mi.ShapePtr(scene.shapes()[0]), mi.Point2f(0.5), [0, 0, 1]
-    DetachedHits.of(scene).read().put_right(si, pi, mi.Bool(True))
+    DetachedHits.from_scene(scene).read().put_right(si, pi, mi.Bool(True))
     dr.backward(si.uv.y + si.n.x + si.n.y)
     assert dr.grad(x)[0] == 0
 
@@ -359,7 +359,7 @@ def test_a_ray_along_a_surface_has_no_slope(kind):
     x = mi.Float(0)
     dr.enable_grad(x)
     ray = mi.Ray3f(mi.Point3f(1 + x, 0, -2), mi.Vector3f(0, 0, 1))
-    found = DetachedHits.of(scene).read().attach(pi, pi.shape, ray, mi.Bool(True))
+    found = DetachedHits.from_scene(scene).read().attach(pi, pi.shape, ray, mi.Bool(True))
     assert (found.t[0], found.prim_uv.x[0]) == (2, 0.5)
     dr.backward(found.t + found.prim_uv.x)
     assert dr.grad(x)[0] == 0

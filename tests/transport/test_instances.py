@@ -59,7 +59,8 @@ def rays(x):
 
 
 def surfaces_of(scene):
-    return AttachedSurfaces.of(Local(instances=Instances.of(scene), detached_hits=DetachedHits.of(scene)))
+    contents = Local(instances=Instances.from_scene(scene), detached_hits=DetachedHits.from_scene(scene))
+    return AttachedSurfaces.from_contents(contents)
 
 
 def interaction(scene, ray, flags):
@@ -215,7 +216,7 @@ def test_poses_are_hidden_for_a_while():
     params = mi.traverse(scene)
     dr.enable_grad(x)
     move(params, x, ("second",))
-    found = Instances.of(scene)
+    found = Instances.from_scene(scene)
 
     def attached():
         return {node.id(): dr.grad_enabled(shown.read(node)) for node, shown in found._shown}

@@ -24,7 +24,7 @@ def vertex_before(x, following, radius=0.5):
 
 
 def following_at(ray, pi, mis):
-    return Local(of=lambda name: {"mis": mi.Float(mis)}, pi=pi, ray=ray, τ=mi.Float64(11),
+    return Local(record_of=lambda name: {"mis": mi.Float(mis)}, pi=pi, ray=ray, τ=mi.Float64(11),
                  arrival=lambda name: f"arrival of {name}")  # fmt: skip
 
 
@@ -64,7 +64,7 @@ def test_the_sun_that_a_path_escapes_into():
 
     connection = EmitterFound()
     connection.sun = Local(
-        shines=lambda emitter, direction: mi.Bool([True] * 4 + [False]) & (direction.x > 0.2), followed=followed
+        shines=lambda emitter, direction: mi.Bool([True] * 4 + [False]) & (direction.x > 0.2), attach_direction=followed
     )
     pi = Local(compute_surface_interaction=lambda *a: Sky())
     vertex = vertex_before(x, following_at(ray, pi, [0.8, 0.8, 0.8, 0, 0.8]))

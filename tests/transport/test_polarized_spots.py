@@ -127,7 +127,7 @@ def test_polarized_light_of_a_spot_with_derivatives(turned, geometry):
         return Local(value=value, wo=wo, eta=mi.Float(1.5))
 
     world = Local(scattering=Local(evaluate=evaluate), segment=Local(attached_transmittance=lambda *a: 1))
-    v = Local(of=lambda name: {"lit": mi.Bool(True)}, η=mi.Float(1.25), arrival=lambda name: None)
+    v = Local(record_of=lambda name: {"lit": mi.Bool(True)}, η=mi.Float(1.25), arrival=lambda name: None)
     vertex = Local(scattered_si=moving, v=v, rotation=polarized.rotation_to_sensor(si, ray.d),
                    carry=Local(β=throughput(), η=mi.Float(1.25)), scattered_opl=mi.Float64(3),
                    scattered_slope=7 * (x - dr.detach(x)))  # fmt: skip

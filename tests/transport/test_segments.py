@@ -12,7 +12,7 @@ from torchtransient.plugins.transport import vacuum as vacuum
 from torchtransient.plugins.transport.material_points import MaterialVacuum
 from torchtransient.plugins.transport.media import reference
 from torchtransient.plugins.transport.strategy import Guide, Local, Step
-from torchtransient.plugins.transport.surface_scattering import Surface, is_black, strayed
+from torchtransient.plugins.transport.surface_scattering import Surface, is_black, is_on_wrong_side
 
 VARIANT = "llvm_ad_mono"
 FAR = DistantReference((0.5, 0.25, 0.0), 4.0)
@@ -82,7 +82,7 @@ def test_what_a_vertex_records_of_its_ray():
         record = segment.record(Local(ray=ray, leg=pi))
         assert set(fields) <= set(record)
         primary = mi.Ray3f(mi.Point3f(9, 9, 9), mi.Vector3f(1, 0, 0), 0.75, [])
-        v = Local(of=lambda name, record=record: record, active=mi.Bool(True))
+        v = Local(record_of=lambda name, record=record: record, active=mi.Bool(True))
         restored, found = segment.restore(v, primary)
         assert np.array(restored.o).ravel().tolist() == [1, 2, 3] and restored.time[0] == 0.75
         assert np.array(restored.d).ravel().tolist() == [0, 0, 1] and found.t[0] == 2 and found.is_valid()[0]
@@ -97,14 +97,14 @@ class Given(vacuum.Vacuum):
     def __init__(self, place):
         self.place, self.triangles = place, True
 
-    def material(self, world, pi, ray, n, active):
+    def material_hits(self, world, pi, ray, n, active):
         return self.place
 
 
 class GivenMaterial(MaterialVacuum):
     """The same around corners."""
 
-    __init__, material = Given.__init__, Given.material
+    __init__, material_hits = Given.__init__, Given.material_hits
 
 
 def of_two_points(kind, radius):
@@ -185,8 +185,8 @@ def test_samples_that_stray_from_their_lobe():
     kinds = [R, R, T, T, R | T, R | T]
     bs = dr.zeros(mi.BSDFSample3f, 6)
     bs.sampled_type, bs.wo = mi.UInt32(kinds), mi.Vector3f(0.6, 0, mi.Float([0.8, -0.8] * 3))
-    assert np.array(strayed(mi.Vector3f(0, 0, 1), bs)).tolist() == [False, True, True, False, False, False]
-    assert np.array(strayed(mi.Vector3f(0, 0, -1), bs)).tolist() == [True, False, False, True, False, False]
+    assert np.array(is_on_wrong_side(mi.Vector3f(0, 0, 1), bs)).tolist() == [False, True, True, False, False, False]
+    assert np.array(is_on_wrong_side(mi.Vector3f(0, 0, -1), bs)).tolist() == [True, False, False, True, False, False]
     assert np.array(is_black(mi.UnpolarizedSpectrum(mi.Float([0, 0.5])))).tolist() == [True, False]
 
 
@@ -289,7 +289,8 @@ def test_weights_of_what_guides_have_drawn():
     pi = dr.zeros(mi.PreliminaryIntersection3f, count)
     pi.t, pi.valid = mi.Float(2), mi.Bool([True] * 5 + [False] + [True] * 3)
     pi.shape, pi.prim_index = shape, mi.UInt32([3] * count)
-    segment = Local(surface_of=lambda leg: (pi, mi.Bool(True)), found=lambda *a: Local(p=mi.Point3f(p), n=None))
+    segment = Local(surface_of=lambda leg: (pi, mi.Bool(True)),
+                    interaction_of=lambda *a: Local(p=mi.Point3f(p), n=None))  # fmt: skip
     vertex = Local(at=Local(p=mi.Point3f(0, 0, 0)), goes_on=mi.Bool(True), bsdf=None,
                    scattered_si=Local(to_local=lambda v: v))  # fmt: skip
     surface.weigh(Local(segment=segment), Local(depth=mi.UInt32(1)), vertex, step, Local(d=mi.Vector3f(0, 0, 1)), None)

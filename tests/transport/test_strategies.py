@@ -26,7 +26,7 @@ VARIANT = "llvm_ad_mono"
 OWED = {
     Strategy: set(),
     Segment: {
-        "first", "depart", "arrive", "surface_of", "found", "transmittance", "restore", "next_surface", "end",
+        "first", "depart", "arrive", "surface_of", "interaction_of", "transmittance", "restore", "next_surface", "end",
         "attached", "motion",
     },
     Connection: {"connect", "attached"},
@@ -51,7 +51,7 @@ def test_what_a_strategy_leaves_out_is_an_error_at_the_call(kind):
 
 def test_what_a_strategy_may_leave_out_has_an_answer():
     leg = object()
-    assert Segment().known(leg, None) is leg
+    assert Segment().leg_to(leg, None) is leg
     assert (Segment().weight(None), Segment().attached_transmittance(None, None, None, None)) == (1, 1)
     assert Segment().has_no_normal(None) is None
     assert Connection().events(None) == 1

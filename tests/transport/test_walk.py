@@ -150,7 +150,7 @@ class Line:
     def first(self, world, ray, sampler):
         return mi.Float(1)
 
-    def known(self, leg, ray):
+    def leg_to(self, leg, ray):
         return 7 * leg
 
     def depart(self, world, ray, vertex, β, sampler, active):

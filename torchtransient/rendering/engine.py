@@ -23,8 +23,8 @@ from torchtransient.checks import one_line
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, TorchTransientError, UnitError, VariantError
 from torchtransient.interfaces import BACKWARD, FORWARD, RENDER, is_time_resolved
 from torchtransient.plugins.frozen_state import says_it_can_be_recorded
-from torchtransient.plugins.guards import no_collection, surely
-from torchtransient.plugins.parameters import check_slope, lifted
+from torchtransient.plugins.guards import ensure_restored, no_collection
+from torchtransient.plugins.parameters import check_slope, without_zeros
 from torchtransient.rendering.broken_numbers import broken_entries, fill_broken
 from torchtransient.rendering.films import FilmLayout, layout_of_film
 from torchtransient.rendering.job import Item, RenderJob, RunLog, samples_drawn
@@ -116,7 +116,7 @@ class Session:
             slot.check(entry)
             leaf = own_array(entry)
             if need and slot.loses_black():
-                leaf = lifted(leaf)
+                leaf = without_zeros(leaf)
             if need:
                 dr.enable_grad(leaf)
             leaves.append(leaf)
@@ -169,7 +169,7 @@ def with_settings(settings: Sequence[tuple[Any, str, Any]]) -> Iterator[None]:
             setattr(plugin, name, value)
         yield
     finally:
-        surely(put_back)
+        ensure_restored(put_back)
 
 
 @contextmanager
@@ -192,7 +192,7 @@ def open_session(job: RenderJob) -> Iterator[Session]:
                 attached = any(job.needs)
             finally:
                 if attached or job.scene.is_shared:
-                    surely(lambda: job.scene.restore(job.options, session.slots))
+                    ensure_restored(lambda: job.scene.restore(job.options, session.slots))
 
 
 @contextmanager
@@ -218,7 +218,7 @@ def _values_at_call(job: RenderJob) -> Iterator[None]:
             put_back(params, job.at_call[0], now)
         yield
     finally:
-        surely(restore)
+        ensure_restored(restore)
 
 
 # ------------------------------------------------------------------------------------------------------------ renders

@@ -253,7 +253,7 @@ def _group_labels(
     found = []
     for job in jobs:
         job.run(job)
-        found.append(_tensors(job, job.film.taken(), names))
+        found.append(_tensors(job, job.film.release_storage(), names))
     return [reason] * len(jobs), found
 
 

@@ -91,7 +91,7 @@ def execute(session: Any, results: Any, group: Sequence[Numbered]) -> None:
                     results.collect(*group[-1])
                     return
                 for (n, item), each, of_film in zip(group, jobs, arrays, strict=True):
-                    each.film.hold(of_film)
+                    each.film.adopt_storage(of_film)
                     results.collect(n, item)
                 return
         results.calls += [reason] * len(group)
@@ -321,7 +321,7 @@ class Recording:
             results = []
             for job in self._jobs:
                 job.integrator.run(job)
-                results.append([] if job.kind == BACKWARD else job.film.taken())
+                results.append([] if job.kind == BACKWARD else job.film.release_storage())
             return results
 
         return dr.freeze(call, limit=MAX_RECORDINGS, warn_after=2**31 - 1)

@@ -17,7 +17,7 @@ from torchtransient.errors import SceneError, TorchTransientError
 from torchtransient.interfaces import IntegratorInterface, is_time_resolved
 from torchtransient.plugins.described_scene import check_scene
 from torchtransient.plugins.drjit_pool import threads_for_files
-from torchtransient.plugins.guards import let_go
+from torchtransient.plugins.guards import release_when_safe
 from torchtransient.plugins.mitsuba_compat import is_dark, scene_parameters
 from torchtransient.plugins.node_walk import objects_below
 from torchtransient.plugins.parameter_effect import class_of
@@ -78,7 +78,7 @@ class BuiltScene:
     def __del__(self) -> None:
         contents = list(self.__dict__.values())
         self.__dict__.clear()
-        let_go(contents)
+        release_when_safe(contents)
 
 
 # Errors of constructors, of Mitsuba and of plugins in Python.

@@ -222,7 +222,7 @@ def _describe(built: BuiltScene, tracker: ParameterTracker, key: str, node: Any)
     value = read_value(current, shape) if shape is None or math.prod(shape) <= _MAX_LISTED else None
     effect = tracker.effect_of(node, name, built.params.flags(key))
     if effect.stand_in:
-        holders = tracker.stood_in_for(node, name)
+        holders = tracker.replaced_plugins(node, name)
         if built.loaded.intersection(plugin.ptr for plugin, _ in holders):
             return _info(key, kind, shape, value, without_stand_in(effect, holders[0][0]))
         if isinstance(node, mi.BSDF):

@@ -36,7 +36,12 @@ class Carry:
 
 
 def attach(carry: Carry, names: Sequence[str], tangents: Carry | None = None) -> Carry:
-    """Return the Carry with new leaves for the fields ``names``, which have ``tangents`` in forward mode."""
+    """Return a Carry with new leaves of the AD graph.
+
+    Args:
+        names: fields that become leaves.
+        tangents: Carry with their tangents in forward mode, None in reverse mode.
+    """
     leaves = {}
     for name in names:
         leaf = type(getattr(carry, name))(getattr(carry, name))
@@ -58,7 +63,7 @@ def with_fields(carry: Carry, names: Sequence[str], values: Sequence[Any]) -> Ca
 
 
 def inner(adjoint: Carry, carry: Carry, names: Sequence[str]) -> Any:
-    """Return ``<adjoint, carry>`` over the fields ``names``."""
+    """Return ``<adjoint, carry>``, the sum over the fields ``names`` (Float)."""
     total = mi.Float(0)
     for name in names:
         total += total_of(getattr(adjoint, name), getattr(carry, name))
@@ -75,7 +80,7 @@ def total_of(a: Any, b: Any) -> Any:
 
 
 def choose(mask: Any, a: Carry, b: Carry, names: Sequence[str]) -> Carry:
-    """Return ``a`` where ``mask`` and ``b`` elsewhere in the fields ``names``, and other fields of ``b``."""
+    """Return the fields ``names`` of ``a`` where ``mask``, and of ``b`` elsewhere; other fields are those of ``b``."""
     return replace(b, **{name: dr.select(mask, getattr(a, name), getattr(b, name)) for name in names})
 
 
