@@ -18,7 +18,7 @@ from torchtransient.checks import as_number, as_whole, of_class, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.rendering.engine import Session, check_values, open_session
 from torchtransient.rendering.job import RenderJob, Seeding
-from torchtransient.rendering.recording import NotRecordedError, Numbered, check_whole, groups_of, refusal
+from torchtransient.rendering.recording import NotRecordedError, Numbered, groups_of, raise_if_broken, reason_to_trace
 from torchtransient.rendering.renderer import TransientRenderer
 from torchtransient.scene.load import Scene
 from torchtransient.scene.opaque import opaque
@@ -240,7 +240,7 @@ def _group_labels(
     jobs = [
         LabelJob(session.scene, session.sensors[item.sensor], names, tables, samples).prepare() for _, item in group
     ]
-    reason = refusal(session)
+    reason = reason_to_trace(session)
     if reason is None:
         try:
             how, results = session.recordings.run(jobs)
@@ -248,12 +248,12 @@ def _group_labels(
                 _tensors(job, arrays, names) for job, arrays in zip(jobs, results, strict=True)
             ]
         except NotRecordedError as error:
-            check_whole(session, error)
+            raise_if_broken(session, error)
             reason = str(error)
     found = []
     for job in jobs:
         job.run(job)
-        found.append(_tensors(job, job.film.taken(), names))
+        found.append(_tensors(job, job.film.take_arrays(), names))
     return [reason] * len(jobs), found
 
 
