@@ -48,7 +48,7 @@ def one_of(name: str, value: Any, options: Collection[Any]) -> Any:
 
 
 def checked_axis(time_axis: TimeAxis, who: str) -> TimeAxis:
-    """A time axis. Raises ShapeError for anything else."""
+    """Return a time axis. Raises ArgumentError for anything else."""
     if not isinstance(time_axis, TimeAxis):
         raise ArgumentError(f"{who}: expected time_axis as a tt.TimeAxis, got {shown(time_axis)}.")
     return time_axis

@@ -21,7 +21,7 @@ MOST_SAMPLES, MOST_DEPTH = 2**32 - 1, 2**32 - 2
 TEMPORAL_FILTERS = ("auto", "box", "tent", "gaussian")
 
 
-def samples(name: str, value: int | None) -> int | None:
+def checked_samples(name: str, value: int | None) -> int | None:
     """A number of samples per pixel, or None. Raises ``UnitError``."""
     if value is None:
         return None
@@ -102,7 +102,7 @@ def sensor_list(sensors: int | Sequence[int] | str, count: int) -> tuple[tuple[i
     return whole, True
 
 
-def mangle(keys: Sequence[str]) -> dict[str, str]:
+def torch_names(keys: Sequence[str]) -> dict[str, str]:
     """Names that torch allows: slashes for dots."""
     names = {key: key.replace(".", "/") for key in keys}
     if len(set(names.values())) != len(keys):
@@ -112,7 +112,7 @@ def mangle(keys: Sequence[str]) -> dict[str, str]:
     return names
 
 
-def film_asked_for(film: Any, named: Mapping[str, Any]) -> FilmLayout | None:
+def requested_film(film: Any, named: Mapping[str, Any]) -> FilmLayout | None:
     """The film of a call: an object, or one of the ``named`` arguments. Raises ``ArgumentError``."""
     found = film_of_arguments(named)
     if film is None:
@@ -126,7 +126,7 @@ def film_asked_for(film: Any, named: Mapping[str, Any]) -> FilmLayout | None:
     return film
 
 
-def given_values(values: Any) -> dict[str, Any]:
+def checked_values(values: Any) -> dict[str, Any]:
     """The values of a call. Raises ArgumentError for what is no mapping: a seed, most likely."""
     if values is not None and not isinstance(values, Mapping):
         raise ArgumentError(

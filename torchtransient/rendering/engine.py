@@ -20,10 +20,10 @@ from typing import Any
 import torch
 
 from torchtransient.checks import one_line
-from torchtransient.errors import ArgumentError, SceneError, ShapeError, TorchTransientError, UnitError, VariantError
+from torchtransient.errors import ArgumentError, SceneError, TorchTransientError, UnitError, VariantError
 from torchtransient.interfaces import BACKWARD, FORWARD, RENDER, is_time_resolved
 from torchtransient.plugins.frozen_state import says_it_can_be_recorded
-from torchtransient.plugins.guards import no_collection, surely
+from torchtransient.plugins.guards import no_collection, run_despite_interrupts
 from torchtransient.plugins.parameters import check_slope, lifted
 from torchtransient.rendering.broken_numbers import broken_entries, fill_broken
 from torchtransient.rendering.films import FilmLayout, layout_of_film
@@ -34,7 +34,7 @@ from torchtransient.rendering.values import detached, put_back, values_of
 from torchtransient.scene.edits import built_depth
 from torchtransient.scene.parameters import needing_slope
 from torchtransient.scene.physics import all_finite, are_finite, smallest_and_largest
-from torchtransient.scene.values import own_array, wait_for_torch
+from torchtransient.scene.values import flat_drjit_copy, wait_for_torch
 from torchtransient.scene.variant import active_variant, clear_frames, named_errors, quiet
 
 
@@ -114,7 +114,7 @@ class Session:
         for slot, value, batched, need in zip(self.slots.slots, values, self.job.batched, needs, strict=True):
             entry = value[item.entry] if batched else value
             slot.check(entry)
-            leaf = own_array(entry)
+            leaf = flat_drjit_copy(entry)
             if need and slot.loses_black():
                 leaf = lifted(leaf)
             if need:
@@ -169,7 +169,7 @@ def with_settings(settings: Sequence[tuple[Any, str, Any]]) -> Iterator[None]:
             setattr(plugin, name, value)
         yield
     finally:
-        surely(put_back)
+        run_despite_interrupts(put_back)
 
 
 @contextmanager
@@ -192,7 +192,7 @@ def open_session(job: RenderJob) -> Iterator[Session]:
                 attached = any(job.needs)
             finally:
                 if attached or job.scene.is_shared:
-                    surely(lambda: job.scene.restore(job.options, session.slots))
+                    run_despite_interrupts(lambda: job.scene.restore(job.options, session.slots))
 
 
 @contextmanager
@@ -218,7 +218,7 @@ def _values_at_call(job: RenderJob) -> Iterator[None]:
             put_back(params, job.at_call[0], now)
         yield
     finally:
-        surely(restore)
+        run_despite_interrupts(restore)
 
 
 # ------------------------------------------------------------------------------------------------------------ renders
@@ -242,8 +242,6 @@ class Images:
         self._steady: torch.Tensor | None = None
         self._response: torch.Tensor | None = None
         self._memory: Any = None
-        if not job.items:
-            raise ShapeError("a batch must have at least one entry, got 0.")
         check_items(session.sensors, job.items)
         self.films = [session.film(item) for item in job.items]
         check_fits(self.films[0].cube_shape(), self.count, job.scene.variant)
@@ -252,7 +250,7 @@ class Images:
         """Install the values of an entry, which the items of a group share."""
         self.session.install(item, self.values, [False] * len(self.values))
         for _, each in group:
-            self.session.job.watch.placed(self.session.scene, each.sensor)
+            self.session.job.watch.check_installed(self.session.scene, each.sensor)
 
     def adjoint(self, _n: int) -> tuple[None, None]:
         """Return no adjoint."""
@@ -322,7 +320,7 @@ class Images:
         calls = tuple(self.calls)
         job.log.append(RunLog(job.items, seconds, integrator, spp, before, after, total, calls, depth))
         if job.watch.enabled:
-            job.watch.window(sum(total), sum(before), sum(after))
+            job.watch.check_window(sum(total), sum(before), sum(after))
         return self._steady, self._response
 
 
@@ -391,7 +389,7 @@ def check_values(job: RenderJob, values: Sequence[torch.Tensor]) -> None:
                 f"value of {key!r}: expected finite numbers, got {bad} of {value.numel()} that are NaN or infinite."
             )
         if job.watch.enabled:
-            job.watch.value(key, value, low, high)
+            job.watch.check_value(key, value, low, high)
 
 
 # -------------------------------------------------------------------------------------------------------- derivatives
@@ -531,7 +529,7 @@ class Tangents(_Derivatives):
         super().install(item, group)
         wanted = [leaf for leaf, need in zip(self.leaves, self.session.job.needs, strict=True) if need]
         for leaf, tangent in zip(wanted, self._of_entry(item), strict=True):
-            dr.set_grad(leaf, own_array(tangent))
+            dr.set_grad(leaf, flat_drjit_copy(tangent))
             dr.enqueue(dr.ADMode.Forward, leaf)
         # Interior nodes keep their tangents: the loops of the integrator read them at their boundary.
         dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)

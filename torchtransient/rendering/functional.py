@@ -8,7 +8,7 @@ from typing import Any
 from torch import nn
 
 from torchtransient.checks import arguments_of
-from torchtransient.rendering.arguments import given_values
+from torchtransient.rendering.arguments import checked_values
 from torchtransient.rendering.output import RenderOutput
 from torchtransient.rendering.renderer import TransientRenderer
 from torchtransient.scene.opaque import opaque
@@ -30,7 +30,7 @@ def render(
     Same result as the module with the same keys and seed. For a loop, keep the scene of :func:`torchtransient.load`:
     it holds what was built.
     """
-    given = given_values(values)
+    given = checked_values(values)
     with arguments_of("render", TransientRenderer.__init__, ("scene", "parameters", "spp")):
         renderer = TransientRenderer(scene, parameters=list(given), spp=spp, **settings)
     for name, start in list(renderer.named_parameters()):

@@ -169,7 +169,7 @@ def _check_distinct(seeds: list[int]) -> None:
             raise UnitError(f"seed: {other} and {seed} are one seed: seeds count modulo 2^32. Take others.")
 
 
-def drawn(seed: int | Sequence[int] | torch.Tensor | None) -> tuple[Any, torch.Tensor | None]:
+def draw_seed(seed: int | Sequence[int] | torch.Tensor | None) -> tuple[Any, torch.Tensor | None]:
     """Return the seed of a call as (seed, None), or as (None, tensor) where ``vmap`` has one for each of its entries.
 
     None draws from torch's generator, under ``vmap`` as its ``randomness`` says. Raises ``UnitError`` where that is

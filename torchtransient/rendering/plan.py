@@ -16,7 +16,7 @@ from torchtransient.checks import Numbers, arguments_of, as_whole, count, is_one
 from torchtransient.errors import ArgumentError, SceneError, UnitError
 from torchtransient.gates import Gate
 from torchtransient.pulses import Pulse
-from torchtransient.rendering.arguments import checked_depth, checked_filter, checked_keys, film_asked_for
+from torchtransient.rendering.arguments import checked_depth, checked_filter, checked_keys, requested_film
 from torchtransient.rendering.films import FILMS, FilmLayout, Gates, Histogram, Phasors, layout_of_plugin
 from torchtransient.rendering.renderer import TransientRenderer
 from torchtransient.scene.edits import checked_pulse
@@ -248,7 +248,7 @@ def plan(
     loaded = load(scene)
     wanted = _checked_outputs(outputs)
     inventory = scene_inventory(loaded, sensor)
-    given = film_asked_for(film, {"frequencies": frequencies, "gates": gates})
+    given = requested_film(film, {"frequencies": frequencies, "gates": gates})
     if given is not None and given.has_bins:
         if time_axis is not None:
             raise ArgumentError("tt.plan: film and time_axis both give a time axis; leave out one of them.")

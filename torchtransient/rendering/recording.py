@@ -282,8 +282,8 @@ class Recordings:
             warnings.warn(
                 f"the last {self._unlaunched} renders and derivatives of a scene were all traced anew, none could use "
                 f"a recording: {self._reason(kind, structure)}. Tracing costs some milliseconds a call; keep spp, "
-                "keys, shapes and which values need gradients the same from call to call, or switch recordings off with "
-                "freeze=False.",
+                "keys, shapes and which values need gradients the same from call to call, or switch recordings off "
+                "with freeze=False.",
                 stacklevel=level_of_user(),
             )
         self._last_structures[kind] = structure

@@ -25,15 +25,15 @@ from torchtransient.rendering.arguments import (
     checked_grad_seed,
     checked_keys,
     checked_sampler,
-    film_asked_for,
-    given_values,
-    mangle,
-    samples,
+    checked_samples,
+    checked_values,
+    requested_film,
     sensor_list,
+    torch_names,
 )
 from torchtransient.rendering.autograd import RenderCall, run
 from torchtransient.rendering.films import FilmLayout, steady_channels_first
-from torchtransient.rendering.job import Item, RenderJob, Seeding, drawn, rounded_count, samples_drawn
+from torchtransient.rendering.job import Item, RenderJob, Seeding, draw_seed, rounded_count, samples_drawn
 from torchtransient.rendering.output import RenderOutput, RenderStats
 from torchtransient.rendering.progress import Bar
 from torchtransient.scene.edits import BuildOptions, checked_pulse
@@ -135,7 +135,7 @@ class TransientRenderer(CopiesParametrized):
         freeze: bool = True,
     ):
         super().__init__()
-        film = film_asked_for(film, {"time_axis": time_axis, "frequencies": frequencies, "gates": gates})
+        film = requested_film(film, {"time_axis": time_axis, "frequencies": frequencies, "gates": gates})
         if isinstance(effects, Effects):
             scene = effects.planned_scene(scene)
             film, temporal_filter = effects.film_settings(film, temporal_filter)
@@ -146,11 +146,11 @@ class TransientRenderer(CopiesParametrized):
             raise ArgumentError(f"effects: expected 'auto' or a plan of tt.plan(...), got {shown(effects)}.")
         self._keys = checked_keys(parameters)
         self.scene: Scene = load(scene)
-        self.spp, self.spp_grad = samples("spp", spp), samples("spp_grad", spp_grad)
+        self.spp, self.spp_grad = checked_samples("spp", spp), checked_samples("spp_grad", spp_grad)
         self.temporal_filter = checked_filter(temporal_filter)
         self.grad_seed = checked_grad_seed(grad_seed)
         self.freeze = bool(freeze)
-        self.boundary, self.spp_boundary = flag("boundary", boundary), samples("spp_boundary", spp_boundary)
+        self.boundary, self.spp_boundary = flag("boundary", boundary), checked_samples("spp_boundary", spp_boundary)
         if not self.boundary and self.spp_boundary is not None:
             raise ArgumentError(
                 "spp_boundary: expected none with boundary=False, which leaves out what they are samples of; leave one "
@@ -169,7 +169,7 @@ class TransientRenderer(CopiesParametrized):
                 effects.check_sensors(self._sensors)
             start = self._initial_values(parameters)
             self._look_at_scene()
-        self._names = mangle(self._keys)
+        self._names = torch_names(self._keys)
         for key in self._keys:
             self.register_parameter(self._names[key], nn.Parameter(start[key]))
 
@@ -233,7 +233,7 @@ class TransientRenderer(CopiesParametrized):
             self._watch.directions = sun_axes(built.params, self._keys)
             # What is given replaces what is described.
             findings = self.scene.findings(self._options)
-            self._watch.scene({key: text for key, text in findings.items() if key not in self._keys})
+            self._watch.check_description({key: text for key, text in findings.items() if key not in self._keys})
 
     def _initial_values(self, given: Sequence[str] | Mapping[str, Any]) -> dict[str, torch.Tensor]:
         slots = self.scene.slots(self._keys, self._options).slots
@@ -310,7 +310,7 @@ class TransientRenderer(CopiesParametrized):
         """Samples per pixel that a render with ``spp`` really draws: stratified samplers round up."""
         with active_variant(self.scene.variant):
             sensor = self.scene.built(self._options).scene.sensors()[self._sensors[0]]
-            return samples_drawn(sensor.sampler().clone(), samples("spp", spp))
+            return samples_drawn(sensor.sampler().clone(), checked_samples("spp", spp))
 
     @opaque
     def forward(
@@ -346,13 +346,13 @@ class TransientRenderer(CopiesParametrized):
         temporal_filter = self.effective_filter
         self._check_slope(temporal_filter, tensors)
         self._check_edges(tensors)
-        wanted = samples("spp", spp) or self.spp or self._scene_spp
+        wanted = checked_samples("spp", spp) or self.spp or self._scene_spp
         used = used_grad = rounded_count(wanted, self._counts, self.samples_drawn)
         graph = torch.is_grad_enabled()
         if self.spp_grad is not None and any(may_have_derivative(tensor, graph=graph) for tensor in tensors):
             used_grad = rounded_count(self.spp_grad, self._counts, self.samples_drawn)
         seeding = Seeding(self._sensors, 1 if batch is None else batch, self.grad_seed)
-        number, per_entry = drawn(seed)
+        number, per_entry = draw_seed(seed)
         bar = Bar() if progress else None
         job = RenderJob(
             scene=self.scene,
@@ -386,7 +386,7 @@ class TransientRenderer(CopiesParametrized):
 
     def _collect(self, values: Mapping[str, Any] | None) -> tuple[list[torch.Tensor], list[bool], int | None]:
         """The tensors of a call in the order of the keys, which of them are batched, and the batch size."""
-        given = given_values(values)
+        given = checked_values(values)
         for key in given:
             if key not in self._shapes:
                 hint = unknown_key(key, list(self._shapes), "this renderer")

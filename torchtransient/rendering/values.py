@@ -17,7 +17,7 @@ from torchtransient.errors import DeviceError, SceneError, ShapeError, TorchTran
 from torchtransient.plugins.mitsuba_compat import check_pose, is_turned_by_reflections
 from torchtransient.plugins.node_walk import ShownValue
 from torchtransient.scene.parameters import classify, is_transform, read_value, unknown_key
-from torchtransient.scene.values import as_mitsuba_value, changed_with, with_normals
+from torchtransient.scene.values import FEW, add_normals, as_mitsuba_value, dependent_keys, wait_for_torch
 from torchtransient.scene.variant import quiet
 
 # --------------------------------------------------------------------------------------------------------- PyTrees
@@ -122,8 +122,6 @@ _WIDER = {
     torch.uint16: torch.int32,
 }
 _MODULES = {"cpu": "drjit.llvm.ad", "cuda": "drjit.cuda.ad"}
-# A list of so few entries is copied sooner than a kernel is launched.
-_FEW = 64
 
 
 def computable(tensor: torch.Tensor, name: str) -> torch.Tensor:
@@ -152,20 +150,19 @@ def computable(tensor: torch.Tensor, name: str) -> torch.Tensor:
     return tensor if wider == tensor.dtype else tensor.to(wider)
 
 
-def own(tensor: torch.Tensor) -> Any:
+def drjit_copy(tensor: torch.Tensor) -> Any:
     """Copy a torch tensor to a Dr.Jit tensor, so that a scene never aliases memory of the caller."""
     import drjit as dr
 
     kind = getattr(importlib.import_module(_MODULES[tensor.device.type]), _NAMES[tensor.dtype])
     shape = tuple(int(n) for n in tensor.shape)
-    if tensor.numel() <= _FEW:
+    if tensor.numel() <= FEW:
         few = dr.array_t(kind)(tensor.reshape(-1).tolist())
         # A single number would be a literal of the kernels, compiled again for every other number.
         dr.make_opaque(few)
         return kind(few, shape)
     dense = tensor.detach().resolve_neg().contiguous()
-    if dense.is_cuda:  # Dr.Jit works on a stream of its own
-        torch.cuda.current_stream(dense.device).synchronize()
+    wait_for_torch(dense)
     copied = fresh(kind(dense))
     dr.eval(copied)
     dr.sync_thread()
@@ -267,14 +264,14 @@ def put_back(params: Any, values: Mapping[str, Any], now: Mapping[str, Any] | No
     if not keys:
         return
     # Mitsuba recomputes normals when positions change: both have to go back.
-    keys = with_normals(keys, values)
+    keys = add_normals(keys, values)
     for key in keys:
         params[key] = values[key]
     _update(params, keys)
 
 
 def _update(params: Any, keys: Sequence[str]) -> None:
-    for key in (*keys, *changed_with(keys, params)):
+    for key in (*keys, *dependent_keys(keys, params)):
         params.set_dirty(key)
     with quiet():
         params.update()

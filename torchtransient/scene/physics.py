@@ -80,14 +80,14 @@ class PhysicsWatch:
             self._warned.add(message)
             warnings.warn(message, GradientWarning, stacklevel=level_of_user())
 
-    def scene(self, findings: Mapping[str, str]) -> None:
+    def check_description(self, findings: Mapping[str, str]) -> None:
         """Warn of findings in the description, by key: of the first ones, where there are many."""
         for number, (key, message) in enumerate(findings.items()):
             if number < _MOST_WARNINGS:
                 more = len(findings) - _MOST_WARNINGS if number == _MOST_WARNINGS - 1 else 0
                 self.warn(key, message + (f" {more} more of such values." if more > 0 else ""))
 
-    def value(self, key: str, value: torch.Tensor, low: float, high: float) -> None:
+    def check_value(self, key: str, value: torch.Tensor, low: float, high: float) -> None:
         """Check a value of a call, with its smallest and largest number."""
         limits = self.ranges.get(key)
         if limits is not None:
@@ -110,13 +110,13 @@ class PhysicsWatch:
             if any(is_singular(matrix) for matrix in matrices):
                 self.warn(key, singular_message(key))
 
-    def placed(self, scene: Any, sensor: int) -> None:
+    def check_installed(self, scene: Any, sensor: int) -> None:
         """Check a built scene that holds the values of a call, before it is rendered."""
         if self.enabled and self.installed is not None:
             for about, message in self.installed(scene, sensor).items():
                 self.warn(about, message)
 
-    def window(self, total: float, before: float, after: float) -> None:
+    def check_window(self, total: float, before: float, after: float) -> None:
         """Check the light that a render's window missed, before and after it, against the total."""
         if not self.window_name or before + after <= 0 or (self.mode != "error" and self.window_name in self._warned):
             return

@@ -107,7 +107,7 @@ class Choice:
     reason: str
 
 
-def some(findings: Sequence[Finding], most: int = 3) -> str:
+def text_of(findings: Sequence[Finding], most: int = 3) -> str:
     """Return the first few findings as text."""
     named = "; ".join(str(finding) for finding in findings[:most])
     return named if len(findings) <= most else f"{named}; and {len(findings) - most} more"
@@ -143,11 +143,11 @@ def choose_variant(
 
 def _colour(inventory: SceneInventory, spectral: bool) -> tuple[str, str]:
     if inventory.bands:
-        return "spectral", f"wavelengths, since the film has bands: {some(inventory.bands)}"
+        return "spectral", f"wavelengths, since the film has bands: {text_of(inventory.bands)}"
     if spectral:
-        return "spectral", f"wavelengths, which three numbers cannot stand in for: {some(inventory.measured)}"
+        return "spectral", f"wavelengths, which three numbers cannot stand in for: {text_of(inventory.measured)}"
     if inventory.colours:
-        return "rgb", f"colour: {some(inventory.colours)}"
+        return "rgb", f"colour: {text_of(inventory.colours)}"
     return "mono", "every spectrum is grey, so that one channel carries all of it"
 
 
@@ -157,16 +157,17 @@ def _polarization(inventory: SceneInventory, outputs: Sequence[str], strict: boo
     if inventory.integrator == "stokes":
         return True, "polarized, since the scene's own integrator is stokes", []
     if inventory.elements:
-        return True, f"polarized, since it changes the intensity: {some(inventory.elements)}", []
+        return True, f"polarized, since it changes the intensity: {text_of(inventory.elements)}", []
     if not inventory.interfaces:
         return False, "unpolarized, since nothing polarizes light", []
     if not inventory.interfaces_in_a_row:
-        return False, f"unpolarized, which is exact: a single flat surface polarizes, {some(inventory.interfaces)}", []
+        surface = text_of(inventory.interfaces)
+        return False, f"unpolarized, which is exact: a single flat surface polarizes, {surface}", []
     if strict:
-        return True, f"polarized (strict), since light can meet several of these: {some(inventory.interfaces)}", []
+        return True, f"polarized (strict), since light can meet several of these: {text_of(inventory.interfaces)}", []
     note = (
         "approximation: the light between polarizing surfaces is taken as unpolarized, as unpolarized renderers do; "
-        f"strict=True carries it. Found: {some(inventory.interfaces)}"
+        f"strict=True carries it. Found: {text_of(inventory.interfaces)}"
     )
     return False, "unpolarized, see the approximation", [note]
 
@@ -174,7 +175,7 @@ def _polarization(inventory: SceneInventory, outputs: Sequence[str], strict: boo
 def choose_integrator(inventory: SceneInventory) -> tuple[Choice, list[str]]:
     """Return the integrator for surfaces or for volumes, or another transient one of the scene, and notes."""
     notes = [
-        f"not used: {some(inventory.declared_only)}, declared and referred to by nothing"
+        f"not used: {text_of(inventory.declared_only)}, declared and referred to by nothing"
     ] if inventory.declared_only else []  # fmt: skip
     own = inventory.integrator or ""
     if own in _WITH_PICTURES:
@@ -185,7 +186,7 @@ def choose_integrator(inventory: SceneInventory) -> tuple[Choice, list[str]]:
     if is_transient_integrator(own) and _ALIASES.get(own, own) not in (_SURFACES, _VOLUMES):
         return Choice(own, f"integrator: {own}, the scene's own"), notes
     if inventory.media:
-        return Choice(_VOLUMES, f"integrator: {_VOLUMES}, since the scene has {some(inventory.media)}"), notes
+        return Choice(_VOLUMES, f"integrator: {_VOLUMES}, since the scene has {text_of(inventory.media)}"), notes
     return Choice(_SURFACES, f"integrator: {_SURFACES}, since no medium can be reached from the scene"), notes
 
 
@@ -523,11 +524,3 @@ class Finder:
             why = "the scene's own" if self.inventory.temporal_filter else "since no parameter changes a path length"
             self.reasons.append(f"temporal filter: {own}, {why}")
         return chosen
-
-
-# What every film can show beside its own measurement.
-_OF_ANY_FILM = ("steady", "stokes", "bands")
-SURFACES, VOLUMES = "transient_path", "transient_prbvolpath"
-_ALIASES = {"transient_volpath": VOLUMES}
-# They add pictures to what a nested integrator traces.
-_WITH_PICTURES = ("aov", "moment")

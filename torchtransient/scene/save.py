@@ -33,7 +33,7 @@ from torchtransient.scene.build import BuiltScene
 from torchtransient.scene.description import Plain
 from torchtransient.scene.nodes import children, name_children, node_kind, split_merged_shapes
 from torchtransient.scene.parameters import read_value
-from torchtransient.scene.values import Slot, SlotTable, as_float, fit_shape, own_array
+from torchtransient.scene.values import Slot, SlotTable, as_float, fit_shape, flat_drjit_copy
 from torchtransient.scene.variant import device_type
 
 # Numbers that went through a file differ by the rounding of single precision.
@@ -132,7 +132,7 @@ def _leaf(slot: Any, value: Any, variant: str) -> Any:
     if batched:
         raise ShapeError(f"scene.save: expected shape {slot.shape} for {slot.key!r}, got {tuple(tensor.shape)}.")
     slot.check(tensor)
-    return own_array(tensor)
+    return flat_drjit_copy(tensor)
 
 
 def _parsed(description: Plain, variant: str) -> Any:

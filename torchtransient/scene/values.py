@@ -129,7 +129,7 @@ def _is_dual(tensor: torch.Tensor) -> bool:
     return unpacked.tangent is not None
 
 
-def own_array(tensor: torch.Tensor) -> Any:
+def flat_drjit_copy(tensor: torch.Tensor) -> Any:
     """Return a flat Dr.Jit copy of a tensor in Dr.Jit's own memory.
 
     The scene must not alias memory of the caller, and a recorded kernel would go on reading other memory where the
@@ -245,7 +245,7 @@ def as_mitsuba_value(kind: str, shape: tuple[int, ...], current: Any, leaf: Any)
     return type(current)(leaf)
 
 
-def changed_with(keys: Iterable[str], params: Any) -> list[str]:
+def dependent_keys(keys: Iterable[str], params: Any) -> list[str]:
     """Return the parameters to mark as changed beside ``keys``.
 
     A light with a texture is sampled by a map from texture coordinates to points, which Mitsuba keeps until positions
@@ -256,7 +256,7 @@ def changed_with(keys: Iterable[str], params: Any) -> list[str]:
     return [key for key in others if key in params]
 
 
-def with_normals(keys: Iterable[str], params: Mapping[str, Any]) -> list[str]:
+def add_normals(keys: Iterable[str], params: Mapping[str, Any]) -> list[str]:
     """Return the keys, each once, and those of the normals that Mitsuba computes where positions among them change."""
     normals = [key_beside(key, NORMALS) for key in keys if names_array(key, POSITIONS)]
     return list(dict.fromkeys((*keys, *(key for key in normals if key in params))))
@@ -269,9 +269,9 @@ class SlotTable:
         self.built = built
         self.slots = [Slot(built, key) for key in keys]
         # Mitsuba recomputes normals when positions change: both have to go back.
-        touched = with_normals([target for slot in self.slots for target in slot.targets], built.params)
+        touched = add_normals([target for slot in self.slots for target in slot.targets], built.params)
         self._check_overlap()
-        self._changed_too = changed_with(touched, built.params)
+        self._changed_too = dependent_keys(touched, built.params)
         # Copies: what `params` returns may be the plugin's own variable, which changes when it is written.
         self.originals = {target: type(built.params[target])(built.params[target]) for target in touched}
 

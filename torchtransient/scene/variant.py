@@ -29,7 +29,7 @@ from torchtransient.errors import (
     level_of_user,
 )
 from torchtransient.plugins.drjit_pool import check_process, engine_lock
-from torchtransient.plugins.guards import chain_of, interrupt_behind, interrupts_wait, surely
+from torchtransient.plugins.guards import chain_of, interrupt_behind, interrupts_wait, run_despite_interrupts
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 
@@ -87,7 +87,7 @@ def quiet() -> Iterator[None]:
     try:
         yield
     finally:
-        surely(lambda: mi.logger().set_log_level(before))
+        run_despite_interrupts(lambda: mi.logger().set_log_level(before))
 
 
 def is_differentiable(variant: str | None) -> bool:
@@ -164,7 +164,7 @@ def active_variant(variant: str) -> Iterator[None]:
                 take_over(device_type(variant))
             yield
         finally:
-            surely(lambda: _put_back(before))
+            run_despite_interrupts(lambda: _put_back(before))
 
 
 def _put_back(before: str | None) -> None:

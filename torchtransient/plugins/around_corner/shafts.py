@@ -54,7 +54,7 @@ class ScanRegion:
         return bool(np.all(local >= self.low - slack) and np.all(local <= self.high + slack))
 
 
-def pays(scene: Any, rays: int) -> bool:
+def saves_time(scene: Any, rays: int) -> bool:
     """Return whether finding shafts takes less time than the rays that they may spare: it costs some 400 rays a
     triangle.
     """

@@ -16,7 +16,7 @@ from torchtransient.plugins.around_corner.geometry import WallPoints, points_of
 from torchtransient.plugins.around_corner.late_light import LateLight
 from torchtransient.plugins.around_corner.launches import ScanJob
 from torchtransient.plugins.around_corner.scan_table import ACROSS, ScanTable
-from torchtransient.plugins.around_corner.shafts import pays, spare_rays
+from torchtransient.plugins.around_corner.shafts import saves_time, spare_rays
 from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
 from torchtransient.plugins.around_corner.third_bounce_gradients import (
     ThirdBounceGradients,
@@ -269,7 +269,7 @@ class SharedThirdBounce:
         points = (
             [self.light.sensors] if self.light.spots is self.light.sensors else [self.light.sensors, self.light.spots]
         )
-        if pays(self.world.scene, samples * sum(each.width for each in points)):
+        if saves_time(self.world.scene, samples * sum(each.width for each in points)):
             p, n = (np.concatenate([_rows(getattr(each, name), each.width) for each in points]) for name in "pn")
             spare_rays(self.world.scene, elements, p, n)
 
