@@ -25,7 +25,7 @@ Tensors = tuple[torch.Tensor, ...]
 
 @dataclass(frozen=True)
 class Request:
-    """Derivatives of one call.
+    """Derivatives that are requested of a call.
 
     Args:
         needs: for each input tensor, whether there is a derivative by it.
@@ -37,10 +37,15 @@ class Request:
 
 
 class Replayable(Protocol):
-    """Call that is run, and run again for its derivatives. ``what`` is its name in messages."""
+    """Call that is run, and run again for its derivatives.
+
+    Tensors are those of the call, in its order. Cotangents are those of the real outputs that have one, tangents those
+    of the tensors that need a derivative.
+    """
 
     @property
-    def what(self) -> str: ...
+    def what(self) -> str:
+        """Name of the call in messages."""
 
     def primal(self, tensors: Sequence[torch.Tensor]) -> Tensors:
         """Return the outputs."""
@@ -141,7 +146,7 @@ def _zeros(tensors: Sequence[torch.Tensor]) -> list[torch.Tensor | None]:
 def _vmap_by_loop(
     function: Any, info: Any, in_dims: tuple[Any, ...], args: tuple[Any, ...]
 ) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-    """``vmap`` by one call per entry: what a loop over the entries would give."""
+    """Return outputs and their batch dimensions under ``vmap``, by one call for each entry."""
     if not info.batch_size:
         raise ShapeError(f"{args[0].what}: expected a batch of at least one entry under torch.func.vmap, got none.")
     columns = []
@@ -153,7 +158,7 @@ def _vmap_by_loop(
 
 
 class Run(torch.autograd.Function):
-    """(job, *tensors) -> outputs."""
+    """Function of torch: (job, *tensors) -> outputs."""
 
     @staticmethod
     def forward(job: Replayable, *tensors: torch.Tensor) -> Tensors:
@@ -190,7 +195,7 @@ class Run(torch.autograd.Function):
 
 
 class Pullback(torch.autograd.Function):
-    """(job, request, *cotangents that are given, *tensors) -> gradients of the tensors that need one."""
+    """Function of torch: (job, request, *cotangents, *tensors) -> gradients of the tensors that need one."""
 
     @staticmethod
     def forward(job: Replayable, request: Request, *tensors: torch.Tensor) -> Tensors:
@@ -234,7 +239,7 @@ class Pullback(torch.autograd.Function):
 
 
 class Pushforward(torch.autograd.Function):
-    """(job, request, *tangents of the tensors that need one, *tensors) -> derivatives of the real outputs."""
+    """Function of torch: (job, request, *tangents, *tensors) -> derivatives of the real outputs."""
 
     @staticmethod
     def forward(job: Replayable, request: Request, *tensors: torch.Tensor) -> Tensors:

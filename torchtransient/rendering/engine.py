@@ -39,16 +39,16 @@ from torchtransient.scene.variant import active_variant, clear_frames, named_err
 
 
 def run(
-    job: RenderJob, kind: str, values: Sequence[torch.Tensor], given: Sequence[torch.Tensor | None] = ()
+    job: RenderJob, kind: str, values: Sequence[torch.Tensor], vectors: Sequence[torch.Tensor | None] = ()
 ) -> tuple[torch.Tensor, ...]:
-    """Execute a job.
+    """Execute a job: a render, or one of its derivatives.
 
     Args:
-        job: the call.
+        job: settings of the call.
         kind: ``RENDER``, ``BACKWARD`` or ``FORWARD`` of :mod:`torchtransient.interfaces`.
         values: one tensor per key of the job, with a leading dimension of entries where ``job.batched`` says so.
-        given: for ``BACKWARD`` the adjoints of steady and response, None for zero; for ``FORWARD`` the tangents of the
-            values that need a derivative.
+        vectors: for ``BACKWARD`` the adjoints of steady and response, None for zero; for ``FORWARD`` the tangents of
+            the values that need a derivative.
 
     Returns:
         Of ``RENDER`` steady and response, of ``FORWARD`` their derivatives, of ``BACKWARD`` the gradients of the values
@@ -56,17 +56,18 @@ def run(
 
     Raises:
         UnitError: for values that are not finite.
-        SceneError, StorageError, GradientError, VariantError: for scenes, films and derivatives that cannot be.
+        SceneError, StorageError, GradientError, VariantError: for scenes that cannot be rendered, films beyond the
+            memory, derivatives that do not exist, and flags of Dr.Jit under which derivatives are wrong.
     """
     if kind == RENDER:
         check_values(job, values)
-    if kind == BACKWARD and all(g is None for g in given):
+    if kind == BACKWARD and all(v is None for v in vectors):
         return tuple(torch.zeros_like(v) for v, need in zip(values, job.needs, strict=True) if need)
     kinds: dict[str, Any] = {RENDER: Images, BACKWARD: Gradients, FORWARD: Tangents}
     handled = sys.exc_info()[1]
     try:
         with open_session(job) as session:
-            results = kinds[kind](session, values, given)
+            results = kinds[kind](session, values, vectors)
             for group in groups_of(session):
                 execute(session, results, group)
             found: tuple[torch.Tensor, ...] = results.finish()
@@ -86,7 +87,7 @@ def run(
 
 
 class Session:
-    """A built scene in use by one job."""
+    """Built scene in use by one job, with its recordings and the slots of the job's keys."""
 
     def __init__(self, job: RenderJob):
         self.job = job
@@ -106,7 +107,19 @@ class Session:
         return math.prod(self.film(item).cube_shape())
 
     def install(self, item: Item, values: Sequence[torch.Tensor], needs: Sequence[bool]) -> list[Any]:
-        """Write the values of one batch entry into the scene; leaves that need it carry gradients."""
+        """Write the values of one batch entry into the scene.
+
+        Args:
+            item: item, whose entry counts.
+            values: one tensor for each key, of all entries where they are batched.
+            needs: for each value, whether its leaf carries gradients.
+
+        Returns:
+            Leaves of Dr.Jit's graph that the scene's parameters were computed from, flat, one for each key.
+
+        Raises:
+            SceneError: for values that Mitsuba refuses.
+        """
         import drjit as dr
 
         leaves: list[Any] = []
@@ -149,7 +162,15 @@ class Session:
 
 
 def boundary_settings(boundary: bool, spp: int | None, integrator: Any) -> list[tuple[Any, str, Any]]:
-    """Return the attributes of an integrator that switch its boundary term; the layer warns in its place."""
+    """Return the attributes of an integrator that switch its boundary term, as (plugin, name, value).
+
+    The integrator's own warning of edges is switched off: the layer warns.
+
+    Args:
+        boundary: False leaves the boundary term out.
+        spp: samples per pixel of each of its passes, None for the integrator's.
+        integrator: integrator of the built scene; attributes that it does not have are left out.
+    """
     changes: dict[str, Any] = {"warns_of_edges": False}
     changes |= ({} if boundary else {"boundary": False}) | ({} if spp is None else {"spp_boundary": spp})
     return [(integrator, name, value) for name, value in changes.items() if hasattr(integrator, name)]
@@ -232,7 +253,7 @@ class Images:
 
     kind = RENDER
 
-    def __init__(self, session: Session, values: Sequence[torch.Tensor], _given: Sequence[torch.Tensor | None]):
+    def __init__(self, session: Session, values: Sequence[torch.Tensor], _vectors: Sequence[torch.Tensor | None]):
         job = session.job
         self.session, self.values, self.count = session, values, len(job.items)
         self._started = time.perf_counter()
@@ -247,7 +268,7 @@ class Images:
         check_fits(self.films[0].cube_shape(), self.count, job.scene.variant)
 
     def install(self, item: Item, group: Sequence[Numbered]) -> None:
-        """Install the values of an entry, which the items of a group share."""
+        """Install the values of an item's entry, which the group shares, and check the scene that holds them."""
         self.session.install(item, self.values, [False] * len(self.values))
         for _, each in group:
             self.session.job.watch.check_installed(self.session.scene, each.sensor)
@@ -257,13 +278,13 @@ class Images:
         return None, None
 
     def progress(self, n: int) -> Callable[[float], None] | None:
-        """Return the function that is called with the share of item ``n`` that is done."""
+        """Return a function of the share of item ``n`` that is done, None without a progress bar."""
         report = self.session.job.progress
         return None if report is None else lambda fraction: report((n + fraction) / self.count)
 
     @contextmanager
     def storage(self, film: Any, n: int) -> Iterator[bool]:
-        """Let a large film write to the place of item ``n``; yields whether it does."""
+        """Lend a large film the memory of item ``n`` in the output for a render; yield whether it was lent."""
         entries = math.prod(film.cube_shape())
         large = self.count > 1 and entries >= LARGE_FILM and self.count * entries < 2**32
         # An integrator of others may not know of first entries.
@@ -360,7 +381,16 @@ def _tensors_of(film: Any, into: torch.Tensor | None) -> tuple[torch.Tensor, tor
 
 
 def check_items(sensors: Sequence[Any], items: Sequence[Item]) -> FilmLayout:
-    """Return the layout of the films of a call, which measure the same in one shape. Raises ``SceneError``."""
+    """Return the layout of the films of a call, which have to measure the same in one shape.
+
+    Args:
+        sensors: sensors of the built scene.
+        items: items of the call.
+
+    Raises:
+        ArgumentError: for an index without a sensor.
+        SceneError: for films of several layouts, shapes or channels.
+    """
     found: dict[int, tuple[FilmLayout, tuple[int, ...], tuple[str, ...]]] = {}
     for item in items:
         if not 0 <= item.sensor < len(sensors):
@@ -380,7 +410,12 @@ def check_items(sensors: Sequence[Any], items: Sequence[Item]) -> FilmLayout:
 
 
 def check_values(job: RenderJob, values: Sequence[torch.Tensor]) -> None:
-    """Raise ``UnitError`` for values that are not finite, and warn of unphysical ones."""
+    """Raise ``UnitError`` for values that are not finite, and warn of unphysical ones.
+
+    Args:
+        job: job with the keys of the values.
+        values: one tensor for each key.
+    """
     for key, value in zip(job.keys, values, strict=True):
         low, high = smallest_and_largest(value)
         if not are_finite(low, high):
@@ -398,8 +433,8 @@ def check_values(job: RenderJob, values: Sequence[torch.Tensor]) -> None:
 class _Derivatives:
     """Results of derivatives: the leaves of the values that were installed last."""
 
-    def __init__(self, session: Session, values: Sequence[torch.Tensor], given: Sequence[torch.Tensor | None]):
-        self.session, self.values, self.given = session, values, given
+    def __init__(self, session: Session, values: Sequence[torch.Tensor], vectors: Sequence[torch.Tensor | None]):
+        self.session, self.values, self.vectors = session, values, vectors
         self.leaves: list[Any] = []
         self.calls: list[str] = []
         job = session.job
@@ -418,11 +453,11 @@ class _Derivatives:
         return None, None
 
     def progress(self, _n: int) -> None:
-        """Derivatives report no progress."""
+        """Return None: derivatives report no progress."""
 
     @contextmanager
     def storage(self, _film: Any, _n: int) -> Iterator[bool]:
-        """Films of derivatives write to memory of their own."""
+        """Lend nothing: films of derivatives have memory of their own."""
         yield False
 
 
@@ -431,15 +466,15 @@ class Gradients(_Derivatives):
 
     kind = BACKWARD
 
-    def __init__(self, session: Session, values: Sequence[torch.Tensor], given: Sequence[torch.Tensor | None]):
-        super().__init__(session, values, given)
+    def __init__(self, session: Session, values: Sequence[torch.Tensor], vectors: Sequence[torch.Tensor | None]):
+        super().__init__(session, values, vectors)
         self._grads = [
             torch.zeros_like(value) if need else None for value, need in zip(values, session.job.needs, strict=True)
         ]
 
     def adjoint(self, n: int) -> tuple[Any, Any]:
         several = len(self.session.job.items) > 1
-        steady, response = (g if g is None or not several else g[n] for g in self.given)
+        steady, response = (g if g is None or not several else g[n] for g in self.vectors)
         return _steady_adjoint(steady), _cube_adjoint(response)
 
     def collect(self, _n: int, item: Item) -> None:
@@ -464,7 +499,7 @@ class Gradients(_Derivatives):
     def finish(self) -> tuple[torch.Tensor, ...]:
         """Return the gradients, NaN where a film's adjoint is not finite: of its entry, and of unbatched values."""
         self.session.job.derivative_log.extend(self.calls)
-        job, adjoints = self.session.job, [g for g in self.given if g is not None]
+        job, adjoints = self.session.job, [g for g in self.vectors if g is not None]
         if len(job.items) == 1:
             broken = [not all(map(all_finite, adjoints))]
         else:
@@ -511,16 +546,16 @@ class Tangents(_Derivatives):
 
     kind = FORWARD
 
-    def __init__(self, session: Session, values: Sequence[torch.Tensor], given: Sequence[torch.Tensor | None]):
-        super().__init__(session, values, given)
+    def __init__(self, session: Session, values: Sequence[torch.Tensor], vectors: Sequence[torch.Tensor | None]):
+        super().__init__(session, values, vectors)
         job = session.job
         self._batched = [batched for batched, need in zip(job.batched, job.needs, strict=True) if need]
         self._steady: list[torch.Tensor] = []
         self._response: list[torch.Tensor] = []
 
     def _of_entry(self, item: Item) -> list[torch.Tensor]:
-        given = [tangent for tangent in self.given if tangent is not None]
-        return [t[item.entry] if batched else t for t, batched in zip(given, self._batched, strict=True)]
+        tangents = [tangent for tangent in self.vectors if tangent is not None]
+        return [t[item.entry] if batched else t for t, batched in zip(tangents, self._batched, strict=True)]
 
     def install(self, item: Item, group: Sequence[Numbered]) -> None:
         """Install the values of an entry, and carry their tangents on to the scene's parameters."""

@@ -92,13 +92,33 @@ def scene_labels(
 
 @opaque
 def label_names(renderer: TransientRenderer) -> tuple[str, ...]:
-    """Return the names of the shapes that the label "shape" counts, in the order of the scene's description."""
+    """Return the names of the shapes that the label "shape" is an index into.
+
+    Args:
+        renderer: the renderer.
+
+    Returns:
+        Names in the order of the scene's description.
+
+    Raises:
+        ArgumentError: for other objects.
+    """
     return tuple(_tables(renderer).shape_names)
 
 
 @opaque
 def material_names(renderer: TransientRenderer) -> tuple[str, ...]:
-    """Return the names of the materials that the label "material" counts, in the order of their shapes."""
+    """Return the names of the materials that the label "material" is an index into.
+
+    Args:
+        renderer: the renderer.
+
+    Returns:
+        Names in the order of their shapes.
+
+    Raises:
+        ArgumentError: for other objects.
+    """
     return tuple(_tables(renderer).material_names)
 
 

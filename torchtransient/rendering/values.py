@@ -46,7 +46,7 @@ def flatten(tree: Any) -> tuple[Any, list[Any]]:
 
 
 def unflatten(structure: Any, leaves: Sequence[Any]) -> Any:
-    """Return a PyTree of a structure with ``leaves`` in their order."""
+    """Return the PyTree of a structure of :func:`flatten`, with ``leaves`` in the order of its slots."""
     return _map_leaves(lambda slot: leaves[slot.number], structure)
 
 
@@ -151,7 +151,7 @@ def computable(tensor: torch.Tensor, name: str) -> torch.Tensor:
 
 
 def drjit_copy(tensor: torch.Tensor) -> Any:
-    """Copy a torch tensor to a Dr.Jit tensor, so that a scene never aliases memory of the caller."""
+    """Return a copy of a torch tensor as a Dr.Jit tensor: a scene never aliases memory of the caller."""
     import drjit as dr
 
     kind = getattr(importlib.import_module(_MODULES[tensor.device.type]), _NAMES[tensor.dtype])
@@ -258,7 +258,13 @@ def _same(a: Any, b: Any) -> bool:
 
 
 def put_back(params: Any, values: Mapping[str, Any], now: Mapping[str, Any] | None = None) -> None:
-    """Write ``values`` that differ from those of the scene, which are ``now``, and update the scene."""
+    """Write those values that differ from the scene's, and update the scene.
+
+    Args:
+        params: ``mitsuba.SceneParameters`` of the scene.
+        values: values by key, such as :func:`values_of` returned before.
+        now: values that the scene holds now, None to read them.
+    """
     now = values_of(params) if now is None else now
     keys = [key for key, value in values.items() if key not in now or not _same(value, now[key])]
     if not keys:
@@ -285,7 +291,12 @@ def detached(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def shapes_of(params: Any, keys: Iterable[str], name: str) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of torch values by key; ``name`` begins the messages.
+    """Return the shapes of torch values by key.
+
+    Args:
+        params: ``mitsuba.SceneParameters`` of the scene.
+        keys: keys of parameters.
+        name: name of the wrapped function, for messages.
 
     Raises:
         UnknownKeyError: if the scene has no such parameter.
@@ -308,6 +319,11 @@ def shapes_of(params: Any, keys: Iterable[str], name: str) -> dict[str, tuple[in
 
 def write(params: Any, leaves: Mapping[str, Any], name: str) -> None:
     """Set parameters from flat Dr.Jit arrays by operations that gradients pass, and update the scene.
+
+    Args:
+        params: ``mitsuba.SceneParameters`` of the scene.
+        leaves: flat arrays by key, of the shapes of :func:`shapes_of`.
+        name: name of the wrapped function, for messages.
 
     Raises:
         SceneError: if Mitsuba refuses a value, or a pose reflects a shape that it would turn inside out.

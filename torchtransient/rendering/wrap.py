@@ -3,9 +3,9 @@
 A call keeps no graph of Dr.Jit. Its derivatives are *replays*: they call the function again with the saved arguments,
 attached, and with the scenes as they were at the call. Every run takes the engine's lock and puts the scenes back.
 
-Scenes are found by a walk over the variables of the function. To ask for all of them would be no safer: plugins in C++
-read a scene without a trace in Python, so that a scene that was not named could be told by such a walk alone, and one
-that it finds needs no name. ``state`` names those that it does not find.
+Scenes are found by a walk over the variables of the function, so that users need not name them; ``state`` names those
+that the walk does not find. Nothing else would find a scene that was not named: plugins in C++ read it without a trace
+in Python.
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ class _Seed(int):
 
 
 class _Wrapped:
-    """A function and its options."""
+    """Wrapped function with its options."""
 
     def __init__(self, function: Callable[..., Any], parameters: Any, state: Any, reseed: str | None):
         if not callable(function):
@@ -306,7 +306,7 @@ _USED_AS_TORCH = re.compile(r"must be Tensor, not TensorX|'TensorX\w+' object ha
 
 @dataclass(frozen=True)
 class Call:
-    """Everything about a call that is not a tensor (:class:`.autograd.Replayable`).
+    """Call of a wrapped function, without its tensors (:class:`.autograd.Replayable`).
 
     Attributes:
         tree, leaves: the arguments ``(args, kwargs)``, with a :class:`Slot` for each tensor.

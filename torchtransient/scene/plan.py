@@ -1,4 +1,4 @@
-"""Decisions of ``tt.plan``, each with the line that explains it.
+"""Decisions of ``tt.plan``, each with a line of explanation.
 
 Variant, integrator and a depth by albedo follow from the description; depth, time window and temporal filter may need a
 pilot run (:mod:`.pilot`).
@@ -40,14 +40,14 @@ _REACH = {"tent": 0.5, "gaussian": 2.0}
 
 @dataclass(frozen=True, kw_only=True)
 class Effects(abc.ABC):
-    """Decisions about one scene that a renderer takes over where its own arguments leave them open.
+    """Decisions about a scene that a renderer uses where its own arguments leave them open.
 
     Attributes:
         scene: the scene, in the variant of the plan.
         variant, integrator: names.
         film_choice, max_depth, pulse, irf: None keeps the scene's.
         temporal_filter: empty for films without one.
-        filter_is_given: the filter was asked for, and no other one may take its place.
+        filter_is_given: the filter was an argument of the plan, which no other filter replaces.
         sensor: index of the sensor whose light the decisions are about.
     """
 
@@ -78,7 +78,12 @@ class Effects(abc.ABC):
         return load(given, variant=self.variant)
 
     def film_settings(self, film: Any, temporal_filter: str) -> tuple[Any, str]:
-        """Return film and temporal filter of a renderer: its own where it has some, else the plan's."""
+        """Return film and temporal filter of a renderer.
+
+        Args:
+            film: film of the renderer's arguments, which precedes the plan's; None without one.
+            temporal_filter: filter of the renderer's arguments; the plan's replaces "auto".
+        """
         film = self.film_choice if film is None else film
         # A box of the plan's own choice stays "auto": parameters that were not planned for may call for a slope.
         decided = self.temporal_filter if self.filter_is_given or self.temporal_filter != "box" else ""
@@ -101,14 +106,14 @@ class Effects(abc.ABC):
 
 @dataclass(frozen=True)
 class Choice:
-    """A decision with the line that explains it."""
+    """Decision, and the line that explains it."""
 
     value: str
     reason: str
 
 
 def text_of(findings: Sequence[Finding], most: int = 3) -> str:
-    """Return the first few findings as text."""
+    """Return the first ``most`` findings as text, with the number of the others."""
     named = "; ".join(str(finding) for finding in findings[:most])
     return named if len(findings) <= most else f"{named}; and {len(findings) - most} more"
 
@@ -196,7 +201,15 @@ def _depth_text(depth: int) -> str:
 
 
 def depth_by_albedo(inventory: SceneInventory, tail: float) -> tuple[int | None, str]:
-    """Return the depth at which at most ``tail`` of the emitted power is left, if the albedos bound it, and why."""
+    """Return the depth at which little of the emitted power is left, if the albedos bound it, and the reason.
+
+    Args:
+        inventory: contents of the scene.
+        tail: largest share of the emitted power beyond the depth.
+
+    Returns:
+        The depth, None without a bound, and the line that explains it.
+    """
     if inventory.albedo >= 1:
         return None, (
             f"max_depth: {_depth_text(inventory.max_depth)}, kept; not bounded, since {inventory.brightest} may "

@@ -111,7 +111,9 @@ def fit_shape(key: str, value: torch.Tensor, shape: tuple[int, ...]) -> tuple[to
 def may_have_derivative(tensor: torch.Tensor, *, graph: bool = True) -> bool:
     """Return whether autograd, forward mode or a transform of ``torch.func`` may differentiate by a tensor.
 
-    Without a ``graph`` (``torch.no_grad``) forward mode alone can.
+    Args:
+        tensor: the tensor.
+        graph: False under ``torch.no_grad``, where forward mode alone can.
     """
     transforms = torch._C._functorch
     while not ((graph and tensor.requires_grad) or _is_dual(tensor)):
@@ -154,7 +156,7 @@ def flat_drjit_copy(tensor: torch.Tensor) -> Any:
 
 
 def wait_for_torch(tensor: torch.Tensor) -> None:
-    """Wait for torch's queue: Dr.Jit reads and reuses memory on a stream of its own."""
+    """Wait for torch's stream of a CUDA tensor: Dr.Jit reads and reuses memory on a stream of its own."""
     if tensor.is_cuda:
         torch.cuda.current_stream(tensor.device).synchronize()
 
@@ -202,7 +204,12 @@ class Slot:
         return self._built.params.properties[self.key][2].class_name(), self.key.rsplit(".", 1)[-1]
 
     def write(self, leaf: Any, originals: Mapping[str, Any]) -> None:
-        """Set the parameters of Mitsuba from the flat array ``leaf``, by operations that Dr.Jit differentiates."""
+        """Set the parameters of Mitsuba by operations that Dr.Jit differentiates.
+
+        Args:
+            leaf: the value as a flat array.
+            originals: described values of the targets by key.
+        """
         if self.kind == "mesh_transform":
             self._write_mesh(leaf, originals)
             return
@@ -229,7 +236,13 @@ class Slot:
 
 
 def as_mitsuba_value(kind: str, shape: tuple[int, ...], current: Any, leaf: Any) -> Any:
-    """Return the flat array ``leaf`` as a value like ``current``, by operations that Dr.Jit differentiates."""
+    """Return a flat array as a value of Mitsuba, by operations that Dr.Jit differentiates.
+
+    Args:
+        kind, shape: kind and shape of the torch value (:func:`.parameters.classify`).
+        current: value of the parameter, whose type counts.
+        leaf: the flat array.
+    """
     import drjit as dr
     import mitsuba as mi
 
@@ -246,7 +259,7 @@ def as_mitsuba_value(kind: str, shape: tuple[int, ...], current: Any, leaf: Any)
 
 
 def dependent_keys(keys: Iterable[str], params: Any) -> list[str]:
-    """Return the parameters to mark as changed beside ``keys``.
+    """Return those of ``params`` to be marked as changed together with ``keys``.
 
     A light with a texture is sampled by a map from texture coordinates to points, which Mitsuba keeps until positions
     change; where those do and normals do not, it makes up new normals.
@@ -257,13 +270,13 @@ def dependent_keys(keys: Iterable[str], params: Any) -> list[str]:
 
 
 def add_normals(keys: Iterable[str], params: Mapping[str, Any]) -> list[str]:
-    """Return the keys, each once, and those of the normals that Mitsuba computes where positions among them change."""
+    """Return the keys, and those of ``params`` for the normals that Mitsuba recomputes when positions change."""
     normals = [key_beside(key, NORMALS) for key in keys if names_array(key, POSITIONS)]
     return list(dict.fromkeys((*keys, *(key for key in normals if key in params))))
 
 
 class SlotTable:
-    """Slots of some keys in one built scene, with the described values."""
+    """Slots of some keys in a built scene, and the described values, which can be put back."""
 
     def __init__(self, built: BuiltScene, keys: tuple[str, ...]):
         self.built = built
@@ -286,7 +299,7 @@ class SlotTable:
                 owner[target] = slot.key
 
     def install(self, leaves: list[Any]) -> None:
-        """Write one leaf per slot and let the scene follow."""
+        """Write the leaves, one flat array for each slot, and update the scene."""
         for slot, leaf in zip(self.slots, leaves, strict=True):
             slot.write(leaf, self.originals)
         self._update()
