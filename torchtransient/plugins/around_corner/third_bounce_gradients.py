@@ -31,9 +31,11 @@ from torchtransient.plugins.transport.strategy import Local
 
 
 class Ends:
-    """Fields of ``count`` samples or points, by name, attached where the scene is: vectors, spectra and numbers.
+    """Ends of connections, hidden samples or scanned points, attached where the scene is. A plain class.
 
-    :meth:`load` reads the fields four numbers at a time. A plain object, which Dr.Jit loops leave alone.
+    Args:
+        count: number of samples or points.
+        fields: vectors, spectra and numbers by name, of all of them or one for all.
     """
 
     def __init__(self, count: int, fields: dict[str, Any]) -> None:
@@ -47,17 +49,19 @@ class Ends:
 
     @property
     def attached(self) -> list[str]:
-        """Names of the fields with derivatives; none are where derivatives are suspended."""
+        """Names of the fields with derivatives; none where derivatives are suspended."""
         return [name for name, value in self.fields.items() if dr.grad_enabled(value)]
 
     def detached(self) -> Ends:
-        """Return a detached copy. A virtual call attaches what it returns as soon as any plugin is attached that
-        it could have gone to: fields may be attached that nothing moves.
+        """Return a detached copy.
+
+        Virtual calls attach their results as soon as one of the plugins that they may go to is attached: fields may be
+        attached although nothing moves them.
         """
         return Ends(self.count, {name: dr.detach(value) for name, value in self.fields.items()})
 
     def load(self, index: Any) -> Local:
-        """Gather the fields of some of them, detached."""
+        """Return the fields of the ends with the numbers ``index`` (UInt32), detached, four numbers at a load."""
         rows = [dr.gather(mi.Vector4f, self.flat, index * self.rows + i) for i in range(self.rows)]
         columns = [row[i] for row in rows for i in range(4)]
         found = {}
@@ -68,11 +72,11 @@ class Ends:
         return Local(**found)
 
     def tangents(self) -> Ends:
-        """Tangents of the attached fields in forward mode."""
+        """Return the tangents of the attached fields, in forward mode."""
         return Ends(self.count, {name: dr.grad(self.fields[name]) for name in self.attached})
 
     def hand_on(self, adjoints: dict[str, Any]) -> None:
-        """Back-propagate ``<adjoints, fields>``: adjoints by field, of one sample or point each."""
+        """Back-propagate ``<adjoints, fields>``; ``adjoints``: by name of the field, one for each end."""
         for name, adjoint in adjoints.items():
             field = self.fields[name]
             if dr.width(field) < self.count:
@@ -85,7 +89,14 @@ def _columns(value: Any) -> list[Any]:
 
 
 def leaves(local: Local, names: list[str], width: int, tangents: Local | None = None) -> dict[str, Any]:
-    """Make leaves of the fields ``names`` of one sample or point a lane, with ``tangents`` in forward mode."""
+    """Replace fields of an end by leaves of the graph, and return the leaves by name.
+
+    Args:
+        local: one end for each lane, which is changed.
+        names: names of the fields.
+        width: number of lanes.
+        tangents: tangents of the fields in forward mode, else None.
+    """
     found = {}
     for name in names:
         value = getattr(local, name)
@@ -100,11 +111,19 @@ def leaves(local: Local, names: list[str], width: int, tangents: Local | None = 
 
 
 def ends_of_samples(scene: Any, elements: Any, samples: Any, meshes: Any, laser: Any = None) -> Ends:
-    """Shared samples as material points: ``p``, ``n``, ``front`` and ``back`` (what the sides scatter of light, times
-    the area that a sample stands for), and ``geometric_n`` where normals are interpolated.
+    """Return shared samples as material points.
 
-    ``laser`` (:class:`.geometry.WallPoints` of one point): the spot that lights them all. ``n`` then points to the
-    side that is lit, ``front`` holds what arrives there, and ``delay`` is the length of the way to the spot.
+    Args:
+        scene: built scene.
+        elements: table of the hidden elements.
+        samples: the samples.
+        meshes: meshes of the scene.
+        laser: spot that lights all samples (:class:`.geometry.WallPoints` of one point), None for confocal captures.
+
+    Returns:
+        Ends with ``p``, ``n``, and ``front`` and ``back``: albedo over pi of the sides, times the area that a sample
+        stands for; with ``geometric_n`` where normals are interpolated. With ``laser``, ``n`` is that of the side that
+        is lit, ``front`` the light that it scatters, and ``delay`` the length of the way to the spot (metres).
     """
     found = material_samples(elements, samples, meshes)
     fields = {"p": found.p, "n": found.n, "front": found.front}
@@ -131,8 +150,13 @@ def _line_start(sample: Local, smooth: bool) -> Local:
 
 
 def ends_of_points(sensors: Any, lasers: Any, energy: Any) -> Ends:
-    """Scanned points with what the wall makes of light there and at the spot, times the laser's energy (``value``), and
-    the legs before and behind (``leg``).
+    """Return scanned points with ``p`` and ``n``, ``value`` (albedos over pi at point and spot, times the energy), and
+    ``leg`` (both legs, metres).
+
+    Args:
+        sensors: the scanned points.
+        lasers: the spots, one or one for each point.
+        energy: energy of the laser by colour (J).
     """
     value = mi.UnpolarizedSpectrum(sensors.value * lasers.value * energy)
     leg = mi.Float(sensors.leg) + mi.Float(lasers.leg)
@@ -146,10 +170,13 @@ BUSY = 2**14
 
 
 class ThirdBounceGradients:
-    """One job of derivatives. ``samples`` and ``points``: :class:`Ends`, attached; ``clear``: how many of the
-    samples, the first ones, nothing can hide.
+    """Derivatives of one job. A plain class.
 
-    A plain class, which Dr.Jit loops leave alone.
+    Args:
+        scene: built scene.
+        film: film of the job.
+        samples, points: hidden samples and scanned points, attached where derivatives are requested.
+        clear: number of samples, the first ones, that nothing can hide.
     """
 
     def __init__(self, scene: Any, film: Any, samples: Ends, points: Ends, clear: Any) -> None:
@@ -159,7 +186,16 @@ class ThirdBounceGradients:
         self.window = film.arrivals()
 
     def connection(self, sample: Any, point: Any, k: Any) -> tuple[Any, Any, Any, Any]:
-        """Return (value, length and arrival minus the film's start of sample ``k`` at a point, whether it arrives)."""
+        """Connect samples to points.
+
+        Args:
+            sample, point: one of each for each lane, as :meth:`Ends.load` returns them.
+            k: numbers of the samples (UInt32).
+
+        Returns:
+            Value, optical path length (Float, metres), the same minus the film's start (Float64, detached), and a mask
+            of connections that carry light.
+        """
         geometric_n = sample.geometric_n if self.smooth else sample.n
         start = Local(p=sample.p, n=sample.n, geometric_n=geometric_n)
         line = span(start, point.p, point.n)
@@ -183,7 +219,7 @@ class ThirdBounceGradients:
     # ------------------------------------------------------------------------------------------------- reverse
 
     def backward(self, incoming: Any) -> None:
-        """Hand ``<incoming adjoint, capture>`` on to the scene."""
+        """Back-propagate ``<adjoint, capture>`` to the scene; ``incoming``: the film's adjoint."""
         read = AdjointReader(self.film, self.match, incoming)
         found = []
         for own, others, over in ((self.samples, self.points, over_points), (self.points, self.samples, over_samples)):
@@ -200,8 +236,13 @@ class ThirdBounceGradients:
                 ends.hand_on(adjoints)
 
     def step_back(self, read: AdjointReader, kept: dict[str, Any], pair: Local, by_sample: bool) -> None:
-        """Add the adjoints of one connection to ``kept``: those of its sample, or of its point. ``pair``: ``sample``
-        and ``point``, number ``k`` and ``s``.
+        """Add the adjoints of one connection to those of its sample, or of its point.
+
+        Args:
+            read: the film's adjoint.
+            kept: adjoints by field, which are added to.
+            pair: ``sample`` and ``point`` of the connection, with their numbers ``k`` and ``s``.
+            by_sample: adjoints are those of the sample.
         """
         with dr.resume_grad():
             sample, point = dr_copy(pair.sample), dr_copy(pair.point)
@@ -216,10 +257,10 @@ class ThirdBounceGradients:
     # ------------------------------------------------------------------------------------------------- forward
 
     def forward(self) -> None:
-        """Put the derivative along the scene's tangents onto the film."""
+        """Add the derivative along the scene's tangents to the film."""
         with dr.resume_grad():
             tangents = self.samples.tangents(), self.points.tangents()
-        for launch in launches_of(self.film, self.points.count, self.samples.count):
+        for launch in launches_of(self.film, self.samples.count):
             pixel, first, last = launch.lanes()
             base = launch.base(self.film, pixel)
             block = self.film.create_event_block(launch, base, self.match, launch.most_events, tangents=True)
@@ -234,7 +275,7 @@ class ThirdBounceGradients:
             dr.eval(self.film.bands[launch.band][2], self.film.steady)
 
     def step_on(self, tangents: Ends, block: Any, kept: dict[str, Any], lane: Local, k: Any) -> None:
-        """Put the derivative of one connection into the film's block."""
+        """Add the derivative of the connection with sample ``k`` to the film's block and to ``kept``."""
         with dr.resume_grad():
             sample, point, width = self.samples.load(k), dr_copy(lane.fields), dr.width(lane.own)
             leaves(sample, list(tangents.fields), width, tangents.load(k))
@@ -251,9 +292,12 @@ def dr_copy(local: Local) -> Local:
 
 
 class Split:
-    """Lanes for samples or points ``ends``, several each where there are few, and the range of the ``others`` that each
-    of them goes through; ``fields``: those of the lane's own sample or point. Neighbouring lanes go through the others
-    together. A plain object.
+    """Lanes of a pass over all connections: one for each end of one kind, or several if there are few. A plain class.
+
+    Args:
+        ends: the lanes' own ends.
+        others: number of ends of the other kind; each lane goes through a range of them, ``first`` to ``last``
+            (exclusive), neighbouring lanes through the same.
     """
 
     def __init__(self, ends: Ends, others: int) -> None:
@@ -267,7 +311,7 @@ class Split:
         dr.eval(self.own, self.first, self.last, vars(self.fields))
 
     def reduced(self, value: Any) -> Any:
-        """Sums over the lanes of one sample or point."""
+        """Return the sums of ``value`` over the lanes of each end."""
         if self.lanes == 1:
             return value
         own = dr.arange(mi.UInt32, self.count)
@@ -278,14 +322,14 @@ class Split:
 
 
 class AdjointReader:
-    """The film's adjoint (:class:`~..integrators.job.IncomingAdjoint`) at scanned points."""
+    """Adjoint of the film (:class:`~..integrators.job.IncomingAdjoint`) at scanned points."""
 
     def __init__(self, film: Any, match: Any, incoming: Any) -> None:
         self.match, self.incoming = match, incoming
         self.width = dr.opaque(mi.UInt32, int(film.crop_size()[0]))
 
     def block(self, s: Any) -> Any:
-        """Block of each lane's point, as :class:`~..films.block.AdjointBlock`."""
+        """Return the :class:`~..films.block.AdjointBlock` of the points with the numbers ``s``."""
         row = s // self.width
         place = Local(row=row, column=s - row * self.width, laser=None)
         return self.incoming.block(place, s, self.match)
@@ -293,7 +337,7 @@ class AdjointReader:
 
 @dr.syntax
 def over_points(job, read, kept, split):
-    """Adjoints of each lane's sample, from its range of the points."""
+    """Return the adjoints of each lane's sample, by its range of the points."""
     s = mi.UInt32(split.first)
     while dr.hint(s < split.last, label="scanned points, reverse"):
         job.step_back(read, kept, Local(sample=split.fields, point=job.points.load(s), k=split.own, s=s), True)
@@ -303,7 +347,7 @@ def over_points(job, read, kept, split):
 
 @dr.syntax
 def over_samples(job, read, kept, split):
-    """Adjoints of each lane's point, from its range of the samples."""
+    """Return the adjoints of each lane's point, by its range of the samples."""
     k = mi.UInt32(split.first)
     while dr.hint(k < split.last, label="hidden samples, reverse"):
         job.step_back(read, kept, Local(sample=job.samples.load(k), point=split.fields, k=k, s=split.own), False)
@@ -313,7 +357,7 @@ def over_samples(job, read, kept, split):
 
 @dr.syntax
 def tangents_over_samples(job, tangents, block, kept, lane):
-    """Derivatives of what each lane's range of the samples sends to its point."""
+    """Add the derivatives of the light from each lane's range of the samples to its point."""
     k = mi.UInt32(lane.first)
     while dr.hint(k < lane.last, label="hidden samples, forward mode"):
         job.step_on(tangents, block, kept, lane, k)
