@@ -8,7 +8,6 @@ from typing import Any
 import torch
 from torch import nn
 
-from torchtransient.capture import Scan
 from torchtransient.checks import as_whole, shown
 from torchtransient.errors import ArgumentError, SceneError
 from torchtransient.rendering.job import SEED_RANGE, draw_seed
@@ -39,12 +38,6 @@ def check_seeds(who: str, value: Any) -> None:
     _, of_each_entry = draw_seed(value)
     if of_each_entry is None:
         checked_seed(who, value)
-
-
-def check_is_scan(who: str, value: Any) -> None:
-    """Raise ArgumentError for anything but a scan."""
-    if not isinstance(value, Scan):
-        raise ArgumentError(f"{who}: expected scan as a tt.nlos.Scan, got {type(value).__name__}.")
 
 
 def check_sensor(who: str, sensor: Any, generator: Any = None) -> None:

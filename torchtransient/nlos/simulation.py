@@ -23,11 +23,11 @@ import torch
 from torchtransient.array_files.array_file import path_of
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.checks import Numbers, count
+from torchtransient.checks import Numbers, count, of_class
 from torchtransient.errors import ArgumentError
 from torchtransient.nlos import defaults
 from torchtransient.nlos.answers import checked_module, measured, say_black
-from torchtransient.nlos.arguments import check_is_scan, check_sensor, checked_seed
+from torchtransient.nlos.arguments import check_sensor, checked_seed
 from torchtransient.nlos.forecast import Forecast, forecast_of
 from torchtransient.nlos.part_file import PartFile
 from torchtransient.nlos.point_rows import RowLayout, Rows
@@ -147,7 +147,7 @@ def _work(
     spp = checked_samples("simulate: spp", spp)
     if scan is None:
         return _scene_work(hidden, time_axis, frequencies, spp, of_light, variant, parts)
-    check_is_scan("simulate", scan)
+    of_class("simulate: scan", scan, Scan)
     if isinstance(hidden, Scene):
         raise ArgumentError(
             "simulate: a tt.Scene has a sensor of its own; expected hidden shapes beside scan=. Leave scan out to "

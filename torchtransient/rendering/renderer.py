@@ -225,7 +225,7 @@ class TransientRenderer(CopiesParametrized):
             built = self.scene.built(self._options)
             slots = self.scene.slots(self._keys, self._options).slots
             if self.film.count > 1 or self.effective_filter in ("", "box"):
-                # Of one bin for all times a wider filter spreads up to a half over the rim, and nobody looks there.
+                # Of one bin for all times a wider filter spreads up to a half over the rim, which is no loss.
                 self._watch.window_name = f"window of {self.film.describe('')}"
             ranges = built.ranges() if self._keys else {}
             self._watch.ranges = {key: ranges[key] for key in self._keys if key in ranges}

@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from torchtransient.checks import flag, shown
+from torchtransient.checks import flag, mapping
 from torchtransient.errors import ArgumentError, GradientError, SceneError, TorchTransientError
 from torchtransient.plugins import kind_of, modules_of_others, register_module
 from torchtransient.plugins.guards import run_despite_interrupts
@@ -115,11 +115,11 @@ class Scene:
         Raises:
             SceneError: for numbers of a spectral model, arrays of plugins that read no file and loaded objects, which
                 XML cannot hold, for unknown keys and for other paths. Nothing is written then.
+            ArgumentError: if ``values`` is no mapping.
             ShapeError, UnitError, GradientError: for values, as a renderer raises them.
         """
-        if values is not None and not isinstance(values, Mapping):
-            raise ArgumentError(f"scene.save: expected values by key, got {shown(values)}.")
-        description, given = self._description, dict(values or {})
+        given = {} if values is None else dict(mapping("scene.save: values", values, "{key: value}"))
+        description = self._description
         description.check_described("scene.save")
         assert not isinstance(description, LoadedScene)  # refused above
         with replaced_files(path) as (target, draft, folder), active_variant(self.variant):

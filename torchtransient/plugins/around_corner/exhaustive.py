@@ -167,33 +167,33 @@ def _launch(
     wanted = pixel <= laser if mirrored else mi.Mask(True)
     base = film.pixel_base(local * film.entries_per_pixel(), laser)
     target = film.create_event_block(Local(band=band), base, job.match, 1, exclusive=True, origin=pairs.origin)
-    kept = {"L": mi.UnpolarizedSpectrum(0), "before": mi.Float(0), "after": mi.Float(0)}
-    kept = sum_over_block(job, block, pairs, target, kept, wanted)
-    _count(film, job.match, pixel, kept, wanted)
+    sums = {"L": mi.UnpolarizedSpectrum(0), "before": mi.Float(0), "after": mi.Float(0)}
+    sums = sum_over_block(job, block, pairs, target, sums, wanted)
+    _count(film, job.match, pixel, sums, wanted)
     if mirrored:
-        _count(film, job.match, laser, kept, pixel < laser)
+        _count(film, job.match, laser, sums, pixel < laser)
     dr.eval(film.bands[band][2], film.steady, film.outside)
 
 
-def _count(film: Any, match: Any, pixel: Any, kept: dict[str, Any], active: Any) -> None:
-    film.add_steady(pixel, [dr.select(active, c, 0) for c in match.to_channels(kept["L"])])
-    film.add_outside(pixel, dr.select(active, kept["before"], 0), dr.select(active, kept["after"], 0))
+def _count(film: Any, match: Any, pixel: Any, sums: dict[str, Any], active: Any) -> None:
+    film.add_steady(pixel, [dr.select(active, c, 0) for c in match.to_channels(sums["L"])])
+    film.add_outside(pixel, dr.select(active, sums["before"], 0), dr.select(active, sums["after"], 0))
 
 
 @dr.syntax
-def sum_over_block(job, block, pairs, target, kept, wanted):
+def sum_over_block(job, block, pairs, target, sums, wanted):
     """Add the light that goes from each lane's laser spot by the samples of a block to its scan point."""
     k = mi.UInt32(0)
     going = mi.Mask(wanted)
     while dr.hint(going, label="pairs of points"):
         for u in range(UNROLLED):
-            deposit(job, block, pairs, target, kept, k + u)
+            deposit(job, block, pairs, target, sums, k + u)
         k += UNROLLED
         going &= k < block.size
-    return kept
+    return sums
 
 
-def deposit(job, block, pairs, target, kept, k):
+def deposit(job, block, pairs, target, sums, k):
     """Add the light of sample ``k`` of the block."""
     seen = dr.gather(mi.Vector2f, block.seen, k * pairs.sensor_count + pairs.pixel)
     lit = dr.gather(mi.Vector2f, block.lit, k * pairs.laser_count + pairs.laser)
@@ -206,10 +206,10 @@ def deposit(job, block, pairs, target, kept, k):
     if block.values is not None:
         row = dr.gather(mi.Vector4f, block.values, 2 * k + dr.select(seen.x > 0, mi.UInt32(0), 1), active)
         value *= mi.UnpolarizedSpectrum(row.x, row.y, row.z)
-    kept["L"] = kept["L"] + dr.select(active, value, 0)
+    sums["L"] = sums["L"] + dr.select(active, value, 0)
     before, after = target.put({}, opl, value, active)
-    kept["before"] = kept["before"] + before
-    kept["after"] = kept["after"] + after
+    sums["before"] = sums["before"] + before
+    sums["after"] = sums["after"] + after
 
 
 def _rows_at_once(points: int, size: int) -> int:

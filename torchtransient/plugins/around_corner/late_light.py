@@ -286,13 +286,13 @@ class Links:
         # Of the group that has most.
         self.most = int(dr.max(self.count)[0])
         # A row more, so that there is one: lanes without links load what they do not use.
-        kept = dr.compress(some)
-        self.flat = dr.zeros(mi.Float, 4 * (dr.width(kept) + 1))
-        if dr.width(kept):
-            tail, head = _ends(kept, n)
-            weight, r = dr.gather(mi.Float, weight, kept), dr.gather(mi.Float, r, kept)
+        linked = dr.compress(some)
+        self.flat = dr.zeros(mi.Float, 4 * (dr.width(linked) + 1))
+        if dr.width(linked):
+            tail, head = _ends(linked, n)
+            weight, r = dr.gather(mi.Float, weight, linked), dr.gather(mi.Float, r, linked)
             row = mi.Vector4f(weight, r, mi.Float(head), mi.Float(tail))
-            dr.scatter(self.flat, row, dr.arange(mi.UInt32, dr.width(kept)))
+            dr.scatter(self.flat, row, dr.arange(mi.UInt32, dr.width(linked)))
         dr.eval(self.flat, self.count, self.first)
 
 
@@ -474,11 +474,11 @@ class LateLight:
         if self.exhaustive:
             base = film.pixel_base(base, lanes.laser)
         target = film.create_event_block(launch, base, self.job.match, EVENTS, exclusive=launch.spp == 1)
-        kept = {"L": mi.UnpolarizedSpectrum(0), "before": mi.Float(0), "after": mi.Float(0), "block": target.begin()}
-        kept = sum_over_links(self, part, lanes, target, kept)
-        target.end(kept["block"])
-        film.add_steady(lanes.pixel, self.job.match.to_channels(kept["L"]))
-        film.add_outside(lanes.pixel, kept["before"], kept["after"])
+        sums = {"L": mi.UnpolarizedSpectrum(0), "before": mi.Float(0), "after": mi.Float(0), "block": target.begin()}
+        sums = sum_over_links(self, part, lanes, target, sums)
+        target.end(sums["block"])
+        film.add_steady(lanes.pixel, self.job.match.to_channels(sums["L"]))
+        film.add_outside(lanes.pixel, sums["before"], sums["after"])
         target.finish()
 
 
@@ -604,16 +604,16 @@ def divmod_by(number: Any, divisor: int) -> tuple[Any, Any]:
 
 
 @dr.syntax
-def sum_over_links(light, part, lanes, target, kept):
-    """Add the light of each lane's links to the film's block ``target`` and to the sums ``kept``."""
+def sum_over_links(light, part, lanes, target, sums):
+    """Add the light of each lane's links to the film's block ``target`` and to ``sums``."""
     k = mi.UInt32(lanes.first)
     while dr.hint(k < lanes.last, label="links"):
-        deposit(light, part, lanes, target, kept, k)
+        deposit(light, part, lanes, target, sums, k)
         k += 1
-    return kept
+    return sums
 
 
-def deposit(light, part, lanes, target, kept, k):
+def deposit(light, part, lanes, target, sums, k):
     """Add the events of link ``k``."""
     link = dr.gather(mi.Vector4f, part.links.flat, k)
     head, tail = mi.UInt32(link.z), mi.UInt32(link.w)
@@ -633,7 +633,7 @@ def deposit(light, part, lanes, target, kept, k):
         value = factor * g
         if part.colours > 1:
             value = value * dr.gather(mi.UnpolarizedSpectrum, vertices.value, tail)
-        kept["L"] = kept["L"] + dr.select(active, value, 0)
-        before, after = target.put(kept["block"], opl, value, active)
-        kept["before"] = kept["before"] + before
-        kept["after"] = kept["after"] + after
+        sums["L"] = sums["L"] + dr.select(active, value, 0)
+        before, after = target.put(sums["block"], opl, value, active)
+        sums["before"] = sums["before"] + before
+        sums["after"] = sums["after"] + after

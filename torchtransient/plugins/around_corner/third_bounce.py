@@ -171,16 +171,16 @@ class ThirdBounce(ScanJob):
             exclusive=launch.chunks == 1,
             origin=lane.origin,
         )
-        kept = {"L": mi.UnpolarizedSpectrum(0), "before": mi.Float(0), "after": mi.Float(0), "block": block.begin()}
+        sums = {"L": mi.UnpolarizedSpectrum(0), "before": mi.Float(0), "after": mi.Float(0), "block": block.begin()}
         clear = dr.clip(dr.gather(mi.UInt32, self.samples.clear, tile), first, last)
         first, clear, last = (k + tile * dr.opaque(mi.UInt32, table.count) for k in (first, clear, last))
         if self.samples.has_clear:
-            kept = sum_over_samples(self, table, lane, block, kept, (first, clear), False)
+            sums = sum_over_samples(self, table, lane, block, sums, (first, clear), False)
             first = clear
-        kept = sum_over_samples(self, table, lane, block, kept, (first, last), True)
-        block.end(kept["block"])
-        film.add_steady(pixel, self.match.to_channels(kept["L"]))
-        film.add_outside(pixel, kept["before"], kept["after"])
+        sums = sum_over_samples(self, table, lane, block, sums, (first, last), True)
+        block.end(sums["block"])
+        film.add_steady(pixel, self.match.to_channels(sums["L"]))
+        film.add_outside(pixel, sums["before"], sums["after"])
         block.finish()
 
 
@@ -205,19 +205,19 @@ class ScanLanes:
 
 
 @dr.syntax
-def sum_over_samples(job, table, lane, block, kept, numbers, rays):
-    """Add the light of samples at the lanes' scan points to the film's ``block`` and to the sums ``kept``.
+def sum_over_samples(job, table, lane, block, sums, numbers, rays):
+    """Add the light of samples at the lanes' scan points to the film's ``block`` and to ``sums``.
 
     ``numbers``: first and last sample, exclusive; ``rays``: trace visibility rays.
     """
     k, last = mi.UInt32(numbers[0]), numbers[1]
     while dr.hint(k < last, label="hidden samples"):
-        deposit(job, table, lane, block, kept, k, rays)
+        deposit(job, table, lane, block, sums, k, rays)
         k += 1
-    return kept
+    return sums
 
 
-def deposit(job, table, lane, block, kept, k, rays):
+def deposit(job, table, lane, block, sums, k, rays):
     """Add the light of sample ``k``."""
     sample = table.load(k)
     line = span(sample, lane.p, lane.n)
@@ -243,10 +243,10 @@ def deposit(job, table, lane, block, kept, k, rays):
         if lane.apart:
             active &= ~occluded(job.scene, sample, to_spot, lane.spot_p, lane.spot_n, active)
     value = value * lane.factor
-    kept["L"] = kept["L"] + dr.select(active, value, 0)
-    before, after = block.put(kept["block"], opl, value, active)
-    kept["before"] = kept["before"] + before
-    kept["after"] = kept["after"] + after
+    sums["L"] = sums["L"] + dr.select(active, value, 0)
+    before, after = block.put(sums["block"], opl, value, active)
+    sums["before"] = sums["before"] + before
+    sums["after"] = sums["after"] + after
 
 
 def lit_by(scene: Any, samples: SharedSamples, laser: WallPoints) -> SampleTable:

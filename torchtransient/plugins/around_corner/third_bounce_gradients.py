@@ -227,32 +227,32 @@ class ThirdBounceGradients:
                 names = own.attached
             if names:
                 split = Split(own, others.count)
-                kept = over(self, read, {name: dr.zeros(type(own.fields[name])) for name in names}, split)
-                dr.eval(kept)
-                found.append((own, {name: split.reduced(value) for name, value in kept.items()}))
+                adjoints = over(self, read, {name: dr.zeros(type(own.fields[name])) for name in names}, split)
+                dr.eval(adjoints)
+                found.append((own, {name: split.reduced(value) for name, value in adjoints.items()}))
         dr.eval([adjoints for _, adjoints in found])
         with dr.resume_grad():
             for ends, adjoints in found:
                 ends.hand_on(adjoints)
 
-    def step_back(self, read: AdjointReader, kept: dict[str, Any], pair: Local, by_sample: bool) -> None:
+    def step_back(self, read: AdjointReader, adjoints: dict[str, Any], pair: Local, by_sample: bool) -> None:
         """Add the adjoints of one connection to those of its sample, or of its point.
 
         Args:
             read: the film's adjoint.
-            kept: adjoints by field, which are added to.
+            adjoints: adjoints by field, which are added to.
             pair: ``sample`` and ``point`` of the connection, with their numbers ``k`` and ``s``.
             by_sample: adjoints are those of the sample.
         """
         with dr.resume_grad():
             sample, point = dr_copy(pair.sample), dr_copy(pair.point)
-            found = leaves(sample if by_sample else point, list(kept), dr.width(pair.k))
+            found = leaves(sample if by_sample else point, list(adjoints), dr.width(pair.k))
             value, length, opl, arrives = self.connection(sample, point, pair.k)
             A, slope = read.block(pair.s).read(opl, arrives)
             objective = total_of(A, value) + total_of(slope, dr.detach(value)) * slope_only(length)
             dr.backward_from(dr.select(arrives, objective, 0))
             for name, leaf in found.items():
-                kept[name] = kept[name] + dr.grad(leaf)
+                adjoints[name] = adjoints[name] + dr.grad(leaf)
 
     # ------------------------------------------------------------------------------------------------- forward
 
@@ -267,23 +267,23 @@ class ThirdBounceGradients:
             lane = Local(own=pixel, first=first, last=last, fields=self.points.load(pixel))
             lane.tangent = tangents[1].load(pixel)
             dr.eval(vars(lane.fields), vars(lane.tangent), pixel, first, last)
-            kept = {"dL": mi.UnpolarizedSpectrum(0), "block": block.begin()}
-            kept = tangents_over_samples(self, tangents[0], block, kept, lane)
-            block.end(kept["block"])
-            self.film.add_steady(pixel, self.match.to_channels(kept["dL"]))
+            sums = {"dL": mi.UnpolarizedSpectrum(0), "block": block.begin()}
+            sums = tangents_over_samples(self, tangents[0], block, sums, lane)
+            block.end(sums["block"])
+            self.film.add_steady(pixel, self.match.to_channels(sums["dL"]))
             block.finish()
             dr.eval(self.film.bands[launch.band][2], self.film.steady)
 
-    def step_on(self, tangents: Ends, block: Any, kept: dict[str, Any], lane: Local, k: Any) -> None:
-        """Add the derivative of the connection with sample ``k`` to the film's block and to ``kept``."""
+    def step_on(self, tangents: Ends, block: Any, sums: dict[str, Any], lane: Local, k: Any) -> None:
+        """Add the derivative of the connection with sample ``k`` to the film's block and to ``sums``."""
         with dr.resume_grad():
             sample, point, width = self.samples.load(k), dr_copy(lane.fields), dr.width(lane.own)
             leaves(sample, list(tangents.fields), width, tangents.load(k))
             leaves(point, list(vars(lane.tangent)), width, lane.tangent)
             value, length, opl, arrives = self.connection(sample, point, k)
             d_value, d_opl = tangents_of([value, slope_only(length)])
-        kept["dL"] = kept["dL"] + dr.select(arrives, d_value, 0)
-        block.put_slope(kept["block"], opl, d_value, value * d_opl, arrives)
+        sums["dL"] = sums["dL"] + dr.select(arrives, d_value, 0)
+        block.put_slope(sums["block"], opl, d_value, value * d_opl, arrives)
 
 
 def dr_copy(local: Local) -> Local:
@@ -336,30 +336,30 @@ class AdjointReader:
 
 
 @dr.syntax
-def over_points(job, read, kept, split):
+def over_points(job, read, adjoints, split):
     """Return the adjoints of each lane's sample, by its range of the points."""
     s = mi.UInt32(split.first)
     while dr.hint(s < split.last, label="scanned points, reverse"):
-        job.step_back(read, kept, Local(sample=split.fields, point=job.points.load(s), k=split.own, s=s), True)
+        job.step_back(read, adjoints, Local(sample=split.fields, point=job.points.load(s), k=split.own, s=s), True)
         s += 1
-    return kept
+    return adjoints
 
 
 @dr.syntax
-def over_samples(job, read, kept, split):
+def over_samples(job, read, adjoints, split):
     """Return the adjoints of each lane's point, by its range of the samples."""
     k = mi.UInt32(split.first)
     while dr.hint(k < split.last, label="hidden samples, reverse"):
-        job.step_back(read, kept, Local(sample=job.samples.load(k), point=split.fields, k=k, s=split.own), False)
+        job.step_back(read, adjoints, Local(sample=job.samples.load(k), point=split.fields, k=k, s=split.own), False)
         k += 1
-    return kept
+    return adjoints
 
 
 @dr.syntax
-def tangents_over_samples(job, tangents, block, kept, lane):
+def tangents_over_samples(job, tangents, block, sums, lane):
     """Add the derivatives of the light from each lane's range of the samples to its point."""
     k = mi.UInt32(lane.first)
     while dr.hint(k < lane.last, label="hidden samples, forward mode"):
-        job.step_on(tangents, block, kept, lane, k)
+        job.step_on(tangents, block, sums, lane, k)
         k += 1
-    return kept
+    return sums
