@@ -26,7 +26,7 @@ from torchtransient.plugins.mitsuba_compat import (
 from torchtransient.scene.build import BuiltScene
 from torchtransient.scene.parameters import classify, read_value
 
-# Up to so many entries a list is copied faster than a kernel is launched.
+# Most entries of a tensor that is copied by way of a list, which is faster than launching a kernel.
 FEW = 64
 
 

@@ -124,9 +124,9 @@ class WallPoints:
         """Gather (``p``, ``n``, ``value``, ``leg``) of the points with the numbers ``index`` (UInt32)."""
         return (
             dr.gather(mi.Point3f, self.p, index, active),
-            _one_or_each(self.n, index, active),
-            _one_or_each(self.value, index, active),
-            _one_or_each(self.leg, index, active),
+            gather_one_or_each(self.n, index, active),
+            gather_one_or_each(self.value, index, active),
+            gather_one_or_each(self.leg, index, active),
         )
 
 
@@ -147,5 +147,6 @@ def points_of(si: Any, factor: Any, length: Any) -> WallPoints:
     return WallPoints(dr.select(valid, si.p, 0), n, value, dr.select(valid, length, 0))
 
 
-def _one_or_each(array: Any, index: Any, active: Any) -> Any:
+def gather_one_or_each(array: Any, index: Any, active: Any = True) -> Any:
+    """Gather entries of an array that has one entry for all, or one each."""
     return dr.gather(type(array), array, index if dr.width(array) > 1 else mi.UInt32(0), active)

@@ -23,7 +23,14 @@ import numpy as np
 
 from torchtransient.errors import SceneError, UnitError
 from torchtransient.interfaces import CaptureType
-from torchtransient.plugins.around_corner.geometry import OFFSET, WallPoints, front_normal, occluded, span
+from torchtransient.plugins.around_corner.geometry import (
+    OFFSET,
+    WallPoints,
+    front_normal,
+    gather_one_or_each,
+    occluded,
+    span,
+)
 from torchtransient.plugins.around_corner.launches import EVENTS, ScanJob
 from torchtransient.plugins.bsdfs.lambertian import scatters_behind
 from torchtransient.plugins.sampling.area_elements import morton_order
@@ -231,13 +238,10 @@ class VertexTable:
 
     def take(self, index: Any) -> Local:
         """Gather ``p, n, geometric_n, value, length, alive`` of vertices."""
-        rows = Local(**{name: _gather(getattr(self, name), index) for name in self._FIELDS})
-        rows.geometric_n = _gather(self.geometric_n, index) if self.smooth else rows.n
+        rows = Local(**{name: gather_one_or_each(getattr(self, name), index) for name in self._FIELDS})
+        rows.geometric_n = gather_one_or_each(self.geometric_n, index) if self.smooth else rows.n
         return rows
 
-
-def _gather(array: Any, index: Any) -> Any:
-    return dr.gather(type(array), array, index if dr.width(array) > 1 else mi.UInt32(0))
 
 # Numbers of chains stand in rows of single precision, which counts so far.
 MOST_CHAINS = 2**24

@@ -28,6 +28,7 @@ from typing import Any, ClassVar
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins.around_corner.late_light import FIRST
 from torchtransient.plugins.around_corner.outline_table import OutlineTable
 from torchtransient.plugins.integrators.job import Pass
 from torchtransient.plugins.polarized import (
@@ -58,7 +59,6 @@ from torchtransient.plugins.transport.walk import first_leg
 BESIDE, BEFORE = 1e-4, 1e-5
 # Cosines under which a surface is seen edge-on.
 EDGE_ON = 1e-4
-BOUNCES = 3
 
 
 class MutualOcclusion:
@@ -264,9 +264,6 @@ class MutualOcclusion:
 # pass of the vertices, :mod:`~..transport.boundary.vertex`: a path that begins at S goes on behind an edge. Those of
 # the last one are found the other way round (:class:`SpotPass`): a path begins at L, past an edge, and is connected to
 # S.
-
-# The fewest bounces of late light.
-FIRST = 4
 
 
 class SpotPass(BoundaryPass):

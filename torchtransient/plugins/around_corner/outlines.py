@@ -10,8 +10,10 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient.errors import GradientWarning
+from torchtransient.plugins.around_corner.division import BOUNCES
 from torchtransient.plugins.around_corner.geometry import front_normal
-from torchtransient.plugins.around_corner.occlusion import BOUNCES, FIRST, LateOutlines, MutualOcclusion
+from torchtransient.plugins.around_corner.late_light import FIRST
+from torchtransient.plugins.around_corner.occlusion import LateOutlines, MutualOcclusion
 from torchtransient.plugins.around_corner.outline_table import OutlineTable, Part, hiding_pairs, parts_of
 from torchtransient.plugins.integrators.job import passes_of, seed_array
 from torchtransient.plugins.kernel_arrays import registry_number
