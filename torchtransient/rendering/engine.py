@@ -29,7 +29,7 @@ from torchtransient.rendering.broken_numbers import broken_entries, fill_broken
 from torchtransient.rendering.films import FilmLayout, layout_of_film
 from torchtransient.rendering.job import Item, RenderJob, RunLog, samples_drawn
 from torchtransient.rendering.memory import check_fits
-from torchtransient.rendering.recording import LARGE_FILM, Numbered, Recordings, execute, groups_of
+from torchtransient.rendering.recording import LARGE_FILM, Numbered, Recordings, Results, execute, groups_of
 from torchtransient.rendering.values import detached, put_back, values_of
 from torchtransient.scene.edits import built_depth
 from torchtransient.scene.parameters import needing_slope
@@ -63,15 +63,14 @@ def run(
         check_values(job, values)
     if kind == BACKWARD and all(v is None for v in vectors):
         return tuple(torch.zeros_like(v) for v, need in zip(values, job.needs, strict=True) if need)
-    kinds: dict[str, Any] = {RENDER: Images, BACKWARD: Gradients, FORWARD: Tangents}
+    kinds: dict[str, Callable[..., Results]] = {RENDER: Images, BACKWARD: Gradients, FORWARD: Tangents}
     handled = sys.exc_info()[1]
     try:
         with open_session(job) as session:
             results = kinds[kind](session, values, vectors)
             for group in groups_of(session):
                 execute(session, results, group)
-            found: tuple[torch.Tensor, ...] = results.finish()
-            return found
+            return results.finish()
     except Exception:
         raise
     except BaseException as interrupt:

@@ -27,8 +27,11 @@ from __future__ import annotations
 import sys
 import warnings
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
+from typing import Any, Protocol
+
+import torch
 
 from torchtransient.errors import SceneError, level_of_user
 from torchtransient.interfaces import BACKWARD, FORWARD, RENDER
@@ -58,9 +61,9 @@ Numbered = tuple[int, Item]
 
 
 def groups_of(session: Any) -> Iterator[list[Numbered]]:
-    """Yield the items of a call, numbered, in groups that share their values and are one call of kernels.
+    """Yield the items of a call, numbered, in groups that share their values and are executed together.
 
-    A group holds the sensors of an entry of a batch where their films are small.
+    A group holds the sensors of one entry of a batch if their films are small, else a single item.
     """
     group: list[Numbered] = []
     for n, item in enumerate(session.job.items):
@@ -73,7 +76,34 @@ def groups_of(session: Any) -> Iterator[list[Numbered]]:
         yield group
 
 
-def execute(session: Any, results: Any, group: Sequence[Numbered]) -> None:
+class Results(Protocol):
+    """Destination of a call's results, one class for each kind of job (``Images``, ``Gradients``, ``Tangents`` of the
+    engine). ``kind``: kind of the job; ``calls``: how each item was executed, in order.
+    """
+
+    kind: str
+    calls: list[str]
+
+    def install(self, item: Item, group: Sequence[Numbered], /) -> None:
+        """Write the values of an item's entry into the scene, attached for derivatives."""
+
+    def adjoint(self, n: int, /) -> tuple[Any, Any]:
+        """Return the adjoints of steady image and response of item ``n``, None for each one that is zero."""
+
+    def progress(self, n: int, /) -> Callable[[float], None] | None:
+        """Return a function of the share of item ``n`` that is done, None where no progress is reported."""
+
+    def storage(self, film: Any, n: int, /) -> AbstractContextManager[bool]:
+        """Lend the film of item ``n`` memory of the output for a block; its value is whether any was lent."""
+
+    def collect(self, n: int, item: Item, /) -> None:
+        """Take the results of item ``n`` from its film, or from the leaves of the installed values."""
+
+    def finish(self) -> tuple[torch.Tensor, ...]:
+        """Return the results of all items."""
+
+
+def execute(session: Any, results: Results, group: Sequence[Numbered]) -> None:
     """Install the values of a group of items, execute the integrator's job of each, and collect the results.
 
     All jobs of the group are one recording; where there can be none, they are traced one by one. What became of each
@@ -81,8 +111,7 @@ def execute(session: Any, results: Any, group: Sequence[Numbered]) -> None:
 
     Args:
         session: the built scene in use (:class:`.engine.Session`).
-        results: destination of the results, which installs values and has adjoints (:class:`.engine.Images`,
-            :class:`.engine.Gradients`, :class:`.engine.Tangents`).
+        results: destination of the results, which installs the values too.
         group: numbered items with the same values, as :func:`groups_of` yields them.
     """
     n, item = group[0]
@@ -99,7 +128,7 @@ def execute(session: Any, results: Any, group: Sequence[Numbered]) -> None:
             _trace_each(session, results, group, method, reason)
 
 
-def _execute_by_recording(session: Any, results: Any, group: Sequence[Numbered]) -> str | None:
+def _execute_by_recording(session: Any, results: Results, group: Sequence[Numbered]) -> str | None:
     """Record the jobs of a group or launch their recording; return the reason to trace them instead, None if done.
 
     Where a reason is returned, nothing has been rendered and the values are installed.
@@ -125,7 +154,7 @@ def _execute_by_recording(session: Any, results: Any, group: Sequence[Numbered])
     return None
 
 
-def _trace_each(session: Any, results: Any, group: Sequence[Numbered], method: Any, reason: str) -> None:
+def _trace_each(session: Any, results: Results, group: Sequence[Numbered], method: Any, reason: str) -> None:
     """Trace the jobs of a group, by an integrator's own ``method`` if it has one."""
     results.calls += [reason] * len(group)
     for i, (n, item) in enumerate(group):
@@ -138,15 +167,15 @@ def _trace_each(session: Any, results: Any, group: Sequence[Numbered], method: A
         results.collect(n, item)
 
 
-def _draw(session: Any, results: Any, item: Item) -> tuple[int, int]:
+def _seed_and_samples(session: Any, results: Results, item: Item) -> tuple[int, int]:
     """Return seed and samples per pixel of the render of an item, or of its derivatives."""
     job = session.job
     return (item.seed, job.spp) if results.kind == RENDER else (item.grad_seed, job.spp_grad)
 
 
-def _prepared(session: Any, results: Any, n: int, item: Item) -> Any:
+def _prepared(session: Any, results: Results, n: int, item: Item) -> Any:
     """Return the job of an item, ready for the integrator's ``run``."""
-    seed, spp = _draw(session, results, item)
+    seed, spp = _seed_and_samples(session, results, item)
     return session.integrator.prepared(session.scene, item.sensor, seed, spp, results.kind, results.adjoint(n))
 
 
@@ -157,10 +186,10 @@ def _overridden_method(integrator: Any, kind: str) -> Any:
     return None if owner.__module__ == "torchtransient.plugins.integrators.base" else getattr(integrator, name)
 
 
-def _call_method(method: Any, session: Any, results: Any, n: int, item: Item) -> None:
+def _call_method(method: Any, session: Any, results: Results, n: int, item: Item) -> None:
     """Call an integrator's own method for a job, with the arguments of Mitsuba's."""
     kind = results.kind
-    seed, spp = _draw(session, results, item)
+    seed, spp = _seed_and_samples(session, results, item)
     common = {"sensor": item.sensor, "seed": seed, "spp": spp}
     if kind == RENDER:
         method(session.scene, **common, develop=False, progress_callback=results.progress(n))
