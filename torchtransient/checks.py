@@ -50,6 +50,8 @@ _UNITS = {
 MOST = 2**63 - 1
 # Most objects that one call makes.
 MOST_MADE = 2**24
+# Farthest point of a mesh, metres: squares of areas are numbers of single precision in kernels.
+_FAR = 1e9
 # Types that need no further look.
 _PLAIN = {int, float}
 # Most numbers of an array that a message shows.
@@ -487,3 +489,29 @@ def check_folder(path: Any, what: str) -> Path:
         problem = f"cannot be written: no permission for '{closed}'" if closed else "is no file on a disk"
         raise StorageError(f"{what}: '{target}' {'is a folder' if place.is_dir() else problem}. Choose another place.")
     return target
+
+
+def checked_mesh(who: str, vertices: Any, faces: Any) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return a triangle mesh as float64 (V, 3), metres, and int64 (F, 3). Raises ShapeError and UnitError."""
+    points, given = real_array(vertices), real_array(faces)
+    if points is None or given is None:
+        raise ShapeError(
+            f"{who}: expected vertices (V, 3) and faces (F, 3) as rows of three numbers, got {shown(vertices)} and "
+            f"{shown(faces)}."
+        )
+    if points.ndim != 2 or points.shape[1] != 3 or given.ndim != 2 or given.shape[1] != 3 or not len(given):
+        raise ShapeError(
+            f"{who}: expected vertices (V, 3) and faces (F, 3), got shapes {points.shape} and {given.shape}."
+        )
+    if not (np.abs(points) < _FAR).all():
+        raise UnitError(
+            f"{who}: expected vertices in finite metres, less than {_FAR:g} from the origin, got "
+            f"{int((~(np.abs(points) < _FAR)).sum())} other numbers."
+        )
+    whole = bool((given == np.round(given)).all())
+    if not whole or given.min() < 0 or given.max() >= len(points):
+        raise ShapeError(
+            f"{who}: expected faces of whole numbers from 0 to {len(points) - 1}, one less than the vertices, got "
+            f"numbers from {given.min():g} to {given.max():g}."
+        )
+    return points.copy(), given.astype(np.int64)

@@ -1,17 +1,13 @@
-"""Precision of tensors in functions and modules: half precision is computed in single, and autocast is switched off.
-
-Modules with single numbers in their state, loaded from single numbers alone, are :class:`ScalarState`.
-"""
+"""Precision of tensors in functions and modules: half precision is computed in single, and autocast is switched off."""
 
 from __future__ import annotations
 
 import functools
-import itertools
 from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchtransient.checks import real_array, shown
 from torchtransient.errors import ShapeError, TorchTransientError
@@ -146,31 +142,3 @@ def is_true(condition: Tensor) -> bool:
         if "vmap" not in str(error):
             raise
         return True
-
-
-class ScalarState(nn.Module):
-    """Base of modules with numbers in their state. Torch 2.6 takes the first number of several for one number, in
-    silence; later versions report it. Loading reports it here, of the numbers of modules inside too.
-    """
-
-    def _load_from_state_dict(self, state: Any, prefix: str, *rest: Any) -> None:
-        super()._load_from_state_dict(state, prefix, *rest)
-        errors = rest[-1]
-        if not _loads_first_of_several():
-            return
-        for name, own in itertools.chain(self.named_parameters(), self.named_buffers()):
-            given, key = state.get(prefix + name), prefix + name
-            several = isinstance(given, Tensor) and given.ndim == 1 and len(given) != 1
-            if own.ndim == 0 and several and not any(key in error for error in errors):
-                errors.append(f"size mismatch for {key}: {tuple(given.shape)} in the state, expected one number.")
-
-
-def _loads_first_of_several() -> bool:
-    """Return True if this version of torch loads a number from several."""
-    module = nn.Module()
-    module.register_buffer("number", torch.zeros(()))
-    try:
-        module.load_state_dict({"number": torch.zeros(2)})
-    except RuntimeError:
-        return False
-    return True

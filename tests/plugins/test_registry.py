@@ -61,6 +61,28 @@ def test_variant_context_there_and_back():
     assert isinstance(build("transient_path"), mi.Integrator)
 
 
+def test_a_plugin_is_imported_at_its_first_use():
+    """Hair is built on the class of plastic: both are imported by one use, and belong to each later variant."""
+    found = run(
+        """
+        import sys
+        import torchtransient
+        import mitsuba as mi
+        def loaded():
+            return sum(f"torchtransient.plugins.bsdfs.{name}" in sys.modules for name in ("hair", "plastic", "delayed"))
+        mi.set_variant("llvm_ad_rgb")
+        print(loaded())
+        rgb = type(mi.load_dict({"type": "diff_hair"}))
+        print(loaded())
+        mi.set_variant("llvm_ad_spectral")
+        for plugin in ("diff_hair", "diff_plastic"):
+            made = mi.load_dict({"type": plugin})
+            print(isinstance(made, mi.BSDF), isinstance(made, rgb))
+        """
+    )
+    assert found == ["0", "2", "True", "False", "True", "False"]
+
+
 def test_scalar_variants_register_and_refuse():
     with mi.variant_context("scalar_rgb"):
         assert plugins.sync() == "scalar_rgb"

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.capture.triangles import first_hits, triangle_normals
-from torchtransient.checks import Numbers, as_whole, flag, positive, real_array, shares, shown, transform
+from torchtransient.checks import Numbers, as_whole, checked_mesh, flag, positive, real_array, shares, shown, transform
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 
 Array = NDArray[np.float64]
@@ -19,8 +19,6 @@ Array = NDArray[np.float64]
 ON_WALL = 1e-4
 # From the edges of a wall, in parts of its size and its distance from the origin.
 _EDGE = 2.0**-20
-# Squares of areas are numbers of single precision in kernels.
-_FAR = 1e9
 # Indices of points have 32 bits in kernels.
 _MOST_POINTS = 2**32 - 1
 
@@ -280,32 +278,6 @@ def triple(what: str, values: Any) -> Array:
     if not np.isfinite(array).all():
         raise UnitError(f"{what}: expected finite metres, got {array.tolist()}.")
     return array
-
-
-def checked_mesh(who: str, vertices: Any, faces: Any) -> tuple[Array, NDArray[np.int64]]:
-    """A triangle mesh as float64 (V, 3), metres, and int64 (F, 3). Raises ShapeError and UnitError."""
-    points, given = real_array(vertices), real_array(faces)
-    if points is None or given is None:
-        raise ShapeError(
-            f"{who}: expected vertices (V, 3) and faces (F, 3) as rows of three numbers, got {shown(vertices)} and "
-            f"{shown(faces)}."
-        )
-    if points.ndim != 2 or points.shape[1] != 3 or given.ndim != 2 or given.shape[1] != 3 or not len(given):
-        raise ShapeError(
-            f"{who}: expected vertices (V, 3) and faces (F, 3), got shapes {points.shape} and {given.shape}."
-        )
-    if not (np.abs(points) < _FAR).all():
-        raise UnitError(
-            f"{who}: expected vertices in finite metres, less than {_FAR:g} from the origin, got "
-            f"{int((~(np.abs(points) < _FAR)).sum())} other numbers."
-        )
-    whole = bool((given == np.round(given)).all())
-    if not whole or given.min() < 0 or given.max() >= len(points):
-        raise ShapeError(
-            f"{who}: expected faces of whole numbers from 0 to {len(points) - 1}, one less than the vertices, got "
-            f"numbers from {given.min():g} to {given.max():g}."
-        )
-    return points.copy(), given.astype(np.int64)
 
 
 def grid_size(size: int | Sequence[int], who: str) -> tuple[int, int]:

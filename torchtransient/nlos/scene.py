@@ -10,8 +10,7 @@ import numpy as np
 import torch
 
 from torchtransient.capture import Scan
-from torchtransient.capture.wall import checked_mesh
-from torchtransient.checks import MOST, as_number, as_whole, of_class, shown
+from torchtransient.checks import MOST, as_number, as_whole, checked_mesh, of_class, shown
 from torchtransient.errors import SceneError, UnitError
 from torchtransient.nlos import defaults
 from torchtransient.nlos.mesh_file import mesh_file

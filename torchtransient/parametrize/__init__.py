@@ -4,6 +4,7 @@ Torch only, never Mitsuba. Functions there and back first, under them the module
 that `torch.nn.utils.parametrize.register_parametrization` takes; `register` is the same by Mitsuba's keys.
 """
 
+from torchtransient.modules import CopiesParametrized as CopiesParametrized
 from torchtransient.parametrize.bounded import Albedo as Albedo
 from torchtransient.parametrize.bounded import Anisotropy as Anisotropy
 from torchtransient.parametrize.bounded import Bounded as Bounded
@@ -12,7 +13,6 @@ from torchtransient.parametrize.bounded import PrincipledRoughness as Principled
 from torchtransient.parametrize.bounded import Roughness as Roughness
 from torchtransient.parametrize.bounded import bounded as bounded
 from torchtransient.parametrize.bounded import bounded_inverse as bounded_inverse
-from torchtransient.parametrize.copies import CopiesParametrized as CopiesParametrized
 from torchtransient.parametrize.poses import AxisAnglePose as AxisAnglePose
 from torchtransient.parametrize.poses import SE3Pose as SE3Pose
 from torchtransient.parametrize.poses import axis_angle_from_pose as axis_angle_from_pose

@@ -11,8 +11,8 @@ from torch.nn.utils import parametrize
 from torchtransient.checks import shown
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, TorchTransientError, UnknownKeyError
 from torchtransient.floating import without_autocast
+from torchtransient.modules import let_copy
 from torchtransient.parametrize.bounded import Roughness
-from torchtransient.parametrize.copies import let_copy
 
 
 @without_autocast

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import SceneError
-from torchtransient.floating import ScalarState
+from torchtransient.modules import ScalarState
 
 
 class Settings(ScalarState):

@@ -1,8 +1,9 @@
 """Registers the library's Mitsuba plugins for whichever variant is active.
 
 A Mitsuba plugin written in Python is a class whose base (`mi.Film`, `mi.BSDF`, ...) belongs to one variant. The plugin
-modules therefore define ordinary module-level classes and are executed again (`importlib.reload`) each time the variant
-changes. Mitsuba tells us of a change through a callback. Three of its habits shape this file:
+modules therefore define ordinary module-level classes. A module is executed when Mitsuba first makes a plugin of it,
+and from then on again (`importlib.reload`) each time the variant changes. Mitsuba tells us of a change through a
+callback. Three of its habits shape this file:
 
 - the callbacks are a set without order, and fire on a change only, so a variant that was active before this module was
   imported is caught up with in `attach()`;
@@ -43,6 +44,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import FunctionType
 
 import mitsuba as mi
 
@@ -131,7 +133,7 @@ KINDS = (
 
 @dataclass(frozen=True)
 class PluginModule:
-    """A module to execute for each variant, and the plugins it registers as pairs `(kind, name)`.
+    """A module of plugins, and what it registers as pairs `(kind, name)`.
 
     A module without plugins is listed when others inherit from its classes: it has to be executed again before them.
     """
@@ -220,7 +222,9 @@ def register(kind: str, name: str, constructor: Callable[..., object]) -> None:
             "does not. Its base class documents them."
         )
     key = (kind, name)
-    module = _state.loading or getattr(constructor, "__module__", "?")
+    # A module that is being executed may import others, which register plugins too.
+    named = isinstance(constructor, type | FunctionType)
+    module = (constructor.__module__ if named else _state.loading) or "?"
     with _state.lock:
         other = _state.owner.get(key)
         if _state.loading is not None and other is not None and other != module:
@@ -228,9 +232,7 @@ def register(kind: str, name: str, constructor: Callable[..., object]) -> None:
                 f"register: {kind} plugin '{name}' of module {module} was already registered by {other}. "
                 "Give one of them another name."
             )
-        _state.owner[key] = module
-        _state.constructors[key] = _keeping_errors(constructor)
-        _hand_to_mitsuba(key)
+        _add(key, module, constructor)
 
 
 def register_module(module: str, plugins: tuple[tuple[str, str], ...] = ()) -> None:
@@ -399,20 +401,24 @@ def _tell_all(variant: str) -> None:
 
 
 def _load_all(variant: str) -> None:
-    """Execute every plugin module for `variant`. Leaves `_state.variant` None when one fails, so sync() tries again."""
+    """Register all plugins for `variant`. Modules of the library that are not loaded yet wait for their first use; all
+    others are executed. Leaves `_state.variant` None when one fails, so that sync() tries again.
+    """
     _state.variant = None
     _state.constructors.clear()
     _state.owner.clear()
     for entry in (*PLUGIN_MODULES, *_state.third_party):
-        if is_jit(variant):
+        if is_jit(variant) and (entry.module in sys.modules or entry in _state.third_party):
             _execute(entry, variant)
-        else:
-            for kind, name in entry.plugins:
-                register(kind, name, _refusal(kind, name))
+            continue
+        for key in entry.plugins:
+            _add(key, entry.module, _first_use(entry, key) if is_jit(variant) else _refusal(*key))
     _state.variant = variant
 
 
 def _execute(entry: PluginModule, variant: str) -> None:
+    for key in entry.plugins:
+        _state.constructors.pop(key, None)
     _state.loading = entry.module
     try:
         loaded = sys.modules.get(entry.module)
@@ -436,9 +442,27 @@ def _execute(entry: PluginModule, variant: str) -> None:
         )
 
 
+def _add(key: tuple[str, str], module: str, constructor: Callable[..., object]) -> None:
+    _state.owner[key] = module
+    _state.constructors[key] = _keeping_errors(constructor)
+    _hand_to_mitsuba(key)
+
+
 def _hand_to_mitsuba(key: tuple[str, str]) -> None:
     kind, name = key
     getattr(mi, f"register_{kind}")(name, _state.constructors[key])
+
+
+def _first_use(entry: PluginModule, key: tuple[str, str]) -> Callable[[object], object]:
+    """Return a constructor that executes the module and goes on with the one that it registers."""
+
+    def construct(props: object) -> object:
+        with _state.lock, interrupts_wait():
+            if entry.module not in sys.modules:
+                _execute(entry, require_jit_variant(f"{key[0]} plugin '{key[1]}'"))
+        return _state.constructors[key](props)
+
+    return construct
 
 
 def _refusal(kind: str, name: str) -> Callable[[object], object]:

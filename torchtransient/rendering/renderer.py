@@ -14,7 +14,7 @@ from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.checks import Numbers, flag, is_one_of, shown
 from torchtransient.errors import ArgumentError, SceneError, ShapeError
 from torchtransient.gates import Gate
-from torchtransient.parametrize.copies import CopiesParametrized
+from torchtransient.modules import CopiesParametrized
 from torchtransient.plugins.parameters import check_slope, sun_axes
 from torchtransient.pulses import Pulse
 from torchtransient.rendering import engine

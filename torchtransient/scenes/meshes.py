@@ -9,8 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.capture.wall import checked_mesh
-from torchtransient.checks import Numbers, count, positive, transform
+from torchtransient.checks import Numbers, checked_mesh, count, positive, transform
 from torchtransient.errors import SceneError, ShapeError
 from torchtransient.scenes.parts import SceneDict, diffuse
 from torchtransient.scenes.transforms import Matrix, Triple

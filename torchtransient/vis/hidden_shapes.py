@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.capture.wall import checked_mesh, triple
-from torchtransient.checks import positive, shown, transform
+from torchtransient.capture.wall import triple
+from torchtransient.checks import checked_mesh, positive, shown, transform
 from torchtransient.errors import SceneError
 
 Array = NDArray[np.float64]

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Scan, Wall
-from torchtransient.capture.wall import checked_mesh
-from torchtransient.checks import Numbers, mapping, numbers, of_class, shown
+from torchtransient.checks import Numbers, checked_mesh, mapping, numbers, of_class, shown
 from torchtransient.errors import SceneError, ShapeError
 from torchtransient.vis.files import figure_type, save_figure
 from torchtransient.vis.sources import real_tensor

@@ -13,7 +13,8 @@ from torch import Tensor, nn
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import GradientError, ShapeError, TorchTransientError, UnitError
-from torchtransient.floating import ScalarState, in_single
+from torchtransient.floating import in_single
+from torchtransient.modules import ScalarState
 from torchtransient.sensing.base.given import careful_init
 from torchtransient.sensing.base.layout import TIME, check_generator
 from torchtransient.sensing.base.policies import (

@@ -1,4 +1,4 @@
-"""Copies and pickles of modules with parametrizations, which torch alone does not make.
+"""Base classes of the library's torch modules: states of single numbers, copies and pickles with parametrizations.
 
 `register_parametrization` gives a module a class of its own, with a property for each parametrized name. Torch refuses
 to pickle it, and copies share the class: what is removed from the copy is gone in the module it was copied from.
@@ -8,15 +8,42 @@ from __future__ import annotations
 
 import copy
 import copyreg
+import itertools
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
-from torchtransient.floating import ScalarState
-
 _CONTAINERS = ("_parameters", "_buffers", "_modules")
+
+
+class ScalarState(nn.Module):
+    """Base of modules with numbers in their state. Torch 2.6 takes the first number of several for one number, in
+    silence; later versions report it. Loading reports it here, of the numbers of modules inside too.
+    """
+
+    def _load_from_state_dict(self, state: Any, prefix: str, *rest: Any) -> None:
+        super()._load_from_state_dict(state, prefix, *rest)
+        errors = rest[-1]
+        if not _loads_first_of_several():
+            return
+        for name, own in itertools.chain(self.named_parameters(), self.named_buffers()):
+            given, key = state.get(prefix + name), prefix + name
+            several = isinstance(given, Tensor) and given.ndim == 1 and len(given) != 1
+            if own.ndim == 0 and several and not any(key in error for error in errors):
+                errors.append(f"size mismatch for {key}: {tuple(given.shape)} in the state, expected one number.")
+
+
+def _loads_first_of_several() -> bool:
+    """Return True if this version of torch loads a number from several."""
+    module = nn.Module()
+    module.register_buffer("number", torch.zeros(()))
+    try:
+        module.load_state_dict({"number": torch.zeros(2)})
+    except RuntimeError:
+        return False
+    return True
 
 
 class CopiesParametrized(ScalarState):
