@@ -11,7 +11,7 @@ import torchtransient as tt
 from tools.small_room import COLOUR, VARIANT, WALL_POSE, make_room
 from torchtransient.errors import SceneError, ShapeError
 from torchtransient.plugins.drjit_pool import engine_lock
-from torchtransient.plugins.guards import interrupts_wait, no_collection, run_despite_interrupts
+from torchtransient.plugins.guards import interrupts_wait, no_collection, ensure_restored
 from torchtransient.scene.variant import active_variant
 
 
@@ -65,7 +65,7 @@ def test_settings_are_put_back_when_an_interrupt_cuts_that_off():
         done.append(1)
 
     with pytest.raises(KeyboardInterrupt):
-        run_despite_interrupts(put_back)
+        ensure_restored(put_back)
     assert done == [1]
 
 

@@ -92,7 +92,7 @@ def _put_back_handlers(left: list[tuple[int, Any]]) -> None:
             _put_back_handlers(left)
 
 
-def run_despite_interrupts(put_back: Callable[[], object]) -> None:
+def ensure_restored(put_back: Callable[[], object]) -> None:
     """Call ``put_back``, which may run twice: once more where an interrupt has cut it off.
 
     For ``finally`` blocks. Only a second Ctrl-C within the same call can leave a scene with the settings of that call.

@@ -23,7 +23,7 @@ from torchtransient.checks import one_line
 from torchtransient.errors import ArgumentError, SceneError, TorchTransientError, UnitError, VariantError
 from torchtransient.interfaces import BACKWARD, FORWARD, RENDER, is_time_resolved
 from torchtransient.plugins.frozen_state import says_it_can_be_recorded
-from torchtransient.plugins.guards import no_collection, run_despite_interrupts
+from torchtransient.plugins.guards import no_collection, ensure_restored
 from torchtransient.plugins.parameters import check_slope, lifted
 from torchtransient.rendering.broken_numbers import broken_entries, fill_broken
 from torchtransient.rendering.films import FilmLayout, layout_of_film
@@ -189,7 +189,7 @@ def with_settings(settings: Sequence[tuple[Any, str, Any]]) -> Iterator[None]:
             setattr(plugin, name, value)
         yield
     finally:
-        run_despite_interrupts(put_back)
+        ensure_restored(put_back)
 
 
 @contextmanager
@@ -212,7 +212,7 @@ def open_session(job: RenderJob) -> Iterator[Session]:
                 attached = any(job.needs)
             finally:
                 if attached or job.scene.is_shared:
-                    run_despite_interrupts(lambda: job.scene.restore(job.options, session.slots))
+                    ensure_restored(lambda: job.scene.restore(job.options, session.slots))
 
 
 @contextmanager
@@ -238,7 +238,7 @@ def _values_at_call(job: RenderJob) -> Iterator[None]:
             put_back(params, job.at_call[0], now)
         yield
     finally:
-        run_despite_interrupts(restore)
+        ensure_restored(restore)
 
 
 # ------------------------------------------------------------------------------------------------------------ renders

@@ -273,7 +273,7 @@ def _group_labels(
     found = []
     for job in jobs:
         job.run(job)
-        found.append(_tensors(job, job.film.take_arrays(), names))
+        found.append(_tensors(job, job.film.release_storage(), names))
     return [reason] * len(jobs), found
 
 

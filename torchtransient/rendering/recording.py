@@ -149,7 +149,7 @@ def _execute_by_recording(session: Any, results: Results, group: Sequence[Number
         results.collect(*group[-1])
         return None
     for (n, item), job, of_film in zip(group, jobs, arrays, strict=True):
-        job.film.put_back_arrays(of_film)
+        job.film.adopt_storage(of_film)
         results.collect(n, item)
     return None
 
@@ -265,7 +265,7 @@ class Recordings:
             jobs: :class:`~torchtransient.plugins.integrators.job.Prepared` jobs.
 
         Returns:
-            ``RECORDED`` or ``LAUNCHED``, and the arrays of each film for its ``put_back_arrays``; none in reverse mode.
+            ``RECORDED`` or ``LAUNCHED``, and the arrays of each film for its ``adopt_storage``; none in reverse mode.
 
         Raises:
             NotRecordedError: for jobs to be traced: the first ones of a structure, and those that cannot be recorded.
@@ -424,7 +424,7 @@ class Recording:
             results = []
             for job in self._jobs:
                 job.integrator.run(job)
-                results.append([] if job.kind == BACKWARD else job.film.take_arrays())
+                results.append([] if job.kind == BACKWARD else job.film.release_storage())
             return results
 
         return dr.freeze(call, limit=MAX_RECORDINGS, warn_after=2**31 - 1)

@@ -17,7 +17,7 @@ from typing import Any
 from torchtransient.checks import flag, mapping
 from torchtransient.errors import ArgumentError, GradientError, SceneError, TorchTransientError
 from torchtransient.plugins import kind_of, modules_of_others, register_module
-from torchtransient.plugins.guards import run_despite_interrupts
+from torchtransient.plugins.guards import ensure_restored
 from torchtransient.scene.build import BuiltScene, build
 from torchtransient.scene.description import SceneDescription, describe_dict, describe_xml, same_description
 from torchtransient.scene.edits import BuildOptions
@@ -128,7 +128,7 @@ class Scene:
             try:
                 written = write_scene(description, self.variant, slots, given, draft, folder)
             finally:
-                run_despite_interrupts(lambda: self.restore(options, slots))
+                ensure_restored(lambda: self.restore(options, slots))
             again = load(draft, variant=self.variant)
             try:
                 built = again.built(again._save_options(given))

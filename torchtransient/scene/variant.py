@@ -29,7 +29,7 @@ from torchtransient.errors import (
     level_of_user,
 )
 from torchtransient.plugins.drjit_pool import check_process, engine_lock
-from torchtransient.plugins.guards import chain_of, interrupt_behind, interrupts_wait, run_despite_interrupts
+from torchtransient.plugins.guards import chain_of, interrupt_behind, interrupts_wait, ensure_restored
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 
@@ -92,7 +92,7 @@ def quiet() -> Iterator[None]:
     try:
         yield
     finally:
-        run_despite_interrupts(lambda: mi.logger().set_log_level(before))
+        ensure_restored(lambda: mi.logger().set_log_level(before))
 
 
 def is_differentiable(variant: str | None) -> bool:
@@ -169,7 +169,7 @@ def active_variant(variant: str) -> Iterator[None]:
                 take_over(device_type(variant))
             yield
         finally:
-            run_despite_interrupts(lambda: _put_back(before))
+            ensure_restored(lambda: _put_back(before))
 
 
 def _put_back(before: str | None) -> None:

@@ -422,8 +422,8 @@ class TimeResolvedFilm(mi.Film):
         """Return the index of the film's first value in its band (``UInt32``), which is added to a base; None for 0."""
         return None if self._lent is None else dr.opaque(mi.UInt32, self._lent[1])
 
-    def take_arrays(self):
-        """Return the arrays of a finished render as :meth:`put_back_arrays` takes them; the film keeps none of them.
+    def release_storage(self):
+        """Return the arrays of a finished render as :meth:`adopt_storage` takes them; the film keeps none of them.
 
         Other arrays of the film stay: Dr.Jit writes attributes of plugins back after a recorded call.
         """
@@ -431,8 +431,8 @@ class TimeResolvedFilm(mi.Film):
         self.clear()
         return arrays
 
-    def put_back_arrays(self, arrays):
-        """Take arrays of :meth:`take_arrays` as those of a render."""
+    def adopt_storage(self, arrays):
+        """Take arrays of :meth:`release_storage` as those of a render."""
         self.steady, self.outside, *stored = arrays
         self.bands = [(first, rows, flat) for (first, rows), flat in zip(self.band_layout(), stored, strict=True)]
 
