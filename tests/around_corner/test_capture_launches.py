@@ -42,14 +42,14 @@ def covered(found):
 def test_lanes_that_add_up(monkeypatch, busy):
     """As many for a pixel as keep all cores busy, in launches of so many connections."""
     monkeypatch.setattr(launches, "_BUSY", {dr.backend_v(mi.Float): busy})
-    found = launches.launches_of(film_of(), WIDTH * 4, SAMPLES)
+    found = launches.launches_of(film_of(), SAMPLES)
     lanes = [min(max(1, busy // (WIDTH * rows)), SAMPLES) for _, rows in BANDS]
     expected = [(k, first, rows, first, lanes[k], 0, SAMPLES) for k, (first, rows) in enumerate(BANDS)]
     told = [(n.band, n.first_row, n.rows, n.band_first_row, n.spp, n.first, n.last) for n in found]
     assert told == expected and {(n.width, n.most_events, n.lists_events) for n in found} == {(WIDTH, 1, False)}
     assert (covered(found) == 1).all()
     monkeypatch.setattr(launches, "_CONNECTIONS", 15 * 7)
-    found = launches.launches_of(film_of(), WIDTH * 4, SAMPLES)
+    found = launches.launches_of(film_of(), SAMPLES)
     parts = [(n.band, n.first, n.last) for n in found]
     ends = [[*range(0, SAMPLES, size), SAMPLES] for size in (7, 21)]
     assert parts == [(k, *pair) for k in (0, 1) for pair in zip(ends[k], ends[k][1:], strict=False)]
@@ -58,7 +58,7 @@ def test_lanes_that_add_up(monkeypatch, busy):
 
 def test_few_points_have_many_lanes():
     """Some thousands in all, in one launch for a second's work."""
-    found = launches.launches_of(film_of(), WIDTH * 4, 2**16)
+    found = launches.launches_of(film_of(), 2**16)
     assert len(found) == 2 and all(2**11 < n.width * n.rows * n.spp <= 2**13 for n in found)
 
 
@@ -68,7 +68,7 @@ def test_few_points_have_many_lanes():
 ])  # fmt: skip
 def test_lanes_that_list_events(most, spp, rows):
     """Of at most sixteen samples each: all lanes of a row at once where they fit, several rows where these do."""
-    found = launches.launches_of(film_of(most), WIDTH * 4, SAMPLES)
+    found = launches.launches_of(film_of(most), SAMPLES)
     assert [(n.rows, n.spp) for n in found] == [(height, lanes) for height in rows for lanes in spp]
     starts = np.cumsum([0, *rows])[:-1]
     assert [n.first_row for n in found] == [row for row in starts for _ in spp]
@@ -141,7 +141,7 @@ def test_points_of_a_tile_lie_as_far_apart_as_a_scan_is_wide():
     """Neighbouring tiles stand next to each other along a curve."""
     tiles = Tiles(5, 3, 2)
     assert tiles.count == 6 and tiles.numbers.tolist() == [0, 1, 2, 0, 1, 3, 4, 5, 3, 4, 0, 1, 2, 0, 1]
-    assert np.array(tiles.of).tolist() == tiles.numbers.tolist()
+    assert np.array(tiles.tile_of_pixel).tolist() == tiles.numbers.tolist()
     assert np.array(tiles.rank).tolist() == [0, 1, 4, 2, 3, 5]
     one = Tiles(3, 2, 4)
     assert (one.count, one.numbers.tolist(), np.array(one.rank).tolist()) == (1, [0] * 6, [0])

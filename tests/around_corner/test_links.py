@@ -280,7 +280,7 @@ def test_points_of_a_tile_lie_far_apart(width, height, side, tiles):
     for y in range(height):
         for x in range(width):
             assert of[y, x] == (y % down) * across + x % across
-    assert np.array(found.of).tolist() == found.numbers.tolist()
+    assert np.array(found.tile_of_pixel).tolist() == found.numbers.tolist()
     rank = np.array(found.rank)
     assert sorted(rank) == list(range(across * down))
     if (across, down) == (4, 3):  # quarters of the scan come one after the other, within them row by row

@@ -318,7 +318,7 @@ def test_how_points_see_vertices_of_chains(monkeypatch, kind, smooth):
                                         geometric_n=mi.Vector3f(ends.g.T), value=spectrum(ends.value),
                                         length=mi.Float(ends.delay.astype(np.float32))), smooth)  # fmt: skip
     of = np.array([3, 0, 7, 2, 3, 6])
-    light = Local(tiles=Local(count=tiles, of=mi.UInt32(of.astype(np.uint32))), confocal=kind == "confocal",
+    light = Local(tiles=Local(count=tiles, tile_of_pixel=mi.UInt32(of.astype(np.uint32))), confocal=kind == "confocal",
                   job=Local(scene=None))  # fmt: skip
     part = Local(rows=rows, colours=1)
     found = late_light.GroupBlock._visibility(part, light, points_of(ends, slice(0, 6)), vertices, from_laser)

@@ -155,9 +155,9 @@ def test_scans_that_meet_nothing(monkeypatch):
     table = table_of(film=film(bins=2) | {"width": 7, "height": 2})
     assert len(table.reference_points()[0]) == 10 and told == [(1, "laser")]
     told.clear()
-    table.found.t = mi.Float([1.0] * 2 + [dr.inf] * 12)
+    table.hits.t = mi.Float([1.0] * 2 + [dr.inf] * 12)
     assert len(table.reference_points()[0]) == 1 and told == []
-    table.found.t = dr.full(mi.Float, dr.inf, 14)
+    table.hits.t = dr.full(mi.Float, dr.inf, 14)
     assert len(table.reference_points()[0]) == 0 and told == [(10, "sensor")]
 
 
@@ -169,7 +169,7 @@ def test_the_spot_of_a_beam():
     length = np.linalg.norm(way)
     assert spots.length[0] == pytest.approx(length, rel=1e-5)
     np.testing.assert_allclose(np.array(spots.origin).ravel(), [-0.5, 0, 0.25], atol=1e-6)
-    assert np.array(spots.lit().wi)[2, 0] == pytest.approx(0.25 / length, rel=1e-5)
+    assert np.array(spots.lit_interactions().wi)[2, 0] == pytest.approx(0.25 / length, rel=1e-5)
     for legs in (False, True):
         for energy in (False, True):
             points = spots.points(legs, energy=energy)

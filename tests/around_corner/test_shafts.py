@@ -319,7 +319,7 @@ def test_triangles_in_the_plane_of_a_scan_or_of_what_is_hidden(turn):
 def test_when_shafts_are_looked_for(rays, worth):
     """For more than a thousand rays a triangle."""
     scene = scene_of(mesh("a", plate(1, 1, (0, 0, 1))), mi.load_dict({"type": "sphere"}))
-    assert shafts.pays(scene, rays) is worth
+    assert shafts.saves_time(scene, rays) is worth
 
 
 @pytest.mark.slow

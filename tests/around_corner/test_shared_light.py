@@ -26,7 +26,7 @@ def test_rays_that_are_left_out_change_nothing(monkeypatch, kind):
     found = shared_light.spare_rays
     monkeypatch.setattr(shared_light, "spare_rays", lambda *a: shares.append(found(*a)))
     for pays in (True, False):
-        monkeypatch.setattr(shared_light, "pays", lambda scene, rays, p=pays: p)
+        monkeypatch.setattr(shared_light, "saves_time", lambda scene, rays, p=pays: p)
         points = 2 if kind == "exhaustive" else 4
         scene = scan_scene(hidden, kind, film(points, kind=kind), max_depth=3, third_bounce="shared")
         runs.append(captures(scene, 2048, 8))
@@ -95,7 +95,7 @@ def test_variants_whose_paths_are_not_alike(variant):
 def test_rays_that_would_be_traced(monkeypatch):
     """To every scanned point and every spot, but once where these are the same."""
     asked, spared = [], []
-    monkeypatch.setattr(shared_light, "pays", lambda scene, rays: asked.append(rays) or len(asked) != 2)
+    monkeypatch.setattr(shared_light, "saves_time", lambda scene, rays: asked.append(rays) or len(asked) != 2)
     monkeypatch.setattr(shared_light, "spare_rays", lambda *given: spared.append(given))
     points, normals = wall_grid(3)
     sensors, spot = wall_of(points, normals), wall_of(points[:1] + 0.25, normals[:1])
@@ -189,9 +189,9 @@ def test_light_of_a_scan(monkeypatch, kind, legs):
     seen = Local(p=mi.Point3f([0.5, 3.5], 0, [-2, 5]))
     beam = Local(energy_at=lambda wavelengths, active: mi.UnpolarizedSpectrum(3))
     emitter = Local() if kind == "an emitter" else beam
-    spots = Local(emitter=emitter, origin=mi.Point3f(0.5, 0, 1 + (kind == "a beam")), lit=lambda: "lit",
+    spots = Local(emitter=emitter, origin=mi.Point3f(0.5, 0, 1 + (kind == "a beam")), lit_interactions=lambda: "lit",
                   points=lambda legs, energy=True: ("spots", legs, energy))  # fmt: skip
-    table = Local(sensor=Local(origin=origin), spots=spots, seen=lambda: seen)
+    table = Local(sensor=Local(origin=origin), spots=spots, interactions=lambda: seen)
     for same in (True, False):
         monkeypatch.setattr(shared_light, "_same", lambda lit, points, same=same: same)
         for capture in shared_light.CaptureType:

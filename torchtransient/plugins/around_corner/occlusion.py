@@ -28,6 +28,7 @@ from typing import Any, ClassVar
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins.around_corner.late_light import FIRST
 from torchtransient.plugins.around_corner.outline_table import OutlineTable
 from torchtransient.plugins.integrators.job import Pass
 from torchtransient.plugins.polarized import (
@@ -58,17 +59,21 @@ from torchtransient.plugins.transport.walk import first_leg
 BESIDE, BEFORE = 1e-4, 1e-5
 # Cosines under which a surface is seen edge-on.
 EDGE_ON = 1e-4
-BOUNCES = 3
 
 
 class MutualOcclusion:
-    """The boundary term of a job, to be added by ``backward`` or ``forward``.
+    """Boundary term of a job of derivatives in light of three bounces, added by ``backward`` or ``forward``.
 
-    ``integrator``: of the job, for its primary rays; ``edges``: where outlines can be; ``spots``: the connection to the
-    laser's spots; ``jobs``: launches with as many edge samples a pixel and viewpoint as they say. All lanes of a launch
-    are one kernel without a loop, whose memory does not grow with their number.
+    Hidden surfaces scatter by their BSDF's smooth lobes. A launch is one kernel without a loop, whose memory does not
+    grow with the number of lanes.
 
-    Light of three bounces alone; hidden surfaces scatter by their BSDF's smooth lobes.
+    Args:
+        integrator: integrator of the job, which draws primary rays.
+        world: context of the job.
+        sensor, film: sensor and film of the job.
+        edges: edges that can be outlines.
+        spots: connection to the laser's spots.
+        jobs: launches (:class:`~..integrators.job.Pass`), whose ``spp`` are edge samples of a pixel and viewpoint.
     """
 
     can_be_recorded = False
@@ -78,13 +83,13 @@ class MutualOcclusion:
         self.edges, self.spots, self.jobs = edges, spots, jobs
 
     def tables(self) -> list[Any]:
-        """Arrays computed from the scene's parameters."""
+        """Return the attached arrays that were computed from the scene's parameters."""
         return [end for end in self.edges.ends if dr.grad_enabled(end)]
 
     # ------------------------------------------------------------------------------------------ both modes
 
     def backward(self, incoming: Any) -> None:
-        """Accumulate into the attached parameters; ``incoming``: the film's adjoint."""
+        """Add gradients to the attached parameters; ``incoming``: the film's adjoint."""
         for job in self.jobs:
             rays = self._start(job)
             match = self.integrator.channel_match(self.world.contents, self.film, rays)
@@ -100,7 +105,7 @@ class MutualOcclusion:
             dr.eval()
 
     def forward(self) -> None:
-        """Add to the film, along the tangents of the tables and of the scene."""
+        """Add the derivative along the tangents of tables and scene to the film."""
         film = self.film
         for job in self.jobs:
             rays = self._start(job)
@@ -121,7 +126,7 @@ class MutualOcclusion:
             dr.eval(film.bands[job.band][2], film.steady)
 
     def _array(self, rays: Any, pixel: Any) -> Any:
-        """Number of the array of the film that each sample belongs to: of a pixel, or of a pixel and a laser spot."""
+        """Return the number of each sample's array of the film: of a pixel, or of a pixel and a laser spot."""
         return pixel if rays.laser is None else pixel * self.film.laser_count() + rays.laser
 
     def _start(self, job: Pass) -> Any:
@@ -133,8 +138,9 @@ class MutualOcclusion:
     # --------------------------------------------------------------------------------------------- the terms
 
     def _terms(self, rays: Any, pixel: Any, job: Pass) -> list[Local]:
-        """One term for each viewpoint: ``value`` (detached), ``outwards`` (attached), both zero where none is
-        ``active``, and ``opl``.
+        """Return a term for each viewpoint: ``value`` (detached), ``outwards`` (attached), ``opl`` and ``active``.
+
+        Values are zero in lanes that are not active.
         """
         world, ray = self.world, rays.ray
         leg = rays.leg if rays.leg is not None else world.scene.ray_intersect_preliminary(ray, coherent=True)
@@ -158,8 +164,8 @@ class MutualOcclusion:
         return views
 
     def _edge_point(self, pixel: Any, job: Pass) -> Local:
-        """A point of an edge: ``p`` (attached), ``t`` (the edge's direction), ``sides`` (third corners of its faces),
-        ``weight`` (one over the density by length).
+        """Draw a point of an edge: ``p`` (attached), ``t`` (direction of the edge), ``sides`` (third corners of its
+        faces), ``weight`` (one over the density by length).
         """
         lane = dr.arange(mi.UInt32, dr.width(pixel))
         number = lane - lane // dr.opaque(mi.UInt32, job.spp) * dr.opaque(mi.UInt32, job.spp)
@@ -175,7 +181,7 @@ class MutualOcclusion:
         return Local(p=p, t=along / length, sides=sides, weight=length * per_edge)
 
     def _term(self, place: Local, edge: Local, from_spot: bool) -> Local:
-        """The boundary term of one viewpoint."""
+        """Return the boundary term of one viewpoint."""
         scene = self.world.scene
         viewer, Q = (place.lit, place.lit_at) if from_spot else (place.seen, place.seen_at)
         with dr.suspend_grad():
@@ -239,7 +245,7 @@ class MutualOcclusion:
         return sum(dr.select(hit, mi.Float(0), 0.5) for hit in tests)
 
     def _scattered(self, si: Any, into: Any, out: Any, active: Any) -> Any:
-        """Value of the BSDF between the frames of the segments: the ray of direction ``into`` goes on by ``out``."""
+        """Return the BSDF's value for a ray of direction ``into`` that goes on by ``out``, in the segments' frames."""
         si.wi = si.to_local(-into)
         wo = si.to_local(out)
         bsdf = si.bsdf()
@@ -259,13 +265,11 @@ class MutualOcclusion:
 # the last one are found the other way round (:class:`SpotPass`): a path begins at L, past an edge, and is connected to
 # S.
 
-# The fewest bounces of late light.
-FIRST = 4
-
 
 class SpotPass(BoundaryPass):
-    """Boundary pass that draws an edge point seen from the laser's spot, as :class:`VertexPass` does, and follows a
-    path behind it to the scanned point.
+    """Boundary pass from the laser's spot: an edge point, and behind it a path that is connected to the scanned point.
+
+    :class:`VertexPass` does the same from vertices of paths that begin at the sensor.
     """
 
     @staticmethod
@@ -318,8 +322,10 @@ class SpotPass(BoundaryPass):
 
 
 class ScanSampled(Connection):
-    """Connection of a path from the laser's spot to the scanned point; the way from there to the sensor has been
-    counted. As in :class:`LaserSpot`, an event's depth is its number of bounces.
+    """Connection of a path that began at the laser's spot to the scanned point.
+
+    Its length has the way from there to the sensor already. As in :class:`LaserSpot`, an event's depth is its number of
+    bounces.
     """
 
     name = "scan_sampled"
@@ -353,7 +359,7 @@ class ScanSampled(Connection):
 
 
 class LateOutlines(BoundaryTerm):
-    """The boundary term of one job in light of ``FIRST`` and more bounces.
+    """Boundary term of a job of derivatives in light of ``FIRST`` and more bounces.
 
     Args:
         integrator, world, sensor, film, seed, samples: as of :class:`BoundaryTerm`; ``world`` is that of the job.
@@ -375,7 +381,7 @@ class LateOutlines(BoundaryTerm):
         super().__init__(integrator, late, sensor, film, seed, samples, tuple(self.kinds))
 
     def _light_world(self) -> RenderContext:
-        """The world of paths that start at the spot and are connected to the scanned point."""
+        """Return the context of paths that start at the spot and are connected to the scanned point."""
         world = self.world
         scattering = Lambertian() if Lambertian.fits(world.contents) else Surface()
         if self.has_vertex_normals:

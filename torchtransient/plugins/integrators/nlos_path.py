@@ -368,7 +368,8 @@ class TransientNLOSPath(base.TransientIntegrator):
         shared = [self._shared(context, film, seed, samples)] if context.division.third_bounce else []
         if not self.boundary:
             return shared
-        edges = mutual_occlusion(self, context, sensor, film, seed, samples, dr.detach(self._table(context).seen()))
+        scanned = dr.detach(self._table(context).interactions())
+        edges = mutual_occlusion(self, context, sensor, film, seed, samples, scanned)
         late = late_outlines(self, context, sensor, film, seed, samples)
         return shared + [term for term in (edges, late) if term is not None]
 
