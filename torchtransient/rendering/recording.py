@@ -124,8 +124,17 @@ def execute(session: Any, results: Results, group: Sequence[Numbered]) -> None:
         results.install(item, group)
         if reason is None:
             reason = _execute_by_recording(session, results, group)
-        if reason is not None:
-            _trace_each(session, results, group, method, reason)
+        if reason is None:
+            return
+        results.calls += [reason] * len(group)
+        for i, (n, item) in enumerate(group):
+            if i > 0 and results.kind != RENDER:
+                results.install(item, group)
+            if method is None:
+                session.integrator.run(_prepared(session, results, n, item), progress=results.progress(n))
+            else:
+                _call_method(method, session, results, n, item)
+            results.collect(n, item)
 
 
 def _execute_by_recording(session: Any, results: Results, group: Sequence[Numbered]) -> str | None:
@@ -152,19 +161,6 @@ def _execute_by_recording(session: Any, results: Results, group: Sequence[Number
         job.film.adopt_storage(of_film)
         results.collect(n, item)
     return None
-
-
-def _trace_each(session: Any, results: Results, group: Sequence[Numbered], method: Any, reason: str) -> None:
-    """Trace the jobs of a group, by an integrator's own ``method`` if it has one."""
-    results.calls += [reason] * len(group)
-    for i, (n, item) in enumerate(group):
-        if i > 0 and results.kind != RENDER:
-            results.install(item, group)
-        if method is None:
-            session.integrator.run(_prepared(session, results, n, item), progress=results.progress(n))
-        else:
-            _call_method(method, session, results, n, item)
-        results.collect(n, item)
 
 
 def _seed_and_samples(session: Any, results: Results, item: Item) -> tuple[int, int]:
