@@ -14,7 +14,6 @@ from torchtransient.plugins.around_corner.late_light import LateLight
 from torchtransient.plugins.around_corner.launches import ScanJob
 from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
 from torchtransient.plugins.sampling.shared_samples import draw_samples
-from torchtransient.plugins.transport.strategy import Local
 
 VARIANT = "llvm_ad_mono"
 SCENES = {
@@ -121,22 +120,6 @@ def test_bands_of_a_film_hold_what_it_holds(monkeypatch, rows):
 
 def held_by(film):
     return np.array(film.steady), np.concatenate([np.array(values) for _, _, values in film.bands])
-
-
-def test_turns_of_the_loop_end_with_a_block():
-    """What stands behind it in memory is not looked at, nor what pairs that are not wanted would see."""
-    rng = np.random.default_rng(9)
-    seen, lit = rng.uniform(0.1, 1, (12, 3, 2)), rng.uniform(0.1, 1, (12, 2, 2))
-    tables = [mi.Float(each.ravel().astype(np.float32)) for each in (seen, lit)]
-    block = Local(seen=tables[0], lit=tables[1], values=None, size=mi.UInt32(8))
-    pairs = Local(pixel=mi.UInt32([0, 1, 2, 2]), laser=mi.UInt32([1, 0, 1, 0]), sensor_count=mi.UInt32(3),
-                  laser_count=mi.UInt32(2), factor=mi.UnpolarizedSpectrum(mi.Float(2)))  # fmt: skip
-    target = Local(put=lambda state, opl, value, active: (mi.Float(0), mi.Float(0)))
-    kept = {"L": mi.UnpolarizedSpectrum(0), "before": mi.Float(0), "after": mi.Float(0)}
-    wanted = mi.Bool([True, True, True, False])
-    kept = exhaustive.sum_over_block(Local(window=None), block, pairs, target, kept, wanted)
-    expected = 2 * (seen[:8, [0, 1, 2, 2], 0] * lit[:8, [1, 0, 1, 0], 0]).sum(0) * [1, 1, 1, 0]
-    np.testing.assert_allclose(np.array(kept["L"][0]), expected, rtol=1e-5)
 
 
 def test_interpolated_normals_are_not_reciprocal():
