@@ -1,6 +1,5 @@
 """Light in a medium against what is known exactly: moments of the random walk, ballistic and single-scattered light."""
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -8,9 +7,8 @@ import pytest
 from support.marks import long
 from support.media_scenes import film, homogeneous, load, rgb
 from support.runs import T, runs
-from support.walks import RecordedVertex, RecordSink, trace
+from support.walks import recorded_paths
 from torchtransient.accuracy.statistics import z_test
-from torchtransient.plugins.transport.context import Wanted
 
 VARIANT = "llvm_ad_mono"
 
@@ -26,34 +24,8 @@ def radiance_meter(direction, **arguments):
     }  # fmt: skip
 
 
-def vertices(scene, lanes, seed):
-    """Positions (lanes, depth, 3), optical lengths and throughputs (lanes, depth) of the paths that are traced; the
-    ones of a path that has ended are infinitely far in time.
-    """
-    integrator, sensor = scene.integrator(), scene.sensors()[0]
-    contents = integrator.contents(scene, sensor)
-    world = integrator.world(scene, contents, Wanted([], sensor, contents))
-    sampler = sensor.sampler().clone()
-    sampler.seed(seed, lanes)
-    with dr.suspend_grad():
-        ray, _ = sensor.sample_ray(mi.Float(0), mi.Float(0), mi.Point2f(0.5), mi.Point2f(0.5))
-        ray.o, ray.d = [dr.repeat(x, lanes) if dr.width(x) == 1 else x for x in (ray.o, ray.d)]
-        sink = RecordSink()
-        count, store = trace(world, sampler, ray, mi.Float64(0), sink)
-        points, lengths, weights = [], [], []
-        for k in range(integrator.max_depth):
-            there = mi.UInt32(k) < count
-            v = RecordedVertex(sink.layout, store, mi.UInt32(k), there, ray)
-            points.append(v.ray(v.t))
-            lengths.append(dr.select(there, v.τ, dr.inf))
-            weights.append(v.β[0] * v.weight[0])
-        dr.eval(points, lengths, weights)
-    stack = [np.array(p).T for p in points], [np.array(x) for x in lengths], [np.array(x) for x in weights]
-    return [np.stack(x, axis=1) for x in stack]
-
-
 def positions_at(time, points, lengths):
-    """Where the photons of :func:`vertices` are at a time, (lanes, 3)."""
+    """Where the photons of :func:`recorded_paths` are at a time, (lanes, 3)."""
     starts = np.concatenate([np.zeros_like(points[:, :1]), points], axis=1)
     times = np.concatenate([np.zeros_like(lengths[:, :1]), lengths], axis=1)
     k = (times <= time).sum(1) - 1
@@ -70,7 +42,7 @@ def test_moments_of_the_random_walk(g):
     μ_s = 1.3
     objects, sensor = infinite(homogeneous(μ_s, 1.0, g), radiance_meter((0, 0, 1)))
     scene = load(objects, sensor, max_depth=30)
-    points, lengths, _ = vertices(scene, 40_000, seed=3)
+    points, lengths, _ = recorded_paths(scene, 40_000, seed=3)
     length = 1 / (μ_s * (1 - g))
     for time in (0.3, 1.0, 4.0):
         p = positions_at(time, points, lengths)
@@ -85,7 +57,7 @@ def test_energy_falls_with_absorption():
     """The energy in a medium is exp(-mu_a t): throughputs at a time, averaged over all paths."""
     objects, sensor = infinite(homogeneous(1.5, 0.6), radiance_meter((0, 0, 1)))
     scene = load(objects, sensor, max_depth=30)
-    _, lengths, β = vertices(scene, 40_000, seed=5)
+    _, lengths, β = recorded_paths(scene, 40_000, seed=5)
     for time in (0.5, 2.0, 4.0):
         # The throughput on the way to vertex k is what is left after k collisions.
         collisions = (lengths <= time).sum(1)
