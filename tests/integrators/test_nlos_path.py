@@ -9,7 +9,6 @@ import pytest
 from support.marks import long
 from support.nlos_scenes import captures, film, plane, ratio, scan_scene, side, transform, worst_of_blocks
 from torchtransient.errors import SceneError
-from torchtransient.plugins.transport.strategy import Local
 
 VARIANT = "llvm_ad_mono"
 SIGMAS = 4.0
@@ -266,36 +265,6 @@ def test_polarized_light_of_a_glossy_surface():
 
 
 # ------------------------------------------------------------------------------------------------- what walks are of
-
-
-def test_segments_and_guides_of_a_walk():
-    """In vacuum vertices are points of their shapes, but where these are attached along rays alone; hidden area takes
-    nine tenths of the samples at the wall and a quarter beyond, or half of them everywhere.
-    """
-    plain = {"media": None, "instances": None, "detached_hits": None}
-
-    def integrator(laser=True, hidden=True, **settings):
-        settings |= {"nlos_laser_sampling": laser, "nlos_hidden_geometry_sampling": hidden}
-        return mi.load_dict({"type": "transient_nlos_path"} | settings)
-
-    def segment(laser=True, hidden=True, **changes):
-        return integrator(laser, hidden)._segment(Local(**plain | changes)).__name__
-
-    assert [segment(), segment(hidden=False), segment(laser=False)] == ["FoundVacuum", "MaterialVacuum", "Vacuum"]
-    assert [segment(instances=1), segment(detached_hits=1), segment(media=1)] == ["Vacuum", "Vacuum", "Media"]
-    asked, wall = [], object()
-    table = Local(elements=lambda without: asked.append(without))
-    contents = Local(media=None, sensor=Local(get_shape=lambda: wall))
-
-    def guide(contents=contents, **settings):
-        (found,) = integrator(**settings)._guides(contents, table)
-        return found.at_wall, found.share
-
-    assert guide() == (0.9, 0.25) and asked == [[wall]]
-    assert guide(nlos_hidden_geometry_sampling_do_rroulette=True) == (0.5, 0.5)
-    assert guide(Local(media="fog", sensor=Local(get_shape=lambda: None))) == (0.5, 0.5) and asked[-1] == []
-    assert guide(nlos_hidden_geometry_sampling_includes_relay_wall=True) == (0.9, 0.25) and asked[-1] == []
-    assert integrator(hidden=False)._guides(contents, table) == []
 
 
 @pytest.mark.parametrize(("given", "kind"), [

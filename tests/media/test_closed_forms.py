@@ -90,14 +90,38 @@ def test_ballistic_light():
     assert result.passed, str(result)
 
 
-def single_scattering(radius, cosine, μ_s, μ_t, edges):
+def isotropic(cosine):
+    return 1 / (4 * np.pi)
+
+
+def henyey_greenstein(g):
+    return lambda cosine: (1 - g * g) / (4 * np.pi * (1 + g * g - 2 * g * cosine) ** 1.5)
+
+
+def rayleigh(cosine):
+    return 3 / (16 * np.pi) * (1 + cosine**2)
+
+
+PHASES = {
+    "isotropic": ({"type": "isotropic"}, isotropic),
+    "backward": ({"type": "hg", "g": -0.35}, henyey_greenstein(-0.35)),
+    "rayleigh": ({"type": "rayleigh"}, rayleigh),
+    "blend": (
+        {"type": "blendphase", "weight": 0.3, "a": {"type": "hg", "g": 0.6}, "b": {"type": "rayleigh"}},
+        lambda cosine: 0.7 * henyey_greenstein(0.6)(cosine) + 0.3 * rayleigh(cosine),
+    ),
+}
+
+
+def single_scattering(radius, cosine, μ_s, μ_t, edges, phase=isotropic):
     """Radiance per bin of once-scattered light of an isotropic point source of unit intensity at ``radius``, seen from
-    the origin at an angle from the source: the scattering point at distance s gives the length s + d(s).
+    the origin at an angle from the source: the scattering point at distance s gives the length s + d(s). ``phase``: by
+    the cosine of the angle by which light turns.
     """
     s = np.linspace(0, 30, 400_001)
     s = 0.5 * (s[1:] + s[:-1])
     d = np.sqrt(radius**2 + s**2 - 2 * radius * s * cosine)
-    value = μ_s / (4 * np.pi) * np.exp(-μ_t * (s + d)) / d**2 * (30 / 400_000)
+    value = μ_s * phase((radius * cosine - s) / d) * np.exp(-μ_t * (s + d)) / d**2 * (30 / 400_000)
     return np.histogram(s + d, edges, weights=value)[0]
 
 
@@ -119,18 +143,20 @@ def test_single_scattering_formula():
     np.testing.assert_allclose(total, expected, rtol=2e-3)
 
 
-@pytest.mark.parametrize("angle", [0.5, 2.5])
-def test_single_scattering(angle):
+@pytest.mark.parametrize(
+    ("name", "angle"), [("isotropic", 0.5), ("isotropic", 2.5), ("backward", 0.5), ("rayleigh", 2.5), ("blend", 2.5)]
+)
+def test_single_scattering(name, angle):
     radius, μ_s, μ_a = 1.5, 0.7, 0.2
     direction = (np.sin(angle), 0, np.cos(angle))
     sensor = radiance_meter(direction, bins=30, bin_width=0.2)
     light = {"type": "point", "position": [0, 0, radius], "intensity": 1.0}
-    objects, sensor = infinite(homogeneous(μ_s + μ_a, μ_s / (μ_s + μ_a)), sensor, light=light)
+    node, phase = PHASES[name]
+    fog = homogeneous(μ_s + μ_a, μ_s / (μ_s + μ_a)) | {"phase": node}
+    objects, sensor = infinite(fog, sensor, light=light)
     _, transient = runs(load(objects, sensor, max_depth=2), count=10, spp=8192)
-    edges = np.arange(31) * 0.2
-    result = z_test(
-        transient.reshape(10, -1), single_scattering(radius, np.cos(angle), μ_s, μ_s + μ_a, edges), rounding=2e-7
-    )
+    expected = single_scattering(radius, np.cos(angle), μ_s, μ_s + μ_a, np.arange(31) * 0.2, phase)
+    result = z_test(transient.reshape(10, -1), expected, rounding=2e-7)
     assert result.passed, str(result)
     assert result.entries > 15 and result.chi2_z < 4
 

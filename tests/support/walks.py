@@ -13,6 +13,8 @@ Renders, their gradients and errors are the first choice. Each name stands for a
 - what an author of strategies gets wrong: `Guide`, `Surface`;
 - the same numbers by another way: `nail_down`, `no_flat_shortcut`, `limit_records`;
 - moments in the middle of a trace, for interrupts, errors and scenes that are dropped there: `before_each_turn`.
+
+Beside it, `toy_strategies` and `toy_integrators` import what an author of strategies does.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a scene contains is looked up once: one that changes after a render renders as one that has changed before it."""
+"""What a scene contains is looked up once: one that changes after a render renders like one that has changed before."""
 
 from __future__ import annotations
 
