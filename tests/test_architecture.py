@@ -269,8 +269,8 @@ def test_tests_share_through_their_support():
 
 
 def test_tests_take_one_door_to_the_core():
-    """It names few things, each with a reason; what an author of strategies imports, the toys do. Paths that are patched
-    count as imports.
+    """It names few things, each with a reason; what an author of strategies imports, the toys do. Paths that are
+    patched count as imports.
     """
     doors = {"walks.py", "toy_strategies.py", "toy_integrators.py", "test_new_strategies.py", Path(__file__).name}
     core = re.compile(r"plugins\.transport|plugins import transport")
