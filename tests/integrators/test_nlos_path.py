@@ -6,6 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from support.gradient_cases.cases_curves import file_of
 from support.marks import long
 from support.nlos_scenes import captures, film, plane, ratio, scan_scene, side, transform, worst_of_blocks
 from torchtransient.errors import SceneError
@@ -53,6 +54,22 @@ def test_hidden_geometry_sampling_is_unbiased(hidden, kind):
     guided = captures(scan_scene(HIDDEN[hidden](), kind, max_depth=5, **paths), 1024, 8)
     brute = captures(scan_scene(HIDDEN[hidden](), kind, max_depth=5, nlos_hidden_geometry_sampling=False), 4096, 8)
     agree(guided, brute, 0.02)
+
+
+FACES = "v -0.5 -0.5 0.7\nv 0.5 -0.5 1.1\nv 0.5 0.5 1.3\nv -0.2 0.4 0.9\nf 1 3 2\nf 1 4 3\n"
+
+
+def test_hidden_lights_are_found_by_points_that_are_drawn_as_well():
+    """A connection to a light weighs how likely that point is drawn on the hidden area, of which triangle whatever."""
+    lamp = {"type": "obj", "filename": file_of("lamp of two faces.obj", FACES), "face_normals": True,
+            "emitter": {"type": "area", "radiance": 1.0}}  # fmt: skip
+    given = {"laser": {"type": "projector"}, "nlos_laser_sampling": False, "max_depth": 3}
+    axis = film(2, start=0.0, bins=60, width=0.2)
+    guided, brute = (
+        captures(scan_scene({"a": lamp}, "single", axis, nlos_hidden_geometry_sampling=on, **given), 2048, 8)
+        for on in (True, False)
+    )
+    agree(guided, brute, 0.005)
 
 
 @pytest.mark.slow

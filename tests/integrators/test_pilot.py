@@ -95,20 +95,6 @@ def test_more_events_than_there_was_room_for(monkeypatch):
     assert events_of(scene).paths < 40
 
 
-def test_depths_and_roulette_of_a_pilot(monkeypatch):
-    """Paths go as deep as a pilot's, whatever the integrator's depth; its roulette begins at the latest where that of a
-    pilot does.
-    """
-    asked = []
-    world = type(lit_wall().integrator()).world
-    for arguments in ({"max_depth": 2, "rr_depth": 3}, {"max_depth": 9, "rr_depth": 20}):
-        scene = lit_wall(**arguments)
-        monkeypatch.setattr(type(scene.integrator()), "world", lambda self, *a, settings=None: (
-            asked.append((settings.max_depth, settings.rr_depth)) or world(self, *a, settings=settings)))  # fmt: skip
-        events_of(scene)
-    assert asked == [(512, 3), (512, 5)]
-
-
 def test_light_of_one_number_of_bounces_stays_alone():
     mi.set_variant("llvm_ad_mono")
     scene = mi.load_dict(scan_scene({"a": plane()}, "single", filter_bounces=3))

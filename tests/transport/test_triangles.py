@@ -21,14 +21,16 @@ SHEETS = {
 
 
 def sheets():
-    """Meshes side by side, all in view, before a point light."""
-    pose = transform().look_at(origin=[1, 0, 14], target=[1, 0, 0], up=[0, 1, 0])
+    """Meshes side by side under a wall that the camera looks at, lit by a point: light goes by way of both."""
+    pose = transform().look_at(origin=[1, 0, 3], target=[1, 0, 6], up=[0, 1, 0])
+    wall = transform().translate([1, 0, 6]).rotate([0, 1, 0], 180).scale(6)
     grey = {"type": "twosided", "nested": {"type": "diffuse", "reflectance": 0.6}}
     return {
         "type": "scene",
-        "integrator": {"type": "transient_path", "max_depth": 2},
-        "sensor": {"type": "perspective", "fov": 55, "to_world": pose, "film": film(20.0, 60, 0.4, 8)},
-        "light": {"type": "point", "position": [1.5, 0.5, 9.0], "intensity": 300.0},
+        "integrator": {"type": "transient_path", "max_depth": 3},
+        "sensor": {"type": "perspective", "fov": 90, "to_world": pose, "film": film(4.0, 60, 0.5, 8)},
+        "light": {"type": "point", "position": [1.5, 0.5, 4.0], "intensity": 300.0},
+        "wall": {"type": "rectangle", "to_world": wall, "bsdf": grey},
         **{
             name: {"type": "obj", "filename": file_of(f"sheet {name}.obj", text), "face_normals": True, "bsdf": grey}
             for name, text in SHEETS.items()
