@@ -4,6 +4,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+import torchtransient as tt
 from support.marks import long
 from support.media_scenes import film, homogeneous, load, rgb
 from support.runs import T, runs
@@ -184,3 +185,30 @@ def test_furnace(variant):
     steady, _ = runs(connected, count=8, spp=64)
     result = z_test(steady, 1.0, rounding=1e-5)
     assert result.passed, str(result)
+
+
+@pytest.mark.filterwarnings("ignore:the derivative by")  # of shadows, of which a large wall casts none here
+def test_fog_that_a_wall_uncovers():
+    """A black wall that moves away along the line of sight uncovers fog: the derivative of what it scatters is what
+    scatters at the wall.
+    """
+    μ_s, μ_t, distance, lamp = 0.7, 0.9, 2.0, np.array([0.8, 0.0, 1.0])
+    fog = {"type": "ref", "id": "fog"}
+    wall = {"type": "rectangle", "to_world": T().translate([0, 0, distance]).rotate([1, 0, 0], 180).scale(50),
+            "bsdf": {"type": "diffuse", "reflectance": 0.0}, "interior": fog, "exterior": fog}  # fmt: skip
+    light = {"type": "point", "position": lamp.tolist(), "intensity": 1.0}
+    sensor = radiance_meter((0, 0, 1), bins=60, filter="tent")
+    objects, sensor = infinite(homogeneous(μ_t, μ_s / μ_t), sensor, light=light, wall=wall)
+    integrator = {"type": "transient_prbvolpath", "max_depth": 2}
+    scene = tt.load({"type": "scene", "integrator": integrator, "sensor": sensor, **objects}, variant=VARIANT)
+    renderer = tt.TransientRenderer(scene, ["wall.to_world"], spp=8192)
+    slopes = []
+    for seed in range(8):
+        renderer.zero_grad()
+        renderer(seed=seed).steady.sum().backward()
+        slopes.append(float(renderer.values["wall.to_world"].grad[2, 3]))
+    d = np.linalg.norm(lamp - [0, 0, distance])
+    expected = μ_s / (4 * np.pi) * np.exp(-μ_t * (distance + d)) / d**2
+    result = z_test(np.array(slopes), expected)
+    assert result.passed, str(result)
+    assert np.std(slopes) / 8**0.5 < 0.05 * expected
