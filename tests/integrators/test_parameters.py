@@ -101,7 +101,7 @@ def test_max_depth_out_of_range(depth):
 @pytest.mark.slow
 @pytest.mark.parametrize("small_box", ["diffuse", "dielectric"])
 def test_roulette_does_not_change_the_mean(small_box):
-    """In glass the chance goes by the square of the index, and is one at most."""
+    """In glass the chance goes by the square of the index."""
     box = mi.cornell_box()
     box["small-box"]["bsdf"] = {"type": small_box}
     objects = {k: v for k, v in box.items() if k not in ("type", "integrator", "sensor")}
