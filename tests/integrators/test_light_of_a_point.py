@@ -55,9 +55,9 @@ def test_a_far_lamp_that_grows():
             "temporal_filter": "tent"}  # fmt: skip
     key = "lamp.vertex_positions"
     renderer = tt.TransientRenderer(scene(film, wall=wall, lamp=lamp), [key], spp=4096)
-    light = renderer(seed=0).steady.sum()
-    light.backward()
+    out = renderer(seed=0).steady.sum()
+    out.backward()
     away = torch.tensor(corners - corners.mean(0), dtype=torch.float32)
     found = float((renderer.values[key].grad.reshape(3, 3) * away).sum())
-    assert light > 0.01
-    assert found == pytest.approx(2 * float(light), rel=0.01)
+    assert out > 0.01
+    assert found == pytest.approx(2 * out.item(), rel=0.01)
