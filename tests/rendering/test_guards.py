@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.walks import before_each_turn
 from tools.small_room import COLOUR, VARIANT, WALL_POSE, make_room
 from torchtransient.errors import SceneError, ShapeError
 from torchtransient.plugins.drjit_pool import engine_lock
@@ -89,7 +90,7 @@ def test_calls_in_an_except_block_raise_their_own_errors(room_scene, monkeypatch
         raise RuntimeError("a plain mistake")
 
     renderer = tt.TransientRenderer(room_scene, [COLOUR], spp=2, freeze=False)
-    monkeypatch.setattr("torchtransient.plugins.transport.walk.bounce", broken)
+    before_each_turn(monkeypatch, broken)
     try:
         raise handled
     except (KeyboardInterrupt, ValueError):
