@@ -94,29 +94,29 @@ def _visible(si: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def mutual_occlusion(
-    integrator: Any, world: Any, sensor: Any, film: Any, seed: Any, spp: int, scanned: Any
+    integrator: Any, context: Any, sensor: Any, film: Any, seed: Any, spp: int, scanned: Any
 ) -> MutualOcclusion | None:
     """Return the boundary term of a job of derivatives in light of three bounces, None if it is zero or not followed.
 
     Warns of shapes without edges that may hide another one.
 
     Args:
-        integrator, world, sensor, film: integrator and context of the job, its sensor and film.
+        integrator, context, sensor, film: integrator and context of the job, its sensor and film.
         seed: seed of the job.
         spp: samples per pixel of the job, 0 for the sampler's own; there is an edge sample for every ``SHARE`` of them.
         scanned: interactions of the scanned points, detached.
     """
-    wanted = world.wanted
-    if not (wanted.geometry and follows_outlines(type(world.segment), world.contents)):
+    wanted = context.wanted
+    if not (wanted.geometry and follows_outlines(type(context.segment), context.contents)):
         return None
-    if not world.min_depth <= BOUNCES <= world.max_depth:
+    if not context.min_depth <= BOUNCES <= context.max_depth:
         return None
     moves_viewpoints = wanted.sensor or wanted.light
     if not (moves_viewpoints or wanted.shapes):
         return None
-    (spots,) = world.connections
+    (spots,) = context.connections
     viewpoints = Viewpoints(scanned, dr.detach(spots.spots.si), spots.confocal)
-    shapes = list(world.scene.shapes())
+    shapes = list(context.scene.shapes())
     moving = {k for k, shape in enumerate(shapes) if shape.ptr in wanted.shapes}
     moves_viewpoints |= any(registry_number(shapes[k]) in viewpoints.shapes for k in moving)
     parts, triangles = parts_of(shapes)
@@ -137,29 +137,29 @@ def mutual_occlusion(
     count = spp or sampler.sample_count()
     own_seed, _ = mi.sample_tea_32(seed_array(seed), mi.UInt32(_SEED))
     jobs, _ = passes_of(sampler, film, own_seed, max(1, count // SHARE), 2)
-    return MutualOcclusion(integrator, world, sensor, film, edges, spots, jobs)
+    return MutualOcclusion(integrator, context, sensor, film, edges, spots, jobs)
 
 
-def late_outlines(integrator: Any, world: Any, sensor: Any, film: Any, seed: Any, spp: int) -> LateOutlines | None:
+def late_outlines(integrator: Any, context: Any, sensor: Any, film: Any, seed: Any, spp: int) -> LateOutlines | None:
     """Return the boundary term of light of more than three bounces; arguments as of :func:`mutual_occlusion`.
 
     None if there is no such light, if nothing moves, or if the hidden scene is one body that cannot hide a part of
     itself.
     """
-    wanted = world.wanted
-    if not (wanted.geometry and follows_outlines(type(world.segment), world.contents)) or mi.is_polarized:
+    wanted = context.wanted
+    if not (wanted.geometry and follows_outlines(type(context.segment), context.contents)) or mi.is_polarized:
         return None
-    if world.max_depth < FIRST or not (wanted.sensor or wanted.light or wanted.shapes):
+    if context.max_depth < FIRST or not (wanted.sensor or wanted.light or wanted.shapes):
         return None
-    (spots,) = world.connections
+    (spots,) = context.connections
     wall = {shape.ptr for shape in spots.table.wall or ()}
-    hidden = [shape for shape in world.scene.shapes() if shape.ptr not in wall]
+    hidden = [shape for shape in context.scene.shapes() if shape.ptr not in wall]
     if wall and len(hidden) < 2:
         parts, _ = parts_of(hidden)
         if len(parts) < 2 and not any(part.hides_itself for part in parts):
             return None
     count = spp or sensor.sampler().sample_count()
-    return LateOutlines(integrator, world, sensor, film, seed, max(1, count // SHARE))
+    return LateOutlines(integrator, context, sensor, film, seed, max(1, count // SHARE))
 
 
 def _names(shapes: list[Any], parts: list[Part], pairs: list[tuple[int, int]]) -> str:

@@ -202,17 +202,17 @@ def _same(spots: Any, points: Any) -> bool:
     return bool(dr.all(near & (spots.wi.z * points.wi.z > 0) & spots.is_valid() & points.is_valid()))
 
 
-def moves(world: Any, shapes: list[Any]) -> bool:
+def moves(context: Any, shapes: list[Any]) -> bool:
     """Return whether derivatives are requested by parameters of ``shapes``, or of plugins inside them."""
     held = {node.ptr for shape in shapes for node in [shape, *objects_below(shape, mi.Object)]}
-    return bool(held & world.wanted.nodes)
+    return bool(held & context.wanted.nodes)
 
 
-def moves_scan(world: Any, hidden: list[Any]) -> bool:
+def moves_scan(context: Any, hidden: list[Any]) -> bool:
     """Return whether derivatives are requested by other parameters than those of ``hidden``: wall, sensor, laser."""
-    others = [shape for shape in world.scene.shapes() if shape.ptr not in {one.ptr for one in hidden}]
+    others = [shape for shape in context.scene.shapes() if shape.ptr not in {one.ptr for one in hidden}]
     held = {node.ptr for shape in hidden for node in [shape, *objects_below(shape, mi.Object)]}
-    return bool(world.wanted.nodes - held) or moves(world, others)
+    return bool(context.wanted.nodes - held) or moves(context, others)
 
 
 def _rows(vectors: Any, width: int) -> np.ndarray:
@@ -240,7 +240,7 @@ class SharedThirdBounce:
     """Light of three bounces of one job from shared samples: its render, or its derivatives (confocal and single).
 
     Args:
-        world: context of the job.
+        context: context of the job.
         film: film of the job.
         light: wall points of the capture, attached where the scene is.
         elements: table of the hidden elements.
@@ -252,35 +252,35 @@ class SharedThirdBounce:
 
     def __init__(
         self,
-        world: Any,
+        context: Any,
         film: Any,
         light: ScanLight,
         elements: HiddenElements,
         capture: CaptureType,
         draw: tuple[Any, int],
     ) -> None:
-        self.world, self.film, self.light, self.capture = world, film, light, capture
+        self.context, self.film, self.light, self.capture = context, film, light, capture
         self.tile = None
-        if world.wanted is None and capture is not CaptureType.EXHAUSTIVE:
+        if context.wanted is None and capture is not CaptureType.EXHAUSTIVE:
             elements = self._near(elements)
         self._spare_rays(elements, draw[1] * elements.tile_count)
         self.samples = draw_samples(elements, draw[1], draw[0])
         self.gradients = None
-        if world.wanted is not None:
+        if context.wanted is not None:
             laser = None if capture is CaptureType.CONFOCAL else light.spots
             with dr.resume_grad():
-                samples = ends_of_samples(world.scene, elements, self.samples, world.contents.meshes, laser)
+                samples = ends_of_samples(context.scene, elements, self.samples, context.contents.meshes, laser)
                 points = ends_of_points(light.sensors, light.spots, light.energy)
             # Forward mode has to pass by all that is attached, wanted or not.
             self._tables = [ends.fields[n] for ends in (samples, points) for n in ends.fields]
             self._tables += [*vars(light.sensors).values(), *vars(light.spots).values(), light.energy]
-            scan = moves_scan(world, elements.shapes)
+            scan = moves_scan(context, elements.shapes)
             if not scan:
                 points = points.detached()
             # What a single spot lights follows the spot.
-            if not (moves(world, elements.shapes) or (scan and laser is not None)):
+            if not (moves(context, elements.shapes) or (scan and laser is not None)):
                 samples = samples.detached()
-            self.gradients = ThirdBounceGradients(world.scene, film, samples, points, self.samples.clear)
+            self.gradients = ThirdBounceGradients(context.scene, film, samples, points, self.samples.clear)
 
     def _near(self, elements: HiddenElements) -> HiddenElements:
         """Return elements with a density for each tile of the scan, if hidden ones are nearer than half its width."""
@@ -290,7 +290,7 @@ class SharedThirdBounce:
         if tiles.count == 1:
             return elements
         self.tile = tiles.tile_per_point()
-        memory = self.world.contents.memory
+        memory = self.context.contents.memory
         return copy(HiddenElements.cached(memory, elements.shapes, tiles.points, tiles.normals))
 
     def _spare_rays(self, elements: HiddenElements, samples: int) -> None:
@@ -298,14 +298,15 @@ class SharedThirdBounce:
         points = (
             [self.light.sensors] if self.light.spots is self.light.sensors else [self.light.sensors, self.light.spots]
         )
-        if saves_time(self.world.scene, samples * sum(each.width for each in points)):
+        if saves_time(self.context.scene, samples * sum(each.width for each in points)):
             p, n = (np.concatenate([_rows(getattr(each, name), each.width) for each in points]) for name in "pn")
-            spare_rays(self.world.scene, elements, p, n)
+            spare_rays(self.context.scene, elements, p, n)
 
     def add(self, progress: Any = None) -> None:
         """Add the light to the film."""
         light = self.light
-        third = ThirdBounce(self.world.scene, self.film, self.samples, light.sensors, light.energy, progress, self.tile)
+        scene = self.context.scene
+        third = ThirdBounce(scene, self.film, self.samples, light.sensors, light.energy, progress, self.tile)
         if self.capture is CaptureType.CONFOCAL:
             third.add_confocal(self.light.spots)
         elif self.capture is CaptureType.SINGLE:

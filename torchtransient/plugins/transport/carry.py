@@ -19,13 +19,13 @@ class Carry:
     """Differentiable state of a path. A dataclass: its adjoint and tangent are loop state. Copied, never changed."""
 
     β: Any      # Spectrum    throughput; its adjoint is the light beyond, weighed by the film's adjoint
-    slope: Any  # Float       zero with the derivative of the optical path length so far
+    slope: Any  # Float       value 0, derivative that of the optical path length so far
     η: Any      # Float       index of refraction along the ray
-    o: Any      # Point3f     ray origin, attached behind delta lobes and sensors
-    d: Any      # Vector3f    ray direction, likewise
+    o: Any      # Point3f     ray origin behind delta lobes and sensors, else zero with the sideways shift of the ray
+    d: Any      # Vector3f    ray direction behind delta lobes and sensors
     x: Any      # Point3f     start of the segment, where its transmittance matters
     w: Any      # Vector3f    direction at the far end of the segment, for ``si.wi`` there
-    p: Any      # Point3f     far end of the segment, where segments say where their ends are
+    p: Any      # Point3f     far end of the segment, where a segment strategy places it (``material_points``)
     n: Any      # Normal3f    normal there, likewise
 
     @staticmethod
@@ -85,5 +85,5 @@ def choose(mask: Any, a: Carry, b: Carry, names: Sequence[str]) -> Carry:
 
 
 def slope_only(x: Any) -> Any:
-    """Return zero with the derivative of ``x``."""
+    """Return a number whose value is 0 and whose derivative is that of ``x``."""
     return dr.replace_grad(mi.Float(0), x)

@@ -429,7 +429,8 @@ class Connection(Strategy):
 
     # All light comes from emitters of the scene, whose bounding box limits the remaining path length.
     light_of_scene_alone = False
-    # The last vertex of a path, which connects to nothing, can have an event.
+    # The last vertex of a path can have an event: emission that was run into. False of connections that sample lights,
+    # which the vertex before has used up.
     finds_light = True
     # The first vertex has no event, on any path of the job.
     dark_at_first = False

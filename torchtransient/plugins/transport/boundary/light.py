@@ -47,7 +47,7 @@ class LightPass(BoundaryPass):
 
     def run(self, mode, job):
         term = mode.term
-        context, edges, sampler, lit = term.world, term.edges, term.sampler(job), term.light_world
+        context, edges, sampler, lit = term.context, term.edges, term.sampler(job), term.light_context
         k = edges.pick(edges.by_length, sampler.next_1d(), sampler.next_1d())
         numbers = term.places.numbers(sampler)
         middle = term.places.rays_at(context, sampler, term.places.middle(numbers), numbers, total=job.total)
@@ -104,7 +104,7 @@ class LightPass(BoundaryPass):
         decide, once more than in the pass of the sensor. That one sees past the edge either what the light reaches, or
         the shadow: where it is not lit, the edge of the shadow is in view.
         """
-        context, b, ds = term.world, light.b, light.ds
+        context, b, ds = term.context, light.b, light.ds
         scale = BESIDE * (1 + dr.max(dr.abs(b.p)))
         seen, _ = term.places.seen_from(x.at, numbers, active)
         off = dr.norm(dr.cross(b.p - seen.p, mi.Vector3f(seen.d)))
@@ -133,7 +133,7 @@ class LightPass(BoundaryPass):
         ``ds, b, far, Le`` (emission over the density per solid angle at the edge), ``near, u`` (what it was drawn
         from).
         """
-        context = term.world
+        context = term.context
         near = at_point(k.near, ray)
         ds, weight = self.lights.sample(context, near, u, mi.Bool(True))
         far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
@@ -155,8 +155,8 @@ class LightPass(BoundaryPass):
         For x as the first vertex of a path of the sensor, as another one, and as the first one seen through a chain.
         """
         b = light.b
-        context = term.world
-        pi, on_surface = term.light_world.segment.surface_of(path.leg)
+        context = term.context
+        pi, on_surface = term.light_context.segment.surface_of(path.leg)
         surface = active & on_surface & pi.is_valid()
         with dr.suspend_grad():
             seen, _ = term.places.seen_from(x.at, numbers, active)
@@ -203,7 +203,7 @@ class LightPass(BoundaryPass):
 
     def _through_chain(self, term, x, n, pi, ray, surface, active):
         """Return the displacement of x on the ray of the sensor that sees it through a chain."""
-        context, through = term.world, term.through
+        context, through = term.context, term.through
         with dr.suspend_grad():
             seen, rays = through.seen_from(x, active)
         found = active & seen.valid

@@ -38,7 +38,7 @@ class PrimaryPass(BoundaryPass):
 
     def run(self, mode, job):
         term = mode.term
-        context, edges, sampler = term.world, term.edges, term.sampler(job)
+        context, edges, sampler = term.context, term.edges, term.sampler(job)
         numbers = term.places.numbers(sampler)
         k = edges.pick(edges.of_moving, sampler.next_1d(), sampler.next_1d())
         # Along parallel rays the point of view depends on what is seen.

@@ -87,7 +87,7 @@ def both_sides(context, mode, sampler, view, b, past, first, factor, speeds, nee
         # The same random numbers on both sides.
         value = mode.follow(context, sampler.clone(), path, view, dr.select(need, sign * factor, 0), speed)
         if value is not None:
-            in_memory(mode.term.world, None, value)
+            in_memory(mode.term.context, None, value)
             with dr.resume_grad():
                 objective += value * speed
     return objective

@@ -361,7 +361,7 @@ class SpecularPass(BoundaryPass):
 
     def run(self, mode, job):
         term = mode.term
-        context, edges, chains, sampler = term.world, term.edges, term.chains, term.sampler(job)
+        context, edges, chains, sampler = term.context, term.edges, term.chains, term.sampler(job)
         numbers = term.places.numbers(sampler)
         k = edges.pick(edges.by_length if chains.move else edges.of_moving, sampler.next_1d(), sampler.next_1d())
         chain, eye = chains.draw(sampler.next_1d()), term.places.eye(numbers)

@@ -62,8 +62,8 @@ class BoundaryTerm:
         names: passes to run, of ``kinds``.
 
     Attributes:
-        world: ``context``.
-        light_world: :class:`~..context.RenderContext` of paths that start at a light and are connected to the sensor.
+        context: ``context``.
+        light_context: :class:`~..context.RenderContext` of paths that start at a light and are connected to the sensor.
         edges: :class:`~...edges.table.EdgeTable` of the scene.
         places: :class:`~...sensors.seen_from.SensorPlaces`.
         chains: :class:`.specular.Chains` that the sensor sees, None without.
@@ -74,7 +74,7 @@ class BoundaryTerm:
     kinds = PASSES
 
     def __init__(self, integrator, context, sensor, film, seed, samples, names=tuple(PASSES)):
-        self.integrator, self.world, self.sensor, self.film = integrator, context, sensor, film
+        self.integrator, self.context, self.sensor, self.film = integrator, context, sensor, film
         self._sampler = context.contents.memory.get("sampler", b"", lambda: mi.load_dict({"type": "independent"}))
         scene, wanted = context.scene, context.wanted
         views_move = wanted.sensor or wanted.light
@@ -90,7 +90,7 @@ class BoundaryTerm:
         seeds = {name: mi.sample_tea_32(seed_array(seed), mi.UInt32(own))[0] for name, own in _SEEDS.items()}
         self.chains, self.through, self._seed_of_chains = None, None, seeds["chains"]
         with dr.suspend_grad():
-            self.light_world = self._light_world()
+            self.light_context = self._light_context()
         self.passes, self.jobs = {}, {}
         for name in names if topology.count else ():
             if self.kinds[name].exists(context, sensor):
@@ -98,9 +98,9 @@ class BoundaryTerm:
                 own = sensor.sampler().clone()
                 self.jobs[name], _ = passes_of(own, film, seeds[name], samples, context.most_events())
 
-    def _light_world(self):
+    def _light_context(self):
         """Return the context of paths that start at a light and are connected to the sensor."""
-        context, integrator = self.world, self.integrator
+        context, integrator = self.context, self.integrator
         self.places = SensorPlaces(self.sensor, self.film, self.radius)
         self.is_meter = self.places.is_meter
         if sees_chains(context, self.sensor):

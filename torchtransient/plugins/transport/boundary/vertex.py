@@ -47,7 +47,7 @@ class VertexPass(BoundaryPass):
 
     def run(self, mode, job):
         term = mode.term
-        context, edges = term.world, term.edges
+        context, edges = term.context, term.edges
         finds_light = context.finds_light and sees_one_line(term.sensor)
         rays = term.integrator.start(context.scene, context.contents, term.sensor, term.film, job)
         context.start(rays)

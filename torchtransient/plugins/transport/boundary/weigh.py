@@ -41,7 +41,7 @@ class Reverse:
             place: ``row, column, laser`` of the pixels.
         """
         term = self.term
-        match = term.integrator.channel_match(term.world.contents, term.film, rays)
+        match = term.integrator.channel_match(term.context.contents, term.film, rays)
         pixel = dr.fma(place.row, int(term.film.crop_size()[0]), place.column)
         return self.incoming.block(place, pixel, match)
 
@@ -75,7 +75,7 @@ class Reverse:
     def sum_of_pixels(self, state, factors):
         """Return the attached objective, from the state of the sink and the factors."""
         factor, speeds = factors
-        in_memory(self.term.world, None, state)
+        in_memory(self.term.context, None, state)
         with dr.resume_grad():
             names = PixelSums.NAMES[: len(speeds)]
             return sum(finite(state[name] * factor) * speed for name, speed in zip(names, speeds, strict=True))
@@ -129,9 +129,9 @@ class Forward:
     def view(self, rays):
         """Return (film block, map to channels, pixel) of primary rays."""
         term, film = self.term, self.term.film
-        match, (base, pixel) = term.integrator.channel_match(term.world.contents, film, rays), self._indices(rays)
+        match, (base, pixel) = term.integrator.channel_match(term.context.contents, film, rays), self._indices(rays)
         if rays.strata is not None:
-            return film.create_event_block(self.job, base, match, term.world.most_events()), match, pixel
+            return film.create_event_block(self.job, base, match, term.context.most_events()), match, pixel
         # Rays that go anywhere are not in the order of pixels, which some films count on.
         return FilmBlock(film, self.job.band, base, match), match, pixel
 
@@ -190,7 +190,7 @@ class PixelFilmSink(Sink):
         own, share = mode.rows_in_band(row)
         active = event.active & inside & own
         place = Local(row=dr.select(active, row, mode.first), column=column, laser=None)
-        match = term.integrator.channel_match(term.world.contents, film, seen_along(self.middle, event.d))
+        match = term.integrator.channel_match(term.context.contents, film, seen_along(self.middle, event.d))
         base, pixel = mode._indices(place)
         scale = dr.select(event.first, self.scales[event.speed], self.scales[1]) * (weight * share)
         channels = [dr.select(active, c, 0) for c in match.to_channels(event.value * scale)]
