@@ -73,7 +73,7 @@ def bare_pass(maker: Any, recipe: Any) -> Callable[[], None]:
     def call(scene: Any, arrays: list[Any]) -> list[Any]:
         for job in jobs:
             integrator.run(job)
-        return [job.film.taken() for job in jobs]
+        return [job.film.release_storage() for job in jobs]
 
     frozen = dr.freeze(call)
 

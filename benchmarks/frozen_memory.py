@@ -25,7 +25,7 @@ GROWTH_BAR = 0.01
 def recordings_of(scene: Any) -> tuple[int, int]:
     """(structures of calls that a scene remembers, recordings among them)."""
     tables = [each for by_keys in scene.recordings.values() for each in by_keys.values()]
-    found = [recording for table in tables for recording in table._found.values()]
+    found = [recording for table in tables for recording in table._by_structure.values()]
     made = [recording._frozen for recording in found if recording._frozen is not None]
     return len(found), sum(frozen.n_cached_recordings for frozen in made)
 

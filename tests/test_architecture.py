@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 import torchtransient
+from support import walks
 from support.sweeps import together
 from support.syntax import statements, syntax_of
 
@@ -266,6 +267,19 @@ def test_tests_share_through_their_support():
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
             names += [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
             assert not {n.split(".")[0] for n in names} & shared, f"{path.relative_to(TESTS)}:{node.lineno}"
+
+
+def test_tests_take_one_door_to_the_core():
+    """It names few things, each with a reason; what an author of strategies imports, the toys do. Paths that are
+    patched count as imports.
+    """
+    doors = {"walks.py", "toy_strategies.py", "toy_integrators.py", "test_new_strategies.py", Path(__file__).name}
+    core = re.compile(r"plugins\.transport|plugins import transport")
+    for path in TESTS.rglob("*.py"):
+        if path.name not in doors:
+            found = core.search(path.read_text(encoding="utf-8"))
+            assert not found, f"{path.relative_to(TESTS)} names the core; see tests/support/walks.py"
+    assert len(walks.__all__) <= 25
 
 
 def test_every_package_has_a_level():

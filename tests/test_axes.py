@@ -116,10 +116,10 @@ def test_equal_hashable_picklable_frozen():
     [
         ((0.0, 0.0, 5), UnitError, "bin_width_opl > 0"),
         ((0.0, -1.0, 5), UnitError, "bin_width_opl > 0"),
-        ((float("nan"), 1.0, 5), UnitError, "start_opl to be finite"),
-        ((0.0, float("inf"), 5), UnitError, "bin_width_opl to be finite"),
-        (("far", 1.0, 5), UnitError, "start_opl to be one number"),
-        ((torch.zeros(2), 1.0, 5), UnitError, "start_opl to be one number"),
+        ((float("nan"), 1.0, 5), UnitError, "start_opl: expected a finite number"),
+        ((0.0, float("inf"), 5), UnitError, "bin_width_opl: expected a finite number"),
+        (("far", 1.0, 5), UnitError, "start_opl: expected a finite number"),
+        ((torch.zeros(2), 1.0, 5), UnitError, "start_opl: expected a finite number"),
         ((1e9, 1e-9, 5), UnitError, "cannot be told apart"),
         ((0.0, 1e308, 5), UnitError, "cannot be told apart"),
         ((0.0, 1.0, 0), ShapeError, "num_bins >= 1"),
@@ -155,7 +155,7 @@ def test_frequency_axes_are_plain_values():
     [
         ((()), ShapeError, "at least one"),
         ((float("inf"),), UnitError, "finite"),
-        (("a",), UnitError, "one number"),
+        (("a",), UnitError, "a finite number"),
     ],
 )
 def test_frequencies_that_are_refused(arguments, error, message):

@@ -122,7 +122,7 @@ def test_widths_of_bins_in_seconds(width):
 
 def test_one_frequency_needs_no_list():
     assert tt.FrequencyAxis.from_hertz(20e6) == tt.FrequencyAxis.from_hertz([20e6])
-    with pytest.raises(UnitError, match="a frequency to be one number, got 'x'"):
+    with pytest.raises(UnitError, match="a frequency: expected a finite number, got 'x'"):
         tt.FrequencyAxis.from_hertz("x")
 
 

@@ -119,7 +119,7 @@ def test_transform():
     [
         (lambda: Pulse.gaussian(0.0), UnitError, "above 0"),
         (lambda: Pulse.gaussian(float("nan")), UnitError, "finite"),
-        (lambda: Pulse.rectangular("wide"), UnitError, "one number"),
+        (lambda: Pulse.rectangular("wide"), UnitError, "a finite number"),
         (lambda: Pulse.tabulated([0, 1], [1, -1]), UnitError, "background"),
         (lambda: Pulse.tabulated([0, 1], [0, 0]), UnitError, "not all zero"),
         (lambda: Pulse.tabulated([0, 0], [1, 1]), UnitError, "rising"),

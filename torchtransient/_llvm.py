@@ -51,14 +51,14 @@ else:
 
 @dataclass(frozen=True)
 class LLVMLibrary:
-    """A shared library and its version, `(major, ...)`; an unknown version is the empty tuple."""
+    """LLVM shared library: path, and version `(major, ...)`, empty if unknown."""
 
     path: str
     version: tuple[int, ...]
 
     @property
     def is_good(self) -> bool:
-        """True if Dr.Jit can work with it."""
+        """Dr.Jit can work with the library."""
         return bool(self.version) and self.version[0] >= MIN_MAJOR
 
     def __str__(self) -> str:
@@ -117,7 +117,7 @@ def _warn_of_bound() -> None:
 
 
 def _bound_version() -> tuple[int, ...]:
-    """Version of the LLVM that Dr.Jit has bound; empty when it has none."""
+    """Return the version of the LLVM that Dr.Jit has bound, empty without one."""
     import drjit as dr
 
     version = tuple(int(n) for n in dr.detail.llvm_version())
@@ -130,10 +130,10 @@ def users_choice() -> str | None:
 
 
 def ensure_llvm() -> LLVMLibrary:
-    """Return the LLVM that Dr.Jit uses, or raise VariantError that says what is wrong and what to install.
+    """Return the LLVM that Dr.Jit has bound, whoever imported Dr.Jit. Called before an `llvm_*` variant is set.
 
-    Call it before an `llvm_*` variant is set. It asks Dr.Jit what it really bound, so it is right also when Dr.Jit was
-    imported before torchtransient.
+    Raises:
+        VariantError: without a usable LLVM, with what to install.
     """
     version = _bound_version()
     if version and version[0] >= MIN_MAJOR:
@@ -198,7 +198,7 @@ def _search() -> None:
 
 
 def candidates() -> Iterator[str]:
-    """Paths of LLVM shared libraries in the order of preference, each file once; the newest first in one folder."""
+    """Yield paths of LLVM shared libraries in the order of preference, each file once, newest first in a folder."""
     seen: set[str] = set()
     pattern = {"darwin": "libLLVM*.dylib", "win32": "LLVM-C.dll"}.get(sys.platform, "libLLVM*.so*")
     for folder in _folders():
@@ -218,7 +218,7 @@ def _age(path: str) -> tuple[list[int], str]:
 
 
 def _folders() -> Iterator[str]:
-    """Glob patterns of folders: the wheel of this environment, conda, then what distributions use."""
+    """Yield glob patterns of folders: the wheel of this environment, conda, then what distributions use."""
     yield os.path.join(sys.prefix, "lib")
     user_base = os.environ.get("PYTHONUSERBASE") or os.path.join(os.path.expanduser("~"), ".local")
     yield os.path.join(user_base, "lib")

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchtransient import checks
-from torchtransient.checks import Numbers, as_number, as_whole, numbers, shown
+from torchtransient.checks import Numbers, as_whole, finite, numbers, shown
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.units import LATEST_S, SHORTEST_OPL, SPEED_OF_LIGHT, near_seconds, opl_to_seconds, seconds_to_opl
 
@@ -47,8 +47,8 @@ class TimeAxis:
     num_bins: int
 
     def __post_init__(self) -> None:
-        start = _finite(self.start_opl, "start_opl")
-        width = _finite(self.bin_width_opl, "bin_width_opl")
+        start = finite("TimeAxis: start_opl", self.start_opl)
+        width = finite("TimeAxis: bin_width_opl", self.bin_width_opl)
         if width <= 0:
             raise UnitError(f"TimeAxis: expected bin_width_opl > 0 metres, got {width!r}.")
         bins = as_whole(self.num_bins)
@@ -86,7 +86,7 @@ class TimeAxis:
                 make such axes in metres.
             ShapeError: as the class.
         """
-        start, width = _finite(start_s, "start_s"), _finite(bin_width_s, "bin_width_s")
+        start, width = finite("TimeAxis: start_s", start_s), finite("TimeAxis: bin_width_s", bin_width_s)
         near_seconds(width, "bin_width_s", "TimeAxis.from_seconds", limit_s=WIDEST_BIN_S)
         near_seconds(start, "start_s", "TimeAxis.from_seconds", limit_s=LATEST_S)
         return cls(seconds_to_opl(start), seconds_to_opl(width), num_bins)
@@ -184,7 +184,7 @@ class FrequencyAxis:
                 f"got {highest!r}. Hertz? FrequencyAxis.from_hertz takes them."
             )
         object.__setattr__(self, "frequencies", numbers)
-        object.__setattr__(self, "start_opl", _finite(self.start_opl, "start_opl", "FrequencyAxis"))
+        object.__setattr__(self, "start_opl", finite("FrequencyAxis: start_opl", self.start_opl))
 
     @classmethod
     def uniform(cls, first: float, step: float, count: int, *, start_opl: float = 0.0) -> FrequencyAxis:
@@ -198,7 +198,7 @@ class FrequencyAxis:
         Raises:
             UnitError, ShapeError: as the class.
         """
-        low, width = _finite(first, "first", "FrequencyAxis.uniform"), _finite(step, "step", "FrequencyAxis.uniform")
+        low, width = finite("FrequencyAxis.uniform: first", first), finite("FrequencyAxis.uniform: step", step)
         number = checks.count("FrequencyAxis.uniform: count", count, 1, ShapeError, checks.MOST_MADE)
         return cls(tuple(low + k * width for k in range(number)), start_opl)
 
@@ -254,16 +254,7 @@ def _row(given: Any, owner: str) -> tuple[float, ...]:
     plain = given.tolist() if isinstance(given, Tensor) else given
     alone = isinstance(plain, (str, bytes)) or not isinstance(plain, Iterable) or getattr(plain, "ndim", None) == 0
     values = (plain,) if alone else tuple(plain)
-    return tuple(_finite(value, "a frequency", owner) for value in values)
-
-
-def _finite(value: float, name: str, owner: str = "TimeAxis") -> float:
-    number = as_number(value)
-    if number is None:
-        raise UnitError(f"{owner}: expected {name} to be one number, got {shown(value)}.")
-    if not math.isfinite(number):
-        raise UnitError(f"{owner}: expected {name} to be finite, got {number!r}.")
-    return number
+    return tuple(finite(f"{owner}: a frequency", value) for value in values)
 
 
 def fast_length(least: int, multiple: int = 1) -> int:

@@ -1,8 +1,9 @@
 """Checks of arguments: numbers, flags, rows, mappings, functions, names and paths, and values as messages show them.
 
-Each check returns the value or raises a typed error that says what was expected and what came. Numbers are those of
-Python, numpy and torch; truth values, texts and dates are refused, although Python or numpy convert them. Without
-torch, for the command line and the plugins.
+Each check returns the value, or raises a typed error with what was expected and what came. Their common arguments:
+``name`` begins the message ("simulate: tiles"), ``error`` is the type that is raised. Numbers are those of Python,
+numpy and torch; truth values, texts and dates are refused, although Python or numpy convert them. Nothing here imports
+torch: the command line and the plugins use these checks.
 """
 
 from __future__ import annotations
@@ -102,7 +103,18 @@ def shares(name: str, values: Any) -> float | tuple[float, float, float]:
 def count(
     name: str, value: Any, least: int | None = 1, error: type[TorchTransientError] = SceneError, most: int | None = MOST
 ) -> int:
-    """Return ``value`` as an int. Raises ``error`` unless it is whole, from ``least`` to ``most``; None: no bound."""
+    """Return ``value`` as an int; 3.0 is three.
+
+    Args:
+        name: name in the message.
+        value: number of any library.
+        least: smallest value, None for no bound.
+        error: type of the error.
+        most: largest value, None for no bound.
+
+    Raises:
+        error: unless ``value`` is whole and within the bounds.
+    """
     number = as_whole(value)
     if number is None:
         whole = _number(value)
@@ -252,7 +264,7 @@ def _is_truth(value: Any) -> bool:
 def of_class(
     name: str, value: Any, kind: type[Kind], hint: str = "", error: type[TorchTransientError] = ArgumentError
 ) -> Kind:
-    """Return an instance of ``kind``. Raises ``error``, with a ``hint`` at its end."""
+    """Return ``value``, an instance of ``kind``. Raises ``error`` for others; ``hint`` ends its message."""
     if not isinstance(value, kind):
         raise error(f"{name}: expected {with_article(kind.__name__)}, got {shown(value)}{hint}.")
     return value
@@ -261,10 +273,17 @@ def of_class(
 def several(
     name: str, values: Any, what: str, kind: type[Kind] | None = None, error: type[TorchTransientError] = ShapeError
 ) -> list[Kind]:
-    """Return ``values`` as a list, each an instance of ``kind`` if one is given.
+    """Return ``values`` as a list.
 
-    Raises ``error`` for texts, mappings and objects that are not iterable. ``what``: names them in the message,
-    "pixels (row, column)".
+    Args:
+        name: name in the message.
+        values: any iterable but a text and a mapping.
+        what: plural of the values in the message, "pixels (row, column)".
+        kind: class of each value, None for any.
+        error: type of the error.
+
+    Raises:
+        error: for other objects, and for values of another class.
     """
     found = list(one_by_one(name, values, what, error))
     for one in found:
@@ -276,7 +295,7 @@ def several(
 def one_by_one(
     name: str, values: Any, what: str, error: type[TorchTransientError] = ShapeError
 ) -> Iterator[Any]:
-    """Return an iterator as :func:`several` returns a list."""
+    """Return an iterator over ``values``; arguments and errors as of :func:`several`."""
     with contextlib.suppress(TypeError):
         if not isinstance(values, (str, bytes, Mapping)):
             return iter(values)
@@ -284,14 +303,14 @@ def one_by_one(
 
 
 def mapping(name: str, value: Any, what: str, error: type[TorchTransientError] = ArgumentError) -> Mapping[Any, Any]:
-    """Return a mapping. Raises ``error``, with its form in ``what``: "{title: image}"."""
+    """Return ``value``, a mapping. Raises ``error`` for others; ``what`` is its form, "{title: image}"."""
     if not isinstance(value, Mapping):
         raise error(f"{name}: expected a dictionary {what}, got {shown(value)}.")
     return value
 
 
 def function(name: str, value: Any, what: str, error: type[TorchTransientError] = ArgumentError) -> Callable[..., Any]:
-    """Return a callable. Raises ``error``, with its arguments in ``what``: "images (N, 1, H, W)"."""
+    """Return ``value``, a callable. Raises ``error`` for others; ``what`` are its arguments, "images (N, 1, H, W)"."""
     if not callable(value):
         raise error(f"{name}: expected a function of {what}, got {shown(value)}.")
     called: Callable[..., Any] = value
@@ -299,7 +318,7 @@ def function(name: str, value: Any, what: str, error: type[TorchTransientError] 
 
 
 def a_recipe(name: str, value: Any, *methods: str) -> Any:
-    """Return a recipe with ``methods``. Raises ArgumentError, which names the function that reads files of recipes."""
+    """Return ``value``, a recipe with ``methods``. Raises ArgumentError, with the reader of files of recipes."""
     missing = [method for method in methods if isinstance(value, type) or not callable(getattr(value, method, None))]
     if not missing:
         return value
@@ -312,7 +331,7 @@ def a_recipe(name: str, value: Any, *methods: str) -> Any:
 
 
 def by_number(name: str, value: Any) -> Any:
-    """Return a data set or list with samples by number. Raises ArgumentError."""
+    """Return ``value``, a data set or list with samples by number. Raises ArgumentError for others."""
     is_none = isinstance(value, (type, str, bytes)) or getattr(value, "ndim", None) == 0
     if is_none or not hasattr(value, "__len__") or not hasattr(value, "__getitem__"):
         raise ArgumentError(f"{name}: expected a data set of samples by number, got {shown(value)}.")
@@ -320,7 +339,7 @@ def by_number(name: str, value: Any) -> Any:
 
 
 def text(name: str, value: Any, what: str, error: type[TorchTransientError] = ArgumentError) -> str:
-    """Return a text. Raises ``error``, with its meaning in ``what``: "the name of a sampler"."""
+    """Return ``value``, a text. Raises ``error`` for others; ``what`` is its meaning, "the name of a sampler"."""
     if not isinstance(value, str):
         raise error(f"{name}: expected {what}, got {shown(value)}.")
     return value
@@ -335,7 +354,7 @@ def is_one_of(value: Any, names: Collection[str]) -> bool:
 
 
 def some_of(names: Any, letters: int = 240) -> str:
-    """Return names for a message: at most ``letters`` characters of them, and the number of those left out."""
+    """Return names as text for a message, cut to ``letters`` characters, with the number of names left out."""
     names = [name if len(name) <= 60 else f"{name[:57]}..." for name in map(str, names)]
     text = ", ".join(names)
     if len(text) <= letters:
@@ -386,9 +405,15 @@ def short_errors(what: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def arguments_of(name: str, function: Callable[..., Any], given: Collection[str] = ()) -> Iterator[None]:
-    """Report a TypeError about arguments of ``function`` as one of ``name``, which passes its ``**options`` on.
+    """Report a TypeError about arguments of ``function`` as one of a function that passes its ``**options`` on.
 
-    The message lists the arguments of ``function`` but for ``given``, which ``name`` passes itself.
+    Args:
+        name: name of the function that was called.
+        function: function that the options are passed to; the message lists its arguments.
+        given: arguments that the caller does not choose, which are left out of the list.
+
+    Raises:
+        TypeError: in place of that of ``function``.
     """
     try:
         yield
@@ -408,7 +433,11 @@ def arguments_of(name: str, function: Callable[..., Any], given: Collection[str]
 
 
 def path_of(path: Any, what: str) -> Path:
-    """Return ``path`` as a Path. Raises StorageError for names that this file system cannot have."""
+    """Return ``path`` as a Path; ``what`` begins the message.
+
+    Raises:
+        StorageError: for names that this file system cannot have.
+    """
     try:
         found = Path(path)
         os.lstat(found)
@@ -430,7 +459,7 @@ def is_special(path: str | os.PathLike[str]) -> bool:
 
 
 def check_special(path: str | os.PathLike[str], what: str, error: type[TorchTransientError] = StorageError) -> None:
-    """Raise ``error`` for a device, a pipe or a socket; missing files are left to the caller that opens them."""
+    """Raise ``error`` for a device, a pipe or a socket. Missing files pass: opening them fails with its own error."""
     if is_special(path):
         raise error(f"{what}: '{path}' is no file on a disk (a device or a pipe). Give the name of a file.")
 

@@ -129,7 +129,12 @@ def holds(condition: Tensor) -> bool:
     Checks of values are left out inside `torch.func.vmap`, in `torch.compile` (the graph would break), and for
     tensors on "meta".
     """
-    if torch.compiler.is_compiling() or condition.device.type == "meta":
+    return torch.compiler.is_compiling() or is_true(condition)
+
+
+def is_true(condition: Tensor) -> bool:
+    """Return as :func:`holds`, but read the values in `torch.compile` too, which breaks the graph."""
+    if condition.is_meta:
         return True
     try:
         return bool(condition.all())

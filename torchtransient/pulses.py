@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.checks import Numbers, as_number, finite, is_one_of, numbers, of_class, positive, several, shown
+from torchtransient.checks import Numbers, finite, is_one_of, numbers, of_class, positive, several, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.units import LONGEST_PULSE_S, SHORTEST_OPL, near_seconds, seconds_to_opl
 
@@ -58,11 +58,11 @@ class Pulse:
     def __post_init__(self) -> None:
         if not is_one_of(self.kind, KINDS):
             raise ArgumentError(f"Pulse: expected one of {', '.join(KINDS)}, got {shown(self.kind)}.")
-        object.__setattr__(self, "center_opl", _number(self.center_opl, "center_opl"))
+        object.__setattr__(self, "center_opl", finite("Pulse: center_opl", self.center_opl))
         if self.kind == "tabulated":
             self._check_table()
             return
-        width = _number(self.width_opl, "width")
+        width = finite("Pulse: width", self.width_opl)
         if width <= 0:
             raise UnitError(f"Pulse: expected a width above 0 metres, got {width!r}.")
         _check_metres(width)
@@ -256,12 +256,3 @@ def _check_metres(width: float) -> None:
             f"Pulse: expected a width in metres of optical path, at least {SHORTEST_OPL:g} (0.3 fs), got {width!r}. "
             "Seconds? gaussian_s, rectangular_s and tabulated_s take them."
         )
-
-
-def _number(value: Any, name: str) -> float:
-    number = as_number(value)
-    if number is None:
-        raise UnitError(f"Pulse: expected {name} to be one number in metres, got {shown(value)}.")
-    if not math.isfinite(number):
-        raise UnitError(f"Pulse: expected a finite {name}, got {number!r}.")
-    return number

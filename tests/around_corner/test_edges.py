@@ -75,6 +75,16 @@ def test_parts():
     assert [len(np.unique(label[triangles.mesh == m])) for m in (0, 1)] == [6, 1]
 
 
+def test_closed_bodies_that_touch_in_one_place_are_one_part():
+    """Its coordinates may be zeros of either sign."""
+    corners = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1.0]])
+    faces = [[x, y, z] if (x + y + z) % 2 else [y, x, z] for x in (0, 1) for y in (2, 3) for z in (4, 5)]
+    aside = np.array([1, 0, 0])
+    one, other = corners + aside, corners - aside
+    other[0] = [-0.0, -0.0, 0.0]
+    assert len(parts_of([mesh("both", join((one, np.array(faces)), (other, np.array(faces))))])[0]) == 1
+
+
 def pairs(*shapes, points=None):
     """By number of the shape."""
     parts, _ = parts_of(list(shapes))

@@ -14,7 +14,6 @@ from torchtransient.plugins.around_corner.late_light import LateLight
 from torchtransient.plugins.around_corner.launches import ScanJob
 from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
 from torchtransient.plugins.sampling.shared_samples import draw_samples
-from torchtransient.plugins.transport.strategy import Local
 
 VARIANT = "llvm_ad_mono"
 SCENES = {
@@ -81,7 +80,6 @@ def test_reciprocity_is_exact(monkeypatch, name, bins, samples):
     start = type(runs.pairs).start_render
     monkeypatch.setattr(type(runs.pairs), "start_render", lambda film, count: start(film, samples))
     monkeypatch.setattr(exhaustive, "MOST_MIRRORED", 2 * GRID**2 * bins)
-    assert [exhaustive._rows_at_once(*pair) for pair in ((9, bins), (9, 2 * bins), (18, 2 * bins))] == [2, 1, 1]
     steady, cube = runs.exhaustive()
     assert np.array_equal(cube, cube.transpose(1, 0, 2, 3))
     whole_steady, whole = runs.exhaustive(reciprocal=False)
@@ -123,22 +121,6 @@ def held_by(film):
     return np.array(film.steady), np.concatenate([np.array(values) for _, _, values in film.bands])
 
 
-def test_turns_of_the_loop_end_with_a_block():
-    """What stands behind it in memory is not looked at, nor what pairs that are not wanted would see."""
-    rng = np.random.default_rng(9)
-    seen, lit = rng.uniform(0.1, 1, (12, 3, 2)), rng.uniform(0.1, 1, (12, 2, 2))
-    tables = [mi.Float(each.ravel().astype(np.float32)) for each in (seen, lit)]
-    block = Local(seen=tables[0], lit=tables[1], values=None, size=mi.UInt32(8))
-    pairs = Local(pixel=mi.UInt32([0, 1, 2, 2]), laser=mi.UInt32([1, 0, 1, 0]), sensor_count=mi.UInt32(3),
-                  laser_count=mi.UInt32(2), factor=mi.UnpolarizedSpectrum(mi.Float(2)))  # fmt: skip
-    target = Local(put=lambda state, opl, value, active: (mi.Float(0), mi.Float(0)))
-    kept = {"L": mi.UnpolarizedSpectrum(0), "before": mi.Float(0), "after": mi.Float(0)}
-    wanted = mi.Bool([True, True, True, False])
-    kept = exhaustive.sum_over_block(Local(window=None), block, pairs, target, kept, wanted)
-    expected = 2 * (seen[:8, [0, 1, 2, 2], 0] * lit[:8, [1, 0, 1, 0], 0]).sum(0) * [1, 1, 1, 0]
-    np.testing.assert_allclose(np.array(kept["L"][0]), expected, rtol=1e-5)
-
-
 def test_interpolated_normals_are_not_reciprocal():
     runs = Runs(SCENES["smooth"]())
     _, cube = runs.exhaustive()
@@ -151,8 +133,6 @@ def test_blocks_of_samples_add_up(monkeypatch):
     runs = Runs(SCENES["body"]())
     _, cube = runs.exhaustive()
     monkeypatch.setattr(exhaustive, "MOST_BYTES", 8 * GRID**2 * 50)
-    made, block = [], exhaustive.SampleBlock
-    monkeypatch.setattr(exhaustive, "SampleBlock", lambda *a: made.append(a[2:]) or block(*a))
     told = []
     _, parts = captured(
         runs.pairs,
@@ -163,57 +143,6 @@ def test_blocks_of_samples_add_up(monkeypatch):
     parts, bands = parts.reshape(cube.shape), len(runs.pairs.band_layout())
     assert told == pytest.approx([(k + 1) / (3 * bands) for k in range(3 * bands)])
     assert parts == pytest.approx(cube, rel=1e-5, abs=1e-7 * cube.max())
-    # Eight bytes for each sample and point, in whole turns of four; spots of their own are points, too.
-    assert made == [(0, 48), (48, 96), (96, 130)]
-    runs.exhaustive(runs.spots)
-    assert made[3:] == [(k, min(k + 24, 130)) for k in range(0, 130, 24)]
-
-
-@pytest.mark.parametrize("name", ["smooth", "V and plate"])
-def test_how_points_see_samples(name):
-    """Cosines over the squared distance, that of the shading normal towards a spot and that of the surface towards a
-    scanned point, negative at backs, times the root of what one colour scatters; zero where something is in between,
-    but for the first samples, which nothing is said to hide.
-    """
-    shapes = SCENES["smooth"]()
-    if name != "smooth":
-        v, f = folded_plates()
-        f[::2] = f[::2, ::-1]  # every other face shows its back
-        shapes = [mesh("a", (v, f), two_sided=True, back=0.3)]
-    runs = Runs(shapes)
-    if name != "smooth":
-        v, f = plate(0.3, 0.8, (0.1, 0, 0.4))
-        runs.scene = scene_of(*shapes, mesh("sheet", (v, f)))
-        runs.samples.clear = mi.UInt32(13)
-    runs.pairs.start_render(1)
-    block = exhaustive.SampleBlock(runs.job(runs.pairs), runs.spots, 7, 25)
-    s, some = runs.samples, slice(7, 25)
-    p, n = np.array(s.p)[:, some].T, np.array(s.n)[:, some].T
-    surface = np.array(s.geometric_n)[:, some].T if s.smooth else n
-    to = wall_grid(GRID, 0.4)[0][None] - p[:, None]
-    r = np.linalg.norm(to, axis=2)
-    cos, across = ((to * each[:, None]).sum(2) / r for each in (n, surface))
-    front, back, weight = (np.array(each).reshape(-1)[some, None] for each in (s.front, s.back, s.weight))
-    side = np.where(cos > 0, front, back)
-    sees = side > 0
-    if name != "smooth":
-        at = wall_grid(GRID, 0.4)[0] + (p[:, None] - wall_grid(GRID, 0.4)[0]) * (0.4 / p[:, 2])[:, None, None]
-        behind = (np.abs(at[..., 0] - 0.1) < 0.15) & (np.abs(at[..., 1]) < 0.4) & (p[:, 2] > 0.4)[:, None]
-        behind[:6] = False
-        sees &= ~behind
-        assert behind[6].any() and (cos[sees] < 0).any() and (cos[sees] > 0).any()
-    assert block.rows == 20 and block.count == 18 and block.values is None
-    for table, one in ((block.seen, across), (block.lit, cos)):
-        found = np.array(table).reshape(20, GRID**2, 2)
-        assert not found[18:].any()
-        expected = np.abs(one) * p[:, None, 2] / r**3 * np.sqrt(side * weight) * np.sign(cos)
-        np.testing.assert_allclose(found[:18, :, 1], r, rtol=1e-5)
-        if name == "smooth":  # a convex body hides what its surface turns away
-            sees = (side > 0) & (across > 0)
-        there = found[:18, :, 0] != 0
-        np.testing.assert_allclose(found[:18, :, 0][there], expected[there], rtol=2e-4)
-        assert not (there & ~sees).any() and (there == sees).mean() > (0.99 if name == "smooth" else 0.8)
-        assert 10 < there.sum() < there.size
 
 
 @pytest.mark.parametrize(("name", "window"), [("body", (1.0, 60)), ("body", (2.2, 3)), ("sheet across", (1.0, 60))])

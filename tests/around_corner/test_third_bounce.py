@@ -6,12 +6,8 @@ import pytest
 
 from support.hidden_shapes import ball, folded_plates, join, mannequin, mesh, plate, scene_of, wall_grid
 from support.marks import long_pairs
-from support.third_bounce_runs import WALL_ALBEDO, BruteForce, captured, confocal, film_of, single, table_of, wall_of
-from torchtransient.plugins.around_corner import launches
-from torchtransient.plugins.around_corner.third_bounce import ThirdBounce, _clear
-from torchtransient.plugins.sampling.hidden_elements import HiddenElements
+from support.third_bounce_runs import WALL_ALBEDO, BruteForce, confocal, film_of, single, table_of
 from torchtransient.plugins.sampling.shared_samples import draw_samples
-from torchtransient.plugins.transport.strategy import Local
 
 VARIANT = "llvm_ad_mono"
 UP = (0.0, 0.0, 1.0)
@@ -185,45 +181,3 @@ def unoccluded(shape, points, normals):
         g = np.maximum((n * d).sum(1), 0) * np.maximum(-d @ m, 0) / r**4
         total.append((f * g * g).sum() * (WALL_ALBEDO / np.pi) ** 2)
     return np.array(total)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("busy", [1, 64])
-@pytest.mark.parametrize("kind", ["confocal", "single"])
-def test_the_first_samples_are_taken_without_rays(monkeypatch, kind, busy):
-    """Behind a sheet, of those alone there is light: of so many of each tile."""
-    monkeypatch.setattr(launches, "_BUSY", dict.fromkeys(launches._BUSY, busy))
-    hidden = mesh("a", plate(0.5, 0.4, (0.1, 0, 1)))
-    scene = scene_of(hidden, mesh("sheet", plate(5, 5, (0, 0, 0.5)), 0.0))
-    points, normals = wall_grid(2)
-    table = HiddenElements([hidden], np.stack([points[:2], points[2:]]), np.stack([normals[:2]] * 2))
-    samples, film, sensors = draw_samples(table, 11, 3), film_of(2, 2), wall_of(points, normals)
-    samples.has_clear, samples.clear, samples.region = True, mi.UInt32([3, 8]), Local(holds=lambda p: True)
-    tile = np.array([0, 1, 1, 0])
-
-    def add():
-        job = ThirdBounce(scene, film, samples, sensors, tile=mi.UInt32(tile.astype(np.uint32)))
-        job.add_confocal() if kind == "confocal" else job.add_single(wall_of(points[1:2], normals[1:2]))
-
-    steady, cube = captured(film, add)
-    p, n, weight = (np.array(each, dtype=float).T for each in (samples.p, samples.n, samples.weight))
-    value = np.array(samples.front)[0] * weight * (WALL_ALBEDO / np.pi) ** 2
-    expected = np.zeros(4)
-    for i in range(4):
-        some = slice(11 * tile[i], 11 * tile[i] + (3, 8)[tile[i]])
-        light = value[some]
-        for end in (points[i], points[i] if kind == "confocal" else points[1]):
-            d = end - p[some]
-            r = np.linalg.norm(d, axis=1)
-            light = light * (d * n[some]).sum(1) / r * p[some, 2] / r / r**2
-        expected[i] = light.sum()
-    assert len(p) == 22
-    np.testing.assert_allclose(steady.ravel(), expected, rtol=1e-4)
-    np.testing.assert_allclose(cube.reshape(4, -1).sum(1), expected, rtol=1e-4)
-
-
-def test_samples_that_need_no_rays():
-    """The first ones of each tile, as many as it says."""
-    samples = Local(count=4, tiles=3, clear=mi.UInt32([0, 3, 4]))
-    assert np.array(_clear(samples)).reshape(3, 4).sum(1).tolist() == [0, 3, 4]
-    assert np.array(_clear(samples)).tolist() == [False] * 4 + [True] * 3 + [False] + [True] * 4

@@ -185,7 +185,7 @@ def test_a_file_that_is_there_stays_unless_it_is_asked_for(tmp_path):
 def test_settings_of_captures():
     capture = made(grids()["confocal"])
     for change, error, words in (
-        ({"scan": None}, ArgumentError, "expected scan as a Scan, got None"),
+        ({"scan": None}, ArgumentError, "scan: expected a Scan, got None"),
         ({"axis": (0.0, 0.1, 7)}, ArgumentError, "expected axis as a TimeAxis or None"),
         ({"frequencies": capture.axis}, ArgumentError, "expected frequencies as a FrequencyAxis or None"),
         ({"channels": ["a"]}, ArgumentError, "expected channels as a tuple of names"),

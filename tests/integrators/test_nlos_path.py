@@ -6,10 +6,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from support.gradient_cases.cases_curves import file_of
 from support.marks import long
 from support.nlos_scenes import captures, film, plane, ratio, scan_scene, side, transform, worst_of_blocks
 from torchtransient.errors import SceneError
-from torchtransient.plugins.transport.strategy import Local
 
 VARIANT = "llvm_ad_mono"
 SIGMAS = 4.0
@@ -54,6 +54,22 @@ def test_hidden_geometry_sampling_is_unbiased(hidden, kind):
     guided = captures(scan_scene(HIDDEN[hidden](), kind, max_depth=5, **paths), 1024, 8)
     brute = captures(scan_scene(HIDDEN[hidden](), kind, max_depth=5, nlos_hidden_geometry_sampling=False), 4096, 8)
     agree(guided, brute, 0.02)
+
+
+FACES = "v -0.5 -0.5 0.7\nv 0.5 -0.5 1.1\nv 0.5 0.5 1.3\nv -0.2 0.4 0.9\nf 1 3 2\nf 1 4 3\n"
+
+
+def test_hidden_lights_are_found_by_points_that_are_drawn_as_well():
+    """A connection to a light weighs how likely that point is drawn on the hidden area, of which triangle whatever."""
+    lamp = {"type": "obj", "filename": file_of("lamp of two faces.obj", FACES), "face_normals": True,
+            "emitter": {"type": "area", "radiance": 1.0}}  # fmt: skip
+    given = {"laser": {"type": "projector"}, "nlos_laser_sampling": False, "max_depth": 3}
+    axis = film(2, start=0.0, bins=60, width=0.2)
+    guided, brute = (
+        captures(scan_scene({"a": lamp}, "single", axis, nlos_hidden_geometry_sampling=on, **given), 2048, 8)
+        for on in (True, False)
+    )
+    agree(guided, brute, 0.005)
 
 
 @pytest.mark.slow
@@ -266,36 +282,6 @@ def test_polarized_light_of_a_glossy_surface():
 
 
 # ------------------------------------------------------------------------------------------------- what walks are of
-
-
-def test_segments_and_guides_of_a_walk():
-    """In vacuum vertices are points of their shapes, but where these are attached along rays alone; hidden area takes
-    nine tenths of the samples at the wall and a quarter beyond, or half of them everywhere.
-    """
-    plain = {"media": None, "instances": None, "detached_hits": None}
-
-    def integrator(laser=True, hidden=True, **settings):
-        settings |= {"nlos_laser_sampling": laser, "nlos_hidden_geometry_sampling": hidden}
-        return mi.load_dict({"type": "transient_nlos_path"} | settings)
-
-    def segment(laser=True, hidden=True, **changes):
-        return integrator(laser, hidden)._segment(Local(**plain | changes)).__name__
-
-    assert [segment(), segment(hidden=False), segment(laser=False)] == ["FoundVacuum", "MaterialVacuum", "Vacuum"]
-    assert [segment(instances=1), segment(detached_hits=1), segment(media=1)] == ["Vacuum", "Vacuum", "Media"]
-    asked, wall = [], object()
-    table = Local(elements=lambda without: asked.append(without))
-    contents = Local(media=None, sensor=Local(get_shape=lambda: wall))
-
-    def guide(contents=contents, **settings):
-        (found,) = integrator(**settings)._guides(contents, table)
-        return found.at_wall, found.share
-
-    assert guide() == (0.9, 0.25) and asked == [[wall]]
-    assert guide(nlos_hidden_geometry_sampling_do_rroulette=True) == (0.5, 0.5)
-    assert guide(Local(media="fog", sensor=Local(get_shape=lambda: None))) == (0.5, 0.5) and asked[-1] == []
-    assert guide(nlos_hidden_geometry_sampling_includes_relay_wall=True) == (0.9, 0.25) and asked[-1] == []
-    assert integrator(hidden=False)._guides(contents, table) == []
 
 
 @pytest.mark.parametrize(("given", "kind"), [

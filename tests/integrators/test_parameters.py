@@ -99,8 +99,11 @@ def test_max_depth_out_of_range(depth):
 
 
 @pytest.mark.slow
-def test_roulette_does_not_change_the_mean():
+@pytest.mark.parametrize("small_box", ["diffuse", "dielectric"])
+def test_roulette_does_not_change_the_mean(small_box):
+    """In glass the chance goes by the square of the index."""
     box = mi.cornell_box()
+    box["small-box"]["bsdf"] = {"type": small_box}
     objects = {k: v for k, v in box.items() if k not in ("type", "integrator", "sensor")}
     sensor = camera(fov=39, origin=(0, 0, 3.9), bin_width=0.4, bins=60)
     scenes = [load(sensor, objects, max_depth=12, rr_depth=depth) for depth in (1, 1000)]

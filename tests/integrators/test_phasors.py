@@ -8,7 +8,6 @@ import pytest
 
 from support.plain_scenes import camera, load
 from support.runs import T
-from support.walks import launches
 from torchtransient.accuracy.statistics import two_sample_z_test, z_test
 from torchtransient.plugins.films import phasor_sums
 
@@ -162,10 +161,7 @@ def test_several_launches_and_bands(monkeypatch):
     per_path = 8 * (phasor_sums.EVENT_BYTES + 12)
     for limit in (24 * 10 * per_path, 7 * 16 * per_path):
         monkeypatch.setattr(f"{FILMS}.phasor.MAX_EVENT_BYTES", limit)
-        film = scene.sensors()[0].film()
-        integrator, sensor = scene.integrator(), scene.sensors()[0]
-        world = integrator.world(scene, integrator.contents(scene, sensor))
-        assert len(launches(world, sensor, film, 0, 16)) > 1
+        assert len(scene.integrator().prepared(scene, spp=16).launches) > 1
         several = np.array([render(scene, 30 + seed)[1] for seed in range(12)])
         for part in (np.real, np.imag):
             result = two_sample_z_test(part(one), part(several), rounding=1e-6)

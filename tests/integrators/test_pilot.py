@@ -12,8 +12,7 @@ from support.plain_scenes import camera, load
 from torchtransient.errors import SceneError, VariantError
 from torchtransient.plugins.integrators import pilot
 from torchtransient.plugins.integrators.job import Pass, seed_array
-from torchtransient.plugins.integrators.pilot import pilot_events, pilot_size
-from torchtransient.plugins.transport.strategy import Local
+from torchtransient.plugins.integrators.pilot import pilot_events
 
 VARIANT = "llvm_ad_rgb"
 WALL = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.5, 0.9]}}}
@@ -27,24 +26,6 @@ def lit_wall(intensity=3.0, **arguments):
 
 def events_of(scene, **changes):
     return pilot_events(scene, scene.integrator(), 0, **({"seed": 1, "pixels": 8, "paths": 200} | changes))
-
-
-def test_sizes_of_films_for_a_pilot():
-    """Of the film's proportions, about as many pixels as are asked for, never more than it has nor none."""
-
-    def size(width, height, pixels):
-        return pilot_size(Local(crop_size=lambda: (width, height)), pixels)
-
-    assert [size(6, 4, 6), size(6, 4, 24), size(6, 4, 1000)] == [(3, 2), (6, 4), (6, 4)]
-    assert [size(100, 1, 4), size(2, 300, 6)] == [(20, 1), (1, 30)]
-
-
-def test_energy_of_an_arrival():
-    """The mean of what a spectrum weighs; of the channels where a film has curves."""
-    mi.set_variant(VARIANT)
-    match = Local(weight=mi.Color3f(1, 2, 4), to_channels=lambda value: [10 * value[2], mi.Float(0)])
-    assert pilot._energy(match, mi.Color3f(1, 2, 3), None)[0] == pytest.approx((1 + 4 + 12) / 3)
-    assert pilot._energy(match, mi.Color3f(1, 2, 3), "curves")[0] == pytest.approx(15)
 
 
 def test_arrivals_of_a_lit_wall():
@@ -112,20 +93,6 @@ def test_more_events_than_there_was_room_for(monkeypatch):
     np.testing.assert_array_equal(found.depth[order], expected.depth[other])
     monkeypatch.setattr(pilot, "_MAX_EVENTS", 3 * 40)
     assert events_of(scene).paths < 40
-
-
-def test_depths_and_roulette_of_a_pilot(monkeypatch):
-    """Paths go as deep as a pilot's, whatever the integrator's depth; its roulette begins at the latest where that of a
-    pilot does.
-    """
-    asked = []
-    world = type(lit_wall().integrator()).world
-    for arguments in ({"max_depth": 2, "rr_depth": 3}, {"max_depth": 9, "rr_depth": 20}):
-        scene = lit_wall(**arguments)
-        monkeypatch.setattr(type(scene.integrator()), "world", lambda self, *a, settings=None: (
-            asked.append((settings.max_depth, settings.rr_depth)) or world(self, *a, settings=settings)))  # fmt: skip
-        events_of(scene)
-    assert asked == [(512, 3), (512, 5)]
 
 
 def test_light_of_one_number_of_bounces_stays_alone():

@@ -92,7 +92,7 @@ def test_each_of_a_thousand_lights_is_drawn_often_enough():
     for name, weight in (("drawn", 1.0), ("rare", 1e-4)):
         lights[name] = {"type": "sphere", "emitter": {"type": "area", "sampling_weight": weight}}
     scene = mi.load_dict({"type": "scene", **lights}, optimize=False)
-    draws = np.array(SphereLights.of(scene).read(scene).draws(scene.emitters_dr()))
+    draws = np.array(SphereLights.from_scene(scene).read(scene).draws(scene.emitters_dr()))
     spheres = [light.get_shape() is not None for light in scene.emitters()]
     expected = [light.sampling_weight() == 1 for light in scene.emitters()]
     np.testing.assert_array_equal(draws, np.logical_and(spheres, expected))

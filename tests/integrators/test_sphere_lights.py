@@ -208,7 +208,8 @@ def test_texture_coordinates_of_samples(inside):
     n = 1 << 12
     rng = np.random.default_rng(5)
     u = mi.Point2f(*rng.random((2, n)).astype(np.float32))
-    ds, _, _ = densities(SphereLights.of(scene).read(scene), scene, mi.Point3f(0.1, 0.05, 1.1 if inside else 0.1), u)
+    table, p = SphereLights.from_scene(scene).read(scene), mi.Point3f(0.1, 0.05, 1.1 if inside else 0.1)
+    ds, _, _ = densities(table, scene, p, u)
     si = scene.ray_intersect(mi.Ray3f(ds.p - 0.01 * ds.d, ds.d))
     assert np.array(si.is_valid()).all() and np.abs(np.array(dr.norm(si.p - ds.p))).max() < 1e-5
     off = np.abs(np.array(si.uv - ds.uv))
@@ -219,7 +220,7 @@ def test_texture_coordinates_of_samples(inside):
 @pytest.mark.parametrize(("ratio", "flipped"), [(1e-6, False), (0.99, False), (0.5, True), (1.5, True)])
 def test_densities_agree_and_integrate_to_the_solid_angle(ratio, flipped):
     scene = over_a_plane(lamp(ratio, flip_normals=flipped), {"type": "point", "position": [0, 0, 1], "intensity": 1})
-    table = SphereLights.of(scene).read(scene)
+    table = SphereLights.from_scene(scene).read(scene)
     n = 1 << 18
     x = (dr.arange(mi.Float, n) + 0.5) / n
     turns = 0.61803 * mi.Float(dr.arange(mi.UInt32, n) % 4096)
@@ -295,7 +296,7 @@ def test_small_light_in_fog():
 def test_rows_are_the_same_in_recordings():
     """Where a call is recorded, numbers are written into the table by kernels."""
     scene = over_a_plane(on_its_side(1.0), lamp(0.1, 2.0))
-    lights = SphereLights.of(scene)
+    lights = SphereLights.from_scene(scene)
     plain = lights.read(scene).tables()[0]
     rows = lights.read(scene)._rows
     with dr.scoped_set_flag(dr.JitFlag.FreezingScope, True):
@@ -309,7 +310,7 @@ def test_numbers_of_lights():
     inward = {"type": "sphere", "to_world": turned, "flip_normals": True, "emitter": {"type": "area", "radiance": 1.0}}
     inward["emitter"]["sampling_weight"] = 3.0
     scene = over_a_plane(inward, lamp(0.25, 2.0))
-    rows = np.array([[np.array(x)[0] for x in row] for row in SphereLights.of(scene).read(scene)._rows])
+    rows = np.array([[np.array(x)[0] for x in row] for row in SphereLights.from_scene(scene).read(scene)._rows])
     eps = float(mi.math.RayEpsilon)
     outer = [0, 0, 2, 0.5, 0.25, (0.5 * (1 - eps)) ** 2, 1, 0.25]
     np.testing.assert_allclose(rows, [[0.5, -1, 7, 3, 9, (3 * (1 + eps)) ** 2, -1, 0.75], outer], rtol=3e-6)
@@ -319,7 +320,7 @@ def test_numbers_of_lights():
 def test_no_density_along_the_surface(inside):
     """Neither towards a point that is seen from the side or from behind, nor where there is no way to it."""
     scene = over_a_plane(lamp(0.1, flip_normals=inside))
-    table = SphereLights.of(scene).read(scene)
+    table = SphereLights.from_scene(scene).read(scene)
     ds = dr.zeros(mi.DirectionSample3f, 4)
     ds.d, ds.n = mi.Vector3f(0, 0, 1), mi.Normal3f([1, 0, 0, 0], 0, [0, 1, -1, -1])
     ds.dist, ds.emitter = mi.Float(2.0, 2.0, 0.0, 2.0), scene.emitters_dr()[0]

@@ -11,8 +11,9 @@ import torch
 
 from torchtransient import FrequencyAxis, TimeAxis, losses
 from torchtransient.errors import ShapeError, TorchTransientWarning, UnitError
+from torchtransient.floating import is_true
 from torchtransient.losses import phasors as losses_of_phasors
-from torchtransient.losses.comparison import check_level, holds
+from torchtransient.losses.comparison import check_level
 from torchtransient.losses.dead_time_likelihoods import armed_periods
 from torchtransient.losses.likelihoods import LEAST_MEAN
 from torchtransient.losses.mesh_smoothness import _edges
@@ -185,10 +186,10 @@ def test_what_cannot_be_looked_at_for_another_reason_is_an_error():
 
     condition = Condition()
     condition.words = "vmap: it looks like you are calling .item() on a Tensor"
-    assert holds(condition)
+    assert is_true(condition)
     condition.words = "not enough memory"
     with pytest.raises(RuntimeError, match="not enough memory"):
-        holds(condition)
+        is_true(condition)
 
 
 def test_histograms_of_detectors_that_run_free():

@@ -1,16 +1,15 @@
 """Light in a medium against what is known exactly: moments of the random walk, ballistic and single-scattered light."""
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
+import torchtransient as tt
 from support.marks import long
 from support.media_scenes import film, homogeneous, load, rgb
 from support.runs import T, runs
-from support.walks import RecordedVertex, RecordSink, trace
+from support.walks import recorded_paths
 from torchtransient.accuracy.statistics import z_test
-from torchtransient.plugins.transport.context import Wanted
 
 VARIANT = "llvm_ad_mono"
 
@@ -26,34 +25,8 @@ def radiance_meter(direction, **arguments):
     }  # fmt: skip
 
 
-def vertices(scene, lanes, seed):
-    """Positions (lanes, depth, 3), optical lengths and throughputs (lanes, depth) of the paths that are traced; the
-    ones of a path that has ended are infinitely far in time.
-    """
-    integrator, sensor = scene.integrator(), scene.sensors()[0]
-    contents = integrator.contents(scene, sensor)
-    world = integrator.world(scene, contents, Wanted([], sensor, contents))
-    sampler = sensor.sampler().clone()
-    sampler.seed(seed, lanes)
-    with dr.suspend_grad():
-        ray, _ = sensor.sample_ray(mi.Float(0), mi.Float(0), mi.Point2f(0.5), mi.Point2f(0.5))
-        ray.o, ray.d = [dr.repeat(x, lanes) if dr.width(x) == 1 else x for x in (ray.o, ray.d)]
-        sink = RecordSink()
-        count, store = trace(world, sampler, ray, mi.Float64(0), sink)
-        points, lengths, weights = [], [], []
-        for k in range(integrator.max_depth):
-            there = mi.UInt32(k) < count
-            v = RecordedVertex(sink.layout, store, mi.UInt32(k), there, ray)
-            points.append(v.ray(v.t))
-            lengths.append(dr.select(there, v.τ, dr.inf))
-            weights.append(v.β[0] * v.weight[0])
-        dr.eval(points, lengths, weights)
-    stack = [np.array(p).T for p in points], [np.array(x) for x in lengths], [np.array(x) for x in weights]
-    return [np.stack(x, axis=1) for x in stack]
-
-
 def positions_at(time, points, lengths):
-    """Where the photons of :func:`vertices` are at a time, (lanes, 3)."""
+    """Where the photons of :func:`recorded_paths` are at a time, (lanes, 3)."""
     starts = np.concatenate([np.zeros_like(points[:, :1]), points], axis=1)
     times = np.concatenate([np.zeros_like(lengths[:, :1]), lengths], axis=1)
     k = (times <= time).sum(1) - 1
@@ -70,7 +43,7 @@ def test_moments_of_the_random_walk(g):
     μ_s = 1.3
     objects, sensor = infinite(homogeneous(μ_s, 1.0, g), radiance_meter((0, 0, 1)))
     scene = load(objects, sensor, max_depth=30)
-    points, lengths, _ = vertices(scene, 40_000, seed=3)
+    points, lengths, _ = recorded_paths(scene, 40_000, seed=3)
     length = 1 / (μ_s * (1 - g))
     for time in (0.3, 1.0, 4.0):
         p = positions_at(time, points, lengths)
@@ -85,7 +58,7 @@ def test_energy_falls_with_absorption():
     """The energy in a medium is exp(-mu_a t): throughputs at a time, averaged over all paths."""
     objects, sensor = infinite(homogeneous(1.5, 0.6), radiance_meter((0, 0, 1)))
     scene = load(objects, sensor, max_depth=30)
-    _, lengths, β = vertices(scene, 40_000, seed=5)
+    _, lengths, β = recorded_paths(scene, 40_000, seed=5)
     for time in (0.5, 2.0, 4.0):
         # The throughput on the way to vertex k is what is left after k collisions.
         collisions = (lengths <= time).sum(1)
@@ -118,14 +91,38 @@ def test_ballistic_light():
     assert result.passed, str(result)
 
 
-def single_scattering(radius, cosine, μ_s, μ_t, edges):
+def isotropic(cosine):
+    return 1 / (4 * np.pi)
+
+
+def henyey_greenstein(g):
+    return lambda cosine: (1 - g * g) / (4 * np.pi * (1 + g * g - 2 * g * cosine) ** 1.5)
+
+
+def rayleigh(cosine):
+    return 3 / (16 * np.pi) * (1 + cosine**2)
+
+
+PHASES = {
+    "isotropic": ({"type": "isotropic"}, isotropic),
+    "backward": ({"type": "hg", "g": -0.35}, henyey_greenstein(-0.35)),
+    "rayleigh": ({"type": "rayleigh"}, rayleigh),
+    "blend": (
+        {"type": "blendphase", "weight": 0.3, "a": {"type": "hg", "g": 0.6}, "b": {"type": "rayleigh"}},
+        lambda cosine: 0.7 * henyey_greenstein(0.6)(cosine) + 0.3 * rayleigh(cosine),
+    ),
+}
+
+
+def single_scattering(radius, cosine, μ_s, μ_t, edges, phase=isotropic):
     """Radiance per bin of once-scattered light of an isotropic point source of unit intensity at ``radius``, seen from
-    the origin at an angle from the source: the scattering point at distance s gives the length s + d(s).
+    the origin at an angle from the source: the scattering point at distance s gives the length s + d(s). ``phase``: by
+    the cosine of the angle by which light turns.
     """
     s = np.linspace(0, 30, 400_001)
     s = 0.5 * (s[1:] + s[:-1])
     d = np.sqrt(radius**2 + s**2 - 2 * radius * s * cosine)
-    value = μ_s / (4 * np.pi) * np.exp(-μ_t * (s + d)) / d**2 * (30 / 400_000)
+    value = μ_s * phase((radius * cosine - s) / d) * np.exp(-μ_t * (s + d)) / d**2 * (30 / 400_000)
     return np.histogram(s + d, edges, weights=value)[0]
 
 
@@ -147,18 +144,20 @@ def test_single_scattering_formula():
     np.testing.assert_allclose(total, expected, rtol=2e-3)
 
 
-@pytest.mark.parametrize("angle", [0.5, 2.5])
-def test_single_scattering(angle):
+@pytest.mark.parametrize(
+    ("name", "angle"), [("isotropic", 0.5), ("isotropic", 2.5), ("backward", 0.5), ("rayleigh", 2.5), ("blend", 2.5)]
+)
+def test_single_scattering(name, angle):
     radius, μ_s, μ_a = 1.5, 0.7, 0.2
     direction = (np.sin(angle), 0, np.cos(angle))
     sensor = radiance_meter(direction, bins=30, bin_width=0.2)
     light = {"type": "point", "position": [0, 0, radius], "intensity": 1.0}
-    objects, sensor = infinite(homogeneous(μ_s + μ_a, μ_s / (μ_s + μ_a)), sensor, light=light)
+    node, phase = PHASES[name]
+    fog = homogeneous(μ_s + μ_a, μ_s / (μ_s + μ_a)) | {"phase": node}
+    objects, sensor = infinite(fog, sensor, light=light)
     _, transient = runs(load(objects, sensor, max_depth=2), count=10, spp=8192)
-    edges = np.arange(31) * 0.2
-    result = z_test(
-        transient.reshape(10, -1), single_scattering(radius, np.cos(angle), μ_s, μ_s + μ_a, edges), rounding=2e-7
-    )
+    expected = single_scattering(radius, np.cos(angle), μ_s, μ_s + μ_a, np.arange(31) * 0.2, phase)
+    result = z_test(transient.reshape(10, -1), expected, rounding=2e-7)
     assert result.passed, str(result)
     assert result.entries > 15 and result.chi2_z < 4
 
@@ -186,3 +185,30 @@ def test_furnace(variant):
     steady, _ = runs(connected, count=8, spp=64)
     result = z_test(steady, 1.0, rounding=1e-5)
     assert result.passed, str(result)
+
+
+@pytest.mark.filterwarnings("ignore:the derivative by")  # of shadows, of which a large wall casts none here
+def test_fog_that_a_wall_uncovers():
+    """A black wall that moves away along the line of sight uncovers fog: the derivative of what it scatters is what
+    scatters at the wall.
+    """
+    μ_s, μ_t, distance, lamp = 0.7, 0.9, 2.0, np.array([0.8, 0.0, 1.0])
+    fog = {"type": "ref", "id": "fog"}
+    wall = {"type": "rectangle", "to_world": T().translate([0, 0, distance]).rotate([1, 0, 0], 180).scale(50),
+            "bsdf": {"type": "diffuse", "reflectance": 0.0}, "interior": fog, "exterior": fog}  # fmt: skip
+    light = {"type": "point", "position": lamp.tolist(), "intensity": 1.0}
+    sensor = radiance_meter((0, 0, 1), bins=60, filter="tent")
+    objects, sensor = infinite(homogeneous(μ_t, μ_s / μ_t), sensor, light=light, wall=wall)
+    integrator = {"type": "transient_prbvolpath", "max_depth": 2}
+    scene = tt.load({"type": "scene", "integrator": integrator, "sensor": sensor, **objects}, variant=VARIANT)
+    renderer = tt.TransientRenderer(scene, ["wall.to_world"], spp=8192)
+    slopes = []
+    for seed in range(8):
+        renderer.zero_grad()
+        renderer(seed=seed).steady.sum().backward()
+        slopes.append(float(renderer.values["wall.to_world"].grad[2, 3]))
+    d = np.linalg.norm(lamp - [0, 0, distance])
+    expected = μ_s / (4 * np.pi) * np.exp(-μ_t * (distance + d)) / d**2
+    result = z_test(np.array(slopes), expected)
+    assert result.passed, str(result)
+    assert np.std(slopes) / 8**0.5 < 0.05 * expected

@@ -1,14 +1,11 @@
 """Optical lengths in media: null collisions, boundaries and indices of refraction."""
 
-import mitsuba as mi
 import numpy as np
 import pytest
 
 from support.media_scenes import block, camera, film, homogeneous, load, volume
 from support.runs import T, runs
 from torchtransient.accuracy.statistics import two_sample_z_test, z_test
-from torchtransient.plugins.transport.free_flight import closed_surface, lets_through
-from torchtransient.plugins.transport.scene_contents import is_open
 
 VARIANT = "llvm_ad_mono"
 
@@ -100,29 +97,3 @@ def test_unwarped_first_leg():
     np.testing.assert_allclose(full, unwarped, rtol=1e-5)
     first = [np.argmax(x.sum((0, 1, 2, 4)) > 0) for x in (transient, reference)]
     assert first[0] < first[1] - 15
-
-
-def test_the_next_surface_behind_open_boundaries():
-    """Counted from where the ray begins, however many boundaries lie between; what scatters or shines is none."""
-    shapes = block(homogeneous(1.0, 0.8)) | {
-        "inner": {"type": "cube", "to_world": T().scale(0.4), "bsdf": {"type": "null"}},
-        "solid": {"type": "cube", "to_world": T().translate([10, 0, 0]), "bsdf": {"type": "diffuse"}},
-        "glow": {
-            "type": "rectangle", "to_world": T().translate([20, 0, 1]), "bsdf": {"type": "null"},
-            "emitter": {"type": "area", "radiance": 1.0},
-        },
-    }  # fmt: skip
-    scene = load(shapes)
-    media = scene.integrator().contents(scene, scene.sensors()[0]).media
-    ray = mi.Ray3f(mi.Point3f([0.1, 0.7, 10, 20, 50, 0.1], 0.2, 5), mi.Vector3f(0, 0, -1))
-    active = mi.Bool([True] * 5 + [False])
-    found = np.array(closed_surface(scene, media, ray, active).t)
-    np.testing.assert_allclose(found[:5], [7, 7, 4, 4, np.inf], rtol=1e-5)
-    # Without media, or for those that are not asked about, the first surface counts.
-    np.testing.assert_allclose(np.array(closed_surface(scene, None, ray, active).t)[:4], [4, 4, 4, 4], rtol=1e-5)
-    pi = scene.ray_intersect_preliminary(ray)
-    opens = [np.array(lets_through(media, ray, pi, hide)).tolist() for hide in (False, True)]
-    assert opens == [[True, True, False, False, False, True], [True, True, False, True, False, True]]
-    assert {shape.id(): is_open(shape) for shape in scene.shapes()} == {
-        "floor": False, "lamp": False, "block": True, "inner": True, "solid": False, "glow": False,
-    }  # fmt: skip

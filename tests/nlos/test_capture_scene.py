@@ -14,7 +14,7 @@ import torch
 import torchtransient as tt
 from support.scalars import no_gradient_is_lost
 from torchtransient.errors import ArgumentError, SceneError, StorageError, UnitError
-from torchtransient.nlos.arguments import check_seeds, check_sensor, checked_count, checked_seed, keys_and_values
+from torchtransient.nlos.arguments import check_seeds, check_sensor, checked_seed, keys_and_values
 from torchtransient.nlos.mesh_file import mesh_file
 from torchtransient.nlos.part_file import PartFile
 from torchtransient.nlos.renderer import in_film_shape, in_scan_shape, steady_in_scan_shape
@@ -141,11 +141,7 @@ def test_light_among_hidden_things_is_found_wherever_it_is(kind):
 # ------------------------------------------------------------------------------------------------------------ arguments
 
 
-def test_counts_seeds_and_keys():
-    assert checked_count("f", "n", 1) == 1 and checked_count("f", "n", np.int64(3)) == 3
-    for value in (0, -1, 1.5, True, None):
-        with pytest.raises(ArgumentError, match="f: n: expected a whole number of at least 1"):
-            checked_count("f", "n", value)
+def test_seeds_and_keys():
     assert checked_seed("f", 0) == 0 and checked_seed("f", 2**32 - 1) == 2**32 - 1
     for value in (-1, 2**32, 0.5, None):
         with pytest.raises(ArgumentError, match="f: seed: expected a whole number from 0 to 4294967295"):

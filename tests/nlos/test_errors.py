@@ -210,7 +210,7 @@ CASES = {
     # what is no capture
     "no scan": (lambda: tt.nlos.simulate(Z), ArgumentError, r"expected scan= beside hidden shapes.*got letter and"),
     "a mesh without a scan": (lambda: tt.nlos.simulate(MESH), ArgumentError, "expected scan= beside a mesh"),
-    "a scan in words": (lambda: simulate(of="confocal"), ArgumentError, r"expected scan as a tt\.nlos\.Scan, got str"),
+    "a scan in words": (lambda: simulate(of="confocal"), ArgumentError, "scan: expected a Scan, got 'confocal'"),
     "a scene and a scan": (lambda: simulate(tt.load(complete())), ArgumentError,
         "Leave scan out to simulate the scene"),
     "a dictionary of a scene and a scan": (lambda: simulate(complete()), SceneError, "is no hidden thing"),

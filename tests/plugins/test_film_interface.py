@@ -162,12 +162,12 @@ def test_films_add_to_an_array_that_was_lent(kind):
     expected = np.array(scene.integrator().render(scene, seed=2, spp=8)[1]).ravel()
     film.lend((dr.zeros(mi.Float, 7 + expected.size + 4), 7))
     scene.integrator().render(scene, seed=2, spp=8, develop=False)
-    found = np.array(film.taken()[-1])
+    found = np.array(film.release_storage()[-1])
     film.lend(None)
     assert np.abs(expected).sum() > 0
     np.testing.assert_allclose(found[7:-4], expected, rtol=1e-5, atol=1e-6)
     assert not found[:7].any() and not found[-4:].any()
-    assert film.taken() == [None, None]
+    assert film.release_storage() == [None, None]
 
 
 def test_what_can_be_lent_an_array(monkeypatch):

@@ -237,7 +237,7 @@ def test_bands_are_summed_up_to_the_rows_where_they_are(monkeypatch):
     values = np.arange(1.0, 73.0).reshape(3, 2, 4, 3) ** 2
     film.start_render()
     assert [(first, rows) for first, rows, _ in film.bands] == [(0, 2), (2, 1)]
-    film.hold([film.steady, None, mi.Float(values[:2].ravel()), mi.Float(values[2:].ravel())])
+    film.adopt_storage([film.steady, None, mi.Float(values[:2].ravel()), mi.Float(values[2:].ravel())])
     film.finish_render()
     np.testing.assert_array_equal(np.array(film.steady).reshape(3, 2, 3), values.sum(2))
 

@@ -387,11 +387,12 @@ def test_light_box():
         lamp = {"type": "sphere", "center": [0, 0, 3], "radius": 0.5, "emitter": {"type": "area"}}
         scene = mi.load_dict({"type": "scene", "lamp": lamp, "spot": {"type": "point", "position": [2, 0, 3]}})
         p = mi.Point3f([0, 1, -1, 4], [0, 0, 0, 4], [0, 3, 3, 3])
-        box = LightBox.of(scene, [])
+        box = LightBox.from_scene(scene, [])
         np.testing.assert_allclose(box.distance(p), [2.5, 0, 0.5, np.hypot(2, 3.5)], rtol=2e-5)
         glass = mi.load_dict({"type": "dielectric"})
-        assert LightBox.of(scene, [glass]) is None
-        assert LightBox.of(mi.load_dict({"type": "scene", "sky": {"type": "constant"}}), []) is None
-        assert LightBox.of(mi.load_dict({"type": "scene", "sky": {"type": "constant"}, "lamp": lamp}), []) is None
+        assert LightBox.from_scene(scene, [glass]) is None
+        assert LightBox.from_scene(mi.load_dict({"type": "scene", "sky": {"type": "constant"}}), []) is None
+        lit = mi.load_dict({"type": "scene", "sky": {"type": "constant"}, "lamp": lamp})
+        assert LightBox.from_scene(lit, []) is None
         sun = {"type": "directional", "direction": [0, 0, -1]}
-        assert LightBox.of(mi.load_dict({"type": "scene", "sun": sun, "lamp": lamp}), []) is None
+        assert LightBox.from_scene(mi.load_dict({"type": "scene", "sun": sun, "lamp": lamp}), []) is None

@@ -12,8 +12,6 @@ import pytest
 from torchtransient import plugins
 from torchtransient.plugins import polarized
 from torchtransient.plugins.bsdfs.fresnel import Interface, across_plane, metal_reflection, two_by_two
-from torchtransient.plugins.transport.strategy import Local
-from torchtransient.plugins.transport.surface_scattering import Surface
 
 VARIANT = "llvm_ad_mono_polarized"
 COSINES = np.array([1.0, 0.93, 0.7, 0.5, 0.31, 0.12, 0.01])
@@ -269,18 +267,3 @@ def test_where_an_interface_that_is_not_there_lets_light_pass():
     for cosine, passes in ((least, 1), (np.nextafter(least, np.float32(0)), 0), (10 * least, 1)):
         passed = entries(Interface(mi.Float(float(cosine)), mi.Float(1.0)).transmission())[..., 0]
         np.testing.assert_allclose(passed, passes * np.eye(4), rtol=1e-5)
-
-
-def test_the_back_side_of_what_is_two_sided_is_mirrored():
-    """Seen from below; not from above, nor along it, nor for what has one side."""
-    two_sided = Local(lists=lambda bsdf: bsdf)
-    m, wo = as_spectrum(matrix(5)), mi.Vector3f(-0.36, 0.48, 0.8)
-    z = np.array([0.64, -0.64, 0.0, -0.64])
-    wi = np.array([0.48 + 0 * z, 0.6 + 0 * z, z])
-    wi /= np.linalg.norm(wi, axis=0)
-    si = Local(wi=mi.Vector3f(wi))
-    listed = mi.Bool([True, True, True, False])
-    for world, there in ((two_sided, True), (None, False)):
-        found = Surface.correct_two_sided(Local(contents=Local(two_sided=world)), listed, si, wo, m)
-        changed = abs(entries(found) - matrix(5)[..., None]).max((0, 1)) > 1e-3
-        assert np.broadcast_to(changed, 4).tolist() == [False, there, False, False]

@@ -37,8 +37,8 @@ def test_none_where_nothing_refracts_through_a_lobe():
         {"type": "hair"},
         {"type": "diff_hair", "sigma_a": 0.5},
     ):
-        assert RefractiveBSDFs.of(scene_of(bsdf)) is None
-    assert RefractiveBSDFs.of(scene_of({"type": "principled", "roughness": 0.5})) is None
+        assert RefractiveBSDFs.from_scene(scene_of(bsdf)) is None
+    assert RefractiveBSDFs.from_scene(scene_of({"type": "principled", "roughness": 0.5})) is None
 
 
 @pytest.mark.parametrize(
@@ -65,14 +65,14 @@ def test_none_where_nothing_refracts_through_a_lobe():
 )
 def test_index(bsdf, index):
     scene = scene_of(DIFFUSE, bsdf, {"type": "dielectric", "int_ior": 2.0})
-    table = RefractiveBSDFs.of(scene).read()
+    table = RefractiveBSDFs.from_scene(scene).read()
     np.testing.assert_allclose(across(table, scene), [1, index, 1], rtol=1e-6)
     np.testing.assert_allclose(across(table, scene, outside=False), [1, 1 / index, 1], rtol=1e-6)
 
 
 def test_same_side_is_the_same_medium():
     scene = scene_of(GLASS)
-    table = RefractiveBSDFs.of(scene).read()
+    table = RefractiveBSDFs.from_scene(scene).read()
     si = dr.zeros(mi.SurfaceInteraction3f, 2)
     si.wi.z = mi.Float(1, -1)
     pointers = mi.BSDFPtr([scene.shapes()[0].bsdf()] * 2)
@@ -86,19 +86,19 @@ def test_shapes_of_groups_are_found():
         "instance": {"type": "instance", "ref": {"type": "ref", "id": "group"}},
     })  # fmt: skip
     si = scene.ray_intersect(mi.Ray3f([0, 0, 5], [0, 0, -1]))
-    table = RefractiveBSDFs.of(scene).read()
+    table = RefractiveBSDFs.from_scene(scene).read()
     assert table.relative_index(si.bsdf(), si, mi.Vector3f(0, 0, -1))[0] == pytest.approx(1.7)
 
 
 def test_parts_with_different_indices_are_refused():
     blend = {"type": "blendbsdf", "weight": 0.5, "a": GLASS, "b": {**GLASS, "int_ior": 1.3}}
     with pytest.raises(ValueError, match=r"its parts have 1.3, 1.5"):
-        RefractiveBSDFs.of(scene_of(blend))
+        RefractiveBSDFs.from_scene(scene_of(blend))
 
 
 def test_parts_that_become_different_are_refused():
     scene = scene_of({"type": "blendbsdf", "weight": 0.5, "a": OURS, "b": {**OURS, "alpha": 0.2}})
-    found = RefractiveBSDFs.of(scene)
+    found = RefractiveBSDFs.from_scene(scene)
     found.read()
     params = mi.traverse(scene)
     params["s0.bsdf.bsdf_1.eta"] = mi.Float(1.3)
@@ -109,7 +109,7 @@ def test_parts_that_become_different_are_refused():
 
 def test_reading_again_finds_new_values():
     scene = scene_of(OURS)
-    found = RefractiveBSDFs.of(scene)
+    found = RefractiveBSDFs.from_scene(scene)
     np.testing.assert_allclose(across(found.read(), scene), [1.5])
     params = mi.traverse(scene)
     params["s0.bsdf.eta"] = mi.Float(1.25)
@@ -142,7 +142,7 @@ def test_derivative_inside_a_suspended_loop(glass):
     si.wi = mi.Vector3f(0, 0, mi.Float(1, 1, -1, -1, 1))
     wo = mi.Vector3f(0, 0, mi.Float(1, -1, 1, -1, -1))
     with dr.suspend_grad():
-        table = RefractiveBSDFs.of(scene).read()
+        table = RefractiveBSDFs.from_scene(scene).read()
         total = _sum_of_slopes(table, mi.BSDFPtr([scene.shapes()[0].bsdf()] * 5), si, wo)
     np.testing.assert_allclose(total.numpy(), [3, 4.5, 2, 3, 4.5], rtol=1e-6)
     assert dr.grad(params[key])[0] == pytest.approx(3 * (1 - 1 / 1.5**2 + 1), rel=1e-5)

@@ -23,7 +23,7 @@ def around(**shapes):
     camera = {"type": "perspective", "fov": 0.01, "film": {"type": "hdrfilm", "width": 1, "height": 1}}
     scene = mi.load_dict({"type": "scene", "camera": camera, **shapes}, optimize=False)
     sensor = scene.sensors()[0]
-    found = Surroundings.of(scene, sensor, [shape.bsdf() for shape in scene.shapes()])
+    found = Surroundings.from_scene(scene, sensor, [shape.bsdf() for shape in scene.shapes()])
     lines = np.array(found._lines(sensor).d, dtype=float)
     assert lines.shape == (3, 64) and (lines[2, ::2] > 0.999).all()
     return float(found.indices(scene)[0][0]), lines[:, 1::2]
@@ -67,7 +67,7 @@ def test_each_sensor_of_a_batch_has_its_own():
     batch = {"type": "batch", "film": {**film, "width": 2}, **cameras}
     inside_out = {"type": "sphere", "flip_normals": True, "bsdf": GLASS}
     scene = mi.load_dict({"type": "scene", "batch": batch, "body": inside_out}, optimize=False)
-    found = Surroundings.of(scene, scene.sensors()[0], [shape.bsdf() for shape in scene.shapes()])
+    found = Surroundings.from_scene(scene, scene.sensors()[0], [shape.bsdf() for shape in scene.shapes()])
     assert [float(index[0]) for index in found.indices(scene)] == pytest.approx([1.0, 1 / 1.5])
 
 

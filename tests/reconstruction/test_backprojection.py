@@ -281,7 +281,7 @@ def test_captures_go_in_as_they_are():
 @pytest.mark.parametrize(
     "arguments, error, words",
     [
-        ((None, POINTS, AXIS, torch.float32), ShapeError, "tt.nlos.Scan"),
+        ((None, POINTS, AXIS, torch.float32), ShapeError, "scan: expected a Scan"),
         ((SCANS["single"], POINTS, None, torch.float32), ArgumentError, "TimeAxis"),
         ((SCANS["single"], POINTS.tolist(), AXIS, torch.float32), ShapeError, "VoxelGrid"),
         ((SCANS["single"], POINTS[:0], AXIS, torch.float32), ShapeError, "VoxelGrid"),

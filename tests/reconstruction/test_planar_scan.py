@@ -109,7 +109,7 @@ def test_the_normal_is_that_of_the_wall():
 
 
 def test_scans_alone_have_walls():
-    with pytest.raises(ShapeError, match=r"Method: expected a tt\.nlos\.Scan, got"):
+    with pytest.raises(ShapeError, match="Method: scan: expected a Scan, got"):
         PlanarScan.of_scan(points_of(), "Method")
 
 

@@ -14,11 +14,11 @@ from torchtransient.rendering.arguments import (
     checked_depth,
     checked_filter,
     checked_grad_seed,
-    film_asked_for,
-    given_values,
-    mangle,
-    samples,
+    checked_samples,
+    checked_values,
+    requested_film,
     sensor_list,
+    torch_names,
 )
 from torchtransient.rendering.films import Histogram
 from torchtransient.scene.values import as_float, fit_shape
@@ -27,13 +27,13 @@ NO_NUMBERS = "expected a torch tensor, an array, a list of numbers or a number, 
 
 
 def test_numbers_of_samples():
-    assert samples("spp", None) is None
-    assert [samples("spp", n) for n in (1, np.int64(7), 2**32 - 1)] == [1, 7, 4294967295]
+    assert checked_samples("spp", None) is None
+    assert [checked_samples("spp", n) for n in (1, np.int64(7), 2**32 - 1)] == [1, 7, 4294967295]
     with pytest.raises(UnitError, match="spp: expected at most 4294967295 samples, got 4294967296"):
-        samples("spp", 2**32)
+        checked_samples("spp", 2**32)
     for wrong in (0, -3, 2.5, "4", True):
         with pytest.raises(UnitError, match="spp: expected a positive integer or None"):
-            samples("spp", wrong)
+            checked_samples("spp", wrong)
 
 
 def test_depths():
@@ -68,10 +68,10 @@ def test_sensors():
 
 
 def test_names_that_torch_allows():
-    assert mangle(["a.b", "c"]) == {"a.b": "a/b", "c": "c"}
+    assert torch_names(["a.b", "c"]) == {"a.b": "a/b", "c": "c"}
     for wrong in (["a", "a"], ["a.b", "a/b"]):
         with pytest.raises(ArgumentError, match="every key once"):
-            mangle(wrong)
+            torch_names(wrong)
 
 
 @pytest.mark.parametrize(
@@ -151,19 +151,19 @@ def test_shapes_that_do_not_fit(given, shape, batch):
 
 def test_films():
     axis = tt.TimeAxis(0.0, 1.0, 3)
-    assert film_asked_for(None, {"time_axis": None}) is None
-    assert film_asked_for(None, {"time_axis": axis}) == film_asked_for(Histogram(axis), {}) == Histogram(axis)
+    assert requested_film(None, {"time_axis": None}) is None
+    assert requested_film(None, {"time_axis": axis}) == requested_film(Histogram(axis), {}) == Histogram(axis)
     with pytest.raises(ArgumentError, match="film, time_axis, gates: a film measures one thing"):
-        film_asked_for(Histogram(axis), {"time_axis": axis, "gates": None})
+        requested_film(Histogram(axis), {"time_axis": axis, "gates": None})
     with pytest.raises(ArgumentError, match=r"expected a film such as Histogram\(axis\)"):
-        film_asked_for(axis, {})
+        requested_film(axis, {})
 
 
 def test_values_of_a_call():
     given = {"a": 1}
-    assert given_values(None) == {} and given_values(given) == given and given_values(given) is not given
+    assert checked_values(None) == {} and checked_values(given) == given and checked_values(given) is not given
     with pytest.raises(ArgumentError, match="expected a mapping from keys to values, got int"):
-        given_values(5)
+        checked_values(5)
 
 
 def test_parameters_by_their_keys():

@@ -13,7 +13,7 @@ from torchtransient.rendering import engine, memory, progress
 from torchtransient.rendering.broken_numbers import broken_entries, spread_nan
 from torchtransient.rendering.output import RenderOutput, RenderStats
 from torchtransient.scene.physics import all_finite
-from torchtransient.scene.values import own_array
+from torchtransient.scene.values import flat_drjit_copy
 
 VARIANT = "llvm_ad_mono"
 
@@ -25,11 +25,11 @@ VARIANT = "llvm_ad_mono"
 def test_copies_of_few_and_of_many_numbers(rows):
     """Of memory that the caller has not, whatever he holds: a transposed view, one with a gradient."""
     given = (torch.arange(rows * 3.0).reshape(3, rows) % 7).T.clone().requires_grad_().T.T
-    flat, before = own_array(given), given.detach().numpy().ravel().copy()
+    flat, before = flat_drjit_copy(given), given.detach().numpy().ravel().copy()
     with torch.no_grad():
         given *= 3
     assert type(flat) is mi.Float and np.array_equal(np.array(flat), before)
-    assert own_array(torch.tensor(3.0, requires_grad=True))[0] == 3
+    assert flat_drjit_copy(torch.tensor(3.0, requires_grad=True))[0] == 3
 
 
 def test_negative_views_are_their_numbers():
@@ -38,7 +38,7 @@ def test_negative_views_are_their_numbers():
         view = torch.view_as_complex(torch.arange(2.0 * count).reshape(count, 2)).conj().imag
         assert view.is_neg()
         expected = -np.arange(1.0, 2 * count, 2)
-        assert np.array_equal(np.array(own_array(view)), expected)
+        assert np.array_equal(np.array(flat_drjit_copy(view)), expected)
         flat, offset, strides = engine._cube_adjoint(view)
         assert np.array_equal(np.array(flat)[offset :: strides[0]][:count], expected)
         assert np.array_equal(np.array(engine._steady_adjoint(view)), expected)

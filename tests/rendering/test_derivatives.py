@@ -9,7 +9,7 @@ import torch
 from torch.autograd import forward_ad
 
 from torchtransient.errors import GradientError, ShapeError
-from torchtransient.rendering.autograd import Asked, run
+from torchtransient.rendering.autograd import Request, run
 
 # Outputs (2,), (3,) and whole numbers of values (3,), (2,) and whole ones: 3 x 2, no symmetry.
 A = torch.tensor([[1.0, -2.0, 3.0], [0.5, 4.0, -1.0]], dtype=torch.float64)
@@ -36,7 +36,7 @@ class Job:
         with torch.enable_grad():
             given = [t.detach().clone().requires_grad_(need) for t, need in zip(tensors, asked.needs, strict=True)]
             real = [out for out in outputs(*given) if out.is_floating_point()]
-            used = [out for out, is_given in zip(real, asked.given, strict=True) if is_given]
+            used = [out for out, is_given in zip(real, asked.has_cotangent, strict=True) if is_given]
             total = sum((out * g).sum() for out, g in zip(used, cotangents, strict=True))
         wanted = [t for t in given if t.requires_grad]
         grads = torch.autograd.grad(total, wanted, allow_unused=True)
@@ -84,7 +84,7 @@ def test_gradients_of_what_is_asked_for(given, first, second, needs):
     outs = [out for out, there in zip(found, (first, second), strict=False) if there]
     wanted = [t for t, need in zip((x, y), needs, strict=True) if need]
     grads = torch.autograd.grad(outs, wanted, used)
-    assert job.asked == ["primal", ("pullback", Asked((*needs, False), (first, second)), len(used))]
+    assert job.asked == ["primal", ("pullback", Request((*needs, False), (first, second)), len(used))]
     cotangents = [g if there else None for g, there in zip(COTANGENTS, (first, second), strict=True)]
     for grad, one in zip(grads, expected(given, *wanted, cotangents=cotangents), strict=True):
         torch.testing.assert_close(grad, one)
@@ -99,7 +99,7 @@ def test_derivatives_along_tangents(given, along):
         a = forward_ad.make_dual(x, dx) if along[0] else x
         b = forward_ad.make_dual(y, dy) if along[1] else y
         found = [forward_ad.unpack_dual(out).tangent for out in run(job, a, b, n)]
-    assert job.asked[1:] == [("pushforward", Asked((*along, False)), sum(along))]
+    assert job.asked[1:] == [("pushforward", Request((*along, False)), sum(along))]
     _, right = torch.func.jvp(
         lambda x, y: outputs(x, y, n)[:2], (x, y), (dx if along[0] else 0 * dx, dy if along[1] else 0 * dy)
     )
@@ -120,10 +120,10 @@ def test_derivatives_are_linear_in_what_they_are_taken_along(given):
         job.asked.clear()
         (found,) = torch.autograd.grad(grads, (cotangents[number],), along, retain_graph=True)
         torch.testing.assert_close(found, one)
-        assert job.asked == [("pushforward", Asked((True, True, False), (True, True)), 2)]
+        assert job.asked == [("pushforward", Request((True, True, False), (True, True)), 2)]
     (found,) = torch.autograd.grad(grads[1], (cotangents[0],), along[1], retain_graph=True)
     torch.testing.assert_close(found, A @ x.detach() * along[1])
-    assert job.asked[-1] == ("pushforward", Asked((False, True, False), (True, True)), 1)
+    assert job.asked[-1] == ("pushforward", Request((False, True, False), (True, True)), 1)
     with pytest.raises(GradientError, match=r"second derivatives of the function .* again in reverse mode"):
         torch.autograd.grad(grads[0].sum(), (y,), retain_graph=True)
     with pytest.raises(GradientError, match="again in forward mode"):
@@ -142,10 +142,10 @@ def test_derivatives_along_tangents_have_gradients_by_the_tangents(given):
     first, second = along(dx)
     (found,) = torch.autograd.grad((first, second), (dx,), COTANGENTS)
     torch.testing.assert_close(found, expected(given, given[0])[0])
-    assert job.asked[-1] == ("pullback", Asked((True, True, False), (True, True)), 2)
+    assert job.asked[-1] == ("pullback", Request((True, True, False), (True, True)), 2)
     (found,) = torch.autograd.grad(along(dx)[1], (dx,), COTANGENTS[1])
     torch.testing.assert_close(found, 2 * x * COTANGENTS[1])
-    assert job.asked[-1] == ("pullback", Asked((True, True, False), (False, True)), 1)
+    assert job.asked[-1] == ("pullback", Request((True, True, False), (False, True)), 1)
 
 
 def test_entries_of_a_batch_are_calls_of_their_own(given):

@@ -8,10 +8,11 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.walks import before_each_turn
 from tools.small_room import COLOUR, VARIANT, WALL_POSE, make_room
 from torchtransient.errors import SceneError, ShapeError
 from torchtransient.plugins.drjit_pool import engine_lock
-from torchtransient.plugins.guards import interrupts_wait, no_collection, surely
+from torchtransient.plugins.guards import ensure_restored, interrupts_wait, no_collection
 from torchtransient.scene.variant import active_variant
 
 
@@ -65,7 +66,7 @@ def test_settings_are_put_back_when_an_interrupt_cuts_that_off():
         done.append(1)
 
     with pytest.raises(KeyboardInterrupt):
-        surely(put_back)
+        ensure_restored(put_back)
     assert done == [1]
 
 
@@ -89,7 +90,7 @@ def test_calls_in_an_except_block_raise_their_own_errors(room_scene, monkeypatch
         raise RuntimeError("a plain mistake")
 
     renderer = tt.TransientRenderer(room_scene, [COLOUR], spp=2, freeze=False)
-    monkeypatch.setattr("torchtransient.plugins.transport.walk.bounce", broken)
+    before_each_turn(monkeypatch, broken)
     try:
         raise handled
     except (KeyboardInterrupt, ValueError):

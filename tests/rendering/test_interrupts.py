@@ -12,6 +12,7 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.walks import before_each_turn
 from tools.small_room import COLOUR, VARIANT, WALL_POSE, make_room
 from torchtransient.plugins import _registry
 from torchtransient.scene.variant import active_variant
@@ -52,7 +53,7 @@ CALLS = {
 def test_in_a_loop_that_is_traced(renderer, monkeypatch, level, call):
     expected = renderer(seed=0).transient
     with monkeypatch.context() as patched:
-        patched.setattr("torchtransient.plugins.transport.walk.bounce", interrupt)
+        before_each_turn(patched, interrupt)
         with pytest.raises(KeyboardInterrupt):
             CALLS[call](renderer)
     assert mi.variant() == VARIANT
@@ -62,7 +63,7 @@ def test_in_a_loop_that_is_traced(renderer, monkeypatch, level, call):
 def test_in_a_backward_pass(renderer, monkeypatch, level):
     out = renderer(seed=0).transient
     with monkeypatch.context() as patched:
-        patched.setattr("torchtransient.plugins.transport.walk.bounce", interrupt)
+        before_each_turn(patched, interrupt)
         with pytest.raises(KeyboardInterrupt):
             out.sum().backward(retain_graph=True)
     renderer.zero_grad()
@@ -115,7 +116,7 @@ def test_errors_that_are_no_interrupts_stay_what_they_are(renderer, monkeypatch)
     def broken(*args, **kwargs):
         raise ValueError("a plain mistake")
 
-    monkeypatch.setattr("torchtransient.plugins.transport.walk.bounce", broken)
+    before_each_turn(monkeypatch, broken)
     with pytest.raises(tt.errors.SceneError, match="a plain mistake"):
         renderer(seed=0)
 

@@ -100,7 +100,7 @@ def test_bad_settings(scene, histogram_scene):
         tt.render(scene, frequencies=[float("nan")])
     with pytest.raises(ShapeError, match="at least one"):
         tt.render(scene, frequencies=[])
-    with pytest.raises(UnitError, match="one number"):
+    with pytest.raises(UnitError, match="a finite number"):
         tt.render(scene, frequencies=["fast"])
 
 

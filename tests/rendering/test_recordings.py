@@ -126,23 +126,23 @@ def test_why_calls_are_in_vain(kept):
     for number in range(63):
         called(kept, ("spp", number), "rest")
     called(kept, ("spp", 1000), "rest", kind="backward")
-    kept._warned, kept._in_vain = False, 100
+    kept._warned, kept._unlaunched = False, 100
     (text,) = said(kept, ("spp", 1001), "rest")
     assert "more than 64 kinds of calls take turns, and what they depend on changed from 62 to 1001. Tracing" in text
     few = Recordings()
     called(few, ("spp", 1), "rest")
-    few._in_vain = 100
+    few._unlaunched = 100
     (text,) = said(few, ("spp", 2), "rest")
     assert "could use a recording: what they depend on changed from 1 to 2. Tracing" in text
     refusing = Recordings()
     called(refusing, "a")
-    next(iter(refusing._found.values())).refusal = "traced: too wide"
-    refusing._in_vain = 100
+    next(iter(refusing._by_structure.values())).refusal = "traced: too wide"
+    refusing._unlaunched = 100
     (text,) = said(refusing, "a")
     assert "could use a recording: traced: too wide. Tracing" in text
-    found = next(iter(refusing._found.values()))
+    found = next(iter(refusing._by_structure.values()))
     found.refusal, found.waits = None, "traced: an array waits"
-    assert refusing._reason("render", next(iter(refusing._found))) == "traced: an array waits"
+    assert refusing._reason("render", next(iter(refusing._by_structure))) == "traced: an array waits"
 
 
 def test_what_waits_is_recorded_another_time(monkeypatch):
@@ -190,7 +190,7 @@ def test_drjit_itself_warns_of_nothing(monkeypatch):
 
     made = []
     monkeypatch.setattr(dr, "freeze", lambda call, **settings: made.append(settings))
-    Recording()._made()
+    Recording()._freeze()
     assert made == [{"limit": 8, "warn_after": 2**31 - 1}]
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchtransient.errors import ShapeError, TorchTransientWarning, UnitError
-from torchtransient.rendering.job import Item, Seeding, drawn, mix_seed, whole_number
+from torchtransient.rendering.job import Item, Seeding, draw_seed, mix_seed, whole_number
 
 
 def test_numbers_are_those_of_splitmix64():
@@ -75,18 +75,18 @@ def test_what_is_no_seed_among_others():
 
 
 def test_tensors_are_taken_apart_where_they_are_one_number():
-    assert drawn(torch.tensor(3)) == (3, None)
-    assert type(drawn(torch.tensor(3))[0]) is int
+    assert draw_seed(torch.tensor(3)) == (3, None)
+    assert type(draw_seed(torch.tensor(3))[0]) is int
     for other in (torch.tensor([3, 4]), torch.tensor(3.0), torch.tensor(True)):
-        assert drawn(other)[0] is other and drawn(other)[1] is None
-    assert drawn([1, 2]) == ([1, 2], None)
+        assert draw_seed(other)[0] is other and draw_seed(other)[1] is None
+    assert draw_seed([1, 2]) == ([1, 2], None)
 
 
 def test_without_a_seed_torch_s_generator_draws():
     torch.manual_seed(5)
-    first = drawn(None), drawn(None)
+    first = draw_seed(None), draw_seed(None)
     torch.manual_seed(5)
-    assert (drawn(None), drawn(None)) == first
+    assert (draw_seed(None), draw_seed(None)) == first
     assert first[0] != first[1]
     assert all(0 <= seed < 2**32 and tensor is None for seed, tensor in first)
 
@@ -97,7 +97,7 @@ def test_what_torch_says_of_other_things_is_passed_on(monkeypatch):
 
     monkeypatch.setattr(torch, "randint", broken)
     with pytest.raises(RuntimeError, match="no memory"):
-        drawn(None)
+        draw_seed(None)
 
 
 def test_entries_of_a_vmap():
@@ -105,12 +105,12 @@ def test_entries_of_a_vmap():
     seen = []
 
     def take(x, seed):
-        seen.append(drawn(seed))
+        seen.append(draw_seed(seed))
         return x
 
     torch.func.vmap(take)(torch.zeros(2), torch.tensor([1, 2]))
     assert seen[0][0] is None and isinstance(seen[0][1], torch.Tensor)
     with pytest.raises(UnitError, match=r"randomness='same'\) draws one seed"):
-        torch.func.vmap(lambda x: x + drawn(None)[0])(torch.zeros(2))
+        torch.func.vmap(lambda x: x + draw_seed(None)[0])(torch.zeros(2))
     torch.func.vmap(lambda x: take(x, None), randomness="same")(torch.zeros(2))
     assert isinstance(seen[1][0], int)

@@ -60,7 +60,7 @@ def test_threads(names):
 def test_numbers_and_reasons_are_those_of_the_code():
     assert f"recordings of {recording.MAX_STRUCTURES} kinds of calls" in TEXT
     assert f"and {recording.MAX_RECORDINGS} for sizes" in TEXT
-    assert f"that {max(recording.IN_VAIN, recording.MAX_STRUCTURES)} calls in a row" in TEXT
+    assert f"that {max(recording.MOST_UNLAUNCHED, recording.MAX_STRUCTURES)} calls in a row" in TEXT
     assert f"up to {MOST_AT_ONCE} at once" in TEXT
     assert LARGE_FILM == 2**18 and "films below 2^18 values" in TEXT
     for name in ("FIRST", "SWITCHED_OFF", "SEVERAL", "LARGE", "PROGRESS", "OWN_ENTRY", "NO_FREEZING"):

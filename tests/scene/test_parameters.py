@@ -180,7 +180,7 @@ def test_a_pattern_that_shifts_over_a_light_is_sampled_where_it_is(tmp_path):
 def test_mesh_pose_keeps_authored_normals(tmp_path):
     import mitsuba as mi
 
-    with_normals = tmp_path / "smooth.ply"
+    add_normals = tmp_path / "smooth.ply"
     with active_variant(VARIANT):
         mesh = mi.Mesh("tri", 3, 1, has_vertex_normals=True)
         params = mi.traverse(mesh)
@@ -189,9 +189,9 @@ def test_mesh_pose_keeps_authored_normals(tmp_path):
         params.update()
         params["vertex_normals"] = [0.6, 0, 0.8, -0.6, 0, 0.8, 0, 0.6, 0.8]
         params.update()
-        mesh.write_ply(str(with_normals))
+        mesh.write_ply(str(add_normals))
     room = make_room()
-    room["box"] = {"type": "ply", "filename": str(with_normals), "to_world": pose(0, 0, 0.5, 0.5)}
+    room["box"] = {"type": "ply", "filename": str(add_normals), "to_world": pose(0, 0, 0.5, 0.5)}
     scene = tt.load(room, variant=VARIANT)
     plain = tt.TransientRenderer(scene, parameters=[GREY], spp=16, temporal_filter="tent")(seed=0).transient.detach()
     posed = tt.TransientRenderer(scene, parameters=["box.to_world"], spp=16)(seed=0).transient.detach()

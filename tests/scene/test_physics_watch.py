@@ -35,9 +35,11 @@ def test_both_ends_of_a_range_are_said_once_each():
     each = watch()
     each.ranges = {"k": SHARE}
     value = torch.tensor([0.0])
-    assert messages(each.value, "k", value, 0.0, 1.0) == []
-    assert len(messages(each.value, "k", value, 0.0, 1.5)) == len(messages(each.value, "k", value, -0.5, 1.0)) == 1
-    assert messages(each.value, "k", value, -0.5, 1.5) == messages(each.value, "other", value, -9.0, 9.0) == []
+    assert messages(each.check_value, "k", value, 0.0, 1.0) == []
+    assert len(messages(each.check_value, "k", value, 0.0, 1.5)) == 1
+    assert len(messages(each.check_value, "k", value, -0.5, 1.0)) == 1
+    assert messages(each.check_value, "k", value, -0.5, 1.5) == []
+    assert messages(each.check_value, "other", value, -9.0, 9.0) == []
 
 
 # -------------------------------------------------------------------------------------------------------- transforms
@@ -47,26 +49,27 @@ def test_flat_transforms_of_a_batch_that_has_a_gradient():
     each = watch()
     each.transforms = frozenset(["pose"])
     poses = torch.stack([torch.eye(4), torch.eye(4), torch.eye(4)]).requires_grad_()
-    assert messages(each.value, "pose", poses, 0.0, 1.0) == []
+    assert messages(each.check_value, "pose", poses, 0.0, 1.0) == []
     flat = torch.stack([torch.eye(4), torch.diag(torch.tensor([1.0, 1.0, 0.0, 1.0]))]).requires_grad_()
-    assert len(messages(each.value, "pose", flat, 0.0, 1.0)) == 1
-    assert messages(each.value, "pose", flat, 0.0, 1.0) == []
-    assert messages(each.value, "other", flat, 0.0, 1.0) == []
+    assert len(messages(each.check_value, "pose", flat, 0.0, 1.0)) == 1
+    assert messages(each.check_value, "pose", flat, 0.0, 1.0) == []
+    assert messages(each.check_value, "other", flat, 0.0, 1.0) == []
 
 
 def test_directions_without_a_length():
     """One of a batch, too."""
     each = watch()
     each.directions = {"sky.sun_direction": np.array([0.0, 1.0, 0.0])}
-    assert messages(each.value, "sky.sun_direction", torch.tensor([[0.0, 0.0, -2.0], [1.0, 0.0, 0.0]]), -2.0, 1.0) == []
+    across = torch.tensor([[0.0, 0.0, -2.0], [1.0, 0.0, 0.0]])
+    assert messages(each.check_value, "sky.sun_direction", across, -2.0, 1.0) == []
     given = torch.tensor([[0.0, 0.0, -2.0], [0.0, 0.0, 0.0]])
     assert "'sky.sun_direction' is a direction and has no length" in messages(
-        each.value, "sky.sun_direction", given, -2.0, 0.0
+        each.check_value, "sky.sun_direction", given, -2.0, 0.0
     )[0]
-    assert messages(each.value, "other", given, -2.0, 0.0) == []
+    assert messages(each.check_value, "other", given, -2.0, 0.0) == []
     along = torch.tensor([0.0, -3.0, 0.0])
-    assert messages(each.value, "sky.sun_direction", along, -3.0, 0.0) == []
-    (said,) = messages(each.value, "sky.sun_direction", along.requires_grad_(), -3.0, 0.0)
+    assert messages(each.check_value, "sky.sun_direction", along, -3.0, 0.0) == []
+    (said,) = messages(each.check_value, "sky.sun_direction", along.requires_grad_(), -3.0, 0.0)
     assert "points along the axis of its sky" in said
 
 
@@ -75,7 +78,7 @@ def test_flat_transforms_are_errors_each_time():
     each.transforms = frozenset(["pose"])
     for _ in range(2):
         with pytest.raises(PhysicsError, match="'pose' has no inverse"):
-            each.value("pose", torch.zeros(4, 4), 0.0, 0.0)
+            each.check_value("pose", torch.zeros(4, 4), 0.0, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -107,7 +110,7 @@ def test_smallest_and_largest():
 
 
 def window(each, before, after, total=40.0):
-    return messages(each.window, total, before, after)
+    return messages(each.check_window, total, before, after)
 
 
 @pytest.mark.parametrize(("before", "after"), [(2.0, 0.0), (0.0, 2.0), (0.5, 1.5), (0.0, 0.0)])
@@ -145,15 +148,15 @@ def test_windows_are_errors_each_time():
     each.window_name = "window"
     for _ in range(2):
         with pytest.raises(PhysicsError, match=r"misses 25\.0% of the light.*With physics='warn'"):
-            each.window(40.0, 3.0, 7.0)
+            each.check_window(40.0, 3.0, 7.0)
 
 
 def test_warnings_point_at_the_line_outside():
     """Lines of the library and of torch are passed over, however many calls are in between."""
     calls = (
         lambda: watch().warn("a", "b"),
-        lambda: watch().scene({"a": "b"}),
-        lambda: torch.func.vmap(lambda x: (watch().scene({"a": "b"}), x)[1])(torch.ones(2)),
+        lambda: watch().check_description({"a": "b"}),
+        lambda: torch.func.vmap(lambda x: (watch().check_description({"a": "b"}), x)[1])(torch.ones(2)),
     )
     for call in calls:
         with warnings.catch_warnings(record=True) as caught:

@@ -11,7 +11,7 @@ from support.gradient_cases.cases_gaps import OFF, corner, lamp, plates
 from support.gradient_cases.problem import Case, Problem
 from support.gradient_cases.unknowns import move
 from support.marks import long
-from torchtransient.plugins.transport import scene_contents as contents
+from support.walks import nail_down, no_flat_shortcut
 
 SCENES = {"plates": (plates, (0, 0, 1)), "corner": (corner, (1, 0, 0)), "lamp": (lamp, (0, 0, 1))}
 GAPS = (1e-2, 1e-3, 1e-4)
@@ -44,7 +44,7 @@ def test_variance_is_bounded(name):
 @pytest.mark.parametrize("name", long(SCENES, ["plates"]))
 def test_a_tenth_of_the_variance_at_a_millimetre(name, monkeypatch):
     damped = damped_gradients(name, 1e-3).var(ddof=1)
-    monkeypatch.setattr(contents, "DAMPING", 0.0)
+    nail_down(monkeypatch)
     assert 10 * damped < gradients(name, 1e-3).var(ddof=1)
 
 
@@ -65,5 +65,5 @@ def test_mean_at_a_millimetre(name):
 def test_plain_surfaces_are_no_special_case(monkeypatch):
     """Guards against a slide of flat plain surfaces that is not that of a ray which is shifted."""
     plain = problem("plates", 5e-3).reverse(1)
-    monkeypatch.setattr(contents, "is_flat", lambda shape: False)
+    no_flat_shortcut(monkeypatch)
     assert problem("plates", 5e-3).reverse(1) == pytest.approx(plain, rel=1e-4)

@@ -57,10 +57,10 @@ class MovedCapture:
         self.steady = steady
         shape = tuple(self.scene.sensors()[0].film().cube_shape())
         rng = np.random.default_rng(5)
-        weights = 1 + 0.3 * rng.normal(size=shape[:2])
+        # Of every point, and of every pair of a point and a spot in exhaustive captures.
+        weights = 1 + 0.3 * rng.normal(size=shape[:2] if steady else shape[:-2])
         if not steady:
-            bins = 1 + wave(np.arange(shape[-2]))
-            weights = weights.reshape(*shape[:2], *[1] * (len(shape) - 3)) * bins
+            weights = weights[..., None] * (1 + wave(np.arange(shape[-2])))
         weights = weights[..., None] * (1 + 0.5 * np.arange(shape[-1]))
         self.adjoint = mi.TensorXf(np.broadcast_to(weights, shape if not steady else weights.shape).astype(np.float32))
 

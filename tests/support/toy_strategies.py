@@ -50,38 +50,38 @@ class OwnPointLight(Connection):
     def __init__(self, position, intensity):
         self.position, self.intensity = position, intensity
 
-    def propose(self, world, path, vertex, sampler):
+    def propose(self, context, path, vertex, sampler):
         p = mi.Point3f(self.position)
         to = p - vertex.at.p
         ds = Local(p=p, n=mi.Normal3f(0), d=dr.normalize(to), dist=dr.norm(to), delta=mi.Bool(True), emitter=None)
         active, u = vertex.goes_on & vertex.connectable, sampler.next_2d()
         return Proposal(d=ds.d, active=active, ds=ds, u=u, sampler=sampler)
 
-    def connect(self, world, path, vertex, proposal, answer, zeros):
+    def connect(self, context, path, vertex, proposal, answer, zeros):
         ds = proposal.ds
         value = product(vertex.β, answer.value) * (self.intensity / dr.square(ds.dist))
         opl = vertex.scattered_τ + mi.Float64(ds.dist * vertex.η * answer.eta)
-        active = world.counted(proposal.active, opl)
-        active, T = world.segment.transmittance(world, vertex, ds, proposal.u, proposal.sampler, active)
+        active = context.counted(proposal.active, opl)
+        active, T = context.segment.transmittance(context, vertex, ds, proposal.u, proposal.sampler, active)
         return Event(value=value * T, opl=opl, active=active, depth=path.depth + 2, T=T)
 
-    def fields(self, world):
-        return {"lit": mi.Bool} | ({"T": mi.UnpolarizedSpectrum} if world.contents.media is not None else {})
+    def fields(self, context):
+        return {"lit": mi.Bool} | ({"T": mi.UnpolarizedSpectrum} if context.contents.media is not None else {})
 
     def record(self, sample):
         return {"lit": sample.event.active, "T": sample.event.T}
 
-    def attached(self, world, vertex, step, wanted):
-        r, si, p = vertex.v.of(self.name), vertex.scattered_si, mi.Point3f(self.position)
+    def attached(self, context, vertex, step, wanted):
+        r, si, p = vertex.v.record_of(self.name), vertex.scattered_si, mi.Point3f(self.position)
         lit = r["lit"]
         fixed = dr.normalize(dr.detach(p - si.p))
         out = direction_to(si.p, p, lit, fixed)
-        towards = world.scattering.evaluate(world, vertex, out, lit)
+        towards = context.scattering.evaluate(context, vertex, out, lit)
         length = distance(si.p, p, lit)
         value = scatter_unpolarized(towards.value, vertex.rotation) * r.get("T", 1)
         value *= self.intensity / dr.square(length)
         end = Local(p=p, d=fixed, far=mi.Bool(False), ahead=False)
-        value *= world.segment.attached_transmittance(world, vertex, end, lit)
+        value *= context.segment.attached_transmittance(context, vertex, end, lit)
         slope = vertex.scattered_slope
         if wanted.geometry:
             slope = slope + slope_only(vertex.carry.η * towards.eta * length)
@@ -95,16 +95,16 @@ class AreaOfShape(Guide):
     def __init__(self, shape_id, share, name="area_of_shape"):
         self.shape_id, self.share, self.name = shape_id, share, name
 
-    def prepare(self, world):
-        self.shape = next(shape for shape in world.scene.shapes() if shape.id() == self.shape_id)
+    def prepare(self, context):
+        self.shape = next(shape for shape in context.scene.shapes() if shape.id() == self.shape_id)
         self.per_area = 1 / self.shape.surface_area()
         dr.eval(self.per_area)
 
-    def draw(self, world, vertex, x, y):
+    def draw(self, context, vertex, x, y):
         point = self.shape.sample_position(0.0, mi.Point2f(mi.Float(x), y)).p
         return GuidedPoint(point, mi.ShapePtr(self.shape))
 
-    def density(self, world, p, q, n, shape, active, primitive=None):
+    def density(self, context, p, q, n, shape, active, primitive=None):
         on_it = active & (shape == mi.ShapePtr(self.shape))
         per_area = solid_angle_over_area(p, q, n, on_it)
         return dr.select(on_it & (per_area > 0), self.per_area / per_area, 0)

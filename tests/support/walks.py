@@ -1,23 +1,81 @@
-"""Door to the walk of light: tests that need paths, records or launches without a film import them from here."""
+"""Door to the core of the walk: a test whose subject no render shows by itself imports it from here, and from no module
+of `plugins/transport`.
+
+Renders, their gradients and errors are the first choice. Each name stands for a reason that they do not serve:
+
+- the loop alone, on strategies and sinks of a test's own: `trace`, `primary_rays`, `Connection`, `Event`, `Step`,
+  `Vertex`, `Sink`;
+- what a walk hands to other sinks than a film: `AdjointSumSink`, `EventListSink`; and `recorded_paths`, the random walk
+  itself, before any light;
+- mathematics with a closed form, at single points: `damped_motion`, the field by which points near a vertex move along
+  with it; `attached_interaction` and `attached_distance`, hits of curves, ellipsoids and instances with the derivatives
+  that Mitsuba lacks; `varies_by_place`, a property of every plugin that costs time or derivatives where it is wrong;
+- what an author of strategies gets wrong: `Guide`, `Surface`;
+- the same numbers by another way: `nail_down`, `no_flat_shortcut`, `limit_records`;
+- moments in the middle of a trace, for interrupts, errors and scenes that are dropped there: `before_each_turn`.
+
+Beside it, `toy_strategies` and `toy_integrators` import what an author of strategies does.
+"""
 
 from __future__ import annotations
 
+import sys
 from types import SimpleNamespace
 
 import drjit as dr
+import mitsuba as mi
+import numpy as np
 
 from torchtransient.plugins.integrators.job import passes_of
+from torchtransient.plugins.transport import scene_contents, walk
+from torchtransient.plugins.transport.context import Wanted
+from torchtransient.plugins.transport.geometry_terms import damped_motion
 from torchtransient.plugins.transport.record import RecordedVertex, RecordSink
-from torchtransient.plugins.transport.walk import first_leg, start, walk
+from torchtransient.plugins.transport.sinks import AdjointSumSink, EventListSink, Sink
+from torchtransient.plugins.transport.strategy import Connection, Event, Guide, Step, Vertex
+from torchtransient.plugins.transport.surface_interactions import (
+    AttachedSurfaces,
+    DetachedHits,
+    Instances,
+    distance_to,
+    surface_interaction,
+)
+from torchtransient.plugins.transport.surface_scattering import Surface
 
-__all__ = ["RecordSink", "RecordedVertex", "launches", "primary_rays", "trace"]
+__all__ = [
+    "AdjointSumSink",
+    "Connection",
+    "Event",
+    "EventListSink",
+    "Guide",
+    "Sink",
+    "Step",
+    "Surface",
+    "Vertex",
+    "attached_distance",
+    "attached_interaction",
+    "before_each_turn",
+    "damped_motion",
+    "limit_records",
+    "nail_down",
+    "no_flat_shortcut",
+    "primary_rays",
+    "recorded_paths",
+    "trace",
+    "varies_by_place",
+]
 
+CORE = "torchtransient.plugins.transport"
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# The loop.
 
 def trace(context, sampler, ray, first_opl, sink, η=1, pi=None):
     """Trace the paths of primary rays into a sink.
 
     Args:
-        context: ``RenderContext`` of a job.
+        context: ``RenderContext`` of a job, or a namespace of what the loop reads of it.
         sampler: Mitsuba sampler of the lanes.
         ray: primary rays, Ray3f.
         first_opl: optical path length before their origins, minus the film's start, metres (Float64).
@@ -28,14 +86,9 @@ def trace(context, sampler, ray, first_opl, sink, η=1, pi=None):
     Returns:
         (number of vertices, UInt32; state of the sink).
     """
-    path = start(context, ray, first_opl, η)
-    path.leg = first_leg(context, sampler, ray, pi)
-    return walk(context, sampler, path, sink)
-
-
-def launches(context, sensor, film, seed, spp):
-    """Return the launches of a render."""
-    return passes_of(sensor.sampler().clone(), film, seed, spp, context.most_events())[0]
+    path = walk.start(context, ray, first_opl, η)
+    path.leg = walk.first_leg(context, sampler, ray, pi)
+    return walk.walk(context, sampler, path, sink)
 
 
 def primary_rays(scene, seed, spp):
@@ -44,9 +97,96 @@ def primary_rays(scene, seed, spp):
     with dr.suspend_grad():
         sensor, film = integrator.resolve(scene, 0)
         contents = integrator.contents(scene, sensor)
-        context = integrator.world(scene, contents)
-        job = launches(context, sensor, film, seed, spp)[0]
+        context = integrator.render_context(scene, contents)
+        job = passes_of(sensor.sampler().clone(), film, seed, spp, context.most_events())[0][0]
         rays = integrator.start(scene, contents, sensor, film, job)
     return SimpleNamespace(
         integrator=integrator, sensor=sensor, film=film, contents=contents, context=context, job=job, rays=rays
     )
+
+
+def recorded_paths(scene, lanes, seed):
+    """Return the vertices of paths along the axis of a sensor.
+
+    Returns:
+        (positions (lanes, max_depth, 3); optical path lengths up to them, infinite behind the last one, and
+        throughputs, (lanes, max_depth)).
+    """
+    integrator, sensor = scene.integrator(), scene.sensors()[0]
+    contents = integrator.contents(scene, sensor)
+    context = integrator.render_context(scene, contents, Wanted([], sensor, contents))
+    sampler = sensor.sampler().clone()
+    sampler.seed(seed, lanes)
+    with dr.suspend_grad():
+        ray, _ = sensor.sample_ray(mi.Float(0), mi.Float(0), mi.Point2f(0.5), mi.Point2f(0.5))
+        ray.o, ray.d = [dr.repeat(x, lanes) if dr.width(x) == 1 else x for x in (ray.o, ray.d)]
+        sink = RecordSink()
+        count, store = trace(context, sampler, ray, mi.Float64(0), sink)
+        points, lengths, weights = [], [], []
+        for k in range(integrator.max_depth):
+            there = mi.UInt32(k) < count
+            v = RecordedVertex(sink.layout, store, mi.UInt32(k), there, ray)
+            points.append(v.ray(v.t))
+            lengths.append(dr.select(there, v.τ, dr.inf))
+            weights.append(v.β[0] * v.weight[0])
+        dr.eval(points, lengths, weights)
+    stack = [np.array(p).T for p in points], [np.array(x) for x in lengths], [np.array(x) for x in weights]
+    return [np.stack(x, axis=1) for x in stack]
+
+
+def before_each_turn(monkeypatch, call):
+    """Have ``call()`` run whenever a turn of the loop is traced. It may raise."""
+    loop = sys.modules[f"{CORE}.walk"]  # where integrators find it
+    bounce = loop.bounce
+
+    def turn(*arguments, **named):
+        call()
+        return bounce(*arguments, **named)
+
+    monkeypatch.setattr(loop, "bounce", turn)
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Hits.
+
+def _surfaces(scene):
+    return AttachedSurfaces.from_contents(
+        SimpleNamespace(instances=Instances.from_scene(scene), detached_hits=DetachedHits.from_scene(scene))
+    )
+
+
+def attached_interaction(scene, pi, ray, flags, active=True):
+    """Return the SurfaceInteraction3f of ``pi``, attached to the ray, to its shape and to what moves that."""
+    return surface_interaction(_surfaces(scene), pi, ray, flags, mi.Bool(active))
+
+
+def attached_distance(scene, pi, ray, active=True):
+    """Return the distance of the surface at ``pi`` along an attached ray."""
+    return distance_to(_surfaces(scene), pi, ray, mi.Bool(active))
+
+
+def varies_by_place(plugin):
+    """Return whether a BSDF or an emitter is not the same all over its surface."""
+    if isinstance(plugin, mi.Emitter):
+        return scene_contents.emits_by_place(plugin)
+    return scene_contents.scatters_by_place(plugin)
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Other ways to the same numbers.
+
+def nail_down(monkeypatch):
+    """Points near a vertex do not move along with it."""
+    monkeypatch.setattr(f"{CORE}.scene_contents.DAMPING", 0.0)
+
+
+def no_flat_shortcut(monkeypatch):
+    """Points slide on flat surfaces as on all others."""
+    monkeypatch.setattr(f"{CORE}.scene_contents.is_flat", lambda shape: False)
+
+
+def limit_records(monkeypatch, stack, memory=None):
+    """Set the bytes that the record of a path may take: of the stack, and of memory (None: as it is)."""
+    monkeypatch.setattr(f"{CORE}.record.room_of_path", lambda: stack)
+    if memory is not None:
+        monkeypatch.setattr(f"{CORE}.record.MEMORY", memory)

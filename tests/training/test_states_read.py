@@ -145,7 +145,7 @@ def test_parts_that_are_none():
     for wrong in (5, None, torch.tensor(3.0)):
         with pytest.raises(ArgumentError, match="accumulate: expected parts as a list or any iterable"):
             tt.training.accumulate(lambda part: one, wrong)
-    with pytest.raises(ArgumentError, match="accumulate: expected loss_of as a function of a part, got 5"):
+    with pytest.raises(ArgumentError, match="accumulate: loss_of: expected a function of a part, got 5"):
         tt.training.accumulate(5, range(2))
     for scaler in (5, object()):
         with pytest.raises(ArgumentError, match=r"accumulate: expected scaler as a torch\.amp\.GradScaler"):

@@ -7,6 +7,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from support.walks import damped_motion
+
 RADIUS = 0.4
 δ = np.array([0.3, -0.7, 0.5])
 # A plane seen from the origin, as the points q with N.q = 1.
@@ -39,8 +41,6 @@ def directions():
 def tangents(d):
     """The derivatives of direction, solid angle, drag and slide."""
     mi.set_variant("llvm_ad_mono")
-    from torchtransient.plugins.transport.geometry_terms import damped_motion
-
     def vector(v):
         return mi.Vector3f(np.ascontiguousarray(v.T, dtype=np.float32))
 

@@ -8,21 +8,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-import scipy.interpolate
 import scipy.spatial.transform
 
 from support.gradient_cases.cases_curves import DIFFUSE, ellipsoid, file_of, seen_wall
 from support.marks import long, long_rows
-from torchtransient.plugins.transport.strategy import Local
-from torchtransient.plugins.transport.surface_interactions import (
-    AttachedSurfaces,
-    DetachedHits,
-    Instances,
-    _spline,
-    _starts,
-    distance_to,
-    surface_interaction,
-)
+from support.walks import attached_distance, attached_interaction
 
 VARIANT = "llvm_ad_mono"
 OUT_OF_SIGHT = [5.0, 0.0, 30.0, 0.1, 0.1, 0.1, 0.0, 0.0, 0.0, 1.0]
@@ -85,8 +75,10 @@ def slopes_of_hits(ours):
         params["curve.control_points"] = start + direction * x
         params.update()
         pi = scene.ray_intersect_preliminary(ray)
-        surfaces = AttachedSurfaces(None, DetachedHits.of(scene).read()) if ours else None
-        si = surface_interaction(surfaces, pi, ray, mi.RayFlags.All, mi.Bool(True))
+        if ours:
+            si = attached_interaction(scene, pi, ray, mi.RayFlags.All)
+        else:
+            si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
         return [si.t, si.n, si.sh_frame.n, si.uv]
 
     above, below = ([np.array(part) for part in hits(x)] for x in (step, -step))
@@ -172,16 +164,10 @@ def rays_to_targets(x):
 
 
 def read_fields(scene, ray, fields):
-    surfaces = AttachedSurfaces.of(contents_of(scene))
     pi = scene.ray_intersect_preliminary(dr.detach(ray))
-    si = surface_interaction(surfaces, pi, ray, mi.RayFlags.All, mi.Bool(ACTIVE))
+    si = attached_interaction(scene, pi, ray, mi.RayFlags.All, ACTIVE)
     found = {"t": si.t, "n": si.n, "shading": si.sh_frame.n, "s": si.sh_frame.s, "uv": si.uv, "dp_du": si.dp_du}
     return [dr.select(si.is_valid(), found[name], 0) for name in fields]
-
-
-def contents_of(scene):
-    """What the interactions of a job ask the contents of its scene for."""
-    return Local(instances=Instances.of(scene), detached_hits=DetachedHits.of(scene))
 
 
 STEP = 1e-3
@@ -290,30 +276,6 @@ def test_slopes_backwards_are_finite(kind):
     assert np.isfinite(slope).all() and slope.any()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", long(KEYS, ["bsplinecurve"]))
-def test_what_is_none_of_theirs_moves_as_it_did(kind):
-    """The lanes of other shapes, of nothing and of what is not asked for: no infinity reaches their rays and points."""
-    scene = mi.load_dict({"type": "scene", **two_of_each(kind)}, optimize=False)
-    ray = rays_to_targets(0.0)
-    pi, table = scene.ray_intersect_preliminary(ray), DetachedHits.of(scene).read()
-    plain, others = pi.compute_surface_interaction(ray), slice(6, 9)
-    si, p = mi.SurfaceInteraction3f(plain), mi.Point3f(plain.p)
-    dr.enable_grad(ray.o, ray.d, p)
-    si.p = p
-    found = table.attach(pi, pi.shape, ray, mi.Bool(ACTIVE))
-    table.put_right(si, found, mi.Bool(ACTIVE))
-    for name in ("n", "uv", "dp_du"):
-        np.testing.assert_array_equal(np.array(getattr(si, name)), np.array(getattr(plain, name)))
-    dr.backward(dr.sum(found.t + found.prim_uv.x + si.n.x + si.n.y + si.uv.y + si.dp_du.z + si.sh_frame.s.y + p.x))
-    slopes = [np.array(dr.grad(part)) for part in (ray.o, ray.d, p)]
-    assert not any(np.isnan(slope).any() for slope in slopes)
-    assert not slopes[0][:, others].any() and not slopes[1][:, others].any()
-    np.testing.assert_array_equal(slopes[2][:, others], [[1] * 3, [0] * 3, [0] * 3])
-    # Those of theirs follow the ray, or the point.
-    assert slopes[0 if kind != "bsplinecurve" else 2][:2, :6].any(0).all()
-
-
 def test_a_cone_as_steep_as_its_radius_has_no_slope_along_it():
     """A segment whose radius grows as fast as it is long: nothing is divided by zero."""
     scene = mi.load_dict(
@@ -322,27 +284,12 @@ def test_a_cone_as_steep_as_its_radius_has_no_slope_along_it():
     params, pi = mi.traverse(scene), dr.zeros(mi.PreliminaryIntersection3f)
     dr.enable_grad(params["shape.control_points"])
     params.update()
-    pi.t, pi.prim_uv, pi.shape = mi.Float(2), mi.Point2f(0.5, 0), mi.ShapePtr(scene.shapes()[0])
+    pi.t, pi.prim_uv, pi.shape, pi.valid = 2, mi.Point2f(0.5, 0), mi.ShapePtr(scene.shapes()[0]), True
     ray = mi.Ray3f(mi.Point3f(0.3, 0.2, -4), mi.Vector3f(0, 0, 1))
-    found = DetachedHits.of(scene).read().attach(pi, pi.shape, ray, mi.Bool(True))
-    dr.backward(found.t + found.prim_uv.x)
+    dr.backward(attached_interaction(scene, pi, ray, mi.RayFlags.All).t)
     slope = np.array(dr.grad(params["shape.control_points"])).reshape(2, 4)
     # The distance alone: |off|^2 = r^2 at (0.3, 0.2, -2), in the middle between both ends.
     np.testing.assert_allclose(slope, np.tile([0.3, 0.2, -2, 2], (2, 1)) * 0.5 / -2, rtol=1e-5)
-
-
-def test_a_spline_that_bends_as_its_surface_has_no_slope():
-    """At the centre of its curvature every place along it is as near: nothing is divided by zero."""
-    points = np.array([[-3, 0, 0, 1], [0, 1.5, 0, 1], [3, 0, 0, 1], [6, 0, 0, 1]])
-    scene = mi.load_dict({"type": "scene", "shape": curve_of("bsplinecurve", "bent as far.txt", points)})
-    pi, si = dr.zeros(mi.PreliminaryIntersection3f), dr.zeros(mi.SurfaceInteraction3f)
-    x = mi.Float(0)
-    dr.enable_grad(x)
-    # The curve begins at (0, 1, 0) with the slope (3, 0, 0) and bends by (0, -3, 0).
-    si.p, si.shape, si.uv, si.dp_du = mi.Point3f(x, -2, 0), mi.ShapePtr(scene.shapes()[0]), mi.Point2f(0.5), [0, 0, 1]
-    DetachedHits.of(scene).read().put_right(si, pi, mi.Bool(True))
-    dr.backward(si.uv.y + si.n.x + si.n.y)
-    assert dr.grad(x)[0] == 0
 
 
 @pytest.mark.parametrize("kind", ["ellipsoids", "linearcurve"])
@@ -355,30 +302,14 @@ def test_a_ray_along_a_surface_has_no_slope(kind):
         shape = curve_of(kind, "tube.txt", np.array([[0, -1.0, 0, 1], [0, 1.0, 0, 1]]))
     scene = mi.load_dict({"type": "scene", "shape": shape}, optimize=False)
     pi = dr.zeros(mi.PreliminaryIntersection3f)
-    pi.t, pi.prim_uv, pi.shape = mi.Float(2), mi.Point2f(0.5, 0), mi.ShapePtr(scene.shapes()[0])
+    pi.t, pi.prim_uv, pi.shape, pi.valid = 2, mi.Point2f(0.5, 0), mi.ShapePtr(scene.shapes()[0]), True
     x = mi.Float(0)
     dr.enable_grad(x)
     ray = mi.Ray3f(mi.Point3f(1 + x, 0, -2), mi.Vector3f(0, 0, 1))
-    found = DetachedHits.of(scene).read().attach(pi, pi.shape, ray, mi.Bool(True))
-    assert (found.t[0], found.prim_uv.x[0]) == (2, 0.5)
-    dr.backward(found.t + found.prim_uv.x)
+    found = attached_interaction(scene, pi, ray, mi.RayFlags.All)
+    assert found.t[0] == 2
+    dr.backward(found.t)
     assert dr.grad(x)[0] == 0
-
-
-def test_the_place_on_a_spline():
-    rng = np.random.default_rng(1)
-    points = rng.normal(size=(4, 4))
-    v = np.array([0.0, 0.13, 0.5, 0.71, 1.0])
-    spline = scipy.interpolate.BSpline(np.arange(-3.0, 5.0), points, 3)
-    for order, (place, radius) in enumerate(_spline([[mi.Float(x) for x in p] for p in points], mi.Float(v))):
-        expected = spline(v, nu=order) if order else spline(v)
-        np.testing.assert_allclose(np.array(place).T, expected[:, :3], rtol=1e-5, atol=1e-5)
-        np.testing.assert_allclose(np.array(radius), expected[:, 3], rtol=1e-5, atol=1e-5)
-
-
-def test_where_shapes_begin_in_a_table_of_all():
-    arrays = [dr.zeros(mi.Float, width) for width in (8, 12, 4, 0)]
-    assert _starts(arrays, 4) == [0, 2, 5, 6]
 
 
 def test_distance_of_where_a_ray_leaves():
@@ -392,7 +323,7 @@ def test_distance_of_where_a_ray_leaves():
     params = mi.traverse(scene)
     params["ball.to_world"] = mi.Transform4f(params["ball.to_world"]) @ mi.Transform4f().scale(mi.Vector3f(scale))
     params.update()
-    t = distance_to(None, pi, mi.Ray3f(mi.Point3f(x, 0, -3), mi.Vector3f(0, 0, 1)), mi.Bool(True))
+    t = attached_distance(scene, pi, mi.Ray3f(mi.Point3f(x, 0, -3), mi.Vector3f(0, 0, 1)))
     dr.backward(t)
     assert dr.grad(x)[0] == pytest.approx(-0.9 / 1.2, rel=1e-5)
     assert dr.grad(scale)[0] == pytest.approx(1.5 * 1.5 / 1.2, rel=1e-5)

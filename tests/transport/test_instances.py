@@ -9,9 +9,7 @@ import pytest
 
 from support.gradient_cases.cases_curves import file_of
 from support.marks import long
-from torchtransient.plugins.transport import surface_interactions as module
-from torchtransient.plugins.transport.strategy import Local
-from torchtransient.plugins.transport.surface_interactions import AttachedSurfaces, DetachedHits, Instances
+from support.walks import attached_distance, attached_interaction
 
 VARIANT = "llvm_ad_mono"
 STEP = 1e-3
@@ -58,13 +56,9 @@ def rays(x):
     return mi.Ray3f(mi.Point3f(start) + mi.Vector3f(moved) * x, d)
 
 
-def surfaces_of(scene):
-    return AttachedSurfaces.of(Local(instances=Instances.of(scene), detached_hits=DetachedHits.of(scene)))
-
-
 def interaction(scene, ray, flags):
     pi = scene.ray_intersect_preliminary(dr.detach(ray))
-    return module.surface_interaction(surfaces_of(scene), pi, ray, flags, mi.Bool(True))
+    return attached_interaction(scene, pi, ray, flags)
 
 
 def fields_of(si):
@@ -167,7 +161,7 @@ def test_distance_to_where_a_ray_leaves(name):
         pi = scene.ray_intersect_preliminary(mi.Ray3f(before(entry.t + 0.01), before.d))
         pi.t += entry.t + 0.01
         met = pi.is_valid()
-        return dr.select(met, module.distance_to(surfaces_of(scene), pi, ray, met), 0)
+        return dr.select(met, attached_distance(scene, pi, ray, met), 0)
 
     above, below = (np.array(distance(mi.Float(x))) for x in (5 * STEP, -5 * STEP))
     x = unknown()
@@ -202,62 +196,8 @@ def test_idle_lanes_reach_no_pose():
     ray.d = dr.select(missed & (lane >= 6), np.nan, ray.d)
     dr.enable_grad(ray.o)
     flags = mi.RayFlags.All | mi.RayFlags.FollowShape
-    si = module.surface_interaction(surfaces_of(scene), pi, ray, flags, mi.Bool(True))
+    si = attached_interaction(scene, pi, ray, flags)
     dr.backward(dr.sum(dr.select(si.is_valid(), si.t + si.n.x + si.p.z, 0)))
     slope = np.array(dr.grad(ray.o))
     assert np.isfinite(dr.grad(x)[0]) and np.isfinite(slope).all() and slope.any()
     assert np.array(missed).sum() == 4 and not slope[:, np.array(missed)].any()
-
-
-def test_poses_are_hidden_for_a_while():
-    """From Mitsuba, and attached again afterwards, whatever has happened: those that were."""
-    scene, x = scene_of("egg", "tube"), mi.Float(0)
-    params = mi.traverse(scene)
-    dr.enable_grad(x)
-    move(params, x, ("second",))
-    found = Instances.of(scene)
-
-    def attached():
-        return {node.id(): dr.grad_enabled(shown.read(node)) for node, shown in found._shown}
-
-    before = {"first": False, "second": True}
-    assert attached() == before
-
-    def fail():
-        with found.detached():
-            assert attached() == dict.fromkeys(before, False)
-            raise ValueError("what a derivative may raise")
-
-    with pytest.raises(ValueError, match="may raise"):
-        fail()
-    assert attached() == before
-    matrix = np.array(params["second.to_world"].matrix).reshape(4, 4)
-    np.testing.assert_allclose(matrix, POSES["second"], rtol=1e-6)
-
-
-def test_frames_of_normals_and_tangents():
-    """Across the normal along the tangent; where there is none, as Mitsuba does it."""
-    n = dr.normalize(mi.Normal3f([0.3, 0.2], [-0.2, 0.1], [0.9, -0.5]))
-    tangent = mi.Vector3f([1.0, 0.0], [2.0, 0.0], [0.5, 0.0])
-    frame = module._frame(n, tangent)
-    normal, along = np.array(n, dtype=np.float64), np.array(tangent)[:, 0]
-    across = along - normal[:, 0] * (normal[:, 0] @ along)
-    expected = np.stack([across / np.linalg.norm(across), np.array(mi.coordinate_system(n)[0])[:, 1]], axis=1)
-    np.testing.assert_allclose(np.array(frame.s), expected, rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(np.array(frame.t), np.cross(normal, np.array(frame.s), axis=0), atol=1e-6)
-    np.testing.assert_array_equal(np.array(frame.n), np.array(n))
-
-
-def test_surfaces_need_help_with_instances_or_curves():
-    """Each alone, too."""
-    both = scene_of()
-    group = {"type": "shapegroup", "ball": {"type": "sphere"}}
-    copy = {"type": "instance", "group": {"type": "ref", "id": "group"}}
-    instance = mi.load_dict({"type": "scene", "group": group, "copy": copy})
-    tube = {"type": "bsplinecurve", "filename": file_of("tube in a group.txt", TUBE)}
-    curve = mi.load_dict({"type": "scene", "tube": tube})
-    assert surfaces_of(mi.load_dict({"type": "scene", "wall": {"type": "rectangle"}})) is None
-    assert [len(surfaces_of(scene).tables()) for scene in (instance, curve, both)] == [1, 1, 4]
-    ray = mi.Ray3f(mi.Point3f(-0.25, -1.4, 5), mi.Vector3f(0, 0, -1))
-    assert interaction(curve, ray, mi.RayFlags.All).t[0] == pytest.approx(5 - 0.3, abs=0.1)
-    assert not interaction(instance, ray, mi.RayFlags.All).is_valid()[0]

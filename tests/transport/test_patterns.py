@@ -5,8 +5,8 @@ from __future__ import annotations
 import mitsuba as mi
 
 from support.sweeps import together
+from support.walks import varies_by_place
 from tools.every_plugin import bsdfs
-from torchtransient.plugins.transport.scene_contents import emits_by_place, scatters_by_place
 
 VARIANT = "llvm_ad_rgb"
 BOARD = {"type": "checkerboard"}
@@ -16,7 +16,7 @@ VARYING = ("bumpmap", "normalmap", "delayed")
 
 def light(shape, **emitter):
     holder = mi.load_dict({"type": shape, "emitter": emitter})
-    return emits_by_place(holder.emitter())  # which does not keep its shape alive
+    return varies_by_place(holder.emitter())  # which does not keep its shape alive
 
 
 def test_lights():
@@ -26,24 +26,24 @@ def test_lights():
     assert not light("rectangle", type="angulararea", radiance=1.0)
     assert light("rectangle", type="angulararea", radiance=BOARD)
     assert light("cylinder", type="angulararea", radiance=1.0)
-    assert not emits_by_place(mi.load_dict({"type": "point"}))
+    assert not varies_by_place(mi.load_dict({"type": "point"}))
 
 
 @together("name", [name for name in bsdfs() if name not in VARYING])
 def test_every_bsdf_without_a_varying_texture(name):
     """Guards against names of Mitsuba's classes that have changed: all would count as patterned, at a cost."""
-    assert not scatters_by_place(mi.load_dict(bsdfs()[name]))
+    assert not varies_by_place(mi.load_dict(bsdfs()[name]))
 
 
 def test_textures_of_what_is_held():
     paint = {"type": "mask", "nested": {"type": "twosided", "nested": {"type": "diffuse", "reflectance": BOARD}}}
-    assert scatters_by_place(mi.load_dict(paint))
+    assert varies_by_place(mi.load_dict(paint))
 
 
 def test_attributes_of_meshes():
     """Mitsuba's texture of them says that it does not vary."""
     attribute = {"type": "mesh_attribute", "name": "vertex_color"}
-    assert scatters_by_place(mi.load_dict({"type": "diffuse", "reflectance": attribute}))
+    assert varies_by_place(mi.load_dict({"type": "diffuse", "reflectance": attribute}))
     assert light("cube", type="area", radiance=attribute)
 
 
@@ -75,7 +75,7 @@ def register_those_of_another():
 def test_plugins_of_others_whatever_holds_them():
     register_those_of_another()
     stripes = {"type": "stripes_of_another"}
-    assert scatters_by_place(mi.load_dict(stripes))
-    assert scatters_by_place(mi.load_dict({"type": "twosided", "nested": stripes}))
-    assert scatters_by_place(mi.load_dict({"type": "diffuse", "reflectance": {"type": "waves_of_another"}}))
+    assert varies_by_place(mi.load_dict(stripes))
+    assert varies_by_place(mi.load_dict({"type": "twosided", "nested": stripes}))
+    assert varies_by_place(mi.load_dict({"type": "diffuse", "reflectance": {"type": "waves_of_another"}}))
     assert light("rectangle", type="area", radiance={"type": "waves_of_another"})

@@ -17,7 +17,7 @@ from torchtransient.capture.arithmetic import summed
 from torchtransient.capture.files import reader, writer
 from torchtransient.capture.metadata import metadata_text
 from torchtransient.capture.scan import Scan, laser_index
-from torchtransient.checks import arguments_of, finite, flag, shown
+from torchtransient.checks import arguments_of, finite, flag, of_class, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.tensor_record import TensorRecord
 
@@ -80,8 +80,7 @@ class Capture(TensorRecord):
         metadata_text(self.metadata, "Capture")
 
     def _check_settings(self) -> None:
-        if not isinstance(self.scan, Scan):
-            raise ArgumentError(f"Capture: expected scan as a Scan, got {shown(self.scan)}.")
+        of_class("Capture: scan", self.scan, Scan)
         for name, kind in (("axis", TimeAxis), ("frequencies", FrequencyAxis)):
             given = getattr(self, name)
             if given is not None and not isinstance(given, kind):

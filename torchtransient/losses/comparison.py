@@ -17,6 +17,7 @@ from torch.autograd import forward_ad
 
 from torchtransient.checks import MOST, finite, is_one_of, shown
 from torchtransient.errors import ArgumentError, DeviceError, ShapeError, TorchTransientError, UnitError
+from torchtransient.floating import is_true
 from torchtransient.units import SHORTEST_OPL
 
 Reduction = Literal["none", "sum", "mean"]
@@ -101,7 +102,7 @@ def check_level(
         _check_fit(name, value, like, where)
         # of whole numbers and narrower ones in the precision they are used in
         level = value if value.dtype == torch.float64 else value.to(dtype)
-        fits = holds((level >= least) & (level <= most) | (level == 0 if zero else torch.zeros_like(level).bool()))
+        fits = is_true((level >= least) & (level <= most) | (level == 0 if zero else torch.zeros_like(level).bool()))
     else:
         number = check_number(name, value, where)
         fits = least <= number <= most or (zero and number == 0)
@@ -154,18 +155,6 @@ def check_option(
     check_level(name, value, torch.empty(shape, dtype=torch.float64, device=device), where, zero=zero, square=square)
 
 
-def holds(condition: Tensor) -> bool:
-    """Whether it is true everywhere, as far as it can be looked at: not in `torch.vmap`, not without memory."""
-    if condition.is_meta:
-        return True
-    try:
-        return bool(condition.all())
-    except RuntimeError as error:
-        if "vmap" not in str(error):
-            raise
-        return True
-
-
 def check_number(name: str, value: object, where: str) -> float:
     """One finite number. Raises UnitError, also for a tensor with a gradient, which ends where a number is taken."""
     if isinstance(value, Tensor) and (value.requires_grad or _tangent(value) is not None):
@@ -187,12 +176,6 @@ def check_whole(name: str, value: object, where: str, error: type[TorchTransient
     if not 1 <= number <= MOST or number != int(number):
         raise error(f"{where}: expected {name} to be a whole number of at least 1, got {shown(value)}.")
     return int(number)
-
-
-def check_function(name: str, value: object, where: str) -> None:
-    """Raise ArgumentError unless ``value`` is a function of tensors."""
-    if not callable(value):
-        raise ArgumentError(f"{where}: expected {name} to be a function of tensors, got {shown(value)}.")
 
 
 def check_mask(mask: Tensor | None, like: Tensor, where: str) -> Tensor | None:

@@ -29,6 +29,7 @@ from torch import Tensor, nn
 
 from torchtransient.checks import flag
 from torchtransient.errors import GradientError, TorchTransientWarning, UnitError
+from torchtransient.floating import is_true
 from torchtransient.losses.comparison import (
     Reduction,
     check_dense,
@@ -38,7 +39,6 @@ from torchtransient.losses.comparison import (
     check_pair,
     check_reduction,
     counted,
-    holds,
     item_mean,
     working_dtype,
 )
@@ -105,7 +105,7 @@ def _are_counts(x: Tensor) -> bool:
         return x.numel() >= _A_RECORD
     # of predictions as a rule a few entries say enough
     few = x.view(-1)[:: x.numel() // _A_RECORD] if x.is_contiguous() else x.select(0, 0) if x.ndim else x
-    return holds(few == few.round()) and holds((x == x.round()) & (x.amin() != x.amax()))
+    return is_true(few == few.round()) and is_true((x == x.round()) & (x.amin() != x.amax()))
 
 
 def check_rates(model: Tensor, where: str) -> None:

@@ -10,13 +10,12 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from torchtransient.checks import flag
+from torchtransient.checks import flag, function
 from torchtransient.errors import ArgumentError, ShapeError
 from torchtransient.losses.comparison import (
     Reduction,
     check_dense,
     check_device,
-    check_function,
     check_mask,
     check_pair,
     check_reduction,
@@ -96,7 +95,7 @@ def _checked(
     operator: object, compare: PairLoss | PairModule, scale_invariant: bool, reduction: Reduction, where: str
 ) -> tuple[Callable[..., Tensor], dict[str, inspect.Parameter]]:
     """`compare` as a function (input, target, mask) with that reduction, and its parameters. Raises ShapeError."""
-    check_function("the operator", operator, where)
+    function(f"{where}: the operator", operator, "tensors")
     flag(f"{where}: scale_invariant", scale_invariant)
     known = check_compare(compare, where, reduction)
     if not isinstance(compare, nn.Module):

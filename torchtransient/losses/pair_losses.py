@@ -9,9 +9,10 @@ from typing import Any, Protocol, cast
 
 from torch import Tensor, nn
 
+from torchtransient import checks
 from torchtransient.checks import shown
 from torchtransient.errors import ArgumentError
-from torchtransient.losses.comparison import Reduction, check_function
+from torchtransient.losses.comparison import Reduction
 from torchtransient.losses.layouts import time_dim
 
 # First arguments of what is no loss (input, target): a model there would be taken for a measurement, in silence, since
@@ -39,7 +40,7 @@ def check_compare(compare: object, where: str, reduction: Reduction | None) -> d
     """Its parameters. Raises ArgumentError unless it is a function or module (model, measurement) with a mask, and of
     nothing else that is not given; `reduction`: a function takes it, too.
     """
-    check_function("compare", compare, where)
+    checks.function(f"{where}: compare", compare, "tensors")
     module = isinstance(compare, nn.Module)
     function = cast(Callable[..., Any], compare.forward if isinstance(compare, nn.Module) else compare)
     title = type(compare).__name__ if module else _title(compare)

@@ -7,11 +7,11 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
+from torchtransient.checks import function
 from torchtransient.errors import ShapeError
 from torchtransient.losses.comparison import (
     Reduction,
     check_dense,
-    check_function,
     check_level,
     check_mask,
     check_option,
@@ -66,7 +66,7 @@ def root_loss(
     ShapeError, UnitError.
     """
     check_reduction(reduction, "root_loss")
-    check_function("root", root, "root_loss")
+    function("root_loss: root", root, "tensors")
     input, target = check_pair(input, target, "root_loss")
     mask = check_mask(mask, input, "root_loss")
     ours, theirs = root(counted(input, mask)), root(counted(target, mask))
@@ -119,7 +119,7 @@ class RootLoss(nn.Module):
     def __init__(self, root: Callable[[Tensor], Tensor] = anscombe, reduction: Reduction = "mean") -> None:
         super().__init__()
         check_reduction(reduction, "RootLoss")
-        check_function("root", root, "RootLoss")
+        function("RootLoss: root", root, "tensors")
         self.root, self.reduction = root, reduction
 
     def forward(self, input: Light, target: Light, mask: Tensor | None = None) -> Tensor:

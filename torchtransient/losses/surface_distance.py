@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import ShapeError
-from torchtransient.losses.comparison import check_dense, check_device, check_whole, holds, working_dtype
+from torchtransient.floating import is_true
+from torchtransient.losses.comparison import check_dense, check_device, check_whole, working_dtype
 from torchtransient.losses.triangles import check_faces, unit_normals
 
 # Numbers held at a time of one of the tensors (points, triangles, 3, 3).
@@ -60,7 +61,7 @@ def _one_way(triangles: Tensor, others: Tensor, cells: int) -> Tensor:
     longest = edges.detach().abs().amax()
     edges = edges / torch.where(longest > 0, longest, torch.ones_like(longest))
     area = _length(torch.linalg.cross(edges[:, 0], edges[:, 1]))
-    if not holds((area.sum() > 0) | area.isnan().any()):
+    if not is_true((area.sum() > 0) | area.isnan().any()):
         raise ShapeError("surface_distance: expected meshes with an area, got one of whose triangles none has any.")
     mean: Tensor = (distance.mean(1) * area).sum() / area.sum()
     return mean

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.losses.comparison import check_device, holds
+from torchtransient.floating import is_true
+from torchtransient.losses.comparison import check_device
 
 # The sine, or cotangent, of the sharpest corner that is told from none: ten times the rounding of single precision.
 SHARPEST = 1e-6
@@ -18,7 +19,7 @@ def check_faces(faces: Tensor, vertices: Tensor, where: str) -> None:
         raise UnitError(f"{where}: expected faces of whole numbers, got {faces.dtype}. Use faces.long().")
     check_device(faces, vertices, where, "vertices and faces")
     wide, number = faces.long(), vertices.shape[-2]
-    if not holds((wide >= 0) & (wide < number)):
+    if not is_true((wide >= 0) & (wide < number)):
         raise ShapeError(f"{where}: expected faces of numbers from 0 to {number - 1}, got others.")
 
 

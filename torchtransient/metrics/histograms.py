@@ -13,7 +13,8 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.checks import share, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.losses.comparison import check_mask, check_pair, counted, holds
+from torchtransient.floating import is_true
+from torchtransient.losses.comparison import check_mask, check_pair, counted
 from torchtransient.losses.layouts import bins_dim
 from torchtransient.losses.results import TRANSIENT, Transient, reads
 from torchtransient.metrics.tally import Reduction, Tally, check_finite
@@ -137,7 +138,7 @@ def _distributions(
     for record, name in ((x, "input"), (y, "target")):
         check_finite(record, given, name, where)
         kept = counted(record, given)
-        if not holds(kept >= 0):
+        if not is_true(kept >= 0):
             raise UnitError(
                 f"{where}: expected {name} without negative bins, got {int((kept < 0).sum())} of them. A record less "
                 "its background is no distribution: use .clamp_min(0), or a loss of tt.losses."
@@ -148,7 +149,7 @@ def _distributions(
     ours, theirs = (record.sum(place, keepdim=True) for record in records)
     lit = theirs > 0
     dark = lit & (ours <= 0)
-    if not holds(~dark):
+    if not is_true(~dark):
         raise UnitError(
             f"{where}: expected light in the input wherever the target has some, got {int(dark.sum())} pixels without. "
             "Leave them out with mask=, and say how many those are; tt.losses.wasserstein_loss fills them up."

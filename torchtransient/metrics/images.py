@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.losses.comparison import check_level, check_mask, check_pair, counted, holds
+from torchtransient.floating import is_true
+from torchtransient.losses.comparison import check_level, check_mask, check_pair, counted
 from torchtransient.losses.layouts import time_dim
 from torchtransient.losses.results import STEADY, TRANSIENT, Picture, Transient, reads
 from torchtransient.losses.similarity import WINDOW, ssim_loss
@@ -190,7 +191,7 @@ def _range(
             return limit
         low, high = target.clamp(max=0), target.clamp_min(0)
         spread = high.amax(dims, keepdim=True) - low.amin(dims, keepdim=True)
-        if not holds(spread <= limit * (1 + 1e-5)):
+        if not is_true(spread <= limit * (1 + 1e-5)):
             raise UnitError(
                 f"{where}: expected a target within value_range {value_range}, got values over "
                 f"{float(spread.max()):.4g}. Give the range of the data, or none."
@@ -200,7 +201,7 @@ def _range(
         return target.new_ones(())
     top = target.amax(dims, keepdim=True)
     needed = torch.ones_like(top, dtype=torch.bool) if mask is None else mask.to(top.dtype).amax(dims, keepdim=True) > 0
-    if not holds((top > 0) | ~needed):
+    if not is_true((top > 0) | ~needed):
         raise UnitError(
             f"{where}: expected targets with light, whose highest value is their range, got one without. Give "
             "value_range=, that of the data."

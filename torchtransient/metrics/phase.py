@@ -12,7 +12,8 @@ from torch import Tensor
 
 from torchtransient.checks import positive
 from torchtransient.errors import UnitError
-from torchtransient.losses.comparison import check_mask, check_pair, counted, holds
+from torchtransient.floating import is_true
+from torchtransient.losses.comparison import check_mask, check_pair, counted
 from torchtransient.losses.results import PHASOR, Phasors, reads
 from torchtransient.metrics.tally import Finish, Kind, Reduction, Tally, check_finite, check_weight
 
@@ -119,7 +120,7 @@ def _difference(
     if not x.is_complex():
         return _wrapped(counted(x, measured) - counted(y, measured), turn), counts
     x, y = counted(x, measured, 1.0), counted(y, measured, 1.0)
-    if not holds(x != 0):
+    if not is_true(x != 0):
         raise UnitError(
             f"{where}: expected phasors other than zero where the target is, got {int((x == 0).sum())} of zero, which "
             "have no phase. Leave them out with mask=, and say how many those are."

@@ -16,7 +16,8 @@ from torch import Tensor
 from torchtransient import stokes
 from torchtransient.checks import shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.losses.comparison import check_level, check_mask, check_pair, holds
+from torchtransient.floating import is_true
+from torchtransient.losses.comparison import check_level, check_mask, check_pair
 from torchtransient.losses.layouts import check_dim
 from torchtransient.losses.results import Picture
 from torchtransient.metrics.phase import phase_mae
@@ -158,7 +159,7 @@ def _finite(pair: tuple[Tensor, Tensor], counts: Tensor, dim: int, where: str) -
 
 def _check_there(level: Tensor, counts: Tensor, what: str, where: str) -> None:
     missing = counts & ~(level > torch.finfo(level.dtype).tiny)
-    if not holds(~missing):
+    if not is_true(~missing):
         raise UnitError(
             f"{where}: expected an input with {what} where the target has some, got {int(missing.sum())} entries of "
             "none. Leave them out with mask=, and say how many those are."

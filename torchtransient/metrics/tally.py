@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.losses.comparison import check_device, check_mask, holds
+from torchtransient.floating import is_true
+from torchtransient.losses.comparison import check_device, check_mask
 
 Reduction = Literal["mean", "item", "none"]
 
@@ -103,7 +104,7 @@ def check_reduction(reduction: object, where: str) -> None:
 def check_finite(x: Tensor, mask: Tensor | None, name: str, where: str) -> None:
     """Raises UnitError for NaN and infinite numbers where `mask` counts."""
     wrong = ~torch.isfinite(x) if mask is None else ~torch.isfinite(x) & mask
-    if not holds(~wrong):
+    if not is_true(~wrong):
         raise UnitError(
             f"{where}: expected {name} of finite numbers where it is measured, got {int(wrong.sum())} of "
             f"{wrong.numel()} that are NaN or infinite. Leave them out with mask=, and say how many those are."
@@ -127,6 +128,6 @@ def check_weight(weight: Tensor | None, mask: Tensor | None, like: Tensor, where
         ) from None
     if mask is not None:
         full = torch.where(mask, full, torch.zeros_like(full))
-    if not holds(torch.isfinite(full) & (full >= 0)):
+    if not is_true(torch.isfinite(full) & (full >= 0)):
         raise UnitError(f"{where}: expected weights that are finite and not below zero, got others.")
     return full

@@ -8,22 +8,10 @@ from typing import Any
 import torch
 from torch import nn
 
-from torchtransient.capture import Scan
-from torchtransient.checks import as_whole, count, shown
+from torchtransient.checks import as_whole, shown
 from torchtransient.errors import ArgumentError, SceneError
-from torchtransient.rendering.arguments import samples
-from torchtransient.rendering.job import SEED_RANGE, drawn
+from torchtransient.rendering.job import SEED_RANGE, draw_seed
 from torchtransient.sensing import Device
-
-
-def checked_count(who: str, name: str, value: Any) -> int:
-    """A whole number of at least 1. Raises ArgumentError."""
-    return count(f"{who}: {name}", value, 1, ArgumentError)
-
-
-def checked_samples(who: str, value: Any) -> int | None:
-    """Samples of a sensor point, or None. Raises UnitError."""
-    return samples(f"{who}: spp", value)
 
 
 def checked_seed(who: str, value: Any) -> int:
@@ -47,19 +35,13 @@ def check_seeds(who: str, value: Any) -> None:
         for one in value:
             check_seeds(who, one)
         return
-    _, of_each_entry = drawn(value)
+    _, of_each_entry = draw_seed(value)
     if of_each_entry is None:
         checked_seed(who, value)
 
 
-def check_is_scan(who: str, value: Any) -> None:
-    """Raise SceneError for what is no scan."""
-    if not isinstance(value, Scan):
-        raise ArgumentError(f"{who}: expected scan as a tt.nlos.Scan, got {type(value).__name__}.")
-
-
 def check_sensor(who: str, sensor: Any, generator: Any = None) -> None:
-    """Raise SceneError unless ``sensor`` can take a transient and ``generator`` draw its noise, or they are None."""
+    """Raise ArgumentError unless ``sensor`` can take a transient and ``generator`` draw its noise, or they are None."""
     if not isinstance(sensor, nn.Module | Device | None):
         raise ArgumentError(f"{who}: expected sensor as a module or device of tt.sensing, got {shown(sensor)}.")
     if not isinstance(generator, torch.Generator | None):

@@ -10,13 +10,15 @@ import torch
 from torch import nn
 
 from torchtransient.capture import Capture, Scan
+from torchtransient.checks import of_class
 from torchtransient.errors import ArgumentError, SceneError, TorchTransientError
 from torchtransient.nlos import defaults
 from torchtransient.nlos.answers import black_message, checked_module, is_readable, measured
-from torchtransient.nlos.arguments import check_is_scan, check_seeds, check_sensor, checked_samples, keys_and_values
+from torchtransient.nlos.arguments import check_seeds, check_sensor, keys_and_values
 from torchtransient.nlos.scan_watch import HIDDEN, LASER_RAYS, SENSOR_RAYS, ScanWatch
 from torchtransient.nlos.scene import SENSOR, WALL, capture_scene, film_size, hidden_bounds, laser_size
 from torchtransient.nlos.scene_scan import check_scan_is_seen, tolerance_of
+from torchtransient.rendering.arguments import checked_samples
 from torchtransient.rendering.output import RenderOutput
 from torchtransient.rendering.renderer import TransientRenderer
 from torchtransient.scene.edits import BuildOptions
@@ -77,10 +79,10 @@ class CaptureRenderer(nn.Module):
         **settings: Any,
     ):
         super().__init__()
-        check_is_scan("CaptureRenderer", scan)
+        of_class("CaptureRenderer: scan", scan, Scan)
         check_sensor("CaptureRenderer", sensor)
         wanted = keys_and_values("CaptureRenderer", "parameters", parameters)
-        settings["spp"] = checked_samples("CaptureRenderer", settings.get("spp"))
+        settings["spp"] = checked_samples("CaptureRenderer: spp", settings.get("spp"))
         if settings.get("max_depth") is not None:
             raise ArgumentError("CaptureRenderer: max_depth: bounces= says how far light is followed; leave it out.")
         scene = load(capture_scene(hidden, scan, bounces=bounces, energy=energy), variant=variant)
@@ -130,7 +132,7 @@ class CaptureRenderer(nn.Module):
         """
         check_seeds("CaptureRenderer", seed)
         check_sensor("CaptureRenderer", self.sensor, generator)
-        checked_samples("CaptureRenderer", spp)
+        checked_samples("CaptureRenderer: spp", spp)
         self._sources.check()
         given = _attached(self.scan)
         if values is not None:

@@ -10,10 +10,9 @@ import numpy as np
 import torch
 
 from torchtransient.capture import Scan
-from torchtransient.checks import MOST, as_number, as_whole, checked_mesh, shown
+from torchtransient.checks import MOST, as_number, as_whole, checked_mesh, of_class, shown
 from torchtransient.errors import SceneError, UnitError
 from torchtransient.nlos import defaults
-from torchtransient.nlos.arguments import check_is_scan
 from torchtransient.nlos.mesh_file import mesh_file
 from torchtransient.scene.edits import BuildOptions
 from torchtransient.scene.load import load
@@ -46,7 +45,7 @@ def capture_scene(
     Raises SceneError for what is no shape or emits light, for names that the capture needs itself, and for a scan
     without a wall; UnitError for an energy below zero.
     """
-    check_is_scan("capture", scan)
+    of_class("capture: scan", scan, Scan)
     if scan.wall is None:
         raise SceneError(
             "capture: expected a scan that knows its wall, got one of points alone. Make it with Scan.grid(wall, ...) "

@@ -23,11 +23,11 @@ import torch
 from torchtransient.array_files.array_file import path_of
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.checks import Numbers
+from torchtransient.checks import Numbers, count, of_class
 from torchtransient.errors import ArgumentError
 from torchtransient.nlos import defaults
 from torchtransient.nlos.answers import checked_module, measured, say_black
-from torchtransient.nlos.arguments import check_is_scan, check_sensor, checked_count, checked_samples, checked_seed
+from torchtransient.nlos.arguments import check_sensor, checked_seed
 from torchtransient.nlos.forecast import Forecast, forecast_of
 from torchtransient.nlos.part_file import PartFile
 from torchtransient.nlos.point_rows import RowLayout, Rows
@@ -35,6 +35,7 @@ from torchtransient.nlos.renderer import in_film_shape, in_scan_shape
 from torchtransient.nlos.scene import capture_scene, hidden_bounds
 from torchtransient.nlos.variant_choice import choose_variant
 from torchtransient.nlos.work import Film, HiddenWork, SceneWork, Work, seed_of
+from torchtransient.rendering.arguments import checked_samples
 from torchtransient.scene.load import Scene, load
 from torchtransient.scene.variant import active_variant
 from torchtransient.sensing import Device
@@ -143,10 +144,10 @@ def _work(
 ) -> Work:  # fmt: skip
     if time_axis is not None and frequencies is not None:
         raise ArgumentError("simulate: expected time_axis or frequencies, got both. Leave out one of them.")
-    spp = checked_samples("simulate", spp)
+    spp = checked_samples("simulate: spp", spp)
     if scan is None:
         return _scene_work(hidden, time_axis, frequencies, spp, of_light, variant, parts)
-    check_is_scan("simulate", scan)
+    of_class("simulate: scan", scan, Scan)
     if isinstance(hidden, Scene):
         raise ArgumentError(
             "simulate: a tt.Scene has a sensor of its own; expected hidden shapes beside scan=. Leave scan out to "
@@ -208,7 +209,7 @@ def _parts(scan: Any, part: Path | None, tiles: int | None) -> int:
     if tiles is None:
         many = defaults.EXHAUSTIVE_PARTS if getattr(scan, "kind", None) == "exhaustive" else defaults.PARTS
         return 1 if part is None else many
-    return checked_count("simulate", "tiles", tiles)
+    return count("simulate: tiles", tiles, 1, ArgumentError)
 
 
 # ------------------------------------------------------------------------------------------------------------- renders

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from torchtransient.scene.inventory import scene_inventory
 from torchtransient.scene.load import Scene, load
-from torchtransient.scene.plan import some
+from torchtransient.scene.plan import text_of
 from torchtransient.scene.variant import is_differentiable, resolve_variant
 
 
@@ -38,4 +38,4 @@ def choose_variant(scene: Scene, requested: str | None) -> VariantChoice:
         device = name.split("_")[0]
         return VariantChoice(f"{device}_ad_mono", "every spectrum is grey, so that one channel carries all of it")
     # One channel may have been chosen for the scene before.
-    return VariantChoice(name.replace("_mono", "_rgb"), f"colour: {some(coloured)}")
+    return VariantChoice(name.replace("_mono", "_rgb"), f"colour: {text_of(coloured)}")

@@ -22,12 +22,15 @@ _MOST = 4
 
 
 class Cache:
-    """The last few results of each kind, keyed by all that they depend on.
+    """Cache of the last few results of each kind, keyed by all that they depend on.
 
-    ``plugins``: their numbers are inputs of every result, beside its key; results are detached. They are dropped as
-    soon as one number is replaced. The arrays that they were computed from are held with them: so none is written in
-    place meanwhile, and no later one can be taken for it because it got the same number from Dr.Jit. While a call is
-    recorded (``dr.freeze``) such a cache is not read, since the recording has to compute for other numbers.
+    Results are detached. While a call is recorded (``dr.freeze``) a cache with ``plugins`` is not read, since the
+    recording has to compute for other numbers.
+
+    Args:
+        plugins: plugins whose numbers are inputs of every result, beside its key. Results are dropped as soon as one
+            number is replaced. The arrays that they were computed from are held with them, so that none is written in
+            place, and no later one can be taken for it because it got the same number from Dr.Jit.
     """
 
     # Results follow from their keys: recorded calls do not depend on them beside these.
@@ -44,7 +47,13 @@ class Cache:
         self._arrays: list[Any] = []
 
     def get(self, kind: str, key: Hashable, compute: Callable[[], Result]) -> Result:
-        """Return ``compute()``, or the earlier result of this kind and key. It is shared: not to be changed."""
+        """Return a result, computed unless it is in the cache. It is shared: not to be changed.
+
+        Args:
+            kind: name of the computation.
+            key: all that the result depends on, beside the numbers of plugins.
+            compute: function that computes it.
+        """
         if self._has_plugins:
             if dr.flag(dr.JitFlag.FreezingScope):
                 return compute()
@@ -68,7 +77,7 @@ class Cache:
 
 
 def digest(*arrays: np.ndarray) -> bytes:
-    """Return a number that differs for arrays of other values or types."""
+    """Return a hash of arrays, of their values, shapes and types."""
     found = hashlib.blake2b(digest_size=16)
     for array in arrays:
         found.update(f"{array.dtype.str}{array.shape}".encode())

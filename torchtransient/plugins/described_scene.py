@@ -212,7 +212,7 @@ class DescribedScene:
         self.is_checked = False
 
     def is_of(self, scene: Any) -> bool:
-        """Return whether ``scene`` is the scene of this state."""
+        """Return True if ``scene`` is the scene of this state."""
         return self._key == _key_of(scene)
 
 

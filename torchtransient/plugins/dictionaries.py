@@ -45,7 +45,7 @@ class Pixels:
 
     @classmethod
     def of(cls, bitmap: Any) -> Pixels:
-        """A bitmap as plain data."""
+        """Return a bitmap as plain data."""
         values, given = np.array(bitmap), bitmap.pixel_format()
         pixel_format = "" if mi.Bitmap(values).pixel_format() == given else str(given).rsplit(".", 1)[-1]
         return cls(values, bool(bitmap.srgb_gamma()), pixel_format)
@@ -69,7 +69,7 @@ class Voxels:
 
     @classmethod
     def of(cls, grid: Any) -> Voxels:
-        """A grid as plain data."""
+        """Return a grid as plain data."""
         stream = mi.MemoryStream()
         grid.write(stream)
         return cls(bytes(stream.raw_buffer()), float(grid.max()))
@@ -85,7 +85,7 @@ class Voxels:
 
 
 def is_ours(node: Mapping[str, Any]) -> bool:
-    """Return whether a node is of a plugin of this library, or of one that was added to it."""
+    """Return True if a node is of a plugin of this library, or of one that was added to it."""
     return kind_of(str(node.get("type"))) is not None
 
 
@@ -153,7 +153,7 @@ def parsed(config: Any, tree: Mapping[str, Any]) -> Any:
 
 
 def _with_one_row(value: Any, kept: list[tuple[Any, Any]]) -> Any:
-    """A dictionary with stand-ins for tensors of three rows; ``kept`` gets the pairs of both."""
+    """Return a dictionary with stand-ins for tensors of three rows; ``kept`` gets the pairs of both."""
     if isinstance(value, dict):
         return {name: _with_one_row(item, kept) for name, item in value.items()}
     if dr.is_tensor_v(value) and value.ndim > 1 and value.shape[0] == 3:

@@ -58,28 +58,40 @@ _REASONS = {
 
 
 class NotComparableError(Exception):
-    """Failure to compare a job with another one: it holds an object of an unknown type."""
+    """Error of a job that cannot be compared with another one: it holds an object of an unknown type."""
 
 
 def arrays_below(value: Any) -> list[Any]:
-    """The Dr.Jit arrays in plain objects and in the containers they hold, each once and in order, and Mitsuba's
-    structures of arrays. Raises NotComparableError.
+    """Return the Dr.Jit arrays of plain objects and of the containers that they hold, each once and in order.
+
+    Mitsuba's structures of arrays count as arrays.
+
+    Raises:
+        NotComparableError: for objects of an unknown type.
     """
     return state_below(value)[1]
 
 
 def state_below(value: Any) -> tuple[tuple[Any, ...], list[Any]]:
-    """Return (structure, arrays). The structure is all that is no array in plain objects and in the containers they
-    hold, with the places and types of arrays: of two jobs with the same structure the same kernels are traced.
-    Hashable; Mitsuba's objects count by their address. Arrays: as :func:`arrays_below`. Raises NotComparableError.
+    """Return structure and arrays of plain objects and of the containers that they hold.
+
+    Two jobs of the same structure are traced to the same kernels.
+
+    Returns:
+        (structure: all that is no array, with the places and types of arrays, hashable; Mitsuba's objects count by
+        their address. Arrays: as of :func:`arrays_below`).
+
+    Raises:
+        NotComparableError: for objects of an unknown type.
     """
     walk = _Walk(value)
     return tuple(walk.structure), walk.arrays
 
 
 class _Walk:
-    """Once through plain objects. ``arrays``: Dr.Jit's; ``structure``: everything else. Not recursive: a function that
-    calls itself would leave circles of references, and so objects that live on, behind.
+    """Walk over plain objects that collects ``arrays`` and ``structure``.
+
+    Not recursive: a function that calls itself would leave circles of references, and so objects that live on.
     """
 
     def __init__(self, value: Any) -> None:
@@ -150,7 +162,7 @@ class _Walk:
         return True
 
     def _library(self, current: Any, kind: type) -> bool:
-        """Things of Python, NumPy, torch, Dr.Jit and Mitsuba that are values."""
+        """Add values of Python, NumPy, torch, Dr.Jit and Mitsuba; return False for others."""
         note = self.structure.append
         if isinstance(current, (np.ndarray, np.generic)):
             if np.asarray(current).dtype.hasobject:
@@ -241,8 +253,10 @@ def _torch_tensor() -> tuple[type, ...]:
 
 
 def says_it_can_be_recorded(plugin: Any) -> bool:
-    """Return whether a plugin's own class declares that it can be recorded. Subclasses do not inherit the declaration,
-    since they may behave otherwise; classes of this library can all be recorded.
+    """Return True if a plugin's own class declares that it can be recorded.
+
+    Subclasses do not inherit the declaration, since they may behave otherwise; classes of this library can all be
+    recorded.
     """
     kind = type(plugin)
     known = kind.__module__.startswith("torchtransient.plugins.")
@@ -250,8 +264,11 @@ def says_it_can_be_recorded(plugin: Any) -> bool:
 
 
 def not_recordable(error: BaseException, before: BaseException | None = None) -> str | BaseException:
-    """Why Dr.Jit could not record a call that has raised, or, where it was something else that went wrong, that error.
-    ``before``: what was being handled when the call was made.
+    """Return the reason why Dr.Jit could not record a call, or the error itself if it is of another kind.
+
+    Args:
+        error: exception that the call raised.
+        before: exception that was being handled when the call was made, None without.
     """
     seen: BaseException | None = error
     found = error

@@ -1,4 +1,4 @@
-"""Guards of what must not be cut in two: signals that wait, a garbage collector that waits, interrupts below C++.
+"""Guards of what must not be cut in two: delayed signals, a paused garbage collector, interrupts below C++.
 
 A method call on Mitsuba's objects is compiled for all objects alive at that moment. When a scene is freed in the middle
 of a trace, two calls in one kernel are compiled for different numbers of objects, and where this changes "several" to
@@ -23,8 +23,10 @@ _PRINTED = re.compile(r"^(KeyboardInterrupt|SystemExit)\b(?:: (\d+)$)?", re.MULT
 def chain_of(error: BaseException, handled: BaseException | None = None) -> list[BaseException]:
     """Return an exception and its causes, the root last, hidden contexts (``from None``) included.
 
-    The chain ends before ``handled``, the exception handled at the call: a call in an ``except`` block did not fail
-    because of it.
+    Args:
+        error: the exception.
+        handled: exception that was handled at the call, where the chain ends: a call in an ``except`` block did not
+            fail because of it.
     """
     found = [error]
     while (below := found[-1].__cause__ or found[-1].__context__) is not None and below not in found:
@@ -37,7 +39,8 @@ def chain_of(error: BaseException, handled: BaseException | None = None) -> list
 def interrupt_behind(error: BaseException, handled: BaseException | None = None) -> BaseException | None:
     """Return the interrupt, or other exception that is no ``Exception``, that caused an error; None without one.
 
-    ``handled``: as for :func:`chain_of`.
+    Args:
+        error, handled: as of :func:`chain_of`.
     """
     chain = chain_of(error, handled)
     own = next((cause for cause in reversed(chain) if not isinstance(cause, Exception)), None)
@@ -92,10 +95,13 @@ def _put_back_handlers(left: list[tuple[int, Any]]) -> None:
             _put_back_handlers(left)
 
 
-def surely(put_back: Callable[[], object]) -> None:
-    """Call ``put_back``, which may run twice: once more where an interrupt has cut it off.
+def ensure_restored(put_back: Callable[[], object]) -> None:
+    """Call a function that puts settings back, once more if an interrupt cuts it off.
 
     For ``finally`` blocks. Only a second Ctrl-C within the same call can leave a scene with the settings of that call.
+
+    Args:
+        put_back: function that may run twice.
     """
     try:
         put_back()
@@ -116,7 +122,7 @@ _waiting: list[Any] = []
 
 @contextmanager
 def no_collection() -> Iterator[None]:
-    """Hold back the garbage collector and :func:`let_go` in every thread. May be nested; also a decorator."""
+    """Hold back the garbage collector and :func:`release_when_safe` in every thread. May be nested, or a decorator."""
     global _blocks, _stopped
     with _lock:
         _blocks += 1
@@ -135,7 +141,7 @@ def no_collection() -> Iterator[None]:
                     gc.enable()
 
 
-def let_go(contents: list[Any]) -> None:
+def release_when_safe(contents: list[Any]) -> None:
     """Empty a list that holds the last references to Mitsuba objects: now, or after the last :func:`no_collection`."""
     with _lock:
         if _blocks:

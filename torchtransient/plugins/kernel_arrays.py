@@ -19,7 +19,7 @@ _ALIGNMENT = 64
 
 
 def host_numbers(value: Any, dtype: DTypeLike = np.float64) -> np.ndarray:
-    """A copy of an array's numbers.
+    """Return a copy of an array's numbers.
 
     Of a detached handle: Dr.Jit evaluates what it reads in place, and a literal that a scene shows to recordings would
     be another array afterwards.
@@ -28,12 +28,12 @@ def host_numbers(value: Any, dtype: DTypeLike = np.float64) -> np.ndarray:
 
 
 def whole_numbers(values: np.ndarray) -> Any:
-    """A copy of an array of numpy's as a ``mi.UInt32``."""
+    """Return a copy of an array of numpy's as a ``mi.UInt32``."""
     return mi.UInt32(_aligned(values, np.uint32))
 
 
 def floats(values: np.ndarray) -> Any:
-    """A copy of an array of numpy's as a ``mi.Float``."""
+    """Return a copy of an array of numpy's as a ``mi.Float``."""
     return mi.Float(_aligned(values, np.float32))
 
 
@@ -72,7 +72,7 @@ _STEP = 64
 
 
 def registry_number(plugin: Any) -> int:
-    """The number of a plugin in Dr.Jit's registry. Numbers start at one, each kind of plugin has its own. Raises
+    """Return the number of a plugin in Dr.Jit's registry. Numbers start at one, each kind of plugin has its own. Raises
     ``SceneError`` for what kernels cannot point to.
     """
     for kind, pointer in _POINTERS.items():
@@ -82,7 +82,7 @@ def registry_number(plugin: Any) -> int:
 
 
 def null_pointers() -> list[Any]:
-    """A pointer to nothing of each kind."""
+    """Return a pointer to nothing of each kind."""
     return [dr.zeros(getattr(mi, name)) for name in (*_POINTERS.values(), *_MORE_POINTERS)]
 
 
@@ -113,13 +113,12 @@ class PointerTable:
 
     @staticmethod
     def marking(plugins: Sequence[Any]) -> PointerTable | None:
-        """A table that only tells which plugins are listed, for :meth:`lists`; None when none is: kernels then hold
-        nothing of the question.
+        """Return a table that tells listed plugins apart (:meth:`lists`), None for no plugins: kernels need none then.
         """
         return PointerTable(plugins, [1] * len(plugins)) if plugins else None
 
     def look_up(self, pointer: Any, active: Any = True) -> Any:
-        """The values of an array of pointers; ``default`` where ``active`` is false."""
+        """Return the values of an array of pointers; ``default`` where ``active`` is false."""
         number = dr.reinterpret_array(mi.UInt32, pointer)
         known = mi.Mask(active) & (number < dr.width(self.values))
         found = dr.gather(type(self.values), self.values, number, known)

@@ -61,7 +61,7 @@ class LabelTables:
         self.seen = SceneCache(scene, integrator)
 
     def lets_light_through(self) -> bool:
-        """Return whether any surface may let light pass unbent: parameters may add a lobe."""
+        """Return True if any surface may let light pass unbent: parameters may add a lobe."""
         return any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in self._bsdfs)
 
     def tables(self) -> list[Any]:
@@ -109,7 +109,7 @@ class LabelResults:
         """Hold what has been computed."""
         self._arrays = arrays
 
-    def taken(self) -> list[Any]:
+    def release_storage(self) -> list[Any]:
         """Return the results and release them."""
         found, self._arrays = self._arrays, []
         return found
@@ -122,7 +122,7 @@ class LabelResults:
 @dataclass
 class LabelJob:
     """Labels ``names`` of one ``sensor``, the mean of ``samples`` places in each pixel, or at its centre for 0.
-    Results (:meth:`LabelResults.taken`) come in the order of the names, one array for each component.
+    Results (:meth:`LabelResults.release_storage`) come in the order of the names, one array for each component.
     """
 
     scene: Any

@@ -30,7 +30,7 @@ _WEIGHT_SLOTS = {"MaskBSDF": "opacity", "BlendBSDF": "weight", "BlendPhaseFuncti
 
 
 def cancels_lobe_probability(bsdf: Any) -> bool:
-    """Return whether the weight of a BSDF's own delta lobe lacks the derivative of the lobe's probability."""
+    """Return True if the weight of a BSDF's own delta lobe lacks the derivative of the lobe's probability."""
     return bsdf.class_name() in _CANCELLING
 
 
@@ -42,7 +42,7 @@ def weight_slot(bsdf: Any) -> str | None:
 
 
 def adds_up_wrongly(bsdf: Any, held: list[Any], nested: list[Any]) -> bool:
-    """Return whether a BSDF is a blend of which a part has a delta lobe or lets light through, or works on a side of
+    """Return True if a BSDF is a blend of which a part has a delta lobe or lets light through, or works on a side of
     the surface where another does nothing. ``held``: the parts; ``nested``: all BSDFs in it, asked themselves since a
     blend does not notice lobes that they get later.
 
@@ -59,12 +59,12 @@ def adds_up_wrongly(bsdf: Any, held: list[Any], nested: list[Any]) -> bool:
 
 
 def is_two_sided_itself(bsdf: Any) -> bool:
-    """Return whether a BSDF is ``twosided``, whose Mueller matrices are wrong from behind."""
+    """Return True if a BSDF is ``twosided``, whose Mueller matrices are wrong from behind."""
     return bool(bsdf.class_name() == "TwoSidedBRDF")
 
 
 def has_equal_sides(bsdf: Any) -> bool:
-    """Return whether the same medium lies on both sides, although a lobe of transmission is not symmetric: a fibre."""
+    """Return True if the same medium lies on both sides, although a lobe of transmission is not symmetric: a fibre."""
     return bool(bsdf.class_name() == "Hair" or getattr(bsdf, "has_equal_sides", False))
 
 
@@ -81,7 +81,7 @@ def normal_texture(bsdf: Any) -> str | None:
 
 
 def forgets_black_samples(bsdf: Any) -> bool:
-    """Return whether a BSDF drops samples of the one it holds whose weight is zero, so that the derivative of what is
+    """Return True if a BSDF drops samples of the one it holds whose weight is zero, so that the derivative of what is
     black, by the light that comes from elsewhere, is lost. A normal map reports no density for them, and paths end
     there; a bump map masks the weight, of which a delta lobe has no other value.
     """
@@ -93,7 +93,7 @@ PIXELS = "data"
 
 
 def is_bump_map(bsdf: Any) -> bool:
-    """Return whether a BSDF takes its normals from the slope of a texture, which jumps at each texel of a bitmap."""
+    """Return True if a BSDF takes its normals from the slope of a texture, which jumps at each texel of a bitmap."""
     return bool(bsdf.class_name() == "BumpMap")
 
 
@@ -134,7 +134,7 @@ BUILDS_LOBES = ("principled", "principledthin", "diff_principled", "diff_princip
 
 
 def lost_at(bsdf: Any, slot: str) -> tuple[float, ...]:
-    """The values at which a BSDF loses a lobe whose weight is the texture that it holds under the name ``slot``."""
+    """Return the values at which a BSDF loses a lobe, whose weight is the texture that it holds as ``slot``."""
     name = bsdf.class_name()
     if slot == "base_color" and name in LOST_AT and mi.has_flag(bsdf.flags(), mi.BSDFFlags.GlossyTransmission):
         return (0,)
@@ -146,7 +146,7 @@ _LEAST_PRODUCT = 0.008
 
 
 def loses_slope_of_metal(slot: str, eta: tuple[float, float], k: tuple[float, float]) -> bool:
-    """Return whether Mitsuba's Fresnel term of a metal loses its derivative by ``slot``, for indices in the ranges
+    """Return True if Mitsuba's Fresnel term of a metal loses its derivative by ``slot``, for indices in the ranges
     ``eta, k``.
 
     It takes a root of the difference of ``n^2 = |(eta - i k)^2 - sin^2|`` and its real part's modulus, which are equal
@@ -163,12 +163,12 @@ def loses_slope_of_metal(slot: str, eta: tuple[float, float], k: tuple[float, fl
 
 
 def is_absorption_of_hair(bsdf: Any, slot: str) -> bool:
-    """Return whether what a BSDF holds under the name ``slot`` is the absorption of Mitsuba's ``hair``."""
+    """Return True if what a BSDF holds under the name ``slot`` is the absorption of Mitsuba's ``hair``."""
     return bool(bsdf.class_name() == "Hair" and slot == "sigma_a")
 
 
 def is_replaced_for(bsdf: Any, slot: str) -> bool:
-    """Return whether another BSDF is built in place of one where a derivative by what it holds under ``slot`` is asked
+    """Return True if another BSDF is built in place of one where a derivative by what it holds under ``slot`` is asked
     for.
     """
     return bool(lost_at(bsdf, slot)) or is_absorption_of_hair(bsdf, slot)
@@ -207,7 +207,7 @@ _OWN_PARAMETERS = frozenset((*VERTEX_COLUMNS, FACES, _WEIGHT, *_SHARED_ROWS.valu
 
 
 def shows_rows() -> bool:
-    """Return whether Mitsuba shows the arrays of meshes as rows, under the names of version 3.10."""
+    """Return True if Mitsuba shows the arrays of meshes as rows, under the names of version 3.10."""
     major, minor, *_ = mi.__version__.split(".")
     return (int(major), int(minor)) >= (3, 10)
 
@@ -246,7 +246,7 @@ def _users_parameters(base: type) -> type:
 
 
 def names_array(key: str, name: str) -> bool:
-    """Return whether a key of scene parameters, users' or Mitsuba's, names an array of a mesh, such as POSITIONS."""
+    """Return True if a key of scene parameters, users' or Mitsuba's, names an array of a mesh, such as POSITIONS."""
     own = key.rsplit(".", 1)[-1]
     return own == name or (shows_rows() and own == _NEW_NAMES.get(name))
 
@@ -309,17 +309,17 @@ def rows_of_faces(mesh: Any, name: str) -> np.ndarray:
 
 
 def has_normals(mesh: Any) -> bool:
-    """Return whether a mesh has normals at its vertices."""
+    """Return True if a mesh has normals at its vertices."""
     return bool(mesh.has_normals() if shows_rows() else mesh.has_vertex_normals())
 
 
 def has_texcoords(mesh: Any) -> bool:
-    """Return whether a mesh has texture coordinates at its vertices."""
+    """Return True if a mesh has texture coordinates at its vertices."""
     return bool(mesh.has_texcoords() if shows_rows() else mesh.has_vertex_texcoords())
 
 
 def has_more_than_arrays(mesh: Any) -> bool:
-    """Return whether a mesh has parameters beside its arrays and its weight: attributes, or a material by face."""
+    """Return True if a mesh has parameters beside its arrays and its weight: attributes, or a material by face."""
     shown = mi.traverse(mesh)
     names = {users_name(mesh, name) for name in shown.properties if "." not in name} - _OWN_PARAMETERS
     return any(name != _MATERIALS or dr.width(shown[name]) for name in names)
@@ -356,7 +356,7 @@ def mesh_of_arrays(
 
 
 def is_instance(shape: Any) -> bool:
-    """Return whether a shape is one copy of a shape group."""
+    """Return True if a shape is one copy of a shape group."""
     return bool(shape.class_name() == "Instance")
 
 
@@ -369,19 +369,19 @@ def group_name(instance: Any) -> str:
 
 
 def has_surface(shape: Any) -> bool:
-    """Return whether rays can meet a shape itself. Groups and their copies only hold others, and have a BSDF
+    """Return True if rays can meet a shape itself. Groups and their copies only hold others, and have a BSDF
     nevertheless.
     """
     return shape.class_name() not in ("Instance", "ShapeGroupPlugin")
 
 
 def is_sphere(shape: Any) -> bool:
-    """Return whether a shape is Mitsuba's ``sphere``, which is sampled over the cone that it fills."""
+    """Return True if a shape is Mitsuba's ``sphere``, which is sampled over the cone that it fills."""
     return bool(shape.class_name() == "Sphere")
 
 
 def samples_its_shape(emitter: Any) -> bool:
-    """Return whether an emitter is an area light that asks its shape for a direction. Mitsuba's sphere answers with the
+    """Return True if an emitter is an area light that asks its shape for a direction. Mitsuba's sphere answers with the
     solid angle ``2 pi (1 - cos)`` of its cone in single precision, which has no digits left for small spheres, and from
     a point on its own surface with one of two densities that are not the same; see ``sampling/sphere_lights.py``.
     """
@@ -389,43 +389,43 @@ def samples_its_shape(emitter: Any) -> bool:
 
 
 def is_dark(emitter: Any) -> bool:
-    """Return whether no path that starts at a sensor finds an emitter: it shines along its normals and nowhere else."""
+    """Return True if no path that starts at a sensor finds an emitter: it shines along its normals and nowhere else."""
     return bool(emitter.class_name() == "DirectionalArea" or getattr(emitter, "stays_dark", False))
 
 
 def lacks_directions(emitter: Any) -> bool:
-    """Return whether an emitter raises where it is asked for its light in a direction: derivatives cannot be traced."""
+    """Return True if an emitter raises where it is asked for its light in a direction: derivatives cannot be traced."""
     return bool(emitter.class_name() == "DirectionalArea")
 
 
 def leaves_hits_detached(shape: Any) -> bool:
-    """Return whether the interactions of a shape lie at a detached distance along the ray: they follow neither the
+    """Return True if the interactions of a shape lie at a detached distance along the ray: they follow neither the
     shape nor a ray that moves.
     """
     return bool(shape.class_name() in ("Ellipsoids", "LinearCurve"))
 
 
 def misplaces_hits(shape: Any) -> bool:
-    """Return whether the place along a curve, at which a ray hits it, has a wrong derivative, and the normal with it:
+    """Return True if the place along a curve, at which a ray hits it, has a wrong derivative, and the normal with it:
     Mitsuba projects onto one of two directions of its surface as if they were perpendicular.
     """
     return bool(shape.class_name() == "BSplineCurve")
 
 
 def has_no_material(shape: Any) -> bool:
-    """Return whether no point of a shape can be followed: Mitsuba's interactions follow the surface, not its points and
+    """Return True if no point of a shape can be followed: Mitsuba's interactions follow the surface, not its points and
     areas.
     """
     return bool(shape.class_name() in ("Ellipsoids", "EllipsoidsMesh", "LinearCurve", "BSplineCurve", "SDFGrid"))
 
 
 def has_vertices(shape: Any) -> bool:
-    """Return whether a shape is a mesh of listed vertices: False of rectangles and disks, which are `mi.Mesh` too."""
+    """Return True if a shape is a mesh of listed vertices: False of rectangles and disks, which are `mi.Mesh` too."""
     return isinstance(shape, mi.Mesh) and shape.class_name() not in _FLAT
 
 
 def has_smooth_shape(emitter: Any) -> bool:
-    """Return whether a light lies on a mesh with normals at its vertices. Mitsuba's density per solid angle of a point
+    """Return True if a light lies on a mesh with normals at its vertices. Mitsuba's density per solid angle of a point
     on it is that of a face with the interpolated normal: lights of few faces are too bright or too dark, by 20 % and
     more.
     """
@@ -438,12 +438,12 @@ _OUTLINED = ("Sphere", "Disk", "Cylinder", "Ellipsoids", "Instance", "ShapeGroup
 
 
 def lacks_edges(shape: Any) -> bool:
-    """Return whether a shape has outlines that no table of edges holds: curves and grids of distances."""
+    """Return True if a shape has outlines that no table of edges holds: curves and grids of distances."""
     return not (shape.is_mesh() or shape.class_name() in _OUTLINED)
 
 
 def has_limb(shape: Any) -> bool:
-    """Return whether the points of a shape's outline depend on where it is seen from."""
+    """Return True if the points of a shape's outline depend on where it is seen from."""
     return bool(shape.class_name() in ("Sphere", "Cylinder", "Ellipsoids"))
 
 
@@ -454,12 +454,12 @@ _LARGE_MESH = 10_000
 
 
 def is_flat_shape(shape: Any) -> bool:
-    """Return whether a shape is a rectangle or a disk."""
+    """Return True if a shape is a rectangle or a disk."""
     return bool(shape.class_name() in _FLAT)
 
 
 def is_flat(shape: Any) -> bool:
-    """Return whether the shading normal does not change along a face. Mitsuba's rectangles, its cube and the mesh that
+    """Return True if the shading normal does not change along a face. Mitsuba's rectangles, its cube and the mesh that
     it merges them into have normals at their vertices: across the faces.
     """
     if not isinstance(shape, mi.Mesh):
@@ -487,8 +487,9 @@ EMIT_ALIKE = frozenset(("AreaLight", "DirectionalArea"))
 
 
 def bounds_of(shape: Any) -> Any:
-    """The bounding box of a shape. Mitsuba leaves out that of a mesh that it merged from rectangles, and the scene's
-    bounds lack it.
+    """Return the bounding box of a shape.
+
+    Mitsuba leaves out that of a mesh that it merged from rectangles, and the scene's bounds lack it.
     """
     bounds = shape.bbox()
     if not bounds.valid() and isinstance(shape, mi.Mesh):
@@ -524,24 +525,24 @@ def sun_half_angle(emitter: Any) -> float:
 
 
 def is_distant(sensor: Any) -> bool:
-    """Return whether a sensor sits at infinity (two classes, by the kind of target)."""
+    """Return True if a sensor sits at infinity (two classes, by the kind of target)."""
     return bool(sensor.class_name().startswith("DistantSensor"))
 
 
 def is_batch(sensor: Any) -> bool:
-    """Return whether a sensor only holds others, which share its film. Derivatives through its virtual call to them end
+    """Return True if a sensor only holds others, which share its film. Derivatives through its virtual call to them end
     the process in forward mode, so they are asked one by one.
     """
     return bool(sensor.class_name() == "BatchSensor")
 
 
 def is_irradiance_meter(sensor: Any) -> bool:
-    """Return whether a sensor collects light from all directions over a shape, without a pixel for each."""
+    """Return True if a sensor collects light from all directions over a shape, without a pixel for each."""
     return bool(sensor.class_name() == "IrradianceMeter")
 
 
 def starts_off_itself(sensor: Any) -> bool:
-    """Return whether the rays of a sensor start a little off the sensor, by ``mi.math.RayEpsilon``."""
+    """Return True if the rays of a sensor start a little off the sensor, by ``mi.math.RayEpsilon``."""
     return bool(sensor.class_name() in ("RadianceMeter", "IrradianceMeter"))
 
 
@@ -567,7 +568,7 @@ def attribute_name(texture: Any) -> str | None:
 
 
 def attribute_scale(texture: Any) -> float:
-    """The factor of the attribute that a texture reads, 1 for other textures and volumes."""
+    """Return the factor of the attribute that a texture reads, 1 for other textures and volumes."""
     return 1.0 if texture.class_name() != "MeshAttribute" else float(mi.traverse(texture)["scale"])
 
 
@@ -597,7 +598,7 @@ def attribute_sizes(bsdf: Any, slot: str) -> tuple[int, ...]:
 
 
 def varies(texture: Any) -> bool:
-    """Return whether a texture may have another value at another place. Mitsuba's ``mesh_attribute`` does not say
+    """Return True if a texture may have another value at another place. Mitsuba's ``mesh_attribute`` does not say
     so.
     """
     return bool(texture.is_spatially_varying() or texture.class_name() == "MeshAttribute")
@@ -619,12 +620,12 @@ _TURNED_BY_REFLECTIONS = frozenset({("Sphere", "to_world"), ("Cylinder", "to_wor
 
 
 def is_number_of_kernels(class_name: str, name: str) -> bool:
-    """Return whether kernels contain a value as a literal, so that each value compiles its own."""
+    """Return True if kernels contain a value as a literal, so that each value compiles its own."""
     return (class_name, name) in _READ_WHEN_INSTALLED
 
 
 def is_turned_by_reflections(class_name: str, name: str) -> bool:
-    """Return whether a pose that reflects turns the shape inside out once more at every installation."""
+    """Return True if a pose that reflects turns the shape inside out once more at every installation."""
     return (class_name, name) in _TURNED_BY_REFLECTIONS
 
 

@@ -108,7 +108,7 @@ NORMAL_SLOPES = replace(NORMAL, biased=True, reason=_STEPS)
 
 
 def index_by_stand_in(plugin: str) -> ParameterEffect:
-    """The index of refraction of a plugin of Mitsuba that is built as one of ours when the key is asked for."""
+    """Return the index of refraction of a plugin of Mitsuba that is built as one of ours when the key is asked for."""
     twin = DIFFERENTIABLE_PLUGINS[plugin]
     return ParameterEffect(
         moves_length=True,
@@ -125,23 +125,23 @@ def index_by_stand_in(plugin: str) -> ParameterEffect:
 
 
 def _turns_delta_lobes(bsdf: object) -> bool:
-    """Return whether a BSDF with a delta lobe has its frame turned by a texture."""
+    """Return True if a BSDF with a delta lobe has its frame turned by a texture."""
     return normal_texture(bsdf) is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)  # type: ignore[attr-defined]
 
 
 def _bsdfs_of(site: Site) -> list[Any]:
-    """The BSDF of a shape and all that it holds."""
+    """Return the BSDF of a shape and all that it holds."""
     outer = site.node.bsdf()
     return [] if outer is None else [outer, *objects_below(outer, mi.BSDF)]
 
 
 def _places_normals(site: Site) -> bool:
-    """Return whether the texture coordinates of a mesh place normals of a delta lobe."""
+    """Return True if the texture coordinates of a mesh place normals of a delta lobe."""
     return any(_turns_delta_lobes(bsdf) for bsdf in _bsdfs_of(site))
 
 
 def _places_slopes(site: Site) -> bool:
-    """Return whether the texture coordinates of a mesh place the slopes of a bump map."""
+    """Return True if the texture coordinates of a mesh place the slopes of a bump map."""
     return any(is_bump_map(bsdf) for bsdf in _bsdfs_of(site))
 
 
@@ -150,7 +150,7 @@ def _places_delta_slopes(site: Site) -> bool:
 
 
 def _places_light(site: Site) -> bool:
-    """Return whether the texture coordinates of a mesh place what it emits."""
+    """Return True if the texture coordinates of a mesh place what it emits."""
     emitter = site.node.emitter()
     return emitter is not None and any(t.is_spatially_varying() for t in objects_below(emitter, mi.Texture))
 
@@ -160,12 +160,12 @@ def _places_light_and_normals(site: Site) -> bool:
 
 
 def _is_clamped(site: Site) -> bool:
-    """Return whether the opacities of ellipsoids decide how large they are."""
+    """Return True if the opacities of ellipsoids decide how large they are."""
     return any(shown.key == "extent_adaptive_clamping" and shown.read(site.node) for shown in shown_by(site.node)[0])
 
 
 def _is_normal(site: Site) -> bool:
-    """Return whether a texture holds normals or heights of a delta lobe."""
+    """Return True if a texture holds normals or heights of a delta lobe."""
     return any(
         isinstance(holder, mi.BSDF) and normal_texture(holder) == name and _turns_delta_lobes(holder)
         for holder, name in site.owners
@@ -173,12 +173,12 @@ def _is_normal(site: Site) -> bool:
 
 
 def _is_extinction(site: Site) -> bool:
-    """Return whether a plugin is part of a medium's extinction."""
+    """Return True if a plugin is part of a medium's extinction."""
     return any(isinstance(holder, mi.Medium) and _attenuates(holder, name) for holder, name in site.owners)
 
 
 def _attenuates(medium: Any, name: str) -> bool:
-    """Return whether what a medium holds under ``name`` changes how far light gets. The albedo does not; a phase
+    """Return True if what a medium holds under ``name`` changes how far light gets. The albedo does not; a phase
     function does where it is one of flakes, whose projected area is a factor of the extinction.
     """
     if name == "phase_function":
@@ -187,19 +187,19 @@ def _attenuates(medium: Any, name: str) -> bool:
 
 
 def _is_an_index_of_one(site: Site) -> bool:
-    """Return whether the index of a principled surface is (what Mitsuba takes for) one."""
+    """Return True if the index of a principled surface is (what Mitsuba takes for) one."""
     now = mi.traverse(site.node)[site.key]
     taken_for = (0, 1e-3) if site.key == "specular" else (1, 1.001)
     return any(bool(dr.any(dr.abs(now - value) < 1e-7)) for value in taken_for)
 
 
 def _is_weight_in(cls: str, site: Site) -> bool:
-    """Return whether a texture is the weight of a lobe that a BSDF of the class ``cls`` loses at some value."""
+    """Return True if a texture is the weight of a lobe that a BSDF of the class ``cls`` loses at some value."""
     return any(holder.class_name() == cls and lost_at(holder, name) for holder, name in site.owners)
 
 
 def _is_lost_in(cls: str, site: Site) -> bool:
-    """Return whether a BSDF of the class ``cls`` has lost such a lobe at the current value."""
+    """Return True if a BSDF of the class ``cls`` has lost such a lobe at the current value."""
     held = [(holder, name) for holder, name in site.owners if holder.class_name() == cls and lost_at(holder, name)]
     with dr.suspend_grad():
         if cls in PLASTICS:
@@ -238,7 +238,7 @@ def _range_of(texture: Any) -> tuple[float, float] | None:
 
 
 def _rows_of_weights() -> Iterator[Row]:
-    """The rows of the weights of lobes, those of lost ones first."""
+    """Return the rows of the weights of lobes, those of lost ones first."""
     for condition, now in ((_is_lost_in, True), (_is_weight_in, False)):
         for cls, plugin in LOSING.items():
             twin = DIFFERENTIABLE_PLUGINS[plugin]
@@ -254,7 +254,7 @@ def _is_in_hair(site: Site) -> bool:
 
 
 def _lies_in_dark_light(site: Site) -> bool:
-    """Return whether all holders of a texture are lights that paths never find."""
+    """Return True if all holders of a texture are lights that paths never find."""
     kinds = (mi.BSDF, mi.Emitter, mi.Medium)
     holders = [holder for holder, _ in site.owners if isinstance(holder, kinds)]
     return bool(holders) and all(isinstance(holder, mi.Emitter) and is_dark(holder) for holder in holders)

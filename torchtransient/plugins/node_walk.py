@@ -21,8 +21,14 @@ from torchtransient.plugins.mitsuba_compat import (
 
 
 class ShownValue(NamedTuple):
-    """One parameter of a plugin as Mitsuba hands it over: ``handle`` is the value itself where ``cpptype`` is None
-    (plugins written in Python), else an address inside the plugin.
+    """Parameter of a plugin, as its ``traverse`` shows it.
+
+    Attributes:
+        key: name in the plugin.
+        handle: the value itself where ``cpptype`` is None (plugins written in Python), else an address inside the
+            plugin.
+        flags: Mitsuba's ``ParamFlags``.
+        cpptype: type at that address.
     """
 
     key: str
@@ -34,22 +40,22 @@ class ShownValue(NamedTuple):
     only_remembers = True
 
     def read(self, node: Any) -> Any:
-        """The value now, attached where it is; ``node`` is the plugin that showed it."""
+        """Return the current value, attached where it is; ``node`` is the plugin that showed it."""
         return self.handle if self.cpptype is None else unshared(mi.get_property(self.handle, self.cpptype, node))
 
 
 def unshared(value: Any) -> Any:
-    """Copy a Dr.Jit array: reading a plugin's literal would evaluate it into memory, which recorded calls cannot find
-    in every plugin (``hg`` shows it to Mitsuba alone).
+    """Return a copy of a Dr.Jit array, and other values as they are.
+
+    Reading a plugin's literal would evaluate it into memory, which recorded calls cannot find in every plugin (``hg``
+    shows it to Mitsuba alone).
     """
     return type(value)(value) if dr.is_jit_v(value) else value
 
 
 @functools.cache
 def _collector(base: type) -> type:
-    """A callback that collects what one plugin shows; made once for each variant, since making a class takes longer
-    than asking a plugin.
-    """
+    """Return a callback class that collects what one plugin shows, made once for each variant."""
 
     class Collector(base):  # type: ignore[misc, valid-type]
         def __init__(self) -> None:
@@ -71,7 +77,11 @@ def _collector(base: type) -> type:
 
 
 def shown_by(node: Any) -> tuple[list[ShownValue], list[tuple[str, Any, int]]]:
-    """Return (parameters, objects) of one plugin, objects as (name, object, flags)."""
+    """Return what one plugin shows.
+
+    Returns:
+        (parameters; objects as (name, object, flags)).
+    """
     collector = _collector(mi.TraversalCallback)()
     node.traverse(collector)
     if shows_rows() and isinstance(node, mi.Mesh):
@@ -80,12 +90,17 @@ def shown_by(node: Any) -> tuple[list[ShownValue], list[tuple[str, Any, int]]]:
 
 
 def objects_of(node: Any) -> list[tuple[str, Any]]:
-    """The objects that a plugin holds, by name and in order."""
+    """Return the objects that a plugin holds, as (name, object), in order."""
     return [(name, value) for name, value, _ in shown_by(node)[1]]
 
 
 def objects_below(node: Any, kind: type, through: bool = True) -> list[Any]:
-    """The objects of a kind below a plugin, each once and in order. ``through``: also those inside others found."""
+    """Return the objects of a kind below a plugin, each once and in order.
+
+    Args:
+        kind: class of Mitsuba.
+        through: also look inside of objects of that kind.
+    """
     found: dict[int, Any] = {}
     visited: set[int] = set()
     # Not a function that calls itself: it would be a circle of references, and what it has seen would live on.
@@ -104,14 +119,15 @@ def objects_below(node: Any, kind: type, through: bool = True) -> list[Any]:
 
 
 def has_mean(texture: Any) -> bool:
-    """Return whether Mitsuba knows the mean of a texture, and those of the textures that it holds."""
+    """Return True if Mitsuba knows the mean of a texture, and those of the textures that it holds."""
     held = (texture, *objects_below(texture, mi.Texture))
     return not any(t.class_name() in TEXTURES_WITHOUT_MEAN.values() for t in held)
 
 
 def carries_derivatives(node: Any) -> bool:
-    """Return whether a number of a plugin, or of what it holds, is attached; call with gradients enabled. True for
-    textures that read an attribute of their shapes, which may be attached.
+    """Return True if a number of a plugin, or of what it holds, is attached; call with gradients enabled.
+
+    Also for textures that read an attribute of their shapes, which may be attached.
     """
     below = (node, *objects_below(node, mi.Object))
     if any(isinstance(part, mi.Texture) and attribute_name(part) is not None for part in below):
@@ -125,19 +141,20 @@ def attached_as(*values: Any) -> tuple[int, ...]:
 
 
 def bsdfs_below(node: Any) -> list[Any]:
-    """The outermost BSDFs below a scene, shape or BSDF, those of shape groups included, each once and in order."""
+    """Return the outermost BSDFs below a scene, shape or BSDF, those of shape groups included, each once and in order.
+    """
     return objects_below(node, mi.BSDF, through=False)
 
 
 def bsdfs_of_scene(scene: Any) -> list[Any]:
-    """The outermost BSDFs of a scene, those of shape groups included, each once."""
+    """Return the outermost BSDFs of a scene, those of shape groups included, each once."""
     # Every shape is asked for its own: some (ellipsoids) do not show it in a walk.
     bsdfs = (shape.bsdf() for shape in shapes_of_scene(scene) if has_surface(shape))
     return list({bsdf.ptr: bsdf for bsdf in bsdfs if bsdf is not None}.values())
 
 
 def shapes_of_scene(scene: Any) -> list[Any]:
-    """All shapes of a scene, those of shape groups included."""
+    """Return all shapes of a scene, those of shape groups included."""
     shapes = list(scene.shapes())
     if not any(is_instance(shape) for shape in shapes):
         return shapes
@@ -146,15 +163,21 @@ def shapes_of_scene(scene: Any) -> list[Any]:
 
 
 def members_of(scene: Any, instance: Any) -> list[Any]:
-    """The shapes that an instance copies, in the order of their numbers in intersections (``shape_index``)."""
+    """Return the shapes that an instance copies, in the order of their numbers in intersections (``shape_index``)."""
     name = group_name(instance)
     group = next(s for s in objects_below(scene, mi.Shape) if s.class_name() == "ShapeGroupPlugin" and s.id() == name)
     return [shape for _, shape in objects_of(group) if isinstance(shape, mi.Shape)]
 
 
 def owners_of(node: Any, holders: dict[int, list[tuple[Any, str]]]) -> Iterator[tuple[Any, str]]:
-    """Everything that holds ``node``, directly or not, as (plugin, the name it has for what leads to ``node``), nearest
-    first. ``holders``: by address, who holds an object under which name.
+    """Return all that holds a plugin, directly or not, nearest first.
+
+    Args:
+        node: plugin.
+        holders: direct holders by address of the object held, as (holder, name there).
+
+    Returns:
+        Iterator of (holder, the name that it has for what leads to ``node``).
     """
     waiting: list[Any] = [node]
     seen: set[int] = set()

@@ -33,21 +33,22 @@ ROLES = ("shape", "normal", "emitter", "sun", "sensor", "index", "delay", "mediu
 class ParameterEffect:
     """Effect of a parameter on geometry, and quality of its derivative.
 
-    ``moves_length``: it can change an optical path length. ``moves_silhouette``: it can move a visibility edge, seen
-    directly, in a mirror or through glass. ``moves_medium``: it can change an extinction (transmittances, sampled
-    distances), which an albedo does not, and a phase function only where it is one of flakes.
-
-    ``role``: which part of the geometry it moves. "shape": points of a surface; "normal": the frame that a delta lobe
-    works in; "emitter": an emitter without a shape; "sun": the disk in a sky; "sensor": the sensor and its rays;
-    "index": an index of refraction; "delay": a lifetime; "medium": an extinction; "value": none.
-
-    ``supported``: it has a derivative. ``biased``: that derivative is known to be wrong somewhere, in whatever scene;
-    what it lacks of moving edges in one scene is a question for the integrator (``silhouettes``). ``reason``: the state
-    in words.
-
-    ``trusted``: the derivative is right although Mitsuba marks the parameter as not differentiable. ``stand_in``: name
-    of the plugin that is built in place of Mitsuba's when the derivative is asked for; of a texture, in place of the
-    plugin that holds it. ``stand_in_needed``: Mitsuba's has not the right derivative as it is now.
+    Attributes:
+        moves_length: it can change an optical path length.
+        moves_silhouette: it can move a visibility edge, seen directly, in a mirror or through glass.
+        moves_medium: it can change an extinction (transmittances, sampled distances), which an albedo does not, and a
+            phase function only where it is one of flakes.
+        role: part of the geometry that it moves. "shape": points of a surface; "normal": the frame that a delta lobe
+            works in; "emitter": an emitter without a shape; "sun": the disk in a sky; "sensor": the sensor and its
+            rays; "index": an index of refraction; "delay": a lifetime; "medium": an extinction; "value": none.
+        supported: it has a derivative.
+        biased: that derivative is wrong in some scenes, beside what it lacks of moving edges, which integrators answer
+            (``silhouettes``).
+        reason: the state in words.
+        trusted: the derivative is right although Mitsuba marks the parameter as not differentiable.
+        stand_in: name of the plugin that is built in place of Mitsuba's when the derivative is asked for; for a
+            texture, in place of the plugin that holds it.
+        stand_in_needed: Mitsuba's own derivative is not right.
     """
 
     moves_length: bool = False
@@ -72,8 +73,12 @@ VALUE = ParameterEffect()
 
 @dataclass(frozen=True)
 class Site:
-    """Place of a parameter: the plugin ``node`` that has it under the name ``key``, and what holds the plugin, directly
-    or not, as (holder, name there), nearest first. A plugin that is shared has several holders.
+    """Place of a parameter in a scene.
+
+    Attributes:
+        node, key: plugin that has it, and its name there.
+        owners: all that holds the plugin, directly or not, as (holder, name there), nearest first. A plugin that is
+            shared has several holders.
     """
 
     node: Any
@@ -83,7 +88,13 @@ class Site:
 
 @dataclass(frozen=True)
 class Row:
-    """One line of the table. It counts where ``when`` holds; ``condition`` says in words when that is."""
+    """Row of the table.
+
+    Attributes:
+        effect: effect of the parameter.
+        when: function of the site that says whether the row counts, None if it always does.
+        condition: the same in words.
+    """
 
     effect: ParameterEffect
     when: Callable[[Site], bool] | None = None
@@ -97,9 +108,14 @@ _rows: dict[str, dict[str, tuple[Row, ...]]] = {}
 def declare_effects(plugin: type | str, effects: Mapping[str, ParameterEffect | Sequence[Row]]) -> None:
     """Enter the parameters of a plugin class into the table; called by the module that defines the plugin.
 
-    ``plugin``: the class, or the name by which Mitsuba calls it. ``effects``: by key (the last name of the parameter,
-    "*" for all others), an effect, or rows with conditions. Calling it again replaces the entries of the same keys, as
-    happens when a module is executed again for another variant. Raises PluginRegistrationError for an unknown role.
+    Another call replaces the entries of the same keys, as happens when a module is executed again for another variant.
+
+    Args:
+        plugin: the class, or the name by which Mitsuba calls it.
+        effects: by key (the last name of the parameter, "*" for all others), an effect, or rows with conditions.
+
+    Raises:
+        PluginRegistrationError: for an unknown role.
     """
     name = plugin if isinstance(plugin, str) else plugin.__name__
     for key, given in effects.items():
@@ -122,7 +138,7 @@ def all_rows() -> Iterator[tuple[str, str, Row]]:
 
 
 def lineage(node: Any) -> tuple[str, ...]:
-    """The names of a plugin's classes, the most special first."""
+    """Return the names of a plugin's classes, the most special first."""
     names = [cls.__name__ for cls in type(node).__mro__]
     own = node.class_name().split("[")[0]
     # Mitsuba calls a plugin written in Python by the class that it derives from.
@@ -135,7 +151,7 @@ def class_of(node: Any) -> str:
 
 
 def matching_effect(site: Site) -> ParameterEffect:
-    """The effect of the row that counts for a parameter."""
+    """Return the effect of the row that counts for a parameter."""
     for name in lineage(site.node):
         by_key = _rows.get(name, {})
         for key in (site.key, ANY_KEY):
@@ -158,7 +174,7 @@ _NAMED_BY_USERS = ("ShapeGroupPlugin", "BatchSensor")
 
 
 def location_of(site: Site) -> tuple[str, ...]:
-    """Names of a parameter and of what its plugin is in, the nearest first: "class.key", "class.slot"."""
+    """Return the names of a parameter and of what its plugin is in, the nearest first: "class.key", "class.slot"."""
     places = [(lineage(node)[0], name) for node, name in [(site.node, site.key), *site.owners]]
     return tuple(dict.fromkeys(cls if cls in _NAMED_BY_USERS else f"{cls}.{name}" for cls, name in places))
 
@@ -170,6 +186,10 @@ def _swept() -> tuple[frozenset[str], tuple[frozenset[str], ...]]:
 
 
 def is_checked(place: Sequence[str]) -> bool:
-    """Return whether the sweep has compared a parameter in such a place with finite differences, and decided."""
+    """Return True if the sweep has compared a parameter in such a place with finite differences, and decided.
+
+    Args:
+        place: names by :func:`location_of`.
+    """
     checked, undecided = _swept()
     return checked.issuperset(place) and not any(places.issubset(place) for places in undecided)

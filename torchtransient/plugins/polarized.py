@@ -26,12 +26,12 @@ def light_type():
 
 
 def intensity(light):
-    """The power of light as a spectrum, whatever its polarization."""
+    """Return the power of light as a spectrum, whatever its polarization."""
     return light[0] if mi.is_polarized else light
 
 
 def attenuated(β, T):
-    """A throughput times a spectrum ``T`` that acts on all of its components alike."""
+    """Return a throughput times a spectrum ``T`` that acts on all of its components alike."""
     if not mi.is_polarized:
         return β * T
     return mi.Spectrum(*[β[i, j] * T for i in range(4) for j in range(4)])
@@ -71,21 +71,25 @@ class FrameRotation:
         self.c, self.s = c, s
 
     def angle(self):
-        """Zero with the derivative of twice the angle."""
+        """Return zero with the derivative of twice the angle."""
         return dr.detach(self.c) * self.s - dr.detach(self.s) * self.c
 
 
 def rotation_between(forward, current, target):
-    """The rotation from the frame with x along ``current`` to that along ``target``, projected across ``forward``.
+    """Return the rotation from the frame with x along one vector to that along another one.
 
-    ``forward`` is the direction in which light travels, ``current`` a vector across it of any length. No rotation where
-    ``target`` is parallel to the direction.
+    No rotation where ``target`` is parallel to the direction.
+
+    Args:
+        forward: direction in which light travels.
+        current: vector across it, of any length.
+        target: vector, projected across it.
     """
     return rotation_along(dr.dot(current, target), dr.dot(forward, dr.cross(current, target)))
 
 
 def rotation_along(c, s):
-    """The rotation by the angle of the point ``(c, s)``, at any distance from the origin; none at the origin."""
+    """Return the rotation by the angle of the point ``(c, s)``, at any distance from the origin; none at the origin."""
     n = c * c + s * s
     there = n > 0
     scale = dr.rcp(dr.select(there, n, 1))
@@ -93,7 +97,7 @@ def rotation_along(c, s):
 
 
 def stokes_frame_of(d):
-    """The vector that the Stokes frame of a segment is tied to, from the direction of its ray."""
+    """Return the vector that the Stokes frame of a segment is tied to, from the direction of its ray."""
     return mi.coordinate_system(-dr.detach(d))[0]
 
 
@@ -123,7 +127,7 @@ def rotation_from_light(si, wo, out=None, d=None):
 
 
 def rotate_stokes(light, rotation):
-    """A Stokes vector in the rotated frame."""
+    """Return a Stokes vector in the rotated frame."""
     if not mi.is_polarized:
         return light
     c, s = rotation.c, rotation.s
@@ -138,7 +142,12 @@ def scatter_unpolarized(value, rotation):
 
 
 def rotate_mueller(value, out, into):
-    """A BSDF's value between the frames of the two segments: ``out`` towards the sensor, ``into`` towards the light."""
+    """Return a BSDF's value between the frames of the segments.
+
+    Args:
+        value: Mueller matrix between the implicit frames of its directions.
+        out, into: rotations to the frame of the segment towards the sensor, and from that towards the light.
+    """
     if not mi.is_polarized:
         return mi.unpolarized_spectrum(value)
     m = [[value[i, j] for j in range(4)] for i in range(4)]
@@ -152,10 +161,14 @@ def rotate_mueller(value, out, into):
 
 
 def from_mirrored_frames(value, wi, wo, mirrored):
-    """A BSDF's value between the frames of its directions, where ``mirrored`` lanes hold it between the frames of their
-    mirror images at the surface.
+    """Return a BSDF's value between the frames of its directions, from that between mirrored ones.
 
     Reflected, a frame changes its hand: S2 and S3 change their signs on both sides.
+
+    Args:
+        value: Mueller matrix.
+        wi, wo: local directions.
+        mirrored: mask of lanes with the value between the frames of their mirror images at the surface.
     """
     m = [[value[i, j] if (i < 2) == (j < 2) else -value[i, j] for j in range(4)] for i in range(4)]
     out = rotation_between(wi, _mirror(mi.coordinate_system(_mirror(wi))[0]), mi.coordinate_system(wi)[0])

@@ -24,7 +24,7 @@ MOST = 2**32 - 2
 
 
 def whole_number(props: Any, name: str, default: int, least: int = -1) -> int:
-    """A whole number from ``least`` to 2^32 - 2. Raises SceneError."""
+    """Return a whole number from ``least`` to 2^32 - 2. Raises SceneError."""
     given = props.get(name, default)
     if isinstance(given, bool) or not isinstance(given, (int, float)) or given != given // 1:
         raise SceneError(f"{props.plugin_name()}: {name}: expected a whole number, got {shown(given)}.")
@@ -36,7 +36,7 @@ def whole_number(props: Any, name: str, default: int, least: int = -1) -> int:
 
 
 def number(props: Any, name: str, default: float | None = None) -> float:
-    """A finite number; without a ``default`` it has to be there. Raises SceneError."""
+    """Return a finite number; without a ``default`` it has to be there. Raises SceneError."""
     given = props[name] if default is None else props.get(name, default)
     if isinstance(given, bool) or not isinstance(given, (int, float)):
         raise SceneError(
@@ -95,7 +95,7 @@ def refuse(bad: Mapping[str, str]) -> None:
 
 
 def numbers_of(value: Any) -> np.ndarray | None:
-    """The real numbers of a value of Mitsuba, detached; None for what has none."""
+    """Return the real numbers of a value of Mitsuba, detached; None for what has none."""
     if isinstance(value, (bool, int, str)) or value is None:
         return None
     if isinstance(value, float):

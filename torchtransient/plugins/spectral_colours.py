@@ -23,7 +23,7 @@ TOLERANCE = 2e-5
 
 
 def keeps_coefficients(node: Any, key: str) -> bool:
-    """Return whether the numbers ``key`` of a texture, volume or mesh are coefficients of a smooth spectrum (Jakob and
+    """Return True if the numbers ``key`` of a texture, volume or mesh are coefficients of a smooth spectrum (Jakob and
     Hanika 2019) instead of a colour: those of colours, in spectral variants.
     """
     if not mi.is_spectral:
@@ -73,7 +73,7 @@ def as_colours(coefficients: np.ndarray, where: str) -> np.ndarray:
 
 
 def same_spectra(a: np.ndarray, b: np.ndarray) -> bool:
-    """Return whether coefficients (..., 3) describe the same spectra, to the precision of files."""
+    """Return True if coefficients (..., 3) describe the same spectra, to the precision of files."""
     if a.shape != b.shape or a.size % 3:
         return False
     pairs = zip(a.reshape(-1, 3), b.reshape(-1, 3), strict=True)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.checks import as_whole, positive, shown, with_article
+from torchtransient.checks import as_whole, of_class, positive, shown, with_article
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.reconstruction.linear import PRECISIONS
 from torchtransient.reconstruction.planar_scan import PlanarScan, check_real
@@ -48,17 +48,13 @@ def one_of(name: str, value: Any, options: Collection[Any]) -> Any:
 
 
 def checked_axis(time_axis: TimeAxis, who: str) -> TimeAxis:
-    """A time axis. Raises ShapeError for anything else."""
-    if not isinstance(time_axis, TimeAxis):
-        raise ArgumentError(f"{who}: expected time_axis as a tt.TimeAxis, got {shown(time_axis)}.")
-    return time_axis
+    """Return a time axis. Raises ArgumentError for anything else."""
+    return of_class(f"{who}: time_axis", time_axis, TimeAxis)
 
 
 def checked_scan(scan: Scan, who: str) -> Scan:
-    """A scan. Raises ShapeError for anything else."""
-    if not isinstance(scan, Scan):
-        raise ShapeError(f"{who}: expected a tt.nlos.Scan, got {shown(scan)}.")
-    return scan
+    """Return a scan. Raises ShapeError for anything else."""
+    return of_class(f"{who}: scan", scan, Scan, error=ShapeError)
 
 
 def checked_points(points: Any, who: str) -> Tensor:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.capture import Scan
-from torchtransient.checks import shown
+from torchtransient.checks import of_class
 from torchtransient.errors import ShapeError
 
 # Share of a pitch that points may be off the grid: single precision of a scan that is metres away from the origin.
@@ -64,8 +64,7 @@ class PlanarScan:
     @staticmethod
     def of_scan(scan: Scan, who: str) -> PlanarScan:
         """The sensor points of a scan, and its :func:`hidden_side`. Raises ShapeError."""
-        if not isinstance(scan, Scan):
-            raise ShapeError(f"{who}: expected a tt.nlos.Scan, got {shown(scan)}.")
+        of_class(f"{who}: scan", scan, Scan, error=ShapeError)
         wall = PlanarScan.of(scan.sensor_points, who=who)
         return replace(wall, normal=hidden_side(scan, wall.normal))
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchtransient.capture import Scan, Wall
 from torchtransient.capture.scan import bounds_of
-from torchtransient.checks import Numbers, count, positive, real_array, shown
+from torchtransient.checks import Numbers, count, of_class, positive, real_array, shown
 from torchtransient.errors import SceneError, ShapeError, UnitError
 from torchtransient.reconstruction.planar_scan import PlanarScan, hidden_side
 
@@ -84,8 +84,7 @@ class VoxelGrid:
         Before the wall is where its normals point. A scan that knows none has its voxels where its sensor and its laser
         stand; where those stand in the wall or on both sides of it, in the direction of along_x times along_y.
         """
-        if not isinstance(scan, Scan):
-            raise ShapeError(f"VoxelGrid.before: expected a tt.nlos.Scan, got {shown(scan)}.")
+        of_class("VoxelGrid.before: scan", scan, Scan, error=ShapeError)
         depths = checked_depths(depths, "VoxelGrid.before")
         if size is None and extent is None:
             wall = PlanarScan.of_scan(scan, "VoxelGrid.before without size and extent")

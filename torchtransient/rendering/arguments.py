@@ -1,4 +1,4 @@
-"""Checks of what is passed to the renderer, values and settings."""
+"""Checks of the arguments of renderers: values and settings."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ MOST_SAMPLES, MOST_DEPTH = 2**32 - 1, 2**32 - 2
 TEMPORAL_FILTERS = ("auto", "box", "tent", "gaussian")
 
 
-def samples(name: str, value: int | None) -> int | None:
-    """A number of samples per pixel, or None. Raises ``UnitError``."""
+def checked_samples(name: str, value: int | None) -> int | None:
+    """Return a number of samples per pixel, or None. Raises ``UnitError`` for other values."""
     if value is None:
         return None
     number = as_whole(value)
@@ -37,7 +37,7 @@ def samples(name: str, value: int | None) -> int | None:
 
 
 def checked_depth(value: Any) -> int | None:
-    """A ``max_depth``, or None. Raises ``ArgumentError``."""
+    """Return a ``max_depth``, or None. Raises ``ArgumentError`` for other values."""
     if value is None:
         return None
     number = as_whole(value)
@@ -49,20 +49,27 @@ def checked_depth(value: Any) -> int | None:
 
 
 def checked_filter(name: str) -> str:
-    """The name of a temporal filter, or "auto". Raises ``ArgumentError``."""
+    """Return the name of a temporal filter, or "auto". Raises ``ArgumentError`` for other values."""
     if not is_one_of(name, TEMPORAL_FILTERS):
         raise ArgumentError(f"temporal_filter: expected one of {', '.join(TEMPORAL_FILTERS)}, got {shown(name)}.")
     return name
 
 
 def checked_sampler(name: Any) -> str | None:
-    """The plugin name of a sampler, or None. Raises ``ArgumentError``."""
+    """Return the plugin name of a sampler, or None. Raises ``ArgumentError`` for other types."""
     return None if name is None else text("sampler", name, "the plugin name of a sampler of Mitsuba, or None")
 
 
 def checked_keys(keys: Any, known: Sequence[str] | None = None) -> tuple[str, ...]:
-    """Keys of parameters, also those of a mapping. Raises ``ArgumentError``, and ``UnknownKeyError`` for those that a
-    renderer with ``known`` ones does not have.
+    """Return keys of parameters as a tuple.
+
+    Args:
+        keys: list of keys, or mapping from them.
+        known: keys of the renderer, None to leave unknown ones to the scene.
+
+    Raises:
+        ArgumentError: for a text and for values without a length.
+        UnknownKeyError: for keys that are not among ``known``.
     """
     with contextlib.suppress(TypeError):
         if not isinstance(keys, (str, bytes)):
@@ -76,7 +83,7 @@ def checked_keys(keys: Any, known: Sequence[str] | None = None) -> tuple[str, ..
 
 
 def checked_grad_seed(value: int | str | None) -> int | str | None:
-    """None, "same" or an integer. Raises ``ArgumentError``."""
+    """Return a seed of derivatives: None, "same" or an integer. Raises ``ArgumentError`` for other values."""
     if value is None or (isinstance(value, str) and value == "same"):
         return value
     number = as_whole(value)
@@ -86,8 +93,18 @@ def checked_grad_seed(value: int | str | None) -> int | str | None:
 
 
 def sensor_list(sensors: int | Sequence[int] | str, count: int) -> tuple[tuple[int, ...], bool]:
-    """The sensors to render out of ``count``, and whether they get a dimension of their own. Raises
-    ``ArgumentError``."""
+    """Return the indices of the sensors to render.
+
+    Args:
+        sensors: an index, several, or "all".
+        count: number of sensors of the scene.
+
+    Returns:
+        The indices, not checked against ``count``, and True if outputs have a dimension of sensors.
+
+    Raises:
+        ArgumentError: for other values.
+    """
     if isinstance(sensors, str) and sensors == "all":
         return tuple(range(count)), True
     array = getattr(sensors, "ndim", None) == 1
@@ -102,8 +119,8 @@ def sensor_list(sensors: int | Sequence[int] | str, count: int) -> tuple[tuple[i
     return whole, True
 
 
-def mangle(keys: Sequence[str]) -> dict[str, str]:
-    """Names that torch allows: slashes for dots."""
+def torch_names(keys: Sequence[str]) -> dict[str, str]:
+    """Return names that torch allows for parameters, by key: slashes in place of dots."""
     names = {key: key.replace(".", "/") for key in keys}
     if len(set(names.values())) != len(keys):
         raise ArgumentError(
@@ -112,8 +129,16 @@ def mangle(keys: Sequence[str]) -> dict[str, str]:
     return names
 
 
-def film_asked_for(film: Any, named: Mapping[str, Any]) -> FilmLayout | None:
-    """The film of a call: an object, or one of the ``named`` arguments. Raises ``ArgumentError``."""
+def requested_film(film: Any, named: Mapping[str, Any]) -> FilmLayout | None:
+    """Return the film of a call, None to keep the scene's.
+
+    Args:
+        film: the argument ``film``: a layout, or None.
+        named: the arguments that choose a film by its settings (``time_axis``, ``frequencies``, ``gates``).
+
+    Raises:
+        ArgumentError: for several films, and for other objects.
+    """
     found = film_of_arguments(named)
     if film is None:
         return found
@@ -126,8 +151,8 @@ def film_asked_for(film: Any, named: Mapping[str, Any]) -> FilmLayout | None:
     return film
 
 
-def given_values(values: Any) -> dict[str, Any]:
-    """The values of a call. Raises ArgumentError for what is no mapping: a seed, most likely."""
+def checked_values(values: Any) -> dict[str, Any]:
+    """Return the values of a call by key. Raises ``ArgumentError`` for anything but a mapping, most likely a seed."""
     if values is not None and not isinstance(values, Mapping):
         raise ArgumentError(
             f"values: expected a mapping from keys to values, got {type(values).__name__}; write {{key: value}}, and a "
@@ -137,10 +162,10 @@ def given_values(values: Any) -> dict[str, Any]:
 
 
 class Values(Mapping[str, nn.Parameter]):
-    """The renderer's parameters under their Mitsuba keys. Setting one writes into it, as ``load_state_dict`` does.
+    """Parameters of a renderer by their Mitsuba keys. Setting one writes into it, as ``load_state_dict`` does.
 
-    Of a key with a parametrization the value is computed at each look: setting it writes the numbers behind, and what
-    is written into it in place (``clamp_``, ``fill_``, ``copy_``) is lost.
+    The value of a key with a parametrization is computed at each access: setting it writes the numbers behind it, and
+    operations in place on it (``clamp_``, ``fill_``, ``copy_``) are lost.
     """
 
     def __init__(self, module: nn.Module, names: Mapping[str, str]):

@@ -24,31 +24,40 @@ Tensors = tuple[torch.Tensor, ...]
 
 
 @dataclass(frozen=True)
-class Asked:
-    """Derivatives of one call.
+class Request:
+    """Derivatives that are requested of a call.
 
     Args:
         needs: for each input tensor, whether there is a derivative by it.
-        given: for each real output, whether it has a cotangent.
+        has_cotangent: for each real output, whether it has a cotangent.
     """
 
     needs: tuple[bool, ...]
-    given: tuple[bool, ...] = ()
+    has_cotangent: tuple[bool, ...] = ()
 
 
 class Replayable(Protocol):
-    """Call that is run, and run again for its derivatives. ``what`` is its name in messages."""
+    """Call that is run, and run again for its derivatives.
+
+    Tensors are those of the call, in its order. Cotangents are those of the real outputs that have one, tangents those
+    of the tensors that need a derivative.
+    """
 
     @property
-    def what(self) -> str: ...
+    def what(self) -> str:
+        """Name of the call in messages."""
 
     def primal(self, tensors: Sequence[torch.Tensor]) -> Tensors:
         """Return the outputs."""
 
-    def pullback(self, asked: Asked, tensors: Sequence[torch.Tensor], cotangents: Sequence[torch.Tensor]) -> Tensors:
+    def pullback(
+        self, request: Request, tensors: Sequence[torch.Tensor], cotangents: Sequence[torch.Tensor]
+    ) -> Tensors:
         """Return the gradients of the sum over outputs of <cotangent, output> by the tensors that need one."""
 
-    def pushforward(self, asked: Asked, tensors: Sequence[torch.Tensor], tangents: Sequence[torch.Tensor]) -> Tensors:
+    def pushforward(
+        self, request: Request, tensors: Sequence[torch.Tensor], tangents: Sequence[torch.Tensor]
+    ) -> Tensors:
         """Return the derivatives of all real outputs along tangents of the tensors that need one."""
 
 
@@ -120,13 +129,13 @@ def _check_runs(job: Replayable, tensors: Sequence[torch.Tensor]) -> None:
     )
 
 
-def _given(tensors: Sequence[torch.Tensor | None]) -> list[torch.Tensor]:
+def _without_none(tensors: Sequence[torch.Tensor | None]) -> list[torch.Tensor]:
     return [tensor for tensor in tensors if tensor is not None]
 
 
-def _those(flags: Sequence[bool], asked: Sequence[torch.Tensor | None]) -> tuple[bool, ...]:
-    """Return the flags whose entry in ``asked``, which has one for each flag that is set, is not None."""
-    remaining = iter(asked)
+def _flags_with_tensor(flags: Sequence[bool], tensors: Sequence[torch.Tensor | None]) -> tuple[bool, ...]:
+    """Return the flags whose entry in ``tensors``, which has one for each flag that is set, is not None."""
+    remaining = iter(tensors)
     return tuple(flag and next(remaining) is not None for flag in flags)
 
 
@@ -134,10 +143,10 @@ def _zeros(tensors: Sequence[torch.Tensor]) -> list[torch.Tensor | None]:
     return [torch.zeros_like(tensor) if tensor.is_floating_point() else None for tensor in tensors]
 
 
-def _each(
+def _vmap_by_loop(
     function: Any, info: Any, in_dims: tuple[Any, ...], args: tuple[Any, ...]
 ) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-    """``vmap`` by one call per entry: what a loop over the entries would give."""
+    """Return outputs and their batch dimensions under ``vmap``, by one call for each entry."""
     if not info.batch_size:
         raise ShapeError(f"{args[0].what}: expected a batch of at least one entry under torch.func.vmap, got none.")
     columns = []
@@ -149,7 +158,7 @@ def _each(
 
 
 class Run(torch.autograd.Function):
-    """(job, *tensors) -> outputs."""
+    """Function of torch: (job, *tensors) -> outputs."""
 
     @staticmethod
     def forward(job: Replayable, *tensors: torch.Tensor) -> Tensors:
@@ -168,47 +177,47 @@ class Run(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *cotangents: torch.Tensor | None) -> tuple[Any, ...]:
         real = [g for g, is_real in zip(cotangents, ctx.is_real, strict=True) if is_real]
-        asked = Asked(tuple(ctx.needs_input_grad[1:]), tuple(g is not None for g in real))
-        if not any(asked.given) or not any(asked.needs):
-            return (None,) * (1 + len(asked.needs))
-        found = iter(Pullback.apply(ctx.job, asked, *_given(real), *_once(ctx.job, ctx.saved_tensors)))  # type: ignore[no-untyped-call]
-        return (None, *(next(found) if need else None for need in asked.needs))
+        request = Request(tuple(ctx.needs_input_grad[1:]), tuple(g is not None for g in real))
+        if not any(request.has_cotangent) or not any(request.needs):
+            return (None,) * (1 + len(request.needs))
+        found = iter(Pullback.apply(ctx.job, request, *_without_none(real), *_once(ctx.job, ctx.saved_tensors)))  # type: ignore[no-untyped-call]
+        return (None, *(next(found) if need else None for need in request.needs))
 
     @staticmethod
     def jvp(ctx: Any, _: None, *tangents: torch.Tensor | None) -> tuple[Any, ...]:
-        asked = Asked(tuple(tangent is not None for tangent in tangents))
-        found = iter(Pushforward.apply(ctx.job, asked, *_given(tangents), *_once(ctx.job, ctx.saved_tensors)))  # type: ignore[no-untyped-call]
+        request = Request(tuple(tangent is not None for tangent in tangents))
+        found = iter(Pushforward.apply(ctx.job, request, *_without_none(tangents), *_once(ctx.job, ctx.saved_tensors)))  # type: ignore[no-untyped-call]
         return tuple(next(found) if is_real else None for is_real in ctx.is_real)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[Any, Any]:
-        return _each(Run, info, in_dims, args)
+        return _vmap_by_loop(Run, info, in_dims, args)
 
 
 class Pullback(torch.autograd.Function):
-    """(job, asked, *cotangents that are given, *tensors) -> gradients of the tensors that need one."""
+    """Function of torch: (job, request, *cotangents, *tensors) -> gradients of the tensors that need one."""
 
     @staticmethod
-    def forward(job: Replayable, asked: Asked, *tensors: torch.Tensor) -> Tensors:
+    def forward(job: Replayable, request: Request, *tensors: torch.Tensor) -> Tensors:
         _check_runs(job, tensors)
-        count = sum(asked.given)
-        return job.pullback(asked, tensors[count:], tensors[:count])
+        count = sum(request.has_cotangent)
+        return job.pullback(request, tensors[count:], tensors[:count])
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-        ctx.job, ctx.asked, *tensors = inputs
+        ctx.job, ctx.request, *tensors = inputs
         ctx.set_materialize_grads(False)
-        values = tensors[sum(ctx.asked.given) :]
+        values = tensors[sum(ctx.request.has_cotangent) :]
         ctx.save_for_backward(*values)
         ctx.save_for_forward(*values)
 
     @staticmethod
     def backward(ctx: Any, *grads: torch.Tensor | None) -> tuple[Any, ...]:
-        values, asked = ctx.saved_tensors, replace(ctx.asked, needs=_those(ctx.asked.needs, grads))
-        found: Sequence[Any] = [None] * len(asked.given)
-        if any(asked.needs):
-            found = Pushforward.apply(ctx.job, asked, *_given(grads), *values)  # type: ignore[no-untyped-call]
-        of_cotangents = [d for d, is_given in zip(found, asked.given, strict=True) if is_given]
+        values, request = ctx.saved_tensors, replace(ctx.request, needs=_flags_with_tensor(ctx.request.needs, grads))
+        found: Sequence[Any] = [None] * len(request.has_cotangent)
+        if any(request.needs):
+            found = Pushforward.apply(ctx.job, request, *_without_none(grads), *values)  # type: ignore[no-untyped-call]
+        of_cotangents = [d for d, is_given in zip(found, request.has_cotangent, strict=True) if is_given]
         wanted = ctx.needs_input_grad[2 : 2 + len(of_cotangents)]
         return (
             None,
@@ -219,51 +228,51 @@ class Pullback(torch.autograd.Function):
 
     @staticmethod
     def jvp(ctx: Any, _: None, __: None, *tangents: torch.Tensor | None) -> Tensors:
-        of_cotangents = tangents[: sum(ctx.asked.given)]
-        asked = replace(ctx.asked, given=_those(ctx.asked.given, of_cotangents))
-        found: Tensors = Pullback.apply(ctx.job, asked, *_given(of_cotangents), *ctx.saved_tensors)  # type: ignore[no-untyped-call]
+        of_cotangents = tangents[: sum(ctx.request.has_cotangent)]
+        request = replace(ctx.request, has_cotangent=_flags_with_tensor(ctx.request.has_cotangent, of_cotangents))
+        found: Tensors = Pullback.apply(ctx.job, request, *_without_none(of_cotangents), *ctx.saved_tensors)  # type: ignore[no-untyped-call]
         return found
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[Any, Any]:
-        return _each(Pullback, info, in_dims, args)
+        return _vmap_by_loop(Pullback, info, in_dims, args)
 
 
 class Pushforward(torch.autograd.Function):
-    """(job, asked, *tangents of the tensors that need one, *tensors) -> derivatives of the real outputs."""
+    """Function of torch: (job, request, *tangents, *tensors) -> derivatives of the real outputs."""
 
     @staticmethod
-    def forward(job: Replayable, asked: Asked, *tensors: torch.Tensor) -> Tensors:
+    def forward(job: Replayable, request: Request, *tensors: torch.Tensor) -> Tensors:
         _check_runs(job, tensors)
-        count = sum(asked.needs)
-        return job.pushforward(asked, tensors[count:], tensors[:count])
+        count = sum(request.needs)
+        return job.pushforward(request, tensors[count:], tensors[:count])
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-        ctx.job, ctx.asked, *tensors = inputs
+        ctx.job, ctx.request, *tensors = inputs
         ctx.set_materialize_grads(False)
-        values = tensors[sum(ctx.asked.needs) :]
+        values = tensors[sum(ctx.request.needs) :]
         ctx.save_for_backward(*values)
         ctx.save_for_forward(*values)
 
     @staticmethod
     def backward(ctx: Any, *cotangents: torch.Tensor | None) -> tuple[Any, ...]:
-        asked = replace(ctx.asked, given=tuple(g is not None for g in cotangents))
-        grads: Sequence[Any] = (None,) * sum(asked.needs)
-        if any(asked.given):
-            grads = Pullback.apply(ctx.job, asked, *_given(cotangents), *ctx.saved_tensors)  # type: ignore[no-untyped-call]
+        request = replace(ctx.request, has_cotangent=tuple(g is not None for g in cotangents))
+        grads: Sequence[Any] = (None,) * sum(request.needs)
+        if any(request.has_cotangent):
+            grads = Pullback.apply(ctx.job, request, *_without_none(cotangents), *ctx.saved_tensors)  # type: ignore[no-untyped-call]
         return (None, None, *grads, *_zeros(ctx.saved_tensors))
 
     @staticmethod
     def jvp(ctx: Any, _: None, __: None, *tangents: torch.Tensor | None) -> Tensors:
-        of_tangents = tangents[: sum(ctx.asked.needs)]
-        asked = replace(ctx.asked, needs=_those(ctx.asked.needs, of_tangents))
-        found: Tensors = Pushforward.apply(ctx.job, asked, *_given(of_tangents), *ctx.saved_tensors)  # type: ignore[no-untyped-call]
+        of_tangents = tangents[: sum(ctx.request.needs)]
+        request = replace(ctx.request, needs=_flags_with_tensor(ctx.request.needs, of_tangents))
+        found: Tensors = Pushforward.apply(ctx.job, request, *_without_none(of_tangents), *ctx.saved_tensors)  # type: ignore[no-untyped-call]
         return found
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[Any, Any]:
-        return _each(Pushforward, info, in_dims, args)
+        return _vmap_by_loop(Pushforward, info, in_dims, args)
 
 
 # ------------------------------------------------------------------------------------------------------------ renders
@@ -289,16 +298,20 @@ class RenderCall:
         """Return steady and response."""
         return engine.run(self._seeded(tensors), RENDER, tensors[self.seeds :])
 
-    def pullback(self, asked: Asked, tensors: Sequence[torch.Tensor], cotangents: Sequence[torch.Tensor]) -> Tensors:
+    def pullback(
+        self, request: Request, tensors: Sequence[torch.Tensor], cotangents: Sequence[torch.Tensor]
+    ) -> Tensors:
         """Return the gradients of the values that need one."""
         given = iter(cotangents)
-        adjoints = [next(given) if is_given else None for is_given in asked.given]
-        return engine.run(self._seeded(tensors, asked), BACKWARD, tensors[self.seeds :], adjoints)
+        adjoints = [next(given) if is_given else None for is_given in request.has_cotangent]
+        return engine.run(self._seeded(tensors, request), BACKWARD, tensors[self.seeds :], adjoints)
 
-    def pushforward(self, asked: Asked, tensors: Sequence[torch.Tensor], tangents: Sequence[torch.Tensor]) -> Tensors:
+    def pushforward(
+        self, request: Request, tensors: Sequence[torch.Tensor], tangents: Sequence[torch.Tensor]
+    ) -> Tensors:
         """Return the derivatives of steady and response."""
-        return engine.run(self._seeded(tensors, asked), FORWARD, tensors[self.seeds :], tangents)
+        return engine.run(self._seeded(tensors, request), FORWARD, tensors[self.seeds :], tangents)
 
-    def _seeded(self, tensors: Sequence[torch.Tensor], asked: Asked | None = None) -> RenderJob:
+    def _seeded(self, tensors: Sequence[torch.Tensor], request: Request | None = None) -> RenderJob:
         job = self.job.seeded(tensors[0] if self.seeds else None)
-        return job if asked is None else replace(job, needs=asked.needs[self.seeds :])
+        return job if request is None else replace(job, needs=request.needs[self.seeds :])

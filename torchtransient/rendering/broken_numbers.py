@@ -17,7 +17,7 @@ Tensors = tuple[torch.Tensor, ...]
 
 
 def broken_entries(tensor: torch.Tensor, count: int) -> list[bool]:
-    """Return, for each of ``count`` entries along the first dimension, True if it is not finite."""
+    """Return for each entry along the first dimension of size ``count`` whether it has numbers that are not finite."""
     return [False] * count if all_finite(tensor) else [not all_finite(tensor[n]) for n in range(count)]
 
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 
 from torchtransient import geometry
@@ -78,24 +79,11 @@ def camera_of(
         name, film = found.id(), found.film()
         # A thin lens has its axis in the middle of the film.
         built = dict.fromkeys(_OPTICS["PerspectiveCamera"], 0.0)
-        built |= {key: _number(params, key) for key in _OPTICS[class_of(found)]}
-        matrix = torch.tensor(_matrix(found), dtype=torch.float32)
+        built |= {key: float(np.array(params[key]).reshape(-1)[0]) for key in _OPTICS[class_of(found)]}
+        matrix = torch.tensor(np.array(found.world_transform().matrix).reshape(4, 4), dtype=torch.float32)
         whole, crop, offset = ([int(n) for n in size] for size in (film.size(), film.crop_size(), film.crop_offset()))
     x_fov, x, y = (given.get(f"{name}.{key}", torch.tensor(value)) for key, value in built.items())
     inside = geometry.intrinsics(
         x_fov, (whole[1], whole[0]), fov_axis="x", principal_point_offset=torch.stack([x, y], -1), crop_offset=offset
     )
     return Camera(inside, given.get(f"{name}.to_world", matrix), (crop[1], crop[0]))
-
-
-def _number(params: Any, key: str) -> float:
-    import numpy as np
-
-    return float(np.array(params[key]).reshape(-1)[0])
-
-
-def _matrix(sensor: Any) -> Any:
-    import numpy as np
-
-    matrix = np.array(sensor.world_transform().matrix)
-    return matrix.reshape(4, 4)

@@ -20,36 +20,36 @@ from typing import Any
 import torch
 
 from torchtransient.checks import one_line
-from torchtransient.errors import ArgumentError, SceneError, ShapeError, TorchTransientError, UnitError, VariantError
+from torchtransient.errors import ArgumentError, SceneError, TorchTransientError, UnitError, VariantError
 from torchtransient.interfaces import BACKWARD, FORWARD, RENDER, is_time_resolved
 from torchtransient.plugins.frozen_state import says_it_can_be_recorded
-from torchtransient.plugins.guards import no_collection, surely
-from torchtransient.plugins.parameters import check_slope, lifted
+from torchtransient.plugins.guards import ensure_restored, no_collection
+from torchtransient.plugins.parameters import check_slope, without_zeros
 from torchtransient.rendering.broken_numbers import broken_entries, fill_broken
 from torchtransient.rendering.films import FilmLayout, layout_of_film
 from torchtransient.rendering.job import Item, RenderJob, RunLog, samples_drawn
 from torchtransient.rendering.memory import check_fits
-from torchtransient.rendering.recording import LARGE_FILM, Numbered, Recordings, execute, groups_of
+from torchtransient.rendering.recording import LARGE_FILM, Numbered, Recordings, Results, execute, groups_of
 from torchtransient.rendering.values import detached, put_back, values_of
 from torchtransient.scene.edits import built_depth
 from torchtransient.scene.objects import sampler_plugin
 from torchtransient.scene.parameters import needing_slope
 from torchtransient.scene.physics import all_finite, are_finite, smallest_and_largest
-from torchtransient.scene.values import own_array, wait_for_torch
+from torchtransient.scene.values import flat_drjit_copy, wait_for_torch
 from torchtransient.scene.variant import active_variant, clear_frames, named_errors, quiet
 
 
 def run(
-    job: RenderJob, kind: str, values: Sequence[torch.Tensor], given: Sequence[torch.Tensor | None] = ()
+    job: RenderJob, kind: str, values: Sequence[torch.Tensor], vectors: Sequence[torch.Tensor | None] = ()
 ) -> tuple[torch.Tensor, ...]:
-    """Execute a job.
+    """Execute a job: a render, or one of its derivatives.
 
     Args:
-        job: the call.
+        job: settings of the call.
         kind: ``RENDER``, ``BACKWARD`` or ``FORWARD`` of :mod:`torchtransient.interfaces`.
         values: one tensor per key of the job, with a leading dimension of entries where ``job.batched`` says so.
-        given: for ``BACKWARD`` the adjoints of steady and response, None for zero; for ``FORWARD`` the tangents of the
-            values that need a derivative.
+        vectors: for ``BACKWARD`` the adjoints of steady and response, None for zero; for ``FORWARD`` the tangents of
+            the values that need a derivative.
 
     Returns:
         Of ``RENDER`` steady and response, of ``FORWARD`` their derivatives, of ``BACKWARD`` the gradients of the values
@@ -57,21 +57,21 @@ def run(
 
     Raises:
         UnitError: for values that are not finite.
-        SceneError, StorageError, GradientError, VariantError: for scenes, films and derivatives that cannot be.
+        SceneError, StorageError, GradientError, VariantError: for scenes that cannot be rendered, films beyond the
+            memory, derivatives that do not exist, and flags of Dr.Jit under which derivatives are wrong.
     """
     if kind == RENDER:
         check_values(job, values)
-    if kind == BACKWARD and all(g is None for g in given):
+    if kind == BACKWARD and all(v is None for v in vectors):
         return tuple(torch.zeros_like(v) for v, need in zip(values, job.needs, strict=True) if need)
-    kinds: dict[str, Any] = {RENDER: Images, BACKWARD: Gradients, FORWARD: Tangents}
+    kinds: dict[str, Callable[..., Results]] = {RENDER: Images, BACKWARD: Gradients, FORWARD: Tangents}
     handled = sys.exc_info()[1]
     try:
         with open_session(job) as session:
-            results = kinds[kind](session, values, given)
+            results = kinds[kind](session, values, vectors)
             for group in groups_of(session):
                 execute(session, results, group)
-            found: tuple[torch.Tensor, ...] = results.finish()
-            return found
+            return results.finish()
     except Exception:
         raise
     except BaseException as interrupt:
@@ -87,7 +87,7 @@ def run(
 
 
 class Session:
-    """A built scene in use by one job."""
+    """Built scene in use by one job, with its recordings and the slots of the job's keys."""
 
     def __init__(self, job: RenderJob):
         self.job = job
@@ -107,7 +107,19 @@ class Session:
         return math.prod(self.film(item).cube_shape())
 
     def install(self, item: Item, values: Sequence[torch.Tensor], needs: Sequence[bool]) -> list[Any]:
-        """Write the values of one batch entry into the scene; leaves that need it carry gradients."""
+        """Write the values of one batch entry into the scene.
+
+        Args:
+            item: item, whose entry counts.
+            values: one tensor for each key, of all entries where they are batched.
+            needs: for each value, whether its leaf carries gradients.
+
+        Returns:
+            Leaves of Dr.Jit's graph that the scene's parameters were computed from, flat, one for each key.
+
+        Raises:
+            SceneError: for values that Mitsuba refuses.
+        """
         import drjit as dr
 
         leaves: list[Any] = []
@@ -115,9 +127,9 @@ class Session:
         for slot, value, batched, need in zip(self.slots.slots, values, self.job.batched, needs, strict=True):
             entry = value[item.entry] if batched else value
             slot.check(entry)
-            leaf = own_array(entry)
+            leaf = flat_drjit_copy(entry)
             if need and slot.loses_black():
-                leaf = lifted(leaf)
+                leaf = without_zeros(leaf)
             if need:
                 dr.enable_grad(leaf)
             leaves.append(leaf)
@@ -150,7 +162,15 @@ class Session:
 
 
 def boundary_settings(boundary: bool, spp: int | None, integrator: Any) -> list[tuple[Any, str, Any]]:
-    """Return the attributes of an integrator that switch its boundary term; the layer warns in its place."""
+    """Return the attributes of an integrator that switch its boundary term, as (plugin, name, value).
+
+    The integrator's own warning of edges is switched off: the layer warns.
+
+    Args:
+        boundary: False leaves the boundary term out.
+        spp: samples per pixel of each of its passes, None for the integrator's.
+        integrator: integrator of the built scene; attributes that it does not have are left out.
+    """
     changes: dict[str, Any] = {"warns_of_edges": False}
     changes |= ({} if boundary else {"boundary": False}) | ({} if spp is None else {"spp_boundary": spp})
     return [(integrator, name, value) for name, value in changes.items() if hasattr(integrator, name)]
@@ -170,7 +190,7 @@ def with_settings(settings: Sequence[tuple[Any, str, Any]]) -> Iterator[None]:
             setattr(plugin, name, value)
         yield
     finally:
-        surely(put_back)
+        ensure_restored(put_back)
 
 
 @contextmanager
@@ -193,7 +213,7 @@ def open_session(job: RenderJob) -> Iterator[Session]:
                 attached = any(job.needs)
             finally:
                 if attached or job.scene.is_shared:
-                    surely(lambda: job.scene.restore(job.options, session.slots))
+                    ensure_restored(lambda: job.scene.restore(job.options, session.slots))
 
 
 @contextmanager
@@ -219,7 +239,7 @@ def _values_at_call(job: RenderJob) -> Iterator[None]:
             put_back(params, job.at_call[0], now)
         yield
     finally:
-        surely(restore)
+        ensure_restored(restore)
 
 
 # ------------------------------------------------------------------------------------------------------------ renders
@@ -233,7 +253,7 @@ class Images:
 
     kind = RENDER
 
-    def __init__(self, session: Session, values: Sequence[torch.Tensor], _given: Sequence[torch.Tensor | None]):
+    def __init__(self, session: Session, values: Sequence[torch.Tensor], _vectors: Sequence[torch.Tensor | None]):
         job = session.job
         self.session, self.values, self.count = session, values, len(job.items)
         self._started = time.perf_counter()
@@ -243,30 +263,28 @@ class Images:
         self._steady: torch.Tensor | None = None
         self._response: torch.Tensor | None = None
         self._memory: Any = None
-        if not job.items:
-            raise ShapeError("a batch must have at least one entry, got 0.")
         check_items(session.sensors, job.items)
         self.films = [session.film(item) for item in job.items]
         check_fits(self.films[0].cube_shape(), self.count, job.scene.variant)
 
     def install(self, item: Item, group: Sequence[Numbered]) -> None:
-        """Install the values of an entry, which the items of a group share."""
+        """Install the values of an item's entry, which the group shares, and check the scene that holds them."""
         self.session.install(item, self.values, [False] * len(self.values))
         for _, each in group:
-            self.session.job.watch.placed(self.session.scene, each.sensor)
+            self.session.job.watch.check_installed(self.session.scene, each.sensor)
 
     def adjoint(self, _n: int) -> tuple[None, None]:
         """Return no adjoint."""
         return None, None
 
     def progress(self, n: int) -> Callable[[float], None] | None:
-        """Return the function that is called with the share of item ``n`` that is done."""
+        """Return a function of the share of item ``n`` that is done, None without a progress bar."""
         report = self.session.job.progress
         return None if report is None else lambda fraction: report((n + fraction) / self.count)
 
     @contextmanager
     def storage(self, film: Any, n: int) -> Iterator[bool]:
-        """Let a large film write to the place of item ``n``; yields whether it does."""
+        """Lend a large film the memory of item ``n`` in the output for a render; yield whether it was lent."""
         entries = math.prod(film.cube_shape())
         large = self.count > 1 and entries >= LARGE_FILM and self.count * entries < 2**32
         # An integrator of others may not know of first entries.
@@ -325,7 +343,7 @@ class Images:
         name = sampler_plugin(sampler)
         job.log.append(RunLog(job.items, seconds, integrator, spp, before, after, total, calls, depth, name))
         if job.watch.enabled:
-            job.watch.window(sum(total), sum(before), sum(after))
+            job.watch.check_window(sum(total), sum(before), sum(after))
         return self._steady, self._response
 
 
@@ -365,7 +383,16 @@ def _tensors_of(film: Any, into: torch.Tensor | None) -> tuple[torch.Tensor, tor
 
 
 def check_items(sensors: Sequence[Any], items: Sequence[Item]) -> FilmLayout:
-    """Return the layout of the films of a call, which measure the same in one shape. Raises ``SceneError``."""
+    """Return the layout of the films of a call, which have to measure the same in one shape.
+
+    Args:
+        sensors: sensors of the built scene.
+        items: items of the call.
+
+    Raises:
+        ArgumentError: for an index without a sensor.
+        SceneError: for films of several layouts, shapes or channels.
+    """
     found: dict[int, tuple[FilmLayout, tuple[int, ...], tuple[str, ...]]] = {}
     for item in items:
         if not 0 <= item.sensor < len(sensors):
@@ -385,7 +412,12 @@ def check_items(sensors: Sequence[Any], items: Sequence[Item]) -> FilmLayout:
 
 
 def check_values(job: RenderJob, values: Sequence[torch.Tensor]) -> None:
-    """Raise ``UnitError`` for values that are not finite, and warn of unphysical ones."""
+    """Raise ``UnitError`` for values that are not finite, and warn of unphysical ones.
+
+    Args:
+        job: job with the keys of the values.
+        values: one tensor for each key.
+    """
     for key, value in zip(job.keys, values, strict=True):
         low, high = smallest_and_largest(value)
         if not are_finite(low, high):
@@ -394,7 +426,7 @@ def check_values(job: RenderJob, values: Sequence[torch.Tensor]) -> None:
                 f"value of {key!r}: expected finite numbers, got {bad} of {value.numel()} that are NaN or infinite."
             )
         if job.watch.enabled:
-            job.watch.value(key, value, low, high)
+            job.watch.check_value(key, value, low, high)
 
 
 # -------------------------------------------------------------------------------------------------------- derivatives
@@ -403,8 +435,8 @@ def check_values(job: RenderJob, values: Sequence[torch.Tensor]) -> None:
 class _Derivatives:
     """Results of derivatives: the leaves of the values that were installed last."""
 
-    def __init__(self, session: Session, values: Sequence[torch.Tensor], given: Sequence[torch.Tensor | None]):
-        self.session, self.values, self.given = session, values, given
+    def __init__(self, session: Session, values: Sequence[torch.Tensor], vectors: Sequence[torch.Tensor | None]):
+        self.session, self.values, self.vectors = session, values, vectors
         self.leaves: list[Any] = []
         self.calls: list[str] = []
         job = session.job
@@ -423,11 +455,11 @@ class _Derivatives:
         return None, None
 
     def progress(self, _n: int) -> None:
-        """Derivatives report no progress."""
+        """Return None: derivatives report no progress."""
 
     @contextmanager
     def storage(self, _film: Any, _n: int) -> Iterator[bool]:
-        """Films of derivatives write to memory of their own."""
+        """Lend nothing: films of derivatives have memory of their own."""
         yield False
 
 
@@ -436,15 +468,15 @@ class Gradients(_Derivatives):
 
     kind = BACKWARD
 
-    def __init__(self, session: Session, values: Sequence[torch.Tensor], given: Sequence[torch.Tensor | None]):
-        super().__init__(session, values, given)
+    def __init__(self, session: Session, values: Sequence[torch.Tensor], vectors: Sequence[torch.Tensor | None]):
+        super().__init__(session, values, vectors)
         self._grads = [
             torch.zeros_like(value) if need else None for value, need in zip(values, session.job.needs, strict=True)
         ]
 
     def adjoint(self, n: int) -> tuple[Any, Any]:
         several = len(self.session.job.items) > 1
-        steady, response = (g if g is None or not several else g[n] for g in self.given)
+        steady, response = (g if g is None or not several else g[n] for g in self.vectors)
         return _steady_adjoint(steady), _cube_adjoint(response)
 
     def collect(self, _n: int, item: Item) -> None:
@@ -469,7 +501,7 @@ class Gradients(_Derivatives):
     def finish(self) -> tuple[torch.Tensor, ...]:
         """Return the gradients, NaN where a film's adjoint is not finite: of its entry, and of unbatched values."""
         self.session.job.derivative_log.extend(self.calls)
-        job, adjoints = self.session.job, [g for g in self.given if g is not None]
+        job, adjoints = self.session.job, [g for g in self.vectors if g is not None]
         if len(job.items) == 1:
             broken = [not all(map(all_finite, adjoints))]
         else:
@@ -516,16 +548,16 @@ class Tangents(_Derivatives):
 
     kind = FORWARD
 
-    def __init__(self, session: Session, values: Sequence[torch.Tensor], given: Sequence[torch.Tensor | None]):
-        super().__init__(session, values, given)
+    def __init__(self, session: Session, values: Sequence[torch.Tensor], vectors: Sequence[torch.Tensor | None]):
+        super().__init__(session, values, vectors)
         job = session.job
         self._batched = [batched for batched, need in zip(job.batched, job.needs, strict=True) if need]
         self._steady: list[torch.Tensor] = []
         self._response: list[torch.Tensor] = []
 
     def _of_entry(self, item: Item) -> list[torch.Tensor]:
-        given = [tangent for tangent in self.given if tangent is not None]
-        return [t[item.entry] if batched else t for t, batched in zip(given, self._batched, strict=True)]
+        tangents = [tangent for tangent in self.vectors if tangent is not None]
+        return [t[item.entry] if batched else t for t, batched in zip(tangents, self._batched, strict=True)]
 
     def install(self, item: Item, group: Sequence[Numbered]) -> None:
         """Install the values of an entry, and carry their tangents on to the scene's parameters."""
@@ -534,7 +566,7 @@ class Tangents(_Derivatives):
         super().install(item, group)
         wanted = [leaf for leaf, need in zip(self.leaves, self.session.job.needs, strict=True) if need]
         for leaf, tangent in zip(wanted, self._of_entry(item), strict=True):
-            dr.set_grad(leaf, own_array(tangent))
+            dr.set_grad(leaf, flat_drjit_copy(tangent))
             dr.enqueue(dr.ADMode.Forward, leaf)
         # Interior nodes keep their tangents: the loops of the integrator read them at their boundary.
         dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)

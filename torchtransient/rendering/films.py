@@ -27,8 +27,8 @@ class FilmLayout(abc.ABC):
     """Settings of a film, and where its measurements lie in a tensor.
 
     A subclass is a frozen dataclass with one field, the settings; outputs have them under the name of the field. It
-    owes the names from ``measures`` to ``output`` and the abstract methods; the rest has defaults. Layouts with equal
-    settings are equal.
+    defines the names from ``measures`` to ``output`` and the abstract methods; the rest has defaults. Layouts with
+    equal settings are equal.
     """
 
     # Word of the plugin's `measures`: the attribute of a RenderOutput, and the name in a result file.
@@ -77,7 +77,7 @@ class FilmLayout(abc.ABC):
         return self.settings
 
     def describe(self, temporal_filter: str) -> str:
-        """Return the part of ``print(renderer)`` that tells of the film."""
+        """Return the film's part of ``print(renderer)``; ``temporal_filter``: name of the one in use."""
         return f"{self.argument}={self.settings}"
 
     def jump(self) -> str:
@@ -156,7 +156,7 @@ class FilmLayout(abc.ABC):
 
     @classmethod
     def seen(cls, film: FilmInterface, arrivals: Arrivals) -> Arrivals:
-        """Return the arrivals of a pilot run as the film sees them."""
+        """Return the arrivals of a pilot run, weighted by the response of a built ``film`` at their times."""
         return arrivals
 
     def parts(self, arrivals: Arrivals) -> list[Arrivals]:
@@ -167,6 +167,9 @@ class FilmLayout(abc.ABC):
 @dataclass(frozen=True)
 class Histogram(FilmLayout):
     """Radiance integrated over each bin of ``axis``: float32 (C, T, H, W).
+
+    Args:
+        axis: bins of optical path length.
 
     Raises:
         ArgumentError: for anything but a :class:`~torchtransient.axes.TimeAxis`.
@@ -242,7 +245,8 @@ _FREQUENCY_PROPERTIES = (
 class Phasors(FilmLayout):
     """Radiance times ``exp(-2 pi i nu (opl - start_opl))`` for each of ``frequencies``: complex64 (C, F, H, W).
 
-    A :class:`~torchtransient.axes.FrequencyAxis`, or numbers in cycles per metre.
+    Args:
+        frequencies: a :class:`~torchtransient.axes.FrequencyAxis`, or numbers in cycles per metre.
 
     Raises:
         UnitError, ShapeError: for anything else.
@@ -298,7 +302,8 @@ class Phasors(FilmLayout):
 class Gates(FilmLayout):
     """The light as each of ``gates`` sees it: float32 (C, G, H, W). The steady image is the sum over the gates.
 
-    One :class:`~torchtransient.gates.Gate` or several.
+    Args:
+        gates: one :class:`~torchtransient.gates.Gate` or several.
 
     Raises:
         ArgumentError: for anything else.

@@ -1,4 +1,4 @@
-"""Job of a call: everything about it that is no tensor; seeds and numbers of samples."""
+"""Job of a call: all its settings but the tensors; seeds and numbers of samples."""
 
 from __future__ import annotations
 
@@ -102,10 +102,10 @@ class RunLog:
 
 @dataclass(frozen=True)
 class RenderJob:
-    """Everything about a call that is no tensor. Does not change but for its two logs.
+    """Settings of a call: everything but its tensors. Immutable but for ``at_call`` and the two logs.
 
     Args:
-        scene, options, keys: what is built, and which of its parameters the values are for.
+        scene, options, keys: the scene, options of its build, and keys of the values.
         items: films to fill, empty where the seed is known later; ``seeding`` makes them then.
         batched: for each value, whether it has a leading batch dimension.
         spp, spp_grad: samples per pixel of the render and of its derivatives.
@@ -143,7 +143,7 @@ class RenderJob:
     derivative_log: list[str] = field(default_factory=list)
 
     def seeded(self, seed: torch.Tensor | None) -> RenderJob:
-        """Return the job with the items of a seed, known inside of a ``vmap`` alone; None for its own items."""
+        """Return the job with the items of a seed that is known inside of ``vmap`` only; itself for None."""
         return self if seed is None else replace(self, items=self.seeding.items(int(seed.item())))
 
 
@@ -171,11 +171,17 @@ def _check_distinct(seeds: list[int]) -> None:
             raise UnitError(f"seed: {other} and {seed} are one seed: seeds count modulo 2^32. Take others.")
 
 
-def drawn(seed: int | Sequence[int] | torch.Tensor | None) -> tuple[Any, torch.Tensor | None]:
-    """Return the seed of a call as (seed, None), or as (None, tensor) where ``vmap`` has one for each of its entries.
+def draw_seed(seed: int | Sequence[int] | torch.Tensor | None) -> tuple[Any, torch.Tensor | None]:
+    """Return the seed of a call, drawn from torch's generator for None.
 
-    None draws from torch's generator, under ``vmap`` as its ``randomness`` says. Raises ``UnitError`` where that is
-    "error", as it is unless something else is asked for.
+    Args:
+        seed: one seed, one for each batch entry, or None; under ``vmap`` None follows its ``randomness``.
+
+    Returns:
+        (seed, None), or (None, tensor) where ``vmap`` has a seed for each of its entries.
+
+    Raises:
+        UnitError: for None under ``vmap`` with ``randomness="error"``, its default.
     """
     if seed is None:
         try:
@@ -219,7 +225,10 @@ def _each_number(seed: Any) -> int:
 
 
 def mix_seed(seed: int, number: int) -> int:
-    """A 32-bit seed that looks unrelated to ``seed``; 0 leaves it as it is (a splitmix64 step, Steele et al. 2014)."""
+    """Return a 32-bit seed that looks unrelated to ``seed``; for number 0 ``seed`` itself, modulo 2^32.
+
+    A step of splitmix64 (Steele et al. 2014).
+    """
     if number == 0:
         return seed % SEED_RANGE
     z = (seed + number * 0x9E3779B97F4A7C15) % 2**64
@@ -231,23 +240,23 @@ def mix_seed(seed: int, number: int) -> int:
 # ------------------------------------------------------------------------------------------------ numbers of samples
 
 
-def rounded_count(asked: int, known: dict[int, int], drawn: Callable[[int], int]) -> int:
-    """Return the number of samples that a sampler draws for ``asked``, and warn once where it differs.
+def rounded_count(spp: int, known: dict[int, int], count: Callable[[int], int]) -> int:
+    """Return the number of samples that a sampler draws for ``spp``, and warn once where it differs.
 
     Args:
-        asked: samples per pixel.
-        known: numbers that were found before, to which this one is added.
-        drawn: asks the sampler.
+        spp: samples per pixel that are asked for.
+        known: numbers that were found before, by ``spp``; this one is added.
+        count: function of ``spp`` that asks the sampler.
     """
-    if asked not in known:
-        known[asked] = drawn(asked)
-        if known[asked] != asked:
+    if spp not in known:
+        known[spp] = count(spp)
+        if known[spp] != spp:
             warnings.warn(
-                f"spp={asked} is rounded to {known[asked]}, a number of samples that the scene's sampler can draw.",
+                f"spp={spp} is rounded to {known[spp]}, a number of samples that the scene's sampler can draw.",
                 TorchTransientWarning,
                 stacklevel=level_of_user(),
             )
-    return known[asked]
+    return known[spp]
 
 
 def samples_drawn(sampler: Any, count: int | None) -> int:

@@ -18,7 +18,7 @@ from torchtransient.checks import as_number, as_whole, of_class, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.rendering.engine import Session, check_values, open_session
 from torchtransient.rendering.job import RenderJob, Seeding
-from torchtransient.rendering.recording import NotRecordedError, Numbered, check_whole, groups_of, refusal
+from torchtransient.rendering.recording import NotRecordedError, Numbered, groups_of, raise_if_broken, reason_to_trace
 from torchtransient.rendering.renderer import TransientRenderer
 from torchtransient.scene.load import Scene
 from torchtransient.scene.opaque import opaque
@@ -92,13 +92,33 @@ def scene_labels(
 
 @opaque
 def label_names(renderer: TransientRenderer) -> tuple[str, ...]:
-    """Return the names of the shapes that the label "shape" counts, in the order of the scene's description."""
+    """Return the names of the shapes that the label "shape" is an index into.
+
+    Args:
+        renderer: the renderer.
+
+    Returns:
+        Names in the order of the scene's description.
+
+    Raises:
+        ArgumentError: for other objects.
+    """
     return tuple(_tables(renderer).shape_names)
 
 
 @opaque
 def material_names(renderer: TransientRenderer) -> tuple[str, ...]:
-    """Return the names of the materials that the label "material" counts, in the order of their shapes."""
+    """Return the names of the materials that the label "material" is an index into.
+
+    Args:
+        renderer: the renderer.
+
+    Returns:
+        Names in the order of their shapes.
+
+    Raises:
+        ArgumentError: for other objects.
+    """
     return tuple(_tables(renderer).material_names)
 
 
@@ -240,7 +260,7 @@ def _group_labels(
     jobs = [
         LabelJob(session.scene, session.sensors[item.sensor], names, tables, samples).prepare() for _, item in group
     ]
-    reason = refusal(session)
+    reason = reason_to_trace(session)
     if reason is None:
         try:
             how, results = session.recordings.run(jobs)
@@ -248,12 +268,12 @@ def _group_labels(
                 _tensors(job, arrays, names) for job, arrays in zip(jobs, results, strict=True)
             ]
         except NotRecordedError as error:
-            check_whole(session, error)
+            raise_if_broken(session, error)
             reason = str(error)
     found = []
     for job in jobs:
         job.run(job)
-        found.append(_tensors(job, job.film.taken(), names))
+        found.append(_tensors(job, job.film.release_storage(), names))
     return [reason] * len(jobs), found
 
 

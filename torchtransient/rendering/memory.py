@@ -14,7 +14,7 @@ _SMALL = 2**22
 
 
 def available_bytes(variant: str) -> int | None:
-    """Memory that can still be taken on the variant's device, None where the system does not say."""
+    """Return the free memory of a variant's device in bytes, None where the system does not say."""
     if device_type(variant) == "cuda":
         import torch
 
@@ -23,9 +23,14 @@ def available_bytes(variant: str) -> int | None:
 
 
 def check_fits(cube_shape: tuple[int, ...], items: int, variant: str) -> None:
-    """Raise ``StorageError`` when ``items`` films of ``cube_shape`` (H, W, T, C) exceed the memory that is left.
+    """Raise ``StorageError`` if the films of a call exceed the free memory.
 
     Several items are gathered in one tensor while the next is rendered: one film more than there are items.
+
+    Args:
+        cube_shape: shape of a film, (H, W, T, C).
+        items: number of films.
+        variant: variant, whose device has the memory.
     """
     cube = math.prod(cube_shape) * _BYTES_PER_VALUE
     films = items + 1 if items > 1 else 1

@@ -61,7 +61,7 @@ class RenderStats:
 
     @classmethod
     def of_job(cls, job: RenderJob, pixels: int) -> RenderStats:
-        """Return the statistics of a job that has run, on films of so many pixels."""
+        """Return the statistics of a job that has run; ``pixels``: number of pixels of each film."""
         runs = job.log
         items, seconds = [item for run in runs for item in run.items], sum(run.seconds for run in runs)
         return cls(
@@ -153,7 +153,7 @@ class RenderOutput(TensorRecord):
 
     @property
     def polarized(self) -> bool:
-        """Return whether the Stokes components come before the channels."""
+        """Stokes components come before the channels."""
         return stokes_components(self.stats.variant) > 1
 
     @property
@@ -188,12 +188,28 @@ class RenderOutput(TensorRecord):
         stats: RenderStats,
         channels: Sequence[str],
     ) -> RenderOutput:
-        """The output of a film whose tensors are in torch's order already."""
+        """Build the output of a film.
+
+        Args:
+            film: layout of the film.
+            steady: steady image in torch's order, (..., C, H, W).
+            response: the film's measurement in torch's order, such as (..., C, T, H, W).
+            stats: statistics of the render.
+            channels: names of the C channels.
+        """
         return cls(steady=steady, stats=stats, channels=tuple(channels), **named_fields(film, response))
 
 
 def named_fields(film: FilmLayout, response: torch.Tensor) -> dict[str, Any]:
-    """Return a film's measurements as arguments of a dataclass like ``RenderOutput``; ``others`` holds the rest."""
+    """Return a film's tensor and settings as arguments of ``RenderOutput`` and dataclasses like it.
+
+    Args:
+        film: layout of the film.
+        response: tensor of the film, in torch's order.
+
+    Returns:
+        Values of all fields of films, None for those of other films; ``others`` holds what has no field.
+    """
     found = {film.measures: response, **film.attributes()}
     named = {name: found.pop(name, None) for name in _OF_FILMS}
     return {**named, "others": found}

@@ -16,7 +16,7 @@ from torchtransient.checks import Numbers, arguments_of, as_whole, count, is_one
 from torchtransient.errors import ArgumentError, SceneError, UnitError
 from torchtransient.gates import Gate
 from torchtransient.pulses import Pulse
-from torchtransient.rendering.arguments import checked_depth, checked_filter, checked_keys, film_asked_for
+from torchtransient.rendering.arguments import checked_depth, checked_filter, checked_keys, requested_film
 from torchtransient.rendering.films import FILMS, FilmLayout, Gates, Histogram, Phasors, layout_of_plugin
 from torchtransient.rendering.renderer import TransientRenderer
 from torchtransient.scene.edits import checked_pulse
@@ -87,14 +87,14 @@ def planned(outputs: Sequence[str]) -> PlannedFilm:
 
 @dataclass(frozen=True, kw_only=True)
 class Plan(Effects):
-    """Decisions of :func:`plan`, for :meth:`renderer` or ``tt.TransientRenderer(scene, effects=plan)``.
+    """Decisions of :func:`plan`. :meth:`renderer` makes a renderer of them, as does ``effects=`` of the renderer.
 
     ``str(plan)`` prints the reasons.
 
     Attributes:
         outputs: outputs of the plan.
         film: "transient", "steady" (one bin), "phasor" or "gated".
-        parameters: keys that gradients will be asked for.
+        parameters: keys of the parameters that will have gradients.
         reasons: one line per decision.
         pilot: results of the pilot run, None without one.
         scene, variant, integrator, temporal_filter: as the renderer uses them; the filter is empty for phasor and
@@ -134,7 +134,14 @@ class Plan(Effects):
         """Return a :class:`TransientRenderer` of the planned scene.
 
         Args:
-            settings: its other arguments, which go before the plan's.
+            settings: arguments of :class:`TransientRenderer`, which take precedence over the plan.
+
+        Returns:
+            The renderer, with the plan's parameters unless ``settings`` has others.
+
+        Raises:
+            TypeError: for arguments that :class:`TransientRenderer` does not have.
+            ArgumentError, SceneError, GradientError: as :class:`TransientRenderer` raises them.
         """
         settings.setdefault("parameters", self.parameters)
         with arguments_of("Plan.renderer", TransientRenderer.__init__, ("scene", "effects")):
@@ -192,7 +199,7 @@ def plan(
     seed: int = 0,
     film: FilmLayout | None = None,
 ) -> Plan:
-    """Choose the cheapest way to render a scene that shows what is asked for.
+    """Choose the cheapest variant, integrator, depth and film that show the requested outputs.
 
     Depths and times hold for the described values: parameters that change brightness or geometry very much call for
     another plan.
@@ -200,7 +207,7 @@ def plan(
     Args:
         scene: scene, as for :func:`load`. The variant that it was loaded with only sets the device.
         outputs: some of "transient", "steady", "phasor", "stokes", "gates", "bands".
-        parameters: keys that gradients will be asked for.
+        parameters: keys of the parameters that will have gradients.
         time_axis: axis of the film, "scene" for the scene's own, None to find one.
         frequencies, gates: settings of a phasor or gated film.
         pulse, irf: shapes of pulse and impulse response, which the renderer uses; they widen the axis.
@@ -220,7 +227,7 @@ def plan(
         film: film and its settings, in place of ``frequencies`` and ``gates``.
 
     Returns:
-        The plan.
+        The plan; ``str(plan)`` prints its reasons.
 
     Raises:
         ArgumentError: for unknown outputs, and settings that have no effect.
@@ -248,7 +255,7 @@ def plan(
     loaded = load(scene)
     wanted = _checked_outputs(outputs)
     inventory = scene_inventory(loaded, sensor)
-    given = film_asked_for(film, {"frequencies": frequencies, "gates": gates})
+    given = requested_film(film, {"frequencies": frequencies, "gates": gates})
     if given is not None and given.has_bins:
         if time_axis is not None:
             raise ArgumentError("tt.plan: film and time_axis both give a time axis; leave out one of them.")

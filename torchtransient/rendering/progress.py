@@ -9,7 +9,7 @@ _T = TypeVar("_T")
 
 
 class Bar:
-    """A progress bar that takes fractions, under a name. Made on demand: tqdm is imported only when asked for."""
+    """Progress bar, called with the fraction that is done. tqdm is imported when the first one is made."""
 
     def __init__(self, name: str = "render") -> None:
         from tqdm.auto import tqdm
@@ -22,12 +22,12 @@ class Bar:
         self._bar.update(fraction - self._bar.n)
 
     def close(self) -> None:
-        """End it."""
+        """Finish the bar."""
         self._bar.close()
 
 
 def with_bar(things: Sequence[_T], name: str, progress: bool) -> Iterator[_T]:
-    """Things one by one, with a bar where one was asked for."""
+    """Yield the entries of a sequence; show a bar called ``name`` if ``progress``."""
     bar = Bar(name) if progress else None
     try:
         for done, thing in enumerate(things):

@@ -26,15 +26,15 @@ from torchtransient.rendering.arguments import (
     checked_grad_seed,
     checked_keys,
     checked_sampler,
-    film_asked_for,
-    given_values,
-    mangle,
-    samples,
+    checked_samples,
+    checked_values,
+    requested_film,
     sensor_list,
+    torch_names,
 )
 from torchtransient.rendering.autograd import RenderCall, run
 from torchtransient.rendering.films import FilmLayout, steady_channels_first
-from torchtransient.rendering.job import Item, RenderJob, Seeding, drawn, rounded_count, samples_drawn
+from torchtransient.rendering.job import Item, RenderJob, Seeding, draw_seed, rounded_count, samples_drawn
 from torchtransient.rendering.output import RenderOutput, RenderStats
 from torchtransient.rendering.progress import Bar
 from torchtransient.scene.edits import BuildOptions, checked_pulse
@@ -139,7 +139,7 @@ class TransientRenderer(CopiesParametrized):
         freeze: bool = True,
     ):
         super().__init__()
-        film = film_asked_for(film, {"time_axis": time_axis, "frequencies": frequencies, "gates": gates})
+        film = requested_film(film, {"time_axis": time_axis, "frequencies": frequencies, "gates": gates})
         if isinstance(effects, Effects):
             scene = effects.planned_scene(scene)
             film, temporal_filter = effects.film_settings(film, temporal_filter)
@@ -150,11 +150,11 @@ class TransientRenderer(CopiesParametrized):
             raise ArgumentError(f"effects: expected 'auto' or a plan of tt.plan(...), got {shown(effects)}.")
         self._keys = checked_keys(parameters)
         self.scene: Scene = load(scene)
-        self.spp, self.spp_grad = samples("spp", spp), samples("spp_grad", spp_grad)
+        self.spp, self.spp_grad = checked_samples("spp", spp), checked_samples("spp_grad", spp_grad)
         self.temporal_filter = checked_filter(temporal_filter)
         self.grad_seed = checked_grad_seed(grad_seed)
         self.freeze = bool(freeze)
-        self.boundary, self.spp_boundary = flag("boundary", boundary), samples("spp_boundary", spp_boundary)
+        self.boundary, self.spp_boundary = flag("boundary", boundary), checked_samples("spp_boundary", spp_boundary)
         if not self.boundary and self.spp_boundary is not None:
             raise ArgumentError(
                 "spp_boundary: expected none with boundary=False, which leaves out what they are samples of; leave one "
@@ -173,7 +173,7 @@ class TransientRenderer(CopiesParametrized):
                 effects.check_sensors(self._sensors)
             start = self._initial_values(parameters)
             self._look_at_scene()
-        self._names = mangle(self._keys)
+        self._names = torch_names(self._keys)
         for key in self._keys:
             self.register_parameter(self._names[key], nn.Parameter(start[key]))
 
@@ -199,7 +199,7 @@ class TransientRenderer(CopiesParametrized):
         return {key: table[key] for key in self._keys}
 
     def _read_scene(self, sensors: int | Sequence[int] | str) -> None:
-        """Sensors, axis, film and samples of the built scene."""
+        """Read sensors, axis, film and samples off the built scene."""
         built = self.scene.built(self._options)
         found = built.scene.sensors()
         if not found:
@@ -241,7 +241,7 @@ class TransientRenderer(CopiesParametrized):
             built = self.scene.built(self._options)
             slots = self.scene.slots(self._keys, self._options).slots
             if self.film.count > 1 or self.effective_filter in ("", "box"):
-                # Of one bin for all times a wider filter spreads up to a half over the rim, and nobody looks there.
+                # Of one bin for all times a wider filter spreads up to a half over the rim, which is no loss.
                 self._watch.window_name = f"window of {self.film.describe('')}"
             ranges = built.ranges() if self._keys else {}
             self._watch.ranges = {key: ranges[key] for key in self._keys if key in ranges}
@@ -249,7 +249,7 @@ class TransientRenderer(CopiesParametrized):
             self._watch.directions = sun_axes(built.params, self._keys)
             # What is given replaces what is described.
             findings = self.scene.findings(self._options)
-            self._watch.scene({key: text for key, text in findings.items() if key not in self._keys})
+            self._watch.check_description({key: text for key, text in findings.items() if key not in self._keys})
 
     def _initial_values(self, given: Sequence[str] | Mapping[str, Any]) -> dict[str, torch.Tensor]:
         slots = self.scene.slots(self._keys, self._options).slots
@@ -273,34 +273,45 @@ class TransientRenderer(CopiesParametrized):
 
     @property
     def axis(self) -> TimeAxis | None:
-        """The time axis; None for a film without one."""
+        """Time axis of the film, None for a film without one."""
         return self.film.attributes().get("axis")
 
     @property
     def frequencies(self) -> FrequencyAxis | None:
-        """The frequencies of a phasor film, else None."""
+        """Frequencies of a phasor film, else None."""
         return self.film.attributes().get("frequencies")
 
     @property
     def gates(self) -> tuple[Gate, ...] | None:
-        """The gates of a gated film, else None."""
+        """Gates of a gated film, else None."""
         return self.film.attributes().get("gates")
 
     @property
     def values(self) -> Values:
-        """The parameters under their Mitsuba keys; of a parametrized one its value, which is no leaf."""
+        """Parameters by their Mitsuba keys; of a parametrized one its value, which is no leaf of a graph."""
         return Values(self, self._names)
 
     @property
     def effective_filter(self) -> str:
-        """The temporal filter that renders use; empty for a film that has none."""
+        """Temporal filter of renders, with "auto" resolved; empty for a film without one."""
         if self.temporal_filter != "auto":
             return self.temporal_filter
         return filter_for(needing_slope(self._infos, self._keys), self._scene_filter, self._pulsed)
 
     @opaque
     def variation(self, *, sampler: str | None = None, temporal_filter: str | None = None) -> TransientRenderer:
-        """A copy with the same values and another sampler or temporal filter; None keeps what this one has."""
+        """Return a copy with the same values and another sampler or temporal filter.
+
+        Args:
+            sampler: plugin name of a Mitsuba sampler, None to keep this renderer's.
+            temporal_filter: "box", "tent", "gaussian" or "auto", None to keep this renderer's.
+
+        Returns:
+            The copy, with parameters of its own.
+
+        Raises:
+            ArgumentError: for other names, and for a filter of a film that has none.
+        """
         if temporal_filter is not None:
             checked_filter(temporal_filter)
         if not self.film.has_bins and temporal_filter not in (None, "auto"):
@@ -315,6 +326,12 @@ class TransientRenderer(CopiesParametrized):
     def has_slope_for(self, keys: Sequence[str]) -> bool:
         """Return whether gradients for ``keys`` exist with the filter or gates in use: a box has none of path lengths.
 
+        Args:
+            keys: some keys of the renderer's parameters.
+
+        Returns:
+            True if no key changes path lengths, or the film's response has a slope over time.
+
         Raises:
             UnknownKeyError: for keys that the renderer does not have.
         """
@@ -323,10 +340,20 @@ class TransientRenderer(CopiesParametrized):
 
     @opaque
     def samples_drawn(self, spp: int) -> int:
-        """Samples per pixel that a render with ``spp`` really draws: stratified samplers round up."""
+        """Return the samples per pixel that a render draws: stratified samplers round up.
+
+        Args:
+            spp: samples per pixel that are asked for.
+
+        Returns:
+            Samples per pixel, at least ``spp``.
+
+        Raises:
+            UnitError: if ``spp`` is no positive integer.
+        """
         with active_variant(self.scene.variant):
             sensor = self.scene.built(self._options).scene.sensors()[self._sensors[0]]
-            return samples_drawn(sensor.sampler().clone(), samples("spp", spp))
+            return samples_drawn(sensor.sampler().clone(), checked_samples("spp", spp))
 
     @opaque
     def forward(
@@ -337,7 +364,7 @@ class TransientRenderer(CopiesParametrized):
         spp: int | None = None,
         progress: bool = False,
     ) -> RenderOutput:
-        """Render.
+        """Render the scene with the module's parameters, or with ``values`` in their place.
 
         Args:
             values: by key of ``parameters``, in place of the module's own: tensors, arrays, lists or numbers of the
@@ -346,8 +373,8 @@ class TransientRenderer(CopiesParametrized):
             seed: same seed, same tensor. None draws one from torch's generator (``torch.manual_seed``). In a batch
                 every entry has its own seed, derived from this one, the first entry the seed itself; or give one seed
                 per entry.
-            spp: instead of the renderer's.
-            progress: whether a bar is shown.
+            spp: samples per pixel, None for the renderer's.
+            progress: show a progress bar.
 
         Returns:
             A :class:`RenderOutput` whose tensors carry gradients to the values.
@@ -362,13 +389,13 @@ class TransientRenderer(CopiesParametrized):
         temporal_filter = self.effective_filter
         self._check_slope(temporal_filter, tensors)
         self._check_edges(tensors)
-        wanted = samples("spp", spp) or self.spp or self._scene_spp
+        wanted = checked_samples("spp", spp) or self.spp or self._scene_spp
         used = used_grad = rounded_count(wanted, self._counts, self.samples_drawn)
         graph = torch.is_grad_enabled()
         if self.spp_grad is not None and any(may_have_derivative(tensor, graph=graph) for tensor in tensors):
             used_grad = rounded_count(self.spp_grad, self._counts, self.samples_drawn)
         seeding = Seeding(self._sensors, 1 if batch is None else batch, self.grad_seed)
-        number, per_entry = drawn(seed)
+        number, per_entry = draw_seed(seed)
         bar = Bar() if progress else None
         job = RenderJob(
             scene=self.scene,
@@ -401,8 +428,8 @@ class TransientRenderer(CopiesParametrized):
         return RenderOutput.of(self.film, steady, response, stats=stats, channels=self._channels)
 
     def _collect(self, values: Mapping[str, Any] | None) -> tuple[list[torch.Tensor], list[bool], int | None]:
-        """The tensors of a call in the order of the keys, which of them are batched, and the batch size."""
-        given = given_values(values)
+        """Return the tensors of a call in the order of the keys, which of them are batched, and the batch size."""
+        given = checked_values(values)
         for key in given:
             if key not in self._shapes:
                 hint = unknown_key(key, list(self._shapes), "this renderer")
@@ -431,7 +458,7 @@ class TransientRenderer(CopiesParametrized):
             check_slope(moving, *self._response)
 
     def _check_edges(self, tensors: Sequence[torch.Tensor]) -> None:
-        """Say once of each key whose derivative a call can be asked for what that lacks of moving edges."""
+        """Warn once for each key of what derivatives of this call lack at moving edges."""
         graph = torch.is_grad_enabled()
         new = [
             key
@@ -452,12 +479,12 @@ class TransientRenderer(CopiesParametrized):
         self._asked_of_edges.update(new)
 
     def _depth_bound(self, given: Mapping[str, Any] | None, tensors: Sequence[torch.Tensor]) -> DepthBound | None:
-        """On the depth of a call whose values can have derivatives; None for others, and where a depth is stated."""
+        """Return the bound on the depth if values can have derivatives and no depth is stated, else None."""
         own = not set(self._keys) <= set(given or ()) and any(p.requires_grad for p in self.parameters())
         if not own and not any(map(may_have_derivative, tensors)):
             return None
         return depth_bound(self.scene, self._options, self._sensors, self.film, self._watch)
 
     def extra_repr(self) -> str:
-        """Shown by ``print(renderer)``."""
+        """Return the scene, the keys and the film, for ``print(renderer)``."""
         return f"{self.scene!r}, parameters={list(self._keys)}, {self.film.describe(self.effective_filter)}"

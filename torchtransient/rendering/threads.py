@@ -1,4 +1,4 @@
-"""``tt.threads``: how many threads torch and Dr.Jit compute with, set together."""
+"""``tt.threads``: the numbers of threads of torch and of Dr.Jit, set together."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from torchtransient.errors import DeviceError, SceneError, ShapeError, TorchTran
 from torchtransient.plugins.mitsuba_compat import check_pose, is_turned_by_reflections
 from torchtransient.plugins.node_walk import ShownValue
 from torchtransient.scene.parameters import classify, is_transform, read_value, unknown_key
-from torchtransient.scene.values import as_mitsuba_value, changed_with, with_normals
+from torchtransient.scene.values import FEW, add_normals, as_mitsuba_value, dependent_keys, wait_for_torch
 from torchtransient.scene.variant import quiet
 
 # --------------------------------------------------------------------------------------------------------- PyTrees
@@ -46,7 +46,7 @@ def flatten(tree: Any) -> tuple[Any, list[Any]]:
 
 
 def unflatten(structure: Any, leaves: Sequence[Any]) -> Any:
-    """Return a PyTree of a structure with ``leaves`` in their order."""
+    """Return the PyTree of a structure of :func:`flatten`, with ``leaves`` in the order of its slots."""
     return _map_leaves(lambda slot: leaves[slot.number], structure)
 
 
@@ -122,8 +122,6 @@ _WIDER = {
     torch.uint16: torch.int32,
 }
 _MODULES = {"cpu": "drjit.llvm.ad", "cuda": "drjit.cuda.ad"}
-# A list of so few entries is copied sooner than a kernel is launched.
-_FEW = 64
 
 
 def computable(tensor: torch.Tensor, name: str) -> torch.Tensor:
@@ -152,20 +150,19 @@ def computable(tensor: torch.Tensor, name: str) -> torch.Tensor:
     return tensor if wider == tensor.dtype else tensor.to(wider)
 
 
-def own(tensor: torch.Tensor) -> Any:
-    """Copy a torch tensor to a Dr.Jit tensor, so that a scene never aliases memory of the caller."""
+def drjit_copy(tensor: torch.Tensor) -> Any:
+    """Return a copy of a torch tensor as a Dr.Jit tensor: a scene never aliases memory of the caller."""
     import drjit as dr
 
     kind = getattr(importlib.import_module(_MODULES[tensor.device.type]), _NAMES[tensor.dtype])
     shape = tuple(int(n) for n in tensor.shape)
-    if tensor.numel() <= _FEW:
+    if tensor.numel() <= FEW:
         few = dr.array_t(kind)(tensor.reshape(-1).tolist())
         # A single number would be a literal of the kernels, compiled again for every other number.
         dr.make_opaque(few)
         return kind(few, shape)
     dense = tensor.detach().resolve_neg().contiguous()
-    if dense.is_cuda:  # Dr.Jit works on a stream of its own
-        torch.cuda.current_stream(dense.device).synchronize()
+    wait_for_torch(dense)
     copied = fresh(kind(dense))
     dr.eval(copied)
     dr.sync_thread()
@@ -261,20 +258,26 @@ def _same(a: Any, b: Any) -> bool:
 
 
 def put_back(params: Any, values: Mapping[str, Any], now: Mapping[str, Any] | None = None) -> None:
-    """Write ``values`` that differ from those of the scene, which are ``now``, and update the scene."""
+    """Write those values that differ from the scene's, and update the scene.
+
+    Args:
+        params: ``mitsuba.SceneParameters`` of the scene.
+        values: values by key, such as :func:`values_of` returned before.
+        now: values that the scene holds now, None to read them.
+    """
     now = values_of(params) if now is None else now
     keys = [key for key, value in values.items() if key not in now or not _same(value, now[key])]
     if not keys:
         return
     # Mitsuba recomputes normals when positions change: both have to go back.
-    keys = with_normals(keys, values)
+    keys = add_normals(keys, values)
     for key in keys:
         params[key] = values[key]
     _update(params, keys)
 
 
 def _update(params: Any, keys: Sequence[str]) -> None:
-    for key in (*keys, *changed_with(keys, params)):
+    for key in (*keys, *dependent_keys(keys, params)):
         params.set_dirty(key)
     with quiet():
         params.update()
@@ -288,7 +291,12 @@ def detached(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def shapes_of(params: Any, keys: Iterable[str], name: str) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of torch values by key; ``name`` begins the messages.
+    """Return the shapes of torch values by key.
+
+    Args:
+        params: ``mitsuba.SceneParameters`` of the scene.
+        keys: keys of parameters.
+        name: name of the wrapped function, for messages.
 
     Raises:
         UnknownKeyError: if the scene has no such parameter.
@@ -311,6 +319,11 @@ def shapes_of(params: Any, keys: Iterable[str], name: str) -> dict[str, tuple[in
 
 def write(params: Any, leaves: Mapping[str, Any], name: str) -> None:
     """Set parameters from flat Dr.Jit arrays by operations that gradients pass, and update the scene.
+
+    Args:
+        params: ``mitsuba.SceneParameters`` of the scene.
+        leaves: flat arrays by key, of the shapes of :func:`shapes_of`.
+        name: name of the wrapped function, for messages.
 
     Raises:
         SceneError: if Mitsuba refuses a value, or a pose reflects a shape that it would turn inside out.

@@ -3,9 +3,9 @@
 A call keeps no graph of Dr.Jit. Its derivatives are *replays*: they call the function again with the saved arguments,
 attached, and with the scenes as they were at the call. Every run takes the engine's lock and puts the scenes back.
 
-Scenes are found by a walk over the variables of the function. To ask for all of them would be no safer: plugins in C++
-read a scene without a trace in Python, so that a scene that was not named could be told by such a walk alone, and one
-that it finds needs no name. ``state`` names those that it does not find.
+Scenes are found by a walk over the variables of the function, so that users need not name them; ``state`` names those
+that the walk does not find. Nothing else would find a scene that was not named: plugins in C++ read it without a trace
+in Python.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from torch.autograd import forward_ad
 from torchtransient.checks import as_whole, is_one_of, shown
 from torchtransient.errors import ArgumentError, GradientError, ShapeError, UnitError, VariantError
 from torchtransient.plugins.guards import interrupts_wait, no_collection
-from torchtransient.rendering.autograd import Asked, run
+from torchtransient.rendering.autograd import Request, run
 from torchtransient.rendering.broken_numbers import spread_nan
 from torchtransient.rendering.job import mix_seed
 from torchtransient.rendering.values import (
@@ -41,10 +41,10 @@ from torchtransient.rendering.values import (
     as_torch,
     computable,
     detached,
+    drjit_copy,
     flatten,
     fresh,
     is_typed_structure,
-    own,
     put_back,
     same_structure,
     shapes_of,
@@ -146,7 +146,7 @@ class _Seed(int):
 
 
 class _Wrapped:
-    """A function and its options."""
+    """Wrapped function with its options."""
 
     def __init__(self, function: Callable[..., Any], parameters: Any, state: Any, reseed: str | None):
         if not callable(function):
@@ -306,7 +306,7 @@ _USED_AS_TORCH = re.compile(r"must be Tensor, not TensorX|'TensorX\w+' object ha
 
 @dataclass(frozen=True)
 class Call:
-    """Everything about a call that is not a tensor (:class:`.autograd.Replayable`).
+    """Call of a wrapped function, without its tensors (:class:`.autograd.Replayable`).
 
     Attributes:
         tree, leaves: the arguments ``(args, kwargs)``, with a :class:`Slot` for each tensor.
@@ -345,21 +345,25 @@ class Call:
         with self._at_work():
             return self._primal(tensors)
 
-    def pullback(self, asked: Asked, tensors: Sequence[torch.Tensor], cotangents: Sequence[torch.Tensor]) -> Tensors:
+    def pullback(
+        self, request: Request, tensors: Sequence[torch.Tensor], cotangents: Sequence[torch.Tensor]
+    ) -> Tensors:
         """Return gradients of <cotangents, outputs>; NaN where a cotangent that is not finite arrives."""
 
         def replay(given: Sequence[torch.Tensor]) -> Tensors:
             with self._at_work():
-                return self._pullback(asked, tensors, given)
+                return self._pullback(request, tensors, given)
 
         return spread_nan(replay, cotangents)
 
-    def pushforward(self, asked: Asked, tensors: Sequence[torch.Tensor], tangents: Sequence[torch.Tensor]) -> Tensors:
+    def pushforward(
+        self, request: Request, tensors: Sequence[torch.Tensor], tangents: Sequence[torch.Tensor]
+    ) -> Tensors:
         """Return derivatives of the real outputs; NaN where a tangent that is not finite arrives."""
 
         def replay(given: Sequence[torch.Tensor]) -> Tensors:
             with self._at_work():
-                return self._pushforward(asked, tensors, given)
+                return self._pushforward(request, tensors, given)
 
         return spread_nan(replay, tangents)
 
@@ -371,7 +375,7 @@ class Call:
     def _primal(self, tensors: Sequence[torch.Tensor]) -> Tensors:
         import drjit as dr
 
-        tree, leaves, arrays = self._outputs([own(tensor) for tensor in tensors], derivative=False)
+        tree, leaves, arrays = self._outputs([drjit_copy(tensor) for tensor in tensors], derivative=False)
         if any(dr.grad_enabled(array) for array in arrays):
             raise GradientError(
                 f"{self.name}: the result depends on arrays of Dr.Jit that want a gradient, and would get none: those "
@@ -389,31 +393,35 @@ class Call:
             self.returned.append((tree, leaves))
         return as_torch([fresh(array) for array in arrays])
 
-    def _pullback(self, asked: Asked, tensors: Sequence[torch.Tensor], cotangents: Sequence[torch.Tensor]) -> Tensors:
+    def _pullback(
+        self, request: Request, tensors: Sequence[torch.Tensor], cotangents: Sequence[torch.Tensor]
+    ) -> Tensors:
         import drjit as dr
 
-        leaves, wanted = _attached(asked, tensors)
-        outputs = self._real_outputs(leaves, wanted, len(asked.given))
-        pulled = [output for output, is_given in zip(outputs, asked.given, strict=True) if is_given]
+        leaves, wanted = _attached(request, tensors)
+        outputs = self._real_outputs(leaves, wanted, len(request.has_cotangent))
+        pulled = [output for output, is_given in zip(outputs, request.has_cotangent, strict=True) if is_given]
         self._check_dependence(pulled)
         for output, cotangent in zip(pulled, cotangents, strict=True):
             if dr.grad_enabled(output):
                 # two outputs may be one array; no memory of torch's, which Dr.Jit would free under a lock of its own
-                dr.accum_grad(output, own(cotangent))
+                dr.accum_grad(output, drjit_copy(cotangent))
         # Of all that leads to the outputs, the part that starts at the wanted leaves.
         for leaf in wanted:
             dr.enqueue(dr.ADMode.Forward, leaf)
         dr.traverse(dr.ADMode.Backward)
         return as_torch([_derivative(leaf) for leaf in wanted])
 
-    def _pushforward(self, asked: Asked, tensors: Sequence[torch.Tensor], tangents: Sequence[torch.Tensor]) -> Tensors:
+    def _pushforward(
+        self, request: Request, tensors: Sequence[torch.Tensor], tangents: Sequence[torch.Tensor]
+    ) -> Tensors:
         import drjit as dr
 
-        leaves, wanted = _attached(asked, tensors)
+        leaves, wanted = _attached(request, tensors)
         outputs = self._real_outputs(leaves, wanted, None)
         self._check_dependence(outputs)
         for leaf, tangent in zip(wanted, tangents, strict=True):
-            dr.set_grad(leaf, own(tangent))
+            dr.set_grad(leaf, drjit_copy(tangent))
             dr.enqueue(dr.ADMode.Forward, leaf)
         # Outputs keep their tangents, though others may be computed from them.
         dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)
@@ -586,12 +594,12 @@ def _generators_at(states: tuple[Any, ...]) -> Iterator[None]:
         _set_generators(before)
 
 
-def _attached(asked: Asked, tensors: Sequence[torch.Tensor]) -> tuple[list[Any], list[Any]]:
+def _attached(request: Request, tensors: Sequence[torch.Tensor]) -> tuple[list[Any], list[Any]]:
     """Return all tensors as leaves of Dr.Jit's graph, and those that need a derivative."""
     import drjit as dr
 
-    leaves = [own(tensor) for tensor in tensors]
-    wanted = [leaf for leaf, need in zip(leaves, asked.needs, strict=True) if need]
+    leaves = [drjit_copy(tensor) for tensor in tensors]
+    wanted = [leaf for leaf, need in zip(leaves, request.needs, strict=True) if need]
     dr.enable_grad(wanted)
     return leaves, wanted
 

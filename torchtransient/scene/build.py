@@ -17,7 +17,7 @@ from torchtransient.errors import SceneError, TorchTransientError
 from torchtransient.interfaces import IntegratorInterface, is_time_resolved
 from torchtransient.plugins.described_scene import check_scene
 from torchtransient.plugins.drjit_pool import threads_for_files
-from torchtransient.plugins.guards import let_go
+from torchtransient.plugins.guards import release_when_safe
 from torchtransient.plugins.mitsuba_compat import is_dark, scene_parameters
 from torchtransient.plugins.node_walk import objects_below
 from torchtransient.plugins.parameter_effect import class_of
@@ -41,7 +41,7 @@ from torchtransient.scene.physics import scene_findings
 
 @dataclass
 class BuiltScene:
-    """A Mitsuba scene with what is known of its nodes.
+    """Built Mitsuba scene, with data of its description that Mitsuba does not keep.
 
     Attributes:
         scene, params: the ``mitsuba.Scene``, and its ``mitsuba.SceneParameters`` by users' keys.
@@ -49,7 +49,7 @@ class BuiltScene:
         integrator: plugin name of the integrator.
         to_world: all transforms as described, by key.
         label_tables: tables of labels, once they are asked for.
-        loaded: addresses of the plugins that were loaded by others, in whose place none can be built.
+        loaded: addresses of the plugins that users have loaded themselves, which no other plugin can replace.
     """
 
     scene: Any
@@ -78,7 +78,7 @@ class BuiltScene:
     def __del__(self) -> None:
         contents = list(self.__dict__.values())
         self.__dict__.clear()
-        let_go(contents)
+        release_when_safe(contents)
 
 
 # Errors of constructors, of Mitsuba and of plugins in Python.
@@ -90,6 +90,11 @@ _CANNOT_MERGE = "Mesh::merge()"
 
 def build(description: SceneDescription, variant: str, options: BuildOptions) -> BuiltScene:
     """Build a description under the active variant.
+
+    Args:
+        description: description of the scene, or a loaded scene.
+        variant: name of the active variant.
+        options: changes of the description.
 
     Raises:
         SceneError: with file and line, or the entry of the dictionary, where Mitsuba knows them.

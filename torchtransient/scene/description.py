@@ -29,7 +29,7 @@ _MOST_INCLUDES = 16
 
 @dataclass(frozen=True)
 class XmlDescription(Description):
-    """An XML file: its path, its text at the time of loading, and the values for its ``$parameters``."""
+    """XML file: path, text at the time of loading, and values of its ``$parameters``."""
 
     path: str
     text: str
@@ -59,7 +59,7 @@ class XmlDescription(Description):
 
 @dataclass(frozen=True)
 class DictDescription(Description):
-    """A scene dictionary: strings, numbers, lists, and numpy arrays for transforms and pixels."""
+    """Scene dictionary as plain data: strings, numbers, lists, and numpy arrays for transforms and pixels."""
 
     tree: dict[str, Any]
     folder: str
@@ -153,7 +153,15 @@ def _names_files(tree: Mapping[str, Any]) -> bool:
 
 
 def describe_xml(path: str | os.PathLike[str], parameters: Mapping[str, Any]) -> XmlDescription:
-    """Read an XML scene. Raises ``SceneError`` for a missing, unreadable or malformed file."""
+    """Read an XML scene.
+
+    Args:
+        path: path of the file.
+        parameters: values of its ``$name`` parameters, strings or numbers.
+
+    Raises:
+        SceneError: for a missing, unreadable or malformed file, and other values.
+    """
     try:
         file = path_of(path, "tt.load")
     except StorageError as error:

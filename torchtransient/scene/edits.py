@@ -92,7 +92,7 @@ _SPREADING = ("transient_hdr_film", "gated_hdr_film")
 
 
 class FilmRequest(Protocol):
-    """A film that is asked for: a plugin and the properties that it is given."""
+    """Film that replaces those of a scene: a plugin and its properties."""
 
     @property
     def plugin(self) -> str:
@@ -100,7 +100,7 @@ class FilmRequest(Protocol):
 
     @property
     def argument(self) -> str:
-        """Argument of a renderer that asks for the film, for messages."""
+        """Argument of a renderer that chooses the film, for messages."""
 
     @property
     def takes_pulse(self) -> bool:
@@ -121,12 +121,13 @@ DEFAULT_SAMPLER = "owen"
 
 @dataclass(frozen=True)
 class BuildOptions:
-    """Changes of a description when it is built.
+    """Changes of a description before it is built.
 
     Attributes:
         film: film that takes the place of every film, None to keep them.
         max_depth: bound for the integrator, None to keep its own.
-        substitute: BSDFs that are built as their differentiable twins: name, and the texture that is asked for or "".
+        substitute: BSDFs to be built as their differentiable twins: name, and name of the texture with the parameter
+            ("" for a number).
         real_bitmaps: store bitmaps as real numbers; Mitsuba keeps 8-bit images in 8 bits, which have no derivative.
         merge: let Mitsuba merge meshes and equal materials, which is faster to trace but takes parameters away.
         transient: turn a steady film and integrator into transient ones.
@@ -151,7 +152,16 @@ class BuildOptions:
 
 
 def edit(config: Any, state: Any, options: BuildOptions) -> None:
-    """Edit a parsed scene by the options. Raises ``SceneError`` for edits that would lose something of the scene."""
+    """Edit a parsed scene in place.
+
+    Args:
+        config: ``mitsuba.parser.ParserConfig`` of the variant.
+        state: ``mitsuba.parser.ParserState``.
+        options: the changes.
+
+    Raises:
+        SceneError: for changes that would lose something of the scene.
+    """
     described = _replaceable(state)
     _edit_films(state, options)
     _edit_integrator(state, options)
@@ -309,7 +319,7 @@ def _traced(state: Any, index: int) -> int:
 
 
 def described_depth(state: Any, index: int) -> Any:
-    """Return ``max_depth`` of an integrator node or its default, -1 for no limit."""
+    """Return ``max_depth`` of the integrator at node ``index``, or the plugin's default; -1 for no limit."""
     props = state.nodes[_traced(state, index)].props
     return props.get("max_depth", _DEPTHS.get(props.plugin_name(), _DEPTH_IN_PYTHON))
 
@@ -549,11 +559,7 @@ def pixel_format(film: Any) -> str:
 
 
 def checked_pulse(name: str, value: Any) -> Pulse | None:
-    """Return a pulse of a call, or None.
-
-    Raises:
-        ArgumentError: for anything else.
-    """
+    """Return a pulse of a call, or None. Raises ``ArgumentError`` for other objects."""
     if value is None or isinstance(value, Pulse):
         return value
     raise ArgumentError(

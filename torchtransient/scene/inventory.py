@@ -49,7 +49,7 @@ _FLAT_SHAPES = ("rectangle", "disk")
 
 @dataclass(frozen=True)
 class Finding:
-    """Content of a scene, and the node that has it, by its name and place in the file."""
+    """Something that a scene contains, and the label of its node: plugin, name and place in the file."""
 
     what: str
     where: str
@@ -63,12 +63,16 @@ class SceneInventory:
     """Contents of a scene. Lists are in the order of the description.
 
     Attributes:
-        media, colours, measured, bands, elements, interfaces: participating media; colours that three numbers carry;
-            data over wavelength; response curves of films; polarizing elements; polarizing surfaces.
+        media: participating media.
+        colours: colours that three numbers carry.
+        measured: data over wavelength.
+        bands: response curves of films.
+        elements: polarizing elements.
+        interfaces: polarizing surfaces.
         interfaces_in_a_row: light can meet two polarizing surfaces in a row.
         declared_only: media and polarizing elements that nothing refers to.
-        albedo, brightest: no surface or medium scatters more than this share of the light, 1 when that is not known,
-            and the node that sets it.
+        albedo: largest share of the light that a surface or medium scatters, 1 if unknown.
+        brightest: label of the node with that share.
         integrator, max_depth: plugin name, and its bound on the depth, -1 for no limit.
         film, film_props: plugin name and properties of the film of the sensor.
         temporal_filter: described temporal filter, of the integrator or else of the film.
@@ -96,7 +100,11 @@ class SceneInventory:
 
 
 def scene_inventory(scene: Scene, sensor: int = 0) -> SceneInventory:
-    """Return the contents of a scene, with the film of one of its sensors.
+    """Return the contents of a scene.
+
+    Args:
+        scene: the scene.
+        sensor: index of the sensor whose film is described.
 
     Raises:
         SceneError: for a scene that Mitsuba cannot parse, and for one with loaded objects.
@@ -127,7 +135,13 @@ def _resolved(name: str) -> Path:
 
 
 def take_inventory(state: Any, lookup: Callable[[str], Path], sensor: int = 0) -> SceneInventory:
-    """Return the contents of a parsed scene. ``lookup`` finds files as Mitsuba does."""
+    """Return the contents of a parsed scene.
+
+    Args:
+        state: ``mitsuba.parser.ParserState``.
+        lookup: function of a file's name that finds its path as Mitsuba does.
+        sensor: index of the sensor whose film is described.
+    """
     inventory = SceneInventory()
     order = reachable(state, rendered_children(state))
     _note_unused(inventory, state, set(order))
@@ -346,7 +360,7 @@ _COLOURED_PLUGINS = {
 
 @dataclass(frozen=True)
 class Verdict:
-    """``kind``: COLOUR or MEASURED. ``why``: the property or plugin that has it."""
+    """Colour of a value or plugin: ``kind`` COLOUR or MEASURED, and the property or plugin that has it."""
 
     kind: str
     why: str

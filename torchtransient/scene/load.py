@@ -14,10 +14,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from torchtransient.checks import flag, shown
+from torchtransient.checks import flag, mapping
 from torchtransient.errors import ArgumentError, GradientError, SceneError, TorchTransientError
 from torchtransient.plugins import kind_of, modules_of_others, register_module
-from torchtransient.plugins.guards import surely
+from torchtransient.plugins.guards import ensure_restored
 from torchtransient.scene.build import BuiltScene, build
 from torchtransient.scene.description import SceneDescription, describe_dict, describe_xml, same_description
 from torchtransient.scene.edits import BuildOptions
@@ -34,11 +34,10 @@ _MAX_BUILDS = 8
 
 
 class Scene:
-    """A scene's description, and the Mitsuba scenes built from it when they are needed.
+    """Description of a scene, and the Mitsuba scenes that are built from it at the first use. Made by :func:`load`.
 
-    Made by :func:`load`. Pickling and copying take the description alone; the Mitsuba scene is built on first use,
-    under the scene's variant. Instances are immutable, so copies share everything. A scene that holds loaded Mitsuba
-    objects (:func:`load`) stays in their variant and process.
+    Pickles hold the description alone; copies share everything, since instances are immutable. A scene with loaded
+    objects of Mitsuba (:func:`load`) stays in their variant and process.
     """
 
     def __init__(self, description: SceneDescription, variant: str | None):
@@ -65,7 +64,7 @@ class Scene:
 
     @property
     def variant(self) -> str:
-        """Variant that this scene is built in; settled at the first use."""
+        """Variant that the scene is built in, settled at the first use."""
         if self._variant is None:
             self._variant = resolve_variant(self._requested_variant)
         return self._variant
@@ -86,7 +85,7 @@ class Scene:
         return self.known_parameters()
 
     def known_parameters(self) -> ParameterTable:
-        """Return the table with the values at the first request."""
+        """Return the table of :meth:`parameters` with the values at the first request, which are not read again."""
         return self._parameters(BuildOptions(real_bitmaps=True))
 
     def _parameters(self, options: BuildOptions) -> ParameterTable:
@@ -116,11 +115,11 @@ class Scene:
         Raises:
             SceneError: for numbers of a spectral model, arrays of plugins that read no file and loaded objects, which
                 XML cannot hold, for unknown keys and for other paths. Nothing is written then.
+            ArgumentError: if ``values`` is no mapping.
             ShapeError, UnitError, GradientError: for values, as a renderer raises them.
         """
-        if values is not None and not isinstance(values, Mapping):
-            raise ArgumentError(f"scene.save: expected values by key, got {shown(values)}.")
-        description, given = self._description, dict(values or {})
+        given = {} if values is None else dict(mapping("scene.save: values", values, "{key: value}"))
+        description = self._description
         description.check_described("scene.save")
         assert not isinstance(description, LoadedScene)  # refused above
         with replaced_files(path) as (target, draft, folder), active_variant(self.variant):
@@ -129,7 +128,7 @@ class Scene:
             try:
                 written = write_scene(description, self.variant, slots, given, draft, folder)
             finally:
-                surely(lambda: self.restore(options, slots))
+                ensure_restored(lambda: self.restore(options, slots))
             again = load(draft, variant=self.variant)
             try:
                 built = again.built(again._save_options(given))
@@ -143,7 +142,14 @@ class Scene:
         return self.options_for(keys, options) if keys else options
 
     def same_description(self, other: Scene) -> bool:
-        """Return whether both describe one scene, in any variants."""
+        """Return whether two scenes have one description, in any variants.
+
+        Args:
+            other: the other scene.
+
+        Returns:
+            True for equal values, and files looked up in the same places.
+        """
         return same_description(self._description, other._description)
 
     # ------------------------------------------------------------------------------------------------- built scenes
@@ -152,6 +158,12 @@ class Scene:
         """Return the Mitsuba scene for some options, with the described values.
 
         Called inside ``active_variant(scene.variant)``.
+
+        Args:
+            options: options of the build.
+
+        Raises:
+            SceneError: for a scene that Mitsuba or this library refuses.
         """
         installed = self.installed.get(options)
         if installed is not None:
@@ -169,14 +181,14 @@ class Scene:
         return found
 
     def drop(self, options: BuildOptions) -> None:
-        """Forget one built scene; the next use builds it anew."""
+        """Forget the scene that was built with ``options``; the next use builds it anew."""
         self._builds.pop(options, None)
         self.installed.pop(options, None)
         self._slots.pop(options, None)
         self.recordings.pop(options, None)
 
     def findings(self, options: BuildOptions) -> dict[str, str]:
-        """Return messages about unphysical values of the description, by key.
+        """Return messages about unphysical values of the description, by key, for a scene built with ``options``.
 
         Called inside ``active_variant(scene.variant)``.
         """
@@ -187,7 +199,14 @@ class Scene:
         return found
 
     def options_for(self, keys: Iterable[str], options: BuildOptions) -> BuildOptions:
-        """Return the options under which every one of ``keys`` is an independent, differentiable parameter.
+        """Return the options of a build in which each key is an independent, differentiable parameter.
+
+        Args:
+            keys: keys of :meth:`parameters`.
+            options: options that the others are added to.
+
+        Returns:
+            Options with differentiable twins of plugins, and without merged shapes where there are keys.
 
         Raises:
             SceneError: for unknown keys.
@@ -209,10 +228,14 @@ class Scene:
         return replace(options, substitute=frozenset(substitute), real_bitmaps=True, merge=False)
 
     def slots(self, keys: Iterable[str], options: BuildOptions) -> SlotTable:
-        """Return the slots of ``keys`` in the built scene.
+        """Return the places of values in the built scene.
 
         Called inside ``active_variant(scene.variant)``. The scene holds described values or those of the last run with
         these keys.
+
+        Args:
+            keys: keys of the values.
+            options: options of the build.
         """
         wanted = tuple(keys)
         if self.is_shared:  # the scene goes back to the values that it holds now
@@ -229,7 +252,12 @@ class Scene:
         return found
 
     def restore(self, options: BuildOptions, slots: SlotTable) -> None:
-        """Put described values back, so that no graph of derivatives is left; a scene that cannot is built anew."""
+        """Put the described values back into a built scene, and with them end its graph of derivatives.
+
+        Args:
+            options: options of the build, which is dropped if a value cannot be put back.
+            slots: slots of the values that the scene holds.
+        """
         try:
             slots.restore()
         except BaseException:
@@ -393,7 +421,7 @@ def _signal(number: int) -> str:
 
 
 def probe_child() -> None:
-    """Render the scene on standard input, print its error as JSON, null for none, and end the process."""
+    """Render the pickled scene on standard input, print its error as JSON, null for none, and end the process."""
     error: str | None = None
     try:
         scene, variant, others = pickle.load(sys.stdin.buffer)
@@ -424,7 +452,7 @@ def _render_pixels(scene: Scene, variant: str) -> None:
 
 
 class _Cropped:
-    """A description with films of a few pixels."""
+    """Description whose films have a few pixels."""
 
     def __init__(self, description: Any):
         self._whole = description

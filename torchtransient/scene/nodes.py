@@ -27,7 +27,10 @@ _PYTHON_INTEGRATORS = (
 def children(state: Any, node: Any, by_id: Mapping[str, int] | None = None) -> list[tuple[str, int]]:
     """Return (property, node index) of every child of a node, references by id included.
 
-    ``by_id``: the state's ``id_to_index``, which Mitsuba copies as a whole at each access.
+    Args:
+        state: the parsed scene.
+        node: one of its nodes.
+        by_id: the state's ``id_to_index``, None to read it. Mitsuba copies it at each access.
     """
     import mitsuba as mi
 
@@ -43,12 +46,12 @@ def children(state: Any, node: Any, by_id: Mapping[str, int] | None = None) -> l
 
 
 def find_child(state: Any, node: Any, matches: Callable[[Any], bool]) -> int | None:
-    """Return the index of the first child that ``matches``, None without one."""
+    """Return the index of the first child for which ``matches(node)`` is true, None without one."""
     return next((index for _, index in children(state, node) if matches(state.nodes[index])), None)
 
 
 def reachable(state: Any, starts: list[int]) -> list[int]:
-    """Return the nodes that can be reached from some nodes, these included, through children and references."""
+    """Return the indices of ``starts`` and of all nodes below them, through children and references, each once."""
     seen: dict[int, None] = {}
     waiting, by_id = list(reversed(starts)), state.id_to_index
     while waiting:
@@ -232,9 +235,13 @@ def texture_names(state: Any) -> list[str]:
 
 
 def restore_texture_names(scene: Any, names: list[str]) -> None:
-    """Name the textures of a built scene that Mitsuba has made other objects of (a ``bitmap``, for one).
+    """Give textures of a built scene their names back, without which their keys are addresses in memory.
 
-    They lose their names, and their keys would be addresses in memory.
+    Mitsuba replaces some by other objects without a name when it builds them, a ``bitmap`` for instance.
+
+    Args:
+        scene: built scene.
+        names: names of :func:`texture_names`, in order.
     """
     import mitsuba as mi
 

@@ -1,8 +1,8 @@
-"""Objects and scenes of Mitsuba that are loaded already: described where that is possible, otherwise used as they are.
+"""Objects and scenes of Mitsuba that users have loaded themselves: described if possible, otherwise used as they are.
 
-A description is plain data: it can be pickled, and built in any variant. A loaded object has lost what it was made of.
-It belongs to its variant and its process, is shared with its owner, and keeps its plugins: no other plugin is built in
-its place. Calls that need one are refused.
+A description is plain data: it can be pickled, and built in any variant. A loaded object no longer has the properties
+that it was made of. It belongs to its variant and process, is shared with its owner, and keeps its plugins: calls that
+need another plugin in its place are refused.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Description(abc.ABC):
 
 @dataclass(frozen=True, eq=False)
 class LoadedObject:
-    """An object of Mitsuba inside a scene dictionary; ``where``: its place there."""
+    """Object of Mitsuba inside a scene dictionary, and the path of its keys there."""
 
     value: Any
     where: str
@@ -92,7 +92,7 @@ class LoadedObject:
 
 @dataclass(frozen=True, eq=False)
 class LoadedScene(Description):
-    """A ``mitsuba.Scene`` that is rendered as it is, in place of a description."""
+    """``mitsuba.Scene`` that is rendered as it is, in place of a description."""
 
     scene: Any
 
@@ -108,7 +108,7 @@ class LoadedScene(Description):
 
     @property
     def objects(self) -> tuple[Any, ...]:
-        """All of the scene."""
+        """The scene itself."""
         return (self,)
 
     def __str__(self) -> str:
@@ -150,7 +150,12 @@ def pointers(objects: tuple[Any, ...]) -> frozenset[int]:
 
 
 def without_stand_in(effect: ParameterEffect, plugin: Any) -> ParameterEffect:
-    """Return the effect of a parameter of a loaded plugin: no other plugin can be built in its place."""
+    """Return the effect of a parameter of a loaded plugin, in whose place no other can be built.
+
+    Args:
+        effect: effect of the parameter in a described plugin.
+        plugin: the loaded plugin.
+    """
     if not effect.stand_in_needed:
         return replace(effect, stand_in="")
     reason = (
@@ -164,7 +169,15 @@ def without_stand_in(effect: ParameterEffect, plugin: Any) -> ParameterEffect:
 
 
 def describe_object(value: Any, where: str) -> Any:
-    """Return plain data for an object of Mitsuba, or the object itself. Raises ``SceneError`` for a whole scene."""
+    """Return plain data for an object of Mitsuba, or a :class:`LoadedObject` where there is none.
+
+    Args:
+        value: the object.
+        where: path of its keys in the scene dictionary.
+
+    Raises:
+        SceneError: for a whole scene.
+    """
     if value.class_name() == "VolumeGrid":
         return Voxels.of(value)
     if value.class_name() == "Scene":

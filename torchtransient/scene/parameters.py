@@ -30,7 +30,7 @@ _MAX_LISTED = 65536  # larger values are not copied: textures of a real scene wo
 
 @dataclass(frozen=True)
 class ParameterInfo:
-    """One parameter of a scene.
+    """Parameter of a scene: shape, value, and the properties of its derivative.
 
     Attributes:
         key: name in ``mitsuba.traverse``, and in ``TransientRenderer(parameters=...)``.
@@ -42,7 +42,7 @@ class ParameterInfo:
         moves_path_length, moves_silhouette, moves_medium: it can change an optical path length, move a visibility
             edge, change an extinction.
         reason: why there is no derivative, or where it is wrong.
-        substitute: materials that are built as others when the key is asked for: name, and the name of the texture
+        substitute: materials that are replaced by differentiable ones for this key: name, and the name of the texture
             in it ("" for a number).
         always_biased: the derivative is known to be wrong in every scene.
         edges_missing: moving edges that the derivative does not follow in this scene, in words.
@@ -70,7 +70,7 @@ class ParameterInfo:
 
     @property
     def biased(self) -> bool:
-        """Derivative that is known to be wrong: everywhere, or where edges are not followed."""
+        """The derivative is known to be wrong: in every scene, or at edges of this one."""
         return self.always_biased or bool(self.edges_missing)
 
 
@@ -113,7 +113,13 @@ class ParameterTable(Mapping[str, ParameterInfo]):
 
 
 def unknown_key(key: str, known: list[str], owner: str = "the scene") -> str:
-    """Return the message for a key that a scene, or another ``owner``, does not have."""
+    """Return the message for an unknown key, with similar keys.
+
+    Args:
+        key: the unknown key.
+        known: all keys of the owner.
+        owner: subject of the message.
+    """
     inside = [other for other in known if f".{key}." in f".{other}."]
     close = inside[:3] or difflib.get_close_matches(str(key), known, n=3, cutoff=0.5)
     hint = f"Did you mean {', '.join(repr(c) for c in close)}? " if close else ""
@@ -148,7 +154,12 @@ def parameter_table(built: BuiltScene) -> ParameterTable:
 
 
 def moving_edges_of(scene: Any, sensors: Sequence[Any]) -> MovingEdges:
-    """Return the gaps of derivatives where edges move, for the transient integrator that renders the scene."""
+    """Return what derivatives lack at moving edges that some sensors see, by the scene's integrator.
+
+    Args:
+        scene: built scene.
+        sensors: some of its sensors.
+    """
     integrator = scene.integrator()
     if isinstance(integrator, IntegratorInterface):
         edges: MovingEdges = integrator.silhouettes(scene, sensors)
@@ -157,7 +168,16 @@ def moving_edges_of(scene: Any, sensors: Sequence[Any]) -> MovingEdges:
 
 
 def missing_edges(built: BuiltScene, keys: Iterable[str], sensors: Iterable[int]) -> dict[Gap, list[str]]:
-    """Return the gaps of derivatives by ``keys`` at moving edges that some sensors see, with their keys."""
+    """Return what derivatives lack at moving edges.
+
+    Args:
+        built: built scene.
+        keys: keys of the derivatives.
+        sensors: indices of the sensors that see the edges.
+
+    Returns:
+        Keys by gap.
+    """
     every = built.scene.sensors()
     edges = moving_edges_of(built.scene, [every[sensor] for sensor in sensors])
     tracker = built.scene.integrator().parameters(built.scene)
@@ -222,7 +242,7 @@ def _describe(built: BuiltScene, tracker: ParameterTracker, key: str, node: Any)
     value = read_value(current, shape) if shape is None or math.prod(shape) <= _MAX_LISTED else None
     effect = tracker.effect_of(node, name, built.params.flags(key))
     if effect.stand_in:
-        holders = tracker.stood_in_for(node, name)
+        holders = tracker.replaced_plugins(node, name)
         if built.loaded.intersection(plugin.ptr for plugin, _ in holders):
             return _info(key, kind, shape, value, without_stand_in(effect, holders[0][0]))
         if isinstance(node, mi.BSDF):
@@ -242,7 +262,12 @@ def _describe(built: BuiltScene, tracker: ParameterTracker, key: str, node: Any)
 
 
 def needing_slope(infos: Mapping[str, ParameterInfo], keys: Iterable[str]) -> list[str]:
-    """Return the ``keys`` that can change a path length: their derivatives need a response in time with a slope."""
+    """Return the keys that can change a path length, whose derivatives need a film with a slope in time.
+
+    Args:
+        infos: parameters by key.
+        keys: some of the keys.
+    """
     return [key for key in keys if infos[key].moves_path_length]
 
 
@@ -255,7 +280,15 @@ def is_transform(value: Any) -> bool:
 
 
 def classify(key: str, current: Any) -> tuple[str, tuple[int, ...] | None]:
-    """Return kind and shape of the torch value of a Mitsuba value; the shape is None for one that is not numeric."""
+    """Return kind and shape of the torch value of a parameter.
+
+    Args:
+        key: key of the parameter; its name tells vertices from lists.
+        current: Mitsuba's value.
+
+    Returns:
+        A kind of :class:`ParameterInfo`, and the shape, None for a value that is not numeric.
+    """
     import drjit as dr
 
     if current is None:
@@ -283,7 +316,12 @@ def classify(key: str, current: Any) -> tuple[str, tuple[int, ...] | None]:
 
 
 def read_value(current: Any, shape: tuple[int, ...] | None) -> Any:
-    """Return a Mitsuba value as numpy in the shape of its torch value, plain Python values unchanged."""
+    """Return a Mitsuba value as numpy, plain Python values unchanged.
+
+    Args:
+        current: Mitsuba's value.
+        shape: shape of its torch value (:func:`classify`), None for the name of the type of other objects.
+    """
     import drjit as dr
 
     if is_transform(current):

@@ -1,4 +1,4 @@
-"""Warnings of scenes and values that can be rendered, and that no physical system has.
+"""Warnings of unphysical scenes and values, which can be rendered all the same.
 
 More light scattered than arrives, numbers out of their range, transforms without an inverse, windows that miss the
 light, depths that had to be bounded. None stops a computation: an optimiser steps over the edge of [0, 1] and comes
@@ -44,7 +44,8 @@ class PhysicsWatch:
         ranges: physical ranges of the renderer's keys.
         transforms: keys of transforms.
         directions: keys of directions of a sun, with the axis of its sky.
-        installed: check of a built scene that holds the values of a call, for a sensor; returns messages by subject.
+        installed: function of a built scene that holds the values of a call, and the index of a sensor, which returns
+            messages by subject; None to check nothing.
     """
 
     def __init__(self, mode: str, warned: set[str]):
@@ -61,11 +62,20 @@ class PhysicsWatch:
 
     @property
     def enabled(self) -> bool:
-        """Checks are made."""
+        """The mode is not "ignore"."""
         return self.mode != "ignore"
 
     def warn(self, about: str, message: str, *, is_error: bool = True) -> None:
-        """Warn of one subject once, or raise in the mode "error" unless ``is_error`` is False."""
+        """Warn once of a subject, or raise.
+
+        Args:
+            about: the subject, of which the first message is given only.
+            message: text of the warning or error.
+            is_error: False warns in the mode "error" too.
+
+        Raises:
+            PhysicsError: in the mode "error".
+        """
         if self.mode == "error" and is_error:
             raise PhysicsError(f"{message} With physics='warn' it is computed all the same.")
         if about not in self._warned:
@@ -73,22 +83,36 @@ class PhysicsWatch:
             warnings.warn(message, PhysicsWarning, stacklevel=level_of_user())
 
     def warn_of_gradient(self, message: str, *, is_error: bool = True) -> None:
-        """Warn once of a derivative that lacks a part, in the mode "ignore" too; "error" raises ``GradientError``."""
+        """Warn once of a derivative that lacks a part, in the mode "ignore" too.
+
+        Args:
+            message: text of the warning or error.
+            is_error: False warns in the mode "error" too.
+
+        Raises:
+            GradientError: in the mode "error".
+        """
         if self.mode == "error" and is_error:
             raise GradientError(f"{message} With physics='warn' it is computed all the same.")
         if message not in self._warned:
             self._warned.add(message)
             warnings.warn(message, GradientWarning, stacklevel=level_of_user())
 
-    def scene(self, findings: Mapping[str, str]) -> None:
-        """Warn of findings in the description, by key: of the first ones, where there are many."""
+    def check_description(self, findings: Mapping[str, str]) -> None:
+        """Warn of unphysical values of the description, four at most; ``findings``: messages by key."""
         for number, (key, message) in enumerate(findings.items()):
             if number < _MOST_WARNINGS:
                 more = len(findings) - _MOST_WARNINGS if number == _MOST_WARNINGS - 1 else 0
                 self.warn(key, message + (f" {more} more of such values." if more > 0 else ""))
 
-    def value(self, key: str, value: torch.Tensor, low: float, high: float) -> None:
-        """Check a value of a call, with its smallest and largest number."""
+    def check_value(self, key: str, value: torch.Tensor, low: float, high: float) -> None:
+        """Check a value of a call against its physical range.
+
+        Args:
+            key: key of the parameter.
+            value: the value, with or without a batch.
+            low, high: smallest and largest number of the value.
+        """
         limits = self.ranges.get(key)
         if limits is not None:
             if limits.above(high):
@@ -110,14 +134,19 @@ class PhysicsWatch:
             if any(is_singular(matrix) for matrix in matrices):
                 self.warn(key, singular_message(key))
 
-    def placed(self, scene: Any, sensor: int) -> None:
-        """Check a built scene that holds the values of a call, before it is rendered."""
+    def check_installed(self, scene: Any, sensor: int) -> None:
+        """Check a built scene that holds the values of a call; ``sensor``: index of the one to be rendered."""
         if self.enabled and self.installed is not None:
             for about, message in self.installed(scene, sensor).items():
                 self.warn(about, message)
 
-    def window(self, total: float, before: float, after: float) -> None:
-        """Check the light that a render's window missed, before and after it, against the total."""
+    def check_window(self, total: float, before: float, after: float) -> None:
+        """Check the share of the light that a render's time window misses.
+
+        Args:
+            total: all light, in units of the steady image.
+            before, after: light before and after the window, in the same units.
+        """
         if not self.window_name or before + after <= 0 or (self.mode != "error" and self.window_name in self._warned):
             return
         if total > 0 and before + after > MISSED * total:
@@ -160,7 +189,13 @@ def dark_message(name: str) -> str:
 
 
 def outside_message(key: str, limits: PhysicalRange, low: float, high: float) -> str:
-    """Return the message for numbers from ``low`` to ``high`` that leave a range."""
+    """Return the message for a value outside of its physical range.
+
+    Args:
+        key: key of the parameter.
+        limits: the range.
+        low, high: smallest and largest number of the value.
+    """
     if limits == SHARE:
         number = f"{high:.6g}, more than all" if limits.above(high) else f"{low:.6g}, less than nothing"
         message = (

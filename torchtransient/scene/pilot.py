@@ -1,4 +1,4 @@
-"""Pilot runs: how deep the paths of a scene have to be, and when its light arrives.
+"""Pilot runs: depth of paths and time window that hold a scene's light.
 
 A run lists arrivals one by one (:class:`torchtransient.plugins.integrators.pilot.PilotEvents`). Depth and window are
 read off the list for the image as a whole and for its blocks, since light that matters to a corner of the picture may
@@ -64,7 +64,7 @@ class PilotReport:
 
 
 class Arrivals:
-    """Arrivals of a pilot run, with the shares of light in parts of them.
+    """Arrivals of a pilot run: energies and times, and the shares of the light in parts of them.
 
     Attributes:
         opl, energy, depth, path: optical path length (metres), energy, depth and number of the path, all (N,).
@@ -93,7 +93,7 @@ class Arrivals:
 
     @property
     def dark(self) -> bool:
-        """No light was met at all."""
+        """There is no light."""
         return not self.total > 0
 
     def share(self, chosen: np.ndarray) -> tuple[float, float]:
@@ -111,9 +111,13 @@ class Arrivals:
         return self.share(np.ones(len(self.energy), dtype=bool))[1]
 
     def negligible(self, chosen: np.ndarray, share: float) -> bool:
-        """Return whether the chosen arrivals hold at most ``share`` of the light, with two standard errors to spare.
+        """Return whether the chosen arrivals hold at most a share of the light, with two standard errors to spare.
 
-        No block of the image may lose more than ten times that, beyond two standard errors.
+        No block of the image may lose more than ten times that share, beyond two standard errors.
+
+        Args:
+            chosen: mask (N,) of arrivals.
+            share: largest share of the light.
         """
         part, error = self.share(chosen)
         if part + 2 * error > share:
@@ -152,7 +156,15 @@ class Arrivals:
     # ----------------------------------------------------------------------------------------------------- window
 
     def window(self, depth: int, missed: float) -> tuple[float, float]:
-        """Return the earliest arrival and the one after which light is negligible, of paths up to ``depth``, metres."""
+        """Return the time window of the light.
+
+        Args:
+            depth: paths of more vertices are left out; none are for -1.
+            missed: largest share of the light after the window, as of :meth:`negligible`.
+
+        Returns:
+            Earliest arrival, and the arrival after which light is negligible, metres.
+        """
         kept = self.depth <= depth if depth > 0 else np.ones(len(self.depth), dtype=bool)
         times = np.sort(self.opl[kept & (self.energy > 0)])
         low, high = 0, len(times) - 1
@@ -207,10 +219,13 @@ def pilot_run(
 
 
 def axis_over(first: float, last: float, bin_width_opl: float | None, num_bins: int | None) -> TimeAxis:
-    """Return a time axis that holds ``first`` and ``last``, in metres.
+    """Return a time axis that holds two arrivals. It starts at a multiple of the bin width, unless it has one bin.
 
-    The bin width is ``bin_width_opl``, or else the window over ``num_bins`` bins (300 when None), rounded up to three
-    digits. Bins start at a multiple of the width, except for a single one.
+    Args:
+        first, last: earliest and latest arrival, metres.
+        bin_width_opl: width of a bin in metres, None for the window over the number of bins, rounded up to
+            three digits.
+        num_bins: number of bins, None for as many as the width needs, or 300 without a width.
     """
     count = num_bins or DEFAULT_BINS
     if num_bins == 1 and bin_width_opl is None:
@@ -260,14 +275,16 @@ class DepthBound:
 def depth_bound(
     scene: Scene, options: BuildOptions, sensors: Sequence[int], film: Any, watch: PhysicsWatch
 ) -> DepthBound | None:
-    """Return the bound on the depth for derivatives of a scene, found at the first request; None for a stated depth.
+    """Return the bound on the depth for derivatives of a scene, found at the first call; None for a stated depth.
 
     A derivative keeps a record of every bounce and needs to know how many there are at most. The bound holds for a call
     whose values can have derivatives, for its value too. Other renders have none: Russian roulette ends their paths.
 
     Args:
-        scene, options, sensors: the scene, its build, and the sensors that are rendered.
-        film: film of the sensors, with ``seen`` (arrivals as it sees them) and ``parts`` (parts of its light).
+        scene: the scene.
+        options: options of its build.
+        sensors: indices of the sensors that are rendered.
+        film: layout of their films (:class:`~torchtransient.rendering.films.FilmLayout`).
         watch: warns of the bound.
 
     Raises:

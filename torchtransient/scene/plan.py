@@ -1,4 +1,4 @@
-"""Decisions of ``tt.plan``, each with the line that explains it.
+"""Decisions of ``tt.plan``, each with a line of explanation.
 
 Variant, integrator and a depth by albedo follow from the description; depth, time window and temporal filter may need a
 pilot run (:mod:`.pilot`).
@@ -40,14 +40,14 @@ _REACH = {"tent": 0.5, "gaussian": 2.0}
 
 @dataclass(frozen=True, kw_only=True)
 class Effects(abc.ABC):
-    """Decisions about one scene that a renderer takes over where its own arguments leave them open.
+    """Decisions about a scene that a renderer uses where its own arguments leave them open.
 
     Attributes:
         scene: the scene, in the variant of the plan.
         variant, integrator: names.
         film_choice, max_depth, pulse, irf: None keeps the scene's.
         temporal_filter: empty for films without one.
-        filter_is_given: the filter was asked for, and no other one may take its place.
+        filter_is_given: the filter was an argument of the plan, which no other filter replaces.
         sensor: index of the sensor whose light the decisions are about.
     """
 
@@ -78,7 +78,12 @@ class Effects(abc.ABC):
         return load(given, variant=self.variant)
 
     def film_settings(self, film: Any, temporal_filter: str) -> tuple[Any, str]:
-        """Return film and temporal filter of a renderer: its own where it has some, else the plan's."""
+        """Return film and temporal filter of a renderer.
+
+        Args:
+            film: film of the renderer's arguments, which precedes the plan's; None without one.
+            temporal_filter: filter of the renderer's arguments; the plan's replaces "auto".
+        """
         film = self.film_choice if film is None else film
         # A box of the plan's own choice stays "auto": parameters that were not planned for may call for a slope.
         decided = self.temporal_filter if self.filter_is_given or self.temporal_filter != "box" else ""
@@ -101,14 +106,14 @@ class Effects(abc.ABC):
 
 @dataclass(frozen=True)
 class Choice:
-    """A decision with the line that explains it."""
+    """Decision, and the line that explains it."""
 
     value: str
     reason: str
 
 
-def some(findings: Sequence[Finding], most: int = 3) -> str:
-    """Return the first few findings as text."""
+def text_of(findings: Sequence[Finding], most: int = 3) -> str:
+    """Return the first ``most`` findings as text, with the number of the others."""
     named = "; ".join(str(finding) for finding in findings[:most])
     return named if len(findings) <= most else f"{named}; and {len(findings) - most} more"
 
@@ -143,11 +148,11 @@ def choose_variant(
 
 def _colour(inventory: SceneInventory, spectral: bool) -> tuple[str, str]:
     if inventory.bands:
-        return "spectral", f"wavelengths, since the film has bands: {some(inventory.bands)}"
+        return "spectral", f"wavelengths, since the film has bands: {text_of(inventory.bands)}"
     if spectral:
-        return "spectral", f"wavelengths, which three numbers cannot stand in for: {some(inventory.measured)}"
+        return "spectral", f"wavelengths, which three numbers cannot stand in for: {text_of(inventory.measured)}"
     if inventory.colours:
-        return "rgb", f"colour: {some(inventory.colours)}"
+        return "rgb", f"colour: {text_of(inventory.colours)}"
     return "mono", "every spectrum is grey, so that one channel carries all of it"
 
 
@@ -157,16 +162,17 @@ def _polarization(inventory: SceneInventory, outputs: Sequence[str], strict: boo
     if inventory.integrator == "stokes":
         return True, "polarized, since the scene's own integrator is stokes", []
     if inventory.elements:
-        return True, f"polarized, since it changes the intensity: {some(inventory.elements)}", []
+        return True, f"polarized, since it changes the intensity: {text_of(inventory.elements)}", []
     if not inventory.interfaces:
         return False, "unpolarized, since nothing polarizes light", []
     if not inventory.interfaces_in_a_row:
-        return False, f"unpolarized, which is exact: a single flat surface polarizes, {some(inventory.interfaces)}", []
+        surface = text_of(inventory.interfaces)
+        return False, f"unpolarized, which is exact: a single flat surface polarizes, {surface}", []
     if strict:
-        return True, f"polarized (strict), since light can meet several of these: {some(inventory.interfaces)}", []
+        return True, f"polarized (strict), since light can meet several of these: {text_of(inventory.interfaces)}", []
     note = (
         "approximation: the light between polarizing surfaces is taken as unpolarized, as unpolarized renderers do; "
-        f"strict=True carries it. Found: {some(inventory.interfaces)}"
+        f"strict=True carries it. Found: {text_of(inventory.interfaces)}"
     )
     return False, "unpolarized, see the approximation", [note]
 
@@ -174,7 +180,7 @@ def _polarization(inventory: SceneInventory, outputs: Sequence[str], strict: boo
 def choose_integrator(inventory: SceneInventory) -> tuple[Choice, list[str]]:
     """Return the integrator for surfaces or for volumes, or another transient one of the scene, and notes."""
     notes = [
-        f"not used: {some(inventory.declared_only)}, declared and referred to by nothing"
+        f"not used: {text_of(inventory.declared_only)}, declared and referred to by nothing"
     ] if inventory.declared_only else []  # fmt: skip
     own = inventory.integrator or ""
     if own in _WITH_PICTURES:
@@ -185,7 +191,7 @@ def choose_integrator(inventory: SceneInventory) -> tuple[Choice, list[str]]:
     if is_transient_integrator(own) and _ALIASES.get(own, own) not in (_SURFACES, _VOLUMES):
         return Choice(own, f"integrator: {own}, the scene's own"), notes
     if inventory.media:
-        return Choice(_VOLUMES, f"integrator: {_VOLUMES}, since the scene has {some(inventory.media)}"), notes
+        return Choice(_VOLUMES, f"integrator: {_VOLUMES}, since the scene has {text_of(inventory.media)}"), notes
     return Choice(_SURFACES, f"integrator: {_SURFACES}, since no medium can be reached from the scene"), notes
 
 
@@ -195,7 +201,15 @@ def _depth_text(depth: int) -> str:
 
 
 def depth_by_albedo(inventory: SceneInventory, tail: float) -> tuple[int | None, str]:
-    """Return the depth at which at most ``tail`` of the emitted power is left, if the albedos bound it, and why."""
+    """Return the depth at which little of the emitted power is left, if the albedos bound it, and the reason.
+
+    Args:
+        inventory: contents of the scene.
+        tail: largest share of the emitted power beyond the depth.
+
+    Returns:
+        The depth, None without a bound, and the line that explains it.
+    """
     if inventory.albedo >= 1:
         return None, (
             f"max_depth: {_depth_text(inventory.max_depth)}, kept; not bounded, since {inventory.brightest} may "
@@ -523,11 +537,3 @@ class Finder:
             why = "the scene's own" if self.inventory.temporal_filter else "since no parameter changes a path length"
             self.reasons.append(f"temporal filter: {own}, {why}")
         return chosen
-
-
-# What every film can show beside its own measurement.
-_OF_ANY_FILM = ("steady", "stokes", "bands")
-SURFACES, VOLUMES = "transient_path", "transient_prbvolpath"
-_ALIASES = {"transient_volpath": VOLUMES}
-# They add pictures to what a nested integrator traces.
-_WITH_PICTURES = ("aov", "moment")

@@ -1,4 +1,4 @@
-"""``scene.save``: a scene with values as an XML file, written, read back and compared."""
+"""``scene.save``: writes a scene with values as an XML file, reads it back and compares."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from torchtransient.scene.build import BuiltScene
 from torchtransient.scene.description import Plain
 from torchtransient.scene.nodes import children, name_children, node_kind, split_merged_shapes
 from torchtransient.scene.parameters import read_value
-from torchtransient.scene.values import Slot, SlotTable, as_float, fit_shape, own_array
+from torchtransient.scene.values import Slot, SlotTable, as_float, fit_shape, flat_drjit_copy
 from torchtransient.scene.variant import device_type
 
 # Numbers that went through a file differ by the rounding of single precision.
@@ -43,7 +43,14 @@ WAY_OUT = "Leave such keys out of values, or keep the values and the description
 
 @contextmanager
 def replaced_files(path: str | os.PathLike[str]) -> Iterator[tuple[Path, Path, Path]]:
-    """Yield the path of a scene, and a draft of the file and of its folder that take their place without an error."""
+    """Yield the path of an XML file, and drafts of the file and of its folder, which replace both after the block.
+
+    Args:
+        path: name of an XML file in an existing folder.
+
+    Raises:
+        SceneError, StorageError: for other paths, and files that cannot be written. An error leaves the old files.
+    """
     target = path_of(path, "scene.save")
     if target.suffix != ".xml":
         raise SceneError(f"scene.save: expected the name of an XML file, such as scene.xml, got {str(target)!r}.")
@@ -68,13 +75,22 @@ def replaced_files(path: str | os.PathLike[str]) -> Iterator[tuple[Path, Path, P
 def write_scene(
     description: Plain, variant: str, slots: SlotTable, values: Mapping[str, Any], draft: Path, folder: Path
 ) -> dict[str, np.ndarray]:
-    """Write a scene with values, which are installed in its built scene, and return all its numbers by key.
+    """Write a scene with values, which are installed in its built scene.
 
     Args:
-        description, variant: the scene.
+        description: description of the scene.
+        variant: name of the active variant.
         slots: slots of the values.
         values: values by key.
-        draft, folder: the XML file, and the folder of arrays and files beside it.
+        draft: path of the XML file.
+        folder: path of the folder for arrays and files beside it.
+
+    Returns:
+        All numbers of the scene with these values, by key.
+
+    Raises:
+        SceneError: for what XML cannot hold.
+        ShapeError, UnitError, DeviceError: for values, as a renderer raises them.
     """
     import mitsuba as mi
 
@@ -106,7 +122,12 @@ def write_scene(
 
 
 def check_same(built: BuiltScene, wanted: Mapping[str, np.ndarray]) -> None:
-    """Raise ``SceneError`` where the numbers of a scene that was read back are not the wanted ones."""
+    """Raise ``SceneError`` if a scene that was read back has other numbers than were written.
+
+    Args:
+        built: the scene that was read back.
+        wanted: numbers by key, as :func:`write_scene` returns them; compared to single precision.
+    """
     found = _numbers(built)
     other = sorted(found.keys() ^ wanted.keys())
     params = built.params.properties
@@ -132,7 +153,7 @@ def _leaf(slot: Any, value: Any, variant: str) -> Any:
     if batched:
         raise ShapeError(f"scene.save: expected shape {slot.shape} for {slot.key!r}, got {tuple(tensor.shape)}.")
     slot.check(tensor)
-    return own_array(tensor)
+    return flat_drjit_copy(tensor)
 
 
 def _parsed(description: Plain, variant: str) -> Any:
@@ -189,8 +210,11 @@ _DERIVED = {("spot", "cutoff_angle"): ("beam_width",)}
 class Place(NamedTuple):
     """Place of a built object in the description.
 
-    ``node``: index of a node. For objects that Mitsuba has made of a number, of a colour or of a default: ``names``
-    that lead to the object from there, and the first object ``made`` on that way.
+    Attributes:
+        node: index of the node that the object was made of, or of one above it.
+        names: names that lead from the object of that node to this one, which Mitsuba has made of a number, a colour
+            or a default; empty for an object with a node.
+        made: the first object on that way.
     """
 
     node: int

@@ -48,6 +48,12 @@ def filter_for(moving: Sequence[str], own: str, pulsed: bool) -> str:
 
 
 def check_filter(moving: Sequence[str], temporal_filter: str, pulsed: bool) -> None:
-    """Raise ``GradientError`` for a filter without the slope that ``moving`` parameters need."""
+    """Raise ``GradientError`` for a filter without a slope, if parameters need one.
+
+    Args:
+        moving: keys of parameters that change path lengths.
+        temporal_filter: name of the filter.
+        pulsed: the film has a pulse or an impulse response.
+    """
     remedy = "Use temporal_filter='auto', 'tent' or 'gaussian'."
     check_slope(moving, has_slope(temporal_filter, pulsed), temporal_filter, remedy)

@@ -26,7 +26,7 @@ from torchtransient.plugins.mitsuba_compat import (
 from torchtransient.scene.build import BuiltScene
 from torchtransient.scene.parameters import classify, read_value
 
-# Up to so many entries a list is copied faster than a kernel is launched.
+# Most entries of a tensor that is copied by way of a list, which is faster than launching a kernel.
 FEW = 64
 
 
@@ -111,7 +111,9 @@ def fit_shape(key: str, value: torch.Tensor, shape: tuple[int, ...]) -> tuple[to
 def may_have_derivative(tensor: torch.Tensor, *, graph: bool = True) -> bool:
     """Return whether autograd, forward mode or a transform of ``torch.func`` may differentiate by a tensor.
 
-    Without a ``graph`` (``torch.no_grad``) forward mode alone can.
+    Args:
+        tensor: the tensor.
+        graph: False under ``torch.no_grad``, where forward mode alone can.
     """
     transforms = torch._C._functorch
     while not ((graph and tensor.requires_grad) or _is_dual(tensor)):
@@ -129,7 +131,7 @@ def _is_dual(tensor: torch.Tensor) -> bool:
     return unpacked.tangent is not None
 
 
-def own_array(tensor: torch.Tensor) -> Any:
+def flat_drjit_copy(tensor: torch.Tensor) -> Any:
     """Return a flat Dr.Jit copy of a tensor in Dr.Jit's own memory.
 
     The scene must not alias memory of the caller, and a recorded kernel would go on reading other memory where the
@@ -154,7 +156,7 @@ def own_array(tensor: torch.Tensor) -> Any:
 
 
 def wait_for_torch(tensor: torch.Tensor) -> None:
-    """Wait for torch's queue: Dr.Jit reads and reuses memory on a stream of its own."""
+    """Wait for torch's stream of a CUDA tensor: Dr.Jit reads and reuses memory on a stream of its own."""
     if tensor.is_cuda:
         torch.cuda.current_stream(tensor.device).synchronize()
 
@@ -202,7 +204,12 @@ class Slot:
         return self._built.params.properties[self.key][2].class_name(), self.key.rsplit(".", 1)[-1]
 
     def write(self, leaf: Any, originals: Mapping[str, Any]) -> None:
-        """Set the parameters of Mitsuba from the flat array ``leaf``, by operations that Dr.Jit differentiates."""
+        """Set the parameters of Mitsuba by operations that Dr.Jit differentiates.
+
+        Args:
+            leaf: the value as a flat array.
+            originals: described values of the targets by key.
+        """
         if self.kind == "mesh_transform":
             self._write_mesh(leaf, originals)
             return
@@ -229,7 +236,13 @@ class Slot:
 
 
 def as_mitsuba_value(kind: str, shape: tuple[int, ...], current: Any, leaf: Any) -> Any:
-    """Return the flat array ``leaf`` as a value like ``current``, by operations that Dr.Jit differentiates."""
+    """Return a flat array as a value of Mitsuba, by operations that Dr.Jit differentiates.
+
+    Args:
+        kind, shape: kind and shape of the torch value (:func:`.parameters.classify`).
+        current: value of the parameter, whose type counts.
+        leaf: the flat array.
+    """
     import drjit as dr
     import mitsuba as mi
 
@@ -245,8 +258,8 @@ def as_mitsuba_value(kind: str, shape: tuple[int, ...], current: Any, leaf: Any)
     return type(current)(leaf)
 
 
-def changed_with(keys: Iterable[str], params: Any) -> list[str]:
-    """Return the parameters to mark as changed beside ``keys``.
+def dependent_keys(keys: Iterable[str], params: Any) -> list[str]:
+    """Return those of ``params`` to be marked as changed together with ``keys``.
 
     A light with a texture is sampled by a map from texture coordinates to points, which Mitsuba keeps until positions
     change; where those do and normals do not, it makes up new normals.
@@ -256,22 +269,22 @@ def changed_with(keys: Iterable[str], params: Any) -> list[str]:
     return [key for key in others if key in params]
 
 
-def with_normals(keys: Iterable[str], params: Mapping[str, Any]) -> list[str]:
-    """Return the keys, each once, and those of the normals that Mitsuba computes where positions among them change."""
+def add_normals(keys: Iterable[str], params: Mapping[str, Any]) -> list[str]:
+    """Return the keys, and those of ``params`` for the normals that Mitsuba recomputes when positions change."""
     normals = [key_beside(key, NORMALS) for key in keys if names_array(key, POSITIONS)]
     return list(dict.fromkeys((*keys, *(key for key in normals if key in params))))
 
 
 class SlotTable:
-    """Slots of some keys in one built scene, with the described values."""
+    """Slots of some keys in a built scene, and the described values, which can be put back."""
 
     def __init__(self, built: BuiltScene, keys: tuple[str, ...]):
         self.built = built
         self.slots = [Slot(built, key) for key in keys]
         # Mitsuba recomputes normals when positions change: both have to go back.
-        touched = with_normals([target for slot in self.slots for target in slot.targets], built.params)
+        touched = add_normals([target for slot in self.slots for target in slot.targets], built.params)
         self._check_overlap()
-        self._changed_too = changed_with(touched, built.params)
+        self._changed_too = dependent_keys(touched, built.params)
         # Copies: what `params` returns may be the plugin's own variable, which changes when it is written.
         self.originals = {target: type(built.params[target])(built.params[target]) for target in touched}
 
@@ -286,7 +299,7 @@ class SlotTable:
                 owner[target] = slot.key
 
     def install(self, leaves: list[Any]) -> None:
-        """Write one leaf per slot and let the scene follow."""
+        """Write the leaves, one flat array for each slot, and update the scene."""
         for slot, leaf in zip(self.slots, leaves, strict=True):
             slot.write(leaf, self.originals)
         self._update()

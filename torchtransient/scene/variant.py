@@ -29,7 +29,7 @@ from torchtransient.errors import (
     level_of_user,
 )
 from torchtransient.plugins.drjit_pool import check_process, engine_lock
-from torchtransient.plugins.guards import chain_of, interrupt_behind, interrupts_wait, surely
+from torchtransient.plugins.guards import chain_of, ensure_restored, interrupt_behind, interrupts_wait
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 
@@ -72,14 +72,19 @@ def interrupts_pass() -> Iterator[None]:
 
 
 def clear_frames(error: BaseException, handled: BaseException | None = None) -> None:
-    """Drop the local variables in the frames of a traceback: attached arrays, and plugins of scenes out of use."""
+    """Drop local variables in the frames of an error's traceback: attached arrays, plugins of scenes out of use.
+
+    Args:
+        error: the error.
+        handled: error that was being handled before, whose frames stay.
+    """
     for cause in chain_of(error, handled):
         traceback.clear_frames(cause.__traceback__)
 
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Silence Mitsuba's warnings of parameters that it does not list as differentiable: our table knows better."""
+    """Silence Mitsuba for a block: it warns of parameters that this library differentiates by and Mitsuba does not."""
     import mitsuba as mi
 
     before = mi.logger().log_level()
@@ -87,7 +92,7 @@ def quiet() -> Iterator[None]:
     try:
         yield
     finally:
-        surely(lambda: mi.logger().set_log_level(before))
+        ensure_restored(lambda: mi.logger().set_log_level(before))
 
 
 def is_differentiable(variant: str | None) -> bool:
@@ -96,7 +101,7 @@ def is_differentiable(variant: str | None) -> bool:
 
 
 def resolve_variant(requested: str | None) -> str:
-    """The variant of a scene: the requested one, else the active one if it is differentiable, else ``llvm_ad_rgb``.
+    """Return the variant of a scene: the requested one, else the active one if differentiable, else ``llvm_ad_rgb``.
 
     Raises ``VariantError`` for a variant that is unknown or not differentiable.
     """
@@ -119,17 +124,17 @@ def resolve_variant(requested: str | None) -> str:
 
 
 def device_type(variant: str) -> str:
-    """The torch device type whose memory a variant works on: ``cuda`` or ``cpu``."""
+    """Return the torch device type whose memory a variant works on, ``cuda`` or ``cpu``."""
     return "cuda" if variant.startswith("cuda") else "cpu"
 
 
 def stokes_components(variant: str) -> int:
-    """Components of the light that a variant renders: the four of a Stokes vector in polarized ones, otherwise 1."""
+    """Return the number of Stokes components that a variant renders: 4 in polarized ones, otherwise 1."""
     return 4 if variant.endswith("_polarized") else 1
 
 
 def take_over(device: str) -> None:
-    """Before Dr.Jit works on a device, at the beginning of a call: take over from other threads, and from torch.
+    """Make Dr.Jit wait for other threads and for torch, at the beginning of a call on a device.
 
     What another thread has made may be read in a block of a later number alone, or Dr.Jit refuses: handles of OptiX are
     never evaluated, and torch calls backwards of CUDA tensors in threads of its own. A result that was freed may still
@@ -164,7 +169,7 @@ def active_variant(variant: str) -> Iterator[None]:
                 take_over(device_type(variant))
             yield
         finally:
-            surely(lambda: _put_back(before))
+            ensure_restored(lambda: _put_back(before))
 
 
 def _put_back(before: str | None) -> None:
@@ -181,8 +186,10 @@ _transformed: dict[Any, types.CodeType] = {}
 
 @contextmanager
 def syntax_kept() -> Iterator[None]:
-    """Let ``dr.syntax`` transform each function once. It reads and rewrites source, and Mitsuba executes its own
-    integrators anew at every change of the variant: nine tenths of the time of a change.
+    """Cache the functions that ``dr.syntax`` transforms, for a block with a change of the variant.
+
+    It reads and rewrites source, and Mitsuba executes its own integrators anew at every change: nine tenths of the
+    time of a change.
     """
     import drjit as dr
 
@@ -207,7 +214,7 @@ def syntax_kept() -> Iterator[None]:
 
 
 def _count_switch(before: str | None, variant: str) -> None:
-    """Say once that the calls of a scene keep switching to and fro."""
+    """Count a switch of the variant, and warn once if there are many."""
     if before is None:
         return
     _switches["count"] += 1
@@ -246,7 +253,7 @@ _EVALUATED = ": not permitted. "
 
 @contextmanager
 def named_errors() -> Iterator[None]:
-    """For the time of a render: raise the error of this library that ended it, or one that names the reason."""
+    """Raise the error of this library that ended a block, or one with the reason, in place of Dr.Jit's RuntimeError."""
     raised: BaseException | None = None
     handled = sys.exc_info()[1]
     try:
@@ -271,7 +278,7 @@ def _instead_of(error: RuntimeError, handled: BaseException | None) -> BaseExcep
 
 
 def _reason(chain: list[BaseException]) -> BaseException:
-    """The first cause that says more than that something happened inside."""
+    """Return the innermost cause with a message of its own."""
     return next((one for one in reversed(chain) if str(one) and "(see above)" not in str(one)), chain[-1])
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
-from torchtransient.checks import Numbers, as_number, shown
+from torchtransient.checks import Numbers, as_number, function, shown
 from torchtransient.errors import ArgumentError, GradientError, ShapeError, UnitError
 
 Part = TypeVar("Part")
@@ -59,8 +59,7 @@ def accumulate(
         raise ShapeError(f"accumulate: expected a weight for each of {len(listed)} parts, got {len(shares)}.")
     if model is not None and not isinstance(model, nn.Module):
         raise ArgumentError(f"accumulate: expected model as a module, got {type(model).__name__}.")
-    if not callable(loss_of):
-        raise ArgumentError(f"accumulate: expected loss_of as a function of a part, got {shown(loss_of)}.")
+    function("accumulate: loss_of", loss_of, "a part")
     if scaler is not None and not callable(getattr(scaler, "scale", None)):
         raise ArgumentError(f"accumulate: expected scaler as a torch.amp.GradScaler, got {shown(scaler)}.")
     values = []

@@ -55,7 +55,7 @@ def test_weights_of_axes():
 
 def test_rows_of_triangles():
     shapes = [mesh("a", SHEET), mesh("b", plate(1, 1, (0, 0, 2)), two_sided=True)]
-    found = AreaElements.of(shapes)
+    found = AreaElements.from_shapes(shapes)
     v, f = SHEET
     assert len(found) == 4 and found.shape.tolist() == [0, 0, 1, 1] and found.primitive.tolist() == [0, 1, 0, 1]
     assert found.two_sided.tolist() == [False, False, True, True] and found.left_out == []
@@ -78,7 +78,7 @@ def test_rows_of_round_shapes(flip, mirror):
         analytic("disk", 0.5, 1.5 * mirror, 2.0, flip_normals=flip), analytic("sphere", 0.3, 0.3, 0.3 * mirror),
         analytic("cylinder", 0.4, 0.4, 3.0 * mirror, flip_normals=flip),
     ]  # fmt: skip
-    found = AreaElements.of(shapes)
+    found = AreaElements.from_shapes(shapes)
     assert found.kind.tolist() == [DISK, SPHERE, CYLINDER]
     np.testing.assert_allclose(found.area, np.pi * np.array([0.75, 4 * 0.09, 2 * 0.4 * 3]), rtol=1e-6)
     np.testing.assert_allclose(found.axes[:, 0], [[0.2, -0.3, 1.7]] * 3, atol=1e-6)
@@ -107,7 +107,7 @@ def test_rows_of_round_shapes(flip, mirror):
 
 def test_points_of_elements_of_several_kinds():
     """Of a triangle beside others sixteen places, too, with its own normal."""
-    elements = AreaElements.of([mesh("sheet", SHEET), analytic("sphere", 0.3, 0.3, 0.3)])
+    elements = AreaElements.from_shapes([mesh("sheet", SHEET), analytic("sphere", 0.3, 0.3, 0.3)])
     points, normals = elements.points(np.array([2, 1]))
     np.testing.assert_allclose(normals[1], np.tile(elements.normal[1], (16, 1)))
     away = points[1] - elements.axes[1, 0]
@@ -121,7 +121,7 @@ def test_spheres_that_are_turned_inside_out():
     for mirror, flip, inwards in ((1, True, True), (-1, False, False), (-1, True, True)):
         shape = analytic("sphere", *[0.3 * mirror] * 3, flip_normals=flip)
         si = mi.load_dict({"type": "scene", "s": shape}).ray_intersect(mi.Ray3f([0.2, -0.3, -5], [0, 0, 1]))
-        (row,) = AreaElements.of([shape]).normal
+        (row,) = AreaElements.from_shapes([shape]).normal
         # That of the side that shading normals take for the front.
         assert (row[0] < 0) == bool(si.sh_frame.n.z[0] > 0), inwards
         assert abs(row[0]) == pytest.approx(1 / 0.3, rel=1e-6)
@@ -139,7 +139,7 @@ def test_a_flag_turns_triangles_around_and_the_order_of_corners_does_not(vertex_
         shape = mi.load_dict({"type": "mesh_arrays", **arrays})
         ordered = np.sign(np.cross(v[faces[0, 1]] - v[faces[0, 0]], v[faces[0, 2]] - v[faces[0, 0]])[2])
         expected = (-1 if vertex_normals else ordered) * (-1 if flip else 1)
-        np.testing.assert_allclose(AreaElements.of([shape]).normal[:, 2], expected, rtol=1e-6)
+        np.testing.assert_allclose(AreaElements.from_shapes([shape]).normal[:, 2], expected, rtol=1e-6)
         assert not has_shading_normals(shape)
 
 
@@ -169,23 +169,23 @@ def test_sheared_shapes_are_left_out(kind, matrix, listed):
     """By more than a ten thousandth, of their angles or, of round ones, of their lengths."""
     shape = mi.load_dict({"type": kind, "id": "odd", "to_world": mi.ScalarTransform4f(matrix)})
     assert can_be_listed(shape) == listed
-    found = AreaElements.of([shape, analytic("disk", 1, 1, 1)])
+    found = AreaElements.from_shapes([shape, analytic("disk", 1, 1, 1)])
     assert len(found) == 1 + listed and found.left_out == ([] if listed else ["odd"])
     assert found.shape.tolist()[-1] == 1
     unnamed = mi.load_dict({"type": kind, "to_world": mi.ScalarTransform4f(matrix)})
-    assert AreaElements.of([unnamed]).left_out == ([] if listed else [kind.capitalize()])
+    assert AreaElements.from_shapes([unnamed]).left_out == ([] if listed else [kind.capitalize()])
 
 
 def test_shapes_with_derivatives():
     """Rows are numbers, whatever is attached."""
     shapes = [analytic("disk", 0.5, 1.5, 2.0), mesh("ball", ball((0, 0, 1), 0.5, 0), vertex_normals=True)]
-    before = AreaElements.of(shapes)
+    before = AreaElements.from_shapes(shapes)
     for shape, keys in zip(shapes, (["to_world"], ["vertex_positions", "vertex_normals"]), strict=True):
         params = mi.traverse(shape)
         for key in keys:
             dr.enable_grad(params[key])
         params.update()
-    after = AreaElements.of(shapes)
+    after = AreaElements.from_shapes(shapes)
     for one, other in zip(before.columns(), after.columns(), strict=True):
         np.testing.assert_array_equal(one, other)
 
@@ -194,7 +194,7 @@ def test_of_nothing():
     group = {"type": "shapegroup", "inner": {"type": "sphere"}}
     copy = {"type": "instance", "ref": {"type": "ref", "id": "group"}}
     scene = mi.load_dict({"type": "scene", "group": group, "copy": copy})
-    found = AreaElements.of([shape for shape in scene.shapes() if shape.id() == "copy"])
+    found = AreaElements.from_shapes([shape for shape in scene.shapes() if shape.id() == "copy"])
     assert len(found) == 0 and found.left_out == ["copy"] and found.axes.shape == (0, 4, 3)
     assert facing_weight(found, np.ones((2, 3)), np.ones((2, 3))).shape == (0,)
 
@@ -210,7 +210,7 @@ def test_what_elements_of_every_kind_weigh():
         analytic("disk", 0.5, 0.3, 1.0, bsdf={"type": "twosided", "nested": {"type": "diffuse"}}),
         analytic("cylinder", 0.2, 0.2, 0.6), analytic("sphere", 0.3, 0.3, 0.3),
     ]  # fmt: skip
-    elements = AreaElements.of(shapes)
+    elements = AreaElements.from_shapes(shapes)
     wall = np.array([[-0.3, 0.1, 0.0], [0.4, -0.5, 0.1], [0.7, 0.9, -0.2]])
     normals = np.array([[0.0, 0.0, 1.0], [0.0, 0.6, 0.8], [0.28, 0.0, 0.96]])
     expected = []

@@ -32,7 +32,7 @@ WALL = np.array([[0.0, 0, 0], [0.5, 0.2, 0.1]])
 def elements():
     sheet = {"type": "obj", "filename": file_of("cut sheet.obj", SHEET), "face_normals": True}
     shapes = [mi.load_dict(node) for node in (sheet, {"type": "sphere", "center": [0, 0, 9.0]})]
-    return shapes, AreaElements.of(shapes)
+    return shapes, AreaElements.from_shapes(shapes)
 
 
 def test_parts_are_small_beside_their_distance():
@@ -56,14 +56,14 @@ def test_the_middle_may_be_nearest():
     """Of a triangle with edges of 5, 3 and 4 m, 0.4 m below its middle and farther from all corners: 32 parts."""
     sheet = "v 0 0 2\nv 3 0 2\nv 0 4 2\nf 1 2 3\n"
     shape = mi.load_dict({"type": "obj", "filename": file_of("right sheet.obj", sheet), "face_normals": True})
-    found = AreaElements.of([shape])
+    found = AreaElements.from_shapes([shape])
     assert [int(cuts_of(found, np.array([[1.0, 4 / 3, 2 - z]]))[0]) for z in (0.4, 0.63, 1.3, 5.0)] == [32, 16, 8, 2]
 
 
 def test_what_is_round_or_has_no_area_is_not_cut():
     sliver = "v 0 0 0.1\nv 1 0 0.1\nv 2 0 0.1\nf 1 2 3\n"
     flat = mi.load_dict({"type": "obj", "filename": file_of("sliver.obj", sliver), "face_normals": True})
-    around = AreaElements.of([flat, mi.load_dict({"type": "sphere"}), mi.load_dict({"type": "disk"})])
+    around = AreaElements.from_shapes([flat, mi.load_dict({"type": "sphere"}), mi.load_dict({"type": "disk"})])
     assert cuts_of(around, WALL).tolist() == [1, 1, 1]
     assert around.area[0] == 0 and around.normal[0].tolist() == [0, 0, 0]
 

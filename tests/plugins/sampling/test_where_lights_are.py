@@ -51,7 +51,7 @@ def test_the_nearest_place_where_a_light_could_be():
     lamp = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([1, 2, 3]).scale([0.5, 0.25, 1]),
             "emitter": {"type": "area"}}  # fmt: skip
     scene = scene_of(lamp=lamp, bulb=point(position=(-1.0, 2.0, 5.0)))
-    box = LightBox.of(scene, [shape.bsdf() for shape in scene.shapes()])
+    box = LightBox.from_scene(scene, [shape.bsdf() for shape in scene.shapes()])
     # From (-1, 1.75, 3) to (1.5, 2.25, 5).
     places = np.array([[0.0, 2, 4], [1.5, 2.25, 5], [4.5, 2, 9], [-3, 1.75, 1], [0, -0.25, 4], [2.5, 4.25, 7]])
     found = np.array(box.distance(mi.Point3f(places.T)))
@@ -66,7 +66,7 @@ def test_the_nearest_place_where_a_light_could_be():
 def test_no_box_where_light_comes_from_anywhere_or_sooner(more):
     def box(**parts):
         scene = scene_of(**parts)
-        return LightBox.of(scene, [shape.bsdf() for shape in scene.shapes()])
+        return LightBox.from_scene(scene, [shape.bsdf() for shape in scene.shapes()])
 
     assert box(bulb=point(), ball={"type": "sphere"}) is not None
     assert box(bulb=point(), ball={"type": "sphere"}, **more) is None
@@ -111,8 +111,8 @@ def test_directions_into_the_sun():
     np.testing.assert_allclose(np.array(sun.direction).ravel(), np.array(towards(0.0)).ravel(), atol=1e-6)
     inside = [bool(sun.contains(towards(angle))[0]) for angle in (0, 9.99, -9.99, 10.005, 10.02, -10.02, 170)]
     assert inside == [True, True, True, True, False, False, False] and not sun.rare
-    assert MovingSun.of(types.SimpleNamespace(scene=scene, wanted=None)) is None
-    assert MovingSun.of(types.SimpleNamespace(scene=scene, wanted=types.SimpleNamespace(sky=None))) is None
+    assert MovingSun.from_context(types.SimpleNamespace(scene=scene, wanted=None)) is None
+    assert MovingSun.from_context(types.SimpleNamespace(scene=scene, wanted=types.SimpleNamespace(sky=None))) is None
 
 
 def test_the_light_that_is_the_suns():
@@ -134,11 +134,11 @@ def test_directions_turn_with_the_sun():
     params.update()
     sun = MovingSun(scene, scene.emitters()[0])
     d = mi.Vector3f([0.0, 0, 1], [1.0, 0, 0], [0.0, 1, 0])
-    followed = sun.followed(d, mi.Mask([True, True, True]))
+    followed = sun.attach_direction(d, mi.Mask([True, True, True]))
     np.testing.assert_array_equal(np.array(dr.detach(followed)), np.array(d))
     found = np.array(dr.forward_to(followed))
     np.testing.assert_allclose(found, [[0, 0, 0], [0, -1, 0], [1, 0, 0]], atol=1e-5)
-    still = sun.followed(d, mi.Mask([False, True, True]))
+    still = sun.attach_direction(d, mi.Mask([False, True, True]))
     assert dr.all(dr.detach(still) == d, axis=None)
 
 

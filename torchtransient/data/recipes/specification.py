@@ -13,7 +13,7 @@ import numpy as np
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Scan
-from torchtransient.checks import MOST, Numbers, as_whole, count, is_one_of, mapping, real_array, shown
+from torchtransient.checks import MOST, Numbers, as_whole, count, is_one_of, mapping, of_class, real_array, shown
 from torchtransient.data.recipes.distribution import Distribution, Place
 from torchtransient.data.recipes.distributions import Choice, pick
 from torchtransient.data.recipes.plugin_modules import check_plugins
@@ -92,8 +92,8 @@ class Specification:
             raise ArgumentError(f"recipe: physics: expected 'ignore' or 'error', got {shown(physics)}.")
         if parameters is not None:
             mapping("recipe: parameters", parameters, "{name: value}")
-        if scan is not None and not isinstance(scan, Scan):
-            raise ArgumentError(f"recipe: scan: expected a tt.nlos.Scan, got {shown(scan)}.")
+        if scan is not None:
+            of_class("recipe: scan", scan, Scan)
         for name, given, kind in (
             ("time_axis", time_axis, TimeAxis), ("pulse", pulse, Pulse), ("irf", irf, Pulse), ("vary", vary, Mapping),
         ):  # fmt: skip

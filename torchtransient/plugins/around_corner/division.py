@@ -1,4 +1,7 @@
-"""Division of a capture's light among hidden samples, chains that scanned points share, and paths."""
+"""Division of a capture's light among hidden samples, chains and paths, by numbers of bounces.
+
+Samples and chains are shared by all scanned points; paths are traced for each.
+"""
 
 from __future__ import annotations
 
@@ -13,9 +16,12 @@ BOUNCES = 3
 
 @dataclass(frozen=True)
 class Division:
-    """``shared``: the numbers of bounces whose light comes from shared samples and chains, an empty range where all
-    comes from paths; ``longest``: the largest number of bounces that is left for paths, 0 for none; ``why_not``: what
-    stands against shared samples, in words, or None.
+    """Division of light by numbers of bounces.
+
+    Attributes:
+        shared: numbers of bounces whose light comes from shared samples and chains; empty if all comes from paths.
+        longest: largest number of bounces that is left for paths, 0 for none.
+        why_not: reason against shared samples, in words; None without one.
     """
 
     shared: range
@@ -24,7 +30,15 @@ class Division:
 
     @staticmethod
     def of(shared: range, first: int, last: int, wall_lights_itself: bool) -> Division:
-        """Divide light of ``first`` to ``last`` bounces: one lights the spot alone, and two go from wall to wall."""
+        """Divide light into shared samples and paths.
+
+        Light of one bounce is that of the laser's spot, light of two goes from wall to wall.
+
+        Args:
+            shared: numbers of bounces for shared samples and chains.
+            first, last: numbers of bounces that are rendered.
+            wall_lights_itself: points of the wall see each other.
+        """
         if last >= shared.stop:
             return Division(shared, last)
         before = range(max(first, 2 if wall_lights_itself else 3), shared.start)
@@ -52,7 +66,13 @@ SHARED = "from hidden samples that all scanned points share"
 
 
 def explanation(integrator: Any, scene: Any, contents: Any) -> str:
-    """Describe in one line how light of three bounces and later light are found."""
+    """Describe in one line how light of three bounces and later light are found.
+
+    Args:
+        integrator: integrator of the capture.
+        scene: built scene.
+        contents: its :class:`~..transport.scene_contents.SceneContents`.
+    """
     division, (least, most) = integrator.division(scene, contents), integrator.asked_bounces()
     parts = []
     if least <= BOUNCES and (most is None or most >= BOUNCES):
@@ -79,7 +99,7 @@ def _range(first: int, last: int | None) -> str:
 
 
 def _why(integrator: Any, division: Division) -> str:
-    """Why paths, where samples were not shared."""
+    """Return why paths are followed in place of shared samples."""
     if integrator.third_bounce == "paths":
         return ", as third_bounce asks for"
     return f", since {division.why_not}"

@@ -1,9 +1,9 @@
-"""Exhaustive captures: the laser falls on every one of its spots while every scan point is looked at.
+"""Exhaustive captures: a histogram for every pair of a scan point and a laser spot.
 
-How samples are seen, ``cos cos / r^2`` where nothing stands in between and the distance, is found once for each pair
-of a sample and a point of the wall, one ray each, and kept in pairs of numbers. Every lane is a pair of a scan point
-and a laser spot, has a histogram of its own and loops over the samples of a block: two loads and a product. As many
-samples are in a block as memory allows, however many points there are.
+The visibility of a sample from a point of the wall, ``cos cos / r^2`` or zero, and the distance are computed once for
+each such pair, with one ray, and stored. A lane is a pair of a scan point and a laser spot; it has a histogram of its
+own and loops over the samples of a block, with two loads and a product for each. A block has as many samples as memory
+allows.
 """
 
 from __future__ import annotations
@@ -28,11 +28,18 @@ UNROLLED = 4
 
 
 def add_exhaustive(job: ThirdBounce, lasers: WallPoints, reciprocal: bool | None = None) -> None:
-    """Light of all pairs, onto a film for exhaustive scans whose laser grid has a position for every spot, row by row.
+    """Add the light of all pairs of a laser spot and a scan point to a film for exhaustive scans.
 
-    ``reciprocal``: use that light goes either way, so that half of the pairs need no work. None: where that is exact
-    to the last digit, which it is where ``lasers`` and scan points are one object (legs too), normals are not
-    interpolated, and the film is stored in one band and holds no light yet. Raises SceneError, ShapeError.
+    Args:
+        job: the capture.
+        lasers: laser spots, one for each position of the film's laser grid, row by row.
+        reciprocal: compute half of the pairs and mirror them, since light goes either way. That is exact to the last
+            digit if ``lasers`` and scan points are one object (legs too), normals are not interpolated, and the film
+            is stored in one band and holds no light yet; None does it then.
+
+    Raises:
+        SceneError: for other films and samples, and for ``reciprocal`` where it is not exact.
+        ShapeError: for another number of spots.
     """
     film = job.film
     job.check_region(lasers)
@@ -78,11 +85,13 @@ def add_exhaustive(job: ThirdBounce, lasers: WallPoints, reciprocal: bool | None
 
 
 class SampleBlock:
-    """Samples ``first`` to ``last`` (exclusive): how scan points and laser spots see them, and their colours. A plain
-    class.
+    """Block of samples ``first`` to ``last`` (exclusive), with their visibility from all points. A plain class.
 
-    ``seen``, ``lit``: ``[g, r]`` for each sample and point, sample by sample, ``g`` negative where the back of the
-    sample is seen. One colour is split evenly among both ``g``, as a square root, so that it needs no load of its own.
+    Attributes:
+        seen, lit: ``[g, r]`` for each sample and scan point, or laser spot, sample by sample: cosines over the squared
+            distance, negative where the back of the sample is seen, and distance (metres).
+        values: colours of front and back, None in monochromatic variants: there the square root of the one colour is a
+            factor of both ``g``.
     """
 
     def __init__(self, job: ThirdBounce, lasers: WallPoints, first: int, last: int) -> None:
@@ -132,7 +141,7 @@ class SampleBlock:
 
 
 class Pairs:
-    """Pairs of the lanes of a launch: constants of the loop, a plain object."""
+    """Scan point and laser spot of each lane of a launch: constants of the loop. A plain class."""
 
     def __init__(self, job: ThirdBounce, lasers: WallPoints, pixel: Any, laser: Any) -> None:
         _, _, value, leg = job.sensors.take(pixel)
@@ -158,34 +167,34 @@ def _launch(
     wanted = pixel <= laser if mirrored else mi.Mask(True)
     base = film.pixel_base(local * film.entries_per_pixel(), laser)
     target = film.create_event_block(Local(band=band), base, job.match, 1, exclusive=True, origin=pairs.origin)
-    kept = {"L": mi.UnpolarizedSpectrum(0), "before": mi.Float(0), "after": mi.Float(0)}
-    kept = sum_over_block(job, block, pairs, target, kept, wanted)
-    _count(film, job.match, pixel, kept, wanted)
+    sums = {"L": mi.UnpolarizedSpectrum(0), "before": mi.Float(0), "after": mi.Float(0)}
+    sums = sum_over_block(job, block, pairs, target, sums, wanted)
+    _count(film, job.match, pixel, sums, wanted)
     if mirrored:
-        _count(film, job.match, laser, kept, pixel < laser)
+        _count(film, job.match, laser, sums, pixel < laser)
     dr.eval(film.bands[band][2], film.steady, film.outside)
 
 
-def _count(film: Any, match: Any, pixel: Any, kept: dict[str, Any], active: Any) -> None:
-    film.add_steady(pixel, [dr.select(active, c, 0) for c in match.to_channels(kept["L"])])
-    film.add_outside(pixel, dr.select(active, kept["before"], 0), dr.select(active, kept["after"], 0))
+def _count(film: Any, match: Any, pixel: Any, sums: dict[str, Any], active: Any) -> None:
+    film.add_steady(pixel, [dr.select(active, c, 0) for c in match.to_channels(sums["L"])])
+    film.add_outside(pixel, dr.select(active, sums["before"], 0), dr.select(active, sums["after"], 0))
 
 
 @dr.syntax
-def sum_over_block(job, block, pairs, target, kept, wanted):
-    """Splat the light that the samples of a block send from each lane's laser spot to its scan point."""
+def sum_over_block(job, block, pairs, target, sums, wanted):
+    """Add the light that goes from each lane's laser spot by the samples of a block to its scan point."""
     k = mi.UInt32(0)
     going = mi.Mask(wanted)
     while dr.hint(going, label="pairs of points"):
         for u in range(UNROLLED):
-            deposit(job, block, pairs, target, kept, k + u)
+            deposit(job, block, pairs, target, sums, k + u)
         k += UNROLLED
         going &= k < block.size
-    return kept
+    return sums
 
 
-def deposit(job, block, pairs, target, kept, k):
-    """Splat one sample's light."""
+def deposit(job, block, pairs, target, sums, k):
+    """Add the light of sample ``k`` of the block."""
     seen = dr.gather(mi.Vector2f, block.seen, k * pairs.sensor_count + pairs.pixel)
     lit = dr.gather(mi.Vector2f, block.lit, k * pairs.laser_count + pairs.laser)
     g = seen.x * lit.x
@@ -197,10 +206,10 @@ def deposit(job, block, pairs, target, kept, k):
     if block.values is not None:
         row = dr.gather(mi.Vector4f, block.values, 2 * k + dr.select(seen.x > 0, mi.UInt32(0), 1), active)
         value *= mi.UnpolarizedSpectrum(row.x, row.y, row.z)
-    kept["L"] = kept["L"] + dr.select(active, value, 0)
+    sums["L"] = sums["L"] + dr.select(active, value, 0)
     before, after = target.put({}, opl, value, active)
-    kept["before"] = kept["before"] + before
-    kept["after"] = kept["after"] + after
+    sums["before"] = sums["before"] + before
+    sums["after"] = sums["after"] + after
 
 
 def _rows_at_once(points: int, size: int) -> int:
@@ -209,7 +218,7 @@ def _rows_at_once(points: int, size: int) -> int:
 
 
 def _mirror(film: Any) -> None:
-    """Histograms of (scan point, laser spot) with the numbers in descending order, from those in ascending order."""
+    """Copy the histogram of each pair (scan point, laser spot) with ascending numbers to the swapped pair."""
     cube = film.band_array(0)
     points, size = film.laser_count(), film.entries_per_array()
     # Four numbers at once where a histogram is made of fours.

@@ -1,4 +1,4 @@
-"""From a hidden point to a point of the wall: cosines, distance, and whether something is in between."""
+"""Lines from hidden points to points of the wall: cosines, distances, occlusion."""
 
 from __future__ import annotations
 
@@ -17,10 +17,15 @@ OFFSET = 2**-20
 
 
 def span(sample: Any, p: Any, n: Any) -> Local:
-    """The straight line from samples to wall points ``p`` with normals ``n``.
+    """Return the straight lines from samples to wall points.
 
-    ``r`` (metres), ``cos`` (of the shading normal there, signed), ``geometric_cos`` (signed), ``wall_cos`` (0 behind
-    the wall), ``inverse_square`` (1 / r^2), ``d`` (not normalized).
+    Args:
+        sample: samples with ``p``, ``n`` and ``geometric_n``.
+        p, n: wall points and their normals.
+
+    Returns:
+        ``d`` (not normalized), ``r`` (metres), ``inverse_square`` (1 / r^2), ``cos`` and ``geometric_cos`` (signed, of
+        the sample's shading and geometric normal), ``wall_cos`` (0 behind the wall).
     """
     d = mi.Vector3f(p - sample.p)
     square = dr.squared_norm(d)
@@ -39,15 +44,21 @@ def span(sample: Any, p: Any, n: Any) -> Local:
 
 
 def front_normal(si: Any) -> Any:
-    """The geometric normal (Normal3f) on the side that the shading normal points to, where a one-sided surface
-    scatters: with mirrored transforms, and normals against the order of the corners, Mitsuba's own points behind.
+    """Return the geometric normal (Normal3f) on the side of the shading normal, where a one-sided surface scatters.
+
+    Mitsuba's own points to the other side with mirrored transforms, and with normals against the order of the corners.
     """
     return dr.mulsign(mi.Normal3f(si.n), dr.dot(si.sh_frame.n, si.n))
 
 
 def sees(scene: Any, start: Any, end: Any, n: Any, active: Any) -> Any:
-    """Return whether points ``start`` (``p``, ``geometric_n``) see the points ``end``, which face them with the side of
-    ``n``: points of one plane do not.
+    """Return a mask of pairs of points that see each other; points of one plane do not.
+
+    Args:
+        scene: built scene.
+        start: points with ``p`` and ``geometric_n``.
+        end, n: points, and normals of the sides that have to face ``start``.
+        active: mask of pairs.
     """
     to = mi.Vector3f(end - start.p)
     line = Local(geometric_cos=dr.dot(start.geometric_n, to), r=dr.norm(to))
@@ -57,11 +68,18 @@ def sees(scene: Any, start: Any, end: Any, n: Any, active: Any) -> Any:
 
 
 def occluded(scene: Any, sample: Any, line: Any, p: Any, n: Any, active: Any) -> Any:
-    """Return whether something stands between samples and wall points.
+    """Return a mask of samples and wall points with something in between.
 
     Both ends are moved off their surfaces along the geometric normals, by what single precision leaves of the largest
     coordinate on the way: on curved meshes neighbouring triangles are not met, whatever the scale of the scene. What
     lies nearer to a surface than that does not hide it.
+
+    Args:
+        scene: built scene.
+        sample: samples with ``p`` and ``geometric_n``.
+        line: their lines to the wall points (:func:`span`), of which ``r`` and ``geometric_cos`` count.
+        p, n: wall points and their normals.
+        active: mask of pairs to be tested.
     """
     # No coordinate of the sample exceeds the largest of the wall point by more than the distance.
     reach = dr.max(dr.abs(p)) + line.r
@@ -79,13 +97,16 @@ def occluded(scene: Any, sample: Any, line: Any, p: Any, n: Any, active: Any) ->
 
 
 class WallPoints:
-    """``width`` points of a diffuse wall, plane or curved.
+    """Points of a diffuse wall, plane or curved: scan points or laser spots. A plain class, no state of Dr.Jit's loops.
 
-    ``p`` (``Point3f``, metres), ``n`` (``Normal3f``, unit, of the side that is lit), ``value``
-    (``UnpolarizedSpectrum``: albedo over pi, one or one each), ``leg`` (``Float64``, metres, one or one each: optical
-    path from laser to spot, or from scan point to sensor; 0 where the legs are left out). Raises ShapeError.
+    Args:
+        p: points (``Point3f``, metres), ``width`` of them.
+        n: unit normals of the side that is lit (``Normal3f``), one for all or one each, as ``value`` and ``leg``.
+        value: albedo over pi (``UnpolarizedSpectrum``).
+        leg: optical path from laser to spot, or from scan point to sensor (``Float64``, metres), 0 to leave it out.
 
-    A plain class, which Dr.Jit loops leave alone.
+    Raises:
+        ShapeError: for another number of normals, values or legs.
     """
 
     def __init__(self, p: Any, n: Any, value: Any, leg: Any = 0.0) -> None:
@@ -100,18 +121,22 @@ class WallPoints:
         dr.make_opaque(self.p, self.n, self.value, self.leg)
 
     def take(self, index: Any, active: Any = True) -> tuple[Any, Any, Any, Any]:
-        """Return (``p``, ``n``, ``value``, ``leg``) of these points."""
+        """Gather (``p``, ``n``, ``value``, ``leg``) of the points with the numbers ``index`` (UInt32)."""
         return (
             dr.gather(mi.Point3f, self.p, index, active),
-            _one_or_each(self.n, index, active),
-            _one_or_each(self.value, index, active),
-            _one_or_each(self.leg, index, active),
+            gather_one_or_each(self.n, index, active),
+            gather_one_or_each(self.value, index, active),
+            gather_one_or_each(self.leg, index, active),
         )
 
 
 def points_of(si: Any, factor: Any, length: Any) -> WallPoints:
-    """Build wall points from interactions with a diffuse wall, for light along ``si.wi``: their albedo times
-    ``factor``, and the legs ``length``.
+    """Build wall points from interactions with a diffuse wall.
+
+    Args:
+        si: interactions (SurfaceInteraction3f); ``wi`` is where the light comes from or goes to.
+        factor: factor of the albedo, such as 1 / pi.
+        length: legs (Float, metres).
     """
     bsdf, valid = si.bsdf(), si.is_valid()
     side = dr.select(si.wi.z > 0, 1, dr.select(scatters_behind(bsdf) & (si.wi.z < 0), -1, 0))
@@ -122,5 +147,6 @@ def points_of(si: Any, factor: Any, length: Any) -> WallPoints:
     return WallPoints(dr.select(valid, si.p, 0), n, value, dr.select(valid, length, 0))
 
 
-def _one_or_each(array: Any, index: Any, active: Any) -> Any:
+def gather_one_or_each(array: Any, index: Any, active: Any = True) -> Any:
+    """Gather entries of an array that has one entry for all, or one each."""
     return dr.gather(type(array), array, index if dr.width(array) > 1 else mi.UInt32(0), active)

@@ -5,9 +5,9 @@ between is the same for all points of the tile, so that an event costs two loads
 
     value_s value_l Q  g(s, x_i)  link_ik  b_kj g(v_kj, l)      at |s x_i| + |x_i v_k1| + ... + |v_kj l| + legs
 
-``g``: cosines over the squared distance. What points of a tile have in common is noise of their sum, which
-reconstructions see. Therefore a tile is not a patch: its points lie as far from each other as the scan is wide, so that
-one path arrives at different times, and neighbours have chains of their own. The chains of all tiles are one set of
+``g``: cosines over the squared distance. Points of a tile have correlated noise, which would show in reconstructions.
+Therefore a tile is not a patch: its points lie as far from each other as the scan is wide, so that one path arrives at
+different times, and neighbours have chains of their own. The chains of all tiles are one set of
 Sobol's points, those of neighbouring points in blocks next to each other, which fill each other's gaps. (Sums of a
 16 x 16 scan: 2 to 3 times less variance than with patches of 4 x 4.)
 """
@@ -23,7 +23,14 @@ import numpy as np
 
 from torchtransient.errors import SceneError, UnitError
 from torchtransient.interfaces import CaptureType
-from torchtransient.plugins.around_corner.geometry import OFFSET, WallPoints, front_normal, occluded, span
+from torchtransient.plugins.around_corner.geometry import (
+    OFFSET,
+    WallPoints,
+    front_normal,
+    gather_one_or_each,
+    occluded,
+    span,
+)
 from torchtransient.plugins.around_corner.launches import EVENTS, ScanJob
 from torchtransient.plugins.bsdfs.lambertian import scatters_behind
 from torchtransient.plugins.sampling.area_elements import morton_order
@@ -57,9 +64,15 @@ LONGEST_TAIL = 1 + (DIMENSIONS - _FURTHER) // 2
 
 @dataclass
 class ChainPlan:
-    """Layout of chains: ``elements`` (:class:`..sampling.hidden_elements.HiddenElements`), ``center`` (Point3f
-    in memory: about where the scan points are), ``size`` chains of a group (a power of two), ``groups`` of each tile,
-    ``tail`` vertices, ``seed`` (UInt32 of width one, in memory).
+    """Layout of chains.
+
+    Attributes:
+        elements: density of their heads (:class:`..sampling.hidden_elements.HiddenElements`).
+        center: middle of the scan points (Point3f of width one, in memory).
+        size: chains of a group, a power of two.
+        groups: groups of each tile.
+        tail: vertices of a tail.
+        seed: UInt32 of width one, in memory.
     """
 
     elements: Any
@@ -71,20 +84,30 @@ class ChainPlan:
 
     @property
     def stride(self) -> int:
-        """Indices of Sobol's points that a tile has for itself, a power of two."""
+        """Number of Sobol's points of a tile, a power of two."""
         return 1 << max(0, self.size * self.groups - 1).bit_length()
 
 
 class Vertices(Local):
-    """Vertices of chains, one each: ``p``, ``n`` and ``geometric_n`` (of the side that light meets), ``value`` (per
-    colour: of a head its albedo over pi and the area it stands for, of a tail albedo over pi times what arrives of the
-    step before), ``length`` (metres from the first vertex of the tail), ``alive``; ``shape``, ``primitive`` and
-    ``uv``: the material point.
+    """Vertices of chains, one of each chain.
+
+    Attributes:
+        p, n, geometric_n: place, and normals of the side that light meets.
+        value: by colour, of a head its albedo over pi times the area that it stands for, of a tail its albedo over pi
+            times the light of the step before.
+        length: metres from the first vertex of the tail.
+        alive: mask of vertices that exist.
+        shape, primitive, uv: the material point.
     """
 
 
 def trace_chains(scene: Any, plan: ChainPlan, index: Any) -> tuple[Vertices, list[Vertices]]:
-    """Return (heads, vertices of tails) of the chains of numbers ``index`` (UInt32) of Sobol's points. Not evaluated.
+    """Return heads and vertices of tails of some chains, not evaluated.
+
+    Args:
+        scene: built scene.
+        plan: layout of the chains.
+        index: numbers of Sobol's points (UInt32), one for each chain.
     """
     numbers = [sobol(index, d, plan.seed) for d in range(_FURTHER + 2 * (plan.tail - 1))]
     head = _drawn(plan, numbers, _HEAD, _SIDES[0])
@@ -110,7 +133,7 @@ def trace_chains(scene: Any, plan: ChainPlan, index: Any) -> tuple[Vertices, lis
 
 
 def _drawn(plan: ChainPlan, numbers: list[Any], place: tuple[int, int], side: int) -> Vertices:
-    """Points over the hidden area, and a side of the surface there."""
+    """Draw points over the hidden area, and a side of the surface there."""
     u, v = (numbers[i] for i in place)
     s = samples_at(plan.elements, unit_double(u), unit_float(v), plan.size * plan.groups)
     two_sided = scatters_behind(s.shape.bsdf())
@@ -127,7 +150,7 @@ def _drawn(plan: ChainPlan, numbers: list[Any], place: tuple[int, int], side: in
 
 
 def _probability_of_front(plan: ChainPlan, p: Any, n: Any, two_sided: Any) -> Any:
-    """With which the side of ``n`` is drawn at ``p``."""
+    """Return the probability of the side of ``n`` at ``p``."""
     faces = dr.dot(n, plan.center - p) > 0
     return dr.select(two_sided, dr.select(faces, mi.Float(FACING), 1 - FACING), 1)
 
@@ -202,7 +225,7 @@ def _select(mask: Any, a: Vertices, b: Vertices) -> Vertices:
 
 
 class VertexTable:
-    """Vertices in memory, loaded by number. A plain class."""
+    """Vertices in memory, gathered by number. A plain class."""
 
     _FIELDS = ("p", "n", "value", "length", "alive")
 
@@ -215,23 +238,23 @@ class VertexTable:
 
     def take(self, index: Any) -> Local:
         """Gather ``p, n, geometric_n, value, length, alive`` of vertices."""
-        rows = Local(**{name: _gather(getattr(self, name), index) for name in self._FIELDS})
-        rows.geometric_n = _gather(self.geometric_n, index) if self.smooth else rows.n
+        rows = Local(**{name: gather_one_or_each(getattr(self, name), index) for name in self._FIELDS})
+        rows.geometric_n = gather_one_or_each(self.geometric_n, index) if self.smooth else rows.n
         return rows
 
-
-def _gather(array: Any, index: Any) -> Any:
-    return dr.gather(type(array), array, index if dr.width(array) > 1 else mi.UInt32(0))
 
 # Numbers of chains stand in rows of single precision, which counts so far.
 MOST_CHAINS = 2**24
 
 
 class Links:
-    """The connections of all heads and tails of groups that carry light, group by group: rows of ``[weight, r, head,
-    tail]``. ``first``, ``count``: where those of each group stand. A plain class.
+    """Connections of heads and tails that carry light, group by group. A plain class.
 
-    ``weight``: per colour of the tail what a head makes of it; in monochromatic variants the head's value is in it.
+    Attributes:
+        flat: rows of ``[weight, r, head, tail]``: factor of the tail's light (in monochromatic variants with the
+            head's value), distance in metres, and numbers of the chains.
+        first, count: first row and number of rows of each group (UInt32).
+        most: largest number of rows of a group.
     """
 
     def __init__(self, scene: Any, plan: ChainPlan, heads: VertexTable, starts: VertexTable, area_density: Any) -> None:
@@ -267,13 +290,13 @@ class Links:
         # Of the group that has most.
         self.most = int(dr.max(self.count)[0])
         # A row more, so that there is one: lanes without links load what they do not use.
-        kept = dr.compress(some)
-        self.flat = dr.zeros(mi.Float, 4 * (dr.width(kept) + 1))
-        if dr.width(kept):
-            tail, head = _ends(kept, n)
-            weight, r = dr.gather(mi.Float, weight, kept), dr.gather(mi.Float, r, kept)
+        linked = dr.compress(some)
+        self.flat = dr.zeros(mi.Float, 4 * (dr.width(linked) + 1))
+        if dr.width(linked):
+            tail, head = _ends(linked, n)
+            weight, r = dr.gather(mi.Float, weight, linked), dr.gather(mi.Float, r, linked)
             row = mi.Vector4f(weight, r, mi.Float(head), mi.Float(tail))
-            dr.scatter(self.flat, row, dr.arange(mi.UInt32, dr.width(kept)))
+            dr.scatter(self.flat, row, dr.arange(mi.UInt32, dr.width(linked)))
         dr.eval(self.flat, self.count, self.first)
 
 
@@ -285,7 +308,12 @@ def _ends(lane: Any, size: int) -> tuple[Any, Any]:
 
 
 def area_density(plan: ChainPlan, starts: Vertices) -> Any:
-    """Density per area with which a tail's first vertex is drawn over the hidden area, on its side of the surface."""
+    """Return the density per area of the first vertices of tails that are drawn over the hidden area.
+
+    Args:
+        plan: layout of the chains.
+        starts: the first vertices; the side of the surface counts.
+    """
     per_area = plan.elements.per_area(starts.shape, starts.primitive, starts.p, starts.alive)
     two_sided = scatters_behind(starts.shape.bsdf())
     return per_area * _probability_of_front(plan, starts.p, starts.geometric_n, two_sided)
@@ -309,9 +337,14 @@ _STREAM = 0x6C617465
 
 
 class Tiles:
-    """Groups of scan points that share chains: ``side`` of them along each side of the scan, as far apart as possible.
-    ``of`` (UInt32): tile of each pixel of a film; ``rank`` (UInt32): place of each tile along a curve that keeps
-    neighbours together; ``count``; ``numbers``: ``of`` as numpy. A plain class.
+    """Groups of scan points that share chains. A plain class.
+
+    A tile has ``side`` points along each side of the scan, as far apart as possible.
+
+    Attributes:
+        count: number of tiles.
+        tile_of_pixel: tile of each pixel of a film (UInt32); ``numbers`` is the same as numpy.
+        rank: place of each tile along a curve that keeps neighbours together (UInt32).
     """
 
     def __init__(self, width: int, height: int, side: int) -> None:
@@ -323,14 +356,21 @@ class Tiles:
         places = np.stack([tx, ty, np.zeros_like(tx)], 1)
         rank = np.empty(self.count, dtype=np.uint32)
         rank[morton_order(places, bits=max(1, int(max(across, down) - 1).bit_length()))] = np.arange(self.count)
-        self.of, self.rank = mi.UInt32(self.numbers.astype(np.uint32)), mi.UInt32(rank)
-        dr.make_opaque(self.of, self.rank)
+        self.tile_of_pixel, self.rank = mi.UInt32(self.numbers.astype(np.uint32)), mi.UInt32(rank)
+        dr.make_opaque(self.tile_of_pixel, self.rank)
 
 
 @dataclass
 class LateLaunch:
-    """Launch of ``rows`` rows of pixels from ``first_row`` on of a band, in ``spp`` lanes each (named as the film asks
-    for it): ``pieces`` for each group, of so many links at most. ``listed``: lanes of a pixel stand together.
+    """Launch of some rows of pixels.
+
+    Attributes:
+        band: storage band of the film.
+        first_row, rows: first row of pixels and number of rows.
+        spp: lanes of a pixel, under the name that films read.
+        pieces: lanes of a pixel for each group.
+        links: most links of a lane.
+        listed: the film lists events, and the lanes of a pixel are neighbours.
     """
 
     band: int
@@ -343,13 +383,20 @@ class LateLaunch:
 
 
 class LateLight:
-    """Late light of one capture, of ``lowest`` to ``highest`` bounces (within ``FIRST`` and ``MOST``).
+    """Late light of a capture, from chains. Mono and RGB variants, diffuse surfaces, every film; no derivatives.
 
-    ``job``: a :class:`.launches.ScanJob`; ``elements``: the density of heads, see :func:`.shared_light.late_density`;
-    ``lasers``: the spots, one each of the scan points in confocal captures. ``side``: scan points of a tile
-    along each side of the scan; ``size``: chains of a group, a power of two.
+    Args:
+        job: the scan (:class:`.launches.ScanJob`).
+        elements: density of the heads (:func:`.shared_light.late_density`).
+        lasers: laser spots, in confocal captures one for each scan point.
+        capture: type of the capture.
+        bounces: lowest and highest number of bounces, within ``FIRST`` and ``MOST``.
+        side: scan points of a tile along each side of the scan.
+        size: chains of a group, a power of two.
 
-    Mono and RGB variants, diffuse surfaces, every film. Not supported: derivatives.
+    Raises:
+        SceneError: for other numbers of bounces.
+        UnitError: for other sizes of groups.
     """
 
     def __init__(
@@ -373,12 +420,17 @@ class LateLight:
         self.tiles = Tiles(width, height, side)
 
     def _entries(self, tiles: int) -> int:
-        """Numbers of the largest table of one group."""
+        """Return the number of entries of the largest table of one group."""
         seen_by = self.lasers.width * (self.highest - FIRST + 1) if self.exhaustive else 1
         return tiles * self.group_size * max(self.group_size, seen_by)
 
     def add(self, count: int, seed: Any) -> None:
-        """Add the light of ``count`` chains for each tile, or of some more that fill the last group, to the film."""
+        """Add light to the film.
+
+        Args:
+            count: chains of each tile, rounded up to whole groups.
+            seed: a number, or UInt32 of width one.
+        """
         job, film = self.job, self.job.film
         size = min(self.group_size, 1 << max(0, count - 1).bit_length())
         center = mi.Point3f(*(dr.mean(c) for c in job.sensors.p))
@@ -397,7 +449,7 @@ class LateLight:
                 job.done(last / groups, band)
 
     def _groups_at_once(self) -> int:
-        """So many that all cores have work, and tables stay small."""
+        """Return the number of groups of a block: all cores have work, and tables stay small."""
         lanes = self.job.sensors.width * (self.lasers.width if self.exhaustive else 1)
         wanted = max(1, _BUSY.get(dr.backend_v(mi.Float), _BUSY_GPU) // lanes)
         return max(1, min(wanted, self.plan.groups, _MOST_ENTRIES // self._entries(self.tiles.count)))
@@ -426,20 +478,23 @@ class LateLight:
         if self.exhaustive:
             base = film.pixel_base(base, lanes.laser)
         target = film.create_event_block(launch, base, self.job.match, EVENTS, exclusive=launch.spp == 1)
-        kept = {"L": mi.UnpolarizedSpectrum(0), "before": mi.Float(0), "after": mi.Float(0), "block": target.begin()}
-        kept = sum_over_links(self, part, lanes, target, kept)
-        target.end(kept["block"])
-        film.add_steady(lanes.pixel, self.job.match.to_channels(kept["L"]))
-        film.add_outside(lanes.pixel, kept["before"], kept["after"])
+        sums = {"L": mi.UnpolarizedSpectrum(0), "before": mi.Float(0), "after": mi.Float(0), "block": target.begin()}
+        sums = sum_over_links(self, part, lanes, target, sums)
+        target.end(sums["block"])
+        film.add_steady(lanes.pixel, self.job.match.to_channels(sums["L"]))
+        film.add_outside(lanes.pixel, sums["before"], sums["after"])
         target.finish()
 
 
 class GroupBlock:
-    """Groups ``first`` to ``first + groups`` of all tiles: their links, and how points see heads and tails. A plain
-    class.
+    """Groups ``first`` to ``first + groups`` of all tiles, with their links and visibilities. A plain class.
 
-    ``seen``, ``lit``: ``[g, r]``, of heads and scan points by row of a tile and point (``lit`` of confocal captures as
-    well), of tails and laser spots by chain and spot.
+    Attributes:
+        links: the :class:`Links` of the groups.
+        seen: ``[g, r]`` of heads from scan points, by row of a tile and point: cosines over the squared distance, and
+            distance (metres).
+        lit: likewise of each vertex of tails from laser spots, by chain and spot, in confocal captures by row of a tile
+            and point.
     """
 
     def __init__(self, light: LateLight, first: int, groups: int) -> None:
@@ -468,7 +523,7 @@ class GroupBlock:
         lane = dr.arange(mi.UInt32, (light.tiles.count if by_chain else 1) * self.rows * points.width)
         row = lane // width
         point = lane - row * width
-        chain = row if by_chain else dr.gather(mi.UInt32, light.tiles.of, point) * rows + row
+        chain = row if by_chain else dr.gather(mi.UInt32, light.tiles.tile_of_pixel, point) * rows + row
         p, n, _, _ = points.take(point)
         n = mi.Vector3f(n)
         vertex = vertices.take(chain)
@@ -489,8 +544,10 @@ class GroupBlock:
 
 
 def _in_regions(row: Any, plan: ChainPlan) -> Any:
-    """Number of Sobol's point of a tile's chain. The lowest bits of a number tell which part of the hidden area a head
-    lies in: those of a group are near enough to each other to light the same places.
+    """Return the number of Sobol's point of each chain of a tile.
+
+    The lowest bits of a number are a part of the hidden area for the head: the heads of a group lie near each other and
+    light the same places.
     """
     regions = 1 << _REGIONS
     if plan.groups % regions:
@@ -502,7 +559,7 @@ def _in_regions(row: Any, plan: ChainPlan) -> Any:
 
 
 class LateLanes:
-    """Data of the lanes of a launch: constants of the loop, a plain object."""
+    """Data of the lanes of a launch: constants of the loop. A plain class."""
 
     def __init__(self, light: LateLight, part: GroupBlock, launch: LateLaunch) -> None:
         job, lasers = light.job, light.lasers
@@ -512,7 +569,7 @@ class LateLanes:
         _, _, spot_value, spot_leg = lasers.take(spot)
         self.factor = value * job.energy * spot_value
         self.opl = leg + spot_leg - job.film.start_opl
-        tile = dr.gather(mi.UInt32, light.tiles.of, self.pixel)
+        tile = dr.gather(mi.UInt32, light.tiles.tile_of_pixel, self.pixel)
         tile_group = tile * dr.opaque(mi.UInt32, part.groups) + group
         first = dr.gather(mi.UInt32, part.links.first, tile_group)
         end = first + dr.gather(mi.UInt32, part.links.count, tile_group)
@@ -544,24 +601,24 @@ class LateLanes:
 
 
 def divmod_by(number: Any, divisor: int) -> tuple[Any, Any]:
-    """Return (quotient, rest) of whole numbers, divided by a number in memory."""
+    """Return quotient and rest of whole numbers; the divisor is kept in memory, not in the kernel."""
     by = dr.opaque(mi.UInt32, divisor)
     quotient = number // by
     return quotient, number - quotient * by
 
 
 @dr.syntax
-def sum_over_links(light, part, lanes, target, kept):
-    """Splat the light of each lane's links."""
+def sum_over_links(light, part, lanes, target, sums):
+    """Add the light of each lane's links to the film's block ``target`` and to ``sums``."""
     k = mi.UInt32(lanes.first)
     while dr.hint(k < lanes.last, label="links"):
-        deposit(light, part, lanes, target, kept, k)
+        deposit(light, part, lanes, target, sums, k)
         k += 1
-    return kept
+    return sums
 
 
-def deposit(light, part, lanes, target, kept, k):
-    """Splat the events of one link."""
+def deposit(light, part, lanes, target, sums, k):
+    """Add the events of link ``k``."""
     link = dr.gather(mi.Vector4f, part.links.flat, k)
     head, tail = mi.UInt32(link.z), mi.UInt32(link.w)
     seen = dr.gather(mi.Vector2f, part.seen, (head - lanes.offset) * lanes.stride + lanes.pixel)
@@ -580,7 +637,7 @@ def deposit(light, part, lanes, target, kept, k):
         value = factor * g
         if part.colours > 1:
             value = value * dr.gather(mi.UnpolarizedSpectrum, vertices.value, tail)
-        kept["L"] = kept["L"] + dr.select(active, value, 0)
-        before, after = target.put(kept["block"], opl, value, active)
-        kept["before"] = kept["before"] + before
-        kept["after"] = kept["after"] + after
+        sums["L"] = sums["L"] + dr.select(active, value, 0)
+        before, after = target.put(sums["block"], opl, value, active)
+        sums["before"] = sums["before"] + before
+        sums["after"] = sums["after"] + after

@@ -1,4 +1,4 @@
-"""The kernel launches of a capture: which pixels, which samples, how many lanes a pixel."""
+"""Kernel launches of a capture: pixels, samples, and lanes of each pixel."""
 
 from __future__ import annotations
 
@@ -23,8 +23,17 @@ EVENTS = 16
 
 @dataclass
 class Launch:
-    """Launch of ``rows`` rows of pixels from ``first_row`` on in one storage band, samples ``first`` to ``last``
-    (exclusive), in ``spp`` lanes each (named as the film asks for it).
+    """Launch of some rows of pixels and some samples.
+
+    Attributes:
+        band: storage band of the film.
+        first_row, rows: first row of pixels and number of rows.
+        spp: lanes of a pixel, under the name that films read.
+        width: pixels of a row.
+        band_first_row: first row of the band.
+        first, last: range of the samples, ``last`` exclusive.
+        most_events: most events that a lane puts onto the film.
+        lists_events: the film lists events, and the lanes of a pixel are neighbours.
     """
 
     band: int
@@ -40,11 +49,11 @@ class Launch:
 
     @property
     def chunks(self) -> int:
-        """Lanes of a pixel."""
+        """Number of lanes of a pixel."""
         return self.spp
 
     def lanes(self) -> tuple[Any, Any, Any]:
-        """Pixel of every lane, its first sample and the last one (exclusive), ``UInt32``."""
+        """Return pixel, first sample and last sample (exclusive) of each lane, ``UInt32``."""
         pixels = self.width * self.rows
         lane = dr.arange(mi.UInt32, pixels * self.chunks)
         if self.chunks == 1:
@@ -65,14 +74,14 @@ class Launch:
         return pixel + dr.opaque(mi.UInt32, self.first_row * self.width), first, last
 
     def base(self, film: Any, pixel: Any) -> Any:
-        """Index of the first value of each lane's pixel in its band."""
+        """Return the index of the first value of each lane's ``pixel`` in the band of the film."""
         base = (pixel - dr.opaque(mi.UInt32, self.band_first_row * self.width)) * film.entries_per_pixel()
         entry = film.first_entry()
         return base if entry is None else base + entry
 
 
-def launches_of(film: Any, points: int, samples: int) -> list[Launch]:
-    """The launches that bring ``samples`` samples to ``points`` scan points."""
+def launches_of(film: Any, samples: int) -> list[Launch]:
+    """Return the launches of ``samples`` samples for each pixel of a film."""
     width = int(film.crop_size()[0])
     most = film.lanes_at_most(EVENTS)
     found = []
@@ -85,7 +94,7 @@ def launches_of(film: Any, points: int, samples: int) -> list[Launch]:
 
 
 def _with_sums(band: int, first_row: int, rows: int, width: int, samples: int) -> list[Launch]:
-    """A lane for each pixel, several where there are few."""
+    """Return launches with a lane for each pixel, or several if there are few pixels."""
     busy = _BUSY.get(dr.backend_v(mi.Float), _BUSY_GPU)
     pixels = width * rows
     block = min(samples, max(1, _CONNECTIONS // pixels))
@@ -97,7 +106,7 @@ def _with_sums(band: int, first_row: int, rows: int, width: int, samples: int) -
 
 
 def _with_events(band: int, band_first: int, rows: int, width: int, samples: int, most: int) -> list[Launch]:
-    """Lanes of ``EVENTS`` samples each, at most ``most`` of them in a launch."""
+    """Return launches with lanes of ``EVENTS`` samples each, at most ``most`` lanes in a launch."""
     chunks = min(-(-samples // EVENTS), max(1, most // width))
     at_once = max(1, most // (width * chunks))
     found = []
@@ -115,10 +124,19 @@ def _with_events(band: int, band_first: int, rows: int, width: int, samples: int
 
 
 class ScanJob:
-    """Job of a scan. ``film``: one with a pixel for each scan point, row by row, on which ``prepare`` was called (and
-    ``finish_render`` will be): light is added to what it holds. ``sensors``: the scan points; ``energy`` (J, a number
-    or an ``UnpolarizedSpectrum``): of the laser, by colour. ``scene``: everything that can stand in the way, the wall
-    too. ``progress(fraction)`` is called after every kernel launch. Raises SceneError, ShapeError, VariantError.
+    """Render of a scan onto a film, whose light is added to.
+
+    Args:
+        scene: everything that can stand in the way, the wall too.
+        film: film with a pixel for each scan point, row by row; between its ``prepare`` and ``finish_render``.
+        sensors: the scan points.
+        energy: energy of the laser by colour (J), a number or an ``UnpolarizedSpectrum``.
+        progress: function of the fraction that is done, called after every launch; or None.
+
+    Raises:
+        VariantError: in spectral and polarized variants.
+        ShapeError: for another number of scan points.
+        SceneError: for a film that no render was started on.
     """
 
     def __init__(self, scene: Any, film: Any, sensors: WallPoints, energy: Any = 1.0, progress: Any = None) -> None:
@@ -146,7 +164,7 @@ class ScanJob:
         self.progress = progress
 
     def done(self, fraction: float, band: int) -> None:
-        """Run what is recorded."""
+        """Evaluate what was added to a ``band`` of the film, and report the ``fraction`` of the job."""
         dr.eval(self.film.bands[band][2], self.film.steady, self.film.outside)
         if self.progress:
             dr.sync_thread()

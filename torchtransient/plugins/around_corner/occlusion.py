@@ -28,6 +28,7 @@ from typing import Any, ClassVar
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins.around_corner.late_light import FIRST
 from torchtransient.plugins.around_corner.outline_table import OutlineTable
 from torchtransient.plugins.integrators.job import Pass
 from torchtransient.plugins.polarized import (
@@ -58,36 +59,42 @@ from torchtransient.plugins.transport.walk import first_leg
 BESIDE, BEFORE = 1e-4, 1e-5
 # Cosines under which a surface is seen edge-on.
 EDGE_ON = 1e-4
-BOUNCES = 3
 
 
 class MutualOcclusion:
-    """The boundary term of a job, to be added by ``backward`` or ``forward``.
+    """Boundary term of a job of derivatives in light of three bounces, added by ``backward`` or ``forward``.
 
-    ``integrator``: of the job, for its primary rays; ``edges``: where outlines can be; ``spots``: the connection to the
-    laser's spots; ``jobs``: launches with as many edge samples a pixel and viewpoint as they say. All lanes of a launch
-    are one kernel without a loop, whose memory does not grow with their number.
+    Hidden surfaces scatter by their BSDF's smooth lobes. A launch is one kernel without a loop, whose memory does not
+    grow with the number of lanes.
 
-    Light of three bounces alone; hidden surfaces scatter by their BSDF's smooth lobes.
+    Args:
+        integrator: integrator of the job, which draws primary rays.
+        context: context of the job.
+        sensor, film: sensor and film of the job.
+        edges: edges that can be outlines.
+        spots: connection to the laser's spots.
+        jobs: launches (:class:`~..integrators.job.Pass`), whose ``spp`` are edge samples of a pixel and viewpoint.
     """
 
     can_be_recorded = False
 
-    def __init__(self, integrator: Any, world: Any, sensor: Any, film: Any, edges: OutlineTable, spots: Any, jobs: Any):
-        self.integrator, self.world, self.sensor, self.film = integrator, world, sensor, film
+    def __init__(
+        self, integrator: Any, context: Any, sensor: Any, film: Any, edges: OutlineTable, spots: Any, jobs: Any
+    ) -> None:
+        self.integrator, self.context, self.sensor, self.film = integrator, context, sensor, film
         self.edges, self.spots, self.jobs = edges, spots, jobs
 
     def tables(self) -> list[Any]:
-        """Arrays computed from the scene's parameters."""
+        """Return the attached arrays that were computed from the scene's parameters."""
         return [end for end in self.edges.ends if dr.grad_enabled(end)]
 
     # ------------------------------------------------------------------------------------------ both modes
 
     def backward(self, incoming: Any) -> None:
-        """Accumulate into the attached parameters; ``incoming``: the film's adjoint."""
+        """Add gradients to the attached parameters; ``incoming``: the film's adjoint."""
         for job in self.jobs:
             rays = self._start(job)
-            match = self.integrator.channel_match(self.world.contents, self.film, rays)
+            match = self.integrator.channel_match(self.context.contents, self.film, rays)
             _, pixel = self.integrator.pixel_indices(self.film, job, rays)
             block = incoming.block(rays, pixel, match)
             with dr.resume_grad():
@@ -100,11 +107,11 @@ class MutualOcclusion:
             dr.eval()
 
     def forward(self) -> None:
-        """Add to the film, along the tangents of the tables and of the scene."""
+        """Add the derivative along the tangents of tables and scene to the film."""
         film = self.film
         for job in self.jobs:
             rays = self._start(job)
-            match = self.integrator.channel_match(self.world.contents, film, rays)
+            match = self.integrator.channel_match(self.context.contents, film, rays)
             base, pixel = self.integrator.pixel_indices(film, job, rays)
             block = film.create_event_block(job, base, match, 2, tangents=True)
             with dr.resume_grad():
@@ -121,23 +128,24 @@ class MutualOcclusion:
             dr.eval(film.bands[job.band][2], film.steady)
 
     def _array(self, rays: Any, pixel: Any) -> Any:
-        """Number of the array of the film that each sample belongs to: of a pixel, or of a pixel and a laser spot."""
+        """Return the number of each sample's array of the film: of a pixel, or of a pixel and a laser spot."""
         return pixel if rays.laser is None else pixel * self.film.laser_count() + rays.laser
 
     def _start(self, job: Pass) -> Any:
-        world = self.world
-        rays = self.integrator.start(world.scene, world.contents, self.sensor, self.film, job)
-        world.start(rays)
+        context = self.context
+        rays = self.integrator.start(context.scene, context.contents, self.sensor, self.film, job)
+        context.start(rays)
         return rays
 
     # --------------------------------------------------------------------------------------------- the terms
 
     def _terms(self, rays: Any, pixel: Any, job: Pass) -> list[Local]:
-        """One term for each viewpoint: ``value`` (detached), ``outwards`` (attached), both zero where none is
-        ``active``, and ``opl``.
+        """Return a term for each viewpoint: ``value`` (detached), ``outwards`` (attached), ``opl`` and ``active``.
+
+        Values are zero in lanes that are not active.
         """
-        world, ray = self.world, rays.ray
-        leg = rays.leg if rays.leg is not None else world.scene.ray_intersect_preliminary(ray, coherent=True)
+        context, ray = self.context, rays.ray
+        leg = rays.leg if rays.leg is not None else context.scene.ray_intersect_preliminary(ray, coherent=True)
         seen = leg.compute_surface_interaction(ray, mi.RayFlags.All)
         found = seen.is_valid()
         spot = self.spots.general_spot(ray.wavelengths, found)
@@ -148,7 +156,7 @@ class MutualOcclusion:
         )  # fmt: skip
         with dr.suspend_grad():
             place.before = self.integrator.first_opl(self.film, rays)
-            if not world.camera_unwarp:
+            if not context.camera_unwarp:
                 place.before += mi.Float64(dr.norm(seen.p - ray.o) * rays.η)
             place.before += mi.Float64(spot.leg)
         edge = self._edge_point(pixel, job)
@@ -158,8 +166,8 @@ class MutualOcclusion:
         return views
 
     def _edge_point(self, pixel: Any, job: Pass) -> Local:
-        """A point of an edge: ``p`` (attached), ``t`` (the edge's direction), ``sides`` (third corners of its faces),
-        ``weight`` (one over the density by length).
+        """Draw a point of an edge: ``p`` (attached), ``t`` (direction of the edge), ``sides`` (third corners of its
+        faces), ``weight`` (one over the density by length).
         """
         lane = dr.arange(mi.UInt32, dr.width(pixel))
         number = lane - lane // dr.opaque(mi.UInt32, job.spp) * dr.opaque(mi.UInt32, job.spp)
@@ -175,8 +183,8 @@ class MutualOcclusion:
         return Local(p=p, t=along / length, sides=sides, weight=length * per_edge)
 
     def _term(self, place: Local, edge: Local, from_spot: bool) -> Local:
-        """The boundary term of one viewpoint."""
-        scene = self.world.scene
+        """Return the boundary term of one viewpoint."""
+        scene = self.context.scene
         viewer, Q = (place.lit, place.lit_at) if from_spot else (place.seen, place.seen_at)
         with dr.suspend_grad():
             d = edge.p - viewer.p
@@ -211,7 +219,7 @@ class MutualOcclusion:
     def _light(self, place: Local, si: Any, from_spot: bool, active: Any) -> tuple[Any, Any, Any]:
         """Return (light by way of a hidden point per solid angle around the viewpoint, arrival, which lanes have some).
         """
-        world, seen, lit = self.world, dr.copy(place.seen), place.lit
+        context, seen, lit = self.context, dr.copy(place.seen), place.lit
         to_hidden, to_spot = si.p - seen.p, lit.p - si.p
         r_seen, r_spot = dr.norm(to_hidden), dr.norm(to_spot)
         d_seen, d_spot = to_hidden / r_seen, to_spot / r_spot
@@ -224,7 +232,7 @@ class MutualOcclusion:
         # The cosine towards the spot is in the BSDF's value.
         measure = dr.rcp(dr.square(r_spot)) if not from_spot else cos_seen / (cos_spot * dr.square(r_seen))
         opl = place.before + mi.Float64((r_seen + r_spot) * place.η)
-        active = world.counted(active, opl)
+        active = context.counted(active, opl)
         return value * measure, opl, active
 
     def _seen_otherwise(self, other: Any, viewer: Any, si: Any, d: Any, active: Any) -> Any:
@@ -235,16 +243,16 @@ class MutualOcclusion:
         """
         hidden = dr.copy(si)
         hidden.p = mi.Point3f(viewer.p + d * (dr.dot(si.n, si.p - viewer.p) / dr.dot(si.n, d)))
-        tests = [self.world.scene.ray_test(at.spawn_ray_to(other.p), active) for at in (si, hidden)]
+        tests = [self.context.scene.ray_test(at.spawn_ray_to(other.p), active) for at in (si, hidden)]
         return sum(dr.select(hit, mi.Float(0), 0.5) for hit in tests)
 
     def _scattered(self, si: Any, into: Any, out: Any, active: Any) -> Any:
-        """Value of the BSDF between the frames of the segments: the ray of direction ``into`` goes on by ``out``."""
+        """Return the BSDF's value for a ray of direction ``into`` that goes on by ``out``, in the segments' frames."""
         si.wi = si.to_local(-into)
         wo = si.to_local(out)
         bsdf = si.bsdf()
         value = bsdf.eval(mi.BSDFContext(), si, wo, active)
-        value = self.world.scattering.correct_two_sided(self.world, bsdf, si, wo, value)
+        value = self.context.scattering.correct_two_sided(self.context, bsdf, si, wo, value)
         return rotate_mueller(value, rotation_to_sensor(si, into), rotation_from_light(si, wo, out))
 
 
@@ -259,28 +267,26 @@ class MutualOcclusion:
 # the last one are found the other way round (:class:`SpotPass`): a path begins at L, past an edge, and is connected to
 # S.
 
-# The fewest bounces of late light.
-FIRST = 4
-
 
 class SpotPass(BoundaryPass):
-    """Boundary pass that draws an edge point seen from the laser's spot, as :class:`VertexPass` does, and follows a
-    path behind it to the scanned point.
+    """Boundary pass from the laser's spot: an edge point, and behind it a path that is connected to the scanned point.
+
+    :class:`VertexPass` does the same from vertices of paths that begin at the sensor.
     """
 
     @staticmethod
-    def exists(world: Any, sensor: Any) -> bool:
+    def exists(context: Any, sensor: Any) -> bool:
         """Return whether there is light past edges that the spot sees."""
-        return bool(world.max_depth >= FIRST)
+        return bool(context.max_depth >= FIRST)
 
     def run(self, mode: Any, job: Any) -> Any:
         term = mode.term
-        world, edges, (spots,) = term.world, term.edges, term.world.connections
-        rays = term.integrator.start(world.scene, world.contents, term.sensor, term.film, job)
-        world.start(rays)
+        context, edges, (spots,) = term.context, term.edges, term.context.connections
+        rays = term.integrator.start(context.scene, context.contents, term.sensor, term.film, job)
+        context.start(rays)
         view, sampler, ray = mode.view(rays), rays.sampler, dr.detach(rays.ray)
         η = dr.detach(rays.η)
-        seen = first_leg(world, sampler, ray, rays.leg).compute_surface_interaction(ray, mi.RayFlags.All)
+        seen = first_leg(context, sampler, ray, rays.leg).compute_surface_interaction(ray, mi.RayFlags.All)
         spot = spots.general_spot(ray.wavelengths, seen.is_valid())
         L, active = spot.p, seen.is_valid() & spot.valid
         term.to_scan.look_at(seen, ray)
@@ -297,16 +303,16 @@ class SpotPass(BoundaryPass):
         way = b.beside - L
         end = Local(p=b.beside, d=dr.normalize(way), dist=dr.norm(way))
         active = b.valid & (most > 0) & dr.isfinite(most)
-        active, _ = world.segment.transmittance(world, Local(at=spot.si), end, sampler.next_2d(), sampler, active)
+        active, _ = context.segment.transmittance(context, Local(at=spot.si), end, sampler.next_2d(), sampler, active)
         # A throughput that is handed to roulette is no larger than one.
         β = dr.select(active, light * dr.select(most > 0, dr.rcp(most), 0), 0)
         factor = most * b.sin * b.inv_pdf / dr.square(b.dist)
-        past = past_edge(world, b, ray, None, β, sampler, active)
+        past = past_edge(context, b, ray, None, β, sampler, active)
         with dr.resume_grad():
             v_L = displacement(dr.gather(mi.Point3f, spots.spots.si.p, spots.index, active), active)
-            speeds = sides_from(world, b, edges, v_L, behind(world, b, *past, active), mi.Float(0), active)
+            speeds = sides_from(context, b, edges, v_L, behind(context, b, *past, active), mi.Float(0), active)
         τ = term.integrator.first_opl(term.film, rays) + mi.Float64(spot.leg)
-        if not world.camera_unwarp:
+        if not context.camera_unwarp:
             τ += mi.Float64(dr.norm(seen.p - ray.o) * η)
         # The spot is the vertex before the first one.
         first = {
@@ -314,12 +320,14 @@ class SpotPass(BoundaryPass):
             "medium": None,
         }  # fmt: skip
         needed = None, mi.Bool(True)
-        return both_sides(term.light_world, mode, sampler, view, b, past, first, factor, speeds, needed)
+        return both_sides(term.light_context, mode, sampler, view, b, past, first, factor, speeds, needed)
 
 
 class ScanSampled(Connection):
-    """Connection of a path from the laser's spot to the scanned point; the way from there to the sensor has been
-    counted. As in :class:`LaserSpot`, an event's depth is its number of bounces.
+    """Connection of a path that began at the laser's spot to the scanned point.
+
+    Its length has the way from there to the sensor already. As in :class:`LaserSpot`, an event's depth is its number of
+    bounces.
     """
 
     name = "scan_sampled"
@@ -329,8 +337,8 @@ class ScanSampled(Connection):
         """Set the scanned points (SurfaceInteraction3f) of a launch, and the rays of the sensor that see them."""
         self.seen, self.ray = seen, ray
 
-    def propose(self, world: Any, path: Any, vertex: Any, sampler: Any) -> Proposal:
-        active = world.deep_enough(vertex.goes_on & vertex.connectable, path.depth + 2)
+    def propose(self, context: Any, path: Any, vertex: Any, sampler: Any) -> Proposal:
+        active = context.deep_enough(vertex.goes_on & vertex.connectable, path.depth + 2)
         to = self.seen.p - vertex.at.p
         dist = dr.norm(to)
         active &= dist > 0
@@ -339,7 +347,7 @@ class ScanSampled(Connection):
         ds = Local(p=self.seen.p, n=self.seen.n, d=d, dist=dist, delta=mi.Bool(True), emitter=None)
         return Proposal(d=d, active=active, ds=ds, u=mi.Point2f(0), sampler=sampler)
 
-    def connect(self, world: Any, path: Any, vertex: Any, proposal: Any, answer: Any, zeros: bool) -> Event:
+    def connect(self, context: Any, path: Any, vertex: Any, proposal: Any, answer: Any, zeros: bool) -> Event:
         ds, active = proposal.ds, proposal.active
         seen = dr.copy(self.seen)
         seen.wi = seen.to_local(-self.ray.d)
@@ -347,42 +355,42 @@ class ScanSampled(Connection):
         value = product(vertex.β, product(answer.matrix, at_wall)) * dr.select(active, dr.rcp(dr.square(ds.dist)), 0)
         active &= dr.max(dr.abs(value)) > 0
         opl = vertex.scattered_τ + mi.Float64(ds.dist * vertex.η * answer.eta)
-        active = world.counted(active, opl)
-        active, _ = world.segment.transmittance(world, vertex, ds, proposal.u, proposal.sampler, active)
+        active = context.counted(active, opl)
+        active, _ = context.segment.transmittance(context, vertex, ds, proposal.u, proposal.sampler, active)
         return Event(value=value, opl=opl, active=active, depth=path.depth + 2)
 
 
 class LateOutlines(BoundaryTerm):
-    """The boundary term of one job in light of ``FIRST`` and more bounces.
+    """Boundary term of a job of derivatives in light of ``FIRST`` and more bounces.
 
     Args:
-        integrator, world, sensor, film, seed, samples: as of :class:`BoundaryTerm`; ``world`` is that of the job.
+        integrator, context, sensor, film, seed, samples: as of :class:`BoundaryTerm`; ``context`` is that of the job.
     """
 
     can_be_recorded = False
     kinds: ClassVar[dict[str, Any]] = {"vertex": VertexPass, "spot": SpotPass}
 
-    def __init__(self, integrator: Any, world: Any, sensor: Any, film: Any, seed: Any, samples: int) -> None:
-        (spots,) = world.connections
+    def __init__(self, integrator: Any, context: Any, sensor: Any, film: Any, seed: Any, samples: int) -> None:
+        (spots,) = context.connections
         settings = integrator.settings()
         self.settings = replace(settings, min_depth=max(FIRST, settings.min_depth))
-        _, scattering, _ = integrator.strategies(world.contents, spots.table)
+        _, scattering, _ = integrator.strategies(context.contents, spots.table)
         spots = LaserSpot(spots.table, spots.confocal, spots.legs)
         # Paths begin behind edges.
         spots.dark_at_first = False
         strategies = MaterialVacuum(), scattering, [spots]
-        late = RenderContext(world.scene, world.contents, self.settings, strategies, world.wanted, world.window)
+        late = RenderContext(context.scene, context.contents, self.settings, strategies, context.wanted, context.window)
         super().__init__(integrator, late, sensor, film, seed, samples, tuple(self.kinds))
 
-    def _light_world(self) -> RenderContext:
-        """The world of paths that start at the spot and are connected to the scanned point."""
-        world = self.world
-        scattering = Lambertian() if Lambertian.fits(world.contents) else Surface()
+    def _light_context(self) -> RenderContext:
+        """Return the context of paths that start at the spot and are connected to the scanned point."""
+        context = self.context
+        scattering = Lambertian() if Lambertian.fits(context.contents) else Surface()
         if self.has_vertex_normals:
             scattering = FromLight(scattering)
         self.to_scan = ScanSampled()
         strategies = MaterialVacuum(), scattering, [self.to_scan]
-        return RenderContext(world.scene, world.contents, self.settings, strategies, None, world.window)
+        return RenderContext(context.scene, context.contents, self.settings, strategies, None, context.window)
 
     def tables(self) -> list[Any]:
-        return [*super().tables(), *(table for table in self.world.tables() if dr.grad_enabled(table))]
+        return [*super().tables(), *(table for table in self.context.tables() if dr.grad_enabled(table))]

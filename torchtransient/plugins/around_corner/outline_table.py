@@ -1,4 +1,4 @@
-"""Edges of meshes at which one thing may begin to hide another: where outlines can be, seen from points of a wall.
+"""Edges of meshes that can be outlines seen from points of a wall, where one thing begins to hide another.
 
 An edge of one face is an outline from everywhere; one of two faces is one from where both are seen on the same side of
 it, which a flat crease never is. Laid out with numpy, outside of kernels.
@@ -24,10 +24,14 @@ DEFENSIVE = 0.1
 
 @dataclass
 class Edges:
-    """Edges of some faces, ``E`` of them: ``ends`` (E, 2) and ``sides`` (E, 2), numbers of vertices; ``mesh`` (E,),
-    that of the ends. ``sides``: the third corners of the two outermost faces, twice the same where there is one.
-    ``share`` (E,): an edge at which several meshes meet is listed for each of them, with shares that sum to one.
-    ``closed``: no edge has a single face.
+    """Edges of some faces.
+
+    Attributes:
+        ends: numbers of vertices, (E, 2).
+        sides: third corners of the two outermost faces, twice the same for a single face, (E, 2).
+        mesh: number of the mesh of the ends, (E,).
+        share: weight of the edge, (E,): one where several meshes meet is listed for each, with weights that sum to one.
+        closed: no edge has a single face.
     """
 
     ends: np.ndarray
@@ -38,7 +42,7 @@ class Edges:
 
     @staticmethod
     def from_faces(triangles: Triangles, faces: np.ndarray) -> Edges:
-        """The edges that can be outlines of some faces (F,), given by their numbers."""
+        """Return the edges that can be outlines of some faces, given by their numbers (F,)."""
         corners = triangles.faces[faces]
         key, proper = edge_keys(triangles.joined[faces])
         mesh = np.repeat(triangles.mesh[faces], 3)
@@ -68,7 +72,7 @@ class Edges:
 
 
 def _across(v: np.ndarray, ends: np.ndarray, sides: np.ndarray) -> np.ndarray:
-    """Unit vectors ``(E, 3)`` in faces, across their edges, away from them."""
+    """Return unit vectors (E, 3) in faces, across their edges and away from them."""
     t = v[ends[:, 1]] - v[ends[:, 0]]
     h = v[sides] - v[ends[:, 0]]
     h = h - t * ((h * t).sum(1) / (t * t).sum(1))[:, None]
@@ -76,8 +80,9 @@ def _across(v: np.ndarray, ends: np.ndarray, sides: np.ndarray) -> np.ndarray:
 
 
 def _outermost(v: np.ndarray, ends: np.ndarray, around: np.ndarray) -> np.ndarray | None:
-    """Return the two of several faces at an edge that bound the widest gap, None where it is no wider than half a turn:
-    no plane through the edge leaves all faces on one side then.
+    """Return the third corners of the two faces at an edge that bound the widest gap.
+
+    None for a gap of at most half a turn: no plane through the edge leaves all faces on one side then.
     """
     h = _across(v, np.repeat(ends[None], len(around), 0), around)
     t = v[ends[1]] - v[ends[0]]
@@ -92,8 +97,12 @@ def _outermost(v: np.ndarray, ends: np.ndarray, around: np.ndarray) -> np.ndarra
 
 
 class OutlineTable:
-    """Some edges of ``triangles`` with a density along them, and their attached ends. ``viewpoints`` and ``normals``
-    ``(P, 3)``: points that see them, some of the wall.
+    """Edges with a density along them, and their ends, attached to the meshes.
+
+    Args:
+        triangles: triangles of the meshes.
+        edges: edges of some parts.
+        viewpoints, normals: points of the wall that see the edges, and their normals, (P, 3).
 
     The probability of an edge is the root mean square over the viewpoints of what it spans there over the square of
     the distance, times the cosine at the viewpoint, zero from where it is no outline; mixed with plain length.
@@ -120,12 +129,12 @@ class OutlineTable:
         dr.eval(self.ends, self._sides, self._share)
 
     def sample(self, x: Any) -> tuple[Any, Any]:
-        """Number of an edge for a ``Float64`` in [0, 1), and one over its probability, times its share."""
+        """Return the number of an edge, and its share over its probability; ``x``: Float64 in [0, 1)."""
         index, p = self._distribution.sample_pmf(dr.minimum(mi.Float(x), dr.one_minus_epsilon(mi.Float)))
         return index, dr.gather(mi.Float, self._share, index) / p
 
     def end_points(self, index: Any) -> list[Any]:
-        """The ends (Point3f) of edges, attached where gradients are not suspended."""
+        """Return the ends (Point3f) of edges, attached where gradients are not suspended."""
         return [dr.gather(mi.Point3f, end, index) for end in self.ends]
 
     def third_corners(self, index: Any) -> list[Any]:
@@ -134,7 +143,7 @@ class OutlineTable:
 
 
 def _attached(triangles: Triangles, mesh: np.ndarray, vertices: np.ndarray) -> Any:
-    """Vertices, given by their numbers and in the order of their meshes, as one Point3f."""
+    """Return vertices as one Point3f, by numbers in the order of their meshes."""
     points = []
     for number in np.unique(mesh):
         rows = (vertices[mesh == number] - triangles.first[number]).astype(np.uint32)
@@ -143,7 +152,7 @@ def _attached(triangles: Triangles, mesh: np.ndarray, vertices: np.ndarray) -> A
 
 
 def _weights(p: np.ndarray, viewpoints: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Weights (E,) of edges with ends and sides ``p`` (E, 4, 3)."""
+    """Return weights (E,) of edges; ``p``: their ends and sides, (E, 4, 3)."""
     blocks = [_weights_of_some(p[i : i + BLOCK], viewpoints, normals) for i in range(0, len(p), BLOCK)]
     return np.concatenate(blocks)
 
@@ -182,10 +191,14 @@ STEPS = 64
 
 @dataclass
 class Part:
-    """A connected piece of meshes, or a whole shape without triangles (``edges`` None).
+    """Connected piece of meshes, or a whole shape without triangles.
 
-    ``shapes``: numbers in the list of shapes; ``corners`` (K, 3): points whose convex hull holds it; ``planes`` (M, 3):
-    normals of planes that may part it from others; ``hides_itself``: it is not known to be flat, or convex and closed.
+    Attributes:
+        shapes: numbers in the list of shapes.
+        corners: points whose convex hull holds the part, (K, 3).
+        planes: normals of planes that may separate it from others, (M, 3).
+        hides_itself: the part is not known to be flat, or convex and closed.
+        edges: edges of the faces, None without triangles.
     """
 
     shapes: frozenset[int]
@@ -196,7 +209,10 @@ class Part:
 
 
 def parts_of(shapes: list[Any]) -> tuple[list[Part], Triangles]:
-    """The parts of all shapes, and the triangles of the meshes. Of very many pieces those of a mesh count as one."""
+    """Return the parts of all shapes, and the triangles of the meshes.
+
+    With more than ``MOST_PARTS`` pieces each mesh is one part.
+    """
     numbers = [k for k, shape in enumerate(shapes) if shape.is_mesh()]
     triangles = Triangles.from_meshes([shapes[k] for k in numbers])
     label = triangles.parts()
@@ -218,7 +234,7 @@ def _part_of_bounds(number: int, shape: Any) -> Part:
 
 
 def _box(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """The corners ``(8, 3)`` of a box."""
+    """Return the corners (8, 3) of a box."""
     return np.array([[(low, high)[i >> axis & 1][axis] for axis in range(3)] for i in range(8)])
 
 

@@ -10,8 +10,10 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient.errors import GradientWarning
+from torchtransient.plugins.around_corner.division import BOUNCES
 from torchtransient.plugins.around_corner.geometry import front_normal
-from torchtransient.plugins.around_corner.occlusion import BOUNCES, FIRST, LateOutlines, MutualOcclusion
+from torchtransient.plugins.around_corner.late_light import FIRST
+from torchtransient.plugins.around_corner.occlusion import LateOutlines, MutualOcclusion
 from torchtransient.plugins.around_corner.outline_table import OutlineTable, Part, hiding_pairs, parts_of
 from torchtransient.plugins.integrators.job import passes_of, seed_array
 from torchtransient.plugins.kernel_arrays import registry_number
@@ -31,14 +33,22 @@ _SEED = 0x85EBCA6B
 
 
 def follows_outlines(segment: type, contents: Any) -> bool:
-    """Return whether outlines are followed in derivatives: where hidden points are points of their shapes
-    (``segment``), and nothing scatters late.
+    """Return whether derivatives follow outlines.
+
+    Args:
+        segment: class of the job's segments; with material ones hidden points follow their shapes.
+        contents: contents of the scene, in which nothing may scatter with a delay.
     """
     return issubclass(segment, MaterialVacuum) and contents.delays is None
 
 
 def silhouettes(scene: Any, least: int, most: int) -> MovingEdges:
-    """Return what derivatives of light of ``least`` to ``most`` bounces lack where outlines are followed."""
+    """Return what derivatives lack where outlines are followed.
+
+    Args:
+        scene: built scene.
+        least, most: numbers of bounces that are rendered.
+    """
     words, always, bent = [], [], []
     if least <= BOUNCES <= most:
         alone = "" if most == BOUNCES else "in light of three bounces "
@@ -54,8 +64,12 @@ def silhouettes(scene: Any, least: int, most: int) -> MovingEdges:
 
 
 class Viewpoints:
-    """Viewpoints of the hidden shapes: the scanned points and the laser's spots, ``p, n`` (P, 3), of
-    the former and of the latter; ``shapes``: registry numbers of what they lie on.
+    """Viewpoints that hidden shapes are seen from: scanned points, then the laser's spots unless confocal.
+
+    Attributes:
+        p, n: places, and normals towards the viewer, (P, 3).
+        references: numbers of the viewpoints that a density of edges is made for.
+        shapes: registry numbers of the shapes that the viewpoints lie on.
     """
 
     def __init__(self, scanned: Any, spots: Any, confocal: bool) -> None:
@@ -71,7 +85,7 @@ class Viewpoints:
 
 
 def _visible(si: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Places, normals towards the viewer and shapes of those interactions that hit something."""
+    """Return places, normals towards the viewer and shapes of the valid interactions."""
     valid = np.array(si.is_valid())
     n = front_normal(si)
     n = dr.select(si.wi.z < 0, -n, n)
@@ -80,25 +94,29 @@ def _visible(si: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def mutual_occlusion(
-    integrator: Any, world: Any, sensor: Any, film: Any, seed: Any, spp: int, scanned: Any
+    integrator: Any, context: Any, sensor: Any, film: Any, seed: Any, spp: int, scanned: Any
 ) -> MutualOcclusion | None:
-    """The boundary term of a job, None where nothing that moves can change what hides what, or where outlines are not
-    followed.
+    """Return the boundary term of a job of derivatives in light of three bounces, None if it is zero or not followed.
 
-    ``scanned``: preliminary intersections of the scanned points. ``spp``: of the job, 0 for the sampler's own; there
-    is an edge sample for every ``SHARE`` paths. Warns where something that has no edges may hide another thing.
+    Warns of shapes without edges that may hide another one.
+
+    Args:
+        integrator, context, sensor, film: integrator and context of the job, its sensor and film.
+        seed: seed of the job.
+        spp: samples per pixel of the job, 0 for the sampler's own; there is an edge sample for every ``SHARE`` of them.
+        scanned: interactions of the scanned points, detached.
     """
-    wanted = world.wanted
-    if not (wanted.geometry and follows_outlines(type(world.segment), world.contents)):
+    wanted = context.wanted
+    if not (wanted.geometry and follows_outlines(type(context.segment), context.contents)):
         return None
-    if not world.min_depth <= BOUNCES <= world.max_depth:
+    if not context.min_depth <= BOUNCES <= context.max_depth:
         return None
     moves_viewpoints = wanted.sensor or wanted.light
     if not (moves_viewpoints or wanted.shapes):
         return None
-    (spots,) = world.connections
+    (spots,) = context.connections
     viewpoints = Viewpoints(scanned, dr.detach(spots.spots.si), spots.confocal)
-    shapes = list(world.scene.shapes())
+    shapes = list(context.scene.shapes())
     moving = {k for k, shape in enumerate(shapes) if shape.ptr in wanted.shapes}
     moves_viewpoints |= any(registry_number(shapes[k]) in viewpoints.shapes for k in moving)
     parts, triangles = parts_of(shapes)
@@ -119,31 +137,33 @@ def mutual_occlusion(
     count = spp or sampler.sample_count()
     own_seed, _ = mi.sample_tea_32(seed_array(seed), mi.UInt32(_SEED))
     jobs, _ = passes_of(sampler, film, own_seed, max(1, count // SHARE), 2)
-    return MutualOcclusion(integrator, world, sensor, film, edges, spots, jobs)
+    return MutualOcclusion(integrator, context, sensor, film, edges, spots, jobs)
 
 
-def late_outlines(integrator: Any, world: Any, sensor: Any, film: Any, seed: Any, spp: int) -> LateOutlines | None:
-    """The boundary term of light of more than three bounces; arguments as of :func:`mutual_occlusion`. None where there
-    is no such light, where nothing moves, or where what is hidden is one body that cannot hide a part of itself.
+def late_outlines(integrator: Any, context: Any, sensor: Any, film: Any, seed: Any, spp: int) -> LateOutlines | None:
+    """Return the boundary term of light of more than three bounces; arguments as of :func:`mutual_occlusion`.
+
+    None if there is no such light, if nothing moves, or if the hidden scene is one body that cannot hide a part of
+    itself.
     """
-    wanted = world.wanted
-    if not (wanted.geometry and follows_outlines(type(world.segment), world.contents)) or mi.is_polarized:
+    wanted = context.wanted
+    if not (wanted.geometry and follows_outlines(type(context.segment), context.contents)) or mi.is_polarized:
         return None
-    if world.max_depth < FIRST or not (wanted.sensor or wanted.light or wanted.shapes):
+    if context.max_depth < FIRST or not (wanted.sensor or wanted.light or wanted.shapes):
         return None
-    (spots,) = world.connections
+    (spots,) = context.connections
     wall = {shape.ptr for shape in spots.table.wall or ()}
-    hidden = [shape for shape in world.scene.shapes() if shape.ptr not in wall]
+    hidden = [shape for shape in context.scene.shapes() if shape.ptr not in wall]
     if wall and len(hidden) < 2:
         parts, _ = parts_of(hidden)
         if len(parts) < 2 and not any(part.hides_itself for part in parts):
             return None
     count = spp or sensor.sampler().sample_count()
-    return LateOutlines(integrator, world, sensor, film, seed, max(1, count // SHARE))
+    return LateOutlines(integrator, context, sensor, film, seed, max(1, count // SHARE))
 
 
 def _names(shapes: list[Any], parts: list[Part], pairs: list[tuple[int, int]]) -> str:
-    """Up to three of the pairs in words."""
+    """Return up to three of the pairs in words."""
 
     def name(part: Part) -> str:
         return " and ".join(repr(shapes[k].id() or shapes[k].class_name()) for k in sorted(part.shapes))

@@ -1,4 +1,4 @@
-"""Scanned points and laser spots: computed once a job, attached where parameters are."""
+"""Scanned points and laser spots of a capture, computed once a job and attached where parameters are."""
 
 from __future__ import annotations
 
@@ -39,9 +39,15 @@ _SEEDS = (0x51ED270B, 0x7FEB352D)
 
 
 def overlaps(scene: Any, elements: HiddenElements, points: np.ndarray, normals: np.ndarray) -> list[str]:
-    """Names of the shapes that lie in others, or whose own triangles lie in each other, where light finds them: seen
-    from wall points ``(P, 3)``, or from what those see. Overlaps of less than one in two thousand of the density of
-    ``elements`` may stay unnoticed.
+    """Return the names of shapes that lie in others, or whose own triangles lie in each other.
+
+    Overlaps count where light finds them: seen from the wall, or from points that the wall sees. Those of less than one
+    in two thousand of the density of ``elements`` may stay unnoticed.
+
+    Args:
+        scene: built scene.
+        elements: table of the hidden elements.
+        points, normals: wall points and their normals, (P, 3).
     """
     with dr.suspend_grad():
         index = dr.arange(mi.UInt32, POINTS) % dr.opaque(mi.UInt32, len(points))
@@ -62,8 +68,8 @@ def overlaps(scene: Any, elements: HiddenElements, points: np.ndarray, normals: 
 
 
 def _look(scene: Any, elements: HiddenElements, viewer: Local, seed: Any, active: Any) -> tuple[Local, Any, Any]:
-    """Return (drawn points with the normals of the sides that are seen, which of them are seen, and of these the ones
-    that something else lies in).
+    """Draw points. Return them with the normals of the sides that are seen, a mask of those that are seen, and of
+    these a mask of those that something else lies in.
     """
     x, y = plane_points(POINTS, seed)
     # Points in another order than those that see them.
@@ -105,11 +111,14 @@ _FIELDS = ("p", "n", "sh_frame", "uv", "dp_du", "dp_dv")
 
 
 class ScanTable:
-    """Scanned points and laser spots of a capture, traced once a job.
+    """Scanned points and laser spots of a capture, traced once a job, with gradients enabled and outside of loops.
 
-    ``scene``, ``sensor``; ``rays`` (Ray3f, one a pixel, attached where the sensor is), ``found``
-    (PreliminaryIntersection3f of those); ``spots`` (:class:`LaserSpots`), None where lights are sampled. Built with
-    gradients enabled, outside of traced code.
+    Attributes:
+        scene, sensor: built scene, and sensor of the capture.
+        rays: rays to the scanned points, one a pixel, attached where the sensor is (Ray3f).
+        hits: intersections of the rays (PreliminaryIntersection3f).
+        spots: the :class:`LaserSpots`, None where lights are sampled.
+        wall: shapes of a flat relay wall, None for another one.
     """
 
     def __init__(self, scene: Any, contents: Any, capture: CaptureType, fov: float | None, laser: bool) -> None:
@@ -117,8 +126,8 @@ class ScanTable:
         self.scene, self.sensor, self.memory = scene, sensor, contents.memory
         self.rays, self.spots = scan_rays(sensor), None
         with dr.suspend_grad():
-            self.found = scene.ray_intersect_preliminary(self.rays, coherent=True)
-            dr.eval(self.found)
+            self.hits = scene.ray_intersect_preliminary(self.rays, coherent=True)
+            dr.eval(self.hits)
         if laser:
             aims = aims_of(scene, sensor, capture, fov)
             check_count(aims, sensor, capture)
@@ -132,8 +141,7 @@ class ScanTable:
         return hasattr(self.sensor, "scanned")
 
     def elements(self, without: list[Any]) -> HiddenElements:
-        """The table of hidden elements, but for those of the shapes ``without``. The same each time: not to be changed.
-        """
+        """Return the table of elements of all shapes but those of ``without``, computed once and not to be changed."""
         left_out = frozenset(shape.ptr for shape in without)
         if left_out not in self._elements:
             every = self.scene.shapes()
@@ -143,7 +151,7 @@ class ScanTable:
         return self._elements[left_out]
 
     def overlaps(self, with_wall: bool) -> list[str]:
-        """Names of hidden shapes that lie in others; ``with_wall``: a flat wall is one of them."""
+        """Return the names of hidden shapes that lie in others; ``with_wall``: a flat wall counts as one."""
         elements = self.elements([] if with_wall or self.wall is None else self.wall)
 
         def found() -> list[str]:
@@ -160,19 +168,17 @@ class ScanTable:
         diffuse = all(is_lambertian(shape.bsdf()) and not has_shading_normals(shape) for shape in self.wall)
         return self.spots.points(legs) if diffuse else None
 
-    def seen(self) -> Any:
-        """Interactions of the rays (SurfaceInteraction3f), attached where sensor or shape are."""
-        return self.found.compute_surface_interaction(self.rays, mi.RayFlags.All)
+    def interactions(self) -> Any:
+        """Return the interactions of the rays (SurfaceInteraction3f), attached where sensor or shape are."""
+        return self.hits.compute_surface_interaction(self.rays, mi.RayFlags.All)
 
     def reference_points(self) -> tuple[np.ndarray, np.ndarray]:
-        """Some 5 x 5 points of the relay wall, spread over the scan, and the normals there on the sensor's side: ``(P,
-        3)``.
-        """
+        """Return some 5 x 5 points of the relay wall over the whole scan, and normals on the sensor's side, (P, 3)."""
         size = self.sensor.film().crop_size()
         columns, rows = (np.unique(np.linspace(0, int(n) - 1, min(int(n), ACROSS)).round().astype(int)) for n in size)
         index = mi.UInt32((rows[:, None] * int(size[0]) + columns).ravel().astype(np.uint32))
         with dr.suspend_grad():
-            found = dr.gather(mi.PreliminaryIntersection3f, self.found, index)
+            found = dr.gather(mi.PreliminaryIntersection3f, self.hits, index)
             si = found.compute_surface_interaction(dr.gather(mi.Ray3f, self.rays, index), mi.RayFlags.All)
             n = front_normal(si)
             n = dr.select(si.wi.z < 0, -n, n)
@@ -183,12 +189,13 @@ class ScanTable:
         return np.array(si.p).T[valid], np.array(n).T[valid]
 
     def _wall(self) -> list[Any] | None:
-        """The shapes that rays and beams end on, where all of these lie in one plane: no point of such a wall lights
-        another. None where they do not, or where no laser says where beams end.
+        """Return the shapes that rays and beams end on, if all lie in one plane, where no point lights another.
+
+        None for other walls, and without laser spots.
         """
         if self.spots is None:
             return None
-        met = {int(k) for each in (self.found.shape, self.spots.shape) for k in np.unique(_numbers(each))} - {0}
+        met = {int(k) for each in (self.hits.shape, self.spots.shape) for k in np.unique(_numbers(each))} - {0}
         shapes = [shape for shape in self.scene.shapes() if registry_number(shape) in met]
         return shapes if len(shapes) == len(met) and _in_one_plane(shapes) else None
 
@@ -207,7 +214,7 @@ def _in_one_plane(shapes: list[Any]) -> bool:
 
 
 def _corners(shape: Any) -> np.ndarray | None:
-    """Points that span a shape (N, 3), None for one that is curved."""
+    """Return points that span a shape, (N, 3); None for a curved one."""
     if shape.is_mesh():
         return host_numbers(mesh_positions(shape)).reshape(-1, 3)
     if not is_flat_shape(shape):
@@ -218,10 +225,18 @@ def _corners(shape: Any) -> np.ndarray | None:
 
 
 class LaserSpots:
-    """The spots of a laser on what its beam meets first.
+    """Spots of a laser on the surfaces that its beam meets first.
 
-    ``si`` (SurfaceInteraction3f of all spots), ``length`` (Float, from the laser), ``origin`` (Point3f),
-    ``shape`` (ShapePtr: what they lie on).
+    Args:
+        scene: built scene.
+        laser: the emitter.
+        aims: directions of the beam, of any length, one or one for each spot (:func:`aims_of`).
+        origin: position of the laser (Point3f).
+
+    Attributes:
+        si: the spots (SurfaceInteraction3f).
+        length: distance from the laser (Float, metres).
+        shape: shapes that the spots lie on (ShapePtr).
     """
 
     def __init__(self, scene: Any, laser: Any, aims: Any, origin: Any) -> None:
@@ -243,32 +258,41 @@ class LaserSpots:
         dr.eval(self.si, self.length, self.ray, self.origin)
 
     def arrays(self) -> list[Any]:
-        """Arrays that are attached where the scene's parameters are."""
+        """Return the arrays that are attached where the scene's parameters are."""
         frame = self.si.sh_frame
         fields = [getattr(self.si, name) for name in _FIELDS if name != "sh_frame"]
         return [*fields, frame.s, frame.t, frame.n, self.length, self.ray.d]
 
-    def lit(self) -> Any:
-        """SurfaceInteraction3f of the spots, as they are lit."""
+    def lit_interactions(self) -> Any:
+        """Return the spots (SurfaceInteraction3f), with ``wi`` towards the laser."""
         si = dr.copy(self.si)
         si.wi = si.to_local(-self.ray.d)
         return si
 
     def points(self, legs: bool, *, energy: bool = True) -> WallPoints:
-        """The spots on a diffuse wall without wavelengths: what they scatter of the light that falls on them, or with
-        ``energy=False`` of a beam of one joule. ``legs``: the way from the laser counts.
+        """Return the spots as points of a diffuse wall, in variants without wavelengths.
+
+        Args:
+            legs: the way from the laser counts.
+            energy: values hold the light that falls on the spots; False for that of a beam of one joule.
         """
-        si, factor = self.lit(), mi.UnpolarizedSpectrum(1)
+        si, factor = self.lit_interactions(), mi.UnpolarizedSpectrum(1)
         if energy:
             cos = dr.abs_dot(si.n, self.ray.d)
             factor = self.energy([], dr.arange(mi.UInt32, dr.width(si.p)), cos, si.is_valid()) * cos
         return points_of(si, factor * dr.inv_pi, self.length if legs else mi.Float(0))
 
     def energy(self, wavelengths: Any, index: Any, cos: Any, active: Any) -> Any:
-        """Return the energy on a spot, per colour, and per cosine ``cos`` of the beam there (UnpolarizedSpectrum).
+        """Return the energy on spots by colour, over the cosine of the beam (UnpolarizedSpectrum).
 
         A ``laser_beam`` brings its energy however it falls. For Mitsuba's emitters the irradiance at the spot is taken
         over a square metre, as mitransient does, with the emitter turned towards it.
+
+        Args:
+            wavelengths: wavelengths of the paths, in spectral variants.
+            index: numbers of the spots (UInt32).
+            cos: cosine of the beam on the surface.
+            active: mask.
         """
         if hasattr(self.emitter, "energy_at"):
             return self.emitter.energy_at(wavelengths, active) * dr.select(cos > 0, dr.rcp(cos), 0)
@@ -282,7 +306,7 @@ class LaserSpots:
 
 
 def capture_type(given: Any) -> CaptureType:
-    """A capture type by its number or name. Raises SceneError."""
+    """Return a capture type by its number or name. Raises SceneError for others."""
     if isinstance(given, str) and not given.strip().lstrip("-").isdigit():
         names = {c.name.lower(): c for c in CaptureType}
         if given.lower() in names:
@@ -295,7 +319,7 @@ def capture_type(given: Any) -> CaptureType:
 
 
 def laser_of(scene: Any) -> Any:
-    """The one emitter of an NLOS scene. Raises SceneError for another number."""
+    """Return the one emitter of an NLOS scene. Raises SceneError for another number of emitters."""
     emitters = scene.emitters()
     if len(emitters) != 1:
         names = ", ".join(repr(e.id()) for e in emitters) or "none"
@@ -362,8 +386,9 @@ def _check_aimed_once(sensor: Any, capture: CaptureType, fov: float | None) -> N
 
 
 def scan_rays(sensor: Any) -> Any:
-    """One ray (Ray3f) for each pixel of a sensor's film, to the scanned point or along the pixel's axis; attached where
-    the sensor is.
+    """Return a ray for each pixel of a sensor's film, to the scanned point or along the pixel's axis (Ray3f).
+
+    Attached where the sensor is.
     """
     if hasattr(sensor, "scanned"):
         origin = mi.Point3f(sensor.origin)

@@ -33,7 +33,11 @@ _ACROSS = [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0), (1.0, 1.0), (-1.0, 
 
 
 class ScanRegion:
-    """The box that holds all points ``(P, 3)`` of a scan, scan points and laser spots, along its mean normal."""
+    """Box around all points of a scan, aligned with their mean normal.
+
+    Args:
+        points, normals: scan points and laser spots, and their normals, (P, 3).
+    """
 
     def __init__(self, points: np.ndarray, normals: np.ndarray) -> None:
         points, normals = (np.asarray(a, dtype=np.float64).reshape(-1, 3) for a in (points, normals))
@@ -54,19 +58,25 @@ class ScanRegion:
         return bool(np.all(local >= self.low - slack) and np.all(local <= self.high + slack))
 
 
-def pays(scene: Any, rays: int) -> bool:
-    """Return whether finding shafts takes less time than the rays that they may spare: it costs some 400 rays a
-    triangle.
+def saves_time(scene: Any, rays: int) -> bool:
+    """Return whether finding shafts takes less time than ``rays`` visibility rays, some of which they spare.
+
+    It costs some 400 rays a triangle.
     """
     triangles = sum(int(shape.face_count()) for shape in scene.shapes() if shape.is_mesh())
     return rays > _RAYS_A_TRIANGLE * triangles
 
 
 def spare_rays(scene: Any, elements: HiddenElements, points: np.ndarray, normals: np.ndarray) -> float:
-    """Put those elements first that nothing of the scene hides from any of ``points`` ``(P, 3)``, all scan points and
-    laser spots, so that samples of them are counted without visibility rays. Returns the share of samples that are.
+    """Put elements that nothing hides from the scan first in a table: their samples need no visibility rays.
 
-    The scene has to stay as it is; what moves needs another table.
+    Args:
+        scene: built scene, which has to stay as it is; moved shapes need another table.
+        elements: table of the hidden elements, which is changed.
+        points, normals: all scan points and laser spots, and their normals, (P, 3).
+
+    Returns:
+        Share of the samples without visibility rays.
     """
     region = ScanRegion(points, normals)
     clear = clear_elements(scene.shapes(), elements.elements, region, elements.smooth)
@@ -106,8 +116,9 @@ def clear_elements(shapes: list[Any], elements: AreaElements, region: ScanRegion
 
 
 def _turned_to(region: ScanRegion, p: np.ndarray, normal: np.ndarray, two_sided: np.ndarray) -> tuple[Any, Any]:
-    """Normals of the planes through points ``p``, those of two-sided elements turned to the region where all of it lies
-    behind; and whether all of it lies before.
+    """Return normals of the planes through ``p``, and a mask of those with the whole region in front.
+
+    Normals of two-sided elements are turned round where the whole region lies behind.
     """
     height = (normal * p).sum(1)
     least, most = _extent(normal, region.low, region.high)
@@ -116,13 +127,14 @@ def _turned_to(region: ScanRegion, p: np.ndarray, normal: np.ndarray, two_sided:
 
 
 def _extent(n: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Least and largest coordinate of a box along normals ``(N, 3)``."""
+    """Return the least and largest coordinate of a box along normals (N, 3)."""
     return np.minimum(n * low, n * high).sum(1), np.maximum(n * low, n * high).sum(1)
 
 
 def _shafts(corners: np.ndarray, normal: np.ndarray, seen_from_front: np.ndarray, region: ScanRegion) -> np.ndarray:
-    """Planes ``(E, planes, 4)``: what has ``a . p > b`` is outside of the shaft. ``seen_from_front``: no line of an
-    element goes behind its plane.
+    """Return planes ``[a, b]`` (E, planes, 4): points with ``a . p > b`` are outside of the shaft.
+
+    ``seen_from_front``: no line of an element goes behind its plane.
     """
     low, high = region.low, region.high
     w, zero = corners[:, :, 2], np.zeros(len(corners))
@@ -142,8 +154,10 @@ def _shafts(corners: np.ndarray, normal: np.ndarray, seen_from_front: np.ndarray
 
 
 class ObstacleTree:
-    """A complete binary tree of boxes over what can hide something, in the region's coordinates. Every leaf is one
-    triangle, or the box of another shape. Node 1 is the root; 2 n and 2 n + 1 are below node n. A plain class.
+    """Complete binary tree of boxes over everything that can hide an element, in the region's coordinates.
+
+    A leaf is a triangle, or the box of a shape without triangles. Node 1 is the root; 2 n and 2 n + 1 are below node n.
+    A plain class.
     """
 
     def __init__(self, shapes: list[Any], region: ScanRegion, hidden: np.ndarray, slack: float) -> None:
@@ -170,7 +184,7 @@ class ObstacleTree:
 
 
 def _obstacles(shapes: list[Any], frame: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles ``(T, 3, 3)`` of meshes, and boxes ``(B, 2, 3)`` around all other shapes, in the frame."""
+    """Return triangles (T, 3, 3) of meshes, and boxes (B, 2, 3) around all other shapes, in the frame."""
     triangles, boxes = [np.zeros((0, 3, 3))], [np.zeros((0, 2, 3))]
     for shape in shapes:
         if shape.is_mesh() and not shape.is_ellipsoids():
@@ -184,7 +198,7 @@ def _obstacles(shapes: list[Any], frame: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _harmless(triangles: np.ndarray, region: ScanRegion, hidden: np.ndarray, slack: float) -> np.ndarray:
-    """Triangles whose plane has region and hidden geometry on the same side: those of a plane wall, first of all."""
+    """Return a mask of triangles with region and hidden geometry on one side, as those of a flat wall."""
     n = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     n /= np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-300)
     height = (n * triangles[:, 0]).sum(1)
@@ -230,8 +244,9 @@ def _box_outside(tree, shafts, node):
 
 
 def _triangle_outside(tree, shafts, own, leaf, active):
-    """Return as :func:`_box_outside`, for triangles; true as well where element and region lie on one side of its
-    plane. False for boxes.
+    """Return a mask of triangles outside of the shafts, as :func:`_box_outside`; False for boxes.
+
+    Triangles with element and region on one side of their plane count as outside.
     """
     corners = [mi.Vector3d(dr.gather(mi.Point3d, c, leaf, active)) for c in tree.corners]
     outside = mi.Mask(False)

@@ -1,4 +1,4 @@
-"""Light of a whole scan from shared samples and chains: what it needs of a scene, and when it is possible."""
+"""Light of a whole scan from shared samples and chains: conditions on the scene, densities, and the jobs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torchtransient.plugins.around_corner.geometry import WallPoints, points_of
 from torchtransient.plugins.around_corner.late_light import LateLight
 from torchtransient.plugins.around_corner.launches import ScanJob
 from torchtransient.plugins.around_corner.scan_table import ACROSS, ScanTable
-from torchtransient.plugins.around_corner.shafts import pays, spare_rays
+from torchtransient.plugins.around_corner.shafts import saves_time, spare_rays
 from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
 from torchtransient.plugins.around_corner.third_bounce_gradients import (
     ThirdBounceGradients,
@@ -46,12 +46,17 @@ _BEFORE = 0.4
 def late_density(
     scene: Any, elements: HiddenElements, points: np.ndarray, normals: np.ndarray, memory: Cache | None = None
 ) -> HiddenElements:
-    """The elements drawn by the root mean square, over wall points ``(P, 3)`` and directions of scattering, of what a
-    point sends by way of one further hidden point.
+    """Return the elements with the density of late light: proportional to the light by way of one more hidden point.
 
-    A body's creases weigh more than what stands free, where no light is scattered twice. Neighbours have one weight
-    per area, the mean of some samples. What the weights leave out is drawn by its share of plain area. ``memory``: of
-    densities that were made for the same ``elements`` (with a ``key``), seen from the same points.
+    That light is a root mean square over wall points and directions of scattering. Creases of a body weigh more than
+    free surfaces, where no light is scattered twice. Neighbours have one weight per area, the mean of some samples, and
+    a share of the density stays that of ``elements``.
+
+    Args:
+        scene: built scene.
+        elements: table of the hidden elements.
+        points, normals: wall points and their normals, (P, 3).
+        memory: cache of densities by ``elements.key``, None without one.
     """
     s = draw_samples(elements, _POINTS, _SEED)
     # The side that faces the scan: of two-sided surfaces it counts most.
@@ -97,15 +102,16 @@ def _density(scene: Any, elements: HiddenElements, wall: tuple[np.ndarray, np.nd
 
 
 def _factor(p: Any, n: Any, q: Any, m: Any) -> Any:
-    """Cosines over the squared distance."""
+    """Return cosines over the squared distance of two points with their normals."""
     d = mi.Vector3f(q - p)
     inverse = dr.rcp(dr.squared_norm(d))
     return dr.maximum(dr.dot(n, d), 0) * dr.maximum(-dr.dot(m, d), 0) * dr.square(inverse)
 
 
 def _smoothed(elements: HiddenElements, square: np.ndarray, area: np.ndarray, element: np.ndarray) -> np.ndarray:
-    """Weights ``(1, E)`` of elements from squares at samples, which stand for ``area`` each; elements next to each
-    other in the table are neighbours in space.
+    """Return weights (1, E) of elements; ``square``, ``area``, ``element``: of samples, the area that each stands for.
+
+    Elements next to each other in the table are neighbours in space.
     """
     size = len(elements.elements)
     drawn = np.bincount(element, minlength=size)
@@ -124,6 +130,8 @@ def why_not(table: ScanTable, contents: Any, with_wall: bool) -> str | None:
     """Return the reason why a scene cannot have shared samples, None if it can.
 
     Args:
+        table: scanned points and laser spots.
+        contents: contents of the scene.
         with_wall: points are drawn on the wall as well.
     """
     scene, sensor = table.scene, table.sensor
@@ -154,9 +162,12 @@ def why_not(table: ScanTable, contents: Any, with_wall: bool) -> str | None:
 
 @dataclass
 class ScanLight:
-    """Capture as shared samples see it: scanned points and laser spots, each with its scattering, and the laser's
-    energy by colour. Attached where the scene's parameters are. Where every spot is a scanned point, both are one
-    object.
+    """Wall points of a capture, attached where the scene's parameters are.
+
+    Attributes:
+        sensors: the scanned points.
+        spots: the laser's spots, the same object where every spot is a scanned point.
+        energy: energy of the laser by colour (UnpolarizedSpectrum, J).
     """
 
     sensors: WallPoints
@@ -165,14 +176,20 @@ class ScanLight:
 
 
 def scan_light(table: ScanTable, capture: CaptureType, legs: bool) -> ScanLight:
-    """Compute the :class:`ScanLight` of the scene as it is now."""
-    origin, spots, seen = mi.Point3f(table.sensor.origin), table.spots, table.seen()
+    """Return the :class:`ScanLight` of the scene as it is now.
+
+    Args:
+        table: scanned points and laser spots.
+        capture: type of the capture.
+        legs: the ways from laser to spot and from scanned point to sensor count.
+    """
+    origin, spots, seen = mi.Point3f(table.sensor.origin), table.spots, table.interactions()
     looked_at = points_of(seen, dr.inv_pi, dr.norm(seen.p - origin) if legs else mi.Float(0))
     if not hasattr(spots.emitter, "energy_at"):
         return ScanLight(looked_at, spots.points(legs), mi.UnpolarizedSpectrum(1))
     energy = spots.emitter.energy_at([], True)
     same_legs = not legs or bool(dr.all(spots.origin == origin))
-    if capture is CaptureType.EXHAUSTIVE and same_legs and _same(spots.lit(), seen):
+    if capture is CaptureType.EXHAUSTIVE and same_legs and _same(spots.lit_interactions(), seen):
         return ScanLight(looked_at, looked_at, energy)
     return ScanLight(looked_at, spots.points(legs, energy=False), energy)
 
@@ -185,17 +202,17 @@ def _same(spots: Any, points: Any) -> bool:
     return bool(dr.all(near & (spots.wi.z * points.wi.z > 0) & spots.is_valid() & points.is_valid()))
 
 
-def moves(world: Any, shapes: list[Any]) -> bool:
-    """Return whether derivatives are requested by parameters of the ``shapes`` or of what they hold."""
+def moves(context: Any, shapes: list[Any]) -> bool:
+    """Return whether derivatives are requested by parameters of ``shapes``, or of plugins inside them."""
     held = {node.ptr for shape in shapes for node in [shape, *objects_below(shape, mi.Object)]}
-    return bool(held & world.wanted.nodes)
+    return bool(held & context.wanted.nodes)
 
 
-def moves_scan(world: Any, hidden: list[Any]) -> bool:
-    """Return whether derivatives are requested by anything beside the hidden shapes: wall, sensor, laser."""
-    others = [shape for shape in world.scene.shapes() if shape.ptr not in {one.ptr for one in hidden}]
+def moves_scan(context: Any, hidden: list[Any]) -> bool:
+    """Return whether derivatives are requested by other parameters than those of ``hidden``: wall, sensor, laser."""
+    others = [shape for shape in context.scene.shapes() if shape.ptr not in {one.ptr for one in hidden}]
     held = {node.ptr for shape in hidden for node in [shape, *objects_below(shape, mi.Object)]}
-    return bool(world.wanted.nodes - held) or moves(world, others)
+    return bool(context.wanted.nodes - held) or moves(context, others)
 
 
 def _rows(vectors: Any, width: int) -> np.ndarray:
@@ -204,8 +221,14 @@ def _rows(vectors: Any, width: int) -> np.ndarray:
 
 
 def add_late_light(table: ScanTable, film: Any, job: Any, bounces: range, run: Any) -> None:
-    """Add the light of these numbers of bounces to a film; ``job``: ``light`` (:class:`ScanLight`), ``elements`` and
-    ``capture``, ``run``: ``seed``, ``samples`` and ``progress``.
+    """Add late light to a film.
+
+    Args:
+        table: scanned points and laser spots.
+        film: film of the capture.
+        job: has ``light`` (:class:`ScanLight`), ``elements`` and ``capture``.
+        bounces: numbers of bounces.
+        run: has ``seed``, ``samples`` (chains of a tile) and ``progress``.
     """
     elements = late_density(table.scene, job.elements, *table.reference_points(), table.memory)
     film_job = ScanJob(table.scene, film, job.light.sensors, job.light.energy, run.progress)
@@ -214,69 +237,76 @@ def add_late_light(table: ScanTable, film: Any, job: Any, bounces: range, run: A
 
 
 class SharedThirdBounce:
-    """Light of three bounces of one job: its render, and its derivatives beside those of paths (confocal and single).
+    """Light of three bounces of one job from shared samples: its render, or its derivatives (confocal and single).
 
-    ``light``: attached where the scene is; ``draw``: (seed, number of samples).
+    Args:
+        context: context of the job.
+        film: film of the job.
+        light: wall points of the capture, attached where the scene is.
+        elements: table of the hidden elements.
+        capture: type of the capture.
+        draw: seed and number of samples.
     """
 
     can_be_recorded = False
 
     def __init__(
         self,
-        world: Any,
+        context: Any,
         film: Any,
         light: ScanLight,
         elements: HiddenElements,
         capture: CaptureType,
         draw: tuple[Any, int],
     ) -> None:
-        self.world, self.film, self.light, self.capture = world, film, light, capture
+        self.context, self.film, self.light, self.capture = context, film, light, capture
         self.tile = None
-        if world.wanted is None and capture is not CaptureType.EXHAUSTIVE:
+        if context.wanted is None and capture is not CaptureType.EXHAUSTIVE:
             elements = self._near(elements)
         self._spare_rays(elements, draw[1] * elements.tile_count)
         self.samples = draw_samples(elements, draw[1], draw[0])
         self.gradients = None
-        if world.wanted is not None:
+        if context.wanted is not None:
             laser = None if capture is CaptureType.CONFOCAL else light.spots
             with dr.resume_grad():
-                samples = ends_of_samples(world.scene, elements, self.samples, world.contents.meshes, laser)
+                samples = ends_of_samples(context.scene, elements, self.samples, context.contents.meshes, laser)
                 points = ends_of_points(light.sensors, light.spots, light.energy)
             # Forward mode has to pass by all that is attached, wanted or not.
             self._tables = [ends.fields[n] for ends in (samples, points) for n in ends.fields]
             self._tables += [*vars(light.sensors).values(), *vars(light.spots).values(), light.energy]
-            scan = moves_scan(world, elements.shapes)
+            scan = moves_scan(context, elements.shapes)
             if not scan:
                 points = points.detached()
             # What a single spot lights follows the spot.
-            if not (moves(world, elements.shapes) or (scan and laser is not None)):
+            if not (moves(context, elements.shapes) or (scan and laser is not None)):
                 samples = samples.detached()
-            self.gradients = ThirdBounceGradients(world.scene, film, samples, points, self.samples.clear)
+            self.gradients = ThirdBounceGradients(context.scene, film, samples, points, self.samples.clear)
 
     def _near(self, elements: HiddenElements) -> HiddenElements:
-        """With a density for each tile of the scan, where something hidden is nearer than half the scan's width."""
+        """Return elements with a density for each tile of the scan, if hidden ones are nearer than half its width."""
         p, n = (_rows(getattr(self.light.sensors, name), self.light.sensors.width) for name in "pn")
         some = np.linspace(0, len(p) - 1, min(len(p), ACROSS**2)).round().astype(int)
         tiles = ScanTiles(p, n, distance_to(elements.elements.centers(), p[some]))
         if tiles.count == 1:
             return elements
         self.tile = tiles.tile_per_point()
-        memory = self.world.contents.memory
+        memory = self.context.contents.memory
         return copy(HiddenElements.cached(memory, elements.shapes, tiles.points, tiles.normals))
 
     def _spare_rays(self, elements: HiddenElements, samples: int) -> None:
-        """Leave out rays to what nothing hides, where that is found faster than they are traced."""
+        """Leave out rays to elements that nothing hides, if these are found faster than rays are traced."""
         points = (
             [self.light.sensors] if self.light.spots is self.light.sensors else [self.light.sensors, self.light.spots]
         )
-        if pays(self.world.scene, samples * sum(each.width for each in points)):
+        if saves_time(self.context.scene, samples * sum(each.width for each in points)):
             p, n = (np.concatenate([_rows(getattr(each, name), each.width) for each in points]) for name in "pn")
-            spare_rays(self.world.scene, elements, p, n)
+            spare_rays(self.context.scene, elements, p, n)
 
     def add(self, progress: Any = None) -> None:
         """Add the light to the film."""
         light = self.light
-        third = ThirdBounce(self.world.scene, self.film, self.samples, light.sensors, light.energy, progress, self.tile)
+        scene = self.context.scene
+        third = ThirdBounce(scene, self.film, self.samples, light.sensors, light.energy, progress, self.tile)
         if self.capture is CaptureType.CONFOCAL:
             third.add_confocal(self.light.spots)
         elif self.capture is CaptureType.SINGLE:
@@ -287,14 +317,14 @@ class SharedThirdBounce:
             add_exhaustive(third, self.light.spots)
 
     def tables(self) -> list[Any]:
-        """Arrays computed from the scene's parameters."""
+        """Return the attached arrays that were computed from the scene's parameters."""
         with dr.resume_grad():
             return [table for table in self._tables if dr.is_array_v(table) and dr.grad_enabled(table)]
 
     def backward(self, incoming: Any) -> None:
-        """Accumulate into the attached parameters; ``incoming``: the film's adjoint."""
+        """Add gradients to the attached parameters; ``incoming``: the film's adjoint."""
         self.gradients.backward(incoming)
 
     def forward(self) -> None:
-        """Add to the film, along the tangents of the scene."""
+        """Add the derivative along the scene's tangents to the film."""
         self.gradients.forward()

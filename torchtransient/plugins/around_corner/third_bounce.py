@@ -30,11 +30,15 @@ from torchtransient.plugins.transport.strategy import Local
 
 
 class SampleTable:
-    """Rows of ``[p, f0] [n, b0] (RGB: [f1, f2, b1, b2]) (interpolated normals: [geometric n, -])``: places, normals,
-    and what front and back scatter, times the weight of the sample.
+    """Samples in memory, in packets of four numbers.
 
-    With ``delay`` each sample is lit by one laser spot: ``f`` is what arrives there times what it scatters, ``n``
-    points to the side that is lit, and in place of ``b0`` stands the length of the way to the spot, metres.
+    Rows are ``[p, f0] [n, b0] (RGB: [f1, f2, b1, b2]) (interpolated normals: [geometric n, -])``: place, normal, and
+    albedo over pi of front and back, times the weight of the sample.
+
+    Args:
+        samples: the samples.
+        front, n, delay: for samples that are lit by one laser spot, else None: scattered light in place of ``f``,
+            normals of the sides that are lit, and lengths of the ways to the spot (metres) in place of ``b0``.
     """
 
     def __init__(self, samples: SharedSamples, front: Any = None, n: Any = None, delay: Any = None) -> None:
@@ -51,7 +55,7 @@ class SampleTable:
         self.flat = packed_columns(rows, samples.count * samples.tiles)
 
     def load(self, k: Any, active: Any = True) -> Local:
-        """Load ``p``, ``n``, ``geometric_n``, ``front``, ``back`` and ``delay`` of samples."""
+        """Return ``p``, ``n``, ``geometric_n``, ``front``, ``back`` and ``delay`` of samples ``k`` (UInt32)."""
         rows = [dr.gather(mi.Vector4f, self.flat, k * self.packets + i, active) for i in range(self.packets)]
         n = mi.Vector3f(rows[1].x, rows[1].y, rows[1].z)
         front, back = [rows[0].w], [rows[1].w]
@@ -70,17 +74,17 @@ class SampleTable:
 
 
 class ThirdBounce(ScanJob):
-    """One capture: scene, film and samples, and the points that ``add_confocal``, ``add_pairs`` and ``add_single`` go
-    through.
+    """Light of three bounces of a capture, which ``add_confocal``, ``add_pairs`` or ``add_single`` adds to the film.
 
-    ``film``: one with a pixel for each scan point, row by row, on which ``prepare`` was called (and ``finish_render``
-    will be): light is added to what it holds. ``sensors``: the scan points; ``energy`` (J, a number or an
-    ``UnpolarizedSpectrum``): of the laser, by colour. ``scene``: everything that can stand in the way, the wall too.
-    ``progress(fraction)`` is called after every kernel launch. ``tile`` (``UInt32``): which tile's samples each scan
-    point takes, where there are several.
+    Not supported: spectral and polarized variants; derivatives.
 
-    Light outside of the film's window is counted as the film does. Raises SceneError, ShapeError, VariantError. Not
-    supported: spectral and polarized variants; derivatives.
+    Args:
+        scene, film, sensors, energy, progress: as of :class:`.launches.ScanJob`.
+        samples: hidden samples.
+        tile: tile whose samples each scan point takes (UInt32), None for samples without tiles.
+
+    Raises:
+        SceneError, ShapeError, VariantError: as :class:`.launches.ScanJob`; ``ShapeError`` for tiles that do not fit.
     """
 
     def __init__(
@@ -104,12 +108,14 @@ class ThirdBounce(ScanJob):
         self.check_region(sensors)
 
     def add_pairs(self, lasers: WallPoints) -> None:
-        """Add light of a laser with a separate spot for each scan point."""
+        """Add light of a laser with a spot for each scan point, ``lasers``."""
         self._add_each("add_pairs", lasers, apart=True)
 
     def add_confocal(self, lasers: WallPoints | None = None) -> None:
-        """Add light of a laser that falls on each scan point while it is scanned. ``lasers``: the same points with the
-        legs and albedo of the laser's side, where those differ.
+        """Add light of a laser that falls on each scan point while it is scanned.
+
+        Args:
+            lasers: the same points with the legs and albedo of the laser's side, None where those do not differ.
         """
         self._add_each("add_confocal", self.sensors if lasers is None else lasers, apart=False)
 
@@ -124,7 +130,7 @@ class ThirdBounce(ScanJob):
         self._run(SampleTable(self.samples), lasers, apart)
 
     def add_single(self, laser: WallPoints) -> None:
-        """Add light of a laser with one fixed spot."""
+        """Add light of a laser with one fixed spot, ``laser``."""
         if laser.width != 1:
             raise ShapeError(f"add_single: expected one laser spot, got {laser.width}.")
         self._check_not_exhaustive("add_single")
@@ -132,7 +138,7 @@ class ThirdBounce(ScanJob):
         self._run(lit_by(self.scene, self.samples, laser), laser)
 
     def check_region(self, points: WallPoints) -> None:
-        """Raise ShapeError for points that samples without visibility rays were not told of."""
+        """Raise ShapeError for points outside of the region in which some samples need no visibility rays."""
         if self.samples.has_clear and not self.samples.region.holds(np.array(points.p, dtype=float).T):
             raise ShapeError(
                 "ThirdBounce: expected points within the region that shafts.spare_rays was given, got others; hand all "
@@ -147,7 +153,7 @@ class ThirdBounce(ScanJob):
             )
 
     def _run(self, table: SampleTable, lasers: WallPoints, apart: bool = False) -> None:
-        launches = launches_of(self.film, self.sensors.width, table.count)
+        launches = launches_of(self.film, table.count)
         for i, launch in enumerate(launches):
             self._launch(table, lasers, launch, apart)
             self.done((i + 1) / len(launches), launch.band)
@@ -165,23 +171,23 @@ class ThirdBounce(ScanJob):
             exclusive=launch.chunks == 1,
             origin=lane.origin,
         )
-        kept = {"L": mi.UnpolarizedSpectrum(0), "before": mi.Float(0), "after": mi.Float(0), "block": block.begin()}
+        sums = {"L": mi.UnpolarizedSpectrum(0), "before": mi.Float(0), "after": mi.Float(0), "block": block.begin()}
         clear = dr.clip(dr.gather(mi.UInt32, self.samples.clear, tile), first, last)
         first, clear, last = (k + tile * dr.opaque(mi.UInt32, table.count) for k in (first, clear, last))
         if self.samples.has_clear:
-            kept = sum_over_samples(self, table, lane, block, kept, (first, clear), False)
+            sums = sum_over_samples(self, table, lane, block, sums, (first, clear), False)
             first = clear
-        kept = sum_over_samples(self, table, lane, block, kept, (first, last), True)
-        block.end(kept["block"])
-        film.add_steady(pixel, self.match.to_channels(kept["L"]))
-        film.add_outside(pixel, kept["before"], kept["after"])
+        sums = sum_over_samples(self, table, lane, block, sums, (first, last), True)
+        block.end(sums["block"])
+        film.add_steady(pixel, self.match.to_channels(sums["L"]))
+        film.add_outside(pixel, sums["before"], sums["after"])
         block.finish()
 
 
 class ScanLanes:
-    """Scan points and laser spots of the lanes of a launch: constants of the loop, a plain object.
+    """Scan points and laser spots of the lanes of a launch: constants of the loop. A plain class.
 
-    ``apart``: whether spots are others than the scan points; then ``spot_p``, ``spot_n``.
+    ``apart``: spots are not the scan points, and have places ``spot_p`` and normals ``spot_n``.
     """
 
     def __init__(self, job: ThirdBounce, lasers: WallPoints, pixel: Any, lit: bool, apart: bool) -> None:
@@ -199,19 +205,20 @@ class ScanLanes:
 
 
 @dr.syntax
-def sum_over_samples(job, table, lane, block, kept, numbers, rays):
-    """Splat the light of the samples ``numbers`` (first, last exclusive) at the lanes' scan points. ``rays``: trace
-    visibility rays.
+def sum_over_samples(job, table, lane, block, sums, numbers, rays):
+    """Add the light of samples at the lanes' scan points to the film's ``block`` and to ``sums``.
+
+    ``numbers``: first and last sample, exclusive; ``rays``: trace visibility rays.
     """
     k, last = mi.UInt32(numbers[0]), numbers[1]
     while dr.hint(k < last, label="hidden samples"):
-        deposit(job, table, lane, block, kept, k, rays)
+        deposit(job, table, lane, block, sums, k, rays)
         k += 1
-    return kept
+    return sums
 
 
-def deposit(job, table, lane, block, kept, k, rays):
-    """Splat one sample's light."""
+def deposit(job, table, lane, block, sums, k, rays):
+    """Add the light of sample ``k``."""
     sample = table.load(k)
     line = span(sample, lane.p, lane.n)
     to_spot = span(sample, lane.spot_p, lane.spot_n) if lane.apart else None
@@ -236,14 +243,20 @@ def deposit(job, table, lane, block, kept, k, rays):
         if lane.apart:
             active &= ~occluded(job.scene, sample, to_spot, lane.spot_p, lane.spot_n, active)
     value = value * lane.factor
-    kept["L"] = kept["L"] + dr.select(active, value, 0)
-    before, after = block.put(kept["block"], opl, value, active)
-    kept["before"] = kept["before"] + before
-    kept["after"] = kept["after"] + after
+    sums["L"] = sums["L"] + dr.select(active, value, 0)
+    before, after = block.put(sums["block"], opl, value, active)
+    sums["before"] = sums["before"] + before
+    sums["after"] = sums["after"] + after
 
 
 def lit_by(scene: Any, samples: SharedSamples, laser: WallPoints) -> SampleTable:
-    """The samples with what reaches them from one laser spot, one ray for each."""
+    """Return samples that are lit by one laser spot, with one ray for each.
+
+    Args:
+        scene: built scene.
+        samples: hidden samples.
+        laser: the spot, a single wall point.
+    """
     sample = _as_lines(samples)
     p, n, _, _ = laser.take(mi.UInt32(0))
     line = span(sample, p, mi.Vector3f(n))

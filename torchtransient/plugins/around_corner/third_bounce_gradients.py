@@ -31,9 +31,11 @@ from torchtransient.plugins.transport.strategy import Local
 
 
 class Ends:
-    """Fields of ``count`` samples or points, by name, attached where the scene is: vectors, spectra and numbers.
+    """Ends of connections, hidden samples or scanned points, attached where the scene is. A plain class.
 
-    :meth:`load` reads the fields four numbers at a time. A plain object, which Dr.Jit loops leave alone.
+    Args:
+        count: number of samples or points.
+        fields: vectors, spectra and numbers by name, of all of them or one for all.
     """
 
     def __init__(self, count: int, fields: dict[str, Any]) -> None:
@@ -47,17 +49,19 @@ class Ends:
 
     @property
     def attached(self) -> list[str]:
-        """Names of the fields with derivatives; none are where derivatives are suspended."""
+        """Names of the fields with derivatives; none where derivatives are suspended."""
         return [name for name, value in self.fields.items() if dr.grad_enabled(value)]
 
     def detached(self) -> Ends:
-        """Return a detached copy. A virtual call attaches what it returns as soon as any plugin is attached that
-        it could have gone to: fields may be attached that nothing moves.
+        """Return a detached copy.
+
+        Virtual calls attach their results as soon as one of the plugins that they may go to is attached: fields may be
+        attached although nothing moves them.
         """
         return Ends(self.count, {name: dr.detach(value) for name, value in self.fields.items()})
 
     def load(self, index: Any) -> Local:
-        """Gather the fields of some of them, detached."""
+        """Return the fields of the ends with the numbers ``index`` (UInt32), detached, four numbers at a load."""
         rows = [dr.gather(mi.Vector4f, self.flat, index * self.rows + i) for i in range(self.rows)]
         columns = [row[i] for row in rows for i in range(4)]
         found = {}
@@ -68,11 +72,11 @@ class Ends:
         return Local(**found)
 
     def tangents(self) -> Ends:
-        """Tangents of the attached fields in forward mode."""
+        """Return the tangents of the attached fields, in forward mode."""
         return Ends(self.count, {name: dr.grad(self.fields[name]) for name in self.attached})
 
     def hand_on(self, adjoints: dict[str, Any]) -> None:
-        """Back-propagate ``<adjoints, fields>``: adjoints by field, of one sample or point each."""
+        """Back-propagate ``<adjoints, fields>``; ``adjoints``: by name of the field, one for each end."""
         for name, adjoint in adjoints.items():
             field = self.fields[name]
             if dr.width(field) < self.count:
@@ -85,7 +89,14 @@ def _columns(value: Any) -> list[Any]:
 
 
 def leaves(local: Local, names: list[str], width: int, tangents: Local | None = None) -> dict[str, Any]:
-    """Make leaves of the fields ``names`` of one sample or point a lane, with ``tangents`` in forward mode."""
+    """Replace fields of an end by leaves of the graph, and return the leaves by name.
+
+    Args:
+        local: one end for each lane, which is changed.
+        names: names of the fields.
+        width: number of lanes.
+        tangents: tangents of the fields in forward mode, else None.
+    """
     found = {}
     for name in names:
         value = getattr(local, name)
@@ -100,11 +111,19 @@ def leaves(local: Local, names: list[str], width: int, tangents: Local | None = 
 
 
 def ends_of_samples(scene: Any, elements: Any, samples: Any, meshes: Any, laser: Any = None) -> Ends:
-    """Shared samples as material points: ``p``, ``n``, ``front`` and ``back`` (what the sides scatter of light, times
-    the area that a sample stands for), and ``geometric_n`` where normals are interpolated.
+    """Return shared samples as material points.
 
-    ``laser`` (:class:`.geometry.WallPoints` of one point): the spot that lights them all. ``n`` then points to the
-    side that is lit, ``front`` holds what arrives there, and ``delay`` is the length of the way to the spot.
+    Args:
+        scene: built scene.
+        elements: table of the hidden elements.
+        samples: the samples.
+        meshes: meshes of the scene.
+        laser: spot that lights all samples (:class:`.geometry.WallPoints` of one point), None for confocal captures.
+
+    Returns:
+        Ends with ``p``, ``n``, and ``front`` and ``back``: albedo over pi of the sides, times the area that a sample
+        stands for; with ``geometric_n`` where normals are interpolated. With ``laser``, ``n`` is that of the side that
+        is lit, ``front`` the light that it scatters, and ``delay`` the length of the way to the spot (metres).
     """
     found = material_samples(elements, samples, meshes)
     fields = {"p": found.p, "n": found.n, "front": found.front}
@@ -131,8 +150,13 @@ def _line_start(sample: Local, smooth: bool) -> Local:
 
 
 def ends_of_points(sensors: Any, lasers: Any, energy: Any) -> Ends:
-    """Scanned points with what the wall makes of light there and at the spot, times the laser's energy (``value``), and
-    the legs before and behind (``leg``).
+    """Return scanned points with ``p`` and ``n``, ``value`` (albedos over pi at point and spot, times the energy), and
+    ``leg`` (both legs, metres).
+
+    Args:
+        sensors: the scanned points.
+        lasers: the spots, one or one for each point.
+        energy: energy of the laser by colour (J).
     """
     value = mi.UnpolarizedSpectrum(sensors.value * lasers.value * energy)
     leg = mi.Float(sensors.leg) + mi.Float(lasers.leg)
@@ -146,10 +170,13 @@ BUSY = 2**14
 
 
 class ThirdBounceGradients:
-    """One job of derivatives. ``samples`` and ``points``: :class:`Ends`, attached; ``clear``: how many of the
-    samples, the first ones, nothing can hide.
+    """Derivatives of one job. A plain class.
 
-    A plain class, which Dr.Jit loops leave alone.
+    Args:
+        scene: built scene.
+        film: film of the job.
+        samples, points: hidden samples and scanned points, attached where derivatives are requested.
+        clear: number of samples, the first ones, that nothing can hide.
     """
 
     def __init__(self, scene: Any, film: Any, samples: Ends, points: Ends, clear: Any) -> None:
@@ -159,7 +186,16 @@ class ThirdBounceGradients:
         self.window = film.arrivals()
 
     def connection(self, sample: Any, point: Any, k: Any) -> tuple[Any, Any, Any, Any]:
-        """Return (value, length and arrival minus the film's start of sample ``k`` at a point, whether it arrives)."""
+        """Connect samples to points.
+
+        Args:
+            sample, point: one of each for each lane, as :meth:`Ends.load` returns them.
+            k: numbers of the samples (UInt32).
+
+        Returns:
+            Value, optical path length (Float, metres), the same minus the film's start (Float64, detached), and a mask
+            of connections that carry light.
+        """
         geometric_n = sample.geometric_n if self.smooth else sample.n
         start = Local(p=sample.p, n=sample.n, geometric_n=geometric_n)
         line = span(start, point.p, point.n)
@@ -183,7 +219,7 @@ class ThirdBounceGradients:
     # ------------------------------------------------------------------------------------------------- reverse
 
     def backward(self, incoming: Any) -> None:
-        """Hand ``<incoming adjoint, capture>`` on to the scene."""
+        """Back-propagate ``<adjoint, capture>`` to the scene; ``incoming``: the film's adjoint."""
         read = AdjointReader(self.film, self.match, incoming)
         found = []
         for own, others, over in ((self.samples, self.points, over_points), (self.points, self.samples, over_samples)):
@@ -191,58 +227,63 @@ class ThirdBounceGradients:
                 names = own.attached
             if names:
                 split = Split(own, others.count)
-                kept = over(self, read, {name: dr.zeros(type(own.fields[name])) for name in names}, split)
-                dr.eval(kept)
-                found.append((own, {name: split.reduced(value) for name, value in kept.items()}))
+                adjoints = over(self, read, {name: dr.zeros(type(own.fields[name])) for name in names}, split)
+                dr.eval(adjoints)
+                found.append((own, {name: split.reduced(value) for name, value in adjoints.items()}))
         dr.eval([adjoints for _, adjoints in found])
         with dr.resume_grad():
             for ends, adjoints in found:
                 ends.hand_on(adjoints)
 
-    def step_back(self, read: AdjointReader, kept: dict[str, Any], pair: Local, by_sample: bool) -> None:
-        """Add the adjoints of one connection to ``kept``: those of its sample, or of its point. ``pair``: ``sample``
-        and ``point``, number ``k`` and ``s``.
+    def step_back(self, read: AdjointReader, adjoints: dict[str, Any], pair: Local, by_sample: bool) -> None:
+        """Add the adjoints of one connection to those of its sample, or of its point.
+
+        Args:
+            read: the film's adjoint.
+            adjoints: adjoints by field, which are added to.
+            pair: ``sample`` and ``point`` of the connection, with their numbers ``k`` and ``s``.
+            by_sample: adjoints are those of the sample.
         """
         with dr.resume_grad():
             sample, point = dr_copy(pair.sample), dr_copy(pair.point)
-            found = leaves(sample if by_sample else point, list(kept), dr.width(pair.k))
+            found = leaves(sample if by_sample else point, list(adjoints), dr.width(pair.k))
             value, length, opl, arrives = self.connection(sample, point, pair.k)
             A, slope = read.block(pair.s).read(opl, arrives)
             objective = total_of(A, value) + total_of(slope, dr.detach(value)) * slope_only(length)
             dr.backward_from(dr.select(arrives, objective, 0))
             for name, leaf in found.items():
-                kept[name] = kept[name] + dr.grad(leaf)
+                adjoints[name] = adjoints[name] + dr.grad(leaf)
 
     # ------------------------------------------------------------------------------------------------- forward
 
     def forward(self) -> None:
-        """Put the derivative along the scene's tangents onto the film."""
+        """Add the derivative along the scene's tangents to the film."""
         with dr.resume_grad():
             tangents = self.samples.tangents(), self.points.tangents()
-        for launch in launches_of(self.film, self.points.count, self.samples.count):
+        for launch in launches_of(self.film, self.samples.count):
             pixel, first, last = launch.lanes()
             base = launch.base(self.film, pixel)
             block = self.film.create_event_block(launch, base, self.match, launch.most_events, tangents=True)
             lane = Local(own=pixel, first=first, last=last, fields=self.points.load(pixel))
             lane.tangent = tangents[1].load(pixel)
             dr.eval(vars(lane.fields), vars(lane.tangent), pixel, first, last)
-            kept = {"dL": mi.UnpolarizedSpectrum(0), "block": block.begin()}
-            kept = tangents_over_samples(self, tangents[0], block, kept, lane)
-            block.end(kept["block"])
-            self.film.add_steady(pixel, self.match.to_channels(kept["dL"]))
+            sums = {"dL": mi.UnpolarizedSpectrum(0), "block": block.begin()}
+            sums = tangents_over_samples(self, tangents[0], block, sums, lane)
+            block.end(sums["block"])
+            self.film.add_steady(pixel, self.match.to_channels(sums["dL"]))
             block.finish()
             dr.eval(self.film.bands[launch.band][2], self.film.steady)
 
-    def step_on(self, tangents: Ends, block: Any, kept: dict[str, Any], lane: Local, k: Any) -> None:
-        """Put the derivative of one connection into the film's block."""
+    def step_on(self, tangents: Ends, block: Any, sums: dict[str, Any], lane: Local, k: Any) -> None:
+        """Add the derivative of the connection with sample ``k`` to the film's block and to ``sums``."""
         with dr.resume_grad():
             sample, point, width = self.samples.load(k), dr_copy(lane.fields), dr.width(lane.own)
             leaves(sample, list(tangents.fields), width, tangents.load(k))
             leaves(point, list(vars(lane.tangent)), width, lane.tangent)
             value, length, opl, arrives = self.connection(sample, point, k)
             d_value, d_opl = tangents_of([value, slope_only(length)])
-        kept["dL"] = kept["dL"] + dr.select(arrives, d_value, 0)
-        block.put_slope(kept["block"], opl, d_value, value * d_opl, arrives)
+        sums["dL"] = sums["dL"] + dr.select(arrives, d_value, 0)
+        block.put_slope(sums["block"], opl, d_value, value * d_opl, arrives)
 
 
 def dr_copy(local: Local) -> Local:
@@ -251,9 +292,12 @@ def dr_copy(local: Local) -> Local:
 
 
 class Split:
-    """Lanes for samples or points ``ends``, several each where there are few, and the range of the ``others`` that each
-    of them goes through; ``fields``: those of the lane's own sample or point. Neighbouring lanes go through the others
-    together. A plain object.
+    """Lanes of a pass over all connections: one for each end of one kind, or several if there are few. A plain class.
+
+    Args:
+        ends: the lanes' own ends.
+        others: number of ends of the other kind; each lane goes through a range of them, ``first`` to ``last``
+            (exclusive), neighbouring lanes through the same.
     """
 
     def __init__(self, ends: Ends, others: int) -> None:
@@ -267,7 +311,7 @@ class Split:
         dr.eval(self.own, self.first, self.last, vars(self.fields))
 
     def reduced(self, value: Any) -> Any:
-        """Sums over the lanes of one sample or point."""
+        """Return the sums of ``value`` over the lanes of each end."""
         if self.lanes == 1:
             return value
         own = dr.arange(mi.UInt32, self.count)
@@ -278,44 +322,44 @@ class Split:
 
 
 class AdjointReader:
-    """The film's adjoint (:class:`~..integrators.job.IncomingAdjoint`) at scanned points."""
+    """Adjoint of the film (:class:`~..integrators.job.IncomingAdjoint`) at scanned points."""
 
     def __init__(self, film: Any, match: Any, incoming: Any) -> None:
         self.match, self.incoming = match, incoming
         self.width = dr.opaque(mi.UInt32, int(film.crop_size()[0]))
 
     def block(self, s: Any) -> Any:
-        """Block of each lane's point, as :class:`~..films.block.AdjointBlock`."""
+        """Return the :class:`~..films.block.AdjointBlock` of the points with the numbers ``s``."""
         row = s // self.width
         place = Local(row=row, column=s - row * self.width, laser=None)
         return self.incoming.block(place, s, self.match)
 
 
 @dr.syntax
-def over_points(job, read, kept, split):
-    """Adjoints of each lane's sample, from its range of the points."""
+def over_points(job, read, adjoints, split):
+    """Return the adjoints of each lane's sample, by its range of the points."""
     s = mi.UInt32(split.first)
     while dr.hint(s < split.last, label="scanned points, reverse"):
-        job.step_back(read, kept, Local(sample=split.fields, point=job.points.load(s), k=split.own, s=s), True)
+        job.step_back(read, adjoints, Local(sample=split.fields, point=job.points.load(s), k=split.own, s=s), True)
         s += 1
-    return kept
+    return adjoints
 
 
 @dr.syntax
-def over_samples(job, read, kept, split):
-    """Adjoints of each lane's point, from its range of the samples."""
+def over_samples(job, read, adjoints, split):
+    """Return the adjoints of each lane's point, by its range of the samples."""
     k = mi.UInt32(split.first)
     while dr.hint(k < split.last, label="hidden samples, reverse"):
-        job.step_back(read, kept, Local(sample=job.samples.load(k), point=split.fields, k=k, s=split.own), False)
+        job.step_back(read, adjoints, Local(sample=job.samples.load(k), point=split.fields, k=k, s=split.own), False)
         k += 1
-    return kept
+    return adjoints
 
 
 @dr.syntax
-def tangents_over_samples(job, tangents, block, kept, lane):
-    """Derivatives of what each lane's range of the samples sends to its point."""
+def tangents_over_samples(job, tangents, block, sums, lane):
+    """Add the derivatives of the light from each lane's range of the samples to its point."""
     k = mi.UInt32(lane.first)
     while dr.hint(k < lane.last, label="hidden samples, forward mode"):
-        job.step_on(tangents, block, kept, lane, k)
+        job.step_on(tangents, block, sums, lane, k)
         k += 1
-    return kept
+    return sums

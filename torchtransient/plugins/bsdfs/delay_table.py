@@ -42,11 +42,11 @@ class DelaySample:
         self.bsdf, self.weight, self.delay, self.wavelengths = bsdf, weight, delay, wavelengths
 
     def after(self, τ):
-        """A path length, later by the delay."""
+        """Return a path length, later by the delay."""
         return τ if self.delay is None else τ + mi.Float64(dr.detach(self.delay))
 
     def scaled(self, value):
-        """A BSDF's value or weight times the factor."""
+        """Return a BSDF's value or weight times the factor."""
         return value if self.weight is None else attenuated(value, self.weight)
 
     def shift_wavelengths(self, *interactions):
@@ -140,7 +140,7 @@ class DelayTable:
         self._probability = dr.select(bsdfs.only_delayed == 1, 1, p)
 
     def attached(self) -> list:
-        """The tables that carry derivatives."""
+        """Return the tables that carry derivatives."""
         return [t for t in (self.lifetimes, self.elastic_weights, self.delayed_weights) if dr.grad_enabled(t)]
 
     def sample(self, bsdf, u, wavelengths) -> DelaySample:
@@ -193,7 +193,7 @@ def _gathered(values):
 
 
 def _scatters_late(bsdf) -> bool:
-    """Return whether a BSDF declares that its light comes back late."""
+    """Return True if a BSDF declares that its light comes back late."""
     return getattr(bsdf, "scatters_late", False)
 
 

@@ -33,7 +33,7 @@ def relative_index(props: Any, plugin: str, default: str = "bk7") -> Any:
 
 
 def optional_texture(props: Any, name: str) -> Any | None:
-    """The texture of a lobe, or None (a factor of one) when the scene does not give it."""
+    """Return the texture of a lobe, or None (a factor of one) when the scene does not give it."""
     return props.get_texture(name) if name in props else None
 
 

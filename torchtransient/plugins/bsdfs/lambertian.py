@@ -10,7 +10,7 @@ from torchtransient.plugins.node_walk import bsdfs_below
 
 
 def is_lambertian(bsdf: Any) -> bool:
-    """Return whether a BSDF is Mitsuba's ``diffuse``, or ``twosided`` around nothing else. By class, since other
+    """Return True if a BSDF is Mitsuba's ``diffuse``, or ``twosided`` around nothing else. By class, since other
     plugins may set the diffuse flag without being Lambertian.
     """
     name = bsdf.class_name()

@@ -47,7 +47,7 @@ from torchtransient.plugins.parameter_effect import class_of
 
 
 def hides_lobe_probability(bsdf: Any) -> bool:
-    """Return whether the weight of a delta lobe lacks the derivative of the lobe's probability, which has to be put
+    """Return True if the weight of a delta lobe lacks the derivative of the lobe's probability, which has to be put
     back.
 
     Of a mixture (mask, blend) it is asked for each part, since a part's probability hides its weight as well.
@@ -56,7 +56,7 @@ def hides_lobe_probability(bsdf: Any) -> bool:
 
 
 def mirrors_matrices(bsdf: Any) -> bool:
-    """Return whether a BSDF is ``twosided`` or holds one (in a mask, in a blend).
+    """Return True if a BSDF is ``twosided`` or holds one (in a mask, in a blend).
 
     From behind, Mitsuba's ``twosided`` evaluates what it holds for the mirror images of the directions, and returns its
     Mueller matrix as if it belonged to the directions themselves: turned, and with the hands of circular light
@@ -82,7 +82,7 @@ def _has(bsdf: Any, attribute: str, itself: Callable[[Any], bool], ends: Callabl
 
 
 def can_be_rebuilt(wrapper: Any) -> bool:
-    """Return whether a BSDF is one that :func:`rebuild_wrapper` knows."""
+    """Return True if a BSDF is one that :func:`rebuild_wrapper` knows."""
     return is_two_sided_itself(wrapper) or normal_texture(wrapper) is not None
 
 
@@ -256,7 +256,7 @@ class Mixture:
         return self.for_derivatives if derivatives else self.always, derivatives and self._has_derivative()
 
     def _has_derivative(self) -> bool:
-        """Return whether one of the weights carries derivatives; call with gradients enabled."""
+        """Return True if one of the weights carries derivatives; call with gradients enabled."""
         numbers = (value for texture in self.textures for value in numbers_below(texture, self._shapes))
         return any(map(dr.grad_enabled, numbers))
 
@@ -308,13 +308,13 @@ class Seal:
 
 
 def needs_choice(node: Any) -> bool:
-    """Return whether a mixture has wrong values where Mitsuba samples it as a whole."""
+    """Return True if a mixture has wrong values where Mitsuba samples it as a whole."""
     held = [part for _, part in objects_of(node) if isinstance(part, mi.BSDF)]
     return adds_up_wrongly(node, held, objects_below(node, mi.BSDF))
 
 
 def is_mixture(node: Any) -> bool:
-    """Return whether a BSDF or phase function is a mixture, or one that can be rebuilt around the parts of what it
+    """Return True if a BSDF or phase function is a mixture, or one that can be rebuilt around the parts of what it
     holds.
     """
     if weight_slot(node) is not None:

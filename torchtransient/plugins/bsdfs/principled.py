@@ -155,7 +155,7 @@ class DiffPrincipled(mi.BSDF):
         self.index_value = opaque(mi.Float(mi.traverse(own)[self.index]))
 
     def _build(self) -> None:
-        """The BSDF of Mitsuba, with the lobes of ``built``."""
+        """Return the BSDF of Mitsuba, with the lobes of ``built``."""
         ends = LOST_AT[self.kind]
         held: dict[str, Any] = {name: self.textures[name] for name in self.built}
         for name in self.built & set(ends):

@@ -37,7 +37,7 @@ class RefractiveBSDFs:
         self._check()
 
     @staticmethod
-    def of(scene: Any, bsdfs: list[Any] | None = None) -> RefractiveBSDFs | None:
+    def from_scene(scene: Any, bsdfs: list[Any] | None = None) -> RefractiveBSDFs | None:
         """Return the refractive surfaces of ``scene``, or None when nothing in it refracts through a lobe that can be
         connected to.
 
@@ -52,7 +52,7 @@ class RefractiveBSDFs:
         return RefractiveBSDFs(entries) if entries else None
 
     def read(self) -> RefractionTable:
-        """Read the current indices; call outside of loops, once a job. Raises as :meth:`of` where values
+        """Read the current indices; call outside of loops, once a job. Raises as :meth:`from_scene` where values
         were installed since; a call that is recorded cannot look at numbers.
         """
         if not dr.flag(dr.JitFlag.FreezingScope):

@@ -61,7 +61,7 @@ def look_up(table: Any, cos_theta: Any, active: Any) -> Any:
 
 
 def _refracts_all(eta: Any) -> bool:
-    """Return whether light refracts at every angle on its way to the side whose relative index is ``eta``."""
+    """Return True if light refracts at every angle on its way to the side whose relative index is ``eta``."""
     return bool(dr.all(eta > 1))
 
 

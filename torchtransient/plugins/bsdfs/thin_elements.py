@@ -71,7 +71,7 @@ class ThinElement(mi.BSDF):
 
 
 def _turned_to_basis(matrix: Any, forward: Any, x: Any, y: Any, z: Any) -> Any:
-    """A matrix whose horizontal axis is the projection of (x, y, z) across the direction, in the implicit frame.
+    """Return a matrix whose horizontal axis is the projection of (x, y, z) across the direction, in the implicit frame.
 
     The components are spectra: angles may depend on the wavelength.
     """

@@ -20,11 +20,16 @@ _DIGITS = 24
 
 @dataclass
 class Triangles:
-    """The triangles of several ``meshes``, their vertices joined by position, of one mesh and of different ones.
+    """Triangles of several meshes, their vertices joined by position, of one mesh and of different ones.
 
-    ``vertices`` (V, 3), of all meshes in their order; ``first`` (M,), number of each one's first; ``faces`` (F, 3),
-    numbers of vertices; ``joined`` (F, 3), numbers of places; ``mesh`` (F,), number of the mesh. Faces without area are
-    left out.
+    Faces without area are left out.
+
+    Attributes:
+        vertices: of all meshes in their order, (V, 3).
+        first: number of the first vertex of each mesh, (M,).
+        faces: numbers of vertices, (F, 3).
+        joined: numbers of places, (F, 3).
+        mesh: number of the mesh, (F,).
     """
 
     meshes: list[Any]
@@ -52,14 +57,20 @@ class Triangles:
         return Triangles(meshes, positions.astype(np.float64), first, faces, joined, mesh)
 
     def parts(self) -> np.ndarray:
-        """Number of the connected part that each face belongs to, ``(F,)``."""
+        """Return the number of the connected part that each face belongs to, (F,)."""
         return merged(self.joined, int(self.joined.max(initial=-1)) + 1)[self.joined[:, 0]]
 
 
 def joined_places(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Places of the corners of faces. What is not the same to the bit is the same place if it lies on rims: pieces that
-    were put together by transforms are off by some roundings. No face loses an edge by it: far from the origin, edges
-    may be as short as roundings are long.
+    """Return the places of the corners of faces, (F, 3), the same number for corners that lie at the same place.
+
+    What is not the same to the bit is the same place if it lies on rims: pieces that were put together by transforms
+    are off by some roundings. No face loses an edge by it: far from the origin, edges may be as short as roundings are
+    long.
+
+    Args:
+        positions: (V, 3), single precision.
+        faces: numbers of vertices, (F, 3).
     """
     # Adding zero makes one of the two zeros.
     keys = np.ascontiguousarray(positions + np.float32(0)).view("V12").ravel()
@@ -86,9 +97,11 @@ def joined_places(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def near_places(positions: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """The first of those points that lie at the same place as each of ``positions`` (K, 3), to some roundings.
+    """Return for each point the first of those that lie at the same place, to some roundings, (K,).
 
-    ``reach`` (K,): length of the longest rim at each, which a rotation may have rounded by.
+    Args:
+        positions: (K, 3).
+        reach: length of the longest rim at each, which a rotation may have rounded by, (K,).
     """
     p = positions.astype(np.float64)
     low = np.frexp(np.abs(p).max(axis=1, initial=0))[1] - 1
@@ -109,8 +122,12 @@ def near_places(positions: np.ndarray, reach: np.ndarray) -> np.ndarray:
 
 
 def merged(groups: np.ndarray, count: int, numbered: bool = True) -> np.ndarray:
-    """A label for each of ``count`` things, the same for those that a row of ``groups`` (G, K) names: the least number
-    of its like, or ``numbered`` from zero on.
+    """Return a label of each thing, the same for those of one group and of groups that overlap, (count,).
+
+    Args:
+        groups: numbers of things that belong together, (G, K).
+        count: number of things.
+        numbered: labels run from zero on; else they are the least number of their group.
     """
     label = np.arange(count)
     while True:
@@ -123,6 +140,10 @@ def merged(groups: np.ndarray, count: int, numbered: bool = True) -> np.ndarray:
 
 
 def edge_keys(joined: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A number for each edge of each face, the same for the same edge, and whether it is one at all: ``(3 F,)``."""
+    """Return (a number for each edge of each face, the same for the same edge; mask of proper edges), (3 F,).
+
+    Args:
+        joined: places of the corners of faces, (F, 3).
+    """
     low, high = joined.ravel(), joined[:, [1, 2, 0]].ravel()
     return np.minimum(low, high) * (int(joined.max(initial=0)) + 1) + np.maximum(low, high), low != high

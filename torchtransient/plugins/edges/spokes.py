@@ -1,5 +1,4 @@
-"""Edges that start at the corners of a face: candidates for a point of a mesh, next to which edges lie that a draw by
-length hardly ever finds.
+"""Edges at the corners of a face: candidates for a viewer on a mesh, next to which a draw by length hardly finds edges.
 """
 
 from __future__ import annotations
@@ -15,12 +14,13 @@ from torchtransient.plugins.transport.strategy import Local
 
 
 class Spokes:
-    """Edges by the corners of faces of some ``shapes``.
+    """Edges by the corners of faces.
 
     Args:
+        shapes: meshes.
         faces: joined places of the corners of all faces of each shape, (F, 3).
         ends: joined places of the ends of all edges of each shape, (E, 2), in the order of the table's rows.
-        listed: whether points of a shape are asked for, by shape: members of instances are not.
+        listed: points of a shape are asked for, by shape: members of instances are not.
     """
 
     def __init__(self, shapes: list[Any], faces: list[np.ndarray], ends: list[np.ndarray], listed: list[bool]) -> None:
@@ -36,7 +36,12 @@ class Spokes:
         dr.make_opaque(self._corners, self._ends, self._rows, self._starts)
 
     def around(self, pi: Any, V: Any, active: Any) -> Local:
-        """The corners of the face at ``pi``, seen from its point ``V``: ``active``, ``places``."""
+        """Return the corners of the faces that viewers lie on: ``active``, ``places``, and ``V``.
+
+        Args:
+            pi: PreliminaryIntersection3f of the viewers.
+            V: viewers, Point3f.
+        """
         face = self._faces.look_up(pi.shape, active & pi.is_valid())
         active = active & (face > 0) & (dr.reinterpret_array(mi.UInt32, pi.instance) == 0)
         first = (face - 1 + pi.prim_index) * 3
@@ -44,7 +49,7 @@ class Spokes:
         return Local(active=active, places=places, V=mi.Point3f(V))
 
     def draw(self, around: Local, x: Any) -> tuple[Any, Any]:
-        """Number of an edge for a uniform number, and whether it runs from its corner on."""
+        """Return (row of an edge, mask of edges that run from their corner on) for a uniform number ``x``."""
         x = x * 3
         corner = dr.minimum(mi.UInt32(x), 2)
         place = dr.select(corner == 0, around.places[0], dr.select(corner == 1, around.places[1], around.places[2]))
@@ -54,14 +59,21 @@ class Spokes:
         return row, dr.gather(mi.UInt32, self._ends, 2 * row, around.active) == place
 
     def place(self, around: Local, k: Local, forward: Any, u: Any) -> Any:
-        """Place along edges ``k``, near their corner as often as their squared distance from ``V`` is small there."""
+        """Return the place in [0, 1] along edges ``k``, with a density near ``1 / squared distance from V``.
+
+        Args:
+            around: corners by :meth:`around`.
+            k: rows of the table.
+            forward: mask of edges that run from their corner on.
+            u: uniform number.
+        """
         L, corner = dr.norm(k.b - k.a), dr.select(forward, k.a, k.b)
         ρ = dr.norm(corner - around.V)
         along = ρ * u / dr.maximum(ρ + L * (1 - u), 1e-20)
         return dr.select(forward, along, 1 - along)
 
     def density(self, around: Local, k: Local) -> Any:
-        """Density by length of points of edges ``k`` that :meth:`draw` and :meth:`place` have."""
+        """Return the density by length of the points of edges ``k`` that :meth:`draw` and :meth:`place` have."""
         L, total = dr.norm(k.b - k.a), mi.Float(0)
         for i, (corner, along) in enumerate(((k.a, k.u), (k.b, 1 - k.u))):
             place = dr.gather(mi.UInt32, self._ends, 2 * k.e + i, around.active & (2 * k.e + i < dr.width(self._ends)))

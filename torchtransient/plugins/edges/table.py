@@ -47,8 +47,11 @@ TILT = 2e-3
 
 
 class EdgeDensity:
-    """Density of rows of a table, in proportion to ``weight`` (Float), whose cumulative sum is ``cumulative`` (Float64:
-    of single precision, steps of long tables would be rounding).
+    """Density of rows of a table.
+
+    Args:
+        weight: weight of each row, Float.
+        cumulative: its cumulative sum, Float64: of single precision, steps of long tables would be rounding.
     """
 
     def __init__(self, weight: Any, cumulative: Any) -> None:
@@ -71,10 +74,13 @@ class EdgeTable:
         topology: of the scene.
         moving: addresses of the shapes that move.
 
-    ``ends``: two attached Point3f: ends of edges; behind those, origins and axes of limbs. ``count``: rows.
-    ``of_moving``: :class:`EdgeDensity` by length times crease angle and by body, of the shapes that move (of all where
-    none does);
-    ``by_length``: of all, with half of the samples for those that move. Nothing is drawn from a table of zero rows.
+    Attributes:
+        ends: two attached Point3f: ends of edges; behind those, origins and axes of limbs.
+        count: number of rows.
+        of_moving: :class:`EdgeDensity` by length times crease angle and by body, of the shapes that move (of all where
+            none does).
+        by_length: the same of all shapes, with half of the samples for those that move. Nothing is drawn from a table
+            of zero rows.
     """
 
     def __init__(self, topology: Topology, moving: frozenset[Any]) -> None:
@@ -100,8 +106,9 @@ class EdgeTable:
         dr.eval(self.ends, self.third, self.flags, vars(self.by_length), vars(self.of_moving))
 
     def _by_length_and_body(self) -> Any:
-        """Weights of the density: half by length, half with an equal share for each body, since the longest edges are
-        often those of a floor, behind which there is nothing.
+        """Return the weights of the density: half by length, half with an equal share for each body.
+
+        The longest edges are often those of a floor, behind which there is nothing.
         """
         owner, bodies = self.topology.owners[0], len(self.topology.bodies)
         sums = dr.zeros(mi.Float, bodies)
@@ -111,7 +118,7 @@ class EdgeTable:
         return self.weight * (0.5 + 0.5 * alike)
 
     def _measure(self) -> None:
-        """Third corners, flags and weights of the rows."""
+        """Compute third corners, flags and weights of the rows."""
         t, rows = self.topology, dr.arange(mi.UInt32, self.count)
         edge = rows < self.edges
         self.third = [dr.zeros(mi.Point3f, self.count)] * 2
@@ -134,7 +141,7 @@ class EdgeTable:
         self.weight = dr.select(dr.isfinite(weight), weight, 0)
 
     def _row(self, e: Any) -> Local:
-        """Ends of rows, or origin and axes ``a, x, y, z`` of limbs; lengths, halves of what is listed twice."""
+        """Return rows: ends, or origin and axes ``a, x, y, z`` of limbs; lengths, halves of what is listed twice."""
         k = Local(e=e, flags=dr.gather(mi.UInt32, self.flags, e))
         k.kind = k.flags // KIND
         k.a, k.b = (dr.gather(mi.Point3f, dr.detach(end), e) for end in self.ends)
@@ -154,11 +161,15 @@ class EdgeTable:
         return k
 
     def pick(self, density: EdgeDensity, x: Any, u: Any) -> Local:
-        """Draw a row by ``x`` and a place ``u`` along it.
+        """Draw an edge and a place along it.
+
+        Args:
+            density: :attr:`of_moving` or :attr:`by_length`.
+            x, u: uniform numbers for the row and the place.
 
         Returns:
             ``e``, ``pmf`` (probability of the row), ``u``, ``a, b`` (ends, or origin and first axis), ``length``;
-            ``ball``: the point of a limb waits for who looks at it; ``near``: the point, of limbs one inside the shape.
+            ``ball``: the point of a limb depends on the viewer; ``near``: the point, of limbs one inside the shape.
         """
         e, pmf = density.sample(x)
         with dr.suspend_grad():
@@ -188,8 +199,9 @@ class EdgeTable:
         return k
 
     def _faces(self, k: Any, p: Any, t: Any, d: Any) -> tuple[Any, Any, Any, Any]:
-        """Unit vectors in both faces at ``p``, across the edge (unit tangent ``t``); whether there are two, and whether
-        they are next to each other seen along ``d``.
+        """Return unit vectors in both faces at ``p``, across the edge of unit tangent ``t``; masks ``two``, ``beside``.
+
+        ``two``: there are two faces; ``beside``: they are next to each other seen along ``d``.
         """
         wa, wb = (dr.gather(mi.Point3f, third, k.e) - p for third in self.third)
         two, beside = k.flags & TWO != 0, mi.Bool(True)
@@ -207,10 +219,16 @@ class EdgeTable:
     def choose(
         self, density: EdgeDensity, sampler: Any, V: Any, at: Any, active: Any, candidates: int, worth: Any
     ) -> Local:
-        """Return one of several picks, which cost no rays, in proportion to what it may be ``worth(d, dist, crease)``
-        seen from ``V``: an outline times its span, a crease less, the flatter it is. (Resampling, Talbot et al. 2005.)
-        ``at``: (PreliminaryIntersection3f of ``V``, mask of those that lie on it); on a mesh, half of the candidates
-        are edges around the face there.
+        """Return one of several picks, which cost no rays, in proportion to its worth (resampling, Talbot et al. 2005).
+
+        Args:
+            density: density of the candidates.
+            V: viewer, Point3f.
+            at: (PreliminaryIntersection3f of ``V``, mask of those that lie on it); on a mesh, half of the candidates
+                are edges around the face there.
+            candidates: number of picks.
+            worth: function ``worth(d, dist, crease)`` of direction, distance and mask of creases, which is multiplied
+                by the span of an outline, of a crease by less, the flatter it is.
         """
         if candidates == 1:
             return self.pick(density, sampler.next_1d(), sampler.next_1d())
@@ -249,7 +267,7 @@ class EdgeTable:
         return best
 
     def _tangent(self, k: Any) -> Any:
-        """Unit tangent at the point of an edge or rim."""
+        """Return the unit tangent at the point of an edge or rim."""
         t = k.b - k.a
         if self.topology.rounds:
             sin, cos = dr.sincos(k.u * dr.two_pi)
@@ -257,7 +275,11 @@ class EdgeTable:
         return dr.normalize(mi.Vector3f(t))
 
     def seen_from(self, k: Any, V: Any, active: Any) -> Local:
-        """The point of the picked row ``k`` seen from ``V``.
+        """Return the point of a picked row as seen from a viewer.
+
+        Args:
+            k: result of :meth:`pick` or :meth:`choose`.
+            V: viewer, Point3f.
 
         Returns:
             ``p, d, dist``: the point, direction and distance of it; ``n``: out of what hides, across edge and line of
@@ -306,7 +328,7 @@ class EdgeTable:
         )  # fmt: skip
 
     def _leg(self, k: Any, other: Any, t: Any, valid: Any) -> Any:
-        """The intersection at the point in its first face, or in the ``other`` one."""
+        """Return the intersection at the point in its first face, or in the ``other`` one."""
         top = self.topology
         face, owner = (
             dr.select(other, *(dr.gather(mi.UInt32, each, k.e) for each in reversed(pair)))
@@ -327,7 +349,7 @@ class EdgeTable:
         return pi
 
     def moving(self, b: Any) -> Any:
-        """The point of ``b`` (of :meth:`seen_from`), attached to what it is an edge of."""
+        """Return the point of an outline ``b`` (:meth:`seen_from`), attached to the shape that it is an edge of."""
         k = b.k
         a, c = (dr.gather(mi.Point3f, end, k.e, b.valid) for end in self.ends)
         p = dr.lerp(a, c, k.u)
@@ -343,7 +365,7 @@ class EdgeTable:
         return k.x * v.x + k.y * v.y + k.z * v.z
 
     def _to_local(self, k: Any, w: Any) -> Any:
-        """A vector in the space of a limb, and what brings normals back."""
+        """Return a vector in the space of a limb, and the axes that bring normals back."""
         across = dr.cross(k.y, k.z), dr.cross(k.z, k.x), dr.cross(k.x, k.y)
         volume = dr.dot(k.x, across[0])
         return mi.Vector3f(*[dr.dot(c, w) / volume for c in across]), [c * dr.sign(volume) for c in across]
@@ -372,7 +394,7 @@ class EdgeTable:
         return mi.Point3f(local), along, n, dr.select(ball, D, dr.select(tube, ρ, dr.inf)) > 1
 
     def _tilted(self, k: Any, local: Any, d: Any) -> Any:
-        """A place a little towards the viewer, from where a limb shows its lit side."""
+        """Return a place a little towards the viewer, from where a limb shows its lit side."""
         towards, _ = self._to_local(k, d)
         towards.z = dr.select(k.kind == BALL, towards.z, 0)
         turned = local - dr.normalize(towards) * TILT
@@ -387,10 +409,10 @@ def _is_tube(kind: Any) -> Any:
 
 
 def _across(w: Any, t: Any) -> Any:
-    """Unit vectors along ``w``, across the edge with unit tangent ``t``."""
+    """Return unit vectors along ``w``, across the edge with unit tangent ``t``."""
     return dr.normalize(mi.Vector3f(w - t * dr.dot(w, t)))
 
 
 def _bend(k: Any, ha: Any, hb: Any) -> Any:
-    """Weight of a crease, from 0, flat, to 1. Two bodies may differ where they are flat."""
+    """Return the weight of a crease, from 0, flat, to 1; two bodies may differ where they are flat."""
     return dr.select(k.flags & SEAM != 0, 1, 0.5 * dr.norm(ha + hb))

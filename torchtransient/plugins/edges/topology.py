@@ -32,7 +32,13 @@ _ELLIPSOID = 10
 
 
 class Body:
-    """A shape of the scene, or a member of an instance. ``index``: its number among the members."""
+    """Shape of the scene, or member of an instance.
+
+    Args:
+        shape: the shape.
+        instance: instance that it is a member of, or None.
+        index: its number among the members.
+    """
 
     def __init__(self, shape: Any, instance: Any = None, index: int = 0xFFFFFFFF) -> None:
         self.shape, self.instance, self.index = shape, instance, index
@@ -46,15 +52,15 @@ class Body:
         return p if self._placed is None else mi.AffineTransform4f(self._placed.read(self.instance)) @ p
 
     def moves(self, moving: frozenset[Any]) -> bool:
-        """Return whether the address of the shape or of its instance is one of ``moving``."""
+        """Return True if the address of the shape or of its instance is one of ``moving``."""
         return self.shape.ptr in moving or (self.instance is not None and self.instance.ptr in moving)
 
     def vertices(self, index: Any) -> Any:
-        """Vertices of a mesh (Point3f) by their numbers, attached."""
+        """Return vertices of a mesh (Point3f) by their numbers, attached."""
         return self._to_world(dr.gather(mi.Point3f, mesh_positions(self.shape), index))
 
     def limbs(self) -> list[tuple[int, int]]:
-        """Kinds of the rows of a shape that is no mesh, and numbers of the ellipsoids that they are of."""
+        """Return (kind of the row, number of the ellipsoid) for each row of a shape that is no mesh."""
         name = self.shape.class_name()
         if name == "Ellipsoids":
             return [(BALL, i) for i in range(dr.width(self._value("data")) // _ELLIPSOID)]
@@ -62,7 +68,7 @@ class Body:
         return [(kind, 0) for kind in kinds[name]]
 
     def frames(self) -> list[tuple[Any, Any, Any, Any]]:
-        """Origin and axes of the space in which the shape is a unit ball, disk or tube, for each row, attached."""
+        """Return the space in which the shape is a unit ball, disk or tube, for each row: origin and axes, attached."""
         if self.shape.class_name() == "Ellipsoids":
             return [self._ellipsoid_frames()]
         T = mi.AffineTransform4f(self._value("to_world"))
@@ -107,7 +113,7 @@ class _Rows(NamedTuple):
 
 
 def _halves(joined: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Start, stop and third corner of half-edges, numbers (K, 3) in ``joined.ravel()``; all of one edge run alike."""
+    """Return start, stop and third corner of half-edges, numbers (K, 3) in ``joined.ravel()``; one edge's run alike."""
     face, k = rows // 3 * 3, rows % 3
     start, stop = face + k, face + (k + 1) % 3
     turned = joined.ravel()[start] > joined.ravel()[stop]
@@ -115,7 +121,7 @@ def _halves(joined: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def _numbers_of(mesh: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices (V, 3) and faces (F, 3) of a mesh as they are now, and which faces have an area (F,)."""
+    """Return vertices (V, 3) and faces (F, 3) of a mesh as they are now, and a mask of faces with an area (F,)."""
     positions = host_numbers(mesh_positions(mesh), np.float32).reshape(-1, 3)
     faces = np.array(mesh_faces(mesh), np.int64).reshape(-1, 3)
     corners = positions.astype(np.float64)[faces]
@@ -158,7 +164,7 @@ def _edges_of(positions: np.ndarray, faces: np.ndarray, solid: np.ndarray) -> tu
 
 
 def _angles(p: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """Angles of faces around their edges against the first of their ``group``; ``p`` (K, 3, 3): ends, third corner."""
+    """Return angles of faces (K,) around their edges against the first of their group, from ends and third corner."""
     t = p[:, 1] - p[:, 0]
     t /= np.linalg.norm(t, axis=1, keepdims=True)
     w = p[:, 2] - p[:, 0]
@@ -185,14 +191,22 @@ class Corners:
 
 
 class Topology:
-    """The edges and limbs of ``scene``: ``count`` rows, of which the last ``rounds`` are limbs and rims of what has no
-    triangles. ``hides``: which shapes count, None for all.
+    """Edges and limbs of a scene, without positions.
 
     A plain object of Dr.Jit arrays, to be kept with the scene and to be named as state of recorded calls.
 
     Two meshes that touch along rims have edges there with one face of each, listed for both, with half of the light:
     where they come apart later, each is a rim of its own. What comes together later is not joined, and the order of
     three and more faces around an edge stays. Faces without area are left out (:func:`topology_of` looks again).
+
+    Args:
+        scene: Mitsuba scene.
+        hides: function of a shape that says whether it hides light, None for all.
+
+    Attributes:
+        count: number of rows.
+        rounds: number of limbs and rims of shapes without triangles, the last of the rows.
+        bodies: :class:`Body` objects with rows.
     """
 
     def __init__(self, scene: Any, hides: Callable[[Any], bool] | None = None) -> None:
@@ -238,7 +252,8 @@ class Topology:
         return found
 
     def areas(self) -> bytes:
-        """Masks of the faces with an area now, of the meshes in which some had none; empty without such meshes."""
+        """Return masks of the faces with an area now, of the meshes in which some had none; empty without such meshes.
+        """
         return b"".join(np.packbits(_numbers_of(mesh)[2]).tobytes() for mesh in self._flat)
 
     def _edges(self, found: dict[int, tuple[_Rows, np.ndarray]]) -> tuple[_Rows, np.ndarray, np.ndarray]:
@@ -259,16 +274,16 @@ class Topology:
         return rows, owners, starts
 
     def points(self) -> Any:
-        """The vertices of all meshes (Point3f), one after the other, detached."""
+        """Return the vertices of all meshes (Point3f), one after the other, detached."""
         with dr.suspend_grad():
             return _concatenated([b.vertices(dr.arange(mi.UInt32, b.shape.vertex_count())) for b in self._meshes])
 
     def ends(self) -> list[Any]:
-        """Two Point3f, attached where they are: starts and stops of all edges; behind them origins and second axes,
-        first and third axes of the limbs.
+        """Return the ends of all rows, two Point3f, attached where they are.
 
-        By a single gather from the scene's parameters: Dr.Jit's ``isolate_grad`` loses what arrives at gathers of
-        gathers that were made before.
+        Starts and stops of all edges; behind them origins and second axes, first and third axes of the limbs. By a
+        single gather from the scene's parameters: Dr.Jit's ``isolate_grad`` loses what arrives at gathers of gathers
+        that were made before.
         """
         edges = [[body.vertices(i) for body, i in zip(self._meshes, each, strict=True)] for each in self.corners.ends]
         frames = [frame for body in self._others for frame in body.frames()]
@@ -276,7 +291,11 @@ class Topology:
         return [_concatenated([*part, *first, *then]) for part, first, then in zip(edges, (o, x), (y, z), strict=True)]
 
     def moves(self, moving: frozenset[Any]) -> Any:
-        """Ones for the rows of bodies that move, None where none does."""
+        """Return ones for the rows of bodies that move (Float), None where none does.
+
+        Args:
+            moving: addresses of the shapes that move.
+        """
         moves = [self.bodies[k].moves(moving) for k, _ in self._runs]
         if not any(moves):
             return None
@@ -284,7 +303,12 @@ class Topology:
 
 
 def topology_of(scene: Any, memory: Cache, hides: Callable[[Any], bool] | None = None) -> Topology:
-    """Return the :class:`Topology` of a scene as it is now, kept in ``memory``."""
+    """Return the :class:`Topology` of a scene as it is now, cached.
+
+    Args:
+        memory: cache of the scene.
+        hides: function of a shape that says whether it hides light, None for all.
+    """
     meshes = [shape for shape in shapes_of_scene(scene) if shape.is_mesh()]
     sizes = np.array([(mesh.vertex_count(), mesh.face_count()) for mesh in meshes], np.int64).tobytes()
     found = memory.get("edges", sizes, lambda: Topology(scene, hides))
@@ -294,8 +318,9 @@ def topology_of(scene: Any, memory: Cache, hides: Callable[[Any], bool] | None =
 
 
 def bodies_of(scene: Any) -> list[Body]:
-    """Return the bodies of a scene that have edges or limbs, by name: Mitsuba orders what it merges by addresses, and
-    kernels would differ from process to process.
+    """Return the bodies of a scene that have edges or limbs, ordered by name.
+
+    Mitsuba orders what it merges by addresses, and kernels would differ from process to process.
     """
     bodies = []
     for shape in sorted(scene.shapes(), key=lambda shape: str(shape.id())):
@@ -311,7 +336,7 @@ def _concatenated(parts: list[Any]) -> Any:
 
 
 def _stacked(parts: list[_Rows], starts: np.ndarray) -> _Rows:
-    """The rows of all meshes, vertices counted through."""
+    """Return the rows of all meshes, vertices counted through."""
     if not parts:
         none = np.zeros((0, 2), int)
         return _Rows(none, none, none, none, np.zeros((0, 4), int), np.zeros(0, int), none)
@@ -323,7 +348,7 @@ def _stacked(parts: list[_Rows], starts: np.ndarray) -> _Rows:
 
 
 def _joined_rims(rows: _Rows, owners: np.ndarray, positions: np.ndarray) -> tuple[_Rows, np.ndarray]:
-    """The rows with rims of two bodies that lie at the same place joined in pairs; more than two stay as they are."""
+    """Return the rows with rims of two bodies at the same place joined in pairs; more than two stay as they are."""
     rims = np.flatnonzero(rows.flags & TWO == 0)
     if not len(rims):
         return rows, owners

@@ -21,7 +21,8 @@ from torchtransient.plugins.properties import number, truth, whole_number
 
 
 def plain_image(film):
-    """An ``hdrfilm`` like ``film``, in single precision: RGB, or luminance in monochromatic variants."""
+    """Return an ``hdrfilm`` of the same size, crop and filter in single precision: RGB, or luminance in mono variants.
+    """
     size, crop, offset = film.size(), film.crop_size(), film.crop_offset()
     return mi.load_dict(
         {
@@ -41,7 +42,12 @@ def plain_image(film):
 
 
 def bitmap_of(steady, names):
-    """The steady image ``(H, W, C)`` as a bitmap; ``names`` of its channels."""
+    """Return a steady image as a bitmap.
+
+    Args:
+        steady: TensorXf (H, W, C), channels of S0, S1, S2 and S3 in polarized variants.
+        names: names of the channels.
+    """
     if tuple(names) in (("L",), ("R", "G", "B")) and steady.shape[2] == len(names):
         return mi.Bitmap(steady)
     stokes = [f"{name}.S{s}" for s in range(4) for name in names] if steady.shape[2] > len(names) else list(names)
@@ -61,8 +67,13 @@ MANY_VALUES = 2**23
 
 
 def zeros(real, size):
-    """An array of zeros for a film. Dr.Jit lets one thread of a processor write those of ``dr.zeros``, and where the
-    memory is new, that thread waits for every page.
+    """Return an array of zeros; large ones are written by all threads.
+
+    ``dr.zeros`` lets one thread write them, which waits for every page of new memory.
+
+    Args:
+        real: type of the array.
+        size: number of entries.
     """
     if dr.backend_v(real) is not dr.JitBackend.LLVM or size < MANY_VALUES:
         return dr.zeros(real, size)
@@ -135,9 +146,9 @@ class TimeResolvedFilm(mi.Film):
 
         Args:
             band: number of the band.
-            base: index of the pixel's first value in the band.
-            opl_from_start: ``opl - start_opl`` of the arrival, ``Float64``.
-            value: contribution by channel.
+            base: index of the pixel's first value in the band, UInt32.
+            opl_from_start: ``opl - start_opl`` of the arrival, metres (Float64).
+            value: contribution by channel, list of Float.
             active: mask of lanes.
             exclusive: no two lanes have the same base; for films with ``knows_exclusive_lanes`` alone. Films with
                 ``knows_crowds`` take ``crowded`` too.
@@ -148,16 +159,22 @@ class TimeResolvedFilm(mi.Film):
 
     @abc.abstractmethod
     def put_slope(self, band, base, opl_from_start, d_value, value_d_opl, active):
-        """Add ``k df + f k' dtau`` in forward mode, with ``df`` and ``f dtau`` by channel; arguments as in ``put``."""
+        """Add the derivative of an event, ``k df + f k' dtau`` with the film's response ``k``, in forward mode.
+
+        Args:
+            band, base, opl_from_start, active: as of :meth:`put`.
+            d_value: ``df`` by channel.
+            value_d_opl: ``f dtau`` by channel.
+        """
 
     @abc.abstractmethod
     def read(self, adjoint, base, opl_from_start, active, steady=None):
-        """Adjoint of ``put`` at an arrival.
+        """Read the adjoint of :meth:`put` at an arrival.
 
         Args:
             adjoint: (flat array, stride of entries, stride of channels), or None.
-            base: index of the pixel's first value in the array.
-            opl_from_start: ``opl - start_opl`` of the arrival, ``Float64``.
+            base: index of the pixel's first value in the array, UInt32.
+            opl_from_start: ``opl - start_opl`` of the arrival, metres (Float64).
             active: mask of lanes.
             steady: adjoint of the sum over the array by channel, for films without a steady image of their own.
 
@@ -174,7 +191,7 @@ class TimeResolvedFilm(mi.Film):
         self.laser_scan_width = whole_number(props, "laser_scan_width", 0, least=0)
         self.laser_scan_height = whole_number(props, "laser_scan_height", 0, least=0)
         self._check_laser_grid()
-        self.curves = SensorResponse.of(props)
+        self.curves = SensorResponse.from_properties(props)
         self.bands = []
         self._lent = None
         self.steady = None
@@ -208,7 +225,11 @@ class TimeResolvedFilm(mi.Film):
         return 1 if mi.is_monochromatic else 3
 
     def prepare(self, aovs=()):
-        """Begin an image, with other channels of these names behind its own; returns the number of channels."""
+        """Begin an image of an integrator without time, and return its number of channels.
+
+        Args:
+            aovs: names of further channels, behind the film's own.
+        """
         self.clear()
         self._image = plain_image(self)
         return self._image.prepare(list(aovs))
@@ -222,7 +243,7 @@ class TimeResolvedFilm(mi.Film):
         return self._image
 
     def create_block(self, size=(0, 0), normalize=False, borders=False):
-        """A block of the image, which :meth:`put_block` takes."""
+        """Return a block of the image, which :meth:`put_block` takes."""
         return self._begun_image().create_block(mi.ScalarVector2u(size), normalize, borders)
 
     def put_block(self, block):
@@ -230,7 +251,7 @@ class TimeResolvedFilm(mi.Film):
         self._begun_image().put_block(block)
 
     def bitmap(self, raw: bool = False):
-        """The image, or the steady image of a time-resolved render, as a ``mi.Bitmap``."""
+        """Return the image, or the steady image of a time-resolved render, as a ``mi.Bitmap``."""
         if self._image is not None:
             return self._image.bitmap(raw)
         return bitmap_of(self.develop(raw)[0], self.channel_names())
@@ -259,7 +280,12 @@ class TimeResolvedFilm(mi.Film):
         return self.temporal_filter
 
     def take_filter(self, name: str, stddev: float | None):
-        """Replace the temporal filter; an empty name and None leave it, and films without one ignore the call."""
+        """Replace the temporal filter; films without one ignore the call.
+
+        Args:
+            name: filter, empty to leave it.
+            stddev: its standard deviation in bins, None to leave it.
+        """
 
     def arrivals(self):
         """Return the :class:`~.block.ArrivalWindow` of a film without a steady image, None where all light counts."""
@@ -304,19 +330,18 @@ class TimeResolvedFilm(mi.Film):
         return len(self.channel_names()) * (4 if mi.is_polarized else 1)
 
     def channel_names(self) -> tuple[str, ...]:
-        """Names of the channels: those of the response curves, else ("L",) in monochromatic variants and ("R", "G",
-        "B").
+        """Return the names of the channels: response curves, else ("L",) in monochromatic variants and ("R", "G", "B").
         """
         if self.curves is not None:
             return self.curves.names
         return ("L",) if mi.is_monochromatic else ("R", "G", "B")
 
     def laser_count(self) -> int:
-        """Number of laser positions of an exhaustive scan, otherwise 1."""
+        """Return the number of laser positions of an exhaustive scan, otherwise 1."""
         return self.laser_scan_width * self.laser_scan_height if self.exhaustive_scan else 1
 
     def laser_shape(self) -> tuple[int, ...]:
-        """The dimensions of an array that belong to the laser: (Lh, Lw), or none."""
+        """Return the dimensions of the array that belong to the laser: (Lh, Lw), or none."""
         return (self.laser_scan_height, self.laser_scan_width) if self.exhaustive_scan else ()
 
     def entries_per_array(self) -> int:
@@ -328,13 +353,20 @@ class TimeResolvedFilm(mi.Film):
         return self.laser_count() * math.prod(self.cube_shape()[-2:])
 
     def pixel_base(self, base, laser):
-        """Index of the array of one laser position (``row * laser_scan_width + column``, None without a scan), where
-        ``base`` is that of a pixel's first one.
+        """Return the index of the array of one laser position.
+
+        Args:
+            base: index of the pixel's first value, UInt32.
+            laser: ``row * laser_scan_width + column``, UInt32; None without a scan.
         """
         return base if laser is None else base + laser * self.entries_per_array()
 
     def band_rows(self) -> int:
-        """Rows of one storage band: as many as 32-bit indices allow."""
+        """Return the number of rows of one storage band: as many as 32-bit indices allow.
+
+        Raises:
+            StorageError: if one row has more than 2^32 values.
+        """
         per_row = int(self.crop_size()[0]) * self.entries_per_pixel()
         rows = MAX_ARRAY_ENTRIES // per_row
         if rows < 1:
@@ -351,7 +383,14 @@ class TimeResolvedFilm(mi.Film):
         return [(first, min(rows, height - first)) for first in range(0, height, rows)]
 
     def start_render(self, samples: int = 0):
-        """Allocate zeroed storage for a render of ``samples`` per pixel."""
+        """Allocate zeroed storage.
+
+        Args:
+            samples: samples per pixel; sums of more than 2^16 are in double precision.
+
+        Raises:
+            StorageError: if such sums are asked for in an array that is lent (:meth:`lend`).
+        """
         height, width = self.cube_shape()[:2]
         real = mi.Float64 if samples > MAX_SINGLE_PRECISION_SAMPLES else mi.Float
         per_row = width * self.entries_per_pixel()
@@ -371,14 +410,24 @@ class TimeResolvedFilm(mi.Film):
         self.outside = dr.zeros(real, height * width * 2) if self.has_window else None
 
     def add_steady(self, pixel, channels):
-        """Add to the steady image of pixels, unless the film sums it up of its array."""
+        """Add light to the steady image, unless the film sums it up of its array.
+
+        Args:
+            pixel: index of the pixels, UInt32.
+            channels: light by channel, list of Float.
+        """
         if self.keeps_steady:
             for c, value in enumerate(channels):
                 index = pixel * self.channel_count() + c
                 dr.scatter_reduce(dr.ReduceOp.Add, self.steady, type(self.steady)(value), index)
 
     def add_outside(self, pixel, before, after):
-        """Count the light of pixels that a window missed; nothing to do for a film without one."""
+        """Count light that the window missed, in films with one.
+
+        Args:
+            pixel: index of the pixels, UInt32.
+            before, after: energy before and after the window, Float.
+        """
         if self.outside is not None:
             for side, value in enumerate((before, after)):
                 dr.scatter_reduce(dr.ReduceOp.Add, self.outside, type(self.outside)(value), pixel * 2 + side)
@@ -408,22 +457,26 @@ class TimeResolvedFilm(mi.Film):
             self._image.clear()
 
     def can_borrow(self, samples):
-        """Return whether renders of ``samples`` per pixel can add to an array that is lent (:meth:`lend`)."""
+        """Return True if renders of ``samples`` per pixel can add to an array that is lent (:meth:`lend`)."""
         # Samplers may round up; a sum over the array needs one that starts with the film; classes made out of this one
         # may have storage of their own.
         in_single = 4 * samples <= MAX_SINGLE_PRECISION_SAMPLES and says_it_can_be_recorded(self)
         return in_single and len(self.band_layout()) == 1 and self.keeps_steady
 
     def lend(self, storage):
-        """Let renders add to ``(flat array of zeros, first entry)`` instead of an array of their own, until None."""
+        """Let renders add to memory of the caller.
+
+        Args:
+            storage: (flat array of zeros, index of the film's first entry); None for arrays of the film's own again.
+        """
         self._lent = storage
 
     def first_entry(self):
         """Return the index of the film's first value in its band (``UInt32``), which is added to a base; None for 0."""
         return None if self._lent is None else dr.opaque(mi.UInt32, self._lent[1])
 
-    def taken(self):
-        """Return the arrays of a finished render as :meth:`hold` takes them; the film keeps none of them.
+    def release_storage(self):
+        """Return the arrays of a finished render, as :meth:`adopt_storage` takes them; the film keeps none of them.
 
         Other arrays of the film stay: Dr.Jit writes attributes of plugins back after a recorded call.
         """
@@ -431,8 +484,8 @@ class TimeResolvedFilm(mi.Film):
         self.clear()
         return arrays
 
-    def hold(self, arrays):
-        """Take arrays of :meth:`taken` as those of a render."""
+    def adopt_storage(self, arrays):
+        """Take the ``arrays`` of :meth:`release_storage` as those of a render."""
         self.steady, self.outside, *stored = arrays
         self.bands = [(first, rows, flat) for (first, rows), flat in zip(self.band_layout(), stored, strict=True)]
 
@@ -441,7 +494,7 @@ class TimeResolvedFilm(mi.Film):
         return self.bands
 
     def band_array(self, band: int):
-        """The flat array of a band, which :meth:`put` adds to."""
+        """Return the flat array of a band, which :meth:`put` adds to."""
         return self.bands[band][2]
 
     def check_one_band(self):
@@ -453,10 +506,15 @@ class TimeResolvedFilm(mi.Film):
             )
 
     def develop(self, raw: bool = False):
-        """The pair (steady ``(H, W, C)``, array of shape ``cube_shape()``), without a copy; the image ``(H, W, C)``
-        alone where an integrator that knows nothing of time has rendered.
+        """Return the images of a render, without a copy.
 
-        A cube of more than 2^32 entries cannot be one Dr.Jit tensor: use :meth:`transient_bands`.
+        Returns:
+            (steady ``(H, W, C)``, array of shape ``cube_shape()``); the image ``(H, W, C)`` alone where an integrator
+            without time has rendered.
+
+        Raises:
+            SceneError: if nothing was rendered.
+            StorageError: if the array has more than 2^32 entries: use :meth:`transient_bands`.
         """
         if self._image is not None:
             return self._image.develop(raw)
@@ -487,7 +545,11 @@ class TimeResolvedFilm(mi.Film):
     # ----------------------------------------------------------------------------------- pixel sampling
 
     def tabulate_filter(self):
-        """Tabulate the density of :meth:`sample_offset` once; called before anything is recorded."""
+        """Tabulate the density of :meth:`sample_offset` once; called before anything is recorded.
+
+        Raises:
+            SceneError: for filters whose radius or values are out of range.
+        """
         rfilter = self.rfilter()
         if rfilter.is_box_filter() or self._offset_distribution is not None:
             return
@@ -511,7 +573,14 @@ class TimeResolvedFilm(mi.Film):
         )
 
     def sample_offset(self, sample):
-        """Return an offset from the pixel's centre drawn from the spatial filter, and its weight (None for one)."""
+        """Draw an offset from the pixel's centre, by the absolute value of the spatial filter.
+
+        Args:
+            sample: two uniform numbers, Point2f.
+
+        Returns:
+            (offset, Point2f, pixels; weight, Float, negative where the filter is; None for one).
+        """
         rfilter = self.rfilter()
         if rfilter.is_box_filter():
             return sample - 0.5, None

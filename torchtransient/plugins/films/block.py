@@ -14,7 +14,7 @@ from torchtransient.plugins.polarized import light_type
 
 
 class FilmBlock:
-    """Events of the samples of one launch on their way to the film.
+    """Block of the samples of one launch, which writes their events to the film.
 
     A loop calls ``begin`` once, ``put`` (or ``put_slope`` in forward mode) for every event and ``end`` after the last
     one; the integrator calls ``finish`` behind the loop. A histogram writes every event at once.
@@ -58,7 +58,7 @@ class FilmBlock:
         return energy * before, energy * after
 
     def counted(self, opl):
-        """Return a path length from the film's start on, Float64."""
+        """Return a path length counted from the film's start, Float64."""
         return opl if self.origin is None else self.origin + mi.Float64(opl)
 
     def put_slope(self, events, opl, d_value, value_d_opl, active):
@@ -82,13 +82,29 @@ class FilmBlock:
 
 
 class AdjointBlock:
-    """Adjoint ``A(tau)`` of the film and its slope ``A'(tau)``, read by the samples of one launch."""
+    """Block of the samples of one launch, which reads the adjoint ``A(tau)`` of the film and its slope ``A'(tau)``.
+
+    Args:
+        film: film of the job.
+        response: adjoint of the array as (flat array, stride of entries, stride of channels), or None.
+        base: index of each sample's first entry in it, UInt32.
+        steady: adjoint of the steady image by channel.
+        match: :class:`.colour.ChannelMatch` of the samples.
+    """
 
     def __init__(self, film, response, base, steady, match):
         self.film, self.response, self.base, self.steady, self.match = film, response, base, steady, match
 
     def read(self, opl, active):
-        """Return adjoint and slope (per metre) at ``opl`` as spectra that weigh a contribution of a primary ray."""
+        """Read the adjoint at an arrival.
+
+        Args:
+            opl: optical path length, minus the film's start, metres (Float64).
+            active: mask of lanes.
+
+        Returns:
+            (adjoint, slope per metre), spectra that weigh a contribution of a primary ray.
+        """
         if not self.film.keeps_steady:
             A, slope = self.film.read(self.response, self.base, opl, active, self.steady)
             return self.match.to_spectrum(A), self.match.to_spectrum(slope)
@@ -97,27 +113,51 @@ class AdjointBlock:
         return self.as_spectra(*self.film.read(self.response, self.base, opl, active))
 
     def as_spectra(self, A, slope):
-        """Return adjoint (plus that of the steady image) and slope (None for none), given by channel, as spectra."""
+        """Return the adjoint of transient and steady image as spectra.
+
+        Args:
+            A: adjoint of the transient, by channel.
+            slope: its slope by channel, or None.
+
+        Returns:
+            (adjoint, slope or None).
+        """
         A = [a + s for a, s in zip(A, self.steady, strict=True)]
         return self.match.to_spectrum(A), None if slope is None else self.match.to_spectrum(slope)
 
     def together(self, most, with_slope):
-        """Return the number of arrivals, out of ``most`` of a path, that are read at once, before their vertices.
+        """Return the number of arrivals that are read at once, before their vertices; 0 if each is read at its vertex.
 
-        0: each arrival is read at its vertex. A film whose readings are expensive returns more.
+        A film whose readings are expensive returns more.
+
+        Args:
+            most: largest number of arrivals of a path.
+            with_slope: the slope is read as well.
         """
         return 0
 
     def read_together(self, opls, with_slope, active):
-        """Return (A, its slope or None) by channel for each of several arrivals."""
+        """Read the adjoint at several arrivals of a path.
+
+        Args:
+            opls: optical path lengths, minus the film's start, metres (Float64).
+            with_slope: read the slope as well.
+            active: mask of lanes.
+
+        Returns:
+            (adjoint, slope or None): for each arrival a list over channels.
+        """
         raise NotImplementedError
 
 
 class ArrivalWindow:
-    """Arrivals that a film counts: from ``first`` to ``last``, metres after its ``start_opl``.
+    """Window of arrivals that a film counts.
 
     A path that is longer than ``last`` has no further event that counts. A plain object, which Dr.Jit loops leave
     alone.
+
+    Args:
+        first, last: ends, metres after the film's ``start_opl``.
     """
 
     def __init__(self, first: float, last: float):
@@ -128,12 +168,17 @@ class ArrivalWindow:
         return (opl >= self.first) & (opl < self.last)
 
     def over(self, opl):
-        """Return a mask of path lengths ``opl`` behind which no arrival counts."""
+        """Return a mask of path lengths ``opl`` (Float64) behind which no arrival counts."""
         return opl >= self.last
 
 
 class GappedWindow(ArrivalWindow):
-    """A window in which equal cells of time count or not, for gates with gaps in between."""
+    """Window in which equal cells of time count or not, for gates with gaps in between.
+
+    Args:
+        first, last: ends, metres after the film's ``start_opl``.
+        cells: 1 for each cell that counts, 0 for others.
+    """
 
     def __init__(self, first: float, last: float, cells):
         super().__init__(first, last)
@@ -148,7 +193,15 @@ class GappedWindow(ArrivalWindow):
 
 
 class BinLayout:
-    """Place of one event in a film: arrays, index of the histogram's first value, strides, bins and channels."""
+    """Place of one event in a film.
+
+    Args:
+        flat: array of the film.
+        base: index of the histogram's first value in it, UInt32.
+        bin_stride, channel_stride: strides in the array.
+        bins, channels: their numbers.
+        exclusive: every lane has a histogram of its own.
+    """
 
     def __init__(self, flat, base, bin_stride, channel_stride, bins, channels, exclusive=False):
         self.flat, self.base = flat, base

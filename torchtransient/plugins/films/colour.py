@@ -29,7 +29,7 @@ class StandardObserver:
 
     @staticmethod
     def of_variant() -> StandardObserver | None:
-        """The observer in variants with wavelengths, None in others."""
+        """Return the observer in variants with wavelengths, None in others."""
         return StandardObserver() if mi.is_spectral else None
 
     def matrix(self, wavelengths) -> list:
@@ -70,7 +70,7 @@ class ChannelMatch:
         return self._to_channels(value)
 
     def to_spectrum(self, channels: list):
-        """The transposed map: adjoint of a contribution from adjoint channel values."""
+        """Return the transposed map: adjoint of a contribution from adjoint channel values."""
         if mi.is_polarized:
             n = len(channels) // 4
             parts = [self._to_spectrum(channels[n * i : n * (i + 1)]) for i in range(4)]
@@ -169,8 +169,8 @@ class SensorResponse:
         return [mi.unpolarized_spectrum(curve.eval(si)) for curve in self.textures]
 
     @staticmethod
-    def of(props) -> SensorResponse | None:
-        """The bands among the properties of a film; None when it has none."""
+    def from_properties(props) -> SensorResponse | None:
+        """Return the bands among the properties of a film; None when it has none."""
         names = [name for name in list(props.keys()) if _is_curve(props, name)]
         if not names:
             return None

@@ -32,7 +32,7 @@ _WAVELENGTHS = ("wl_mean", "wl_sigma", "temporal_bins", "bin_width_opl")
 
 
 def frequencies_of(props) -> np.ndarray:
-    """The frequencies that a film's properties ask for: float64, cycles per metre. Raises ``SceneError``."""
+    """Return the frequencies that a film's properties ask for: float64, cycles per metre. Raises ``SceneError``."""
     given = [names for names in (_LIST, _GRID, _WAVELENGTHS) if any(name in props for name in names)]
     if len(given) > 1:
         sets = " and ".join(", ".join(name for name in names if name in props) for names in given)
@@ -90,7 +90,10 @@ def _checked(values) -> np.ndarray:
 
 
 def step_of(frequencies: np.ndarray) -> float | None:
-    """The step of a uniform grid, None for other lists. Deviations that no phase could show are taken as rounding."""
+    """Return the step of a uniform grid of frequencies, None for other lists.
+
+    Deviations that no phase could show are taken as rounding.
+    """
     count = len(frequencies)
     step = (frequencies[-1] - frequencies[0]) / (count - 1) if count > 1 else 0.0
     deviation = np.abs(frequencies - (frequencies[0] + np.arange(count) * step)).max()

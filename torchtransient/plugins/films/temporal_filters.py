@@ -117,7 +117,7 @@ class GaussianFilter:
 
 
 def make_temporal_filter(name: str, stddev: float = 0.5):
-    """The filter called ``name`` (``box``, ``tent`` or ``gaussian``). Raises ``SceneError`` for another name."""
+    """Return the filter called ``name`` (``box``, ``tent`` or ``gaussian``). Raises ``SceneError`` for another name."""
     check_name(name)
     if name == "box":
         return BoxFilter()
@@ -194,10 +194,18 @@ class PulsedFilter:
 
 
 def pulse_of(props, prefix: str, plugin: str) -> Pulse | None:
-    """The pulse that the properties ``<prefix>``, ``<prefix>_fwhm_opl`` ... of a film describe; None without them.
+    """Return the pulse that properties of a film describe, None without them.
 
     ``<prefix>``: ``gaussian`` (``_fwhm_opl``), ``rectangular`` (``_width_opl``) or ``tabulated`` (``_opl`` and
-    ``_values``: numbers separated by spaces or commas); ``_center_opl`` (0) for all. Metres. Raises SceneError.
+    ``_values``: numbers separated by spaces or commas); ``_center_opl`` (0) for all. Metres.
+
+    Args:
+        props: properties of the film.
+        prefix: of their names.
+        plugin: name of the film, for messages.
+
+    Raises:
+        SceneError: for other kinds, and for values out of range.
     """
     if prefix not in props:
         return None

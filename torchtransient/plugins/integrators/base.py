@@ -98,7 +98,19 @@ class TransientIntegrator(mi.CppADIntegrator):
     # ----------------------------------------------------------------------------------- preparation
 
     def resolve(self, scene, sensor):
-        """Return the sensor and its film, checked; set the film's temporal filter by that of the integrator."""
+        """Check a sensor and its film, and set the film's temporal filter by that of the integrator.
+
+        Args:
+            sensor: sensor, or its index in the scene.
+
+        Returns:
+            (sensor, film).
+
+        Raises:
+            VariantError: in a variant without JIT compilation.
+            SceneError: if there is no such sensor, or if the integrator cannot render the film, media or lights of the
+                scene.
+        """
         if not (mi.variant() or "").startswith(("llvm", "cuda")):
             raise VariantError(
                 f"transient rendering needs a JIT variant such as llvm_ad_rgb, the active one is {mi.variant()!r}; "
@@ -144,7 +156,11 @@ class TransientIntegrator(mi.CppADIntegrator):
         return self._seen_scene(scene).tracker(scene)
 
     def silhouettes(self, scene, sensors=None) -> MovingEdges:
-        """Return the gaps of derivatives at moving edges, seen by some sensors (None: all)."""
+        """Return the gaps of derivatives at moving edges.
+
+        Args:
+            sensors: sensors that see the edges, None for all.
+        """
         return missing(f"{class_of(self)} follows no edges", "Use transient_path or transient_prbvolpath.")
 
     def reference(self, scene):
@@ -162,8 +178,15 @@ class TransientIntegrator(mi.CppADIntegrator):
             self.max_depth, self.rr_depth, bool(self.hide_emitters), self.discard_direct_light, self.camera_unwarp
         )
 
-    def world(self, scene, contents, wanted=None, window=None, settings=None) -> RenderContext:
-        """Return the context of a job; ``settings``: others than the integrator's own."""
+    def render_context(self, scene, contents, wanted=None, window=None, settings=None) -> RenderContext:
+        """Build the :class:`~..transport.context.RenderContext` of a job.
+
+        Args:
+            contents: :class:`~..transport.scene_contents.SceneContents`.
+            wanted: :class:`~..transport.context.Wanted` derivatives, None for a render.
+            window: :class:`~..films.block.ArrivalWindow` of the film, or None.
+            settings: settings of the walk, None for the integrator's own.
+        """
         return RenderContext(scene, contents, settings or self.settings(), self.strategies(contents), wanted, window)
 
     def frozen_state(self, scene, sensor=0) -> list:
@@ -175,7 +198,16 @@ class TransientIntegrator(mi.CppADIntegrator):
         return arrays_below([self.contents(scene, sensor), vars(film)])
 
     def start(self, scene, contents, sensor, film, job: Pass) -> PrimaryRays:
-        """Return the :class:`~..sensors.origin.PrimaryRays` of one launch."""
+        """Draw the primary rays of a launch.
+
+        Args:
+            contents: :class:`~..transport.scene_contents.SceneContents`.
+            sensor, film: sensor and its film.
+            job: the launch.
+
+        Returns:
+            :class:`~..sensors.origin.PrimaryRays`, attached to the sensor.
+        """
         sampler = sensor.sampler().clone()
         sampler.set_sample_count(job.spp)
         sampler.set_samples_per_wavefront(job.spp)
@@ -216,18 +248,30 @@ class TransientIntegrator(mi.CppADIntegrator):
         return rays
 
     def offset_in_pixel(self, film, sensor, sampler):
-        """Return (offset of a sample from its pixel's centre, weight or None for one)."""
+        """Draw a place in a pixel, from two numbers of the sampler.
+
+        Returns:
+            (offset from the pixel's centre, Point2f, pixels; weight, Float, None for one).
+        """
         return film.sample_offset(sampler.next_2d())
 
     def channel_match(self, contents, film, rays):
-        """Return the detached map from spectra of the primary rays to channels of the film."""
+        """Return the detached :class:`~..films.colour.ChannelMatch` from spectra of primary rays to channels."""
         ray = dr.detach(rays.ray)
         rotation = sensor_rotation(rays.seen, ray) if mi.is_polarized else None
         weight = dr.detach(rays.weight) * rays.scale
         return ChannelMatch(ray.wavelengths, weight, film.curves or contents.observer, rotation)
 
     def pixel_indices(self, film, job, rays):
-        """Return (index of a pixel's first entry in its band, index of the pixel in the film), UInt32."""
+        """Return where primary rays write to.
+
+        Args:
+            job: their launch.
+            rays: :class:`~..sensors.origin.PrimaryRays`.
+
+        Returns:
+            (index of the pixel's first entry in its storage band, index of the pixel in the film), UInt32.
+        """
         width = int(film.crop_size()[0])
         first = film.band_layout()[job.band][0]
         pixel = dr.fma(rays.row, width, rays.column)
@@ -247,8 +291,15 @@ class TransientIntegrator(mi.CppADIntegrator):
     def beside(self, context, sensor, film, seed, samples):
         """Return further terms of the derivatives of a job, such as the boundary term.
 
-        Objects with ``tables()`` (attached to the parameters), ``backward(incoming)``, ``forward()`` and
-        ``can_be_recorded``.
+        Args:
+            context: :class:`~..transport.context.RenderContext` of the job.
+            sensor, film: sensor and its film.
+            seed: seed of the job.
+            samples: largest number of samples of a pixel.
+
+        Returns:
+            Objects with ``tables()`` (attached to the parameters), ``backward(incoming)``, ``forward()`` and
+            ``can_be_recorded``.
 
         Raises:
             GradientError: if a term is needed and cannot be computed.
@@ -282,12 +333,16 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     @no_collection()
     def prepared(self, scene, sensor=0, seed=0, spp=0, kind=RENDER, grad_in=(None, None)):
-        """Return a :class:`.job.Prepared` job: contents, checks, launches and tables, outside of recorded code.
+        """Look up, check and tabulate what a job needs, outside of recorded code.
 
-        Arguments and errors as in :meth:`render`, :meth:`render_backward` and :meth:`render_forward`.
+        Other arguments and errors are those of :meth:`render`, :meth:`render_backward` and :meth:`render_forward`.
 
         Args:
             kind: one of :data:`~torchtransient.interfaces.JOBS`.
+            grad_in: adjoint of the images, in reverse mode.
+
+        Returns:
+            :class:`.job.Prepared`, the argument of :meth:`run`.
         """
         if kind not in JOBS:
             raise SceneError(f"prepared: expected a kind of job, one of {', '.join(JOBS)}, got {kind!r}.")
@@ -299,7 +354,7 @@ class TransientIntegrator(mi.CppADIntegrator):
                 contents = self.contents(scene, sensor)
             else:
                 contents, wanted = self._wanted(scene, sensor, film)
-            context = self.world(scene, contents, wanted, film.arrivals())
+            context = self.render_context(scene, contents, wanted, film.arrivals())
             lanes = None if context.record_room is None else context.record_room.lanes
             sampler = sensor.sampler().clone()
             launches, samples = passes_of(sampler, film, seed, int(spp), context.most_events(), lanes)
@@ -321,7 +376,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         for plugin in job.plugins:
             if not says_it_can_be_recorded(plugin):
                 return f"the plugin {type(plugin).__name__} does not say that it can be (can_be_recorded)"
-        if job.world.record_room is not None and job.world.record_room.in_memory:
+        if job.context.record_room is not None and job.context.record_room.in_memory:
             return "records of so many bounces lie in global memory"
         if not all(part.can_be_recorded for part in job.beside):
             return "derivatives beside paths read numbers of the scene"
@@ -349,7 +404,7 @@ class TransientIntegrator(mi.CppADIntegrator):
                 (_backward if prepared.kind == BACKWARD else _forward)(prepared)
                 return
 
-            context, film, launches = prepared.world, prepared.film, prepared.launches
+            context, film, launches = prepared.context, prepared.film, prepared.launches
             film.start_render(prepared.samples)
 
             # ------------------------------------------------------------------------- samples that pixels share
@@ -364,9 +419,9 @@ class TransientIntegrator(mi.CppADIntegrator):
                 rays, match, base, pixel = _primary_rays(prepared, launch)
                 block = film.create_event_block(launch, base, match, context.most_events())
                 path = self.primary_path(context, film, rays)
-                _, kept = walk(context, rays.sampler, path, FilmSink(block))
-                film.add_steady(pixel, match.to_channels(kept["L"]))
-                film.add_outside(pixel, kept["before"], kept["after"])
+                _, state = walk(context, rays.sampler, path, FilmSink(block))
+                film.add_steady(pixel, match.to_channels(state["L"]))
+                film.add_outside(pixel, state["before"], state["after"])
                 block.finish()
                 if evaluate or len(launches) > 1:
                     dr.eval(film.bands[launch.band][2], film.steady, film.outside)
@@ -377,10 +432,18 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     @no_collection()
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True, progress_callback=None):
-        """Render steady ``(H, W, C)`` and transient ``(H, W, T, C)``.
+        """Render an image of a sensor.
 
-        ``progress_callback(fraction)`` is called after every pass. With ``develop=False`` nothing is returned and the
-        result stays in the film.
+        Args:
+            sensor: sensor, or its index in the scene.
+            seed: whole number, or UInt32 of width one.
+            spp: samples per pixel, 0 for those of the sampler.
+            develop: return the images; otherwise the result stays in the film.
+            evaluate: run the kernels, instead of only recording them.
+            progress_callback: function of the share that is done, called after every launch; or None.
+
+        Returns:
+            Steady ``(H, W, C)`` and transient ``(H, W, T, C)`` TensorXf, or None.
         """
         with dr.suspend_grad():
             if develop:
@@ -393,12 +456,16 @@ class TransientIntegrator(mi.CppADIntegrator):
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
         """Accumulate the gradient of ``<grad_in, render()>`` into the attached parameters of the scene.
 
-        ``grad_in`` is the pair (steady ``(H, W, C)`` or None, transient or None). The transient adjoint is a TensorXf
-        ``(H, W, T, C)``, or the tuple ``(flat array, offset, (row, column, bin, channel) strides)``, which reads any
-        layout without a copy. ``params`` is not used: parameters are found through Dr.Jit's graph.
+        Args:
+            params: not used; parameters are found through Dr.Jit's graph.
+            grad_in: (steady ``(H, W, C)`` or None, transient or None). The transient is a TensorXf ``(H, W, T, C)``, or
+                the tuple ``(flat array, offset, (row, column, bin, channel) strides)``, which reads any layout without
+                a copy.
+            sensor, seed, spp: as of :meth:`render`.
 
-        Raises GradientError when a path length can change and the temporal filter has no slope, or without a bound on
-        the depth.
+        Raises:
+            GradientError: if a path length can change and the temporal filter has no slope, or without a bound on the
+                depth.
         """
         job = self.prepared(scene, sensor, seed, spp, BACKWARD, grad_in)
         if grad_in[0] is not None or grad_in[1] is not None:
@@ -431,7 +498,7 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     def _warn_of_edges(self, scene, sensor, effects):
         """Warn once a scene of the gaps in the derivative of each attached parameter."""
-        warned = self._seen_scene(scene).told_of_edges
+        warned = self._seen_scene(scene).warned_of_edges
         new = [one for one in effects if one[2].moves_silhouette and (one[0].ptr, one[1]) not in warned]
         if not new:
             return
@@ -445,13 +512,22 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     @no_collection()
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0, develop=True):
-        """Derivatives (steady ``(H, W, C)``, transient) along the tangents set on the scene's attached parameters.
+        """Render the derivative along the tangents that are set on the scene's attached parameters.
 
         One pass over the samples for one tangent. Tangents are set on values of the scene or on what they come from,
-        and are carried on from there; a caller who does so before clears the edges (``ADFlag.ClearEdges``) and keeps
-        what lies between: with Dr.Jit's default flags it is gone, which a warning says, and without any flag it is
-        counted twice. ``params`` is not used; with ``develop=False`` the result stays in the film. Errors as in
-        :meth:`render_backward`.
+        and are propagated from there. A caller who does so before clears the edges (``ADFlag.ClearEdges``) and keeps
+        what lies between: Dr.Jit's default flags remove it, with a warning here, and without any flag it is counted
+        twice.
+
+        Args:
+            params: not used; parameters are found through Dr.Jit's graph.
+            sensor, seed, spp, develop: as of :meth:`render`.
+
+        Returns:
+            Steady ``(H, W, C)`` and transient ``(H, W, T, C)`` TensorXf, or None.
+
+        Raises:
+            GradientError: as of :meth:`render_backward`.
         """
         with dr.suspend_grad():
             job = self.prepared(scene, sensor, seed, spp, FORWARD)
@@ -470,7 +546,7 @@ class TransientIntegrator(mi.CppADIntegrator):
 
 def _primary_rays(job, launch):
     """Return (primary rays, map to the film's channels, first entry and pixel of each lane)."""
-    integrator, context = job.integrator, job.world
+    integrator, context = job.integrator, job.context
     rays = integrator.start(context.scene, context.contents, job.sensor, job.film, launch)
     match = integrator.channel_match(context.contents, job.film, rays)
     base, pixel = integrator.pixel_indices(job.film, launch, rays)
@@ -479,12 +555,12 @@ def _primary_rays(job, launch):
 
 def _record_sink(job, rays, block=None):
     """Return the sink that records paths, with their arrivals for the adjoint ``block``."""
-    return RecordSink(block, dr.width(rays.ray) if job.world.record_room.in_memory else None)
+    return RecordSink(block, dr.width(rays.ray) if job.context.record_room.in_memory else None)
 
 
 def _backward(job):
     """Execute a prepared job in reverse mode, with gradients suspended."""
-    integrator, context = job.integrator, job.world
+    integrator, context = job.integrator, job.context
     # Derivatives wait at the arrays that kernels read until the scope ends after the last launch; Dr.Jit carries on
     # then: following the graph further uses up its edges, and only those of the first launch would arrive.
     with dr.isolate_grad(), context.contents.hidden_from_mitsuba():
@@ -508,7 +584,7 @@ def _backward(job):
 
 def _forward(job):
     """Execute a prepared job in forward mode, with gradients suspended: the film holds the tangent afterwards."""
-    integrator, context, film = job.integrator, job.world, job.film
+    integrator, context, film = job.integrator, job.context, job.film
     film.start_render(job.samples)
     with context.contents.hidden_from_mitsuba():
         for launch in job.launches if context.walks else ():

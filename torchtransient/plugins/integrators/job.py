@@ -21,9 +21,14 @@ MAX_LANES = 2**26
 
 @dataclass
 class Pass:
-    """Kernel launch: ``spp`` of ``total`` samples per pixel for ``rows`` rows of one storage band.
+    """Kernel launch: ``spp`` of ``total`` samples per pixel for some rows of one storage band.
 
-    ``seed`` is a UInt32 in memory: a number would be a literal of the kernel.
+    Attributes:
+        band: number of the storage band.
+        first_row, rows: first row of the film, number of rows.
+        spp: samples per pixel of the launch.
+        total: samples per pixel of all launches.
+        seed: UInt32 in memory; a number would be a literal of the kernel.
     """
 
     band: int
@@ -61,12 +66,24 @@ def laser_count(film: Any) -> int:
 def passes_of(
     sampler: Any, film: Any, seed: Any, spp: int, most_events: int, record_lanes: int | None = None
 ) -> tuple[list[Pass], int]:
-    """The launches of a job of ``spp`` samples per pixel (0: the sampler's own number), and the largest number of
-    samples of a pixel. ``sampler`` is changed. ``most_events``: of one path. ``record_lanes``: paths of a launch whose
-    records there is memory for, None for any number. Raises GradientError where it is less than a row of the film.
+    """Divide a job into launches.
 
     Some samplers round the number of samples of a launch, so that storage bands of different heights may get different
     totals.
+
+    Args:
+        sampler: sampler of the sensor, whose sample count is changed.
+        film: film of the sensor.
+        seed: seed of the job, whole number or UInt32.
+        spp: samples per pixel, 0 for the sampler's own number.
+        most_events: largest number of events of a path.
+        record_lanes: largest number of paths of a launch whose records fit into memory, None for any.
+
+    Returns:
+        (launches, largest number of samples of a pixel).
+
+    Raises:
+        GradientError: if ``record_lanes`` is less than a row of the film.
     """
     if spp:
         sampler.set_sample_count(spp)
@@ -108,8 +125,13 @@ def _seed_of_pass(seed: Any, number: int, count: int) -> Any:
 
 
 def seed_array(seed: Any) -> Any:
-    """A seed as an array in memory: an array of one, or a whole number, of which the lowest 32 bits count. Raises
-    UnitError.
+    """Return a seed as UInt32 in memory.
+
+    Args:
+        seed: array of one, or a whole number, of which the lowest 32 bits count, with a warning.
+
+    Raises:
+        UnitError: for other numbers.
     """
     return mi.UInt32(seed) if dr.is_array_v(seed) else dr.opaque(mi.UInt32, _whole(seed))
 
@@ -129,9 +151,9 @@ def _whole(seed: Any) -> int:
 
 
 def _launch_counts(sampler: Any, spp: int, most: int) -> list[int]:
-    """Samples per pixel of the launches that make up ``spp``, at most ``most`` each, in numbers that the sampler takes.
+    """Return the samples per pixel of the launches that make up ``spp``, at most ``most`` each.
 
-    Samplers such as multijitter or ldsampler round a number up; what they really draw is what a pixel is divided by.
+    Samplers such as multijitter or ldsampler round a number up; a pixel is divided by what they draw.
     """
 
     def drawn(count):
@@ -157,7 +179,13 @@ def _launch_counts(sampler: Any, spp: int, most: int) -> list[int]:
 
 
 def share_of(progress: Any, part: int, count: int) -> Any:
-    """Return the progress function of one of several parts of a job."""
+    """Return the progress function of one of several parts of a job, None without one.
+
+    Args:
+        progress: function of the share of the job that is done, or None.
+        part: number of the part.
+        count: number of parts.
+    """
     return progress and (lambda done: progress((part + done) / count))
 
 
@@ -166,14 +194,22 @@ def share_of(progress: Any, part: int, count: int) -> Any:
 
 @dataclass
 class Prepared:
-    """One render or one derivative of it. Made outside of recorded code by
-    :meth:`~.base.TransientIntegrator.prepared`, carried out by :meth:`~.base.TransientIntegrator.run`.
+    """Render, or derivative of one, with all look-ups, checks and tables done: a function of arrays is left.
 
-    ``kind``: one of :data:`~torchtransient.interfaces.JOBS`. ``launches``: the :class:`Pass` of its paths;
-    ``seed`` (``UInt32``) of the job; ``samples``: the largest number of a pixel. ``incoming``: the film's adjoint in
-    reverse mode. ``beside``: what derivatives have beside paths. ``plugins``: those of the scene that are
-    written in Python, whose numbers become part of the kernels. ``refusal``: why it cannot be recorded, None where it
-    can.
+    Made outside of recorded code by :meth:`~.base.TransientIntegrator.prepared`, executed by
+    :meth:`~.base.TransientIntegrator.run`.
+
+    Attributes:
+        kind: one of :data:`~torchtransient.interfaces.JOBS`.
+        integrator, scene, sensor, film: plugins of the job.
+        context: :class:`~..transport.context.RenderContext` of its paths, with the wanted derivatives.
+        launches: the :class:`Pass` of its paths.
+        seed: seed of the job, UInt32.
+        samples: largest number of samples of a pixel.
+        incoming: :class:`IncomingAdjoint` in reverse mode.
+        beside: terms of the derivative that paths do not have, see :meth:`~.base.TransientIntegrator.beside`.
+        plugins: plugins of the scene that are written in Python, whose numbers become part of the kernels.
+        refusal: reason why the job cannot be recorded, None if it can.
     """
 
     kind: str
@@ -181,7 +217,7 @@ class Prepared:
     scene: Any
     sensor: Any
     film: Any
-    world: Any
+    context: Any
     launches: list[Any]
     seed: Any
     samples: int
@@ -192,18 +228,20 @@ class Prepared:
 
     def tables(self) -> list[Any]:
         """Return the attached arrays that were computed from the scene's parameters."""
-        tables = self.world.tables() + [table for part in self.beside for table in part.tables()]
+        tables = self.context.tables() + [table for part in self.beside for table in part.tables()]
         with dr.resume_grad():
             return [table for table in tables if dr.grad_enabled(table)]
 
 
 def state_of(jobs: list[Prepared]) -> tuple[tuple[Any, ...], list[Any]]:
-    """Return (structure, arrays) of jobs: what their kernels depend on beside arrays, and the arrays that they read.
+    """Return what the kernels of jobs depend on, beside the scene's parameters.
 
-    The scene's parameters are not among them.
+    Returns:
+        (structure: hashable, all that is no array; arrays that the kernels read), see
+        :func:`~..frozen_state.state_below`.
     """
     held = [
-        [job.kind, job.integrator, job.film, job.world, job.launches, job.seed, job.samples, job.incoming, job.beside]
+        [job.kind, job.integrator, job.film, job.context, job.launches, job.seed, job.samples, job.incoming, job.beside]
         for job in jobs
     ]
     return state_below([held, [vars(plugin) for plugin in jobs[0].plugins]])
@@ -238,7 +276,13 @@ class IncomingAdjoint:
         return transient.array, 0, tuple(int(stride) for stride in strides)
 
     def block(self, rays: Any, pixel: Any, match: Any) -> Any:
-        """Return the film's :class:`~..films.block.AdjointBlock` for the primary ``rays`` of the pixels ``pixel``."""
+        """Return the film's :class:`~..films.block.AdjointBlock` for the samples of a launch.
+
+        Args:
+            rays: primary rays, with ``row``, ``column`` and ``laser``.
+            pixel: index of their pixels in the film, UInt32.
+            match: :class:`~..films.colour.ChannelMatch` of the rays.
+        """
         film, channels = self.film, self.film.channel_count()
         steady = [mi.Float(0)] * channels
         if self.steady is not None:

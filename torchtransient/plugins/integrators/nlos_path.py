@@ -211,7 +211,8 @@ class TransientNLOSPath(base.TransientIntegrator):
         return 0 if self.laser_sampling else 1
 
     def asked_bounces(self) -> tuple[int, int | None]:
-        """The smallest and the largest number of bounces whose light is asked for, the latter None without a limit."""
+        """Return the smallest and the largest number of bounces whose light is wanted, the latter None without a limit.
+        """
         settings, light = self.settings(), self._light_segments
         most = None if settings.max_depth == UNLIMITED else settings.max_depth - light
         return max(settings.min_depth - light, 0), most
@@ -260,7 +261,9 @@ class TransientNLOSPath(base.TransientIntegrator):
         division = Division.of(bounces, settings.min_depth, settings.max_depth, wall is None)
         return division if wall is not None else replace(division, why_not=NOT_FLAT)
 
-    def world(self, scene: Any, contents: Any, wanted: Any = None, window: Any = None, settings: Any = None) -> Any:
+    def render_context(
+        self, scene: Any, contents: Any, wanted: Any = None, window: Any = None, settings: Any = None
+    ) -> Any:
         table = self.scan_table(scene, contents)
         if settings is None:
             settings = self.settings()
@@ -281,7 +284,7 @@ class TransientNLOSPath(base.TransientIntegrator):
         return parts
 
     def refusal_of(self, job: Any) -> str | None:
-        if job.world.wanted is None and (job.world.division.third_bounce or job.world.division.chained):
+        if job.context.wanted is None and (job.context.division.third_bounce or job.context.division.chained):
             return "samples that a scan shares are drawn by reading numbers of the scene"
         return super().refusal_of(job)
 
@@ -365,7 +368,8 @@ class TransientNLOSPath(base.TransientIntegrator):
         shared = [self._shared(context, film, seed, samples)] if context.division.third_bounce else []
         if not self.boundary:
             return shared
-        edges = mutual_occlusion(self, context, sensor, film, seed, samples, dr.detach(self._table(context).seen()))
+        scanned = dr.detach(self._table(context).interactions())
+        edges = mutual_occlusion(self, context, sensor, film, seed, samples, scanned)
         late = late_outlines(self, context, sensor, film, seed, samples)
         return shared + [term for term in (edges, late) if term is not None]
 

@@ -42,13 +42,15 @@ _SHEAR = 1e-4
 
 @dataclass
 class AreaElements:
-    """Elements of ``shapes`` in the order of shapes and primitives, float64; ``E`` of them.
+    """Elements of shapes in the order of shapes and primitives, float64; ``E`` of them.
 
-    ``axes`` ``(E, 4, 3)``: origin and three axes; ``kind``, ``shape``, ``primitive``, ``area`` ``(E,)``; ``normal``
-    ``(E, 3)`` of flat ones, of the side that shading normals take for the front, else ``(sign / radius, 0, 0)``;
-    ``two_sided``: whether
-    light scatters on the back as well. ``left_out``: names of the shapes that have no rows: copies of groups, curves,
-    signed distances, ellipsoids.
+    Attributes:
+        axes: origin and three axes, (E, 4, 3).
+        kind, shape, primitive, area: row of the table above, numbers of shape and primitive, square metres, (E,).
+        normal: (E, 3); of flat elements on the side that shading normals take for the front, else
+            ``(sign / radius, 0, 0)``.
+        two_sided: light scatters on the back as well, (E,).
+        left_out: names of the shapes without rows: copies of groups, curves, signed distances, ellipsoids.
     """
 
     axes: np.ndarray
@@ -61,7 +63,7 @@ class AreaElements:
     left_out: list[str]
 
     @staticmethod
-    def of(shapes: list[Any]) -> AreaElements:
+    def from_shapes(shapes: list[Any]) -> AreaElements:
         """Build the elements of Mitsuba shapes, those without area included."""
         parts, left_out = [], []
         for number, shape in enumerate(shapes):
@@ -100,15 +102,19 @@ class AreaElements:
         return self.axes, self.kind, self.shape, self.primitive, self.area, self.normal, self.two_sided
 
     def centers(self) -> np.ndarray:
-        """A point of (or in) each element, ``(E, 3)``."""
+        """Return a point of (or in) each element, (E, 3)."""
         o, a, b, c = (self.axes[:, i] for i in range(4))
         return o + np.select(
             [self.kind[:, None] == TRIANGLE, self.kind[:, None] == CYLINDER], [(a + b) / 3, c / 2], np.zeros(3)
         )
 
     def points(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Points spread over the elements of these numbers, and normals there: two arrays ``(M, P, 3)``. One point, its
-        centre, for triangles, and 16 for all others, of which there are few.
+        """Return points spread over some elements, and normals there: two arrays (M, P, 3).
+
+        One point, its centre, for triangles, and 16 for all others, of which there are few.
+
+        Args:
+            numbers: numbers of the elements, (M,).
         """
         part = self.take(numbers)
         if np.all(part.kind == TRIANGLE):
@@ -126,8 +132,13 @@ class AreaElements:
 
 
 def local_point(kind: Any, a: Any, y: Any, math_of: Any, kinds: tuple[int, ...] = (0, 1, 2, 3)) -> list[Any]:
-    """Weights of the three axes of elements for two numbers in [0, 1), see the table above; ``math_of``: the module
-    with ``sqrt``, ``cos``, ``sin`` and ``where`` (numpy) or ``select`` (Dr.Jit). ``kinds``: those that there are.
+    """Return the weights of the three axes of elements for a point, see the table above.
+
+    Args:
+        kind: kinds of the elements.
+        a, y: two numbers in [0, 1).
+        math_of: module with ``sqrt``, ``cos``, ``sin`` and ``where`` (numpy) or ``select`` (Dr.Jit).
+        kinds: kinds that there are.
     """
     select = getattr(math_of, "select", None) if math_of is dr else math_of.where
     s = math_of.sqrt(y)
@@ -145,8 +156,10 @@ def local_point(kind: Any, a: Any, y: Any, math_of: Any, kinds: tuple[int, ...] 
 
 
 def can_be_listed(shape: Any) -> bool:
-    """Return whether points can be drawn on a shape. Not on copies of groups, curves, signed distances and ellipsoids,
-    nor on sheared disks, spheres and cylinders, where Mitsuba's rays disagree with the matrix.
+    """Return True if points can be drawn on a shape.
+
+    Not on copies of groups, curves, signed distances and ellipsoids, nor on sheared disks, spheres and cylinders, where
+    Mitsuba's rays disagree with the matrix.
     """
     if not has_surface(shape) or shape.is_ellipsoids():
         return False
@@ -154,9 +167,7 @@ def can_be_listed(shape: Any) -> bool:
 
 
 def _is_sheared(shape: Any) -> bool:
-    """Return whether the axes of an analytic shape have lost their right angles, or those of a round one their
-    length.
-    """
+    """Return True if the axes of an analytic shape are not orthogonal, or those of a round one differ in length."""
     axes = _matrix(shape)[:3].T
     length = np.linalg.norm(axes, axis=1)
     same = {"Disk": [], "Sphere": [0, 1, 2], "Cylinder": [0, 1]}[shape.class_name()]
@@ -191,14 +202,14 @@ def _triangles(mesh: Any) -> tuple[np.ndarray, int, np.ndarray, np.ndarray]:
 
 
 def _corner_normals(mesh: Any, faces: np.ndarray) -> np.ndarray | None:
-    """The normals at the corners of the triangles (F, 3, 3), None where there are none but those of their planes."""
+    """Return the normals at the corners of the triangles (F, 3, 3), None if there are only those of their planes."""
     if mesh.has_face_normals() or not has_normals(mesh):
         return None
     return host_numbers(mesh_normals(mesh)).reshape(-1, 3)[faces]
 
 
 def has_shading_normals(shape: Any) -> bool:
-    """Return whether the normals at the corners of some triangle are not those of one side of its plane."""
+    """Return True if the normals at the corners of some triangle are not those of one side of its plane."""
     if not shape.is_mesh():
         return False
     at_corners = _corner_normals(shape, np.array(mesh_faces(shape), dtype=np.int64).reshape(-1, 3))
@@ -235,7 +246,12 @@ def _analytic(shape: Any, kind: int) -> tuple[np.ndarray, int, np.ndarray, np.nd
 
 
 def morton_order(points: np.ndarray, bits: int = 10) -> np.ndarray:
-    """The order of points ``(N, 3)`` along a curve that keeps neighbours together."""
+    """Return the order of points along a Morton curve, which keeps neighbours together, (N,).
+
+    Args:
+        points: (N, 3).
+        bits: bits of a coordinate.
+    """
     if not len(points):
         return np.zeros(0, dtype=np.int64)
     extent = max(float(np.ptp(points, axis=0).max()), 1e-30)
@@ -248,8 +264,15 @@ def morton_order(points: np.ndarray, bits: int = 10) -> np.ndarray:
 
 
 def facing_weight(elements: AreaElements, points: np.ndarray, normals: np.ndarray, chunk: int = 1 << 16) -> np.ndarray:
-    """Area times the root mean square over wall points ``(P, 3)`` of ``cos^2 cos^2 / r^4``, at both ends: what
-    single-corner light that is sent and received there weighs, without visibility and albedo. ``(E,)``.
+    """Return the weight of elements in single-corner light that is sent and received at wall points, (E,).
+
+    Area times the root mean square over wall points of ``cos^2 cos^2 / r^4``, with the cosines at both ends, without
+    visibility and albedo.
+
+    Args:
+        elements: elements of hidden shapes.
+        points, normals: of the wall, (P, 3), metres.
+        chunk: number of elements that are computed at once.
     """
     weight = np.zeros(len(elements))
     flat = elements.kind == TRIANGLE

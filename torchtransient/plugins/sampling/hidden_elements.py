@@ -40,8 +40,11 @@ def packed(values: np.ndarray) -> Any:
 
 
 def packed_columns(rows: list[list[Any]], count: int) -> Any:
-    """Pack a flat ``Float`` with ``rows`` of four numbers (``Float`` arrays) for each lane, one lane after the other,
-    filled up with zeros to ``count`` lanes.
+    """Pack rows of four numbers for each lane into a flat ``Float``, one lane after the other.
+
+    Args:
+        rows: four ``Float`` arrays for each row.
+        count: number of lanes, up to which zeros fill the array.
     """
     width = max(dr.width(column) for row in rows for column in row)
     target = dr.zeros(mi.Float, 4 * len(rows) * count)
@@ -65,8 +68,11 @@ _BUDGET = 2**17
 
 
 def cuts_of(elements: AreaElements, points: np.ndarray) -> np.ndarray:
-    """Into how many parts each edge of a triangle is cut, a power of two: ``(E,)``, 1 for all that is small or not a
-    triangle. ``points``: wall points ``(P, 3)``.
+    """Return the number of parts of each triangle's edges, a power of two, (E,): 1 for others and for small ones.
+
+    Args:
+        elements: elements of hidden shapes.
+        points: wall points, (P, 3).
     """
     o, e1, e2 = (elements.axes[:, i] for i in range(3))
     longest = np.sqrt(np.max([(e * e).sum(1) for e in (e1, e2, e1 - e2)], axis=0))
@@ -89,8 +95,17 @@ def cuts_of(elements: AreaElements, points: np.ndarray) -> np.ndarray:
 
 
 def cut(elements: AreaElements, cuts: np.ndarray) -> tuple[AreaElements, np.ndarray, np.ndarray]:
-    """Return (the parts, ``(M,)``: whose part each is, ``(M,)``: in which cell of it). Cells are numbered along the two
-    edges, two for each square of a grid: ``2 (j n + i)``, and one more for the upper triangle.
+    """Cut triangles into equal ones.
+
+    Cells of a triangle are numbered along its two edges, two for each square of a grid: ``2 (j n + i)``, and one more
+    for the upper triangle.
+
+    Args:
+        elements: elements of hidden shapes.
+        cuts: parts of each triangle's edges, (E,).
+
+    Returns:
+        (parts; number of the element that each is a part of, (M,); its cell there, (M,)).
     """
     numbers, cells = [np.flatnonzero(cuts == 1)], [np.zeros((cuts == 1).sum(), dtype=int)]
     for n in np.unique(cuts[cuts > 1]):
@@ -114,10 +129,14 @@ def cut(elements: AreaElements, cuts: np.ndarray) -> tuple[AreaElements, np.ndar
 
 
 class PrimitiveDensity:
-    """The density per area of a point, by the shape and primitive that it lies on. A plain class.
+    """Density per area of a point, by the shape and primitive that it lies on. A plain class.
 
-    ``uncut``: elements before they are cut, by ``cuts``; ``place`` ``(M,)`` and ``cell``: whose parts, and which, the
-    columns of ``density`` ``(tiles, M)`` are.
+    Args:
+        shapes: shapes of the elements.
+        uncut: elements before they are cut.
+        cuts: parts of each triangle's edges.
+        place, cell: for each part the element that it belongs to, and its cell there, (M,).
+        density: (tiles, M).
     """
 
     def __init__(
@@ -150,7 +169,13 @@ class PrimitiveDensity:
             self._frames = packed(_frames(uncut.take(records), cuts[records]))
 
     def look_up(self, shape: Any, prim_index: Any, p: Any, active: Any, tile: Any) -> Any:
-        """Return the density (Float), 0 for what is not in the table."""
+        """Return the density (Float, per square metre), 0 for what is not in the table.
+
+        Args:
+            shape, prim_index: ShapePtr and primitive, UInt32.
+            p: point on it, Point3f.
+            tile: tile of the scan, UInt32; None for the first.
+        """
         start = self._start.look_up(shape, active)
         listed = mi.Mask(active) & (start > 0)
         index = start - 1 + prim_index
@@ -164,7 +189,7 @@ class PrimitiveDensity:
         return dr.gather(mi.Float, self._density, index, listed)
 
     def _cell(self, record: Any, p: Any, active: Any) -> Any:
-        """Number of the cell that a point lies in; 0 where inactive."""
+        """Return the number of the cell that a point lies in; 0 where inactive."""
         o, g1, g2 = (dr.gather(mi.Vector4f, self._frames, (record - 1) * 3 + i, active) for i in range(3))
         d = mi.Vector3f(p.x - o.x, p.y - o.y, p.z - o.z)
         u = dr.maximum(dr.dot(d, mi.Vector3f(g1.x, g1.y, g1.z)), 0)
@@ -196,20 +221,33 @@ DEFENSIVE = 0.1
 
 
 class HiddenElements:
-    """A density over the area of ``shapes``: uniform within an element, see :mod:`.area_elements`; triangles that are
-    large beside their distance from the wall are several elements (:func:`cut`).
+    """Density over the area of shapes: uniform within an element, see :mod:`.area_elements`.
 
-    The probability of an element is its area times the root mean square over wall points of ``cos^2 cos^2 / r^4``
-    (both cosines, to the wall point and there), mixed with ``defensive`` of plain area. ``points`` and ``normals``
-    ``(P, 3)``: wall points, some 5 x 5 over the scan; ``(tiles, P, 3)`` gives each tile of a scan a density of its own,
-    which pays where geometry is nearer than half the scan's width. Arrays, or ``mi.Point3f`` and ``mi.Normal3f``.
-
-    The albedo does not enter. ``left_out`` names the shapes that are not in the table (copies of shape groups, curves,
-    signed distances, ellipsoids): nothing is ever drawn on them, so that whoever samples this density alone has to
-    refuse them. Elements without area are dropped. ``smooth``: whether some shape has normals that are interpolated.
+    Triangles that are large beside their distance from the wall are several elements (:func:`cut`). The probability of
+    an element is its area times the root mean square over wall points of ``cos^2 cos^2 / r^4`` (both cosines, to the
+    wall point and there), mixed with a share of plain area. The albedo does not enter. Elements without area are
+    dropped.
 
     A plain class: its arrays are constants of kernels, which do not depend on their values and sizes. It describes the
-    shapes as they are when it is built. Raises SceneError where nothing has an area, ShapeError, UnitError.
+    shapes as they are when it is built.
+
+    Args:
+        shapes: hidden shapes.
+        points, normals: wall points (P, 3), some 5 x 5 over the scan, as arrays or ``mi.Point3f`` and ``mi.Normal3f``;
+            (tiles, P, 3) gives each tile of a scan a density of its own, which pays where geometry is nearer than half
+            the scan's width.
+        defensive: share of plain area.
+        every: elements of the shapes, None to build them.
+
+    Attributes:
+        left_out: names of the shapes that are not in the table (copies of shape groups, curves, signed distances,
+            ellipsoids). Nothing is ever drawn on them: estimators by this density alone refuse them.
+        smooth: some shape has normals that are interpolated.
+
+    Raises:
+        SceneError: if nothing has an area.
+        ShapeError: if points and normals do not match.
+        UnitError: if ``defensive`` is no share.
     """
 
     def __init__(
@@ -228,7 +266,7 @@ class HiddenElements:
             raise ShapeError(
                 f"HiddenElements: points and normals of the wall have to match, got {points.shape} and {normals.shape}."
             )
-        every = AreaElements.of(shapes) if every is None else every
+        every = AreaElements.from_shapes(shapes) if every is None else every
         self.left_out, self.key = every.left_out, b""
         if not np.any(every.area > 0):
             raise SceneError(
@@ -250,10 +288,17 @@ class HiddenElements:
     def cached(
         memory: Cache, shapes: list[Any], points: Any, normals: Any, beside: Sequence[Any] = ()
     ) -> HiddenElements:
-        """Return the elements of shapes, the same object while they stay in place: not to be changed. ``beside``: the
-        other shapes of the scene. ``key`` holds where all of them are, and is empty where some do not say.
+        """Return the elements of shapes, the same object while they stay in place: not to be changed.
+
+        ``key`` of the result is that of the places of all shapes, and empty where some do not show them.
+
+        Args:
+            memory: cache of the scene.
+            shapes: hidden shapes.
+            points, normals: as of the class.
+            beside: other shapes of the scene.
         """
-        every, others = AreaElements.of(shapes), AreaElements.of(list(beside))
+        every, others = AreaElements.from_shapes(shapes), AreaElements.from_shapes(list(beside))
         parts = [array for each in (every, others) for array in each.columns()]
         numbers = np.array([registry_number(shape) for shape in (*shapes, *beside)])
         seen_from = (np.asarray(points, dtype=np.float64), np.asarray(normals, dtype=np.float64))
@@ -267,8 +312,12 @@ class HiddenElements:
         return memory.get("hidden elements", key, made)
 
     def reweighted(self, weights: np.ndarray) -> HiddenElements:
-        """Return the same elements drawn by other weights ``(tiles, E)``, finite and not negative, in the order of
-        ``elements``; the share of plain area stays. Before :meth:`put_first` alone.
+        """Return the same elements with other probabilities; the share of plain area stays.
+
+        To be called before :meth:`put_first`.
+
+        Args:
+            weights: (tiles, E), finite and not negative, in the order of ``elements``.
         """
         other = copy(self)
         other.tile_count = len(weights)
@@ -278,12 +327,12 @@ class HiddenElements:
     # ----------------------------------------------------------------------------------------- tables
 
     def _probabilities(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Return (tiles, elements)"""
+        """Return the probabilities of elements for wall points, (tiles, E)."""
         pairs = zip(points, normals, strict=True)
         return np.array([self._mixed(facing_weight(self.elements, q, n)) for q, n in pairs])
 
     def _mixed(self, w: np.ndarray) -> np.ndarray:
-        """Probabilities of weights, with the share of plain area: all of it where nothing has a weight."""
+        """Return probabilities of weights, mixed with plain area, which is all where no element has a weight."""
         area, total = self.elements.area / self.elements.area.sum(), w.sum()
         return (1 - self._defensive) * w / total + self._defensive * area if total > 0 else area
 
@@ -293,8 +342,11 @@ class HiddenElements:
         self._by_primitive = PrimitiveDensity(self.shapes, *self._cutting, p / self.elements.area)
 
     def put_first(self, clear: np.ndarray, region: Any) -> None:
-        """Put those elements first, ``(E,)`` of booleans, whose samples need no visibility rays to points that
-        ``region.holds``. The density stays what it is.
+        """Put the elements first whose samples need no visibility rays. The density stays what it is.
+
+        Args:
+            clear: mask of these elements, (E,).
+            region: region of the points that see them, with ``holds``.
         """
         self.region = region
         order = np.argsort(~clear, kind="stable")
@@ -321,23 +373,40 @@ class HiddenElements:
     # ---------------------------------------------------------------------------------------- in kernels
 
     def draw(self, u: Any, active: Any = True, tile: Any = None) -> tuple[Any, Any]:
-        """Draw a point and the geometric normal there (``Point3f``, ``Normal3f``) for two random numbers (``Point2f``)
-        of each lane; ``tile`` (``UInt32``): of which tile's density, the first where None.
+        """Draw points on the hidden geometry.
+
+        Args:
+            u: two uniform numbers, Point2f.
+            tile: tile whose density is drawn from, UInt32; None for the first.
+
+        Returns:
+            (Point3f, geometric Normal3f).
         """
         element, a = self.select_element(mi.Float64(u.x), active, tile)
         return self.point(element, a, u.y, active)
 
     def draw_with_surface(self, x: Any, y: Any, active: Any = True) -> tuple[Any, Any, Any, Any, Any]:
-        """Draw a point for two numbers in [0, 1) (``Float64``, ``Float``), the geometric normal there, its place on the
-        primitive as in :meth:`coordinates`, and the shape and primitive that it lies on.
+        """Draw points on the hidden geometry, with the places on their surfaces.
+
+        Args:
+            x, y: uniform numbers in [0, 1), Float64 and Float.
+
+        Returns:
+            (Point3f, geometric Normal3f, place on the primitive as of :meth:`coordinates`, ShapePtr, primitive).
         """
         element, a = self.select_element(x, active)
         point, n = self.point(element, a, y, active)
         return point, n, self.coordinates(element, a, y, active), *self.surface(element, active)
 
     def select_element(self, x: Any, active: Any = True, tile: Any = None) -> tuple[Any, Any]:
-        """Select an element (its number in the table) for a ``Float64`` in [0, 1), and what is left of that number:
-        uniform in [0, 1) again.
+        """Draw an element.
+
+        Args:
+            x: uniform number in [0, 1), Float64.
+            tile: tile whose density is drawn from, UInt32; None for the first.
+
+        Returns:
+            (number of the element in the table, UInt32; rest of ``x``, uniform in [0, 1) again, Float).
         """
         row = mi.UInt32(0) if tile is None else tile * (self._count + 1)
         element = _search((self._cuts, self._cdf), row, self._count, x, active)
@@ -347,7 +416,15 @@ class HiddenElements:
         return element, dr.clip(rest, 0, 1 - dr.epsilon(mi.Float))
 
     def point(self, element: Any, a: Any, y: Any, active: Any = True) -> tuple[Any, Any]:
-        """Return the point of an element for two numbers in [0, 1), and the geometric normal there."""
+        """Return the point of an element.
+
+        Args:
+            element: number in the table, UInt32.
+            a, y: numbers in [0, 1).
+
+        Returns:
+            (Point3f, geometric Normal3f).
+        """
         first, axes = self._row(element, 0, active), [self._row(element, i, active) for i in (1, 2)]
         n = mi.Vector3f(first.w, axes[0].w, axes[1].w)
         p = mi.Vector3f(first.x, first.y, first.z)
@@ -366,14 +443,23 @@ class HiddenElements:
         return mi.Point3f(p + offset), mi.Normal3f(n)
 
     def per_area(self, shape: Any, prim_index: Any, p: Any, active: Any = True, tile: Any = None) -> Any:
-        """Density per unit area (``Float``) at a point ``p`` (``Point3f``) of a shape (``ShapePtr``) and primitive
-        (``UInt32``); 0 for what is not in the table.
+        """Return the density of a point per square metre (Float), 0 for what is not in the table.
+
+        Args:
+            shape, prim_index: ShapePtr and primitive, UInt32.
+            p: point on it, Point3f.
+            tile: tile of the scan, UInt32; None for the first.
         """
         return self._by_primitive.look_up(shape, prim_index, p, active, tile)
 
     def coordinates(self, element: Any, a: Any, y: Any, active: Any = True) -> Any:
-        """Return Mitsuba's surface coordinates of the point of two numbers on an element: barycentrics of triangles,
-        the point of the unit disk (``Point2f``); meaningless for spheres and cylinders.
+        """Return Mitsuba's surface coordinates (Point2f) of the point of an element.
+
+        Barycentrics of triangles, the point of the unit disk; meaningless for spheres and cylinders.
+
+        Args:
+            element: number in the table, UInt32.
+            a, y: numbers in [0, 1), as of :meth:`point`.
         """
         row, kind = self._row(element, 3, active), self.kind(element, active)
         x = mi.Point2f(*local_point(kind, a, y, dr, self.kinds)[:2])
@@ -381,7 +467,7 @@ class HiddenElements:
         return dr.select(kind == TRIANGLE, mi.Point2f(row.x, row.y) + row.z * x, x)
 
     def density_of(self, element: Any, active: Any = True, tile: Any = None) -> Any:
-        """Density per unit area of an element of the table, ``Float``."""
+        """Return the density of an element of the table per square metre, ``Float``."""
         row = mi.UInt32(0) if tile is None else tile * (self._count + 1)
         low = dr.gather(mi.Float64, self._cdf, row + element, active)
         high = dr.gather(mi.Float64, self._cdf, row + element + 1, active)
@@ -392,7 +478,7 @@ class HiddenElements:
         return mi.UInt32(self._row(element, 3, active).w)
 
     def surface(self, element: Any, active: Any = True) -> tuple[Any, Any]:
-        """Shape (``ShapePtr``) and primitive (``UInt32``) of an element of the table."""
+        """Return shape (``ShapePtr``) and primitive (``UInt32``) of an element of the table."""
         number = dr.gather(mi.UInt32, self._shape, element, active)
         return dr.reinterpret_array(mi.ShapePtr, number), dr.gather(mi.UInt32, self._primitive, element, active)
 
@@ -401,8 +487,10 @@ class HiddenElements:
 
 
 def _cut_points(cdf: np.ndarray) -> np.ndarray:
-    """Return for each of as many equal parts of [0, 1] as there are intervals, and one more, the interval that it
-    begins in: a search has but a few to choose from (Chen and Asau 1974).
+    """Return the guide table of a cumulative distribution of N intervals, (N + 1,).
+
+    For each of N equal parts of [0, 1] the interval that it begins in, so that a search has few to choose from (Chen
+    and Asau 1974).
     """
     count = len(cdf) - 1
     begins = np.searchsorted(cdf, np.arange(count + 1) / count, side="right") - 1
@@ -411,8 +499,7 @@ def _cut_points(cdf: np.ndarray) -> np.ndarray:
 
 @dr.syntax
 def _search(tables, row, count, x, active):
-    """Number of the interval of a cumulative distribution that ``x`` falls into; ``tables``: cut points and
-    distribution.
+    """Return the interval of a cumulative distribution that ``x`` falls into; ``tables``: (guide table, distribution).
     """
     cuts, cdf = tables
     part = dr.minimum(mi.UInt32(x * mi.Float64(count)), count - 1)
@@ -428,7 +515,7 @@ def _search(tables, row, count, x, active):
 
 
 def _tiles_of(values: Any, name: str) -> np.ndarray:
-    """An array ``(tiles, P, 3)``, float64."""
+    """Return points or normals as an array (tiles, P, 3), float64."""
     array = np.array(values, dtype=np.float64)
     if dr.is_array_v(values) and not dr.is_tensor_v(values):
         array = array.T
@@ -446,6 +533,6 @@ def _is_smooth(shapes: list[Any], every: AreaElements) -> bool:
 
 
 def _named(shapes: list[Any]) -> str:
-    """Up to three shapes in words."""
+    """Return the names of up to three shapes."""
     names = [repr(shape.id() or shape.class_name()) for shape in shapes]
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "") or "no shape"

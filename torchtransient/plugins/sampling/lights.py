@@ -1,4 +1,4 @@
-"""Lights as samples need them: those far away, where all of them are, the sun, and those that are drawn too rarely."""
+"""Lights as samples need them: distant ones, the box of all of them, rarely drawn ones, the sun."""
 
 from __future__ import annotations
 
@@ -16,18 +16,27 @@ from torchtransient.plugins.mitsuba_compat import bounds_of, sun_half_angle
 
 
 class DistantReference:
-    """Sphere whose tangent planes distant light leaves at t = 0."""
+    """Sphere whose tangent planes distant light leaves at t = 0.
+
+    Args:
+        center, radius: of the sphere around the scene, metres.
+    """
 
     def __init__(self, center: tuple[float, float, float], radius: float):
         self.center, self.radius = center, radius
 
     def length(self, point, direction):
-        """Optical path length in vacuum from the tangent plane to ``point``; ``direction`` points to the light."""
+        """Return the optical path length in vacuum from a tangent plane to a point, metres.
+
+        Args:
+            point: Point3f.
+            direction: unit vector to the light.
+        """
         return self.radius - dr.dot(point - mi.ScalarPoint3f(*self.center), direction)
 
 
 def distant_reference(scene) -> DistantReference:
-    """The sphere around all shapes of ``scene``."""
+    """Return the sphere around all shapes of a scene."""
     box = mi.ScalarBoundingBox3f()
     for shape in scene.shapes():
         box.expand(bounds_of(shape))
@@ -46,16 +55,25 @@ MARGIN = 1e-5
 
 
 class LightBox:
-    """The box around all lights of a scene. A plain object, which Dr.Jit loops leave alone."""
+    """Box around all lights of a scene. A plain object, which Dr.Jit loops leave alone.
+
+    Args:
+        low, high: its corners.
+    """
 
     def __init__(self, low, high):
         self._low, self._high = mi.Point3f(low), mi.Point3f(high)
         dr.make_opaque(self._low, self._high)
 
     @staticmethod
-    def of(scene, bsdfs) -> LightBox | None:
-        """Return the box of a scene's lights; None where lights are infinitely far, have no known place, or where light
-        can pass into a medium of another index, in which optical lengths may be shorter than geometric ones.
+    def from_scene(scene, bsdfs) -> LightBox | None:
+        """Return the box of a scene's lights, None if it bounds no optical length.
+
+        That is so where lights are infinitely far or have no known place, and where light can pass into a medium of
+        another index, in which optical lengths may be shorter than geometric ones.
+
+        Args:
+            bsdfs: BSDFs of the scene.
         """
         if any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission) for bsdf in bsdfs):
             return None
@@ -71,7 +89,7 @@ class LightBox:
         return LightBox(total.min, total.max) if total.valid() else None
 
     def distance(self, p):
-        """Least distance from ``p`` to a light."""
+        """Return a lower bound of the distance from ``p`` to any light, metres."""
         away = dr.maximum(dr.maximum(self._low - p, p - self._high), 0)
         return dr.norm(away) * (1 - MARGIN)
 
@@ -88,12 +106,12 @@ _LEAST_SHARE = 1e-3
 
 
 def least_probability(count: int) -> float:
-    """Probability of being chosen among ``count`` lights, below which a light is hardly ever drawn."""
+    """Return the probability of being chosen among ``count`` lights, below which a light counts as rarely drawn."""
     return _LEAST_SHARE / count
 
 
 def is_rare(scene: Any, light: Any) -> bool:
-    """Return whether a light of a scene is hardly ever drawn."""
+    """Return True if a light of a scene is rarely drawn."""
     weights = {emitter.ptr: float(emitter.sampling_weight()) for emitter in scene.emitters()}
     return weights[light.ptr] < least_probability(len(weights)) * sum(weights.values())
 
@@ -107,10 +125,17 @@ _MARGIN = 1.001
 
 
 class MovingSun:
-    """The disk of one sky. ``rare``: it is hardly ever drawn, and paths that escape into it have to do
-    (:func:`is_rare`).
+    """Disk of the sun in a sky, whose direction has a derivative.
 
-    A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
+    A plain class: Dr.Jit loops would take a dataclass apart as loop state.
+
+    Args:
+        scene: scene of the sky.
+        emitter: the sky.
+
+    Attributes:
+        direction: unit vector to the sun in world space, attached.
+        rare: the sky is rarely drawn (:func:`is_rare`), so that paths that escape into the sun take its derivative.
     """
 
     def __init__(self, scene: Any, emitter: Any) -> None:
@@ -124,24 +149,27 @@ class MovingSun:
         self._cosine = float(dr.cos(_MARGIN * sun_half_angle(emitter)))
 
     @staticmethod
-    def of(world: Any) -> MovingSun | None:
+    def from_context(context: Any) -> MovingSun | None:
         """Return the sun of the sky that a job differentiates, or None."""
-        sky = None if world.wanted is None else world.wanted.sky
-        return None if sky is None else MovingSun(world.scene, sky)
+        sky = None if context.wanted is None else context.wanted.sky
+        return None if sky is None else MovingSun(context.scene, sky)
 
     def contains(self, d: Any) -> Any:
-        """Return whether the unit direction ``d`` points into the disk."""
+        """Return a mask of unit directions ``d`` that point into the disk."""
         return dr.dot(self.direction, d) >= self._cosine
 
     def shines(self, emitter: Any, d: Any) -> Any:
-        """Return a mask of light of ``emitter`` from ``d`` that is the sun's: that of the scene's environment, and not
-        of a directional emitter.
+        """Return a mask of light from direction ``d`` that is the sun's, and not that of a directional emitter.
+
+        Args:
+            emitter: EmitterPtr of the light.
+            d: unit vector towards it.
         """
         flags = emitter.flags()
         around = mi.has_flag(flags, mi.EmitterFlags.Infinite) & ~mi.has_flag(flags, mi.EmitterFlags.DeltaDirection)
         return around & self.contains(d)
 
-    def followed(self, d: Any, active: Any) -> Any:
-        """Attach ``d`` to the rotation of the sun where ``active``."""
+    def attach_direction(self, d: Any, active: Any) -> Any:
+        """Return ``d``, attached to the rotation of the sun where ``active``."""
         turn = dr.cross(dr.detach(self.direction), self.direction)
         return dr.select(active, dr.replace_grad(d, d + dr.cross(turn, d)), d)

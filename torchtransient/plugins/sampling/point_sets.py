@@ -13,8 +13,14 @@ ROUNDS = 16
 
 
 def scrambled(x: Any, seed: Any) -> Any:
-    """Owen's nested uniform scrambling of 32-bit fractions by a hash: every bit is flipped by a function of the bits
-    above it (Laine and Karras 2011, Burley 2020; constants of Vegdahl 2021).
+    """Return 32-bit fractions in Owen's nested uniform scrambling.
+
+    By a hash: every bit is flipped by a function of the bits above it (Laine and Karras 2011, Burley 2020; constants of
+    Vegdahl 2021).
+
+    Args:
+        x: fractions, UInt32.
+        seed: UInt32.
     """
     x = dr.brev(x)
     x ^= x * mi.UInt32(0x3D20ADEA)
@@ -69,8 +75,16 @@ def plane_points(count: int, seed: Any, sets: int = 1) -> tuple[Any, Any]:
 
 
 def plane_point(j: Any, count: int, seed: Any, number: Any = 0) -> tuple[Any, Any]:
-    """Point number ``j`` (UInt32) of the set ``number`` of :func:`plane_points`; ``seed`` (UInt32) may be another one
-    in each lane, which then has a set of its own.
+    """Return points of a set of :func:`plane_points` by their numbers.
+
+    Args:
+        j: number of the point, UInt32.
+        count: number of points of the set.
+        seed: UInt32, of one lane or of each, which then has a set of its own.
+        number: number of the set.
+
+    Returns:
+        (``Float64``, ``Float``): both coordinates.
     """
     bits = max(1, (count - 1).bit_length())
     shift, key = mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(number), ROUNDS)
@@ -111,11 +125,15 @@ def _directions(dimension: int) -> list[int]:
 
 
 def sobol(index: Any, dimension: int, seed: Any) -> Any:
-    """Coordinate ``dimension`` (0 to ``DIMENSIONS - 1``) of the points ``index`` (UInt32): a ``UInt32`` fraction.
+    """Return a coordinate of Sobol's points, scrambled: a ``UInt32`` fraction.
 
-    ``seed`` (UInt32 of width one, in memory) scrambles every dimension in its own way, so that each point by itself is
-    uniform. Of every block of ``2^m`` indices that starts at a multiple of it the points are evenly spread, and those
-    of neighbouring blocks fill each other's gaps.
+    Each point by itself is uniform. Of every block of ``2^m`` indices that starts at a multiple of it the points are
+    evenly spread, and those of neighbouring blocks fill each other's gaps.
+
+    Args:
+        index: numbers of the points, UInt32.
+        dimension: of the coordinate, 0 to ``DIMENSIONS - 1``.
+        seed: UInt32 of width one, in memory, which scrambles every dimension in its own way.
     """
     if dimension == 0:
         bits = dr.brev(index)

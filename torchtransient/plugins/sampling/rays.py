@@ -14,14 +14,15 @@ SHORTEST = 1e-6
 
 
 def past(p: Any) -> Any:
-    """Return the offset behind a hit ``p`` at which a ray goes on without meeting the same surface again. Mitsuba's own
-    rays start as far off a surface.
+    """Return the offset behind a hit ``p`` at which a ray goes on without meeting the same surface again, metres.
+
+    Mitsuba's own rays start as far off a surface.
     """
     return (1 + dr.max(dr.abs(p))) * mi.math.RayEpsilon
 
 
 def shortest(o: Any) -> Any:
-    """Return the shortest distance from ``o`` to a point that has a direction seen from there."""
+    """Return the shortest distance from ``o`` to a point that has a direction seen from there, metres."""
     return (1 + dr.max(dr.abs(o))) * SHORTEST
 
 
@@ -30,10 +31,15 @@ def shortest(o: Any) -> Any:
 
 @dr.syntax
 def behind_area_lights(scene, ray, pi):
-    """Find the first hit along ``ray`` at or behind ``pi`` that is not an area light.
+    """Find the first hit along a ray that is not an area light.
 
     Each search starts on the ray itself and distances stay those from ``ray.o``: an origin lifted off the light along
     its normal would land the hit beside the ray, at a wrong distance.
+
+    Args:
+        scene: Mitsuba scene.
+        ray: Ray3f.
+        pi: its first hit, PreliminaryIntersection3f, which is the result if it is no light.
     """
     pi = mi.PreliminaryIntersection3f(pi)
     lit = pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711 (a Dr.Jit comparison)

@@ -29,10 +29,16 @@ _POINTS = 25
 
 
 class ScanTiles:
-    """Tiles of a scan's ``points`` and ``normals`` ``(P, 3)``, for geometry at ``distance`` (metres) from the nearest.
+    """Tiles of a scan, one where the scan is not wider than twice the distance of the hidden geometry.
 
-    ``count``; ``tile`` ``(P,)``: of each point; ``points``, ``normals`` ``(count, 25, 3)``: what ``HiddenElements`` is
-    given. There is one tile where the scan is not wider than twice the distance.
+    Args:
+        points, normals: of the scan, (P, 3).
+        distance: of the nearest hidden geometry, metres.
+
+    Attributes:
+        count: number of tiles.
+        tile: tile of each point, (P,).
+        points, normals: points that stand for each tile, (count, 25, 3), as ``HiddenElements`` takes them.
     """
 
     def __init__(self, points: Any, normals: Any, distance: float) -> None:
@@ -50,14 +56,14 @@ class ScanTiles:
         self.points, self.normals = points[chosen], normals[chosen]
 
     def tile_per_point(self) -> Any:
-        """The tile of every scan point, ``UInt32`` in memory."""
+        """Return the tile of every scan point, ``UInt32`` in memory."""
         tile = mi.UInt32(self.tile.astype(np.uint32))
         dr.make_opaque(tile)
         return tile
 
 
 def distance_to(vertices: np.ndarray, points: np.ndarray) -> float:
-    """Distance of the vertices ``(V, 3)`` nearest to any of the points ``(P, 3)``, metres."""
+    """Return the distance of the vertex (V, 3) that is nearest to any of the points (P, 3), metres."""
     nearest = np.inf
     for p in points:
         nearest = min(nearest, float(((vertices - p) ** 2).sum(1).min()))
@@ -77,16 +83,25 @@ MAX_SAMPLES = 2**26
 
 @dataclass
 class SharedSamples:
-    """Samples shared by scan points: ``count`` points for each of ``tiles`` tiles of the scan, one tile after the
-    other, in the order of the elements of ``HiddenElements`` (neighbours stand together).
+    """Samples on hidden geometry that scan points share, for each tile of the scan.
 
-    ``p`` (``Point3f``); ``n`` shading and ``geometric_n`` geometric normal (``Normal3f``), the same where ``smooth`` is
-    false; ``front``, ``back`` (``UnpolarizedSpectrum``): albedo over pi of the side that the shading normal points to,
-    and of the other one; ``weight`` (``Float``): one over ``count`` times the density per area, so that a mean over the
-    area is a sum over samples; ``element`` (``UInt32``): number in the table; ``shape``, ``primitive``, ``u``
-    (``Point2f``): the material point, the same for other positions of the shape. ``clear`` (``UInt32``, one for each
-    tile): how many of its samples, the first ones, nothing hides from any point that ``region.holds``; ``has_clear``:
-    whether there are elements of that kind.
+    One tile after the other, in the order of the elements of ``HiddenElements`` (neighbours stand together).
+
+    Attributes:
+        count: number of samples of each tile.
+        p: Point3f.
+        n, geometric_n: shading and geometric normal, Normal3f, the same where ``smooth`` is false.
+        front, back: albedo over pi on the side that the shading normal points to, and on the other,
+            UnpolarizedSpectrum.
+        weight: one over ``count`` times the density per area, Float: a mean over the area is a sum over samples.
+        element: number in the table, UInt32.
+        shape, primitive, u: material point (ShapePtr, UInt32, Point2f), the same for other positions of the shape.
+        smooth: some normals are interpolated.
+        tiles: number of tiles.
+        clear: number of samples of each tile, the first ones, that nothing hides from points that ``region.holds``,
+            UInt32.
+        has_clear: there are elements of that kind.
+        region: region of those points, or None.
     """
 
     count: int
@@ -144,8 +159,13 @@ def draw_samples(elements: HiddenElements, count: int, seed: Any) -> SharedSampl
 
 
 def samples_at(elements: HiddenElements, x: Any, y: Any, count: int, tile: Any = None) -> SharedSamples:
-    """The samples at two numbers in [0, 1) for each lane (``Float64``, ``Float``), ``count`` of which make up the
-    area; not evaluated, and without ``clear``.
+    """Return the samples of given numbers, not evaluated and without ``clear``.
+
+    Args:
+        elements: hidden elements.
+        x, y: numbers in [0, 1) for each lane, Float64 and Float.
+        count: number of samples that make up the area.
+        tile: tile of each lane, UInt32; None for the first.
     """
     element, a = elements.select_element(x, tile=tile)
     p, n = elements.point(element, a, y)
@@ -164,9 +184,17 @@ def samples_at(elements: HiddenElements, x: Any, y: Any, count: int, tile: Any =
 
 
 def material_samples(elements: HiddenElements, samples: SharedSamples, meshes: Any) -> Local:
-    """Samples as points that follow their shapes, attached where these are: ``p``, ``n``, ``geometric_n``, and
-    ``front`` and ``back``, albedo over pi of the sides times the area that a sample stands for. ``meshes``
-    (:class:`~..kernel_arrays.PointerTable`): the shapes with vertices of their own.
+    """Return samples as material points, attached where their shapes are.
+
+    Args:
+        elements: hidden elements.
+        samples: samples of their density.
+        meshes: :class:`~..kernel_arrays.PointerTable` of the shapes with vertices of their own.
+
+    Returns:
+        ``p``, ``n``, ``geometric_n``, and ``front`` and ``back``: albedo over pi of the sides times the area that a
+            sample
+        stands for.
     """
     a, y = samples.u.x, samples.u.y
     pi, ray = _preliminary(elements, samples.element, samples.p, samples.geometric_n, a, y)
@@ -179,19 +207,19 @@ def material_samples(elements: HiddenElements, samples: SharedSamples, meshes: A
 
 
 def not_diffuse(shapes: list[Any]) -> list[str]:
-    """Names of the shapes, with their BSDFs, that scatter light in another way than a Lambertian surface."""
+    """Return the names of the shapes, with their BSDFs, that scatter otherwise than a Lambertian surface."""
     others = [(shape, shape.bsdf()) for shape in shapes if not is_lambertian(shape.bsdf())]
     return list(dict.fromkeys(f"{shape.id() or shape.class_name()} ({bsdf.class_name()})" for shape, bsdf in others))
 
 
 def _interaction(elements: HiddenElements, element: Any, p: Any, n: Any, a: Any, y: Any) -> Any:
-    """Build Mitsuba's interactions of the points: shading frame, texture coordinates."""
+    """Return Mitsuba's interactions of the points: shading frame, texture coordinates."""
     pi, ray = _preliminary(elements, element, p, n, a, y)
     return pi.compute_surface_interaction(ray, mi.RayFlags.All)
 
 
 def _preliminary(elements: HiddenElements, element: Any, p: Any, n: Any, a: Any, y: Any) -> tuple[Any, Any]:
-    """Return (the points as they would be found, by a ray from a metre before them)."""
+    """Return (the points as hits, the rays that find them from a metre away along their normals)."""
     pi = dr.zeros(mi.PreliminaryIntersection3f, dr.width(p))
     pi.shape, pi.prim_index = elements.surface(element)
     pi.valid, pi.t = mi.Mask(True), mi.Float(1)
@@ -202,7 +230,7 @@ def _preliminary(elements: HiddenElements, element: Any, p: Any, n: Any, a: Any,
 
 
 def _scattered(si: Any, side: float) -> Any:
-    """Albedo over pi of one side."""
+    """Return the albedo over pi of one side."""
     si = mi.SurfaceInteraction3f(si)
     si.wi = mi.Vector3f(0, 0, side)
     return mi.unpolarized_spectrum(si.bsdf().eval(mi.BSDFContext(), si, mi.Vector3f(0, 0, side)))

@@ -32,9 +32,9 @@ from torchtransient.plugins.sampling.lights import least_probability
 
 
 class ShapeLights:
-    """The lights of a scene that are sampled over their shapes; all others are left to Mitsuba.
+    """Lights of a scene that are sampled over their shapes; all others are left to Mitsuba.
 
-    Spheres are sampled over their cones (:mod:`.sphere_lights`). Nothing here is attached.
+    Spheres are sampled over their cones (:class:`SphereLights`). Nothing here is attached.
     """
 
     def __init__(self, scene: Any) -> None:
@@ -48,8 +48,14 @@ class ShapeLights:
             self._numbers = mi.UInt32(numbers)
 
     def sample(self, scene: Any, ref: Any, u: Any, active: Any) -> tuple[Any, Any]:
-        """Return (direction sample, emission over density), as ``scene.sample_emitter_direction(ref, u, False,
-        active)``.
+        """Sample a point on an emitter, as ``scene.sample_emitter_direction(ref, u, False, active)``.
+
+        Args:
+            ref: Interaction3f that the light is seen from.
+            u: two uniform numbers, Point2f.
+
+        Returns:
+            (DirectionSample3f, emission over density).
         """
         if not self._shapes:
             return scene.sample_emitter_direction(ref, u, False, active)
@@ -60,7 +66,16 @@ class ShapeLights:
         return ds, weight * choice
 
     def sample_direction(self, emitter: Any, ref: Any, u: Any, active: Any) -> tuple[Any, Any]:
-        """Sample as ``emitter.sample_direction(ref, u, active)`` of an array of emitter pointers."""
+        """Sample a point on given emitters, as ``emitter.sample_direction(ref, u, active)``.
+
+        Args:
+            emitter: EmitterPtr.
+            ref: Interaction3f that the light is seen from.
+            u: two uniform numbers, Point2f.
+
+        Returns:
+            (DirectionSample3f, emission over density).
+        """
         if not self._shapes:
             return emitter.sample_direction(ref, u, active)
         slot = self._marks.look_up(emitter, active)
@@ -76,7 +91,7 @@ class ShapeLights:
         return dr.select(listed, ds, other), dr.select(listed, weight, other_weight)
 
     def pdf(self, scene: Any, ref: Any, ds: Any, active: Any) -> Any:
-        """Density of :meth:`sample` per solid angle, as ``scene.pdf_emitter_direction(ref, ds, active)``."""
+        """Return the density of :meth:`sample` per solid angle, as ``scene.pdf_emitter_direction(ref, ds, active)``."""
         if not self._shapes:
             return scene.pdf_emitter_direction(ref, ds, active)
         slot = self._marks.look_up(ds.emitter, active)
@@ -91,8 +106,9 @@ class ShapeLights:
 
 
 def _call_each(methods: list[Any], slot: Any, active: Any, ref: Any, *arguments: Any) -> Any:
-    """Call a method of the listed lights' shapes. Not by shape pointers: Dr.Jit would trace it for all shapes, some
-    of which cannot be sampled.
+    """Call a method of the listed lights' shapes.
+
+    Not by shape pointers: Dr.Jit would trace it for all shapes, some of which cannot be sampled.
     """
     place = mi.Interaction3f(0.0, ref.time, ref.wavelengths, ref.p, ref.n)
     return dr.switch(dr.select(active, slot - 1, 0), methods, place, *arguments, active)
@@ -123,19 +139,19 @@ def _is_listed(emitter: Any) -> bool:
 
 
 def _fills_the_unit_square(shape: Any) -> bool:
-    """Return whether texture coordinates lie on a shape as Mitsuba's sampling of textures takes them to."""
+    """Return True if texture coordinates lie on a shape as Mitsuba's sampling of textures assumes."""
     return bool(shape.class_name() == "Rectangle" and not shape.has_flipped_normals())
 
 
 def _is_plain_bitmap(texture: Any) -> bool:
-    """Return whether a texture is a bitmap without a transform, which Mitsuba 3.9 ignores where it draws texels."""
+    """Return True if a texture is a bitmap without a transform, which Mitsuba 3.9 ignores where it draws texels."""
     if not texture.class_name().startswith("BitmapTextureImpl"):
         return False
     return np.array_equal(_matrix(texture, "to_uv"), np.eye(3).ravel())
 
 
 def _is_inside_out(shape: Any) -> bool:
-    """Return whether rays find the opposite of the normals that a shape is sampled with."""
+    """Return True if rays find the opposite of the normals that a shape is sampled with."""
     if shape.class_name() != "Cylinder":
         return False
     return bool(np.linalg.det(_matrix(shape, "to_world").reshape(4, 4)) < 0)
@@ -153,9 +169,18 @@ _PACKET = 4
 
 
 class SphereLights:
-    """The spherical lights among those of a scene; ``numbers``: which ones. ``all``: there are no others; ``others``:
-    how these are sampled. ``textured``: one of them has a texture. ``marks``: one plus the place of each in the table,
-    zero for all others. ``least_pmf``: of lights that are hardly ever drawn less (:func:`.lights.is_rare`).
+    """Spherical lights of a scene.
+
+    Args:
+        scene: scene of the lights.
+        numbers: their numbers among its emitters.
+
+    Attributes:
+        all: there are no other lights.
+        others: :class:`ShapeLights`, which samples these.
+        textured: one of the spheres has a texture.
+        marks: table of emitters: one plus the place of each sphere in the table, zero for other lights.
+        least_pmf: probability below which a light is rarely drawn (:func:`.lights.is_rare`).
     """
 
     def __init__(self, scene: Any, numbers: list[int]) -> None:
@@ -171,13 +196,16 @@ class SphereLights:
         self._cache = Cache([*self._shapes, *lights])
 
     @staticmethod
-    def of(scene: Any) -> SphereLights | None:
+    def from_scene(scene: Any) -> SphereLights | None:
         """Return the spherical lights of ``scene``, None when it has none."""
         numbers = [n for n, emitter in enumerate(scene.emitters()) if _is_sphere_light(emitter)]
         return SphereLights(scene, numbers) if numbers else None
 
     def read(self, scene: Any) -> SphereLightTable:
-        """Read centres and radii of the lights, attached where their shapes are; call outside of loops, once a job."""
+        """Return the table of the lights with their current numbers, attached where their shapes are.
+
+        Called outside of loops, once a job.
+        """
         table = self._cache.get("cones", None, lambda: self._detached(scene))
         with dr.resume_grad():
             attached = [n for n in range(len(self._shapes)) if dr.grad_enabled(self._matrix(n))]
@@ -194,7 +222,9 @@ class SphereLights:
         return self._to_world[n].read(self._shapes[n]).matrix
 
     def _numbers_of(self, scene: Any, n: int) -> list[Any]:
-        """Center, radius, its square, squared distance up to which a point is inside, sign of the outward normal,
+        """Return the row of a light in the table.
+
+        Centre, radius, its square, squared distance up to which a point is inside, sign of the outward normal,
         probability of choosing the light; where there are textures the matrix.
         """
         matrix = self._matrix(n)
@@ -216,8 +246,11 @@ def _is_sphere_light(emitter: Any) -> bool:
 
 
 class SphereLightTable:
-    """Spherical lights as kernels read them, one in each of ``rows``. Not a dataclass on purpose: Dr.Jit loops would
-    take it apart.
+    """Spherical lights as kernels read them. Not a dataclass: Dr.Jit loops would take it apart.
+
+    Args:
+        lights: the lights.
+        rows: numbers of each, by :meth:`SphereLights.read`.
     """
 
     def __init__(self, lights: SphereLights, rows: list[list[Any]]) -> None:
@@ -241,19 +274,31 @@ class SphereLightTable:
                 dr.scatter(values, number, mi.UInt32(self._width * n + k))
 
     def attached(self, rows: dict[int, list[Any]]) -> SphereLightTable:
-        """Return a table with attached rows in some places: gathered from one array, which derivatives come to."""
+        """Return a table with attached rows at some places, gathered from one array, at which gradients arrive.
+
+        Args:
+            rows: attached numbers by place.
+        """
         table = copy.copy(self)
         table._only, table._values = None, mi.Float(self._laid_out(self._rows))
         table._write(table._values, rows)
         return table
 
     def tables(self) -> list[Any]:
-        """The arrays that are attached where parameters are."""
+        """Return the arrays that are attached where parameters are."""
         return [] if self._values is None else [self._values]
 
     def kept_in_cone(self, emitter: Any, x: Any, y: Any, ref: Any, active: Any) -> Any:
-        """The DirectionSample3f seen from ``ref``, attached, that keeps the place which the point ``y`` of a sphere has
-        in the cone seen from ``x``.
+        """Return the point of a sphere that keeps its place in the cone while the viewer moves.
+
+        Args:
+            emitter: EmitterPtr of the sphere.
+            x: viewer without derivatives, Point3f.
+            y: point of the sphere seen from ``x``, Point3f.
+            ref: Interaction3f of the viewer, attached.
+
+        Returns:
+            DirectionSample3f seen from ``ref``, attached.
         """
         with dr.suspend_grad():
             sphere = _Sphere(self, emitter, x, active)
@@ -264,17 +309,23 @@ class SphereLightTable:
         return _Sphere(self, emitter, ref.p, active).sampled(u, ref)
 
     def lists(self, emitter: Any, active: Any = True) -> Any:
-        """Return a mask of the emitter pointers that are spherical lights."""
+        """Return a mask of emitters (EmitterPtr) that are spherical lights."""
         return self._marks.look_up(emitter, active) > 0
 
     def draws(self, emitter: Any) -> Any:
-        """Return a mask of the emitter pointers that are spherical lights which :meth:`sample` chooses often enough."""
+        """Return a mask of emitters (EmitterPtr) that are spherical lights and not rarely drawn."""
         listed = self.lists(emitter)
         return listed & (self.numbers(emitter, listed)[7] >= self._least_pmf)
 
     def sample(self, scene: Any, ref: Any, u: Any, active: Any) -> tuple[Any, Any]:
-        """Return (direction sample, emission over density) towards an emitter of the scene, as
-        ``scene.sample_emitter_direction(ref, u, False, active)``. Attached where ``ref`` and the shapes are.
+        """Sample a point on an emitter of the scene, as ``scene.sample_emitter_direction(ref, u, False, active)``.
+
+        Args:
+            ref: Interaction3f that the light is seen from.
+            u: two uniform numbers, Point2f.
+
+        Returns:
+            (DirectionSample3f, emission over density), attached where ``ref`` and the spheres are.
         """
         number, choice, x = scene.sample_emitter(u.x, active)
         emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), number, active)
@@ -292,7 +343,7 @@ class SphereLightTable:
         return dr.select(spherical, ds, other), dr.select(spherical, weight, other_weight * choice)
 
     def pdf(self, scene: Any, ref: Any, ds: Any, active: Any) -> Any:
-        """Density of :meth:`sample` per solid angle, as ``scene.pdf_emitter_direction(ref, ds, active)``."""
+        """Return the density of :meth:`sample` per solid angle, as ``scene.pdf_emitter_direction(ref, ds, active)``."""
         spherical = active if self.all else active & self.lists(ds.emitter, active)
         sphere = _Sphere(self, ds.emitter, ref.p, spherical)
         pdf = dr.select(spherical, sphere.density(ds, -dr.dot(ds.d, ds.n)) * sphere.pmf, 0)
@@ -301,7 +352,7 @@ class SphereLightTable:
         return dr.select(spherical, pdf, self._others.pdf(scene, ref, ds, active & ~spherical))
 
     def numbers(self, emitter: Any, active: Any) -> list[Any]:
-        """The numbers of the lights that an array of pointers points to."""
+        """Return the rows of the lights that ``emitter`` (EmitterPtr) points to, a list of Float."""
         if self._only is not None:
             return self._only
         slot = self._marks.look_up(emitter, active)
@@ -330,16 +381,14 @@ class _Sphere:
         self.solid_angle = 2 * dr.pi * self.versine_max
 
     def density(self, ds: Any, cos: Any) -> Any:
-        """Density per solid angle of a point whose normal makes an angle of this cosine with the way back, zero where
-        it shows its dark side.
-        """
+        """Return the density per solid angle of a point, zero on its dark side (``cos`` of its normal below 0)."""
         lit = (cos > 0) & (ds.dist > 0)
         from_inside = 4 * dr.pi * self.square * dr.select(lit, cos, 1)
         pdf = dr.select(self.outside, 1, dr.square(ds.dist)) / dr.select(self.outside, self.solid_angle, from_inside)
         return dr.select(lit, pdf, 0)
 
     def sampled(self, u: Any, ref: Any) -> Any:
-        """The DirectionSample3f of two random numbers, without an emitter.
+        """Return the DirectionSample3f of two uniform numbers, without an emitter.
 
         Outside, the direction is uniform in the cone: with ``1 - cos = u (1 - cos_max)`` the sine is ``a sin_max``; the
         law of sines gives the distance and the angle at the center. The root of ``u`` stands alone: that of a product
@@ -375,7 +424,7 @@ class _Sphere:
         return ds
 
     def _uv(self, normal: Any) -> Any:
-        """Texture coordinates of the point with an outward normal: ``to_world`` is a similarity."""
+        """Return the texture coordinates of the point with an outward normal: ``to_world`` is a similarity."""
         m = self.matrix
         x, y, z = (dr.dot(mi.Vector3f(m[k], m[3 + k], m[6 + k]), normal) for k in range(3))
         phi = dr.atan2(y, x)

@@ -48,7 +48,7 @@ class PlacesOnMesh:
         dr.make_opaque(self._triangle, self._along)
 
     def points(self, mesh: Any, index: Any) -> Any:
-        """The points (Point3f) of places given by their index, attached where the vertices of ``mesh`` are."""
+        """Return the points (Point3f) of places given by their index, attached where the vertices of ``mesh`` are."""
         face = mesh.face_indices(dr.gather(mi.UInt32, self._triangle, index))
         a, b, c = (mi.Point3f(mesh.vertex_position(corner)) for corner in face)
         first, second = (dr.gather(mi.Float, column, index) for column in self._along)
@@ -131,7 +131,7 @@ class NLOSCaptureMeter(mi.Sensor):
         return mi.Transform4f().translate(self.origin)
 
     def targets(self, pixel: Any) -> Any:
-        """The scanned points (Point3f) of pixels, given by their index in the film."""
+        """Return the scanned points (Point3f) of pixels, given by their index in the film."""
         if self.points is not None:
             return dr.gather(mi.Point3f, self.points, pixel)
         shape, size = self._surface(), self.film().size()
@@ -163,7 +163,7 @@ class NLOSCaptureMeter(mi.Sensor):
         )
 
     def scanned(self) -> Any:
-        """The scanned points (Point3f) of all pixels of the film's crop window, row by row."""
+        """Return the scanned points (Point3f) of all pixels of the film's crop window, row by row."""
         film = self.film()
         (width, height), (x, y) = film.crop_size(), film.crop_offset()
         index = dr.arange(mi.UInt32, int(width) * int(height))
@@ -211,7 +211,7 @@ def _is_rectangle(shape: Any) -> bool:
 
 
 def _place_of(props: Any, name: str, default: Any = None) -> Any:
-    """A point of a sensor's properties. Raises SceneError unless it is one, and finite."""
+    """Return a point of a sensor's properties. Raises SceneError unless it is one, and finite."""
     given = props.get(name, default)
     numbers = real_array(given)
     if numbers is None or numbers.shape != (3,) or not np.isfinite(numbers).all():
@@ -220,7 +220,7 @@ def _place_of(props: Any, name: str, default: Any = None) -> Any:
 
 
 def _points_of(props: Any, name: str) -> Any:
-    """An array of points of a sensor's properties as a Point3f in memory, None where there is none."""
+    """Return an array of points of a sensor's properties as a Point3f in memory, None where there is none."""
     if name not in props:
         return None
     given = props[name]

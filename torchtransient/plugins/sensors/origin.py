@@ -19,10 +19,14 @@ from torchtransient.plugins.polarized import rotation_between, stokes_frame_of
 
 
 class View:
-    """One sensor, and the lanes that look through it: several for a ``batch``, whose children share a film.
+    """Sensor, and the lanes that look through it: several for a ``batch``, whose children share a film.
 
-    ``reference`` is the sphere whose tangent plane stands for a sensor at infinity, None for other sensors. A plain
-    object, which Dr.Jit loops leave alone.
+    A plain object, which Dr.Jit loops leave alone.
+
+    Args:
+        sensor: the sensor.
+        active: mask of its lanes.
+        reference: sphere whose tangent plane stands for a sensor at infinity, None for other sensors.
     """
 
     def __init__(self, sensor: Any, active: Any, reference: Any = None) -> None:
@@ -30,11 +34,11 @@ class View:
 
     @property
     def near(self) -> Any:
-        """Distance of the near clip plane along the axis, None for sensors that are no projective cameras."""
+        """Distance of the near clip plane along the axis, metres, None for sensors that are no projective cameras."""
         return near_clip(self.sensor)
 
     def length(self, ray: Any) -> Any:
-        """Distance in metres from the sensor's origin to ``ray.o``, attached where the sensor is."""
+        """Return the distance in metres from the sensor's origin to ``ray.o``, attached where the sensor is."""
         if is_distant(self.sensor):
             # From the tangent plane that the wave reaches last to where Mitsuba happens to start the ray.
             return self.reference.length(ray.o, -ray.d)
@@ -48,13 +52,20 @@ class View:
 
 
 class PrimaryRays:
-    """The rays of one pass: seeded ``sampler``, ``ray`` and ``weight`` (attached to the sensor), ``scale`` (of a sample
-    in its pixel), ``row`` and ``column`` of the pixel, the :class:`View` of every sensor (``seen``),
-    and the index of refraction ``η`` where the rays start (attached to the glass that they start in); ``laser``:
-    number of the laser position in an exhaustive scan, else None; ``strata``: (number of the sample in its pixel, how
-    many there are); ``leg``: how the first segment ends where that is known; ``clip``: distance from ``ray.o`` at
-    which the first surface can be, None for 0; ``meter_normal``: that of an irradiance meter at rest where each ray
-    starts, None for other sensors. A plain object, which Dr.Jit loops leave alone.
+    """Rays of one launch. A plain object, which Dr.Jit loops leave alone.
+
+    Attributes:
+        sampler: seeded sampler of the lanes.
+        ray, weight: Ray3f and spectrum, attached to the sensor.
+        scale: weight of a sample in its pixel, Float; None for rays that weigh nothing.
+        row, column: pixel, UInt32.
+        seen: :class:`View` of every sensor.
+        η: index of refraction where the rays start, attached to the glass that they start in.
+        laser: number of the laser position in an exhaustive scan, else None.
+        strata: (number of the sample in its pixel, number of samples), None for rays that are in no order.
+        clip: distance from ``ray.o`` at which the first surface can be, None for 0.
+        leg: PreliminaryIntersection3f of the first segment, None if unknown.
+        meter_normal: normal of an irradiance meter at rest where each ray starts, None for other sensors.
     """
 
     def __init__(self, sampler, ray, weight, scale, row, column, seen, η, laser=None, strata=None, clip=None):
@@ -63,16 +74,19 @@ class PrimaryRays:
         self.strata, self.clip, self.meter_normal = strata, clip, None
 
     def length(self):
-        """Optical length from the sensor's origin to where the rays start, attached."""
+        """Return the optical length from the sensor's origin to where the rays start, attached."""
         # Where a distance to the clip plane is given, the rays of projective cameras start at the origin.
         seen = [view for view in self.seen if self.clip is None or view.near is None]
         return length_to_sensor_origin(seen, self.ray) * self.η
 
 
 def views(sensor: Any, position: Any, reference: Any) -> list[View]:
-    """The sensors behind the film positions ``position`` in [0, 1]^2, each with the lanes that are its own.
+    """Return the sensors behind places of the film, each with its lanes.
 
-    ``reference()`` gives the sphere around the scene; it is only asked for when a sensor sits at infinity.
+    Args:
+        sensor: sensor, or a ``batch``.
+        position: places of the film in [0, 1]^2.
+        reference: function that returns the sphere around the scene, called for sensors at infinity alone.
     """
 
     def view(one, active):
@@ -87,22 +101,29 @@ def views(sensor: Any, position: Any, reference: Any) -> list[View]:
 
 
 def sensors_of(sensor: Any) -> list[Any]:
-    """The children of a ``batch`` in their order on the film, or the sensor itself."""
+    """Return the children of a ``batch`` in their order on the film, or the sensor itself."""
     if not is_batch(sensor):
         return [sensor]
     return [child for _, child in objects_of(sensor) if isinstance(child, mi.Sensor)]
 
 
 def shapes_of_sensors(sensor: Any) -> list[Any]:
-    """The shape that each sensor sits on, None for those that stand alone."""
+    """Return the shape that each sensor sits on, None for those that stand alone."""
     return [one.get_shape() for one in sensors_of(sensor)]
 
 
 def sample_rays(sensor: Any, seen: list[View], time: Any, wavelength: Any, position: Any, aperture: Any) -> Any:
-    """Primary rays and their weights, attached to the sensor.
+    """Sample primary rays and their weights, attached to the sensor.
 
     The children of a batch are asked one by one once one of them is attached, see
     :func:`~torchtransient.plugins.mitsuba_compat.is_batch`.
+
+    Args:
+        seen: result of :func:`views`.
+        time, wavelength, position, aperture: numbers of ``sample_ray_differential``.
+
+    Returns:
+        (Ray3f, weight).
     """
     if len(seen) == 1 or not any(dr.grad_enabled(value) for _, value in mi.traverse(sensor)):
         return sensor.sample_ray_differential(time=time, sample1=wavelength, sample2=position, sample3=aperture)
@@ -119,8 +140,14 @@ def sample_rays(sensor: Any, seen: list[View], time: Any, wavelength: Any, posit
 
 
 def meter_normal(sensor: Any, ray: Any, position: Any) -> Any:
-    """Normal of an irradiance meter at the origins of its rays, drawn with ``position``; None for other sensors and for
-    one that is attached, whose rays carry its motion.
+    """Return the normal of an irradiance meter at the origins of its rays.
+
+    Args:
+        ray: its rays.
+        position: numbers that they were drawn with.
+
+    Returns:
+        Normal3f; None for other sensors and for one that is attached, whose rays carry its motion.
     """
     with dr.resume_grad():
         if not is_irradiance_meter(sensor) or dr.grad_enabled(ray.o, ray.d):
@@ -129,7 +156,7 @@ def meter_normal(sensor: Any, ray: Any, position: Any) -> Any:
 
 
 def length_to_sensor_origin(seen: list[View], ray: Any) -> Any:
-    """Distance in metres from the sensor's origin to ``ray.o``, 0 for rays of none of the sensors ``seen``.
+    """Return the distance in metres from the sensor's origin to ``ray.o``, 0 for rays of none of the sensors ``seen``.
 
     Mitsuba's projective cameras start their rays on the near clip plane; their light travels on to the pinhole
     (perspective), to the sampled point of the aperture (thin lens) or to the sensor plane (orthographic). Radiance and
@@ -144,9 +171,13 @@ def length_to_sensor_origin(seen: list[View], ray: Any) -> Any:
 
 
 def start_at_sensor(seen: list[View], ray: Any) -> tuple[Any, Any]:
-    """Return (``ray`` from the origin of a projective camera on, attached where it is; distance to its near clip plane,
-    detached, 0 for rays of other sensors, None without such cameras): a medium around the camera attenuates and
-    scatters light there, too.
+    """Return rays that start at the origins of projective cameras.
+
+    A medium around the camera attenuates and scatters light before the near clip plane, too.
+
+    Returns:
+        (rays, attached where they are; distance to the near clip plane, detached, 0 for rays of other sensors, None
+        without such cameras).
     """
     clipped = [view for view in seen if view.near is not None]
     if not clipped:
@@ -160,8 +191,11 @@ def start_at_sensor(seen: list[View], ray: Any) -> tuple[Any, Any]:
 
 
 def index_at_sensor(seen: list[View], surroundings: Any, scene: Any) -> Any:
-    """Index of refraction where the rays start, attached to the glass around the sensor; ``surroundings`` (a
-    :class:`~.surroundings.Surroundings`): what may lie around it, None for nothing.
+    """Return the index of refraction where the rays start, attached to the glass around the sensor.
+
+    Args:
+        seen: result of :func:`views`.
+        surroundings: :class:`~.surroundings.Surroundings`, None for vacuum.
     """
     if surroundings is None:
         return mi.Float(1)
@@ -175,12 +209,15 @@ def index_at_sensor(seen: list[View], surroundings: Any, scene: Any) -> Any:
 
 
 def sensor_rotation(seen, ray):
-    """Rotation from the frame of the primary ray to the sensor's, attached where the sensor's pose is.
+    """Return the rotation from the frame of the primary ray to the sensor's, attached where the sensor's pose is.
 
-    ``seen``: the :class:`~.origin.View` of every sensor that the rays belong to. The sensor's horizontal axis is
-    ``cross(d, up)`` with the ray's direction ``d`` and ``up`` the sensor's local +y in
-    the world: to the right of the picture, as in Mitsuba's ``stokes`` integrator. Rays along ``up`` have no such axis;
-    they keep the implicit frame of their direction.
+    The sensor's horizontal axis is ``cross(d, up)`` with the ray's direction ``d`` and ``up`` the sensor's local +y in
+    world space: to the right of the picture, as in Mitsuba's ``stokes`` integrator. Rays along ``up`` have no such
+    axis; they keep the implicit frame of their direction.
+
+    Args:
+        seen: :class:`~.origin.View` of every sensor that the rays belong to.
+        ray: primary rays.
     """
     up = seen[0].sensor.world_transform() @ mi.Vector3f(0, 1, 0)
     for view in seen[1:]:

@@ -23,17 +23,17 @@ FAR = 300
 
 
 def can_be_connected(sensor: Any) -> bool:
-    """Return whether rays of a sensor fill a solid angle or a beam in which a point of the scene is found again."""
+    """Return True if rays of a sensor fill a solid angle or a beam in which a point of the scene is found again."""
     return all(is_irradiance_meter(one) or near_clip(one) is not None for one in sensors_of(sensor))
 
 
 def has_eye(sensor: Any) -> bool:
-    """Return whether rays of a sensor start at a point that their random numbers choose, wherever they go."""
+    """Return True if rays of a sensor start at a point that their random numbers choose, wherever they go."""
     return all(near_clip(one) is not None and not _sees_in_parallel(one) for one in sensors_of(sensor))
 
 
 def sees_one_line(sensor: Any) -> bool:
-    """Return whether each sensor sees along one ray, which no edge meets but for moments."""
+    """Return True if each sensor sees along one ray, which no edge meets but for moments."""
     return all(one.class_name() == "RadianceMeter" for one in sensors_of(sensor))
 
 
@@ -58,7 +58,10 @@ class SensorPlaces:
         self.is_sharp = not (self.is_meter or any(camera.needs_aperture_sample() for camera in self.cameras))
 
     def numbers(self, sampler: Any) -> Local:
-        """Random numbers that choose (``aperture``, ``wavelength``, ``camera``), constants where there is no choice."""
+        """Draw the numbers that choose a point of the sensor: ``aperture``, ``wavelength``, ``camera``.
+
+        Constants where there is no choice.
+        """
         aperture = mi.Point2f(0.5) if self.is_sharp else sampler.next_2d()
         wavelength = sampler.next_1d() if mi.is_spectral else mi.Float(0)
         camera, count = mi.UInt32(0), len(self.cameras)
@@ -67,11 +70,11 @@ class SensorPlaces:
         return Local(aperture=aperture, wavelength=wavelength, camera=camera)
 
     def middle(self, numbers: Any) -> Any:
-        """The middle of the film of the chosen camera, in pixels."""
+        """Return the middle of the film of the chosen camera, Point2f, pixels."""
         return mi.Point2f((mi.Float(numbers.camera) + 0.5) / len(self.cameras), 0.5) * self.size
 
     def eye(self, numbers: Any) -> Any:
-        """The point from which the chosen camera sees, see :func:`has_eye`."""
+        """Return the point from which the chosen camera sees, see :func:`has_eye`."""
         found = [self._line(camera, (0.5, 0.5), numbers.aperture)[0] for camera in self.cameras]
         eye = found[0]
         for number, other in enumerate(found[1:], 1):
@@ -79,13 +82,17 @@ class SensorPlaces:
         return eye
 
     def rays_at(
-        self, world: Any, sampler: Any, uv: Any, numbers: Any, row: Any = None, column: Any = None,
+        self, context: Any, sampler: Any, uv: Any, numbers: Any, row: Any = None, column: Any = None,
         total: int | None = None, η: Any = None,
     ) -> PrimaryRays:
-        """Return the primary rays through places ``uv`` of the film, in pixels, attached to the sensor.
+        """Return the primary rays through places of the film, attached to the sensor.
 
-        ``total``: samples of a pixel, None where the rays weigh nothing. ``η``: index of refraction where they start,
-        None to look it up, which cannot be done within loops.
+        Args:
+            uv: places, Point2f, pixels.
+            numbers: result of :meth:`numbers`.
+            row, column: their pixels, None if unknown.
+            total: samples of a pixel, None where the rays weigh nothing.
+            η: index of refraction where they start, None to look it up, which cannot be done within loops.
         """
         position = uv / self.size
         # Sensors at infinity, which ask for a sphere around the scene, cannot be connected.
@@ -96,18 +103,23 @@ class SensorPlaces:
             if self.film.curves is not None:
                 ray, weight = self.film.curves.draw(self.sensor, ray, weight, u)
             if η is None:
-                η = index_at_sensor(seen, world.contents.surroundings, world.scene)
-            if world.contents.media is not None and world.contents.media.at_sensor is not None:
+                η = index_at_sensor(seen, context.contents.surroundings, context.scene)
+            if context.contents.media is not None and context.contents.media.at_sensor is not None:
                 ray, clip = start_at_sensor(seen, ray)
         scale = None if total is None else dr.opaque(mi.Float, 1 / total)
         return PrimaryRays(sampler, ray, weight, scale, row, column, seen, η, clip=clip)
 
     def seen_from(self, at: Any, numbers: Any, active: Any) -> tuple[Any, Any]:
-        """Return (where the sensor sees ``at`` (Interaction3f), its importance there per area across).
+        """Return where the sensor sees a point, and the importance there.
 
-        The first: ``uv`` (in pixels), ``p`` (the sensor's point), ``eye`` (a point on the line of sight from which
-        everything near is seen as by the sensor), ``d, dist`` (to ``p``), ``pdf`` (zero where nothing is seen),
-        ``numbers`` (those of the ray through ``uv`` that meets ``at``).
+        Args:
+            at: Interaction3f of the point.
+            numbers: result of :meth:`numbers`.
+
+        Returns:
+            (Local with ``uv`` (in pixels), ``p`` (the sensor's point), ``eye`` (a point on the line of sight from which
+            everything near is seen as by the sensor), ``d, dist`` (to ``p``), ``pdf`` (zero where nothing is seen),
+            ``numbers`` (those of the ray through ``uv`` that meets ``at``); importance per area across, Float).
         """
         if self.is_meter:
             return self._seen_from_meter(at, numbers, active)

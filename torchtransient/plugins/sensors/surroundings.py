@@ -63,8 +63,14 @@ class Surroundings:
         self._cache = Cache(_bodies(shapes, bsdfs) + _with_shapes(self._sensors))
 
     @staticmethod
-    def of(scene: Any, sensor: Any, bsdfs: list[Any]) -> Surroundings | None:
-        """None where nothing in a scene of these outermost BSDFs refracts."""
+    def from_scene(scene: Any, sensor: Any, bsdfs: list[Any]) -> Surroundings | None:
+        """Return what surrounds a sensor, None if nothing in the scene refracts.
+
+        Args:
+            scene: Mitsuba scene.
+            sensor: sensor of the job.
+            bsdfs: outermost BSDFs of the scene.
+        """
         boundaries = boundaries_of(bsdfs)
         return Surroundings(sensor, boundaries, shapes_of_scene(scene)) if boundaries else None
 
@@ -123,7 +129,7 @@ class Surroundings:
 
 
 def _bodies(shapes: list[Any], bsdfs: list[Any]) -> list[Any]:
-    """The shapes with one of these BSDFs, and the instances that may move them."""
+    """Return the shapes with one of these BSDFs, and the instances that may move them."""
     known = {bsdf.ptr for bsdf in bsdfs}
     surfaces = ((shape, shape.bsdf()) for shape in shapes if has_surface(shape))
     bodies = [shape for shape, bsdf in surfaces if bsdf is not None and bsdf.ptr in known]

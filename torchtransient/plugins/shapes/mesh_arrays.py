@@ -14,7 +14,7 @@ from torchtransient.plugins.mitsuba_compat import mesh_of_arrays
 
 
 def mesh_arrays(props: Any) -> Any:
-    """A Mitsuba mesh of arrays.
+    """Return a Mitsuba mesh of arrays.
 
     ``vertices``: (V, 3), metres, before ``to_world``; ``faces``: (F, 3), whole numbers, wound against the clock as seen
     from outside. ``normals``: (V, 3), directions at the vertices before ``to_world``; without them there is one normal

@@ -19,13 +19,13 @@ class Carry:
     """Differentiable state of a path. A dataclass: its adjoint and tangent are loop state. Copied, never changed."""
 
     β: Any      # Spectrum    throughput; its adjoint is the light beyond, weighed by the film's adjoint
-    slope: Any  # Float       zero with the derivative of the optical path length so far
+    slope: Any  # Float       value 0, derivative that of the optical path length so far
     η: Any      # Float       index of refraction along the ray
-    o: Any      # Point3f     ray origin, attached behind delta lobes and sensors
-    d: Any      # Vector3f    ray direction, likewise
+    o: Any      # Point3f     ray origin behind delta lobes and sensors, else zero with the sideways shift of the ray
+    d: Any      # Vector3f    ray direction behind delta lobes and sensors
     x: Any      # Point3f     start of the segment, where its transmittance matters
     w: Any      # Vector3f    direction at the far end of the segment, for ``si.wi`` there
-    p: Any      # Point3f     far end of the segment, where segments say where their ends are
+    p: Any      # Point3f     far end of the segment, where a segment strategy places it (``material_points``)
     n: Any      # Normal3f    normal there, likewise
 
     @staticmethod
@@ -36,7 +36,12 @@ class Carry:
 
 
 def attach(carry: Carry, names: Sequence[str], tangents: Carry | None = None) -> Carry:
-    """Return the Carry with new leaves for the fields ``names``, which have ``tangents`` in forward mode."""
+    """Return a Carry with new leaves of the AD graph.
+
+    Args:
+        names: fields that become leaves.
+        tangents: Carry with their tangents in forward mode, None in reverse mode.
+    """
     leaves = {}
     for name in names:
         leaf = type(getattr(carry, name))(getattr(carry, name))
@@ -58,7 +63,7 @@ def with_fields(carry: Carry, names: Sequence[str], values: Sequence[Any]) -> Ca
 
 
 def inner(adjoint: Carry, carry: Carry, names: Sequence[str]) -> Any:
-    """Return ``<adjoint, carry>`` over the fields ``names``."""
+    """Return ``<adjoint, carry>``, the sum over the fields ``names`` (Float)."""
     total = mi.Float(0)
     for name in names:
         total += total_of(getattr(adjoint, name), getattr(carry, name))
@@ -75,10 +80,10 @@ def total_of(a: Any, b: Any) -> Any:
 
 
 def choose(mask: Any, a: Carry, b: Carry, names: Sequence[str]) -> Carry:
-    """Return ``a`` where ``mask`` and ``b`` elsewhere in the fields ``names``, and other fields of ``b``."""
+    """Return the fields ``names`` of ``a`` where ``mask``, and of ``b`` elsewhere; other fields are those of ``b``."""
     return replace(b, **{name: dr.select(mask, getattr(a, name), getattr(b, name)) for name in names})
 
 
 def slope_only(x: Any) -> Any:
-    """Return zero with the derivative of ``x``."""
+    """Return a number whose value is 0 and whose derivative is that of ``x``."""
     return dr.replace_grad(mi.Float(0), x)

@@ -38,9 +38,10 @@ class PathSettings:
 
 
 class RenderContext:
-    """Context of one job, a render or a derivative. Built outside of traced code, not changed afterwards.
+    """Context of a job, a render or a derivative: what every strategy receives.
 
-    A plain class: Dr.Jit loops would take a dataclass apart as loop state.
+    Built outside of traced code, not changed afterwards. A plain class: Dr.Jit loops would take a dataclass apart as
+    loop state.
 
     Args:
         scene: Mitsuba scene.
@@ -49,6 +50,14 @@ class RenderContext:
         strategies: (segment, scattering, list of connections), see :mod:`.strategy`.
         wanted: :class:`Wanted` derivatives, None in a render.
         window: :class:`~..films.block.ArrivalWindow` of the film, None if its steady image counts all arrivals.
+
+    Attributes:
+        finds_light: some connection can have an event at the last vertex of a path.
+        dark_at_first: no connection has an event at the first vertex.
+        plays_roulette: paths can be long enough for Russian roulette.
+        surfaces: :class:`.surface_interactions.AttachedSurfaces`, None where no path length changes.
+        carried: fields of the :class:`.carry.Carry` that derivatives pass through.
+        record_room: :class:`.record.RecordRoom` of the records of derivatives, None in a render.
     """
 
     def __init__(self, scene: Any, contents: Any, settings: PathSettings, strategies: Any, wanted=None, window=None):
@@ -60,7 +69,7 @@ class RenderContext:
         self.camera_unwarp = settings.camera_unwarp
         self.window = window
         # The motion of surfaces matters only where path lengths change.
-        self.surfaces = AttachedSurfaces.of(contents) if wanted is not None and wanted.geometry else None
+        self.surfaces = AttachedSurfaces.from_contents(contents) if wanted is not None and wanted.geometry else None
         self.segment, self.scattering, self.connections = strategies
         self.finds_light = any(connection.finds_light for connection in self.connections)
         # In media connections draw random numbers, which derivatives draw as well.
@@ -70,7 +79,7 @@ class RenderContext:
         self._check_names()
         # Lower bound of the remaining length of a path, where all light comes from emitters of the scene.
         bounded = window is not None and all(c.light_of_scene_alone for c in self.connections)
-        self._light_box = LightBox.of(scene, contents.bsdfs) if bounded else None
+        self._light_box = LightBox.from_scene(scene, contents.bsdfs) if bounded else None
         with dr.resume_grad():  # tables are attached where the parameters are
             for strategy in self.strategies():
                 strategy.prepare(self)
@@ -94,16 +103,16 @@ class RenderContext:
             )
 
     def start(self, rays: Any) -> None:
-        """Tell all strategies of the primary rays of a launch."""
+        """Prepare all strategies for the primary rays of a launch (:class:`~..sensors.origin.PrimaryRays`)."""
         for strategy in self.strategies():
             strategy.start(self, rays)
 
     def strategies(self) -> list[Any]:
-        """All strategies, each once."""
+        """Return all strategies, each once: segment, connections, scattering."""
         return [self.segment, *self.connections, self.scattering]
 
     def most_events(self) -> int:
-        """Return the largest number of events of a path; of terms in a derivative."""
+        """Return the largest number of events of a path, in a derivative of their terms."""
         return self.max_depth * sum(c.events(self.wanted) for c in self.connections)
 
     def tables(self) -> list[Any]:
@@ -130,14 +139,20 @@ class RenderContext:
         return active & ((depth < shared.start) | (depth >= shared.stop))
 
     def in_time(self, active: Any, τ: Any, p: Any) -> Any:
-        """Return a mask of paths of length ``τ`` up to ``p`` that can have a further event in the film's window."""
+        """Return a mask of paths that can still have an event in the film's window.
+
+        Args:
+            active: mask of lanes.
+            τ: optical path length up to ``p``, minus the film's start, metres (Float64).
+            p: last vertex, Point3f; the way to the nearest light is a lower bound of what remains.
+        """
         if self.window is None:
             return active
         least = τ if self._light_box is None else τ + mi.Float64(self._light_box.distance(p))
         return active & ~self.window.over(least)
 
     def counted(self, active: Any, τ: Any) -> Any:
-        """Return a mask of arrivals at ``τ`` in the film's window."""
+        """Return a mask of arrivals at ``τ`` (Float64) that lie in the film's window."""
         return active if self.window is None else active & self.window.counts(τ)
 
 
@@ -145,7 +160,14 @@ class RenderContext:
 # Derivatives of a job, by the effects of the attached parameters.
 
 class Wanted:
-    """Derivatives of a job. Built outside of traced code, not changed afterwards.
+    """Derivatives of a job, by the effects of the attached parameters.
+
+    Built outside of traced code, not changed afterwards.
+
+    Args:
+        effects: (plugin, key, effect) of the attached parameters, see :mod:`torchtransient.plugins.parameters`.
+        sensor: sensor of the job.
+        contents: :class:`.scene_contents.SceneContents`.
 
     Attributes:
         nodes: pointers of the plugins with attached parameters.
@@ -159,14 +181,13 @@ class Wanted:
         sensor: the sensor moves.
         index: an index of refraction changes.
         ray: the Carry has the ray, behind delta lobes or a moving sensor.
-        plain: a point that slides on its surface changes in position alone.
+        slides_position_only: path lengths change, and a hit that slides on its surface changes in position
+            alone, since no ray is attached (``ray``), no normals or vertices of a mesh are parameters, and surfaces
+            are flat and alike everywhere (``contents.patterned``). Its slide is then the vector
+            ``o - d (n.o) / (n.d)`` for a shift ``o`` of the ray, in place of an attached ray, which Dr.Jit
+            back-propagates through every shape.
         extinction: the extinction of a medium changes.
         carried: fields of the :class:`.carry.Carry` that derivatives pass through, without those of the segments.
-
-    Args:
-        effects: (plugin, key, effect) of the attached parameters, see :mod:`torchtransient.plugins.parameters`.
-        sensor: sensor of the job.
-        contents: :class:`.scene_contents.SceneContents`.
     """
 
     def __init__(self, effects: Sequence[tuple[Any, str, ParameterEffect]], sensor: Any, contents: Any) -> None:
@@ -187,7 +208,7 @@ class Wanted:
         self.sphere_lights = self.geometry and contents.sphere_lights is not None
         self.ray = self.geometry and (contents.delta or self.sensor)
         bent = any(key in (NORMALS, POSITIONS) for _, key, _ in effects)
-        self.plain = self.geometry and not (self.ray or bent or contents.patterned)
+        self.slides_position_only = self.geometry and not (self.ray or bent or contents.patterned)
         self.extinction = any(effect.moves_medium for _, _, effect in effects)
         self.carried: tuple[str, ...] = ("β",)
         if self.geometry:

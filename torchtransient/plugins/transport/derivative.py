@@ -22,7 +22,13 @@ from torchtransient.plugins.transport.strategy import VertexEnd
 
 
 def attached_carry(v, names, tangents=None):
-    """Return the recorded Carry that arrives at a vertex, with leaves for the fields ``names``."""
+    """Return the recorded Carry that arrives at a vertex, with new leaves of the AD graph.
+
+    Args:
+        v: :class:`.record.RecordedVertex`.
+        names: fields that become leaves.
+        tangents: Carry with their tangents in forward mode, None in reverse mode.
+    """
     # A leaf has the width of the lanes, or its gradient would be summed up over them.
     zero = dr.zeros(mi.Float, dr.width(v.ray.d))
     o, d = mi.Point3f(v.ray.o), mi.Vector3f(v.ray.d)
@@ -46,7 +52,21 @@ def attached_carry(v, names, tangents=None):
 # gradient, and no Mueller matrix is inverted.
 
 def step_back(context, layout, store, block, ray, k, live, adjoint, following):
-    """Back-propagate vertex ``k``; return (adjoint of the Carry that arrives there, VertexEnd of the vertex)."""
+    """Back-propagate the events of a vertex and the Carry behind it.
+
+    Args:
+        context: :class:`.context.RenderContext` of the job.
+        layout, store: layout of the record, and the record.
+        block: adjoint block of the film.
+        ray: primary ray, Ray3f.
+        k: number of the vertex, UInt32.
+        live: mask of paths that have it.
+        adjoint: adjoint of the Carry behind the vertex.
+        following: :class:`.strategy.VertexEnd` of the next vertex.
+
+    Returns:
+        (adjoint of the Carry that arrives at the vertex, VertexEnd of the vertex).
+    """
     wanted = context.wanted
     v = RecordedVertex(layout, store, k, live, ray)
     v.next = following
@@ -140,7 +160,7 @@ def _is_untouched(value):
 
 
 def tangents_of(values):
-    """Return the tangents of attached values, zero for detached ones."""
+    """Return the tangents of values, pushed through the AD graph; zeros for detached ones."""
     attached = [v for v in values if dr.grad_enabled(v)]
     if not attached:
         return [dr.zeros(type(v)) for v in values]
@@ -151,9 +171,17 @@ def tangents_of(values):
 
 
 def vertex_tangents(context, v, tangent):
-    """Return (detached events with ``d_value`` and ``d_opl``; tangent of the next Carry).
+    """Evaluate a recorded vertex in forward mode.
 
     No attached variable outlives this call: it would leave an edge in Dr.Jit's graph, which breaks the next traversal.
+
+    Args:
+        context: :class:`.context.RenderContext` of the job.
+        v: :class:`.record.RecordedVertex`.
+        tangent: tangent of the Carry that arrives there.
+
+    Returns:
+        (detached events with ``d_value`` and ``d_opl``, tangent of the next Carry).
     """
     wanted = context.wanted
     with dr.resume_grad():
@@ -175,7 +203,22 @@ def vertex_tangents(context, v, tangent):
 
 
 def step_on(context, layout, store, block, events, ray, k, live, tangent, dL):
-    """Write the events of vertex ``k``; return (tangent of the Carry behind it, ``dL`` with their derivatives)."""
+    """Write the derivatives of the events of a vertex to the film.
+
+    Args:
+        context: :class:`.context.RenderContext` of the job.
+        layout, store: layout of the record, and the record.
+        block: block of the film.
+        events: loop state of the film.
+        ray: primary ray, Ray3f.
+        k: number of the vertex, UInt32.
+        live: mask of paths that have it.
+        tangent: tangent of the Carry that arrives there.
+        dL: derivative of the steady radiance so far, a spectrum.
+
+    Returns:
+        (tangent of the Carry behind the vertex, ``dL`` with that of its events).
+    """
     v = RecordedVertex(layout, store, k, live, ray)
     v.next = context.segment.end(context, v.after())
     terms, tangent = vertex_tangents(context, v, tangent)
@@ -216,7 +259,13 @@ def forward(context, layout, store, count, block, ray, tangent):
 # Derivatives by the sensor: adjoint and tangent of the Carry of its primary rays.
 
 def objective_of(context: Any, rays: Any, adjoint: Carry) -> Any:
-    """Return ``<adjoint, Carry>`` of the primary rays, attached to the sensor."""
+    """Return ``<adjoint, Carry>`` of the primary rays (Float), attached to the sensor.
+
+    Args:
+        context: :class:`.context.RenderContext` of the job.
+        rays: attached :class:`~..sensors.origin.PrimaryRays`.
+        adjoint: adjoint of the Carry that leaves the sensor, by :func:`reverse`.
+    """
     parts = {"η": adjoint.η}
     if not context.camera_unwarp:
         parts["slope"] = adjoint.slope
@@ -237,7 +286,7 @@ def objective_of(context: Any, rays: Any, adjoint: Carry) -> Any:
 
 
 def tangent_of(context: Any, rays: Any) -> Carry:
-    """Return the tangent of the Carry of the primary rays."""
+    """Return the tangent of the Carry of attached primary rays (:class:`~..sensors.origin.PrimaryRays`)."""
     tangent = Carry.zeros()
     with dr.resume_grad():
         if not (context.wanted.sensor or dr.grad_enabled(rays.η)):

@@ -1,8 +1,9 @@
-"""Emission of what a path runs into.
+"""Connections to the emitters of the scene: emission that a path hits, and points that are sampled on lights.
 
-Light that is found moves as every vertex does (``_here``), and as the points of connections do: both strategies must
-move their samples alike, or the weights between them would no longer sum to one under the motion. A sun that moves and
-is hardly ever drawn is attached at the vertex before (``_sun_ahead``).
+Light that is hit moves as every vertex does (``_here``), and as the sampled points do: both strategies have to move
+their samples alike, or the weights between them would no longer sum to one under the motion. A sun that moves and is
+rarely drawn is attached at the vertex before (``_sun_ahead``). Arguments that all methods share are explained in
+:mod:`.strategy`.
 """
 
 from __future__ import annotations
@@ -22,13 +23,13 @@ from torchtransient.plugins.transport.strategy import Connection, Event, EventTe
 
 
 class EmitterFound(Connection):
-    """Emission where a path arrives, weighed against the strategies that could have connected to it."""
+    """Connection to emission where a path arrives, weighed against the strategies that could have sampled it."""
 
     name = "emitter_found"
     light_of_scene_alone = True
 
     def prepare(self, context):
-        sun = MovingSun.of(context)
+        sun = MovingSun.from_context(context)
         self.sun = sun if sun is not None and sun.rare else None
 
     def events(self, wanted):
@@ -50,7 +51,7 @@ class EmitterFound(Connection):
         prev.time, prev.wavelengths = path.ray.time, path.ray.wavelengths
         ds = mi.DirectionSample3f(context.scene, si=vertex.si, ref=prev)
         if context.contents.smooth_lights is not None:
-            # The face's area, on the side that emission is told by: on a mirrored mesh it is the other one.
+            # The face's normal, on the side of that which emission depends on: on a mirrored mesh it is the other one.
             ds.n = dr.mulsign(vertex.si.n, dr.dot(vertex.si.n, ds.d) * dr.dot(ds.n, ds.d))
         connected = hit & ~path.prev_unconnected
         sampled = [c.density(context, prev, ds, connected) for c in context.connections if c is not self]
@@ -77,7 +78,7 @@ class EmitterFound(Connection):
 
     def _here(self, context, vertex, wanted):
         v, si = vertex.v, vertex.si
-        mis = v.of(self.name)["mis"]
+        mis = v.record_of(self.name)["mis"]
         hit = v.active & (mis > 0)
         emitter = vertex.sid.emitter(context.scene)
         elsewhere = self._claimed(context, emitter, v.ray.d, wanted)
@@ -91,23 +92,21 @@ class EmitterFound(Connection):
         return EventTerm(value=value, slope=vertex.slope, opl=v.τ, active=hit, arrival=v.arrival(self.name))
 
     def _claimed(self, context, emitter, d, wanted):
-        """Mask of the emitters, in the direction ``d``, that derivatives reach by another strategy alone; None for
-        none.
-        """
+        """Return a mask of lights in direction ``d`` that another strategy alone differentiates, None for none."""
         claims = [c.claims(context, emitter, d, wanted) for c in context.connections if c is not self]
         claims = [c for c in claims if c is not None]
         return reduce(or_, claims) if claims else None
 
     def _sun_ahead(self, context, vertex, step):
-        """Light of the sun along a path that escapes into it: the direction that was drawn turns with it."""
+        """Return the term of sunlight along a path that escapes into the sun: the drawn direction turns with it."""
         following = vertex.v.after()
-        mis = following.of(self.name)["mis"]
+        mis = following.record_of(self.name)["mis"]
         lit = (step.inv_pdf > 0) & ~step.ahead & (mis > 0)
         with dr.suspend_grad():
             sky = following.pi.compute_surface_interaction(following.ray, mi.RayFlags.Minimal, lit)
             emitter = sky.emitter(context.scene)
             lit &= self.sun.shines(emitter, following.ray.d)
-        d = self.sun.followed(mi.Vector3f(following.ray.d), lit)
+        d = self.sun.attach_direction(mi.Vector3f(following.ray.d), lit)
         sky.wi = -d
         towards = context.scattering.evaluate(context, vertex, d, lit)
         Le = mi.unpolarized_spectrum(emitter.eval(sky, lit))
@@ -122,7 +121,11 @@ class EmitterFound(Connection):
 # A point sampled on a light (next-event estimation).
 
 class EmitterSampled(Connection):
-    """A point of an emitter, drawn by Mitsuba's sampling of emitters, but for spheres and most textured lights."""
+    """Connection to a point of an emitter (next-event estimation).
+
+    Mitsuba samples the emitters, but for spheres and most textured lights
+    (:mod:`~..sampling.sphere_lights`).
+    """
 
     name = "emitter_sampled"
     light_of_scene_alone = True
@@ -131,7 +134,7 @@ class EmitterSampled(Connection):
     def prepare(self, context):
         lights = context.contents.sphere_lights
         self.spheres = None if lights is None else lights.read(context.scene)
-        self.sun = MovingSun.of(context)
+        self.sun = MovingSun.from_context(context)
         # A light without attached numbers is dark where it is dark.
         self.lights_change = context.wanted is not None and any(map(carries_derivatives, context.scene.emitters()))
 
@@ -139,13 +142,21 @@ class EmitterSampled(Connection):
         return [] if self.spheres is None else self.spheres.tables()
 
     def sample(self, context, ref, u, active):
-        """(direction sample, emission over density) towards an emitter."""
+        """Sample a point on an emitter.
+
+        Args:
+            ref: Interaction3f that the light is seen from.
+            u: two uniform numbers, Point2f.
+
+        Returns:
+            (DirectionSample3f, emission over density), attached where spherical lights and ``ref`` are.
+        """
         lights = context.contents.shape_lights if self.spheres is None else self.spheres
         found = lights.sample(context.scene, ref, u, active)
         return found if context.contents.smooth_lights is None else self._by_faces(context, ref, *found, active)
 
     def _by_faces(self, context, ref, ds, weight, active):
-        """The sample with the solid angle of the face that it lies on; Mitsuba takes the interpolated normal for it."""
+        """Return the sample with the solid angle of its face; Mitsuba takes that of the interpolated normal."""
         _, _, there, n = self._found_by_ray(context, ref, ds, active & context.contents.smooth_lights.lists(ds.emitter))
         cos = dr.abs_dot(ds.n, ds.d)
         ratio = dr.select(there & (cos > 0), dr.abs_dot(n, ds.d) / cos, 1)
@@ -182,8 +193,9 @@ class EmitterSampled(Connection):
         return Event(value=value * T, opl=opl, active=active, depth=path.depth + 2, T=T, crowded=True)
 
     def _may_change(self, context, proposal, answer):
-        """Return a mask of samples of value zero that may have a derivative: with an albedo of zero, but not behind
-        a surface.
+        """Return a mask of samples of value zero that may have a derivative.
+
+        With an albedo of zero they may, behind a surface not.
         """
         may = mi.Bool(True)
         if not self.lights_change:
@@ -194,7 +206,7 @@ class EmitterSampled(Connection):
 
     @staticmethod
     def _length(context, p, ds, d):
-        """Length of the connection from ``p`` to a sampled point of a light, or to a distant one in direction ``d``."""
+        """Return the length from ``p`` to a sampled point of a light, or to a distant light in direction ``d``."""
         if context.contents.distant is None:
             return ds.dist
         far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
@@ -225,12 +237,12 @@ class EmitterSampled(Connection):
 
     def attached(self, context, vertex, step, wanted):
         v, si = vertex.v, vertex.scattered_si
-        r = v.of(self.name)
+        r = v.record_of(self.name)
         lit = r["lit"]
         light = self._light(context, si, r["u"], lit, wanted)
         d = self._move(context, vertex, light, wanted) if wanted.geometry else mi.Vector3f(light.ds.d)
         if self.sun is not None:
-            d = self.sun.followed(d, light.sun)
+            d = self.sun.attach_direction(d, light.sun)
         Le = self._emission(context, si, light, d, lit, wanted)
         towards = context.scattering.evaluate(context, vertex, d, lit, ds=light.ds)
         alone = light.ds.delta | light.cone
@@ -254,7 +266,7 @@ class EmitterSampled(Connection):
         return [EventTerm(value=value, slope=slope, opl=opl, active=lit, arrival=v.arrival(self.name))]
 
     def _light(self, context, si, u, lit, wanted):
-        """The sampled point of a light, attached: ``p, n``, its ``area`` element, and what kind it is of."""
+        """Return the sampled point of a light, attached: ``p, n, uv``, its ``area`` element, masks of its kind."""
         scene = context.scene
         with dr.suspend_grad():
             ds, weight = self.sample(context, si, u, lit)
@@ -263,7 +275,7 @@ class EmitterSampled(Connection):
             surface = lit & mi.has_flag(flags, mi.EmitterFlags.Surface) & ~far
         light = Local(ds=ds, weight=mi.unpolarized_spectrum(weight), far=far, near=lit & ~far, surface=surface)
         light.p, light.n, light.uv, light.area = mi.Point3f(ds.p), mi.Normal3f(ds.n), mi.Point2f(ds.uv), mi.Float(1)
-        # That of the face, and the one that emission is told by.
+        # Normal of the face; ``n`` is that which emission depends on.
         light.face_n = mi.Normal3f(ds.n)
         light.longer, light.found = mi.Float(0), None
         light.cone, light.cone_weight, light.sun = mi.Bool(False), None, mi.Bool(False)
@@ -287,8 +299,10 @@ class EmitterSampled(Connection):
 
     @staticmethod
     def _found_by_ray(context, ref, ds, active):
-        """(the ray to the point of a light, its intersection, where it finds the light, the normal of the face there):
-        what knows the shape.
+        """Trace a ray to the point of a light, whose shape the hit knows.
+
+        Returns:
+            (ray, PreliminaryIntersection3f, mask of rays that find the light, normal of the face there).
         """
         with dr.suspend_grad():
             ray = ref.spawn_ray(ds.d)
@@ -298,13 +312,13 @@ class EmitterSampled(Connection):
             return ray, pi, there & (found.emitter(context.scene) == ds.emitter), found.n
 
     def _found(self, context, si, light):
-        """Find the point of ``light``, once."""
+        """Return :meth:`_found_by_ray` for the point of ``light``, traced once."""
         if light.found is None:
             light.found = self._found_by_ray(context, si, light.ds, light.surface)
         return light.found
 
     def _follow_shape(self, context, si, light):
-        """Make the point a material one of the light's shape."""
+        """Make the point of ``light`` a material one of its shape."""
         ray, pi, there, _ = self._found(context, si, light)
         found, area = material_point(pi, ray, there, context.contents.emitting_meshes)
         light.p = dr.select(there, dr.replace_grad(light.p, found.p), light.p)
@@ -314,8 +328,9 @@ class EmitterSampled(Connection):
         light.area = dr.relative_grad(area)
 
     def _move(self, context, vertex, light, wanted):
-        """The attached direction towards the point of a light, which slides like any other one that is near: points
-        that are found must move as those that are sampled.
+        """Return the attached direction towards the point of a light, and set how the point moves.
+
+        Near points slide as the next vertex of a path does (:func:`~.geometry_terms.damped_motion`).
         """
         si, ds, near, on_surface = vertex.scattered_si, light.ds, light.near, light.surface
         n = dr.detach(light.face_n)
@@ -335,7 +350,7 @@ class EmitterSampled(Connection):
 
     @staticmethod
     def _emission(context, si, light, d, lit, wanted):
-        """Emission over density, with the derivative of the emission and of the solid angle."""
+        """Return emission over density, with the derivatives of the emission and of the solid angle."""
         ds = dr.copy(light.ds)
         if wanted.emitter_shape:  # a pattern that moves over the shape
             ds.uv = light.uv

@@ -52,7 +52,7 @@ def generator(numbers, lanes, stream):
 
 
 def medium_interaction(ray, medium, t):
-    """The point at distance ``t`` on ``ray`` inside ``medium``."""
+    """Return the point at distance ``t`` on ``ray`` inside ``medium``."""
     mei = dr.zeros(mi.MediumInteraction3f)
     mei.t = t
     mei.p = ray(t)
@@ -71,7 +71,7 @@ def channel_probabilities(carried):
 
 
 def value_of_channel(spectrum, probabilities, u):
-    """The entry of a channel drawn by ``u``."""
+    """Return the entry of a channel drawn by ``u``."""
     value, below = spectrum[0], probabilities[0]
     for c in range(1, len(spectrum)):
         value = dr.select(u >= below, spectrum[c], value)
@@ -149,7 +149,7 @@ def cross_boundary(scene, ray, pi, medium, passes):
 
 
 def surface_beyond(scene, ray, start, active, coherent=False):
-    """The first surface along ``ray`` at a distance of ``start`` (None for 0) or more, counted from ``ray.o``."""
+    """Return the first hit along ``ray`` at a distance of ``start`` (None for 0) or more, counted from ``ray.o``."""
     if start is None:
         return scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
     onward = mi.Ray3f(ray)
@@ -162,7 +162,7 @@ def surface_beyond(scene, ray, start, active, coherent=False):
 
 @dr.syntax
 def closed_surface(scene, media, ray, active):
-    """The next surface along ``ray`` that is not an open boundary."""
+    """Return the next surface along ``ray`` that is not an open boundary."""
     pi = scene.ray_intersect_preliminary(ray, active=active)
     if dr.hint(media is not None and media.open_boundaries, mode="scalar"):
         passes = active & lets_through(media, ray, pi, False)
@@ -225,7 +225,7 @@ def sample_free_flight(scene, media, ray, medium, carried, u, lanes, active, fir
 
 @dr.syntax
 def medium_along(scene, ray, medium, active):
-    """The medium at the end of ``ray``, which starts in ``medium``, whatever is in between."""
+    """Return the medium at the end of ``ray``, which starts in ``medium``, whatever is in between."""
     medium = mi.MediumPtr(medium)
     pi = scene.ray_intersect_preliminary(ray, active=active)
     going = active & pi.is_valid()
@@ -305,10 +305,15 @@ ARRIVING, CONNECTING, EMITTING = 0xC2B2AE35, 0x27D4EB2F, 0x165667B1
 
 
 class Leg:
-    """A straight leg from ``x0`` to ``x1``, or without end in direction ``d`` where ``far``, starting in ``medium``.
-    Surfaces nearer to ``x0`` than ``clip`` are not there (None: all are).
+    """Straight leg through media. A plain object that lives within one iteration.
 
-    A plain object that only lives within one iteration.
+    Args:
+        v: :class:`.record.RecordedVertex` that it belongs to, whose numbers seed its tracking.
+        x0, x1: ends, Point3f.
+        d, far: direction of legs without end, and their mask.
+        medium: medium at the start, MediumPtr.
+        stream: number that tells the legs of a vertex apart.
+        clip: distance from ``x0`` of the first surface at least, None for 0.
     """
 
     def __init__(self, v, x0, x1, d, far, medium, stream, clip=None):
@@ -472,7 +477,14 @@ class LogTransmittance(dr.CustomOp):
 
 
 def with_log_slope(scene, media, leg, x0, x1, hook, active):
-    """One with the derivative of the logarithm of the transmittance of ``leg``, whose attached ends are ``x0, x1``."""
+    """Return one, with the derivative of the logarithm of a leg's transmittance.
+
+    Args:
+        media: :class:`.scene_contents.FlightSettings`.
+        leg: detached :class:`Leg`.
+        x0, x1: its attached ends.
+        hook: attached value that keeps the operation in the AD graph.
+    """
     if not media.extinction_changes:
         return 1
     return 1 + dr.custom(LogTransmittance, mi.Point3f(x0), mi.Point3f(x1), hook, scene, media, leg, mi.Bool(active))

@@ -14,16 +14,23 @@ EDGE_ON = 1e-4
 
 
 def distance(p, q, active):
-    """Distance from ``p`` to ``q``, 1 where inactive."""
+    """Return the distance from ``p`` to ``q``, 1 where inactive."""
     return dr.norm(dr.select(active, q - p, mi.Vector3f(0, 0, 1)))
 
 
 def material_point(pi, ray, active, meshes=None, surfaces=None):
-    """Interaction that follows its shape, and the area element there (up to a constant).
+    """Return hits as material points, which follow their shapes.
 
-    ``meshes`` (PointerTable or None): those that may be met. Their derivatives by texture coordinates change with
-    these, or are made up where there are none; the area is that of the triangle. ``surfaces``: as in
-    :func:`~.surface_interactions.surface_interaction`.
+    Args:
+        pi: PreliminaryIntersection3f of the hits.
+        ray: Ray3f that found them.
+        active: mask of lanes.
+        meshes: PointerTable of the meshes that may be met, or None. Their derivatives by texture coordinates change
+            with these, or are made up where there are none: the area is that of the triangle.
+        surfaces: as of :func:`~.surface_interactions.surface_interaction`.
+
+    Returns:
+        (SurfaceInteraction3f; area element, Float, up to a constant).
     """
     si = surface_interaction(surfaces, pi, ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
     area = dr.cross(si.dp_du, si.dp_dv)
@@ -40,8 +47,16 @@ def material_point(pi, ray, active, meshes=None, surfaces=None):
 
 
 def slide_on_shape(pi, ray, drag, active):
-    """Return the changes of a point that slides on its shape, held in place, as ``ray`` is shifted by ``drag``: ``uv,
-    n`` and ``sh_n``, the shading normal, each zero with the derivative.
+    """Return how a hit that slides on its shape, held in place, changes as its ray is shifted.
+
+    Args:
+        pi: PreliminaryIntersection3f of the hit.
+        ray: Ray3f that found it.
+        drag: shift of the ray, Vector3f.
+        active: mask of lanes.
+
+    Returns:
+        ``uv``, ``n`` and ``sh_n`` (shading normal), each zero with the derivative.
     """
     shifted = mi.Ray3f(ray)
     shifted.o = shifted.o + dr.select(active, drag, 0)
@@ -54,46 +69,60 @@ def slide_on_shape(pi, ray, drag, active):
 
 
 def displacement(p, active):
-    """Zero with the derivative of the point or vector ``p`` where active."""
+    """Return zero with the derivative of the point or vector ``p``, where active."""
     zero = dr.zeros(mi.Point2f if dr.size_v(p) == 2 else mi.Vector3f)
     return dr.select(active, dr.replace_grad(zero, type(zero)(p)), zero)
 
 
 def slide(drag, d, n, active):
-    """Return the displacement of the point that a ray in direction ``d`` finds on a surface of normal ``n`` when it is
-    shifted by ``drag``, across its direction.
+    """Return how a hit slides on its surface when its ray is shifted across: ``drag - d (n.drag) / (n.d)``.
+
+    Args:
+        drag: shift of the ray, Vector3f.
+        d, n: direction of the ray, normal at the hit.
+        active: mask of lanes.
     """
     cos = dr.dot(n, d)
     return drag - d * (dr.dot(n, drag) * dr.select(active & (dr.abs(cos) > EDGE_ON), dr.rcp(cos), 0))
 
 
 class DampedMotion(Local):
-    """Motion of a connection to a point that follows its vertex: direction ``d`` (attached), ``J`` (one, with the
-    derivative of the solid angle), ``drag`` (zero, with how far the ray to the point is shifted sideways).
+    """Motion of a segment to a point that follows its vertex, by :func:`damped_motion`.
+
+    Attributes:
+        d: direction, attached.
+        J: one, with the relative derivative of the solid angle.
+        drag: zero, with the sideways shift of the ray to the point.
+        stays: ``1 - a``, the share of the motion that the point does not follow.
     """
 
     def slide(self, n):
-        """Zero with the derivative of the point, on a surface with normal ``n``, held in place."""
+        """Return zero with the derivative of the point on a surface with normal ``n``, held in place."""
         return self.drag - self.fixed * dr.dot(n, self.drag) * self.per_cos
 
     def longer(self, n=None):
-        """Zero with the derivative of the length: what is due to the vertex, and with ``n`` to the slide of the point.
+        """Return zero with the derivative of the length, due to the vertex alone.
+
+        Args:
+            n: normal of the point's surface, to add what its slide lengthens.
         """
         if n is None:
             return -dr.dot(self.δ, self.fixed)
         return -dr.dot(self.δ, self.stays * self.fixed + (1 - self.stays) * self.per_cos * n)
 
     def of_material(self, n, area):
-        """The part of ``J`` that is due to the normal ``n`` and the element ``area`` (one, attached) of a material
-        point: as far as it does not slide.
+        """Return the factor of ``J`` that is due to a material point, as far as it does not slide.
+
+        Args:
+            n: attached normal at the point.
+            area: one, with the relative derivative of its area element.
         """
         tilt = dr.dot(dr.replace_grad(mi.Vector3f(0), mi.Vector3f(n)), self.fixed) * self.per_cos
         return 1 + self.stays * (area - 1 + tilt)
 
 
 def damped_motion(δ, d, r, n, active, radius, nailed=None, volume=None):
-    """The direction ``d`` to a point at distance ``r`` on a surface of normal ``n``, when its vertex moves by ``δ``
-    against it.
+    """Return the motion of a segment of length ``r`` whose vertex moves by ``δ`` against its end.
 
     Far away the direction moves by ``-δ_perp / r``. In corners and gaps that has no bounded variance. Nearer than
     ``radius`` the point is dragged along with the vertex by a share ``a``, and the direction moves by
@@ -104,9 +133,17 @@ def damped_motion(δ, d, r, n, active, radius, nailed=None, volume=None):
 
         r W' (n.δ / n.d - d.δ) + 2 W d.δ.
 
-    ``nailed``: where the point never slides and the measure is no area: that of a point light. ``volume``: where the
-    point lies in a volume. Its distance is a coordinate of its own there, ``W`` is the same in all directions, and the
+    In a volume the distance of the point is a coordinate of its own, ``W`` is the same in all directions, and the
     divergence is ``2 W d.δ``.
+
+    Args:
+        δ: displacement of the vertex, Vector3f: zero, with the derivative.
+        d, r: direction and distance of the point, metres.
+        n: normal of its surface.
+        active: mask of lanes.
+        radius: damping radius, metres.
+        nailed: mask of points that never slide, whose measure is no area: those of point lights; None for none.
+        volume: mask of points in a volume, None for none.
     """
     near = r < radius
     if nailed is not None:

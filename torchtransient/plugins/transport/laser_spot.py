@@ -1,4 +1,4 @@
-"""The spot that a laser makes on what it meets first: at every vertex one connection to it.
+"""Connection to the spot that a laser makes on the first surface in its way.
 
 Nothing else finds a point without area, so no weights are needed. In a confocal scan the first hidden vertex has seen
 the spot already: the path came from there.
@@ -25,11 +25,14 @@ from torchtransient.plugins.transport.strategy import Connection, Event, EventTe
 
 
 class LaserSpot(Connection):
-    """Light that was scattered once by a laser spot.
+    """Connection to light that was scattered once by a laser spot.
 
-    ``table``: the :class:`~torchtransient.plugins.around_corner.scan_table.ScanTable` of the job, with its spots.
-    ``confocal``: each path ends at the spot that it started from. ``legs``: the way from the laser to the spot counts.
     An event's depth is its number of bounces: the laser's own way is no segment of the path.
+
+    Args:
+        table: :class:`~torchtransient.plugins.around_corner.scan_table.ScanTable` of the job, with its spots.
+        confocal: each path ends at the spot that it started from.
+        legs: the way from the laser to the spot counts in time.
     """
 
     name = "laser_spot"
@@ -62,7 +65,7 @@ class LaserSpot(Connection):
     # ------------------------------------------------------------------------------------------------ the spot
 
     def spot(self, wavelengths, active, *, attached=False):
-        """The path's own spot: :class:`DiffuseSpot`, or :class:`GeneralSpot` with its derivatives."""
+        """Return the path's own spot: :class:`DiffuseSpot`, or :class:`GeneralSpot` with its derivatives."""
         if self.points is None:
             return self.general_spot(wavelengths, active)
         if not attached:
@@ -70,7 +73,7 @@ class LaserSpot(Connection):
         return DiffuseSpot(*self.points.take(self.index, active))
 
     def general_spot(self, wavelengths, active):
-        """The same whatever the wall is: with an interaction, from which rays can start."""
+        """Return the path's own spot as a :class:`GeneralSpot`, from whose interaction rays can start."""
         return GeneralSpot(self.spots, self.index, wavelengths, self.legs, active)
 
     # ------------------------------------------------------------------------------------------------- primal
@@ -113,7 +116,7 @@ class LaserSpot(Connection):
     # ----------------------------------------------------------------------------------------------- attached
 
     def attached(self, context, vertex, step, wanted):
-        si, r = vertex.scattered_si, vertex.v.of(self.name)
+        si, r = vertex.scattered_si, vertex.v.record_of(self.name)
         lit = r["lit"]
         spot = self.spot(si.wavelengths, lit, attached=True)
         to = dr.select(lit, spot.p - si.p, mi.Vector3f(0, 0, 1))
@@ -194,7 +197,7 @@ class PackedSpots:
         self.flat = packed_columns([columns[i : i + 4] for i in range(0, len(columns), 4)], points.width)
 
     def take(self, index, active):
-        """The :class:`DiffuseSpot` of each lane."""
+        """Return the :class:`DiffuseSpot` of each lane."""
         rows = [dr.gather(mi.Vector4f, self.flat, index * self.count + i, active) for i in range(self.count)]
         x = [row[i] for row in rows for i in range(4)]
         value = mi.UnpolarizedSpectrum(x[7 : 7 + self.channels])

@@ -24,11 +24,19 @@ from torchtransient.plugins.transport.strategy import Connection, Event, Proposa
 
 
 class SensorSampled(Connection):
-    """``places``: :class:`~..sensors.seen_from.SensorPlaces`; ``numbers``: those that choose the sensor's point, set
-    before a launch. ``unwarp``: the segment to the sensor does not count in time. Events carry ``uv``, in pixels, ``d``
-    towards the sensor, ``first`` (the path's first vertex is connected), and ``speed``: which of the speeds of a pass
-    of the boundary term is theirs then. ``in_line``: None, or Local with masks ``near`` of paths of which it is known
-    whether the first vertex is ``shown``, and a ``step`` from it to where nothing is in the way then.
+    """Connection of a path that starts at a light to the sensor.
+
+    Events carry ``uv``, in pixels, ``d`` towards the sensor, ``first`` (the path's first vertex is connected), and
+    ``speed``, the number of their speed in a pass of the boundary term.
+
+    Args:
+        places: :class:`~..sensors.seen_from.SensorPlaces`.
+        unwarp: the segment to the sensor does not count in time.
+
+    Attributes:
+        numbers: numbers that choose the sensor's point, set before a launch.
+        in_line: None, or Local with masks ``near`` of paths of which it is known whether the first vertex is ``shown``,
+            and a ``step`` from it to where nothing is in the way then.
     """
 
     name = "sensor_sampled"
@@ -81,12 +89,7 @@ def in_sensor_frame(light, d):
 # Scattering on the way from lights, where shading normals are not those of the surface (Veach 1997, 5.3).
 
 class FromLight:
-    """The ``scattering`` of paths that run against those of the sensor.
-
-    A value holds the cosine of the side that it is asked for. Paths of the sensor hold that of the light's side,
-    against the normal that the BSDF shades by, and the area of a surface changes from one side's to the other's by the
-    true normal: the values of both ways differ by ``|n . wo| f(wo, wi) / (|n . wi| f(wi, wo))``, cosines included in f.
-    """
+    """Scattering of paths that run from lights towards the sensor."""
 
     def __init__(self, scattering: Any) -> None:
         self._scattering = scattering
@@ -118,7 +121,7 @@ class FromLight:
 
 
 def shades_by_other_normals(scene: Any) -> bool:
-    """Return whether some surface has normals at its vertices or in a texture."""
+    """Return True if some surface has normals at its vertices or in a texture."""
     shapes = [shape for shape in shapes_of_scene(scene) if has_surface(shape) and shape.bsdf() is not None]
     if any(has_vertices(shape) and has_normals(shape) for shape in shapes):
         return True

@@ -17,7 +17,7 @@ from torchtransient.plugins.transport.vacuum import AttachedTriangles, Vacuum
 
 
 class MaterialVacuum(Vacuum):
-    """Segments like :class:`.vacuum.Vacuum`'s, without a damping radius."""
+    """Segment like :class:`.vacuum.Vacuum`, without a damping radius."""
 
     drags = False
 
@@ -25,8 +25,8 @@ class MaterialVacuum(Vacuum):
         super().prepare(context)
         moving = frozenset() if context.wanted is None or not context.wanted.geometry else context.wanted.shapes
         self.triangles = AttachedTriangles(context.scene.shapes(), moving)
-        # A point and its normal are all that Lambertian surfaces ask for: whoever has gathered a triangle's vertices to
-        # go there hands them on, and each is back-propagated to once.
+        # Lambertian surfaces read the point and its normal alone. The segment that gathers a triangle's vertices hands
+        # both on in the Carry, so that each is back-propagated to once.
         self.carried = ("p", "n") if moving and self.triangles.holds_all and context.scattering.turns_freely else ()
 
     def attached(self, context, v, carry, wanted):
@@ -45,7 +45,7 @@ class MaterialVacuum(Vacuum):
         return dr.select(free, self._material(v, carry, active & free), found)
 
     def _material(self, v, carry, active):
-        """Hit points that follow their shapes."""
+        """Return hits as material points."""
         flags = mi.RayFlags.All | mi.RayFlags.FollowShape
         if not self.carried:
             return v.pi.compute_surface_interaction(v.ray, flags, active)
@@ -62,7 +62,7 @@ class MaterialVacuum(Vacuum):
     def motion(self, context, vertex, following, ahead):
         v, si = vertex.v, vertex.scattered_si
         after = v.after()
-        p, n, area = self.material(context, after.pi, after.ray, following.n, ahead)
+        p, n, area = self.material_hits(context, after.pi, after.ray, following.n, ahead)
         to = dr.select(ahead, p - si.p, mi.Vector3f(following.d))
         r2 = dr.squared_norm(to)
         d = to * dr.rsqrt(r2)
@@ -76,19 +76,22 @@ class MaterialVacuum(Vacuum):
 
 
 class FoundVacuum(MaterialVacuum):
-    """The same for walks with guides, which look at the end of a segment before they weigh it: what was found there is
-    carried to the next turn of the loop. A leg is ``pi`` and ``si``, of which the loop keeps what is used.
+    """Segments of walks with guides, which carry the interaction at their end to the next iteration.
 
-    ``overlaps``: some of what guides draw lies in something else (:mod:`~..around_corner.scan_table`).
+    The scattering looks it up before it weighs the segment. A leg is ``pi`` and ``si``, of which the loop keeps the
+    fields that are used.
+
+    Args:
+        overlaps: some points that guides draw lie in another surface (:mod:`~..around_corner.scan_table`).
     """
 
     def __init__(self, overlaps):
         self.overlaps = overlaps
 
     def first(self, context, ray, sampler):
-        return self.known(super().first(context, ray, sampler), ray)
+        return self.leg_to(super().first(context, ray, sampler), ray)
 
-    def known(self, pi, ray):
+    def leg_to(self, pi, ray):
         return {"pi": pi, "si": pi.compute_surface_interaction(ray, mi.RayFlags.All)}
 
     def depart(self, context, ray, vertex, β, sampler, active):
@@ -119,5 +122,5 @@ class FoundVacuum(MaterialVacuum):
     def surface_of(self, leg):
         return leg["pi"], mi.Bool(True)
 
-    def found(self, leg, ray, flags, active=True):
+    def interaction_of(self, leg, ray, flags, active=True):
         return leg["si"]

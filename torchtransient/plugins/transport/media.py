@@ -35,7 +35,7 @@ from torchtransient.plugins.transport.vacuum import Vacuum, intersection, inters
 
 
 class Media(Vacuum):
-    """Straight lines that can end in a medium, and pass open boundaries.
+    """Segment that can end in a medium, and passes open boundaries.
 
     A leg is a dictionary: ``pi`` (the next surface), ``scatter`` (the leg ends in a medium, at distance ``t`` from the
     ray's origin), ``medium`` (at its end), ``weight`` (transmittance over density); for derivatives also ``begin`` (the
@@ -88,7 +88,7 @@ class Media(Vacuum):
             scatter=scatter, mei=mei, medium=leg["medium"], opl=self.optical_length(context, path, at.p, valid),
         )  # fmt: skip
 
-    def found(self, leg, ray, flags, active=True):
+    def interaction_of(self, leg, ray, flags, active=True):
         return leg["pi"].compute_surface_interaction(ray, flags, active)
 
     def surface_of(self, leg):
@@ -150,7 +150,7 @@ class Media(Vacuum):
         return values | (intersection_numbers(leg["entry"], "entry_") if "entry" in leg else {})
 
     def restore(self, v, ray):
-        r = v.of(self.name)
+        r = v.record_of(self.name)
         v.scatter, v.t, v.weight = r["scatter"], r["t_end"], r["weight"]
         v.begin, v.end = (dr.reinterpret_array(mi.MediumPtr, r[name]) for name in ("begin", "end"))
         v.entry = intersection(r, v.active, "entry_") if self.settings.keeps_entry else None
@@ -188,7 +188,7 @@ class Media(Vacuum):
         return vertex
 
     def _surface_or_medium(self, context, v, carry, ray, wanted):
-        """(interaction, medium interaction, attached length of the stretch that a vertex in a medium divides).
+        """Return (interaction, medium interaction, attached length of the stretch that a vertex in a medium divides).
 
         Vertices in media come as surface interactions too: at the point itself, with no normal and no shape.
         """
@@ -213,7 +213,7 @@ class Media(Vacuum):
         return si, mei, stretch
 
     def _attached_distance(self, v, carry, ray, wanted):
-        """Distance along ``ray`` of a vertex in a medium, and the length of the stretch that it divides."""
+        """Return (distance along ``ray`` of a vertex in a medium, length of the stretch that it divides)."""
         if not wanted.geometry:
             return v.t, mi.Float(1)
         begin = dr.dot(carry.x - ray.o, ray.d)
@@ -238,12 +238,12 @@ class Media(Vacuum):
 
 
 def lane_numbers(sampler):
-    """The number of each lane."""
+    """Return the number of each lane."""
     return dr.arange(mi.UInt32, sampler.wavefront_size())
 
 
 def reference(si, mei, scatter):
-    """The vertex as a point of reference: that of the surface, or of the medium where ``scatter``."""
+    """Return the vertex as a point of reference: that of the surface, or of the medium where ``scatter``."""
     at = dr.zeros(mi.Interaction3f)
     at.t = dr.select(scatter, mei.t, si.t)
     at.time = si.time
@@ -255,6 +255,6 @@ def reference(si, mei, scatter):
 
 
 def medium_behind(si, d, medium, at_surface):
-    """The medium of a ray that leaves a vertex in direction ``d``."""
+    """Return the medium of a ray that leaves a vertex in direction ``d``."""
     changes = at_surface & si.is_medium_transition()
     return dr.select(changes, si.target_medium(d), medium)

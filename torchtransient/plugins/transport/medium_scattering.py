@@ -32,7 +32,7 @@ def phase_and_scattering(mei, active):
 
 
 class SurfaceOrMedium(Surface):
-    """In a medium the vertex scatters by the phase function times the scattering coefficient."""
+    """Scattering at surfaces, and in media by the phase function times the scattering coefficient."""
 
     def prepare(self, context):
         super().prepare(context)
@@ -40,7 +40,7 @@ class SurfaceOrMedium(Surface):
         self.blends = None if blends is None else blends.read(context.wanted)
 
     def _phase_and_scattering(self, mei, u, active):
-        """(phase function, or the part of one that ``u`` chooses; scattering coefficient times its weight)."""
+        """Return (phase function, or the part of one that ``u`` chooses; scattering coefficient times its weight)."""
         phase, σ_s = phase_and_scattering(mei, active)
         if self.blends is None:
             return phase, σ_s
@@ -58,7 +58,7 @@ class SurfaceOrMedium(Surface):
         allowed = True if context.contents.media.emitter_sampling else vertex.medium.use_emitter_sampling()
         return dr.select(vertex.scatter, allowed, smooth)
 
-    def elsewhere(self, context, vertex, proposals, answers, step):
+    def scatter_in_volume(self, context, vertex, proposals, answers, step):
         ctx, mei, scatter = mi.PhaseFunctionContext(None), vertex.mei, vertex.scatter
         active = vertex.goes_on & scatter
         step.u_phase = vertex.u_phase
@@ -96,11 +96,13 @@ class SurfaceOrMedium(Surface):
 
     def look_up_attached(self, context, vertex, wanted):
         super().look_up_attached(context, vertex, wanted)
-        u, active = vertex.v.of(self.name).get("u_phase"), vertex.v.active & vertex.scatter
+        u, active = vertex.v.record_of(self.name).get("u_phase"), vertex.v.active & vertex.scatter
         vertex.phase, vertex.σ_s = self._phase_and_scattering(vertex.mei, u, active)
 
     def eval_pdf(self, vertex, wo, out, active, sampled):
-        """A phase function too narrow for single precision has no light towards a given point, and its own samples
+        """Return value and density of an attached vertex towards a direction.
+
+        A phase function too narrow for single precision has no light towards a given point, and its own samples
         (``sampled``) have the ratio of value and density that they were drawn with.
         """
         surface_value, surface_pdf = super().eval_pdf(vertex, wo, out, active, sampled)

@@ -24,7 +24,7 @@ from torchtransient.plugins.transport.strategy import Local
 
 
 class RecordSink(Sink):
-    """Writer of the records of all strategies, which :class:`RecordedVertex` reads by their ``layout``.
+    """Sink that writes the records of all strategies, which :class:`RecordedVertex` reads by their ``layout``.
 
     Args:
         block: adjoint block of the film, where arrivals are read before their vertices; None for no list of them.
@@ -48,29 +48,33 @@ class RecordSink(Sink):
         # Without room for a list of arrivals each is read at its vertex.
         return RecordLayout(context)
 
-    def end(self, kept):
+    def end(self, state):
         if self.lanes is not None:
-            dr.eval([array.numbers for array in kept.values()])
+            dr.eval([array.numbers for array in state.values()])
 
-    def vertex(self, kept, path, samples):
+    def vertex(self, state, path, samples):
         layout, k, active = self.layout, path.depth, path.active
         values = {"walk": vars(samples["walk"])}
         for strategy in layout.context.strategies():
             values[strategy.name] = strategy.record(samples[strategy.name])
         if layout.arrivals is not None:
-            values[layout.arrivals.name] = layout.arrivals.append(kept, samples)
+            values[layout.arrivals.name] = layout.arrivals.append(state, samples)
         for s, name in layout.types:
-            kept[f"{s}.{name}"].write(values[s][name], k, active)
+            state[f"{s}.{name}"].write(values[s][name], k, active)
         flags = mi.UInt32(0)
         for (s, name), bit in layout.bits.items():
             flags |= dr.select(values[s][name], mi.UInt32(bit), 0)
-        kept["flags"].write(flags, k, active)
+        state["flags"].write(flags, k, active)
 
 
 class RecordLayout:
     """Fields of a record by (strategy, name). A plain object, which Dr.Jit loops leave alone.
 
     Masks share the bits of one word: Dr.Jit 1.5 cannot compile a local array of masks (invalid LLVM IR).
+
+    Args:
+        context: :class:`.context.RenderContext` of a job with derivatives.
+        arrivals: :class:`Arrivals` of a path, None if each is read at its vertex.
     """
 
     def __init__(self, context, arrivals=None):
@@ -102,7 +106,12 @@ class RecordLayout:
         return size * self.bytes_of_vertex() + listed
 
     def allocate(self, size, lanes=None):
-        """Return arrays of ``size`` vertices: local ones, or in global memory for ``lanes`` paths."""
+        """Return arrays by field for the vertices of a path.
+
+        Args:
+            size: number of vertices.
+            lanes: number of paths for arrays in global memory, None for local ones.
+        """
         kinds = {f"{s}.{name}": kind for (s, name), kind in self.types.items()} | {"flags": mi.UInt32}
         if lanes is not None:
             return {name: GlobalArray(kind, size, lanes) for name, kind in kinds.items()}
@@ -110,15 +119,26 @@ class RecordLayout:
         return arrays if self.arrivals is None else arrays | self.arrivals.allocate()
 
     def mask(self, flags, s, name):
-        """Return a mask of the word ``flags`` of a vertex."""
+        """Return a mask of a vertex.
+
+        Args:
+            flags: the vertex's word of masks, UInt32.
+            s, name: strategy and field.
+        """
         return (flags & self.bits[s, name]) != 0
 
 
 class RecordedVertex(Local):
-    """Vertex ``k`` of a record.
+    """Vertex of a recorded path.
+
+    Args:
+        layout: :class:`RecordLayout`.
+        store: arrays of the record, by field.
+        k: number of the vertex, UInt32.
+        active: mask of paths that have it.
+        primary_ray: primary ray of the path, Ray3f.
 
     Attributes:
-        k, active: its number, UInt32, and the mask of paths that have it.
         β, τ, η: throughput before its segment, optical path length up to it, index along the segment.
         rr, goes_on: factor of Russian roulette, mask of paths that continue.
         ray, pi: ray and PreliminaryIntersection3f that found it.
@@ -130,10 +150,10 @@ class RecordedVertex(Local):
         # Dr.Jit does not merge equal reads of thread-local memory: each array is read once a vertex.
         self._read = {}
         self.η = mi.Float(1)
-        vars(self).update(self.of("walk"))
+        vars(self).update(self.record_of("walk"))
         self.ray, self.pi = layout.context.segment.restore(self, primary_ray)
 
-    def of(self, name):
+    def record_of(self, name):
         """Return the record of the strategy called ``name``, as a dictionary."""
         layout = self.layout
         found = {field: self._array(f"{s}.{field}") for s, field in layout.types if s == name}
@@ -146,21 +166,26 @@ class RecordedVertex(Local):
         return self._read[name]
 
     def arrival(self, name):
-        """The number of a connection's event among the arrivals of the path, None where they are not listed."""
+        """Return the number of a connection's event among the arrivals of the path, None where they are not listed."""
         arrivals = self.layout.arrivals
-        return None if arrivals is None else arrivals.number(self.of(arrivals.name), name)
+        return None if arrivals is None else arrivals.number(self.record_of(arrivals.name), name)
 
     def numbers(self):
-        """Two uniform random numbers that were drawn at this vertex."""
+        """Return two uniform random numbers that were drawn at this vertex."""
         for c in self.layout.context.connections:
-            numbers = c.numbers(self.of(c.name))
+            numbers = c.numbers(self.record_of(c.name))
             if numbers is not None:
                 return numbers
         # Without random numbers the bits of the ray's direction serve: they are hashed.
         return [self.ray.d.x, self.ray.d.y]
 
     def before(self, name, field, at_sensor):
-        """Return a mask of the vertex before, ``at_sensor`` for the first vertex."""
+        """Return a recorded mask of the vertex before.
+
+        Args:
+            name, field: strategy and field of its record.
+            at_sensor: value at the first vertex, before which there is the sensor.
+        """
         there = self.active & (self.k > 0)
         flags = self.store["flags"].read(dr.maximum(self.k, 1) - 1, there)
         return ((self.k == 0) & mi.Bool(at_sensor)) | (there & self.layout.mask(flags, name, field))
@@ -178,10 +203,15 @@ class RecordedVertex(Local):
 # Arrivals of a recorded path: a list that the walk appends to, and the film's adjoint at each of them.
 
 class Arrivals:
-    """Layout of the arrivals of a record. A plain object, which Dr.Jit loops leave alone.
+    """Layout of the arrivals of a record: a list that the walk appends to, and the film's adjoint at each of them.
 
-    Every vertex records the number of its first arrival, and a mask of each connection with one. ``together``: number
-    of arrivals that are read at once.
+    A plain object, which Dr.Jit loops leave alone. Every vertex records the number of its first arrival, and a mask of
+    each connection with one.
+
+    Attributes:
+        together: number of arrivals that are read at once.
+        most: largest number of arrivals of a path.
+        with_slope: the adjoint's slope is read as well.
     """
 
     name = "arrivals"
@@ -211,51 +241,84 @@ class Arrivals:
         numbers = [f"A.{c}" for c in range(self.channels)]
         numbers += [f"slope.{c}" for c in range(self.channels)] if self.with_slope else []
         size = self._size()
-        kept = {name: dr.alloc_local(mi.Float, size) for name in numbers}
+        state = {name: dr.alloc_local(mi.Float, size) for name in numbers}
         # As wide as the lanes: Dr.Jit takes an index of one entry to be the same in all of them.
-        return kept | {"arrivals": dr.zeros(mi.UInt32, self.lanes), "opl": dr.alloc_local(mi.Float64, size)}
+        return state | {"arrivals": dr.zeros(mi.UInt32, self.lanes), "opl": dr.alloc_local(mi.Float64, size)}
 
-    def append(self, kept, samples):
-        """Append the events of a vertex; return the fields of its record."""
-        found = {"first": kept["arrivals"]}
+    def append(self, state, samples):
+        """Append the events of a vertex and return the fields of its record.
+
+        Args:
+            state: loop state of the sink.
+            samples: samples of the strategies at the vertex, by name.
+        """
+        found = {"first": state["arrivals"]}
         for name in self.connections:
-            event, n = samples[name].event, kept["arrivals"]
-            kept["opl"].write(event.opl, n, event.active)
-            kept["arrivals"] = n + dr.select(event.active, mi.UInt32(1), 0)
+            event, n = samples[name].event, state["arrivals"]
+            state["opl"].write(event.opl, n, event.active)
+            state["arrivals"] = n + dr.select(event.active, mi.UInt32(1), 0)
             found[name] = event.active
         return found
 
     def number(self, found, name):
-        """Return the number of a connection's event, from the record of its vertex."""
+        """Return the number of an event among the arrivals of its path.
+
+        Args:
+            found: record of the arrivals at its vertex, by field.
+            name: connection of the event.
+        """
         before = self.connections[: self.connections.index(name)]
         return found["first"] + sum(dr.select(found[other], mi.UInt32(1), 0) for other in before)
 
-    def read_some(self, kept, block, first, live):
-        """Read the adjoint at the arrivals from number ``first`` on, of ``live`` paths."""
-        opls = [kept["opl"].read(first + e, live & (first + e < kept["arrivals"])) for e in range(self.together)]
+    def read_group(self, store, block, first, live):
+        """Read the adjoint at ``together`` arrivals and store it.
+
+        Args:
+            store: arrays of the record.
+            block: adjoint block of the film.
+            first: number of the first arrival, UInt32.
+            live: mask of paths that have it.
+        """
+        opls = [store["opl"].read(first + e, live & (first + e < store["arrivals"])) for e in range(self.together)]
         A, slope = block.read_together(opls, self.with_slope, live)
         for name, found in (("A", A), ("slope", slope or [])):
             for e, channels in enumerate(found):
                 for c, value in enumerate(channels):
-                    kept[f"{name}.{c}"].write(value, first + e, live)
+                    store[f"{name}.{c}"].write(value, first + e, live)
 
-    def adjoint(self, kept, block, number, active):
-        """Return the adjoint at an arrival and its slope (None without geometry), as spectra."""
-        A = [kept[f"A.{c}"].read(number, active) for c in range(self.channels)]
+    def adjoint(self, store, block, number, active):
+        """Return the adjoint at an arrival, as spectra.
+
+        Args:
+            store: arrays of the record, after :func:`read_ahead`.
+            block: adjoint block of the film.
+            number: number of the arrival, UInt32.
+            active: mask of lanes.
+
+        Returns:
+            (adjoint, its slope per metre or None without geometry).
+        """
+        A = [store[f"A.{c}"].read(number, active) for c in range(self.channels)]
         slope = None
         if self.with_slope:
-            slope = [kept[f"slope.{c}"].read(number, active) for c in range(self.channels)]
+            slope = [store[f"slope.{c}"].read(number, active) for c in range(self.channels)]
         return block.as_spectra(A, slope)
 
 
 @dr.syntax
-def read_ahead(arrivals, kept, block):
-    """Return the record with the film's adjoint at all arrivals."""
+def read_ahead(arrivals, store, block):
+    """Read the film's adjoint at all arrivals of paths and return the record with it.
+
+    Args:
+        arrivals: :class:`Arrivals` of the record's layout.
+        store: arrays of the record.
+        block: adjoint block of the film.
+    """
     first = mi.UInt32(0)
-    while dr.hint(first < kept["arrivals"], label="arrivals"):
-        arrivals.read_some(kept, block, first, first < kept["arrivals"])
+    while dr.hint(first < store["arrivals"], label="arrivals"):
+        arrivals.read_group(store, block, first, first < store["arrivals"])
         first += arrivals.together
-    return kept
+    return store
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -380,9 +443,14 @@ def _vector_width() -> Any:
 
 
 class GlobalArray:
-    """Replacement for a local array of Dr.Jit in global memory: ``size`` entries of type ``kind`` for each lane.
+    """Array of each lane in global memory, in place of a local array of Dr.Jit.
 
     A plain object, which Dr.Jit loops leave alone. One kernel writes it, the next one reads it.
+
+    Args:
+        kind: type of an entry.
+        size: number of entries of each lane.
+        lanes: number of lanes.
     """
 
     def __init__(self, kind: Any, size: int, lanes: int):

@@ -82,15 +82,15 @@ class SceneContents:
         self.bsdfs, self.mixtures = mixtures_of(met, mi.BSDF, shapes_of_scene(scene))
         self.delta = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta) for bsdf in self.bsdfs)
         self.glossy = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) for bsdf in self.bsdfs)
-        self.instances, self.detached_hits = Instances.of(scene), DetachedHits.of(scene)
+        self.instances, self.detached_hits = Instances.from_scene(scene), DetachedHits.from_scene(scene)
         infinite = any(mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in scene.emitters())
         self.distant = reference if infinite else None
-        self.refraction = RefractiveBSDFs.of(scene, self.bsdfs)
-        self.surroundings = Surroundings.of(scene, sensor, outermost)
+        self.refraction = RefractiveBSDFs.from_scene(scene, self.bsdfs)
+        self.surroundings = Surroundings.from_scene(scene, sensor, outermost)
         self.two_sided = _two_sided(self.bsdfs) if mi.is_polarized else None
         self.hidden_probability = PointerTable.marking([bsdf for bsdf in self.bsdfs if hides_lobe_probability(bsdf)])
         self.media = media_of(scene, sensor)
-        self.sphere_lights = SphereLights.of(scene)
+        self.sphere_lights = SphereLights.from_scene(scene)
         self.shape_lights = ShapeLights(scene) if self.sphere_lights is None else self.sphere_lights.others
         self.smooth_lights = PointerTable.marking([e for e in scene.emitters() if has_smooth_shape(e)])
         self.emitting_meshes = PointerTable.marking([s for s in scene.shapes() if s.is_emitter() and has_vertices(s)])
@@ -107,7 +107,7 @@ class SceneContents:
         self._built = True
 
     def hidden_from_mitsuba(self) -> AbstractContextManager[None]:
-        """For the time of a derivative: what is attached here instead of by Mitsuba."""
+        """Return a context manager that detaches in Mitsuba what is attached here instead, during a derivative."""
         return nullcontext() if self.instances is None else self.instances.detached()
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -133,7 +133,7 @@ def scatters_by_place(bsdf: Any) -> bool:
 
 
 def emits_by_place(emitter: Any) -> bool:
-    """Return whether the light that leaves a surface in a given direction may differ from place to place: a texture, or
+    """Return True if the light that leaves a surface in a given direction may differ from place to place: a texture, or
     what counts angles from the normal of a curved shape. Mitsuba's ``area`` asks for the side alone.
     """
     if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface):
@@ -155,7 +155,7 @@ def _is_known(plugin: Any, names: Iterable[str]) -> bool:
 
 
 def _room(plugin: Any) -> str:
-    """The package that a plugin is written in."""
+    """Return the package that a plugin is written in."""
     return type(plugin).__module__.split(".")[0]
 
 
@@ -222,11 +222,18 @@ class MediaContents:
 class FlightSettings:
     """Media of one job: contents and wanted derivatives.
 
-    ``recorded``: the path is kept. ``extinction_changes``: a transmittance can change. ``keeps_entry``: the boundary
-    before a vertex is kept, since the vertex may move with it. ``rate_floor`` (1 / m, None when no extinction is
-    differentiated): the smallest rate at which collisions are sampled: where the density is zero, its derivative is
-    not, and is found by collisions alone. ``hide_emitters``: rays from the sensor pass light sources.
-    ``surfaces``: what their derivatives need beside Mitsuba (:class:`.surface_interactions.AttachedSurfaces`), or None.
+    Args:
+        contents: media of the scene.
+        wanted: :class:`.context.Wanted` derivatives, None in a render.
+        hide_emitters: rays from the sensor pass light sources.
+        surfaces: :class:`.surface_interactions.AttachedSurfaces`, or None.
+
+    Attributes:
+        recorded: paths are recorded for derivatives.
+        extinction_changes: a transmittance can change.
+        keeps_entry: the boundary before a vertex is recorded, since the vertex may move with it.
+        rate_floor: smallest rate at which collisions are sampled, 1 / m; None when no extinction is differentiated.
+            Where the density is zero, its derivative is not, and is found by collisions alone.
     """
 
     def __init__(self, contents: MediaContents, wanted: Any, hide_emitters: bool, surfaces: Any = None):
@@ -248,7 +255,7 @@ class FlightSettings:
 
 
 def media_of(scene: Any, sensor: Any) -> MediaContents | None:
-    """The media of a scene, None when it has none."""
+    """Return the media of a scene, None when it has none."""
     shapes = shapes_of_scene(scene)
     found = [sensor.get_medium() if sensor is not None else None]
     for shape in shapes:
@@ -289,7 +296,7 @@ class SceneCache:
     freed.
     """
 
-    # What recorded calls depend on of it is in their worlds.
+    # What recorded calls depend on is in the contexts of their jobs.
     only_remembers = True
 
     def __init__(self, scene: Any, integrator: Any) -> None:
@@ -307,16 +314,21 @@ class SceneCache:
         self._contents: dict[int, tuple[Any, SceneContents]] = {}
         self._tracker: ParameterTracker | None = None
         self._python: list[Any] | None = None
-        # Parameters, by plugin and key, of which it was said which moving edges derivatives do not follow.
-        self.told_of_edges: set[tuple[int, str]] = set()
+        # Parameters, by plugin and key, whose gaps at moving edges a warning has named.
+        self.warned_of_edges: set[tuple[int, str]] = set()
 
     def is_of(self, scene: Any) -> bool:
         """Return True if the cache is that of ``scene``."""
         return self._described.is_of(scene)
 
     def follow_derivatives(self, scene: Any, asked: bool) -> None:
-        """Let the BSDFs that sample otherwise for derivatives look which parameters carry some now. ``asked``: for a
-        job of derivatives. What they build for it belongs to the scene's contents.
+        """Let the BSDFs that sample otherwise for derivatives look up which parameters carry some now.
+
+        What they build for it belongs to the scene's contents.
+
+        Args:
+            scene: scene of the job.
+            asked: the job is a derivative.
         """
         self._forget_replaced(scene)
         with dr.resume_grad():
@@ -332,15 +344,16 @@ class SceneCache:
         return self._contents[sensor.ptr][1]
 
     def tracker(self, scene: Any) -> ParameterTracker:
-        """The scene's parameters. Walked over when first asked for: a render has no use for it."""
+        """Return the tracker of the scene's parameters, built when first asked for: a render has no use for it."""
         self._forget_replaced(scene)
         if self._tracker is None:
             self._tracker = ParameterTracker(scene)
         return self._tracker
 
     def python_plugins(self, scene: Any) -> list[Any]:
-        """The plugins of the scene that are written in Python: integrator, films, samplers and filters included, and
-        without what plugins do not show.
+        """Return the plugins of the scene that are written in Python.
+
+        Integrator, films, samplers and filters are included; what plugins do not show is not.
         """
         self._forget_replaced(scene)
         if self._python is None:

@@ -15,7 +15,7 @@ class Sink:
     """Base of sinks, which ignores everything.
 
     The loop calls ``begin`` once, ``event`` for every event, ``vertex`` once a vertex, after its last event, and
-    ``end`` after the loop. ``kept`` is the sink's loop state: a dictionary of Dr.Jit values that it may change.
+    ``end`` after the loop. ``state`` is the sink's loop state: a dictionary of Dr.Jit values that it may change.
     """
 
     # Static: events of value zero matter, since their derivatives can differ from zero.
@@ -27,13 +27,20 @@ class Sink:
         """Return the loop state before the first vertex."""
         return {}
 
-    def event(self, kept: dict[str, Any], event: Any) -> None:
-        """Receive an :class:`.strategy.Event`."""
+    def event(self, state: dict[str, Any], event: Any) -> None:
+        """Receive an :class:`.strategy.Event` of the current vertex."""
 
-    def vertex(self, kept: dict[str, Any], path: Any, samples: dict[str, Any]) -> None:
-        """Receive the vertex that ``path`` reached; ``samples``: samples of the strategies there, by name."""
+    def vertex(self, state: dict[str, Any], path: Any, samples: dict[str, Any]) -> None:
+        """Receive the vertex that ``path`` reached.
 
-    def end(self, kept: dict[str, Any]) -> None:
+        Args:
+            state: loop state of the sink.
+            path: :class:`.walk.Path` before the vertex.
+            samples: samples of the strategies there, by name, as :meth:`.strategy.Strategy.record` takes them;
+                ``walk``: those of the loop.
+        """
+
+    def end(self, state: dict[str, Any]) -> None:
         """Finish the loop state."""
 
 
@@ -41,9 +48,12 @@ class Sink:
 # Film.
 
 class FilmSink(Sink):
-    """Writer of events to a film, through its block.
+    """Sink that writes events to a film, through its block.
 
     Its state has the sum ``L`` over all times, and the energy ``before`` and ``after`` the film's window.
+
+    Args:
+        block: :class:`~..films.block.FilmBlock` of the launch.
     """
 
     keeps_vertices = False
@@ -54,23 +64,27 @@ class FilmSink(Sink):
     def begin(self, context):
         return {"L": light_type()(0), "before": mi.Float(0), "after": mi.Float(0), "block": self.block.begin()}
 
-    def event(self, kept, event):
-        kept["L"] = kept["L"] + event.value
-        before, after = self.block.put(kept["block"], event.opl, event.value, event.active, event.crowded)
-        kept["before"] = kept["before"] + before
-        kept["after"] = kept["after"] + after
+    def event(self, state, event):
+        state["L"] = state["L"] + event.value
+        before, after = self.block.put(state["block"], event.opl, event.value, event.active, event.crowded)
+        state["before"] = state["before"] + before
+        state["after"] = state["after"] + after
 
-    def end(self, kept):
-        self.block.end(kept["block"])
+    def end(self, state):
+        self.block.end(state["block"])
 
 
 # --------------------------------------------------------------------------------------------------------------------
 # Sum of events, weighted by the film's adjoint.
 
 class AdjointSumSink(Sink):
-    """Sum of ``A(opl) value`` over the events of a path, with the adjoint ``A`` of the film; its state is ``sum``.
+    """Sink that sums ``A(opl) value`` over the events of a path, with the adjoint ``A`` of the film.
 
-    A boundary term traces paths from both sides of an edge: the sum is the contribution of their light to a loss.
+    A boundary term traces paths from both sides of an edge: the sum is the contribution of their light to a loss. Its
+    state is ``sum``.
+
+    Args:
+        block: :class:`~..films.block.AdjointBlock` of the launch.
     """
 
     def __init__(self, block):
@@ -79,20 +93,25 @@ class AdjointSumSink(Sink):
     def begin(self, context):
         return {"sum": mi.Float(0)}
 
-    def event(self, kept, event):
+    def event(self, state, event):
         A, _ = self.block.read(event.opl, event.active)
-        kept["sum"] = kept["sum"] + dr.select(event.active, total_of(A, event.value), 0)
+        state["sum"] = state["sum"] + dr.select(event.active, total_of(A, event.value), 0)
 
 
 # --------------------------------------------------------------------------------------------------------------------
 # List of events with their depths.
 
 class EventListSink(Sink):
-    """List of events, in slots of each lane.
+    """Sink that lists events, in slots of each lane.
+
+    Args:
+        lanes: number of paths.
+        slots: number of events that fit for each path.
+        energy_of: function of an event's value that returns its energy, Float; events without energy are left out.
 
     Attributes:
         opl: optical path length, minus the film's start, Float64.
-        energy: ``energy_of(value)``, Float; events without energy are left out.
+        energy: energy, Float.
         depth: depth of the event, 0 in empty slots.
         used: number of events of each lane, which may exceed ``slots``.
     """
@@ -108,14 +127,14 @@ class EventListSink(Sink):
     def begin(self, context):
         return {"used": mi.UInt32(0)}
 
-    def event(self, kept, event):
-        energy, used = self.energy_of(event.value), kept["used"]
+    def event(self, state, event):
+        energy, used = self.energy_of(event.value), state["used"]
         found = event.active & (energy != 0)
         slot, fits = dr.fma(self.lane, self.slots, used), found & (used < self.slots)
         dr.scatter(self.opl, event.opl, slot, fits)
         dr.scatter(self.energy, energy, slot, fits)
         dr.scatter(self.depth, event.depth, slot, fits)
-        kept["used"] = used + dr.select(found, mi.UInt32(1), 0)
+        state["used"] = used + dr.select(found, mi.UInt32(1), 0)
 
-    def end(self, kept):
-        self.used = kept["used"]
+    def end(self, state):
+        self.used = state["used"]

@@ -21,10 +21,11 @@ receive events through a block (:class:`~torchtransient.plugins.films.block.Film
 through an adjoint block.
 
 Arguments that all methods share: ``context`` is the :class:`.context.RenderContext` of the job, ``path`` the
-:class:`.walk.Path` before the vertex, ``vertex`` the :class:`Vertex` or :class:`AttachedVertex`, ``sampler`` Mitsuba's
-sampler of the lanes, ``active`` a mask of lanes, ``wanted`` the :class:`.context.Wanted` derivatives of the job. Every
-Float is one number per lane. ``value`` is a spectrum (``mi.UnpolarizedSpectrum``), in polarized variants a Stokes
-vector. Lengths are metres, densities per solid angle unless stated otherwise.
+:class:`.walk.Path` before the vertex, ``vertex`` the :class:`Vertex` or :class:`AttachedVertex`, ``v`` a
+:class:`.record.RecordedVertex`, ``sampler`` Mitsuba's sampler of the lanes, ``active`` a mask of lanes, ``wanted`` the
+:class:`.context.Wanted` derivatives of the job. Every Float is one number per lane. ``value`` is a spectrum
+(``mi.UnpolarizedSpectrum``), in polarized variants a Stokes vector. Lengths are metres, densities per solid angle
+unless stated otherwise.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ import mitsuba as mi
 class Local:
     """Named values that live within one iteration of a loop.
 
-    Not a dataclass on purpose: Dr.Jit would take it apart as loop state.
+    Not a dataclass: Dr.Jit would take it apart as loop state.
     """
 
     def __init__(self, **values: Any) -> None:
@@ -235,83 +236,139 @@ class Segment(Strategy):
     carried: tuple[str, ...] = ()
 
     def first(self, context: Any, ray: Any, sampler: Any) -> Any:
-        """Return the leg of a primary ray."""
+        """Return the leg of a primary ray (Ray3f)."""
         raise NotImplementedError
 
     def depart(
         self, context: Any, ray: Any, vertex: Vertex, β: Any, sampler: Any, active: Any, seen: bool = False
     ) -> Any:
-        """Return the leg of ``ray``, which leaves ``vertex`` with throughput ``β``.
+        """Return the leg of a ray that leaves a vertex.
 
-        ``seen``: the ray is part of a primary ray, which passes lights where ``context.hide_emitters``.
+        Args:
+            ray: Ray3f, which starts beside ``vertex``.
+            β: throughput behind ``vertex``, which chooses among the colours of a medium.
+            seen: the ray is part of a primary ray, which passes lights where ``context.hide_emitters``.
         """
         raise NotImplementedError
 
     def depart_guided(self, context: Any, ray: Any, vertex: Vertex, step: Step, sampler: Any, active: Any) -> Any:
-        """Return the leg of ``ray``, which a guide sent to ``step.point`` where ``step.guided``.
+        """Return the leg of a ray that a guide may have sent to a point.
 
-        ``step.target`` has ``n`` and ``uv`` of the point, or is None.
+        Args:
+            ray: Ray3f, towards ``step.point`` where ``step.guided``.
+            step: sampled direction; ``step.target`` is a :class:`GuidedPoint` with ``n`` and ``uv``, or None.
         """
         return self.depart(context, ray, vertex, vertex.β, sampler, active)
 
     def arrive(self, context: Any, path: Any) -> Vertex:
-        """Return the vertex at the end of the current leg; sensors see no lights where ``context.hide_emitters``."""
+        """Return the vertex at the end of the current leg of ``path``."""
         raise NotImplementedError
 
     def surface_of(self, leg: Any) -> tuple[Any, Any]:
-        """Return (PreliminaryIntersection3f of the next surface, mask: the leg ends there)."""
+        """Return the surface at or behind the end of a leg.
+
+        Returns:
+            (PreliminaryIntersection3f of the next surface, mask of legs that end there).
+        """
         raise NotImplementedError
 
-    def found(self, leg: Any, ray: Any, flags: Any, active: Any = True) -> Any:
-        """Return the SurfaceInteraction3f of the next surface along ``ray``, with the fields of ``flags`` at least."""
+    def interaction_of(self, leg: Any, ray: Any, flags: Any, active: Any = True) -> Any:
+        """Return the SurfaceInteraction3f of the surface of a leg (:meth:`surface_of`).
+
+        Args:
+            ray: Ray3f of the leg.
+            flags: RayFlags, fields that the result has at least.
+        """
         raise NotImplementedError
 
-    def known(self, pi: Any, ray: Any) -> Any:
-        """Return the leg of a primary ray with a known PreliminaryIntersection3f."""
+    def leg_to(self, pi: Any, ray: Any) -> Any:
+        """Return the leg of a primary ray whose first hit ``pi`` (PreliminaryIntersection3f) is known."""
         return pi
 
     def length_of(self, leg: Any) -> tuple[Any, Any]:
-        """Return (length of ``leg`` from the origin of its ray, mask: it ends at something)."""
+        """Return the length of a leg.
+
+        Returns:
+            (metres from the origin of its ray, Float; mask of legs that end at something).
+        """
         raise NotImplementedError
 
-    def held(self, context: Any, pi: Any, ray: Any, active: Any) -> Any:
-        """Return zero with the derivative of the surface point ``pi``, found by ``ray``, as a point of its shape."""
+    def material_displacement(self, context: Any, pi: Any, ray: Any, active: Any) -> Any:
+        """Return the displacement of a hit as a material point of its shape: zero, with the derivative of the point.
+
+        Args:
+            pi: PreliminaryIntersection3f of the hit.
+            ray: Ray3f that found it.
+
+        Returns:
+            Vector3f, attached to the parameters that move the shape.
+        """
         raise NotImplementedError
 
     def ends_at(self, pi: Any, medium: Any) -> Any:
-        """Return the leg that ends at the surface ``pi``, in the ``medium`` of :meth:`medium_towards`."""
+        """Return the leg that ends at a given surface.
+
+        Args:
+            pi: PreliminaryIntersection3f of the surface.
+            medium: MediumPtr in front of it, as of :meth:`medium_towards`; None in vacuum.
+        """
         raise NotImplementedError
 
     def medium_towards(self, d: Any, vertex: Any = None) -> Any:
-        """Return the medium of a ray that leaves ``vertex`` (None: the sensor) along ``d``, None in vacuum."""
+        """Return the medium of a ray that leaves a vertex, None in vacuum.
+
+        Args:
+            d: direction of the ray, Vector3f.
+            vertex: vertex that it leaves, None for the sensor.
+        """
         raise NotImplementedError
 
     def medium_at(self, context: Any, p: Any, start: Any, medium: Any, active: Any) -> Any:
-        """Return the medium at ``p``, None in vacuum; ``medium`` is that at ``start`` on the side of ``p``."""
+        """Return the medium at the end of a straight line, None in vacuum.
+
+        Args:
+            p: end, Point3f.
+            start: start of the line, Point3f.
+            medium: medium at ``start``, on the side of ``p``.
+        """
         raise NotImplementedError
 
     def share_of_surface(self, leg: Any) -> Any:
-        """Return the share of the motion of the surface behind it that the end of ``leg`` follows."""
+        """Return the share of a surface's motion along the ray that the end of a leg follows.
+
+        One for legs that end at the surface. A collision in a medium divides the way to the surface behind it in a
+        fixed ratio ``t / t_surface``, which is its share.
+        """
         raise NotImplementedError
 
     def transmittance(
         self, context: Any, vertex: Vertex, ds: Any, u: Any, sampler: Any, active: Any, seen: bool = False
     ) -> tuple[Any, Any]:
-        """Return (mask: the point ``ds`` is visible, transmittance towards it per colour).
+        """Trace a shadow ray from a vertex.
 
         Args:
-            ds: ``p, d, dist`` of the point.
+            ds: point of the light, ``p, d, dist`` as of a DirectionSample3f.
             u: two uniform numbers, drawn for this vertex, which seed a generator.
             seen: as of :meth:`depart`.
+
+        Returns:
+            (mask of points that are visible, transmittance per colour).
         """
         raise NotImplementedError
 
     def restore(self, v: Any, ray: Any) -> tuple[Any, Any]:
-        """Return (Ray3f, PreliminaryIntersection3f) of a recorded vertex; ``ray`` is the primary one."""
+        """Return the ray and the hit of a recorded vertex.
+
+        Args:
+            ray: primary ray of its path, with time and wavelengths.
+
+        Returns:
+            (Ray3f, PreliminaryIntersection3f).
+        """
         raise NotImplementedError
 
     def next_surface(self, context: Any, ray: Any, active: Any) -> Any:
-        """Return the first surface along ``ray`` that ends a connection."""
+        """Return the first hit (PreliminaryIntersection3f) along ``ray`` that ends a connection."""
         raise NotImplementedError
 
     def end(self, context: Any, v: Any) -> Any:
@@ -323,25 +380,37 @@ class Segment(Strategy):
         return None
 
     def weight(self, v: Any) -> Any:
-        """Return the recorded weight of the leg that led to vertex ``v``."""
+        """Return the recorded transmittance over density of the leg that led to vertex ``v``."""
         return 1
 
     def attached(self, context: Any, v: Any, carry: Any, wanted: Any) -> Any:
-        """Return the :class:`AttachedVertex` of a recorded vertex.
+        """Return the recorded vertex with derivatives.
 
-        Slope and throughput of ``carry`` include the segment; its ``end`` is that of :meth:`end`.
+        Args:
+            carry: attached :class:`.carry.Carry` of the path before the segment.
+
+        Returns:
+            :class:`AttachedVertex`, whose slope and throughput include the segment. Its ``end`` is that of :meth:`end`.
         """
         raise NotImplementedError
 
     def motion(self, context: Any, vertex: Any, following: Any, ahead: Any) -> Any:
-        """Return the motion of the segment from an attached ``vertex`` to the ``following`` one, where ``ahead``.
+        """Return the motion of the segment from an attached vertex to the next one.
 
-        The result has attached ``d``, ``J``, ``drag`` and ``longer()``, as :class:`.geometry_terms.DampedMotion`.
+        Args:
+            vertex: :class:`AttachedVertex` at the start.
+            following: :class:`VertexEnd` of the next vertex.
+            ahead: mask of paths that a smooth lobe led there.
+
+        Returns:
+            Attached ``d`` (direction), ``J`` (one, with the relative derivative of the solid angle), ``drag`` (zero,
+            with the sideways shift of the ray) and ``longer()`` (zero, with how much the start lengthens the segment),
+            as of :class:`.geometry_terms.DampedMotion`.
         """
         raise NotImplementedError
 
     def attached_transmittance(self, context: Any, vertex: Any, connected: Any, active: Any) -> Any:
-        """Return one with the derivative of the logarithm of the transmittance towards a point.
+        """Return one, with the derivative of the logarithm of the transmittance towards a point.
 
         Args:
             connected: attached ``p``, detached ``d``, ``far`` (mask of points at infinity), ``ahead`` (static: the
@@ -351,7 +420,7 @@ class Segment(Strategy):
 
 
 class Connection(Strategy):
-    """Emission that is found at a vertex, or a light that a vertex is connected to.
+    """Strategy that finds light at a vertex: emission that was hit, or a point that is sampled on a light.
 
     A connection respects ``vertex.goes_on``, ``vertex.connectable`` and ``context.deep_enough``, masks with
     ``context.counted`` before it traces a shadow ray, weights its samples by :meth:`weight`, and adds lengths to
@@ -360,7 +429,8 @@ class Connection(Strategy):
 
     # All light comes from emitters of the scene, whose bounding box limits the remaining path length.
     light_of_scene_alone = False
-    # The last vertex of a path, which connects to nothing, can have an event.
+    # The last vertex of a path can have an event: emission that was run into. False of connections that sample lights,
+    # which the vertex before has used up.
     finds_light = True
     # The first vertex has no event, on any path of the job.
     dark_at_first = False
@@ -370,7 +440,7 @@ class Connection(Strategy):
         return 1
 
     def propose(self, context: Any, path: Any, vertex: Vertex, sampler: Any) -> Proposal | None:
-        """Return a direction for the scattering to evaluate, None for none."""
+        """Return a direction for the scattering to evaluate, None for a connection that needs none."""
         return None
 
     def connect(self, context: Any, path: Any, vertex: Vertex, proposal: Any, answer: Any, zeros: bool) -> Event:
@@ -384,9 +454,14 @@ class Connection(Strategy):
         raise NotImplementedError
 
     def density(self, context: Any, ref: Any, ds: Any, active: Any) -> Any:
-        """Return the density of the light's point ``ds`` seen from ``ref``, None if the strategy samples no points.
+        """Return the density with which the strategy samples a point of a light, None if it samples no points.
 
-        Per solid angle; for a light without extent the probability of its choice.
+        Args:
+            ref: Interaction3f that the light is seen from.
+            ds: DirectionSample3f of the point.
+
+        Returns:
+            Density per solid angle (Float); for a light without extent the probability of its choice.
         """
         return None
 
@@ -412,15 +487,29 @@ class Connection(Strategy):
         return dr.select(total > 0, density / total, 0) * mis_weight(total, pdf)
 
     def claims(self, context: Any, emitter: Any, d: Any, wanted: Any) -> Any:
-        """Return a mask of emitters in direction ``d`` that derivatives reach by connections alone, None for none."""
+        """Return a mask of lights whose derivatives this connection computes alone, None for none.
+
+        Args:
+            emitter: EmitterPtr.
+            d: direction of the light from the vertex, Vector3f.
+        """
         return None
 
     def numbers(self, recorded: dict[str, Any]) -> list[Any] | None:
-        """Return two uniform numbers of the record that were drawn at the vertex, None for none."""
+        """Return two uniform numbers that were drawn at a vertex, None for none.
+
+        Args:
+            recorded: record of this strategy at the vertex, by name.
+        """
         return None
 
     def attached(self, context: Any, vertex: Any, step: Any, wanted: Any) -> list[EventTerm]:
-        """Return the events of a recorded vertex with derivatives."""
+        """Return the events of a recorded vertex with derivatives.
+
+        Args:
+            vertex: :class:`AttachedVertex`.
+            step: result of :meth:`Scattering.attached` there.
+        """
         raise NotImplementedError
 
 
@@ -441,13 +530,22 @@ class Guide(Strategy):
         return self.share
 
     def draw(self, context: Any, vertex: Vertex, x: Any, y: Any) -> GuidedPoint:
-        """Return a point on a surface for two uniform numbers (Float64, Float)."""
+        """Draw a point on a surface.
+
+        Args:
+            vertex: vertex that the next segment leaves.
+            x, y: uniform numbers in [0, 1), Float64 and Float.
+        """
         raise NotImplementedError
 
     def density(self, context: Any, p: Any, q: Any, n: Any, shape: Any, active: Any, primitive: Any = None) -> Any:
-        """Return the density per solid angle at ``p`` of the point ``q`` (normal ``n``) of ``shape``.
+        """Return the density of a point on a surface, per solid angle (Float).
 
-        ``primitive``: number of the triangle, None if unknown, for the density of any.
+        Args:
+            p: vertex that it is drawn from, Point3f.
+            q, n: point, Point3f, and its normal.
+            shape: ShapePtr of the point.
+            primitive: number of its triangle, UInt32; None if unknown, for the density of any.
         """
         raise NotImplementedError
 
@@ -465,34 +563,53 @@ class Scattering(Strategy):
         raise NotImplementedError
 
     def scatter(self, context: Any, path: Any, vertex: Vertex, proposals: list, sampler: Any) -> tuple[list, Step]:
-        """Return (an answer for each proposal, None for None; the next direction).
+        """Evaluate the scattering towards the proposals and sample the next direction.
 
         All proposals come together: one virtual call serves the first of them and the next direction.
+
+        Args:
+            proposals: a :class:`Proposal` or None for each connection.
+
+        Returns:
+            (an :class:`Answer` for each proposal, None for None; the :class:`Step`).
         """
         raise NotImplementedError
 
     def weigh(self, context: Any, path: Any, vertex: Vertex, step: Step, ray: Any, leg: Any) -> None:
-        """Set weight and density of ``step`` by the end of its segment; called with guides alone."""
+        """Set weight and density of a step by the end of its segment; called with guides alone.
+
+        Args:
+            step: :class:`Step` whose ``guided`` lanes a guide has drawn.
+            ray: Ray3f of the segment.
+            leg: its leg.
+        """
 
     def look_up_attached(self, context: Any, vertex: Any, wanted: Any) -> None:
         """Look up the scattering of an attached vertex, before :meth:`attached` and those of connections."""
         raise NotImplementedError
 
     def evaluate(self, context: Any, vertex: Any, out: Any, active: Any, sampled: bool = False, ds: Any = None) -> Any:
-        """Return attached ``value``, ``pdf``, ``wo`` (local direction) and ``eta`` towards a direction.
+        """Evaluate an attached vertex towards a direction.
 
         Args:
+            vertex: :class:`AttachedVertex`.
             out: attached direction in world space.
             sampled: the scattering sampled the direction itself.
             ds: point of a light in that direction, None otherwise.
+
+        Returns:
+            Attached ``value`` and ``pdf``, ``wo`` (local direction) and ``eta`` (relative index of refraction).
         """
         raise NotImplementedError
 
     def attached(self, context: Any, vertex: Any, wanted: Any) -> Any:
-        """Return the next step with derivatives; the record of a scattering has the mask ``delta``.
+        """Return the next step of an attached vertex with derivatives.
 
-        The result has ``carry`` behind the vertex, ``inv_pdf`` of the recorded direction and ``ahead`` (mask: a smooth
-        lobe found the next vertex).
+        The record of a scattering has the mask ``delta``.
+
+        Returns:
+            ``carry`` behind the vertex, ``inv_pdf`` (one over the density of the recorded direction) and ``ahead``
+            (mask of paths that a smooth lobe led to the next vertex).
         """
         raise NotImplementedError
 

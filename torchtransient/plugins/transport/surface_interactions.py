@@ -35,7 +35,7 @@ class Instances:
         self._identities = mi.Float(np.tile(np.eye(4, dtype=np.float32).reshape(-1), 2 * (1 + max(self._numbers))))
 
     @staticmethod
-    def of(scene: Any) -> Instances | None:
+    def from_scene(scene: Any) -> Instances | None:
         """Return the instances of ``scene``, None without."""
         found = [shape for shape in scene.shapes() if is_instance(shape)]
         return Instances(found) if found else None
@@ -84,7 +84,7 @@ class InstanceTable:
         return dr.gather(mi.Matrix4f, self.table, row), dr.gather(mi.Matrix4f, self.table, row + 1)
 
     def to_world(self, instance: Any, v: Any) -> Any:
-        """A vector of the space of an ``instance`` (pointer) in the world, attached to both."""
+        """Return a vector of the space of an ``instance`` (pointer) in the world, attached to both."""
         return _vector(self._matrices(instance)[0], v)
 
     def interaction(self, pi: Any, ray: Any, flags: int, active: Any, hits: HitTable | None) -> Any:
@@ -128,14 +128,14 @@ class AttachedSurfaces:
         self._instances, self._hits = instances, hits
 
     @staticmethod
-    def of(contents: Any) -> AttachedSurfaces | None:
+    def from_contents(contents: Any) -> AttachedSurfaces | None:
         """Return the surfaces of one job, None where Mitsuba's own interactions are right."""
         if contents.instances is None and contents.detached_hits is None:
             return None
         return AttachedSurfaces(*(part and part.read() for part in (contents.instances, contents.detached_hits)))
 
     def to_world(self, instance: Any, v: Any) -> Any:
-        """A vector of the space of an ``instance`` in the world, attached to both."""
+        """Return a vector of the space of an ``instance`` in the world, attached to both."""
         return v if self._instances is None else self._instances.to_world(instance, v)
 
     def tables(self) -> list[Any]:
@@ -179,14 +179,15 @@ def _vector(M: Any, v: Any) -> Any:
 
 
 def _normal(inverse: Any, n: Any, valid: Any) -> Any:
-    """A unit normal, brought to the other space by the transpose of the inverse; some normal where not ``valid``."""
+    """Return a unit normal in the other space, by the transpose of the inverse; an arbitrary one where not ``valid``.
+    """
     n = dr.select(valid, n, mi.Normal3f(0, 0, 1))
     across = [inverse[0, i] * n.x + inverse[1, i] * n.y + inverse[2, i] * n.z for i in range(3)]
     return dr.normalize(mi.Normal3f(*across))
 
 
 def _frame(n: Any, dp_du: Any) -> Any:
-    """The shading frame that Mitsuba makes of a normal and a tangent, which may be zero."""
+    """Return the shading frame that Mitsuba makes of a normal and a tangent, which may be zero."""
     across = dp_du - n * dr.dot(n, dp_du)
     across = dr.select(dr.any(dp_du != 0), across, mi.coordinate_system(n)[0])
     s = dr.normalize(across)
@@ -233,7 +234,7 @@ class DetachedHits:
             self._starts = [ellipsoids, segments, pieces]
 
     @staticmethod
-    def of(scene: Any) -> DetachedHits | None:
+    def from_scene(scene: Any) -> DetachedHits | None:
         """Return the shapes of ``scene``, shape groups included; None when it has none."""
         found = [s for s in shapes_of_scene(scene) if leaves_hits_detached(s) or misplaces_hits(s)]
         return DetachedHits(found) if found else None
@@ -259,11 +260,11 @@ class HitTable:
         self._kinds = kinds
 
     def tables(self) -> list[Any]:
-        """The arrays that are attached where parameters are."""
+        """Return the arrays that are attached where parameters are."""
         return [table for kind in self._kinds for table in kind.tables()]
 
     def attach(self, pi: Any, shape: Any, ray: Any, active: Any) -> Any:
-        """The intersection ``pi`` of ``ray`` with ``shape``, attached to both."""
+        """Return the intersection ``pi`` of ``ray`` with ``shape``, attached to both."""
         pi = mi.PreliminaryIntersection3f(pi)
         for kind in self._kinds:
             kind.attach(pi, shape, ray, active)
@@ -276,7 +277,7 @@ class HitTable:
 
 
 class _Kind:
-    """One kind of shape."""
+    """Class of shapes with detached hits."""
 
     def attach(self, pi: Any, shape: Any, ray: Any, active: Any) -> None:
         """Attach the intersections with such shapes, before Mitsuba computes the interaction."""
@@ -416,7 +417,7 @@ def _spline(points: Sequence[Sequence[Any]], v: Any) -> list[tuple[Any, Any]]:
 
 
 def _floats(value: Any) -> Any:
-    """A parameter as a flat array; tensors hand theirs out."""
+    """Return a parameter as a flat array; tensors hand theirs out."""
     return mi.Float(value.array if dr.is_tensor_v(value) else value)
 
 

@@ -1,4 +1,4 @@
-"""Scattering by the BSDFs of surfaces."""
+"""Scattering by the BSDFs of surfaces. Arguments that all methods share are explained in :mod:`.strategy`."""
 
 from __future__ import annotations
 
@@ -27,7 +27,11 @@ _ANY = 0xFFFFFFFF
 class Surface(Scattering):
     """Scattering at surfaces; vertices in media are those of :class:`.medium_scattering.SurfaceOrMedium`.
 
-    ``guides``: a list of :class:`~.strategy.Guide`, whose shares sum to less than one.
+    Args:
+        guides: list of :class:`~.strategy.Guide`, whose shares sum to less than one.
+
+    Raises:
+        SceneError: if a share is not positive, or if they sum to one and more.
     """
 
     # Whether light scatters alike around the normal, whatever the tangents are.
@@ -40,7 +44,7 @@ class Surface(Scattering):
             raise SceneError(f"guides: expected positive shares that sum to less than one, got {shares}.")
 
     def own_share(self, depth):
-        """Share of the next directions that the scattering draws itself, at the vertices number ``depth``."""
+        """Return the share of the next directions that the scattering samples itself, at vertices number ``depth``."""
         return 1 - sum(guide.share_at(depth) for guide in self.guides)
 
     def prepare(self, context):
@@ -70,16 +74,30 @@ class Surface(Scattering):
         if self.mixtures is not None:
             self.mixtures.take_part(vertex.delay, vertex.si, vertex.u_part, vertex.si.is_valid())
         vertex.bsdf = vertex.delay.bsdf
-        vertex.scattered_si, vertex.at = self.behind(vertex.delay, vertex.si, vertex.at)
+        vertex.scattered_si, vertex.at = self.with_shifted_wavelengths(vertex.delay, vertex.si, vertex.at)
         vertex.connectable = self.connectable(context, vertex)
 
     def delay(self, bsdf, u, wavelengths):
-        """Return the delay of a surface: the BSDF in its place, where it holds, and its weight."""
+        """Sample the delay of a surface.
+
+        Args:
+            bsdf: BSDFPtr.
+            u: two uniform numbers, None without delays.
+            wavelengths: those of the segment.
+
+        Returns:
+            :class:`~..bsdfs.delay_table.DelaySample`: the delay, the BSDF that scatters with it, and its weight.
+        """
         return DelaySample(bsdf) if self.delays is None else self.delays.sample(bsdf, u, wavelengths)
 
     @staticmethod
-    def behind(delay, *interactions):
-        """The interactions with the wavelengths beyond the surface."""
+    def with_shifted_wavelengths(delay, *interactions):
+        """Return copies of interactions with the wavelengths beyond a surface that fluoresces.
+
+        Args:
+            delay: :class:`~..bsdfs.delay_table.DelaySample` of the surface.
+            interactions: those at the vertex, on the sensor's side.
+        """
         if delay.wavelengths is None:
             return interactions
         copies = {id(i): dr.copy(i) for i in interactions}
@@ -114,8 +132,8 @@ class Surface(Scattering):
         )  # fmt: skip
         step.unconnected = step.delta
         if context.wanted is not None and context.contents.glossy:
-            step.pdf = dr.select(is_black(weight) & strayed(si.wi, bs), 0, step.pdf)
-        self.elsewhere(context, vertex, proposals, answers, step)
+            step.pdf = dr.select(is_black(weight) & is_on_wrong_side(si.wi, bs), 0, step.pdf)
+        self.scatter_in_volume(context, vertex, proposals, answers, step)
         rotation = rotation_to_sensor(si, path.ray.d)
         for p, answer in zip(proposals, answers, strict=True):
             if answer is not None:
@@ -130,20 +148,33 @@ class Surface(Scattering):
         return answers, step
 
     def sample(self, bsdf, si, u_lobe, u_dir, active):
-        """A direction and its weight where nothing is connected."""
+        """Sample a direction and its weight where no connection has proposed one.
+
+        Args:
+            bsdf: BSDFPtr.
+            si: SurfaceInteraction3f.
+            u_lobe, u_dir: uniform numbers, Float and Point2f.
+
+        Returns:
+            (BSDFSample3f, value over density).
+        """
         return bsdf.sample(mi.BSDFContext(), si, u_lobe, u_dir, active)
 
-    def elsewhere(self, context, vertex, proposals, answers, step):
-        """Change answers and step where the vertex is not on a surface."""
+    def scatter_in_volume(self, context, vertex, proposals, answers, step):
+        """Replace answers and step at vertices in a medium; a surface leaves them.
+
+        Args:
+            proposals, answers, step: as of :meth:`~.strategy.Scattering.scatter`.
+        """
 
     # ------------------------------------------------------------------------------------------------- guides
 
     def _follow_guides(self, context, path, vertex, step, sampler):
-        """Let guides draw some of the next vertices: ``step.guided``, at ``step.point``. Of the scattering's own sample
-        and those of the guides one is used.
+        """Let guides draw some of the next vertices: ``step.guided``, at ``step.point``.
 
-        At the first vertex the samples of a pixel share out among them who draws, and what: they vary less, and lanes
-        beside each other look at places beside each other, where their rays find the same boxes and triangles.
+        One sample is used, of the scattering or of one guide. At the first vertex the samples of a pixel are stratified
+        over guides and points: they vary less, and neighbouring lanes look at neighbouring places, where their rays
+        traverse the same boxes and triangles.
         """
         u = mi.Float64(sampler.next_1d())
         if self.strata is not None:
@@ -169,8 +200,13 @@ class Surface(Scattering):
         step.weight = dr.select(step.delta, step.weight / own, step.weight)
 
     def mixture(self, context, depth, p, ds, pdf, active):
-        """Density with which the walk goes from its vertex ``p``, number ``depth``, to the light's point ``ds``;
-        ``pdf``: that of the scattering.
+        """Return the density of the walk, guides included, towards a point of a light (Float).
+
+        Args:
+            depth: number of the vertex, UInt32.
+            p: vertex, Point3f.
+            ds: point of the light.
+            pdf: density of the scattering towards it.
         """
         if not self.guides:
             return pdf
@@ -181,14 +217,22 @@ class Surface(Scattering):
         return self.own_share(depth) * pdf + dr.select(active, guided, 0)
 
     def guided_density(self, context, depth, p, to, shape, active, primitive=None):
-        """Density per solid angle, shares included, with which guides draw the point ``to`` (``p, n``) from ``p``."""
+        """Return the density per solid angle with which guides draw a point, shares included (Float).
+
+        Args:
+            depth: number of the vertex that it is drawn from, UInt32.
+            p: that vertex, Point3f.
+            to: point, with ``p`` and ``n``.
+            shape: ShapePtr of the point.
+            primitive: number of its triangle, None if unknown.
+        """
         return sum(g.share_at(depth) * g.density(context, p, to.p, to.n, shape, active, primitive) for g in self.guides)
 
     def weigh(self, context, path, vertex, step, ray, leg):
         smooth = vertex.goes_on & ~step.delta
         pi, reached = context.segment.surface_of(leg)
         reached = smooth & reached & pi.is_valid()
-        found = context.segment.found(leg, ray, mi.RayFlags.Minimal, reached)
+        found = context.segment.interaction_of(leg, ray, mi.RayFlags.Minimal, reached)
         # From the vertex itself to what was found, not from beside it, where the ray starts.
         p, to = vertex.at.p, dr.select(reached, found.p - vertex.at.p, ray.d)
         value, pdf = self.value_towards(context, path, vertex, to * dr.rsqrt(dr.squared_norm(to)), smooth)
@@ -207,7 +251,11 @@ class Surface(Scattering):
         step.eta = dr.select(smooth, self.relative_index(vertex.bsdf, vertex.scattered_si, wo), step.eta)
 
     def value_towards(self, context, path, vertex, out, active):
-        """(value between the frames of the segments, density) of the scattering towards the world direction ``out``."""
+        """Return the scattering towards a world direction ``out``.
+
+        Returns:
+            (value between the frames of both segments, density).
+        """
         si = vertex.scattered_si
         wo = si.to_local(out)
         value, pdf = vertex.bsdf.eval_pdf(mi.BSDFContext(), si, wo, active)
@@ -218,19 +266,31 @@ class Surface(Scattering):
 
     @staticmethod
     def correct_two_sided(context, bsdf, si, wo, value):
-        """``value`` of a BSDF towards ``wo``, put right where Mitsuba's two-sided BSDFs mirror it."""
+        """Return the value of a BSDF in the right frames where Mitsuba's two-sided BSDFs mirror them.
+
+        Args:
+            bsdf: BSDFPtr.
+            si: SurfaceInteraction3f.
+            wo: local direction of ``value``.
+            value: Mueller matrix, or a spectrum, which passes.
+        """
         two_sided = context.contents.two_sided
         if two_sided is None:
             return value
         return from_mirrored_frames(value, si.wi, wo, two_sided.lists(bsdf) & (si.wi.z < 0))
 
     def relative_index(self, bsdf, si, wo):
-        """Index on the side of ``wo`` over that on the side of ``si.wi``."""
+        """Return the index of refraction on the side of ``wo`` over that on the side of ``si.wi``."""
         return mi.Float(1) if self.refraction is None else self.refraction.relative_index(bsdf, si, wo)
 
     @staticmethod
     def lobe_probability(context, bsdf, bs):
-        """One, with the derivative of a delta lobe's probability where the BSDF's weight hides it."""
+        """Return one, with the derivative of a delta lobe's probability where the BSDF's weight hides it.
+
+        Args:
+            bsdf: BSDFPtr.
+            bs: BSDFSample3f of the lobe.
+        """
         hidden = context.contents.hidden_probability
         return 1 if hidden is None else dr.select(hidden.lists(bsdf), dr.relative_grad(bs.pdf), 1)
 
@@ -254,13 +314,13 @@ class Surface(Scattering):
     def look_up_attached(self, context, vertex, wanted):
         v, si = vertex.v, vertex.si
         vertex.rotation = rotation_to_sensor(si, vertex.carry.w)
-        u = v.of(self.name).get("u_delay")
+        u = v.record_of(self.name).get("u_delay")
         vertex.delay = self.delay(vertex.sid.bsdf(v.ray), u, v.ray.wavelengths)
         if self.mixtures is not None:
-            u_part = v.of(self.name)["u_part"]
+            u_part = v.record_of(self.name)["u_part"]
             self.mixtures.take_part(vertex.delay, si, u_part, vertex.sid.is_valid())
         vertex.bsdf = vertex.delay.bsdf
-        (vertex.scattered_si,) = self.behind(vertex.delay, si)
+        (vertex.scattered_si,) = self.with_shifted_wavelengths(vertex.delay, si)
         vertex.scattered_slope, vertex.scattered_opl = vertex.slope, vertex.delay.after(v.τ)
         if wanted.geometry and vertex.delay.delay is not None:
             vertex.scattered_slope = vertex.slope + slope_only(vertex.delay.delay)
@@ -275,11 +335,16 @@ class Surface(Scattering):
         return Local(value=value, pdf=pdf, wo=wo, eta=self.relative_index(vertex.bsdf, si, wo))
 
     def eval_pdf(self, vertex, wo, out, active, sampled):
-        """Value and density towards the local direction ``wo``, in the world ``out``."""
+        """Return value and density of an attached vertex towards a direction.
+
+        Args:
+            wo, out: local and world direction.
+            sampled: the scattering sampled the direction itself.
+        """
         return vertex.bsdf.eval_pdf(mi.BSDFContext(), vertex.scattered_si, wo, active)
 
     def attached(self, context, vertex, wanted):
-        v, si, r, following = vertex.v, vertex.scattered_si, vertex.v.of(self.name), vertex.v.next
+        v, si, r, following = vertex.v, vertex.scattered_si, vertex.v.record_of(self.name), vertex.v.next
         smooth, mirrored = v.goes_on & ~r["delta"], v.goes_on & r["delta"]
         ahead = smooth & following.valid
         out, J, drag = mi.Vector3f(following.d), mi.Float(1), mi.Vector3f(0)
@@ -328,9 +393,14 @@ class Surface(Scattering):
         return Local(carry=carry, inv_pdf=inv_pdf, ahead=ahead)
 
 
-def strayed(wi, bs):
-    """Return whether a sample of a lobe of reflection or transmission ended on the other side of the surface. BSDFs
-    throw it away; what they hold has a density there, and may be black.
+def is_on_wrong_side(wi, bs):
+    """Return a mask of samples of reflection that cross the surface, and of transmission that do not.
+
+    BSDFs throw such samples away (weight zero); their lobes have a density in that direction, and may be black there.
+
+    Args:
+        wi: local direction towards the sensor, Vector3f.
+        bs: BSDFSample3f.
     """
     reflects = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Reflection)
     transmits = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Transmission)
@@ -347,8 +417,11 @@ def is_black(weight):
 # Scattering where every surface is Lambertian: cosines instead of virtual calls.
 
 class Lambertian(Surface):
-    """:class:`Surface` for scenes that :meth:`fits`. ``draws_lobe``: draw the number that chooses a lobe, so
-    that a seed gives the same paths as there.
+    """Scattering where every surface is Lambertian (:meth:`fits`): cosines instead of virtual calls.
+
+    Args:
+        guides: as of :class:`Surface`.
+        draws_lobe: draw the number that chooses a lobe, so that a seed gives the same paths as :class:`Surface`.
     """
 
     turns_freely = samples_all = True
@@ -395,7 +468,7 @@ class Lambertian(Surface):
 
     @staticmethod
     def _towards(vertex, d):
-        """The :class:`~.strategy.Answer` towards the world direction ``d``."""
+        """Return the :class:`~.strategy.Answer` towards the world direction ``d``."""
         cos = dr.dot(vertex.si.sh_frame.n, d) * vertex.side
         pdf = dr.select(cos > 0, cos, 0) * dr.inv_pi
         value = vertex.ρ * pdf
@@ -418,9 +491,7 @@ class Lambertian(Surface):
 
 
 def _side(bsdf, si):
-    """1 where light comes from the front, -1 from the back, 0 where nothing scatters: on the back of a one-sided
-    surface.
-    """
+    """Return 1 where light comes from the front, -1 from the back, 0 on the back of one-sided surfaces."""
     return dr.select(si.wi.z > 0, 1, dr.select(scatters_behind(bsdf) & (si.wi.z < 0), -1, 0))
 
 

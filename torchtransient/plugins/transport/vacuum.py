@@ -1,4 +1,7 @@
-"""Segments through vacuum: straight lines from surface to surface."""
+"""Segments through vacuum: straight lines from surface to surface.
+
+Arguments that all methods share are explained in :mod:`.strategy`.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,12 @@ NUMBERS = {"t": "Float", "prim_uv": "Point2f", "prim_index": "UInt32", "shape_in
 
 
 def intersection_fields(context, prefix=""):
-    """Types of the numbers that a preliminary intersection is kept as."""
+    """Return the types of the numbers that record a preliminary intersection.
+
+    Args:
+        context: :class:`.context.RenderContext` of the job.
+        prefix: prefix of their names.
+    """
     pointers = ("shape", "instance") if context.contents.instances else ("shape",)
     return {prefix + name: getattr(mi, kind) for name, kind in NUMBERS.items()} | {
         prefix + name: mi.UInt32 for name in pointers
@@ -32,13 +40,19 @@ def intersection_fields(context, prefix=""):
 
 
 def intersection_numbers(pi, prefix=""):
-    """A preliminary intersection as numbers."""
+    """Return the numbers that record the PreliminaryIntersection3f ``pi``, by name."""
     values = {prefix + name: getattr(pi, name) for name in NUMBERS}
     return values | {prefix + n: dr.reinterpret_array(mi.UInt32, getattr(pi, n)) for n in ("shape", "instance")}
 
 
 def intersection(numbers, active, prefix=""):
-    """The preliminary intersection again."""
+    """Return the recorded PreliminaryIntersection3f.
+
+    Args:
+        numbers: record, by name.
+        active: mask of lanes that have one.
+        prefix: prefix of the names.
+    """
     pi = dr.zeros(mi.PreliminaryIntersection3f)
     for name in NUMBERS:
         setattr(pi, name, numbers[prefix + name])
@@ -50,7 +64,14 @@ def intersection(numbers, active, prefix=""):
 
 
 def length_to(contents, p, q, valid, d):
-    """Length from ``p`` to the point ``q``, or to the distant light in direction ``d`` where ``q`` is not valid."""
+    """Return the length of a segment, metres.
+
+    Args:
+        contents: :class:`.scene_contents.SceneContents`.
+        p, q: ends, Point3f.
+        valid: mask of segments that end at ``q``; others lead to distant light, or nowhere (length 0).
+        d: direction of the segment.
+    """
     length = dr.norm(dr.select(valid, q - p, mi.Vector3f(0, 0, 1)))
     if contents.distant is None:
         return dr.select(valid, length, 0)
@@ -58,11 +79,12 @@ def length_to(contents, p, q, valid, d):
 
 
 class Vacuum(Segment):
-    """Nothing between surfaces. A leg is the preliminary intersection at its end.
+    """Segment through vacuum. A leg is the preliminary intersection at its end.
 
     In derivatives the first vertex and those behind delta lobes slide along the rays that found them. All others are
-    points of their shapes, so that the integral over a surface that moves has no edges but where something hides it;
-    near points are dragged along with the vertex that sees them (:func:`~.geometry_terms.damped_motion`).
+    material points: they move with their shapes, so that the integral over a surface that moves has no edges but where
+    something hides it. Near points are dragged along with the vertex that sees them
+    (:func:`~.geometry_terms.damped_motion`).
     """
 
     def prepare(self, context):
@@ -89,14 +111,23 @@ class Vacuum(Segment):
         return behind_area_lights(context.scene, ray, pi) if seen and context.hide_emitters else pi
 
     def arrive(self, context, path):
-        si, (leg, _) = self.found(path.leg, path.ray, mi.RayFlags.All), self.surface_of(path.leg)
+        si, (leg, _) = self.interaction_of(path.leg, path.ray, mi.RayFlags.All), self.surface_of(path.leg)
         return Vertex(
             si=si, at=si, valid=si.is_valid(), surface=mi.Bool(True), β=path.β, ray=path.ray, leg=leg,
             opl=self.optical_length(context, path, si.p, si.is_valid()),
         )  # fmt: skip
 
     def optical_length(self, context, path, p, valid):
-        """Optical length of the segment that ends at ``p``, measured between hit points."""
+        """Return the optical length of the segment that ends at ``p``, measured between hit points.
+
+        Args:
+            path: :class:`.walk.Path` before the vertex, with the start ``prev_p`` and the index ``η`` of the segment.
+            p: end, Point3f.
+            valid: mask of segments that end at a surface; others lead to distant light.
+
+        Returns:
+            Metres times index, Float64. Zero for the first segment where ``context.camera_unwarp``.
+        """
         length = dr.norm(p - path.prev_p)
         if context.contents.distant is not None:
             length = dr.select(valid, length, context.contents.distant.length(path.prev_p, path.ray.d))
@@ -122,7 +153,7 @@ class Vacuum(Segment):
     def share_of_surface(self, leg):
         return mi.Float(1)
 
-    def found(self, leg, ray, flags, active=True):
+    def interaction_of(self, leg, ray, flags, active=True):
         return leg.compute_surface_interaction(ray, flags, active)
 
     def transmittance(self, context, vertex, ds, u, sampler, active, seen=False):
@@ -147,7 +178,7 @@ class Vacuum(Segment):
         return {"o": ray.o, "d": ray.d, "wavelengths": ray.wavelengths} | intersection_numbers(vertex.leg)
 
     def restore(self, v, ray):
-        r = v.of(self.name)
+        r = v.record_of(self.name)
         wavelengths = r.get("wavelengths", ray.wavelengths)
         return mi.Ray3f(r["o"], r["d"], ray.time, wavelengths), intersection(r, v.active)
 
@@ -161,15 +192,24 @@ class Vacuum(Segment):
         if wanted.geometry:
             carry = self.from_meter(context, v, carry)
         ray = mi.Ray3f(v.ray)
-        if not wanted.plain:
+        if not wanted.slides_position_only:
             ray.o, ray.d = carry.o, carry.d
         si = self.attached_surface(context, v, carry, ray, wanted, v.active)
         return self.arrived(context, v, carry, ray, si, wanted)
 
     def attached_surface(self, context, v, carry, ray, wanted, active):
-        """Return the interaction of ``ray`` where ``active``: attached to it and to the surface, along the ray."""
+        """Return the SurfaceInteraction3f of a recorded vertex, attached to its ray and to the surface.
+
+        The hit moves along the ray as the surface moves. Where ``wanted.slides_position_only``, a shift ``carry.o`` of
+        the ray is added to the position as a vector; else the ray itself is attached. Seen edge-on
+        (:data:`.geometry_terms.EDGE_ON`) the hit stays: it would move by one over the cosine, which is rounding there.
+
+        Args:
+            carry: attached Carry that arrives there.
+            ray: Ray3f of the segment, attached if need be.
+        """
         si = surface_interaction(context.surfaces, v.pi, ray, mi.RayFlags.All, active)
-        if wanted.plain:  # an attached ray would have every shape differentiated
+        if wanted.slides_position_only:  # an attached ray would have every shape differentiated
             si.p = si.p + slide(displacement(carry.o, active), v.ray.d, dr.detach(si.n), active)
         if wanted.geometry:
             with dr.suspend_grad():
@@ -178,7 +218,17 @@ class Vacuum(Segment):
         return si
 
     def arrived(self, context, v, carry, ray, si, wanted):
-        """The attached vertex at ``si``, behind the optical length of its segment."""
+        """Return the attached vertex (:class:`.strategy.AttachedVertex`) at the end of a segment of known interaction.
+
+        With the Carry's slope before the segment and its index η, the slope at the vertex is ``slope + η d|p - o|``. A
+        sideways shift makes a ray no longer, so that the origin ``o`` is attached only where the ray is
+        (``wanted.ray``).
+
+        Args:
+            carry: attached Carry before the segment.
+            ray: Ray3f of the segment, attached if need be.
+            si: attached SurfaceInteraction3f at its end.
+        """
         vertex = AttachedVertex(v=v, si=si, sid=dr.detach(si), carry=carry, slope=carry.slope)
         valid = vertex.sid.is_valid()
         vertex.end = VertexEnd(vertex.sid.t, vertex.sid.n, v.ray.d, valid)
@@ -200,12 +250,31 @@ class Vacuum(Segment):
         return self.motion_to(context, vertex.v.after(), δ, following, ahead, vertex.damping_radius)
 
     def motion_to(self, context, after, δ, following, ahead, radius):
-        """:meth:`motion` to the vertex ``after`` from a point that moves by ``δ``."""
+        """Return the motion of a segment from a point x, which moves by ``δ``, to a recorded vertex y.
+
+        y is a material point and moves by ``v`` with its shape (:meth:`material_hits`; zero where no shape moves).
+        Relative to y, the start moves by ``δ - v``, to which :func:`~.geometry_terms.damped_motion` gives the direction
+        ``d - W (δ - v)_perp``, the solid angle ``J`` and a drag of y by the share ``a = 1 - W r``. To these come
+
+            J     *= 1 + (1 - a) (dA / A + dn.d / n.d)    since the element of area and the normal at y move,
+            drag  += v_perp                               so that the ray meets y where it went,
+            longer = -δ.d                                 by the start alone: :meth:`arrived` counts the end.
+
+        Args:
+            after: :class:`.record.RecordedVertex` of y.
+            δ: displacement of x, Vector3f: zero, with the derivative.
+            following: :class:`.strategy.VertexEnd` of y.
+            ahead: mask of paths that a smooth lobe led to y.
+            radius: damping radius, metres: nearer points are dragged along.
+
+        Returns:
+            Attached ``d``, ``J``, ``drag`` and ``longer()``, see :meth:`~.strategy.Segment.motion`.
+        """
         d, volume = mi.Vector3f(following.d), self.has_no_normal(following)
         if self.triangles is None:
             return damped_motion(δ, d, following.t, following.n, ahead, radius, volume=volume)
         surface = ahead if volume is None else ahead & ~volume
-        p, n, area = self.material(context, after.pi, after.ray, following.n, surface)
+        p, n, area = self.material_hits(context, after.pi, after.ray, following.n, surface)
         moved = displacement(p, surface)
         motion = damped_motion(δ - moved, d, following.t, following.n, ahead, radius, volume=volume)
         J = motion.J * dr.select(surface, motion.of_material(n, dr.relative_grad(area)), 1)
@@ -213,9 +282,24 @@ class Vacuum(Segment):
         drag = motion.drag + (moved - d * dr.dot(d, moved))
         return Local(d=motion.d, J=J, drag=drag, longer=lambda: -dr.dot(δ, d))
 
-    def material(self, context, pi, ray, n, active):
-        """(point, normal, area element) of hit points that follow their shapes, whose normals are ``n``. Points of
-        shapes without material points stay where they are.
+    def material_hits(self, context, pi, ray, n, active):
+        """Return recorded hits as material points: attached to the parameters that move their shapes.
+
+        A material point keeps its coordinates (u, v) on its triangle with the corners a, b, c:
+
+            p = a + u (b - a) + v (c - a),    n ~ (b - a) x (c - a),    A = |(b - a) x (c - a)|.
+
+        Triangles that move are gathered from :class:`AttachedTriangles`; for other shapes Mitsuba computes the same
+        (:func:`~.geometry_terms.material_point`). Shapes without material points (``contents.sliding``) stay where they
+        are.
+
+        Args:
+            pi: PreliminaryIntersection3f of the hits.
+            ray: Ray3f that found them.
+            n: their detached normals, whose side the results take.
+
+        Returns:
+            (p, Point3f; n, Normal3f; A, Float, of which only the relative derivative counts).
         """
         with dr.suspend_grad():
             if context.contents.sliding is not None:
@@ -232,16 +316,24 @@ class Vacuum(Segment):
         p, n = dr.select(other, si.p, at), dr.select(other, si.n, n)
         return dr.select(listed, point.p, p), dr.select(listed, across, n), dr.select(listed, twice, area)
 
-    def held(self, context, pi, ray, active):
-        """Zero with how far derivatives move the surface point ``pi``, found by ``ray``, as a point of its shape."""
+    def material_displacement(self, context, pi, ray, active):
+        """Return the displacement of a hit as a material point, see :meth:`~.strategy.Segment.material_displacement`.
+        """
         if self.triangles is None:
             return mi.Vector3f(0)
-        p, _, _ = self.material(context, pi, ray, mi.Normal3f(0, 0, 1), active & pi.is_valid())
+        p, _, _ = self.material_hits(context, pi, ray, mi.Normal3f(0, 0, 1), active & pi.is_valid())
         return displacement(p, active & pi.is_valid())
 
     def from_meter(self, context, v, carry):
-        """The ``carry`` at the first vertex of a path that starts on an irradiance meter at rest: a point of its shape
-        like those after it, since no pixel holds the ray.
+        """Return the Carry of paths from an irradiance meter at rest, whose first vertex is a material point, too.
+
+        No pixel holds the rays of a meter, so that its first vertex may move as all others do. With the motion of the
+        segment to it from a start at rest, the throughput is multiplied by ``J`` and by the relative change of the
+        cosine at the meter.
+
+        Args:
+            v: :class:`.record.RecordedVertex`; other vertices than the first keep their Carry.
+            carry: attached Carry that arrives there.
         """
         if self.meter_normal is None:
             return carry
@@ -267,10 +359,16 @@ class Vacuum(Segment):
 # own: many times the sums of one gather.
 
 class AttachedTriangles:
-    """The triangles of the ``shapes`` whose vertices are attached and whose normals are those of their planes.
+    """Triangles of meshes whose vertices are attached and whose normals are those of their planes, in one table.
 
-    ``lists(shape)``: which shapes those are; ``holds_all``: no other of the shapes with the pointers ``moving`` moves.
     A plain object, which Dr.Jit loops leave alone.
+
+    Args:
+        shapes: shapes of the scene.
+        moving: pointers of the shapes that move.
+
+    Attributes:
+        holds_all: the table has all shapes that move.
     """
 
     def __init__(self, shapes: list[Any], moving: frozenset[Any]) -> None:
@@ -295,8 +393,14 @@ class AttachedTriangles:
         return mi.Mask(False) if self.starts is None else self.starts.look_up(shape) > 0
 
     def point(self, pi: Any, active: Any) -> Local:
-        """Return the hit points ``pi`` on listed shapes, as their shapes move: ``p``, ``across`` (twice the area
-        along the normal of either side).
+        """Return hits on listed triangles as material points.
+
+        Args:
+            pi: PreliminaryIntersection3f of the hits.
+            active: mask of hits on listed shapes.
+
+        Returns:
+            Attached ``p`` (Point3f) and ``across`` (Vector3f): twice the area, along the normal of either side.
         """
         if self.starts is None:
             return Local(p=mi.Point3f(0), across=mi.Vector3f(0, 0, 1))
@@ -314,7 +418,7 @@ def _is_listed(shape: Any) -> bool:
 
 
 def _joined(buffers: list[Any]) -> Any:
-    """One buffer, attached to all; None for none."""
+    """Return the buffers as one, attached to all; None for none."""
     if len(buffers) < 2:
         return buffers[0] if buffers else None
     joined, first = dr.zeros(mi.Float, sum(map(dr.width, buffers))), 0

@@ -67,7 +67,7 @@ def first_leg(context, sampler, ray, pi):
         ray: primary ray, Ray3f.
         pi: PreliminaryIntersection3f at the end of the leg, None if unknown.
     """
-    return context.segment.first(context, ray, sampler) if pi is None else context.segment.known(pi, ray)
+    return context.segment.first(context, ray, sampler) if pi is None else context.segment.leg_to(pi, ray)
 
 
 @dr.syntax
@@ -83,20 +83,20 @@ def walk(context, sampler, path, sink):
     Returns:
         (number of vertices, UInt32; state of the sink).
     """
-    kept = sink.begin(context)
+    state = sink.begin(context)
     # Without emission that is run into, the last vertex only connects to lights: it needs no iteration of the loop.
     turns = context.max_depth if context.finds_light or sink.keeps_vertices else max(context.max_depth - 2, 0)
     dark = context.dark_at_first and not sink.keeps_vertices and turns > 0
     if dr.hint(dark, mode="scalar"):
-        bounce(context, path, kept, sampler, sink, dark=True)
+        bounce(context, path, state, sampler, sink, dark=True)
     # Dr.Jit compiles a loop without iterations all the same.
     if dr.hint(turns > dark or sink.keeps_vertices, mode="scalar"):
         while dr.hint(path.active & (path.depth < turns), max_iterations=turns, label="path"):
-            bounce(context, path, kept, sampler, sink)
+            bounce(context, path, state, sampler, sink)
     if dr.hint(not (context.finds_light or sink.keeps_vertices), mode="scalar"):
-        bounce(context, path, kept, sampler, sink, last=True)
-    sink.end(kept)
-    return path.depth, kept
+        bounce(context, path, state, sampler, sink, last=True)
+    sink.end(state)
+    return path.depth, state
 
 
 @dr.syntax
@@ -112,18 +112,18 @@ def advance(context, sampler, path, target):
     Returns:
         (path, (PreliminaryIntersection3f of the last surface that was reached, the ray that found it)).
     """
-    kept, sink = {}, Sink()
+    state, sink = {}, Sink()
     pi, ray = mi.PreliminaryIntersection3f(context.segment.surface_of(path.leg)[0]), mi.Ray3f(path.ray)
     going = path.active & (path.depth < target)
     while dr.hint(going, max_iterations=context.max_depth, label="to a vertex"):
         pi, ray = mi.PreliminaryIntersection3f(context.segment.surface_of(path.leg)[0]), mi.Ray3f(path.ray)
-        bounce(context, path, kept, sampler, sink, dark=True)
+        bounce(context, path, state, sampler, sink, dark=True)
         going = path.active & (path.depth < target)
     path.active &= path.depth == target
     return path, (pi, ray)
 
 
-def bounce(context, path, kept, sampler, sink, *, dark=False, last=False):
+def bounce(context, path, state, sampler, sink, *, dark=False, last=False):
     """Follow paths over one vertex: an iteration of the loop, which changes ``path`` at its end.
 
     Plain Python: lists cost nothing where they are empty, and Dr.Jit does not rewrite its syntax.
@@ -131,7 +131,7 @@ def bounce(context, path, kept, sampler, sink, *, dark=False, last=False):
     Args:
         context: :class:`.context.RenderContext` of the job.
         path: :class:`Path` before the vertex.
-        kept: state of the sink.
+        state: loop state of the sink.
         sampler: Mitsuba sampler of the lanes.
         sink: :class:`.sinks.Sink` of events and vertices.
         dark: no connection has light at the vertex.
@@ -153,7 +153,7 @@ def bounce(context, path, kept, sampler, sink, *, dark=False, last=False):
     for c, proposal, answer in zip(connections, proposals, answers, strict=True):
         event = c.connect(context, path, vertex, proposal, answer, sink.zeros)
         event.value = dr.select(event.active, event.value, 0)
-        sink.event(kept, event)
+        sink.event(state, event)
         samples[c.name] = Local(proposal=proposal, event=event)
     if last:
         return
@@ -171,7 +171,7 @@ def bounce(context, path, kept, sampler, sink, *, dark=False, last=False):
     β, goes_on, rr = roulette(context, path, vertex, step, sampler, onward, sink.zeros)
     samples[context.segment.name], samples[context.scattering.name] = vertex, step
     samples["walk"] = Local(β=path.β, τ=vertex.τ, η=path.η, rr=rr, goes_on=goes_on)
-    sink.vertex(kept, path, samples)
+    sink.vertex(state, path, samples)
 
     # ------------------------------------------------------------------------- next segment
     path.ray, path.depth, path.active = ray, path.depth + 1, goes_on

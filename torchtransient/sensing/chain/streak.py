@@ -15,7 +15,7 @@ Source: Velten et al., "Femto-photography" (ACM TOG 2013): 2 ps resolution, addi
 from __future__ import annotations
 
 from torchtransient.axes import TimeAxis
-from torchtransient.errors import ArgumentError
+from torchtransient.checks import of_class
 from torchtransient.sensing.base.layout import check_number
 from torchtransient.sensing.base.policies import GradPolicy
 from torchtransient.sensing.cameras.electronics import PixelElectronics
@@ -55,8 +55,7 @@ class StreakCamera(Compose):
         boundary: Boundary = "periodic",
         grad: GradPolicy = "expected",
     ) -> None:
-        if not isinstance(axis, TimeAxis):
-            raise ArgumentError(f"StreakCamera: expected a TimeAxis, got {type(axis).__name__}.")
+        of_class("StreakCamera: axis", axis, TimeAxis)
         time_fwhm_s = check_number(time_fwhm_s, "time_fwhm_s", "StreakCamera")
         spatial_fwhm_px = check_number(spatial_fwhm_px, "spatial_fwhm_px", "StreakCamera")
         phosphor_fwhm_px = check_number(phosphor_fwhm_px, "phosphor_fwhm_px", "StreakCamera")

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
-from torchtransient.checks import shown
+from torchtransient.checks import function
 from torchtransient.errors import ArgumentError, DeviceError, GradientError, ShapeError, UnitError
 from torchtransient.sensing.base.given import check_dense, no_arrays
 from torchtransient.sensing.base.layout import TIME, check_count, check_time_axis
@@ -145,8 +145,7 @@ def covariance_bound(
     """
     where = "covariance_bound"
     given = tuple(parameters) if isinstance(parameters, Sequence) else ()
-    if not callable(mean):
-        raise ArgumentError(f"{where}: expected mean as a function of the parameters, got {shown(mean)}.")
+    function(f"{where}: mean", mean, "the parameters")
     if not given or any(not isinstance(p, Tensor) or not p.is_floating_point() for p in given):
         raise ShapeError(f"{where}: expected one or more floating tensors (..., C, H, W) as parameters.")
     number = None if cycles is None else check_count(cycles, "cycles", where)

@@ -43,11 +43,10 @@ _MOST_SPLIT, _MOST_PARTS = 10_000, 256
 
 
 class _Solid:
-    """Triangles of a body, of the faces ``rows`` where they are some of a mesh: ``points`` (V, 3), ``faces`` (F, 3),
-    their boxes ``low``, ``high`` (F, 3), ``reach``, the largest coordinate, and ``near`` (F,), which of them reach into
-    another body's box.
+    """Triangles of a body, of the faces ``rows`` of a mesh, or of a grid of points on balls, disks and tubes.
 
-    Of balls, disks and tubes the triangles are those of a grid of points on them.
+    ``points`` (V, 3), ``faces`` (F, 3), their boxes ``low``, ``high`` (F, 3), ``reach``, the largest coordinate, and
+    ``near`` (F,), which of them reach into another body's box.
     """
 
     def __init__(self, body: Body, rows: np.ndarray | None, points: np.ndarray, faces: np.ndarray) -> None:
@@ -71,9 +70,7 @@ class _Solid:
         return ((self.low + depth < high) & (low + depth < self.high)).all(1)
 
     def segments(self) -> np.ndarray:
-        """Ends (E, 2, 3) of what may cross a face: edges of faces marked as ``near``, flat ones included, and sides of
-        smaller triangles in these faces.
-        """
+        """Return the ends (E, 2, 3) of edges of ``near`` faces and of triangles inside them, which may cross a face."""
         faces = self.faces[self.near]
         pairs = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
         keys = np.unique(pairs[:, 0] * len(self.points) + pairs[:, 1])
@@ -84,7 +81,7 @@ class _Solid:
 
 
 def _triangles(body: Body) -> tuple[np.ndarray, np.ndarray]:
-    """Points and triangles of a body in the world."""
+    """Return points and triangles of a body in world space."""
     shape = body.shape
     if not shape.is_mesh():
         return _grid(body)
@@ -96,7 +93,7 @@ def _triangles(body: Body) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _grid(body: Body) -> tuple[np.ndarray, np.ndarray]:
-    """Points and triangles of balls, of a disk or of a tube."""
+    """Return points and triangles of balls, of a disk or of a tube."""
     o, x, y, z = (host_numbers(each).T[:, None, None] for each in body.frames()[0])
     kind = body.limbs()[0][0]
     around = max(_FEWEST, round(_SIDES / len(o) ** 0.5))
@@ -134,7 +131,7 @@ def crossing_bodies(scene: Any) -> list[tuple[Body, Body]]:
 
 
 def _parts(shape: Any) -> list[np.ndarray | None]:
-    """Faces of the connected parts of a mesh, None for all: Mitsuba merges rectangles of one material."""
+    """Return the faces of the connected parts of a mesh, None for all: Mitsuba merges rectangles of one material."""
     if not shape.is_mesh() or not 0 < shape.face_count() <= _MOST_SPLIT:
         return [None]
     faces = np.array(mesh_faces(shape), np.int64).reshape(-1, 3)
@@ -145,7 +142,7 @@ def _parts(shape: Any) -> list[np.ndarray | None]:
 
 
 def _box(body: Body, rows: np.ndarray | None, triangles: Callable[[Body], Any]) -> np.ndarray:
-    """Ends (2, 3) of the box of a body, or of the faces ``rows`` of it."""
+    """Return the corners (2, 3) of the box of a body, or of the faces ``rows`` of it."""
     if rows is None:
         bounds = bounds_of(body.instance or body.shape)
         return np.array([bounds.min, bounds.max]).reshape(2, 3)
@@ -155,7 +152,7 @@ def _box(body: Body, rows: np.ndarray | None, triangles: Callable[[Body], Any]) 
 
 
 def _overlapping(boxes: list[np.ndarray]) -> list[tuple[int, int]]:
-    """Numbers of boxes that reach into each other."""
+    """Return the pairs of boxes that reach into each other."""
     low, high = np.moveaxis(np.array(boxes).reshape(-1, 2, 3), 1, 0)
     depth = _DEPTH * np.maximum(np.abs(low), np.abs(high)).max(1, initial=0)
     pairs = []
@@ -168,7 +165,7 @@ def _overlapping(boxes: list[np.ndarray]) -> list[tuple[int, int]]:
 
 
 def _crossings(scene: Any, solids: list[_Solid]) -> list[tuple[Body, Body]]:
-    """The bodies that cross each other, by rays along the edges near others."""
+    """Return the bodies that cross each other, found by rays along the edges near others."""
     if not solids:
         return []
     reach = np.array([solid.reach for solid in solids])

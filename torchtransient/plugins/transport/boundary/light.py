@@ -26,30 +26,31 @@ _STEEP = 10.0
 
 
 class LightPass(BoundaryPass):
-    """Boundary pass that draws an edge point p and a point y of a light, and follows a path behind p, on its shadow, to
-    the sensor: a walk with one connection (:class:`~..light_tracing.SensorSampled`). Its first vertex x is
-    held on the ray of the camera where it is connected at once (``direct``), and is a point of its shape where it goes
-    on.
+    """Boundary pass of edges between the last vertex of a path and a light.
+
+    It draws an edge point p and a point y of a light, and follows a path behind p, on its shadow, to the sensor: a walk
+    with one connection (:class:`~..light_tracing.SensorSampled`). Its first vertex x is held on the ray of the camera
+    where it is connected at once (``direct``), and is a point of its shape where it goes on.
     """
 
-    def __init__(self, world):
+    def __init__(self, context):
         self.lights = EmitterSampled()
         with dr.resume_grad():
-            self.lights.prepare(world)
+            self.lights.prepare(context)
         delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
-        self.is_sharp = any(mi.has_flag(emitter.flags(), delta) for emitter in world.scene.emitters())
+        self.is_sharp = any(mi.has_flag(emitter.flags(), delta) for emitter in context.scene.emitters())
 
     @staticmethod
-    def exists(world, sensor):
-        """Return whether there are lights and a sensor that can be connected to."""
-        return world.max_depth > 1 and len(world.scene.emitters()) > 0 and can_be_connected(sensor)
+    def exists(context, sensor):
+        """Return True if there are lights and a sensor that can be connected to."""
+        return context.max_depth > 1 and len(context.scene.emitters()) > 0 and can_be_connected(sensor)
 
     def run(self, mode, job):
         term = mode.term
-        world, edges, sampler, lit = term.world, term.edges, term.sampler(job), term.light_world
+        context, edges, sampler, lit = term.context, term.edges, term.sampler(job), term.light_context
         k = edges.pick(edges.by_length, sampler.next_1d(), sampler.next_1d())
         numbers = term.places.numbers(sampler)
-        middle = term.places.rays_at(world, sampler, term.places.middle(numbers), numbers, total=job.total)
+        middle = term.places.rays_at(context, sampler, term.places.middle(numbers), numbers, total=job.total)
         lit.start(middle)
         # Nothing attached is kept that forward mode, which follows the speeds, would run into.
         middle.ray, middle.weight, middle.η = dr.detach((middle.ray, middle.weight, middle.η))
@@ -58,18 +59,18 @@ class LightPass(BoundaryPass):
         b, ds = light.b, light.ds
         most = dr.max(dr.abs(light.Le))
         active = b.valid & (most > 0) & dr.isfinite(most) & ~b.crease
-        medium = world.segment.medium_at(world, b.beside, ray.o, world.segment.medium_towards(b.d), active)
+        medium = context.segment.medium_at(context, b.beside, ray.o, context.segment.medium_towards(b.d), active)
         place, far = place_at(b.beside, ray, medium), light.far
         to_light = Local(p=dr.select(far, b.p + ds.d * ds.dist, ds.p), d=-b.d, dist=dr.select(far, ds.dist, b.dist))
-        active, T = world.segment.transmittance(world, place, to_light, sampler.next_2d(), sampler, active)
+        active, T = context.segment.transmittance(context, place, to_light, sampler.next_2d(), sampler, active)
         if self.is_sharp:  # what is in line with the edge may hide its inside alone
-            active &= is_seen_within(world, b, ray, to_light, medium, sampler, active, seen=False)
+            active &= is_seen_within(context, b, ray, to_light, medium, sampler, active, seen=False)
         factor = dr.select(active, -most * b.sin * b.inv_pdf, 0)
         factor = dr.select(dr.isfinite(factor), factor, 0)
         ray.o, ray.d = b.beside, b.d
         τ = mi.Float64(0)
-        if world.contents.distant is not None:
-            τ = mi.Float64(dr.select(light.far, world.contents.distant.length(b.p, -b.d), 0))
+        if context.contents.distant is not None:
+            τ = mi.Float64(dr.select(light.far, context.contents.distant.length(b.p, -b.d), 0))
         term.to_sensor.numbers = numbers
         through = term.through
         if through is not None:
@@ -88,21 +89,22 @@ class LightPass(BoundaryPass):
             term.to_sensor.in_line = self._in_line(term, edges, light, x, ray, medium, numbers, sampler, active)
         edge_state, path_state = (vars(b.k), b.n, b.p, b.dist), (x.at.p, x.si.n, path.leg, path.β, path.τ, ray)
         chain_state = None if through is None else vars(through.chain)
-        in_memory(world, sampler, edge_state, path_state, chain_state, active, factor, numbers.aperture)
+        in_memory(context, sampler, edge_state, path_state, chain_state, active, factor, numbers.aperture)
         with dr.resume_grad():
             speeds = self._speeds(term, edges, light, x, path, ray, numbers, sampler, active)
         u = sampler.next_2d()
         sink, factors = mode.sink_of_pixels(middle, job, u, factor, speeds)
-        _, kept = walk(lit, sampler, path, sink)
-        return mode.sum_of_pixels(kept, factors)
+        _, state = walk(lit, sampler, path, sink)
+        return mode.sum_of_pixels(state, factors)
 
     def _in_line(self, term, edges, light, x, ray, medium, numbers, sampler, active):
-        """Find where the sensor sees the shadow at ``x`` past the edge itself, as from a place at the light; returns
-        ``shown``, as :class:`~..light_tracing.SensorSampled` asks for it. A ray to the sensor would let
-        rounding decide, once more than in the pass of the sensor. That one sees past the edge either what the light
-        reaches, or the shadow: where it is not lit, the edge of the shadow is in view.
+        """Return where the sensor sees the shadow at x past the edge itself.
+
+        The result is that of :attr:`~..light_tracing.SensorSampled.in_line`. A ray to the sensor would let rounding
+        decide, once more than in the pass of the sensor. That one sees past the edge either what the light reaches, or
+        the shadow: where it is not lit, the edge of the shadow is in view.
         """
-        world, b, ds = term.world, light.b, light.ds
+        context, b, ds = term.context, light.b, light.ds
         scale = BESIDE * (1 + dr.max(dr.abs(b.p)))
         seen, _ = term.places.seen_from(x.at, numbers, active)
         off = dr.norm(dr.cross(b.p - seen.p, mi.Vector3f(seen.d)))
@@ -111,13 +113,14 @@ class LightPass(BoundaryPass):
         near &= outline.valid & ~outline.crease
         to_sensor = Local(p=seen.p, d=-outline.d, dist=dr.norm(outline.p - seen.p))
         place = place_at(outline.beside, ray, medium)
-        free, _ = world.segment.transmittance(world, place, to_sensor, sampler.next_2d(), sampler, near, seen=True)
+        free, _ = context.segment.transmittance(context, place, to_sensor, sampler.next_2d(), sampler, near, seen=True)
         past = mi.Ray3f(ray)
         past.o, past.d = outline.beside, outline.d
-        si = world.segment.next_surface(world, past, near).compute_surface_interaction(past, mi.RayFlags.All, near)
+        si = context.segment.next_surface(context, past, near).compute_surface_interaction(past, mi.RayFlags.All, near)
         behind = Local(at=si, si=si, medium=medium, surface=mi.Bool(True))
         to_light = Local(p=dr.select(light.far, si.p + ds.d * ds.dist, ds.p), d=ds.d, dist=ds.dist)
-        lit, _ = world.segment.transmittance(world, behind, to_light, sampler.next_2d(), sampler, near & si.is_valid())
+        near_surface = near & si.is_valid()
+        lit, _ = context.segment.transmittance(context, behind, to_light, sampler.next_2d(), sampler, near_surface)
         # Across the line of the light, on the surface.
         n, N = mi.Vector3f(b.n), mi.Vector3f(x.si.n)
         along = dr.clip(dr.dot(n, N) / dr.dot(b.d, N), -_STEEP, _STEEP)
@@ -125,12 +128,14 @@ class LightPass(BoundaryPass):
         return Local(near=near, shown=free & ~lit, step=step)
 
     def _light(self, term, edges, k, ray, u):
-        """A point of a light drawn from the edge ``k``, and the outline seen from there: ``ds, b, far, Le`` (emission
-        over the density by solid angle at the edge).
+        """Return a point of a light drawn from the edge ``k``, and the outline seen from there.
+
+        ``ds, b, far, Le`` (emission over the density per solid angle at the edge), ``near, u`` (what it was drawn
+        from).
         """
-        world = term.world
+        context = term.context
         near = at_point(k.near, ray)
-        ds, weight = self.lights.sample(world, near, u, mi.Bool(True))
+        ds, weight = self.lights.sample(context, near, u, mi.Bool(True))
         far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
         y = dr.select(far, k.near + ds.d * (FAR * term.radius), ds.p)
         b = edges.seen_from(k, mi.Point3f(y), ds.pdf > 0)
@@ -139,28 +144,30 @@ class LightPass(BoundaryPass):
         there = dr.copy(ds)
         there.d, there.dist = -b.d, b.dist
         ratio = dr.abs_dot(ds.n, b.d) / dr.abs_dot(ds.n, ds.d) * dr.square(ds.dist / b.dist)
-        other = mi.unpolarized_spectrum(world.scene.eval_emitter_direction(at_point(b.p, ray), there, b.valid & k.ball))
+        other = context.scene.eval_emitter_direction(at_point(b.p, ray), there, b.valid & k.ball)
+        other = mi.unpolarized_spectrum(other)
         other *= dr.select(ds.delta, 1, dr.select(far, 1, ratio) / ds.pdf)
         return Local(ds=ds, b=b, far=far, Le=dr.select(k.ball, other, Le), near=near, u=u)
 
     def _speeds(self, term, edges, light, x, path, ray, numbers, sampler, active):
-        """Attached speeds of the edge: where x is the first vertex of a path of the sensor, where it is another, and
-        where the sensor sees it through a chain.
+        """Return the attached speeds of the edge by :data:`.weigh.PixelSums.NAMES`.
+
+        For x as the first vertex of a path of the sensor, as another one, and as the first one seen through a chain.
         """
         b = light.b
-        world = term.world
-        pi, on_surface = term.light_world.segment.surface_of(path.leg)
+        context = term.context
+        pi, on_surface = term.light_context.segment.surface_of(path.leg)
         surface = active & on_surface & pi.is_valid()
         with dr.suspend_grad():
             seen, _ = term.places.seen_from(x.at, numbers, active)
             behind = dr.norm(x.at.p - b.p)
             t = dr.select(light.far, 0, behind / (behind + b.dist))
             n = dr.select(surface, mi.Vector3f(x.si.n), 0)
-        held = world.segment.held(world, pi, ray, surface)
-        if term.is_meter and not world.wanted.sensor:
+        held = context.segment.material_displacement(context, pi, ray, surface)
+        if term.is_meter and not context.wanted.sensor:
             first = held
         else:
-            rays = term.places.rays_at(world, sampler, seen.uv, seen.numbers)
+            rays = term.places.rays_at(context, sampler, seen.uv, seen.numbers)
             if term.is_meter:
                 with dr.suspend_grad():
                     shift = seen.p - rays.ray.o
@@ -170,7 +177,7 @@ class LightPass(BoundaryPass):
             with dr.suspend_grad():
                 r = dr.norm(x.at.p - o)
                 w = (x.at.p - dr.detach(o)) / r
-            q = dr.dot(n, along_the_ray(world, pi, ray, surface))
+            q = dr.dot(n, along_the_ray(context, pi, ray, surface))
             first = self._on_ray(displacement(rays.ray.o + rays.ray.d * r, active), w, n, q, surface)
         motions = [first, held]
         if term.through is not None:
@@ -178,45 +185,48 @@ class LightPass(BoundaryPass):
         n_p, found, turned = dr.dot(b.n, edges.moving(b)), [], mi.Float(0)
         if self.lights.sun is not None:  # its rays turn about x
             sun = active & light.far & self.lights.sun.shines(light.ds.emitter, light.ds.d)
-            turned = behind * dr.dot(b.n, displacement(self.lights.sun.followed(mi.Vector3f(light.ds.d), sun), sun))
+            to_sun = self.lights.sun.attach_direction(mi.Vector3f(light.ds.d), sun)
+            turned = behind * dr.dot(b.n, displacement(to_sun, sun))
         for v_x in motions:
-            v_y = self._motion(world, light, x.at.p, v_x, active & ~light.far)
+            v_y = self._motion(context, light, x.at.p, v_x, active & ~light.far)
             found.append(dr.select(active, n_p - (1 - t) * dr.dot(b.n, v_x) - t * dr.dot(b.n, v_y) - turned, 0))
         return found
 
     @staticmethod
     def _on_ray(δ, w, n, q, surface):
-        """Motion of the point of a surface, which moves by ``q`` along its normal ``n``, on a ray in direction ``w``
-        that moves by ``δ``.
+        """Return the displacement of a surface point on a ray in direction ``w`` that moves by ``δ``.
+
+        The surface moves by ``q`` along its normal ``n``.
         """
         cos = dr.dot(n, w)
         return δ + w * dr.select(surface & (dr.abs(cos) > EDGE_ON), (q - dr.dot(n, δ)) / cos, 0)
 
     def _through_chain(self, term, x, n, pi, ray, surface, active):
-        """Motion of x on the ray of the sensor that sees it through a chain."""
-        world, through = term.world, term.through
+        """Return the displacement of x on the ray of the sensor that sees it through a chain."""
+        context, through = term.context, term.through
         with dr.suspend_grad():
             seen, rays = through.seen_from(x, active)
         found = active & seen.valid
-        last = attached_ray(world, rays.ray, ratios_of(through.chain), through.chain.count, found)
-        q = dr.dot(n, along_the_ray(world, pi, ray, surface))
+        last = attached_ray(context, rays.ray, ratios_of(through.chain), through.chain.count, found)
+        q = dr.dot(n, along_the_ray(context, pi, ray, surface))
         return self._on_ray(displacement(last.o + last.d * seen.way, found), seen.d, n, q, surface)
 
-    def _motion(self, world, light, x, v_x, active):
-        """Attached motion of a light's point, as interior derivatives hold it, seen from ``x``, which moves by ``v_x``:
-        points and spots move, areas are points of their shapes, dragged along where they are near, and spheres keep the
-        place in the cone that they fill.
+    def _motion(self, context, light, x, v_x, active):
+        """Return the attached displacement of a light's point, as interior derivatives hold it, seen from x.
+
+        x moves by ``v_x``. Points and spots move, areas are points of their shapes, dragged along where they are near,
+        and spheres keep the place in the cone that they fill.
         """
-        wanted, ds, b = world.wanted, light.ds, light.b
+        wanted, ds, b = context.wanted, light.ds, light.b
         v = mi.Vector3f(0)
         flags = ds.emitter.flags()
         if wanted.light:
             at = active & mi.has_flag(flags, mi.EmitterFlags.DeltaPosition)
-            y, _ = world.scene.sample_emitter_direction(light.near, light.u, False, at)
+            y, _ = context.scene.sample_emitter_direction(light.near, light.u, False, at)
             v += displacement(y.p, at)
         on_shape, cone = active & mi.has_flag(flags, mi.EmitterFlags.Surface), mi.Bool(False)
         if wanted.sphere_lights:
-            cone = on_shape & self.lights.claims(world, ds.emitter, ds.d, wanted)
+            cone = on_shape & self.lights.claims(context, ds.emitter, ds.d, wanted)
             moving = dr.replace_grad(mi.Point3f(x), mi.Point3f(x + v_x))
             v += displacement(self.lights.spheres.kept_in_cone(ds.emitter, x, ds.p, at_point(moving), cone).p, cone)
         held = mi.Vector3f(0)
@@ -224,8 +234,8 @@ class LightPass(BoundaryPass):
         if wanted.emitter_shape:
             with dr.suspend_grad():
                 ray = mi.Ray3f(b.beside, -b.d)
-                pi = world.segment.next_surface(world, ray, there)
-            y, _ = material_point(pi, ray, there & pi.is_valid(), world.contents.emitting_meshes)
+                pi = context.segment.next_surface(context, ray, there)
+            y, _ = material_point(pi, ray, there & pi.is_valid(), context.contents.emitting_meshes)
             held = displacement(y.p, there & pi.is_valid())
-        share = dragged_share(dr.norm(ds.p - x), world.contents.damping_radius)
+        share = dragged_share(dr.norm(ds.p - x), context.contents.damping_radius)
         return v + dr.select(there, held + share * (v_x - held), 0)

@@ -54,8 +54,12 @@ _PROBES = 64
 
 @dataclass(frozen=True)
 class Gap:
-    """Edges that are not followed. ``where``: in words that go on from "correct except"; ``remedy``: a sentence;
-    ``is_asked_for``: the boundary term was switched off.
+    """Edges that a derivative does not follow.
+
+    Attributes:
+        where: words that go on from "correct except".
+        remedy: sentence that says what to do.
+        is_asked_for: the boundary term was switched off.
     """
 
     where: str
@@ -70,16 +74,24 @@ class Gap:
 
 
 def moves_edges(key: str, effect: ParameterEffect) -> bool:
-    """Return whether a parameter moves what hides, what is hidden, or who looks; ``key``: its name in the plugin."""
+    """Return True if a parameter moves the hiding shape, the hidden one, or the viewer.
+
+    Args:
+        key: name of the parameter in its plugin.
+        effect: effect of the parameter.
+    """
     return effect.moves_silhouette and effect.role in _MOVE and not key.endswith(_PLACELESS)
 
 
 class MovingEdges:
     """Gaps in a scene's derivatives where edges move, looked up by parameter (:meth:`lacking`).
 
-    ``always``: gaps of every parameter that moves edges. ``bent``: of what bends light alone. ``scene``: searched
-    for textures with steps and for bodies that run into each other, or None. ``words``: gaps that only the table of
-    parameters names, whatever the scene. ``has_term``: whether there is a boundary term at all.
+    Args:
+        always: gaps of every parameter that moves edges.
+        bent: gaps of what bends light alone.
+        scene: scene that is searched for textures with steps and for bodies that run into each other, or None.
+        words: gaps that only the table of parameters names, whatever the scene.
+        has_term: there is a boundary term.
     """
 
     def __init__(
@@ -96,7 +108,12 @@ class MovingEdges:
         self._steps: dict[int, list[str]] = {}
 
     def lacking(self, node: Any, key: str, effect: ParameterEffect) -> tuple[Gap, ...]:
-        """Return the gaps of the derivative by a parameter ``key`` of the plugin ``node``."""
+        """Return the gaps of the derivative by a parameter.
+
+        Args:
+            node, key: plugin, and name of the parameter there.
+            effect: effect of the parameter.
+        """
         if not (effect.moves_silhouette and effect.supported):
             return ()
         name, moves = key.rsplit(".", 1)[-1], moves_edges(key, effect)
@@ -114,7 +131,7 @@ class MovingEdges:
         return tuple(dict.fromkeys(found))
 
     def reason(self, node: Any, key: str, effect: ParameterEffect) -> str:
-        """Return the reason of the effect with what the derivative lacks."""
+        """Return the reason of an effect, with what the derivative lacks; arguments as of :meth:`lacking`."""
         words = list(self.words) if effect.supported and moves_edges(key, effect) else []
         words += [gap.where for gap in self.lacking(node, key, effect)]
         if not words:
@@ -124,7 +141,7 @@ class MovingEdges:
         return f"{text}; {more}" if more else text
 
     def _jumps(self, shape: Any) -> tuple[Gap, ...]:
-        """The gap of textures with steps on a shape, on any for None."""
+        """Return the gap of textures with steps on a shape, on any for None."""
         if self._scene is None:
             return ()
         address = 0 if shape is None else shape.ptr
@@ -142,7 +159,8 @@ class MovingEdges:
         return [] if self._scene is None else crossing_bodies(self._scene)
 
     def _crossings(self, shape: Any) -> tuple[Gap, ...]:
-        """The gap of bodies that run into each other, one of which moves with a shape; a sensor, None, sees any."""
+        """Return the gap of bodies that run into each other, one of which moves with a shape; a sensor (None) sees any.
+        """
         pairs = self._crossing_pairs
         if shape is not None:
             moving = frozenset([shape.ptr])
@@ -154,20 +172,30 @@ class MovingEdges:
 
 
 def missing(reason: str, remedy: str, *, is_asked_for: bool = False) -> MovingEdges:
-    """Return the answer of an integrator that computes no boundary term for a ``reason``."""
+    """Return the gaps of an integrator without a boundary term.
+
+    Args:
+        reason: why it has none, in words that go on from "since".
+        remedy: sentence that says what to do.
+        is_asked_for: it was switched off.
+    """
     gap = Gap(f"where silhouettes move, since {reason}", remedy, is_asked_for)
     return MovingEdges((gap,), (gap,), has_term=False)
 
 
 def switched_off() -> MovingEdges:
-    """Return the answer of an integrator whose ``boundary`` is false."""
+    """Return the gaps of an integrator whose ``boundary`` is false."""
     remedy = "Take out boundary=False, of the renderer or of the scene's integrator."
     return missing("boundary is false", remedy, is_asked_for=True)
 
 
 def moving_edges(scene: Any, sensors: Sequence[Any], max_depth: int | None = None) -> MovingEdges:
-    """Return what the passes of the boundary term (:mod:`.term`) leave out in a scene, seen by ``sensors``, of paths
-    with at most ``max_depth`` segments, None for any number.
+    """Return what the passes of the boundary term (:mod:`.term`) leave out in a scene.
+
+    Args:
+        scene: scene.
+        sensors: sensors that see the edges.
+        max_depth: largest number of segments of a path, None for any.
     """
     always, bent = rims_without_edges(scene), []
     if rims := [emitter.get_shape() or emitter for emitter in scene.emitters() if _has_rim(emitter)]:
@@ -227,13 +255,13 @@ def _seen_through_delta_lobes(
 
 
 def _smooth_shapes(scene: Any) -> list[Any]:
-    """Shapes with delta lobes, but for open boundaries of media, which paths pass."""
+    """Return the shapes with delta lobes, but for open boundaries of media, which paths pass."""
     shapes = [shape for shape in shapes_of_scene(scene) if has_surface(shape) and has_delta_lobe(shape)]
     return [shape for shape in shapes if not (shape.is_medium_transition() and is_open(shape))]
 
 
 def _is_plane(shape: Any) -> bool:
-    """Return whether a shape consists of few planes that mirror or refract by their own normals."""
+    """Return True if a shape consists of few planes that mirror or refract by their own normals."""
     if not is_flat(shape):
         return False
     if isinstance(shape, mi.Mesh) and _number_of_planes(shape) > _PLANES:
@@ -269,14 +297,14 @@ def shapes_without_edges(scene: Any) -> list[Any]:
 
 
 def _is_met_by_connections_alone(emitter: Any) -> bool:
-    """Return whether connections alone differentiate an emitter: points, directions and spheres."""
+    """Return True if connections alone differentiate an emitter: points, directions and spheres."""
     delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
     shape = emitter.get_shape()
     return bool(mi.has_flag(emitter.flags(), delta)) or (shape is not None and is_sphere(shape))
 
 
 def _is_in_view(scene: Any, sky: Any) -> bool:
-    """Return whether a sensor looks into the sun of a sky, whatever is in between."""
+    """Return True if a sensor looks into the sun of a sky, whatever is in between."""
     at, d = dr.zeros(mi.Interaction3f), dr.detach(MovingSun(scene, sky).direction)
     for sensor in filter(can_be_connected, scene.sensors()):
         places = SensorPlaces(sensor, sensor.film(), mi.Float(1))
@@ -293,13 +321,13 @@ def _is_in_view(scene: Any, sky: Any) -> bool:
 
 
 def has_delta_lobe(shape: Any) -> bool:
-    """Return whether a shape has a BSDF with a delta lobe."""
+    """Return True if a shape has a BSDF with a delta lobe."""
     bsdf = shape.bsdf()
     return bsdf is not None and bool(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta))
 
 
 def _is_stepped(shape: Any) -> bool:
-    """Return whether something jumps from place to place on a shape: a texture with steps, the slope of a bump map."""
+    """Return True if something jumps from place to place on a shape: a texture with steps, the slope of a bump map."""
     holders = [part for part in (shape.bsdf(), shape.emitter()) if part is not None]
     nested = [bsdf for holder in holders for bsdf in (holder, *objects_below(holder, mi.BSDF))]
     if any(isinstance(bsdf, mi.BSDF) and is_bump_map(bsdf) for bsdf in nested):
@@ -308,9 +336,7 @@ def _is_stepped(shape: Any) -> bool:
 
 
 def _has_steps(texture: Any) -> bool:
-    """Return whether a texture is flat wherever it is asked, and not the same everywhere. Mitsuba does not show its
-    filter.
-    """
+    """Return True if a texture is flat at all probes, and not the same everywhere; Mitsuba does not show its filter."""
     attribute = attribute_name(texture)
     if attribute is not None:
         return attribute.startswith("face_")
@@ -332,7 +358,7 @@ def _has_steps(texture: Any) -> bool:
 
 
 def _has_rim(emitter: Any) -> bool:
-    """Return whether the light of an emitter ends at once beside its direction."""
+    """Return True if the light of an emitter ends at once beside its direction."""
     if emitter.class_name() == "Projector":
         return True
     if emitter.class_name() == "SpotLight":
@@ -347,7 +373,7 @@ def _listed_shapes(shapes: Sequence[Any]) -> str:
 
 
 def _named_pair(one: Body, two: Body) -> str:
-    """Names of two bodies: of instances, where these differ."""
+    """Return the names of two bodies: of instances, where these differ."""
     if one is two:
         return f"parts of {_name(one.shape)}"
     within = one.instance is not None and two.instance is not None and one.instance.ptr == two.instance.ptr
@@ -360,6 +386,6 @@ def _name(plugin: Any) -> str:
 
 
 def _listed(names: Sequence[str], most: int = 3) -> str:
-    """The first few names, each once."""
+    """Return the first few names in words, each once."""
     names = list(dict.fromkeys(names))
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

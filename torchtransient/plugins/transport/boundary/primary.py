@@ -25,18 +25,20 @@ FACING = 1e-3
 
 
 class PrimaryPass(BoundaryPass):
-    """Boundary pass that draws an edge point and a pixel that sees it. Creases count as well: a point on a camera's ray
-    slides along the ray, and where a face ends under it the light jumps.
+    """Boundary pass of edges between the sensor and the first vertex: draws an edge point and a pixel that sees it.
+
+    Creases count as well: a point on a camera's ray slides along the ray, and where a face ends under it the light
+    jumps.
     """
 
     @staticmethod
-    def exists(world, sensor):
-        """Return whether edges can lie there: rays that are drawn from no area meet none."""
-        return world.max_depth > 0 and can_be_connected(sensor)
+    def exists(context, sensor):
+        """Return True if edges can lie there: rays that are drawn from no area meet none."""
+        return context.max_depth > 0 and can_be_connected(sensor)
 
     def run(self, mode, job):
         term = mode.term
-        world, edges, sampler = term.world, term.edges, term.sampler(job)
+        context, edges, sampler = term.context, term.edges, term.sampler(job)
         numbers = term.places.numbers(sampler)
         k = edges.pick(edges.of_moving, sampler.next_1d(), sampler.next_1d())
         # Along parallel rays the point of view depends on what is seen.
@@ -44,35 +46,37 @@ class PrimaryPass(BoundaryPass):
         b = edges.seen_from(k, mi.Point3f(eye.eye), mi.Bool(True))
         ds, importance = term.places.seen_from(at_point(b.p), numbers, b.valid)
         row, column, weight, inside = term.pixel(ds.uv, sampler.next_2d())
-        own, share = mode.kept(row)
+        own, share = mode.rows_in_band(row)
         inside &= own
         row, column = dr.select(inside, row, job.first_row), dr.select(inside, column, 0)
-        rays = term.places.rays_at(world, sampler, ds.uv, ds.numbers, row, column, job.total)
-        world.start(rays)
+        rays = term.places.rays_at(context, sampler, ds.uv, ds.numbers, row, column, job.total)
+        context.start(rays)
         view, ray = mode.view(rays), dr.detach(rays.ray)
         if term.is_meter:
             ray.o = mi.Point3f(eye.p)
         way, active = dr.norm(b.p - ray.o), b.valid & (ds.pdf > 0) & inside
         if term.has_vertex_normals:
             b.inner = where_normals_face(b)
-        if world.hide_emitters:
+        if context.hide_emitters:
             active &= ~b.inner.shape.is_emitter()
-        medium = world.segment.medium_at(world, b.beside, ray.o, world.segment.medium_towards(b.d), active)
+        medium = context.segment.medium_at(context, b.beside, ray.o, context.segment.medium_towards(b.d), active)
         place, to_sensor = place_at(b.beside, ray, medium), Local(p=ray.o, d=-b.d, dist=way)
-        active, T = world.segment.transmittance(world, place, to_sensor, sampler.next_2d(), sampler, active, seen=True)
+        u = sampler.next_2d()
+        active, T = context.segment.transmittance(context, place, to_sensor, u, sampler, active, seen=True)
         if term.places.is_sharp:  # what is in line with the edge may hide its inside alone
-            active &= is_seen_within(world, b, ray, to_sensor, medium, sampler, active)
+            active &= is_seen_within(context, b, ray, to_sensor, medium, sampler, active)
         factor = importance * b.sin * b.inv_pdf * weight * share
         β = attenuated(mi.Spectrum(1), mi.UnpolarizedSpectrum(T))
-        past = past_edge(world, b, ray, medium, β, sampler, active, seen=True)
-        held = term.is_meter and not world.wanted.sensor
+        past = past_edge(context, b, ray, medium, β, sampler, active, seen=True)
+        held = term.is_meter and not context.wanted.sensor
         needed = mi.Bool(True), mi.Bool(True)
-        in_memory(world, sampler, vars(b.k), b.n, b.p, b.dist, way, ds.uv, numbers.aperture, active, factor, β, past)
+        in_memory(context, sampler, vars(b.k), b.n, b.p, b.dist, way, ds.uv, numbers.aperture, active, factor, β, past)
         with dr.resume_grad():
             if held:  # the first vertex is a point of its shape, see ``Vacuum.from_meter``
-                radius = world.contents.damping_radius
-                speeds = sides_from(world, b, edges, mi.Vector3f(0), behind(world, b, *past, active), radius, active)
-                near = (b.dist < radius) | slides(world, b)
+                radius = context.contents.damping_radius
+                y = behind(context, b, *past, active)
+                speeds = sides_from(context, b, edges, mi.Vector3f(0), y, radius, active)
+                near = (b.dist < radius) | slides(context, b)
                 needed = near, ~b.crease | near
             else:
                 moves = edges.moving(b) - rays.ray.o - rays.ray.d * way
@@ -81,12 +85,14 @@ class PrimaryPass(BoundaryPass):
             "ray": ray, "β": β, "η": dr.detach(rays.η), "τ": term.integrator.first_opl(term.film, rays),
             "prev_p": ray.o, "active": active, "medium": medium,
         }  # fmt: skip
-        return both_sides(world, mode, sampler, view, b, past, first, factor, speeds, needed)
+        return both_sides(context, mode, sampler, view, b, past, first, factor, speeds, needed)
 
 
 def where_normals_face(b):
-    """The face that hides, moved from its edge to where its interpolated normal faces the sensor: between there and the
-    edge it is black, a rim that gets as narrow as the faces of the mesh and is taken to move with the edge.
+    """Return the inner hit of an outline, moved from its edge to where the interpolated normal faces the sensor.
+
+    Between there and the edge the face is black, a rim that gets as narrow as the faces of the mesh and is taken to
+    move with the edge.
     """
     u, v = b.inner.prim_uv
     w, ray = 1 - u - v, mi.Ray3f(b.V, b.d_in)

@@ -1,4 +1,4 @@
-"""Paths on both sides of an edge."""
+"""Paths on both sides of an edge. Arguments that all functions share are explained in :mod:`.term`."""
 
 from __future__ import annotations
 
@@ -10,23 +10,21 @@ from torchtransient.plugins.transport.walk import start
 
 
 class BoundaryPass:
-    """Edges between two kinds of points of a path. Built once a job (a :class:`.term.BoundaryTerm`, which it does not
-    hold: its derivatives would outlive the job).
+    """Base of the passes: edges between two kinds of points of a path, see :mod:`.term`.
+
+    Built once a job. A pass does not hold its :class:`.term.BoundaryTerm`, whose derivatives would outlive the job.
     """
 
-    def __init__(self, world):
+    def __init__(self, context):
         """Prepare what launches share."""
 
     @staticmethod
-    def exists(world, sensor):
-        """Return whether a job has such edges."""
+    def exists(context, sensor):
+        """Return True if a job has such edges."""
         raise NotImplementedError
 
     def run(self, mode, job):
-        """Trace the edge samples of the launch ``job`` (:class:`~...integrators.job.Pass`).
-
-        Args:
-            mode: :class:`.weigh.Reverse` or :class:`.weigh.Forward`; ``mode.term`` is the job's term.
+        """Trace the edge samples of a launch.
 
         Returns:
             In reverse mode the attached objective: sums of events times the film's adjoint, times speeds of edges.
@@ -34,22 +32,34 @@ class BoundaryPass:
         raise NotImplementedError
 
 
-def past_edge(world, b, ray, medium, β, sampler, active, seen=False):
-    """Return (the ray past an outline, its leg); of a crease the other face, seen from x. ``seen``: x is the sensor."""
+def past_edge(context, b, ray, medium, β, sampler, active, seen=False):
+    """Return the rays past outlines; for a crease they end at its other face.
+
+    Args:
+        b: outlines seen from x.
+        ray: ray of the path that led to x, for time and wavelengths.
+        seen: x is the sensor, which may see no lights.
+
+    Returns:
+        (Ray3f from beside the outline, its leg).
+    """
     place = Local(si=dr.zeros(mi.SurfaceInteraction3f), medium=medium, surface=mi.Bool(False))
     past = mi.Ray3f(ray)
     past.o, past.d = dr.select(b.crease, b.V, b.beside), b.d
-    leg = world.segment.depart(world, past, place, β, sampler, active & ~b.crease, seen)
-    return past, dr.select(b.crease, world.segment.ends_at(b.facing, medium), leg)
+    leg = context.segment.depart(context, past, place, β, sampler, active & ~b.crease, seen)
+    return past, dr.select(b.crease, context.segment.ends_at(b.facing, medium), leg)
 
 
-def both_sides(world, mode, sampler, view, b, past, first, factor, speeds, needed, lit=None):
-    """Trace the two sides of the outlines ``b``.
+def both_sides(context, mode, sampler, view, b, past, first, factor, speeds, needed, lit=None):
+    """Trace the two sides of outlines.
 
     Args:
-        past: what :func:`past_edge` says.
-        first: fields of the paths at x: ``ray`` and those of :class:`~..walk.Path`.
-        factor: detached weight of a sample; ``speeds``: attached (inner, outer).
+        view: film block or adjoint block of the samples, as of ``mode.view``.
+        b: outlines seen from x.
+        past: ray past them and its leg, as of :func:`past_edge`.
+        first: fields of the paths at x: ``ray``, ``medium`` and those of :class:`~..walk.Path`.
+        factor: detached weight of a sample.
+        speeds: attached (inner, outer).
         needed: masks (inner, outer) of the sides that can have a speed; None where a side has none.
         lit: masks (inner, outer) of the sides whose own emission counts, in full; None: as ``first`` says.
 
@@ -60,14 +70,14 @@ def both_sides(world, mode, sampler, view, b, past, first, factor, speeds, neede
     factor = dr.select(active, factor, 0)
     near = mi.Ray3f(ray)
     near.o, near.d = b.V, b.d_in
-    sides = (near, world.segment.ends_at(b.inner, first["medium"])), past
+    sides = (near, context.segment.ends_at(b.inner, first["medium"])), past
     fields = {key: value for key, value in first.items() if key != "medium"}
     objective = mi.Float(0)
     for k, ((ray, leg), speed, need) in enumerate(zip(sides, mode.speeds(speeds), needed, strict=True)):
         if need is None:
             continue
         sign = 1 - 2 * k
-        path = start(world, ray, mi.Float64(0), 1)
+        path = start(context, ray, mi.Float64(0), 1)
         for key, value in fields.items():
             setattr(path, key, type(getattr(path, key))(value))
         path.leg, path.active = leg, active & need
@@ -75,34 +85,50 @@ def both_sides(world, mode, sampler, view, b, past, first, factor, speeds, neede
             path.prev_unconnected = mi.Bool(lit[k])
             path.prev_pdf = dr.select(path.prev_unconnected, mi.Float(1), 0)
         # The same random numbers on both sides.
-        value = mode.follow(world, sampler.clone(), path, view, dr.select(need, sign * factor, 0), speed)
+        value = mode.follow(context, sampler.clone(), path, view, dr.select(need, sign * factor, 0), speed)
         if value is not None:
-            in_memory(mode.term.world, None, value)
+            in_memory(mode.term.context, None, value)
             with dr.resume_grad():
                 objective += value * speed
     return objective
 
 
-def in_memory(world, sampler, *values):
-    """Evaluate what speeds are made of where the sensor moves: each entry of its pose is a sum over lanes by itself,
-    which would trace the paths once more.
+def in_memory(context, sampler, *values):
+    """Evaluate the values that speeds are made of, where the sensor moves.
+
+    Each entry of its pose is a sum over lanes by itself, which would trace the paths once more.
+
+    Args:
+        sampler: sampler whose state is evaluated as well, or None.
+        values: trees of arrays.
     """
-    if world.wanted.sensor:
+    if context.wanted.sensor:
         if sampler is not None:
             sampler.schedule_state()
         dr.eval(values)
 
 
-def is_seen_within(world, b, ray, end, medium, sampler, active, seen=True):
-    """Mask of outlines of which the inner side is seen, too, from the point ``end`` (Local). It is hidden where what is
-    in front ends in line with them: there is but one edge then, that of what is in front.
+def is_seen_within(context, b, ray, end, medium, sampler, active, seen=True):
+    """Return a mask of outlines whose inner side is seen from a point, too.
+
+    It is hidden where something in front ends in line with it: then there is one edge, that of what is in front.
+
+    Args:
+        ray: ray for time and wavelengths.
+        end: the point, Local with ``p, d, dist``.
+        seen: the point is the sensor.
     """
     place = place_at(b.within, ray, medium)
-    return world.segment.transmittance(world, place, end, sampler.next_2d(), sampler, active, seen)[0]
+    return context.segment.transmittance(context, place, end, sampler.next_2d(), sampler, active, seen)[0]
 
 
 def at_point(p, ray=None):
-    """An Interaction3f without a normal."""
+    """Return an Interaction3f without a normal.
+
+    Args:
+        p: Point3f.
+        ray: ray whose time and wavelengths it takes, or None.
+    """
     it = dr.zeros(mi.Interaction3f)
     it.p = p
     if ray is not None:
@@ -111,5 +137,10 @@ def at_point(p, ray=None):
 
 
 def place_at(p, ray, medium):
-    """A place in space, of no surface, as rays of a segment depart from it."""
+    """Return a vertex in space, on no surface, which rays of a segment may leave.
+
+    Args:
+        p: Point3f.
+        ray: ray whose time and wavelengths it takes.
+    """
     return Local(at=at_point(p, ray), si=dr.zeros(mi.SurfaceInteraction3f), medium=medium, surface=mi.Bool(False))

@@ -50,7 +50,7 @@ _MISS, _MISS_OF_WALK = 1e-4, 2e-3
 
 
 class KnownLobes(Surface):
-    """Goes on by delta lobes alone: by reflection where ``mirrors``, else through the surface."""
+    """Scattering by delta lobes alone: by reflection where ``mirrors``, else through the surface."""
 
     mirrors = False
 
@@ -65,30 +65,33 @@ class KnownLobes(Surface):
 
 
 class Chains:
-    """The chains that a sensor sees, see the module.
+    """Chains of planes that a sensor sees, see the module.
 
     Args:
-        integrator, world: of the job.
+        integrator, context: of the job.
         places: :class:`~torchtransient.plugins.sensors.seen_from.SensorPlaces`.
         sampler: seeded, with ``RAYS`` lanes.
 
-    ``move``: some of them move, and so do edges at rest as seen through them.
+    Attributes:
+        context: :class:`~..context.RenderContext` of paths that go on by delta lobes alone.
+        longest: largest number of planes.
+        move: some planes move, and so do edges at rest as seen through them.
     """
 
-    def __init__(self, integrator, world, places, sampler):
+    def __init__(self, integrator, context, places, sampler):
         self.integrator, self.places = integrator, places
-        self.longest = min(LONGEST, world.max_depth - 1)
+        self.longest = min(LONGEST, context.max_depth - 1)
         self.move = any(
-            shape.ptr in world.wanted.shapes and (is_instance(shape) or has_delta_lobe(shape))
-            for shape in shapes_of_scene(world.scene)
+            shape.ptr in context.wanted.shapes and (is_instance(shape) or has_delta_lobe(shape))
+            for shape in shapes_of_scene(context.scene)
         )
-        segment, _, connections = integrator.strategies(world.contents)
+        segment, _, connections = integrator.strategies(context.contents)
         self._lobes = KnownLobes()
         strategies = segment, self._lobes, connections
-        self.world = RenderContext(world.scene, world.contents, integrator.settings(), strategies)
+        self.context = RenderContext(context.scene, context.contents, integrator.settings(), strategies)
         numbers = places.numbers(sampler)
-        rays = places.rays_at(world, sampler, sampler.next_2d() * places.size, numbers)
-        found = self.follow(world, rays, sampler, mi.UInt32(self.longest), mi.Bool(True))
+        rays = places.rays_at(context, sampler, sampler.next_2d() * places.size, numbers)
+        found = self.follow(context, rays, sampler, mi.UInt32(self.longest), mi.Bool(True))
         weights = [
             dr.select(on, dr.select(after, _UNFINISHED, 1), 0)
             for on, after in zip(found.reached, [*found.reached[1:], mi.Bool(False)], strict=True)
@@ -106,9 +109,12 @@ class Chains:
         dr.eval(self.keys, self.directions, self.normals, self.offsets, self.ratios, vars(self.density), self.counts)
 
     def draw(self, x):
-        """Draw a chain by a uniform number: ``count`` of its planes, ``planes`` (normal n, offset n . p, ratio of the
-        index behind it to that before, 0 for a mirror), ``key``, ``inverse`` (one over its probability),
-        ``ω`` (direction of a ray that runs through it).
+        """Draw a chain by a uniform number.
+
+        Returns:
+            ``count`` of its planes, ``planes`` (normal n, offset n . p, ratio of the index behind it to that before, 0
+            for a mirror), ``key``, ``inverse`` (one over its probability), ``ω`` (direction of a ray that runs through
+            it).
         """
         row, p = self.density.sample(x)
         ray, active = row % RAYS, p > 0
@@ -122,24 +128,29 @@ class Chains:
         ω = dr.gather(mi.Vector3f, self.directions, ray, active)
         return Local(count=row // RAYS + 1, planes=planes, key=key, inverse=inverse, ω=ω)
 
-    def follow(self, world, rays, sampler, count, active, mirrors=None):
-        """Trace primary rays through up to ``count`` delta vertices in ``world``. ``mirrors``: by vertex, the lobes
-        that :class:`KnownLobes` takes.
+    def follow(self, context, rays, sampler, count, active, mirrors=None):
+        """Trace primary rays through delta vertices.
+
+        Args:
+            context: context of the walk.
+            rays: :class:`~...sensors.origin.PrimaryRays`.
+            count: largest number of vertices, UInt32.
+            mirrors: by vertex, the lobes that :class:`KnownLobes` takes; None for the sampled ones.
 
         Returns:
             ``path``, behind the last one, active where all were delta vertices; by vertex ``reached`` (mask),
             ``planes`` and ``keys`` of the chain that ends there; ``key`` of all.
         """
         ray = dr.detach(rays.ray)
-        path = start(world, ray, self.integrator.first_opl(self.places.film, rays), dr.detach(rays.η))
+        path = start(context, ray, self.integrator.first_opl(self.places.film, rays), dr.detach(rays.η))
         path.active &= active
-        path.leg = world.segment.first(world, ray, sampler)
+        path.leg = context.segment.first(context, ray, sampler)
         key, reached, planes, keys = [mi.UInt32(0), mi.UInt32(0)], [], [], []
         for i in range(self.longest):
             on, η = path.active & (i < count), mi.Float(path.η)
             if mirrors is not None:
                 self._lobes.mirrors = mirrors[i]
-            path, (pi, ray) = advance(world, sampler, path, dr.minimum(i + 1, count))
+            path, (pi, ray) = advance(context, sampler, path, dr.minimum(i + 1, count))
             si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, on)
             path.active &= ~on | path.prev_unconnected
             on &= path.active
@@ -159,19 +170,19 @@ class Chains:
         self._lobes.mirrors = False
         return Local(path=path, reached=reached, planes=planes, keys=keys, key=key)
 
-    def lead(self, world, path, sampler, target):
-        """Let paths go on to their vertex number ``target`` as :func:`~..walk.advance` does.
+    def lead(self, context, path, sampler, target):
+        """Trace paths on to their vertex number ``target``, as :func:`~..walk.advance` does.
 
         Returns:
-            ``path``, ``before`` (what advance says); ``all`` (mask: all vertices are those of a chain) and their
-            ``ratios``.
+            ``path``, ``before`` (last surface and ray, as of advance); ``all`` (mask: all vertices are those of a
+            chain) and their ``ratios``.
         """
         every, ratios = target <= self.longest, []
-        pi, ray = mi.PreliminaryIntersection3f(world.segment.surface_of(path.leg)[0]), mi.Ray3f(path.ray)
+        pi, ray = mi.PreliminaryIntersection3f(context.segment.surface_of(path.leg)[0]), mi.Ray3f(path.ray)
         for i in range(self.longest + 1):
             on, η = path.active & (path.depth < target), mi.Float(path.η)
             stop = target if i == self.longest else dr.minimum(i + 1, target)
-            path, (its_pi, its_ray) = advance(world, sampler, path, stop)
+            path, (its_pi, its_ray) = advance(context, sampler, path, stop)
             pi, ray = dr.select(on, its_pi, pi), dr.select(on, its_ray, ray)
             if i < self.longest:
                 n = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, on).n
@@ -182,13 +193,13 @@ class Chains:
     # -------------------------------------------------------------------------------------------- rays through planes
 
     def image_of_eye(self, chain, eye):
-        """The image of the ``eye`` in the mirrors of a chain."""
+        """Return the image of the ``eye`` in the mirrors of a chain."""
         for i, (n, offset, ratio) in enumerate(chain.planes):
             eye = dr.select((i < chain.count) & (ratio == 0), mirrored(eye, n, offset), eye)
         return mi.Point3f(eye)
 
     def look(self, chain, eye, p, numbers, active):
-        """The ray from ``eye`` through a ``chain`` to the point ``p``.
+        """Find the ray from the ``eye`` through a ``chain`` to a point ``p``.
 
         Returns:
             ``ω`` at the eye, ``uv`` (place on the film, in pixels), ``importance`` per area across at ``p``, last
@@ -217,9 +228,17 @@ class Chains:
         )  # fmt: skip
 
     def turned(self, chain, eye, p, ω, step, least):
-        """Make one try of Newton's method at ``ω + step``: (direction, next step, how far the direction misses ``p``).
-        What is no better than the ``least`` miss so far, or no ray at all (total reflection), is tried again with half
-        of the step.
+        """Take one step of Newton's method.
+
+        A direction that is no better, or no ray at all (total reflection), is tried again with half of the step.
+
+        Args:
+            ω: best direction so far.
+            step: change to be tried.
+            least: distance by which ``ω`` misses ``p``.
+
+        Returns:
+            (best direction, next step, its distance).
         """
         tried = dr.normalize(ω + step)
         end = self._sent(chain, eye, tried)
@@ -231,9 +250,7 @@ class Chains:
         return dr.select(better, tried, ω), dr.select(better, across, step * 0.5), dr.select(better, miss, least)
 
     def _sent(self, chain, eye, ω):
-        """Trace a ray through the chain to where it arrives, with the derivatives of ``o, d`` by ``ω`` along two
-        ``axes``.
-        """
+        """Trace a ray through the chain, with the derivatives of ``o, d`` at its end by ``ω`` along two ``axes``."""
         o, d, length, first, valid = mi.Point3f(eye), mi.Vector3f(ω), mi.Float(0), mi.Float(0), mi.Bool(True)
         axes = [mi.Vector3f(axis) for axis in mi.coordinate_system(ω)]
         moves = [(mi.Vector3f(0), axis) for axis in axes]
@@ -271,15 +288,21 @@ class Chains:
         return mi.Vector2f(by * rx - bx * ry, ax * ry - ay * rx) / det, mi.Vector2f(rx, ry), det
 
 
-def attached_ray(world, ray, ratios, count, active):
-    """The last ray (attached ``o``, ``d``) of the attached primary ``ray`` through ``count`` planes, which move."""
+def attached_ray(context, ray, ratios, count, active):
+    """Return the last ray of an attached primary ray through planes, which move: attached ``o`` and ``d``.
+
+    Args:
+        ray: attached primary ray.
+        ratios: by plane, ratio of the index behind it to that before, 0 for a mirror.
+        count: number of planes, UInt32.
+    """
     carried = mi.Ray3f(ray)
     for i, ratio in enumerate(ratios):
         on = active & (i < count)
         with dr.suspend_grad():
-            pi = world.scene.ray_intersect_preliminary(dr.detach(carried), active=on)
+            pi = context.scene.ray_intersect_preliminary(dr.detach(carried), active=on)
             on &= pi.is_valid()
-        si = surface_interaction(world.surfaces, pi, carried, mi.RayFlags.All, on)
+        si = surface_interaction(context.surfaces, pi, carried, mi.RayFlags.All, on)
         out, _ = bent(carried.d, si.sh_frame.n, ratio)
         with dr.suspend_grad():
             ahead = dr.detach(si).spawn_ray(dr.detach(out))
@@ -295,7 +318,7 @@ def ratios_of(chain):
 
 @dr.syntax
 def newton(chains, chain, eye, p, ω):
-    """The direction at ``eye`` of the ray to ``p``, from one for which there is a ray."""
+    """Return the direction at the ``eye`` of the ray to ``p``, from a direction ``ω`` of some ray through the chain."""
     i, step, least = mi.UInt32(0), mi.Vector3f(0), mi.Float(dr.inf)
     while dr.hint(i < _STEPS, max_iterations=_STEPS, label="ray through a chain"):
         ω, step, least = chains.turned(chain, eye, p, ω, step, least)
@@ -304,12 +327,17 @@ def newton(chains, chain, eye, p, ω):
 
 
 def mirrored(p, n, offset):
-    """The image of ``p`` in a plane."""
+    """Return the image of ``p`` in the plane ``n . q = offset``."""
     return p - n * (2 * (dr.dot(n, p) - offset))
 
 
 def bent(d, n, ratio):
-    """Return (direction behind a plane, derivative of its part along ``n`` by that of ``d``)."""
+    """Return (direction behind a plane, derivative of its part along ``n`` by that of ``d``).
+
+    Args:
+        d, n: direction before it, normal of the plane.
+        ratio: of the index behind it to that before, 0 for a mirror.
+    """
     cos = dr.dot(n, d)
     mirrors = ratio == 0
     inverse = dr.rcp(dr.select(mirrors, 1, ratio))
@@ -324,17 +352,16 @@ def _concatenated(parts):
 
 
 class SpecularPass(BoundaryPass):
-    """Boundary pass that draws an edge point and a pixel that sees it through a chain, as in the pass of primary edges.
-    """
+    """Boundary pass of edges that the sensor sees through a chain: draws an edge point and a pixel that sees it."""
 
     @staticmethod
-    def exists(world, sensor):
-        """Return whether the sensor can see edges through chains."""
-        return sees_chains(world, sensor)
+    def exists(context, sensor):
+        """Return True if the sensor can see edges through chains."""
+        return sees_chains(context, sensor)
 
     def run(self, mode, job):
         term = mode.term
-        world, edges, chains, sampler = term.world, term.edges, term.chains, term.sampler(job)
+        context, edges, chains, sampler = term.context, term.edges, term.chains, term.sampler(job)
         numbers = term.places.numbers(sampler)
         k = edges.pick(edges.by_length if chains.move else edges.of_moving, sampler.next_1d(), sampler.next_1d())
         chain, eye = chains.draw(sampler.next_1d()), term.places.eye(numbers)
@@ -346,53 +373,62 @@ class SpecularPass(BoundaryPass):
         seen = chains.look(chain, eye, b.p, numbers, b.valid & ~(b.k.ball & refracts))
         b = edges.seen_from(k, b.p - seen.d * seen.length, seen.valid)
         row, column, weight, inside = term.pixel(seen.uv, sampler.next_2d())
-        own, share = mode.kept(row)
+        own, share = mode.rows_in_band(row)
         inside &= own
         row, column = dr.select(inside, row, job.first_row), dr.select(inside, column, 0)
-        rays = term.places.rays_at(world, sampler, seen.uv, numbers, row, column, job.total)
-        world.start(rays)
+        rays = term.places.rays_at(context, sampler, seen.uv, numbers, row, column, job.total)
+        context.start(rays)
         view = mode.view(rays)
         if term.has_vertex_normals:
             b.inner = where_normals_face(b)
         active, path = traced(chains, chain, seen, rays, sampler, b.valid & seen.valid & inside)
-        medium = world.segment.medium_towards(b.d)
+        medium = context.segment.medium_towards(b.d)
         place, to_last = place_at(b.beside, path.ray, medium), Local(p=seen.o, d=-b.d, dist=seen.way)
-        active, T = world.segment.transmittance(world, place, to_last, sampler.next_2d(), sampler, active)
+        active, T = context.segment.transmittance(context, place, to_last, sampler.next_2d(), sampler, active)
         β = attenuated(path.β, mi.UnpolarizedSpectrum(T))
         factor = seen.importance * chain.inverse * b.sin * b.inv_pdf * weight * share
-        past = past_edge(world, b, path.ray, medium, β, sampler, active)
+        past = past_edge(context, b, path.ray, medium, β, sampler, active)
         edge_state, path_state = (vars(b.k), b.n, b.limb, b.inner), (path, past, β)
-        in_memory(world, sampler, edge_state, path_state, vars(seen), vars(chain), vars(numbers), active, factor)
+        in_memory(context, sampler, edge_state, path_state, vars(seen), vars(chain), vars(numbers), active, factor)
         with dr.resume_grad():
-            ray = attached_ray(world, rays.ray, ratios_of(chain), chain.count, active)
+            ray = attached_ray(context, rays.ray, ratios_of(chain), chain.count, active)
             moves = edges.moving(b) - ray.o - ray.d * seen.way
             speeds = [dr.select(active, dr.dot(b.n, moves), 0)] * 2
         first = {
             "ray": path.ray, "β": β, "η": path.η, "τ": path.τ, "prev_p": path.prev_p, "prev_n": path.prev_n,
             "depth": chain.count, "active": active, "medium": medium,
         }  # fmt: skip
-        return both_sides(world, mode, sampler, view, b, past, first, factor, speeds, (mi.Bool(True), mi.Bool(True)))
+        return both_sides(context, mode, sampler, view, b, past, first, factor, speeds, (mi.Bool(True), mi.Bool(True)))
 
 
 def traced(chains, chain, seen, rays, sampler, active):
-    """Return (a mask of ``rays`` that run through their chains to what is ``seen``, the paths behind these)."""
+    """Trace rays through their chains to a point.
+
+    Args:
+        chain, seen: results of :meth:`Chains.draw` and :meth:`Chains.look`.
+        rays: primary rays through ``seen.uv``.
+
+    Returns:
+        (mask of rays that visit the same planes and arrive there, the paths behind the planes).
+    """
     mirrors = [ratio == 0 for ratio in ratios_of(chain)]
-    found = chains.follow(chains.world, rays, sampler, chain.count, active, mirrors)
+    found = chains.follow(chains.context, rays, sampler, chain.count, active, mirrors)
     path = found.path
     same = (found.key[0] == chain.key[0]) & (found.key[1] == chain.key[1])
     off = dr.norm(dr.cross(path.ray.d, seen.o + seen.d * seen.way - path.ray.o))
     return active & path.active & same & (off < _MISS_OF_WALK * seen.length), path
 
 
-def sees_chains(world, sensor):
-    """Return whether a sensor has a point of view from which it may see something in mirrors or through glass."""
-    contents = world.contents
-    return world.max_depth > 1 and contents.delta and contents.media is None and has_eye(sensor)
+def sees_chains(context, sensor):
+    """Return True if a sensor has a point of view from which it may see something in mirrors or through glass."""
+    contents = context.contents
+    return context.max_depth > 1 and contents.delta and contents.media is None and has_eye(sensor)
 
 
 class SensorThroughChain(Connection):
-    """The sensor as seen through a chain, which is one for all vertices of a path: :meth:`set` before a launch. Events
-    are as those of :class:`~..light_tracing.SensorSampled`.
+    """Connection to the sensor as seen through a chain, one for all vertices of a path: :meth:`set` before a launch.
+
+    Events are as those of :class:`~..light_tracing.SensorSampled`.
     """
 
     name = "sensor_through_chain"
@@ -402,33 +438,38 @@ class SensorThroughChain(Connection):
         self.chains = chains
 
     def set(self, chain, numbers, η):
-        """Take a drawn ``chain``, ``numbers`` of the sensor, and the index of refraction ``η`` there."""
+        """Set the chain of a launch.
+
+        Args:
+            chain: result of :meth:`Chains.draw`.
+            η: index of refraction at the sensor.
+        """
         self.chain, self.numbers, self.η = chain, numbers, η
         self._eye = self.chains.places.eye(numbers)
 
     def seen_from(self, p, active):
-        """Return (the result of :meth:`Chains.look` for ``p``, the primary rays)."""
+        """Return (result of :meth:`Chains.look` for the point ``p``, primary rays there)."""
         chains = self.chains
         seen = chains.look(self.chain, self._eye, p, self.numbers, active & (self.chain.inverse > 0))
-        return seen, chains.places.rays_at(chains.world, None, seen.uv, self.numbers, η=self.η)
+        return seen, chains.places.rays_at(chains.context, None, seen.uv, self.numbers, η=self.η)
 
-    def propose(self, world, path, vertex, sampler):
+    def propose(self, context, path, vertex, sampler):
         depth = path.depth + 2 + self.chain.count
-        active = vertex.goes_on & vertex.connectable & (depth <= world.max_depth)
-        seen, rays = self.seen_from(vertex.at.p, world.deep_enough(active, depth))
+        active = vertex.goes_on & vertex.connectable & (depth <= context.max_depth)
+        seen, rays = self.seen_from(vertex.at.p, context.deep_enough(active, depth))
         active, through = traced(self.chains, self.chain, seen, rays, sampler, seen.valid)
         ds = Local(p=seen.o, n=mi.Normal3f(0), d=-seen.d, dist=seen.way, delta=mi.Bool(True), emitter=None)
         return Proposal(d=-seen.d, active=active, ds=ds, seen=seen, through=through, depth=depth, u=sampler.next_2d(),
                         sampler=sampler)  # fmt: skip
 
-    def connect(self, world, path, vertex, proposal, answer, zeros):
+    def connect(self, context, path, vertex, proposal, answer, zeros):
         seen, through, ds = proposal.seen, proposal.through, proposal.ds
         value = in_sensor_frame(first_row(product(vertex.β, answer.matrix)), mi.Vector3f(ds.d))
         value = product(through.β, value) * (seen.importance * self.chain.inverse)
         active = proposal.active & (dr.max(dr.abs(intensity(value))) > 0)
         opl = vertex.scattered_τ + through.τ + self.chains.places.film.start_opl + mi.Float64(seen.way * through.η)
-        active = world.counted(active, opl)
-        active, T = world.segment.transmittance(world, vertex, ds, proposal.u, proposal.sampler, active)
+        active = context.counted(active, opl)
+        active, T = context.segment.transmittance(context, vertex, ds, proposal.u, proposal.sampler, active)
         return Event(
             value=value * T, opl=opl, active=active, depth=proposal.depth, uv=seen.uv, d=-seen.ω,
             first=path.depth == 0, speed=2,

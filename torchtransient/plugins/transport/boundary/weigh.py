@@ -15,51 +15,82 @@ from torchtransient.plugins.transport.walk import walk
 
 
 class Reverse:
-    """Sums of events times the adjoint of the film, detached, times attached speeds: the objective of a launch."""
+    """Reverse mode: detached sums of events times the adjoint of the film, times attached speeds.
+
+    Args:
+        term: :class:`.term.BoundaryTerm` of the job.
+        incoming: :class:`~...integrators.job.IncomingAdjoint` of the film.
+    """
 
     def __init__(self, term, incoming):
         self.term, self.incoming = term, incoming
 
     def view(self, rays):
-        """The adjoint block of primary rays."""
+        """Return the adjoint block of primary rays."""
         return self.block(rays, rays)
 
-    def kept(self, row):
-        """Return (mask of the rows of pixels that count, weight of a sample of the whole film)."""
+    def rows_in_band(self, row):
+        """Return (mask of rows of pixels that the launch writes, weight of a sample of the whole film)."""
         return mi.Bool(True), 1
 
     def block(self, rays, place):
-        """The adjoint block of the pixels ``place`` (``row, column, laser``), in the channels of ``rays``."""
+        """Return the adjoint block of pixels.
+
+        Args:
+            rays: rays whose channels count.
+            place: ``row, column, laser`` of the pixels.
+        """
         term = self.term
-        match = term.integrator.channel_match(term.world.contents, term.film, rays)
+        match = term.integrator.channel_match(term.context.contents, term.film, rays)
         pixel = dr.fma(place.row, int(term.film.crop_size()[0]), place.column)
         return self.incoming.block(place, pixel, match)
 
     def speeds(self, attached):
-        """Speeds as :meth:`follow` takes them."""
+        """Return speeds as :meth:`follow` takes them."""
         return attached
 
-    def follow(self, world, sampler, path, block, factor, speed):
-        """Trace ``path``; returns what its events contribute to the loss."""
-        _, kept = walk(world, sampler, path, AdjointSumSink(block))
-        return finite(kept["sum"] * factor)
+    def follow(self, context, sampler, path, block, factor, speed):
+        """Trace paths and return the contribution of their events to the loss, Float.
+
+        Args:
+            path: :class:`~..walk.Path` at x, with its leg.
+            block: result of :meth:`view`.
+            factor: detached weight of each path.
+            speed: not used here.
+        """
+        _, state = walk(context, sampler, path, AdjointSumSink(block))
+        return finite(state["sum"] * factor)
 
     def sink_of_pixels(self, middle, job, u, factor, speeds):
-        """Return (sink of events that have a pixel each, the factors of :meth:`sum_of_pixels`)."""
+        """Return a sink of events that have a pixel each, and the factors of :meth:`sum_of_pixels`.
+
+        Args:
+            middle: primary rays of the middle of the film, whose channels count.
+            u: two uniform numbers, which choose a pixel.
+            factor: detached weight of each path.
+            speeds: attached speeds by :data:`PixelSums.NAMES`.
+        """
         return PixelSums(self, middle, u, len(speeds)), (factor, speeds)
 
-    def sum_of_pixels(self, kept, factors):
-        """The attached objective."""
+    def sum_of_pixels(self, state, factors):
+        """Return the attached objective, from the state of the sink and the factors."""
         factor, speeds = factors
-        in_memory(self.term.world, None, kept)
+        in_memory(self.term.context, None, state)
         with dr.resume_grad():
             names = PixelSums.NAMES[: len(speeds)]
-            return sum(finite(kept[name] * factor) * speed for name, speed in zip(names, speeds, strict=True))
+            return sum(finite(state[name] * factor) * speed for name, speed in zip(names, speeds, strict=True))
 
 
 class PixelSums(Sink):
-    """Sums over the events of the first vertex, over those of all others, and where the sensor sees the first vertex
+    """Sink that sums events, weighed by the adjoint of the pixel of each.
+
+    ``direct``: of the first vertex, seen by the sensor; ``rest``: of all others; ``through``: of the first vertex, seen
     through a chain.
+
+    Args:
+        mode: :class:`Reverse`.
+        middle, u: as of :meth:`Reverse.sink_of_pixels`.
+        count: number of sums.
     """
 
     NAMES = ("direct", "rest", "through")
@@ -67,22 +98,27 @@ class PixelSums(Sink):
     def __init__(self, mode, middle, u, count):
         self.mode, self.middle, self.u, self.names = mode, middle, u, self.NAMES[:count]
 
-    def begin(self, world):
+    def begin(self, context):
         return {name: mi.Float(0) for name in self.names}
 
-    def event(self, kept, event):
+    def event(self, state, event):
         term = self.mode.term
         row, column, weight, inside = term.pixel(event.uv, self.u)
         active, place = event.active & inside, Local(row=row, column=column, laser=None)
         A, _ = self.mode.block(seen_along(self.middle, event.d), place).read(event.opl, active)
         value = dr.select(active, total_of(A, event.value) * weight, 0)
         name = self.NAMES[event.speed]
-        kept[name] = kept[name] + dr.select(event.first, value, 0)
-        kept["rest"] = kept["rest"] + dr.select(event.first, 0, value)
+        state[name] = state[name] + dr.select(event.first, value, 0)
+        state["rest"] = state["rest"] + dr.select(event.first, 0, value)
 
 
 class Forward:
-    """Events onto the film, times the tangents of the speeds."""
+    """Forward mode: events written to the film, times the tangents of the speeds.
+
+    Args:
+        term: :class:`.term.BoundaryTerm` of the job.
+        job: launch, whose band of the film is written.
+    """
 
     def __init__(self, term, job):
         self.term, self.job = term, job
@@ -93,13 +129,13 @@ class Forward:
     def view(self, rays):
         """Return (film block, map to channels, pixel) of primary rays."""
         term, film = self.term, self.term.film
-        match, (base, pixel) = term.integrator.channel_match(term.world.contents, film, rays), self._indices(rays)
+        match, (base, pixel) = term.integrator.channel_match(term.context.contents, film, rays), self._indices(rays)
         if rays.strata is not None:
-            return film.create_event_block(self.job, base, match, term.world.most_events()), match, pixel
+            return film.create_event_block(self.job, base, match, term.context.most_events()), match, pixel
         # Rays that go anywhere are not in the order of pixels, which some films count on.
         return FilmBlock(film, self.job.band, base, match), match, pixel
 
-    def kept(self, row):
+    def rows_in_band(self, row):
         """Return as in reverse mode, for the rows of one band of storage."""
         return (row >= self.first) & (row < self.stop), self.scale
 
@@ -107,54 +143,54 @@ class Forward:
         return self.term.integrator.pixel_indices(self.term.film, self.job, place)
 
     def speeds(self, attached):
-        """Tangents of speeds."""
+        """Return the tangents of speeds."""
         with dr.resume_grad():
             if not any(dr.grad_enabled(speed) for speed in attached):
                 return [mi.Float(0)] * len(attached)
             return tangents_of(list(attached))
 
-    def follow(self, world, sampler, path, view, factor, speed):
-        """Trace ``path`` onto the film."""
+    def follow(self, context, sampler, path, view, factor, speed):
+        """Trace paths and write their events to the film, times ``factor * speed``."""
         film, (block, match, pixel) = self.term.film, view
-        _, kept = walk(world, sampler, path, ScaledFilmSink(block, finite(factor * speed)))
-        film.add_steady(pixel, match.to_channels(kept["L"]))
+        _, state = walk(context, sampler, path, ScaledFilmSink(block, finite(factor * speed)))
+        film.add_steady(pixel, match.to_channels(state["L"]))
         block.finish()
 
     def sink_of_pixels(self, middle, job, u, factor, speeds):
         """Return the sink and factors, as in reverse mode."""
         return PixelFilmSink(self, middle, u, [finite(factor * speed) for speed in self.speeds(speeds)]), None
 
-    def sum_of_pixels(self, kept, factors):
-        """All is on the film."""
+    def sum_of_pixels(self, state, factors):
+        """Return zero: all is on the film."""
         return mi.Float(0)
 
 
 class ScaledFilmSink(FilmSink):
-    """Events times a number for each path."""
+    """Sink that writes events to a film, times a number for each path."""
 
     def __init__(self, block, scale):
         super().__init__(block)
         self.scale = scale
 
-    def event(self, kept, event):
+    def event(self, state, event):
         event.value = event.value * self.scale
-        super().event(kept, event)
+        super().event(state, event)
 
 
 class PixelFilmSink(Sink):
-    """Events that have a pixel each, times one number at the first vertex and another at all others."""
+    """Sink that writes events to the pixel of each, times one number at the first vertex and another at all others."""
 
     def __init__(self, mode, middle, u, scales):
         self.mode, self.middle, self.u, self.scales = mode, middle, u, scales
 
-    def event(self, kept, event):
+    def event(self, state, event):
         mode, term = self.mode, self.mode.term
         film = term.film
         row, column, weight, inside = term.pixel(event.uv, self.u)
-        own, share = mode.kept(row)
+        own, share = mode.rows_in_band(row)
         active = event.active & inside & own
         place = Local(row=dr.select(active, row, mode.first), column=column, laser=None)
-        match = term.integrator.channel_match(term.world.contents, film, seen_along(self.middle, event.d))
+        match = term.integrator.channel_match(term.context.contents, film, seen_along(self.middle, event.d))
         base, pixel = mode._indices(place)
         scale = dr.select(event.first, self.scales[event.speed], self.scales[1]) * (weight * share)
         channels = [dr.select(active, c, 0) for c in match.to_channels(event.value * scale)]
@@ -166,12 +202,12 @@ class PixelFilmSink(Sink):
 
 
 def seen_along(rays, d):
-    """Primary rays of which each arrives against ``d``, as channels of the film ask for them."""
+    """Return primary rays, each of which arrives against ``d``, as channels of the film take them."""
     ray = mi.Ray3f(dr.detach(rays.ray))
     ray.d = -d
     return Local(ray=ray, weight=rays.weight, scale=rays.scale, seen=rays.seen)
 
 
 def finite(value):
-    """Zero in place of what is no number."""
+    """Return ``value``, zero where it is not finite."""
     return dr.select(dr.isfinite(value), value, 0)
