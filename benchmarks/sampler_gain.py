@@ -159,14 +159,15 @@ def main() -> None:
     options = parser.parse_args()
     samplers, runs = ["independent", *options.samplers.split(",")], 3 if options.quick else options.runs
     report = {}
-    print(f"{'scene':18}{'sampler':12}{'gain':>8}{'steady':>8}{'CPU':>7}{'t mean':>9}{'t dev':>7}{'energy':>10}{'+-':>9}")
+    heads = ("gain", "steady", "CPU", "t mean", "t dev", "energy", "+-")
+    print(f"{'scene':18}{'sampler':12}" + "".join(f"{head:>9}" for head in heads))
     for name in options.scenes.split(","):
         make, spp = SCENES[name]
         report[name] = measure(make(), 4 if options.quick else spp, samplers, runs, options.variant)
         for sampler, x in report[name].items():
             print(
-                f"{name:18}{sampler:12}{x['gain']:8.2f}{x['gain_steady']:8.2f}{x['cpu_ratio']:7.3f}"
-                f"{x['block_t_mean']:9.3f}{x['block_t_deviation']:7.3f}{x['energy']:10.5f}"
+                f"{name:18}{sampler:12}{x['gain']:9.2f}{x['gain_steady']:9.2f}{x['cpu_ratio']:9.3f}"
+                f"{x['block_t_mean']:9.3f}{x['block_t_deviation']:9.3f}{x['energy']:9.5f}"
                 f"{x['energy_standard_error']:9.5f}",
                 flush=True,
             )

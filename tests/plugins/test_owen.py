@@ -93,7 +93,7 @@ def test_a_clone_draws_the_same_numbers():
     assert not np.array_equal(np.array(other.next_1d()), np.array(sampler.next_1d()))
 
 
-# ----------------------------------------------------------------------------------------------------------- the default
+# ------------------------------------------------------------------------------------------------------- the default
 
 
 def room(sampler, resolution=8):

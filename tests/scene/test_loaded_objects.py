@@ -197,7 +197,7 @@ def test_values_do_not_leak_between_renderers_that_share_an_object():
 def test_what_would_change_a_ready_scene_is_refused():
     loaded = tt.load(mi.load_dict(make_room(), optimize=False))
     axis = tt.TimeAxis(start_opl=6.0, bin_width_opl=0.25, num_bins=24)
-    for options in ({"max_depth": 2}, {"sampler": "stratified"}, {"steady": False}, {"pulse": tt.Pulse.gaussian(0.5)}):
+    for options in ({"max_depth": 2}, {"steady": False}, {"pulse": tt.Pulse.gaussian(0.5)}):
         with pytest.raises(tt.errors.SceneError, match="was taken as it is"):
             tt.TransientRenderer(loaded, **options)
     with pytest.raises(tt.errors.SceneError, match="time_axis would change"):
@@ -226,7 +226,10 @@ def test_what_would_change_a_film_that_was_taken_is_refused():
 def test_another_sampler_takes_the_number_of_one_that_was_taken():
     room = make_room()
     room["sensor"]["sampler"] = mi.load_dict({"type": "independent", "sample_count": 9})
-    assert tt.TransientRenderer(tt.load(room), sampler="stratified")(seed=0).stats.spp == 9
+    assert tt.TransientRenderer(tt.load(room), sampler="multijitter")(seed=0).stats.spp == 9
+    ready = tt.load(mi.load_dict(room))
+    assert tt.TransientRenderer(ready)(seed=0).stats.sampler == "owen"
+    assert tt.TransientRenderer(ready, sampler="multijitter")(seed=0).stats.sampler == "multijitter"
 
 
 STEADY_FILM = {"type": "hdrfilm", "width": 6, "height": 4, "rfilter": {"type": "tent"}}

@@ -177,7 +177,7 @@ MISSPELT = {
     ),
     "sampler": (
         room(sampler={"type": "independent", "sample_cuont": 9}),
-        {"sampler": "stratified"},
+        {},
         "'independent' does not read 'sample_cuont'",
     ),
     "sensor": (room(fovv=3.0), {}, "'perspective' does not read 'fovv'"),

@@ -147,6 +147,8 @@ class Session:
         """Return the attributes of plugins that the job sets, as (plugin, name, value)."""
         job, integrator = self.job, self.integrator
         found: list[tuple[Any, str, Any]] = []
+        if hasattr(integrator, "sampler_of"):
+            found.append((integrator, "sampler", plugin_of_sampler(integrator, job.sampler)))
         if job.bound is not None:
             found.append((integrator, "max_depth", job.bound.depth))
         if job.temporal_filter:
@@ -159,6 +161,37 @@ class Session:
                 if is_time_resolved(film) and film.temporal_filter
             ]
         return [*found, *boundary_settings(job.boundary, job.spp_boundary, integrator)]
+
+
+def plugin_of_sampler(integrator: Any, asked: str | None) -> str:
+    """Return the ``sampler`` of an integrator for a job: the one asked for, its own, or "auto"."""
+    return asked or integrator.sampler or "auto"
+
+
+def sampler_of(scene: Any, sensor: Any, asked: str | None) -> Any:
+    """Return a copy of the sampler that draws for a sensor.
+
+    Args:
+        scene: built scene.
+        sensor: sensor of the scene.
+        asked: plugin name that a layer asks for, or None.
+
+    Raises:
+        ArgumentError: if the integrator of the scene takes no other sampler than the sensor's.
+        SceneError: for an unknown plugin.
+    """
+    integrator = scene.integrator()
+    if not hasattr(integrator, "sampler_of"):
+        if asked is not None:
+            name = type(integrator).__name__
+            raise ArgumentError(f"sampler: {name} draws from the samplers of the sensors; leave it out.")
+        return sensor.sampler().clone()
+    try:
+        return integrator.sampler_of(scene, sensor, plugin_of_sampler(integrator, asked))
+    except RuntimeError as error:
+        if isinstance(error, TorchTransientError):
+            raise
+        raise SceneError(f"sampler: Mitsuba refuses the plugin {asked!r}: {one_line(error)}") from error
 
 
 def boundary_settings(boundary: bool, spp: int | None, integrator: Any) -> list[tuple[Any, str, Any]]:
@@ -332,8 +365,8 @@ class Images:
             self._response = mi.TensorXf(self._memory, (self.count, *film.cube_shape())).torch()
         assert self._steady is not None and self._response is not None
         seconds = time.perf_counter() - self._started
-        sampler = session.sensors[job.items[0].sensor].sampler()
-        spp = samples_drawn(sampler.clone(), job.spp)
+        sampler = sampler_of(session.scene, session.sensors[job.items[0].sensor], job.sampler)
+        spp = samples_drawn(sampler, job.spp)
         channels = len(film.channel_names())
         light = self._steady[..., :channels].sum((-3, -2, -1), dtype=torch.float64) / channels
         total = tuple(light.reshape(-1).tolist())

@@ -110,6 +110,7 @@ class RenderJob:
         batched: for each value, whether it has a leading batch dimension.
         spp, spp_grad: samples per pixel of the render and of its derivatives.
         temporal_filter: of the films; None for the scene's.
+        sampler: plugin name; None for the integrator's, or "auto".
         watch: warns of unphysical values.
         needs: for each value, whether it wants a derivative.
         bound: on the depth; None for the scene's.
@@ -131,6 +132,7 @@ class RenderJob:
     spp: int
     spp_grad: int
     temporal_filter: str | None
+    sampler: str | None
     watch: PhysicsWatch
     needs: tuple[bool, ...] = ()
     bound: DepthBound | None = None

@@ -192,6 +192,7 @@ def _labels(
         spp=1,
         spp_grad=1,
         temporal_filter=None,
+        sampler=renderer.sampler,
         watch=renderer._watch,
         needs=(False,) * len(tensors),
         freeze=renderer.freeze,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -165,7 +164,8 @@ class TransientRenderer(CopiesParametrized):
         changes: dict[str, Any] = {"pulse": checked_pulse("pulse", pulse), "irf": checked_pulse("irf", irf)}
         changes |= {"film": film, "steady": bool(steady)}
         changes["integrator"] = effects.integrator if isinstance(effects, Effects) else None
-        self._options = self._build_options(max_depth, sampler, changes)
+        self.sampler = checked_sampler(sampler)
+        self._options = self._build_options(max_depth, changes)
         self._infos = self._parameter_infos()
         with active_variant(self.scene.variant):
             self._read_scene(0 if sensors is None else sensors)
@@ -179,18 +179,17 @@ class TransientRenderer(CopiesParametrized):
 
     # --------------------------------------------------------------------------------------------------- set-up
 
-    def _build_options(self, max_depth: int | None, sampler: str | None, changes: dict[str, Any]) -> BuildOptions:
-        changes |= {"max_depth": checked_depth(max_depth), "sampler": checked_sampler(sampler)}
-        options = BuildOptions(transient=True, **changes)
+    def _build_options(self, max_depth: int | None, changes: dict[str, Any]) -> BuildOptions:
+        options = BuildOptions(transient=True, max_depth=checked_depth(max_depth), **changes)
         return self.scene.options_for(self._keys, options)
 
     def _check_sampler(self, plugin: str) -> None:
         if plugin in CORRELATED_SAMPLERS:
             self._watch.warn(
                 f"sampler {plugin}",
-                f"{plugin!r}: this sampler of Mitsuba draws dependent numbers at consecutive vertices, which biases light "
-                "that scatters twice and more, and derivatives (1 % in the Cornell box). Take 'owen', the default, or "
-                "'independent'.",
+                f"{plugin!r}: this sampler of Mitsuba draws dependent numbers at consecutive vertices, which biases "
+                "light that scatters twice and more, and derivatives (1 % in the Cornell box). Take 'owen', the "
+                "default, or 'independent'.",
                 is_error=False,
             )
 
@@ -213,7 +212,7 @@ class TransientRenderer(CopiesParametrized):
         films = [found[sensor].film() for sensor in self._sensors]
         self._cube_shape = tuple(films[0].cube_shape())
         self._channels = tuple(films[0].channel_names())
-        sampler = found[self._sensors[0]].sampler()
+        sampler = engine.sampler_of(built.scene, found[self._sensors[0]], self.sampler)
         self._scene_spp = int(sampler.sample_count())
         self._check_sampler(sampler_plugin(sampler))
         self._counts = {self._scene_spp: self._scene_spp}
@@ -318,7 +317,7 @@ class TransientRenderer(CopiesParametrized):
             raise ArgumentError(f"temporal_filter: the film has none, expected 'auto', got {temporal_filter!r}.")
         twin = copy.deepcopy(self)
         if sampler is not None:
-            twin._options = replace(self._options, sampler=checked_sampler(sampler))
+            twin.sampler = checked_sampler(sampler)
         if temporal_filter is not None:
             twin.temporal_filter = temporal_filter
         return twin
@@ -352,8 +351,9 @@ class TransientRenderer(CopiesParametrized):
             UnitError: if ``spp`` is no positive integer.
         """
         with active_variant(self.scene.variant):
-            sensor = self.scene.built(self._options).scene.sensors()[self._sensors[0]]
-            return samples_drawn(sensor.sampler().clone(), checked_samples("spp", spp))
+            scene = self.scene.built(self._options).scene
+            sampler = engine.sampler_of(scene, scene.sensors()[self._sensors[0]], self.sampler)
+            return samples_drawn(sampler, checked_samples("spp", spp))
 
     @opaque
     def forward(
@@ -407,6 +407,7 @@ class TransientRenderer(CopiesParametrized):
             spp=used,
             spp_grad=used_grad,
             temporal_filter=temporal_filter or None,
+            sampler=self.sampler,
             watch=self._watch,
             progress=bar,
             freeze=self.freeze,

@@ -281,7 +281,7 @@ def _check_loaded_sensor(number: int, sensor: Any, options: BuildOptions) -> Non
             "film is built in its place. Make the scene with a transient_hdr_film, phasor_hdr_film or gated_hdr_film. "
             f"{WAY_OUT}."
         )
-    changes = [name for name in ("sampler", "pulse", "irf") if getattr(options, name) is not None]
+    changes = [name for name in ("pulse", "irf") if getattr(options, name) is not None]
     changes += [] if options.steady or not getattr(film, "keeps_steady", True) else ["steady"]
     if options.film is not None and not (options.transient and options.film.describes(film)):
         changes.append(options.film.argument)

@@ -116,9 +116,6 @@ class FilmRequest(Protocol):
         """Write the properties into those of a film node."""
 
 
-DEFAULT_SAMPLER = "owen"
-
-
 @dataclass(frozen=True)
 class BuildOptions:
     """Changes of a description before it is built.
@@ -131,8 +128,6 @@ class BuildOptions:
         real_bitmaps: store bitmaps as real numbers; Mitsuba keeps 8-bit images in 8 bits, which have no derivative.
         merge: let Mitsuba merge meshes and equal materials, which is faster to trace but takes parameters away.
         transient: turn a steady film and integrator into transient ones.
-        sampler: plugin name of a sampler that replaces those of the sensors, with the same number of samples; None
-            replaces ``independent``, and the one of a sensor without a sampler, by :data:`DEFAULT_SAMPLER`.
         pulse, irf: shape of the pulse and impulse response of every film, None to keep their own.
         steady: False takes the steady image from the histograms.
         integrator: plugin name of a transient integrator that replaces the scene's, with the parameters of both.
@@ -144,7 +139,6 @@ class BuildOptions:
     real_bitmaps: bool = False
     merge: bool = False
     transient: bool = False
-    sampler: str | None = None
     pulse: Pulse | None = None
     irf: Pulse | None = None
     steady: bool = True
@@ -165,7 +159,6 @@ def edit(config: Any, state: Any, options: BuildOptions) -> None:
     described = _replaceable(state)
     _edit_films(state, options)
     _edit_integrator(state, options)
-    _edit_samplers(state, options)
     _check_replaced(config, state, described)
     _substitute_twins(state, options)
 
@@ -275,7 +268,7 @@ def _edit_film(state: Any, index: int, options: BuildOptions) -> None:
     film.write(props)
 
 
-# --------------------------------------------------------------------------------------------- integrators and samplers
+# ------------------------------------------------------------------------------------------------------- integrators
 
 
 def _edit_integrator(state: Any, options: BuildOptions) -> None:
@@ -373,37 +366,6 @@ def _become_path(state: Any, index: int) -> None:
     if "hide_emitters" in old:
         props["hide_emitters"] = old["hide_emitters"]
     state.nodes[index].props = props
-
-
-def _edit_samplers(state: Any, options: BuildOptions) -> None:
-    """Replace the samplers of all sensors by the one asked for, with the same number of samples. None was asked for:
-    replace those that the scene names by habit.
-    """
-    import mitsuba as mi
-
-    if options.sampler is None and not options.transient:
-        return
-    for index in range(len(state.nodes)):
-        node = state.nodes[index]
-        if node.type != mi.ObjectType.Sensor:
-            continue
-        sampler = find_child(state, node, lambda child: child.type == mi.ObjectType.Sampler)
-        loaded = _loaded_child(node, mi.Sampler)
-        if options.sampler is None and not _names_by_habit(state, node, sampler, loaded):
-            continue
-        plugin = options.sampler or DEFAULT_SAMPLER
-        if sampler is None:
-            count = {} if loaded is None else {"sample_count": node.props[loaded].sample_count()}
-            _add_child(state, index, loaded or "sampler", plugin, mi.ObjectType.Sampler, count)
-        else:
-            _become(state, sampler, plugin, keep=("sample_count", "seed"))
-
-
-def _names_by_habit(state: Any, node: Any, sampler: int | None, loaded: str | None) -> bool:
-    """Return whether a sensor has the sampler that every scene file names, or none."""
-    if loaded is not None:
-        return bool(node.props[loaded].class_name() == "IndependentSampler")
-    return sampler is None or state.nodes[sampler].props.plugin_name() == "independent"
 
 
 # --------------------------------------------------------------------------------------------------------------- twins

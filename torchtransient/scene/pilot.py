@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -291,8 +291,6 @@ def depth_bound(
         GradientError: for a scene without light, and for a loaded polarized one.
         PhysicsError: with ``physics="error"``, for more light beyond the bound than a time window may miss.
     """
-    # One for all samplers, so that renderers that differ by theirs alone can be compared.
-    options = replace(options, sampler=None)
     key = options, tuple(sensors)
     if key not in scene.depth_bounds:
         scene.depth_bounds[key] = _found_bound(scene, options, sensors, film)

@@ -133,7 +133,7 @@ def mutual_occlusion(
         return None
     rows = viewpoints.references
     edges = OutlineTable(triangles, [parts[i].edges for i in hiders], viewpoints.p[rows], viewpoints.n[rows])
-    sampler = sensor.sampler().clone()
+    sampler = integrator.sampler_of(context.scene, sensor)
     count = spp or sampler.sample_count()
     own_seed, _ = mi.sample_tea_32(seed_array(seed), mi.UInt32(_SEED))
     jobs, _ = passes_of(sampler, film, own_seed, max(1, count // SHARE), 2)

@@ -61,7 +61,8 @@ class TransientIntegrator(mi.CppADIntegrator):
     Parameters: ``max_depth`` (6; -1 for no limit), ``rr_depth`` (5), ``hide_emitters`` (false), ``camera_unwarp``
     (false: leave out the leg from the first surface to the sensor), ``discard_direct_light`` (false: leave out emission
     that reaches the sensor without a bounce),
-    ``temporal_filter`` (the film's) and ``gaussian_stddev`` (the film's, in bins).
+    ``temporal_filter`` (the film's), ``gaussian_stddev`` (the film's, in bins), ``sampler`` (those of the sensors; the
+    plugin name of one in their place, or "auto": ``owen`` in place of ``independent``).
 
     Subclasses return the parts of their walk from :meth:`strategies`, see :mod:`..transport.strategy`; derivatives in
     both modes follow.
@@ -81,6 +82,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         if "gaussian_stddev" in props:
             self.gaussian_stddev = number(props, "gaussian_stddev")
             check_stddev(self.gaussian_stddev)
+        self.sampler = str(props.get("sampler", ""))
         self._seen = None
 
     # Paths scatter in participating media; otherwise scenes with media are refused.
@@ -151,6 +153,14 @@ class TransientIntegrator(mi.CppADIntegrator):
         """Return the contents of the scene, cached by sensor."""
         return self._seen_scene(scene).contents_for(scene, sensor)
 
+    def sampler_of(self, scene, sensor, plugin=None):
+        """Return a copy of the sampler that draws for a sensor, with the sensor's number of samples.
+
+        Args:
+            plugin: in place of the integrator's ``sampler``.
+        """
+        return self._seen_scene(scene).sampler(sensor, self.sampler if plugin is None else plugin).clone()
+
     def parameters(self, scene) -> ParameterTracker:
         """Return the tracker of the scene's parameters with gradients."""
         return self._seen_scene(scene).tracker(scene)
@@ -208,7 +218,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         Returns:
             :class:`~..sensors.origin.PrimaryRays`, attached to the sensor.
         """
-        sampler = sensor.sampler().clone()
+        sampler = self.sampler_of(scene, sensor)
         sampler.set_sample_count(job.spp)
         sampler.set_samples_per_wavefront(job.spp)
         width, lasers = int(film.crop_size()[0]), laser_count(film)
@@ -356,11 +366,11 @@ class TransientIntegrator(mi.CppADIntegrator):
                 contents, wanted = self._wanted(scene, sensor, film)
             context = self.render_context(scene, contents, wanted, film.arrivals())
             lanes = None if context.record_room is None else context.record_room.lanes
-            sampler = sensor.sampler().clone()
+            sampler = self.sampler_of(scene, sensor)
             launches, samples = passes_of(sampler, film, seed, int(spp), context.most_events(), lanes)
             film.tabulate_filter()
             job = Prepared(kind, self, scene, sensor, film, context, launches, seed_array(seed), samples)
-            job.plugins = self._seen_scene(scene).python_plugins(scene)
+            job.plugins = self._seen_scene(scene).python_plugins(scene, [sampler])
             if wanted is not None:
                 job.beside = self.beside(context, sensor, film, seed, samples)
             if kind == BACKWARD:

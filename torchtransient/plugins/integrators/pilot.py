@@ -109,7 +109,7 @@ def _trace(scene, integrator, sensor, film, size, spp, seed, slots, roulette) ->
     """The events, the samples per pixel, and the largest number of events of a path, which may be more than it had
     slots for.
     """
-    sampler = sensor.sampler().clone()
+    sampler = integrator.sampler_of(scene, sensor)
     sampler.set_sample_count(spp)
     spp = sampler.sample_count()
     with dr.suspend_grad():

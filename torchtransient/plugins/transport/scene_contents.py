@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
@@ -314,6 +314,7 @@ class SceneCache:
         self._contents: dict[int, tuple[Any, SceneContents]] = {}
         self._tracker: ParameterTracker | None = None
         self._python: list[Any] | None = None
+        self._samplers: dict[tuple[int, str], tuple[Any, Any]] = {}
         # Parameters, by plugin and key, whose gaps at moving edges a warning has named.
         self.warned_of_edges: set[tuple[int, str]] = set()
 
@@ -350,10 +351,30 @@ class SceneCache:
             self._tracker = ParameterTracker(scene)
         return self._tracker
 
-    def python_plugins(self, scene: Any) -> list[Any]:
+    def sampler(self, sensor: Any, plugin: str) -> Any:
+        """Return the sampler of a sensor, or one in its place with the same number of samples.
+
+        Args:
+            plugin: name of the other sampler; "" for none, "auto" for ``owen`` in place of ``independent``, which
+                scenes name by habit.
+        """
+        own = sensor.sampler()
+        if not plugin or (plugin == "auto" and own.class_name() != "IndependentSampler"):
+            return own
+        key = sensor.ptr, plugin
+        if key not in self._samplers:
+            name = "owen" if plugin == "auto" else plugin
+            made = mi.load_dict({"type": name, "sample_count": own.sample_count()})
+            self._samplers[key] = sensor, made
+        return self._samplers[key][1]
+
+    def python_plugins(self, scene: Any, others: Sequence[Any] = ()) -> list[Any]:
         """Return the plugins of the scene that are written in Python.
 
         Integrator, films, samplers and filters are included; what plugins do not show is not.
+
+        Args:
+            others: plugins beside the scene.
         """
         self._forget_replaced(scene)
         if self._python is None:
@@ -363,8 +384,8 @@ class SceneCache:
             self._python = list({one.ptr: one for one in found if _is_python(one)}.values())
         sensors = scene.sensors()
         films = [sensor.film() for sensor in sensors]
-        others = [*sensors, *films, *(sensor.sampler() for sensor in sensors), *(film.rfilter() for film in films)]
-        others += [*scene.emitters(), *scene.shapes(), scene.integrator()]
+        others = [*others, *sensors, *films, *scene.emitters(), *scene.shapes(), scene.integrator()]
+        others += [*(sensor.sampler() for sensor in sensors), *(film.rfilter() for film in films)]
         return [*self._python, *filter(_is_python, others)]
 
     def _forget_replaced(self, scene: Any) -> None:

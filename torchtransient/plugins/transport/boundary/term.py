@@ -95,7 +95,7 @@ class BoundaryTerm:
         for name in names if topology.count else ():
             if self.kinds[name].exists(context, sensor):
                 self.passes[name] = self.kinds[name](context)
-                own = sensor.sampler().clone()
+                own = integrator.sampler_of(scene, sensor)
                 self.jobs[name], _ = passes_of(own, film, seeds[name], samples, context.most_events())
 
     def _light_context(self):
