@@ -245,3 +245,108 @@ def test_a_plugin_that_refuses_its_parameters_takes_part_in_no_later_kernel():
     si = scene.ray_intersect(mi.Ray3f(mi.Point3f(0, 0, -3), mi.Vector3f(0, 0, 1)))
     value = si.bsdf().eval(mi.BSDFContext(), si, mi.Vector3f(0, 0, 1))
     assert dr.all(dr.isfinite(value), axis=None)
+
+
+# ------------------------------------------------------------------------------------------- first use, several threads
+
+
+def test_a_class_is_imported_in_one_thread_while_another_uses_it():
+    assert run(
+        """
+        import importlib, threading
+        import torchtransient
+        import mitsuba as mi
+        mi.set_variant("llvm_ad_rgb")
+        names = ("integrators.path", "films.histogram", "bsdfs.plastic")
+        threads = [
+            threading.Thread(target=importlib.import_module, args=(f"torchtransient.plugins.{name}",)) for name in names
+        ]
+        for thread in threads:
+            thread.start()
+        for plugin in ("transient_volpath", "transient_path", "transient_hdr_film", "diff_hair", "diff_plastic"):
+            mi.load_dict({"type": plugin})
+        for thread in threads:
+            thread.join()
+        print("ok")
+        """
+    ) == ["ok"]
+
+
+def test_a_module_loads_a_scene_of_other_plugins_while_it_is_executed(tmp_path):
+    """Mitsuba builds the parts of a scene in threads of its own."""
+    (tmp_path / "loads_a_scene.py").write_text(
+        textwrap.dedent(
+            """
+            import mitsuba as mi
+            from torchtransient.plugins import register
+            mi.load_dict({
+                "type": "scene", "a": {"type": "sphere", "bsdf": {"type": "diff_hair"}},
+                "b": {"type": "sphere", "bsdf": {"type": "diff_plastic"}},
+            })
+            class Mine(mi.BSDF):
+                def __init__(self, props):
+                    mi.BSDF.__init__(self, props)
+            register("bsdf", "mine", Mine)
+            """
+        )
+    )
+    assert run(
+        f"""
+        import sys
+        sys.path.insert(0, {str(tmp_path)!r})
+        from torchtransient import plugins
+        import mitsuba as mi
+        mi.set_variant("llvm_ad_rgb")
+        plugins.register_module("loads_a_scene")
+        print(type(mi.load_dict({{"type": "mine"}})).__name__)
+        """
+    ) == ["Mine"]
+
+
+def test_modules_that_register_one_class_under_one_name(third_party):
+    """The owner of a name is the module that registers it, not the one that has the class."""
+    text = "from torchtransient.plugins import register\nfrom torchtransient.plugins.bsdfs import retroreflector\n"
+    text += "register('bsdf', 'taken_twice', retroreflector.Retroreflector)\n"
+    plugins.register_module(third_party(text))
+    with pytest.raises(PluginRegistrationError, match="their_texture"):
+        plugins.register_module(third_party(text, "their_rival"))
+
+
+@pytest.mark.parametrize(
+    "take", ["plugins.register('bsdf', 'diff_plastic', Mine)", "mi.register_bsdf('diff_plastic', Mine)"]
+)
+def test_the_last_one_to_take_a_name_has_it(take):
+    """Hair imports plastic, which does not take its name back."""
+    assert run(
+        f"""
+        from torchtransient import plugins
+        import mitsuba as mi
+        mi.set_variant("llvm_ad_rgb")
+        class Mine(mi.BSDF):
+            def __init__(self, props):
+                mi.BSDF.__init__(self, props)
+        {take}
+        mi.load_dict({{"type": "diff_hair"}})
+        print(type(mi.load_dict({{"type": "diff_plastic"}})).__name__)
+        """
+    ) == ["Mine"]
+
+
+def test_a_scene_may_be_freed_before_its_render_is_read():
+    """Spheres are met through their addresses: what is rendered must not wait for the scene to be gone."""
+    assert run(
+        """
+        import numpy as np
+        import torchtransient
+        import mitsuba as mi
+        mi.set_variant("llvm_ad_rgb")
+        film = {"type": "transient_hdr_film", "width": 32, "height": 32, "temporal_bins": 8, "bin_width_opl": 2.0}
+        for _ in range(6):
+            steady, _ = mi.render(mi.load_dict({
+                "type": "scene", "integrator": {"type": "transient_path", "max_depth": 3},
+                "sensor": {"type": "perspective", "film": film},
+                "light": {"type": "point"}, "ball": {"type": "sphere", "center": [0, 0, 5]},
+            }), spp=4)
+            print(np.isfinite(np.array(steady)).all())
+        """
+    ) == ["True"] * 6

@@ -34,7 +34,7 @@ def at_rest() -> None:
     locked: list[str] = []
 
     def ask() -> None:
-        locks = {"engine": engine_lock, "registry": _registry._state.lock, "collection": guards._lock}
+        locks = {"engine": engine_lock, "registry": _registry._state.changes, "collection": guards._lock}
         for name, lock in locks.items():
             if lock.acquire(timeout=5):
                 lock.release()

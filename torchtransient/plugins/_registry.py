@@ -13,6 +13,10 @@ callback. Three of its habits shape this file:
 - a plugin constructor that raises reaches the caller as a `RuntimeError` with the traceback as text, so the typed error
   is kept aside and `plugin_errors()` raises it again.
 
+Constructors run in threads of Mitsuba, while the thread that loads a scene waits. So three locks are taken in one
+order: `changes` (one change of the variant at a time), Python's locks of modules, `tables` (never while code of a
+module runs).
+
 How to write a plugin module::
 
     import mitsuba as mi
@@ -44,7 +48,6 @@ import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import FunctionType
 
 import mitsuba as mi
 
@@ -182,22 +185,23 @@ PLUGIN_MODULES: tuple[PluginModule, ...] = (
 )
 
 
+_OWN_MODULES = frozenset(entry.module for entry in PLUGIN_MODULES)
 # Surfaces of this library, by the names of their plugins.
 OWN_BSDFS = tuple(name for module in PLUGIN_MODULES for kind, name in module.plugins if kind == "bsdf")
 
 
 @dataclass
 class _State:
-    """Registered modules and listeners. Guarded by `lock`, since scenes are loaded from several threads, except
-    `listeners`, which need none (:func:`plugin_errors`).
-    """
+    """Registered modules and listeners (which need no lock, see :func:`plugin_errors`)."""
 
-    lock: threading.RLock = field(default_factory=threading.RLock)
+    changes: threading.RLock = field(default_factory=threading.RLock)
+    tables: threading.RLock = field(default_factory=threading.RLock)
     third_party: list[PluginModule] = field(default_factory=list)
     variant: str | None = None  # the variant that the entries below were made for
     constructors: dict[tuple[str, str], Callable[..., object]] = field(default_factory=dict)
     owner: dict[tuple[str, str], str] = field(default_factory=dict)
-    loading: str | None = None  # the module that is being executed
+    waiting: set[tuple[str, str]] = field(default_factory=set)  # plugins whose module is not executed yet
+    loading: threading.local = field(default_factory=threading.local)  # `module` that a change of the variant executes
     listeners: list[list[BaseException]] = field(default_factory=list)  # take what constructors raise
     interrupted: bool = False  # a change of the variant, before all who wait for one had been told
 
@@ -223,16 +227,24 @@ def register(kind: str, name: str, constructor: Callable[..., object]) -> None:
             "does not. Its base class documents them."
         )
     key = (kind, name)
+    loading = getattr(_state.loading, "module", None)
     # A module that is being executed may import others, which register plugins too.
-    named = isinstance(constructor, type | FunctionType)
-    module = (constructor.__module__ if named else _state.loading) or "?"
-    with _state.lock:
+    caller = sys._getframe(1).f_globals.get("__name__", "?")
+    module = caller if loading is None or caller in _OWN_MODULES else loading
+    with _state.tables:
+        if loading is None and caller in _OWN_MODULES:
+            # Its first use: Mitsuba has a constructor that asks for this one, unless somebody took the name.
+            if key in _state.waiting:
+                _state.waiting.discard(key)
+                _state.constructors[key] = _keeping_errors(constructor)
+            return
         other = _state.owner.get(key)
-        if _state.loading is not None and other is not None and other != module:
+        if loading is not None and other is not None and other != module:
             raise PluginRegistrationError(
                 f"register: {kind} plugin '{name}' of module {module} was already registered by {other}. "
                 "Give one of them another name."
             )
+        _state.waiting.discard(key)
         _add(key, module, constructor)
 
 
@@ -244,7 +256,7 @@ def register_module(module: str, plugins: tuple[tuple[str, str], ...] = ()) -> N
     only. Adding a module twice is the same as adding it once. Raises PluginRegistrationError when the module cannot be
     found or executed.
     """
-    with _state.lock:
+    with _state.changes:
         # A name is taken as given: find_spec imports the parent packages and raises for what is not a module.
         try:
             found = importlib.util.find_spec(module)
@@ -270,7 +282,7 @@ def register_module(module: str, plugins: tuple[tuple[str, str], ...] = ()) -> N
 
 def modules_of_others() -> tuple[PluginModule, ...]:
     """Modules added with :func:`register_module`, in order."""
-    with _state.lock:
+    with _state.changes:
         return tuple(_state.third_party)
 
 
@@ -292,7 +304,7 @@ def _version(module: str) -> str:
 
 def kind_of(name: str) -> str | None:
     """The kind of a plugin of this library or of a module that was added to it, such as "bsdf"; None for others."""
-    with _state.lock:
+    with _state.changes:
         for entry in (*PLUGIN_MODULES, *_state.third_party):
             for kind, plugin in entry.plugins:
                 if plugin == name:
@@ -307,7 +319,7 @@ def sync() -> str | None:
     PluginRegistrationError when a plugin module cannot be executed, also when that happened during an earlier change
     of the variant, and VariantError when Dr.Jit is bound to an LLVM that would abort the process.
     """
-    with _state.lock:
+    with _state.changes:
         attach_callback()
         variant = active_variant()
         if variant is None:
@@ -364,7 +376,7 @@ def plugin_errors() -> Iterator[None]:
 
 def _on_variant_change(_old: str | None, new: str | None) -> None:
     _check_nothing_was_raised()
-    with _state.lock:
+    with _state.changes:
         try:
             if new is not None and new != _state.variant:
                 # Python's own import keeps its lock for ever where an interrupt comes as it lets go: other threads
@@ -406,21 +418,27 @@ def _load_all(variant: str) -> None:
     others are executed. Leaves `_state.variant` None when one fails, so that sync() tries again.
     """
     _state.variant = None
-    _state.constructors.clear()
-    _state.owner.clear()
+    with _state.tables:
+        _state.constructors.clear()
+        _state.owner.clear()
+        _state.waiting.clear()
     for entry in (*PLUGIN_MODULES, *_state.third_party):
-        if is_jit(variant) and (entry.module in sys.modules or entry in _state.third_party):
+        if not is_jit(variant):
+            for key in entry.plugins:
+                _add(key, entry.module, _refusal(*key))
+        elif entry.module in _OWN_MODULES and entry.module not in sys.modules:
+            for key in entry.plugins:
+                _add(key, entry.module, _first_use(entry.module, key))
+                _state.waiting.add(key)
+        else:
             _execute(entry, variant)
-            continue
-        for key in entry.plugins:
-            _add(key, entry.module, _first_use(entry, key) if is_jit(variant) else _refusal(*key))
     _state.variant = variant
 
 
 def _execute(entry: PluginModule, variant: str) -> None:
-    for key in entry.plugins:
-        _state.constructors.pop(key, None)
-    _state.loading = entry.module
+    """Execute a module for `variant`, again if it is loaded."""
+    before = getattr(_state.loading, "module", None)
+    _state.loading.module = entry.module
     try:
         loaded = sys.modules.get(entry.module)
         if loaded is None:
@@ -428,13 +446,9 @@ def _execute(entry: PluginModule, variant: str) -> None:
         else:
             importlib.reload(loaded)
     except Exception as error:
-        # Whatever the module raised: it is reported under one type, with the module named.
-        raise PluginRegistrationError(
-            f"plugin module {entry.module} could not be executed for variant '{variant}': "
-            f"{type(error).__name__}: {error}"
-        ) from error
+        raise _not_executed(entry.module, variant, error) from error
     finally:
-        _state.loading = None
+        _state.loading.module = before
     missing = [f"{kind} '{name}'" for kind, name in entry.plugins if (kind, name) not in _state.constructors]
     if missing:
         raise PluginRegistrationError(
@@ -443,10 +457,19 @@ def _execute(entry: PluginModule, variant: str) -> None:
         )
 
 
+def _not_executed(module: str, variant: str | None, error: Exception) -> PluginRegistrationError:
+    """Return the error under which all that a module raises is reported."""
+    return PluginRegistrationError(
+        f"plugin module {module} could not be executed for variant '{variant}': {type(error).__name__}: {error}"
+    )
+
+
 def _add(key: tuple[str, str], module: str, constructor: Callable[..., object]) -> None:
-    _state.owner[key] = module
-    _state.constructors[key] = _keeping_errors(constructor)
-    _hand_to_mitsuba(key)
+    """Register a plugin in Mitsuba under the name of the module that it belongs to."""
+    with _state.tables:
+        _state.owner[key] = module
+        _state.constructors[key] = _keeping_errors(constructor)
+        _hand_to_mitsuba(key)
 
 
 def _hand_to_mitsuba(key: tuple[str, str]) -> None:
@@ -454,14 +477,22 @@ def _hand_to_mitsuba(key: tuple[str, str]) -> None:
     getattr(mi, f"register_{kind}")(name, _state.constructors[key])
 
 
-def _first_use(entry: PluginModule, key: tuple[str, str]) -> Callable[[object], object]:
-    """Return a constructor that executes the module and goes on with the one that it registers."""
+def _first_use(module: str, key: tuple[str, str]) -> Callable[[object], object]:
+    """Return a constructor that imports a module of the library, and goes on with the one that it registers."""
 
     def construct(props: object) -> object:
-        with _state.lock, interrupts_wait():
-            if entry.module not in sys.modules:
-                _execute(entry, require_jit_variant(f"{key[0]} plugin '{key[1]}'"))
-        return _state.constructors[key](props)
+        try:
+            with interrupts_wait():
+                importlib.import_module(module)
+        except Exception as error:
+            raise _not_executed(module, active_variant(), error) from error
+        made = _state.constructors.get(key)
+        if made is None or key in _state.waiting:
+            raise PluginRegistrationError(
+                f"plugin module {module} was expected to register {key[0]} '{key[1]}' for variant "
+                f"'{active_variant()}' and did not."
+            )
+        return made(props)
 
     return construct
 

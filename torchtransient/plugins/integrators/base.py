@@ -398,7 +398,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         return state_of(jobs)
 
     @no_collection()
-    def run(self, prepared, evaluate=True, progress=None):
+    def run(self, prepared, progress=None):
         """Execute a prepared job; this is what ``dr.freeze`` records.
 
         A render or a tangent stays in the film, gradients arrive at the parameters of the scene and at the tables of
@@ -406,7 +406,6 @@ class TransientIntegrator(mi.CppADIntegrator):
 
         Args:
             prepared: :class:`.job.Prepared` by :meth:`prepared`.
-            evaluate: run the kernels of a render, instead of only recording them.
             progress: function of the share of a render that is done, or None.
         """
         with dr.suspend_grad():
@@ -421,7 +420,7 @@ class TransientIntegrator(mi.CppADIntegrator):
             shared = self.shared_light(context, film)
             parts = len(shared) + bool(context.walks)
             for i, add in enumerate(shared):
-                add(Job(launches, prepared.seed, prepared.samples, evaluate, share_of(progress, i, parts)))
+                add(Job(launches, prepared.seed, prepared.samples, share_of(progress, i, parts)))
 
             # ------------------------------------------------------------------------- paths
             progress = share_of(progress, len(shared), parts)
@@ -433,8 +432,8 @@ class TransientIntegrator(mi.CppADIntegrator):
                 film.add_steady(pixel, match.to_channels(state["L"]))
                 film.add_outside(pixel, state["before"], state["after"])
                 block.finish()
-                if evaluate or len(launches) > 1:
-                    dr.eval(film.bands[launch.band][2], film.steady, film.outside)
+                # Not later: kernels hold addresses of shapes, which `mi.render` may free with the scene.
+                dr.eval(film.bands[launch.band][2], film.steady, film.outside)
                 if progress:
                     dr.sync_thread()
                     progress((i + 1) / len(launches))
@@ -449,7 +448,7 @@ class TransientIntegrator(mi.CppADIntegrator):
             seed: whole number, or UInt32 of width one.
             spp: samples per pixel, 0 for those of the sampler.
             develop: return the images; otherwise the result stays in the film.
-            evaluate: run the kernels, instead of only recording them.
+            evaluate: without effect, an argument of Mitsuba's; the kernels run at once.
             progress_callback: function of the share that is done, called after every launch; or None.
 
         Returns:
@@ -459,7 +458,7 @@ class TransientIntegrator(mi.CppADIntegrator):
             if develop:
                 self.resolve(scene, sensor)[1].check_one_band()
             job = self.prepared(scene, sensor, seed, spp)
-            self.run(job, evaluate, progress_callback)
+            self.run(job, progress_callback)
             return job.film.develop() if develop else None
 
     @no_collection()

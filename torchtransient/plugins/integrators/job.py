@@ -47,14 +47,12 @@ class Job:
         passes: launches of the paths.
         seed: seed of the job, UInt32.
         samples: largest number of samples of a pixel.
-        evaluate: run the kernels, instead of only recording them.
         progress: function of the share that is done, or None.
     """
 
     passes: list[Pass]
     seed: Any
     samples: int
-    evaluate: bool
     progress: Any
 
 
