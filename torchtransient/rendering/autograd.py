@@ -18,6 +18,7 @@ import torch
 from torchtransient.errors import GradientError, ShapeError
 from torchtransient.interfaces import BACKWARD, FORWARD, RENDER
 from torchtransient.rendering import engine
+from torchtransient.rendering.batches import run_in_batches
 from torchtransient.rendering.job import RenderJob
 
 Tensors = tuple[torch.Tensor, ...]
@@ -296,7 +297,8 @@ class RenderCall:
 
     def primal(self, tensors: Sequence[torch.Tensor]) -> Tensors:
         """Return steady and response."""
-        return engine.run(self._seeded(tensors), RENDER, tensors[self.seeds :])
+        job, values = self._seeded(tensors), tensors[self.seeds :]
+        return engine.run(job, RENDER, values) if job.errors is None else run_in_batches(job, values)
 
     def pullback(
         self, request: Request, tensors: Sequence[torch.Tensor], cotangents: Sequence[torch.Tensor]

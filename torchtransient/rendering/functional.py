@@ -21,6 +21,7 @@ def render(
     *,
     spp: int | None = None,
     seed: int | Sequence[int] | None = None,
+    errors: bool | str = False,
     progress: bool = False,
     **settings: Any,
 ) -> RenderOutput:
@@ -34,6 +35,7 @@ def render(
         values: values by key of ``scene.parameters()``, with or without a leading batch dimension.
         spp: samples per pixel, None for the scene's.
         seed: one seed, or one for each entry of a batch; None draws one from torch's generator.
+        errors: True, or "bins", for error bars: ``out.standard_error``.
         progress: show a progress bar.
         settings: other arguments of :class:`TransientRenderer`, such as ``time_axis``.
 
@@ -52,5 +54,5 @@ def render(
     for name, start in list(renderer.named_parameters()):
         # Not by `requires_grad_`, which torch.func forbids inside of its transforms.
         setattr(renderer, name, nn.Parameter(start, requires_grad=False))
-    out: RenderOutput = renderer(values, seed=seed, progress=progress)
+    out: RenderOutput = renderer(values, seed=seed, errors=errors, progress=progress)
     return out

@@ -11,6 +11,7 @@ import torch
 
 from torchtransient.checks import as_whole, shown
 from torchtransient.errors import ShapeError, TorchTransientWarning, UnitError, level_of_user
+from torchtransient.rendering.error_bars import BatchErrors
 from torchtransient.scene.edits import BuildOptions
 from torchtransient.scene.load import Scene
 from torchtransient.scene.physics import PhysicsWatch
@@ -118,6 +119,7 @@ class RenderJob:
             integrator's.
         progress: called with the fraction that is done.
         freeze: whether calls are recorded.
+        errors: request for error bars, and where they are put; None for none.
         at_call: values of a shared scene at the call.
         log: a report of each render; under ``vmap`` a call is several.
         derivative_log: how the calls of its derivatives were made.
@@ -140,6 +142,7 @@ class RenderJob:
     spp_boundary: int | None = None
     progress: Callable[[float], None] | None = None
     freeze: bool = True
+    errors: BatchErrors | None = None
     at_call: list[Mapping[str, Any]] = field(default_factory=list)
     log: list[RunLog] = field(default_factory=list)
     derivative_log: list[str] = field(default_factory=list)

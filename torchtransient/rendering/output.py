@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
-from torchtransient.errors import ShapeError
+from torchtransient.errors import ArgumentError, ShapeError
 from torchtransient.gates import Gate
-from torchtransient.rendering.films import FilmLayout
+from torchtransient.rendering.error_bars import BatchErrors, ErrorCells, local_errors, variance
+from torchtransient.rendering.films import FilmLayout, layout_of_output
 from torchtransient.scene.variant import stokes_components
 from torchtransient.tensor_record import TensorRecord
 
@@ -131,7 +132,10 @@ class RenderOutput(TensorRecord):
     their names. In polarized variants the Stokes components S0, S1, S2, S3 come before C in all of them, as (4, C, T,
     H, W), in the sensor's frame: x to the right of the picture, y up, as the sensor sees it. ``transient``, ``phasor``
     and ``gated`` are views of the film's own memory with the rows first: ``.contiguous()`` makes a copy in torch's
-    order. ``others``: tensors and settings of films that have no attribute here, by name.
+    order. ``differences`` (..., T', H', W', R), ``squares`` (..., T', H', W'), ``steady_differences`` (..., H, W, R)
+    and their ``cells``, of renders with ``errors=``: what independent batches of samples differ by, mean over channels,
+    for :meth:`standard_error` and :meth:`error_map`.
+    ``others``: tensors and settings of films that have no attribute here, by name.
 
     ``to``, ``cpu``, ``detach``, ``clone`` and ``map`` make copies; ``stack`` and ``cat`` put several together, as
     ``torch.utils.data.default_collate`` does. Torch's pytrees see the tensors.
@@ -150,6 +154,10 @@ class RenderOutput(TensorRecord):
     gates: tuple[Gate, ...] | None = None
     gated: torch.Tensor | None = None
     others: Mapping[str, Any] = field(default_factory=dict)
+    differences: torch.Tensor | None = None
+    squares: torch.Tensor | None = None
+    steady_differences: torch.Tensor | None = None
+    cells: ErrorCells | None = None
 
     @property
     def polarized(self) -> bool:
@@ -163,6 +171,87 @@ class RenderOutput(TensorRecord):
         """
         before, after, total = map(sum, (self.stats.energy_before, self.stats.energy_after, self.stats.energy_total))
         return (before / total, after / total) if total > 0 and before + after > 0 else (0.0, 0.0)
+
+    # ---------------------------------------------------------------------------------------------------- error bars
+
+    def standard_error(self, weights: Any = None, *, steady: bool = False) -> torch.Tensor:
+        """Return the standard error of a weighted sum of what was measured, mean over channels.
+
+        That of one pixel rests on one number, and is as uncertain; sums over some ten pixels and more are known to some
+        20 %. See ``docs/accuracy.md``.
+
+        Args:
+            weights: real numbers or truth values that broadcast to (T, H, W) ((F, H, W) of phasors, (G, H, W) of
+                gates), behind dimensions of Stokes components and items; None for ones. (H, W) with ``steady``.
+            steady: of the steady image.
+
+        Returns:
+            (...), without the last three dimensions (two with ``steady``).
+
+        Raises:
+            ArgumentError: for a render without ``errors=``.
+            ShapeError: for weights of another shape.
+        """
+        differences, shape, cells = self._error_layout(steady)
+        given = torch.ones((), device=differences.device) if weights is None else torch.as_tensor(weights)
+        real = differences.real if differences.is_complex() else differences
+        try:
+            given = given.to(real).broadcast_to(*differences.shape[:-4], *shape)
+        except RuntimeError as error:
+            raise ShapeError(
+                f"standard_error: expected weights that broadcast to {(*differences.shape[:-4], *shape)}, got "
+                f"{tuple(given.shape)}."
+            ) from error
+        return variance(differences, given, cells).sqrt()
+
+    def error_map(self, *, steady: bool = False) -> torch.Tensor:
+        """Return the standard error of every bin, (..., T, H, W), (..., H, W) with ``steady``.
+
+        It is that of its neighbourhood, the cell of 4 x 4 pixels x 8 bins, or 3 x 3 x 3 bins with ``errors="bins"``:
+        single dark bins have seen too few events to know their own.
+
+        Raises:
+            ArgumentError: for a render without ``errors=``.
+        """
+        differences, shape, cells = self._error_layout(steady)
+        squares = differences.abs().square().sum(-1) if steady or self.squares is None else self.squares
+        found = local_errors(squares, cells, shape)
+        return found.squeeze(-3) if steady else found
+
+    def with_differences(self, request: BatchErrors, leading: tuple[int, ...]) -> RenderOutput:
+        """Return the output with what its batches differ by.
+
+        Args:
+            request: request of the call that made it.
+            leading: sizes of the dimensions of items.
+        """
+        if len(request.differences) != 1:
+            raise ArgumentError(
+                "errors: expected a call outside of torch.func.vmap, which takes the batches of samples apart. Give "
+                "the values a batch dimension instead."
+            )
+        measured, steady = (x[0].movedim(0, -1) for x in (request.differences, request.steady))
+        squares = request.squares[0]
+        return replace(
+            self,
+            differences=measured.reshape(*leading, *measured.shape[1:]),
+            squares=squares.reshape(*leading, *squares.shape[1:]),
+            steady_differences=steady.reshape(*leading, *steady.shape[1:]),
+            cells=request.cells,
+        )
+
+    def _error_layout(self, steady: bool) -> tuple[torch.Tensor, tuple[int, ...], ErrorCells]:
+        """Return (differences (..., T', H', W', R), (T, H, W), cells); one bin of time with ``steady``."""
+        if self.differences is None or self.steady_differences is None or self.cells is None:
+            raise ArgumentError("standard_error: expected a render with errors=True or errors='bins', got one without.")
+        if steady:
+            image = self.steady_differences
+            return image.unsqueeze(-4), (1, *image.shape[-3:-1]), ErrorCells(1, 1, 1, self.cells.shared)
+        layout = layout_of_output(self)
+        tensor = None if layout is None else layout.tensor(self)
+        if tensor is None:
+            raise ArgumentError("standard_error: expected what the film measured, got a steady image alone.")
+        return self.differences, tuple(tensor.shape[-3:]), self.cells
 
     @classmethod
     def merged_notes(cls, records: Sequence[RenderOutput]) -> dict[str, Any]:

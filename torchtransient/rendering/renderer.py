@@ -32,6 +32,7 @@ from torchtransient.rendering.arguments import (
     torch_names,
 )
 from torchtransient.rendering.autograd import RenderCall, run
+from torchtransient.rendering.error_bars import CELL_BINS, CELL_PIXELS, BatchErrors, ErrorCells
 from torchtransient.rendering.films import FilmLayout, steady_channels_first
 from torchtransient.rendering.job import Item, RenderJob, Seeding, draw_seed, rounded_count, samples_drawn
 from torchtransient.rendering.output import RenderOutput, RenderStats
@@ -362,6 +363,7 @@ class TransientRenderer(CopiesParametrized):
         *,
         seed: int | Sequence[int] | None = None,
         spp: int | None = None,
+        errors: bool | str = False,
         progress: bool = False,
     ) -> RenderOutput:
         """Render the scene with the module's parameters, or with ``values`` in their place.
@@ -374,6 +376,9 @@ class TransientRenderer(CopiesParametrized):
                 every entry has its own seed, derived from this one, the first entry the seed itself; or give one seed
                 per entry.
             spp: samples per pixel, None for the renderer's.
+            errors: True renders in independent batches of samples (two, or eight where pixels share light) and keeps
+                what they differ by in cells of 4 x 4 pixels x 8 bins, so that ``out.standard_error`` knows the error of
+                sums; "bins" keeps it bin by bin.
             progress: show a progress bar.
 
         Returns:
@@ -389,7 +394,12 @@ class TransientRenderer(CopiesParametrized):
         temporal_filter = self.effective_filter
         self._check_slope(temporal_filter, tensors)
         self._check_edges(tensors)
+        request = self._error_request(errors)
         wanted = checked_samples("spp", spp) or self.spp or self._scene_spp
+        if request is not None and wanted < request.batches:
+            raise ArgumentError(
+                f"errors: expected at least {request.batches} samples per pixel, one for each batch, got spp={wanted}."
+            )
         used = used_grad = rounded_count(wanted, self._counts, self.samples_drawn)
         graph = torch.is_grad_enabled()
         if self.spp_grad is not None and any(may_have_derivative(tensor, graph=graph) for tensor in tensors):
@@ -414,6 +424,7 @@ class TransientRenderer(CopiesParametrized):
             bound=self._depth_bound(values, tensors),
             boundary=self.boundary,
             spp_boundary=self.spp_boundary,
+            errors=request,
         )
         try:
             seed_given = () if per_entry is None else (per_entry,)
@@ -426,7 +437,27 @@ class TransientRenderer(CopiesParametrized):
         steady = steady_channels_first(steady, leading, components)
         response = self.film.channels_first(response, leading, components)
         stats = RenderStats.of_job(job, pixels)
-        return RenderOutput.of(self.film, steady, response, stats=stats, channels=self._channels)
+        out = RenderOutput.of(self.film, steady, response, stats=stats, channels=self._channels)
+        return out if request is None else out.with_differences(request, leading)
+
+    def _error_request(self, errors: bool | str) -> BatchErrors | None:
+        """Return the request for error bars of a call, None for none."""
+        if not isinstance(errors, bool) and not is_one_of(errors, ("bins",)):
+            raise ArgumentError(f"errors: expected True, False or 'bins', got {shown(errors)}.")
+        if errors is False:
+            return None
+        if len(self._cube_shape) > 4:
+            raise ArgumentError("errors: expected False for exhaustive scans, whose error bars are not followed.")
+        with active_variant(self.scene.variant):
+            integrator = self.scene.built(self._options).scene.integrator()
+        shared = not getattr(integrator, "pixels_are_independent", False)
+        bins, pixels = (CELL_BINS if self.film.has_bins else 1, CELL_PIXELS) if errors is True else (1, 1)
+        components = stokes_components(self.scene.variant)
+        return BatchErrors(
+            ErrorCells(bins, pixels, pixels, shared),
+            lambda cube: self.film.channels_first(cube, (-1,), components),
+            lambda steady: steady_channels_first(steady, (-1,), components),
+        )
 
     def _collect(self, values: Mapping[str, Any] | None) -> tuple[list[torch.Tensor], list[bool], int | None]:
         """Return the tensors of a call in the order of the keys, which of them are batched, and the batch size."""

@@ -90,6 +90,8 @@ class TransientIntegrator(mi.CppADIntegrator):
     # The laser of a scan lights one position after the other; beams without width are seen.
     scans_exhaustively = False
     aims_lasers = False
+    # Every pixel has samples of its own.
+    pixels_are_independent = True
     # Derivatives warn of moving edges that they do not follow; False if the caller warns, by its keys.
     warns_of_edges = True
 

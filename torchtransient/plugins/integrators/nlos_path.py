@@ -111,6 +111,8 @@ class TransientNLOSPath(base.TransientIntegrator):
     """
 
     walks_through_media = True
+    # All points of a wall share what is sampled of the hidden scene.
+    pixels_are_independent = False
     scans_exhaustively = True
 
     def __init__(self, props: Any) -> None:

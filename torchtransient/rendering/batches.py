@@ -1,0 +1,76 @@
+"""Renders in independent batches of samples, for their error bars."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import torch
+
+from torchtransient.interfaces import RENDER
+from torchtransient.rendering import engine
+from torchtransient.rendering.error_bars import SquaresOfBatches, differences_of, in_cells
+from torchtransient.rendering.job import RenderJob, RunLog, mix_seed
+
+_BATCH = 0xBA7C4
+
+
+def run_in_batches(job: RenderJob, values: Sequence[torch.Tensor]) -> tuple[torch.Tensor, ...]:
+    """Execute a job whose ``errors`` ask for error bars.
+
+    Returns:
+        Steady and response, as :func:`.engine.run`; the differences are added to ``job.errors``.
+    """
+    request = job.errors
+    assert request is not None
+    count = request.batches
+    sizes = [job.spp // count + (b < job.spp % count) for b in range(count)]
+    runs: list[RunLog] = []
+    sums, steady_sums, squares = [], [], SquaresOfBatches()
+    steady = response = torch.zeros(())
+    for b, spp in enumerate(sizes):
+        log: list[RunLog] = []
+        items = tuple(replace(item, seed=mix_seed(item.seed, _BATCH + b)) for item in job.items)
+        part = replace(job, items=items, spp=spp, log=log, progress=_share(job.progress, b, count), errors=None)
+        image, cube = engine.run(part, RENDER, values)
+        runs += log
+        weight = runs[-1].spp
+        mean = request.response_first(cube).detach().mean(-4)
+        squares.add(mean, weight)
+        sums.append(in_cells(mean, request.cells))
+        steady_sums.append(request.steady_first(image).detach().mean(-3))
+        if b == 0:
+            steady, response = image.mul_(weight), cube.mul_(weight)
+        else:
+            steady.add_(image, alpha=weight)
+            response.add_(cube, alpha=weight)
+        del image, cube, mean
+    total = sum(run.spp for run in runs)
+    weights = [run.spp / total for run in runs]
+    job.log.append(joined(job, runs, weights))
+    request.differences.append(differences_of(sums, weights))
+    request.squares.append(in_cells(squares.result(), request.cells))
+    request.steady.append(differences_of(steady_sums, weights))
+    return steady.div_(total), response.div_(total)
+
+
+def joined(job: RenderJob, runs: Sequence[RunLog], weights: Sequence[float]) -> RunLog:
+    """Return the report of a whole call; ``recorded`` is that of the last batch."""
+
+    def energies(name: str) -> tuple[float, ...]:
+        rows = [getattr(run, name) for run in runs]
+        return tuple(sum(w * x for w, x in zip(weights, column, strict=True)) for column in zip(*rows, strict=True))
+
+    return replace(
+        runs[-1],
+        items=job.items,
+        seconds=sum(run.seconds for run in runs),
+        spp=sum(run.spp for run in runs),
+        energy_before=energies("energy_before"),
+        energy_after=energies("energy_after"),
+        energy_total=energies("energy_total"),
+    )
+
+
+def _share(progress: Callable[[float], None] | None, part: int, count: int) -> Callable[[float], None] | None:
+    return None if progress is None else lambda done: progress((part + done) / count)
