@@ -9,7 +9,7 @@ import torch
 
 from torchtransient.interfaces import RENDER
 from torchtransient.rendering import engine
-from torchtransient.rendering.error_bars import SquaresOfBatches, differences_of, in_cells
+from torchtransient.rendering.error_bars import RunningMean, differences_of, in_cells
 from torchtransient.rendering.job import RenderJob, RunLog, mix_seed
 
 _BATCH = 0xBA7C4
@@ -26,7 +26,7 @@ def run_in_batches(job: RenderJob, values: Sequence[torch.Tensor]) -> tuple[torc
     count = request.batches
     sizes = [job.spp // count + (b < job.spp % count) for b in range(count)]
     runs: list[RunLog] = []
-    sums, steady_sums, squares = [], [], SquaresOfBatches()
+    sums, steady_sums, numbers, running = [], [], [], RunningMean()
     steady = response = torch.zeros(())
     for b, spp in enumerate(sizes):
         log: list[RunLog] = []
@@ -34,24 +34,19 @@ def run_in_batches(job: RenderJob, values: Sequence[torch.Tensor]) -> tuple[torc
         part = replace(job, items=items, spp=spp, log=log, progress=_share(job.progress, b, count), errors=None)
         image, cube = engine.run(part, RENDER, values)
         runs += log
-        weight = runs[-1].spp
+        numbers.append(runs[-1].spp)
         mean = request.response_first(cube).detach().mean(-4)
-        squares.add(mean, weight)
+        running.add(mean, numbers[-1])
         sums.append(in_cells(mean, request.cells))
         steady_sums.append(request.steady_first(image).detach().mean(-3))
-        if b == 0:
-            steady, response = image.mul_(weight), cube.mul_(weight)
-        else:
-            steady.add_(image, alpha=weight)
-            response.add_(cube, alpha=weight)
+        share = numbers[-1] / sum(numbers)
+        steady, response = (image, cube) if b == 0 else (steady.lerp_(image, share), response.lerp_(cube, share))
         del image, cube, mean
-    total = sum(run.spp for run in runs)
-    weights = [run.spp / total for run in runs]
-    job.log.append(joined(job, runs, weights))
-    request.differences.append(differences_of(sums, weights))
-    request.squares.append(in_cells(squares.result(), request.cells))
-    request.steady.append(differences_of(steady_sums, weights))
-    return steady.div_(total), response.div_(total)
+    job.log.append(joined(job, runs, [n / sum(numbers) for n in numbers]))
+    request.differences.append(differences_of(sums, numbers))
+    request.squares.append(in_cells(running.squared_error(), request.cells))
+    request.steady.append(differences_of(steady_sums, numbers))
+    return steady, response
 
 
 def joined(job: RenderJob, runs: Sequence[RunLog], weights: Sequence[float]) -> RunLog:

@@ -1,11 +1,11 @@
 """Error bars of renders: the samples of a call in batches with seeds of their own, and what the batches differ by.
 
-With means ``m_b`` of ``n_b`` samples and weights ``w_b = n_b / N`` the render is ``x = sum_b w_b m_b``, and
+With means ``m_b`` of ``n_b`` of ``N`` samples in ``K`` batches, the render is ``x = sum_b n_b m_b / N``, and
 
-    d_b = w_b (m_b - x) / sqrt(1 - sum_b w_b^2),    E sum_b <A, d_b>^2 = Var <A, x>
+    d_b = sqrt(n_b / ((K - 1) N)) (m_b - x),    E sum_b <A, d_b>^2 = Var <A, x>
 
 for every linear functional ``A``, whatever sampler each batch has, since the batches are independent. Two batches
-differ by one number, ``sqrt(w_1 w_2) (m_1 - m_2)``. Pixels are independent of each other, so that their squares are
+differ by one number, ``sqrt(n_1 n_2) / N (m_1 - m_2)``. Pixels are independent of each other, so that their squares are
 added up, one degree of freedom each; where pixels share light, the functional as a whole is squared.
 """
 
@@ -76,39 +76,52 @@ def in_cells(values: torch.Tensor, cells: ErrorCells) -> torch.Tensor:
     Returns:
         (..., ceil(T / bins), ceil(H / rows), ceil(W / columns)).
     """
-    for dim, size in ((-3, cells.bins), (-2, cells.rows), (-1, cells.columns)):
-        values = _sum_of_runs(values, dim, size)
-    return values.contiguous()
+    size = (cells.bins, cells.rows, cells.columns)
+    if size == (1, 1, 1):
+        return values
+    if values.is_complex():
+        return torch.complex(in_cells(values.real, cells), in_cells(values.imag, cells))
+    flat = values.reshape(-1, *values.shape[-3:])
+    found = torch.nn.functional.avg_pool3d(flat, size, ceil_mode=True, divisor_override=1)
+    return found.reshape(*values.shape[:-3], *found.shape[-3:])
 
 
-class SquaresOfBatches:
-    """Sum over batches of the squared differences, bin by bin, of batches that come one after the other."""
+class RunningMean:
+    """Mean of batches that come one after the other, and the square of its error (Welford)."""
 
     def __init__(self) -> None:
-        self._first: torch.Tensor | None = None
-        self._sums: list[torch.Tensor] = []
+        self.number, self.batches = 0, 0
+        self.mean = self._squares = torch.zeros(())
 
-    def add(self, mean: torch.Tensor, weight: float) -> None:
-        """Add the mean of a batch, which counts with ``weight``. Deviations from the first one keep their digits."""
-        if self._first is None:
-            self._first, self._sums = mean, [torch.zeros_like(mean) for _ in range(3)]
-            self._sums[2] = self._sums[2].real.clone() if mean.is_complex() else self._sums[2]
-            self._weights = [weight]
+    def add(self, mean: torch.Tensor, number: int) -> None:
+        """Add the mean of a batch of ``number`` samples."""
+        self.number, self.batches = self.number + number, self.batches + 1
+        if self.batches == 1:
+            self.mean, self._squares = mean.clone(), torch.zeros(())
             return
-        off = mean - self._first
-        for total, term in zip(self._sums, (off * weight, off * weight**2, (off.abs() * weight).square()), strict=True):
-            total += term
-        self._weights.append(weight)
+        off = mean - self.mean
+        self.mean += off * (number / self.number)
+        square = (off.abs() if off.is_complex() else off).square().mul_(number * (1 - number / self.number))
+        self._squares = square if self.batches == 2 else self._squares.add_(square)
 
-    def result(self) -> torch.Tensor:
-        """Return ``sum_b |d_b|^2``."""
-        whole = sum(self._weights)
-        squares = sum(w * w for w in self._weights)
-        linear, by_square, square = self._sums
-        mean = linear / whole
-        cross = (mean.conj() * by_square).real if mean.is_complex() else mean * by_square
-        total = square - 2 * cross + mean.abs().square() * squares
-        return (total / (whole**2 - squares)).clamp(min=0)
+    def squared_error(self) -> torch.Tensor:
+        """Return the estimate of the variance of the mean, of two batches and more."""
+        return self._squares / ((self.batches - 1) * self.number)
+
+
+def differences_of(sums: Sequence[torch.Tensor], numbers: Sequence[int]) -> torch.Tensor:
+    """Return the differences ``d_b`` between means of batches, (R, ...).
+
+    Args:
+        sums: mean of each batch.
+        numbers: its samples.
+    """
+    total = sum(numbers)
+    if len(sums) == 2:
+        return (math.sqrt(numbers[0] * numbers[1]) / total * (sums[0] - sums[1]))[None]
+    mean = sum(n / total * part for n, part in zip(numbers, sums, strict=True))
+    scale = 1 / ((len(sums) - 1) * total)
+    return torch.stack([(part - mean) * math.sqrt(n * scale) for n, part in zip(numbers, sums, strict=True)])
 
 
 def cell_weights(weights: torch.Tensor, cells: ErrorCells) -> torch.Tensor:
@@ -122,10 +135,9 @@ def cell_weights(weights: torch.Tensor, cells: ErrorCells) -> torch.Tensor:
     Returns:
         (..., ceil(T / bins), H, W).
     """
-    length = weights.shape[-3]
-    sizes = _sizes(length, cells.bins, weights)[:, None, None]
-    mean = _sum_of_runs(weights, -3, cells.bins) / sizes
-    square = _sum_of_runs(weights.square(), -3, cells.bins) / sizes
+    along = ErrorCells(cells.bins, 1, 1, cells.shared)
+    sizes = _sizes(weights.shape[-3], cells.bins, weights)[:, None, None]
+    mean, square = in_cells(weights, along) / sizes, in_cells(weights.square(), along) / sizes
     return torch.where(mean < 0, -square.sqrt(), square.sqrt())
 
 
@@ -175,32 +187,9 @@ def local_errors(squares: torch.Tensor, cells: ErrorCells, shape: Sequence[int])
     return mean.sqrt()
 
 
-def differences_of(parts: Sequence[torch.Tensor], weights: Sequence[float]) -> torch.Tensor:
-    """Return the differences ``d_b`` between the means of batches, (R, ...)."""
-    if len(parts) == 2:
-        return (math.sqrt(weights[0] * weights[1]) * (parts[0] - parts[1]))[None]
-    mean = sum(w * part for w, part in zip(weights, parts, strict=True))
-    scale = math.sqrt(1 - sum(w * w for w in weights))
-    return torch.stack([(part - mean) * (w / scale) for w, part in zip(weights, parts, strict=True)])
-
-
 def _sizes(length: int, size: int, like: torch.Tensor) -> torch.Tensor:
     """Return the number of entries of each cell along a dimension."""
     real = like.real if like.is_complex() else like
     sizes = torch.full((-(-length // size),), float(size), dtype=real.dtype, device=real.device)
     sizes[-1] = length - size * (len(sizes) - 1)
     return sizes
-
-
-def _sum_of_runs(tensor: torch.Tensor, dim: int, size: int) -> torch.Tensor:
-    """Sum ``size`` entries in a row along a dimension; the last run may be shorter."""
-    if size == 1:
-        return tensor
-    length = tensor.shape[dim]
-    missing = -length % size
-    if missing:
-        padding = [0] * (2 * -dim)
-        padding[-1] = missing
-        tensor = torch.nn.functional.pad(tensor, padding)
-    where = tensor.ndim + dim
-    return tensor.reshape(*tensor.shape[:where], -1, size, *tensor.shape[where + 1 :]).sum(dim)
