@@ -35,10 +35,10 @@ def run_in_batches(job: RenderJob, values: Sequence[torch.Tensor]) -> tuple[torc
         image, cube = engine.run(part, RENDER, values)
         runs += log
         numbers.append(runs[-1].spp)
-        mean = request.response_first(cube).detach().mean(-4)
-        running.add(mean, numbers[-1])
+        mean = request.mean_of(cube, 3, request.is_complex)
         sums.append(in_cells(mean, request.cells))
-        steady_sums.append(request.steady_first(image).detach().mean(-3))
+        running.add(mean, numbers[-1], last=b == count - 1)
+        steady_sums.append(request.mean_of(image, 2))
         share = numbers[-1] / sum(numbers)
         steady, response = (image, cube) if b == 0 else (steady.lerp_(image, share), response.lerp_(cube, share))
         del image, cube, mean

@@ -12,7 +12,7 @@ added up, one degree of freedom each; where pixels share light, the functional a
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -45,17 +45,18 @@ class BatchErrors:
 
     Args:
         cells: layout of the differences.
-        response_first, steady_first: put the film's arrays (items, ...) in the order of torch.
+        components: Stokes components of the film's channels.
+        is_complex: the film's array has real and imaginary parts in turn.
 
     Attributes:
-        differences: for each run of the job (R, items, [4,] T, H, W), summed over cells; R is 1 for two batches.
-        squares: likewise (items, [4,] T, H, W), their squares, summed over R and cells.
+        differences: for each run of the job (R, items, [4,] H, W, T), summed over cells; R is 1 for two batches.
+        squares: likewise (items, [4,] H, W, T), their squares, summed over R and cells.
         steady: likewise (R, items, [4,] H, W), pixel by pixel.
     """
 
     cells: ErrorCells
-    response_first: Callable[[torch.Tensor], torch.Tensor]
-    steady_first: Callable[[torch.Tensor], torch.Tensor]
+    components: int
+    is_complex: bool
     differences: list[torch.Tensor] = field(default_factory=list)
     squares: list[torch.Tensor] = field(default_factory=list)
     steady: list[torch.Tensor] = field(default_factory=list)
@@ -65,20 +66,56 @@ class BatchErrors:
         """Number of batches."""
         return BATCHES_OF_SHARED_LIGHT if self.cells.shared else BATCHES
 
+    def mean_of(self, array: torch.Tensor, dims: int, is_complex: bool = False) -> torch.Tensor:
+        """Return the mean over channels.
+
+        Args:
+            array: (H, W, ..., channels) of ``dims + 1`` dimensions, with or without one of items.
+            dims: number of dimensions of a film without channels.
+            is_complex: as in :func:`channel_mean`.
+
+        Returns:
+            (items, [4,] H, W, ...).
+        """
+        mean = channel_mean(array.reshape(-1, *array.shape[-dims - 1 :]), self.components, is_complex)
+        return mean if self.components == 1 else mean.movedim(-1, 1)
+
+
+def channel_mean(array: torch.Tensor, components: int, is_complex: bool = False) -> torch.Tensor:
+    """Return the mean over the channels of a film's array, in its own order of dimensions.
+
+    Args:
+        array: (..., channels), of Stokes components one after the other; real and imaginary parts in turn if
+            ``is_complex``.
+        components: number of Stokes components.
+        is_complex: return complex numbers.
+
+    Returns:
+        (..., [4]).
+    """
+    parts = 2 if is_complex else 1
+    channels = array.shape[-1] // (components * parts)
+    # A product is several times faster than `mean` over a dimension of three entries.
+    matrix = torch.eye(components * parts).reshape(components, 1, parts, -1).expand(-1, channels, -1, -1) / channels
+    mean = array.detach() @ matrix.reshape(array.shape[-1], -1).to(array)
+    if is_complex:
+        mean = torch.view_as_complex(mean.reshape(*mean.shape[:-1], components, 2))
+    return mean.squeeze(-1) if components == 1 else mean
+
 
 def in_cells(values: torch.Tensor, cells: ErrorCells) -> torch.Tensor:
     """Sum over cells.
 
     Args:
-        values: (..., T, H, W).
+        values: (..., H, W, T).
         cells: layout; those at the ends of a dimension may hold fewer entries.
 
     Returns:
-        (..., ceil(T / bins), ceil(H / rows), ceil(W / columns)).
+        (..., ceil(H / rows), ceil(W / columns), ceil(T / bins)), memory of its own.
     """
-    size = (cells.bins, cells.rows, cells.columns)
+    size = (cells.rows, cells.columns, cells.bins)
     if size == (1, 1, 1):
-        return values
+        return values.clone()
     if values.is_complex():
         return torch.complex(in_cells(values.real, cells), in_cells(values.imag, cells))
     flat = values.reshape(-1, *values.shape[-3:])
@@ -93,20 +130,21 @@ class RunningMean:
         self.number, self.batches = 0, 0
         self.mean = self._squares = torch.zeros(())
 
-    def add(self, mean: torch.Tensor, number: int) -> None:
-        """Add the mean of a batch of ``number`` samples."""
+    def add(self, mean: torch.Tensor, number: int, *, last: bool) -> None:
+        """Add the mean of a batch of ``number`` samples, which may be changed; ``last``: none follows."""
         self.number, self.batches = self.number + number, self.batches + 1
         if self.batches == 1:
-            self.mean, self._squares = mean.clone(), torch.zeros(())
+            self.mean = mean
             return
-        off = mean - self.mean
-        self.mean += off * (number / self.number)
-        square = (off.abs() if off.is_complex() else off).square().mul_(number * (1 - number / self.number))
+        off = mean.sub_(self.mean)
+        if not last:
+            self.mean.add_(off, alpha=number / self.number)
+        square = (off.abs() if off.is_complex() else off).square_().mul_(number * (1 - number / self.number))
         self._squares = square if self.batches == 2 else self._squares.add_(square)
 
     def squared_error(self) -> torch.Tensor:
         """Return the estimate of the variance of the mean, of two batches and more."""
-        return self._squares / ((self.batches - 1) * self.number)
+        return self._squares.div_((self.batches - 1) * self.number)
 
 
 def differences_of(sums: Sequence[torch.Tensor], numbers: Sequence[int]) -> torch.Tensor:
@@ -130,13 +168,13 @@ def cell_weights(weights: torch.Tensor, cells: ErrorCells) -> torch.Tensor:
     Within a cell, bins are taken as independent: one that is covered in part counts with the root of its mean square.
 
     Args:
-        weights: (..., T, H, W).
+        weights: (..., H, W, T).
 
     Returns:
-        (..., ceil(T / bins), H, W).
+        (..., H, W, ceil(T / bins)).
     """
     along = ErrorCells(cells.bins, 1, 1, cells.shared)
-    sizes = _sizes(weights.shape[-3], cells.bins, weights)[:, None, None]
+    sizes = _sizes(weights.shape[-1], cells.bins, weights)
     mean, square = in_cells(weights, along) / sizes, in_cells(weights.square(), along) / sizes
     return torch.where(mean < 0, -square.sqrt(), square.sqrt())
 
@@ -152,12 +190,13 @@ def variance(differences: torch.Tensor, weights: torch.Tensor, cells: ErrorCells
     Returns:
         (...).
     """
-    along = cell_weights(weights, cells)
-    height, width = along.shape[-2:]
-    spread = differences.repeat_interleave(cells.rows, -3)[..., :height, :, :]
-    spread = spread.repeat_interleave(cells.columns, -2)[..., :width, :]
+    along = cell_weights(weights.movedim(-3, -1), cells)
+    height, width = along.shape[-3:-1]
+    spread = differences.movedim(-4, -1)  # (..., H', W', R, T')
+    spread = spread.repeat_interleave(cells.rows, -4)[..., :height, :, :, :]
+    spread = spread.repeat_interleave(cells.columns, -3)[..., :width, :, :]
     # Of each pixel the sum over time, as if all pixels of its cell had the weights of this one.
-    sums = (spread * along[..., None]).sum(-4)
+    sums = (spread * along[..., None, :]).sum(-1)
     number = _sizes(height, cells.rows, along).repeat_interleave(cells.rows)[:height, None]
     number = number * _sizes(width, cells.columns, along).repeat_interleave(cells.columns)[:width]
     if cells.shared:

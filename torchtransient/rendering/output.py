@@ -230,8 +230,8 @@ class RenderOutput(TensorRecord):
                 "errors: expected a call outside of torch.func.vmap, which takes the batches of samples apart. Give "
                 "the values a batch dimension instead."
             )
-        measured, steady = (x[0].movedim(0, -1) for x in (request.differences, request.steady))
-        squares = request.squares[0]
+        measured = request.differences[0].movedim(-1, -3).movedim(0, -1)
+        squares, steady = request.squares[0].movedim(-1, -3), request.steady[0].movedim(0, -1)
         return replace(
             self,
             differences=measured.reshape(*leading, *measured.shape[1:]),

@@ -452,12 +452,8 @@ class TransientRenderer(CopiesParametrized):
             integrator = self.scene.built(self._options).scene.integrator()
         shared = not getattr(integrator, "pixels_are_independent", False)
         bins, pixels = (CELL_BINS if self.film.has_bins else 1, CELL_PIXELS) if errors is True else (1, 1)
-        components = stokes_components(self.scene.variant)
-        return BatchErrors(
-            ErrorCells(bins, pixels, pixels, shared),
-            lambda cube: self.film.channels_first(cube, (-1,), components),
-            lambda steady: steady_channels_first(steady, (-1,), components),
-        )
+        cells = ErrorCells(bins, pixels, pixels, shared)
+        return BatchErrors(cells, stokes_components(self.scene.variant), self.film.is_complex)
 
     def _collect(self, values: Mapping[str, Any] | None) -> tuple[list[torch.Tensor], list[bool], int | None]:
         """Return the tensors of a call in the order of the keys, which of them are batched, and the batch size."""
