@@ -28,6 +28,7 @@ from torchtransient.capture.metadata import metadata_text
 from torchtransient.errors import ArgumentError, StorageError
 from torchtransient.files.entries import names_of, notes_of, number_of, text_of, whole_of
 from torchtransient.gates import Gate
+from torchtransient.rendering.error_bars import ErrorBars, ErrorCells
 from torchtransient.rendering.films import FILMS, layout_of_entries, layout_of_output
 from torchtransient.rendering.output import RenderOutput, named_fields
 from torchtransient.tensor_record import TensorRecord
@@ -37,11 +38,13 @@ FORMAT = "torchtransient result 2"
 FORMATS = ("torchtransient result 1", FORMAT)
 _WHAT = "result file"
 _READ = {"start_opl": number_of, "bin_width_opl": number_of, "num_bins": whole_of, "gates": text_of}
+_OF_ERRORS = ("differences", "squares", "steady_differences")
 _KNOWN = {"format", "metadata", "channels", "steady", "edges_opl", "frequencies_per_metre", *_READ}
+_KNOWN |= {"cells", *_OF_ERRORS}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Result(TensorRecord):
+class Result(ErrorBars, TensorRecord):
     """What `read_result` returns: the tensors of a render, its axis, and what was noted about its making.
 
     `transient` with `axis`, `phasor` with `frequencies` or `gated` with `gates`; the others are None. `others`: tensors
@@ -61,6 +64,10 @@ class Result(TensorRecord):
     gates: tuple[Gate, ...] | None = None
     gated: torch.Tensor | None = None
     others: Mapping[str, Any] = field(default_factory=dict)
+    differences: torch.Tensor | None = None
+    squares: torch.Tensor | None = None
+    steady_differences: torch.Tensor | None = None
+    cells: ErrorCells | None = None
 
     @classmethod
     def merged_notes(cls, records: Sequence[Result]) -> dict[str, Any]:
@@ -111,6 +118,9 @@ def write_result(path: str | Path, output: RenderOutput | Result, metadata: Mapp
         film.measures: array_of(tensor, _WHAT),
         **{name: value for name, value in settings.items() if name not in values},
     }
+    if output.cells is not None:
+        entries["cells"] = json.dumps(output.cells)
+        arrays |= {name: array_of(getattr(output, name), _WHAT) for name in _OF_ERRORS}
     write_arrays(target, arrays, entries, _WHAT)
     return target
 
@@ -157,4 +167,9 @@ def _result(values: Mapping[str, Any], source: Path) -> Result:
         raise ValueError(f"steady is of shape {tuple(steady.shape)}, {film.measures} of {tuple(response.shape)}")
     if channels and len(channels) != steady.shape[-3]:
         raise ValueError(f"{len(channels)} names of channels, {steady.shape[-3]} channels")
-    return Result(steady=steady, metadata=metadata, channels=channels, **named_fields(film, response))
+    errors: dict[str, Any] = {}
+    if "cells" in values:
+        bins, rows, columns, shared = json.loads(text_of(values, "cells"))
+        errors = {name: tensor_in(values[name]) for name in _OF_ERRORS}
+        errors["cells"] = ErrorCells(int(bins), int(rows), int(columns), bool(shared))
+    return Result(steady=steady, metadata=metadata, channels=channels, **errors, **named_fields(film, response))

@@ -14,9 +14,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
+
+from torchtransient.errors import ArgumentError, ShapeError
+from torchtransient.rendering.films import layout_of_output
 
 # Independent batches of a call: two keep most of the stratification of samplers such as `owen`, and pixels add up to
 # many degrees of freedom. Where pixels share light there are none but those of the batches.
@@ -219,8 +222,10 @@ def local_errors(squares: torch.Tensor, cells: ErrorCells, shape: Sequence[int])
     t, h, w = (_sizes(length, size, squares) for length, size in lengths)
     mean = squares / (t[:, None, None] * h[:, None] * w)
     if cells.rows == 1:
-        flat = mean.reshape(-1, 1, *mean.shape[-3:])
-        mean = torch.nn.functional.avg_pool3d(flat, 3, stride=1, padding=1, count_include_pad=False).reshape(mean.shape)
+        flat, kernel = mean.reshape(-1, 1, *mean.shape[-3:]), [3 if length >= 3 else 1 for length in shape]
+        padding = [size // 2 for size in kernel]
+        near = torch.nn.functional.avg_pool3d(flat, kernel, stride=1, padding=padding, count_include_pad=False)
+        mean = near.reshape(mean.shape)
     for dim, length, size in zip((-3, -2, -1), shape, (cells.bins, cells.rows, cells.columns), strict=True):
         mean = mean.repeat_interleave(size, dim).narrow(dim, 0, length)
     return mean.sqrt()
@@ -232,3 +237,86 @@ def _sizes(length: int, size: int, like: torch.Tensor) -> torch.Tensor:
     sizes = torch.full((-(-length // size),), float(size), dtype=real.dtype, device=real.device)
     sizes[-1] = length - size * (len(sizes) - 1)
     return sizes
+
+
+class ErrorBars:
+    """Error bars of a result with ``differences``, ``squares``, ``steady_differences`` and ``cells``."""
+
+    steady: torch.Tensor
+    differences: torch.Tensor | None
+    squares: torch.Tensor | None
+    steady_differences: torch.Tensor | None
+    cells: ErrorCells | None
+
+    def standard_error(self, weights: Any = None, *, steady: bool = False) -> torch.Tensor:
+        """Return the standard error of a weighted sum of what was measured, mean over channels.
+
+        That of one pixel rests on one number, and is as uncertain; sums over some ten pixels and more are known to some
+        20 %. See ``docs/accuracy.md``.
+
+        Args:
+            weights: real numbers or truth values that broadcast to (T, H, W) ((F, H, W) of phasors, (G, H, W) of
+                gates), behind dimensions of Stokes components and items; None for ones. (H, W) with ``steady``.
+            steady: of the steady image.
+
+        Returns:
+            (...), without the last three dimensions (two with ``steady``).
+
+        Raises:
+            ArgumentError: for a render without ``errors=``.
+            ShapeError: for weights of another shape.
+        """
+        differences, shape, cells = self._error_layout(steady)
+        given = torch.ones((), device=differences.device) if weights is None else torch.as_tensor(weights)
+        real = differences.real if differences.is_complex() else differences
+        try:
+            given = given.to(real).broadcast_to(*differences.shape[:-4], *shape)
+        except RuntimeError as error:
+            raise ShapeError(
+                f"standard_error: expected weights that broadcast to {(*differences.shape[:-4], *shape)}, got "
+                f"{tuple(given.shape)}."
+            ) from error
+        return variance(differences, given, cells).sqrt()
+
+    def error_map(self, *, steady: bool = False) -> torch.Tensor:
+        """Return the standard error of every bin, (..., T, H, W), (..., H, W) with ``steady``.
+
+        It is that of its neighbourhood, the cell of 4 x 4 pixels x 8 bins, or 3 x 3 x 3 bins with ``errors="bins"``:
+        single dark bins have seen too few events to know their own.
+
+        Raises:
+            ArgumentError: for a render without ``errors=``.
+        """
+        differences, shape, cells = self._error_layout(steady)
+        squares = differences.abs().square().sum(-1) if steady or self.squares is None else self.squares
+        found = local_errors(squares, cells, shape)
+        return found.squeeze(-3) if steady else found
+
+    def relative_error(self) -> float | None:
+        """Return the largest relative standard error of the sum over all that was measured; None without light.
+
+        Raises:
+            ArgumentError: for a render without ``errors=``.
+        """
+        error = self.standard_error()
+        tensor = self._measured()
+        assert tensor is not None
+        total = tensor.mean(-4).sum((-3, -2, -1)).abs()
+        found = (error / total)[total > 0]
+        return float(found.max()) if found.numel() else None
+
+    def _measured(self) -> torch.Tensor | None:
+        layout = layout_of_output(self)
+        return None if layout is None else layout.tensor(self)
+
+    def _error_layout(self, steady: bool) -> tuple[torch.Tensor, tuple[int, ...], ErrorCells]:
+        """Return (differences (..., T', H', W', R), (T, H, W), cells); one bin of time with ``steady``."""
+        if self.differences is None or self.steady_differences is None or self.cells is None:
+            raise ArgumentError("standard_error: expected a render with errors=True or errors='bins', got one without.")
+        if steady:
+            image = self.steady_differences
+            return image.unsqueeze(-4), (1, *image.shape[-3:-1]), ErrorCells(1, 1, 1, self.cells.shared)
+        tensor = self._measured()
+        if tensor is None:
+            raise ArgumentError("standard_error: expected what the film measured, got a steady image alone.")
+        return self.differences, tuple(tensor.shape[-3:]), self.cells

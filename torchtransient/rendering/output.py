@@ -11,8 +11,8 @@ import torch
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import ArgumentError, ShapeError
 from torchtransient.gates import Gate
-from torchtransient.rendering.error_bars import BatchErrors, ErrorCells, local_errors, variance
-from torchtransient.rendering.films import FilmLayout, layout_of_output
+from torchtransient.rendering.error_bars import BatchErrors, ErrorBars, ErrorCells
+from torchtransient.rendering.films import FilmLayout
 from torchtransient.scene.variant import stokes_components
 from torchtransient.tensor_record import TensorRecord
 
@@ -116,7 +116,7 @@ _OF_FILMS = ("transient", "phasor", "gated", "axis", "frequencies", "gates")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class RenderOutput(TensorRecord):
+class RenderOutput(ErrorBars, TensorRecord):
     """A rendered scene.
 
     ``steady``: float32 (C, H, W). Beside it, what the film measures, and None for what it does not:
@@ -172,52 +172,6 @@ class RenderOutput(TensorRecord):
         before, after, total = map(sum, (self.stats.energy_before, self.stats.energy_after, self.stats.energy_total))
         return (before / total, after / total) if total > 0 and before + after > 0 else (0.0, 0.0)
 
-    # ---------------------------------------------------------------------------------------------------- error bars
-
-    def standard_error(self, weights: Any = None, *, steady: bool = False) -> torch.Tensor:
-        """Return the standard error of a weighted sum of what was measured, mean over channels.
-
-        That of one pixel rests on one number, and is as uncertain; sums over some ten pixels and more are known to some
-        20 %. See ``docs/accuracy.md``.
-
-        Args:
-            weights: real numbers or truth values that broadcast to (T, H, W) ((F, H, W) of phasors, (G, H, W) of
-                gates), behind dimensions of Stokes components and items; None for ones. (H, W) with ``steady``.
-            steady: of the steady image.
-
-        Returns:
-            (...), without the last three dimensions (two with ``steady``).
-
-        Raises:
-            ArgumentError: for a render without ``errors=``.
-            ShapeError: for weights of another shape.
-        """
-        differences, shape, cells = self._error_layout(steady)
-        given = torch.ones((), device=differences.device) if weights is None else torch.as_tensor(weights)
-        real = differences.real if differences.is_complex() else differences
-        try:
-            given = given.to(real).broadcast_to(*differences.shape[:-4], *shape)
-        except RuntimeError as error:
-            raise ShapeError(
-                f"standard_error: expected weights that broadcast to {(*differences.shape[:-4], *shape)}, got "
-                f"{tuple(given.shape)}."
-            ) from error
-        return variance(differences, given, cells).sqrt()
-
-    def error_map(self, *, steady: bool = False) -> torch.Tensor:
-        """Return the standard error of every bin, (..., T, H, W), (..., H, W) with ``steady``.
-
-        It is that of its neighbourhood, the cell of 4 x 4 pixels x 8 bins, or 3 x 3 x 3 bins with ``errors="bins"``:
-        single dark bins have seen too few events to know their own.
-
-        Raises:
-            ArgumentError: for a render without ``errors=``.
-        """
-        differences, shape, cells = self._error_layout(steady)
-        squares = differences.abs().square().sum(-1) if steady or self.squares is None else self.squares
-        found = local_errors(squares, cells, shape)
-        return found.squeeze(-3) if steady else found
-
     def with_differences(self, request: BatchErrors, leading: tuple[int, ...]) -> RenderOutput:
         """Return the output with what its batches differ by.
 
@@ -240,19 +194,6 @@ class RenderOutput(TensorRecord):
             cells=request.cells,
         )
 
-    def _error_layout(self, steady: bool) -> tuple[torch.Tensor, tuple[int, ...], ErrorCells]:
-        """Return (differences (..., T', H', W', R), (T, H, W), cells); one bin of time with ``steady``."""
-        if self.differences is None or self.steady_differences is None or self.cells is None:
-            raise ArgumentError("standard_error: expected a render with errors=True or errors='bins', got one without.")
-        if steady:
-            image = self.steady_differences
-            return image.unsqueeze(-4), (1, *image.shape[-3:-1]), ErrorCells(1, 1, 1, self.cells.shared)
-        layout = layout_of_output(self)
-        tensor = None if layout is None else layout.tensor(self)
-        if tensor is None:
-            raise ArgumentError("standard_error: expected what the film measured, got a steady image alone.")
-        return self.differences, tuple(tensor.shape[-3:]), self.cells
-
     @classmethod
     def merged_notes(cls, records: Sequence[RenderOutput]) -> dict[str, Any]:
         return {"stats": RenderStats.of_batch([record.stats for record in records])}
@@ -263,6 +204,8 @@ class RenderOutput(TensorRecord):
         made = f"{stats.spp} spp in {stats.seconds:.3g} s, {stats.integrator}, {stats.variant}, {seeds}"
         outside = sum(self.outside)
         made += f", {outside:.2%} of the light outside of the window" if outside else ""
+        if self.cells is not None and (found := self.relative_error()) is not None:
+            made += f", sum known to {found:.2g}"
         if stats.light_beyond is not None:
             made += f", max_depth {stats.max_depth} with {stats.light_beyond:.2g} of the light beyond"
         return {"stats": made}

@@ -107,18 +107,28 @@ def plot_overview(
     path: str | Path,
     pixel: tuple[int, int] | None = None,
     title: str = "",
+    errors: Tensor | None = None,
 ) -> Overview:
     """Write a picture (PNG, or what the ending says) of a render and return what it shows.
 
     `transient` (C, T, H, W) and `steady` (C, H, W), C = 1 or 3 in linear sRGB. `pixel` (row, column) defaults to the
-    `median_pixel`. Each image has its own exposure. Raises ShapeError for other shapes or a pixel outside, and
-    StorageError when the file cannot be written. Needs matplotlib (extra `vis`).
+    `median_pixel`. Each image has its own exposure. `errors` (T, H, W), the `error_map` of a render with `errors=`: a
+    band of two standard errors around the mean over channels in the histogram of the pixel.
+
+    Raises ShapeError for other shapes or a pixel outside, and StorageError when the file cannot be written. Needs
+    matplotlib (extra `vis`).
     """
     transient, steady = _on_axis(transient, axis, "plot_overview"), real_tensor(steady, "plot_overview: steady")
     height, width = transient.shape[-2:]
     if tuple(steady.shape) != (transient.shape[0], height, width):
         expected = (transient.shape[0], height, width)
         raise ShapeError(f"plot_overview: expected steady of shape {expected}, got {tuple(steady.shape)}.")
+    if errors is not None:
+        errors = real_tensor(errors, "plot_overview: errors")
+        if errors.shape != transient.shape[1:]:
+            raise ShapeError(
+                f"plot_overview: expected errors of shape {tuple(transient.shape[1:])}, got {tuple(errors.shape)}."
+            )
     row, column = pixel_of(median_pixel(steady) if pixel is None else pixel, (height, width), "plot_overview")
     shown = Overview(tuple(moments_of_arrival(transient)), (row, column))
     figure = figure_type()(figsize=(12.0, 7.4), layout="constrained")
@@ -126,7 +136,7 @@ def plot_overview(
     panels = upper.subplots(1, 3)
     _draw_steady(panels[0], steady, shown.pixel)
     _draw_peak_time(upper, panels[1], transient, axis)
-    _draw_histogram(panels[2], transient, axis, shown.pixel)
+    _draw_histogram(panels[2], transient, axis, shown.pixel, errors)
     for panel, index in zip(lower.subplots(1, 3), shown.frames, strict=True):
         panel.imshow(tone_map(transient[:, index].cpu()).numpy(), interpolation="nearest")
         opl, time_s = float(axis.centers_opl[index]), float(axis.centers_s[index])
@@ -165,8 +175,15 @@ def _draw_peak_time(figure: Any, panel: Any, transient: Tensor, axis: TimeAxis) 
     panel.set_axis_off()
 
 
-def _draw_histogram(panel: Any, transient: Tensor, axis: TimeAxis, pixel: tuple[int, int]) -> None:
+def _draw_histogram(
+    panel: Any, transient: Tensor, axis: TimeAxis, pixel: tuple[int, int], errors: Tensor | None
+) -> None:
     values = transient[:, :, pixel[0], pixel[1]].detach().cpu().numpy()
+    if errors is not None:
+        band, mean = 2 * errors[:, pixel[0], pixel[1]].detach().cpu().numpy(), values.mean(0)
+        edges = axis.edges_opl.numpy()
+        panel.stairs(mean + band, edges, baseline=mean - band, fill=True, color="0.8", label="mean, 2 standard errors")
+        panel.legend(fontsize=8, frameon=False)
     colours = ("tab:red", "tab:green", "tab:blue") if len(values) == 3 else ("black",)
     for curve, colour in zip(values, colours, strict=True):
         panel.stairs(curve, axis.edges_opl.numpy(), color=colour, linewidth=1.0)

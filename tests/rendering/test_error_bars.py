@@ -1,0 +1,206 @@
+"""Standard errors of renders: calibrated for sums, whatever sampler, film and variant; kept with the output."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+import torchtransient as tt
+from torchtransient.errors import ArgumentError, ShapeError
+
+BINS = 40
+
+
+def room(variant="llvm_ad_rgb", resolution=8):
+    return tt.load(tt.scenes.cornell_box(resolution=resolution, num_bins=BINS, bin_width_opl=0.225), variant=variant)
+
+
+def ratio(renderer, weights, truth, runs, spp, errors=True):
+    """Mean squared residual of sums over the mean estimate of their variance, row by row of ``weights``."""
+    residual, estimate = np.zeros(len(weights)), np.zeros(len(weights))
+    with torch.no_grad():
+        for seed in range(runs):
+            out = renderer(seed=seed, spp=spp, errors=errors)
+            x = measured(out)
+            for i, w in enumerate(weights):
+                residual[i] += float(((x * w).sum() - truth[i]).abs() ** 2)
+                estimate[i] += float(out.standard_error(w) ** 2)
+    return residual / estimate
+
+
+def measured(out):
+    """Mean over channels."""
+    x = next(y for y in (out.transient, out.phasor, out.gated) if y is not None)
+    return x.mean(-4)
+
+
+def regions(bins=BINS, size=8):
+    """Everything, the second half of the time, twelve bins of a quarter of the picture, a cosine over time."""
+    t, y = torch.arange(bins), torch.arange(size)
+    everything = torch.ones(bins, size, size)
+    return [
+        everything,
+        everything * (t >= bins // 2)[:, None, None],
+        everything * ((t >= 11) & (t < 23))[:, None, None] * (y < 4)[:, None] * (y < 4),
+        everything * torch.cos(2 * torch.pi * t / bins)[:, None, None],
+    ]
+
+
+# A ratio of n squares of normal numbers deviates by sqrt(2 / n) from 1: .22 for 40 runs. Four times that.
+@pytest.mark.parametrize("sampler", ["owen", "independent"])
+@pytest.mark.parametrize("errors", [True, "bins"])
+def test_sums_have_the_error_that_is_claimed(sampler, errors):
+    renderer = tt.TransientRenderer(room(), spp=32, sampler=sampler, physics="ignore")
+    weights = regions()
+    with torch.no_grad():
+        long = torch.stack([measured(renderer(seed=900 + k, spp=4096)) for k in range(4)]).mean(0)
+    truth = [float((long * w).sum()) for w in weights]
+    found = ratio(renderer, weights, truth, 40, 32, errors)
+    assert (found > 0.3).all() and (found < 1.9).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sampler", ["owen", "independent"])
+@pytest.mark.parametrize("errors, size, starts", [("bins", 10, (5, 15, 25)), (True, 8, (8, 16, 24))])
+def test_calibration(sampler, errors, size, starts):
+    """Of 12 regions, 200 runs: 1 +- .1. A mean of 2400 squares deviates by .03 if they are normal, and these have
+    heavier tails. Of cells of 8 bins a window that begins within one takes the variance of its neighbours, too.
+    """
+    renderer = tt.TransientRenderer(room(resolution=16), spp=64, sampler=sampler, physics="ignore")
+    t, y = torch.arange(BINS), torch.arange(16)
+    weights = [
+        torch.ones(BINS, 16, 16) * ((t >= a) & (t < a + size))[:, None, None] * (y // 8 == b)[:, None] * (y // 8 == c)
+        for a in starts for b in (0, 1) for c in (0, 1)
+    ]  # fmt: skip
+    with torch.no_grad():
+        long = torch.stack([measured(renderer(seed=900 + k, spp=8192)) for k in range(8)]).mean(0)
+    truth = [float((long * w).sum()) for w in weights]
+    found = ratio(renderer, weights, truth, 200, 64, errors)
+    assert abs(found.mean() - 1) < 0.1
+
+
+def test_the_map_of_errors_adds_up_to_the_squared_error():
+    """Sum over bins of squared residuals over the sum of squared errors; the sum of some 10^3 bins, 20 runs."""
+    renderer = tt.TransientRenderer(room(), spp=64, physics="ignore")
+    with torch.no_grad():
+        long = torch.stack([measured(renderer(seed=900 + k, spp=4096)) for k in range(4)]).mean(0)
+        for errors in (True, "bins"):
+            outs = [renderer(seed=seed, errors=errors) for seed in range(20)]
+            residual = sum(float((measured(out) - long).square().sum()) for out in outs)
+            assert 0.7 < residual / sum(float(out.error_map().square().sum()) for out in outs) < 1.4
+            assert outs[0].error_map().shape == (BINS, 8, 8)
+            assert outs[0].error_map(steady=True).shape == (8, 8)
+
+
+def test_the_mean_is_that_of_the_batches():
+    """The render is unbiased and differs from one without error bars by noise alone; odd numbers of samples too."""
+    renderer = tt.TransientRenderer(room(), spp=33, physics="ignore")
+    with torch.no_grad():
+        plain, batched = (
+            torch.stack([renderer(seed=seed, errors=errors).steady.mean() for seed in range(24)])
+            for errors in (False, True)
+        )
+    out = renderer(seed=0, errors=True)
+    assert out.stats.spp == 33 and out.stats.seeds == (0,)
+    error = torch.sqrt((plain.var() + batched.var()) / 24)
+    assert abs(plain.mean() - batched.mean()) < 4 * error
+    total = sum(out.stats.energy_total)
+    assert total == pytest.approx(float(out.steady.mean(0).sum()), rel=1e-5)
+
+
+@pytest.mark.parametrize("film", ["phasor", "gated", "polarized", "mono"])
+def test_other_films_and_variants(film):
+    variants = {"polarized": "llvm_ad_mono_polarized", "mono": "llvm_ad_mono"}
+    settings = {
+        "phasor": {"frequencies": [0.0, 0.3, 0.9]},
+        "gated": {"gates": [tt.Gate.gaussian(5.0, 1.0), tt.Gate.gaussian(8.0, 1.0)]},
+    }
+    scene = room(variants.get(film, "llvm_ad_rgb"))
+    renderer = tt.TransientRenderer(scene, spp=32, physics="ignore", **settings.get(film, {}))
+    with torch.no_grad():
+        long = torch.stack([measured(renderer(seed=900 + k, spp=4096)) for k in range(2)]).mean(0)
+        residual = estimate = 0.0
+        for seed in range(40):
+            out = renderer(seed=seed, errors=True)
+            assert out.standard_error().shape == long.shape[:-3]
+            residual = residual + (measured(out) - long).sum((-3, -2, -1)).abs() ** 2
+            estimate = estimate + out.standard_error() ** 2
+    found = (residual / estimate).reshape(-1)[0]
+    assert 0.3 < float(found) < 1.9
+
+
+def test_pixels_that_share_light():
+    """Captures: points of the wall share what is sampled of the hidden scene; the whole functional is squared."""
+    scan = tt.nlos.Scan.grid(tt.nlos.Wall.plane(2.0, 2.0, albedo=0.7), 4, kind="confocal")
+    capture = tt.nlos.CaptureRenderer(tt.scenes.nlos_z(), scan, time_axis=tt.TimeAxis(1.5, 0.05, 40), spp=16)
+    with torch.no_grad():
+        outs = [capture.renderer(seed=seed, spp=64, errors=True) for seed in range(24)]
+    assert outs[0].differences.shape[-1] == 8
+    sums = torch.stack([out.transient.mean(-4).sum() for out in outs])
+    estimates = torch.stack([out.standard_error() ** 2 for out in outs])
+    # 23 degrees of freedom against 24 x 7: an F of 4 deviations.
+    assert 0.2 < float(sums.var() / estimates.mean()) < 2.5
+
+
+def test_batches_gradients_and_records():
+    scene = room()
+    renderer = tt.TransientRenderer(scene, ["red.reflectance.value"], spp=8, physics="ignore")
+    value = renderer.values["red.reflectance.value"].detach()
+    out = renderer({"red.reflectance.value": torch.stack([value, 0.5 * value])}, seed=0, errors=True)
+    assert out.standard_error().shape == (2,) and out.transient.shape[0] == 2
+    one = renderer(seed=0, errors=True)
+    torch.testing.assert_close(one.standard_error(), out.standard_error()[0], rtol=1e-4, atol=0)
+    (one.transient.sum()).backward()
+    plain = tt.TransientRenderer(scene, ["red.reflectance.value"], spp=8, physics="ignore")
+    plain(seed=0).transient.sum().backward()
+    torch.testing.assert_close(
+        renderer.values["red.reflectance.value"].grad, plain.values["red.reflectance.value"].grad, rtol=1e-4, atol=1e-6
+    )
+    both = tt.RenderOutput.stack([one.detach(), one.detach()])
+    assert both.standard_error().shape == (2,)
+
+
+def test_wrong_requests():
+    renderer = tt.TransientRenderer(room(), ["red.reflectance.value"], spp=4, physics="ignore")
+    with pytest.raises(ArgumentError, match="errors: expected True, False or 'bins'"):
+        renderer(seed=0, errors="lean")
+    with pytest.raises(ArgumentError, match="at least 2 samples"):
+        renderer(seed=0, spp=1, errors=True)
+    with pytest.raises(ArgumentError, match="errors=True"):
+        renderer(seed=0).standard_error()
+    with pytest.raises(ShapeError, match="broadcast"):
+        renderer(seed=0, errors=True).standard_error(torch.ones(3, 8, 8))
+    values = renderer.values["red.reflectance.value"].detach()[None].repeat(2, *[1] * 1)
+    with pytest.raises(ArgumentError, match="vmap"):
+        torch.func.vmap(lambda v: renderer({"red.reflectance.value": v}, seed=0, errors=True).steady)(values)
+
+
+def test_an_empty_picture_has_no_error():
+    dark = tt.TransientRenderer(room(), ["light.emitter.radiance.value"], spp=8, physics="ignore")
+    with torch.no_grad():
+        dark.values["light.emitter.radiance.value"].zero_()
+        out = dark(seed=0, errors=True)
+    assert float(out.standard_error()) == 0 and not out.error_map().any()
+
+
+def test_a_result_file_keeps_them(tmp_path):
+    with torch.no_grad():
+        out = tt.TransientRenderer(room(), spp=8, physics="ignore")(seed=0, errors=True)
+    from torchtransient.files.result_file import read_result, write_result
+
+    again = read_result(write_result(tmp_path / "a.npz", out))
+    assert torch.equal(again.standard_error(), out.standard_error())
+    assert torch.equal(again.error_map(), out.error_map()) and again.relative_error() == out.relative_error()
+    assert f"known to {out.relative_error():.2g}" in repr(out)
+
+
+def test_a_picture_shows_them(tmp_path):
+    with torch.no_grad():
+        out = tt.TransientRenderer(room(), spp=8, physics="ignore")(seed=0, errors=True)
+    settings = {"axis": out.axis, "pixel": (3, 3)}
+    tt.vis.plot_overview(out.transient, out.steady, **settings, path=tmp_path / "with.png", errors=out.error_map())
+    tt.vis.plot_overview(out.transient, out.steady, **settings, path=tmp_path / "without.png")
+    assert (tmp_path / "with.png").read_bytes() != (tmp_path / "without.png").read_bytes()
+    with pytest.raises(ShapeError, match="errors"):
+        tt.vis.plot_overview(out.transient, out.steady, **settings, path=tmp_path / "x.png", errors=torch.ones(3, 8, 8))
