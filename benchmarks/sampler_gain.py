@@ -32,8 +32,8 @@ import torchtransient as tt
 
 SceneDict = dict[str, Any]
 HEADS = ("gain", "steady", "CPU", "t mean", "t dev", "energy", "+-")
-# Runs of scenes of few samples, which take milliseconds.
-MORE_RUNS = 100
+# Samples of all runs of a scene of few samples, which take milliseconds and have rare outliers.
+MOST_SAMPLES = 4800
 # By which scenes are differentiated.
 KEYS = ("red.reflectance.value", "light.emitter.radiance.value")
 
@@ -246,7 +246,8 @@ def main() -> None:
         if name.startswith("gradient"):
             rows = measure_gradients(make(), spp, samplers, 4 * runs, options.variant)
         else:
-            rows = measure(make(), spp, samplers, max(runs, MORE_RUNS if spp <= 64 and not options.quick else 0), options.variant)
+            more = 0 if options.quick else MOST_SAMPLES // spp if spp <= 64 else runs
+            rows = measure(make(), spp, samplers, max(runs, more), options.variant)
         for sampler, row in rows.items():
             print(f"{name:20}{sampler:12}{_line(row)}", flush=True)
         # Scenes that a run leaves out keep what an earlier one has found.
