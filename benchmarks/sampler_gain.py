@@ -7,7 +7,8 @@ ratio of CPU seconds, and how far apart the means are: energy (with its standard
 which it is divided.
 
 Derivatives (scenes "gradient ..."): variance of the derivatives of the histogram times one period of a cosine over the
-window, by the red wall's reflectance and the lamp's radiance, times the CPU seconds of a render and its backward pass.
+window, by the red wall's reflectance and the lamp's radiance, times the CPU seconds of a render and its backward pass;
+"step ..." is the same of launched training steps of 16 bins at one sample, of which the CPU counts.
 
     python benchmarks/sampler_gain.py [--scenes cornell,glass] [--samplers owen,multijitter] [--runs 12] [--json FILE]
 
@@ -34,6 +35,8 @@ SceneDict = dict[str, Any]
 HEADS = ("gain", "steady", "CPU", "t mean", "t dev", "energy", "+-")
 # Samples of all runs of a scene of few samples, which take milliseconds and have rare outliers.
 MOST_SAMPLES = 4800
+# Training steps that are timed.
+STEPS = 400
 # By which scenes are differentiated.
 KEYS = ("red.reflectance.value", "light.emitter.radiance.value")
 
@@ -116,6 +119,9 @@ SCENES: dict[str, tuple[Made, int]] = {
     "gradient 16 spp": (lambda: cornell(24), 16),
     "gradient 64 spp": (lambda: cornell(24), 64),
     "gradient 256 spp": (lambda: cornell(24), 256),
+    "step 8 x 8": (lambda: cornell(8, num_bins=16, bin_width_opl=0.5), 1),
+    "step 32 x 32": (lambda: cornell(32, num_bins=16, bin_width_opl=0.5), 1),
+    "step 128 x 128": (lambda: cornell(128, num_bins=16, bin_width_opl=0.5), 1),
 }
 
 
@@ -243,8 +249,9 @@ def main() -> None:
     for name in wanted:
         make, spp = scenes[name]
         spp = 4 if options.quick else spp
-        if name.startswith("gradient"):
-            rows = measure_gradients(make(), spp, samplers, 4 * runs, options.variant)
+        if name.startswith(("gradient", "step")):
+            more = 4 * runs if options.quick or name.startswith("gradient") else STEPS
+            rows = measure_gradients(make(), spp, samplers, more, options.variant)
         else:
             more = 0 if options.quick else MOST_SAMPLES // spp if spp <= 64 else runs
             rows = measure(make(), spp, samplers, max(runs, more), options.variant)
