@@ -91,13 +91,14 @@ def staircase(archive: Path | None, variant: str) -> Any:
 
     if archive is None:
         raise SystemExit("staircase: give --archive staircase_ccby.tar.gz, or leave it out of --scenes.")
-    with tempfile.TemporaryDirectory() as folder:
-        sizes = {"resx": 36, "resy": 64, "max_depth": 8, "spp": 16}
-        path = find_scene(archive, Path(folder))
-        scene = tt.load(path, variant=variant, **{key: str(value) for key, value in sizes.items()})
-        tt.TransientRenderer(scene, physics="ignore")  # reads the files
-        return scene
+    _unpacked.append(tempfile.TemporaryDirectory())
+    sizes = {"resx": 36, "resy": 64, "max_depth": 8, "spp": 16}
+    path = find_scene(archive, Path(_unpacked[-1].name))
+    return tt.load(path, variant=variant, **{key: str(value) for key, value in sizes.items()})
 
+
+# Folders of scenes, until the process ends.
+_unpacked: list[tempfile.TemporaryDirectory[str]] = []
 
 Made = Callable[[], Any]
 SCENES: dict[str, tuple[Made, int]] = {
