@@ -26,7 +26,7 @@ def main() -> None:
         spp=spp,
         gradients=keys,
         repeats=options.repeats,
-        samplers=("independent", "multijitter", "ldsampler"),
+        samplers=("independent", "owen", "multijitter"),
         temporal_filters=("box", "tent"),
     )
     print(report.table())

@@ -113,6 +113,32 @@ def test_bands_of_the_film():
         static(plan_scenes.grey_room(), ("bands",))
 
 
+@pytest.mark.parametrize(
+    "named, line",
+    [
+        ("independent", "sampler: owen, in place of the scene's independent"),
+        (None, "sampler: owen, since the scene names none"),
+        ("multijitter", "sampler: multijitter, as the scene names it"),
+        ("owen", "sampler: owen, as the scene names it"),
+    ],
+)
+def test_the_sampler_is_said(named, line):
+    scene = plan_scenes.grey_room()
+    scene["sensor"].pop("sampler", None)
+    if named is not None:
+        scene["sensor"]["sampler"] = {"type": named}
+    plan = static(scene)
+    assert line in plan.reasons
+    assert plan.renderer(spp=4)(seed=0).stats.sampler == line.split()[1].rstrip(",")
+
+
+def test_a_sampler_of_dependent_numbers_is_warned_of():
+    scene = plan_scenes.grey_room()
+    scene["sensor"]["sampler"] = {"type": "ldsampler"}
+    (line,) = (line for line in static(scene).reasons if line.startswith("sampler"))
+    assert "ldsampler, as the scene names it" in line and "biases" in line and "'owen'" in line
+
+
 def test_what_is_declared_and_not_used_costs_nothing():
     scene = plan_scenes.grey_room(
         red={"type": "diffuse", "reflectance": {"type": "rgb", "value": [1.0, 0.0, 0.0]}},

@@ -138,7 +138,7 @@ def test_every_scene_hands_its_numbers_on(name):
         "type": "transient_hdr_film", "width": 5, "height": 3, "rfilter": {"type": "box"}, "temporal_bins": 7,
         "start_opl": -1.5, "bin_width_opl": 0.25,
     }  # fmt: skip
-    assert scene["sensor"]["sampler"] == {"type": "owen", "sample_count": 9}
+    assert scene["sensor"]["sampler"] == {"type": "independent", "sample_count": 9}
     assert scene["integrator"]["max_depth"] == 4
     has_roulette = name in ("furnace", "integrating_sphere", "parallel_plates", "etalon_slab")
     assert scene["integrator"].get("rr_depth") == (1000 if has_roulette else None)

@@ -71,7 +71,7 @@ def test_mitsuba_loads_every_entry(name):
 
 
 def test_cornell_box_is_the_one_of_mitsuba():
-    ours = mi.load_dict(steady_dict(scenes.cornell_box(32, spp=4, sampler="independent")))
+    ours = mi.load_dict(steady_dict(scenes.cornell_box(32, spp=4)))
     reference = mi.cornell_box()
     reference["sensor"]["film"].update({"width": 32, "height": 32, "rfilter": {"type": "box"}})
     theirs = mi.load_dict(reference)

@@ -5,6 +5,7 @@ RECIPES = {
 variant: llvm_ad_mono
 time_axis: {start_opl: 2.0, bin_width_opl: 0.2, num_bins: 60}
 spp: 4
+sampler: owen
 n: 12
 labels: [depth]
 device: vl53l8_like

@@ -54,7 +54,7 @@ def cost_of_accuracy(
     *,
     reference_spp: int | None = None,
     repeats: int = 4,
-    samplers: Sequence[str] = ("independent", "multijitter"),
+    samplers: Sequence[str] = ("owen", "independent"),
     temporal_filters: Sequence[str] | None = None,
     loss: Loss = cosine_over_the_window,
     seed: int = 0,
@@ -63,7 +63,7 @@ def cost_of_accuracy(
     """Measure the error of the transient, and of gradients, against seconds and samples per pixel.
 
     `renderer` renders at the current values of its parameters; `gradients` are keys among them, each the derivative of
-    `loss`, a scalar of the `RenderOutput`. Every pair of `samplers` (Mitsuba's plugin names) and `temporal_filters`
+    `loss`, a scalar of the `RenderOutput`. Every pair of `samplers` (plugin names) and `temporal_filters`
     ("box", "tent", "gaussian"; None: the one that the renderer uses) is one curve. Where a filter has no slope in time
     (box) and a key moves path lengths, there is no gradient: that filter's curve then shows the transient alone, and
     `settings` of the report names the pair under "without_gradients".

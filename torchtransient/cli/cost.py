@@ -33,7 +33,7 @@ class Counts(click.ParamType):  # type: ignore[type-arg]  # a parameter of newer
 @scene_options
 @click.option("--spp", type=Counts(), default="16,64,256", show_default=True, help="Samples per pixel to compare.")
 @click.option("--gradient", "gradients", multiple=True, metavar="KEY", help="Also the derivative by this parameter.")
-@click.option("--sampler", "samplers", multiple=True, default=("independent", "multijitter"), show_default=True)
+@click.option("--sampler", "samplers", multiple=True, default=("owen", "independent"), show_default=True)
 @click.option("--temporal-filter", "filters", multiple=True, type=click.Choice(["box", "tent", "gaussian"]))
 @click.option("--reference-spp", type=click.IntRange(1, 2**32 - 1), help="Compare with a long one, not in pairs.")
 @click.option("--repeats", type=click.IntRange(min=2), default=4, show_default=True, help="Runs of each kind.")

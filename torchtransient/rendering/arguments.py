@@ -56,8 +56,8 @@ def checked_filter(name: str) -> str:
 
 
 def checked_sampler(name: Any) -> str | None:
-    """Return the plugin name of a sampler, or None. Raises ``ArgumentError`` for other types."""
-    return None if name is None else text("sampler", name, "the plugin name of a sampler of Mitsuba, or None")
+    """Return the plugin name of a sampler, "scene", or None. Raises ``ArgumentError`` for other types."""
+    return None if name is None else text("sampler", name, "the plugin name of a sampler, 'scene', or None")
 
 
 def checked_keys(keys: Any, known: Sequence[str] | None = None) -> tuple[str, ...]:

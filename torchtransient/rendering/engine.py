@@ -35,6 +35,7 @@ from torchtransient.scene.edits import built_depth
 from torchtransient.scene.objects import sampler_plugin
 from torchtransient.scene.parameters import needing_slope
 from torchtransient.scene.physics import all_finite, are_finite, smallest_and_largest
+from torchtransient.scene.samplers import AUTO, OF_SCENE
 from torchtransient.scene.values import flat_drjit_copy, wait_for_torch
 from torchtransient.scene.variant import active_variant, clear_frames, named_errors, quiet
 
@@ -165,7 +166,7 @@ class Session:
 
 def plugin_of_sampler(integrator: Any, asked: str | None) -> str:
     """Return the ``sampler`` of an integrator for a job: the one asked for, its own, or "auto"."""
-    return asked or integrator.sampler or "auto"
+    return asked or integrator.sampler or AUTO
 
 
 def sampler_of(scene: Any, sensor: Any, asked: str | None) -> Any:
@@ -182,7 +183,7 @@ def sampler_of(scene: Any, sensor: Any, asked: str | None) -> Any:
     """
     integrator = scene.integrator()
     if not hasattr(integrator, "sampler_of"):
-        if asked is not None:
+        if asked not in (None, OF_SCENE):
             name = type(integrator).__name__
             raise ArgumentError(f"sampler: {name} draws from the samplers of the sensors; leave it out.")
         return sensor.sampler().clone()

@@ -25,6 +25,7 @@ from torchtransient.scene.load import load
 from torchtransient.scene.opaque import opaque
 from torchtransient.scene.pilot import PilotReport
 from torchtransient.scene.plan import Choice, Draft, Effects, Finder, choose_integrator, choose_variant
+from torchtransient.scene.samplers import reason_for
 from torchtransient.scene.variant import resolve_variant
 
 # Outputs that every film can show beside its own measurement.
@@ -265,7 +266,7 @@ def plan(
     tracer, more = choose_integrator(inventory)
     reasons = (
         _reason("variant", variant, best), *notes, _reason("integrator", integrator, tracer), *more,
-        planned_film.reason,
+        planned_film.reason, reason_for(inventory.sampler),
     )  # fmt: skip
     own_film = layout_of_plugin(inventory.film or "")
     described = None if own_film is None else own_film.from_properties(inventory.film_props)

@@ -14,7 +14,6 @@ from torchtransient.checks import Numbers, flag, is_one_of, shown
 from torchtransient.errors import ArgumentError, SceneError, ShapeError
 from torchtransient.gates import Gate
 from torchtransient.modules import CopiesParametrized
-from torchtransient.plugins.mitsuba_compat import CORRELATED_SAMPLERS
 from torchtransient.plugins.parameters import check_slope, sun_axes
 from torchtransient.pulses import Pulse
 from torchtransient.rendering import engine
@@ -45,6 +44,7 @@ from torchtransient.scene.parameters import ParameterInfo, missing_edges, needin
 from torchtransient.scene.physics import PhysicsWatch
 from torchtransient.scene.pilot import DepthBound, depth_bound
 from torchtransient.scene.plan import Effects
+from torchtransient.scene.samplers import correlation_warning
 from torchtransient.scene.slope import check_filter, filter_for, has_slope, response_of
 from torchtransient.scene.values import as_float, fit_shape, may_have_derivative
 from torchtransient.scene.variant import active_variant, device_type, stokes_components
@@ -90,9 +90,10 @@ class TransientRenderer(CopiesParametrized):
             its contents call for; a :class:`Plan` of :func:`torchtransient.plan` brings variant, integrator, depth,
             time axis or frequencies, and temporal filter, where the arguments beside it do not say otherwise; it speaks
             of one sensor.
-        sampler: plugin name of a Mitsuba sampler that replaces those of the sensors, with the same number of samples.
-            None keeps what the scene names, except for "independent", and what a sensor without one has, which are
-            replaced by "owen": points that fill each pixel's dimensions evenly. ``out.stats.sampler`` has the name.
+        sampler: plugin name of a sampler that replaces those of the sensors, with the same number of samples. None
+            keeps what the scene names, except for "independent", and what a sensor without one has, which are replaced
+            by "owen": points that fill each pixel's dimensions evenly. "scene" keeps those too. ``out.stats.sampler``
+            has the name.
         physics: response to what no physical system has: reflectances, albedos and other shares of the light outside of
             [0, 1], described or given, transforms without an inverse, windows that miss more than 5 % of the light, and
             depths that had to be bounded. "warn" gives a ``PhysicsWarning`` with the key and the number, once for a
@@ -185,14 +186,9 @@ class TransientRenderer(CopiesParametrized):
         return self.scene.options_for(self._keys, options)
 
     def _check_sampler(self, plugin: str) -> None:
-        if plugin in CORRELATED_SAMPLERS:
-            self._watch.warn(
-                f"sampler {plugin}",
-                f"{plugin!r}: this sampler of Mitsuba draws dependent numbers at consecutive vertices, which biases "
-                "light that scatters twice and more, and derivatives (1 % in the Cornell box). Take 'owen', the "
-                "default, or 'independent'.",
-                is_error=False,
-            )
+        warning = correlation_warning(plugin)
+        if warning:
+            self._watch.warn(f"sampler {plugin}", f"{plugin!r}: {warning}.", is_error=False)
 
     def _parameter_infos(self) -> dict[str, ParameterInfo]:
         table = self.scene.parameters() if self._keys else {}
@@ -303,7 +299,7 @@ class TransientRenderer(CopiesParametrized):
         """Return a copy with the same values and another sampler or temporal filter.
 
         Args:
-            sampler: plugin name of a Mitsuba sampler, None to keep this renderer's.
+            sampler: plugin name of a sampler, or "scene", None to keep this renderer's.
             temporal_filter: "box", "tent", "gaussian" or "auto", None to keep this renderer's.
 
         Returns:

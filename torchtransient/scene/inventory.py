@@ -10,7 +10,7 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from torchtransient.scene.nodes import (
     find_child,
     is_film,
     is_integrator,
+    is_transient_integrator,
     node_kind,
     node_label,
     reachable,
@@ -34,6 +35,8 @@ from torchtransient.scene.nodes import (
 )
 from torchtransient.scene.objects import LoadedScene
 from torchtransient.scene.variant import active_variant
+
+_Found = TypeVar("_Found")
 
 # Optical elements whose only purpose is polarization: without it even a single one is drawn wrongly.
 POLARIZING_ELEMENTS = ("polarizer", "retarder", "circular", "pplastic", "measured_polarized")
@@ -76,6 +79,7 @@ class SceneInventory:
         integrator, max_depth: plugin name, and its bound on the depth, -1 for no limit.
         film, film_props: plugin name and properties of the film of the sensor.
         temporal_filter: described temporal filter, of the integrator or else of the film.
+        sampler: sampler that integrator or sensor name, None if neither does.
         pulsed: the film spreads arrivals by a pulse or an impulse response.
         plugins: names of all plugins.
     """
@@ -95,6 +99,7 @@ class SceneInventory:
     film: str | None = None
     film_props: Any = None
     temporal_filter: str | None = None
+    sampler: str | None = None
     pulsed: bool = False
     plugins: set[str] = field(default_factory=set)
 
@@ -109,10 +114,15 @@ def scene_inventory(scene: Scene, sensor: int = 0) -> SceneInventory:
     Raises:
         SceneError: for a scene that Mitsuba cannot parse, and for one with loaded objects.
     """
+    return _parsed(scene, "tt.plan", lambda state: take_inventory(state, _resolved, sensor))
+
+
+def _parsed(scene: Scene, what: str, read: Callable[[Any], _Found]) -> _Found:
+    """Return what ``read`` finds in a parsed scene. ``what`` begins the message where it cannot be parsed."""
     import mitsuba as mi
 
     description = scene._description
-    description.check_described("tt.plan")
+    description.check_described(what)
     assert not isinstance(description, LoadedScene)  # refused above
     with active_variant(scene.variant):
         config = mi.parser.ParserConfig(scene.variant)
@@ -121,11 +131,20 @@ def scene_inventory(scene: Scene, sensor: int = 0) -> SceneInventory:
                 state = description.parse(config)
                 check_nodes(state)
                 mi.parser.transform_upgrade(config, state)
-                return take_inventory(state, _resolved, sensor)
+                return read(state)
         except TorchTransientError as error:
             raise type(error)(f"{description.name}: {error}") from error
         except (RuntimeError, ValueError, TypeError) as error:
             raise SceneError(f"{description.name}: Mitsuba could not read the scene. {one_line(error)}") from error
+
+
+def described_samplers(scene: Scene) -> list[str | None]:
+    """Return what names the sampler of each sensor of a scene, None for a sensor without one.
+
+    Raises:
+        SceneError: for a scene that Mitsuba cannot parse, and for one with loaded objects.
+    """
+    return _parsed(scene, "recipe", samplers_of)
 
 
 def _resolved(name: str) -> Path:
@@ -155,6 +174,8 @@ def take_inventory(state: Any, lookup: Callable[[str], Path], sensor: int = 0) -
             _note_colours(inventory, state, index, lookup)
         _note_bands(inventory, state, node)
     _note_film(inventory, state, order, sensor)
+    samplers = samplers_of(state)
+    inventory.sampler = samplers[sensor] if sensor < len(samplers) else None
     _note_integrator(inventory, state)
     _note_albedo(inventory, state, order)
     inventory.interfaces_in_a_row = _in_a_row(state, order, surfaces_of_interfaces)
@@ -219,8 +240,7 @@ def _note_bands(inventory: SceneInventory, state: Any, node: Any) -> None:
 def _note_film(inventory: SceneInventory, state: Any, order: list[int], sensor: int) -> None:
     import mitsuba as mi
 
-    sensors = [state.nodes[index] for index in rendered_children(state) if node_kind(state.nodes[index]) == "Sensor"]
-    films: list[int | None] = [find_child(state, node, is_film) for node in sensors[sensor : sensor + 1]]
+    films: list[int | None] = [find_child(state, node, is_film) for node in _sensors(state)[sensor : sensor + 1]]
     # A sensor of unknown kind, or one that is missing, which the render will report.
     films = films or [next((index for index in order if is_film(state.nodes[index])), None)]
     if films[0] is None:
@@ -230,6 +250,30 @@ def _note_film(inventory: SceneInventory, state: Any, order: list[int], sensor: 
     inventory.pulsed = any(name in props for name in ("pulse", "irf"))
     if "temporal_filter" in props:
         inventory.temporal_filter = str(props["temporal_filter"])
+
+
+def _sensors(state: Any) -> list[Any]:
+    return [state.nodes[index] for index in rendered_children(state) if node_kind(state.nodes[index]) == "Sensor"]
+
+
+def samplers_of(state: Any) -> list[str | None]:
+    """Return what names the sampler of each sensor of a parsed scene: the integrator, or the sensor; None for neither.
+    """
+    of_integrator = _sampler_of_integrator(state)
+    if of_integrator not in ("", "auto"):
+        return [of_integrator for _ in _sensors(state)]
+    found = [find_child(state, node, lambda child: node_kind(child) == "Sampler") for node in _sensors(state)]
+    return [None if index is None else state.nodes[index].props.plugin_name() for index in found]
+
+
+def _sampler_of_integrator(state: Any) -> str:
+    """Return the sampler that the integrator of a parsed scene names in place of those of the sensors, or nothing."""
+    for _, index in children(state, state.root):
+        props = state.nodes[index].props
+        if is_integrator(state.nodes[index]) and is_transient_integrator(props.plugin_name()):
+            given = props.get("sampler", "")
+            return given if isinstance(given, str) else ""
+    return ""
 
 
 def _note_integrator(inventory: SceneInventory, state: Any) -> None:

@@ -23,7 +23,7 @@ def cornell_box(
     mirror: bool = False,
     glass: bool = False,
     index: float = 1.5,
-    sampler: str = "owen",
+    sampler: str = "independent",
 ) -> SceneDict:
     """The standard Cornell box as Mitsuba ships it, with a transient film and integrator. Lengths in metres.
 

@@ -40,7 +40,7 @@ def transient_film(
 
 
 def perspective(
-    to_world: Matrix, fov: float, film: SceneDict, spp: int, sampler: str = "owen", near_clip: float = 1e-3
+    to_world: Matrix, fov: float, film: SceneDict, spp: int, sampler: str = "independent", near_clip: float = 1e-3
 ) -> SceneDict:
     """A pinhole camera; `fov` in degrees along the smaller side of the film, `near_clip` in metres, `spp` samples per
     pixel."""

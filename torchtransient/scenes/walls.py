@@ -82,7 +82,7 @@ def light_over_plane(
             "bsdf": diffuse(0.0),
             "sensor": {
                 "type": "irradiancemeter",
-                "sampler": {"type": "owen", "sample_count": count("spp", spp)},
+                "sampler": {"type": "independent", "sample_count": count("spp", spp)},
                 "film": transient_film(1, num_bins, start_opl, bin_width_opl),
             },
         },

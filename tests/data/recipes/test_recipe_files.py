@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 import torchtransient as tt
 from support.text_files import RECIPES
+from torchtransient.data.generation.settings import check_same
 from torchtransient.data.recipes.places import without_places
 from torchtransient.errors import SceneError, StorageError, UnitError
 
@@ -37,6 +40,60 @@ def test_a_file_is_its_recipe(tmp_path):
         device="vl53l8_like",
     )  # fmt: skip
     assert by_hand.key() == recipe.key()
+
+
+@pytest.mark.parametrize(
+    "named, given, used",
+    [
+        ("independent", None, "owen"), (None, None, "owen"), ("multijitter", None, "multijitter"),
+        ("independent", "scene", "independent"), ("multijitter", "owen", "owen"),
+    ],
+)  # fmt: skip
+def test_the_sampler_is_settled_when_a_recipe_is_made(named, given, used):
+    scene = tt.scenes.cornell_box(resolution=4, num_bins=20, bin_width_opl=0.5)
+    if named is None:
+        del scene["sensor"]["sampler"]
+    else:
+        scene["sensor"]["sampler"]["type"] = named
+    recipe = D.Recipe(scene, spp=1, variant="llvm_ad_mono", sampler=given)
+    assert recipe.to_dict().get("sampler", "scene") == (given or used)
+    again = D.Recipe.from_dict(recipe.to_dict())
+    assert again == recipe and again.key() == recipe.key()
+    assert recipe.maker().kept(recipe.structure(0)).renderer(seed=0).stats.sampler == used
+
+
+def test_scenes_of_several_samplers_and_varied_ones_keep_theirs():
+    scene = tt.scenes.cornell_box(resolution=4)
+    other = tt.scenes.cornell_box(resolution=4, sampler="multijitter")
+    assert D.Recipe(D.OneOf([scene, other])).settings.sampler == "auto"
+    varied = D.Recipe(scene, {"sensor.sampler.type": D.Choice(["independent", "multijitter"])})
+    assert varied.settings.sampler == "scene"
+    samplers = {varied.maker().kept(varied.structure(i)).renderer(seed=0, spp=4).stats.sampler for i in range(12)}
+    assert samplers == {"independent", "multijitter"}
+
+
+def old_sample(scene, seed):
+    scene["sensor"]["sampler"]["seed"] = seed
+    return D.Recipe(scene, variant="llvm_ad_mono", sampler="scene").sample(0).arrays["steady"]
+
+
+def test_files_that_say_nothing_of_samplers_keep_those_of_their_scenes():
+    """As recipes of versions without the setting were rendered: the same numbers, and the same key."""
+    scene = tt.scenes.cornell_box(resolution=4, num_bins=20, bin_width_opl=0.5)
+    scene["sensor"]["sampler"] = {"type": "independent", "sample_count": 4, "seed": 7}
+    written = D.Recipe(scene, variant="llvm_ad_mono").to_dict()
+    del written["sampler"]
+    old = D.Recipe.from_dict(written)
+    assert old.to_dict() == written and old == D.Recipe(scene, variant="llvm_ad_mono", sampler="scene")
+    # The very sampler of the scene, with its seed.
+    light = {seed: old_sample(scene, seed) for seed in (0, 7)}
+    assert not np.array_equal(light[0], light[7]) and np.array_equal(light[7], old.sample(0).arrays["steady"])
+    renderer = tt.TransientRenderer(tt.load(scene, "llvm_ad_mono"), sampler="independent")
+    with torch.no_grad():
+        plain = renderer(seed=old.sample(0).seed).steady.numpy()
+    assert np.array_equal(light[0], plain)
+    with pytest.raises(StorageError, match=r"sampler is None there and 'owen' here.*sampler='scene'"):
+        check_same({"key": "a", "recipe": written}, {"key": "b", "recipe": written | {"sampler": "owen"}}, Path("here"))
 
 
 def test_captures(tmp_path):

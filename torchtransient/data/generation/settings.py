@@ -115,6 +115,8 @@ def check_same(
             if name == "key":
                 recipes = [_deciding(side.get("recipe")) for side in (found, wanted)]
                 told = "its recipe is another one" + _first_difference(*recipes)
+                if all(isinstance(recipe, dict) for recipe in recipes) and "sampler" not in recipes[0]:
+                    told += "; it was made with the sampler of its scene, which Recipe(sampler='scene') goes on with"
             raise StorageError(
                 f"{_WHAT}: '{where}' belongs to another data set: {told}. Choose another folder, or generate with what "
                 "is there."

@@ -101,7 +101,7 @@ class Kept:
         common: dict[str, Any] = {
             "time_axis": settings.time_axis, "frequencies": settings.frequencies, "spp": settings.spp,
             "temporal_filter": settings.temporal_filter, "pulse": settings.pulse, "irf": settings.irf,
-            "physics": settings.physics,
+            "physics": settings.physics, "sampler": settings.sampler,
         }  # fmt: skip
         if self.scan is None:
             own = {"gates": settings.gates, "max_depth": settings.max_depth, "sensors": settings.sensors}

@@ -49,6 +49,11 @@ class Recipe(Specification):
     chain of one's own is written as one, see docs/data_sheet_to_chain.md. Its
     draw is ``measurement``, beside the transient itself. ``physics``: "ignore" or "error", as in the renderer.
 
+    ``sampler``: plugin name, as in the renderer. None settles it here: "owen" for scenes that name ``independent`` or
+    none, else what they name ("auto" where scenes differ, "scene" where a key of ``vary`` stands for it). "scene" is
+    what the scene names, ``independent`` included, which recipes without the entry ``sampler`` have: folders of older
+    versions go on with it.
+
     ``seed``: another one is another data set. Every number of sample i is drawn from (seed, i, key) alone: samples can
     be made in any order, anywhere, and another key leaves the others' draws as they were. ``parameters`` fill the
     $names of an XML scene. ``n``: how many samples a data set has unless :func:`generate` is told otherwise.

@@ -40,12 +40,13 @@ from torchtransient.files.scan_data import scan_data, scan_from_data
 from torchtransient.files.yaml_files import Section, read_yaml
 from torchtransient.scene.description import DictDescription, XmlDescription, describe_dict
 from torchtransient.scene.load import Scene
+from torchtransient.scene.samplers import OF_SCENE
 
 FORMAT = "torchtransient recipe 1"
 # Entries that are the constructor's arguments as they are.
 _PLAIN = (
-    "labels", "keep", "temporal_filter", "spp", "max_depth", "sensors", "bounces", "energy", "physics", "variant",
-    "seed", "n", "plugins",
+    "labels", "keep", "temporal_filter", "spp", "max_depth", "sensors", "bounces", "energy", "physics", "sampler",
+    "variant", "seed", "n", "plugins",
 )  # fmt: skip
 _ENTRIES = (
     "format", "scene", "parameters", "hidden", "wall", "scan", "vary", "time_axis", "frequencies", "gates", "pulse",
@@ -84,6 +85,8 @@ def to_dict(recipe: Specification) -> dict[str, Any]:
         "seed": recipe.seed,
         "n": recipe.n,
     }
+    if settings.sampler != OF_SCENE:
+        found["sampler"] = settings.sampler
     if recipe.plugins:
         found["plugins"] = list(recipe.plugins)
     # Of JSON: no tuples, and nothing that is not plain.
@@ -157,6 +160,8 @@ def from_dict(data: Mapping[str, Any], folder: str | Path | None) -> tuple[Any, 
     vary = section.get("vary", {})
     if not isinstance(vary, Mapping):
         raise SceneError(f"recipe: vary: expected distributions by key, got {shown(vary)}.")
+    # Files without it are older than the setting: they go on with what they were rendered with.
+    arguments.setdefault("sampler", OF_SCENE)
     arguments["vary"] = {str(key): read_distribution(f"recipe: vary: {key}", one) for key, one in vary.items()}
     arguments["time_axis"] = _axis(section)
     arguments["frequencies"] = read_frequencies(section.get("frequencies", None))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -24,7 +24,8 @@ from torchtransient.errors import ArgumentError, SceneError, ShapeError
 from torchtransient.files.content_key import content_key
 from torchtransient.gates import Gate
 from torchtransient.pulses import Pulse
-from torchtransient.rendering.arguments import checked_filter
+from torchtransient.rendering.arguments import checked_filter, checked_sampler
+from torchtransient.scene.samplers import OF_SCENE
 from torchtransient.scene.variant import resolve_variant
 from torchtransient.sensing import DEVICES, Device
 from torchtransient.sensing import device as device_by_name
@@ -53,6 +54,8 @@ class Settings:
     bounces: tuple[int, ...] | str = (3,)
     energy: Any = 1.0
     physics: str = "ignore"
+    # Recipes that say nothing of it, which are older than this setting.
+    sampler: str = OF_SCENE
 
 
 class Specification:
@@ -80,6 +83,7 @@ class Specification:
         energy: Any = 1.0,
         device: Device | str | Path | Mapping[str, Any] | None = None,
         physics: str = "ignore",
+        sampler: str | None = None,
         seed: int = 0,
         parameters: Mapping[str, Any] | None = None,
         n: int | None = None,
@@ -123,6 +127,10 @@ class Specification:
         self.scan = scan
         self.device = _device(device)
         self.scenes = Scenes(scene, self.variant, scan, parameters)
+        sampler = checked_sampler(sampler)
+        if sampler is None:
+            sampler = OF_SCENE if any("sampler" in str(key).split(".") for key in vary or ()) else self.scenes.sampler()
+        self.settings = replace(self.settings, sampler=sampler)
         self._vary = {str(key): read_distribution(f"recipe: {key!r}", given) for key, given in (vary or {}).items()}
         self._check_settings()
 

@@ -22,8 +22,10 @@ from torchtransient.data.recipes.distributions import checked_choices
 from torchtransient.errors import SceneError
 from torchtransient.files.content_key import content_key
 from torchtransient.scene.description import DictDescription, Plain, XmlDescription, describe_dict
+from torchtransient.scene.inventory import described_samplers
 from torchtransient.scene.load import Scene, load
 from torchtransient.scene.objects import LoadedScene
+from torchtransient.scene.samplers import sampler_for, sampler_for_all
 
 # The key that stands for the scan of a capture.
 SCAN = "scan"
@@ -77,6 +79,13 @@ class Scenes:
     def names(self) -> list[str]:
         """Of the scenes."""
         return list(self.descriptions)
+
+    def sampler(self) -> str:
+        """Return the sampler that renderers take for these scenes: a plugin name, or "auto" where scenes differ."""
+        if self.scan is not None:  # the sensors of a capture name none
+            return sampler_for(None)
+        scenes = (Scene(description, self.variant) for description in self.descriptions.values())
+        return sampler_for_all(name for scene in scenes for name in described_samplers(scene))
 
     def has_entry(self, key: str) -> bool:
         """Whether a key stands for an entry of the description of every scene."""

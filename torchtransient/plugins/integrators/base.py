@@ -61,8 +61,8 @@ class TransientIntegrator(mi.CppADIntegrator):
     Parameters: ``max_depth`` (6; -1 for no limit), ``rr_depth`` (5), ``hide_emitters`` (false), ``camera_unwarp``
     (false: leave out the leg from the first surface to the sensor), ``discard_direct_light`` (false: leave out emission
     that reaches the sensor without a bounce),
-    ``temporal_filter`` (the film's), ``gaussian_stddev`` (the film's, in bins), ``sampler`` (those of the sensors; the
-    plugin name of one in their place, or "auto": ``owen`` in place of ``independent``).
+    ``temporal_filter`` (the film's), ``gaussian_stddev`` (the film's, in bins), ``sampler`` ("scene": those of the
+    sensors; the plugin name of one in their place, or "auto": ``owen`` in place of ``independent``).
 
     Subclasses return the parts of their walk from :meth:`strategies`, see :mod:`..transport.strategy`; derivatives in
     both modes follow.

@@ -1,4 +1,4 @@
-"""``owen``: Owen-scrambled points of Sobol's first two dimensions, padded to any number of dimensions."""
+"""``owen``: Owen-scrambled points of four dimensions, padded to any number of dimensions."""
 
 from __future__ import annotations
 
@@ -7,15 +7,16 @@ import mitsuba as mi
 
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.properties import whole_number
-from torchtransient.plugins.sampling.point_sets import hashed, scrambled, sobol_second, unit_float
+from torchtransient.plugins.sampling.point_sets import hashed, scrambled, second_pair, sobol_second, unit_float
 
 
 class OwenSampler(mi.Sampler):
     """Samples that spread evenly over every dimension, and over every pair of dimensions drawn by ``next_2d``.
 
-    Each call draws from a scrambled (0, 2)-sequence of its own, in an order of its own (padding: Kollig and Keller
-    2002). Scrambling and order are Owen's, by hashes (Burley 2020), and differ between pixels, seeds and calls: every
-    number is uniform by itself, so that means are unbiased.
+    Each call draws from a scrambled (0, 2)-sequence. Two calls in a row, the first and the second, the third and the
+    fourth, have theirs in a common order, in which the four numbers spread as evenly as Sobol's; others have orders of
+    their own (padding: Kollig and Keller 2002). Scrambling and order are Owen's, by hashes (Burley 2020), and differ
+    between pixels, seeds and calls: every number is uniform by itself, so that means are unbiased.
 
     ``sample_count`` (4): samples per pixel, any number; powers of two are spread most evenly. ``seed`` (0): shifts the
     seeds of renders.
@@ -71,19 +72,21 @@ class OwenSampler(mi.Sampler):
         dr.schedule(self.index, self.key, self.dimension)
 
     def next_1d(self, active=True):
-        return unit_float(self._next()[0])
+        i, key = self._next()
+        return unit_float(scrambled(dr.brev(i), hashed(key ^ 0x68BC21EB)))
 
     def next_2d(self, active=True):
-        x, i, key = self._next()
+        i, key = self._next()
+        x = scrambled(dr.brev(i), hashed(key ^ 0x68BC21EB))
         return mi.Point2f(unit_float(x), unit_float(scrambled(sobol_second(i), hashed(key ^ 0x02E5BE93))))
 
     def _next(self):
-        """Return the first coordinate of the next point, the point's number in its sequence, and the sequence's key."""
-        key = hashed(self.key ^ (self.dimension * 0x9E3779B9))
+        """Return the number of the next point in its sequence, and the key that scrambles its coordinates."""
+        key, second = hashed(self.key ^ ((self.dimension >> 1) * 0x9E3779B9)), self.dimension & 1
         self.dimension += 1
         # Aligned blocks of numbers stay together, so that what they hold stays a net.
         i = scrambled(self.index, key)
-        return scrambled(dr.brev(i), hashed(key ^ 0x68BC21EB)), i, key
+        return dr.select(second == 1, second_pair(i), i), key ^ (second * 0x5BD1E995)
 
     def to_string(self):
         return f"OwenSampler[\n  sample_count = {self.sample_count()},\n  seed = {self._props_seed}\n]"

@@ -219,7 +219,8 @@ def sample_free_flight(scene, media, ray, medium, carried, u, lanes, active, fir
                 entry = dr.select(passes, pi, entry)
             pi, medium = cross_boundary(scene, ray, pi, medium, passes)
             going = (collides & ~real) | passes
-            u = rng.next_float32()
+            # A stretch of empty space leaves the number of the sampler, which is spread evenly, to the first medium.
+            u = dr.select(inside, rng.next_float32(), u)
     return FreeFlight(pi, scatter, t, medium, weight, entry)
 
 

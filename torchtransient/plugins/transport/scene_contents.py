@@ -355,11 +355,11 @@ class SceneCache:
         """Return the sampler of a sensor, or one in its place with the same number of samples.
 
         Args:
-            plugin: name of the other sampler; "" for none, "auto" for ``owen`` in place of ``independent``, which
-                scenes name by habit.
+            plugin: name of the other sampler; "" or "scene" for none, "auto" for ``owen`` in place of ``independent``,
+                which scenes name by habit.
         """
         own = sensor.sampler()
-        if not plugin or (plugin == "auto" and own.class_name() != "IndependentSampler"):
+        if plugin in ("", "scene") or (plugin == "auto" and own.class_name() != "IndependentSampler"):
             return own
         key = sensor.ptr, plugin
         if key not in self._samplers:
