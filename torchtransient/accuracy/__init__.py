@@ -3,3 +3,4 @@
 from torchtransient.accuracy.cost import cosine_over_the_window as cosine_over_the_window
 from torchtransient.accuracy.cost import cost_of_accuracy as cost_of_accuracy
 from torchtransient.accuracy.report import AccuracyReport as AccuracyReport
+from torchtransient.accuracy.report import SamplesNeeded as SamplesNeeded

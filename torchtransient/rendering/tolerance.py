@@ -4,6 +4,10 @@ Estimate of the error, of ``n`` passes with mean ``x`` and sample variance ``s^2
 
     V = ((n - 1) s^2 + 8 <s^2>) / (n + 7)                  <.>: mean over 3 x 3 pixels, and 3 bins of time
     r = quantile over bins of sqrt(V / n) / <|x|>          never of the mean of a single bin, which may be dark
+
+Rare and bright light is missing from most bins, and their ``V`` with it. Of the even and the odd passes, bins with a
+small ``V`` in the one half then have a large one in the other: a tail is heavy where it is more than twice as large in
+the mean. A loss has one value for each pass, whose tail is seen as in ``accuracy``.
 """
 
 from __future__ import annotations
@@ -38,7 +42,9 @@ _NEIGHBORS, _ONE_SIDED = 8, 1.645
 _RECENT = 15
 # Without a mask, bins count whose local mean is at least this share of the mean over all bins.
 _LIT = 0.02
-# Tail of the passes (see `Tail` of `accuracy`): squared distances before one is looked at, the largest share of one,
+# Variance of bins in one half of the passes over that in the half which they were found to be good in.
+_MOST_IN_OTHER_HALF = 2.0
+# Tail of a loss (see `Tail` of `accuracy`): squared distances before one is looked at, the largest share of one,
 # distances before Hill's index is estimated, those that it is estimated from, and its least value.
 _FEW_PASSES, _MOST_OF_ONE, _MANY_PASSES, _FURTHEST, _LEAST_INDEX = 24, 1 / 3, 88, 8, 2.0
 # A pass has at least so many samples per pixel, and up to so many where fewer make no 2^16 paths: a call has costs of
@@ -234,11 +240,10 @@ class PassSums:
         values: tensors that were rendered, by key.
         passes, seconds: number of passes, and their wall time.
         measured, steady: sums of what the film measures, and of steady images.
-        squares: sum of squared magnitudes in bins (..., T, H, W), channels averaged.
+        odd: sum over passes of odd number in bins (..., T, H, W), channels averaged.
+        squares: sums of squared magnitudes in bins, of passes of even and of odd number.
         stats, channels: statistics of all passes together, and names of the channels.
         losses: value of the loss for each pass, where there is one.
-        center, weight: mean of the bins, and one over local means of those that count, at the last power of two.
-        distances: squared distance of each pass from the center, relative, since the first look.
     """
 
     seed: int
@@ -250,39 +255,37 @@ class PassSums:
     seconds: float = 0.0
     measured: torch.Tensor | None = None
     steady: torch.Tensor | None = None
-    squares: torch.Tensor | None = None
+    odd: torch.Tensor | None = None
+    squares: tuple[torch.Tensor, torch.Tensor] | None = None
     stats: RenderStats | None = None
     channels: tuple[str, ...] = ()
     losses: list[float] = field(default_factory=list)
-    center: torch.Tensor | None = None
-    weight: torch.Tensor | None = None
-    distances: list[float] = field(default_factory=list)
 
     def copy(self) -> PassSums:
         """Return sums that can be added to."""
         found = {one.name: getattr(self, one.name) for one in fields(self)}
-        for name in ("measured", "steady", "squares"):
+        for name in ("measured", "steady", "odd"):
             found[name] = found[name].clone()
-        return PassSums(**{**found, "losses": list(self.losses), "distances": list(self.distances)})
+        even, odd = _filled(self.squares)
+        return PassSums(**{**found, "squares": (even.clone(), odd.clone()), "losses": list(self.losses)})
 
     def add(self, out: RenderOutput, loss: float | None) -> None:
         """Add a pass, and the value of its loss."""
         measured = self.film.tensor(out)
         assert measured is not None  # a layout finds the tensor of its own film
         bins = _channel_mean(measured, out.steady.ndim - 3, out.polarized)
-        distance = None
-        if self.center is not None and self.weight is not None:
-            distance = float((bins - self.center).abs_().mul_(self.weight).square_().sum())
-        squared = bins.abs().square_()
+        squared, number = bins.abs().square_(), self.passes % 2
         with interrupts_wait():
-            if self.measured is None or self.steady is None or self.squares is None:
-                self.measured, self.steady, self.squares = _wide(measured), _wide(out.steady), squared
+            if self.measured is None or self.steady is None or self.odd is None or self.squares is None:
+                self.measured, self.steady = _wide(measured), _wide(out.steady)
+                self.odd, self.squares = torch.zeros_like(bins), (squared, torch.zeros_like(squared))
             else:
                 self.measured += measured
                 self.steady += out.steady
-                self.squares += squared
+                self.squares[number].add_(squared)
+                if number:
+                    self.odd += bins
             self.losses += [] if loss is None else [loss]
-            self.distances += [] if distance is None else [distance]
             self.stats = out.stats if self.stats is None else _stats_of_both(self.stats, out.stats)
             self.channels, self.passes = out.channels, self.passes + 1
 
@@ -304,12 +307,22 @@ class PassSums:
 
     def variance(self) -> torch.Tensor:
         """Return the moderated variance of one pass in each bin; infinite after a single pass."""
-        squares, n = _filled(self.squares), self.passes
-        if n < 2:
+        even, odd = _filled(self.squares)
+        return self._variance(self.mean_bins(), even + odd, self.passes)
+
+    def variances_of_halves(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the moderated variance of one pass as even and as odd passes have it, of four passes and more."""
+        (even, odd), n = _filled(self.squares), self.passes // 2
+        of_odd = _filled(self.odd)
+        of_even = self.mean_bins().mul_(self.passes).sub_(of_odd).div_(self.passes - n)
+        return self._variance(of_even, even, self.passes - n), self._variance(of_odd / n, odd, n)
+
+    def _variance(self, mean: torch.Tensor, squares: torch.Tensor, passes: int) -> torch.Tensor:
+        if passes < 2:
             return torch.full_like(squares, math.inf)
-        deviations: torch.Tensor = squares - self.mean_bins().abs().square_().mul_(n)
-        variance: torch.Tensor = deviations.clamp_(min=0.0).div_(n - 1)
-        return moderated_variance(variance, n, self.near)
+        deviations: torch.Tensor = squares - mean.abs().square_().mul_(passes)
+        variance: torch.Tensor = deviations.clamp_(min=0.0).div_(passes - 1)
+        return moderated_variance(variance, passes, self.near)
 
     def output(self) -> RenderOutput:
         """Return the mean of the passes as a render."""
@@ -317,14 +330,6 @@ class PassSums:
         narrow = torch.complex64 if measured.is_complex() else torch.float32
         stats = _filled(self.stats)
         return RenderOutput.of(self.film, steady.float(), measured.to(narrow), stats=stats, channels=self.channels)
-
-    def remember_center(self, on: Any) -> None:
-        """Measure distances from here on from the mean so far, relative to the local means of bins that count."""
-        self.center = self.mean_bins()
-        mean = local_mean(self.center.abs(), self.near)
-        counted = counted_bins(mean, on, self)
-        weight = counted.to(mean.dtype).div_(mean.clamp_(min=torch.finfo(mean.dtype).tiny))
-        self.weight = weight.div_(max(int(counted.sum()), 1) ** 0.5)
 
 
 _Filled = TypeVar("_Filled")
@@ -413,7 +418,19 @@ def look(sums: PassSums, request: Request) -> Look:
     errors = (sums.variance()[counted] / sums.passes).sqrt_().div_(mean[counted])
     error = quantile_of(errors, request.quantile)
     aim = request.rtol * share_to_aim_at((sums.passes - 1.0) * errors.numel())
-    return Look(sums.passes, error, aim, is_heavy(sums.distances))
+    return Look(sums.passes, error, aim, _ratio_of_halves(sums, mean, counted, request.quantile) > _MOST_IN_OTHER_HALF)
+
+
+def _ratio_of_halves(sums: PassSums, mean: torch.Tensor, counted: torch.Tensor, quantile: float) -> float:
+    """Return the relative variance of a half of the passes, in bins that are good in the other half, over theirs."""
+    if sums.passes < _FIRST_LOOK or not bool(counted.any()):
+        return 1.0
+    power = mean[counted].square_()
+    halves = [variance[counted] / power for variance in sums.variances_of_halves()]
+    good = [half <= quantile_of(half, quantile) for half in halves]
+    own = sum(float(half[mask].mean()) for half, mask in zip(halves, good, strict=True))
+    other = sum(float(half[mask].mean()) for half, mask in zip(halves, reversed(good), strict=True))
+    return other / own if own > 0 else 1.0 if other == 0 else math.inf
 
 
 def _look_at_loss(sums: PassSums, rtol: float) -> Look:
@@ -443,7 +460,8 @@ def counted_bins(mean: torch.Tensor, on: Any, sums: PassSums) -> torch.Tensor:
             wide = mask.broadcast_to(shape)
         except RuntimeError:
             continue
-        return (wide if wide.ndim == mean.ndim else wide.any(dim=place)) & (mean > 0)
+        found: torch.Tensor = (wide if wide.ndim == mean.ndim else wide.any(dim=place)) & (mean > 0)
+        return found
     raise ShapeError(
         f"on: expected a mask that broadcasts to {tuple(mean.shape)} or, with channels, {with_channels}, got "
         f"{tuple(on.shape)}."
@@ -583,9 +601,6 @@ def _goes_on(resume: ToleranceResult, new: PassSums, request: Request) -> Tolera
             "anew, or go on without a loss."
         )
     sums = old.copy()
-    if not alike:
-        # Distances are those of the bins that count.
-        sums.distances, sums.center, sums.weight = [], None, None
     if before.request.loss is not None and request.loss is None:
         sums.losses = []
     if request.is_as(before.request) and not before.ended:
@@ -625,12 +640,8 @@ class _Loop:
         sums, start = self.sums, time.perf_counter()
         out = self.render(pass_seed(sums.seed, sums.passes))
         sums.add(out, None if self.request.loss is None else _number_of(self.request.loss, out))
-        n = sums.passes
-        if self.request.loss is None:
-            if n == 1:
-                counted_bins(sums.mean_bins().abs(), self.request.on, sums)  # a mask of another shape ends here
-            if n >= _FIRST_LOOK and n & (n - 1) == 0:
-                sums.remember_center(self.request.on)
+        if sums.passes == 1 and self.request.loss is None:
+            counted_bins(sums.mean_bins().abs(), self.request.on, sums)  # a mask of another shape ends here
         self.pass_seconds.append(time.perf_counter() - start)
 
     def _look(self) -> str:
